@@ -1,0 +1,1 @@
+"""Geometry, measurement, estimation and storage: arrays and frozen dataclasses in and out."""

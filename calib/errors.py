@@ -1,0 +1,40 @@
+"""Errors of the calib floor: one base, a subclass where a caller would act differently."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+
+class CalibError(Exception):
+    """Base of every error that calib raises on purpose; its text is one plain sentence."""
+
+
+class BadFile(CalibError):
+    """A file that cannot be used: which file, which place in it, and what would be right.
+
+    Parameters
+    ----------
+    path
+        The file, as the user named it.
+    place
+        Key, row or line inside the file (``cameras.navcam_left.A``, ``row 12``); empty for the whole file.
+    reason
+        What is wrong, with the value, and what is expected.
+    """
+
+    def __init__(self, path: str | Path, place: str, reason: str) -> None:
+        self.path = Path(path)
+        self.place = place
+        self.reason = reason
+        super().__init__(f"{path}: {place}: {reason}" if place else f"{path}: {reason}")
+
+
+class Unreachable(CalibError):
+    """No joint angles bring the target onto the pixel; ``code`` names the cause for programs.
+
+    Codes: ``blind_cone``, ``too_near``, ``outside_limits``, ``bad_pixel``, ``bad_target``.
+    """
+
+    def __init__(self, code: str, message: str) -> None:
+        self.code = code
+        super().__init__(message)

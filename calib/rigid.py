@@ -1,0 +1,102 @@
+"""Rotations and rigid transforms.
+
+A transform is named ``b_from_a`` and maps coordinates in frame a to coordinates in frame b, so inner
+names touch in a product: ``c_from_a = c_from_b @ b_from_a``. Quaternions are (w, x, y, z).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+FloatArray = NDArray[np.float64]
+
+
+def frozen_array(values: ArrayLike, shape: tuple[int, ...]) -> FloatArray:
+    """Return a read-only float64 copy of ``values``, which must be finite and of exactly ``shape``.
+
+    Raises
+    ------
+    ValueError
+        If the shape differs or a value is not finite.
+    """
+    array = np.array(values, dtype=np.float64)
+    if array.shape != shape:
+        raise ValueError(f"shape {array.shape} where {shape} is expected")
+    if not np.isfinite(array).all():
+        raise ValueError(f"{array.tolist()} holds a value that is not finite")
+    array.setflags(write=False)
+    return array
+
+
+def rot_x(angle_rad: float) -> FloatArray:
+    """Return the (3, 3) right-handed rotation about x."""
+    c, s = np.cos(angle_rad), np.sin(angle_rad)
+    return np.array([[1.0, 0.0, 0.0], [0.0, c, -s], [0.0, s, c]])
+
+
+def rot_y(angle_rad: float) -> FloatArray:
+    """Return the (3, 3) right-handed rotation about y."""
+    c, s = np.cos(angle_rad), np.sin(angle_rad)
+    return np.array([[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]])
+
+
+def rot_z(angle_rad: float) -> FloatArray:
+    """Return the (3, 3) right-handed rotation about z."""
+    c, s = np.cos(angle_rad), np.sin(angle_rad)
+    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+
+
+@dataclass(frozen=True, eq=False)
+class Rigid:
+    """A rigid transform ``b_from_a``: x_in_b = rotation @ x_in_a + translation_m.
+
+    Attributes
+    ----------
+    rotation
+        (3, 3), orthonormal with determinant +1.
+    translation_m
+        (3,), the origin of a in b, metres.
+    """
+
+    rotation: FloatArray
+    translation_m: FloatArray
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "rotation", frozen_array(self.rotation, (3, 3)))
+        object.__setattr__(self, "translation_m", frozen_array(self.translation_m, (3,)))
+
+    @staticmethod
+    def identity() -> Rigid:
+        """Return the transform that changes nothing."""
+        return Rigid(np.eye(3), np.zeros(3))
+
+    def __matmul__(self, b_from_c: Rigid) -> Rigid:
+        """Return a_from_c = a_from_b @ b_from_c."""
+        return Rigid(
+            self.rotation @ b_from_c.rotation,
+            self.rotation @ b_from_c.translation_m + self.translation_m,
+        )
+
+    @property
+    def inverse(self) -> Rigid:
+        """The transform the other way."""
+        return Rigid(self.rotation.T, -self.rotation.T @ self.translation_m)
+
+    def points(self, points_m: ArrayLike) -> FloatArray:
+        """Return points (..., 3), metres, carried over (turned and moved)."""
+        return np.asarray(points_m, dtype=np.float64) @ self.rotation.T + self.translation_m
+
+    def vectors(self, vectors: ArrayLike) -> FloatArray:
+        """Return vectors (..., 3) carried over (turned only)."""
+        return np.asarray(vectors, dtype=np.float64) @ self.rotation.T
+
+    def __eq__(self, other: Any) -> bool:
+        return (
+            isinstance(other, Rigid)
+            and np.array_equal(self.rotation, other.rotation)
+            and np.array_equal(self.translation_m, other.translation_m)
+        )

@@ -1,0 +1,1 @@
+"""The hardware and its stand-ins: servos, cameras, the simulated rover, replay."""

@@ -1,0 +1,100 @@
+"""What the service asks of a device: two small protocols (contract section 5) and what travels through them.
+
+Times are seconds of CLOCK_MONOTONIC. Calls may block; the service gives each device a thread of its own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+from numpy.typing import NDArray
+
+Image = NDArray[np.uint8]
+
+
+@dataclass(frozen=True)
+class Reading:
+    """Joint state as *measured*, not as commanded.
+
+    Attributes
+    ----------
+    pan_rad, tilt_rad
+        Measured joint angles, radians (positive pan right, positive tilt up).
+    moving
+        Whether an axis is under way or not yet in position.
+    time_s
+        When it was measured, seconds of CLOCK_MONOTONIC.
+    faults
+        Plain words for what the device itself reports as wrong; empty when healthy.
+    """
+
+    pan_rad: float
+    tilt_rad: float
+    moving: bool
+    time_s: float
+    faults: Sequence[str] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """One picture.
+
+    Attributes
+    ----------
+    image
+        uint8, (h, w) grey or (h, w, 3) BGR; read-only by agreement.
+    sequence
+        Counts the camera's frames; a gap is a dropped frame.
+    mid_exposure_s
+        Middle of the exposure, seconds of CLOCK_MONOTONIC.
+    exposure_s
+        Exposure time, seconds: it began at ``mid_exposure_s - exposure_s / 2``.
+    """
+
+    image: Image
+    sequence: int
+    mid_exposure_s: float
+    exposure_s: float
+
+
+@runtime_checkable
+class PanTilt(Protocol):
+    """A two-axis head."""
+
+    def read(self) -> Reading:
+        """Return the measured joint state. Raises DriverError."""
+        ...
+
+    def move(self, pan_rad: float, tilt_rad: float, speed_rad_per_s: float | None = None) -> None:
+        """Start towards the angles and return at once. Raises DriverError."""
+        ...
+
+    def stop(self) -> None:
+        """Halt both axes where they are and hold. Raises DriverError."""
+        ...
+
+    def close(self) -> None:
+        """Make safe and let go of the device; never raises for a device that is already gone."""
+        ...
+
+
+@runtime_checkable
+class Camera(Protocol):
+    """A source of frames."""
+
+    def next_frame(self, exposed_after_s: float, timeout_s: float) -> Frame:
+        """Return a frame whose exposure began after ``exposed_after_s``, within ``timeout_s`` seconds.
+
+        Raises
+        ------
+        NoFreshFrame
+            If none came in time; the message says what came instead.
+        """
+        ...
+
+    def close(self) -> None:
+        """Let go of the device."""
+        ...

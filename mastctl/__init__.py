@@ -1,0 +1,1 @@
+"""The service: configuration, pointing loop, daemon, client and command line."""
