@@ -1,0 +1,130 @@
+"""The door of the command line: choose the command, run it, tell a refusal in one line with its exit code.
+
+Exit codes: 0 success, 2 wrong use or bad input, 1 failure, 130 interrupted, 141 nobody reads the output.
+A command module offers ``add_commands(subparsers)`` and sets ``run=function(args) -> int`` on each of its
+commands. Only the module of the command that was asked for is imported; a module imports what is
+slow (numpy, cv2, numba, fastapi) inside its functions.
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import logging
+import os
+import re
+import sys
+from collections.abc import Sequence
+from difflib import get_close_matches
+from typing import Any, NoReturn
+
+from mastctl.cli import output
+
+log = logging.getLogger(__name__)
+
+# Which module brings which command, in the order in which the help shows them.
+MODULES: dict[str, tuple[str, ...]] = {
+    "mastctl.cli.service": ("run", "status", "point", "stop", "snapshot"),
+    "mastctl.cli.geometry": ("camera", "solve", "triangulate", "budget"),
+}
+
+# argparse's own pattern knows -1 and -1.5 but takes -1e-3 for an option; "not finite" words get our message.
+_NEGATIVE_NUMBER = re.compile(r"^-(?:\d+\.?\d*|\.\d+)(?:e[-+]?\d+)?$|^-(?:inf|infinity|nan)$", re.IGNORECASE)
+
+
+class Parser(argparse.ArgumentParser):
+    """A parser that refuses in one line, reads any negative number, and gives each command --json."""
+
+    def __init__(self, *args: Any, **options: Any) -> None:
+        options.setdefault("allow_abbrev", False)
+        super().__init__(*args, **options)
+        self._negative_number_matcher = _NEGATIVE_NUMBER
+        self.add_argument(
+            "--json",
+            action="store_true",
+            default=argparse.SUPPRESS,
+            help="print one JSON document on stdout and nothing else",
+        )
+
+    def error(self, message: str) -> NoReturn:
+        """Refuse wrong use; the caller prints the one line."""
+        raise output.WrongUse(f"{message} (see '{self.prog} --help')")
+
+
+class _Version(argparse.Action):
+    """Print the installed version; reading it is slow, so only when it is asked for."""
+
+    def __init__(self, option_strings: Sequence[str], dest: str, **options: Any) -> None:
+        super().__init__(option_strings, dest, nargs=0, default=argparse.SUPPRESS, help="print the version")
+
+    def __call__(self, parser: argparse.ArgumentParser, *ignored: Any) -> NoReturn:
+        from importlib.metadata import version
+
+        sys.stdout.write(f"mastctl {version('mastctl')}\n")
+        parser.exit()
+
+
+def build_parser(argv: Sequence[str]) -> Parser:
+    """Return the parser; if ``argv`` names a known command, only that command's module is in it."""
+    parser = Parser(
+        prog="mastctl",
+        description="Rover mast controller: camera geometry, exact pointing, the pointing service.",
+    )
+    parser.add_argument("--version", action=_Version)
+    subparsers = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
+    wanted = next((word for word in argv if not word.startswith("-")), None)
+    modules = [module for module, commands in MODULES.items() if wanted in commands] or list(MODULES)
+    for module in modules:
+        importlib.import_module(module).add_commands(subparsers)
+    return parser
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run one command and return its exit code; never raises, never shows a traceback.
+
+    Parameters
+    ----------
+    argv
+        The words after ``mastctl``; those of the process by default.
+    """
+    words = list(sys.argv[1:] if argv is None else argv)
+    as_json = "--json" in words
+    logging.basicConfig(
+        format="%(levelname)s %(name)s: %(message)s", level=logging.WARNING, stream=sys.stderr
+    )
+    try:
+        code = _run(words)
+        sys.stdout.flush()
+        return code
+    except BrokenPipeError:
+        # The reader (head, less) has gone; keep the interpreter from complaining when it closes stdout.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 141
+    except KeyboardInterrupt:
+        return output.refuse(output.CommandError("interrupted", "interrupted", exit_code=130), as_json)
+    except Exception as error:  # the last door before the user: one line, never a traceback
+        log.debug("refused", exc_info=True)
+        return output.refuse(error, as_json)
+
+
+def _run(words: Sequence[str]) -> int:
+    """Parse and run; --help and --version end here with their own code."""
+    try:
+        _check_command(words)
+        parser = build_parser(words)
+        args = parser.parse_args(words)
+    except SystemExit as done:
+        return int(done.code or 0)
+    args.json = getattr(args, "json", False)
+    return int(args.run(args))
+
+
+def _check_command(words: Sequence[str]) -> None:
+    """Refuse an unknown command with the nearest known one; argparse would list them all."""
+    known = [command for commands in MODULES.values() for command in commands]
+    wanted = next((word for word in words if not word.startswith("-")), None)
+    if wanted is None or wanted in known:
+        return
+    near = get_close_matches(wanted, known, n=1)
+    hint = f"did you mean '{near[0]}'?" if near else f"known are {', '.join(known)}"
+    raise output.WrongUse(f"no command '{wanted}'; {hint}")

@@ -1,0 +1,146 @@
+"""How a command tells its results and refusals: JSON for programs, tables for people, one line an error."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import sys
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+
+class CommandError(Exception):
+    """A command that cannot do what was asked.
+
+    Parameters
+    ----------
+    code
+        A word for programs, ``snake_case``.
+    message
+        One plain sentence.
+    exit_code
+        2 for wrong use or bad input, 1 for a failure.
+    detail
+        More for programs; must be JSON.
+    """
+
+    def __init__(
+        self, code: str, message: str, exit_code: int = 1, detail: Mapping[str, Any] | None = None
+    ) -> None:
+        self.code = code
+        self.exit_code = exit_code
+        self.detail = detail
+        super().__init__(message)
+
+
+class WrongUse(CommandError):
+    """Options or arguments that make no sense; exit code 2."""
+
+    def __init__(self, message: str) -> None:
+        super().__init__("wrong_use", message, exit_code=2)
+
+
+def print_json(document: Mapping[str, Any]) -> None:
+    """Write one JSON document to stdout; a value that is not finite is the caller's defect (ValueError)."""
+    sys.stdout.write(json.dumps(document, allow_nan=False) + "\n")
+
+
+def print_table(
+    title: str, columns: Sequence[str], rows: Iterable[Sequence[str]], notes: Sequence[str] = ()
+) -> None:
+    """Write a table for people to stdout, numbers on the right, notes under it."""
+    from rich.console import Console
+    from rich.table import Table
+    from rich.text import Text
+
+    table = Table(title=Text(title), title_justify="left")
+    for column in columns:
+        table.add_column(Text(column), justify="right")
+    for row in rows:
+        table.add_row(*(Text(cell) for cell in row))
+    console = Console(file=sys.stdout, soft_wrap=True)
+    console.print(table)
+    for note in notes:
+        console.print(Text(note))
+
+
+def tell(message: str) -> None:
+    """Write one line for people to stderr."""
+    sys.stderr.write(one_line(message) + "\n")
+
+
+def one_line(text: str) -> str:
+    """Return the text on one line, with control characters (a file may hold any) shown as escapes."""
+    joined = " ".join(text.split())
+    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in joined)
+
+
+def refuse(error: BaseException, as_json: bool) -> int:
+    """Tell a refusal, as JSON on stdout or as one line on stderr, and return the exit code."""
+    known = as_command_error(error)
+    message = one_line(str(known)) or known.code
+    if as_json:
+        body: dict[str, Any] = {"code": known.code, "message": message}
+        if known.detail:
+            body["detail"] = dict(known.detail)
+        print_json({"error": body})
+        sys.stdout.flush()
+    else:
+        sys.stderr.write(f"mastctl: {message}\n")
+    return known.exit_code
+
+
+def as_command_error(error: BaseException) -> CommandError:
+    """Return what a refusal says to the outside: code, message, exit code.
+
+    Bad files and bad options end with 2, everything else with 1. An error that carries a ``code`` keeps it.
+    An error that nobody foresaw is ``internal``: its type and text on one line.
+    """
+    from calib.errors import BadFile, CalibError, Unreachable
+    from drivers.errors import BadOptions, DriverError
+
+    if isinstance(error, CommandError):
+        return error
+    if isinstance(error, BadFile):
+        return CommandError("bad_file", str(error), 2, {"path": str(error.path), "place": error.place})
+    if isinstance(error, Unreachable):
+        return CommandError("unreachable", str(error), 1, {"reason": error.code})
+    if isinstance(error, BadOptions):
+        return CommandError("bad_options", str(error), 2)
+    if isinstance(error, (CalibError, DriverError)) or isinstance(getattr(error, "code", None), str):
+        return CommandError(_code_of(error), str(error), int(getattr(error, "exit_code", 1)))
+    if isinstance(error, OSError):
+        where = f"{error.filename}: " if error.filename is not None else ""
+        return CommandError("file_system", f"{where}{error.strerror or error}", 1)
+    if isinstance(error, MemoryError):
+        return CommandError("out_of_memory", "not enough memory for this input", 1)
+    return CommandError("internal", f"a defect of the program: {type(error).__name__}: {error}", 1)
+
+
+def _code_of(error: BaseException) -> str:
+    """The error's own code, else its class name in snake_case."""
+    code = getattr(error, "code", None)
+    if isinstance(code, str) and code:
+        return code
+    name = type(error).__name__
+    return "".join(f"_{c.lower()}" if c.isupper() and i else c.lower() for i, c in enumerate(name))
+
+
+def finite_number(text: str) -> float:
+    """Read an option's value as a finite number (argparse ``type``)."""
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not math.isfinite(value) or "_" in text:
+        raise argparse.ArgumentTypeError(f"'{text}' where a finite number is expected")
+    return value
+
+
+def positive_number(text: str) -> float:
+    """Read an option's value as a finite number above zero (argparse ``type``)."""
+    value = finite_number(text)
+    if value <= 0:
+        raise argparse.ArgumentTypeError(f"'{text}' where a number above zero is expected")
+    return value
