@@ -1,0 +1,395 @@
+"""The devices as the service uses them: one owner thread each, answers checked, the one door for moves.
+
+Every call blocks for a bounded time and may come from any thread. The head is read all the time (50 times a
+second while it moves, 20 while it rests), so that each frame gets the joint angles at its mid-exposure.
+This module does not decide where to point and does not retry: an answer that cannot be true is an error.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Future
+from typing import Protocol
+
+import numpy as np
+
+from calib.mast import Rig
+from drivers.clock import Clock
+from drivers.errors import BadFrame, BadReply, DriverError, NoReply
+from drivers.interfaces import Camera, PanTilt, Reading
+from mastctl import frames as frame_checks
+from mastctl import joint_history
+from mastctl.device_thread import DeviceThread, Fault
+from mastctl.errors import FrameGone, MastctlError, Stopped
+from mastctl.frames import CheckedFrame, FrameStore, StampedFrame
+from mastctl.joint_history import JointHistory
+from mastctl.limits import Limits
+
+log = logging.getLogger(__name__)
+
+HEAD = "pan_tilt"
+READ_TIMEOUT_S = 1.0
+MOVE_TIMEOUT_S = 1.0
+STOP_TIMEOUT_S = 1.0
+STOP_PATIENCE_S = 0.05  # how long a stop waits for the head's own thread before it goes out beside it
+CAMERA_GRACE_S = 1.0  # beyond the time given to next_frame, for a busy machine
+MOVING_PERIOD_S = 0.02
+RESTING_PERIOD_S = 0.05
+MOVED_RAD = 1e-5  # a head camera's picture that stays the same to the last bit beyond this is frozen
+
+
+class UnknownCamera(MastctlError):
+    """A camera was named that is not configured."""
+
+    code = "unknown_camera"
+
+
+class HardwareLike(Protocol):
+    """What `drivers.open_hardware` gives, as far as it is used here."""
+
+    @property
+    def pan_tilt(self) -> PanTilt: ...
+    @property
+    def cameras(self) -> Mapping[str, Camera]: ...
+
+
+class Devices:
+    """The head and the cameras behind their threads.
+
+    Parameters
+    ----------
+    hardware
+        The opened drivers; closing them is left to their opener, after `close`.
+    limits
+        Soft limits, checked in `move` as the last thing before the driver is called.
+    mast_digest
+        SHA-256 (hex) of the mast file in use, part of every frame's facts.
+    clock
+        Stamps are judged against it; deadlines run on the machine's own clock.
+    rig
+        The mast file's content: image sizes, and which cameras ride on the head. Without it sizes are
+        not checked and no camera is taken for frozen.
+    """
+
+    def __init__(
+        self, hardware: HardwareLike, limits: Limits, mast_digest: str, clock: Clock, rig: Rig | None = None
+    ) -> None:
+        self._pan_tilt = hardware.pan_tilt
+        self._cameras = dict(hardware.cameras)
+        self._limits = limits
+        self._digest = mast_digest
+        self._clock = clock
+        self._sizes_px = {name: camera.model.size_px for name, camera in rig.cameras.items()} if rig else {}
+        self._on_head = (
+            {name for name, camera in rig.cameras.items() if camera.on == "head"} if rig else set()
+        )
+        self._history = JointHistory()
+        self._store = FrameStore(mast_digest)
+        self._still_since: dict[str, StampedFrame] = {}  # per camera the first frame of the same content
+        self._stamping = {name: threading.Lock() for name in self._cameras}
+        self._gate = threading.Lock()
+        self._stops = 0
+        self._stop_owed = False
+        self._blocked = ""
+        self._closed = False
+        self._last_faults: tuple[str, ...] = ()
+        self._camera_threads = {name: DeviceThread(name) for name in self._cameras}
+        self._head = DeviceThread(HEAD, between=self._poll, between_timeout_s=READ_TIMEOUT_S)
+
+    # The head
+
+    @property
+    def last_reading(self) -> Reading | None:
+        """The last good reading of the head, None before the first; its age is the clock minus its time_s."""
+        return self._history.newest
+
+    def read(self) -> Reading:
+        """Return the joint state measured now.
+
+        Raises
+        ------
+        NoReply, BadReply, DriverError
+            If the head does not answer in 1 s, or answers what cannot be true.
+        """
+        return self._head.call("read", self._read_once, READ_TIMEOUT_S)
+
+    def move(self, pan_rad: float, tilt_rad: float, speed_rad_per_s: float | None = None) -> None:
+        """Start the head towards the angles, radians, and return; at most at the speed cap.
+
+        Raises
+        ------
+        OutsideLimits
+            If an angle or the speed may not be commanded; nothing was sent.
+        Stopped
+            If a stop came first or moves are blocked; nothing was sent.
+        NoReply, DriverError
+            If the head does not take the command in 1 s.
+        """
+        with self._gate:
+            ticket = self._stops
+
+        def send() -> None:
+            with self._gate:
+                if self._blocked or ticket != self._stops:
+                    raise Stopped(self._blocked or "a stop came before the move was sent")
+            self._limits.check(pan_rad, tilt_rad)
+            speed = self._limits.speed(speed_rad_per_s)
+            self._history.move_sent(self._clock.now_s())
+            self._pan_tilt.move(float(pan_rad), float(tilt_rad), speed)
+            self._settle_stop()
+
+        self._head.call("move", send, MOVE_TIMEOUT_S)
+
+    def stop(self) -> None:
+        """Halt the head at once; moves still waiting are never sent.
+
+        The stop goes before everything that waits. If the head's thread hangs in an earlier call, the stop
+        is sent beside it from a thread of its own: a driver that is not made for two threads may then
+        answer badly, but a stop that arrives is worth more than an answer. When the hanging call comes
+        back, the stop is sent once more, since that call may have been a move.
+
+        Raises
+        ------
+        NoReply, DriverError
+            If the head did not confirm within 1 s; it may still move.
+        """
+        deadline_s = time.monotonic() + STOP_TIMEOUT_S
+        with self._gate:
+            self._stops += 1
+        waiting = self._head.submit("stop", self._pan_tilt.stop, STOP_TIMEOUT_S, first=True)
+        try:
+            waiting.result(min(STOP_PATIENCE_S, STOP_TIMEOUT_S))
+            return
+        except TimeoutError:
+            if not waiting.cancel():  # under way already
+                self._head.wait("stop", waiting, deadline_s)
+                return
+        with self._gate:
+            self._stop_owed = True
+        self._stop_beside(deadline_s)
+
+    def block_moves(self, reason: str) -> None:
+        """Refuse every further move, with this reason, until `allow_moves`."""
+        with self._gate:
+            self._blocked = reason
+
+    def allow_moves(self) -> None:
+        """Take moves again, unless the devices are closed."""
+        with self._gate:
+            if not self._closed:
+                self._blocked = ""
+
+    # The cameras
+
+    def frames(
+        self, cameras: Sequence[str], exposed_after_s: float, timeout_s: float
+    ) -> dict[str, StampedFrame]:
+        """Return one frame of each camera, asked for in parallel, with its facts.
+
+        Parameters
+        ----------
+        cameras
+            Names of configured cameras.
+        exposed_after_s
+            Only frames whose exposure began after this moment count, seconds of CLOCK_MONOTONIC.
+        timeout_s
+            What each camera is given, seconds; the call itself ends at most some 2 s later.
+
+        Raises
+        ------
+        UnknownCamera
+            If a name is not configured.
+        NoFreshFrame, BadFrame, NoReply, DriverError
+            If a camera did not deliver; the first in the order asked.
+        BadReply
+            If the head's readings do not reach around an exposure.
+        """
+        for camera in cameras:
+            if camera not in self._cameras:
+                known = ", ".join(sorted(self._cameras)) or "none"
+                raise UnknownCamera(f"camera {camera} is not configured; configured are {known}")
+        deadline_s = time.monotonic() + timeout_s
+        asked: dict[str, Future[CheckedFrame | StampedFrame]] = {}
+        for camera in dict.fromkeys(cameras):
+            take = self._taker(camera, exposed_after_s, deadline_s)
+            asked[camera] = self._camera_threads[camera].submit(
+                "next_frame", take, timeout_s + CAMERA_GRACE_S
+            )
+        taken: dict[str, StampedFrame] = {}
+        for camera, future in asked.items():
+            frame = self._camera_threads[camera].wait("next_frame", future, deadline_s + CAMERA_GRACE_S)
+            taken[camera] = frame if isinstance(frame, StampedFrame) else self._stamp(camera, frame)
+        return taken
+
+    def frame_by_id(self, frame_id: str, max_age_s: float | None = None) -> StampedFrame:
+        """Return a frame that is still kept.
+
+        Raises
+        ------
+        FrameGone
+            With the code ``frame_unknown``, ``frame_too_old`` or ``other_mast_file``.
+        """
+        frame = self._store.by_id(frame_id)
+        age_s = self._clock.now_s() - frame.mid_exposure_s
+        if max_age_s is not None and age_s > max_age_s:
+            raise FrameGone(
+                "frame_too_old", f"frame {frame_id} is {age_s:.0f} s old, at most {max_age_s:.0f} s is taken"
+            )
+        return frame
+
+    def newest_frames(self) -> dict[str, StampedFrame | None]:
+        """Return each configured camera's newest frame, None where there is none yet; asks no camera."""
+        return {camera: self._store.newest(camera) for camera in self._cameras}
+
+    # All
+
+    def faults(self) -> tuple[Fault, ...]:
+        """Return what is wrong with any device now, what the head reports about itself included."""
+        found = list(self._head.faults())
+        reading = self._history.newest
+        if reading is not None:
+            found += [
+                Fault(HEAD, "device_fault", f"{HEAD}: {word}", reading.time_s) for word in reading.faults
+            ]
+        for thread in self._camera_threads.values():
+            found += thread.faults()
+        return tuple(found)
+
+    def close(self) -> None:
+        """Stop the head and end the threads; takes some 4 s at most and never raises."""
+        self.block_moves("the service is closing")
+        with self._gate:
+            if self._closed:
+                return
+            self._closed = True
+        try:
+            self.stop()
+        except (DriverError, MastctlError) as error:
+            log.error("the head did not confirm the last stop: %s", error)
+        until_s = time.monotonic() + 2.0
+        for thread in (self._head, *self._camera_threads.values()):
+            thread.close(max(0.1, until_s - time.monotonic()))
+
+    # In the devices' own threads
+
+    def _read_once(self) -> Reading:
+        answer = self._pan_tilt.read()
+        newest = self._history.newest
+        reading = joint_history.checked(
+            answer, HEAD, self._clock.now_s(), None if newest is None else newest.time_s
+        )
+        self._history.add(reading)
+        if reading.faults != self._last_faults:
+            self._last_faults = tuple(reading.faults)
+            log.warning("%s reports: %s", HEAD, "; ".join(reading.faults) or "healthy again")
+        self._settle_stop()
+        return reading
+
+    def _poll(self) -> float:
+        return MOVING_PERIOD_S if self._read_once().moving else RESTING_PERIOD_S
+
+    def _settle_stop(self) -> None:
+        """Send the stop that went out beside this thread once more, now in order."""
+        with self._gate:
+            owed, self._stop_owed = self._stop_owed, False
+        if owed:
+            self._pan_tilt.stop()
+
+    def _taker(
+        self, camera: str, exposed_after_s: float, deadline_s: float
+    ) -> Callable[[], CheckedFrame | StampedFrame]:
+        def take() -> CheckedFrame | StampedFrame:
+            newest = self._store.newest(camera)
+            if newest is not None and newest.exposure_began_s > exposed_after_s:
+                return newest  # somebody else's request brought it a moment ago
+            answer = self._cameras[camera].next_frame(
+                exposed_after_s, max(0.0, deadline_s - time.monotonic())
+            )
+            now_s = self._clock.now_s()
+            frame = frame_checks.checked(answer, camera, self._sizes_px.get(camera), exposed_after_s, now_s)
+            if newest is not None:
+                _check_order(frame, newest)
+            return frame
+
+        return take
+
+    # In the caller's thread
+
+    def _stamp(self, camera: str, frame: CheckedFrame) -> StampedFrame:
+        """Give a frame its joint angles and id, and keep it."""
+        began_s = frame.mid_exposure_s - frame.exposure_s / 2
+        ended_s = frame.mid_exposure_s + frame.exposure_s / 2
+        until_s = time.monotonic() + READ_TIMEOUT_S
+        while (newest := self._history.newest) is None or newest.time_s < ended_s:
+            self.read()
+            if time.monotonic() > until_s:
+                raise BadReply("the readings stay behind the frame's exposure", device=HEAD)
+        joints = self._history.at_exposure(began_s, frame.mid_exposure_s, ended_s, HEAD)
+        stamped = StampedFrame(
+            frame_id=self._store.frame_id(camera, frame.sequence),
+            camera=camera,
+            image=frame.image,
+            sequence=frame.sequence,
+            mid_exposure_s=frame.mid_exposure_s,
+            exposure_s=frame.exposure_s,
+            pan_rad=joints.pan_rad,
+            tilt_rad=joints.tilt_rad,
+            moving=joints.moving,
+            mast_digest=self._digest,
+        )
+        with self._stamping[camera]:
+            self._check_alive(stamped)
+            return self._store.add(stamped)
+
+    def _check_alive(self, frame: StampedFrame) -> None:
+        """Refuse a head camera's picture that did not change at all while the head moved."""
+        since = self._still_since.get(frame.camera)
+        if since is None or not np.array_equal(since.image, frame.image):
+            self._still_since[frame.camera] = frame
+            return
+        moved_rad = max(abs(frame.pan_rad - since.pan_rad), abs(frame.tilt_rad - since.tilt_rad))
+        if frame.camera in self._on_head and moved_rad > MOVED_RAD:
+            raise BadFrame(
+                f"the picture is frozen: the same to the last bit although the head moved by {moved_rad:.6f} rad",
+                device=frame.camera,
+            )
+
+    def _stop_beside(self, deadline_s: float) -> None:
+        """Send a stop from a thread of its own, because the head's thread hangs."""
+        outcome: Future[None] = Future()
+
+        def send() -> None:
+            try:
+                self._pan_tilt.stop()
+                outcome.set_result(None)
+            except BaseException as error:  # whatever a driver raises must reach the caller as a typed error
+                outcome.set_exception(error)
+
+        threading.Thread(target=send, name="stop beside", daemon=True).start()
+        try:
+            outcome.result(max(0.0, deadline_s - time.monotonic()))
+        except TimeoutError:
+            raise NoReply(
+                "stop did not end within its deadline; the head may still move", device=HEAD
+            ) from None
+        except DriverError:
+            raise
+        except BaseException as error:
+            raise DriverError(
+                f"the driver failed in stop: {type(error).__name__}: {error}", device=HEAD
+            ) from None
+
+
+def _check_order(frame: CheckedFrame, newest: StampedFrame) -> None:
+    """Refuse a frame whose count and time do not go forward together."""
+    ahead = frame.sequence - newest.sequence
+    later_s = frame.mid_exposure_s - newest.mid_exposure_s
+    if (ahead > 0) != (later_s > 0) or (ahead < 0) != (later_s < 0) or ahead < 0:
+        raise BadFrame(
+            f"frame {frame.sequence} is {later_s:.3f} s after frame {newest.sequence}: "
+            "count and time must grow together",
+            device=newest.camera,
+        )

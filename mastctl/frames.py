@@ -1,0 +1,211 @@
+"""Frames with their facts: what a picture shows is worth little without when, where and by which mast file.
+
+A frame's id is ``<camera>-<sequence>-<mast>-<run>``: the last two are the first 8 digits of the mast file's
+digest and a token of this run of the service, so that an id kept from yesterday, or from before the mast
+file changed, never names another picture. Clients take ids as opaque.
+"""
+
+from __future__ import annotations
+
+import secrets
+import threading
+from collections import deque
+from dataclasses import dataclass
+
+import numpy as np
+
+from drivers.errors import BadFrame, NoFreshFrame
+from drivers.interfaces import Image
+from mastctl.errors import FrameGone
+
+KEPT_FRAMES = 16  # per camera; six cameras of 1024x768 grey are 75 MB
+CLOCK_TOLERANCE_S = 0.005  # what a stamp may lie in the future: rounding, and a driver that estimates
+DARK_GREY = 8  # a picture whose brightest hundredth is below this shows nothing to correlate with
+
+
+@dataclass(frozen=True, eq=False)
+class StampedFrame:
+    """One picture and its facts.
+
+    Attributes
+    ----------
+    frame_id, camera, sequence
+        Its name; the camera's name in the mast file; the camera's own count.
+    image
+        uint8 (h, w) or (h, w, 3) BGR, read-only.
+    mid_exposure_s, exposure_s
+        Middle of the exposure, seconds of CLOCK_MONOTONIC, and its length, seconds.
+    pan_rad, tilt_rad
+        Joint angles at mid-exposure, radians, interpolated from the measured ones around it.
+    moving
+        Whether the head moved, or was told to, at any time of the exposure.
+    mast_digest
+        SHA-256 (hex) of the mast file in use.
+    """
+
+    frame_id: str
+    camera: str
+    image: Image
+    sequence: int
+    mid_exposure_s: float
+    exposure_s: float
+    pan_rad: float
+    tilt_rad: float
+    moving: bool
+    mast_digest: str
+
+    @property
+    def exposure_began_s(self) -> float:
+        """When the exposure began, seconds of CLOCK_MONOTONIC."""
+        return self.mid_exposure_s - self.exposure_s / 2
+
+
+@dataclass(frozen=True, eq=False)
+class CheckedFrame:
+    """A camera's frame that passed `checked`: types, size, time and order are right."""
+
+    image: Image
+    sequence: int
+    mid_exposure_s: float
+    exposure_s: float
+
+
+def checked(
+    answer: object, camera: str, size_px: tuple[int, int] | None, exposed_after_s: float, now_s: float
+) -> CheckedFrame:
+    """Return a driver's answer to ``next_frame`` if it can be true and was exposed after the asked moment.
+
+    Parameters
+    ----------
+    answer
+        Whatever the driver returned.
+    camera, size_px
+        The camera's name, and (width, height) by the mast file; None if not known.
+    exposed_after_s, now_s
+        The asked moment and the present, seconds of CLOCK_MONOTONIC.
+
+    Raises
+    ------
+    BadFrame
+        If it is no frame, of another size, dark, or stamped in the future.
+    NoFreshFrame
+        If its exposure began too early.
+    """
+    try:
+        image = answer.image  # type: ignore[attr-defined]
+        sequence = _whole(answer.sequence)  # type: ignore[attr-defined]
+        mid_s = _number(answer.mid_exposure_s)  # type: ignore[attr-defined]
+        exposure_s = _number(answer.exposure_s)  # type: ignore[attr-defined]
+    except (AttributeError, TypeError, ValueError) as reason:
+        words = f"next_frame returned {type(answer).__name__} that is not a frame: {reason}"
+        raise BadFrame(words, device=camera) from None
+    if not isinstance(image, np.ndarray) or image.dtype != np.uint8:
+        kind = image.dtype if isinstance(image, np.ndarray) else type(image).__name__
+        raise BadFrame(f"the image is {kind} where an array of uint8 is expected", device=camera)
+    if not (image.ndim == 2 or (image.ndim == 3 and image.shape[2] == 3)) or image.size == 0:
+        words = f"the image has shape {image.shape} where (h, w) or (h, w, 3) is expected"
+        raise BadFrame(words, device=camera)
+    if size_px is not None and (image.shape[1], image.shape[0]) != size_px:
+        width, height = size_px
+        words = (
+            f"the image is {image.shape[1]}x{image.shape[0]} px where the mast file has {width}x{height} px"
+        )
+        raise BadFrame(words, device=camera)
+    if sequence < 0 or exposure_s < 0.0:
+        words = f"sequence {sequence} and exposure {exposure_s} s where neither may be below 0"
+        raise BadFrame(words, device=camera)
+    ended_s = mid_s + exposure_s / 2
+    if ended_s > now_s + CLOCK_TOLERANCE_S:
+        words = f"the exposure is stamped to end {ended_s - now_s:.3f} s in the future"
+        raise BadFrame(words, device=camera)
+    began_s = mid_s - exposure_s / 2
+    if began_s <= exposed_after_s:
+        words = f"the frame that came was exposed {exposed_after_s - began_s:.3f} s before the asked moment"
+        raise NoFreshFrame(words, device=camera)
+    brightest = np.percentile(image[::8, ::8], 99)
+    if brightest < DARK_GREY:
+        words = f"the picture is dark: its brightest hundredth is at {brightest:.0f} of 255"
+        raise BadFrame(words, device=camera)
+    if image.flags.writeable or not image.flags.c_contiguous:
+        # The driver may use its buffer again; one that hands over a read-only array is spared the copy.
+        image = image.copy()
+        image.setflags(write=False)
+    return CheckedFrame(image, sequence, mid_s, exposure_s)
+
+
+class FrameStore:
+    """The newest frames of each camera, found again by id. Safe to use from any thread."""
+
+    def __init__(self, mast_digest: str, kept: int = KEPT_FRAMES) -> None:
+        self._mast = mast_digest[:8]
+        self._run = secrets.token_hex(2)
+        self._kept = kept
+        self._frames: dict[str, deque[StampedFrame]] = {}
+        self._lock = threading.Lock()
+
+    def frame_id(self, camera: str, sequence: int) -> str:
+        """Return the id of a camera's frame in this run."""
+        return f"{camera}-{sequence:06d}-{self._mast}-{self._run}"
+
+    def add(self, frame: StampedFrame) -> StampedFrame:
+        """Keep a frame and return it; if a frame of that id is kept already, that one is returned."""
+        with self._lock:
+            frames = self._frames.setdefault(frame.camera, deque(maxlen=self._kept))
+            for known in frames:
+                if known.frame_id == frame.frame_id:
+                    return known
+            frames.append(frame)
+            return frame
+
+    def newest(self, camera: str) -> StampedFrame | None:
+        """Return a camera's newest frame, None before the first."""
+        with self._lock:
+            frames = self._frames.get(camera)
+            return frames[-1] if frames else None
+
+    def by_id(self, frame_id: str) -> StampedFrame:
+        """Return a frame by its id.
+
+        Raises
+        ------
+        FrameGone
+            ``frame_too_old`` if it was taken in this run but is no longer kept, ``other_mast_file`` if it
+            was taken with another mast file, ``frame_unknown`` otherwise.
+        """
+        with self._lock:
+            for frames in self._frames.values():
+                for frame in frames:
+                    if frame.frame_id == frame_id:
+                        return frame
+            newest = {camera: frames[-1].sequence for camera, frames in self._frames.items() if frames}
+        parts = frame_id.rsplit("-", 3)
+        if len(parts) == 4 and parts[1].isdecimal():
+            camera, sequence, mast, run = parts
+            if mast != self._mast:
+                raise FrameGone(
+                    "other_mast_file",
+                    f"frame {frame_id} was taken with mast file {mast}..., the one in use is {self._mast}...",
+                )
+            if run == self._run and int(sequence) <= newest.get(camera, -1):
+                raise FrameGone(
+                    "frame_too_old",
+                    f"frame {frame_id} is no longer kept (the newest {self._kept} of a camera are)",
+                )
+        raise FrameGone("frame_unknown", f"frame {frame_id} was not taken by this run of the service")
+
+
+def _number(value: object) -> float:
+    """Return a finite float, refusing what only looks like one."""
+    if isinstance(value, bool) or not isinstance(value, (int, float, np.integer, np.floating)):
+        raise TypeError(f"{type(value).__name__} where a number is expected")
+    number = float(value)
+    if not np.isfinite(number):
+        raise ValueError(f"{number} where a finite number is expected")
+    return number
+
+
+def _whole(value: object) -> int:
+    """Return an int, refusing what only looks like one."""
+    if isinstance(value, bool) or not isinstance(value, (int, np.integer)):
+        raise TypeError(f"{type(value).__name__} where a whole number is expected")
+    return int(value)
