@@ -32,7 +32,18 @@ class BadFile(CalibError):
 class Unreachable(CalibError):
     """No joint angles bring the target onto the pixel; ``code`` names the cause for programs.
 
-    Codes: ``blind_cone``, ``too_near``, ``outside_limits``, ``bad_pixel``, ``bad_target``.
+    Codes: ``blind_cone``, ``too_near``, ``outside_limits``, ``bad_pixel``, ``bad_target``, ``parallel_axes``.
+    """
+
+    def __init__(self, code: str, message: str) -> None:
+        self.code = code
+        super().__init__(message)
+
+
+class NoStereoPoint(CalibError):
+    """Two rays that do not meet in front of both cameras; ``code`` names the cause for programs.
+
+    Codes: ``parallel_rays``, ``behind_camera``, ``bad_pixel``.
     """
 
     def __init__(self, code: str, message: str) -> None:
