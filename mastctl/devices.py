@@ -353,7 +353,7 @@ class Devices:
         moved_rad = max(abs(frame.pan_rad - since.pan_rad), abs(frame.tilt_rad - since.tilt_rad))
         if frame.camera in self._on_head and moved_rad > MOVED_RAD:
             raise BadFrame(
-                f"the picture is frozen: the same to the last bit although the head moved by {moved_rad:.6f} rad",
+                f"the picture is frozen: equal to the last bit although the head moved {moved_rad:.6f} rad",
                 device=frame.camera,
             )
 
