@@ -1,0 +1,258 @@
+"""The one door to hardware: from a configuration's driver names to open devices.
+
+Nothing else knows real and simulated drivers both. A name is ``sim``, ``replay``, or
+``package.module:factory`` for a driver from outside this repository (contract section 5).
+"""
+
+from __future__ import annotations
+
+import importlib
+import logging
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import MappingProxyType, TracebackType
+from typing import TYPE_CHECKING, Any, Literal
+
+from drivers.clock import Clock, SystemClock
+from drivers.errors import BadOptions, DriverError
+from drivers.faults import PAN_TILT, nearest
+from drivers.interfaces import Camera, PanTilt
+
+if TYPE_CHECKING:
+    from drivers.sim.rover import SimulatedRover
+
+log = logging.getLogger(__name__)
+
+Kind = Literal["real", "simulated", "replayed", "mixed"]
+
+NOT_YET = ("dynamixel", "flir_ptu", "v4l2")
+BUILT_IN = ("sim", "replay", *NOT_YET)
+
+
+@dataclass(frozen=True)
+class DeviceSettings:
+    """A device as a configuration names it: the driver, and its options."""
+
+    driver: str
+    options: Mapping[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class HardwareSettings:
+    """All devices of a configuration.
+
+    Attributes
+    ----------
+    pan_tilt
+        The head.
+    cameras
+        Cameras by name, as in the mast file.
+    simulation
+        The ``simulation`` section, which makes the one rover that all ``sim`` devices share.
+    folder
+        Where relative paths in options start: the configuration's folder.
+    """
+
+    pan_tilt: DeviceSettings
+    cameras: Mapping[str, DeviceSettings]
+    simulation: Mapping[str, Any] = field(default_factory=dict)
+    folder: Path = Path()
+
+
+class Hardware:
+    """Open devices. A context manager: leaving it closes them, the head first.
+
+    Attributes
+    ----------
+    pan_tilt, cameras
+        The devices.
+    kind
+        ``real`` (drivers from outside count as real), ``simulated``, ``replayed``, or ``mixed``.
+    simulation
+        The simulated rover behind ``sim`` devices, or None; only for experiments, tests and faults.
+    """
+
+    def __init__(
+        self,
+        pan_tilt: PanTilt,
+        cameras: Mapping[str, Camera],
+        kind: Kind,
+        simulation: SimulatedRover | None = None,
+    ) -> None:
+        self.pan_tilt = pan_tilt
+        self.cameras = MappingProxyType(dict(cameras))
+        self.kind = kind
+        self.simulation = simulation
+
+    def close(self) -> None:
+        """Close every device; one that fails to is logged and does not keep the others open."""
+        _close({PAN_TILT: self.pan_tilt, **self.cameras})
+
+    def __enter__(self) -> Hardware:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        self.close()
+
+
+def open_hardware(settings: HardwareSettings, clock: Clock | None = None) -> Hardware:
+    """Open the head and every camera that the settings name.
+
+    Parameters
+    ----------
+    settings
+        Drivers and their options.
+    clock
+        Time for simulated and replayed devices; the machine's monotonic clock when left out.
+
+    Raises
+    ------
+    BadOptions
+        For a driver that does not exist or cannot be loaded, and options that it refuses.
+    DriverError
+        From a driver that cannot reach its device. Devices opened before are closed again.
+    """
+    opener = _Opener(settings, clock or SystemClock())
+    devices: dict[str, Any] = {}
+    try:
+        devices[PAN_TILT] = opener.open(PAN_TILT, settings.pan_tilt, PanTilt)
+        for name, device in settings.cameras.items():
+            devices[name] = opener.open(name, device, Camera)
+    except BaseException:
+        _close(devices)
+        raise
+    pan_tilt = devices.pop(PAN_TILT)
+    return Hardware(pan_tilt, devices, opener.kind(), opener.rover)
+
+
+class _Opener:
+    """Opens the devices of one configuration; those of a shared rover or replay share it."""
+
+    def __init__(self, settings: HardwareSettings, clock: Clock) -> None:
+        self._settings = settings
+        self._clock = clock
+        self._kinds: set[Kind] = set()
+        self._replays: dict[str, Any] = {}
+        self.rover: SimulatedRover | None = None
+
+    def kind(self) -> Kind:
+        """What the opened devices are, together."""
+        return next(iter(self._kinds)) if len(self._kinds) == 1 else "mixed"
+
+    def open(self, name: str, device: DeviceSettings, protocol: type) -> Any:
+        """Open one device and check that it does what the protocol asks."""
+        if ":" in device.driver:
+            self._kinds.add("real")
+            return _from_outside(name, device, protocol)
+        if device.driver == "sim":
+            self._kinds.add("simulated")
+            return self._simulated(name, device)
+        if device.driver == "replay":
+            self._kinds.add("replayed")
+            return self._replayed(name, device)
+        if device.driver in NOT_YET:
+            raise BadOptions(f"driver {device.driver!r} is not in this version", device=name)
+        raise BadOptions(
+            f"there is no driver {device.driver!r}{nearest(device.driver, BUILT_IN)}; "
+            "a driver from outside is named package.module:factory",
+            device=name,
+        )
+
+    def _simulated(self, name: str, device: DeviceSettings) -> Any:
+        """The head or a camera of the one simulated rover."""
+        if device.options:
+            raise BadOptions(
+                f"driver 'sim' has no option {next(iter(device.options))!r}; "
+                "the simulated rover is set up in the section 'simulation'",
+                device=name,
+            )
+        if self.rover is None:
+            try:
+                from drivers.sim.rover import SimulatedRover, simulation_settings
+            except ImportError as error:
+                raise BadOptions(
+                    f"the simulated rover needs {error.name or error}: install mastctl with its extra 'sim'"
+                ) from None
+            simulation = simulation_settings(self._settings.simulation, self._settings.folder)
+            self.rover = SimulatedRover(simulation, self._clock)
+        if name == PAN_TILT:
+            return self.rover.pan_tilt
+        if name not in self.rover.cameras:
+            raise BadOptions(
+                f"the simulated rover has no such camera{nearest(name, self.rover.cameras)}", device=name
+            )
+        return self.rover.cameras[name]
+
+    def _replayed(self, name: str, device: DeviceSettings) -> Any:
+        """The head or a camera of a recording; devices with the same options share one."""
+        from drivers.replay import open_replay
+
+        key = repr(sorted(device.options.items()))
+        if key not in self._replays:
+            self._replays[key] = open_replay(device.options, self._settings.folder, self._clock)
+        replay = self._replays[key]
+        if name == PAN_TILT:
+            return replay.pan_tilt
+        if name not in replay.cameras:
+            raise BadOptions(f"the recording has no such camera{nearest(name, replay.cameras)}", device=name)
+        return replay.cameras[name]
+
+
+def _factory(name: str, driver: str) -> Callable[..., Any]:
+    """The callable that ``package.module:factory`` names."""
+    module_name, _, attribute = driver.partition(":")
+    try:
+        found: Any = importlib.import_module(module_name)
+    except Exception as error:  # whatever a foreign module does while it is imported
+        raise BadOptions(
+            f"driver {driver!r}: cannot import {module_name!r} ({_one_line(error)})", device=name
+        ) from error
+    for part in attribute.split("."):
+        if not hasattr(found, part):
+            raise BadOptions(f"driver {driver!r}: {module_name!r} has no {attribute!r}", device=name)
+        found = getattr(found, part)
+    if not callable(found):
+        raise BadOptions(f"driver {driver!r}: {attribute!r} cannot be called", device=name)
+    factory: Callable[..., Any] = found
+    return factory
+
+
+def _from_outside(name: str, device: DeviceSettings, protocol: type) -> Any:
+    """A device made by a factory that is not in this repository."""
+    factory = _factory(name, device.driver)
+    try:
+        made = factory(**device.options)
+    except DriverError:
+        raise
+    except Exception as error:  # a foreign factory may raise anything; the user gets one sentence
+        raise BadOptions(
+            f"driver {device.driver!r} refuses the options {dict(device.options)!r} ({_one_line(error)})",
+            device=name,
+        ) from error
+    wanted = [m for m in ("read", "move", "stop", "next_frame", "close") if hasattr(protocol, m)]
+    missing = [method for method in wanted if not callable(getattr(made, method, None))]
+    if missing:
+        raise BadOptions(
+            f"driver {device.driver!r} made a {type(made).__name__} without {', '.join(missing)}", device=name
+        )
+    return made
+
+
+def _one_line(error: BaseException) -> str:
+    """An error as one line."""
+    return " ".join(f"{type(error).__name__}: {error}".split())
+
+
+def _close(devices: Mapping[str, Any]) -> None:
+    """Close devices, whatever some of them do."""
+    for name, device in devices.items():
+        try:
+            device.close()
+        except Exception:  # closing goes on for the others
+            log.exception("%s did not close", name)

@@ -1,0 +1,260 @@
+"""Simulated cameras: frames at fixed instants, rendered only when somebody asks for one.
+
+Frame n of a camera is exposed at a fixed instant whether or not anybody looks, so its sequence number is a
+function of time and a frame that nobody fetched is a gap. All cameras of a rover share the instants, as with
+a hardware trigger. A camera remembers as many finished frames as a capture ring would.
+"""
+
+from __future__ import annotations
+
+import threading
+import zlib
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from drivers.clock import Clock
+from drivers.errors import NoFreshFrame, NoReply
+from drivers.faults import Fault, FaultPanel
+from drivers.interfaces import Frame, Image
+
+RING_FRAMES = 4
+"""Finished frames that can still be fetched, as in a capture ring of four buffers."""
+
+
+@dataclass(frozen=True)
+class CameraSettings:
+    """How a simulated camera takes pictures.
+
+    Attributes
+    ----------
+    rate_hz
+        Frames a second.
+    exposure_s, readout_s
+        Exposure time, and the time from its end until the frame can be had.
+    read_noise_dn
+        Standard deviation of the noise in the dark, grey levels of 0..255.
+    shot_noise_dn
+        Standard deviation that light adds at mid grey (128); grows as the root of the grey level.
+    seed
+        Of the noise; with the camera's name and the sequence number it fixes every pixel.
+    """
+
+    rate_hz: float = 10.0
+    exposure_s: float = 0.008
+    readout_s: float = 0.02
+    read_noise_dn: float = 1.0
+    shot_noise_dn: float = 1.7
+    seed: int = 1
+
+
+@dataclass(frozen=True)
+class _Epoch:
+    """A stretch of time with one frame rate."""
+
+    start_s: float
+    first_sequence: int
+    period_s: float
+
+    def begin_s(self, sequence: int) -> float:
+        """When the exposure of a frame begins."""
+        return self.start_s + (sequence - self.first_sequence) * self.period_s
+
+    def after(self, time_s: float) -> int:
+        """The first frame whose exposure begins after a moment."""
+        sequence = self.first_sequence + int(np.floor((time_s - self.start_s) / self.period_s)) + 1
+        while self.begin_s(sequence - 1) > time_s:
+            sequence -= 1
+        while self.begin_s(sequence) <= time_s:
+            sequence += 1
+        return max(self.first_sequence, sequence)
+
+
+class SimulatedCamera:
+    """One camera of the simulated rover, an instance of ``drivers.interfaces.Camera``; safe from any thread.
+
+    Parameters
+    ----------
+    name
+        The camera's name, also the device name of its faults.
+    settings
+        Rate, exposure and noise.
+    size_px
+        (width, height).
+    expose
+        ``expose(begin_s, exposure_s)`` renders the noise-free float32 (h, w) picture of an exposure.
+    taken
+        ``taken(sequence, mid_exposure_s)`` is told of every frame that is handed out, before it is.
+    clock
+        The simulation's clock.
+    faults
+        The panel that is asked for faults of this camera.
+    start_s
+        When the exposure of frame 0 begins: one value for all cameras of a rover.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        settings: CameraSettings,
+        size_px: tuple[int, int],
+        expose: Callable[[float, float], NDArray[np.float32]],
+        taken: Callable[[int, float], None],
+        clock: Clock,
+        faults: FaultPanel,
+        start_s: float,
+    ) -> None:
+        self.name = name
+        self._settings = settings
+        self._size_px = size_px
+        self._expose = expose
+        self._taken = taken
+        self._clock = clock
+        self._faults = faults
+        self._lock = threading.Lock()
+        self._epoch_lock = threading.Lock()
+        self._epochs = [_Epoch(start_s, 0, 1 / settings.rate_hz)]
+        self._last: Frame | None = None
+        self._frozen: tuple[Fault, Image] | None = None
+        self._closed = threading.Event()
+
+    def next_frame(self, exposed_after_s: float, timeout_s: float) -> Frame:
+        """Return the first frame whose exposure begins after ``exposed_after_s``, waiting for it if need be.
+
+        When that frame has left the ring already, the newest finished one comes instead; it is fresh too.
+        Rendering takes its own time on top of ``timeout_s``, which bounds the wait on the simulation's clock.
+
+        Raises
+        ------
+        NoFreshFrame
+            If none came in time; the message says what came instead.
+        NoReply
+            Under the fault ``intermittent``.
+        """
+        now_s = self._clock.now_s()
+        deadline_s = now_s + max(0.0, timeout_s)
+        if self._faults.strikes(self.name, now_s):
+            raise NoReply("no answer", device=self.name)
+        while not self._closed.is_set():
+            now_s = self._clock.now_s()
+            sequence, epoch = self._wanted(exposed_after_s, now_s)
+            ready_s = self._ready_s(sequence, epoch, now_s)
+            if self._is_missing(sequence, epoch):
+                exposed_after_s = epoch.begin_s(sequence)
+                if exposed_after_s < deadline_s:
+                    continue
+                ready_s = np.inf
+            if ready_s <= now_s:
+                return self._frame(sequence, epoch)
+            if ready_s > deadline_s:
+                self._clock.sleep(deadline_s - now_s)
+                break
+            self._clock.sleep(min(ready_s - now_s, 0.5))
+        raise NoFreshFrame(self._instead(exposed_after_s, timeout_s), device=self.name)
+
+    def close(self) -> None:
+        """Let go; a waiting call ends with NoFreshFrame within half a second."""
+        self._closed.set()
+
+    def _wanted(self, exposed_after_s: float, now_s: float) -> tuple[int, _Epoch]:
+        """The frame that the call is about, with its epoch."""
+        epoch = self._epoch(now_s)
+        sequence = epoch.after(exposed_after_s)
+        latency_s = self._settings.exposure_s + self._settings.readout_s
+        newest = epoch.after(now_s - latency_s) - 1
+        if sequence <= newest - RING_FRAMES:
+            sequence = newest
+        return sequence, epoch
+
+    def _epoch(self, now_s: float) -> _Epoch:
+        """The frame rate of the moment; a ``slow`` fault that comes or goes begins a new epoch."""
+        slow = self._faults.find(self.name, "slow", now_s)
+        period_s = 1 / self._settings.rate_hz / (slow.number("factor") if slow else 1.0)
+        with self._epoch_lock:
+            epoch = self._epochs[-1]
+            if period_s != epoch.period_s:
+                sequence = epoch.after(now_s)
+                first = self._epochs[0]
+                periods = np.ceil((epoch.begin_s(sequence) - first.start_s) / period_s)
+                epoch = _Epoch(first.start_s + float(periods) * period_s, sequence, period_s)
+                self._epochs = [first, epoch]
+            return epoch
+
+    def _ready_s(self, sequence: int, epoch: _Epoch, now_s: float) -> float:
+        """When a frame can be had."""
+        ready_s = epoch.begin_s(sequence) + self._settings.exposure_s + self._settings.readout_s
+        delayed = self._faults.find(self.name, "delayed", now_s)
+        return ready_s + (delayed.number("delay_s") if delayed else 0.0)
+
+    def _is_missing(self, sequence: int, epoch: _Epoch) -> bool:
+        """Whether a fault keeps this frame from coming at all."""
+        begin_s = epoch.begin_s(sequence)
+        if self._faults.find(self.name, "off", begin_s) or self._faults.find(self.name, "stuck", begin_s):
+            return True
+        dropped = self._faults.find(self.name, "dropped", begin_s)
+        if dropped is None:
+            return False
+        chance = np.random.default_rng([int(dropped.number("seed")), sequence]).random()
+        return bool(chance < dropped.number("probability"))
+
+    def _frame(self, sequence: int, epoch: _Epoch) -> Frame:
+        """Take the picture, once."""
+        with self._lock:
+            if self._last is None or self._last.sequence != sequence:
+                begin_s, exposure_s = epoch.begin_s(sequence), self._settings.exposure_s
+                image = self._picture(sequence, epoch)
+                image.setflags(write=False)
+                self._last = Frame(image, sequence, begin_s + exposure_s / 2, exposure_s)
+                self._taken(sequence, self._last.mid_exposure_s)
+            return self._last
+
+    def _picture(self, sequence: int, epoch: _Epoch) -> Image:
+        """The picture of an exposure, as a fault leaves it."""
+        begin_s = epoch.begin_s(sequence)
+        if fault := self._faults.find(self.name, "frozen", begin_s):
+            if self._frozen is None or self._frozen[0] is not fault:
+                before = epoch.after(fault.begin_s) - 1
+                self._frozen = (fault, self._healthy(before, epoch.begin_s(before)))
+            return self._frozen[1].copy()
+        if fault := self._faults.find(self.name, "garbage", begin_s):
+            generator = np.random.default_rng([int(fault.number("seed")), sequence])
+            return generator.integers(0, 256, self._size_px[::-1], dtype=np.uint8)
+        if self._faults.find(self.name, "dark", begin_s):
+            return self._noisy(np.zeros(self._size_px[::-1], np.float32), sequence)
+        image = self._healthy(sequence, begin_s)
+        if fault := self._faults.find(self.name, "wrong", begin_s):
+            shift = np.float32([[1, 0, fault.number("dx_px")], [0, 1, fault.number("dy_px")]])
+            shifted = cv2.warpAffine(image, shift, self._size_px, borderMode=cv2.BORDER_REPLICATE)
+            return np.asarray(shifted, dtype=np.uint8)
+        return image
+
+    def _healthy(self, sequence: int, begin_s: float) -> Image:
+        """The picture without faults."""
+        return self._noisy(self._expose(begin_s, self._settings.exposure_s), sequence)
+
+    def _noisy(self, clean: NDArray[np.float32], sequence: int) -> Image:
+        """Read and shot noise, rounded to grey levels; the same for the same seed, camera and sequence."""
+        s = self._settings
+        generator = np.random.default_rng([s.seed, zlib.crc32(self.name.encode()), sequence])
+        noise = generator.standard_normal(clean.shape, dtype=np.float32)
+        variance = s.read_noise_dn**2 + s.shot_noise_dn**2 / 128 * np.clip(clean, 0, None)
+        return np.rint(np.clip(clean + noise * np.sqrt(variance), 0, 255)).astype(np.uint8)
+
+    def _instead(self, exposed_after_s: float, timeout_s: float) -> str:
+        """What to say when no fresh frame came."""
+        if self._closed.is_set():
+            return "it is closed"
+        message = f"no frame exposed after {exposed_after_s:.3f} s came within {timeout_s:g} s"
+        now_s = self._clock.now_s()
+        if stuck := self._faults.find(self.name, "stuck", now_s):
+            epoch = self._epoch(now_s)
+            sequence = epoch.after(stuck.begin_s) - 1
+            age_s = exposed_after_s - epoch.begin_s(sequence)
+            return f"{message}; only frame {sequence} came again and again, exposed {age_s:.3f} s before"
+        if self._faults.find(self.name, "off", now_s) or self._last is None:
+            return f"{message}; none came at all"
+        age_s = exposed_after_s - (self._last.mid_exposure_s - self._last.exposure_s / 2)
+        return f"{message}; the last one is frame {self._last.sequence}, exposed {age_s:.3f} s before"

@@ -1,0 +1,317 @@
+"""The simulated rover: true rig, true head, cameras that render the scene, and the truth for experiments.
+
+It stands in the ``site`` frame at ``site_from_rover``, the identity by default, so the ground under it is the
+plane z = 0 of the rover frame and the mast head is some 1.46 m above it. The service only ever uses
+``pan_tilt`` and ``cameras``; everything named true, and ``frame_truth``, is for experiments and tests.
+"""
+
+from __future__ import annotations
+
+import math
+import threading
+from collections import OrderedDict
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields, replace
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from calib.cahvor import CameraModel
+from calib.errors import BadFile
+from calib.mast import Rig
+from calib.rigid import FloatArray, Rigid
+from calib.store import load_rig
+from drivers.clock import Clock
+from drivers.errors import BadOptions
+from drivers.faults import FaultPanel, nearest
+from drivers.sim.cameras import CameraSettings, SimulatedCamera
+from drivers.sim.pan_tilt import HeadSettings, SimulatedPanTilt, head_settings
+from drivers.sim.render import Renderer
+from drivers.sim.scene import SceneSettings, build_scene
+
+TRUTH_FRAMES = 512
+"""How many frames of each camera ``frame_truth`` remembers."""
+
+BLUR_STEP_PX = 1.0
+"""An exposure during which the picture moves is averaged over renderings no further apart than this."""
+
+BLUR_STEPS = 8
+"""At most so many renderings an exposure."""
+
+
+@dataclass(frozen=True)
+class SimulationSettings:
+    """The ``simulation`` section of a configuration.
+
+    Attributes
+    ----------
+    rover
+        The true rig, a mast file.
+    head
+        What the head is made of.
+    camera
+        Rate, exposure and noise of every camera; the seed is the simulation's.
+    samples
+        Rays per pixel along each side: 2 is 2x2.
+    scene
+        What is rendered.
+    faults
+        Faults set from the start, as ``FaultPanel.set_all`` reads them.
+    """
+
+    rover: Path
+    head: HeadSettings
+    camera: CameraSettings = field(default_factory=CameraSettings)
+    samples: int = 2
+    scene: SceneSettings = field(default_factory=SceneSettings)
+    faults: tuple[Mapping[str, Any], ...] = ()
+
+
+_KEYS = ("rover", "head", "seed", "samples", "scene", "cameras", "faults")
+
+
+def simulation_settings(section: Mapping[str, Any], folder: Path) -> SimulationSettings:
+    """Return the settings that a configuration's ``simulation`` section asks for.
+
+    Parameters
+    ----------
+    section
+        Keys ``rover`` (a mast file, relative to ``folder``), ``head`` (a preset, see
+        ``drivers.sim.pan_tilt.head_settings``), ``seed`` (of scene and noise), ``samples``, ``scene``
+        (fields of ``SceneSettings``), ``cameras`` (fields of ``CameraSettings``), ``faults`` (a list). Only
+        ``rover`` is needed.
+    folder
+        Where relative paths start.
+
+    Raises
+    ------
+    BadOptions
+        For an unknown key or a value of the wrong kind, naming the key and the nearest valid one.
+    """
+    for key in section:
+        if key not in _KEYS:
+            raise BadOptions(f"simulation has no key {key!r}{nearest(str(key), _KEYS)}")
+    rover = section.get("rover")
+    if not isinstance(rover, str):
+        raise BadOptions(f"simulation.rover is {rover!r}, expected the file of the true rig")
+    seed = _whole(section.get("seed", 1), "simulation.seed", 0, 2**31 - 1)
+    faults = section.get("faults", [])
+    if not isinstance(faults, list | tuple):
+        raise BadOptions(f"simulation.faults is {faults!r}, expected a list of {{device, word, ...}}")
+    camera: CameraSettings = _filled(CameraSettings(), section.get("cameras", {}), "simulation.cameras")
+    if camera.rate_hz <= 0 or not 0 < camera.exposure_s < 1 / camera.rate_hz:
+        raise BadOptions(
+            f"simulation.cameras: exposure_s {camera.exposure_s:g} does not fit rate_hz {camera.rate_hz:g}"
+        )
+    scene = section.get("scene", {})
+    if isinstance(scene, Mapping) and "seed" not in scene:
+        scene = {**scene, "seed": seed}
+    return SimulationSettings(
+        rover=folder / rover,
+        head=head_settings(section.get("head", "ptu_d46_70")),
+        camera=replace(camera, seed=seed),
+        samples=_whole(section.get("samples", 2), "simulation.samples", 1, 6),
+        scene=_filled(SceneSettings(), scene, "simulation.scene"),
+        faults=tuple(faults),
+    )
+
+
+def _whole(value: Any, key: str, low: int, high: int) -> int:
+    """A whole number within bounds."""
+    if isinstance(value, bool) or not isinstance(value, int) or not low <= value <= high:
+        raise BadOptions(f"{key} is {value!r}, expected a whole number from {low} to {high}")
+    return value
+
+
+def _filled(defaults: Any, values: Any, key: str) -> Any:
+    """A settings dataclass with numbers replaced by those of a mapping."""
+    if not isinstance(values, Mapping):
+        raise BadOptions(f"{key} is {values!r}, expected keys and values")
+    known = {f.name: getattr(defaults, f.name) for f in fields(defaults)}
+    changes: dict[str, Any] = {}
+    for name, value in values.items():
+        if name not in known:
+            raise BadOptions(f"{key} has no key {name!r}{nearest(str(name), known)}")
+        kind = type(known[name])
+        if kind in (int, float):
+            wrong = isinstance(value, bool) or not isinstance(value, int if kind is int else int | float)
+            if wrong or not math.isfinite(value) or value < 0:
+                raise BadOptions(f"{key}.{name} is {value!r}, expected a number that is not negative")
+            value = kind(value)
+        elif not isinstance(value, kind):
+            raise BadOptions(f"{key}.{name} is {value!r}, expected {kind.__name__}")
+        changes[str(name)] = value
+    try:
+        return replace(defaults, **changes)
+    except ValueError as error:
+        raise BadOptions(f"{key}: {error}") from None
+
+
+@dataclass(frozen=True, eq=False)
+class FrameTruth:
+    """Where a camera really was when a frame was taken.
+
+    Attributes
+    ----------
+    mid_exposure_s
+        Middle of the exposure.
+    pan_rad, tilt_rad
+        Mechanical joint angles then, with backlash and sag.
+    camera_in_rover
+        The true camera model in the rover frame then.
+    site_from_rover
+        Where the rover stood then.
+    """
+
+    mid_exposure_s: float
+    pan_rad: float
+    tilt_rad: float
+    camera_in_rover: CameraModel
+    site_from_rover: Rigid
+
+
+class SimulatedRover:
+    """A rover in memory: one head, all cameras of its true rig, one scene, one panel of faults.
+
+    Parameters
+    ----------
+    settings
+        What it is made of.
+    clock
+        Time for head, cameras and faults.
+
+    Raises
+    ------
+    BadOptions
+        If the true rig's file cannot be used, or a fault of the settings is unknown.
+    """
+
+    def __init__(self, settings: SimulationSettings, clock: Clock) -> None:
+        try:
+            self.rig: Rig = load_rig(settings.rover).rig
+        except BadFile as error:
+            raise BadOptions(f"simulation.rover: {error}") from None
+        self.settings = settings
+        self.site_from_rover = Rigid.identity()
+        self.faults = FaultPanel(clock.now_s, self.rig.cameras)
+        self.faults.set_all(settings.faults)
+        self.scene = build_scene(settings.scene)
+        self._renderer = Renderer(self.scene)
+        self._render_lock = threading.Lock()
+        self._truth_lock = threading.Lock()
+        self._truth: dict[str, OrderedDict[int, FrameTruth]] = {n: OrderedDict() for n in self.rig.cameras}
+        self.pan_tilt = SimulatedPanTilt(settings.head, clock, self.faults)
+        start_s = clock.now_s()
+        self.cameras: Mapping[str, SimulatedCamera] = MappingProxyType(
+            {name: self._camera(name, clock, start_s) for name in self.rig.cameras}
+        )
+
+    def true_joints(self, time_s: float) -> tuple[float, float]:
+        """Return the mechanical pan and tilt at a moment of the last minute, radians."""
+        return self.pan_tilt.true_joints(time_s)
+
+    def frame_truth(self, camera: str, sequence: int) -> FrameTruth:
+        """Return where a camera was when a frame was taken.
+
+        Raises
+        ------
+        LookupError
+            For an unknown camera, a frame that was never fetched, or one longer ago than ``TRUTH_FRAMES``.
+        """
+        with self._truth_lock:
+            try:
+                return self._truth[camera][sequence]
+            except KeyError:
+                raise LookupError(f"the truth of frame {sequence} of {camera} is not remembered") from None
+
+    def true_point(self, camera: str, sequence: int, pixel_px: ArrayLike) -> FloatArray | None:
+        """Return the point of the scene, (3,) metres in the rover frame, that a pixel of a frame shows.
+
+        None for sky, and for a pixel that the camera's model cannot reach. Raises LookupError.
+        """
+        truth = self.frame_truth(camera, sequence)
+        rays = truth.camera_in_rover.ray(np.asarray(pixel_px, dtype=np.float64).reshape(1, 2))
+        if not rays.valid[0]:
+            return None
+        site_from_rover = truth.site_from_rover
+        ranges_m = self.scene.cast(
+            site_from_rover.points(rays.origins_m), site_from_rover.vectors(rays.directions)
+        )
+        if not np.isfinite(ranges_m[0]):
+            return None
+        return np.asarray(rays.origins_m[0] + ranges_m[0] * rays.directions[0], dtype=np.float64)
+
+    def true_pixel(self, camera: str, sequence: int, point_in_rover_m: ArrayLike) -> FloatArray:
+        """Return the pixel (2,) where a rover-frame point, metres, truly lies in a frame.
+
+        Not-a-number when the camera cannot see there. Whether something hides the point is left to the
+        caller. Raises LookupError.
+        """
+        model = self.frame_truth(camera, sequence).camera_in_rover
+        pixels, _ = model.project(np.asarray(point_in_rover_m, dtype=np.float64).reshape(1, 3))
+        return pixels[0]
+
+    def close(self) -> None:
+        """Stop the head and let waiting camera calls end."""
+        self.pan_tilt.close()
+        for camera in self.cameras.values():
+            camera.close()
+
+    def _camera(self, name: str, clock: Clock, start_s: float) -> SimulatedCamera:
+        """One camera that looks through the true rig."""
+
+        def expose(begin_s: float, exposure_s: float) -> NDArray[np.float32]:
+            return self._exposed(name, begin_s, exposure_s)
+
+        def taken(sequence: int, mid_exposure_s: float) -> None:
+            self._remember(name, sequence, mid_exposure_s)
+
+        size_px = self.rig.cameras[name].model.size_px
+        return SimulatedCamera(
+            name, self.settings.camera, size_px, expose, taken, clock, self.faults, start_s
+        )
+
+    def _exposed(self, name: str, begin_s: float, exposure_s: float) -> NDArray[np.float32]:
+        """Render one exposure: one picture at its middle, or the mean along the head's way through it."""
+        camera = self.rig.cameras[name]
+        steps = self._blur_steps(name, begin_s, exposure_s)
+        samples = self.settings.samples if steps == 1 else 1
+        total: NDArray[np.float32] | None = None
+        for step in range(steps):
+            site_from_frame = self.site_from_rover
+            if camera.on == "head":
+                joints = self.true_joints(begin_s + (step + 0.5) / steps * exposure_s)
+                site_from_frame = site_from_frame @ self.rig.mast.rover_from_head(*joints)
+            with self._render_lock:
+                image = self._renderer.image(camera.model, site_from_frame, samples)
+            total = image if total is None else total + image
+        assert total is not None
+        return total / np.float32(steps) if steps > 1 else total
+
+    def _blur_steps(self, name: str, begin_s: float, exposure_s: float) -> int:
+        """How many renderings an exposure takes: 1 when the camera stands still."""
+        camera = self.rig.cameras[name]
+        if camera.on != "head":
+            return 1
+        way_rad = 0.0
+        pan, tilt = self.true_joints(begin_s)
+        for part in (1 / 3, 2 / 3, 1.0):
+            next_pan, next_tilt = self.true_joints(begin_s + part * exposure_s)
+            way_rad += math.hypot(next_pan - pan, next_tilt - tilt)
+            pan, tilt = next_pan, next_tilt
+        focal_px = float(np.linalg.norm(np.cross(camera.model.A, camera.model.H)))
+        return min(BLUR_STEPS, max(1, math.ceil(way_rad * focal_px / BLUR_STEP_PX))) if way_rad > 1e-7 else 1
+
+    def _remember(self, name: str, sequence: int, mid_exposure_s: float) -> None:
+        """Keep the truth of a frame that is handed out."""
+        pan_rad, tilt_rad = self.true_joints(mid_exposure_s)
+        model = self.rig.camera_in_rover(name, pan_rad, tilt_rad)
+        truth = FrameTruth(mid_exposure_s, pan_rad, tilt_rad, model, self.site_from_rover)
+        with self._truth_lock:
+            frames = self._truth[name]
+            frames[sequence] = truth
+            while len(frames) > TRUTH_FRAMES:
+                frames.popitem(last=False)
