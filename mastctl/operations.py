@@ -1,0 +1,318 @@
+"""Operations: one at a time, in a thread of its own, each with a record of what it did.
+
+This module does not know how to point. It runs what it is given, keeps the record, and makes sure that a
+stop is the last word: from the moment a stop is asked for until the operation has ended, no move goes out.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import logging
+import math
+import secrets
+import threading
+from collections import OrderedDict
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from typing import Any, Literal, Protocol
+
+import numpy as np
+
+from calib.errors import CalibError
+from drivers.clock import Clock
+from drivers.errors import DriverError
+from mastctl.errors import MastctlError, Stopped
+from mastctl.state import Motion, Residual
+
+log = logging.getLogger(__name__)
+
+KEPT_OPERATIONS = 200
+END_TIMEOUT_S = 5.0  # for a cancelled operation to notice, when the service closes
+
+OperationState = Literal["queued", "running", "done", "failed", "stopped"]
+
+
+class Busy(MastctlError):
+    """Another operation runs; ``operation`` is its id."""
+
+    code = "busy"
+
+    def __init__(self, operation: str) -> None:
+        self.operation = operation
+        super().__init__(f"operation {operation} is running; wait for it or stop it")
+
+
+class UnknownOperation(MastctlError):
+    """An operation was named that this run of the service does not know (any more)."""
+
+    code = "operation_unknown"
+
+
+class Mover(Protocol):
+    """What of `mastctl.devices.Devices` is needed to stop and to keep stopped."""
+
+    def stop(self) -> None: ...
+    def block_moves(self, reason: str) -> None: ...
+    def allow_moves(self) -> None: ...
+
+
+@dataclass(frozen=True, eq=False)
+class Operation:
+    """One operation's record so far; replaced as it goes on, never edited. Times of CLOCK_MONOTONIC."""
+
+    id: str
+    state: OperationState
+    request: Mapping[str, Any]
+    created_s: float
+    started_s: float | None = None
+    ended_s: float | None = None
+    steps: tuple[Any, ...] = ()
+    result: Any = None
+    error: Mapping[str, Any] | None = None
+
+    def told(self, *, steps: bool = True) -> dict[str, Any]:
+        """Return the record as JSON; the last pointing's residual stands in front too."""
+        result = {} if self.result is None else as_json(self.result)
+        pointings = result.get("pointings") or []
+        last = pointings[-1] if pointings else {}
+        told: dict[str, Any] = {
+            "id": self.id,
+            "state": self.state,
+            "request": as_json(self.request),
+            "created_s": self.created_s,
+            "started_s": self.started_s,
+            "ended_s": self.ended_s,
+            "residual_px": last.get("residual_px"),
+            "residual_sigma_px": last.get("residual_sigma_px"),
+            "position_m": result.get("position_m"),
+            "range_m": result.get("range_m"),
+            "pointings": pointings,
+            "error": None if self.error is None else dict(self.error),
+        }
+        if steps:
+            told["steps"] = as_json(self.steps)
+        return told
+
+
+Work = Callable[[Callable[[Any], None], threading.Event], Any]
+
+
+class Operations:
+    """The operations of this run of the service; safe to use from any thread.
+
+    Parameters
+    ----------
+    mover
+        Stops the mast.
+    clock
+        Stamps the records.
+    """
+
+    def __init__(self, mover: Mover, clock: Clock) -> None:
+        self._mover = mover
+        self._clock = clock
+        self._lock = threading.Lock()
+        self._records: OrderedDict[str, Operation] = OrderedDict()
+        self._numbers = itertools.count(1)
+        self._run = secrets.token_hex(2)  # so that an id from before a restart names nothing
+        self._current: tuple[str, threading.Event, threading.Thread] | None = None
+        self._motion = Motion()
+        self._closed = False
+
+    @property
+    def motion(self) -> Motion:
+        """What to show about operations: the running one, its target, the last residual."""
+        with self._lock:
+            return self._motion
+
+    def start(self, request: Mapping[str, Any], work: Work) -> Operation:
+        """Start ``work(record_step, cancelled)`` in a thread and return its first record.
+
+        Raises
+        ------
+        Busy
+            If another operation runs.
+        MastctlError
+            If the service is closing.
+        """
+        with self._lock:
+            if self._closed:
+                raise MastctlError("the service is closing")
+            if self._current is not None:
+                raise Busy(self._current[0])
+            name = f"{next(self._numbers):06d}-{self._run}"
+            operation = Operation(name, "queued", dict(request), self._clock.now_s())
+            cancelled = threading.Event()
+            thread = threading.Thread(
+                target=self._work, args=(name, work, cancelled), name=f"operation {name}", daemon=True
+            )
+            self._records[name] = operation
+            while len(self._records) > KEPT_OPERATIONS:
+                self._records.popitem(last=False)
+            self._current = (name, cancelled, thread)
+            self._motion = replace(self._motion, operation=name, target=dict(request), stopped=False)
+        thread.start()
+        return operation
+
+    def stop(self) -> str | None:
+        """Stop the mast and the running operation, if any; return its id.
+
+        Raises
+        ------
+        DriverError
+            If the head did not confirm the stop; the operation is stopped all the same.
+        """
+        with self._lock:
+            name = self._cancel("a stop was asked for")
+            self._motion = replace(self._motion, stopped=True)
+        log.info("stop%s", f": operation {name}" if name else "")
+        self._mover.stop()
+        return name
+
+    def get(self, name: str) -> Operation:
+        """Return one record.
+
+        Raises
+        ------
+        UnknownOperation
+            If this run of the service does not know it, or no longer.
+        """
+        with self._lock:
+            operation = self._records.get(name)
+        if operation is None:
+            raise UnknownOperation(
+                f"operation {name[:80]} is not known; the newest {KEPT_OPERATIONS} of this run are kept"
+            )
+        return operation
+
+    def all(self) -> list[Operation]:
+        """Return the kept records, newest first."""
+        with self._lock:
+            return list(reversed(self._records.values()))
+
+    def close(self) -> None:
+        """Take no more, stop the mast and what runs, and wait some seconds for it to end; never raises."""
+        with self._lock:
+            self._closed = True
+            current = self._current
+            self._cancel("the service is closing")
+        try:
+            self._mover.stop()
+        except (DriverError, MastctlError) as error:
+            log.error("the head did not confirm the stop: %s", error)
+        if current is None:
+            return
+        current[2].join(END_TIMEOUT_S)
+        if current[2].is_alive():
+            log.error("operation %s did not end within %.0f s; it is given up", current[0], END_TIMEOUT_S)
+            self._end(current[0], "stopped", None, error_body(Stopped("the service is closing")))
+
+    def _cancel(self, reason: str) -> str | None:
+        """Tell the running operation to end and let no further move of it out; the lock is held."""
+        if self._current is None:
+            return None
+        name, cancelled, _ = self._current
+        cancelled.set()
+        self._mover.block_moves(reason)
+        return name
+
+    def _work(self, name: str, work: Work, cancelled: threading.Event) -> None:
+        """Run one operation to its end; whatever happens is in its record afterwards."""
+
+        def record(step: Any) -> None:
+            with self._lock:
+                known = self._records.get(name)
+                if known is not None:
+                    self._records[name] = replace(known, steps=(*known.steps, step))
+
+        with self._lock:
+            self._records[name] = replace(self._records[name], state="running", started_s=self._clock.now_s())
+        result: Any = None
+        error: BaseException | None = None
+        try:
+            result = work(record, cancelled)
+        except (MastctlError, DriverError, CalibError) as refusal:
+            error = refusal
+        except BaseException as defect:  # the one broad catch: nothing may leave the mast moving
+            log.exception("operation %s met a defect of the program", name)
+            error = defect
+        if error is None:
+            self._end(name, "done", result, None)
+            log.info("operation %s done", name)
+            return
+        try:
+            self._mover.stop()
+        except (DriverError, MastctlError) as unconfirmed:
+            log.error("the head did not confirm the stop after operation %s: %s", name, unconfirmed)
+        partial = getattr(error, "result", None)
+        if cancelled.is_set():
+            self._end(name, "stopped", partial, error_body(Stopped("the operation was stopped")))
+            log.info("operation %s stopped", name)
+        else:
+            self._end(name, "failed", partial, error_body(error))
+            log.warning("operation %s failed: %s", name, error)
+
+    def _end(self, name: str, state: OperationState, result: Any, error: dict[str, Any] | None) -> None:
+        """Close a record and make room for the next operation."""
+        residual = _last_residual(result, name)
+        with self._lock:
+            if self._current is None or self._current[0] != name:
+                return  # given up before
+            known = self._records.get(name)
+            if known is not None:
+                self._records[name] = replace(
+                    known, state=state, result=result, error=error, ended_s=self._clock.now_s()
+                )
+            self._current = None
+            self._motion = replace(self._motion, operation=None, residual=residual or self._motion.residual)
+            if not self._closed:
+                self._mover.allow_moves()
+
+
+def error_body(error: BaseException) -> dict[str, Any]:
+    """Return an error as programs read it: code, one plain sentence, more detail or null."""
+    if isinstance(error, (MastctlError, DriverError, CalibError)):
+        code = getattr(error, "code", None)
+        detail = getattr(error, "detail", None)
+        return {
+            "code": code if isinstance(code, str) else "failed",
+            "message": " ".join(str(error).split()),
+            "detail": as_json(detail) if isinstance(detail, Mapping) else None,
+        }
+    return {
+        "code": "internal",
+        "message": f"the service met a defect of its own ({type(error).__name__}); its log says more",
+        "detail": None,
+    }
+
+
+def as_json(value: Any) -> Any:
+    """Return dataclasses, arrays and tuples as plain JSON values; numbers that are not finite become null."""
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return {field.name: as_json(getattr(value, field.name)) for field in dataclasses.fields(value)}
+    if isinstance(value, Mapping):
+        return {str(key): as_json(entry) for key, entry in value.items()}
+    if isinstance(value, np.ndarray):
+        return as_json(value.tolist())
+    if isinstance(value, (list, tuple, set, frozenset)):
+        return [as_json(entry) for entry in value]
+    if isinstance(value, np.generic):
+        return as_json(value.item())
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if value is None or isinstance(value, (str, int, bool)):
+        return value
+    return str(value)
+
+
+def _last_residual(result: Any, name: str) -> Residual | None:
+    """The residual that a result ends with, if it measured one."""
+    pointings = getattr(result, "pointings", None) or ()
+    if not pointings:
+        return None
+    told = as_json(pointings[-1])
+    residual, sigma = told.get("residual_px"), told.get("residual_sigma_px")
+    if not (residual and sigma and None not in residual and None not in sigma):
+        return None
+    return Residual((residual[0], residual[1]), (sigma[0], sigma[1]), name)
