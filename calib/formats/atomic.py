@@ -1,0 +1,106 @@
+"""Saving a file so that a crash at any moment leaves the old content or the new, never less.
+
+Steps: write the new content beside the file and fsync it; give the old content a second name; rename the
+new one into place; fsync the folder; rename the old one to ``NAME.previous.SUFFIX``. After a crash in between
+the folder may hold a hidden ``.NAME.*.new`` or ``.NAME.*.old`` beside the file; neither is ever read.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import secrets
+import shutil
+import stat
+from pathlib import Path
+
+from calib.errors import BadFile
+
+
+def previous_path(path: Path) -> Path:
+    """Return where the version before the last save is kept: ``rig.yaml`` -> ``rig.previous.yaml``."""
+    return path.with_name(f"{path.stem}.previous{path.suffix}")
+
+
+def save_bytes(path: str | Path, data: bytes) -> None:
+    """Replace the file's content in one step; keep its permissions, and the old content as ``previous_path``.
+
+    A symbolic link stays one: the file that it names is replaced.
+
+    Raises
+    ------
+    BadFile
+        If the file system refuses; the file then holds what it held before.
+    """
+    try:
+        target = Path(path).resolve()
+        mode = _mode_of(target)
+        mark = secrets.token_hex(4)
+        new = target.with_name(f".{target.name}.{mark}.new")
+        old = target.with_name(f".{target.name}.{mark}.old")
+        placed = False
+        try:
+            _write(new, data, mode)
+            if mode is not None:
+                _second_name(target, old)
+            new.replace(target)
+            placed = True
+            _sync_folder(target.parent)
+            if mode is not None:
+                old.replace(previous_path(target))
+        except OSError:
+            with contextlib.suppress(OSError):
+                if placed and mode is not None:
+                    old.replace(target)
+                elif placed:
+                    target.unlink()
+            for leftover in (new, old):
+                with contextlib.suppress(OSError):
+                    leftover.unlink(missing_ok=True)
+            raise
+    except OSError as error:
+        raise BadFile(path, "", f"cannot be saved: {error.strerror or error}") from None
+    except ValueError as error:  # a path with a NUL
+        raise BadFile(path, "", f"cannot be saved: {error}") from None
+
+
+def _mode_of(target: Path) -> int | None:
+    """The permissions of the file that is to be replaced; None if there is none yet."""
+    try:
+        found = target.stat()
+    except FileNotFoundError:
+        return None
+    if not stat.S_ISREG(found.st_mode):
+        raise OSError("it is not a regular file")
+    return stat.S_IMODE(found.st_mode)
+
+
+def _write(new: Path, data: bytes, mode: int | None) -> None:
+    descriptor = os.open(new, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o666)
+    with os.fdopen(descriptor, "wb") as file:
+        if mode is not None:
+            os.fchmod(descriptor, mode)
+        file.write(data)
+        file.flush()
+        os.fsync(descriptor)
+
+
+def _second_name(target: Path, old: Path) -> None:
+    """Give the file a second name; file systems without hard links get a copy."""
+    try:
+        os.link(target, old)
+    except OSError:
+        shutil.copy2(target, old)
+        descriptor = os.open(old, os.O_RDONLY)
+        try:
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)
+
+
+def _sync_folder(folder: Path) -> None:
+    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
