@@ -35,7 +35,7 @@ READ_TIMEOUT_S = 1.0
 MOVE_TIMEOUT_S = 1.0
 STOP_TIMEOUT_S = 1.0
 STOP_PATIENCE_S = 0.05  # how long a stop waits for the head's own thread before it goes out beside it
-CAMERA_GRACE_S = 1.0  # beyond the time given to next_frame, for a busy machine
+CAMERA_GRACE_S = 3.0  # beyond the time given to next_frame: decoding, or rendering, on a busy machine
 MOVING_PERIOD_S = 0.02
 RESTING_PERIOD_S = 0.05
 MOVED_RAD = 1e-5  # a head camera's picture that stays the same to the last bit beyond this is frozen
@@ -196,7 +196,7 @@ class Devices:
         exposed_after_s
             Only frames whose exposure began after this moment count, seconds of CLOCK_MONOTONIC.
         timeout_s
-            What each camera is given, seconds; the call itself ends at most some 2 s later.
+            What each camera is given, seconds; the call itself ends at most some 4 s later.
 
         Raises
         ------

@@ -1,0 +1,174 @@
+"""The configuration of one daemon (contract section 2), read strictly.
+
+It is checked in two steps: what the file says by itself here, and what it says about the mast file when that
+is read (`check_cameras`). Options of drivers are handed through as they stand; the drivers judge them.
+"""
+
+from __future__ import annotations
+
+import ipaddress
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from urllib.parse import quote
+
+from calib.errors import BadFile
+from calib.formats import read_bytes
+from calib.formats.strict import Section, nearest
+from calib.formats.yaml_text import parse_mapping
+from calib.mast import Rig
+from drivers.open_hardware import DeviceSettings, HardwareSettings
+from mastctl.limits import Limits
+from mastctl.packaged import default_config
+
+CONFIG_SCHEMA = "mastctl/config/1"
+DEFAULT_HOST = "127.0.0.1"
+DEFAULT_PORT = 8420
+
+_MAX_BYTES = 1_000_000
+_FULL_TURN_RAD = 6.2832
+_FASTEST_RAD_PER_S = 100.0
+_LONGEST_SOCKET_PATH = 100  # bytes; the kernel's own bound is 108
+
+
+@dataclass(frozen=True)
+class Listen:
+    """Where the daemon listens: a loopback address, or a Unix socket, which then is not None."""
+
+    host: str = DEFAULT_HOST
+    port: int = DEFAULT_PORT
+    socket: Path | None = None
+
+    @property
+    def url(self) -> str:
+        """The address as clients take it: ``http://127.0.0.1:8420`` or ``unix:/path/of/socket``."""
+        if self.socket is not None:
+            return f"unix:{quote(str(self.socket))}"
+        host = f"[{self.host}]" if ":" in self.host else self.host
+        return f"http://{host}:{self.port}"
+
+
+@dataclass(frozen=True)
+class Config:
+    """A daemon's configuration; paths are absolute or relative to the working folder."""
+
+    path: Path
+    mast_file: Path
+    listen: Listen
+    hardware: HardwareSettings
+    limits: Limits
+
+
+def load_config(path: str | Path | None = None) -> Config:
+    """Read a configuration; without a path the packaged one, which runs the simulated rover.
+
+    Raises
+    ------
+    BadFile
+        If it cannot be read or used: which key, what it holds, and what is expected.
+    """
+    file = default_config() if path is None else Path(path)
+    return parse_config(read_bytes(file, _MAX_BYTES), file)
+
+
+def parse_config(data: bytes, path: str | Path) -> Config:
+    """Read a configuration's bytes; relative paths in it start at the folder of ``path``. Raises BadFile."""
+    document = parse_mapping(data, path)
+    if document.get("schema") != CONFIG_SCHEMA:
+        found = document.get("schema", "no such key")
+        raise BadFile(path, "schema", f"'{str(found)[:60]}' where '{CONFIG_SCHEMA}' is expected")
+    top = Section(
+        path, "", document, ("schema", "mast_file", "pan_tilt", "cameras", "limits"), ("listen", "simulation")
+    )
+    folder = Path(path).resolve().parent
+    cameras = {name: _device(top, "cameras", name) for name in top.mapping("cameras")}
+    if not cameras:
+        raise top.bad("cameras", "holds no camera; at least one is expected")
+    return Config(
+        path=Path(path),
+        mast_file=folder / top.text("mast_file"),
+        listen=_listen(top, folder),
+        hardware=HardwareSettings(
+            pan_tilt=_device(top, "", "pan_tilt"),
+            cameras=cameras,
+            simulation=top.free("simulation"),
+            folder=folder,
+        ),
+        limits=_limits(top),
+    )
+
+
+def check_cameras(config: Config, rig: Rig) -> None:
+    """Pass a configuration whose cameras the mast file knows.
+
+    Raises
+    ------
+    BadFile
+        Naming the camera, and the nearest one that the mast file has.
+    """
+    known = tuple(rig.cameras)
+    for name in config.hardware.cameras:
+        if name not in known:
+            words = f"the mast file {config.mast_file} has no such camera; {nearest(name, known)}"
+            raise BadFile(config.path, f"cameras.{name}", words)
+
+
+def is_loopback(host: str) -> bool:
+    """Return whether a host, as written, is this machine's own and only that."""
+    if host == "localhost":
+        return True
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return False
+
+
+def _device(top: Section, place: str, name: str) -> DeviceSettings:
+    """Read ``{driver: NAME, options: {...}}``."""
+    holder = top.mapping(place)[name] if place else top.values[name]
+    section = Section(top.path, f"{place}.{name}" if place else name, holder, ("driver",), ("options",))
+    return DeviceSettings(section.text("driver"), section.free("options"))
+
+
+def _listen(top: Section, folder: Path) -> Listen:
+    """Read ``{host, port}`` or ``{socket: PATH}``; only this machine itself may be listened to."""
+    if "listen" not in top:
+        return Listen()
+    section = top.section("listen", (), ("host", "port", "socket"))
+    if "socket" in section:
+        for other in ("host", "port"):
+            if other in section:
+                raise section.bad(other, "stands beside 'socket'; one or the other is expected")
+        socket = folder / section.text("socket")
+        if len(str(socket).encode()) > _LONGEST_SOCKET_PATH:
+            raise section.bad("socket", f"{socket} is longer than {_LONGEST_SOCKET_PATH} bytes")
+        return Listen(socket=socket)
+    host = section.text("host") if "host" in section else DEFAULT_HOST
+    if not is_loopback(host):
+        words = f"'{host}' where a loopback address (127.0.0.1, ::1, localhost) is expected"
+        raise section.bad("host", f"{words}: without authentication the daemon serves this machine only")
+    port = section.integer("port", 0, 65535) if "port" in section else DEFAULT_PORT
+    return Listen(host, port)
+
+
+def _limits(top: Section) -> Limits:
+    """Read the soft limits."""
+    section = top.section("limits", ("pan_rad", "tilt_rad", "speed_rad_per_s"))
+    pan_rad, tilt_rad = _range(section, "pan_rad"), _range(section, "tilt_rad")
+    speed_rad_per_s = section.number("speed_rad_per_s", _FASTEST_RAD_PER_S)
+    if speed_rad_per_s <= 0.0:
+        raise section.bad("speed_rad_per_s", f"{speed_rad_per_s:g} where a number above 0 is expected")
+    return Limits(pan_rad, tilt_rad, speed_rad_per_s)
+
+
+def _range(section: Section, key: str) -> tuple[float, float]:
+    """Read ``[lowest, highest]`` in radians, at most a full turn either way."""
+    value = section.values[key]
+    if not isinstance(value, list) or len(value) != 2:
+        raise section.bad(key, "[lowest, highest] in radians is expected")
+    place = section.at(key)
+    ends = Section(section.path, place, {"lowest": value[0], "highest": value[1]}, ("lowest", "highest"))
+    low, high = ends.number("lowest", _FULL_TURN_RAD), ends.number("highest", _FULL_TURN_RAD)
+    if low >= high:
+        raise section.bad(key, f"[{low:g}, {high:g}] where the lowest must be below the highest")
+    return low, high
