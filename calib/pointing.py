@@ -1,12 +1,12 @@
 """Exact pointing: the joint angles that bring a target onto a chosen pixel of a head camera.
 
-The pixel's ray (origin c, unit direction d, both in the head frame) comes from the camera model itself, so lens
-distortion, a moving entrance point, oblique H and V and a principal point off centre are all exact, for any
-pixel. The paper (section IV) turns the camera by a small rotation vector instead, eqs. (19)-(22).
+The pixel's ray (origin c, unit direction d, both in the head frame) comes from the camera model itself, so
+lens distortion, a moving entrance point, oblique H and V and a principal point off centre are all exact, for
+any pixel. The paper (section IV) turns the camera by a small rotation vector instead, eqs. (19)-(22).
 
-Letters: p target in the mast frame (x, y, z), rho its distance from the pan axis; a, k axis offset and twist of
-the mast; u the target in the *arm* frame, which is the mast frame turned with the pan axis; w = c + s d the
-target in the head frame, s > 0 the range along the ray. The kinematics of calib.mast say
+Letters: p target in the mast frame (x, y, z), rho its distance from the pan axis; a, k axis offset and twist
+of the mast; u the target in the *arm* frame, which is the mast frame turned with the pan axis; w = c + s d
+the target in the head frame, s > 0 the range along the ray. The kinematics of calib.mast say
 
     u = a x̂ + Rot(x,k) Rot(y,tilt) w     and     p = Rot(z,pan) u
 
@@ -14,8 +14,8 @@ and three lengths that no joint changes fix everything else:
 
     u_z = z,    u_x² + u_y² = rho²,    w_y = u_y cos k + z sin k,    |w|² = rho² + z² + a² - 2 a u_x.
 
-For a = 0 the last is a quadratic in s, the paper's eq. (25). For a ≠ 0 it makes a quartic. docs/pointing.md has
-the derivation.
+For a = 0 the last is a quadratic in s, the paper's eq. (25). For a ≠ 0 they make a quartic. docs/pointing.md
+has the derivation.
 """
 
 from __future__ import annotations
@@ -37,13 +37,16 @@ _EDGE = 1e-12
 """A miss up to this part of the target's distance is rounding: the target counts as on the edge of reach."""
 
 _SAME_RAD = 1e-7
-"""Solutions closer than this are one: at the edge of reach two solutions meet, good to the root of rounding."""
+"""Solutions closer than this are one: at the edge of reach two meet, good to the root of rounding."""
 
 _PARALLEL = 1e-3
 """|cos k| below this: the axes are parallel to a milliradian, and the mast is not a pan/tilt head."""
 
 _NO_OFFSET_M = 1e-13
 """Axis offsets below this are nothing (2e-13 rad at half a metre) and would underflow in the quartic."""
+
+_FARTHEST_M = 1e9
+"""Coordinates from here on are taken for a mistake; their squares would overflow in the end."""
 
 Triple = tuple[float, float, float]
 
@@ -78,7 +81,7 @@ class _Axes:
 
 @dataclass(frozen=True, slots=True)
 class _Ray:
-    """A ray in the head frame with what the solver asks of it: c·d and the squared distance from the origin."""
+    """A ray in the head frame with c·d and the squared distance at which its line passes the origin."""
 
     c: Triple
     d: Triple
@@ -116,7 +119,9 @@ def _ray(origin_m: Sequence[float], direction: Sequence[float]) -> _Ray:
 def _camera_ray(camera_in_head: CameraModel, x_px: float, y_px: float) -> _Ray:
     rays = camera_in_head.ray(np.array([x_px, y_px]))
     if not rays.valid:
-        raise Unreachable("bad_pixel", f"pixel ({x_px:g}, {y_px:g}) has no ray in this {camera_in_head.kind} camera")
+        raise Unreachable(
+            "bad_pixel", f"pixel ({x_px:g}, {y_px:g}) has no ray in this {camera_in_head.kind} camera"
+        )
     return _ray(rays.origins_m.tolist(), rays.directions.tolist())
 
 
@@ -157,7 +162,8 @@ def solve(
     Unreachable
         ``blind_cone``: too near the pan axis, with the distance from the axis that could be reached.
         ``too_near``: nearer than the ray can be brought, with both distances. ``bad_pixel``, ``bad_target``:
-        the pixel has no ray, or the target is not three finite numbers. ``parallel_axes``: |cos k| < 0.001.
+        the pixel has no ray, or the target is not three finite numbers below 1e9 m. ``parallel_axes``:
+        |cos k| < 0.001.
 
     Notes
     -----
@@ -170,15 +176,14 @@ def solve(
     >>> from calib.mast import Mast
     >>> mast = Mast(np.array([0.0, 0.0, -1.5]), np.zeros(3))
     >>> forward, right, down = np.eye(3)
-    >>> camera = CameraModel("CAHV", (101, 101), np.zeros(3), forward, 100 * right + 50 * forward, 100 * down + 50 * forward)
+    >>> H, V = 100 * right + 50 * forward, 100 * down + 50 * forward
+    >>> camera = CameraModel("CAHV", (101, 101), np.zeros(3), forward, H, V)
     >>> [best, over_the_shoulder] = solve(mast, camera, [0.0, 3.0, -1.5])
     >>> round(best.pan_rad, 6), abs(round(best.tilt_rad, 6)), round(best.range_m, 6)
     (1.570796, 0.0, 3.0)
     """
-    pixel = camera_in_head.image_center_px if pixel_px is None else tuple(np.asarray(pixel_px, dtype=float).tolist())
-    if len(pixel) != 2 or not (math.isfinite(pixel[0]) and math.isfinite(pixel[1])):
-        raise Unreachable("bad_pixel", f"pixel {list(pixel)} is not two finite numbers")
-    ray = _camera_ray(camera_in_head, pixel[0], pixel[1])
+    x_px, y_px = camera_in_head.image_center_px if pixel_px is None else _two_numbers(pixel_px)
+    ray = _camera_ray(camera_in_head, x_px, y_px)
     return _solve(_axes(mast), ray, target_in_rover_m, from_pan_rad, from_tilt_rad)
 
 
@@ -213,7 +218,9 @@ def solve_ray(
     direction = np.asarray(direction_in_head, dtype=np.float64)
     length = float(np.linalg.norm(direction))
     if not (np.isfinite(origin).all() and math.isfinite(length) and length > 0.0):
-        raise Unreachable("bad_pixel", f"ray from {origin.tolist()} along {direction.tolist()} has no finite direction")
+        raise Unreachable(
+            "bad_pixel", f"ray from {origin.tolist()} along {direction.tolist()} has no finite direction"
+        )
     ray = _ray(origin.tolist(), (direction / length).tolist())
     return _solve(_axes(mast), ray, target_in_rover_m, from_pan_rad, from_tilt_rad)
 
@@ -223,11 +230,13 @@ def _solve(
 ) -> list[Solution]:
     x, y, z = _target_in_mast(axes, target_in_rover_m)
     if abs(axes.cos_k) < _PARALLEL:
-        raise Unreachable("parallel_axes", f"pan and tilt axes are parallel (cos k = {axes.cos_k:.2g}): no pan/tilt head")
+        raise Unreachable(
+            "parallel_axes", f"pan and tilt axes are parallel (cos k = {axes.cos_k:.2g}): not a pan/tilt head"
+        )
     rho = math.hypot(x, y)
     on_axis = rho <= _EDGE * math.hypot(rho, z)
     azimuth = math.atan2(y, x)
-    (cx, cy, cz), (dx, dy, dz) = ray.c, ray.d
+    (cx, _, cz), (dx, _, dz) = ray.c, ray.d
     found: list[Solution] = []
     for u_x, u_y, s in _arm_points(axes, ray, rho, z):
         # q = Rot(y,tilt) w turns w_x, w_z in their plane; q_y = w_y.
@@ -255,7 +264,8 @@ def choose(
 ) -> Solution:
     """Return the solution within the joint limits that comes first: upright, then least motion.
 
-    A joint that turns past ±π (limits of 20 to 350 degrees, say) is offered each angle a whole turn up and down too.
+    A joint that turns past ±π (limits of 20 to 350 degrees, say) is offered each angle a whole turn up and
+    down too.
 
     Parameters
     ----------
@@ -277,16 +287,14 @@ def choose(
         for pan_turn in (0.0, math.tau, -math.tau)
         for tilt_turn in (0.0, math.tau, -math.tau)
     ]
-    inside = [
-        one
-        for one in turned
-        if _beyond(one.pan_rad, pan_limits_rad) == 0.0 and _beyond(one.tilt_rad, tilt_limits_rad) == 0.0
-    ]
+
+    def excess(one: Solution) -> tuple[float, float]:
+        return _beyond(one.pan_rad, pan_limits_rad), _beyond(one.tilt_rad, tilt_limits_rad)
+
+    inside = [one for one in turned if excess(one) == (0.0, 0.0)]
     if inside:
         return min(inside, key=lambda one: _order(one, from_pan_rad, from_tilt_rad))
-    nearest = min(
-        turned, key=lambda one: max(_beyond(one.pan_rad, pan_limits_rad), _beyond(one.tilt_rad, tilt_limits_rad))
-    )
+    nearest = min(turned, key=lambda one: max(excess(one)))
     raise Unreachable(
         "outside_limits",
         " and ".join(
@@ -301,13 +309,23 @@ def choose(
     )
 
 
+def _two_numbers(pixel_px: ArrayLike) -> tuple[float, float]:
+    pixel = np.asarray(pixel_px, dtype=np.float64)
+    if pixel.shape != (2,) or not np.isfinite(pixel).all():
+        raise Unreachable("bad_pixel", f"pixel {pixel.tolist()} is not two finite numbers")
+    x_px, y_px = pixel.tolist()
+    return x_px, y_px
+
+
 def _target_in_mast(axes: _Axes, target_in_rover_m: ArrayLike) -> Triple:
     target = np.asarray(target_in_rover_m, dtype=np.float64)
     if target.shape != (3,):
-        raise Unreachable("bad_target", f"target of shape {target.shape} where three coordinates are expected")
+        raise Unreachable(
+            "bad_target", f"target of shape {target.shape} where three coordinates are expected"
+        )
     x, y, z = target.tolist()
-    if not math.isfinite(x + y + z):
-        raise Unreachable("bad_target", f"target {[x, y, z]} holds a value that is not finite")
+    if not max(abs(x), abs(y), abs(z)) < _FARTHEST_M:
+        raise Unreachable("bad_target", f"target {[x, y, z]} is not three finite numbers below 1e9 m")
     tx, ty, tz = axes.translation
     x, y, z = x - tx, y - ty, z - tz
     r0, r1, r2 = axes.rows
@@ -340,8 +358,8 @@ def _arm_points(axes: _Axes, ray: _Ray, rho: float, z: float) -> Iterator[tuple[
                 yield -u_x, u_y, s
         return
 
-    # a ≠ 0: sigma² = reach2 - 2 a u_x, so u_x within ±rho bounds sigma. With sigma = b + a t, b² = reach2, the
-    # quartic u_x² + u_y² = rho² stays well scaled however small a is:
+    # a ≠ 0: sigma² = reach2 - 2 a u_x, so u_x within ±rho bounds sigma. With sigma = b + a t, b² = reach2,
+    # the quartic u_x² + u_y² = rho² stays well scaled however small a is:
     #     u_x = excess/2 - b t - a t²/2,     excess = 0 (or reach2/a with b = 0 where reach2 < 0).
     widest = rho * (1.0 + 1e-9) + slack
     if reach2 + 2.0 * abs(a) * widest <= 0.0:
@@ -385,18 +403,19 @@ def _why_not(axes: _Axes, ray: _Ray, rho: float, z: float) -> Unreachable:
     if farthest <= nearest:
         return Unreachable(
             "too_near",
-            f"target is at most {farthest:.6g} m from the tilt axis centre, nearer by {nearest - farthest:.3g} m "
-            f"than the {nearest:.6g} m at which this pixel's ray begins",
+            f"target is at most {farthest:.6g} m from the tilt axis centre, {nearest - farthest:.3g} m nearer "
+            f"than this pixel's ray comes ({nearest:.6g} m)",
         )
     edge = _reach_edge_m(axes, ray, rho, z)
     side = "up" if z < 0.0 else "down"
-    place = f"target is {rho:.6g} m from the pan axis ({math.atan2(rho, abs(z)):.3g} rad from straight {side})"
+    angle = math.atan2(rho, abs(z))
+    place = f"target is {rho:.6g} m from the pan axis ({angle:.3g} rad from straight {side})"
     if edge is None:
-        return Unreachable("blind_cone", f"{place}; this pixel reaches no target at {z:.6g} m along the axis")
+        return Unreachable("blind_cone", f"{place}; at its height this pixel reaches no target at all")
     return Unreachable(
         "blind_cone",
-        f"{place}, inside the blind cone by {edge - rho:.3g} m: at its height this pixel reaches targets from "
-        f"{edge:.6g} m on",
+        f"{place}, inside the blind cone by {edge - rho:.3g} m: at its height this pixel reaches targets "
+        f"from {edge:.6g} m on",
     )
 
 

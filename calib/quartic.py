@@ -1,8 +1,8 @@
 """Real roots of a quartic within an interval, none lost, by the turning points of its derivatives.
 
-Between neighbouring turning points a polynomial is monotonic, so a change of sign there brackets exactly one root,
-which Newton's steps kept inside the bracket then find to rounding. The leading coefficients may be as small
-as they like: nothing is divided by them, unlike with companion matrices or Ferrari's formula.
+Between neighbouring turning points a polynomial is monotonic, so a change of sign there brackets exactly one
+root, which Newton's steps kept inside the bracket then find to rounding. The leading coefficients may be as
+small as they like: nothing is divided by them, unlike with companion matrices or Ferrari's formula.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ def _between_knots(coefficients: Quartic, knots: list[float]) -> list[float]:
 
 
 def _bracketed(coefficients: Quartic, low: float, high: float, rising: bool, t: float) -> float:
-    """Return the root in [low, high] by Newton's steps from t, halving the bracket where one would leave it."""
+    """Return the root in [low, high] by Newton's steps from t, halving where a step would leave it."""
     c4, c3, c2, c1, c0 = coefficients
     last = high - low
     enough = 1e-16 * max(abs(low), abs(high))
@@ -72,10 +72,8 @@ def _bracketed(coefficients: Quartic, low: float, high: float, rising: bool, t: 
         slope = ((4.0 * c4 * t + 3.0 * c3) * t + 2.0 * c2) * t + c1
         step = -value / slope if slope != 0.0 else math.inf
         # A step that leaves the bracket, or shrinks too slowly for Newton, is replaced by halving.
-        if low <= t + step <= high and abs(step) <= 0.75 * last:
-            after = t + step
-        else:
-            after = 0.5 * (low + high)
+        steps_well = low <= t + step <= high and abs(step) <= 0.75 * last
+        after = t + step if steps_well else 0.5 * (low + high)
         last = abs(after - t)
         if last <= enough:
             return after
