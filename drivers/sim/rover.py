@@ -102,6 +102,9 @@ def simulation_settings(section: Mapping[str, Any], folder: Path) -> SimulationS
     if not isinstance(faults, list | tuple):
         raise BadOptions(f"simulation.faults is {faults!r}, expected a list of {{device, word, ...}}")
     camera: CameraSettings = _filled(CameraSettings(), section.get("cameras", {}), "simulation.cameras")
+    for f in fields(camera):
+        if getattr(camera, f.name) < 0:
+            raise BadOptions(f"simulation.cameras.{f.name} is {getattr(camera, f.name)!r}, expected 0 or more")
     if camera.rate_hz <= 0 or not 0 < camera.exposure_s < 1 / camera.rate_hz:
         raise BadOptions(
             f"simulation.cameras: exposure_s {camera.exposure_s:g} does not fit rate_hz {camera.rate_hz:g}"
@@ -138,16 +141,14 @@ def _filled(defaults: Any, values: Any, key: str) -> Any:
         kind = type(known[name])
         if kind in (int, float):
             wrong = isinstance(value, bool) or not isinstance(value, int if kind is int else int | float)
-            if wrong or not math.isfinite(value) or value < 0:
-                raise BadOptions(f"{key}.{name} is {value!r}, expected a number that is not negative")
+            if wrong or not math.isfinite(value):
+                what = "a whole number" if kind is int else "a number"
+                raise BadOptions(f"{key}.{name} is {value!r}, expected {what}")
             value = kind(value)
         elif not isinstance(value, kind):
             raise BadOptions(f"{key}.{name} is {value!r}, expected {kind.__name__}")
         changes[str(name)] = value
-    try:
-        return replace(defaults, **changes)
-    except ValueError as error:
-        raise BadOptions(f"{key}: {error}") from None
+    return replace(defaults, **changes)
 
 
 @dataclass(frozen=True, eq=False)
