@@ -1,10 +1,11 @@
 """The ``.cahvor`` text files of JPL's camera-model library and of mrcal.
 
 Lines ``KEY = value`` in any order, ``#`` comments. ``Model`` is ``CAHV``, ``CAHVOR``, ``CAHVORE1``,
-``CAHVORE2`` or ``CAHVORE3,linearity``, each followed by words that nobody reads. ``S`` and ``S internal`` head
-matrices, one row a line: the covariance of the vectors' components, and of Hs, Hc, Vs, Vc, Theta (all five follow
-from the vectors). JPL's readers find keys by scanning forward for ``C =`` or ``Hs    =`` with exactly these blanks,
-so this writer keeps JPL's order and blanks; numbers are in shortest round-trip form instead of nine decimals.
+``CAHVORE2`` or ``CAHVORE3,linearity``, each followed by words that nobody reads. ``S`` and ``S internal``
+head matrices, one row a line: the covariance of the vectors' components, and of Hs, Hc, Vs, Vc, Theta (all
+five follow from the vectors). JPL's readers find keys by scanning forward for ``C =`` or ``Hs    =`` with
+exactly these blanks, so this writer keeps JPL's order and blanks; numbers are in shortest round-trip form
+instead of nine decimals.
 
 The format has no place for the frame's name, provenance, or a fit other than the covariance of the vectors.
 Sources: VICAR ``cmod_stdio_*.c`` (what is written and scanned for), mrcal ``cahvor.py`` (what is accepted).
@@ -67,10 +68,9 @@ def parse_cahvor(data: bytes, path: str | Path) -> CameraFile:
         if letter not in values:
             raise BadFile(path, letter, f"the line '{letter} = x y z' is missing; {kind} has it")
     vectors = {letter: _numbers(values, letter, 3, path) for letter in kind}
-    for letter in "ORE":
-        if letter in values and letter not in kind and letter != "O":
-            if np.any(_numbers(values, letter, 3, path)):
-                raise BadFile(path, letter, f"{kind} has no {letter}; expected zeros or another Model")
+    for letter in set("RE") & set(values) - set(kind):
+        if any(_numbers(values, letter, 3, path)):
+            raise BadFile(path, letter, f"{kind} has no {letter}; expected zeros or another Model")
     if "Dimensions" not in values:
         raise BadFile(path, "Dimensions", "the line 'Dimensions = width height' is missing")
     size = _numbers(values, "Dimensions", 2, path)
