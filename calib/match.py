@@ -1,0 +1,336 @@
+"""Find the target of one picture in another: warped template, correlation, sub-pixel place, verdict.
+
+The verdict is part of the measurement: only a ``good`` match is one. What the other words say:
+
+- ``flat``: too little texture (or only along one direction) to hold a position;
+- ``ambiguous``: a second place fits nearly as well;
+- ``weak``: no place fits well enough: hidden, changed, wrong range, or not in the window;
+- ``border``: the patch, or the best place, lies at the border of a picture or of the window.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import cv2
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from calib.cahvor import CameraModel
+from calib.refine import Refined, refine
+from calib.rigid import FloatArray
+from calib.warp import Grey, Plane, Template, blurred_to, carry, warp_patch
+
+Verdict = Literal["good", "flat", "ambiguous", "weak", "border"]
+
+
+@dataclass(frozen=True)
+class MatchSettings:
+    """Sizes and thresholds of the matching, with the reasons for their values.
+
+    Attributes
+    ----------
+    half_px
+        Half of the patch's side in the coarser of the two pictures. 20 (41 px) holds 0.02 px with usual
+        texture and is still nearly plane on a rock (facts: 41 and 61 px differ by a quarter only).
+    smallest_half_px
+        How far the patch may shrink at the border of a picture.
+    most_half_px
+        How far it may grow in an enlarged picture.
+    noise_dn
+        Grey noise of one picture, one sigma; used to tell texture from noise and what correlation to expect.
+    flat_sigma_px
+        A patch whose gradient cannot hold this sigma in its worst direction is flat. Edges fail here too.
+    least_correlation
+        Of what noise alone allows. Unrelated patches of 41 px reach 0.3-0.5 somewhere in a window.
+    least_lead, worst_ratio
+        A second place is ambiguous if its correlation is nearer than ``least_lead``, or if the best leaves
+        more than ``worst_ratio`` of what the second leaves unexplained: (1 - best)/(1 - second).
+    apart_px
+        Peaks nearer than this are one peak.
+    worst_sigma_px
+        A position less certain than this is no measurement.
+    """
+
+    half_px: int = 20
+    smallest_half_px: int = 9
+    most_half_px: int = 90
+    noise_dn: float = 2.0
+    flat_sigma_px: float = 0.15
+    least_correlation: float = 0.7
+    least_lead: float = 0.08
+    worst_ratio: float = 0.6
+    apart_px: int = 5
+    worst_sigma_px: float = 0.5
+
+
+@dataclass(frozen=True, eq=False)
+class Match:
+    """Where the target is in the other picture.
+
+    Attributes
+    ----------
+    verdict, reason
+        See the module; the reason is one plain sentence, empty for ``good``.
+    predicted_px
+        (2,) where geometry alone puts the target; not-a-number if it cannot be seen.
+    pixel_px, covariance_px2
+        (2,) and (2, 2) of the found place; not-a-number unless the verdict is ``good``.
+    correlation, second
+        Normalised correlation at the best place and at the second best one apart from it, -1..1.
+    deformation
+        (2, 2) what the warp did not foresee, as a map of offsets from the target.
+    half_px
+        Half side of the patch that was used, pixels of the destination; 0 if there was none.
+    """
+
+    verdict: Verdict
+    reason: str
+    predicted_px: FloatArray
+    pixel_px: FloatArray
+    covariance_px2: FloatArray
+    correlation: float = 0.0
+    second: float = 0.0
+    deformation: FloatArray | None = None
+    half_px: int = 0
+
+    @property
+    def sigma_px(self) -> FloatArray:
+        """(2,) one sigma of x and y."""
+        return np.sqrt(np.diag(self.covariance_px2))
+
+
+def no_match(
+    verdict: Verdict,
+    reason: str,
+    predicted_px: FloatArray | None = None,
+    correlation: float = 0.0,
+    second: float = 0.0,
+    half_px: int = 0,
+) -> Match:
+    """Return a match that is none."""
+    nowhere = np.full(2, np.nan)
+    return Match(
+        verdict,
+        reason,
+        nowhere if predicted_px is None else predicted_px,
+        nowhere,
+        np.full((2, 2), np.nan),
+        correlation,
+        second,
+        half_px=half_px,
+    )
+
+
+def match(
+    source_image: Grey,
+    source: CameraModel,
+    source_px: ArrayLike,
+    plane: Plane,
+    destination_image: Grey,
+    destination: CameraModel,
+    search_px: float,
+    settings: MatchSettings | None = None,
+) -> Match:
+    """Find the target at ``source_px`` of one picture in another.
+
+    Parameters
+    ----------
+    source_image, destination_image
+        (h, w) float32 grey, 0..255 (`calib.warp.grey`).
+    source, destination
+        The cameras at the moments of the pictures, in one common frame.
+    source_px
+        (2,) the target, sub-pixel.
+    plane
+        The scene around the target, in the common frame.
+    search_px
+        Half side of the window around the predicted place, destination pixels.
+    """
+    settings = settings or MatchSettings()
+    target = np.asarray(source_px, dtype=np.float64)
+    seen, valid = carry(target, source, plane, destination)
+    if not bool(valid):
+        return no_match("border", "the target cannot be seen by the other camera by its position")
+    width, height = destination.size_px
+    if not (
+        -search_px <= seen[0] <= width - 1 + search_px and -search_px <= seen[1] <= height - 1 + search_px
+    ):
+        return no_match("border", f"the target is expected at {_at(seen)}, outside the picture", seen)
+    template = _template(source_image, source, target, plane, destination, settings)
+    if template is None:
+        return no_match("border", f"the patch around {_at(target)} is cut by the picture's border", seen)
+    half = template.values.shape[0] // 2
+    lacking = texture_lacks(template.values, settings)
+    if lacking:
+        return no_match("flat", lacking, seen, half_px=half)
+    found = _search(template, destination_image, search_px, settings)
+    if isinstance(found, Match):
+        return found
+    return judged(template, found, settings)
+
+
+def texture_lacks(values: Grey, settings: MatchSettings) -> str:
+    """Return why a patch (n, n) cannot hold a position, empty if it can.
+
+    The worst sigma that noise allows is √2 noise / √λ with λ the smaller eigenvalue of Σ ∇T ∇Tᵀ, less what
+    noise itself adds to it.
+    """
+    smooth = cv2.GaussianBlur(values, (0, 0), 1.0)
+    inner = smooth.astype(np.float64)
+    gx = (inner[1:-1, 2:] - inner[1:-1, :-2]) / 2
+    gy = (inner[2:, 1:-1] - inner[:-2, 1:-1]) / 2
+    structure = np.array([[(gx * gx).sum(), (gx * gy).sum()], [(gx * gy).sum(), (gy * gy).sum()]])
+    # White noise after a Gaussian of 1 px and a two-sided difference keeps 0.0313 of its variance.
+    smaller, larger = np.linalg.eigvalsh(structure) - 0.0313 * settings.noise_dn**2 * gx.size
+    worst_px = float(np.sqrt(2.0) * settings.noise_dn / np.sqrt(max(smaller, 1e-9)))
+    if worst_px <= settings.flat_sigma_px:
+        return ""
+    if np.sqrt(2.0) * settings.noise_dn / np.sqrt(max(larger, 1e-9)) <= settings.flat_sigma_px / 2:
+        return "the patch has texture along one direction only, like a straight edge"
+    return "the patch has too little texture to hold a position"
+
+
+def expected_correlation(values: Grey, settings: MatchSettings) -> float:
+    """Return what correlation noise alone would leave between two pictures of this patch."""
+    variance = float(values.var())
+    return float(np.clip(1.0 - settings.noise_dn**2 / max(variance, 1e-9), 0.3, 1.0))
+
+
+def peaks(
+    scores: NDArray[np.float32], apart_px: int
+) -> tuple[tuple[int, int], float, float, tuple[int, int] | None]:
+    """Return the best place (x, y) of a score surface, its score, the second peak's score and place.
+
+    A second peak is a local maximum more than ``apart_px`` from the best; -1 and None if there is none.
+    """
+    scores = np.where(np.isfinite(scores), scores, np.float32(-1.0))
+    y, x = (int(v) for v in np.unravel_index(int(np.argmax(scores)), scores.shape))
+    local = (scores >= cv2.dilate(scores, np.ones((3, 3), np.uint8))) & (scores < 2.0)
+    local[max(0, y - apart_px) : y + apart_px + 1, max(0, x - apart_px) : x + apart_px + 1] = False
+    others = np.where(local, scores, np.float32(-1.0))
+    v, u = (int(w) for w in np.unravel_index(int(np.argmax(others)), others.shape))
+    second = float(others[v, u])
+    return (x, y), float(scores[y, x]), second, (u, v) if second > -1.0 else None
+
+
+def rivalled(best: float, second: float, settings: MatchSettings) -> bool:
+    """Tell whether a second place fits nearly as well as the best."""
+    return best - second < settings.least_lead or (1.0 - best) > settings.worst_ratio * (1.0 - second)
+
+
+@dataclass(frozen=True, eq=False)
+class Found:
+    """A refined place with its rival's score and the image it was found in."""
+
+    refined: Refined
+    second: float
+
+
+def judged(template: Template, found: Found, settings: MatchSettings) -> Match:
+    """Return the match with its verdict, from correlation, rival and certainty."""
+    refined, half = found.refined, template.values.shape[0] // 2
+    facts = (refined.correlation, found.second, half)
+    least = settings.least_correlation * expected_correlation(template.values, settings)
+    if refined.correlation < least:
+        words = f"the best place correlates by {refined.correlation:.2f}, at least {least:.2f} is expected"
+        return no_match("weak", words, template.target_px, *facts)
+    if rivalled(refined.correlation, found.second, settings):
+        words = f"a second place fits nearly as well: {found.second:.2f} beside {refined.correlation:.2f}"
+        return no_match("ambiguous", words, template.target_px, *facts)
+    worst_px = float(np.sqrt(np.linalg.eigvalsh(refined.covariance_px2)[-1]))
+    if worst_px > settings.worst_sigma_px:
+        words = f"the place is certain to {worst_px:.2f} px only, {settings.worst_sigma_px} px is expected"
+        return no_match("weak", words, template.target_px, *facts)
+    return Match(
+        "good",
+        "",
+        template.target_px,
+        refined.pixel_px,
+        refined.covariance_px2,
+        refined.correlation,
+        found.second,
+        refined.deformation,
+        half,
+    )
+
+
+def _template(
+    image: Grey,
+    source: CameraModel,
+    target: FloatArray,
+    plane: Plane,
+    destination: CameraModel,
+    settings: MatchSettings,
+) -> Template | None:
+    """Warp the largest patch that the source picture holds, sized by the coarser of the two pictures."""
+    probe = warp_patch(image, source, target, plane, destination, 1)
+    if probe is None:
+        return None
+    grown = max(1.0, probe.magnification)
+    half = min(round(settings.half_px * grown), settings.most_half_px)
+    least = round(settings.smallest_half_px * min(grown, settings.most_half_px / settings.half_px))
+    while half >= least:
+        template = warp_patch(image, source, target, plane, destination, half)
+        if template is not None:
+            return template
+        half = half - 3 if half - 3 >= least or half == least else least
+    return None
+
+
+def _search(template: Template, image: Grey, search_px: float, settings: MatchSettings) -> Found | Match:
+    """Correlate over the window, then refine at the best place."""
+    half, reach = template.values.shape[0] // 2, int(np.ceil(search_px))
+    low = np.maximum(template.centre_px - reach - half, 0)
+    high = np.minimum(template.centre_px + reach + half, np.array(image.shape[::-1]) - 1)
+    if (high - low < 2 * half + 4).any():
+        words = f"the target is expected at {_at(template.target_px)}, too near the picture's border"
+        return no_match("border", words, template.target_px, half_px=half)
+    margin = int(np.ceil(4 * max(template.magnification, 1.0))) + 16
+    cut_low = np.maximum(low - margin, 0)
+    cut = image[cut_low[1] : high[1] + 1 + margin, cut_low[0] : high[0] + 1 + margin]
+    cut = np.ascontiguousarray(blurred_to(cut, template.magnification))
+    inner = low - cut_low
+    window = cut[inner[1] : inner[1] + high[1] - low[1] + 1, inner[0] : inner[0] + high[0] - low[0] + 1]
+    scores = cv2.matchTemplate(window, template.values, cv2.TM_CCOEFF_NORMED).astype(np.float32)
+    (x, y), best, second, _ = peaks(
+        scores, max(settings.apart_px, round(settings.apart_px * template.magnification))
+    )
+    facts = (best, second, half)
+    least = 0.8 * settings.least_correlation * expected_correlation(template.values, settings)
+    if best < least:
+        words = f"no place in the window of {reach} px correlates by more than {best:.2f}"
+        return no_match("weak", words, template.target_px, *facts)
+    if x in (0, scores.shape[1] - 1) or y in (0, scores.shape[0] - 1):
+        words = f"the best place is at the border of the window of {reach} px"
+        return no_match("border", words, template.target_px, *facts)
+    shift = low + half + np.array([x, y]) - template.centre_px
+    start = template.target_px + shift - cut_low
+    refined = refine(
+        template.values,
+        template.centre_px - cut_low,
+        template.target_px - cut_low,
+        cut,
+        start,
+        correlated_px=correlated_px(template.magnification),
+    )
+    if refined is None or float(np.abs(refined.pixel_px - start).max()) > 2.0 * max(
+        1.0, template.magnification
+    ):
+        words = f"the best place (correlation {best:.2f}) does not settle to a sub-pixel position"
+        return no_match("weak", words, template.target_px, *facts)
+    placed = Refined(
+        refined.pixel_px + cut_low, refined.covariance_px2, refined.deformation, refined.correlation
+    )
+    return Found(placed, second)
+
+
+def correlated_px(magnification: float) -> int:
+    """Return over how many pixels grey differences hang together: three, more in an enlarged picture."""
+    return round(3 * max(1.0, magnification))
+
+
+def _at(pixel_px: FloatArray) -> str:
+    """Write a pixel."""
+    return f"({pixel_px[0]:.1f}, {pixel_px[1]:.1f}) px"

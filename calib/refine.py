@@ -1,0 +1,170 @@
+"""Least-squares matching: the last step to sub-pixel, with the covariance of the found position.
+
+Model (Gruen 1985, Foerstner 1982): I(p + (1 + D) q) = g T(q) + b over the patch's offsets q from the target,
+with the position p (2), the small deformation D (2x2), the gain g and the offset b free. Gauss-Newton on the
+grey differences r, with the template's gradient for the image's: step = -(WᵀJ)⁻¹ Wᵀ r. J (n, 8) holds the
+model's derivatives; W the same of the slightly smoothed template (instrumental variables: the template's own noise
+is in r too, and must not weigh it).
+
+Covariance, with N = WᵀJ:
+
+    cov = N⁻¹ M N⁻ᵀ · n / (n - 8),     M = Σ_i Σ_k w(k) W_i r_i (W_{i+k} r_{i+k})ᵀ,
+
+w a triangle over neighbouring pixels (Bartlett; White 1980, Newey and West 1987 in two dimensions).
+Differences of neighbours are not independent: interpolation and blur spread noise over two or three pixels,
+relief and a wrong plane over more. The usual σ²N⁻¹ would call such a position too good.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from calib.rigid import FloatArray
+from calib.warp import Grey, Surface, square_grid
+
+MOST_STEPS = 12
+STEP_ENOUGH_PX = 1e-4
+WORST_DEFORMATION = 0.5  # beyond it the patch is not the same thing any more
+SMOOTH_PX = 0.8  # of the template before its derivative
+WORST_CONDITION = 1e15
+FLOOR_PX = 0.002  # what cubic interpolation itself leaves, measured without noise
+
+
+@dataclass(frozen=True, eq=False)
+class Refined:
+    """Where the target is, and how well the patch fits there.
+
+    Attributes
+    ----------
+    pixel_px
+        (2,) the target in the destination image.
+    covariance_px2
+        (2, 2) of that position.
+    deformation
+        (2, 2) D: what the warp did not foresee, as a linear map of offsets from the target.
+    correlation
+        Normalised correlation of template and image at the found place, -1..1.
+    """
+
+    pixel_px: FloatArray
+    covariance_px2: FloatArray
+    deformation: FloatArray
+    correlation: float
+
+
+def refine(
+    template: Grey,
+    centre_px: NDArray[np.intp],
+    target_px: FloatArray,
+    image: Grey,
+    start_px: FloatArray,
+    deforming: bool = True,
+    correlated_px: int = 3,
+) -> Refined | None:
+    """Find where the image shows the template, from a start good to about a pixel.
+
+    Parameters
+    ----------
+    template
+        (n, n) grey, its middle on the whole pixel ``centre_px`` (2,).
+    target_px
+        (2,) the target's place in the template's own pixel grid.
+    image
+        (h, w) grey.
+    start_px
+        (2,) about where the target is in the image.
+    deforming
+        Whether D is free; else it stays zero.
+    correlated_px
+        Over how many pixels grey differences depend on each other.
+
+    Returns
+    -------
+    refined
+        None if it did not settle, left the image, or found nothing to hold on to.
+    """
+    half = template.shape[0] // 2
+    offsets = square_grid(half) + (centre_px - target_px)  # q: from the target to each patch pixel
+    values = template.astype(np.float64)
+    inner = (slice(2, -2), slice(2, -2))  # the border has no two-sided gradient
+    q, t = offsets[inner], values[inner]
+    jacobian = _columns(_gradient(values)[inner], q, t, deforming)
+    weights = _columns(_gradient(ndimage.gaussian_filter(values, SMOOTH_PX))[inner], q, t, deforming)
+    shape, n = t.shape, t.size
+    normal = weights.T @ jacobian
+    if not np.isfinite(normal).all() or np.linalg.cond(normal) > WORST_CONDITION:
+        return None
+    inverse = np.linalg.inv(normal)
+    position, deformation = np.array(start_px, dtype=np.float64), np.zeros((2, 2))
+    surface = Surface.around(image, position + q.min(axis=(0, 1)), position + q.max(axis=(0, 1)), margin_px=3)
+    gain, offset = 1.0, 0.0
+    for _ in range(MOST_STEPS):
+        places = position + q + q @ deformation.T
+        if not surface.inside(places):
+            return None
+        seen = surface.at(places)
+        gain, offset = _photometry(t, seen)
+        if gain <= 0.05:
+            return None
+        rest = (seen - gain * t - offset).reshape(n)
+        step = -inverse @ (weights.T @ rest)
+        move = step[:2] / gain
+        length = float(np.linalg.norm(move))
+        if length > 1.0:  # never further than the gradient is good for
+            step *= 1.0 / length
+            move = step[:2] / gain
+        position = position + move
+        if deforming:
+            deformation = deformation + (step[2:6] / gain).reshape(2, 2)
+        if np.linalg.norm(deformation) > WORST_DEFORMATION:
+            return None
+        if length < STEP_ENOUGH_PX:
+            break
+    else:
+        return None
+    scores = (weights * rest[:, None]).reshape(*shape, -1)
+    meat = _sum_of_neighbours(scores, correlated_px)
+    parameters = inverse @ meat @ inverse.T * (n / (n - jacobian.shape[1])) / gain**2
+    covariance = parameters[:2, :2] + FLOOR_PX**2 * np.eye(2)
+    correlation = float(np.corrcoef(t.reshape(n), seen.reshape(n))[0, 1])
+    if not np.isfinite(covariance).all() or not np.isfinite(correlation):
+        return None
+    return Refined(position, (covariance + covariance.T) / 2, deformation, correlation)
+
+
+def _gradient(values: FloatArray) -> FloatArray:
+    """Return the derivatives (h, w, 2) along x and y, per pixel, of fourth order."""
+    taps = np.array([1.0, -8.0, 0.0, 8.0, -1.0]) / 12.0
+    return np.stack(
+        [ndimage.correlate1d(values, taps, axis=axis, mode="nearest") for axis in (1, 0)], axis=-1
+    )
+
+
+def _columns(gradient: FloatArray, q: FloatArray, t: FloatArray, deforming: bool) -> FloatArray:
+    """Return the derivatives (n, p) of image minus model: position, deformation row by row, gain, offset."""
+    columns = [gradient[..., 0], gradient[..., 1]]
+    if deforming:
+        columns += [gradient[..., a] * q[..., b] for a in (0, 1) for b in (0, 1)]
+    return np.stack([*columns, -t, -np.ones_like(t)], axis=-1).reshape(t.size, -1)
+
+
+def _photometry(template: FloatArray, seen: FloatArray) -> tuple[float, float]:
+    """Return gain and offset that bring the template nearest to what is seen."""
+    centred = template - template.mean()
+    gain = float((centred * seen).sum() / max(float((centred**2).sum()), 1e-9))
+    return gain, float(seen.mean() - gain * template.mean())
+
+
+def _sum_of_neighbours(scores: FloatArray, reach_px: int) -> FloatArray:
+    """Return Σ_i Σ_k w(k) s_i s_{i+k}ᵀ (p, p) of scores (h, w, p), w a triangle of half-width reach + 1."""
+    triangle = 1.0 - np.abs(np.arange(-reach_px, reach_px + 1)) / (reach_px + 1.0)
+    spread = scores
+    for axis in (0, 1):
+        spread = ndimage.correlate1d(spread, triangle, axis=axis, mode="constant", cval=0.0)
+    p = scores.shape[-1]
+    meat = scores.reshape(-1, p).T @ spread.reshape(-1, p)
+    return np.asarray((meat + meat.T) / 2)
