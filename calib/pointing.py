@@ -45,6 +45,9 @@ _PARALLEL = 1e-3
 _NO_OFFSET_M = 1e-13
 """Axis offsets below this are nothing (2e-13 rad at half a metre) and would underflow in the quartic."""
 
+_FAR_OUT = 1e4
+"""The search for the edge of reach ends at this many times the target's distance: there is none."""
+
 _FARTHEST_M = 1e9
 """Coordinates from here on are taken for a mistake; their squares would overflow in the end."""
 
@@ -324,7 +327,7 @@ def _target_in_mast(axes: _Axes, target_in_rover_m: ArrayLike) -> Triple:
             "bad_target", f"target of shape {target.shape} where three coordinates are expected"
         )
     x, y, z = target.tolist()
-    if not max(abs(x), abs(y), abs(z)) < _FARTHEST_M:
+    if not (abs(x) < _FARTHEST_M and abs(y) < _FARTHEST_M and abs(z) < _FARTHEST_M):
         raise Unreachable("bad_target", f"target {[x, y, z]} is not three finite numbers below 1e9 m")
     tx, ty, tz = axes.translation
     x, y, z = x - tx, y - ty, z - tz
@@ -403,8 +406,8 @@ def _why_not(axes: _Axes, ray: _Ray, rho: float, z: float) -> Unreachable:
     if farthest <= nearest:
         return Unreachable(
             "too_near",
-            f"target is at most {farthest:.6g} m from the tilt axis centre, {nearest - farthest:.3g} m nearer "
-            f"than this pixel's ray comes ({nearest:.6g} m)",
+            f"target is at most {farthest:.6g} m from the tilt axis centre, {nearest - farthest:.3g} m "
+            f"nearer than this pixel's ray comes ({nearest:.6g} m)",
         )
     edge = _reach_edge_m(axes, ray, rho, z)
     side = "up" if z < 0.0 else "down"
@@ -428,7 +431,7 @@ def _reach_edge_m(axes: _Axes, ray: _Ray, rho: float, z: float) -> float | None:
     inside, outside = rho, max(2.0 * rho, 1e-3 * math.hypot(rho, z))
     while not reached(outside):
         inside, outside = outside, 2.0 * outside
-        if outside > 1e6 * math.hypot(rho, z):
+        if outside > _FAR_OUT * math.hypot(rho, z):
             return None
     while outside - inside > 1e-12 * outside:
         middle = 0.5 * (inside + outside)
