@@ -2,8 +2,8 @@
 
 In: UTF-8, with or without a byte-order mark, any line ends; the first line names the columns exactly; a cell
 is a number, ``nan`` and ``inf`` included; a row whose cells are all empty is a row of not-a-numbers, as this
-module writes them. Out: a header, one row an input row, shortest round-trip numbers, empty cells where there is
-no number.
+module writes them. Out: a header, one row an input row, shortest round-trip numbers, empty cells where there
+is no number.
 """
 
 from __future__ import annotations
@@ -77,7 +77,7 @@ def write_table(stream: TextIO, columns: Sequence[str], values: FloatArray) -> N
     """Write (rows, columns) numbers as CSV; a row with a number that is not finite becomes empty cells."""
     stream.write(",".join(columns) + "\n")
     empty = "," * (len(columns) - 1) + "\n"
-    finite = np.isfinite(values).all(axis=1)
+    finite: list[bool] = np.isfinite(values).all(axis=1).tolist()
     rows = zip(values.tolist(), finite, strict=True)
     stream.writelines(",".join(map(repr, row)) + "\n" if good else empty for row, good in rows)
 
