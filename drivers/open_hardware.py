@@ -87,7 +87,8 @@ class Hardware:
 
     def close(self) -> None:
         """Close every device; one that fails to is logged and does not keep the others open."""
-        _close({PAN_TILT: self.pan_tilt, **self.cameras})
+        devices = {PAN_TILT: self.pan_tilt, **self.cameras}
+        _close(devices if self.simulation is None else {**devices, "simulated rover": self.simulation})
 
     def __enter__(self) -> Hardware:
         return self
@@ -125,7 +126,7 @@ def open_hardware(settings: HardwareSettings, clock: Clock | None = None) -> Har
         for name, device in settings.cameras.items():
             devices[name] = opener.open(name, device, Camera)
     except BaseException:
-        _close(devices)
+        _close(devices if opener.rover is None else {**devices, "simulated rover": opener.rover})
         raise
     pan_tilt = devices.pop(PAN_TILT)
     return Hardware(pan_tilt, devices, opener.kind(), opener.rover)
@@ -173,12 +174,8 @@ class _Opener:
                 device=name,
             )
         if self.rover is None:
-            try:
-                from drivers.sim.rover import SimulatedRover, simulation_settings
-            except ImportError as error:
-                raise BadOptions(
-                    f"the simulated rover needs {error.name or error}: install mastctl with its extra 'sim'"
-                ) from None
+            from drivers.sim.rover import SimulatedRover, simulation_settings
+
             simulation = simulation_settings(self._settings.simulation, self._settings.folder)
             self.rover = SimulatedRover(simulation, self._clock)
         if name == PAN_TILT:

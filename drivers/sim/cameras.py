@@ -138,13 +138,14 @@ class SimulatedCamera:
         deadline_s = now_s + max(0.0, timeout_s)
         if self._faults.strikes(self.name, now_s):
             raise NoReply("no answer", device=self.name)
+        after_s = exposed_after_s
         while not self._closed.is_set():
             now_s = self._clock.now_s()
-            sequence, epoch = self._wanted(exposed_after_s, now_s)
-            ready_s = self._ready_s(sequence, epoch, now_s)
+            sequence, epoch = self._wanted(after_s, now_s)
+            ready_s = epoch.begin_s(sequence) + self._latency_s(now_s)
             if self._is_missing(sequence, epoch):
-                exposed_after_s = epoch.begin_s(sequence)
-                if exposed_after_s < deadline_s:
+                after_s = epoch.begin_s(sequence)
+                if after_s < deadline_s:
                     continue
                 ready_s = np.inf
             if ready_s <= now_s:
@@ -159,12 +160,11 @@ class SimulatedCamera:
         """Let go; a waiting call ends with NoFreshFrame within half a second."""
         self._closed.set()
 
-    def _wanted(self, exposed_after_s: float, now_s: float) -> tuple[int, _Epoch]:
+    def _wanted(self, after_s: float, now_s: float) -> tuple[int, _Epoch]:
         """The frame that the call is about, with its epoch."""
         epoch = self._epoch(now_s)
-        sequence = epoch.after(exposed_after_s)
-        latency_s = self._settings.exposure_s + self._settings.readout_s
-        newest = epoch.after(now_s - latency_s) - 1
+        sequence = epoch.after(after_s)
+        newest = epoch.after(now_s - self._latency_s(now_s)) - 1
         if sequence <= newest - RING_FRAMES:
             sequence = newest
         return sequence, epoch
@@ -183,11 +183,11 @@ class SimulatedCamera:
                 self._epochs = [first, epoch]
             return epoch
 
-    def _ready_s(self, sequence: int, epoch: _Epoch, now_s: float) -> float:
-        """When a frame can be had."""
-        ready_s = epoch.begin_s(sequence) + self._settings.exposure_s + self._settings.readout_s
+    def _latency_s(self, now_s: float) -> float:
+        """How long after its exposure begins a frame can be had."""
         delayed = self._faults.find(self.name, "delayed", now_s)
-        return ready_s + (delayed.number("delay_s") if delayed else 0.0)
+        late_s = delayed.number("delay_s") if delayed else 0.0
+        return self._settings.exposure_s + self._settings.readout_s + late_s
 
     def _is_missing(self, sequence: int, epoch: _Epoch) -> bool:
         """Whether a fault keeps this frame from coming at all."""

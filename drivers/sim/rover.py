@@ -25,7 +25,7 @@ from calib.mast import Rig
 from calib.rigid import FloatArray, Rigid
 from calib.store import load_rig
 from drivers.clock import Clock
-from drivers.errors import BadOptions
+from drivers.errors import BadOptions, NoFreshFrame
 from drivers.faults import FaultPanel, nearest
 from drivers.sim.cameras import CameraSettings, SimulatedCamera
 from drivers.sim.pan_tilt import HeadSettings, SimulatedPanTilt, head_settings
@@ -35,11 +35,11 @@ from drivers.sim.scene import SceneSettings, build_scene
 TRUTH_FRAMES = 512
 """How many frames of each camera ``frame_truth`` remembers."""
 
-BLUR_STEP_PX = 1.0
-"""An exposure during which the picture moves is averaged over renderings no further apart than this."""
+BLUR_STEP_PX = 1.5
+"""An exposure during which the picture moves is averaged over renderings no further apart than this..."""
 
-BLUR_STEPS = 8
-"""At most so many renderings an exposure."""
+BLUR_STEPS = 5
+"""...but over no more than so many, of one ray a pixel, which take about as long as one still picture."""
 
 
 @dataclass(frozen=True)
@@ -104,7 +104,9 @@ def simulation_settings(section: Mapping[str, Any], folder: Path) -> SimulationS
     camera: CameraSettings = _filled(CameraSettings(), section.get("cameras", {}), "simulation.cameras")
     for f in fields(camera):
         if getattr(camera, f.name) < 0:
-            raise BadOptions(f"simulation.cameras.{f.name} is {getattr(camera, f.name)!r}, expected 0 or more")
+            raise BadOptions(
+                f"simulation.cameras.{f.name} is {getattr(camera, f.name)!r}, expected 0 or more"
+            )
     if camera.rate_hz <= 0 or not 0 < camera.exposure_s < 1 / camera.rate_hz:
         raise BadOptions(
             f"simulation.cameras: exposure_s {camera.exposure_s:g} does not fit rate_hz {camera.rate_hz:g}"
@@ -201,7 +203,8 @@ class SimulatedRover:
         self.faults.set_all(settings.faults)
         self.scene = build_scene(settings.scene)
         self._renderer = Renderer(self.scene)
-        self._render_lock = threading.Lock()
+        self._render_lock = threading.Lock()  # one picture at a time: each keeps all processors busy
+        self._closed = False
         self._truth_lock = threading.Lock()
         self._truth: dict[str, OrderedDict[int, FrameTruth]] = {n: OrderedDict() for n in self.rig.cameras}
         self.pan_tilt = SimulatedPanTilt(settings.head, clock, self.faults)
@@ -260,6 +263,9 @@ class SimulatedRover:
         self.pan_tilt.close()
         for camera in self.cameras.values():
             camera.close()
+        with self._render_lock:
+            self._closed = True
+            self._renderer.close()
 
     def _camera(self, name: str, clock: Clock, start_s: float) -> SimulatedCamera:
         """One camera that looks through the true rig."""
@@ -287,6 +293,8 @@ class SimulatedRover:
                 joints = self.true_joints(begin_s + (step + 0.5) / steps * exposure_s)
                 site_from_frame = site_from_frame @ self.rig.mast.rover_from_head(*joints)
             with self._render_lock:
+                if self._closed:
+                    raise NoFreshFrame("it is closed", device=name)
                 image = self._renderer.image(camera.model, site_from_frame, samples)
             total = image if total is None else total + image
         assert total is not None
