@@ -1,0 +1,239 @@
+"""The HTTP interface (contract section 4): JSON under /api/v1, described by /openapi.json.
+
+Handlers that wait for a device run in worker threads; ``POST /stop`` has threads of its own, so that it never
+waits behind them. Every refusal is ``{"error": {"code", "message", "detail"}}``.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import math
+from collections.abc import Mapping
+from importlib.metadata import version
+from typing import Annotated, Any
+
+import cv2
+import numpy as np
+from fastapi import FastAPI, Query, Request
+from fastapi.exceptions import RequestValidationError
+from fastapi.responses import JSONResponse, Response
+from starlette.exceptions import HTTPException
+from starlette.types import ASGIApp
+
+from calib.errors import CalibError
+from drivers.errors import BadFrame, BadOptions, BadReply, DriverError
+from drivers.faults import Fault as SetFault
+from drivers.faults import FaultPanel
+from mastctl.api_guard import Guard, error_response
+from mastctl.api_requests import FaultBody, FaultsQuery, PointBody, SnapshotQuery, sentence
+from mastctl.errors import MastctlError
+from mastctl.frames import StampedFrame
+from mastctl.limits import OutsideLimits
+from mastctl.operations import as_json, error_body
+from mastctl.service import Service
+
+PREFIX = "/api/v1"
+JPEG_QUALITY = 90
+PNG_COMPRESSION = 1  # a noisy picture gains 10 % from more, and takes five times as long
+
+STATUS_OF_CODE: Mapping[str, int] = {
+    "busy": 409,
+    "stopped": 409,
+    "frame_moving": 409,
+    "other_mast_file": 409,
+    "frame_too_old": 410,
+    "frame_unknown": 404,
+    "operation_unknown": 404,
+    "unknown_camera": 404,
+    "not_simulated": 404,
+    "bad_aim": 422,
+    "outside_image": 422,
+    "outside_limits": 422,
+    "wrong_camera": 422,
+    "failed": 503,
+}
+
+
+class NotSimulated(MastctlError):
+    """Faults are switched on simulated devices only."""
+
+    code = "not_simulated"
+
+
+def create_app(service: Service) -> ASGIApp:
+    """Return the ASGI application that serves one service."""
+    app = FastAPI(
+        title="mastctl",
+        version=version("mastctl"),
+        description="A rover mast: state, pointing with a measured residual, pictures with their facts.",
+        docs_url=None,
+        redoc_url=None,
+    )
+    _add_errors(app)
+    _add_pointing(app, service)
+    _add_pictures(app, service)
+    _add_simulation(app, service)
+    return Guard(app, ignores_body=frozenset({f"{PREFIX}/stop"}))
+
+
+def _add_pointing(app: FastAPI, service: Service) -> None:
+    """State, operations and the stop."""
+
+    @app.get(f"{PREFIX}/status", summary="What is known at this moment")
+    async def status() -> dict[str, Any]:
+        return service.state().told(service.head)
+
+    @app.post(f"{PREFIX}/point", status_code=202, summary="Point at a pixel, a position, or joint angles")
+    async def point(body: PointBody) -> dict[str, Any]:
+        told = body.model_dump(exclude_none=True)
+        digest = None if body.pixel is None else body.pixel.mast_digest
+        return {"id": service.point(body.request(), told, digest).id}
+
+    @app.get(f"{PREFIX}/operations", summary="The newest operations, without their steps")
+    async def operations() -> dict[str, Any]:
+        return {"operations": [entry.told(steps=False) for entry in service.operations.all()]}
+
+    @app.get(f"{PREFIX}/operations/{{operation_id}}", summary="One operation's record")
+    async def operation(operation_id: str) -> dict[str, Any]:
+        return service.operations.get(operation_id).told()
+
+    @app.post(f"{PREFIX}/stop", summary="Stop the mast and the running operation, at once")
+    async def stop() -> dict[str, Any]:
+        stopped = await asyncio.get_running_loop().run_in_executor(service.stop_threads, service.stop)
+        return {"stopped": True, "operation": stopped}
+
+
+def _add_pictures(app: FastAPI, service: Service) -> None:
+    """Frames with their facts, and the mast file they are to be read by."""
+
+    @app.get(
+        f"{PREFIX}/snapshot/{{camera}}",
+        summary="A picture; its facts are in X-Mastctl headers",
+        response_class=Response,
+        responses={200: {"content": {"image/png": {}, "image/jpeg": {}}}},
+    )
+    def snapshot(camera: str, query: Annotated[SnapshotQuery, Query()]) -> Response:
+        if query.frame_id is not None:
+            frame = service.kept_frame(camera, query.frame_id)
+        else:
+            frame = service.snapshot(camera, query.fresh)
+        return Response(
+            encoded(frame.image, query.format),
+            media_type=f"image/{query.format}",
+            headers=frame_headers(frame),
+        )
+
+    @app.get(f"{PREFIX}/mast", summary="The mast file in use, byte for byte", response_class=Response)
+    async def mast() -> Response:
+        return Response(
+            service.mast_bytes,
+            media_type="application/yaml",
+            headers={"X-Mastctl-Mast-Digest": service.stored.digest},
+        )
+
+
+def _add_simulation(app: FastAPI, service: Service) -> None:
+    """The fault switches of a simulated rover."""
+
+    def panel() -> FaultPanel:
+        if service.hardware.simulation is None:
+            raise NotSimulated(
+                f"the hardware is {service.hardware.kind}: faults are for a simulated rover only"
+            )
+        return service.hardware.simulation.faults
+
+    def told() -> dict[str, Any]:
+        return {"faults": [_fault_told(fault) for fault in panel().active()]}
+
+    @app.get(f"{PREFIX}/simulation/faults", summary="The faults that are switched on")
+    async def faults() -> dict[str, Any]:
+        return told()
+
+    @app.post(f"{PREFIX}/simulation/faults", summary="Switch a fault on")
+    async def set_fault(body: FaultBody) -> dict[str, Any]:
+        panel().set(body.device, body.word, **body.parameters)
+        return told()
+
+    @app.delete(f"{PREFIX}/simulation/faults", summary="Switch the faults of one device, or all, off")
+    async def clear_faults(query: Annotated[FaultsQuery, Query()]) -> dict[str, Any]:
+        panel().clear(query.device)
+        return told()
+
+
+def encoded(image: np.ndarray, kind: str) -> bytes:
+    """Return a picture as PNG (``png``, lossless) or JPEG (``jpeg``)."""
+    options = (
+        [cv2.IMWRITE_PNG_COMPRESSION, PNG_COMPRESSION]
+        if kind == "png"
+        else [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY]
+    )
+    done, data = cv2.imencode(f".{kind}", image, options)
+    if not done:
+        raise MastctlError(f"the picture cannot be written as {kind}")
+    return bytes(data)
+
+
+def frame_headers(frame: StampedFrame) -> dict[str, str]:
+    """Return a frame's facts as headers; numbers in shortest round-trip form."""
+    return {
+        "X-Mastctl-Frame-Id": frame.frame_id,
+        "X-Mastctl-Camera": frame.camera,
+        "X-Mastctl-Sequence": str(frame.sequence),
+        "X-Mastctl-Mid-Exposure-S": repr(frame.mid_exposure_s),
+        "X-Mastctl-Exposure-S": repr(frame.exposure_s),
+        "X-Mastctl-Pan-Rad": repr(frame.pan_rad),
+        "X-Mastctl-Tilt-Rad": repr(frame.tilt_rad),
+        "X-Mastctl-Moving": "true" if frame.moving else "false",
+        "X-Mastctl-Mast-Digest": frame.mast_digest,
+    }
+
+
+def status_of(error: Exception) -> int:
+    """Return the HTTP status that fits an error."""
+    code = getattr(error, "code", "")
+    if isinstance(error, (BadOptions, OutsideLimits, CalibError)):
+        return 422
+    if isinstance(error, (BadReply, BadFrame)):
+        return 502
+    if isinstance(error, DriverError):
+        return 504 if code in ("no_reply", "no_fresh_frame") else 502
+    return STATUS_OF_CODE.get(code, 500)
+
+
+def _fault_told(fault: SetFault) -> dict[str, Any]:
+    """A set fault as JSON; one without an end has ``end_s`` null."""
+    finite = {name: value for name, value in fault.parameters.items() if math.isfinite(value)}
+    told = {"device": fault.device, "word": fault.word, "parameters": finite}
+    return {**told, "begin_s": fault.begin_s, "end_s": as_json(fault.end_s)}
+
+
+def _add_errors(app: FastAPI) -> None:
+    """Every refusal in the one form."""
+
+    async def ours(request: Request, error: Exception) -> JSONResponse:
+        body = error_body(error)
+        return error_response(status_of(error), body["code"], body["message"], body["detail"])
+
+    for kind in (MastctlError, DriverError, CalibError):
+        app.add_exception_handler(kind, ours)
+
+    @app.exception_handler(RequestValidationError)
+    async def invalid(request: Request, error: RequestValidationError) -> JSONResponse:
+        path = request.url.path.removeprefix(PREFIX)
+        route = next((word for word in ("point", "faults", "snapshot") if word in path), "")
+        sentences = [sentence(problem, route) for problem in error.errors()[:10]]
+        return error_response(422, "bad_request", sentences[0], {"problems": sentences})
+
+    @app.exception_handler(HTTPException)
+    async def http(request: Request, error: HTTPException) -> JSONResponse:
+        words = {
+            404: ("not_found", f"there is nothing at {request.url.path[:120]}; see /openapi.json"),
+            405: ("method_not_allowed", f"{request.method} is not possible at {request.url.path[:120]}"),
+        }
+        code, message = words.get(error.status_code, ("bad_request", str(error.detail)))
+        return error_response(error.status_code, code, message, headers=error.headers)
+
+    @app.exception_handler(Exception)
+    async def defect(request: Request, error: Exception) -> JSONResponse:
+        body = error_body(error)
+        return error_response(500, body["code"], body["message"])

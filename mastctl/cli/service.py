@@ -1,0 +1,273 @@
+"""Commands of the service: the daemon itself, and its clients."""
+
+from __future__ import annotations
+
+import argparse
+import logging
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from mastctl.cli import output
+from mastctl.cli.output import CommandError, WrongUse, finite_number, positive_number
+
+if TYPE_CHECKING:
+    from mastctl.client import Client
+
+SUFFIXES = {".png": "png", ".jpg": "jpeg", ".jpeg": "jpeg"}
+
+
+def add_commands(subparsers: argparse._SubParsersAction[Any]) -> None:
+    """Add run, status, point, stop and snapshot."""
+    run = subparsers.add_parser(
+        "run", help="run the daemon; its address is one line on stdout when it is ready"
+    )
+    run.add_argument("--config", metavar="FILE", help="configuration (default: the packaged simulated rover)")
+    run.set_defaults(run=_run)
+
+    status = subparsers.add_parser("status", help="show what a running daemon knows")
+    status.set_defaults(run=_status)
+
+    point = subparsers.add_parser("point", help="point a camera at something and measure the residual")
+    what = point.add_mutually_exclusive_group(required=True)
+    what.add_argument(
+        "--pixel", nargs=4, metavar=("CAMERA", "FRAME_ID", "X", "Y"), help="a pixel of a named frame"
+    )
+    what.add_argument(
+        "--camera", metavar="NAME", help="a pixel (--at) of a snapshot taken now by this camera"
+    )
+    what.add_argument(
+        "--position", nargs=3, type=finite_number, metavar=("X", "Y", "Z"), help="a point, metres"
+    )
+    what.add_argument(
+        "--angles", nargs=2, type=finite_number, metavar=("PAN", "TILT"), help="joint angles, radians"
+    )
+    point.add_argument(
+        "--at", nargs=2, type=finite_number, metavar=("X", "Y"), help="the pixel, with --camera"
+    )
+    point.add_argument("--frame", choices=("rover", "site"), help="frame of --position (default rover)")
+    point.add_argument("--aim", nargs=3, metavar=("CAMERA", "X", "Y"), help="where the target shall come")
+    point.add_argument("--pointings", type=int, choices=(1, 2), help="how often to point (default 1)")
+    point.add_argument("--no-wait", action="store_true", help="print the operation's id and do not wait")
+    point.add_argument(
+        "--timeout", type=positive_number, default=120.0, metavar="S", help="how long to wait (default 120 s)"
+    )
+    point.set_defaults(run=_point)
+
+    stop = subparsers.add_parser("stop", help="stop the mast at once")
+    stop.set_defaults(run=_stop)
+
+    snapshot = subparsers.add_parser("snapshot", help="take a picture and write it to a file")
+    snapshot.add_argument("camera", metavar="CAMERA")
+    snapshot.add_argument("--out", required=True, metavar="FILE", help="where to: .png (lossless), .jpg")
+    snapshot.add_argument("--frame-id", metavar="ID", help="a frame that the daemon still keeps")
+    snapshot.set_defaults(run=_snapshot)
+
+    for client in (status, point, stop, snapshot):
+        client.add_argument("--url", help="the daemon's address (default: that of the configuration)")
+        client.add_argument("--config", metavar="FILE", help="the configuration that the daemon runs with")
+
+
+def _run(args: argparse.Namespace) -> int:
+    from mastctl.config import load_config
+    from mastctl.daemon import run
+
+    for name in ("mastctl", "drivers", "calib"):
+        logging.getLogger(name).setLevel(logging.INFO)
+
+    def ready(url: str) -> None:
+        if args.json:
+            output.print_json({"url": url})
+        else:
+            sys.stdout.write(f"{url}\n")
+        sys.stdout.flush()
+
+    run(load_config(args.config), ready)
+    return 0
+
+
+def _status(args: argparse.Namespace) -> int:
+    with _client(args) as client:
+        status = client.status()
+    if args.json:
+        output.print_json(status)
+        return 0
+    rows = [(name, text) for name, text in _status_rows(status)]
+    output.print_table(f"mastctl at {client.url}", ("what", "now"), rows, _fault_lines(status))
+    return 0
+
+
+def _point(args: argparse.Namespace) -> int:
+    if (args.camera is None) != (args.at is None):
+        raise WrongUse("--camera and --at go together")
+    if args.frame is not None and args.position is None:
+        raise WrongUse("--frame goes with --position")
+    request: dict[str, Any] = {
+        "pointings": args.pointings,
+        "frame": args.frame,
+        "aim": _camera_pixel(args.aim),
+    }
+    with _client(args) as client:
+        if args.pixel is not None:
+            camera, frame_id, x, y = args.pixel
+            request["pixel"] = (camera, frame_id, _number("--pixel", x), _number("--pixel", y))
+        elif args.camera is not None:
+            shot = client.snapshot(args.camera)
+            request["pixel"] = (args.camera, shot.frame_id, *args.at)
+        elif args.position is not None:
+            request["position_m"] = args.position
+        else:
+            request["pan_rad"], request["tilt_rad"] = args.angles
+        operation_id = client.point(**request)
+        if args.no_wait:
+            _tell(args, {"id": operation_id}, f"operation {operation_id}")
+            return 0
+        record = _followed(client, operation_id, args)
+    if record["state"] != "done":
+        error = record.get("error") or {}
+        raise CommandError(
+            str(error.get("code", record["state"])),
+            str(error.get("message", f"operation {operation_id} ended as {record['state']}")),
+            detail={"operation": record},
+        )
+    if args.json:
+        output.print_json(record)
+    else:
+        _show_pointings(record)
+    return 0
+
+
+def _stop(args: argparse.Namespace) -> int:
+    with _client(args) as client:
+        answer = client.stop()
+    operation = answer.get("operation")
+    _tell(args, answer, f"stopped{f', operation {operation} too' if operation else ''}")
+    return 0
+
+
+def _snapshot(args: argparse.Namespace) -> int:
+    out = Path(args.out)
+    kind = SUFFIXES.get(out.suffix.lower())
+    if kind is None:
+        raise WrongUse(f"--out is '{args.out}' where a name ending in {', '.join(SUFFIXES)} is expected")
+    with _client(args) as client:
+        shot = client.snapshot(args.camera, frame_id=args.frame_id, format="png" if kind == "png" else "jpeg")
+    try:
+        out.write_bytes(shot.data)
+    except OSError as error:
+        raise CommandError("file_system", f"{out}: cannot be written: {error.strerror}", 2) from None
+    line = f"{out}: frame {shot.frame_id}, pan {shot.pan_rad:.6f} rad, tilt {shot.tilt_rad:.6f} rad"
+    _tell(args, {"file": str(out), **shot.facts}, line + (", head moving" if shot.moving else ""))
+    return 0
+
+
+@contextmanager
+def _client(args: argparse.Namespace) -> Iterator[Client]:
+    """A client of the daemon that the options name."""
+    from mastctl.client import Client
+    from mastctl.config import load_config
+
+    url = args.url
+    if url is None:
+        listen = load_config(args.config).listen
+        if listen.socket is None and listen.port == 0:
+            raise WrongUse("the configuration listens at any free port (0); give --url")
+        url = listen.url
+    with Client(url) as client:
+        yield client
+
+
+def _followed(client: Client, operation_id: str, args: argparse.Namespace) -> dict[str, Any]:
+    """Wait for an operation, showing its steps to a person."""
+    if args.json:
+        return client.wait(operation_id, args.timeout)
+    from rich.console import Console
+    from rich.text import Text
+
+    console = Console(stderr=True)
+
+    def show(step: dict[str, Any]) -> None:
+        mark = "✓" if step.get("state") == "done" else "✗"
+        line = f"  {mark} {step.get('name')} ({step.get('duration_s') or 0.0:.2f} s)"
+        console.print(Text(output.one_line(line)))
+
+    try:
+        with console.status(f"operation {operation_id}"):
+            return client.wait(operation_id, args.timeout, show)
+    except KeyboardInterrupt:
+        output.tell(f"operation {operation_id} goes on; 'mastctl stop' stops it")
+        raise
+
+
+def _show_pointings(record: dict[str, Any]) -> None:
+    """A table of what was measured."""
+    rows = []
+    for number, pointing in enumerate(record["pointings"], 1):
+        pair, sigma = pointing.get("residual_px"), pointing.get("residual_sigma_px")
+        measured = [
+            f"{value:+.3f} ± {one_sigma:.3f}" if value is not None and one_sigma is not None else "-"
+            for value, one_sigma in zip(pair or (None, None), sigma or (None, None), strict=True)
+        ]
+        rows.append((str(number), *measured, str(pointing.get("frame_id") or "-")))
+    notes = []
+    if record.get("position_m"):
+        x, y, z = record["position_m"]
+        notes.append(f"target at ({x:.3f}, {y:.3f}, {z:.3f}) m in the rover frame")
+    if record.get("range_m") is not None:
+        notes.append(f"range {record['range_m']:.3f} m")
+    columns = ("pointing", "residual x, px", "residual y, px", "measured in frame")
+    output.print_table(f"operation {record['id']}", columns, rows, notes)
+
+
+def _status_rows(status: dict[str, Any]) -> Iterator[tuple[str, str]]:
+    """The lines of the status table."""
+    yield "state", f"{status['state']} ({status['hardware']})"
+    joints = status["joints"]
+    if joints is None:
+        yield "joints", "not read yet"
+    else:
+        yield "pan", f"{joints['pan_rad']:+.6f} rad"
+        yield "tilt", f"{joints['tilt_rad']:+.6f} rad"
+        yield "measured", f"{joints['age_s']:.3f} s ago{', moving' if status['moving'] else ''}"
+    limits = status["limits"]
+    for axis in ("pan", "tilt"):
+        low, high = limits[f"{axis}_rad"]
+        yield f"{axis} limits", f"{low:+.4f} to {high:+.4f} rad"
+    residual = status["last_residual"]
+    if residual is not None:
+        (x, y), (sx, sy) = residual["residual_px"], residual["residual_sigma_px"]
+        yield "last residual", f"{x:+.3f} ± {sx:.3f}, {y:+.3f} ± {sy:.3f} px"
+    for name, camera in status["cameras"].items():
+        age_s = camera["age_s"]
+        yield name, "no frame yet" if age_s is None else f"newest frame {age_s:.1f} s old"
+    mast = status["mast"]
+    yield "mast file", f"{mast['file']} ({mast['digest'][:8]}...)"
+    yield "up", f"{status['uptime_s']:.0f} s, version {status['version']}"
+
+
+def _fault_lines(status: dict[str, Any]) -> list[str]:
+    return [f"fault: {fault['message']} (for {fault['for_s']:.0f} s)" for fault in status["faults"]]
+
+
+def _camera_pixel(words: list[str] | None) -> tuple[str, float, float] | None:
+    """``CAMERA X Y`` of --aim."""
+    if words is None:
+        return None
+    return words[0], _number("--aim", words[1]), _number("--aim", words[2])
+
+
+def _number(option: str, word: str) -> float:
+    try:
+        return finite_number(word)
+    except argparse.ArgumentTypeError as error:
+        raise WrongUse(f"{option}: {error}") from None
+
+
+def _tell(args: argparse.Namespace, document: dict[str, Any], line: str) -> None:
+    """One JSON document for programs, or one line for people, on stdout."""
+    if args.json:
+        output.print_json(document)
+    else:
+        sys.stdout.write(output.one_line(line) + "\n")

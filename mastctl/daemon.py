@@ -1,0 +1,271 @@
+"""The daemon: a socket, a service, a web server, and an orderly end.
+
+Its life is: take the address, open the service, serve, and on the way out stop the mast before anything else.
+Whatever hangs on the way out is left behind after some seconds, and said.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import errno
+import logging
+import os
+import signal
+import socket
+import threading
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from types import TracebackType
+
+import uvicorn
+
+from drivers.clock import Clock
+from drivers.open_hardware import Hardware
+from mastctl.api import create_app
+from mastctl.config import Config, Listen
+from mastctl.errors import MastctlError
+from mastctl.service import Service
+
+log = logging.getLogger(__name__)
+
+GRACE_S = 2  # for requests under way, when the daemon ends
+START_TIMEOUT_S = 600.0  # the first start compiles the simulator's kernels
+END_TIMEOUT_S = 20.0
+
+
+class AddressInUse(MastctlError):
+    """Somebody else listens there already."""
+
+    code = "address_in_use"
+
+
+def run(config: Config, on_ready: Callable[[str], None], clock: Clock | None = None) -> None:
+    """Run a daemon in this thread until SIGTERM or SIGINT; returns after the mast was stopped.
+
+    Parameters
+    ----------
+    config
+        Its configuration.
+    on_ready
+        Called once with the address when requests are answered.
+    clock
+        The service's clock; CLOCK_MONOTONIC by default.
+
+    Raises
+    ------
+    AddressInUse
+        If the address is taken; the hardware was not touched.
+    BadFile, DriverError
+        From opening the service.
+    """
+    with _listening(config.listen) as (listener, url):
+        signal.signal(signal.SIGTERM, _leave)
+        service = Service.open(config, clock)
+        try:
+            asyncio.run(_serve(service, listener, lambda _: on_ready(url), signals=True))
+        finally:
+            service.close()
+
+
+def _leave(number: int, frame: object) -> None:
+    """End cleanly when told so before the service is up: nothing has moved yet."""
+    raise SystemExit(0)
+
+
+class RunningDaemon:
+    """A daemon in a thread of this process, for the demo and for tests. A context manager.
+
+    Parameters
+    ----------
+    config, clock
+        As for `run`.
+
+    Attributes
+    ----------
+    url
+        Its address.
+    service
+        What it holds.
+    """
+
+    def __init__(self, config: Config, clock: Clock | None = None) -> None:
+        self._exit = contextlib.ExitStack()
+        listener, self.url = self._exit.enter_context(_listening(config.listen))
+        try:
+            self.service = Service.open(config, clock)
+        except BaseException:
+            self._exit.close()
+            raise
+        self._exit.callback(self.service.close)
+        self._ready = threading.Event()
+        self._ended = threading.Event()
+        self._stop: Callable[[], None] = lambda: None
+        self._thread = threading.Thread(target=self._work, args=(listener,), name="daemon", daemon=True)
+        self._thread.start()
+        self._ready.wait(START_TIMEOUT_S)
+        if self._ended.is_set():
+            self.close()
+            raise MastctlError("the daemon ended while it started; its log says why")
+
+    @property
+    def hardware(self) -> Hardware:
+        """The opened drivers; ``hardware.simulation`` knows the truth."""
+        return self.service.hardware
+
+    def close(self) -> None:
+        """Stop the mast, end the daemon, let go of everything; bounded. Does nothing the second time."""
+        self._stop()
+        self._thread.join(END_TIMEOUT_S)
+        self._exit.close()
+
+    def __enter__(self) -> RunningDaemon:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    def _work(self, listener: socket.socket) -> None:
+        def ready(stop: Callable[[], None]) -> None:
+            self._stop = stop
+            self._ready.set()
+
+        try:
+            asyncio.run(_serve(self.service, listener, ready, signals=False))
+        except Exception:
+            log.exception("the daemon ended")
+        finally:
+            self._ended.set()
+            self._ready.set()
+            self._stop = lambda: None
+
+
+class _Server(uvicorn.Server):
+    """uvicorn without its own signal handling: the mast is stopped first here."""
+
+    @contextlib.contextmanager
+    def capture_signals(self) -> Iterator[None]:
+        yield
+
+
+async def _serve(
+    service: Service,
+    listener: socket.socket,
+    on_ready: Callable[[Callable[[], None]], None],
+    *,
+    signals: bool,
+) -> None:
+    """Serve until told to stop; ``on_ready`` gets a function that tells it so, from any thread."""
+    loop = asyncio.get_running_loop()
+    server = _Server(
+        uvicorn.Config(
+            create_app(service),
+            http="h11",
+            ws="none",
+            lifespan="off",
+            proxy_headers=False,
+            server_header=False,
+            access_log=False,
+            log_config=None,
+            timeout_graceful_shutdown=GRACE_S,
+        )
+    )
+    ending = asyncio.Event()
+
+    def end() -> None:
+        if ending.is_set():
+            server.force_exit = True  # asked twice: wait for nobody
+        ending.set()
+
+    def end_from_anywhere() -> None:
+        with contextlib.suppress(RuntimeError):  # the loop has ended already
+            loop.call_soon_threadsafe(end)
+
+    if signals:
+        for number in (signal.SIGTERM, signal.SIGINT):
+            loop.add_signal_handler(number, end)
+    serving = asyncio.create_task(server.serve(sockets=[listener]))
+    while not server.started and not serving.done():
+        await asyncio.sleep(0.005)
+    on_ready(end_from_anywhere)
+    asked = asyncio.create_task(ending.wait())
+    await asyncio.wait({serving, asked}, return_when=asyncio.FIRST_COMPLETED)
+    asked.cancel()
+    log.info("ending: the mast is stopped first")
+    await asyncio.to_thread(service.operations.close)
+    server.should_exit = True
+    await serving
+
+
+@contextlib.contextmanager
+def _listening(listen: Listen) -> Iterator[tuple[socket.socket, str]]:
+    """Hold the socket, and say the address as it is (port 0 has become a number)."""
+    if listen.socket is not None:
+        listener = _unix_socket(listen.socket)
+        url = listen.url
+    else:
+        listener = _tcp_socket(listen)
+        port = listener.getsockname()[1]
+        url = Listen(listen.host, port).url
+    try:
+        yield listener, url
+    finally:
+        listener.close()
+        if listen.socket is not None:
+            listen.socket.unlink(missing_ok=True)
+
+
+def _tcp_socket(listen: Listen) -> socket.socket:
+    family = socket.AF_INET6 if ":" in listen.host else socket.AF_INET
+    listener = socket.socket(family, socket.SOCK_STREAM)
+    try:
+        listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        listener.bind((listen.host, listen.port))
+        # Listening at once: SO_REUSEADDR lets two sockets bind as long as neither of them listens.
+        listener.listen()
+    except OSError as error:
+        listener.close()
+        raise _no_address(listen.url, error) from None
+    return listener
+
+
+def _unix_socket(path: Path) -> socket.socket:
+    """Bind a Unix socket that only this user may use; a socket left behind by a dead daemon is replaced."""
+    listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+    try:
+        if path.is_socket() and not _answers(path):
+            path.unlink()
+        before = os.umask(0o177)
+        try:
+            listener.bind(str(path))
+        finally:
+            os.umask(before)
+        listener.listen()
+    except OSError as error:
+        listener.close()
+        raise _no_address(str(path), error) from None
+    return listener
+
+
+def _answers(path: Path) -> bool:
+    """Whether somebody listens at a Unix socket."""
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe:
+        try:
+            probe.connect(str(path))
+        except ConnectionRefusedError:
+            return False
+    return True
+
+
+def _no_address(where: str, error: OSError) -> MastctlError:
+    """Why an address cannot be listened to, as one sentence."""
+    if error.errno == errno.EADDRINUSE:
+        return AddressInUse(
+            f"{where} is in use already, perhaps by another daemon; choose another port or end it"
+        )
+    return MastctlError(f"cannot listen at {where}: {error.strerror or error}")

@@ -1,0 +1,241 @@
+"""What a daemon holds, from the configuration to the last operation, without any web in it."""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections.abc import Callable, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from importlib.metadata import version
+from typing import Any
+
+from calib.formats import read_bytes
+from calib.formats.yaml_text import MAX_BYTES
+from calib.store import StoredRig, parse_rig
+from drivers.clock import Clock, SystemClock
+from drivers.open_hardware import Hardware, open_hardware
+from mastctl.config import Config, check_cameras
+from mastctl.devices import HEAD, Devices, UnknownCamera
+from mastctl.errors import FrameGone, MastctlError
+from mastctl.frames import StampedFrame
+from mastctl.operations import Operation, Operations
+from mastctl.pointing.loop import AnglesTarget, PixelTarget, PointingLoop, PointRequest
+from mastctl.state import State
+
+log = logging.getLogger(__name__)
+
+CLICK_AGE_S = 300.0  # a person may look at a picture for minutes before clicking; the sun moves meanwhile
+SNAPSHOT_AGE_S = 1.0  # a snapshot that need not be fresh may be this old
+SNAPSHOT_TIMEOUT_S = 5.0
+HARDWARE_CLOSE_S = 3.0
+STOP_THREADS = 4
+
+
+class Refused(MastctlError):
+    """A request that makes no sense for this rig; ``code`` names why."""
+
+    def __init__(self, code: str, message: str) -> None:
+        self.code = code
+        super().__init__(message)
+
+
+class Service:
+    """The devices, the pointing loop and the operations of one daemon; safe to use from any thread.
+
+    Parameters
+    ----------
+    config
+        The configuration.
+    stored, mast_bytes
+        The mast file as read, and its bytes.
+    hardware
+        The opened drivers; closed by `close`.
+    clock
+        The clock that stamps everything.
+
+    Attributes
+    ----------
+    stop_threads
+        Where the web side calls `stop`: threads that nothing else can keep busy.
+    """
+
+    def __init__(
+        self, config: Config, stored: StoredRig, mast_bytes: bytes, hardware: Hardware, clock: Clock
+    ) -> None:
+        self.config = config
+        self.stored = stored
+        self.mast_bytes = mast_bytes
+        self.hardware = hardware
+        self.clock = clock
+        self.started_s = clock.now_s()
+        self.devices = Devices(hardware, config.limits, stored.digest, clock, stored.rig)
+        self.operations = Operations(self.devices, clock)
+        self.stop_threads = ThreadPoolExecutor(STOP_THREADS, thread_name_prefix="stop")
+        self._loop = PointingLoop(stored.rig, self.devices, config.limits, clock)
+        self._version = version("mastctl")
+
+    @classmethod
+    def open(cls, config: Config, clock: Clock | None = None) -> Service:
+        """Read the mast file, open the hardware, and return the running service.
+
+        Raises
+        ------
+        BadFile
+            If the mast file cannot be used, or lacks a configured camera.
+        DriverError
+            If a driver refuses its options or cannot reach its device.
+        """
+        clock = clock or SystemClock()
+        mast_bytes = read_bytes(config.mast_file, MAX_BYTES)
+        stored = parse_rig(mast_bytes, config.mast_file)
+        for note in stored.notes:
+            log.warning("%s", note)
+        check_cameras(config, stored.rig)
+        hardware = open_hardware(config.hardware, clock)
+        try:
+            return cls(config, stored, mast_bytes, hardware, clock)
+        except BaseException:
+            hardware.close()
+            raise
+
+    @property
+    def head(self) -> str:
+        """The name under which the head's faults stand."""
+        return HEAD
+
+    def state(self) -> State:
+        """Return what is known at this moment."""
+        return State(
+            now_s=self.clock.now_s(),
+            started_s=self.started_s,
+            version=self._version,
+            hardware=self.hardware.kind,
+            mast_file=self.config.mast_file.name,
+            mast_name=self.stored.rig.name,
+            mast_digest=self.stored.digest,
+            limits=self.config.limits,
+            reading=self.devices.last_reading,
+            frames=self.devices.newest_frames(),
+            motion=self.operations.motion,
+            faults=self.devices.faults(),
+        )
+
+    def snapshot(self, camera: str, fresh: bool) -> StampedFrame:
+        """Return a frame exposed after this call (``fresh``), or one that is at most a second old.
+
+        Raises
+        ------
+        UnknownCamera, DriverError
+            As `mastctl.devices.Devices.frames`.
+        """
+        now_s = self.clock.now_s()
+        after_s = now_s if fresh else now_s - SNAPSHOT_AGE_S
+        return self.devices.frames([camera], after_s, SNAPSHOT_TIMEOUT_S)[camera]
+
+    def kept_frame(self, camera: str, frame_id: str) -> StampedFrame:
+        """Return a frame that is still kept, by its id.
+
+        Raises
+        ------
+        FrameGone, Refused, UnknownCamera
+            If it is not kept, is of another camera, or there is no such camera.
+        """
+        if camera not in self.devices.newest_frames():
+            raise UnknownCamera(f"camera {camera[:80]} is not configured")
+        frame = self.devices.frame_by_id(frame_id)
+        if frame.camera != camera:
+            raise Refused("wrong_camera", f"frame {frame_id} is of camera {frame.camera}, not of {camera}")
+        return frame
+
+    def point(
+        self, request: PointRequest, told: Mapping[str, Any], mast_digest: str | None = None
+    ) -> Operation:
+        """Start a pointing operation and return its first record.
+
+        Parameters
+        ----------
+        request
+            What to point at.
+        told
+            The request as it came, for the record.
+        mast_digest
+            The mast file that the client took the pixel by, if it says so.
+
+        Raises
+        ------
+        FrameGone
+            If the clicked frame is unknown, too old, or of another mast file.
+        OutsideLimits
+            If joint angles were asked for that may not be commanded.
+        Refused
+            If a camera or pixel does not fit this rig, or the head moved while the frame was exposed.
+        Busy
+            If another operation runs.
+        """
+        target = request.target
+        if mast_digest is not None and mast_digest != self.stored.digest:
+            raise FrameGone(
+                "other_mast_file",
+                f"the pixel was taken with mast file {mast_digest[:8]}..., "
+                f"the one in use is {self.stored.digest[:8]}...",
+            )
+        if isinstance(target, PixelTarget):
+            self._check_pixel(target)
+        if isinstance(target, AnglesTarget):
+            self.config.limits.check(target.pan_rad, target.tilt_rad)
+        if request.aim is not None:
+            self._check_aim(request.aim.camera)
+        return self.operations.start(
+            told, lambda record, cancelled: self._loop.run(request, record, cancelled)
+        )
+
+    def stop(self) -> str | None:
+        """Stop the mast and what runs; return the stopped operation's id. Raises DriverError."""
+        return self.operations.stop()
+
+    def close(self) -> None:
+        """Stop the mast and let go of everything; bounded, never raises."""
+        self.operations.close()
+        self.devices.close()
+        self.stop_threads.shutdown(wait=False)
+        _bounded("closing the hardware", self.hardware.close, HARDWARE_CLOSE_S)
+
+    def _check_pixel(self, target: PixelTarget) -> None:
+        frame = self.devices.frame_by_id(target.frame_id, CLICK_AGE_S)
+        if frame.camera != target.camera:
+            words = f"frame {target.frame_id} is of camera {frame.camera}, not of {target.camera}"
+            raise Refused("wrong_camera", words)
+        if frame.moving:
+            words = f"the head moved while frame {target.frame_id} was exposed; take another"
+            raise Refused("frame_moving", words)
+        height, width = frame.image.shape[:2]
+        if not (-0.5 <= target.x_px <= width - 0.5 and -0.5 <= target.y_px <= height - 0.5):
+            raise Refused(
+                "outside_image",
+                f"pixel ({target.x_px:g}, {target.y_px:g}) is outside the image of {width}x{height} px",
+            )
+
+    def _check_aim(self, camera: str) -> None:
+        known = self.stored.rig.cameras.get(camera)
+        if known is None or known.on != "head":
+            on_head = [name for name, entry in self.stored.rig.cameras.items() if entry.on == "head"]
+            raise Refused(
+                "bad_aim",
+                f"aim.camera is '{camera[:80]}' where a camera on the head is expected: {', '.join(on_head)}",
+            )
+
+
+def _bounded(what: str, function: Callable[[], None], timeout_s: float) -> None:
+    """Run something that may hang or raise; go on after ``timeout_s`` seconds at the latest."""
+
+    def run() -> None:
+        try:
+            function()
+        except Exception:  # the last thing done with a driver; nothing is left to protect but the exit
+            log.exception("%s failed", what)
+
+    thread = threading.Thread(target=run, name=what, daemon=True)
+    thread.start()
+    thread.join(timeout_s)
+    if thread.is_alive():
+        log.error("%s did not end within %.0f s and is left behind", what, timeout_s)
