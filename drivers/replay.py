@@ -1,0 +1,265 @@
+"""Replay: recorded frames with joint angles, served through the same PanTilt and Camera as live ones.
+
+The head is always at one of the recorded pointings. A move goes to the recorded pointing nearest to the
+angles asked for, at once, if that is within the tolerance; else it is refused and the message names the
+nearest. The reading is the recorded, *measured* angle, not the asked one. Cameras deliver the frame
+recorded at the pointing with fresh time stamps, at a fixed frame rate.
+
+What replay is not responsible for: there is no motion in between, no blur, and no frame where none was
+recorded.
+"""
+
+from __future__ import annotations
+
+import math
+import threading
+from collections import deque
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any
+
+from drivers.clock import Clock
+from drivers.errors import BadOptions, DriverError, NoFreshFrame
+from drivers.faults import PAN_TILT, nearest
+from drivers.interfaces import Camera, Frame, Image, PanTilt, Reading
+from drivers.recording import Pointing, read_folder, read_products
+
+TOLERANCE_RAD = 0.002
+"""How far from a recorded pointing a move may ask, unless the options say otherwise: two Navcam pixels."""
+
+PERIOD_S = 0.1
+EXPOSURE_S = 0.001
+
+OPTIONS = ("products", "camera", "frames", "tolerance_rad", "grey_range_dn")
+
+
+class NoRecording(DriverError):
+    """Nothing was recorded where the head is asked to go."""
+
+    code = "no_recording"
+
+
+@dataclass(frozen=True)
+class Replay:
+    """The devices of one recording.
+
+    Attributes
+    ----------
+    pan_tilt
+        The head, at the first recorded pointing.
+    cameras
+        Cameras by name.
+    pointings
+        The recorded pointings, in the order of the recording.
+    """
+
+    pan_tilt: PanTilt
+    cameras: Mapping[str, Camera]
+    pointings: Sequence[Pointing]
+
+
+def open_replay(options: Mapping[str, Any], folder: Path, clock: Clock) -> Replay:
+    """Open a recording.
+
+    Parameters
+    ----------
+    options
+        Either ``products`` (a list of PDS3 files, or a pattern like ``opportunity/1N*.IMG``, sorted by
+        name) with ``camera`` (the name that its frames go by), or ``frames`` (a CSV, see
+        `drivers.recording`). ``tolerance_rad``: how far from a recorded pointing a move may ask.
+        ``grey_range_dn``: [low, high], what becomes black and white in frames of more than 8 bits.
+    folder
+        Where relative paths start.
+    clock
+        Time of readings and frames.
+
+    Raises
+    ------
+    BadOptions
+        For unknown or missing options and recordings that cannot be read.
+    """
+    for key in options:
+        if key not in OPTIONS:
+            raise BadOptions(f"driver 'replay' has no option {key!r}{nearest(key, OPTIONS)}", device="replay")
+    if ("products" in options) == ("frames" in options):
+        raise BadOptions("either 'products' or 'frames' is expected among the options", device="replay")
+    tolerance_rad = _number(options, "tolerance_rad", TOLERANCE_RAD)
+    grey_range_dn = _grey_range(options)
+    if "products" in options:
+        camera = options.get("camera")
+        if not isinstance(camera, str) or not camera:
+            raise BadOptions(
+                "'camera' is expected: the name that the products' frames go by", device="replay"
+            )
+        pointings = read_products(_files(options["products"], folder), camera, grey_range_dn)
+    else:
+        if "camera" in options:
+            raise BadOptions(
+                "'camera' goes with 'products'; the table 'frames' names its own", device="replay"
+            )
+        if not isinstance(options["frames"], str):
+            raise BadOptions("'frames' is the path of a CSV file", device="replay")
+        pointings = read_folder(folder / options["frames"], grey_range_dn)
+    if not pointings:
+        raise BadOptions("the recording is empty", device="replay")
+    head = ReplayedHead(pointings, tolerance_rad, clock)
+    names = dict.fromkeys(name for pointing in pointings for name in pointing.frames)
+    cameras = {name: ReplayedCamera(name, head, clock) for name in names}
+    return Replay(head, MappingProxyType(cameras), tuple(pointings))
+
+
+class ReplayedHead:
+    """A head that stands at recorded pointings only; safe from any thread."""
+
+    def __init__(self, pointings: Sequence[Pointing], tolerance_rad: float, clock: Clock) -> None:
+        self._pointings = pointings
+        self._tolerance_rad = tolerance_rad
+        self._clock = clock
+        self._lock = threading.Lock()
+        self._stood: deque[tuple[float, Pointing]] = deque([(-math.inf, pointings[0])], maxlen=1000)
+
+    def read(self) -> Reading:
+        """Return the measured angles that were recorded where the head stands."""
+        now_s = self._clock.now_s()
+        here = self.at(now_s)
+        return Reading(here.pan_rad, here.tilt_rad, False, now_s)
+
+    def move(self, pan_rad: float, tilt_rad: float, speed_rad_per_s: float | None = None) -> None:
+        """Go to the recorded pointing nearest to the angles, at once, whatever the speed.
+
+        Raises
+        ------
+        NoRecording
+            If the nearest one is farther away than the tolerance, in either joint.
+        """
+        apart = [max(abs(p.pan_rad - pan_rad), abs(p.tilt_rad - tilt_rad)) for p in self._pointings]
+        best = min(range(len(apart)), key=apart.__getitem__)
+        target = self._pointings[best]
+        if not apart[best] <= self._tolerance_rad:
+            raise NoRecording(
+                f"nothing was recorded at pan {pan_rad:.6g}, tilt {tilt_rad:.6g} rad; the nearest "
+                f"recording is at pan {target.pan_rad:.6g}, tilt {target.tilt_rad:.6g} rad, "
+                f"{apart[best]:.3g} rad away; at most {self._tolerance_rad:g} rad is taken",
+                device=PAN_TILT,
+            )
+        with self._lock:
+            self._stood.append((self._clock.now_s(), target))
+
+    def stop(self) -> None:
+        """Nothing moves in between, so there is nothing to stop."""
+
+    def close(self) -> None:
+        """Nothing is held."""
+
+    def at(self, time_s: float) -> Pointing:
+        """Return where the head stood at a moment, seconds of the clock."""
+        with self._lock:
+            for since_s, pointing in reversed(self._stood):
+                if since_s <= time_s:
+                    return pointing
+            return self._stood[0][1]
+
+
+class ReplayedCamera:
+    """A camera that delivers the frame recorded where the head stands; safe from any thread.
+
+    Frame n is exposed at a fixed instant, so its sequence number is a function of time; a frame that nobody
+    fetched is a gap.
+    """
+
+    def __init__(self, name: str, head: ReplayedHead, clock: Clock) -> None:
+        self._name = name
+        self._head = head
+        self._clock = clock
+        self._start_s = clock.now_s()
+        self._closed = threading.Event()
+        self._lock = threading.Lock()
+        self._shown: tuple[Pointing, Image] | None = None
+
+    def next_frame(self, exposed_after_s: float, timeout_s: float) -> Frame:
+        """Return the newest frame, or wait for the first whose exposure begins after ``exposed_after_s``.
+
+        Raises
+        ------
+        NoFreshFrame
+            If it does not end its exposure within ``timeout_s``, or the camera took nothing at this pointing.
+        BadFrame
+            If the recorded file cannot be read any more.
+        """
+        deadline_s = self._clock.now_s() + max(0.0, timeout_s)
+        while not self._closed.is_set():
+            now_s = self._clock.now_s()
+            newest = math.floor((now_s - EXPOSURE_S - self._start_s) / PERIOD_S)
+            wanted = max(math.floor((exposed_after_s - self._start_s) / PERIOD_S) + 1, newest, 0)
+            ready_s = self._begin_s(wanted) + EXPOSURE_S
+            if ready_s <= now_s:
+                return self._frame(wanted)
+            if ready_s > deadline_s:
+                self._clock.sleep(deadline_s - now_s)
+                raise NoFreshFrame(
+                    f"no frame exposed after {exposed_after_s:.3f} s came within {timeout_s:g} s; "
+                    f"the next one ends at {ready_s:.3f} s",
+                    device=self._name,
+                )
+            # A little longer, so that rounding does not leave the frame a hair unfinished.
+            self._clock.sleep(min(ready_s - now_s + 1e-6, 0.5))
+        raise NoFreshFrame("it is closed", device=self._name)
+
+    def close(self) -> None:
+        """Let go; a waiting call ends with NoFreshFrame within half a second."""
+        self._closed.set()
+
+    def _begin_s(self, sequence: int) -> float:
+        """When a frame's exposure begins."""
+        return self._start_s + sequence * PERIOD_S
+
+    def _frame(self, sequence: int) -> Frame:
+        """The frame of a sequence number, from the pointing at which its exposure began."""
+        begin_s = self._begin_s(sequence)
+        pointing = self._head.at(begin_s)
+        recorded = pointing.frames.get(self._name)
+        if recorded is None:
+            raise NoFreshFrame(
+                f"it took nothing at pan {pointing.pan_rad:.6g}, tilt {pointing.tilt_rad:.6g} rad",
+                device=self._name,
+            )
+        with self._lock:
+            if self._shown is None or self._shown[0] is not pointing:
+                self._shown = (pointing, recorded.image())
+            image = self._shown[1]
+        return Frame(image, sequence, begin_s + EXPOSURE_S / 2, EXPOSURE_S)
+
+
+def _files(products: Any, folder: Path) -> list[Path]:
+    """The files that the option names: a list, or a pattern whose matches are sorted by name."""
+    if isinstance(products, str):
+        pattern = folder / products
+        found = sorted(pattern.parent.glob(pattern.name))
+        if not found:
+            raise BadOptions(f"no file matches the pattern {str(pattern)!r}", device="replay")
+        return found
+    if isinstance(products, (list, tuple)) and all(isinstance(name, str) for name in products):
+        return [folder / name for name in products]
+    raise BadOptions("'products' is a list of files or a pattern", device="replay")
+
+
+def _number(options: Mapping[str, Any], key: str, default: float) -> float:
+    """A positive number among the options."""
+    value = options.get(key, default)
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not 0 < value < math.inf:
+        raise BadOptions(f"{key!r} is {value!r} where a number above 0 is expected", device="replay")
+    return float(value)
+
+
+def _grey_range(options: Mapping[str, Any]) -> tuple[float, float] | None:
+    """The option ``grey_range_dn``."""
+    value = options.get("grey_range_dn")
+    if value is None:
+        return None
+    numbers = value if isinstance(value, (list, tuple)) else ()
+    fine = len(numbers) == 2 and all(isinstance(n, (int, float)) and not isinstance(n, bool) for n in numbers)
+    if not fine or not -math.inf < numbers[0] < numbers[1] < math.inf:
+        raise BadOptions(f"'grey_range_dn' is {value!r} where [low, high] is expected", device="replay")
+    return float(numbers[0]), float(numbers[1])
