@@ -1,0 +1,146 @@
+"""Small devices for the service's tests: a head and cameras that do, or fail to do, what a test tells them."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+
+from calib.cahvor import CameraModel
+from calib.mast import Mast, Rig, RigCamera
+from drivers.interfaces import Camera, Frame, PanTilt, Reading
+
+SIZE_PX = (64, 48)
+
+
+def rig(size_px: tuple[int, int] = SIZE_PX) -> Rig:
+    """A mast with a stereo pair on the head and one camera on the body."""
+    model = CameraModel(
+        "CAHV",
+        size_px,
+        C=np.zeros(3),
+        A=np.array([1.0, 0, 0]),
+        H=np.array([32.0, 60, 0]),
+        V=np.array([24.0, 0, 60]),
+    )
+    return Rig(
+        name="little",
+        mast=Mast(np.array([0.3, 0.0, -1.4]), np.zeros(3)),
+        cameras={
+            "navcam_left": RigCamera("head", model),
+            "navcam_right": RigCamera("head", model),
+            "hazcam_left": RigCamera("rover", model),
+        },
+        stereo={"navcam": ("navcam_left", "navcam_right")},
+    )
+
+
+@dataclass
+class FakeHead:
+    """A head that is where it was sent at once; ``hook(name)`` runs first in every call and may raise."""
+
+    pan_rad: float = 0.0
+    tilt_rad: float = 0.0
+    moving: bool = False
+    faults: tuple[str, ...] = ()
+    hook: Callable[[str], Any] = lambda name: None
+    answer: Any = None
+    calls: list[tuple[Any, ...]] = field(default_factory=list)
+    threads: set[int] = field(default_factory=set)
+
+    def read(self) -> Any:
+        self.threads.add(threading.get_ident())
+        self.hook("read")
+        if self.answer is not None:
+            return self.answer(self) if callable(self.answer) else self.answer
+        return Reading(self.pan_rad, self.tilt_rad, self.moving, time.monotonic(), self.faults)
+
+    def move(self, pan_rad: float, tilt_rad: float, speed_rad_per_s: float | None = None) -> None:
+        self.threads.add(threading.get_ident())
+        self.hook("move")
+        self.calls.append(("move", pan_rad, tilt_rad, speed_rad_per_s))
+        self.pan_rad, self.tilt_rad = pan_rad, tilt_rad
+
+    def stop(self) -> None:
+        self.hook("stop")
+        self.calls.append(("stop",))
+
+    def close(self) -> None:
+        self.hook("close")
+        self.calls.append(("close",))
+
+
+class FakeCamera:
+    """A camera that takes a picture whenever it is asked; ``change(frame)`` may make something else of it."""
+
+    def __init__(self, name: str, seed: int = 0) -> None:
+        self.name = name
+        self.sequence = 0
+        self.hook: Callable[[], Any] = lambda: None
+        self.change: Callable[[Frame], Any] = lambda frame: frame
+        self.asked: list[tuple[float, float]] = []
+        self._random = np.random.default_rng(seed)
+
+    def next_frame(self, exposed_after_s: float, timeout_s: float) -> Any:
+        self.asked.append((exposed_after_s, timeout_s))
+        self.hook()
+        exposure_s = 0.002
+        begin_s = max(time.monotonic(), exposed_after_s) + 0.001
+        time.sleep(max(0.0, begin_s + exposure_s - time.monotonic()))
+        self.sequence += 1
+        width, height = SIZE_PX
+        image = self._random.integers(0, 255, (height, width), dtype=np.uint8)
+        return self.change(Frame(image, self.sequence, begin_s + exposure_s / 2, exposure_s))
+
+    def close(self) -> None:
+        self.hook()
+
+
+class FakeHardware:
+    """What open_hardware gives, made of fakes."""
+
+    def __init__(self, cameras: tuple[str, ...] = ("navcam_left", "navcam_right", "hazcam_left")) -> None:
+        self.head = FakeHead()
+        self.fake_cameras = {name: FakeCamera(name, seed) for seed, name in enumerate(cameras)}
+        self.kind = "real"
+        self.simulation: Any = None
+        self.closed = 0
+
+    @property
+    def pan_tilt(self) -> PanTilt:
+        return self.head
+
+    @property
+    def cameras(self) -> MappingProxyType[str, Camera]:
+        return MappingProxyType(dict(self.fake_cameras))
+
+    def close(self) -> None:
+        self.closed += 1
+
+
+class Hang:
+    """Something to hang in: ``hook`` blocks until ``let_go``; ``entered`` says that somebody hangs."""
+
+    def __init__(self) -> None:
+        self.entered = threading.Event()
+        self._go = threading.Event()
+
+    def __call__(self, *ignored: Any) -> None:
+        self.entered.set()
+        self._go.wait(30.0)
+
+    def let_go(self) -> None:
+        self._go.set()
+
+
+def eventually(holds: Callable[[], Any], what: str, within_s: float = 10.0) -> None:
+    """Wait until something holds; the bound is only there so that a failing test ends."""
+    until_s = time.monotonic() + within_s
+    while not holds():
+        assert time.monotonic() < until_s, f"never happened: {what}"
+        time.sleep(0.005)

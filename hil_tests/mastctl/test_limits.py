@@ -1,0 +1,75 @@
+"""Soft limits: the bound itself is allowed, one step beyond is not, and nothing that is no number passes."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+
+from mastctl.limits import Limits, OutsideLimits
+
+LIMITS = Limits((-2.6, 2.6), (-1.2, 1.57), 1.0)
+
+
+@pytest.mark.parametrize(("pan", "tilt"), [(0.0, 0.0), (-2.6, -1.2), (2.6, 1.57)])
+def test_angles_up_to_the_bounds_pass(pan: float, tilt: float) -> None:
+    LIMITS.check(pan, tilt)
+
+
+@pytest.mark.parametrize(
+    ("pan", "tilt", "what"),
+    [
+        (math.nextafter(2.6, 3), 0.0, "pan"),
+        (math.nextafter(-2.6, -3), 0.0, "pan"),
+        (0.0, math.nextafter(1.57, 2), "tilt"),
+        (0.0, math.nextafter(-1.2, -2), "tilt"),
+    ],
+)
+def test_the_next_number_beyond_a_bound_is_refused_and_told_apart(pan: float, tilt: float, what: str) -> None:
+    with pytest.raises(OutsideLimits) as refused:
+        LIMITS.check(pan, tilt)
+    assert refused.value.what == what
+    assert refused.value.code == "outside_limits"
+    value, bound = str(refused.value).split(" rad is beyond the soft limit ")
+    assert value.removeprefix(f"{what} ") != bound.removesuffix(" rad")
+
+
+def test_the_message_holds_what_value_bound_and_unit() -> None:
+    with pytest.raises(OutsideLimits, match=r"^tilt 1\.92 rad is beyond the soft limit 1\.57 rad$"):
+        LIMITS.check(0.3, 1.92)
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
+@pytest.mark.parametrize("axis", ["pan", "tilt"])
+def test_what_is_not_finite_is_refused(axis: str, value: float) -> None:
+    angles = (value, 0.0) if axis == "pan" else (0.0, value)
+    with pytest.raises(OutsideLimits, match=f"{axis} .* is not a finite angle"):
+        LIMITS.check(*angles)
+
+
+def test_speed_is_capped_and_defaults_to_the_cap() -> None:
+    assert LIMITS.speed(None) == 1.0
+    assert LIMITS.speed(0.25) == 0.25
+    assert LIMITS.speed(7.0) == 1.0
+
+
+@pytest.mark.parametrize("speed", [0.0, -0.1, math.nan, math.inf])
+def test_a_speed_that_a_servo_could_take_for_full_speed_is_refused(speed: float) -> None:
+    with pytest.raises(OutsideLimits, match="finite number above 0"):
+        LIMITS.speed(speed)
+
+
+@pytest.mark.parametrize(
+    "bounds",
+    [
+        {"pan_rad": (1.0, 1.0)},
+        {"tilt_rad": (1.0, -1.0)},
+        {"pan_rad": (math.nan, 1.0)},
+        {"speed_rad_per_s": 0.0},
+        {"speed_rad_per_s": math.inf},
+    ],
+)
+def test_limits_that_limit_nothing_cannot_be_made(bounds: dict[str, object]) -> None:
+    good: dict[str, object] = {"pan_rad": (-1.0, 1.0), "tilt_rad": (-1.0, 1.0), "speed_rad_per_s": 1.0}
+    with pytest.raises(ValueError, match="is expected"):
+        Limits(**{**good, **bounds})  # type: ignore[arg-type]
