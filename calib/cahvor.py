@@ -1,20 +1,38 @@
 """CAHV, CAHVOR and CAHVORE camera models: project, ray, Jacobians, motion.
 
-Pixels are (x, y) = (column, row), 0-based; the centre of the top-left pixel is (0, 0).
+Pixels are (x, y) = (column, row), 0-based; the centre of the top-left pixel is (0, 0). H and V need not be at
+right angles, and mirrored images are as good as others.
+
+Sources: Yakimovsky and Cunningham 1978 (CAHV); Gennery 2001, 2006 (CAHVOR, CAHVORE); JPL's camera-model
+library as published with VICAR (``cmod_cahv*.c``).
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
-from typing import Literal, NamedTuple
+from dataclasses import dataclass, field
+from functools import cached_property
+from math import inf, isfinite, nan, sqrt
+from numbers import Integral
+from typing import Literal, NamedTuple, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from calib.lens import Lens
+from calib.projection import Place, Projection
+from calib.published import project_as_published
 from calib.rigid import FloatArray, Rigid, frozen_array
 
 Kind = Literal["CAHV", "CAHVOR", "CAHVORE"]
+
+_UNIT = 1e-9
+"""How far the length of A and O may be from 1."""
+
+_ROUNDING = 4e-16
+"""A length this close to 1 is 1: such vectors keep their bits when a file is read and written."""
+
+_FLAT = 1e-12
+"""Relative volume of H, V, A below which they lie in one plane."""
 
 
 class Rays(NamedTuple):
@@ -32,9 +50,39 @@ class Rays(NamedTuple):
 class CameraModel:
     """One camera of the CAHV family; A and O are unit vectors (see ``normalised``).
 
-    ``kind`` says which letters count: CAHV ignores O, R, E; CAHVOR ignores E. ``cahvore_type`` is 1
-    (perspective, linearity 1), 2 (fisheye, linearity 0) or 3 (``linearity`` as given); 0 otherwise.
-    ``size_px`` is (width, height).
+    Attributes
+    ----------
+    kind
+        Says which letters count: CAHV ignores O, R and E, CAHVOR ignores E. Those that do not count are
+        kept as O = A, R = 0, E = 0.
+    size_px
+        (width, height).
+    C, A, H, V, O, R, E
+        (3,) each, read-only. C in metres; A and O unit vectors; H and V in pixels; R and E as published.
+    cahvore_type
+        1 (perspective, linearity 1), 2 (fisheye, linearity 0) or 3 (``linearity`` as given); 0 for CAHV
+        and CAHVOR.
+
+    Raises
+    ------
+    ValueError
+        If the numbers are no camera; the sentence names the letter.
+
+    Notes
+    -----
+    A point has a pixel if the lens reaches it: for CAHV and CAHVOR it is in front of C along A and along O,
+    for CAHVORE its ray is within the angle that the linearity allows (a right angle over ``linearity``, at
+    most half a turn), and for both it is nearer to O than where the polynomial of R first folds. Points so
+    near a CAHVORE lens that two rays of the image pass through them have none. Everything else comes out
+    as not-a-number and False. A point outside the image keeps its numbers.
+
+    Examples
+    --------
+    >>> H, V = [500, 0, 319.5], [0, 500, 239.5]
+    >>> camera = CameraModel("CAHV", (640, 480), C=[0, 0, 0], A=[0, 0, 1], H=H, V=V)
+    >>> pixel, valid = camera.project([0.1, 0.0, 1.0])
+    >>> pixel.tolist(), bool(valid)
+    ([369.5, 239.5], True)
     """
 
     kind: Kind
@@ -43,39 +91,134 @@ class CameraModel:
     A: FloatArray
     H: FloatArray
     V: FloatArray
-    O: FloatArray | None = None  # noqa: E741  the model's own letter
-    R: FloatArray | None = None
-    E: FloatArray | None = None
+    O: FloatArray = None  # type: ignore[assignment]  # noqa: E741  the model's own letter; A if not given
+    R: FloatArray = None  # type: ignore[assignment]  # 0 if not given
+    E: FloatArray = None  # type: ignore[assignment]  # 0 if not given
     cahvore_type: int = 0
     linearity: float = 1.0
-    lens: Lens = field(init=False, repr=False)
+    _rows: FloatArray = field(init=False, repr=False)  # C, A, H, V, and the lens frame's x, y, z = O
+    _projection: Projection = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
+        self._set_words()
         for letter in "CAHV":
-            object.__setattr__(self, letter, frozen_array(getattr(self, letter), (3,)))
+            self._set(letter, _vector(letter, getattr(self, letter)))
         for letter, default in (("O", self.A), ("R", np.zeros(3)), ("E", np.zeros(3))):
-            given = getattr(self, letter)
-            object.__setattr__(self, letter, frozen_array(default if given is None else given, (3,)))
-        if self.cahvore_type in (1, 2):
-            object.__setattr__(self, "linearity", 1.0 if self.cahvore_type == 1 else 0.0)
-        lens = Lens(tuple(self.R.tolist()), tuple(self.E.tolist()), self.kind == "CAHVORE", self.linearity)
-        object.__setattr__(self, "lens", lens)
-        o = self.O
-        e1 = np.cross(o, np.eye(3)[np.argmin(np.abs(o))])
-        e1 /= np.linalg.norm(e1)
-        basis = np.array([e1, np.cross(o, e1), o])
-        object.__setattr__(self, "_basis", basis)
-        object.__setattr__(self, "_k", np.array([self.H, self.V, self.A]) @ basis.T)
-        object.__setattr__(self, "_k_inv", np.linalg.inv(self._k))
+            given = getattr(self, letter) if letter in self.kind else None
+            self._set(letter, _vector(letter, default if given is None else given))
+        for letter, axis in (("A", self.A), ("O", self.O)):
+            if not abs(sqrt(float(axis @ axis)) - 1.0) <= _UNIT:
+                raise ValueError(f"{letter} is {axis.tolist()} where a vector of length 1 is expected")
+        if not self.A @ self.O > 0.0:
+            raise ValueError(
+                f"O is {self.O.tolist()}, which is not within 90 degrees of A, {self.A.tolist()}"
+            )
+        if not 1.0 + self.R[0] > 0.0:
+            raise ValueError(f"R begins with {self.R[0]:g} where a number above -1 is expected")
+        hva = np.array([self.H, self.V, self.A])
+        lengths = np.sqrt(np.einsum("ij,ij->i", hva, hva))
+        if not lengths.all() or not abs(np.linalg.det(hva / lengths[:, None])) > _FLAT:
+            raise ValueError("H, V and A lie in one plane where three directions are expected")
+        axes = _axes_around(self.O)
+        self._set("_rows", np.array([self.C, *hva[[2, 0, 1]], *axes]))
+        self._rows.setflags(write=False)
+        self._set("_projection", self._make_projection(hva @ axes.T))
+
+    def _set(self, name: str, value: object) -> None:
+        object.__setattr__(self, name, value)
+
+    def _set_words(self) -> None:
+        """Check and settle what is not a vector: kind, size, type and linearity."""
+        if self.kind not in get_args(Kind):
+            raise ValueError(f"the kind is {self.kind!r} where CAHV, CAHVOR or CAHVORE is expected")
+        try:
+            sizes = [n if isinstance(n, Integral) and not isinstance(n, bool) else 0 for n in self.size_px]
+        except TypeError:
+            sizes = []
+        if len(sizes) != 2 or min(sizes) <= 0:
+            raise ValueError(f"the size is {self.size_px!r} where two whole numbers above 0 are expected")
+        self._set("size_px", (int(sizes[0]), int(sizes[1])))
+        types = (1, 2, 3) if self.kind == "CAHVORE" else (0,)
+        if self.cahvore_type not in types:
+            expected = "1, 2 or 3" if len(types) == 3 else "0"
+            raise ValueError(
+                f"the type is {self.cahvore_type!r} where {expected} is expected for {self.kind}"
+            )
+        linearity = float(self.linearity) if self.cahvore_type == 3 else 1.0 if self.cahvore_type < 2 else 0.0
+        if not isfinite(linearity):
+            raise ValueError(f"the linearity is {linearity} where a finite number is expected")
+        self._set("linearity", linearity)
+
+    def _make_projection(self, pixel_from_slope: FloatArray) -> Projection:
+        """Return what stays when the camera moves."""
+        r0, r1, r2 = self.R.tolist()
+        e0, e1, e2 = self.E.tolist()
+        slope_from_pixel = np.linalg.inv(pixel_from_slope)
+        lens = Lens(
+            (r0, r1, r2),
+            (e0, e1, e2),
+            self.kind == "CAHVORE",
+            self.linearity,
+            _largest_slope(self.size_px, slope_from_pixel),
+        )
+        return Projection(lens, pixel_from_slope, slope_from_pixel)
 
     @classmethod
-    def normalised(cls, kind, size_px, C, A, H, V, O=None, R=None, E=None, cahvore_type=0, linearity=1.0):
-        A = np.asarray(A, dtype=float)
-        A = A / np.linalg.norm(A)
-        if O is not None:
-            O = np.asarray(O, dtype=float)
-            O = O / np.linalg.norm(O)
-        return cls(kind, size_px, C, A, H, V, O, R, E, cahvore_type, linearity), 0.0
+    def normalised(
+        cls,
+        kind: Kind,
+        size_px: tuple[int, int],
+        C: ArrayLike,
+        A: ArrayLike,
+        H: ArrayLike,
+        V: ArrayLike,
+        O: ArrayLike | None = None,  # noqa: E741
+        R: ArrayLike | None = None,
+        E: ArrayLike | None = None,
+        cahvore_type: int = 0,
+        linearity: float = 1.0,
+    ) -> tuple[CameraModel, float]:
+        """Return the model with A and O made unit vectors, and by how much that moves a pixel at most.
+
+        Arguments as the class, A and O of any length but zero. The change, in pixels, is the largest over
+        the image of points 1 m and 1 km away, against JPL's formulas with the vectors as given; infinite
+        if those give no pixel somewhere.
+
+        Raises
+        ------
+        ValueError
+            As the class, and if A or O is zero.
+        """
+        given = {"A": _vector("A", A)}
+        if O is not None and "O" in str(kind):
+            given["O"] = _vector("O", O)
+        units, stretched = {}, False
+        for letter, axis in given.items():
+            length = float(np.linalg.norm(axis))
+            if not 0.0 < length < inf:
+                raise ValueError(f"{letter} is {axis.tolist()} where a direction is expected")
+            is_unit = abs(length - 1.0) <= _ROUNDING
+            units[letter] = axis if is_unit else axis / length
+            stretched |= not is_unit
+        vectors = {"C": C, "H": H, "V": V, "O": None, "R": R, "E": E} | units
+        model = cls(kind, size_px, cahvore_type=cahvore_type, linearity=linearity, **vectors)  # type: ignore[arg-type]
+        if not stretched:
+            return model, 0.0
+        x, y = np.meshgrid(*(np.linspace(-0.5, n - 0.5, 17) for n in model.size_px))
+        pixels = np.stack([x.ravel(), y.ravel()], axis=-1)
+        rays = model.ray(pixels)
+        letters = {letter: given.get(letter, getattr(model, letter)) for letter in "CAHVORE"}
+        if "O" not in given:
+            letters["O"] = given["A"]
+        curve = model.linearity if kind == "CAHVORE" else None
+        shift_px = 0.0
+        with np.errstate(all="ignore"):
+            for range_m in (1.0, 1000.0):
+                points = rays.origins_m[rays.valid] + range_m * rays.directions[rays.valid]
+                moved = project_as_published(points, linearity=curve, **letters) - pixels[rays.valid]
+                far = np.hypot(moved[:, 0], moved[:, 1])
+                shift_px = max(shift_px, float(np.where(np.isfinite(far), far, inf).max(initial=0.0)))
+        return model, shift_px
 
     @property
     def image_center_px(self) -> tuple[float, float]:
@@ -84,105 +227,105 @@ class CameraModel:
 
     def moved(self, b_from_a: Rigid) -> CameraModel:
         """Return the same camera with its vectors in frame b instead of a: C moves, A H V O turn."""
-        return replace(
-            self,
-            C=b_from_a.points(self.C),
-            A=b_from_a.vectors(self.A),
-            H=b_from_a.vectors(self.H),
-            V=b_from_a.vectors(self.V),
-            O=b_from_a.vectors(self.O),
-        )
+        rows = self._rows @ b_from_a.rotation.T
+        rows[0] += b_from_a.translation_m
+        rows.setflags(write=False)
+        model = object.__new__(CameraModel)
+        letters = {"C": rows[0], "A": rows[1], "H": rows[2], "V": rows[3], "O": rows[6]}
+        model.__dict__.update(self.__dict__, _rows=rows, **letters)
+        model.__dict__.pop("_place", None)
+        return model
 
     def project(self, points_m: ArrayLike) -> tuple[FloatArray, np.ndarray]:
-        """Return pixels (..., 2) of points (..., 3) in metres in the model's frame, and which are valid."""
-        points = np.asarray(points_m, dtype=np.float64)
-        with np.errstate(all="ignore"):
-            a, b, w = np.moveaxis((points - self.C) @ self._basis.T, -1, 0)
-            lens = self.lens
-            r0, r1, r2 = lens.r
-            if lens.curved:
-                e0, e1, e2 = lens.e
-                lam = np.maximum(np.sqrt(a * a + b * b), 1e-150)
-                theta = np.arctan2(lam, w)
-                for _ in range(30):
-                    s, c, t2 = np.sin(theta), np.cos(theta), theta * theta
-                    e = e0 + t2 * (e1 + t2 * e2)
-                    slope = w * c + lam * s - (1 - c) * e - (theta - s) * theta * (2 * e1 + 4 * e2 * t2)
-                    step = (w * s - lam * c - (theta - s) * e) / slope
-                    theta = theta - step
-                    if np.all(~(np.abs(step) > 1e-14)):
-                        break
-                line = lens.linearity
-                if line > 0:
-                    chi = np.tan(line * theta) / line
-                elif line < 0:
-                    chi = np.sin(line * theta) / line
-                else:
-                    chi = theta
-                scale = chi / lam
-                valid = (np.abs(step) < 1e-9) & (slope > 0) & (theta >= 0) & (theta < lens.theta_limit_rad)
-            else:
-                scale = 1 / w
-                valid = w > 0
-                chi = np.sqrt(a * a + b * b) * scale
-            valid &= chi < lens.chi_limit
-            chi2 = chi * chi
-            scale = scale * (1 + r0 + chi2 * (r1 + chi2 * r2))
-            x, y, z = np.moveaxis(np.stack([a * scale, b * scale, np.ones_like(a)], -1) @ self._k.T, -1, 0)
-            pixels = np.stack([x / z, y / z], -1)
-            valid &= (z > 0) & np.isfinite(pixels).all(-1)
-            pixels[~valid] = np.nan
-        return pixels, valid
+        """Return pixels (..., 2) of points (..., 3), metres in the model's frame, and which are valid (...).
 
-    def ray(self, pixels_px: ArrayLike) -> Rays:
-        """Return the rays through pixels (..., 2)."""
-        pixels = np.asarray(pixels_px, dtype=np.float64)
-        with np.errstate(all="ignore"):
-            x, y = pixels[..., 0], pixels[..., 1]
-            a, b, w = np.moveaxis(np.stack([x, y, np.ones_like(x)], -1) @ self._k_inv.T, -1, 0)
-            lens = self.lens
-            r0, r1, r2 = lens.r
-            u, v = a / w, b / w
-            target = np.maximum(np.sqrt(u * u + v * v), 1e-150)
-            valid = (w > 0) & (target < lens.distorted_limit)
-            chi = target / (1 + r0)
-            for _ in range(50):
-                c2 = chi * chi
-                step = (chi * (1 + r0 + c2 * (r1 + c2 * r2)) - target) / (
-                    1 + r0 + c2 * (3 * r1 + c2 * 5 * r2)
-                )
-                chi = chi - step
-                if np.all(~(np.abs(step) > 1e-14)):
-                    break
-            valid &= (chi >= 0) & (chi < lens.chi_limit) & (np.abs(step) < 1e-9)
-            shift = np.zeros_like(chi)
-            if lens.curved:
-                line = lens.linearity
-                if line > 0:
-                    theta = np.arctan(line * chi) / line
-                elif line < 0:
-                    theta = np.arcsin(line * chi) / line
-                else:
-                    theta = chi
-                valid &= theta < lens.theta_limit_rad
-                t2 = theta * theta
-                s, c = np.sin(theta), np.cos(theta)
-                shift = (theta / s - 1) * (lens.e[0] + t2 * (lens.e[1] + t2 * lens.e[2]))
-            else:
-                norm = np.sqrt(1 + chi * chi)
-                s, c = chi / norm, 1 / norm
-            local = np.stack([s * u / target, s * v / target, c], -1)
-            directions = local @ self._basis
-            origins = self.C + shift[..., None] * self.O
-            valid &= np.isfinite(directions).all(-1) & np.isfinite(shift)
-            directions[~valid] = np.nan
-            origins[~valid] = np.nan
-        return Rays(origins, directions, valid)
+        Points that have no pixel (see the class) come out as not-a-number.
+        """
+        points = _as_rows(points_m, 3, "points")
+        if points.ndim == 1:
+            x, y = self._projection.project_point(*points.tolist(), self._place)
+            return np.array([x, y]), np.array(x == x)
+        pixels, _, valid = self._projection.project(points.reshape(-1, 3), self.C, self._axes, False)
+        return pixels.reshape(*points.shape[:-1], 2), valid.reshape(points.shape[:-1])
 
     def project_jacobian(self, points_m: ArrayLike) -> tuple[FloatArray, FloatArray, np.ndarray]:
-        """Return pixels (..., 2), d pixel / d point (..., 2, 3) in px/m, and which are valid."""
-        raise NotImplementedError
+        """Return pixels (..., 2), d pixel / d point (..., 2, 3) in px/m, and which are valid (...).
+
+        Points that have no pixel (see the class) come out as not-a-number.
+        """
+        points = _as_rows(points_m, 3, "points")
+        shape = points.shape[:-1]
+        pixels, jacobian, valid = self._projection.project(points.reshape(-1, 3), self.C, self._axes, True)
+        return pixels.reshape(*shape, 2), jacobian.reshape(*shape, 2, 3), valid.reshape(shape)
+
+    def ray(self, pixels_px: ArrayLike) -> Rays:
+        """Return the rays through pixels (..., 2); a CAHVORE ray begins at the moved entrance point.
+
+        Pixels that no ray of the lens lands on come out as not-a-number.
+        """
+        pixels = _as_rows(pixels_px, 2, "pixels")
+        if pixels.ndim == 1:
+            ray = self._projection.ray_of_pixel(*pixels.tolist(), self._place)
+            if ray is None:
+                return Rays(np.full(3, nan), np.full(3, nan), np.array(False))
+            return Rays(np.array(ray[0]), np.array(ray[1]), np.array(True))
+        shape = pixels.shape[:-1]
+        origins, directions, valid, _, _ = self._projection.rays(
+            pixels.reshape(-1, 2), self.C, self._axes, False
+        )
+        return Rays(origins.reshape(*shape, 3), directions.reshape(*shape, 3), valid.reshape(shape))
 
     def ray_jacobian(self, pixels_px: ArrayLike) -> tuple[Rays, FloatArray, FloatArray]:
-        """Return the rays, d direction / d pixel (..., 3, 2) and d origin / d pixel (..., 3, 2)."""
-        raise NotImplementedError
+        """Return the rays, d direction / d pixel (..., 3, 2) per px and d origin / d pixel (..., 3, 2), m/px.
+
+        Pixels that no ray of the lens lands on come out as not-a-number.
+        """
+        pixels = _as_rows(pixels_px, 2, "pixels")
+        shape = pixels.shape[:-1]
+        origins, directions, valid, d_directions, d_origins = self._projection.rays(
+            pixels.reshape(-1, 2), self.C, self._axes, True
+        )
+        rays = Rays(origins.reshape(*shape, 3), directions.reshape(*shape, 3), valid.reshape(shape))
+        return rays, d_directions.reshape(*shape, 3, 2), d_origins.reshape(*shape, 3, 2)
+
+    @property
+    def _axes(self) -> FloatArray:
+        """The lens frame's x, y and z = O, as rows."""
+        return self._rows[4:]
+
+    @cached_property
+    def _place(self) -> Place:
+        """C and the lens frame's axes as plain floats, for one point at a time."""
+        c, _, _, _, x, y, o = self._rows.tolist()
+        return c, x, y, o
+
+
+def _vector(letter: str, given: ArrayLike) -> FloatArray:
+    """Return one of the model's vectors, read-only, or say which letter is wrong."""
+    try:
+        return frozen_array(given, (3,))
+    except (ValueError, TypeError) as error:
+        raise ValueError(f"{letter}: {error}") from None
+
+
+def _as_rows(values: ArrayLike, width: int, what: str) -> FloatArray:
+    """Return ``values`` as floats (..., width)."""
+    array = np.asarray(values, dtype=np.float64)
+    if array.ndim == 0 or array.shape[-1] != width:
+        raise ValueError(f"{what} of shape {array.shape} where (..., {width}) is expected")
+    return array
+
+
+def _axes_around(o: FloatArray) -> FloatArray:
+    """Return a right-handed set of axes, as rows, whose last is the unit vector ``o``."""
+    across = np.cross(o, np.eye(3)[np.argmin(np.abs(o))])
+    across /= sqrt(float(across @ across))
+    return np.array([across, np.cross(o, across), o])
+
+
+def _largest_slope(size_px: tuple[int, int], slope_from_pixel: FloatArray) -> float:
+    """Return the largest distorted slope inside the image, which is at one of its four corners."""
+    x, y = size_px[0] - 0.5, size_px[1] - 0.5
+    corners = np.array([[-0.5, -0.5, 1.0], [x, -0.5, 1.0], [-0.5, y, 1.0], [x, y, 1.0]])
+    u, v, w = slope_from_pixel @ corners.T
+    return float((np.hypot(u, v) / w).max()) if (w > 0.0).all() else inf

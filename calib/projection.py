@@ -1,0 +1,222 @@
+"""From points to pixels and back, for a camera whose vectors are given in its lens frame.
+
+A point is turned into the lens frame (origin C, z along O), bent into slopes (`calib.lens_arrays`), and a
+plane projection by H, V and A makes pixels of slopes; a ray goes the same way back. What is here does not
+change when the camera moves: where it stands comes with each call as C and the lens frame's axes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property
+from math import inf, isfinite, nan
+
+import numpy as np
+
+from calib.lens import Lens
+from calib.lens_arrays import bend, unbend
+from calib.lens_point import bend_point, unbend_point
+from calib.rigid import FloatArray
+
+_CHUNK = 4096
+"""Points at a time: some thirty rows of them stay in a core's own cache."""
+
+Triple = tuple[float, float, float]
+Place = tuple[list[float], list[float], list[float], list[float]]
+"""C and the lens frame's x, y and z = O as plain floats."""
+
+
+@dataclass(frozen=True, eq=False)
+class Projection:
+    """A lens with the plane behind it.
+
+    Attributes
+    ----------
+    lens
+        Distortion, entrance point and reach.
+    pixel_from_slope
+        (3, 3): H, V and A in the lens frame, as rows.
+    slope_from_pixel
+        (3, 3): its inverse.
+    """
+
+    lens: Lens
+    pixel_from_slope: FloatArray
+    slope_from_pixel: FloatArray
+
+    def project(
+        self, points: FloatArray, center: FloatArray, axes: FloatArray, derivatives: bool
+    ) -> tuple[FloatArray, FloatArray, np.ndarray]:
+        """Return pixels (n, 2), the Jacobians (n, 2, 3) if asked for, else none, and which are valid (n,).
+
+        ``points`` (n, 3) metres, ``center`` (3,) and ``axes`` (3, 3), the lens frame's axes as rows, are in
+        one frame.
+        """
+        count = len(points)
+        pixels, valid = np.empty((count, 2)), np.empty(count, dtype=bool)
+        jacobian = np.empty((count if derivatives else 0, 2, 3))
+        with np.errstate(all="ignore"):
+            for part in _chunks(count):
+                self._project(points[part], center, axes, pixels[part], jacobian[part], valid[part])
+        return pixels, jacobian, valid
+
+    def _project(
+        self,
+        points: FloatArray,
+        center: FloatArray,
+        axes: FloatArray,
+        pixels: FloatArray,
+        jacobian: FloatArray,
+        valid: np.ndarray,
+    ) -> None:
+        """Fill pixels and validity of one chunk, and the Jacobian if it has rows."""
+        lens, k = self.lens, self.pixel_from_slope
+        local = axes @ np.subtract(points.T, center[:, None], order="C")
+        a, b, w = local
+        bent = bend(lens, a, b, w, len(jacobian) > 0)
+        slopes = np.empty_like(local)
+        np.multiply(a, bent.m, out=slopes[0])
+        np.multiply(b, bent.m, out=slopes[1])
+        slopes[2] = 1.0
+        x, y, z = k @ slopes
+        np.logical_and(bent.valid, z > 0.0, out=valid)
+        if not lens.curved:
+            valid &= k[2] @ local > 0.0
+        z = 1.0 / z
+        x *= z
+        y *= z
+        valid &= np.isfinite(x + y)
+        pixels[:, 0] = x
+        pixels[:, 1] = y
+        if bent.n is not None and bent.k is not None:
+            for row, value in enumerate((x, y)):
+                per_u, per_v = (k[row, 0] - k[2, 0] * value) * z, (k[row, 1] - k[2, 1] * value) * z
+                along = a * per_u
+                along += b * per_v
+                across = along * bent.n
+                slopes[0] = bent.m * per_u + a * across
+                slopes[1] = bent.m * per_v + b * across
+                np.multiply(along, bent.k, out=slopes[2])
+                jacobian[:, row] = (axes.T @ slopes).T
+        if not valid.all():
+            pixels[~valid] = nan
+            if len(jacobian):
+                jacobian[~valid] = nan
+
+    def rays(
+        self, pixels: FloatArray, center: FloatArray, axes: FloatArray, derivatives: bool
+    ) -> tuple[FloatArray, FloatArray, np.ndarray, FloatArray, FloatArray]:
+        """Return origins (n, 3), directions (n, 3) and validity (n,) of the rays of pixels (n, 2).
+
+        Then d direction / d pixel and d origin / d pixel, (n, 3, 2) each if asked for, else with no rows.
+        """
+        count = len(pixels)
+        origins, directions, valid = np.empty((count, 3)), np.empty((count, 3)), np.empty(count, dtype=bool)
+        rows = count if derivatives else 0
+        d_directions, d_origins = np.empty((rows, 3, 2)), np.zeros((rows, 3, 2))
+        filled = (origins, directions, valid, d_directions, d_origins)
+        with np.errstate(all="ignore"):
+            for part in _chunks(count):
+                self._rays(pixels[part], center, axes, *(array[part] for array in filled))
+        return filled
+
+    def _rays(
+        self,
+        pixels: FloatArray,
+        center: FloatArray,
+        axes: FloatArray,
+        origins: FloatArray,
+        directions: FloatArray,
+        valid: np.ndarray,
+        d_directions: FloatArray,
+        d_origins: FloatArray,
+    ) -> None:
+        """Fill the rays of one chunk, and their derivatives if these have rows."""
+        lens, k = self.lens, self.slope_from_pixel
+        seen = k[:, :2] @ pixels.T
+        seen += k[:, 2:]
+        u, v, per_w = seen
+        np.greater(per_w, 0.0, out=valid)
+        np.divide(1.0, per_w, out=per_w)
+        u *= per_w
+        v *= per_w
+        ray = unbend(lens, u, v, len(d_directions) > 0)
+        local = np.empty_like(seen)
+        np.multiply(u, ray.p, out=local[0])
+        np.multiply(v, ray.p, out=local[1])
+        local[2] = ray.q
+        valid &= ray.valid
+        if not lens.curved:
+            valid &= self.pixel_from_slope[2] @ local > 0.0
+        valid &= np.isfinite(local[0] + local[1])
+        directions[...] = (axes.T @ local).T
+        origins[...] = center
+        if ray.shift is not None:
+            origins += ray.shift[:, None] * axes[2]
+        if ray.p_rate is not None and ray.q_rate is not None:
+            for column in range(2):
+                du = (k[0, column] - k[2, column] * u) * per_w
+                dv = (k[1, column] - k[2, column] * v) * per_w
+                g = u * du + v * dv
+                along = ray.p_rate * g
+                local[0] = ray.p * du + u * along
+                local[1] = ray.p * dv + v * along
+                np.multiply(ray.q_rate, g, out=local[2])
+                d_directions[:, :, column] = (axes.T @ local).T
+                if ray.shift_rate is not None:
+                    d_origins[:, :, column] = (ray.shift_rate * g)[:, None] * axes[2]
+        if not valid.all():
+            lost = ~valid
+            origins[lost] = nan
+            directions[lost] = nan
+            if len(d_directions):
+                d_directions[lost] = nan
+                d_origins[lost] = nan
+
+    @cached_property
+    def _floats(self) -> tuple[list[list[float]], list[list[float]]]:
+        """Both matrices as plain floats."""
+        return self.pixel_from_slope.tolist(), self.slope_from_pixel.tolist()
+
+    def project_point(self, x: float, y: float, z: float, place: Place) -> tuple[float, float]:
+        """Return the pixel of one point, not-a-number if it has none."""
+        (cx, cy, cz), (xx, xy, xz), (yx, yy, yz), (ox, oy, oz) = place
+        (hx, hy, hz), (vx, vy, vz), (ax, ay, az) = self._floats[0]
+        x, y, z = x - cx, y - cy, z - cz
+        a, b, w = xx * x + xy * y + xz * z, yx * x + yy * y + yz * z, ox * x + oy * y + oz * z
+        m = bend_point(self.lens, a, b, w)
+        if not self.lens.curved and not ax * a + ay * b + az * w > 0.0:
+            return nan, nan
+        u, v = a * m, b * m
+        depth = ax * u + ay * v + az
+        if not depth > 0.0 or (per_depth := 1.0 / depth) == inf:
+            return nan, nan
+        x, y = (hx * u + hy * v + hz) * per_depth, (vx * u + vy * v + vz) * per_depth
+        return (x, y) if isfinite(x + y) else (nan, nan)
+
+    def ray_of_pixel(self, x_px: float, y_px: float, place: Place) -> tuple[Triple, Triple] | None:
+        """Return origin and direction of one pixel's ray, None if it has none."""
+        (ux, uy, uz), (vx, vy, vz), (wx, wy, wz) = self._floats[1]
+        w = wx * x_px + wy * y_px + wz
+        if not w > 0.0 or not w < inf or (per_w := 1.0 / w) == inf:
+            return None
+        u, v = (ux * x_px + uy * y_px + uz) * per_w, (vx * x_px + vy * y_px + vz) * per_w
+        ray = unbend_point(self.lens, u, v)
+        if ray is None:
+            return None
+        p, q, shift = ray
+        a, b = u * p, v * p
+        ax, ay, az = self._floats[0][2]
+        if not self.lens.curved and not ax * a + ay * b + az * q > 0.0:
+            return None
+        (cx, cy, cz), (xx, xy, xz), (yx, yy, yz), (ox, oy, oz) = place
+        return (
+            (cx + shift * ox, cy + shift * oy, cz + shift * oz),
+            (a * xx + b * yx + q * ox, a * xy + b * yy + q * oy, a * xz + b * yz + q * oz),
+        )
+
+
+def _chunks(count: int) -> Iterator[slice]:
+    """Cut ``count`` rows into slices that fit the cache."""
+    return (slice(start, min(start + _CHUNK, count)) for start in range(0, count, _CHUNK))
