@@ -26,6 +26,7 @@ log = logging.getLogger(__name__)
 MODULES: dict[str, tuple[str, ...]] = {
     "mastctl.cli.service": ("run", "status", "point", "stop", "snapshot"),
     "mastctl.cli.geometry": ("camera", "solve", "triangulate", "budget"),
+    "mastctl.cli.experiment": ("experiment", "demo"),
 }
 
 # argparse's own pattern knows -1 and -1.5 but takes -1e-3 for an option; "not finite" words get our message.

@@ -66,8 +66,13 @@ def add_commands(subparsers: argparse._SubParsersAction[Any]) -> None:
     snapshot.set_defaults(run=_snapshot)
 
     for client in (status, point, stop, snapshot):
-        client.add_argument("--url", help="the daemon's address (default: that of the configuration)")
-        client.add_argument("--config", metavar="FILE", help="the configuration that the daemon runs with")
+        add_daemon_options(client)
+
+
+def add_daemon_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options that say which daemon is meant; `client_of` reads them."""
+    parser.add_argument("--url", help="the daemon's address (default: that of the configuration)")
+    parser.add_argument("--config", metavar="FILE", help="the configuration that the daemon runs with")
 
 
 def _run(args: argparse.Namespace) -> int:
@@ -89,7 +94,7 @@ def _run(args: argparse.Namespace) -> int:
 
 
 def _status(args: argparse.Namespace) -> int:
-    with _client(args) as client:
+    with client_of(args) as client:
         status = client.status()
     if args.json:
         output.print_json(status)
@@ -109,7 +114,7 @@ def _point(args: argparse.Namespace) -> int:
         "frame": args.frame,
         "aim": _camera_pixel(args.aim),
     }
-    with _client(args) as client:
+    with client_of(args) as client:
         if args.pixel is not None:
             camera, frame_id, x, y = args.pixel
             request["pixel"] = (camera, frame_id, _number("--pixel", x), _number("--pixel", y))
@@ -140,7 +145,7 @@ def _point(args: argparse.Namespace) -> int:
 
 
 def _stop(args: argparse.Namespace) -> int:
-    with _client(args) as client:
+    with client_of(args) as client:
         answer = client.stop()
     operation = answer.get("operation")
     _tell(args, answer, f"stopped{f', operation {operation} too' if operation else ''}")
@@ -152,7 +157,7 @@ def _snapshot(args: argparse.Namespace) -> int:
     kind = SUFFIXES.get(out.suffix.lower())
     if kind is None:
         raise WrongUse(f"--out is '{args.out}' where a name ending in {', '.join(SUFFIXES)} is expected")
-    with _client(args) as client:
+    with client_of(args) as client:
         shot = client.snapshot(args.camera, frame_id=args.frame_id, format="png" if kind == "png" else "jpeg")
     try:
         out.write_bytes(shot.data)
@@ -164,7 +169,7 @@ def _snapshot(args: argparse.Namespace) -> int:
 
 
 @contextmanager
-def _client(args: argparse.Namespace) -> Iterator[Client]:
+def client_of(args: argparse.Namespace) -> Iterator[Client]:
     """A client of the daemon that the options name."""
     from mastctl.client import Client
     from mastctl.config import load_config

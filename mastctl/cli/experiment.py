@@ -1,0 +1,177 @@
+"""``mastctl experiment pointing`` on any running daemon, and ``mastctl demo`` on the packaged simulated rover."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from mastctl.cli import output
+
+if TYPE_CHECKING:
+    from mastctl.client import Client
+    from mastctl.experiment.pointing import PointingExperiment, Truth
+
+DEFAULT_TARGETS = 10
+DEFAULT_DISTANCES_M = (10.0, 6.0, 2.0)
+
+
+def add_commands(subparsers: Any) -> None:
+    """Add ``experiment`` and ``demo``."""
+    experiment = subparsers.add_parser("experiment", help="the paper's experiments on a running daemon")
+    kinds = experiment.add_subparsers(dest="experiment", metavar="EXPERIMENT", required=True)
+    pointing = kinds.add_parser("pointing", help="point at random textured targets and measure the residuals")
+    from mastctl.cli.service import add_daemon_options
+
+    add_daemon_options(pointing)
+    _add_common(
+        pointing, out_help="folder for report.html, targets.csv and record.json; none is written without"
+    )
+    pointing.add_argument(
+        "--distances", type=output.positive_number, nargs="+", default=list(DEFAULT_DISTANCES_M), metavar="M",
+        help="ranges in metres (default 10 6 2)",
+    )  # fmt: skip
+    pointing.set_defaults(run=run_pointing)
+
+    demo = subparsers.add_parser("demo", help="the pointing experiment on the packaged simulated rover")
+    _add_common(demo, out_help="folder for the report (default mastctl_demo)")
+    demo.add_argument(
+        "--head", choices=("ptu_d46_70", "dynamixel_x"), default="ptu_d46_70", help="simulated head"
+    )
+    demo.set_defaults(run=run_demo, out=Path("mastctl_demo"))
+
+
+def _add_common(parser: argparse.ArgumentParser, out_help: str) -> None:
+    """Options that both commands take."""
+    parser.add_argument(
+        "--targets",
+        type=_count,
+        default=DEFAULT_TARGETS,
+        metavar="N",
+        help="targets at each distance (default 10)",
+    )
+    parser.add_argument(
+        "--seed", type=_seed, default=1, metavar="S", help="chooses views and pixels (default 1)"
+    )
+    parser.add_argument("--out", type=Path, metavar="DIR", help=out_help)
+
+
+def _count(text: str) -> int:
+    """Read a count above zero."""
+    return _whole(text, 1)
+
+
+def _seed(text: str) -> int:
+    """Read a seed: zero or above."""
+    return _whole(text, 0)
+
+
+def _whole(text: str, least: int) -> int:
+    """Read a whole number of at least ``least``."""
+    if not text.isascii() or not text.isdigit() or int(text) < least:
+        raise argparse.ArgumentTypeError(f"'{text}' where a whole number of at least {least} is expected")
+    return int(text)
+
+
+def run_pointing(args: argparse.Namespace) -> int:
+    """Run the experiment on the daemon that --url or --config names."""
+    from mastctl.cli.service import client_of
+
+    with client_of(args) as client:
+        return _report(args, _run(args, client, tuple(args.distances), None, ()))
+
+
+def run_demo(args: argparse.Namespace) -> int:
+    """Start the packaged simulated rover behind a daemon on a free port, and run the experiment on it."""
+    from mastctl.client import Client
+    from mastctl.config import load_config
+    from mastctl.daemon import RunningDaemon
+    from mastctl.experiment.demo import SimulationTruth, demo_config, head_note
+
+    _check_writable(args.out)
+    config = demo_config(load_config(None), head=args.head, seed=args.seed)
+    with _waiting(
+        args, "building the simulated rover and its ground (the first time also compiling the renderer)"
+    ):
+        daemon = RunningDaemon(config)
+    with daemon, Client(daemon.url) as client:
+        rover = daemon.hardware.simulation
+        assert rover is not None  # the packaged configuration is a simulated rover
+        notes = (head_note(rover, daemon.service.stored.rig),)
+        output.tell(f"simulated rover at {daemon.url}, head {args.head}")
+        experiment = _run(args, client, DEFAULT_DISTANCES_M, SimulationTruth(rover), notes)
+    return _report(args, experiment)
+
+
+def _waiting(args: argparse.Namespace, what: str) -> Any:
+    """Show on stderr what a person is waiting for."""
+    from rich.console import Console
+
+    return Console(stderr=True, quiet=args.json).status(what)
+
+
+def _run(
+    args: argparse.Namespace,
+    client: Client,
+    distances_m: tuple[float, ...],
+    truth: Truth | None,
+    notes: tuple[str, ...],
+) -> PointingExperiment:
+    """Run with a progress bar on stderr, one step a target."""
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
+    from mastctl.experiment.pointing import TargetRecord, run_pointing_experiment
+
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+    with Progress(*columns, console=Console(stderr=True, quiet=args.json)) as progress:
+        task = progress.add_task("pointing", total=args.targets * len(distances_m))
+
+        def show(record: TargetRecord) -> None:
+            if record.error:
+                progress.console.print(
+                    f"{record.distance_m:g} m, target {record.index}: {record.error}", style="red"
+                )
+            progress.update(task, advance=1, description=f"pointing at {record.distance_m:g} m")
+
+        return run_pointing_experiment(
+            client,
+            targets=args.targets,
+            distances_m=distances_m,
+            seed=args.seed,
+            truth=truth,
+            notes=notes,
+            on_target=show,
+            keep_pictures=args.out is not None,
+        )
+
+
+def _report(args: argparse.Namespace, experiment: PointingExperiment) -> int:
+    """Write the report if asked, print the table or the document; 1 if no target at all landed."""
+    from mastctl.experiment.report import table_rows, write_report
+
+    page = write_report(experiment, args.out) if args.out is not None else None
+    if args.json:
+        document = experiment.as_json()
+        if page is not None:
+            document["report"] = str(page)
+        output.print_json(document)
+    else:
+        headings, rows = table_rows(experiment.summaries)
+        notes = [*experiment.notes, *([f"report: {page}"] if page is not None else [])]
+        output.print_table(
+            f"Pointing residuals, rms px ({experiment.camera}, {experiment.status.get('hardware')} hardware)",
+            headings, rows, notes,
+        )  # fmt: skip
+    return 0 if any(record.landings for record in experiment.records) else 1
+
+
+def _check_writable(folder: Path) -> None:
+    """Refuse an impossible --out before the minutes of the run, not after them."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        probe = folder / ".writable"
+        probe.touch()
+        probe.unlink()
+    except OSError as error:
+        raise output.CommandError("file_system", f"--out {folder}: {error.strerror}", exit_code=2) from error

@@ -1,0 +1,1 @@
+"""The paper's experiments, run through the HTTP interface of any daemon, simulated or real."""

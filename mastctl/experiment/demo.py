@@ -1,0 +1,67 @@
+"""The demo: the pointing experiment on the packaged simulated rover, with the truth beside each measurement."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from calib.mast import Rig
+from calib.rigid import FloatArray
+from drivers.sim.rover import SimulatedRover
+from mastctl.config import Config, Listen
+
+
+def demo_config(config: Config, *, head: str, seed: int) -> Config:
+    """Return the packaged configuration on any free port, with the head and the seed of the demo."""
+    simulation = {**config.hardware.simulation, "head": head, "seed": seed}
+    return replace(config, listen=Listen(port=0), hardware=replace(config.hardware, simulation=simulation))
+
+
+def head_note(rover: SimulatedRover, rig: Rig) -> str:
+    """Return a sentence that says what the head's counts and backlash allow, in pixels of the first stereo pair."""
+    camera = next(iter(rig.stereo.values()))[0]
+    model = rig.cameras[camera].model
+    # A pixel's step of the ray at the image centre: what a turn of the head moves the picture by.
+    x, y = model.image_center_px
+    rays = model.ray([[x - 0.5, y], [x + 0.5, y]]).directions
+    px_per_rad = 1.0 / float(((rays[1] - rays[0]) ** 2).sum() ** 0.5)
+    head = rover.settings.head
+    axis = head.pan
+    count_px, backlash_px = axis.count_rad * px_per_rad, axis.backlash_rad * px_per_rad
+    told = (
+        f"head {head.name}: one count is {count_px:.2f} px of {camera}, so rounding alone leaves "
+        f"{count_px / 12**0.5:.2f} px rms an axis; backlash {backlash_px:.2f} px"
+    )
+    if axis.approach_rad > 0:
+        return f"{told}, taken up by always approaching from one side."
+    return f"{told}, not taken up: a residual of up to {(backlash_px + count_px) / 2:.1f} px an axis is the head's own."
+
+
+class SimulationTruth:
+    """Where a clicked point really is in a later frame, told by the simulated rover (`experiment.pointing.Truth`)."""
+
+    def __init__(self, rover: SimulatedRover) -> None:
+        self._rover = rover
+        self._points: dict[tuple[str, tuple[float, float]], FloatArray | None] = {}
+
+    def residual_px(
+        self,
+        clicked_frame_id: str,
+        clicked_px: tuple[float, float],
+        landed_frame_id: str,
+        aim_px: tuple[float, float],
+    ) -> tuple[float, float] | None:
+        """Return the true residual (x, y) in pixels, or None if the click hit the sky."""
+        key = (clicked_frame_id, clicked_px)
+        if key not in self._points:
+            self._points[key] = self._rover.true_point(*_camera_and_sequence(clicked_frame_id), clicked_px)
+        point = self._points[key]
+        if point is None:
+            return None
+        x, y = self._rover.true_pixel(*_camera_and_sequence(landed_frame_id), point)
+        return float(x) - aim_px[0], float(y) - aim_px[1]
+
+
+def _camera_and_sequence(frame_id: str) -> tuple[str, int]:
+    """Take a frame's name apart: ``navcam_left-000123``."""
+    camera, _, sequence = frame_id.rpartition("-")
+    return camera, int(sequence)

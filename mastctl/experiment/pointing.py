@@ -1,0 +1,395 @@
+"""The paper's pointing experiment (section IV, Table VI) through the HTTP interface of a running daemon.
+
+For each distance: look at the ground there, choose a textured pixel of the left image at random, ask the daemon
+to point at it twice, and take the residuals that the daemon measured in new images. A target that fails is a row
+of its own with the reason; it never leaves the record.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Protocol
+
+import numpy as np
+
+from calib import pointing
+from calib.errors import Unreachable
+from calib.mast import Rig
+from calib.store import parse_rig
+from drivers.interfaces import Image
+from mastctl.client import Client, ClientError
+from mastctl.experiment.targets import Target, choose_target
+
+# Rms pixel errors (x, y) of the paper's Table VI: first and second pointing at each distance in metres.
+PAPER_TABLE_VI: Mapping[float, tuple[tuple[float, float], tuple[float, float]]] = {
+    10.0: ((0.591, 1.219), (0.527, 0.778)),
+    6.0: ((0.743, 1.243), (0.596, 0.844)),
+    2.0: ((1.260, 0.925), (0.672, 0.921)),
+}
+
+# How far to either side of straight ahead the targets lie: the pan range of the paper's calibration, section III.C.
+PAN_RANGE_RAD = 1.0
+# A view that offers no usable target is left for another; after this many in a row the distance is given up.
+VIEWS_PER_TARGET = 12
+OPERATION_TIMEOUT_S = 60.0
+
+
+class Truth(Protocol):
+    """What only a simulation knows: where the clicked point really is in a later frame."""
+
+    def residual_px(
+        self,
+        clicked_frame_id: str,
+        clicked_px: tuple[float, float],
+        landed_frame_id: str,
+        aim_px: tuple[float, float],
+    ) -> tuple[float, float] | None:
+        """Return the true residual (x, y) in pixels, or None if the click hit the sky."""
+        ...
+
+
+@dataclass(frozen=True)
+class Landing:
+    """One pointing of a target: the measured residual, its sigma, the true one where it is known."""
+
+    residual_px: tuple[float, float]
+    sigma_px: tuple[float, float]
+    frame_id: str
+    true_px: tuple[float, float] | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class TargetRecord:
+    """One target: what was clicked, where it landed, or why it failed; pictures where they were kept."""
+
+    distance_m: float
+    index: int
+    camera: str
+    frame_id: str
+    clicked_px: tuple[float, float]
+    range_m: float
+    pan_before_rad: float
+    tilt_before_rad: float
+    landings: tuple[Landing, ...]
+    error: str = ""
+    seconds: float = 0.0
+    operation: Mapping[str, Any] = field(default_factory=dict)
+    clicked_image: Image | None = None
+    landed_images: tuple[Image, ...] = ()
+
+
+@dataclass(frozen=True)
+class DistanceSummary:
+    """One row of the table. ``*_rms_px`` is None where no target landed."""
+
+    distance_m: float
+    targets: int
+    failed: int
+    first_rms_px: tuple[float, float] | None
+    second_rms_px: tuple[float, float] | None
+    true_first_rms_px: tuple[float, float] | None
+    true_second_rms_px: tuple[float, float] | None
+    worst_first_px: float | None
+    seconds: float
+
+
+@dataclass(frozen=True, eq=False)
+class PointingExperiment:
+    """What was run and what came out."""
+
+    url: str
+    status: Mapping[str, Any]
+    seed: int
+    camera: str
+    aim_px: tuple[float, float]
+    records: tuple[TargetRecord, ...]
+    summaries: tuple[DistanceSummary, ...]
+    started: str
+    seconds: float
+    notes: tuple[str, ...] = ()
+
+    def as_json(self) -> dict[str, Any]:
+        """Return the document of contract section 3, with what else is known of each distance."""
+        return {
+            "url": self.url,
+            "hardware": self.status.get("hardware"),
+            "camera": self.camera,
+            "seed": self.seed,
+            "seconds": round(self.seconds, 2),
+            "distances": [_row_as_json(row) for row in self.summaries],
+            "notes": list(self.notes),
+            "failures": [
+                {"distance_m": r.distance_m, "target": r.index, "error": r.error}
+                for r in self.records
+                if r.error
+            ],
+        }
+
+
+def _row_as_json(row: DistanceSummary) -> dict[str, Any]:
+    """One distance for programs; the keys of the contract first."""
+    document: dict[str, Any] = {
+        "distance_m": row.distance_m,
+        "targets": row.targets,
+        "first_rms_px": row.first_rms_px,
+        "second_rms_px": row.second_rms_px,
+        "seconds": round(row.seconds, 2),
+        "failed": row.failed,
+        "worst_first_px": row.worst_first_px,
+    }
+    if row.true_first_rms_px is not None:
+        document["true_first_rms_px"] = row.true_first_rms_px
+        document["true_second_rms_px"] = row.true_second_rms_px
+    paper = PAPER_TABLE_VI.get(row.distance_m)
+    if paper is not None:
+        document["paper_first_rms_px"], document["paper_second_rms_px"] = paper
+    return document
+
+
+def run_pointing_experiment(
+    client: Client,
+    *,
+    targets: int,
+    distances_m: Sequence[float] = (10.0, 6.0, 2.0),
+    seed: int = 1,
+    truth: Truth | None = None,
+    notes: Sequence[str] = (),
+    on_target: Callable[[TargetRecord], None] | None = None,
+    keep_pictures: bool = True,
+) -> PointingExperiment:
+    """Run the experiment and return its record.
+
+    Parameters
+    ----------
+    client
+        A client of the daemon that moves the mast.
+    targets
+        Targets at each distance.
+    distances_m
+        Ranges from the camera to the ground where targets are looked for.
+    seed
+        Chooses views and pixels; the same seed asks for the same views.
+    truth
+        Where the click really is in a later frame; only a simulation knows.
+    notes
+        Sentences for the reader of the table, carried into the record.
+    on_target
+        Called after each target, failed or not.
+    keep_pictures
+        Whether the chosen and the landed images stay in the records, for the report.
+
+    Raises
+    ------
+    ClientError
+        If the daemon cannot be reached or refuses for another reason than the target itself.
+    """
+    started, begun_s = time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()), time.monotonic()
+    status = client.status()
+    rig = parse_rig(client.mast_file(), "the daemon's mast file").rig
+    pair = _head_pair(rig, set(status["cameras"]))
+    aim_px = rig.cameras[pair[0]].model.image_center_px
+    bench = _Bench(client, rig, pair, status["limits"], np.random.default_rng(seed), truth, keep_pictures)
+    records: list[TargetRecord] = []
+    summaries = []
+    for distance_m in distances_m:
+        distance_begun_s = time.monotonic()
+        rows = []
+        for index in range(targets):
+            record = bench.one_target(distance_m, index)
+            rows.append(record)
+            if on_target is not None:
+                on_target(record)
+        records += rows
+        summaries.append(summarise(distance_m, rows, time.monotonic() - distance_begun_s))
+    return PointingExperiment(
+        client.url, status, seed, pair[0], aim_px, tuple(records), tuple(summaries), started,
+        time.monotonic() - begun_s, tuple(notes),
+    )  # fmt: skip
+
+
+def summarise(distance_m: float, rows: Sequence[TargetRecord], seconds: float) -> DistanceSummary:
+    """Return the table's row for the records of one distance; failed targets are counted, not averaged."""
+    firsts = [row.landings[0] for row in rows if len(row.landings) > 0]
+    seconds_ = [row.landings[1] for row in rows if len(row.landings) > 1]
+    return DistanceSummary(
+        distance_m=distance_m,
+        targets=len(rows),
+        failed=sum(bool(row.error) for row in rows),
+        first_rms_px=rms([landing.residual_px for landing in firsts]),
+        second_rms_px=rms([landing.residual_px for landing in seconds_]),
+        true_first_rms_px=rms([landing.true_px for landing in firsts if landing.true_px is not None]),
+        true_second_rms_px=rms([landing.true_px for landing in seconds_ if landing.true_px is not None]),
+        worst_first_px=max((math.hypot(*landing.residual_px) for landing in firsts), default=None),
+        seconds=seconds,
+    )
+
+
+def rms(pairs: Sequence[tuple[float, float]]) -> tuple[float, float] | None:
+    """Return the root mean square of each column about zero, or None of nothing."""
+    if not pairs:
+        return None
+    x, y = np.sqrt(np.mean(np.square(np.array(pairs, dtype=float)), axis=0))
+    return float(x), float(y)
+
+
+def _head_pair(rig: Rig, served: set[str]) -> tuple[str, str]:
+    """The stereo pair to point with: on the head, both eyes served; the Navcam where there is one."""
+    pairs = {
+        name: pair
+        for name, pair in rig.stereo.items()
+        if all(camera in served and rig.cameras[camera].on == "head" for camera in pair)
+    }
+    if not pairs:
+        raise ClientError(
+            "no_stereo_pair", "the daemon serves no stereo pair on the head, so nothing can be ranged"
+        )
+    return pairs.get("navcam") or next(iter(pairs.values()))
+
+
+class _Bench:
+    """The running experiment: the daemon, the rig as the daemon believes it, the dice."""
+
+    def __init__(
+        self,
+        client: Client,
+        rig: Rig,
+        pair: tuple[str, str],
+        limits: Mapping[str, Any],
+        rng: np.random.Generator,
+        truth: Truth | None,
+        keep_pictures: bool,
+    ) -> None:
+        self._client = client
+        self._rig = rig
+        self._pair = pair
+        self._pan_limits_rad = (float(limits["pan_rad"][0]), float(limits["pan_rad"][1]))
+        self._tilt_limits_rad = (float(limits["tilt_rad"][0]), float(limits["tilt_rad"][1]))
+        self._rng = rng
+        self._truth = truth
+        self._keep_pictures = keep_pictures
+
+    def one_target(self, distance_m: float, index: int) -> TargetRecord:
+        """Find one target at the distance, point at it twice, and return the record of it."""
+        begun_s = time.monotonic()
+        reason = ""
+        for _ in range(VIEWS_PER_TARGET):
+            try:
+                target = self._look_for_target(distance_m)
+            except ClientError as error:
+                reason = f"looking for a target: {error}"
+                break
+            if target is not None:
+                return self._point_at(target, distance_m, index, begun_s)
+        reason = reason or f"no textured target found at {distance_m:g} m in {VIEWS_PER_TARGET} views"
+        nan = math.nan
+        return TargetRecord(
+            distance_m,
+            index,
+            self._pair[0],
+            "",
+            (nan, nan),
+            nan,
+            nan,
+            nan,
+            (),
+            reason,
+            time.monotonic() - begun_s,
+        )
+
+    def _look_for_target(self, distance_m: float) -> Target | None:
+        """Turn to a random piece of ground at the distance and choose a pixel there; None if it offers none."""
+        angles = self._angles_towards(distance_m)
+        if angles is None:
+            return None
+        operation = self._client.wait(
+            self._client.point(pan_rad=angles[0], tilt_rad=angles[1]), timeout_s=OPERATION_TIMEOUT_S
+        )
+        if operation["state"] != "done":
+            error = operation.get("error") or {}
+            raise ClientError(
+                str(error.get("code", operation["state"])), str(error.get("message", "the move was stopped"))
+            )
+        left, right = (self._client.snapshot(camera) for camera in self._pair)
+        models = tuple(
+            self._rig.camera_in_rover(shot.camera, shot.pan_rad, shot.tilt_rad) for shot in (left, right)
+        )
+        return choose_target(left, right, models[0], models[1], distance_m, self._rng)
+
+    def _angles_towards(self, distance_m: float) -> tuple[float, float] | None:
+        """Joint angles that look at level ground at the range, in a random direction; None outside the limits."""
+        mast = self._rig.mast
+        head_in_rover_m = mast.rover_from_head(0.0, 0.0).translation_m
+        height_m = -float(head_in_rover_m[2])
+        along_m = math.sqrt(max(distance_m**2 - height_m**2, 0.0))
+        azimuth_rad = self._rng.uniform(-PAN_RANGE_RAD, PAN_RANGE_RAD)
+        point_m = np.array(
+            [
+                head_in_rover_m[0] + along_m * math.cos(azimuth_rad),
+                head_in_rover_m[1] + along_m * math.sin(azimuth_rad),
+                0.0,
+            ]
+        )
+        try:
+            solutions = pointing.solve(mast, self._rig.cameras[self._pair[0]].model, point_m)
+            chosen = pointing.choose(solutions, self._pan_limits_rad, self._tilt_limits_rad)
+        except Unreachable:
+            return None
+        return chosen.pan_rad, chosen.tilt_rad
+
+    def _point_at(self, target: Target, distance_m: float, index: int, begun_s: float) -> TargetRecord:
+        """Ask the daemon for two pointings and write down what it measured."""
+        error, operation = "", {}
+        try:
+            operation = self._client.wait(
+                self._client.point(
+                    pixel=(target.shot.camera, target.shot.frame_id, target.x_px, target.y_px), pointings=2
+                ),
+                timeout_s=OPERATION_TIMEOUT_S,
+            )
+            if operation["state"] != "done":
+                told = operation.get("error") or {}
+                error = f"{told.get('code', operation['state'])}: {told.get('message', 'stopped')}"
+        except ClientError as refusal:
+            error = f"{refusal.code}: {refusal}"
+        landings = tuple(self._landing(target, entry) for entry in operation.get("pointings") or ())
+        images: tuple[Image, ...] = ()
+        if self._keep_pictures:
+            images = tuple(
+                self._client.snapshot(target.shot.camera, frame_id=landing.frame_id).image
+                for landing in landings
+            )
+        return TargetRecord(
+            distance_m=distance_m,
+            index=index,
+            camera=target.shot.camera,
+            frame_id=target.shot.frame_id,
+            clicked_px=(target.x_px, target.y_px),
+            range_m=target.range_m,
+            pan_before_rad=target.shot.pan_rad,
+            tilt_before_rad=target.shot.tilt_rad,
+            landings=landings,
+            error=error,
+            seconds=time.monotonic() - begun_s,
+            operation=operation,
+            clicked_image=target.shot.image if self._keep_pictures else None,
+            landed_images=images,
+        )
+
+    def _landing(self, target: Target, entry: Mapping[str, Any]) -> Landing:
+        """One entry of the operation's ``pointings``, with the true residual where it is known."""
+        aim_px = self._rig.cameras[self._pair[0]].model.image_center_px
+        true_px = None
+        if self._truth is not None:
+            true_px = self._truth.residual_px(
+                target.shot.frame_id, (target.x_px, target.y_px), str(entry["frame_id"]), aim_px
+            )
+        residual, sigma = entry["residual_px"], entry["residual_sigma_px"]
+        return Landing(
+            (float(residual[0]), float(residual[1])),
+            (float(sigma[0]), float(sigma[1])),
+            str(entry["frame_id"]),
+            true_px,
+        )
