@@ -1,0 +1,44 @@
+"""A small rig, and one scene for all tests of the simulated rover."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from calib.mast import Rig, RigCamera
+from calib.store import load_rig, save_rig
+from drivers.sim import rover
+from drivers.sim.scene import Scene, SceneSettings, build_scene
+
+SHRINK = 4
+
+
+@pytest.fixture(scope="session")
+def scene() -> Scene:
+    """The scene of seed 1 with ten rocks."""
+    return build_scene(SceneSettings(seed=1, rocks=10))
+
+
+@pytest.fixture
+def one_scene(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Every simulated rover gets the same scene, whatever it asks for: building one takes seconds."""
+    monkeypatch.setattr(rover, "build_scene", lambda settings: scene)
+
+
+@pytest.fixture(scope="session")
+def small_rig(repository: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The shipped true rig with images a quarter as large, in a file of its own."""
+    rig = load_rig(repository / "configs" / "sim" / "rocky8.yaml").rig
+    cameras = {}
+    for name, camera in rig.cameras.items():
+        m = camera.model
+        # The centre of the top-left pixel is (0, 0), so x = (x' + 0.5) / 4 - 0.5.
+        size = (m.size_px[0] // SHRINK, m.size_px[1] // SHRINK)
+        shift = (0.5 / SHRINK - 0.5) * m.A
+        model = replace(m, size_px=size, H=m.H / SHRINK + shift, V=m.V / SHRINK + shift)
+        cameras[name] = RigCamera(camera.on, model)
+    path = tmp_path_factory.mktemp("rig") / "small.yaml"
+    save_rig(Rig("small", rig.mast, cameras, rig.stereo), path)
+    return path

@@ -1,0 +1,140 @@
+"""The package of docs/drivers.md, installed from outside the repository, works as head and cameras."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from calib.pointing import solve
+from calib.store import load_rig
+from drivers.errors import BadOptions, NoFreshFrame, NoReply
+from drivers.interfaces import PanTilt
+from drivers.open_hardware import DeviceSettings, Hardware, HardwareSettings, open_hardware
+
+LANDED_WITHIN_PX = 0.6
+"""Peak of a plain correlation to the whole pixel, and a floor seen from another side."""
+
+
+@pytest.fixture(scope="module")
+def sources(repository: Path) -> dict[str, str]:
+    """File name to text, from the code blocks of the page that follow a file's name."""
+    page = (repository / "docs" / "drivers.md").read_text()
+    return dict(re.findall(r"`([\w/]+\.(?:py|toml))`[^\n]*:\n\n```\w+\n(.*?)```", page, re.DOTALL))
+
+
+@pytest.fixture(scope="module")
+def installed(sources: dict[str, str], tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """The package, installed by pip into a folder of its own that is on the path."""
+    project, target = tmp_path_factory.mktemp("project"), tmp_path_factory.mktemp("installed")
+    for name, text in sources.items():
+        path = project / name
+        path.parent.mkdir(exist_ok=True)
+        path.write_text(text)
+    (project / "bench_rig" / "__init__.py").touch()
+    options = "--quiet --no-deps --no-index --no-build-isolation --disable-pip-version-check"
+    done = subprocess.run(
+        [sys.executable, "-m", "pip", "install", *options.split(), "--target", str(target), str(project)],
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
+    assert done.returncode == 0, done.stderr
+    sys.path.insert(0, str(target))
+    yield target
+    sys.path.remove(str(target))
+    for name in [name for name in sys.modules if name.split(".")[0] == "bench_rig"]:
+        del sys.modules[name]
+
+
+@pytest.fixture(scope="module")
+def mast_file(repository: Path) -> Path:
+    return repository / "configs" / "masts" / "rocky8_simulated.yaml"
+
+
+@pytest.fixture
+def hardware(installed: Path, mast_file: Path) -> Iterator[Hardware]:
+    camera = "bench_rig.camera:open_camera"
+    cameras = {
+        name: DeviceSettings(camera, {"mast_file": str(mast_file), "name": name})
+        for name in ("navcam_left", "navcam_right")
+    }
+    head = DeviceSettings("bench_rig.head:open_head", {"speed_rad_per_s": 1.5})
+    with open_hardware(HardwareSettings(head, cameras)) as hardware:
+        yield hardware
+
+
+@pytest.mark.parametrize("name", ["bench_rig/head.py", "bench_rig/camera.py"])
+def test_each_driver_takes_under_sixty_lines(sources: dict[str, str], name: str) -> None:
+    assert 20 < len(sources[name].splitlines()) < 60
+
+
+def test_the_package_comes_from_outside_the_repository(
+    hardware: Hardware, installed: Path, repository: Path
+) -> None:
+    module = sys.modules[type(hardware.pan_tilt).__module__]
+    assert Path(str(module.__file__)).is_relative_to(installed)
+    assert not installed.is_relative_to(repository)
+    assert hardware.kind == "real" and isinstance(hardware.pan_tilt, PanTilt)
+
+
+def wait_until_still(head: PanTilt) -> None:
+    deadline_s = time.monotonic() + 20
+    while head.read().moving:
+        assert time.monotonic() < deadline_s, "the head never settled"
+        time.sleep(0.01)
+
+
+def test_a_spot_of_the_floor_is_pointed_at(hardware: Hardware, mast_file: Path) -> None:
+    """Where a spot of the first picture lands is measured by correlation, not by the geometry that aimed."""
+    rig = load_rig(mast_file).rig
+    head, eye = hardware.pan_tilt, hardware.cameras["navcam_left"]
+    head.move(0.2, -0.5)
+    wait_until_still(head)
+    before = eye.next_frame(time.monotonic(), 5.0).image
+    reading = head.read()
+    spot_px = np.array([560, 420])
+    rays = rig.camera_in_rover("navcam_left", reading.pan_rad, reading.tilt_rad).ray(spot_px)
+    spot_in_rover_m = rays.origins_m - rays.origins_m[2] / rays.directions[2] * rays.directions
+    camera = rig.cameras["navcam_left"].model
+    aim = solve(rig.mast, camera, spot_in_rover_m)[0]
+    head.move(aim.pan_rad, aim.tilt_rad)
+    wait_until_still(head)
+    after = eye.next_frame(time.monotonic(), 5.0).image
+    x, y = spot_px
+    template = before[y - 15 : y + 16, x - 15 : x + 16]
+    score = cv2.matchTemplate(after, template, cv2.TM_CCOEFF_NORMED)
+    _, best, _, corner = cv2.minMaxLoc(score)
+    assert best > 0.8
+    landed_px = np.array(corner) + 15
+    assert np.abs(landed_px - camera.image_center_px).max() < LANDED_WITHIN_PX + 0.5
+
+
+def test_it_keeps_the_promises_of_the_page(hardware: Hardware) -> None:
+    head, eye = hardware.pan_tilt, hardware.cameras["navcam_right"]
+    asked_s = time.monotonic()
+    frame = eye.next_frame(asked_s, 5.0)
+    assert frame.mid_exposure_s - frame.exposure_s / 2 > asked_s
+    with pytest.raises(NoFreshFrame):
+        eye.next_frame(time.monotonic() + 10, 0.05)
+    head.move(0.5, 0.0)
+    assert head.read().moving
+    head.stop()
+    stopped = head.read()
+    assert not stopped.moving and stopped.pan_rad < 0.4
+    head.close()
+    with pytest.raises(NoReply):
+        head.read()
+
+
+def test_options_it_refuses_are_told_in_its_own_words(installed: Path) -> None:
+    head = DeviceSettings("bench_rig.head:open_head", {"speed_rad_per_s": -1})
+    with pytest.raises(BadOptions, match="bench head: speed_rad_per_s is -1, expected a positive number"):
+        open_hardware(HardwareSettings(head, {}))
