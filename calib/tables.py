@@ -77,8 +77,8 @@ def write_table(stream: TextIO, columns: Sequence[str], values: FloatArray) -> N
     """Write (rows, columns) numbers as CSV; a row with a number that is not finite becomes empty cells."""
     stream.write(",".join(columns) + "\n")
     empty = "," * (len(columns) - 1) + "\n"
-    finite: list[bool] = np.isfinite(values).all(axis=1).tolist()
-    rows = zip(values.tolist(), finite, strict=True)
+    finite = np.logical_and.reduce(np.isfinite(values), axis=1)
+    rows = zip(values.tolist(), finite.tolist(), strict=True)
     stream.writelines(",".join(map(repr, row)) + "\n" if good else empty for row, good in rows)
 
 

@@ -135,9 +135,15 @@ def build_model(
             model, shift_px = CameraModel.normalised(
                 kind,
                 size_px,
-                **arrays,
-                cahvore_type=cahvore_type,
-                linearity=1.0 if linearity is None else linearity,
+                arrays["C"],
+                arrays["A"],
+                arrays["H"],
+                arrays["V"],
+                arrays.get("O"),
+                arrays.get("R"),
+                arrays.get("E"),
+                cahvore_type,
+                1.0 if linearity is None else linearity,
             )
     except (ValueError, ArithmeticError, np.linalg.LinAlgError) as error:
         raise BadFile(path, place, f"is no usable camera model: {error}") from None
@@ -145,5 +151,6 @@ def build_model(
         sizes = " and ".join(
             f"|{letter}| = {np.linalg.norm(arrays[letter]):.6g}" for letter in "AO" if letter in arrays
         )
-        notes.append(f"{where}{sizes} made 1, which moves pixels by up to {shift_px:.2g} px")
+        moved = f"by up to {shift_px:.2g} px" if shift_px < LARGEST_IMAGE_PX else "out of the image"
+        notes.append(f"{where}{sizes} made 1, which moves pixels {moved}")
     return model, tuple(notes)
