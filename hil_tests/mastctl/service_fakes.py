@@ -1,4 +1,4 @@
-"""Small devices for the service's tests: a head and cameras that do, or fail to do, what a test tells them."""
+"""Small devices for the service's tests: they do, or fail to do, what a test tells them."""
 
 from __future__ import annotations
 

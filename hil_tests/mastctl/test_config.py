@@ -1,0 +1,168 @@
+"""The configuration: what is wrong is named with file, key, value and what is expected."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from service_fakes import rig
+
+from calib.errors import BadFile
+from mastctl.config import Config, Listen, check_cameras, load_config, parse_config
+from mastctl.packaged import config_folder, default_config
+
+GOOD: dict[str, Any] = {
+    "schema": "mastctl/config/1",
+    "mast_file": "masts/little.yaml",
+    "listen": {"host": "127.0.0.1", "port": 0},
+    "pan_tilt": {"driver": "sim"},
+    "cameras": {"navcam_left": {"driver": "somewhere.cameras:open_it", "options": {"path": "/dev/null"}}},
+    "limits": {"pan_rad": [-2.6, 2.6], "tilt_rad": [-1.2, 0.7], "speed_rad_per_s": 1.0},
+}
+
+
+def changed(place: str, value: Any) -> bytes:
+    """The good configuration with one key changed, or removed by ``...``."""
+    document: dict[str, Any] = yaml.safe_load(yaml.safe_dump(GOOD))
+    holder = document
+    *way, last = place.split("/")
+    for step in way:
+        holder = holder[step]
+    if value is ...:
+        del holder[last]
+    else:
+        holder[last] = value
+    return yaml.safe_dump(document).encode()
+
+
+def parsed(data: bytes) -> Config:
+    return parse_config(data, "rover/daemon.yaml")
+
+
+def test_a_good_configuration_is_read_whole() -> None:
+    config = parsed(yaml.safe_dump(GOOD).encode())
+    assert config.mast_file == Path("rover/masts/little.yaml").resolve()
+    assert config.listen == Listen("127.0.0.1", 0)
+    assert config.limits.tilt_rad == (-1.2, 0.7)
+    assert config.hardware.cameras["navcam_left"].driver == "somewhere.cameras:open_it"
+    assert config.hardware.cameras["navcam_left"].options == {"path": "/dev/null"}
+    assert config.hardware.folder == Path("rover").resolve()
+
+
+def test_an_absolute_mast_file_stays_where_it_is() -> None:
+    assert parsed(changed("mast_file", "/somewhere/mast.yaml")).mast_file == Path("/somewhere/mast.yaml")
+
+
+def test_listen_may_be_left_out_or_be_a_socket() -> None:
+    assert parsed(changed("listen", ...)).listen.url == "http://127.0.0.1:8420"
+    assert (
+        parsed(changed("listen", {"socket": "/run/mast ctl.sock"})).listen.url == "unix:/run/mast%20ctl.sock"
+    )
+    assert parsed(changed("listen", {"host": "::1", "port": 99})).listen.url == "http://[::1]:99"
+
+
+BAD: list[tuple[str, Any, str, str]] = [
+    ("schema", "mastctl/config/2", "schema", "mastctl/config/1"),
+    ("schema", ..., "schema", "mastctl/config/1"),
+    ("mast_fiel", "x", "mast_fiel", "unknown key; the nearest known is 'mast_file'"),
+    ("mast_file", ..., "mast_file", "missing"),
+    ("mast_file", 7, "mast_file", "7 where text is expected"),
+    ("pan_tilt", ..., "pan_tilt", "missing"),
+    ("pan_tilt/drivr", "sim", "pan_tilt.drivr", "the nearest known is 'driver'"),
+    ("pan_tilt/driver", ..., "pan_tilt.driver", "missing"),
+    ("pan_tilt/options", [1], "pan_tilt.options", "a mapping is expected"),
+    ("pan_tilt/options", {"x": float("nan")}, "pan_tilt.options.x", "finite"),
+    ("cameras", {}, "cameras", "at least one"),
+    ("cameras", ["navcam_left"], "cameras", "a mapping is expected"),
+    ("cameras/navcam_left", "v4l2", "cameras.navcam_left", "a mapping with driver"),
+    ("cameras/navcam_left/option", {}, "cameras.navcam_left.option", "the nearest known is 'options'"),
+    ("limits/pan_rad", [1.0], "limits.pan_rad", "[lowest, highest]"),
+    ("limits/pan_rad", [1.0, 1.0], "limits.pan_rad", "below the highest"),
+    ("limits/pan_rad", [2.0, 1.0], "limits.pan_rad", "[2, 1]"),
+    ("limits/pan_rad", [-150, 150], "limits.pan_rad.lowest", "6.2832"),
+    ("limits/tilt_rad", [float("nan"), 1.0], "limits.tilt_rad.lowest", "finite"),
+    ("limits/tilt_rad", [-1.0, float("inf")], "limits.tilt_rad.highest", "finite"),
+    ("limits/tilt_rad", [False, True], "limits.tilt_rad.lowest", "number"),
+    ("limits/tilt_rad", ["-1", "1"], "limits.tilt_rad.lowest", "number"),
+    ("limits/speed_rad_per_s", 0, "limits.speed_rad_per_s", "above 0"),
+    ("limits/speed_rad_per_s", -1.0, "limits.speed_rad_per_s", "above 0"),
+    ("limits/speed_rad_per_s", float("inf"), "limits.speed_rad_per_s", "finite"),
+    ("limits/speed_rad_per_s", ..., "limits.speed_rad_per_s", "missing"),
+    ("limits/tild_rad", [0, 1], "limits.tild_rad", "the nearest known is 'tilt_rad'"),
+    ("listen/port", 65536, "listen.port", "65535"),
+    ("listen/port", "8420", "listen.port", "integer"),
+    ("listen/port", True, "listen.port", "integer"),
+    ("listen/host", "0.0.0.0", "listen.host", "loopback"),
+    ("listen/host", "192.168.1.5", "listen.host", "loopback"),
+    ("listen/host", "::", "listen.host", "loopback"),
+    ("listen/host", "rover.example.org", "listen.host", "loopback"),
+    ("listen/socket", "/run/x.sock", "listen.host", "beside 'socket'"),
+    ("listen", {"socket": "/" + "x" * 120}, "listen.socket", "longer than"),
+    ("simulation", "yes", "simulation", "a mapping is expected"),
+]
+
+
+@pytest.mark.parametrize(
+    ("place", "value", "told_place", "words"), BAD, ids=[f"{b[0]}={b[1]}"[:40] for b in BAD]
+)
+def test_what_is_wrong_is_named(place: str, value: Any, told_place: str, words: str) -> None:
+    with pytest.raises(BadFile) as refused:
+        parsed(changed(place, value))
+    text = str(refused.value)
+    assert text.startswith(f"rover/daemon.yaml: {told_place}: ")
+    assert words in text
+    assert "\n" not in text
+
+
+def test_a_camera_that_the_mast_file_lacks_is_named_with_the_nearest() -> None:
+    config = parsed(changed("cameras", {"navcam_lift": {"driver": "sim"}}))
+    with pytest.raises(BadFile, match=r"cameras\.navcam_lift: .*the nearest known is 'navcam_left'"):
+        check_cameras(config, rig())
+    check_cameras(parsed(yaml.safe_dump(GOOD).encode()), rig())
+
+
+def test_a_file_that_is_not_there_is_named(tmp_path: Path) -> None:
+    with pytest.raises(BadFile, match=r"nowhere\.yaml: cannot be read"):
+        load_config(tmp_path / "nowhere.yaml")
+    with pytest.raises(BadFile, match="cannot be read"):
+        load_config(tmp_path)
+
+
+@settings(max_examples=300, deadline=None)
+@given(st.binary(max_size=400))
+def test_random_bytes_are_refused_in_one_line(data: bytes) -> None:
+    with pytest.raises(BadFile) as refused:
+        parsed(data)
+    assert str(refused.value).startswith("rover/daemon.yaml: ")
+
+
+VALUES = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=8),
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=8), inner, max_size=3),
+    max_leaves=6,
+)
+PLACES = sorted({entry[0] for entry in BAD} | {"cameras/navcam_left/options", "cameras/navcam_left/driver"})
+
+
+@settings(max_examples=300, deadline=None)
+@given(st.sampled_from(PLACES), VALUES)
+def test_any_value_anywhere_is_read_or_refused(place: str, value: Any) -> None:
+    try:
+        config = parsed(changed(place, value))
+    except BadFile:
+        return
+    assert config.limits.pan_rad[0] < config.limits.pan_rad[1]
+    assert config.listen.socket is not None or config.listen.host in ("127.0.0.1", "localhost", "::1")
+
+
+def test_the_packaged_configuration_is_the_simulated_rover() -> None:
+    assert default_config().parent == config_folder()
+    config = load_config()
+    assert config.path == default_config()
+    assert config.hardware.pan_tilt.driver == "sim"
+    assert {device.driver for device in config.hardware.cameras.values()} == {"sim"}
+    assert config.mast_file.is_file()
