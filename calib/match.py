@@ -158,7 +158,7 @@ def match(
         -search_px <= seen[0] <= width - 1 + search_px and -search_px <= seen[1] <= height - 1 + search_px
     ):
         return no_match("border", f"the target is expected at {_at(seen)}, outside the picture", seen)
-    template = _template(source_image, source, target, plane, destination, settings)
+    template = _template(source_image, source, target, plane, destination, seen, settings)
     if template is None:
         return no_match("border", f"the patch around {_at(target)} is cut by the picture's border", seen)
     half = template.values.shape[0] // 2
@@ -262,15 +262,18 @@ def _template(
     target: FloatArray,
     plane: Plane,
     destination: CameraModel,
+    seen: FloatArray,
     settings: MatchSettings,
 ) -> Template | None:
-    """Warp the largest patch that the source picture holds, sized by the coarser of the two pictures."""
+    """Warp the largest patch that both pictures hold, sized by the coarser of the two."""
     probe = warp_patch(image, source, target, plane, destination, 1)
     if probe is None:
         return None
     grown = max(1.0, probe.magnification)
     half = min(round(settings.half_px * grown), settings.most_half_px)
     least = round(settings.smallest_half_px * min(grown, settings.most_half_px / settings.half_px))
+    edge = int(min(*seen, *(np.array(destination.size_px) - 1 - seen))) - 4
+    half = min(half, max(edge, least))
     while half >= least:
         template = warp_patch(image, source, target, plane, destination, half)
         if template is not None:

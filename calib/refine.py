@@ -3,8 +3,8 @@
 Model (Gruen 1985, Foerstner 1982): I(p + (1 + D) q) = g T(q) + b over the patch's offsets q from the target,
 with the position p (2), the small deformation D (2x2), the gain g and the offset b free. Gauss-Newton on the
 grey differences r, with the template's gradient for the image's: step = -(WᵀJ)⁻¹ Wᵀ r. J (n, 8) holds the
-model's derivatives; W the same of the slightly smoothed template (instrumental variables: the template's own noise
-is in r too, and must not weigh it).
+model's derivatives; W the same of the slightly smoothed template (instrumental variables: the template's own
+noise is in r too, and must not weigh it).
 
 Covariance, with N = WᵀJ:
 

@@ -78,7 +78,9 @@ class TexturedPlane:
         normal = self.normal / np.linalg.norm(self.normal)
         side = np.cross(normal, [0.0, 0.0, 1.0] if abs(normal[2]) < 0.9 else [0.0, 1.0, 0.0])
         side /= np.linalg.norm(side)
-        return np.array([side, np.cross(normal, side)])
+        other = np.cross(normal, side)
+        c, s = np.cos(0.4), np.sin(0.4)  # so that the texture's period lies along no epipolar line
+        return np.array([c * side + s * other, -s * side + c * other])
 
     def hit(self, origin_m: NDArray[np.float64], directions: NDArray[np.float64]) -> NDArray[np.float64]:
         reach = ((self.point_m - origin_m) @ self.normal) / (directions @ self.normal)
@@ -92,7 +94,7 @@ class TexturedPlane:
 def random_texture(
     seed: int, shortest_texels: float = 10.0, size: int = 1024, contrast_dn: float = 25.0
 ) -> NDArray[np.float64]:
-    """A periodic texture of mean 120 with all wavelengths from ``shortest_texels`` to a quarter of its size."""
+    """A periodic texture of mean 120, wavelengths from ``shortest_texels`` to a quarter of its size."""
     rng = np.random.default_rng(seed)
     frequency = np.hypot(*np.meshgrid(np.fft.fftfreq(size), np.fft.fftfreq(size)))
     keep = (frequency > 4 / size) & (frequency < 1 / shortest_texels)
@@ -104,7 +106,7 @@ def random_texture(
 def picture(
     camera: Pinhole, plane: TexturedPlane, samples: int = 3, noise_dn: float = 0.0, seed: int = 0
 ) -> NDArray[np.float32]:
-    """The plane as the camera's sensor sees it: the mean of ``samples``² exact rays a pixel, noise, no rounding."""
+    """The plane as the camera sees it: the mean of ``samples``² exact rays a pixel, noise, no rounding."""
     width, height = camera.size_px
     grid = np.stack(np.meshgrid(np.arange(width, dtype=float), np.arange(height, dtype=float)), axis=-1)
     total = np.zeros((height, width))

@@ -1,0 +1,212 @@
+"""Matching against exact pictures of textured planes; the truth is the test's own pinhole geometry."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+import pytest
+from pictures import Pinhole, TexturedPlane, picture, random_texture
+
+from calib.epipolar import find_partner
+from calib.errors import CalibError
+from calib.match import Match, match
+from calib.warp import Plane, carry, facing_plane, grey
+
+FOCAL_PX = 1290.0  # the paper's Navcam
+SIZE_PX = (360, 280)
+NOISE_DN = 2.0
+MEAN_PX, RMS_PX = 0.01, 0.05  # what the pictures of the simulated rover are asked to allow
+HONEST = (0.75, 1.3)  # rms of errors over their own sigmas
+
+
+def wall(
+    seed: int, normal: tuple[float, float, float] = (-1.0, 0.2, -0.3), **texture: float
+) -> TexturedPlane:
+    return TexturedPlane(
+        np.array([4.0, 0.0, 0.0]), np.array(normal), random_texture(seed, 8.0, 1024, **texture), 0.0012
+    )
+
+
+LEFT = Pinhole(np.zeros(3), 0.0, 0.0, FOCAL_PX, SIZE_PX)
+TURNED = Pinhole(np.array([0.01, 0.05, -0.02]), 0.03, 0.02, FOCAL_PX, SIZE_PX, 0.01)
+RIGHT = Pinhole(np.array([0.0, 0.2, 0.0]), 0.01, 0.0, FOCAL_PX, SIZE_PX, 0.002)
+
+
+@cache
+def seen(camera: Pinhole, seed: int, noise_dn: float = NOISE_DN, contrast_dn: float = 25.0) -> np.ndarray:
+    plane = wall(seed, contrast_dn=contrast_dn)
+    return picture(camera, plane, noise_dn=noise_dn, seed=hash((camera.azimuth_rad, seed)) % 2**31)
+
+
+def errors_of(matches: list[tuple[Match, np.ndarray]]) -> tuple[np.ndarray, np.ndarray]:
+    """Errors (n, 2) in pixels and the same over their own sigmas."""
+    errors = np.array([found.pixel_px - truth for found, truth in matches])
+    normalised = [
+        np.linalg.solve(np.linalg.cholesky(found.covariance_px2), error)
+        for (found, _), error in zip(matches, errors, strict=True)
+    ]
+    return errors, np.array(normalised)
+
+
+def test_patch_warped_over_a_guessed_plane_is_found_where_geometry_says() -> None:
+    matches = []
+    rng = np.random.default_rng(3)
+    for seed in (0, 1):
+        plane = wall(seed)
+        for _ in range(40):
+            pixel = np.array([rng.uniform(90, 270), rng.uniform(70, 210)])
+            point = plane.hit(LEFT.position_m, LEFT.rays(pixel))
+            guess = facing_plane(LEFT.model, pixel, 1.01 * float(np.linalg.norm(point)))
+            found = match(
+                seen(LEFT, seed), LEFT.model, pixel, guess, seen(TURNED, seed), TURNED.model, search_px=15
+            )
+            assert found.verdict == "good", f"seed 3, scene {seed}, pixel {pixel}: {found.reason}"
+            matches.append((found, TURNED.pixel(point)))
+    errors, normalised = errors_of(matches)
+    assert np.abs(errors.mean(axis=0)).max() < MEAN_PX
+    assert np.sqrt((errors**2).mean(axis=0)).max() < RMS_PX
+    rms = np.sqrt((normalised**2).mean())
+    assert HONEST[0] < rms < HONEST[1], rms
+
+
+def test_sigma_grows_with_noise_and_stays_honest() -> None:
+    plane, rng, matches = wall(2), np.random.default_rng(8), []
+    for _ in range(40):
+        pixel = np.array([rng.uniform(90, 270), rng.uniform(70, 210)])
+        point = plane.hit(LEFT.position_m, LEFT.rays(pixel))
+        found = match(
+            seen(LEFT, 2, 8.0), LEFT.model, pixel, Plane(point, plane.normal), seen(TURNED, 2, 8.0),
+            TURNED.model, search_px=15,
+        )  # fmt: skip
+        assert found.verdict == "good", found.reason
+        matches.append((found, TURNED.pixel(point)))
+    errors, normalised = errors_of(matches)
+    assert 0.015 < np.sqrt((errors**2).mean()) < 0.1
+    rms = np.sqrt((normalised**2).mean())
+    assert HONEST[0] < rms < HONEST[1], rms
+
+
+@pytest.mark.parametrize("zoom", [2.67, 1 / 2.67])
+def test_cameras_of_different_focal_length_match(zoom: float) -> None:
+    """Navcam to Pancam and back."""
+    near, far = (LEFT, 1.0) if zoom > 1 else (None, zoom)
+    source = near or Pinhole(np.zeros(3), 0.0, 0.0, FOCAL_PX / far, SIZE_PX)
+    other = Pinhole(np.array([0.0, 0.1, 0.0]), -0.025, 0.0, source.focal_px * zoom, SIZE_PX, 0.003)
+    plane, rng, matches = wall(4, (-1.0, 0.05, -0.1)), np.random.default_rng(4), []
+    first = picture(source, plane, noise_dn=NOISE_DN, seed=1)
+    second = picture(other, plane, noise_dn=NOISE_DN, seed=2)
+    reach = 25 if zoom > 1 else 100
+    for _ in range(12):
+        pixel = np.array([180.0, 140.0]) + rng.uniform(-reach, reach, 2)
+        point = plane.hit(source.position_m, source.rays(pixel))
+        guess = facing_plane(source.model, pixel, float(np.linalg.norm(point)))
+        found = match(first, source.model, pixel, guess, second, other.model, search_px=12)
+        assert found.verdict == "good", f"seed 4, pixel {pixel}: {found.reason}"
+        matches.append((found, other.pixel(point)))
+    errors, _ = errors_of(matches)
+    assert np.sqrt((errors**2).mean()) < RMS_PX
+
+
+def test_partner_is_found_along_the_line_with_range_and_slope() -> None:
+    plane, rng, matches, across = wall(5), np.random.default_rng(5), [], []
+    for _ in range(15):
+        pixel = np.array([rng.uniform(120, 330), rng.uniform(40, 240)])
+        point = plane.hit(LEFT.position_m, LEFT.rays(pixel))
+        found = find_partner(seen(LEFT, 5), LEFT.model, pixel, seen(RIGHT, 5), RIGHT.model)
+        assert found.match.verdict == "good", f"seed 5, pixel {pixel}: {found.match.reason}"
+        assert found.plane is not None
+        assert np.linalg.norm(found.plane.point_m - point) < 0.02
+        cosine = abs(found.plane.normal @ plane.normal) / np.linalg.norm(plane.normal)
+        assert np.arccos(min(cosine, 1.0)) < np.radians(12)
+        matches.append((found.match, RIGHT.pixel(point)))
+        across.append(found.across_px / found.across_sigma_px)
+    errors, normalised = errors_of(matches)
+    assert np.sqrt((errors**2).mean()) < RMS_PX
+    assert 0.5 < np.sqrt((normalised**2).mean()) < 1.6
+    assert np.sqrt(np.mean(np.square(across))) < 2.0
+
+
+def test_picture_shifted_across_the_line_shows_as_that_offset() -> None:
+    shifted = np.roll(seen(RIGHT, 5), 2, axis=0)
+    found = find_partner(seen(LEFT, 5), LEFT.model, (200.0, 140.0), shifted, RIGHT.model)
+    assert found.match.verdict == "good", found.match.reason
+    assert abs(abs(found.across_px) - 2.0) < 0.1
+    assert found.across_sigma_px < 0.05
+
+
+def test_surface_without_texture_is_flat() -> None:
+    plain = seen(LEFT, 0, NOISE_DN, 0.001), seen(RIGHT, 0, NOISE_DN, 0.001)
+    found = find_partner(plain[0], LEFT.model, (180.0, 140.0), plain[1], RIGHT.model)
+    assert found.match.verdict == "flat"
+    assert np.isnan(found.match.pixel_px).all()
+
+
+def test_straight_edge_is_flat_along_itself() -> None:
+    edge = np.full(SIZE_PX[::-1], 60.0, np.float32)
+    edge[:, 180:] = 180.0
+    edge += np.random.default_rng(0).normal(scale=NOISE_DN, size=edge.shape).astype(np.float32)
+    found = match(
+        edge, LEFT.model, (180.0, 140.0), facing_plane(LEFT.model, (180, 140), 4), edge, LEFT.model, 10
+    )
+    assert found.verdict == "flat"
+    assert "one direction" in found.reason
+
+
+def test_repeated_texture_is_ambiguous() -> None:
+    tile = random_texture(6, 8.0, 64)
+    repeated = TexturedPlane(np.array([4.0, 0.0, 0.0]), np.array([-1.0, 0.0, 0.0]), tile, 0.0012)
+    first = picture(LEFT, repeated, noise_dn=NOISE_DN, seed=1)
+    second = picture(TURNED, repeated, noise_dn=NOISE_DN, seed=2)
+    guess = facing_plane(LEFT.model, (180.0, 140.0), 4.0)
+    found = match(first, LEFT.model, (180.0, 140.0), guess, second, TURNED.model, search_px=40)
+    assert found.verdict == "ambiguous", found
+
+
+def test_something_else_in_the_picture_is_weak() -> None:
+    guess = facing_plane(LEFT.model, (180.0, 140.0), 4.0)
+    for seed in (0, 1, 2):
+        found = match(seen(LEFT, seed), LEFT.model, (180.0, 140.0), guess, seen(TURNED, 9), TURNED.model, 40)
+        assert found.verdict == "weak", f"scene {seed}: {found}"
+
+
+def test_target_hidden_from_one_eye_is_refused() -> None:
+    """A board before the right eye: what it hides must not be matched to the board."""
+    right = seen(RIGHT, 5).copy()
+    point = wall(5).hit(LEFT.position_m, LEFT.rays(np.array([230.0, 140.0])))
+    x, y = np.rint(RIGHT.pixel(point)).astype(int)
+    right[y - 45 : y + 45, x - 45 : x + 45] = seen(RIGHT, 9)[y - 45 : y + 45, x - 45 : x + 45]
+    found = find_partner(seen(LEFT, 5), LEFT.model, (230.0, 140.0), right, RIGHT.model)
+    assert found.match.verdict in ("weak", "ambiguous", "border")
+
+
+def test_target_outside_the_other_picture_is_at_the_border() -> None:
+    away = Pinhole(np.zeros(3), 1.2, 0.0, FOCAL_PX, SIZE_PX)
+    guess = facing_plane(LEFT.model, (180.0, 140.0), 4.0)
+    found = match(seen(LEFT, 0), LEFT.model, (180.0, 140.0), guess, seen(TURNED, 0), away.model, 20)
+    assert found.verdict == "border"
+
+
+def test_small_shift_of_the_window_does_not_hide_a_target_at_its_edge() -> None:
+    """A target just outside the window is told, not taken for the nearest other place."""
+    point = wall(0).hit(LEFT.position_m, LEFT.rays(np.array([180.0, 140.0])))
+    guess = facing_plane(LEFT.model, (180.0, 140.0), float(np.linalg.norm(point)))
+    moved = np.roll(seen(TURNED, 0), 12, axis=1)
+    found = match(seen(LEFT, 0), LEFT.model, (180.0, 140.0), guess, moved, TURNED.model, search_px=11)
+    assert found.verdict in ("border", "weak")
+
+
+def test_plane_carries_pixels_as_the_pinhole_does() -> None:
+    plane = wall(0)
+    pixel = np.array([100.0, 60.0])
+    point = plane.hit(LEFT.position_m, LEFT.rays(pixel))
+    carried, valid = carry(pixel, LEFT.model, Plane(plane.point_m, plane.normal), TURNED.model)
+    assert bool(valid)
+    assert np.allclose(carried, TURNED.pixel(point), atol=1e-9)
+
+
+def test_arrays_that_are_no_picture_are_refused_in_a_sentence() -> None:
+    with pytest.raises(CalibError, match="shape"):
+        grey(np.zeros((4, 4, 2)))
+    with pytest.raises(CalibError, match="direction"):
+        Plane(np.zeros(3), np.zeros(3))
