@@ -28,7 +28,7 @@ LEFT, RIGHT_EYE = pinhole(-BASELINE_M / 2), pinhole(BASELINE_M / 2)
 
 
 def wide_eye(y_m: float, turn_rad: float, kind: str) -> CameraModel:
-    """A distorted camera that looks inwards and down, with a moving entrance point where the model has one."""
+    """A distorted camera that looks inwards and down; the entrance point of a CAHVORE one moves."""
     axes = Rotation.from_rotvec([0.0, -0.5, turn_rad]).as_matrix().T
     forward, right, down = axes
     lens_axis = forward + 0.004 * right - 0.003 * down
@@ -96,7 +96,7 @@ def test_midpoint_is_the_point_nearest_to_both_rays(kind: str) -> None:
         return np.concatenate([np.cross(point - ray.origins_m, ray.directions) for ray in rays])
 
     seen = triangulate(left, right, left_px, right_px)
-    best = least_squares(distances, seen.position_m + [0.1, -0.1, 0.1], xtol=1e-15, ftol=1e-15, gtol=1e-15)
+    best = least_squares(distances, seen.position_m + 0.1 * FORWARD, xtol=1e-15, ftol=1e-15, gtol=1e-15)
     np.testing.assert_allclose(seen.position_m, best.x, atol=1e-6)
     assert seen.ray_gap_m == pytest.approx(math.sqrt(2.0) * float(np.linalg.norm(best.fun)), rel=1e-6)
 
