@@ -1,4 +1,4 @@
-"""``mastctl experiment pointing`` on any running daemon, and ``mastctl demo`` on the packaged simulated rover."""
+"""``mastctl experiment pointing`` on any daemon, ``mastctl demo`` on the packaged simulated rover."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The demo: the pointing experiment on the packaged simulated rover, with the truth beside each measurement."""
+"""The demo: the pointing experiment on the packaged simulated rover, the truth beside each measurement."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def demo_config(config: Config, *, head: str, seed: int) -> Config:
 
 
 def head_note(rover: SimulatedRover, rig: Rig) -> str:
-    """Return a sentence that says what the head's counts and backlash allow, in pixels of the first stereo pair."""
+    """Return what the head's counts and backlash allow, in words and pixels of the first stereo pair."""
     camera = next(iter(rig.stereo.values()))[0]
     model = rig.cameras[camera].model
     # A pixel's step of the ray at the image centre: what a turn of the head moves the picture by.
@@ -33,11 +33,12 @@ def head_note(rover: SimulatedRover, rig: Rig) -> str:
     )
     if axis.approach_rad > 0:
         return f"{told}, taken up by always approaching from one side."
-    return f"{told}, not taken up: a residual of up to {(backlash_px + count_px) / 2:.1f} px an axis is the head's own."
+    own_px = (backlash_px + count_px) / 2
+    return f"{told}, not taken up: a residual of up to {own_px:.1f} px an axis is the head's own."
 
 
 class SimulationTruth:
-    """Where a clicked point really is in a later frame, told by the simulated rover (`experiment.pointing.Truth`)."""
+    """Where a clicked point really is in a later frame (`experiment.pointing.Truth`)."""
 
     def __init__(self, rover: SimulatedRover) -> None:
         self._rover = rover

@@ -1,8 +1,8 @@
 """The paper's pointing experiment (section IV, Table VI) through the HTTP interface of a running daemon.
 
-For each distance: look at the ground there, choose a textured pixel of the left image at random, ask the daemon
-to point at it twice, and take the residuals that the daemon measured in new images. A target that fails is a row
-of its own with the reason; it never leaves the record.
+For each distance: look at the ground there, choose a textured pixel of the left image at random, ask the
+daemon to point at it twice, and take the residuals that the daemon measured in new images. A target that
+fails is a row of its own with the reason; it never leaves the record.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ PAPER_TABLE_VI: Mapping[float, tuple[tuple[float, float], tuple[float, float]]] 
     2.0: ((1.260, 0.925), (0.672, 0.921)),
 }
 
-# How far to either side of straight ahead the targets lie: the pan range of the paper's calibration, section III.C.
+# Targets lie this far to either side of straight ahead: the pan range of the paper's calibration (III.C).
 PAN_RANGE_RAD = 1.0
 # A view that offers no usable target is left for another; after this many in a row the distance is given up.
 VIEWS_PER_TARGET = 12
@@ -300,7 +300,7 @@ class _Bench:
         )
 
     def _look_for_target(self, distance_m: float) -> Target | None:
-        """Turn to a random piece of ground at the distance and choose a pixel there; None if it offers none."""
+        """Turn to a random piece of ground at the distance and choose a pixel there, if it offers one."""
         angles = self._angles_towards(distance_m)
         if angles is None:
             return None
@@ -319,7 +319,7 @@ class _Bench:
         return choose_target(left, right, models[0], models[1], distance_m, self._rng)
 
     def _angles_towards(self, distance_m: float) -> tuple[float, float] | None:
-        """Joint angles that look at level ground at the range, in a random direction; None outside the limits."""
+        """Joint angles that look at level ground at the range, anywhere ahead; None outside the limits."""
         mast = self._rig.mast
         head_in_rover_m = mast.rover_from_head(0.0, 0.0).translation_m
         height_m = -float(head_in_rover_m[2])
