@@ -7,6 +7,7 @@ file changed, never names another picture. Clients take ids as opaque.
 
 from __future__ import annotations
 
+import re
 import secrets
 import threading
 from collections import deque
@@ -18,6 +19,7 @@ from drivers.errors import BadFrame, NoFreshFrame
 from drivers.interfaces import Image
 from mastctl.errors import FrameGone
 
+_FRAME_ID = re.compile(r"(.{1,100})-([0-9]{6,20})-([0-9a-f]{8})-([0-9a-f]{4})", re.ASCII)
 KEPT_FRAMES = 16  # per camera; six cameras of 1024x768 grey are 75 MB
 CLOCK_TOLERANCE_S = 0.005  # what a stamp may lie in the future: rounding, and a driver that estimates
 DARK_GREY = 8  # a picture whose brightest hundredth is below this shows nothing to correlate with
@@ -178,9 +180,9 @@ class FrameStore:
                     if frame.frame_id == frame_id:
                         return frame
             newest = {camera: frames[-1].sequence for camera, frames in self._frames.items() if frames}
-        parts = frame_id.rsplit("-", 3)
-        if len(parts) == 4 and parts[1].isdecimal():
-            camera, sequence, mast, run = parts
+        named = _FRAME_ID.fullmatch(frame_id)
+        if named is not None:
+            camera, sequence, mast, run = named.groups()
             if mast != self._mast:
                 raise FrameGone(
                     "other_mast_file",
@@ -191,7 +193,21 @@ class FrameStore:
                     "frame_too_old",
                     f"frame {frame_id} is no longer kept (the newest {self._kept} of a camera are)",
                 )
-        raise FrameGone("frame_unknown", f"frame {frame_id} was not taken by this run of the service")
+        raise FrameGone("frame_unknown", f"frame {frame_id[:120]} was not taken by this run of the service")
+
+
+def camera_and_sequence(frame_id: str) -> tuple[str, int]:
+    """Return the camera and the sequence number that a frame's id names.
+
+    Raises
+    ------
+    ValueError
+        If it is no frame id.
+    """
+    named = _FRAME_ID.fullmatch(frame_id)
+    if named is None:
+        raise ValueError(f"'{frame_id[:120]}' is no frame id")
+    return named[1], int(named[2])
 
 
 def _number(value: object) -> float:

@@ -397,7 +397,7 @@ def test_only_the_newest_frames_are_kept_and_the_refusal_says_which_case_it_is(d
     cases = {
         first.frame_id: "frame_too_old",
         f"{camera}-{sequence}-ffffffff-{run}": "other_mast_file",
-        f"{camera}-{sequence}-{mast}-....": "frame_unknown",
+        f"{camera}-{sequence}-{mast}-{int(run, 16) ^ 1:04x}": "frame_unknown",
         f"{camera}-999999-{mast}-{run}": "frame_unknown",
         "nonsense": "frame_unknown",
         "": "frame_unknown",

@@ -8,6 +8,7 @@ from calib.mast import Rig
 from calib.rigid import FloatArray
 from drivers.sim.rover import SimulatedRover
 from mastctl.config import Config, Listen
+from mastctl.frames import camera_and_sequence
 
 
 def demo_config(config: Config, *, head: str, seed: int) -> Config:
@@ -54,15 +55,9 @@ class SimulationTruth:
         """Return the true residual (x, y) in pixels, or None if the click hit the sky."""
         key = (clicked_frame_id, clicked_px)
         if key not in self._points:
-            self._points[key] = self._rover.true_point(*_camera_and_sequence(clicked_frame_id), clicked_px)
+            self._points[key] = self._rover.true_point(*camera_and_sequence(clicked_frame_id), clicked_px)
         point = self._points[key]
         if point is None:
             return None
-        x, y = self._rover.true_pixel(*_camera_and_sequence(landed_frame_id), point)
+        x, y = self._rover.true_pixel(*camera_and_sequence(landed_frame_id), point)
         return float(x) - aim_px[0], float(y) - aim_px[1]
-
-
-def _camera_and_sequence(frame_id: str) -> tuple[str, int]:
-    """Take a frame's name apart: ``navcam_left-000123``."""
-    camera, _, sequence = frame_id.rpartition("-")
-    return camera, int(sequence)
