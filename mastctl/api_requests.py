@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from calib.formats.strict import nearest
-from mastctl.pointing.loop import Aim, AnglesTarget, PixelTarget, PointRequest, PositionTarget
+from mastctl.pointing.requests import Aim, AnglesTarget, PixelTarget, PointRequest, PositionTarget
 
 LARGEST_PX = 1e5
 LARGEST_M = 1e6

@@ -19,7 +19,8 @@ from mastctl.devices import HEAD, Devices, UnknownCamera
 from mastctl.errors import FrameGone, MastctlError
 from mastctl.frames import StampedFrame
 from mastctl.operations import Operation, Operations
-from mastctl.pointing.loop import AnglesTarget, PixelTarget, PointingLoop, PointRequest
+from mastctl.pointing.loop import PointingLoop
+from mastctl.pointing.requests import AnglesTarget, PixelTarget, PointRequest
 from mastctl.state import State
 
 log = logging.getLogger(__name__)
