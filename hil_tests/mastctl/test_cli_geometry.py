@@ -352,7 +352,7 @@ def test_a_reader_that_goes_away_ends_the_command_quietly(folder: Path) -> None:
 
 
 def test_a_full_disk_is_a_failure_in_one_line(folder: Path) -> None:
-    with open("/dev/full", "w") as full:
+    with Path("/dev/full").open("w") as full:
         done = subprocess.run(
             [sys.executable, "-m", "mastctl", "budget"], stdout=full, stderr=subprocess.PIPE, text=True
         )
