@@ -96,6 +96,13 @@ class FaultBody(_Strict):
     word: Name
     parameters: dict[str, float] = Field(default_factory=dict)
 
+    @model_validator(mode="after")
+    def _free_names(self) -> FaultBody:
+        for name in ("device", "word", "self"):
+            if name in self.parameters:
+                raise ValueError(f"parameters.{name}: unknown key; no fault has a parameter of this name")
+        return self
+
 
 class SnapshotQuery(BaseModel):
     """``GET /snapshot/{camera}``; ``frame_id`` asks for a frame that is still kept."""

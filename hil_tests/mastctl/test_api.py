@@ -5,8 +5,10 @@ from __future__ import annotations
 import json
 import socket
 import threading
+import time
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 from urllib.parse import urlsplit
 
@@ -19,6 +21,7 @@ from hypothesis import strategies as st
 from service_fakes import FakeHardware, Hang, ScriptedLoop, eventually, fake_daemon
 
 from drivers.errors import NoReply
+from drivers.faults import FaultPanel
 from mastctl import devices as devices_module
 from mastctl import service as service_module
 from mastctl.api_guard import LARGEST_BODY_BYTES
@@ -346,6 +349,36 @@ def test_an_unknown_query_key_is_named_with_the_nearest(quiet: httpx.Client) -> 
 def test_faults_of_real_hardware_are_refused_with_the_reason(quiet: httpx.Client) -> None:
     answer = quiet.post("/simulation/faults", json={"device": "pan_tilt", "word": "stuck"})
     assert "simulated rover only" in refused(answer, 404, "not_simulated")
+
+
+def test_faults_of_a_simulated_rover_are_set_told_and_cleared(
+    web: httpx.Client, hardware: FakeHardware
+) -> None:
+    panel = FaultPanel(time.monotonic, ["navcam_left"])
+    hardware.simulation = SimpleNamespace(faults=panel)
+    assert web.get("/simulation/faults").json() == {"faults": []}
+    body = {"device": "navcam_left", "word": "delayed", "parameters": {"delay_s": 0.25, "for_s": 60}}
+    told = web.post("/simulation/faults", json=body).json()["faults"]
+    assert [(fault["device"], fault["word"], fault["parameters"]["delay_s"]) for fault in told] == [
+        ("navcam_left", "delayed", 0.25)
+    ]
+    web.post("/simulation/faults", json={"device": "pan_tilt", "word": "stuck"})
+    assert web.get("/simulation/faults").json()["faults"][1]["end_s"] is None
+    for bad in (
+        {"device": "navcam_lift", "word": "dark"},
+        {"device": "navcam_left", "word": "drak"},
+        {"device": "navcam_left", "word": "dark", "parameters": {"probability": 1}},
+        {"device": "navcam_left", "word": "delayed", "parameters": {"delay_s": -1}},
+    ):
+        refused(web.post("/simulation/faults", json=bad), 422, "bad_options")
+    for name in ("device", "word", "self"):
+        bad = {"device": "navcam_left", "word": "delayed", "parameters": {name: 1}}
+        refused(web.post("/simulation/faults", json=bad), 422, "bad_request")
+    refused(web.delete("/simulation/faults?device=navcam_lift"), 422, "bad_options")
+    refused(web.delete("/simulation/faults?devize=pan_tilt"), 422, "bad_request")
+    assert len(panel.active()) == 2
+    assert len(web.delete("/simulation/faults?device=pan_tilt").json()["faults"]) == 1
+    assert web.delete("/simulation/faults").json() == {"faults": []}
 
 
 def test_angles_beyond_the_limits_are_refused_at_once(quiet: httpx.Client) -> None:

@@ -27,8 +27,8 @@ from mastctl import devices as devices_module
 from mastctl import operations as operations_module
 from mastctl import service as service_module
 from mastctl.client import Client
-from mastctl.config import load_config
-from mastctl.daemon import AddressInUse, RunningDaemon
+from mastctl.config import Listen, load_config
+from mastctl.daemon import AddressInUse, RunningDaemon, _tcp_socket
 
 LINE_TIMEOUT_S = 60.0  # for a cold start on a busy machine; only bounds a failing test
 
@@ -179,6 +179,11 @@ def test_a_port_in_use_is_one_line_and_touches_no_hardware(tmp_path: Path) -> No
     assert log.splitlines()[-1].startswith(f"mastctl: http://127.0.0.1:{port} is in use already")
     assert "Traceback" not in log
     assert not (tmp_path / "head.log").exists()
+
+
+def test_answers_do_not_wait_for_nagle() -> None:
+    with _tcp_socket(Listen(port=0)) as listener:
+        assert listener.proto == socket.IPPROTO_TCP  # by this asyncio knows to set TCP_NODELAY
 
 
 def test_a_second_daemon_is_refused_the_address(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
