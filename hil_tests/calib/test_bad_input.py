@@ -19,7 +19,7 @@ from tools import fuzz_readers
 from tools.fuzz_readers import COMMANDS, READERS, VALID, broken, check_command, check_reader
 
 # Generous: a case takes milliseconds; only a hang or a blow-up comes near.
-no_hang = settings(deadline=timedelta(seconds=10), max_examples=150)
+no_hang = settings(deadline=timedelta(seconds=10), max_examples=100)
 
 KEYS = [
     *("schema", "name", "mast", "cameras", "stereo", "fit", "translation_m", "rotation_rad", "axis_offset_m"),
@@ -90,7 +90,7 @@ plain_trees = st.dictionaries(
 
 
 @given(tree=plain_trees)
-@settings(no_hang, max_examples=150)
+@settings(no_hang, max_examples=60)
 def test_plain_data_come_back_from_yaml_as_they_went(tree: dict[str, Any]) -> None:
     written = dump_mapping(tree)
     found = parse_mapping(written, "x")
@@ -138,7 +138,9 @@ def test_the_campaign_notices_what_is_let_out(monkeypatch: pytest.MonkeyPatch, t
         raise KeyError("let out")
 
     def two_lines(*_: object, **__: object) -> None:
-        raise BadFile("f", "", "two\nlines")
+        refusal = BadFile("f", "", "")
+        refusal.args = ("two\nlines",)
+        raise refusal
 
     monkeypatch.setitem(fuzz_readers.READERS, "mast", ("mast.yaml", let_out))
     with pytest.raises(KeyError):
@@ -166,7 +168,7 @@ BLOW_UPS = {
     "many questions": b"? " * 200_000,
     "many anchors": b"".join(b"a%d: &x%d 1\n" % (i, i) for i in range(20_000)),
     "one long key": b"a" * 1_000_000 + b": 1",
-    "many keys": b"".join(b"k%d: 1\n" % i for i in range(50_000)),
+    "many keys": b"".join(b"k%d: 1\n" % i for i in range(20_000)),
     "many quotes": b'"' * 1_000_000,
     "long comment": b"#" * 1_000_000,
     "many colons": b":" * 1_000_000,
