@@ -122,6 +122,20 @@ class FaultsQuery(BaseModel):
     device: Name | None = None
 
 
+class ErrorTold(BaseModel):
+    """Why a request was refused: a word for programs, a sentence for people, more where there is more."""
+
+    code: str
+    message: str
+    detail: dict[str, Any] | None = None
+
+
+class ErrorBody(BaseModel):
+    """Every answer that is not a success."""
+
+    error: ErrorTold
+
+
 _KEYS: Mapping[tuple[str, ...], Sequence[str]] = {
     ("body", "pixel"): tuple(PixelBody.model_fields),
     ("body", "aim"): tuple(AimBody.model_fields),

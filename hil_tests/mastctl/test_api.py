@@ -564,9 +564,10 @@ def test_the_mast_file_is_served_byte_for_byte(web: httpx.Client, daemon: Runnin
 
 def test_the_interface_describes_itself(quiet: httpx.Client) -> None:
     document = quiet.get(str(quiet.base_url.copy_with(path="/openapi.json"))).json()
-    assert {"/api/v1/status", "/api/v1/point", "/api/v1/stop", "/api/v1/snapshot/{camera}"} <= set(
-        document["paths"]
-    )
+    paths = document["paths"]
+    assert {f"/api/v1/{path}" for path in ("status", "point", "stop", "snapshot/{camera}")} <= set(paths)
+    refusal = paths["/api/v1/point"]["post"]["responses"]["422"]["content"]["application/json"]
+    assert refusal["schema"]["$ref"].endswith("/ErrorBody")
 
 
 @pytest.mark.parametrize(
