@@ -161,9 +161,16 @@ def _report(args: argparse.Namespace, experiment: PointingExperiment) -> int:
         notes = [*experiment.notes, *([f"report: {page}"] if page is not None else [])]
         output.print_table(
             f"Pointing residuals, rms px ({experiment.camera}, {experiment.status.get('hardware')} hardware)",
-            headings, rows, notes,
-        )  # fmt: skip
+            *turned(headings, rows),
+            notes,
+        )
     return 0 if any(record.landings for record in experiment.records) else 1
+
+
+def turned(headings: list[str], rows: list[list[str]]) -> tuple[list[str], list[list[str]]]:
+    """Return a table with rows and columns exchanged: a column a distance fits a terminal of 80 columns."""
+    table = [list(column) for column in zip(headings, *rows, strict=True)]
+    return table[0], table[1:]
 
 
 def _check_writable(folder: Path) -> None:

@@ -224,7 +224,10 @@ def _scatter(experiment: PointingExperiment) -> str:
         axis.set_xlabel("x residual, px (right)")
         axis.set_ylabel("y residual, px (down)")
         axis.grid(alpha=0.25)
-    figure.axes[0].legend(loc="upper left", fontsize=8)
+    handles, labels = next(
+        axis.get_legend_handles_labels() for axis in figure.axes if axis.get_legend_handles_labels()[0]
+    )
+    figure.axes[0].legend(handles, labels, loc="upper left", fontsize=8)
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", dpi=110)
     return _image_tag(buffer.getvalue(), "png", "scatter of the residuals")
