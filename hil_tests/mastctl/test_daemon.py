@@ -138,6 +138,18 @@ def test_a_signal_ends_the_daemon_cleanly_with_the_mast_stopped(
     assert words[-1] == "close"
 
 
+def test_a_signal_while_the_daemon_starts_ends_it_cleanly(tmp_path: Path) -> None:
+    config = write_config(tmp_path, "{port: 0}")
+    text = (tmp_path / "outside_devices.py").read_text()
+    waiting = "print('opening', flush=True)\n        time.sleep(60)\n        self.log"
+    (tmp_path / "outside_devices.py").write_text(text.replace("self.log", waiting, 1))
+    with process(tmp_path, "run", "--config", str(config)) as daemon:
+        assert first_line(daemon) == "opening\n"
+        daemon.send_signal(signal.SIGTERM)
+        _, log = daemon.communicate(timeout=LINE_TIMEOUT_S)
+    assert (daemon.returncode, log) == (0, "")
+
+
 def test_a_signal_during_an_operation_stops_it(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     entered = threading.Event()
 
