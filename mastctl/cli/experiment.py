@@ -87,6 +87,7 @@ def run_demo(args: argparse.Namespace) -> int:
     from mastctl.config import load_config
     from mastctl.daemon import RunningDaemon
     from mastctl.experiment.demo import SimulationTruth, demo_config, head_note
+    from mastctl.experiment.pointing import head_pair
 
     _check_writable(args.out)
     config = demo_config(load_config(None), head=args.head, seed=args.seed)
@@ -97,7 +98,9 @@ def run_demo(args: argparse.Namespace) -> int:
     with daemon, Client(daemon.url) as client:
         rover = daemon.hardware.simulation
         assert rover is not None  # the packaged configuration is a simulated rover
-        notes = (head_note(rover, daemon.service.stored.rig),)
+        rig = daemon.service.stored.rig
+        camera = head_pair(rig, set(config.hardware.cameras))[0]
+        notes = (head_note(rover, rig, camera),)
         output.tell(f"simulated rover at {daemon.url}, head {args.head}")
         experiment = _run(args, client, DEFAULT_DISTANCES_M, SimulationTruth(rover), notes)
     return _report(args, experiment)

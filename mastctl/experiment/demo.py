@@ -17,9 +17,8 @@ def demo_config(config: Config, *, head: str, seed: int) -> Config:
     return replace(config, listen=Listen(port=0), hardware=replace(config.hardware, simulation=simulation))
 
 
-def head_note(rover: SimulatedRover, rig: Rig) -> str:
-    """Return what the head's counts and backlash allow, in words and pixels of the first stereo pair."""
-    camera = next(iter(rig.stereo.values()))[0]
+def head_note(rover: SimulatedRover, rig: Rig, camera: str) -> str:
+    """Return what the head's counts and backlash allow, in words and pixels of a camera."""
     model = rig.cameras[camera].model
     # A pixel's step of the ray at the image centre: what a turn of the head moves the picture by.
     x, y = model.image_center_px

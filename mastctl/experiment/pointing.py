@@ -189,7 +189,7 @@ def run_pointing_experiment(
     started, begun_s = time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()), time.monotonic()
     status = client.status()
     rig = parse_rig(client.mast_file(), "the daemon's mast file").rig
-    pair = _head_pair(rig, set(status["cameras"]))
+    pair = head_pair(rig, set(status["cameras"]))
     aim_px = rig.cameras[pair[0]].model.image_center_px
     bench = _Bench(client, rig, pair, status["limits"], np.random.default_rng(seed), truth, keep_pictures)
     records: list[TargetRecord] = []
@@ -235,8 +235,14 @@ def rms(pairs: Sequence[tuple[float, float]]) -> tuple[float, float] | None:
     return float(x), float(y)
 
 
-def _head_pair(rig: Rig, served: set[str]) -> tuple[str, str]:
-    """The stereo pair to point with: on the head, both eyes served; the Navcam where there is one."""
+def head_pair(rig: Rig, served: set[str]) -> tuple[str, str]:
+    """Return the stereo pair to point with: on the head, both eyes served; the Navcam where there is one.
+
+    Raises
+    ------
+    ClientError
+        ``no_stereo_pair``, if there is none.
+    """
     pairs = {
         name: pair
         for name, pair in rig.stereo.items()

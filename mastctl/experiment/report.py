@@ -106,11 +106,11 @@ def _page(experiment: PointingExperiment) -> str:
     """The whole page."""
     status = experiment.status
     kind = str(status.get("hardware", "unknown"))
-    mast = status.get("mast_file") or {}
+    mast = status.get("mast") or {}
     facts = [
         ("hardware", kind),
         ("camera", experiment.camera),
-        ("mast file", f"{mast.get('name', '')} ({str(mast.get('digest', ''))[:12]})"),
+        ("mast file", f"{mast.get('file', '')} ({str(mast.get('digest', ''))[:12]})"),
         ("seed", str(experiment.seed)),
         ("started", experiment.started),
         ("took", f"{experiment.seconds:.0f} s"),
@@ -305,8 +305,8 @@ body { font: 15px/1.5 system-ui, sans-serif; color: #222;
   max-width: 1200px; margin: 2em auto; padding: 0 1em; }
 h1 { font-size: 1.6em; } h2 { font-size: 1.2em; margin-top: 2em; border-bottom: 1px solid #ddd; }
 table { border-collapse: collapse; font-variant-numeric: tabular-nums; }
-th, td { padding: .25em .8em; text-align: right; border-bottom: 1px solid #eee; }
-td:last-child { text-align: left; } th { background: #f4f1ee; }
+th, td { padding: .25em .7em; text-align: right; border-bottom: 1px solid #eee; white-space: nowrap; }
+td:last-child, th:last-child { text-align: left; white-space: normal; } th { background: #f4f1ee; }
 img { max-width: 100%; } .row { display: flex; gap: 12px; margin-bottom: 1.2em; align-items: flex-start; }
 figure { margin: 0; flex: 1 1 0; min-width: 0; } .row figure:first-child { flex: 1.35 1 0; }
 figcaption { font-size: .85em; color: #555; }
