@@ -318,7 +318,11 @@ class Devices:
             now_s = self._clock.now_s()
             frame = frame_checks.checked(answer, camera, self._sizes_px.get(camera), exposed_after_s, now_s)
             if newest is not None:
-                _check_order(frame, newest)
+                try:
+                    _check_order(frame, newest)
+                except BadFrame:  # refused once; a camera that came back counting from 0 goes on after that
+                    self._store.begin_again(camera)
+                    raise
             return frame
 
         return take

@@ -1,7 +1,7 @@
 """Frames with their facts: what a picture shows is worth little without when, where and by which mast file.
 
 A frame's id is ``<camera>-<sequence>-<mast>-<run>``: the last two are the first 8 digits of the mast file's
-digest and a token of this run of the service, so that an id kept from yesterday, or from before the mast
+digest and a token of this run of the camera, so that an id kept from yesterday, or from before the mast
 file changed, never names another picture. Clients take ids as opaque.
 """
 
@@ -140,14 +140,22 @@ class FrameStore:
 
     def __init__(self, mast_digest: str, kept: int = KEPT_FRAMES) -> None:
         self._mast = mast_digest[:8]
-        self._run = secrets.token_hex(2)
+        self._runs: dict[str, str] = {}
         self._kept = kept
         self._frames: dict[str, deque[StampedFrame]] = {}
         self._lock = threading.Lock()
 
     def frame_id(self, camera: str, sequence: int) -> str:
         """Return the id of a camera's frame in this run."""
-        return f"{camera}-{sequence:06d}-{self._mast}-{self._run}"
+        with self._lock:
+            run = self._runs.setdefault(camera, secrets.token_hex(2))
+        return f"{camera}-{sequence:06d}-{self._mast}-{run}"
+
+    def begin_again(self, camera: str) -> None:
+        """Forget a camera's frames, because its count went back: one number must not name two pictures."""
+        with self._lock:
+            self._frames.pop(camera, None)
+            self._runs[camera] = secrets.token_hex(2)
 
     def add(self, frame: StampedFrame) -> StampedFrame:
         """Keep a frame and return it; if a frame of that id is kept already, that one is returned."""
@@ -180,6 +188,7 @@ class FrameStore:
                     if frame.frame_id == frame_id:
                         return frame
             newest = {camera: frames[-1].sequence for camera, frames in self._frames.items() if frames}
+            runs = dict(self._runs)
         named = _FRAME_ID.fullmatch(frame_id)
         if named is not None:
             camera, sequence, mast, run = named.groups()
@@ -188,7 +197,7 @@ class FrameStore:
                     "other_mast_file",
                     f"frame {frame_id} was taken with mast file {mast}..., the one in use is {self._mast}...",
                 )
-            if run == self._run and int(sequence) <= newest.get(camera, -1):
+            if run == runs.get(camera) and int(sequence) <= newest.get(camera, -1):
                 raise FrameGone(
                     "frame_too_old",
                     f"frame {frame_id} is no longer kept (the newest {self._kept} of a camera are)",
