@@ -96,7 +96,7 @@ class CameraModel:
     E: FloatArray = None  # type: ignore[assignment]  # 0 if not given
     cahvore_type: int = 0
     linearity: float = 1.0
-    _rows: FloatArray = field(init=False, repr=False)  # C, A, H, V, and the lens frame's x, y, z = O
+    _rows: FloatArray = field(init=False, repr=False)  # C, H, V, A, and the lens frame's x, y, z = O
     _projection: Projection = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -120,7 +120,7 @@ class CameraModel:
         if not lengths.all() or not abs(np.linalg.det(hva / lengths[:, None])) > _FLAT:
             raise ValueError("H, V and A lie in one plane where three directions are expected")
         axes = _axes_around(self.O)
-        self._set("_rows", np.array([self.C, *hva[[2, 0, 1]], *axes]))
+        self._set("_rows", np.array([self.C, *hva, *axes]))
         self._rows.setflags(write=False)
         self._set("_projection", self._make_projection(hva @ axes.T))
 
@@ -230,7 +230,7 @@ class CameraModel:
         rows[0] += b_from_a.translation_m
         rows.setflags(write=False)
         model = object.__new__(CameraModel)
-        letters = {"C": rows[0], "A": rows[1], "H": rows[2], "V": rows[3], "O": rows[6]}
+        letters = {"C": rows[0], "H": rows[1], "V": rows[2], "A": rows[3], "O": rows[6]}
         model.__dict__.update(self.__dict__, _rows=rows, **letters)
         model.__dict__.pop("_place", None)
         return model
@@ -245,7 +245,7 @@ class CameraModel:
             x_m, y_m, z_m = points.tolist()
             x_px, y_px = self._projection.project_point(x_m, y_m, z_m, self._place)
             return np.array([x_px, y_px]), np.array(x_px == x_px)
-        pixels, _, valid = self._projection.project(points.reshape(-1, 3), self.C, self._axes, False)
+        pixels, _, valid = self._projection.project(points.reshape(-1, 3), self.C, self._rows[3:], False)
         return pixels.reshape(*points.shape[:-1], 2), valid.reshape(points.shape[:-1])
 
     def project_jacobian(self, points_m: ArrayLike) -> tuple[FloatArray, FloatArray, np.ndarray]:
@@ -255,7 +255,9 @@ class CameraModel:
         """
         points = _as_rows(points_m, 3, "points")
         shape = points.shape[:-1]
-        pixels, jacobian, valid = self._projection.project(points.reshape(-1, 3), self.C, self._axes, True)
+        pixels, jacobian, valid = self._projection.project(
+            points.reshape(-1, 3), self.C, self._rows[3:], True
+        )
         return pixels.reshape(*shape, 2), jacobian.reshape(*shape, 2, 3), valid.reshape(shape)
 
     def ray(self, pixels_px: ArrayLike) -> Rays:

@@ -19,8 +19,8 @@ TINY = 1e-150
 SETTLED = 1e-9
 """Newton stops after a step below this; it doubles its digits, so the result is good to rounding."""
 
-_SMALL_TURN_RAD = 0.1
-"""Up to here a sine by its series to the ninth power is exact to rounding."""
+_SMALL_TURN_RAD = 0.02
+"""Up to here a sine by its series to the fifth power is exact to rounding."""
 
 NEAREST_M = 1e-9
 """A point this near the entrance point has no direction from it."""
@@ -30,15 +30,14 @@ _NODES = 257
 
 
 class Bent(NamedTuple):
-    """What the lens does to points: slopes (u, v) = (a, b) m, and which points it reaches.
+    """What the lens does to points (a, b, w): slopes (3, n), rows u, v and 1, and which points it reaches.
 
-    With derivatives: dm = n (a da + b db) + k dw.
+    With derivatives: d(u, v) = m (da, db) + c (n c.(da, db) + k dw), with c (2, n) across the axis.
     """
 
-    m: FloatArray
+    slopes: FloatArray
     valid: np.ndarray
-    n: FloatArray | None = None
-    k: FloatArray | None = None
+    derivatives: tuple[FloatArray, FloatArray, FloatArray, FloatArray] | None = None  # m, n, k, c
 
 
 class Unbent(NamedTuple):
@@ -56,36 +55,47 @@ class Unbent(NamedTuple):
     shift_rate: FloatArray | None = None
 
 
-def bend(lens: Lens, a: FloatArray, b: FloatArray, w: FloatArray, derivatives: bool = False) -> Bent:
-    """Return the slopes at which points (a, b, w) of the lens frame, metres, are seen."""
-    lambda2 = a * a
-    lambda2 += b * b
+def bend(lens: Lens, local: FloatArray, derivatives: bool = False) -> Bent:
+    """Return the slopes at which points (3, n), rows a, b, w of the lens frame in metres, are seen."""
+    slopes = np.empty_like(local)
+    slopes[2] = 1.0
     if lens.curved:
-        return _bend_curved(lens, np.maximum(np.sqrt(lambda2), TINY), w, derivatives)
+        return _bend_curved(lens, local, slopes, derivatives)
     r0, r1, r2 = lens.r
-    per_w = 1.0 / w
-    tau = lambda2
-    tau *= per_w
-    tau *= per_w
+    w = local[2]
     valid = w > 0.0
-    valid &= tau < lens.chi_limit * lens.chi_limit
-    scale = tau * r2
+    undistorted = local[:2] / w
+    squares = undistorted * undistorted
+    tau = np.add(squares[0], squares[1], out=squares[0])
+    if lens.chi_limit < np.inf:
+        valid &= tau < lens.chi_limit * lens.chi_limit
+    scale = np.multiply(tau, r2, out=squares[1])
     scale += r1
     scale *= tau
     scale += 1.0 + r0
-    m = scale * per_w
+    np.multiply(undistorted, scale, out=slopes[:2])
     if not derivatives:
-        return Bent(m, valid)
-    twice_rate = (4.0 * r2) * tau
+        return Bent(slopes, valid)
+    per_w = 1.0 / w
+    twice_rate = tau * (4.0 * r2)
     twice_rate += 2.0 * r1  # 2 d scale / d tau
-    k = (scale + twice_rate * tau) * (-per_w * per_w)
-    return Bent(m, valid, twice_rate * (per_w * per_w * per_w), k)
+    n = twice_rate * per_w
+    twice_rate *= tau
+    twice_rate += scale
+    scale *= per_w
+    twice_rate *= np.negative(per_w, out=per_w)
+    return Bent(slopes, valid, (scale, n, twice_rate, undistorted))
 
 
-def _bend_curved(lens: Lens, lam: FloatArray, w: FloatArray, derivatives: bool) -> Bent:
+def _bend_curved(lens: Lens, local: FloatArray, slopes: FloatArray, derivatives: bool) -> Bent:
     """CAHVORE: the ray's angle first, then its slope."""
     r0, r1, r2 = lens.r
     line = lens.linearity
+    a, b, w = local
+    lam = a * a
+    lam += b * b
+    np.sqrt(lam, out=lam)
+    np.maximum(lam, TINY, out=lam)
     theta, sine, cosine, slope, valid = _ray_angle(lens, lam, w, derivatives)
     if line > 0.0:
         chi = np.tan(line * theta) / line
@@ -95,83 +105,116 @@ def _bend_curved(lens: Lens, lam: FloatArray, w: FloatArray, derivatives: bool) 
         chi = theta
     valid &= theta > 0.0
     valid &= theta < lens.theta_limit_rad
-    valid &= chi < lens.chi_limit
+    if lens.chi_limit < np.inf:
+        valid &= chi < lens.chi_limit
     chi2 = chi * chi
-    m = chi * (1.0 + r0 + chi2 * (r1 + chi2 * r2)) / lam
+    m = chi2 * r2
+    m += r1
+    m *= chi2
+    m += 1.0 + r0
+    m *= chi
+    m /= lam
+    np.multiply(local[:2], m, out=slopes[:2])
     if not derivatives:
-        return Bent(m, valid)
-    rate = 1.0 + r0 + chi2 * (3.0 * r1 + chi2 * (5.0 * r2))  # d chi' / d chi, then times d chi / d theta
+        return Bent(slopes, valid)
+    rate = _growth(lens, chi2)  # d chi' / d chi, then times d chi / d theta
     if line > 0.0:
         rate *= 1.0 + line * line * chi2
     elif line < 0.0:
         rate *= np.cos(line * theta)
     rate /= slope
-    return Bent(m, valid, (rate * cosine - m) / (lam * lam), -rate * sine / lam)
+    n = rate * cosine
+    n -= m
+    rate *= sine
+    return Bent(slopes, valid, (m, n, np.negative(rate, out=rate), local[:2] / lam))
 
 
 def _ray_angle(
-    lens: Lens, lam: FloatArray, w: FloatArray, polish: bool
+    lens: Lens, lam: FloatArray, w: FloatArray, derivatives: bool
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, np.ndarray]:
     """Return theta of the ray through points, its sine and cosine, f'(theta), and where that is right.
 
-    Newton from the direction as seen from C, whose sine and cosine need no trigonometry; those of the
-    later angles follow by a small turn. ``polish`` brings sine, cosine and f' to the last theta.
+    Newton on the turn from the direction seen from C, whose sine and cosine need no trigonometry: with
+    g = s sin(theta) the condition reads f = rho sin(turn) - g = 0.
     """
     rho = np.sqrt(lam * lam + w * w)
     start = np.arctan2(lam, w)
-    sine_start, cosine_start = lam / rho, w / rho
+    per_rho = 1.0 / rho
+    sine_start, cosine_start = lam * per_rho, w * per_rho
     if not lens.moving:
         return start, sine_start, cosine_start, rho, (rho > NEAREST_M) & (rho < np.inf)
-    e0, e1, e2 = lens.e
-    theta, sine, cosine, turn = start, sine_start, cosine_start, np.zeros_like(start)
+    theta, sine, cosine = start, sine_start, cosine_start
+    rise = _lag_over_range(lens, theta, sine, cosine, per_rho)
+    slope = 1.0 - rise[1]
+    turn = rise[0] / slope
     for _ in range(8):
-        y = theta * theta
-        e = e0 + y * (e1 + y * e2)
-        lag = theta - sine
-        slope = w * cosine + lam * sine - (1.0 - cosine) * e - lag * theta * (2.0 * e1 + (4.0 * e2) * y)
-        step = (w * sine - lam * cosine - lag * e) / slope
-        turn = turn - step
         theta = start + turn
-        settled = np.abs(step) < SETTLED
-        done = bool(settled.all())
-        if done and not polish:
+        if np.abs(turn).max() < _SMALL_TURN_RAD:
+            y = turn * turn
+            sine_turn = y * (1.0 / 120.0)
+            sine_turn -= 1.0 / 6.0
+            sine_turn *= y
+            sine_turn += 1.0
+            sine_turn *= turn
+            cosine_turn = np.sqrt(1.0 - sine_turn * sine_turn)
+            sine = sine_start * cosine_turn
+            sine += cosine_start * sine_turn
+            cosine = cosine_start * cosine_turn
+            cosine -= sine_start * sine_turn
+        else:
+            sine_turn, cosine_turn, sine, cosine = np.sin(turn), np.cos(turn), np.sin(theta), np.cos(theta)
+        rise = _lag_over_range(lens, theta, sine, cosine, per_rho)
+        slope = np.subtract(cosine_turn, rise[1], out=cosine_turn)
+        sine_turn -= rise[0]
+        step = np.divide(sine_turn, slope, out=sine_turn)
+        turn -= step
+        if np.abs(step, out=step).max() < SETTLED:
             break
-        sine, cosine = _turned(sine_start, cosine_start, turn, theta)
-        if done:
-            break
+    theta = start + turn
+    settled = step < SETTLED
     settled &= slope > 0.0
     settled &= lam > NEAREST_M * sine
 
     # With f(theta_image) > 0 the ray is inside the image; what Newton did not find there, or may have
     # found twice because rays cross so near the lens, is searched for.
     edge = lens.theta_image_rad
-    edge_lag = (edge - np.sin(edge)) * (e0 + edge**2 * (e1 + edge**2 * e2))
+    edge_lag = (edge - np.sin(edge)) * (lens.e[0] + edge**2 * (lens.e[1] + edge**2 * lens.e[2]))
     unsure = w * np.sin(edge) - lam * np.cos(edge) > edge_lag
     unsure &= ~(settled & (theta > 0.0) & (theta <= edge))
-    unsure |= rho <= lens.near_m
+    if lens.near_m > 0.0:
+        unsure |= rho <= lens.near_m
     if unsure.any():
         found = angle_by_search(lens, lam[unsure], w[unsure])
         theta[unsure] = found
         settled[unsure] = found > 0.0  # not a number where none was found
-        if polish:
+        if derivatives:
             sine, cosine = np.sin(theta), np.cos(theta)
-    if polish:
-        y = theta * theta
-        slope = w * cosine + lam * sine - (1.0 - cosine) * (e0 + y * (e1 + y * e2))
-        slope -= (theta - sine) * theta * (2.0 * e1 + (4.0 * e2) * y)
+            slope = np.cos(theta - start) - _lag_over_range(lens, theta, sine, cosine, per_rho)[1]
+    slope *= rho
     return theta, sine, cosine, slope, settled
 
 
-def _turned(
-    sine: FloatArray, cosine: FloatArray, turn: FloatArray, theta: FloatArray
+def _lag_over_range(
+    lens: Lens, theta: FloatArray, sine: FloatArray, cosine: FloatArray, per_rho: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Return sine and cosine of theta, which is the given one plus ``turn``."""
-    if not np.abs(turn).max() < _SMALL_TURN_RAD:
-        return np.sin(theta), np.cos(theta)
-    y = turn * turn
-    s = turn * (1.0 - y / 6.0 * (1.0 - y / 20.0 * (1.0 - y / 42.0 * (1.0 - y / 72.0))))
-    c = 1.0 - y / 2.0 * (1.0 - y / 12.0 * (1.0 - y / 30.0 * (1.0 - y / 56.0)))
-    return sine * c + cosine * s, cosine * c - sine * s
+    """Return g/rho and g'/rho, with g = (theta - sin theta) (e0 + e1 theta^2 + e2 theta^4)."""
+    e0, e1, e2 = lens.e
+    y = theta * theta
+    e = y * e2
+    rate = e * 4.0
+    e += e1
+    e *= y
+    e += e0
+    e *= per_rho
+    lag = theta - sine
+    rate += 2.0 * e1
+    rate *= theta
+    rate *= lag
+    rate *= per_rho
+    rate += e
+    rate -= cosine * e
+    e *= lag
+    return e, rate
 
 
 def angle_by_search(lens: Lens, lam: FloatArray, w: FloatArray) -> FloatArray:
@@ -205,10 +248,10 @@ def angle_by_search(lens: Lens, lam: FloatArray, w: FloatArray) -> FloatArray:
     return np.where(lost, np.nan, theta)
 
 
-def unbend(lens: Lens, u: FloatArray, v: FloatArray, derivatives: bool = False) -> Unbent:
-    """Return the rays that land on distorted slopes (u, v)."""
-    t2 = u * u
-    t2 += v * v
+def unbend(lens: Lens, slopes: FloatArray, derivatives: bool = False) -> Unbent:
+    """Return the rays that land on distorted slopes (2, n), rows u and v."""
+    squares = slopes * slopes
+    t2 = np.add(squares[0], squares[1], out=squares[0])
     valid = t2 < lens.distorted_limit * lens.distorted_limit
     if not valid.all():
         t2 = np.where(valid, t2, 0.0)
@@ -217,12 +260,15 @@ def unbend(lens: Lens, u: FloatArray, v: FloatArray, derivatives: bool = False) 
         return _unbend_curved(lens, np.maximum(np.sqrt(t2), TINY), k, valid, derivatives)
     chi2 = k * k
     chi2 *= t2
-    q = 1.0 / np.sqrt(1.0 + chi2)
-    p = k * q
+    q = chi2 + 1.0
+    np.sqrt(q, out=q)
+    np.divide(1.0, q, out=q)
+    p = np.multiply(k, q, out=k)
     if not derivatives:
         return Unbent(p, q, None, valid)
     t2 = np.maximum(t2, TINY * TINY)
-    angle_rate = q * q / _growth(lens, chi2)  # d theta / d chi'
+    angle_rate = q * q
+    angle_rate /= _growth(lens, chi2)  # d theta / d chi'
     return Unbent(p, q, None, valid, (q * angle_rate - p) / t2, -p * angle_rate)
 
 
@@ -275,7 +321,11 @@ def _unbend_curved(lens: Lens, t: FloatArray, k: FloatArray, valid: np.ndarray, 
 def _growth(lens: Lens, chi2: FloatArray) -> FloatArray:
     """Return d chi' / d chi."""
     r0, r1, r2 = lens.r
-    return (1.0 + r0) + chi2 * (3.0 * r1 + chi2 * (5.0 * r2))
+    growth = chi2 * (5.0 * r2)
+    growth += 3.0 * r1
+    growth *= chi2
+    growth += 1.0 + r0
+    return growth
 
 
 def _shrink(lens: Lens, t2: FloatArray) -> FloatArray:
@@ -284,24 +334,40 @@ def _shrink(lens: Lens, t2: FloatArray) -> FloatArray:
     c1 = 1.0 + r0
     if r1 == 0.0 and r2 == 0.0:
         return np.full_like(t2, 1.0 / c1)
+    # Newton on c1 k + c3 k^3 + c5 k^5 = 1
     c3 = r1 * t2
     c5 = t2 * t2
     c5 *= r2
-    k = np.full_like(t2, 1.0 / c1)
+    k = c3 + c5
+    k += c1
+    np.divide(1.0, k, out=k)
+    y, low, rate = np.empty_like(k), np.empty_like(k), np.empty_like(k)
     for _ in range(10):
-        y = k * k
-        c5y = c5 * y
-        rise = y * (c5y + c3)
-        step = (k * (rise + c1) - 1.0) / (y * (5.0 * c5y + 3.0 * c3) + c1)
-        k -= step
-        settled = np.abs(step) < SETTLED
-        if settled.all():
+        np.multiply(k, k, out=y)
+        high = y * c5
+        np.add(high, c3, out=low)
+        low *= y
+        high *= y
+        np.multiply(low, 3.0, out=rate)  # 3 c3 k^2 + 5 c5 k^4 + c1
+        high *= 2.0
+        rate += high
+        rate += c1
+        low += c1
+        low *= k
+        low -= 1.0
+        low /= rate
+        k -= low
+        step = np.abs(low, out=low)
+        if step.max() < SETTLED:
             break
-    settled &= k > 0.0
+    found = step < SETTLED
+    found &= k > 0.0
     if lens.chi_limit < np.inf:
-        settled &= k * k * t2 < lens.chi_limit * lens.chi_limit
-    for row in np.flatnonzero(~settled):  # close to the fold, or led astray by it
-        distorted = float(np.sqrt(t2[row]))
-        chi = lens.undistorted(distorted)
-        k[row] = np.nan if chi is None else chi / distorted
+        y *= t2
+        found &= y < lens.chi_limit * lens.chi_limit
+    if not found.all():
+        for row in np.flatnonzero(~found):  # close to the fold, or led astray by it
+            distorted = float(np.sqrt(t2[row]))
+            chi = lens.undistorted(distorted)
+            k[row] = np.nan if chi is None else chi / distorted
     return k

@@ -44,25 +44,26 @@ def _ray_angle(lens: Lens, lam: float, w: float) -> float:
     rho = sqrt(lam * lam + w * w)
     if not NEAREST_M < rho < inf:
         return nan
-    theta = atan2(lam, w)
+    start = atan2(lam, w)
     if not lens.moving:
-        return theta
+        return start
     e0, e1, e2 = lens.e
-    sine, cosine = lam / rho, w / rho
-    settled = False
-    for _ in range(8):
+    theta, sine, cosine, turn, settled = start, lam / rho, w / rho, 0.0, False
+    for newton in range(9):
         y = theta * theta
-        e = e0 + y * (e1 + y * e2)
+        e = (e0 + y * (e1 + y * e2)) / rho
         lag = theta - sine
-        slope = w * cosine + lam * sine - (1.0 - cosine) * e - lag * theta * (2.0 * e1 + 4.0 * e2 * y)
+        rise = (1.0 - cosine) * e + lag * theta * (2.0 * e1 + 4.0 * e2 * y) / rho
+        slope = cos(turn) - rise
         if slope == 0.0:
             break
-        step = (w * sine - lam * cosine - lag * e) / slope
-        theta -= step
-        if abs(step) < SETTLED:
-            settled = slope > 0.0 and lam > NEAREST_M * sine
-            break
+        step = (sin(turn) - lag * e) / slope
+        turn -= step
+        theta = start + turn
         if not abs(theta) < inf:
+            break
+        if newton > 0 and abs(step) < SETTLED:
+            settled = slope > 0.0 and lam > NEAREST_M * sine
             break
         sine, cosine = sin(theta), cos(theta)
     edge = lens.theta_image_rad

@@ -46,63 +46,62 @@ class Projection:
     slope_from_pixel: FloatArray
 
     def project(
-        self, points: FloatArray, center: FloatArray, axes: FloatArray, derivatives: bool
+        self, points: FloatArray, center: FloatArray, frame: FloatArray, derivatives: bool
     ) -> tuple[FloatArray, FloatArray, np.ndarray]:
         """Return pixels (n, 2), the Jacobians (n, 2, 3) if asked for, else none, and which are valid (n,).
 
-        ``points`` (n, 3) metres, ``center`` (3,) and ``axes`` (3, 3), the lens frame's axes as rows, are in
-        one frame.
+        ``points`` (n, 3) metres, ``center`` (3,) and ``frame`` (4, 3) are in one frame; the rows of the last
+        are A and the lens frame's axes.
         """
         count = len(points)
         pixels, valid = np.empty((count, 2)), np.empty(count, dtype=bool)
         jacobian = np.empty((count if derivatives else 0, 2, 3))
         with np.errstate(all="ignore"):
             for part in _chunks(count):
-                self._project(points[part], center, axes, pixels[part], jacobian[part], valid[part])
+                self._project(points[part], center, frame, pixels[part], jacobian[part], valid[part])
         return pixels, jacobian, valid
 
     def _project(
         self,
         points: FloatArray,
         center: FloatArray,
-        axes: FloatArray,
+        frame: FloatArray,
         pixels: FloatArray,
         jacobian: FloatArray,
         valid: np.ndarray,
     ) -> None:
         """Fill pixels and validity of one chunk, and the Jacobian if it has rows."""
         lens, k = self.lens, self.pixel_from_slope
-        local = axes @ np.subtract(points.T, center[:, None], order="C")
-        a, b, w = local
-        bent = bend(lens, a, b, w, len(jacobian) > 0)
-        slopes = np.empty_like(local)
-        np.multiply(a, bent.m, out=slopes[0])
-        np.multiply(b, bent.m, out=slopes[1])
-        slopes[2] = 1.0
-        x, y, z = k @ slopes
-        np.logical_and(bent.valid, z > 0.0, out=valid)
-        if not lens.curved:
-            valid &= k[2] @ local > 0.0
-        z = 1.0 / z
-        x *= z
-        y *= z
-        valid &= np.isfinite(x + y)
-        pixels[:, 0] = x
-        pixels[:, 1] = y
-        if bent.n is not None and bent.k is not None:
-            for row, value in enumerate((x, y)):
-                per_u, per_v = (k[row, 0] - k[2, 0] * value) * z, (k[row, 1] - k[2, 1] * value) * z
-                along = a * per_u
-                along += b * per_v
-                across = along * bent.n
-                slopes[0] = bent.m * per_u + a * across
-                slopes[1] = bent.m * per_v + b * across
-                np.multiply(along, bent.k, out=slopes[2])
-                jacobian[:, row] = (axes.T @ slopes).T
+        along_a_and_local = frame @ np.subtract(points.T, center[:, None], order="C")
+        local = along_a_and_local[1:]
+        bent = bend(lens, local, len(jacobian) > 0)
+        seen = k @ bent.slopes
+        depth = seen[2]
+        if lens.curved:
+            np.greater(depth, 0.0, out=valid)
+        else:
+            np.greater(np.minimum(depth, along_a_and_local[0]), 0.0, out=valid)
+        valid &= bent.valid
+        per_depth = np.divide(1.0, depth, out=depth)
+        np.multiply(seen[:2], per_depth, out=pixels.T)
+        if not isfinite(np.vdot(pixels, pixels)):
+            valid &= np.isfinite(pixels).all(axis=1)
+        if bent.derivatives is not None:
+            m, n, along_w, across = bent.derivatives
+            # d pixel / d slope (2 pixel, 2 slope, n), then by the lens to (a, b, w), then turned
+            per_slope = k[:2, :2, None] - k[2, :2, None] * pixels.T[:, None]
+            per_slope *= per_depth
+            rows = np.empty((2, 3, len(points)))
+            np.multiply(per_slope, m, out=rows[:, :2])
+            per_slope *= across
+            along = per_slope[:, 0] + per_slope[:, 1]
+            np.multiply(along, along_w, out=rows[:, 2])
+            along *= n
+            rows[:, :2] += np.multiply(along[:, None], across, out=per_slope)
+            jacobian[...] = (frame[1:].T @ rows).transpose(2, 0, 1)
         if not valid.all():
             pixels[~valid] = nan
-            if len(jacobian):
-                jacobian[~valid] = nan
+            jacobian[~valid[: len(jacobian)]] = nan
 
     def rays(
         self, pixels: FloatArray, center: FloatArray, axes: FloatArray, derivatives: bool
@@ -136,32 +135,31 @@ class Projection:
         lens, k = self.lens, self.slope_from_pixel
         seen = k[:, :2] @ pixels.T
         seen += k[:, 2:]
-        u, v, per_w = seen
+        slopes, per_w = seen[:2], seen[2]
         np.greater(per_w, 0.0, out=valid)
         np.divide(1.0, per_w, out=per_w)
-        u *= per_w
-        v *= per_w
-        ray = unbend(lens, u, v, len(d_directions) > 0)
+        slopes *= per_w
+        ray = unbend(lens, slopes, len(d_directions) > 0)
         local = np.empty_like(seen)
-        np.multiply(u, ray.p, out=local[0])
-        np.multiply(v, ray.p, out=local[1])
+        np.multiply(slopes, ray.p, out=local[:2])
         local[2] = ray.q
         valid &= ray.valid
         if not lens.curved:
             valid &= self.pixel_from_slope[2] @ local > 0.0
-        valid &= np.isfinite(local[0] + local[1])
-        directions[...] = (axes.T @ local).T
+        if not isfinite(np.vdot(local, local)):
+            valid &= np.isfinite(local).all(axis=0)
+        np.matmul(local.T, axes, out=directions)
         origins[...] = center
         if ray.shift is not None:
             origins += ray.shift[:, None] * axes[2]
         if ray.p_rate is not None and ray.q_rate is not None:
             for column in range(2):
-                du = (k[0, column] - k[2, column] * u) * per_w
-                dv = (k[1, column] - k[2, column] * v) * per_w
-                g = u * du + v * dv
-                along = ray.p_rate * g
-                local[0] = ray.p * du + u * along
-                local[1] = ray.p * dv + v * along
+                d_slopes = k[:2, column, None] - k[2, column] * slopes
+                d_slopes *= per_w
+                g = slopes * d_slopes
+                g = np.add(g[0], g[1], out=g[0])
+                np.multiply(ray.p, d_slopes, out=local[:2])
+                local[:2] += slopes * (ray.p_rate * g)
                 np.multiply(ray.q_rate, g, out=local[2])
                 d_directions[:, :, column] = (axes.T @ local).T
                 if ray.shift_rate is not None:
