@@ -22,6 +22,15 @@ from math import asin, atan, inf, isfinite, pi, sin, sqrt, tan
 
 import numpy as np
 
+TINY = 1e-150
+"""Stands for zero in divisions by a distance from the axis: its square is still a number."""
+
+SETTLED = 1e-9
+"""Newton stops after a step below this; it doubles its digits, so the result is good to rounding."""
+
+NEAREST_M = 1e-9
+"""A point this near the entrance point has no direction from it."""
+
 Coefficients = tuple[float, float, float]
 
 

@@ -1,7 +1,7 @@
 """The lens of `calib.lens` for one point or one slope, in plain floats: no array to set up.
 
 A pointing solution needs one ray; numpy would take ten times as long to begin. Every branch and tolerance
-is that of `calib.lens_arrays`, and a test holds the two together.
+is that of `calib.lens_arrays` and `calib.entrance`, and a test holds the two together.
 """
 
 from __future__ import annotations
@@ -10,8 +10,8 @@ from math import asin, atan, atan2, cos, inf, isfinite, nan, sin, sqrt, tan
 
 import numpy as np
 
-from calib.lens import Lens
-from calib.lens_arrays import NEAREST_M, SETTLED, TINY, angle_by_search
+from calib.entrance import angle_by_search
+from calib.lens import NEAREST_M, SETTLED, TINY, Lens
 
 
 def bend_point(lens: Lens, a: float, b: float, w: float) -> float:

@@ -57,8 +57,11 @@ class Projection:
         pixels, valid = np.empty((count, 2)), np.empty(count, dtype=bool)
         jacobian = np.empty((count if derivatives else 0, 2, 3))
         with np.errstate(all="ignore"):
-            for part in _chunks(count):
-                self._project(points[part], center, frame, pixels[part], jacobian[part], valid[part])
+            if 0 < count <= _CHUNK:
+                self._project(points, center, frame, pixels, jacobian, valid)
+            else:
+                for part in _chunks(count):
+                    self._project(points[part], center, frame, pixels[part], jacobian[part], valid[part])
         return pixels, jacobian, valid
 
     def _project(
@@ -116,8 +119,11 @@ class Projection:
         d_directions, d_origins = np.empty((rows, 3, 2)), np.zeros((rows, 3, 2))
         filled = (origins, directions, valid, d_directions, d_origins)
         with np.errstate(all="ignore"):
-            for part in _chunks(count):
-                self._rays(pixels[part], center, axes, *(array[part] for array in filled))
+            if 0 < count <= _CHUNK:
+                self._rays(pixels, center, axes, *filled)
+            else:
+                for part in _chunks(count):
+                    self._rays(pixels[part], center, axes, *(array[part] for array in filled))
         return filled
 
     def _rays(
