@@ -1,7 +1,8 @@
 """Pan/tilt mast kinematics and the rig: a mast with its cameras.
 
 rover_from_head(pan, tilt) = Trans(t) Rot(x,θx) Rot(y,θy) Rot(z,θz) · Rot(z,pan) · Trans(a,0,0) Rot(x,k) ·
-Rot(y,tilt) (paper eqs. (6)-(8); a and k make it any two revolute axes). Positive pan turns right, positive tilt looks up.
+Rot(y,tilt) (paper eqs. (6)-(8); a and k make it any two revolute axes). Positive pan turns right, positive
+tilt looks up.
 """
 
 from __future__ import annotations

@@ -36,7 +36,7 @@ class BadReply(DriverError):
 
 
 class NoFreshFrame(DriverError):
-    """No frame exposed after the asked moment came within the deadline; the message says what came instead."""
+    """No frame exposed after the asked moment came in time; the message says what came instead."""
 
     code = "no_fresh_frame"
 
