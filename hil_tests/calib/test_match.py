@@ -10,13 +10,14 @@ from pictures import Pinhole, TexturedPlane, picture, random_texture
 
 from calib.epipolar import find_partner
 from calib.errors import CalibError
-from calib.match import Match, match
+from calib.match import Match, MatchSettings, match
 from calib.warp import Plane, carry, facing_plane, grey
 
 FOCAL_PX = 1290.0  # the paper's Navcam
 SIZE_PX = (360, 280)
 NOISE_DN = 2.0
 MEAN_PX, RMS_PX = 0.01, 0.05  # what the pictures of the simulated rover are asked to allow
+PLANE = MatchSettings(roughness=0.0)  # the tests' surfaces are plane
 HONEST = (0.75, 1.3)  # rms of errors over their own sigmas
 
 
@@ -59,7 +60,7 @@ def test_patch_warped_over_a_guessed_plane_is_found_where_geometry_says() -> Non
             point = plane.hit(LEFT.position_m, LEFT.rays(pixel))
             guess = facing_plane(LEFT.model, pixel, 1.01 * float(np.linalg.norm(point)))
             found = match(
-                seen(LEFT, seed), LEFT.model, pixel, guess, seen(TURNED, seed), TURNED.model, search_px=15
+                seen(LEFT, seed), LEFT.model, pixel, guess, seen(TURNED, seed), TURNED.model, 15, PLANE
             )
             assert found.verdict == "good", f"seed 3, scene {seed}, pixel {pixel}: {found.reason}"
             matches.append((found, TURNED.pixel(point)))
@@ -77,7 +78,7 @@ def test_sigma_grows_with_noise_and_stays_honest() -> None:
         point = plane.hit(LEFT.position_m, LEFT.rays(pixel))
         found = match(
             seen(LEFT, 2, 8.0), LEFT.model, pixel, Plane(point, plane.normal), seen(TURNED, 2, 8.0),
-            TURNED.model, search_px=15,
+            TURNED.model, 15, PLANE,
         )  # fmt: skip
         assert found.verdict == "good", found.reason
         matches.append((found, TURNED.pixel(point)))
@@ -113,7 +114,7 @@ def test_partner_is_found_along_the_line_with_range_and_slope() -> None:
     for _ in range(15):
         pixel = np.array([rng.uniform(120, 330), rng.uniform(40, 240)])
         point = plane.hit(LEFT.position_m, LEFT.rays(pixel))
-        found = find_partner(seen(LEFT, 5), LEFT.model, pixel, seen(RIGHT, 5), RIGHT.model)
+        found = find_partner(seen(LEFT, 5), LEFT.model, pixel, seen(RIGHT, 5), RIGHT.model, settings=PLANE)
         assert found.match.verdict == "good", f"seed 5, pixel {pixel}: {found.match.reason}"
         assert found.plane is not None
         assert np.linalg.norm(found.plane.point_m - point) < 0.02
@@ -210,3 +211,18 @@ def test_arrays_that_are_no_picture_are_refused_in_a_sentence() -> None:
         grey(np.zeros((4, 4, 2)))
     with pytest.raises(CalibError, match="direction"):
         Plane(np.zeros(3), np.zeros(3))
+
+
+def test_a_rough_surface_makes_the_place_less_certain_along_the_parallax_only() -> None:
+    pixel = np.array([180.0, 140.0])
+    point = wall(5).hit(LEFT.position_m, LEFT.rays(pixel))
+    sigmas = []
+    for roughness in (0.0, 0.05):
+        found = match(
+            seen(LEFT, 5), LEFT.model, pixel, Plane(point, wall(5).normal), seen(RIGHT, 5), RIGHT.model, 10,
+            MatchSettings(roughness=roughness),
+        )  # fmt: skip
+        sigmas.append(found.sigma_px)
+    # Half a patch of 41 px at 4 m is 62 mm, a twentieth of it 3 mm; f b / z² of it is some 0.05 px.
+    assert 0.03 < np.sqrt(sigmas[1][0] ** 2 - sigmas[0][0] ** 2) < 0.12
+    assert np.sqrt(sigmas[1][1] ** 2 - sigmas[0][1] ** 2) < 0.01

@@ -204,8 +204,8 @@ class Eyes:
     ) -> tuple[Match, dict[str, Any]]:
         """Find the clicked thing in the other eye too and check that both mean the same place.
 
-        One eye alone would believe a shifted picture. A wrong joint angle moves both alike; what is
-        compared is how far each is from its own prediction.
+        One eye alone would believe a shifted picture. Compared is the place in the other eye with where
+        the first eye's ray leads there; a wrong joint angle turns both eyes alike and does not show.
 
         Returns
         -------
@@ -225,11 +225,13 @@ class Eyes:
                 "eyes_disagree",
                 f"{now.frame.camera} finds the target, {other.frame.camera} does not confirm it: {error}",
             ) from None
-        between = (confirmed.pixel_px - confirmed.predicted_px) - (seen.pixel_px - seen.predicted_px)
-        towards = other.camera.project(clicked.plane.point_m + (clicked.plane.point_m - now.camera.C) * 0.02)[
-            0
-        ]
-        along = towards - other.camera.project(clicked.plane.point_m)[0]
+        # The place as the first eye sees it, at the range that is believed, and two per cent farther.
+        ray = now.camera.ray(seen.pixel_px)
+        range_m = float(np.linalg.norm(clicked.plane.point_m - ray.origins_m))
+        believed, farther = other.camera.project(
+            ray.origins_m + range_m * np.array([[1.0], [1.02]]) * ray.directions
+        )[0]
+        between, along = confirmed.pixel_px - believed, farther - believed
         along /= max(float(np.linalg.norm(along)), 1e-12)
         along_px, across_px = float(between @ along), float(along[0] * between[1] - along[1] * between[0])
         detail = {

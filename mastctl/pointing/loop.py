@@ -278,13 +278,23 @@ class _Run:
                 self._again(confirmed)
 
     def _again(self, confirmed: Sequence[tuple[View, FloatArray]]) -> None:
-        """Triangulate from the new pictures: the aiming eye and its partner, or the pair that stood in."""
+        """Measure the position again in the new pictures, by the aiming eye and its partner.
+
+        Where another pair stood in for the partner it gives the range only; the direction stays the aiming
+        eye's own, free of what the mast file has wrong between the two.
+        """
         if len(confirmed) < 2:
             with self._step("triangulate"):
                 words = "a second pointing needs two eyes of a pair that see the target after the first one"
                 raise PointingError("no_stereo", words)
         (one, one_px), (other, other_px) = confirmed[-2:]
         self._triangulate(one, one_px, other, other_px)
+        if len(confirmed) > 2:
+            assert self._position_m is not None
+            aiming, seen_px = confirmed[0]
+            ray = aiming.camera.ray(seen_px)
+            range_m = float((self._position_m - ray.origins_m) @ ray.directions)
+            self._position_m = ray.origins_m + range_m * ray.directions
 
     def _solve_and_go(self, aim: Aim, aim_px: FloatArray, resting: Reading | None) -> tuple[Pair, Reading]:
         """Solve for the present position, move, settle; return the commanded angles and the arrival."""
