@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from calib.cahvor import CameraModel
 from calib.epipolar import find_partner
 from calib.errors import NoStereoPoint
-from calib.match import MatchSettings
 from calib.stereo import triangulate
 from calib.warp import grey
 from drivers.interfaces import Image
@@ -57,15 +56,15 @@ def choose_target(
     rng
         Chooses.
     """
-    rows, columns = np.nonzero(textured(left.image))
+    candidates = textured(left.image)
+    likely = candidates & on_level_ground(left_in_rover, distance_m)
+    rows, columns = np.nonzero(likely if likely.any() else candidates)
     if len(rows) == 0:
         return None
     images = grey(left.image), grey(right.image)
     for pick in rng.integers(len(rows), size=TRIES_PER_VIEW):
         pixel = np.array([columns[pick], rows[pick]], dtype=np.float64)
-        found = find_partner(
-            images[0], left_in_rover, pixel, images[1], right_in_rover, settings=MatchSettings()
-        )
+        found = find_partner(images[0], left_in_rover, pixel, images[1], right_in_rover)
         if found.match.verdict != "good":
             continue
         try:
@@ -76,6 +75,23 @@ def choose_target(
         if abs(range_m - distance_m) <= RANGE_SLACK * distance_m:
             return Target(left, float(pixel[0]), float(pixel[1]), range_m)
     return None
+
+
+def on_level_ground(camera_in_rover: CameraModel, distance_m: float) -> NDArray[np.bool_]:
+    """Return a mask (h, w) of pixels that see level ground (z = 0) near the distance.
+
+    It only saves tries: what counts is the range that stereo measures.
+    """
+    width, height = camera_in_rover.size_px
+    step = 8
+    columns, rows = np.meshgrid(
+        np.arange(0, width, step, dtype=float), np.arange(0, height, step, dtype=float)
+    )
+    rays = camera_in_rover.ray(np.stack([columns, rows], axis=-1))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ranges_m = -rays.origins_m[..., 2] / rays.directions[..., 2]
+        near = np.abs(ranges_m - distance_m) <= RANGE_SLACK * distance_m
+    return np.repeat(np.repeat(near, step, axis=0), step, axis=1)[:height, :width]
 
 
 def textured(image: Image) -> NDArray[np.bool_]:
