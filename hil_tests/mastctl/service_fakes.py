@@ -198,6 +198,7 @@ class ScriptedLoop:
         """Two steps and a residual."""
         record(FakeStep("look", "done", time.monotonic(), 0.01, {"frame_ids": ["a", "b"]}))
         devices.move(0.1, -0.1)
+        devices.read()  # the head has arrived, as after a real loop: the next picture is of a head at rest
         record(FakeStep("measure", "done", time.monotonic(), 0.01, {"not_a_number": float("nan")}))
         pointing = FakePointing(np.array([0.25, -0.5]), np.array([0.05, 0.06]), "navcam_left-000001-x-y")
         return FakeResult(np.array([6.0, 0.0, 0.1]), 6.0, (pointing,))
