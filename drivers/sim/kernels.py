@@ -160,14 +160,18 @@ def borrowed_texture(texture: Texture) -> Texture:
     )
 
 
+PAD = 32  # unused texels behind each row: rows a power of two apart would share one place in the cache
 ONE = 16384.0  # the texel value that means brightness 1
-GROUND_TONE = 118.0
-ROCK_TONE = 104.0
+GROUND_TONE = 108.0
+ROCK_TONE = 106.0
 SKY_HORIZON = 196.0
 SKY_ZENITH = 128.0
 HAZE_M = 900.0
 AMBIENT = 0.30
 MAX_TAPS = 10
+SIGHT_M = 2000.0  # beams are followed no farther
+SHARING = 4  # up to so many rays of a pixel share one look at the ground's texture...
+ONE_PATCH = 1.05  # ...if the farthest hit is no farther than this times the nearest
 
 
 # ---------------------------------------------------------------- ground
@@ -294,16 +298,24 @@ def cross_grid(
 
 @compiled
 def cross_outer(
-    inner: Grid, outer: Grid, ox: float, oy: float, oe: float, dx: float, dy: float, de: float
+    inner: Grid,
+    outer: Grid,
+    ox: float,
+    oy: float,
+    oe: float,
+    dx: float,
+    dy: float,
+    de: float,
+    start: float,
 ) -> tuple[float, int, int]:
-    """First crossing of a ray with the outer grid once it has left the square of the inner one."""
+    """First crossing with the outer grid, after ``start`` and after leaving the inner one's square."""
     half = inner.cells * inner.cell_m * 0.5
     leave = FAR
     if dx != 0.0:
         leave = min(leave, (inner.x0_m + half + math.copysign(half, dx) - ox) / dx)
     if dy != 0.0:
         leave = min(leave, (inner.y0_m + half + math.copysign(half, dy) - oy) / dy)
-    return cross_grid(outer, ox, oy, oe, dx, dy, de, leave, FAR)
+    return cross_grid(outer, ox, oy, oe, dx, dy, de, max(leave, start), FAR)
 
 
 @compiled
@@ -329,7 +341,7 @@ def clear_distance(
     inv_cell = 1.0 / grid.cell_m
     level_flat = math.sqrt(dx * dx + dy * dy)
     s = start
-    while s < 200.0:
+    while s < SIGHT_M:
         radius = rho + (s + step) * spread
         low = min(oe + s * de, oe + (s + step) * de) - radius
         clear = low > grid.highest_m
@@ -475,7 +487,8 @@ def texel_between(texels: NDArray[np.uint16], start: int, size: int, u: float, v
     i, j = int(floor_u), int(floor_v)
     mask = size - 1
     i0, i1 = i & mask, (i + 1) & mask
-    row0, row1 = start + (j & mask) * size, start + ((j + 1) & mask) * size
+    row0 = start + (j & mask) * (size + PAD)
+    row1 = start + ((j + 1) & mask) * (size + PAD)
     a, b = float(texels[row0 + i0]), float(texels[row0 + i1])
     c, d = float(texels[row1 + i0]), float(texels[row1 + i1])
     top = a + u * (b - a)
@@ -495,7 +508,7 @@ def brightness(
 ) -> float:
     """Mean, 1 = the texture's own, over ``taps`` places spread along (ax, ay) about (x, y), metres.
 
-    Each is trilinear for a footprint ``width_m`` wide.
+    Each is bilinear in the level whose texels are as wide as ``width_m``, with a short blend between levels.
     """
     inv = 1.0 / texture.texel_m
     width = width_m * inv
@@ -503,7 +516,7 @@ def brightness(
     if width > 1.0:
         lod = min(halvings(width), texture.levels - 1.001)
         level = int(lod)
-        part = lod - level
+        part = min(max(2.0 * (lod - level) - 0.5, 0.0), 1.0)
     start0, size0 = texture.start[level], texture.size >> level
     start1, size1 = texture.start[level + 1], texture.size >> (level + 1)
     scale = inv / (1 << level)
@@ -513,22 +526,24 @@ def brightness(
     for k in range(taps):
         f = (k + 0.5) * gap - 0.5
         u, v = x + f * ax, y + f * ay
-        fine = texel_between(texture.texels, start0, size0, u, v)
+        if part < 1.0:
+            total += (1.0 - part) * texel_between(texture.texels, start0, size0, u, v)
         if part > 0.0:
-            fine += part * (texel_between(texture.texels, start1, size1, 0.5 * u, 0.5 * v) - fine)
-        total += fine
-    return total / (taps * ONE)
+            total += part * texel_between(texture.texels, start1, size1, 0.5 * u, 0.5 * v)
+    return total * gap * (1.0 / ONE)
 
 
 @inlined
-def stretched_brightness(texture: Texture, x: float, y: float, short_m: float, ax: float, ay: float) -> float:
-    """Mean over a footprint ``short_m`` wide and (ax, ay) metres long, by evenly spaced taps along it."""
-    long_m = math.sqrt(ax * ax + ay * ay)
+def stretched_brightness(
+    texture: Texture, x: float, y: float, short_m: float, long_m: float, ux: float, uy: float
+) -> float:
+    """Mean over a footprint ``short_m`` wide and ``long_m`` long in direction (ux, uy), by taps along it."""
     # a tap reaches twice as far as the footprint is wide, and never less than one texel
     taps = min(math.ceil(long_m / max(2.0 * short_m, texture.texel_m)), MAX_TAPS)
-    if taps <= 1:
-        return brightness(texture, x, y, max(short_m, 0.7 * long_m), 0.0, 0.0, 1)
-    return brightness(texture, x, y, max(short_m, 0.7 * long_m / taps), ax, ay, taps)
+    width_m = max(short_m, 0.7 * long_m / taps)
+    if taps == 1:
+        return brightness(texture, x, y, width_m, 0.0, 0.0, 1)
+    return brightness(texture, x, y, width_m, long_m * ux, long_m * uy, taps)
 
 
 @compiled
@@ -560,15 +575,50 @@ def ground_light(
     norm = 1.0 / math.sqrt(1.0 + sx * sx + sy * sy)
     facing = max((sx * dx + sy * dy - de) * norm, 0.03)  # cosine between ray and the normal (-sx, -sy, 1)
     short = s * pitch
-    flat = math.sqrt(dx * dx + dy * dy)
-    stretch = short / facing / flat if flat > 1e-6 else 0.0
-    if stretch < short:
-        stretch = 0.0
-    tone = stretched_brightness(broad, x, y, short, stretch * dx, stretch * dy)
+    long = short / facing
+    level = 1.0 / math.sqrt(dx * dx + dy * dy + 1e-12)
+    ux, uy = dx * level, dy * level
+    tone = stretched_brightness(broad, x, y, short, long, ux, uy)
     if short < 0.1:
-        tone *= stretched_brightness(detail, x, y, short, stretch * dx, stretch * dy)
+        tone *= stretched_brightness(detail, x, y, short, long, ux, uy)
     haze = s / (s + HAZE_M)
-    return GROUND_TONE * tone * (1.0 - haze) + SKY_HORIZON * haze
+    return float(GROUND_TONE * tone * (1.0 - haze) + SKY_HORIZON * haze)
+
+
+@compiled
+def hits_light(
+    grid: Grid,
+    broad: Texture,
+    detail: Texture,
+    hits: Float64,
+    together: bool,
+    pitch: float,
+    wide_pitch: float,
+) -> float:
+    """Sum of the brightness of a pixel's hits on the ground (n, 6: x, y, s, dx, dy, de).
+
+    ``together`` looks the texture up once for all of them, at their middle and with the pixel's own pitch.
+    """
+    n = hits.shape[0]
+    last = grid.cells - 1
+    inv_cell = 1.0 / grid.cell_m
+    if together:
+        x, y, s, dx, dy, de = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+        for k in range(n):
+            x, y, s = x + hits[k, 0], y + hits[k, 1], s + hits[k, 2]
+            dx, dy, de = dx + hits[k, 3], dy + hits[k, 4], de + hits[k, 5]
+        inv = 1.0 / n
+        x, y, s, dx, dy, de = x * inv, y * inv, s * inv, dx * inv, dy * inv, de * inv
+        ix, iy = min(int(x * inv_cell), last), min(int(y * inv_cell), last)
+        return float(n * ground_light(grid, broad, detail, ix, iy, x, y, s, dx, dy, de, wide_pitch))
+    total = 0.0
+    for k in range(n):
+        x, y = hits[k, 0], hits[k, 1]
+        ix, iy = min(int(x * inv_cell), last), min(int(y * inv_cell), last)
+        total += ground_light(
+            grid, broad, detail, ix, iy, x, y, hits[k, 2], hits[k, 3], hits[k, 4], hits[k, 5], pitch
+        )
+    return total
 
 
 @compiled
@@ -652,7 +702,7 @@ def cast_rays(world: World, origins_m: Float64, directions: Float64, ranges_m: F
         dx, dy, dz = directions[k, 0], directions[k, 1], directions[k, 2]
         s, _ix, _iy = cross_grid(inner, ox, oy, -oz, dx, dy, -dz, 0.0, FAR)
         if s >= FAR:
-            s, _ix, _iy = cross_outer(inner, outer, ox, oy, -oz, dx, dy, -dz)
+            s, _ix, _iy = cross_outer(inner, outer, ox, oy, -oz, dx, dy, -dz, 0.0)
         for rock in range(rocks.spheres_m.shape[0]):
             if meets_ball(rocks.spheres_m, rock, ox, oy, oz, dx, dy, dz, s):
                 met = cross_rock(rocks, rock, ox, oy, oz, dx, dy, dz, s)
@@ -733,6 +783,11 @@ def render_tiles(
     r = rotation
     mx, my, mz = centre_m[0], centre_m[1], centre_m[2]
     per_tile = tile // block
+    half = 0.5 * inner.cells * inner.cell_m
+    off_centre = max(abs(mx - inner.x0_m - half), abs(my - inner.y0_m - half))
+    near_edge = max(half - off_centre - 1.0, 0.0)
+    shared = 1 < q <= SHARING
+    hits = np.empty((q, 6))
     for index in range(first, last):
         row, column = index // tile_beams.shape[1], index % tile_beams.shape[1]
         tx, ty, tz, spread, rho, _ = tile_beams[row, column]
@@ -748,14 +803,20 @@ def render_tiles(
             tx, ty, tz, spread, rho, pitch = block_beams[block_row, block_column]
             if not spread >= 0.0:
                 continue
+            wide_pitch = pitch * math.sqrt(q)
             bx, by, bz = turned(r, tx, ty, tz)
             clear = clear_distance(
                 inner, mx, my, -mz, bx, by, -bz, spread, rho, tile_clear, 8.0 * (rho + tile_clear * spread)
             )
+            clear_beyond = 0.0
+            if (
+                clear >= near_edge
+            ):  # the beam may leave the inner grid; below this the outer one does not count
+                clear_beyond = clear_distance(outer, mx, my, -mz, bx, by, -bz, spread, rho, near_edge, 8.0)
             for y in range(block_row * block, min(block_row * block + block, height)):
                 for x in range(block_column * block, min(block_column * block + block, width)):
                     total = 0.0
-                    rays_met = 0
+                    rays_met, grounded, nearest, farthest = 0, 0, FAR, 0.0
                     for i in range(q):
                         if rays[y, x, i, 0] != rays[y, x, i, 0]:
                             continue
@@ -767,7 +828,7 @@ def render_tiles(
                         s, ix, iy = cross_grid(inner, ox, oy, -oz, dx, dy, -dz, clear, FAR)
                         beyond = s >= FAR
                         if beyond:
-                            s, ix, iy = cross_outer(inner, outer, ox, oy, -oz, dx, dy, -dz)
+                            s, ix, iy = cross_outer(inner, outer, ox, oy, -oz, dx, dy, -dz, clear_beyond)
                         rock, triangle, u, v = NOTHING, NOTHING, 0.0, 0.0
                         for j in range(n_near):
                             k = near[j]
@@ -776,17 +837,33 @@ def render_tiles(
                                 if met_s < s:
                                     s, rock, triangle, u, v = met_s, k, met_t, met_u, met_v
                         px, py, pz = ox + s * dx, oy + s * dy, oz + s * dz
+                        rays_met += 1
                         if rock != NOTHING:
                             total += rock_light(
                                 rocks, stone, sun, rock, triangle, u, v, px, py, pz, s, dx, dy, dz, pitch
                             )
-                        elif s < FAR:
+                        elif s >= FAR:
+                            total += sky_light(-dz)
+                        elif beyond or not shared:
                             grid = outer if beyond else inner
                             px, py = px - inner.x0_m, py - inner.y0_m
                             total += ground_light(grid, broad, detail, ix, iy, px, py, s, dx, dy, -dz, pitch)
                         else:
-                            total += sky_light(-dz)
-                        rays_met += 1
+                            hits[grounded, 0], hits[grounded, 1] = px - inner.x0_m, py - inner.y0_m
+                            hits[grounded, 2], hits[grounded, 3] = s, dx
+                            hits[grounded, 4], hits[grounded, 5] = dy, -dz
+                            nearest, farthest = min(nearest, s), max(farthest, s)
+                            grounded += 1
+                    if grounded > 0:
+                        total += hits_light(
+                            inner,
+                            broad,
+                            detail,
+                            hits[:grounded],
+                            farthest < nearest * ONE_PATCH,
+                            pitch,
+                            wide_pitch,
+                        )
                     if rays_met > 0:
                         image[y, x] = min(total / rays_met, 255.0)
 

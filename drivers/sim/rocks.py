@@ -103,7 +103,7 @@ def make_rocks(count: int, rng: np.random.Generator, ground_z_m: Any) -> Any:
         stone = stone @ np.array([[cos, sin, 0.0], [-sin, cos, 0.0], [0.0, 0.0, 1.0]])
         stone *= diameter / (stone[..., :2].max() - stone[..., :2].min())
         low, high = stone[..., 2].max(), stone[..., 2].min()  # z is down
-        sunk = rng.uniform(0.2, 0.42) * (low - high)
+        sunk = rng.uniform(0.28, 0.46) * (low - high)
         corners[k] = stone + np.array([x, y, float(ground_z_m(x, y)) - low + sunk])
         normals[k] = corner_normals(corners[k])
     tones = np.exp(rng.normal(0.0, 0.16, len(where))).astype(np.float32)

@@ -52,18 +52,19 @@ def gravel(rng: np.random.Generator, sun: NDArray[np.float64]) -> Float32:
         pebble[:, 2] = half_length
         pebble[:, 3] = half_length * rng.uniform(0.55, 0.95, count)
         pebble[:, 4] = rng.uniform(0.0, np.pi, count)
-        pebble[:, 5] = np.exp(rng.normal(0.0, 0.22, count))
+        pebble[:, 5] = np.exp(rng.normal(0.0, 0.19, count))
         layers.append(pebble)
     kernels().lay_pebbles(tones, rough, np.concatenate(layers), sun[0], sun[1], -sun[2])
+    tones = np.minimum(tones, 1.9)
     return np.asarray(tones / tones.mean(), dtype=np.float32)
 
 
 def stone(rng: np.random.Generator) -> Float32:
     """Return a repeating picture of a rock's surface, mean 1: blotches, grain and pits."""
     size = STONE_TEXELS
-    tones = 1.0 + 0.10 * fractal(size, rng, 1.3, 3.0, 500.0) + 0.06 * fractal(size, rng, 0.2, 2.5, 12.0)
+    tones = 1.0 + 0.13 * fractal(size, rng, 1.2, 3.0, 500.0) + 0.09 * fractal(size, rng, 0.3, 2.5, 16.0)
     pits = fractal(size, rng, 0.8, 6.0, 60.0)
-    tones *= 1.0 - 0.30 * np.clip(pits - 1.3, 0.0, 1.0)
+    tones *= 1.0 - 0.40 * np.clip(pits - 1.2, 0.0, 1.0)
     return np.asarray(tones / tones.mean(), dtype=np.float32)
 
 
@@ -80,7 +81,8 @@ def pyramid(tones: Float32, texel_m: float) -> Any:
     """Return the ``kernels.Texture`` of a square picture of relative brightness, side a power of two."""
     module = kernels()
     levels = halved(tones)
-    texels = np.concatenate([level.ravel() for level in levels])
-    start = np.cumsum([0, *(level.size for level in levels[:-1])]).astype(np.int64)
+    padded = [np.pad(level, [(0, 0), (0, module.PAD)]) for level in levels]
+    texels = np.concatenate([level.ravel() for level in padded])
+    start = np.cumsum([0, *(level.size for level in padded[:-1])]).astype(np.int64)
     stored = np.clip(np.rint(texels * module.ONE), 0, 65535).astype(np.uint16)
     return module.Texture(stored, start, tones.shape[0], len(levels), texel_m)

@@ -1,0 +1,222 @@
+"""Measure the sub-pixel error of rendered pictures: where patches land against where geometry puts them.
+
+The head turns between two pictures as it does when pointing. Patches of the first picture are carried along
+their range (``Scene.cast``) into the second (``CameraModel.project``) and found there by OpenCV's ECC with an affine
+warp, which knows nothing of the renderer. Mean error tells of bias, rms of aliasing; the matcher's own floor on
+such pictures is about 0.01 px.
+
+    .venv/bin/python tools/render_bias.py --pairs 12
+"""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from calib.cahvor import CameraModel
+from calib.mast import Mast
+from calib.rigid import FloatArray, Rigid, rot_y, rot_z
+from drivers.sim.render import Renderer
+from drivers.sim.scene import Scene, SceneSettings, build_scene
+
+MAST = Mast(np.array([0.3443, -0.0043, -1.4572]), np.array([-0.0088, -0.0181, 0.0027]))
+HALF_PX = 20
+GRID_PX = np.stack(np.meshgrid(np.linspace(-20, 20, 9), np.linspace(-20, 20, 9)), axis=-1).reshape(-1, 2)
+MARGIN_PX = 14
+BLUR_PX = 0.7
+LEAST_TEXTURE = 2.0
+"""Patches with less than this many grey levels per pixel, in the poorer direction, are not matched."""
+UNEVEN = 0.03
+"""Patches whose inverse range departs from a plane by more than this part hold an edge that hides things."""
+
+
+@dataclass(frozen=True)
+class Errors:
+    """What was measured: error_px (n, 2), found minus true, in x and y, and how many patches were lost."""
+
+    error_px: FloatArray
+    lost: int
+
+    def line(self) -> str:
+        """Number, mean and rms per axis, and the 95th percentile of the length."""
+        if len(self.error_px) < 2:
+            return f"n {len(self.error_px)} lost {self.lost}: too few"
+        mean, rms = self.error_px.mean(axis=0), np.sqrt((self.error_px**2).mean(axis=0))
+        spread = self.error_px.std(axis=0) / np.sqrt(len(self.error_px))
+        length = np.percentile(np.hypot(*self.error_px.T), 95)
+        return (
+            f"n {len(self.error_px):4d} lost {self.lost:3d}  mean {mean[0]:+.4f} {mean[1]:+.4f} "
+            f"(±{spread[0]:.4f} {spread[1]:.4f})  rms {rms[0]:.3f} {rms[1]:.3f}  p95 {length:.3f} px"
+        )
+
+
+def mast_camera(focal_px: float, y_m: float, z_m: float, r2: float) -> CameraModel:
+    """Return a head camera of 1024 x 768 pixels that looks along x, a little askew, with some distortion."""
+    turn = rot_z(0.011) @ rot_y(-0.007)
+    ahead, right, down = turn.T
+    return CameraModel(
+        kind="CAHVOR",
+        size_px=(1024, 768),
+        C=np.array([0.05, y_m, z_m]),
+        A=ahead,
+        H=focal_px * right + 514.2 * ahead,
+        V=focal_px * 1.001 * down + 381.7 * ahead,
+        O=ahead,
+        R=np.array([0.0, r2, 0.0]),
+    )
+
+
+NAVCAM = mast_camera(1290.0, -0.10, -0.02, -0.04)
+PANCAM = mast_camera(3441.0, -0.15, -0.06, -0.11)
+
+
+def head_pose(range_m: float, pan_rad: float, tilt_rad: float) -> Rigid:
+    """Return site_from_head looking at the ground ``range_m`` ahead, turned further by pan and tilt."""
+    return MAST.rover_from_head(pan_rad, tilt_rad - np.arctan2(1.5, range_m))
+
+
+def measure(
+    renderer: Renderer,
+    camera: CameraModel,
+    site_from_head: tuple[Rigid, Rigid],
+    samples: int,
+    patches: int,
+    rng: np.random.Generator,
+    believed: CameraModel | None = None,
+) -> Errors:
+    """Return the errors of up to ``patches`` patches carried from the first pose to the second.
+
+    ``believed`` is the camera that geometry is reckoned with in the second picture, ``camera`` by default.
+    """
+    first, second = (renderer.image(camera, pose, samples) for pose in site_from_head)
+    first, second = (cv2.GaussianBlur(image, (0, 0), BLUR_PX) for image in (first, second))
+    texture = texture_of(first)
+    width, height = camera.size_px
+    edge = HALF_PX + MARGIN_PX
+    errors: list[FloatArray] = []
+    lost = 0
+    for _ in range(40 * patches):
+        if len(errors) + lost == patches:
+            break
+        pixel = np.array([rng.integers(edge, width - edge), rng.integers(edge, height - edge)])
+        if texture[pixel[1], pixel[0]] < LEAST_TEXTURE:
+            continue
+        places = pixel + GRID_PX
+        there = carried(renderer.scene, camera, believed or camera, site_from_head, places)
+        if there is None:
+            continue
+        # an affine warp cannot bend: the truth for it is the best affine carrying of the whole patch
+        best = best_affine(GRID_PX, there)
+        truth = best[:, 2]
+        if not ((truth > edge) & (truth < np.array([width, height]) - edge - 1)).all():
+            continue
+        found = match(first, second, pixel, best, rng)
+        if found is None:
+            lost += 1
+        else:
+            errors.append(found - truth)
+    return Errors(np.array(errors).reshape(-1, 2), lost)
+
+
+def texture_of(image: np.ndarray) -> FloatArray:
+    """Grey levels per pixel in each patch's poorer direction, (h, w)."""
+    dy, dx = np.gradient(image)
+    size = (2 * HALF_PX + 1, 2 * HALF_PX + 1)
+    xx, xy, yy = (cv2.boxFilter(part, -1, size) for part in (dx * dx, dx * dy, dy * dy))
+    least = 0.5 * (xx + yy) - np.sqrt(0.25 * (xx - yy) ** 2 + xy**2)
+    return np.asarray(np.sqrt(np.maximum(least, 0.0)))
+
+
+def carried(
+    scene: Scene, camera: CameraModel, believed: CameraModel, site_from_head: tuple[Rigid, Rigid], places_px: FloatArray
+) -> FloatArray | None:
+    """Pixels (n, 2) of the first picture in the second; None where a patch is not one smooth piece of ground."""
+    first, second = site_from_head
+    rays = camera.ray(places_px)
+    origins_m, directions = first.points(rays.origins_m), first.vectors(rays.directions)
+    ranges_m = scene.cast(origins_m, directions)
+    if not np.isfinite(ranges_m).all():
+        return None
+    plane = np.column_stack([places_px, np.ones(len(places_px))])
+    inverse = 1.0 / ranges_m
+    rest = inverse - plane @ np.linalg.lstsq(plane, inverse, rcond=None)[0]
+    if np.abs(rest).max() > UNEVEN * inverse.mean():
+        return None
+    points = origins_m + ranges_m[:, None] * directions
+    pixels, valid = believed.project(second.inverse.points(points))
+    return pixels if valid.all() else None
+
+
+def best_affine(offsets_px: FloatArray, there_px: FloatArray) -> FloatArray:
+    """Least-squares affine warp (2, 3) from offsets about a patch's centre to pixels of the second picture."""
+    local = np.column_stack([offsets_px, np.ones(len(offsets_px))])
+    return np.asarray(np.linalg.lstsq(local, there_px, rcond=None)[0].T)
+
+
+def match(
+    first: np.ndarray, second: np.ndarray, pixel: np.ndarray, best: FloatArray, rng: np.random.Generator
+) -> FloatArray | None:
+    """Where ECC finds the patch about ``pixel`` in the second picture; None if it gives up."""
+    x, y = pixel
+    template = first[y - HALF_PX : y + HALF_PX + 1, x - HALF_PX : x + HALF_PX + 1]
+    corner = np.rint(best[:, 2]).astype(int) - HALF_PX - MARGIN_PX
+    size = 2 * (HALF_PX + MARGIN_PX) + 1
+    window = second[corner[1] : corner[1] + size, corner[0] : corner[0] + size]
+    # start from the true stretch but up to half a pixel away, so that standing still is no success
+    warp = best.copy()
+    warp[:, 2] += rng.uniform(-0.5, 0.5, 2) - best[:, :2] @ [HALF_PX, HALF_PX] - corner
+    criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 200, 1e-7)
+    try:
+        _, warp = cv2.findTransformECC(
+            template, window, np.ascontiguousarray(warp, np.float32), cv2.MOTION_AFFINE, criteria, None, 1
+        )
+    except cv2.error as error:
+        if error.code != cv2.Error.StsNoConv:
+            raise
+        return None
+    found: FloatArray = warp.astype(np.float64) @ np.array([HALF_PX, HALF_PX, 1.0]) + corner
+    return found
+
+
+def poses(camera: CameraModel, range_m: float, rng: np.random.Generator) -> tuple[Rigid, Rigid]:
+    """Two head poses as a pointing makes them: the second up to a third of the picture away."""
+    reach = 340.0 / float(np.linalg.norm(camera.H - camera.A * (camera.H @ camera.A)))
+    pan, tilt = rng.uniform(-0.8, 0.8), rng.uniform(-0.02, 0.02)
+    turn = rng.uniform(-1.0, 1.0, 2) * reach * np.array([1.0, 0.7])
+    return head_pose(range_m, pan, tilt), head_pose(range_m, pan + turn[0], tilt + turn[1])
+
+
+def main() -> None:
+    """Print one row for each scene, camera, range and number of samples."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--pairs", type=int, default=6, help="pairs of pictures a row")
+    parser.add_argument("--patches", type=int, default=40, help="patches a pair")
+    parser.add_argument("--samples", type=int, nargs="+", default=[1, 2, 3])
+    parser.add_argument("--ranges", type=float, nargs="+", default=[10.0, 6.0, 2.0])
+    parser.add_argument("--seed", type=int, default=1)
+    options = parser.parse_args()
+    for scene_name, settings in (
+        ("flat", SceneSettings(seed=options.seed, relief_m=0.0, rocks=0)),
+        ("relief", SceneSettings(seed=options.seed)),
+    ):
+        renderer = Renderer(build_scene(settings))
+        for camera_name, camera in (("navcam", NAVCAM), ("pancam", PANCAM)):
+            for range_m in options.ranges:
+                for samples in options.samples:
+                    rng = np.random.default_rng([options.seed, int(range_m * 10), samples])
+                    found = [
+                        measure(renderer, camera, poses(camera, range_m, rng), samples, options.patches, rng)
+                        for _ in range(options.pairs)
+                    ]
+                    together = Errors(
+                        np.concatenate([part.error_px for part in found]), sum(part.lost for part in found)
+                    )
+                    label = f"{scene_name:6s} {camera_name} {range_m:4.1f} m  {samples}x{samples}"
+                    print(f"{label}  {together.line()}", flush=True)
+
+
+if __name__ == "__main__":
+    main()
