@@ -206,7 +206,7 @@ def _factory(name: str, driver: str) -> Callable[..., Any]:
     module_name, _, attribute = driver.partition(":")
     try:
         found: Any = importlib.import_module(module_name)
-    except Exception as error:  # whatever a foreign module does while it is imported
+    except (Exception, SystemExit) as error:  # whatever a foreign module does while it is imported
         raise BadOptions(
             f"driver {driver!r}: cannot import {module_name!r} ({_one_line(error)})", device=name
         ) from error
@@ -227,7 +227,7 @@ def _from_outside(name: str, device: DeviceSettings, protocol: type) -> Any:
         made = factory(**device.options)
     except DriverError:
         raise
-    except Exception as error:  # a foreign factory may raise anything; the user gets one sentence
+    except (Exception, SystemExit) as error:  # a foreign factory may raise anything: one sentence tells it
         raise BadOptions(
             f"driver {device.driver!r} refuses the options {dict(device.options)!r} ({_one_line(error)})",
             device=name,

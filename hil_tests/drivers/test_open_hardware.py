@@ -144,6 +144,17 @@ def test_a_module_that_fails_on_import_is_told_in_one_line(
         open_hardware(head_only("broken_driver:make"))
 
 
+def test_a_driver_that_ends_the_program_is_refused_instead(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "quitting_driver.py").write_text("import sys\nsys.exit()\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    with pytest.raises(BadOptions, match=r"cannot import 'quitting_driver' \(SystemExit"):
+        open_hardware(head_only("quitting_driver:make"))
+    with pytest.raises(BadOptions, match=r"driver 'sys:exit' refuses the options \{\} \(SystemExit"):
+        open_hardware(head_only("sys:exit"))
+
+
 def test_a_driver_that_does_not_reach_its_device_says_so_itself(outside: None) -> None:
     with pytest.raises(NoReply, match="picky head: nothing answers"):
         open_hardware(head_only("outside_drivers:picky", port="none"))

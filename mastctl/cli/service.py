@@ -76,8 +76,21 @@ def add_daemon_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--config", metavar="FILE", help="the configuration that the daemon runs with")
 
 
+class _Ended(BaseException):
+    """SIGTERM came before the daemon was up; no SystemExit, which a driver from outside may raise too."""
+
+
 def _run(args: argparse.Namespace) -> int:
-    signal.signal(signal.SIGTERM, _leave)  # before the imports, which take a second
+    try:
+        signal.signal(signal.SIGTERM, _leave)  # before the imports, which take a second
+        _serve(args)
+    except _Ended:
+        pass
+    return 0
+
+
+def _serve(args: argparse.Namespace) -> None:
+    """Run the daemon until it is told to end."""
     from mastctl.config import load_config
     from mastctl.daemon import run
 
@@ -92,12 +105,11 @@ def _run(args: argparse.Namespace) -> int:
         sys.stdout.flush()
 
     run(load_config(args.config), ready)
-    return 0
 
 
 def _leave(number: int, frame: object) -> None:
     """End cleanly when told so before the daemon is up: nothing has moved yet."""
-    raise SystemExit(0)
+    raise _Ended
 
 
 def _status(args: argparse.Namespace) -> int:
