@@ -75,10 +75,10 @@ class Guard:
             _check_host(headers)
             if scope["method"] in _UNSAFE:
                 _check_origin(headers)
-                body = await _body(receive, headers)
-                if scope["path"] in self._ignores_body:
-                    body = b""
-                _check_json(body, headers)
+                body = b""
+                if scope["path"] not in self._ignores_body:
+                    body = await _body(receive, headers)
+                    _check_json(body, headers)
                 receive = _once(body, receive)
             await self._app(scope, receive, send_marked)
         except GuardError as refusal:

@@ -71,6 +71,8 @@ class PointBody(_Strict):
             raise ValueError("frame goes with position_m only")
         if self.aim is not None and angles:
             raise ValueError("aim goes with pixel or position_m, not with joint angles")
+        if self.pointings == 2 and self.pixel is None:
+            raise ValueError("pointings is 2, which goes with pixel only: nothing else can be measured again")
         return self
 
     def request(self) -> PointRequest:

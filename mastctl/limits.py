@@ -33,6 +33,11 @@ class OutsideLimits(MastctlError):
         self.unit = unit
         super().__init__(message)
 
+    @property
+    def detail(self) -> dict[str, float | str]:
+        """The same for programs."""
+        return {"what": self.what, "value": self.value, "bound": self.bound, "unit": self.unit}
+
 
 @dataclass(frozen=True)
 class Limits:

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import logging
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from importlib.metadata import version
 from typing import Any
 
 from calib.formats import read_bytes
 from calib.formats.yaml_text import MAX_BYTES
+from calib.mast import Rig
 from calib.store import StoredRig, parse_rig
 from drivers.clock import Clock, SystemClock
 from drivers.open_hardware import Hardware, open_hardware
@@ -20,7 +22,7 @@ from mastctl.errors import FrameGone, MastctlError
 from mastctl.frames import StampedFrame
 from mastctl.operations import Operation, Operations
 from mastctl.pointing.loop import PointingLoop
-from mastctl.pointing.requests import AnglesTarget, PixelTarget, PointRequest
+from mastctl.pointing.requests import Aim, AnglesTarget, PixelTarget, PointRequest
 from mastctl.state import State
 
 log = logging.getLogger(__name__)
@@ -74,7 +76,8 @@ class Service:
         self.devices = Devices(hardware, config.limits, stored.digest, clock, stored.rig, grace_s)
         self.operations = Operations(self.devices, clock)
         self.stop_threads = ThreadPoolExecutor(STOP_THREADS, thread_name_prefix="stop")
-        self._loop = PointingLoop(stored.rig, self.devices, config.limits, clock)
+        self._rig = _configured(stored.rig, config.hardware.cameras)
+        self._loop = PointingLoop(self._rig, self.devices, config.limits, clock)
         self._version = version("mastctl")
 
     @classmethod
@@ -187,7 +190,7 @@ class Service:
         if isinstance(target, AnglesTarget):
             self.config.limits.check(target.pan_rad, target.tilt_rad)
         if request.aim is not None:
-            self._check_aim(request.aim.camera)
+            self._check_aim(request.aim)
         return self.operations.start(
             told, lambda record, cancelled: self._loop.run(request, record, cancelled)
         )
@@ -212,20 +215,33 @@ class Service:
             words = f"the head moved while frame {target.frame_id} was exposed; take another"
             raise Refused("frame_moving", words)
         height, width = frame.image.shape[:2]
-        if not (-0.5 <= target.x_px <= width - 0.5 and -0.5 <= target.y_px <= height - 0.5):
-            raise Refused(
-                "outside_image",
-                f"pixel ({target.x_px:g}, {target.y_px:g}) is outside the image of {width}x{height} px",
-            )
+        _check_inside("pixel", target.x_px, target.y_px, (width, height))
 
-    def _check_aim(self, camera: str) -> None:
-        known = self.stored.rig.cameras.get(camera)
+    def _check_aim(self, aim: Aim) -> None:
+        known = self._rig.cameras.get(aim.camera)
         if known is None or known.on != "head":
-            on_head = [name for name, entry in self.stored.rig.cameras.items() if entry.on == "head"]
-            raise Refused(
-                "bad_aim",
-                f"aim.camera is '{camera[:80]}' where a camera on the head is expected: {', '.join(on_head)}",
-            )
+            on_head = ", ".join(name for name, entry in self._rig.cameras.items() if entry.on == "head")
+            words = f"'{aim.camera[:80]}' where a configured camera on the head is expected: {on_head}"
+            raise Refused("bad_aim", f"aim.camera is {words}")
+        _check_inside("aim", aim.x_px, aim.y_px, known.model.size_px)
+
+
+def _configured(rig: Rig, cameras: Iterable[str]) -> Rig:
+    """Return the part of a rig that this daemon can see with: nothing is aimed with a camera it lacks."""
+    names = set(cameras)
+    return replace(
+        rig,
+        cameras={name: camera for name, camera in rig.cameras.items() if name in names},
+        stereo={pair: eyes for pair, eyes in rig.stereo.items() if names.issuperset(eyes)},
+    )
+
+
+def _check_inside(what: str, x_px: float, y_px: float, size_px: tuple[int, int]) -> None:
+    """Pass a pixel inside an image. Raises Refused."""
+    width, height = size_px
+    if not (-0.5 <= x_px <= width - 0.5 and -0.5 <= y_px <= height - 0.5):
+        words = f"{what} ({x_px:g}, {y_px:g}) is outside the image of {width}x{height} px"
+        raise Refused("outside_image", words)
 
 
 def _bounded(what: str, function: Callable[[], None], timeout_s: float) -> None:

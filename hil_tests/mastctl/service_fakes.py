@@ -206,14 +206,18 @@ class ScriptedLoop:
 
 @contextmanager
 def fake_daemon(
-    monkeypatch: pytest.MonkeyPatch, folder: Path, listen: str = "{port: 0}"
+    monkeypatch: pytest.MonkeyPatch,
+    folder: Path,
+    listen: str = "{port: 0}",
+    config: str | None = None,
+    loop: type[ScriptedLoop] = ScriptedLoop,
 ) -> Iterator[tuple[RunningDaemon, FakeHardware]]:
     """A daemon on fakes: a real server on loopback, fake devices, a scripted loop."""
     hardware = FakeHardware()
     save_rig(rig(), folder / "little.yaml")
-    (folder / "daemon.yaml").write_text(CONFIG.format(listen=listen))
+    (folder / "daemon.yaml").write_text((config or CONFIG).format(listen=listen))
     monkeypatch.setattr(service_module, "open_hardware", lambda settings, clock: hardware)
-    monkeypatch.setattr(service_module, "PointingLoop", ScriptedLoop)
+    monkeypatch.setattr(service_module, "PointingLoop", loop)
     monkeypatch.setattr(ScriptedLoop, "script", staticmethod(ScriptedLoop.good), raising=False)
     with RunningDaemon(load_config(folder / "daemon.yaml")) as daemon:
         yield daemon, hardware

@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from service_fakes import FakeHardware, Hang, ScriptedLoop, eventually, fake_daemon
+from service_fakes import CONFIG, FakeHardware, Hang, ScriptedLoop, eventually, fake_daemon
 
 from drivers.errors import NoReply
 from drivers.faults import FaultPanel
@@ -227,6 +227,8 @@ BAD_POINTS: list[tuple[Any, str]] = [
     ({"position_m": [1, 2, 3], "frame": "mast"}, "frame: \"mast\" where 'rover' or 'site' is expected"),
     ({**ANGLES, "frame": "rover"}, "frame goes with position_m only"),
     ({**ANGLES, "aim": {"camera": "navcam_left", "x_px": 1, "y_px": 1}}, "aim goes with pixel or position_m"),
+    ({**ANGLES, "pointings": 2}, "pointings is 2, which goes with pixel only"),
+    ({"position_m": [6, 1, 0], "pointings": 2}, "pointings is 2, which goes with pixel only"),
     ({**ANGLES, "pointings": 3}, "pointings: 3 where less than or equal to 2 is expected"),
     ({**ANGLES, "pointings": 0}, "pointings: 0"),
     ({**ANGLES, "pointings": 1.5}, "pointings: 1.5"),
@@ -293,6 +295,12 @@ def test_a_body_without_a_length_is_bounded_too(quiet: httpx.Client) -> None:
     chunks = (b" " * 10000 for _ in range(20))
     answer = quiet.post("/point", content=chunks, headers={"content-type": "application/json"})
     refused(answer, 413, "too_large")
+
+
+def test_a_stop_works_whatever_body_comes_with_it(quiet: httpx.Client) -> None:
+    for body in (b"{", b" " * (LARGEST_BODY_BYTES + 1)):
+        answer = quiet.post("/stop", content=body, headers={"content-type": "application/json"})
+        assert answer.status_code == 200, answer.text
 
 
 KEYS = st.sampled_from(["pixel", "position_m", "frame", "pan_rad", "aim", "pointings", "camera", "x_px"])
@@ -390,6 +398,31 @@ def test_an_aim_needs_a_camera_on_the_head(quiet: httpx.Client) -> None:
     for camera in ("hazcam_left", "pancam_left"):
         body = {"position_m": [1, 2, 3], "aim": {"camera": camera, "x_px": 1, "y_px": 1}}
         assert "navcam_left" in refused(quiet.post("/point", json=body), 422, "bad_aim")
+
+
+def test_an_aim_outside_the_image_is_refused_at_once(quiet: httpx.Client) -> None:
+    for x_px, y_px in ((63.6, 1), (1, -0.6)):
+        body = {"position_m": [6, 1, 0], "aim": {"camera": "navcam_left", "x_px": x_px, "y_px": y_px}}
+        refused(quiet.post("/point", json=body), 422, "outside_image")
+
+
+def test_nothing_is_aimed_with_a_camera_that_the_daemon_lacks(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    given: list[Any] = []
+
+    class Loop(ScriptedLoop):
+        def __init__(self, rig: Any, *others: Any) -> None:
+            given.append(rig)
+            super().__init__(rig, *others)
+
+    lacking = CONFIG.replace("navcam_left: {{driver: fake}}, ", "")
+    with fake_daemon(monkeypatch, tmp_path, config=lacking, loop=Loop) as (daemon, _):
+        assert sorted(given[0].cameras) == ["hazcam_left", "navcam_right"]
+        assert dict(given[0].stereo) == {}
+        with httpx.Client(base_url=f"{daemon.url}/api/v1", trust_env=False) as client:
+            body = {"position_m": [6, 1, 0], "aim": {"camera": "navcam_left", "x_px": 1, "y_px": 1}}
+            assert "navcam_right" in refused(client.post("/point", json=body), 422, "bad_aim")
 
 
 def test_a_click_is_refused_by_name_if_its_frame_does_not_serve(
