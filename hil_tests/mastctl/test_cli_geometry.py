@@ -213,6 +213,13 @@ def test_a_conversion_in_place_keeps_the_version_before(
     assert Path("camera.previous.yaml").read_text() == CAMERA
 
 
+def test_a_mast_file_is_not_replaced_by_one_of_its_cameras(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert Run("camera convert mast.yaml ./mast.yaml --camera eye_left", capsys).code == 2
+    assert Path("mast.yaml").read_text() == MAST
+
+
 WRONG_USE = [
     "",
     "slove",
@@ -358,6 +365,12 @@ def test_a_full_disk_is_a_failure_in_one_line(folder: Path) -> None:
         )
     assert done.returncode == 1
     assert done.stderr.splitlines() == ["mastctl: No space left on device"]
+
+
+def test_closed_streams_are_no_reason_to_fail(folder: Path) -> None:
+    shell = '"$0" -m mastctl budget >&- && "$0" -m mastctl solve 2>&-; test $? = 2'
+    done = subprocess.run(["sh", "-c", shell, sys.executable], capture_output=True, text=True)
+    assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
 
 
 def test_the_module_runs_as_the_command_does(folder: Path) -> None:

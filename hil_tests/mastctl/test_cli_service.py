@@ -160,6 +160,7 @@ def test_a_failed_operation_ends_with_1_and_its_reason(run: Run, monkeypatch: py
         (("snapshot", "navcam_left", "--out", "no/such/folder/x.png"), "file_system"),
         (("snapshot", "navcam_left", "--out", "x.png", "--frame-id", "?"), "frame_unknown"),
         (("status", "--config", "nowhere.yaml", "--url", "mars"), "bad_url"),
+        (("experiment", "pointing", "--targets", "1", "--out", "/proc/x"), "file_system"),
     ],
 )
 def test_wrong_use_and_bad_input_end_with_2(

@@ -110,6 +110,9 @@ def camera_convert(args: argparse.Namespace) -> int:
 
     source = load_any(args.source)
     if not isinstance(source, CameraFile):
+        if args.target.exists() and args.target.samefile(args.source):
+            words = "one camera would take the place of the mast and all its cameras"
+            raise output.WrongUse(f"OUT is the mast file {args.source} itself: {words}; give another file")
         camera = source.rig.cameras[_camera_name(source, args.camera)]
         provenance = {"mast_file_sha256": source.digest, **source.rig.provenance}
         left_out = ("the mast file's 'fit' is left out",) if source.rig.fit else ()

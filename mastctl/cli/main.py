@@ -88,6 +88,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     argv
         The words after ``mastctl``; those of the process by default.
     """
+    for name in ("stdout", "stderr"):
+        if getattr(sys, name) is None:  # closed by whoever started us (>&-): then nobody reads
+            setattr(sys, name, open(os.devnull, "w"))  # noqa: SIM115, PTH123  for as long as the process
     words = list(sys.argv[1:] if argv is None else argv)
     as_json = "--json" in words
     logging.basicConfig(
