@@ -127,6 +127,7 @@ def _run(
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
     from mastctl.experiment.pointing import TargetRecord, run_pointing_experiment
+    from mastctl.experiment.report import PICTURES_PER_DISTANCE
 
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
     with Progress(*columns, console=Console(stderr=True, quiet=args.json)) as progress:
@@ -147,7 +148,7 @@ def _run(
             truth=truth,
             notes=notes,
             on_target=show,
-            keep_pictures=args.out is not None,
+            pictures=PICTURES_PER_DISTANCE if args.out is not None else 0,
         )
 
 

@@ -158,7 +158,7 @@ def run_pointing_experiment(
     truth: Truth | None = None,
     notes: Sequence[str] = (),
     on_target: Callable[[TargetRecord], None] | None = None,
-    keep_pictures: bool = True,
+    pictures: int = 0,
 ) -> PointingExperiment:
     """Run the experiment and return its record.
 
@@ -178,8 +178,8 @@ def run_pointing_experiment(
         Sentences for the reader of the table, carried into the record.
     on_target
         Called after each target, failed or not.
-    keep_pictures
-        Whether the chosen and the landed images stay in the records, for the report.
+    pictures
+        How many targets of each distance keep their images in the record, for the report.
 
     Raises
     ------
@@ -191,14 +191,15 @@ def run_pointing_experiment(
     rig = parse_rig(client.mast_file(), "the daemon's mast file").rig
     pair = head_pair(rig, set(status["cameras"]))
     aim_px = rig.cameras[pair[0]].model.image_center_px
-    bench = _Bench(client, rig, pair, status["limits"], np.random.default_rng(seed), truth, keep_pictures)
+    bench = _Bench(client, rig, pair, status["limits"], np.random.default_rng(seed), truth)
     records: list[TargetRecord] = []
     summaries = []
     for distance_m in distances_m:
         distance_begun_s = time.monotonic()
-        rows = []
+        rows: list[TargetRecord] = []
         for index in range(targets):
-            record = bench.one_target(distance_m, index)
+            wanted = sum(bool(row.landed_images) for row in rows) < pictures
+            record = bench.one_target(distance_m, index, wanted)
             rows.append(record)
             if on_target is not None:
                 on_target(record)
@@ -266,7 +267,6 @@ class _Bench:
         limits: Mapping[str, Any],
         rng: np.random.Generator,
         truth: Truth | None,
-        keep_pictures: bool,
     ) -> None:
         self._client = client
         self._rig = rig
@@ -275,9 +275,8 @@ class _Bench:
         self._tilt_limits_rad = (float(limits["tilt_rad"][0]), float(limits["tilt_rad"][1]))
         self._rng = rng
         self._truth = truth
-        self._keep_pictures = keep_pictures
 
-    def one_target(self, distance_m: float, index: int) -> TargetRecord:
+    def one_target(self, distance_m: float, index: int, with_pictures: bool) -> TargetRecord:
         """Find one target at the distance, point at it twice, and return the record of it."""
         begun_s = time.monotonic()
         reason = ""
@@ -288,7 +287,7 @@ class _Bench:
                 reason = f"looking for a target: {error}"
                 break
             if target is not None:
-                return self._point_at(target, distance_m, index, begun_s)
+                return self._point_at(target, distance_m, index, begun_s, with_pictures)
         reason = reason or f"no textured target found at {distance_m:g} m in {VIEWS_PER_TARGET} views"
         nan = math.nan
         return TargetRecord(
@@ -345,7 +344,9 @@ class _Bench:
             return None
         return chosen.pan_rad, chosen.tilt_rad
 
-    def _point_at(self, target: Target, distance_m: float, index: int, begun_s: float) -> TargetRecord:
+    def _point_at(
+        self, target: Target, distance_m: float, index: int, begun_s: float, with_pictures: bool
+    ) -> TargetRecord:
         """Ask the daemon for two pointings and write down what it measured."""
         error, operation = "", {}
         try:
@@ -362,7 +363,7 @@ class _Bench:
             error = f"{refusal.code}: {refusal}"
         landings = tuple(self._landing(target, entry) for entry in operation.get("pointings") or ())
         images: tuple[Image, ...] = ()
-        if self._keep_pictures:
+        if with_pictures:
             images = tuple(
                 self._client.snapshot(target.shot.camera, frame_id=landing.frame_id).image
                 for landing in landings
@@ -380,7 +381,7 @@ class _Bench:
             error=error,
             seconds=time.monotonic() - begun_s,
             operation=operation,
-            clicked_image=target.shot.image if self._keep_pictures else None,
+            clicked_image=target.shot.image if with_pictures else None,
             landed_images=images,
         )
 

@@ -145,7 +145,7 @@ def _page(experiment: PointingExperiment) -> str:
             if record.distance_m == summary.distance_m
             and record.clicked_image is not None
             and record.landed_images
-        ][:PICTURES_PER_DISTANCE]
+        ]
         if shown:
             parts.append(f"<h2>Targets at {summary.distance_m:g} m</h2>")
             parts.append(
