@@ -1,0 +1,118 @@
+"""The pointing experiment apart from the daemon: choosing targets, summing up, the report."""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from calib.store import load_rig
+from mastctl.cli.experiment import turned
+from mastctl.experiment.pointing import Landing, PointingExperiment, TargetRecord, rms, summarise
+from mastctl.experiment.report import CSV_COLUMNS, table_rows, write_report
+from mastctl.experiment.targets import on_level_ground, textured
+
+NAN = math.nan
+
+
+def landed(index: int, x_px: float, y_px: float, error: str = "") -> TargetRecord:
+    """A target at 6 m that landed once at (x, y) and once on the spot, with pictures."""
+    picture = np.full((768, 1024), 100, dtype=np.uint8)
+    landings = (
+        Landing((x_px, y_px), (0.02, 0.03), "navcam_left-000002-x-y", (x_px + 0.1, y_px)),
+        Landing((0.0, 0.0), (0.02, 0.03), "navcam_left-000003-x-y", (0.0, 0.1)),
+    )
+    return TargetRecord(
+        6.0, index, "navcam_left", "navcam_left-000001-x-y", (300.0, 400.0), 6.1, 0.1, -0.2, landings,
+        error, 4.0, {"id": "1"}, picture, (picture, picture),
+    )  # fmt: skip
+
+
+def lost(index: int, error: str) -> TargetRecord:
+    """A target at 6 m that never was found."""
+    return TargetRecord(6.0, index, "navcam_left", "", (NAN, NAN), NAN, NAN, NAN, (), error, 9.0)
+
+
+def experiment(*records: TargetRecord) -> PointingExperiment:
+    """An experiment at 6 m and an empty one at 4 m."""
+    status = {"hardware": "simulated", "mast": {"file": "m.yaml", "digest": "ab" * 32}, "cameras": {}}
+    summaries = (summarise(6.0, records, 12.0), summarise(4.0, [], 0.0))
+    return PointingExperiment(
+        "http://127.0.0.1:1", status, 1, "navcam_left", (511.5, 383.5), records, summaries,
+        "2026-01-01T00:00:00Z", 12.0, ("a note",),
+    )  # fmt: skip
+
+
+def test_failed_targets_are_counted_and_not_averaged() -> None:
+    row = summarise(6.0, [landed(0, 3.0, 0.0), landed(1, -1.0, 2.0), lost(2, "flat")], 12.0)
+    assert (row.targets, row.failed) == (3, 1)
+    assert row.first_rms_px == pytest.approx((math.sqrt(5.0), math.sqrt(2.0)))
+    assert row.true_second_rms_px == pytest.approx((0.0, 0.1))
+    assert row.worst_first_px == pytest.approx(3.0)
+    assert rms([]) is None
+
+
+def test_a_distance_without_any_landing_has_no_rms() -> None:
+    row = summarise(6.0, [lost(0, "flat")], 1.0)
+    assert row.first_rms_px is None
+    assert experiment(lost(0, "flat")).as_json()["distances"][0]["first_rms_px"] is None
+
+
+def test_document_has_the_keys_of_the_contract_and_every_failure() -> None:
+    document = json.loads(json.dumps(experiment(landed(0, 0.1, 0.2), lost(1, "not_found: gone")).as_json()))
+    first = document["distances"][0]
+    assert {"distance_m", "targets", "first_rms_px", "second_rms_px", "seconds"} <= set(first)
+    assert first["paper_first_rms_px"] == [0.743, 1.243]
+    assert "paper_first_rms_px" not in document["distances"][1]
+    assert document["failures"] == [{"distance_m": 6.0, "target": 1, "error": "not_found: gone"}]
+
+
+def test_report_holds_every_target_and_what_devices_say_is_escaped(tmp_path: Path) -> None:
+    folder = tmp_path / "new" / "report"
+    page = write_report(experiment(landed(0, 0.25, -0.5), lost(1, "<b>no & reply</b>")), folder)
+    words = page.read_text(encoding="utf-8")
+    assert "&lt;b&gt;no &amp; reply&lt;/b&gt;" in words
+    assert "<b>no" not in words
+    assert "+0.25, -0.50 px from the cross-hair" in words
+    assert "http" not in words.replace("http://127.0.0.1:1", "")  # self-contained
+    with (folder / "targets.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert tuple(rows[0]) == CSV_COLUMNS
+    assert [row["error"] for row in rows] == ["", "<b>no & reply</b>"]
+    assert (rows[0]["first_x_px"], rows[0]["second_true_y_px"]) == ("0.25", "0.1")
+    assert (rows[1]["first_x_px"], rows[1]["range_m"]) == ("", "")
+    assert len(json.loads((folder / "record.json").read_text())["targets"]) == 2
+
+
+def test_table_fits_80_columns_when_it_is_turned() -> None:
+    headings, rows = turned(*table_rows(experiment(landed(0, 0.1, 0.2)).summaries))
+    assert headings == ["distance", "6 m", "4 m"]
+    assert ["paper first x, y", "0.743, 1.243", ""] in rows
+    assert ["failed", "0", "0"] in rows
+
+
+def test_only_texture_in_both_directions_counts() -> None:
+    rng = np.random.default_rng(3)
+    image = np.full((400, 600), 120.0)
+    image[:, 200:400] += rng.normal(0, 25, (400, 200))  # texture
+    image[:, 400:] += 60.0 * (np.arange(200) // 20 % 2)  # stripes: one direction only
+    mask = textured(np.clip(image, 0, 255).astype(np.uint8))
+    assert mask[100:300, 240:360].all()
+    assert not mask[:, :170].any()
+    assert not mask[100:300, 430:].any()
+    assert not mask[:64].any()
+
+
+def test_level_ground_at_the_distance_is_where_geometry_puts_it(repository: Path) -> None:
+    rig = load_rig(repository / "configs" / "masts" / "rocky8_simulated.yaml").rig
+    camera = rig.camera_in_rover("navcam_left", 0.3, -0.3)
+    mask = on_level_ground(camera, 5.0)
+    direction = np.array([math.cos(0.4), math.sin(0.4), 0.0])
+    for along_m, seen in ((4.79, True), (3.0, False), (8.0, False)):
+        pixel, valid = camera.project(np.array([camera.C[0], camera.C[1], 0.0]) + along_m * direction)
+        assert valid
+        assert mask[round(pixel[1]), round(pixel[0])] == seen, along_m
