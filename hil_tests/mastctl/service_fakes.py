@@ -171,6 +171,7 @@ class FakePointing:
     residual_px: Any
     residual_sigma_px: Any
     frame_id: str
+    note: str = ""
 
 
 @dataclass(frozen=True)

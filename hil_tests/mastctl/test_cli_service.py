@@ -10,7 +10,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from service_fakes import FakeHardware, ScriptedLoop, fake_daemon
+from service_fakes import FakeHardware, FakePointing, FakeResult, ScriptedLoop, fake_daemon
 
 from drivers.errors import NoReply
 from mastctl.cli.main import main
@@ -117,6 +117,13 @@ def test_point_shows_a_person_steps_and_residual(run: Run) -> None:
     assert "✓ look" in log
     assert "+0.250 ± 0.050" in out
     assert "-0.500 ± 0.060" in out
+    assert "pointing 1: looked at in frame navcam_left-000001-x-y\n" in out
+
+
+def test_point_shows_a_person_why_there_is_no_residual(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    blind = FakeResult(None, None, (FakePointing(None, None, "", note="no picture was taken"),))
+    monkeypatch.setattr(ScriptedLoop, "script", staticmethod(lambda *any: blind))
+    assert "pointing 1: no picture was taken\n" in run("point", "--angles", "0.1", "0.1")[1]
 
 
 def test_point_without_waiting_tells_the_id(run: Run) -> None:

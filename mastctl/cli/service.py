@@ -236,8 +236,9 @@ def _show_pointings(record: dict[str, Any]) -> None:
             for value, one_sigma in zip(residual, sigma, strict=True)
         ]
         rows.append((str(number), *measured))
-        where = f"pointing {number} was looked at in frame {pointing.get('frame_id')}"
-        notes.append(f"{where}{': ' + pointing['note'] if pointing.get('note') else ''}")
+        told = [f"looked at in frame {pointing['frame_id']}"] if pointing.get("frame_id") else []
+        told += [pointing["note"]] if pointing.get("note") else []
+        notes.append(f"pointing {number}: {'; '.join(told)}")
     if record.get("position_m"):
         x, y, z = record["position_m"]
         notes.append(f"target at ({x:.3f}, {y:.3f}, {z:.3f}) m in the rover frame")
