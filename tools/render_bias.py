@@ -1,9 +1,9 @@
 """Measure the sub-pixel error of rendered pictures: where patches land against where geometry puts them.
 
-The head turns between two pictures as it does when pointing. Patches of the first picture are carried along
-their range (``Scene.cast``) into the second (``CameraModel.project``) and found there by OpenCV's ECC with an affine
-warp, which knows nothing of the renderer. Mean error tells of bias, rms of aliasing; the matcher's own floor on
-such pictures is about 0.01 px.
+The head turns between two pictures as it does when pointing, or rolls by half a turn about the camera's axis:
+a shift of all pixels hides from a turn, but not from a roll. Patches of the first picture are carried along
+their range (``Scene.cast``) into the second (``CameraModel.project``) and found there by OpenCV's ECC with an
+affine warp, which knows nothing of the renderer. Mean error tells of bias, rms of aliasing and poor texture.
 
     .venv/bin/python tools/render_bias.py --pairs 12
 """
@@ -11,10 +11,12 @@ such pictures is about 0.01 px.
 from __future__ import annotations
 
 import argparse
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from calib.cahvor import CameraModel
 from calib.mast import Mast
@@ -23,8 +25,11 @@ from drivers.sim.render import Renderer
 from drivers.sim.scene import Scene, SceneSettings, build_scene
 
 MAST = Mast(np.array([0.3443, -0.0043, -1.4572]), np.array([-0.0088, -0.0181, 0.0027]))
+Poses = Callable[[CameraModel, float, np.random.Generator], tuple[Rigid, Rigid]]
 HALF_PX = 20
-GRID_PX = np.stack(np.meshgrid(np.linspace(-20, 20, 9), np.linspace(-20, 20, 9)), axis=-1).reshape(-1, 2)
+SPREAD_PX = (np.arange(9) - 4) * (2 * HALF_PX + 1) / 9
+GRID_PX = np.stack(np.meshgrid(SPREAD_PX, SPREAD_PX), axis=-1).reshape(-1, 2)
+"""Middles of 9 x 9 parts of a patch: a sum over them weighs the patch as a sum over its pixels does."""
 MARGIN_PX = 14
 BLUR_PX = 0.7
 LEAST_TEXTURE = 2.0
@@ -53,6 +58,11 @@ class Errors:
         )
 
 
+def together(parts: list[Errors]) -> Errors:
+    """All errors of several pairs of pictures."""
+    return Errors(np.concatenate([part.error_px for part in parts]), sum(part.lost for part in parts))
+
+
 def mast_camera(focal_px: float, y_m: float, z_m: float, r2: float) -> CameraModel:
     """Return a head camera of 1024 x 768 pixels that looks along x, a little askew, with some distortion."""
     turn = rot_z(0.011) @ rot_y(-0.007)
@@ -69,8 +79,27 @@ def mast_camera(focal_px: float, y_m: float, z_m: float, r2: float) -> CameraMod
     )
 
 
+def fisheye_camera() -> CameraModel:
+    """Return a body camera of 640 x 480 pixels, 120 degrees wide, whose rays do not start in one point."""
+    ahead, right, down = (rot_z(0.004) @ rot_y(-0.62)).T
+    return CameraModel(
+        kind="CAHVORE",
+        size_px=(640, 480),
+        C=np.array([0.40, -0.05, -0.50]),
+        A=ahead,
+        H=309.0 * right + 321.3 * ahead,
+        V=309.4 * down + 238.1 * ahead,
+        O=ahead,
+        R=np.array([0.0, -0.014, 0.0]),
+        E=np.array([0.008, 0.0035, 0.0]),
+        cahvore_type=2,
+        linearity=0.0,
+    )
+
+
 NAVCAM = mast_camera(1290.0, -0.10, -0.02, -0.04)
 PANCAM = mast_camera(3441.0, -0.15, -0.06, -0.11)
+HAZCAM = fisheye_camera()
 
 
 def head_pose(range_m: float, pan_rad: float, tilt_rad: float) -> Rigid:
@@ -89,7 +118,7 @@ def measure(
 ) -> Errors:
     """Return the errors of up to ``patches`` patches carried from the first pose to the second.
 
-    ``believed`` is the camera that geometry is reckoned with in the second picture, ``camera`` by default.
+    ``believed`` is the camera that geometry is reckoned with, ``camera`` by default.
     """
     first, second = (renderer.image(camera, pose, samples) for pose in site_from_head)
     first, second = (cv2.GaussianBlur(image, (0, 0), BLUR_PX) for image in (first, second))
@@ -105,7 +134,7 @@ def measure(
         if texture[pixel[1], pixel[0]] < LEAST_TEXTURE:
             continue
         places = pixel + GRID_PX
-        there = carried(renderer.scene, camera, believed or camera, site_from_head, places)
+        there = carried(renderer.scene, believed or camera, site_from_head, places)
         if there is None:
             continue
         # an affine warp cannot bend: the truth for it is the best affine carrying of the whole patch
@@ -131,9 +160,9 @@ def texture_of(image: np.ndarray) -> FloatArray:
 
 
 def carried(
-    scene: Scene, camera: CameraModel, believed: CameraModel, site_from_head: tuple[Rigid, Rigid], places_px: FloatArray
+    scene: Scene, camera: CameraModel, site_from_head: tuple[Rigid, Rigid], places_px: FloatArray
 ) -> FloatArray | None:
-    """Pixels (n, 2) of the first picture in the second; None where a patch is not one smooth piece of ground."""
+    """Pixels (n, 2) of the first picture in the second; None where a patch is not one smooth piece."""
     first, second = site_from_head
     rays = camera.ray(places_px)
     origins_m, directions = first.points(rays.origins_m), first.vectors(rays.directions)
@@ -146,12 +175,12 @@ def carried(
     if np.abs(rest).max() > UNEVEN * inverse.mean():
         return None
     points = origins_m + ranges_m[:, None] * directions
-    pixels, valid = believed.project(second.inverse.points(points))
+    pixels, valid = camera.project(second.inverse.points(points))
     return pixels if valid.all() else None
 
 
 def best_affine(offsets_px: FloatArray, there_px: FloatArray) -> FloatArray:
-    """Least-squares affine warp (2, 3) from offsets about a patch's centre to pixels of the second picture."""
+    """Least-squares affine warp (2, 3) from offsets about a patch to pixels of the second picture."""
     local = np.column_stack([offsets_px, np.ones(len(offsets_px))])
     return np.asarray(np.linalg.lstsq(local, there_px, rcond=None)[0].T)
 
@@ -181,7 +210,7 @@ def match(
     return found
 
 
-def poses(camera: CameraModel, range_m: float, rng: np.random.Generator) -> tuple[Rigid, Rigid]:
+def turned_poses(camera: CameraModel, range_m: float, rng: np.random.Generator) -> tuple[Rigid, Rigid]:
     """Two head poses as a pointing makes them: the second up to a third of the picture away."""
     reach = 340.0 / float(np.linalg.norm(camera.H - camera.A * (camera.H @ camera.A)))
     pan, tilt = rng.uniform(-0.8, 0.8), rng.uniform(-0.02, 0.02)
@@ -189,33 +218,55 @@ def poses(camera: CameraModel, range_m: float, rng: np.random.Generator) -> tupl
     return head_pose(range_m, pan, tilt), head_pose(range_m, pan + turn[0], tilt + turn[1])
 
 
+def rolled_poses(camera: CameraModel, range_m: float, rng: np.random.Generator) -> tuple[Rigid, Rigid]:
+    """Two head poses half a turn about the camera's axis (and a little) apart: the camera stays in place."""
+    first = head_pose(range_m, rng.uniform(-0.8, 0.8), rng.uniform(-0.02, 0.02))
+    roll = Rotation.from_rotvec(camera.A * (np.pi + rng.uniform(-0.03, 0.03))).as_matrix()
+    return first, first @ Rigid(roll, camera.C - roll @ camera.C)
+
+
+def body_poses(camera: CameraModel, range_m: float, rng: np.random.Generator) -> tuple[Rigid, Rigid]:
+    """Two rover poses: turned on the spot by up to 0.2 rad."""
+    first, second = rng.uniform(-0.2, 0.2, 2)
+    return Rigid(rot_z(first), np.zeros(3)), Rigid(rot_z(second), np.zeros(3))
+
+
 def main() -> None:
     """Print one row for each scene, camera, range and number of samples."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--pairs", type=int, default=6, help="pairs of pictures a row")
     parser.add_argument("--patches", type=int, default=40, help="patches a pair")
     parser.add_argument("--samples", type=int, nargs="+", default=[1, 2, 3])
     parser.add_argument("--ranges", type=float, nargs="+", default=[10.0, 6.0, 2.0])
     parser.add_argument("--seed", type=int, default=1)
     options = parser.parse_args()
+    rows: list[tuple[str, CameraModel, float, Poses]] = []
+    for range_m in options.ranges:
+        rows += [
+            ("navcam turned", NAVCAM, range_m, turned_poses),
+            ("navcam rolled", NAVCAM, range_m, rolled_poses),
+        ]
+        rows += [
+            ("pancam turned", PANCAM, range_m, turned_poses),
+            ("pancam rolled", PANCAM, range_m, rolled_poses),
+        ]
+    rows.append(("hazcam turned", HAZCAM, 2.0, body_poses))
     for scene_name, settings in (
         ("flat", SceneSettings(seed=options.seed, relief_m=0.0, rocks=0)),
         ("relief", SceneSettings(seed=options.seed)),
     ):
         renderer = Renderer(build_scene(settings))
-        for camera_name, camera in (("navcam", NAVCAM), ("pancam", PANCAM)):
-            for range_m in options.ranges:
-                for samples in options.samples:
-                    rng = np.random.default_rng([options.seed, int(range_m * 10), samples])
-                    found = [
-                        measure(renderer, camera, poses(camera, range_m, rng), samples, options.patches, rng)
-                        for _ in range(options.pairs)
-                    ]
-                    together = Errors(
-                        np.concatenate([part.error_px for part in found]), sum(part.lost for part in found)
-                    )
-                    label = f"{scene_name:6s} {camera_name} {range_m:4.1f} m  {samples}x{samples}"
-                    print(f"{label}  {together.line()}", flush=True)
+        for name, camera, range_m, poses in rows:
+            for samples in options.samples:
+                rng = np.random.default_rng([options.seed, int(range_m * 10), samples])
+                found = [
+                    measure(renderer, camera, poses(camera, range_m, rng), samples, options.patches, rng)
+                    for _ in range(options.pairs)
+                ]
+                label = f"{scene_name:6s} {name} {range_m:4.1f} m  {samples}x{samples}"
+                print(f"{label}  {together(found).line()}", flush=True)
 
 
 if __name__ == "__main__":

@@ -168,7 +168,7 @@ SKY_HORIZON = 196.0
 SKY_ZENITH = 128.0
 HAZE_M = 900.0
 AMBIENT = 0.30
-MAX_TAPS = 10
+MAX_TAPS = 12
 SIGHT_M = 2000.0  # beams are followed no farther
 SHARING = 4  # up to so many rays of a pixel share one look at the ground's texture...
 ONE_PATCH = 1.05  # ...if the farthest hit is no farther than this times the nearest
@@ -297,6 +297,16 @@ def cross_grid(
 
 
 @compiled
+def over_ground(grid: Grid, x: float, y: float, e: float) -> bool:
+    """Whether a point is over the grid's square and above its triangles."""
+    px, py = (x - grid.x0_m) / grid.cell_m, (y - grid.y0_m) / grid.cell_m
+    if not (0.0 <= px < grid.cells and 0.0 <= py < grid.cells):
+        return False
+    ix, iy = int(px), int(py)
+    return cell_crossing(grid, ix, iy, 0.0, 0.0, px, py, e, 0.0, 0.0, 0.0) == FAR
+
+
+@compiled
 def cross_outer(
     inner: Grid,
     outer: Grid,
@@ -341,6 +351,7 @@ def clear_distance(
     inv_cell = 1.0 / grid.cell_m
     level_flat = math.sqrt(dx * dx + dy * dy)
     s = start
+    step = max(step, grid.cell_m)
     while s < SIGHT_M:
         radius = rho + (s + step) * spread
         low = min(oe + s * de, oe + (s + step) * de) - radius
@@ -538,8 +549,8 @@ def stretched_brightness(
     texture: Texture, x: float, y: float, short_m: float, long_m: float, ux: float, uy: float
 ) -> float:
     """Mean over a footprint ``short_m`` wide and ``long_m`` long in direction (ux, uy), by taps along it."""
-    # a tap reaches twice as far as the footprint is wide, and never less than one texel
-    taps = min(math.ceil(long_m / max(2.0 * short_m, texture.texel_m)), MAX_TAPS)
+    # a tap reaches 1.5 times as far as the footprint is wide, and never less than one texel
+    taps = max(min(math.ceil(long_m / max(1.5 * short_m, texture.texel_m)), MAX_TAPS), 1)
     width_m = max(short_m, 0.7 * long_m / taps)
     if taps == 1:
         return brightness(texture, x, y, width_m, 0.0, 0.0, 1)
@@ -825,6 +836,8 @@ def render_tiles(
                         if starts.shape[0] > 0:
                             sx, sy, sz = turned(r, starts[y, x, i, 0], starts[y, x, i, 1], starts[y, x, i, 2])
                             ox, oy, oz = mx + sx, my + sy, mz + sz
+                            if not over_ground(inner, ox, oy, -oz):
+                                continue
                         s, ix, iy = cross_grid(inner, ox, oy, -oz, dx, dy, -dz, clear, FAR)
                         beyond = s >= FAR
                         if beyond:

@@ -131,27 +131,33 @@ class Renderer:
             The model in the frame it is mounted in (head or rover). Its rays are computed once and kept, so
             give the same model with another transform for another pose, not a moved model.
         site_from_camera_frame
-            Where that frame is. The camera must be above the ground and within 32 m of the site's origin.
+            Where that frame is. C must be above the ground, and within 32 m of the site's origin in x and y.
         samples
             Rays across a pixel, 1 to 8: each pixel is the mean of samples x samples rays.
 
         Returns
         -------
         image : (h, w) float32
-            Brightness, 0 to 255, noise-free. Pixels for which the model has no ray are 0.
+            Brightness, 0 to 255, noise-free. Pixels for which the model has no ray are 0, and so are those
+            whose ray starts under the ground (in CAHVORE rays start the farther from C the more they bend).
 
         Raises
         ------
         BadOptions
-            If ``samples`` is out of bounds.
+            If ``samples`` is out of bounds, or the camera stands where it sees nothing.
         """
         if not 1 <= samples <= MAX_SAMPLES:
             raise BadOptions(f"{samples} samples across a pixel where 1 to {MAX_SAMPLES} are possible")
+        centre_m = np.array(site_from_camera_frame.points(camera.C))
+        if not self._kernels.over_ground(self.scene.world.inner, centre_m[0], centre_m[1], -centre_m[2]):
+            place = ", ".join(f"{value:.3f}" for value in centre_m)
+            raise BadOptions(
+                f"a camera at ({place}) m in the site frame is under the ground or beyond its edge"
+            )
         table = self._table(camera, samples)
         height, width = table.rays.shape[:2]
         image = np.zeros((height, width), dtype=np.float32)
         rotation = np.array(site_from_camera_frame.rotation)
-        centre_m = np.array(site_from_camera_frame.points(camera.C))
         tiles = table.tile_beams.shape[0] * table.tile_beams.shape[1]
         # short pieces, so that a worker with sky takes its share of ground too
         edges = np.linspace(0, tiles, 8 * self._workers + 1).astype(int) if self._workers > 1 else [0, tiles]

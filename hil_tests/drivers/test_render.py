@@ -1,0 +1,266 @@
+"""Pictures of the simulated world: every pixel where geometry puts it, filtered without a shift."""
+
+from __future__ import annotations
+
+import importlib.util
+import sys
+import threading
+from dataclasses import replace
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+import pytest
+
+from calib.cahvor import CameraModel
+from calib.rigid import Rigid
+from drivers.errors import BadOptions
+from drivers.sim import render, texture
+from drivers.sim.compiled import is_compiled, kernels
+from drivers.sim.render import Renderer, compile_renderer, ray_table
+from drivers.sim.scene import Scene, SceneSettings, build_scene
+
+MOST_BIAS_PX = 0.01
+MOST_RMS_PX = 0.05
+TABLE_PX = 1e-4
+"""float32 directions: one part in 1.7e7 of a unit vector seen through 3441 px."""
+
+
+def load_bias_tool() -> ModuleType:
+    """Return tools/render_bias.py as a module."""
+    path = Path(__file__).resolve().parents[2] / "tools" / "render_bias.py"
+    spec = importlib.util.spec_from_file_location("render_bias", path)
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = module
+    spec.loader.exec_module(module)
+    return module
+
+
+bias = load_bias_tool()
+
+
+@pytest.fixture(scope="module")
+def flat() -> Renderer:
+    return Renderer(build_scene(SceneSettings(seed=2, relief_m=0.0, rocks=0)))
+
+
+@pytest.fixture(scope="module")
+def rough(scene: Scene) -> Renderer:
+    return Renderer(scene)
+
+
+def small(camera: CameraModel, part: int) -> CameraModel:
+    """The same view with 1 / part of the pixels each way."""
+    shift = (0.5 / part - 0.5) * camera.A
+    size = (camera.size_px[0] // part, camera.size_px[1] // part)
+    return replace(camera, size_px=size, H=camera.H / part + shift, V=camera.V / part + shift)
+
+
+# ------------------------------------------------------------- sub-pixel honesty
+
+
+@pytest.mark.parametrize("ground", ["flat", "rough"])
+@pytest.mark.parametrize(
+    ("name", "range_m"), [("NAVCAM", 6.0), ("NAVCAM", 2.0), ("PANCAM", 10.0), ("HAZCAM", 2.0)]
+)
+def test_matched_patches_lie_where_geometry_puts_them(
+    ground: str, name: str, range_m: float, request: pytest.FixtureRequest
+) -> None:
+    """60 patches carried between two pointings at 2x2 samples; tools/render_bias.py takes thousands."""
+    camera = getattr(bias, name)
+    poses = bias.body_poses if name == "HAZCAM" else bias.turned_poses
+    rng = np.random.default_rng(11)
+    renderer = request.getfixturevalue(ground)
+    found = bias.measure(renderer, camera, poses(camera, range_m, rng), 2, 60, rng)
+    assert len(found.error_px) >= 55, found.line()
+    assert (np.abs(found.error_px.mean(axis=0)) < MOST_BIAS_PX).all(), found.line()
+    assert (np.sqrt((found.error_px**2).mean(axis=0)) < MOST_RMS_PX).all(), found.line()
+
+
+def test_pixels_do_not_move_when_the_camera_is_upside_down(flat: Renderer) -> None:
+    """A common shift of all pixels hides from a turning head; rolled by half a turn it shows twice."""
+    rng = np.random.default_rng(12)
+    found = bias.measure(flat, bias.NAVCAM, bias.rolled_poses(bias.NAVCAM, 4.0, rng), 2, 60, rng)
+    assert (np.abs(found.error_px.mean(axis=0)) < MOST_BIAS_PX).all(), found.line()
+
+
+def test_a_quarter_pixel_of_shift_would_be_reported(flat: Renderer) -> None:
+    true = bias.NAVCAM
+    shifted = replace(true, H=true.H + 0.25 * true.A, V=true.V + 0.25 * true.A)
+    rng = np.random.default_rng(12)
+    poses = bias.rolled_poses(true, 4.0, rng)
+    found = bias.measure(flat, true, poses, 2, 60, rng, believed=shifted)
+    np.testing.assert_allclose(found.error_px.mean(axis=0), [-0.5, -0.5], atol=0.02)
+
+
+@pytest.mark.parametrize("axis", [0, 1])
+def test_no_level_of_a_texture_is_shifted_against_another(axis: int) -> None:
+    """A slope stays the same slope at every footprint, between texels and between levels."""
+    size, texel_m = 512, 0.01
+    slope = np.linspace(0.2, 1.8, size, endpoint=False) + 0.8 / size  # mean value of each texel
+    tones = np.broadcast_to(slope if axis == 0 else slope[:, None], (size, size)).astype(np.float32)
+    picture = texture.pyramid(tones, texel_m)
+    rng = np.random.default_rng(13)
+    for width in (0.3, 1.0, 1.3, 1.7, 2.0, 3.1, 5.5, 9.0, 16.0):
+        for stretch in (1.0, 4.0, 13.0):
+            place = rng.uniform(0.35, 0.65, 2) * size * texel_m
+            turn = rng.uniform(0, 2 * np.pi)
+            value = kernels().stretched_brightness(
+                picture, *place, width * texel_m, stretch * width * texel_m, np.cos(turn), np.sin(turn)
+            )
+            expected = 0.2 + 1.6 * place[axis] / (size * texel_m)
+            assert value == pytest.approx(expected, abs=1.6 / size * 0.02), (width, stretch)
+
+
+# ------------------------------------------------------------- the same geometry as Scene.cast
+
+
+def test_sky_is_seen_exactly_where_cast_finds_nothing(rough: Renderer) -> None:
+    """On both sides of the horizon, through hills and past rocks, no block of pixels is skipped."""
+    camera = small(bias.NAVCAM, 2)
+    pose = bias.head_pose(1e6, 0.3, 0.0)
+    rays = camera.ray(pixel_grid(camera))
+    directions = pose.vectors(rays.directions)
+    met = np.isfinite(rough.scene.cast(pose.points(rays.origins_m), directions))
+    picture = rough.image(camera, pose, 1)
+    # the sky's tone goes with height above the horizon alone
+    bins = np.rint(-directions[..., 2] * 500).astype(int)
+    tones = {height: np.median(picture[~met & (bins == height)]) for height in np.unique(bins[~met])}
+    sky = np.vectorize(lambda height: tones.get(height, np.nan))(bins)
+    apart = np.abs(picture - sky)
+    before_hills = met & np.isfinite(sky)
+    assert 0.2 < met.mean() < 0.9 and before_hills.sum() > 1000
+    assert apart[~met].max() < 0.5
+    assert (apart[before_hills] > 0.5).mean() > 0.99
+
+
+@pytest.mark.parametrize("samples", [1, 2])
+def test_how_pixels_are_grouped_makes_no_difference(
+    rough: Renderer, samples: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Beams only spare work: with one pixel a group, nothing is met later or missed."""
+    poses = {"NAVCAM": bias.head_pose(8.0, 0.2, 0.0), "HAZCAM": Rigid.identity()}
+    for name, pose in poses.items():
+        camera = small(getattr(bias, name), 4)
+        usual = rough.image(camera, pose, samples)
+        monkeypatch.setattr(render, "TILE_PX", 1)
+        monkeypatch.setattr(render, "BLOCK_PX", 1)
+        single = Renderer(rough.scene).image(camera, pose, samples)
+        monkeypatch.undo()
+        assert np.abs(usual - single).max() < 4.0, "only the footprint is shared by a group"
+        assert np.abs(usual - single).mean() < 0.1
+
+
+def test_more_samples_come_nearer_to_the_mean_over_each_pixel(rough: Renderer) -> None:
+    camera, pose = small(bias.NAVCAM, 4), bias.head_pose(4.0, -0.3, 0.0)
+    many = rough.image(camera, pose, 8).astype(np.float64)
+    apart = [np.sqrt(((rough.image(camera, pose, samples) - many) ** 2).mean()) for samples in (1, 3, 5)]
+    assert 12.0 > apart[0] > 1.3 * apart[1] > 1.3 * apart[2]
+    assert abs(rough.image(camera, pose, 1).mean() - many.mean()) < 0.5
+
+
+# ------------------------------------------------------------- the table of rays
+
+
+def pixel_grid(camera: CameraModel) -> np.ndarray:
+    return np.stack(np.meshgrid(*(np.arange(n, dtype=float) for n in camera.size_px)), axis=-1)
+
+
+@pytest.mark.parametrize("name", ["NAVCAM", "PANCAM", "HAZCAM"])
+def test_table_rays_lead_back_to_their_samples(name: str) -> None:
+    camera = getattr(bias, name)
+    table = ray_table(camera, 2)
+    starts = table.starts.astype(np.float64) if len(table.starts) else 0.0
+    assert bool(len(table.starts)) == (name == "HAZCAM"), "only CAHVORE's rays start apart"
+    points = camera.C + starts + 7.0 * table.rays.astype(np.float64)
+    pixels, valid = camera.project(points)
+    assert valid.all()
+    for i, (x, y) in enumerate([(-0.25, -0.25), (0.25, -0.25), (-0.25, 0.25), (0.25, 0.25)]):
+        assert np.abs(pixels[:, :, i] - pixel_grid(camera) - [x, y]).max() < TABLE_PX
+
+
+def test_beams_hold_all_their_rays() -> None:
+    for camera in (small(bias.HAZCAM, 4), small(bias.NAVCAM, 5)):  # 160 x 120 and 204 x 153: not whole tiles
+        table = ray_table(camera, 2)
+        rng = np.random.default_rng(14)
+        for size, beams in ((render.TILE_PX, table.tile_beams), (render.BLOCK_PX, table.block_beams)):
+            for _ in range(500):
+                x, y = rng.integers(0, camera.size_px[0]), rng.integers(0, camera.size_px[1])
+                beam = beams[y // size, x // size]
+                assert np.linalg.norm(table.rays[y, x] - beam[:3], axis=-1).max() <= beam[3]
+                if len(table.starts):
+                    assert np.linalg.norm(table.starts[y, x], axis=-1).max() <= beam[4]
+
+
+def test_pixels_without_a_ray_are_black(rough: Renderer) -> None:
+    camera = replace(
+        small(bias.HAZCAM, 4),
+        H=bias.HAZCAM.H / 4 * 0.22 + 60.0 * bias.HAZCAM.A,
+        V=bias.HAZCAM.V / 4 * 0.22,
+        E=np.zeros(3),
+    )
+    valid = camera.ray(pixel_grid(camera)).valid
+    picture = rough.image(camera, Rigid.identity(), 1)
+    assert 0.05 < valid.mean() < 0.95, "the model reaches part of this picture only"
+    assert (picture[~valid] == 0.0).all()
+    assert (picture[valid] > 0.0).all()
+
+
+def test_rays_that_start_under_the_ground_are_black(rough: Renderer) -> None:
+    """At the rim of a wide fisheye the entrance point runs off along O, here into the ground and farther."""
+    camera = small(bias.HAZCAM, 4)
+    camera = replace(camera, H=0.22 * camera.H + 47.0 * camera.A, V=0.22 * camera.V + 47.0 * camera.A)
+    rays = camera.ray(pixel_grid(camera))
+    low = rays.valid & (rays.origins_m[..., 2] > 0.3)
+    high = rays.valid & (rays.origins_m[..., 2] < -0.3)
+    picture = rough.image(camera, Rigid.identity(), 1)
+    assert low.sum() > 50 and (picture[low] == 0.0).all()
+    assert high.sum() > 500 and (picture[high] > 0.0).all()
+
+
+@pytest.mark.parametrize("place_m", [(0.0, 0.0, 3.0), (40.0, 0.0, -1.0)])
+def test_a_camera_that_sees_nothing_is_refused(rough: Renderer, place_m: tuple[float, float, float]) -> None:
+    with pytest.raises(BadOptions, match="under the ground or beyond its edge"):
+        rough.image(small(bias.NAVCAM, 8), Rigid(np.eye(3), np.array(place_m)))
+
+
+# ------------------------------------------------------------- the renderer as a thing to call
+
+
+def test_pictures_are_float32_grey_levels_with_contrast(rough: Renderer) -> None:
+    picture = rough.image(bias.NAVCAM, bias.head_pose(6.0, 0.0, 0.0))
+    assert picture.dtype == np.float32 and picture.shape == (768, 1024)
+    assert picture.min() >= 0.0 and picture.max() <= 255.0
+    assert 60.0 < picture.mean() < 180.0 and picture[300:].std() > 10.0
+    assert (picture >= 255.0).mean() < 0.002
+
+
+def test_threads_may_draw_at_once(rough: Renderer) -> None:
+    cameras = [small(bias.NAVCAM, 4), small(bias.PANCAM, 4), small(bias.HAZCAM, 2)]
+    pose = bias.head_pose(5.0, 0.1, 0.0)
+    alone = [rough.image(camera, pose) for camera in cameras]
+    together: list[np.ndarray | None] = [None] * len(cameras)
+
+    def draw(k: int) -> None:
+        for _ in range(3):
+            together[k] = rough.image(cameras[k], pose)
+
+    threads = [threading.Thread(target=draw, args=(k,)) for k in range(len(cameras))]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    for mine, theirs in zip(alone, together, strict=True):
+        assert theirs is not None and np.array_equal(mine, theirs)
+
+
+@pytest.mark.parametrize("samples", [0, 9])
+def test_samples_out_of_bounds_are_refused(rough: Renderer, samples: int) -> None:
+    with pytest.raises(BadOptions, match=f"{samples} samples across a pixel where 1 to 8 are possible"):
+        rough.image(bias.NAVCAM, Rigid.identity(), samples)
+
+
+def test_compiling_is_known_to_be_done() -> None:
+    compile_renderer()
+    assert is_compiled()
