@@ -20,7 +20,7 @@ from calib.cahvor import CameraModel
 from calib.rigid import Rigid
 from drivers.errors import BadOptions
 from drivers.sim.compiled import is_compiled, kernels
-from drivers.sim.scene import Scene, SceneSettings, build_scene
+from drivers.sim.scene import Scene, tiny_scene
 
 __all__ = ["RayTable", "Renderer", "compile_renderer", "is_compiled", "ray_table"]
 
@@ -206,7 +206,7 @@ def compile_renderer() -> None:
     BadOptions
         If numba is not installed.
     """
-    scene = build_scene(SceneSettings(rocks=1))
+    scene = tiny_scene()
     camera = CameraModel(
         kind="CAHV",
         size_px=(8, 8),

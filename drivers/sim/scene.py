@@ -119,7 +119,6 @@ def build_scene(settings: SceneSettings | None = None) -> Scene:
         If numba is not installed.
     """
     settings = settings or SceneSettings()
-    module = kernels()
     # one stream of numbers for each part: a flat scene keeps the stones and gravel of the rough one
     relief_rng, hill_rng, rock_rng, gravel_rng, tone_rng, stone_rng = (
         np.random.default_rng(child) for child in np.random.SeedSequence(settings.seed).spawn(6)
@@ -128,12 +127,24 @@ def build_scene(settings: SceneSettings | None = None) -> Scene:
     inner = make_grid(inner_relief_m(settings, relief_rng), INNER_CELL_M)
     outer = make_grid(outer_relief_m(settings, hill_rng), OUTER_CELL_M)
     stones = rocks.make_rocks(settings.rocks, rock_rng, lambda x, y: ground_z_m(inner, x, y))
-    detail = texture.pyramid(texture.gravel(gravel_rng, sun), texture.DETAIL_TEXEL_M)
-    stone = texture.pyramid(texture.stone(stone_rng), texture.STONE_TEXEL_M)
-    plain = texture.pyramid(np.ones((4, 4), dtype=np.float32), 1.0)
-    dark = module.World(inner, outer, stones, detail, plain, stone, sun)
-    broad = texture.pyramid(ground_tones(inner, sun, tone_rng) * shadows(dark), INNER_CELL_M)
-    return Scene(settings, dark._replace(broad=broad))
+    tones = ground_tones(inner, sun, tone_rng) * shadows(inner, stones, sun)
+    detail = texture.pyramid(texture.gravel(gravel_rng, sun, texture.DETAIL_TEXELS), texture.DETAIL_TEXEL_M)
+    stone = texture.pyramid(texture.stone(stone_rng, texture.STONE_TEXELS), texture.STONE_TEXEL_M)
+    broad = texture.pyramid(tones, INNER_CELL_M)
+    return Scene(settings, kernels().World(inner, outer, stones, detail, broad, stone, sun))
+
+
+def tiny_scene() -> Scene:
+    """Return a level scene with one rock and next to no texture, made in no time: for compiling only."""
+    settings = SceneSettings(relief_m=0.0, rocks=1)
+    rng = np.random.default_rng(settings.seed)
+    sun = sun_direction(settings)
+    inner = make_grid(np.zeros((9, 9), dtype=np.float32), INNER_CELLS * INNER_CELL_M / 8)
+    stones = rocks.make_rocks(settings.rocks, rng, lambda x, y: ground_z_m(inner, x, y))
+    broad = texture.pyramid(shadows(inner, stones, sun), inner.cell_m)
+    detail = texture.pyramid(texture.gravel(rng, sun, 128), texture.DETAIL_TEXEL_M)
+    stone = texture.pyramid(texture.stone(rng, 128), texture.STONE_TEXEL_M)
+    return Scene(settings, kernels().World(inner, inner, stones, detail, broad, stone, sun))
 
 
 def sun_direction(settings: SceneSettings) -> Float64:
@@ -231,14 +242,13 @@ def ground_tones(grid: Any, sun: Float64, rng: np.random.Generator) -> NDArray[n
     return np.asarray(np.exp(0.13 * soil) * light / level, dtype=np.float32)
 
 
-def shadows(world: Any) -> NDArray[np.float32]:
+def shadows(grid: Any, stones: Any, sun: Float64) -> NDArray[np.float32]:
     """What part (n, n) [y, x] of its light each ground texel keeps beside the rocks."""
     module = kernels()
-    grid, sun = world.inner, world.sun
     kept = np.ones((grid.cells, grid.cells), dtype=np.float32)
     in_shade = module.AMBIENT / (module.AMBIENT - (1.0 - module.AMBIENT) * sun[2])
     fine = (np.arange(SHADOW_SAMPLES) + 0.5) / SHADOW_SAMPLES
-    for x, y, z, radius in world.rocks.spheres_m:
+    for x, y, z, radius in stones.spheres_m:
         throw = (radius + max(-z + radius, 0.0)) / math.tan(math.asin(-sun[2]))
         ends = np.array([[x, y], [x, y] - throw * sun[:2] / np.hypot(sun[0], sun[1])])
         low = np.floor((ends.min(axis=0) - 1.2 * radius - grid.x0_m) / grid.cell_m).astype(int)
@@ -250,7 +260,7 @@ def shadows(world: Any) -> NDArray[np.float32]:
         points[..., 0], points[..., 1] = xs, ys[:, None]
         points[..., 2] = coarse_z_m(grid, low, high)
         clear = np.empty(points[..., 0].size, dtype=np.float32)
-        module.shadow_rays(world.rocks, sun, points.reshape(-1, 3), clear)
+        module.shadow_rays(stones, sun, points.reshape(-1, 3), clear)
         q = SHADOW_SAMPLES
         clear = clear.reshape(high[1] - low[1], q, high[0] - low[0], q).mean(axis=(1, 3))
         block = kept[low[1] : high[1], low[0] : high[0]]

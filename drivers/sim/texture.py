@@ -38,9 +38,8 @@ def fractal(
     return np.asarray(noise / noise.std(), dtype=np.float32)
 
 
-def gravel(rng: np.random.Generator, sun: NDArray[np.float64]) -> Float32:
+def gravel(rng: np.random.Generator, sun: NDArray[np.float64], size: int) -> Float32:
     """Return a repeating picture of sand with pebbles, mean 1, lit from ``sun`` (unit, site frame)."""
-    size = DETAIL_TEXELS
     tones = 1.0 + 0.11 * fractal(size, rng, 0.9, 2.5, 400.0)
     rough = np.clip(fractal(size, rng, 1.2, 3.0, 40.0), -2.0, 2.0)
     layers = []
@@ -59,9 +58,8 @@ def gravel(rng: np.random.Generator, sun: NDArray[np.float64]) -> Float32:
     return np.asarray(tones / tones.mean(), dtype=np.float32)
 
 
-def stone(rng: np.random.Generator) -> Float32:
+def stone(rng: np.random.Generator, size: int) -> Float32:
     """Return a repeating picture of a rock's surface, mean 1: blotches, grain and pits."""
-    size = STONE_TEXELS
     tones = 1.0 + 0.13 * fractal(size, rng, 1.2, 3.0, 500.0) + 0.09 * fractal(size, rng, 0.3, 2.5, 16.0)
     pits = fractal(size, rng, 0.8, 6.0, 60.0)
     tones *= 1.0 - 0.40 * np.clip(pits - 1.2, 0.0, 1.0)
