@@ -83,7 +83,7 @@ def _bend_curved(lens: Lens, lam: FloatArray, w: FloatArray, derivatives: bool) 
     """CAHVORE: the ray's angle first, then its slope."""
     r0, r1, r2 = lens.r
     line = lens.linearity
-    theta, sine, cosine, slope, valid = _ray_angle(lens, lam, w, derivatives)
+    theta, sine, cosine, slope, valid = ray_angle(lens, lam, w, derivatives)
     if line > 0.0:
         chi = np.tan(line * theta) / line
     elif line < 0.0:
@@ -106,7 +106,7 @@ def _bend_curved(lens: Lens, lam: FloatArray, w: FloatArray, derivatives: bool) 
     return Bent(m, valid, (rate * cosine - m) / (lam * lam), -rate * sine / lam)
 
 
-def _ray_angle(
+def ray_angle(
     lens: Lens, lam: FloatArray, w: FloatArray, polish: bool
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, np.ndarray]:
     """Return theta of the ray through points, its sine and cosine, f'(theta), and where that is right.
