@@ -153,7 +153,7 @@ class CameraModel:
         """Return what stays when the camera moves."""
         r0, r1, r2 = self.R.tolist()
         e0, e1, e2 = self.E.tolist()
-        slope_from_pixel = np.linalg.inv(pixel_from_slope)
+        slope_from_pixel = np.asarray(np.linalg.inv(pixel_from_slope), dtype=np.float64)
         lens = Lens(
             (r0, r1, r2),
             (e0, e1, e2),
@@ -212,12 +212,11 @@ class CameraModel:
             letters["O"] = given["A"]
         curve = model.linearity if kind == "CAHVORE" else None
         shift_px = 0.0
-        with np.errstate(all="ignore"):
-            for range_m in (1.0, 1000.0):
-                points = rays.origins_m[rays.valid] + range_m * rays.directions[rays.valid]
-                moved = project_as_published(points, linearity=curve, **letters) - pixels[rays.valid]
-                far = np.hypot(moved[:, 0], moved[:, 1])
-                shift_px = max(shift_px, float(np.where(np.isfinite(far), far, inf).max(initial=0.0)))
+        for range_m in (1.0, 1000.0):
+            points = rays.origins_m[rays.valid] + range_m * rays.directions[rays.valid]
+            published = project_as_published(points, linearity=curve, **letters)
+            far = np.hypot(*(published - pixels[rays.valid]).T)
+            shift_px = max(shift_px, float(np.where(np.isfinite(far), far, inf).max(initial=0.0)))
         return model, shift_px
 
     @property
@@ -248,8 +247,9 @@ class CameraModel:
         """
         points = _as_rows(points_m, 3, "points")
         if points.ndim == 1:
-            x, y = self._projection.project_point(*points.tolist(), self._place)
-            return np.array([x, y]), np.array(x == x)
+            x_m, y_m, z_m = points.tolist()
+            x_px, y_px = self._projection.project_point(x_m, y_m, z_m, self._place)
+            return np.array([x_px, y_px]), np.array(x_px == x_px)
         pixels, _, valid = self._projection.project(points.reshape(-1, 3), self.C, self._axes, False)
         return pixels.reshape(*points.shape[:-1], 2), valid.reshape(points.shape[:-1])
 
@@ -270,7 +270,8 @@ class CameraModel:
         """
         pixels = _as_rows(pixels_px, 2, "pixels")
         if pixels.ndim == 1:
-            ray = self._projection.ray_of_pixel(*pixels.tolist(), self._place)
+            x_px, y_px = pixels.tolist()
+            ray = self._projection.ray_of_pixel(x_px, y_px, self._place)
             if ray is None:
                 return Rays(np.full(3, nan), np.full(3, nan), np.array(False))
             return Rays(np.array(ray[0]), np.array(ray[1]), np.array(True))

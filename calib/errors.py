@@ -26,7 +26,14 @@ class BadFile(CalibError):
         self.path = Path(path)
         self.place = place
         self.reason = reason
-        super().__init__(f"{path}: {place}: {reason}" if place else f"{path}: {reason}")
+        told = (_one_line(text, limit) for text, limit in ((str(path), 300), (place, 120), (reason, 250)))
+        super().__init__(": ".join(text for text in told if text))
+
+
+def _one_line(text: str, limit: int) -> str:
+    """Return the text on one line of bounded length: a file's keys and words can hold anything."""
+    shown = "".join(c if c.isprintable() else repr(c)[1:-1] for c in text[: limit + 1])
+    return shown if len(shown) <= limit else f"{shown[:limit]}..."
 
 
 class Unreachable(CalibError):

@@ -28,6 +28,8 @@ Coefficients = tuple[float, float, float]
 def first_fold(r: Coefficients) -> float:
     """Return the first chi > 0 where chi (1 + r0 + r1 chi^2 + r2 chi^4) stops growing; infinite if none."""
     c, b, a = 1.0 + r[0], 3.0 * r[1], 5.0 * r[2]  # the derivative is a y^2 + b y + c, with y = chi^2
+    largest = max(abs(a), abs(b), c)
+    a, b, c = a / largest, b / largest, c / largest
     discriminant = b * b - 4.0 * a * c
     if discriminant < 0.0:
         return inf
@@ -57,7 +59,7 @@ class Lens:
     theta_image_rad
         The largest theta inside the image.
     near_m
-        Farther than this from C no two rays of the image cross.
+        Farther than this from C no two rays of the image meet.
     """
 
     r: Coefficients

@@ -22,6 +22,9 @@ SETTLED = 1e-9
 _SMALL_TURN_RAD = 0.1
 """Up to here a sine by its series to the ninth power is exact to rounding."""
 
+NEAREST_M = 1e-9
+"""A point this near the entrance point has no direction from it."""
+
 _NODES = 257
 """Angles at which the slow search for a ray looks for a change of sign."""
 
@@ -118,7 +121,7 @@ def ray_angle(
     start = np.arctan2(lam, w)
     sine_start, cosine_start = lam / rho, w / rho
     if not lens.moving:
-        return start, sine_start, cosine_start, rho, rho < np.inf
+        return start, sine_start, cosine_start, rho, (rho > NEAREST_M) & (rho < np.inf)
     e0, e1, e2 = lens.e
     theta, sine, cosine, turn = start, sine_start, cosine_start, np.zeros_like(start)
     for _ in range(8):
@@ -137,6 +140,7 @@ def ray_angle(
         if done:
             break
     settled &= slope > 0.0
+    settled &= lam > NEAREST_M * sine
 
     # With f(theta_image) > 0 the ray is inside the image; what Newton did not find there, or may have
     # found twice because rays cross so near the lens, is searched for.
@@ -195,8 +199,9 @@ def angle_by_search(lens: Lens, lam: FloatArray, w: FloatArray) -> FloatArray:
     slope = w * cosine + lam * sine - (1.0 - cosine) * (e0 + y * (e1 + y * e2))
     slope -= (theta - sine) * theta * (2.0 * e1 + (4.0 * e2) * y)
     theta -= np.clip(miss(theta, lam, w) / slope, -1e-12, 1e-12)  # the last digits of a small angle
-    twice = np.count_nonzero(rising & (nodes[:-1] < lens.theta_image_rad), axis=1) > 1
-    lost = twice | ~rising.any(axis=1) | ~(slope > 0.0)
+    changes = (positive[:, :-1] != positive[:, 1:]) & (nodes[:-1] < lens.theta_image_rad)
+    twice = np.count_nonzero(changes, axis=1) > 1
+    lost = twice | ~rising.any(axis=1) | ~(slope > 0.0) | ~(lam > NEAREST_M * np.sin(theta))
     return np.where(lost, np.nan, theta)
 
 

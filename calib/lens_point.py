@@ -11,7 +11,7 @@ from math import asin, atan, atan2, cos, inf, isfinite, nan, sin, sqrt, tan
 import numpy as np
 
 from calib.lens import Lens
-from calib.lens_arrays import SETTLED, TINY, angle_by_search
+from calib.lens_arrays import NEAREST_M, SETTLED, TINY, angle_by_search
 
 
 def bend_point(lens: Lens, a: float, b: float, w: float) -> float:
@@ -42,7 +42,7 @@ def bend_point(lens: Lens, a: float, b: float, w: float) -> float:
 def _ray_angle(lens: Lens, lam: float, w: float) -> float:
     """Return theta of the ray through a point, not-a-number if there is none or more than one."""
     rho = sqrt(lam * lam + w * w)
-    if not rho < inf:
+    if not NEAREST_M < rho < inf:
         return nan
     theta = atan2(lam, w)
     if not lens.moving:
@@ -60,7 +60,7 @@ def _ray_angle(lens: Lens, lam: float, w: float) -> float:
         step = (w * sine - lam * cosine - lag * e) / slope
         theta -= step
         if abs(step) < SETTLED:
-            settled = slope > 0.0
+            settled = slope > 0.0 and lam > NEAREST_M * sine
             break
         if not abs(theta) < inf:
             break

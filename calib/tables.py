@@ -56,6 +56,8 @@ def parse_table(data: bytes, path: str | Path, columns: Sequence[str]) -> FloatA
         line = data.count(b"\n", 0, error.start) + 1
         raise BadFile(path, f"line {line}", f"byte 0x{data[error.start]:02x} is not UTF-8 text") from None
     lines = csv.reader(io.StringIO(text, newline=""), strict=True)
+    # Python's float reads 1_000 and digits of other scripts too; without them it knows just our numbers.
+    float_is_strict = text.isascii() and text.count("_") == sum(name.count("_") for name in columns)
     values: list[list[float]] = []
     blank_line = 0
     try:
@@ -64,9 +66,15 @@ def parse_table(data: bytes, path: str | Path, columns: Sequence[str]) -> FloatA
             if not cells:
                 blank_line = blank_line or lines.line_num
                 continue
-            place = f"row {len(values) + 1} (line {lines.line_num})"
             if blank_line:
                 raise BadFile(path, f"line {blank_line}", "is blank; a row is expected on every line")
+            if float_is_strict and len(cells) == len(columns):
+                try:
+                    values.append([float(cell) for cell in cells])
+                    continue
+                except ValueError:
+                    pass
+            place = f"row {len(values) + 1} (line {lines.line_num})"
             values.append(_row(cells, path, place, columns))
     except csv.Error as error:
         raise BadFile(path, f"line {lines.line_num}", f"is not CSV: {error}") from None

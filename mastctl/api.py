@@ -25,7 +25,7 @@ from drivers.errors import BadFrame, BadOptions, BadReply, DriverError
 from drivers.faults import Fault as SetFault
 from drivers.faults import FaultPanel
 from mastctl.api_guard import Guard, error_response
-from mastctl.api_requests import FaultBody, FaultsQuery, PointBody, SnapshotQuery, sentence
+from mastctl.api_requests import ErrorBody, FaultBody, FaultsQuery, PointBody, SnapshotQuery, sentence
 from mastctl.errors import MastctlError
 from mastctl.frames import StampedFrame
 from mastctl.limits import OutsideLimits
@@ -66,6 +66,7 @@ def create_app(service: Service) -> ASGIApp:
         title="mastctl",
         version=version("mastctl"),
         description="A rover mast: state, pointing with a measured residual, pictures with their facts.",
+        responses={status: {"model": ErrorBody, "description": "Refused"} for status in ("4XX", "5XX", 422)},
         docs_url=None,
         redoc_url=None,
     )

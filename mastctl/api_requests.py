@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from calib.formats.strict import nearest
-from mastctl.pointing.loop import Aim, AnglesTarget, PixelTarget, PointRequest, PositionTarget
+from mastctl.pointing.requests import Aim, AnglesTarget, PixelTarget, PointRequest, PositionTarget
 
 LARGEST_PX = 1e5
 LARGEST_M = 1e6
@@ -96,6 +96,13 @@ class FaultBody(_Strict):
     word: Name
     parameters: dict[str, float] = Field(default_factory=dict)
 
+    @model_validator(mode="after")
+    def _free_names(self) -> FaultBody:
+        for name in ("device", "word", "self"):
+            if name in self.parameters:
+                raise ValueError(f"parameters.{name}: unknown key; no fault has a parameter of this name")
+        return self
+
 
 class SnapshotQuery(BaseModel):
     """``GET /snapshot/{camera}``; ``frame_id`` asks for a frame that is still kept."""
@@ -113,6 +120,20 @@ class FaultsQuery(BaseModel):
     model_config = ConfigDict(extra="forbid")
 
     device: Name | None = None
+
+
+class ErrorTold(BaseModel):
+    """Why a request was refused: a word for programs, a sentence for people, more where there is more."""
+
+    code: str
+    message: str
+    detail: dict[str, Any] | None = None
+
+
+class ErrorBody(BaseModel):
+    """Every answer that is not a success."""
+
+    error: ErrorTold
 
 
 _KEYS: Mapping[tuple[str, ...], Sequence[str]] = {

@@ -93,7 +93,7 @@ class Client:
         ``bad_url``, if the address is of neither form. Every method raises it for whatever goes wrong.
     """
 
-    def __init__(self, url: str = DEFAULT_URL, timeout_s: float = 15.0) -> None:
+    def __init__(self, url: str = DEFAULT_URL, timeout_s: float = 30.0) -> None:
         self.url = url
         transport: httpx.HTTPTransport | None = None
         base = url.rstrip("/")

@@ -7,7 +7,6 @@ is read (`check_cameras`). Options of drivers are handed through as they stand; 
 from __future__ import annotations
 
 import ipaddress
-from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from urllib.parse import quote

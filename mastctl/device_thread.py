@@ -196,7 +196,7 @@ class DeviceThread:
         except MastctlError as ours:  # a refusal of the service's own: nothing is wrong with the device
             error = ours
         except DriverError as fault:
-            error = fault if fault.device else _named(fault, self._device)
+            error = fault if fault.device == self._device else _named(fault, self._device)
         except (
             BaseException
         ) as anything:  # a driver from outside may raise what it likes, SystemExit included

@@ -35,7 +35,7 @@ READ_TIMEOUT_S = 1.0
 MOVE_TIMEOUT_S = 1.0
 STOP_TIMEOUT_S = 1.0
 STOP_PATIENCE_S = 0.05  # how long a stop waits for the head's own thread before it goes out beside it
-CAMERA_GRACE_S = 3.0  # beyond the time given to next_frame: decoding, or rendering, on a busy machine
+CAMERA_GRACE_S = 3.0  # beyond the time given to next_frame: copying and decoding on a busy machine
 MOVING_PERIOD_S = 0.02
 RESTING_PERIOD_S = 0.05
 MOVED_RAD = 1e-5  # a head camera's picture that stays the same to the last bit beyond this is frozen
@@ -72,10 +72,18 @@ class Devices:
     rig
         The mast file's content: image sizes, and which cameras ride on the head. Without it sizes are
         not checked and no camera is taken for frozen.
+    camera_grace_s
+        How long past its time a camera may take before it counts as hanging, seconds; 3 by default.
     """
 
     def __init__(
-        self, hardware: HardwareLike, limits: Limits, mast_digest: str, clock: Clock, rig: Rig | None = None
+        self,
+        hardware: HardwareLike,
+        limits: Limits,
+        mast_digest: str,
+        clock: Clock,
+        rig: Rig | None = None,
+        camera_grace_s: float | None = None,
     ) -> None:
         self._pan_tilt = hardware.pan_tilt
         self._cameras = dict(hardware.cameras)
@@ -86,6 +94,7 @@ class Devices:
         self._on_head = (
             {name for name, camera in rig.cameras.items() if camera.on == "head"} if rig else set()
         )
+        self._grace_s = CAMERA_GRACE_S if camera_grace_s is None else camera_grace_s
         self._history = JointHistory()
         self._store = FrameStore(mast_digest)
         self._still_since: dict[str, StampedFrame] = {}  # per camera the first frame of the same content
@@ -196,7 +205,7 @@ class Devices:
         exposed_after_s
             Only frames whose exposure began after this moment count, seconds of CLOCK_MONOTONIC.
         timeout_s
-            What each camera is given, seconds; the call itself ends at most some 4 s later.
+            What each camera is given, seconds; the call itself ends at most the grace and 1 s later.
 
         Raises
         ------
@@ -215,12 +224,10 @@ class Devices:
         asked: dict[str, Future[CheckedFrame | StampedFrame]] = {}
         for camera in dict.fromkeys(cameras):
             take = self._taker(camera, exposed_after_s, deadline_s)
-            asked[camera] = self._camera_threads[camera].submit(
-                "next_frame", take, timeout_s + CAMERA_GRACE_S
-            )
+            asked[camera] = self._camera_threads[camera].submit("next_frame", take, timeout_s + self._grace_s)
         taken: dict[str, StampedFrame] = {}
         for camera, future in asked.items():
-            frame = self._camera_threads[camera].wait("next_frame", future, deadline_s + CAMERA_GRACE_S)
+            frame = self._camera_threads[camera].wait("next_frame", future, deadline_s + self._grace_s)
             taken[camera] = frame if isinstance(frame, StampedFrame) else self._stamp(camera, frame)
         return taken
 
@@ -311,7 +318,11 @@ class Devices:
             now_s = self._clock.now_s()
             frame = frame_checks.checked(answer, camera, self._sizes_px.get(camera), exposed_after_s, now_s)
             if newest is not None:
-                _check_order(frame, newest)
+                try:
+                    _check_order(frame, newest)
+                except BadFrame:  # refused once; a camera that came back counting from 0 goes on after that
+                    self._store.begin_again(camera)
+                    raise
             return frame
 
         return take

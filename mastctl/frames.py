@@ -1,12 +1,13 @@
 """Frames with their facts: what a picture shows is worth little without when, where and by which mast file.
 
 A frame's id is ``<camera>-<sequence>-<mast>-<run>``: the last two are the first 8 digits of the mast file's
-digest and a token of this run of the service, so that an id kept from yesterday, or from before the mast
+digest and a token of this run of the camera, so that an id kept from yesterday, or from before the mast
 file changed, never names another picture. Clients take ids as opaque.
 """
 
 from __future__ import annotations
 
+import re
 import secrets
 import threading
 from collections import deque
@@ -18,6 +19,7 @@ from drivers.errors import BadFrame, NoFreshFrame
 from drivers.interfaces import Image
 from mastctl.errors import FrameGone
 
+_FRAME_ID = re.compile(r"(.{1,100})-([0-9]{6,20})-([0-9a-f]{8})-([0-9a-f]{4})", re.ASCII)
 KEPT_FRAMES = 16  # per camera; six cameras of 1024x768 grey are 75 MB
 CLOCK_TOLERANCE_S = 0.005  # what a stamp may lie in the future: rounding, and a driver that estimates
 DARK_GREY = 8  # a picture whose brightest hundredth is below this shows nothing to correlate with
@@ -138,14 +140,22 @@ class FrameStore:
 
     def __init__(self, mast_digest: str, kept: int = KEPT_FRAMES) -> None:
         self._mast = mast_digest[:8]
-        self._run = secrets.token_hex(2)
+        self._runs: dict[str, str] = {}
         self._kept = kept
         self._frames: dict[str, deque[StampedFrame]] = {}
         self._lock = threading.Lock()
 
     def frame_id(self, camera: str, sequence: int) -> str:
         """Return the id of a camera's frame in this run."""
-        return f"{camera}-{sequence:06d}-{self._mast}-{self._run}"
+        with self._lock:
+            run = self._runs.setdefault(camera, secrets.token_hex(2))
+        return f"{camera}-{sequence:06d}-{self._mast}-{run}"
+
+    def begin_again(self, camera: str) -> None:
+        """Forget a camera's frames, because its count went back: one number must not name two pictures."""
+        with self._lock:
+            self._frames.pop(camera, None)
+            self._runs[camera] = secrets.token_hex(2)
 
     def add(self, frame: StampedFrame) -> StampedFrame:
         """Keep a frame and return it; if a frame of that id is kept already, that one is returned."""
@@ -178,20 +188,35 @@ class FrameStore:
                     if frame.frame_id == frame_id:
                         return frame
             newest = {camera: frames[-1].sequence for camera, frames in self._frames.items() if frames}
-        parts = frame_id.rsplit("-", 3)
-        if len(parts) == 4 and parts[1].isdecimal():
-            camera, sequence, mast, run = parts
+            runs = dict(self._runs)
+        named = _FRAME_ID.fullmatch(frame_id)
+        if named is not None:
+            camera, sequence, mast, run = named.groups()
             if mast != self._mast:
                 raise FrameGone(
                     "other_mast_file",
                     f"frame {frame_id} was taken with mast file {mast}..., the one in use is {self._mast}...",
                 )
-            if run == self._run and int(sequence) <= newest.get(camera, -1):
+            if run == runs.get(camera) and int(sequence) <= newest.get(camera, -1):
                 raise FrameGone(
                     "frame_too_old",
                     f"frame {frame_id} is no longer kept (the newest {self._kept} of a camera are)",
                 )
-        raise FrameGone("frame_unknown", f"frame {frame_id} was not taken by this run of the service")
+        raise FrameGone("frame_unknown", f"frame {frame_id[:120]} was not taken by this run of the service")
+
+
+def camera_and_sequence(frame_id: str) -> tuple[str, int]:
+    """Return the camera and the sequence number that a frame's id names.
+
+    Raises
+    ------
+    ValueError
+        If it is no frame id.
+    """
+    named = _FRAME_ID.fullmatch(frame_id)
+    if named is None:
+        raise ValueError(f"'{frame_id[:120]}' is no frame id")
+    return named[1], int(named[2])
 
 
 def _number(value: object) -> float:

@@ -73,7 +73,8 @@ class Operation:
 
     def told(self, *, steps: bool = True) -> dict[str, Any]:
         """Return the record as JSON; the last pointing's residual stands in front too."""
-        result = {} if self.result is None else as_json(self.result)
+        made = as_json(self.result)
+        result = made if isinstance(made, dict) else {}
         pointings = result.get("pointings") or []
         last = pointings[-1] if pointings else {}
         told: dict[str, Any] = {

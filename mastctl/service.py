@@ -19,7 +19,8 @@ from mastctl.devices import HEAD, Devices, UnknownCamera
 from mastctl.errors import FrameGone, MastctlError
 from mastctl.frames import StampedFrame
 from mastctl.operations import Operation, Operations
-from mastctl.pointing.loop import AnglesTarget, PixelTarget, PointingLoop, PointRequest
+from mastctl.pointing.loop import PointingLoop
+from mastctl.pointing.requests import AnglesTarget, PixelTarget, PointRequest
 from mastctl.state import State
 
 log = logging.getLogger(__name__)
@@ -27,6 +28,7 @@ log = logging.getLogger(__name__)
 CLICK_AGE_S = 300.0  # a person may look at a picture for minutes before clicking; the sun moves meanwhile
 SNAPSHOT_AGE_S = 1.0  # a snapshot that need not be fresh may be this old
 SNAPSHOT_TIMEOUT_S = 5.0
+RENDERING_S = 20.0  # six simulated cameras share one renderer, on a machine that may be busy
 HARDWARE_CLOSE_S = 3.0
 STOP_THREADS = 4
 
@@ -68,7 +70,8 @@ class Service:
         self.hardware = hardware
         self.clock = clock
         self.started_s = clock.now_s()
-        self.devices = Devices(hardware, config.limits, stored.digest, clock, stored.rig)
+        grace_s = None if hardware.simulation is None else RENDERING_S
+        self.devices = Devices(hardware, config.limits, stored.digest, clock, stored.rig, grace_s)
         self.operations = Operations(self.devices, clock)
         self.stop_threads = ThreadPoolExecutor(STOP_THREADS, thread_name_prefix="stop")
         self._loop = PointingLoop(stored.rig, self.devices, config.limits, clock)

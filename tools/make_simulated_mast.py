@@ -2,7 +2,7 @@
 
 The true rig is read only to simulate measurements. Same arguments, same file:
 
-    .venv/bin/python tools/make_simulated_mast.py --rig configs/sim/rocky8.yaml --seed 1 \\
+    .venv/bin/python tools/make_simulated_mast.py --rig configs/sim/rocky8.yaml --seed 8 \\
         --out configs/masts/rocky8_simulated.yaml
 """
 
@@ -28,7 +28,9 @@ from drivers.sim.pan_tilt import PRESETS
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--rig", required=True, type=Path, help="the true rig")
     parser.add_argument("--out", required=True, type=Path, help="the mast file to write")
     parser.add_argument("--seed", type=int, default=1)
@@ -47,30 +49,37 @@ def main() -> int:
     images = {name: sum(image.camera == name for image in survey.images) for name in true_rig.rig.cameras}
     name = options.out.stem
     fitted = fit(survey, name, dict(true_rig.rig.stereo), sigmas, options.mast)
-    print(f"survey: {len(survey.tapes_m)} boards, {images} images; fit in {time.monotonic() - started_s:.0f} s")
-    for camera, (x_px, y_px) in fitted.rms_px.items():
-        print(f"  {camera:13s} residual rms {x_px:.3f} {y_px:.3f} px")
+    print(
+        f"survey: {len(survey.tapes_m)} boards, {images} images; fit in {time.monotonic() - started_s:.0f} s"
+    )
+    for step, rms_px in (("camera", fitted.camera_rms_px), ("mast", fitted.mast_rms_px)):
+        for camera, (x_px, y_px) in rms_px.items():
+            print(f"  {step} step, {camera:13s} residual rms {x_px:.3f} {y_px:.3f} px")
     rig = replace(fitted.rig, fit=_fit_record(fitted), provenance=_provenance(options, true_rig.digest))
     save_rig(rig, options.out)
     stored = load_rig(options.out).rig
-    print(f"wrote {options.out}; pointing error, perfect clicks, {options.head}, {options.targets} targets each:")
+    print(f"wrote {options.out}")
+    print(f"pointing error with {options.head}, {options.targets} targets a row, rms (mean):")
     for pair in ("navcam", "pancam"):
-        for distance_m in (10.0, 6.0, 2.0):
-            errors = pointing_error_px(
-                true_rig.rig, stored, PRESETS[options.head], pair, distance_m, options.targets, options.seed
-            )
-            rms, mean = np.sqrt((errors**2).mean(0)), errors.mean(0)
-            print(
-                f"  {pair} {distance_m:4.0f} m: rms {rms[0]:.3f} {rms[1]:.3f} px, "
-                f"mean {mean[0]:+.3f} {mean[1]:+.3f}, worst {np.abs(errors).max():.3f}"
-            )
+        for click_px in (0.0, 0.2):
+            for distance_m in (10.0, 6.0, 2.0):
+                case = (pair, distance_m, options.targets, options.seed, click_px)
+                errors = pointing_error_px(true_rig.rig, stored, PRESETS[options.head], *case)
+                (x, y), (mean_x, mean_y) = np.sqrt((errors**2).mean(0)), errors.mean(0)
+                print(
+                    f"  {pair}, clicks {click_px:.1f} px, {distance_m:2.0f} m: x {x:.3f} ({mean_x:+.3f}), "
+                    f"y {y:.3f} ({mean_y:+.3f}), worst {np.abs(errors).max():.2f} px"
+                )
     return 0
 
 
 def _fit_record(fitted: Fitted) -> dict[str, object]:
     """The ``fit`` section of the mast file."""
-    rms_px = {camera: [round(x, 4), round(y, 4)] for camera, (x, y) in fitted.rms_px.items()}
-    return {"rms_px": rms_px, "unit_weight": round(fitted.unit_weight, 4)}
+    steps = {"camera_rms_px": fitted.camera_rms_px, "mast_rms_px": fitted.mast_rms_px}
+    return {
+        step: {camera: [round(x, 4), round(y, 4)] for camera, (x, y) in rms_px.items()}
+        for step, rms_px in steps.items()
+    }
 
 
 def _provenance(options: argparse.Namespace, digest: str) -> dict[str, object]:

@@ -8,7 +8,8 @@ from pathlib import Path
 from calib.errors import BadFile
 from calib.formats import CameraFile, read_bytes
 from calib.formats.cahvor_text import looks_like_cahvor, parse_cahvor, save_cahvor
-from calib.formats.pds3 import MAX_FILE_BYTES, load_pds3_camera, looks_like_pds3
+from calib.formats.pds3 import load_pds3_camera, looks_like_pds3
+from calib.formats.pds3_image import MAX_FILE_BYTES
 from calib.store import CAMERA_SCHEMA, MAST_SCHEMA, StoredRig, parse_camera, parse_rig, save_camera, schema_of
 
 KNOWN_FORMATS = "a mast file, a camera file, a .cahvor file or a PDS3 label"

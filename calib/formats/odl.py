@@ -80,6 +80,40 @@ def parse_label(text: str, path: str | Path) -> Block:
     return _Parser(text, path).label()
 
 
+def number_in(block: Block, key: str, path: str | Path) -> float:
+    """Return a keyword's number of at most 1e9 in size, its unit left out; raises BadFile."""
+    value = block.values.get(key)
+    value = value.value if isinstance(value, Quantity) else value
+    if not isinstance(value, (int, float)) or not abs(value) <= 1e9:
+        raise BadFile(path, f"{block.name}.{key}", f"{shown(value)} where a number up to 1e9 is expected")
+    return float(value)
+
+
+def integer_in(block: Block, key: str, path: str | Path, low: int, high: int) -> int:
+    """Return a keyword's integer from low to high, its unit left out; raises BadFile."""
+    value = block.values.get(key)
+    value = value.value if isinstance(value, Quantity) else value
+    if not isinstance(value, int) or not low <= value <= high:
+        place = f"{block.name}.{key}" if block.name else key
+        raise BadFile(path, place, f"{shown(value)} where an integer from {low} to {high} is expected")
+    return value
+
+
+def vector_in(block: Block, key: str, path: str | Path) -> list[float]:
+    """Return a keyword's three numbers, their units left out; raises BadFile."""
+    value = block.values.get(key)
+    items = value if isinstance(value, tuple) and not isinstance(value, Quantity) else ()
+    numbers = [item.value if isinstance(item, Quantity) else item for item in items]
+    if len(numbers) != 3 or not all(isinstance(n, (int, float)) and abs(n) <= 1e9 for n in numbers):
+        raise BadFile(path, f"{block.name}.{key}", f"{shown(value)} where three numbers are expected")
+    return [float(n) for n in numbers]
+
+
+def shown(value: Any) -> str:
+    """Return a value as a refusal shows it."""
+    return "nothing" if value is None else f"{value!r:.60}"
+
+
 class _Parser:
     """Reads one label; ``kind`` and ``word`` are the token at hand."""
 
@@ -134,7 +168,7 @@ class _Parser:
                 if self.is_mark("="):
                     self.step()
                     if self.word != name:
-                        self.fail(f"the end of {kind} {name} is expected")
+                        self.fail(f"the end of {kind} {name[:40]} is expected")
                     self.step()
                 stack.pop()
                 stack[-1][3].append(Block(kind, name, values, tuple(blocks)))

@@ -15,30 +15,21 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, cast
 
-import numpy as np
 from numpy.typing import NDArray
 
 from calib.cahvor import CameraModel, Kind
 from calib.errors import BadFile
 from calib.formats import LARGEST_IMAGE_PX, CameraFile, build_model, digest_of, read_bytes
-from calib.formats.odl import Block, Quantity, parse_label
+from calib.formats.odl import Block, Quantity, integer_in, number_in, parse_label, vector_in
+from calib.formats.pds3_image import MAX_FILE_BYTES as MAX_FILE_BYTES
+from calib.formats.pds3_image import read_pixels
 
 #: A label is looked for in the first bytes of a file; the longest known have some 60 kB.
 MAX_LABEL_BYTES = 1_000_000
-MAX_FILE_BYTES = 1 << 30
 
 _FIRST = re.compile(
     rb"(?:\s|/\*[^*]*\*/|CCSD[0-9A-Z]+|[A-Z]+_VERSION_ID\s*=\s*\"?ODL)*PDS_VERSION_ID\s*=\s*\"?PDS3"
 )
-_SAMPLES = {
-    **dict.fromkeys(("MSB_INTEGER", "INTEGER", "SUN_INTEGER", "MAC_INTEGER"), ">i"),
-    **dict.fromkeys(("MSB_UNSIGNED_INTEGER", "UNSIGNED_INTEGER", "SUN_UNSIGNED_INTEGER"), ">u"),
-    **dict.fromkeys(("LSB_INTEGER", "PC_INTEGER", "VAX_INTEGER"), "<i"),
-    **dict.fromkeys(("LSB_UNSIGNED_INTEGER", "PC_UNSIGNED_INTEGER", "VAX_UNSIGNED_INTEGER"), "<u"),
-    **dict.fromkeys(("IEEE_REAL", "FLOAT", "REAL", "SUN_REAL", "MAC_REAL"), ">f"),
-    "PC_REAL": "<f",
-}
-_BITS = {"i": (8, 16, 32), "u": (8, 16, 32), "f": (32, 64)}
 _COMPONENTS = {"CAHV": 4, "CAHVOR": 6, "CAHVORE": 7}
 
 
@@ -125,14 +116,14 @@ def read_product(path: str | Path, with_image: bool = True) -> PdsProduct:
     if image_block is None:
         raise BadFile(path, "IMAGE", "the label has no OBJECT = IMAGE")
     size = (
-        _integer(image_block, "LINE_SAMPLES", path, 1, LARGEST_IMAGE_PX),
-        _integer(image_block, "LINES", path, 1, LARGEST_IMAGE_PX),
+        integer_in(image_block, "LINE_SAMPLES", path, 1, LARGEST_IMAGE_PX),
+        integer_in(image_block, "LINES", path, 1, LARGEST_IMAGE_PX),
     )
     model, frame, source, notes = _camera(label, size)
     azimuth, elevation = _mast_angles(label)
     image = None
     if with_image:
-        image, image_notes = _image(label, image_block, data, size)
+        image, image_notes = read_pixels(label.path, label.root, image_block, data, size)
         notes += image_notes
     return PdsProduct(
         label=label,
@@ -193,19 +184,19 @@ def _camera(
     kind = cast(Kind, block.values["MODEL_TYPE"])
     count = _COMPONENTS[kind]
     vectors = {
-        letter: _vector(block, f"MODEL_COMPONENT_{number}", path)
+        letter: vector_in(block, f"MODEL_COMPONENT_{number}", path)
         for number, letter in zip(range(1, count + 1), kind, strict=True)
     }
     cahvore_type, linearity = 0, None
     if kind == "CAHVORE":
-        number = _number(block, "MODEL_COMPONENT_8", path)
+        number = number_in(block, "MODEL_COMPONENT_8", path)
         if number not in (1.0, 2.0, 3.0):
             raise BadFile(
                 path, f"{block.name}.MODEL_COMPONENT_8", f"{number:g} where type 1, 2 or 3 is expected"
             )
         cahvore_type = int(number)
         if "MODEL_COMPONENT_9" in block.values:
-            linearity = _number(block, "MODEL_COMPONENT_9", path)
+            linearity = number_in(block, "MODEL_COMPONENT_9", path)
         elif cahvore_type == 3:
             raise BadFile(path, f"{block.name}.MODEL_COMPONENT_9", "the linearity of type 3 is missing")
     model, model_notes = build_model(path, block.name, kind, size_px, vectors, cahvore_type, linearity)
@@ -244,107 +235,5 @@ def _radians(value: Any, path: Path, place: str) -> float:
     return float(number) * factor[unit]
 
 
-def _image(
-    label: PdsLabel, block: Block, data: bytes, size_px: tuple[int, int]
-) -> tuple[NDArray[Any] | None, tuple[str, ...]]:
-    """Read the pixels; None with a note if a detached label's file is not there."""
-    path = label.path
-    width, height = size_px
-    code = _SAMPLES.get(str(block.values.get("SAMPLE_TYPE")))
-    if code is None:
-        found = str(block.values.get("SAMPLE_TYPE", "nothing"))[:40]
-        raise BadFile(path, "IMAGE.SAMPLE_TYPE", f"{found} where one of {', '.join(_SAMPLES)} is expected")
-    bits = _integer(block, "SAMPLE_BITS", path, 1, 64)
-    if bits not in _BITS[code[1]]:
-        raise BadFile(path, "IMAGE.SAMPLE_BITS", f"{bits} where one of {_BITS[code[1]]} is expected")
-    if "BANDS" in block.values and _integer(block, "BANDS", path, 1, 10**6) != 1:
-        raise BadFile(path, "IMAGE.BANDS", f"{block.values['BANDS']} where 1 is expected")
-    if str(block.values.get("ENCODING_TYPE", "N/A")) not in ("N/A", "NONE"):
-        raise BadFile(path, "IMAGE.ENCODING_TYPE", "compressed pixels; plain samples are expected")
-    before, after = (
-        _integer(block, key, path, 0, 1 << 20) if key in block.values else 0
-        for key in ("LINE_PREFIX_BYTES", "LINE_SUFFIX_BYTES")
-    )
-    name, offset = _pointer(label)
-    source = path
-    if name:
-        beside = _beside(path, name)
-        if beside is None:
-            return None, (f"{name} is not beside the label; there is no image",)
-        source, data = beside, read_bytes(beside, MAX_FILE_BYTES)
-    line_bytes = before + width * bits // 8 + after
-    if offset + height * line_bytes > len(data):
-        raise BadFile(
-            source, "IMAGE", f"{len(data)} bytes where at least {offset + height * line_bytes} are expected"
-        )
-    lines = np.frombuffer(data, np.uint8, height * line_bytes, offset).reshape(height, line_bytes)
-    pixels = np.ascontiguousarray(lines[:, before : before + width * bits // 8])
-    dtype = np.dtype(f"{code}{bits // 8}")
-    return pixels.view(dtype).astype(dtype.newbyteorder("=")), ()
-
-
-def _pointer(label: PdsLabel) -> tuple[str, int]:
-    """Return where ^IMAGE points: a file's name ('' for the label's own file) and a byte offset."""
-    path = label.path
-    pointer = label.root.values.get("^IMAGE")
-    items = list(pointer) if isinstance(pointer, tuple) and not isinstance(pointer, Quantity) else [pointer]
-    name = str(items.pop(0)) if items and isinstance(items[0], str) else ""
-    where = items[0] if items else 1
-    if len(items) > 1 or (name and not re.fullmatch(r"[\w.+-]+", name)):
-        raise BadFile(path, "^IMAGE", "a record, or a file beside the label with a record, is expected")
-    if (
-        isinstance(where, Quantity)
-        and where.unit.upper() in ("BYTES", "BYTE")
-        and isinstance(where.value, int)
-    ):
-        start, unit_bytes = where.value, 1
-    elif isinstance(where, int) and not isinstance(where, Quantity):
-        start = where
-        unit_bytes = 1 if start == 1 else _integer(label.root, "RECORD_BYTES", path, 1, 1 << 24)
-    else:
-        raise BadFile(path, "^IMAGE", "a record number or a number <BYTES> is expected")
-    if not 1 <= start <= 1 << 40:
-        raise BadFile(path, "^IMAGE", f"{start} where a record from 1 on is expected")
-    return name, (start - 1) * unit_bytes
-
-
-def _beside(path: Path, name: str) -> Path | None:
-    """Return the file of that name beside the label, in whichever case it is written."""
-    for candidate in (name, name.lower(), name.upper()):
-        if (path.parent / candidate).is_file():
-            return path.parent / candidate
-    return None
-
-
 def _first(value: Any) -> Any:
     return value[0] if isinstance(value, tuple) and not isinstance(value, Quantity) and value else value
-
-
-def _number(block: Block, key: str, path: Path) -> float:
-    value = block.values.get(key)
-    value = value.value if isinstance(value, Quantity) else value
-    if not isinstance(value, (int, float)) or not abs(value) <= 1e9:
-        raise BadFile(path, f"{block.name}.{key}", f"{_shown(value)} where a number up to 1e9 is expected")
-    return float(value)
-
-
-def _integer(block: Block, key: str, path: str | Path, low: int, high: int) -> int:
-    value = block.values.get(key)
-    value = value.value if isinstance(value, Quantity) else value
-    if not isinstance(value, int) or not low <= value <= high:
-        place = f"{block.name}.{key}" if block.name else key
-        raise BadFile(path, place, f"{_shown(value)} where an integer from {low} to {high} is expected")
-    return value
-
-
-def _vector(block: Block, key: str, path: Path) -> list[float]:
-    value = block.values.get(key)
-    items = value if isinstance(value, tuple) and not isinstance(value, Quantity) else ()
-    numbers = [item.value if isinstance(item, Quantity) else item for item in items]
-    if len(numbers) != 3 or not all(isinstance(n, (int, float)) and abs(n) <= 1e9 for n in numbers):
-        raise BadFile(path, f"{block.name}.{key}", f"{_shown(value)} where three numbers are expected")
-    return [float(n) for n in numbers]
-
-
-def _shown(value: Any) -> str:
-    return "nothing" if value is None else f"{value!r:.60}"

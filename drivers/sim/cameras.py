@@ -226,7 +226,7 @@ class SimulatedCamera:
             return self._noisy(np.zeros(self._size_px[::-1], np.float32), sequence)
         image = self._healthy(sequence, begin_s)
         if fault := self._faults.find(self.name, "wrong", begin_s):
-            shift = np.float32([[1, 0, fault.number("dx_px")], [0, 1, fault.number("dy_px")]])
+            shift = np.array([[1, 0, fault.number("dx_px")], [0, 1, fault.number("dy_px")]])
             shifted = cv2.warpAffine(image, shift, self._size_px, borderMode=cv2.BORDER_REPLICATE)
             return np.asarray(shifted, dtype=np.uint8)
         return image
@@ -241,7 +241,8 @@ class SimulatedCamera:
         generator = np.random.default_rng([s.seed, zlib.crc32(self.name.encode()), sequence])
         noise = generator.standard_normal(clean.shape, dtype=np.float32)
         variance = s.read_noise_dn**2 + s.shot_noise_dn**2 / 128 * np.clip(clean, 0, None)
-        return np.rint(np.clip(clean + noise * np.sqrt(variance), 0, 255)).astype(np.uint8)
+        image: Image = np.rint(np.clip(clean + noise * np.sqrt(variance), 0, 255)).astype(np.uint8)
+        return image
 
     def _instead(self, exposed_after_s: float, timeout_s: float) -> str:
         """What to say when no fresh frame came."""

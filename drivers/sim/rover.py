@@ -255,8 +255,8 @@ class SimulatedRover:
         caller. Raises LookupError.
         """
         model = self.frame_truth(camera, sequence).camera_in_rover
-        pixels, _ = model.project(np.asarray(point_in_rover_m, dtype=np.float64).reshape(1, 3))
-        return pixels[0]
+        pixels, _ = model.project(np.asarray(point_in_rover_m, dtype=np.float64).reshape(3))
+        return pixels
 
     def close(self) -> None:
         """Stop the head and let waiting camera calls end."""

@@ -424,6 +424,7 @@ def test_a_table_without_rows_is_empty() -> None:
         (b"x_m,y_m,z_m\n1,2,3\n4,five,6\n", "row 2 (line 3), y_m", "'five'"),
         (b"x_m,y_m,z_m\n1,,3\n", "row 1 (line 2), y_m", "''"),
         (b"x_m,y_m,z_m\n1,1_0,3\n", "row 1 (line 2), y_m", "'1_0'"),
+        (b"x_m,y_m,z_m\r1,1_0,3\r", "row 1 (line 2), y_m", "'1_0'"),
         (b"x_m,y_m,z_m\n1,0x1,3\n", "row 1 (line 2), y_m", "'0x1'"),
         ("x_m,y_m,z_m\n1,٣,3\n".encode(), "row 1 (line 2), y_m", "number"),
         (b"x_m,y_m,z_m\n1,2,3\n\n4,5,6\n", "line 3", "blank"),

@@ -226,6 +226,14 @@ def test_a_text_that_is_no_plain_yaml_is_refused(case: str) -> None:
         assert "\n" not in str(refused.value)
 
 
+def test_a_refusal_is_one_line_of_bounded_length_whatever_the_file_holds() -> None:
+    for key in ("a\\nb", "\\e[31mred", "k" * 1000):
+        with pytest.raises(BadFile, match="unknown key") as refused:
+            store.parse_rig(f'schema: mastctl/mast/1\n"{key}": 1\n'.encode(), "rig.yaml")
+        assert str(refused.value).isprintable()
+        assert len(str(refused.value)) < 700
+
+
 def test_an_alias_bomb_is_refused_before_it_is_opened() -> None:
     lines = ["a0: &a0 [x, x, x, x, x, x, x, x, x, x]"]
     lines += [f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 10)}]" for i in range(1, 12)]

@@ -24,7 +24,7 @@ def leg(start: float, velocity: float, goal: float, speed: float = SPEED) -> Leg
 @pytest.mark.parametrize(
     ("distance", "duration_s"),
     [
-        # Textbook rest-to-rest times: 2·sqrt(d/a) without a cruise, d/v + v/a with one; v²/a = 0.32 rad is between.
+        # Textbook rest-to-rest times: 2·sqrt(d/a) without a cruise, d/v + v/a with one; v²/a = 0.32 rad.
         (0.02, 2 * math.sqrt(0.02 / 2.0)),
         (0.32 - 1e-9, 2 * math.sqrt(0.32 / 2.0)),
         (0.32 + 1e-9, 0.32 / 0.8 + 0.8 / 2.0),
@@ -80,10 +80,9 @@ def test_a_new_command_under_way_is_continuous(
     first: float, second: float, when: float, speed: float, stop: bool
 ) -> None:
     before = Motion.at_rest(0.0, 0.0).moved(0.0, [first], SPEED, ACCELERATION)
+    after = before.moved(when, [second], speed, ACCELERATION)
     if stop:
         after = before.stopped(when, ACCELERATION)
-    else:
-        after = before.moved(when, [second], speed, ACCELERATION)
     step_s = 1e-7
     for moment in (when - step_s, when, when + step_s):
         reference = before.at(when)

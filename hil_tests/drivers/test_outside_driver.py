@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -15,9 +16,13 @@ import pytest
 
 from calib.pointing import solve
 from calib.store import load_rig
+from drivers.clock import SystemClock
 from drivers.errors import BadOptions, NoFreshFrame, NoReply
 from drivers.interfaces import PanTilt
 from drivers.open_hardware import DeviceSettings, Hardware, HardwareSettings, open_hardware
+from mastctl.devices import Devices
+from mastctl.limits import Limits
+from mastctl.pointing.loop import AnglesTarget, PixelTarget, PointingLoop, PointRequest, Step
 
 LANDED_WITHIN_PX = 0.6
 """Peak of a plain correlation to the whole pixel, and a floor seen from another side."""
@@ -115,6 +120,38 @@ def test_a_spot_of_the_floor_is_pointed_at(hardware: Hardware, mast_file: Path) 
     assert best > 0.8
     landed_px = np.array(corner) + 15
     assert np.abs(landed_px - camera.image_center_px).max() < LANDED_WITHIN_PX + 0.5
+
+
+def test_the_pointing_loop_runs_on_it(hardware: Hardware, mast_file: Path) -> None:
+    """From a clicked pixel to a residual measured in a new image, twice over; the texture is the witness."""
+    stored = load_rig(mast_file)
+    limits = Limits((-2.0, 2.0), (-1.2, 0.5), 1.5)
+    clock = SystemClock()
+    devices = Devices(hardware, limits, stored.digest, clock, stored.rig)
+    loop = PointingLoop(stored.rig, devices, limits, clock)
+    steps: list[Step] = []
+    try:
+        loop.run(PointRequest(AnglesTarget(-0.3, -0.5)), steps.append, threading.Event())
+        clicked = devices.frames(["navcam_left"], clock.now_s(), 5.0)["navcam_left"]
+        spot_px = (600, 330)
+        target = PixelTarget("navcam_left", clicked.frame_id, *spot_px)
+        result = loop.run(PointRequest(target, pointings=2), steps.append, threading.Event())
+        after = devices.frame_by_id(result.pointings[-1].frame_id)
+    finally:
+        devices.close()
+    assert [step.name for step in steps].count("measure") == 2
+    assert all(step.state == "done" for step in steps)
+    for pointing in result.pointings:
+        assert pointing.residual_px is not None
+        # The rig is exact, the head has no counts and no play: nothing but the matching is left.
+        assert np.abs(pointing.residual_px).max() < 0.2
+    x, y = spot_px
+    score = cv2.matchTemplate(
+        after.image, clicked.image[y - 15 : y + 16, x - 15 : x + 16], cv2.TM_CCOEFF_NORMED
+    )
+    landed_px = np.array(cv2.minMaxLoc(score)[3]) + 15
+    centre_px = stored.rig.cameras["navcam_left"].model.image_center_px
+    assert np.abs(landed_px - centre_px).max() < LANDED_WITHIN_PX + 0.5
 
 
 def test_it_keeps_the_promises_of_the_page(hardware: Hardware) -> None:

@@ -4,16 +4,23 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
+from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
 import numpy as np
+import pytest
 
 from calib.cahvor import CameraModel
 from calib.mast import Mast, Rig, RigCamera
+from calib.store import save_rig
 from drivers.interfaces import Camera, Frame, PanTilt, Reading
+from mastctl import service as service_module
+from mastctl.config import load_config
+from mastctl.daemon import RunningDaemon
 
 SIZE_PX = (64, 48)
 
@@ -144,3 +151,78 @@ def eventually(holds: Callable[[], Any], what: str, within_s: float = 10.0) -> N
     while not holds():
         assert time.monotonic() < until_s, f"never happened: {what}"
         time.sleep(0.005)
+
+
+@dataclass(frozen=True)
+class FakeStep:
+    """A step as a record shows it."""
+
+    name: str
+    state: str
+    started_s: float
+    duration_s: float
+    detail: dict[str, Any]
+
+
+@dataclass(frozen=True)
+class FakePointing:
+    """One pointing's measurement."""
+
+    residual_px: Any
+    residual_sigma_px: Any
+    frame_id: str
+
+
+@dataclass(frozen=True)
+class FakeResult:
+    """What an operation ends with."""
+
+    position_m: Any
+    range_m: float | None
+    pointings: tuple[FakePointing, ...]
+
+
+class ScriptedLoop:
+    """Stands for the pointing loop: ``script(request, record, cancelled, devices)`` is set by a test."""
+
+    script: Callable[..., Any]
+
+    def __init__(self, rig: Rig, devices: Any, *others: Any) -> None:
+        self._devices = devices
+
+    def run(self, request: Any, record: Callable[[Any], None], cancelled: threading.Event) -> Any:
+        return type(self).script(request, record, cancelled, self._devices)
+
+    @staticmethod
+    def good(request: Any, record: Callable[[Any], None], cancelled: threading.Event, devices: Any) -> Any:
+        """Two steps and a residual."""
+        record(FakeStep("look", "done", time.monotonic(), 0.01, {"frame_ids": ["a", "b"]}))
+        devices.move(0.1, -0.1)
+        record(FakeStep("measure", "done", time.monotonic(), 0.01, {"not_a_number": float("nan")}))
+        pointing = FakePointing(np.array([0.25, -0.5]), np.array([0.05, 0.06]), "navcam_left-000001-x-y")
+        return FakeResult(np.array([6.0, 0.0, 0.1]), 6.0, (pointing,))
+
+
+@contextmanager
+def fake_daemon(
+    monkeypatch: pytest.MonkeyPatch, folder: Path, listen: str = "{port: 0}"
+) -> Iterator[tuple[RunningDaemon, FakeHardware]]:
+    """A daemon on fakes: a real server on loopback, fake devices, a scripted loop."""
+    hardware = FakeHardware()
+    save_rig(rig(), folder / "little.yaml")
+    (folder / "daemon.yaml").write_text(CONFIG.format(listen=listen))
+    monkeypatch.setattr(service_module, "open_hardware", lambda settings, clock: hardware)
+    monkeypatch.setattr(service_module, "PointingLoop", ScriptedLoop)
+    monkeypatch.setattr(ScriptedLoop, "script", staticmethod(ScriptedLoop.good), raising=False)
+    with RunningDaemon(load_config(folder / "daemon.yaml")) as daemon:
+        yield daemon, hardware
+
+
+CONFIG = """
+schema: mastctl/config/1
+mast_file: little.yaml
+listen: {listen}
+pan_tilt: {{driver: fake}}
+cameras: {{navcam_left: {{driver: fake}}, navcam_right: {{driver: fake}}, hazcam_left: {{driver: fake}}}}
+limits: {{pan_rad: [-2.0, 2.0], tilt_rad: [-1.0, 1.0], speed_rad_per_s: 0.5}}
+"""

@@ -344,6 +344,12 @@ def test_count_and_time_must_grow_together(devices: Devices, hardware: FakeHardw
     camera.change = lambda frame: replace(frame, sequence=first.sequence + step)
     with pytest.raises(BadFrame, match="must grow together"):
         devices.frames(["navcam_left"], now(), 1.0)
+    # A camera that came back and counts anew is served again, and the old number names no picture.
+    again = devices.frames(["navcam_left"], now(), 1.0)["navcam_left"]
+    assert again.sequence == first.sequence + step
+    assert again.frame_id != first.frame_id
+    with pytest.raises(FrameGone):
+        devices.frame_by_id(first.frame_id)
 
 
 def test_a_head_camera_that_shows_the_same_after_a_move_is_frozen(
@@ -397,7 +403,7 @@ def test_only_the_newest_frames_are_kept_and_the_refusal_says_which_case_it_is(d
     cases = {
         first.frame_id: "frame_too_old",
         f"{camera}-{sequence}-ffffffff-{run}": "other_mast_file",
-        f"{camera}-{sequence}-{mast}-....": "frame_unknown",
+        f"{camera}-{sequence}-{mast}-{int(run, 16) ^ 1:04x}": "frame_unknown",
         f"{camera}-999999-{mast}-{run}": "frame_unknown",
         "nonsense": "frame_unknown",
         "": "frame_unknown",

@@ -1,4 +1,4 @@
-"""``mastctl experiment pointing`` on any running daemon, and ``mastctl demo`` on the packaged simulated rover."""
+"""``mastctl experiment pointing`` on any daemon, ``mastctl demo`` on the packaged simulated rover."""
 
 from __future__ import annotations
 
@@ -87,6 +87,7 @@ def run_demo(args: argparse.Namespace) -> int:
     from mastctl.config import load_config
     from mastctl.daemon import RunningDaemon
     from mastctl.experiment.demo import SimulationTruth, demo_config, head_note
+    from mastctl.experiment.pointing import head_pair
 
     _check_writable(args.out)
     config = demo_config(load_config(None), head=args.head, seed=args.seed)
@@ -97,7 +98,9 @@ def run_demo(args: argparse.Namespace) -> int:
     with daemon, Client(daemon.url) as client:
         rover = daemon.hardware.simulation
         assert rover is not None  # the packaged configuration is a simulated rover
-        notes = (head_note(rover, daemon.service.stored.rig),)
+        rig = daemon.service.stored.rig
+        camera = head_pair(rig, set(config.hardware.cameras))[0]
+        notes = (head_note(rover, rig, camera),)
         output.tell(f"simulated rover at {daemon.url}, head {args.head}")
         experiment = _run(args, client, DEFAULT_DISTANCES_M, SimulationTruth(rover), notes)
     return _report(args, experiment)
@@ -161,9 +164,16 @@ def _report(args: argparse.Namespace, experiment: PointingExperiment) -> int:
         notes = [*experiment.notes, *([f"report: {page}"] if page is not None else [])]
         output.print_table(
             f"Pointing residuals, rms px ({experiment.camera}, {experiment.status.get('hardware')} hardware)",
-            headings, rows, notes,
-        )  # fmt: skip
+            *turned(headings, rows),
+            notes,
+        )
     return 0 if any(record.landings for record in experiment.records) else 1
+
+
+def turned(headings: list[str], rows: list[list[str]]) -> tuple[list[str], list[list[str]]]:
+    """Return a table with rows and columns exchanged: a column a distance fits a terminal of 80 columns."""
+    table = [list(column) for column in zip(headings, *rows, strict=True)]
+    return table[0], table[1:]
 
 
 def _check_writable(folder: Path) -> None:

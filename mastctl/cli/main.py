@@ -94,18 +94,33 @@ def main(argv: Sequence[str] | None = None) -> int:
         format="%(levelname)s %(name)s: %(message)s", level=logging.WARNING, stream=sys.stderr
     )
     try:
-        code = _run(words)
+        code = _tell(words, as_json)
         sys.stdout.flush()
-        return code
+    except OSError as error:
+        # Nobody reads stdout any more (head, less), or its disk is full.
+        _give_up_stdout()
+        return 141 if isinstance(error, BrokenPipeError) else output.refuse(error, as_json=False)
+    return code
+
+
+def _tell(words: Sequence[str], as_json: bool) -> int:
+    """Run and turn what is raised into one line and an exit code; only a broken stdout gets out."""
+    try:
+        return _run(words)
     except BrokenPipeError:
-        # The reader (head, less) has gone; keep the interpreter from complaining when it closes stdout.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return 141
+        raise
     except KeyboardInterrupt:
         return output.refuse(output.CommandError("interrupted", "interrupted", exit_code=130), as_json)
     except Exception as error:  # the last door before the user: one line, never a traceback
         log.debug("refused", exc_info=True)
         return output.refuse(error, as_json)
+
+
+def _give_up_stdout() -> None:
+    """Let what is still buffered for stdout go nowhere, so that the interpreter can close it in peace."""
+    null = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(null, sys.stdout.fileno())
+    os.close(null)
 
 
 def _run(words: Sequence[str]) -> int:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import logging
+import signal
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -76,6 +77,7 @@ def add_daemon_options(parser: argparse.ArgumentParser) -> None:
 
 
 def _run(args: argparse.Namespace) -> int:
+    signal.signal(signal.SIGTERM, _leave)  # before the imports, which take a second
     from mastctl.config import load_config
     from mastctl.daemon import run
 
@@ -91,6 +93,11 @@ def _run(args: argparse.Namespace) -> int:
 
     run(load_config(args.config), ready)
     return 0
+
+
+def _leave(number: int, frame: object) -> None:
+    """End cleanly when told so before the daemon is up: nothing has moved yet."""
+    raise SystemExit(0)
 
 
 def _status(args: argparse.Namespace) -> int:
@@ -207,23 +214,26 @@ def _followed(client: Client, operation_id: str, args: argparse.Namespace) -> di
 
 
 def _show_pointings(record: dict[str, Any]) -> None:
-    """A table of what was measured."""
-    rows = []
+    """A table of what was measured, and in which pictures."""
+    rows, notes = [], []
     for number, pointing in enumerate(record["pointings"], 1):
-        pair, sigma = pointing.get("residual_px"), pointing.get("residual_sigma_px")
+        residual = pointing.get("residual_px") or (None, None)
+        sigma = pointing.get("residual_sigma_px") or (None, None)
         measured = [
-            f"{value:+.3f} ± {one_sigma:.3f}" if value is not None and one_sigma is not None else "-"
-            for value, one_sigma in zip(pair or (None, None), sigma or (None, None), strict=True)
+            "-" if value is None or one_sigma is None else f"{value:+.3f} ± {one_sigma:.3f}"
+            for value, one_sigma in zip(residual, sigma, strict=True)
         ]
-        rows.append((str(number), *measured, str(pointing.get("frame_id") or "-")))
-    notes = []
+        rows.append((str(number), *measured))
+        where = f"pointing {number} was looked at in frame {pointing.get('frame_id')}"
+        notes.append(f"{where}{': ' + pointing['note'] if pointing.get('note') else ''}")
     if record.get("position_m"):
         x, y, z = record["position_m"]
         notes.append(f"target at ({x:.3f}, {y:.3f}, {z:.3f}) m in the rover frame")
     if record.get("range_m") is not None:
         notes.append(f"range {record['range_m']:.3f} m")
-    columns = ("pointing", "residual x, px", "residual y, px", "measured in frame")
-    output.print_table(f"operation {record['id']}", columns, rows, notes)
+    output.print_table(
+        f"operation {record['id']}", ("pointing", "residual x, px", "residual y, px"), rows, notes
+    )
 
 
 def _status_rows(status: dict[str, Any]) -> Iterator[tuple[str, str]]:

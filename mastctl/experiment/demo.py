@@ -1,4 +1,4 @@
-"""The demo: the pointing experiment on the packaged simulated rover, with the truth beside each measurement."""
+"""The demo: the pointing experiment on the packaged simulated rover, the truth beside each measurement."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from calib.mast import Rig
 from calib.rigid import FloatArray
 from drivers.sim.rover import SimulatedRover
 from mastctl.config import Config, Listen
+from mastctl.frames import camera_and_sequence
 
 
 def demo_config(config: Config, *, head: str, seed: int) -> Config:
@@ -16,9 +17,8 @@ def demo_config(config: Config, *, head: str, seed: int) -> Config:
     return replace(config, listen=Listen(port=0), hardware=replace(config.hardware, simulation=simulation))
 
 
-def head_note(rover: SimulatedRover, rig: Rig) -> str:
-    """Return a sentence that says what the head's counts and backlash allow, in pixels of the first stereo pair."""
-    camera = next(iter(rig.stereo.values()))[0]
+def head_note(rover: SimulatedRover, rig: Rig, camera: str) -> str:
+    """Return what the head's counts and backlash allow, in words and pixels of a camera."""
     model = rig.cameras[camera].model
     # A pixel's step of the ray at the image centre: what a turn of the head moves the picture by.
     x, y = model.image_center_px
@@ -33,11 +33,12 @@ def head_note(rover: SimulatedRover, rig: Rig) -> str:
     )
     if axis.approach_rad > 0:
         return f"{told}, taken up by always approaching from one side."
-    return f"{told}, not taken up: a residual of up to {(backlash_px + count_px) / 2:.1f} px an axis is the head's own."
+    own_px = (backlash_px + count_px) / 2
+    return f"{told}, not taken up: a residual of up to {own_px:.1f} px an axis is the head's own."
 
 
 class SimulationTruth:
-    """Where a clicked point really is in a later frame, told by the simulated rover (`experiment.pointing.Truth`)."""
+    """Where a clicked point really is in a later frame (`experiment.pointing.Truth`)."""
 
     def __init__(self, rover: SimulatedRover) -> None:
         self._rover = rover
@@ -53,15 +54,9 @@ class SimulationTruth:
         """Return the true residual (x, y) in pixels, or None if the click hit the sky."""
         key = (clicked_frame_id, clicked_px)
         if key not in self._points:
-            self._points[key] = self._rover.true_point(*_camera_and_sequence(clicked_frame_id), clicked_px)
+            self._points[key] = self._rover.true_point(*camera_and_sequence(clicked_frame_id), clicked_px)
         point = self._points[key]
         if point is None:
             return None
-        x, y = self._rover.true_pixel(*_camera_and_sequence(landed_frame_id), point)
+        x, y = self._rover.true_pixel(*camera_and_sequence(landed_frame_id), point)
         return float(x) - aim_px[0], float(y) - aim_px[1]
-
-
-def _camera_and_sequence(frame_id: str) -> tuple[str, int]:
-    """Take a frame's name apart: ``navcam_left-000123``."""
-    camera, _, sequence = frame_id.rpartition("-")
-    return camera, int(sequence)

@@ -1,8 +1,8 @@
 """The paper's pointing experiment (section IV, Table VI) through the HTTP interface of a running daemon.
 
-For each distance: look at the ground there, choose a textured pixel of the left image at random, ask the daemon
-to point at it twice, and take the residuals that the daemon measured in new images. A target that fails is a row
-of its own with the reason; it never leaves the record.
+For each distance: look at the ground there, choose a textured pixel of the left image at random, ask the
+daemon to point at it twice, and take the residuals that the daemon measured in new images. A target that
+fails is a row of its own with the reason; it never leaves the record.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ PAPER_TABLE_VI: Mapping[float, tuple[tuple[float, float], tuple[float, float]]] 
     2.0: ((1.260, 0.925), (0.672, 0.921)),
 }
 
-# How far to either side of straight ahead the targets lie: the pan range of the paper's calibration, section III.C.
+# Targets lie this far to either side of straight ahead: the pan range of the paper's calibration (III.C).
 PAN_RANGE_RAD = 1.0
 # A view that offers no usable target is left for another; after this many in a row the distance is given up.
 VIEWS_PER_TARGET = 12
@@ -189,7 +189,7 @@ def run_pointing_experiment(
     started, begun_s = time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()), time.monotonic()
     status = client.status()
     rig = parse_rig(client.mast_file(), "the daemon's mast file").rig
-    pair = _head_pair(rig, set(status["cameras"]))
+    pair = head_pair(rig, set(status["cameras"]))
     aim_px = rig.cameras[pair[0]].model.image_center_px
     bench = _Bench(client, rig, pair, status["limits"], np.random.default_rng(seed), truth, keep_pictures)
     records: list[TargetRecord] = []
@@ -235,8 +235,14 @@ def rms(pairs: Sequence[tuple[float, float]]) -> tuple[float, float] | None:
     return float(x), float(y)
 
 
-def _head_pair(rig: Rig, served: set[str]) -> tuple[str, str]:
-    """The stereo pair to point with: on the head, both eyes served; the Navcam where there is one."""
+def head_pair(rig: Rig, served: set[str]) -> tuple[str, str]:
+    """Return the stereo pair to point with: on the head, both eyes served; the Navcam where there is one.
+
+    Raises
+    ------
+    ClientError
+        ``no_stereo_pair``, if there is none.
+    """
     pairs = {
         name: pair
         for name, pair in rig.stereo.items()
@@ -300,7 +306,7 @@ class _Bench:
         )
 
     def _look_for_target(self, distance_m: float) -> Target | None:
-        """Turn to a random piece of ground at the distance and choose a pixel there; None if it offers none."""
+        """Turn to a random piece of ground at the distance and choose a pixel there, if it offers one."""
         angles = self._angles_towards(distance_m)
         if angles is None:
             return None
@@ -319,7 +325,7 @@ class _Bench:
         return choose_target(left, right, models[0], models[1], distance_m, self._rng)
 
     def _angles_towards(self, distance_m: float) -> tuple[float, float] | None:
-        """Joint angles that look at level ground at the range, in a random direction; None outside the limits."""
+        """Joint angles that look at level ground at the range, anywhere ahead; None outside the limits."""
         mast = self._rig.mast
         head_in_rover_m = mast.rover_from_head(0.0, 0.0).translation_m
         height_m = -float(head_in_rover_m[2])

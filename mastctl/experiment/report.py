@@ -1,4 +1,4 @@
-"""What a pointing experiment leaves behind: the raw record as CSV and JSON, and one self-contained HTML page."""
+"""What a pointing experiment leaves: the raw record as CSV and JSON, and one self-contained HTML page."""
 
 from __future__ import annotations
 
@@ -26,14 +26,16 @@ FIRST_COLOUR, SECOND_COLOUR = "#c1440e", "#1f6f8b"
 CSV_COLUMNS = (
     "distance_m", "target", "camera", "frame_id", "clicked_x_px", "clicked_y_px", "range_m",
     "pan_before_rad", "tilt_before_rad",
-    "first_x_px", "first_y_px", "first_sigma_x_px", "first_sigma_y_px", "first_true_x_px", "first_true_y_px", "first_frame_id",
-    "second_x_px", "second_y_px", "second_sigma_x_px", "second_sigma_y_px", "second_true_x_px", "second_true_y_px", "second_frame_id",
+    "first_x_px", "first_y_px", "first_sigma_x_px", "first_sigma_y_px",
+    "first_true_x_px", "first_true_y_px", "first_frame_id",
+    "second_x_px", "second_y_px", "second_sigma_x_px", "second_sigma_y_px",
+    "second_true_x_px", "second_true_y_px", "second_frame_id",
     "seconds", "error",
 )  # fmt: skip
 
 
 def write_report(experiment: PointingExperiment, folder: Path) -> Path:
-    """Write report.html, targets.csv and record.json into ``folder`` (made if need be); return the page's path.
+    """Write report.html, targets.csv and record.json into ``folder`` (made if need be); return the page.
 
     Raises
     ------
@@ -104,24 +106,25 @@ def _page(experiment: PointingExperiment) -> str:
     """The whole page."""
     status = experiment.status
     kind = str(status.get("hardware", "unknown"))
-    mast = status.get("mast_file") or {}
+    mast = status.get("mast") or {}
     facts = [
         ("hardware", kind),
         ("camera", experiment.camera),
-        ("mast file", f"{mast.get('name', '')} ({str(mast.get('digest', ''))[:12]})"),
+        ("mast file", f"{mast.get('file', '')} ({str(mast.get('digest', ''))[:12]})"),
         ("seed", str(experiment.seed)),
         ("started", experiment.started),
         ("took", f"{experiment.seconds:.0f} s"),
     ]
     headings, rows = table_rows(experiment.summaries)
+    badge = f'<span class="badge {html.escape(kind)}">{html.escape(kind.upper())}</span>'
     parts = [
-        f'<h1>Pointing experiment <span class="badge {html.escape(kind)}">{html.escape(kind.upper())}</span></h1>',
+        f"<h1>Pointing experiment {badge}</h1>",
         "<p>" + " · ".join(f"{k} <b>{html.escape(v)}</b>" for k, v in facts) + "</p>",
         "<h2>Rms residual in pixels, beside the paper's Table VI</h2>",
         _html_table(headings, rows),
         "<p>First and second: residuals that the daemon measured in new images, about the aim pixel "
-        f"({experiment.aim_px[0]:g}, {experiment.aim_px[1]:g}), the middle of the image. True: where the clicked "
-        "point really was, which only a simulation knows. The paper's figures are from hardware.</p>",
+        f"({experiment.aim_px[0]:g}, {experiment.aim_px[1]:g}), the middle of the image. True: where the "
+        "clicked point really was, which only a simulation knows. The paper's figures are from hardware.</p>",
     ]
     parts += [f"<p>{html.escape(note)}</p>" for note in experiment.notes]
     failures = [record for record in experiment.records if record.error]
@@ -221,7 +224,10 @@ def _scatter(experiment: PointingExperiment) -> str:
         axis.set_xlabel("x residual, px (right)")
         axis.set_ylabel("y residual, px (down)")
         axis.grid(alpha=0.25)
-    figure.axes[0].legend(loc="upper left", fontsize=8)
+    handles, labels = next(
+        axis.get_legend_handles_labels() for axis in figure.axes if axis.get_legend_handles_labels()[0]
+    )
+    figure.axes[0].legend(handles, labels, loc="upper left", fontsize=8)
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", dpi=110)
     return _image_tag(buffer.getvalue(), "png", "scatter of the residuals")
@@ -295,15 +301,17 @@ _HEAD = """<!doctype html>
 <html lang="en"><head><meta charset="utf-8"><title>Pointing experiment</title>
 <meta name="viewport" content="width=device-width, initial-scale=1">
 <style>
-body { font: 15px/1.5 system-ui, sans-serif; color: #222; max-width: 1200px; margin: 2em auto; padding: 0 1em; }
+body { font: 15px/1.5 system-ui, sans-serif; color: #222;
+  max-width: 1200px; margin: 2em auto; padding: 0 1em; }
 h1 { font-size: 1.6em; } h2 { font-size: 1.2em; margin-top: 2em; border-bottom: 1px solid #ddd; }
 table { border-collapse: collapse; font-variant-numeric: tabular-nums; }
-th, td { padding: .25em .8em; text-align: right; border-bottom: 1px solid #eee; }
-td:last-child { text-align: left; } th { background: #f4f1ee; }
+th, td { padding: .25em .7em; text-align: right; border-bottom: 1px solid #eee; white-space: nowrap; }
+td:last-child, th:last-child { text-align: left; white-space: normal; } th { background: #f4f1ee; }
 img { max-width: 100%; } .row { display: flex; gap: 12px; margin-bottom: 1.2em; align-items: flex-start; }
 figure { margin: 0; flex: 1 1 0; min-width: 0; } .row figure:first-child { flex: 1.35 1 0; }
 figcaption { font-size: .85em; color: #555; }
-.badge { font-size: .55em; vertical-align: middle; padding: .3em .7em; border-radius: 1em; background: #777; color: #fff; }
+.badge { font-size: .55em; vertical-align: middle; padding: .3em .7em; border-radius: 1em;
+  background: #777; color: #fff; }
 .badge.simulated { background: #1f6f8b; } .badge.real { background: #c1440e; }
 </style></head><body>
 """

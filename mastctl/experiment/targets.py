@@ -1,4 +1,4 @@
-"""Choosing a target as a person would: somewhere in the picture, on texture, seen by both eyes, at the distance."""
+"""Choosing a target as a person would: anywhere in the picture, on texture, seen by both eyes."""
 
 from __future__ import annotations
 

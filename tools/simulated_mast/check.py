@@ -1,4 +1,4 @@
-"""What a mast file costs in pointing: the truth of where targets land when the mast file does the pointing."""
+"""What a mast file costs in pointing: where targets truly land when the mast file does the pointing."""
 
 from __future__ import annotations
 
@@ -15,12 +15,19 @@ PAN_LIMITS_RAD, TILT_LIMITS_RAD = (-2.6, 2.6), (-1.2, 0.5)
 
 
 def pointing_error_px(
-    truth: Rig, belief: Rig, head: HeadSettings, pair: str, distance_m: float, targets: int, seed: int
+    truth: Rig,
+    belief: Rig,
+    head: HeadSettings,
+    pair: str,
+    distance_m: float,
+    targets: int,
+    seed: int,
+    click_px: float = 0.0,
 ) -> np.ndarray:
     """Return (n, 2) pixels: where ground targets truly lie from the image centre after one pointing.
 
-    The clicks are perfect: what is left is the mast file, the counts, backlash and sag. A target starts
-    somewhere in the inner half of both images.
+    With perfect clicks (``click_px`` 0, one sigma per axis in each eye) what is left is the mast file, the
+    counts, backlash and sag. A target starts somewhere in the inner half of the left image.
     """
     rng = np.random.default_rng(seed)
     clock = ManualClock()
@@ -47,12 +54,14 @@ def pointing_error_px(
         except Unreachable:
             continue
         measured, true = go(start.pan_rad, start.tilt_rad)
-        clicks, seen = zip(*(truth.camera_in_rover(n, *true).project(target[None]) for n in (left, right)), strict=True)
+        clicks, seen = zip(
+            *(truth.camera_in_rover(n, *true).project(target[None]) for n in (left, right)), strict=True
+        )
         if not (seen[0][0] and seen[1][0]):
             continue
-        found = triangulate(
-            *(belief.camera_in_rover(n, *measured) for n in (left, right)), clicks[0][0], clicks[1][0]
-        )
+        left_px, right_px = (click[0] + rng.normal(0, click_px, 2) for click in clicks)
+        models = (belief.camera_in_rover(n, *measured) for n in (left, right))
+        found = triangulate(*models, left_px, right_px)
         aim = choose(solve(belief.mast, believed, found.position_m), PAN_LIMITS_RAD, TILT_LIMITS_RAD)
         _, true = go(aim.pan_rad, aim.tilt_rad)
         landed, _ = truth.camera_in_rover(left, *true).project(target[None])

@@ -7,7 +7,9 @@ from where the head truly is. Everything here knows the truth; what leaves in a 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 
@@ -29,14 +31,14 @@ PRISMS_IN_ROVER_M = np.array(
 
 @dataclass(frozen=True)
 class Image:
-    """Dots found in one picture; ``dots`` are the indices of those seen. Body cameras have no angles."""
+    """The dots found in one picture, (100, 2); ``purpose`` says which step of the fit it is for."""
 
+    purpose: Literal["camera", "mast"]
     camera: str
     setup: str
     placement: str
     pan_rad: float
     tilt_rad: float
-    dots: np.ndarray
     pixels_px: np.ndarray
 
 
@@ -57,7 +59,9 @@ class Sigmas:
     dot_px: float = 0.1
 
 
-def board(eye_m: np.ndarray, range_m: float, azimuth_rad: float, elevation_rad: float, lean: np.ndarray) -> Rigid:
+def board(
+    eye_m: np.ndarray, range_m: float, azimuth_rad: float, elevation_rad: float, lean: np.ndarray
+) -> Rigid:
     """rover_from_board of a board at a range from an eye, facing it but for small ``lean`` angles (3,)."""
     ahead = rot_z(azimuth_rad) @ rot_y(elevation_rad)
     facing = np.column_stack([ahead[:, 1], ahead[:, 2], ahead[:, 0]])
@@ -86,24 +90,69 @@ class _Surveyor:
         tapes = rover_from_board.points(TAPES_IN_BOARD_M)
         self.survey.tapes_m[setup, placement] = self._measured(setup, tapes)
 
-    def shoot(
-        self, cameras: list[str], setup: str, placement: str, rover_from_board: Rigid, goal: tuple[float, float]
+    def calibrate(
+        self,
+        pair: str,
+        setup: str,
+        placement: str,
+        place: tuple[np.ndarray, float, float, float, float],
+        goal: tuple[float, float],
     ) -> None:
-        """Take a picture with each camera that sees the whole board."""
+        """Put the board up for one pair of cameras, moved inwards until both see it whole, and take pictures.
+
+        ``place`` is eye (3,), range, elevation of the middle, and angles across and up from there.
+        """
+        eye_m, range_m, elevation_rad, across_rad, up_rad = place
+        lean = self.lean()
+        true_joints, reading = self._turn(goal)
+        for inwards in np.linspace(1.0, 0.0, 21):
+            pose = board(eye_m, range_m, inwards * across_rad, elevation_rad + inwards * up_rad, lean)
+            if all(self._whole(name, true_joints, pose) is not None for name in self.rig.stereo[pair]):
+                break
+        self.place(setup, placement, pose)
+        self._picture("camera", self.rig.stereo[pair], setup, placement, pose, true_joints, reading)
+
+    def shoot(
+        self, cameras: Sequence[str], setup: str, placement: str, pose: Rigid, goal: tuple[float, float]
+    ) -> None:
+        """Turn the head; a picture for the mast's step with each camera that sees the whole board."""
+        true_joints, reading = self._turn(goal)
+        self._picture("mast", cameras, setup, placement, pose, true_joints, reading)
+
+    def lean(self) -> np.ndarray:
+        """How far a board is from facing the eye, radians about its axes."""
+        return self.rng.uniform(-1, 1, 3) * np.array([0.5, 0.5, 0.15])
+
+    def _turn(self, goal: tuple[float, float]) -> tuple[tuple[float, float], tuple[float, float]]:
+        """Move the head; where it truly is, and what it reads."""
         self.head.move(*goal)
         while (reading := self.head.read()).moving:
             self.clock.sleep(0.05)
-        true_joints = self.head.true_joints(reading.time_s)
-        dots_m = rover_from_board.points(DOTS_IN_BOARD_M)
+        return self.head.true_joints(reading.time_s), (reading.pan_rad, reading.tilt_rad)
+
+    def _whole(self, name: str, true_joints: tuple[float, float], pose: Rigid) -> np.ndarray | None:
+        """The true pixels of all dots if they are in the picture, else None."""
+        model = self.rig.camera_in_rover(name, *true_joints)
+        pixels, valid = model.project(pose.points(DOTS_IN_BOARD_M))
+        inside = valid & (pixels > 5).all(-1) & (pixels < np.array(model.size_px) - 6).all(-1)
+        return pixels if inside.all() else None
+
+    def _picture(
+        self,
+        purpose: Literal["camera", "mast"],
+        cameras: Sequence[str],
+        setup: str,
+        placement: str,
+        pose: Rigid,
+        true_joints: tuple[float, float],
+        reading: tuple[float, float],
+    ) -> None:
+        """Note the dots that each camera finds, with their noise."""
         for name in cameras:
-            model = self.rig.camera_in_rover(name, *true_joints)
-            pixels, valid = model.project(dots_m)
-            inside = valid & (pixels > 5).all(-1) & (pixels < np.array(model.size_px) - 6).all(-1)
-            if not inside.all():
-                continue
-            seen = pixels + self.rng.normal(0, self.sigmas.dot_px, pixels.shape)
-            image = Image(name, setup, placement, reading.pan_rad, reading.tilt_rad, np.flatnonzero(inside), seen)
-            self.survey.images.append(image)
+            pixels = self._whole(name, true_joints, pose)
+            if pixels is not None:
+                seen = pixels + self.rng.normal(0, self.sigmas.dot_px, pixels.shape)
+                self.survey.images.append(Image(purpose, name, setup, placement, *reading, seen))
 
     def _measured(self, setup: str, points_in_rover_m: np.ndarray) -> np.ndarray:
         """What the station says about points."""
@@ -121,28 +170,22 @@ def measure(rig: Rig, head: HeadSettings, sigmas: Sigmas, rng: np.random.Generat
     surveyor = _Surveyor(rig, head, sigmas, rng)
     eye = np.array(rig.mast.translation_m)
     head_cameras = [name for name, camera in rig.cameras.items() if camera.on == "head"]
-    body_cameras = [name for name, camera in rig.cameras.items() if camera.on == "rover"]
-
-    def lean() -> np.ndarray:
-        return rng.uniform(-1, 1, 3) * np.array([0.5, 0.5, 0.15])
 
     surveyor.set_up("level")
     corners = [(-1, -1), (1, -1), (1, 1), (-1, 1)]
     plan = (
         ("pancam", np.radians(-5), ((5.0, 0.055, 0.040), (10.0, 0.10, 0.065))),
-        ("navcam", np.radians(-10), ((3.0, 0.20, 0.13), (6.0, 0.26, 0.19))),
+        ("navcam", np.radians(-10), ((3.0, 0.22, 0.15), (6.0, 0.28, 0.21))),
     )
     for pair, tilt, rings in plan:
-        for range_m, across, down in rings:
-            for index, (right, up) in enumerate(corners):
-                pose = board(eye, range_m, right * across, tilt + up * down, lean())
-                placement = f"{pair}-{range_m:g}m-{index}"
-                surveyor.place("level", placement, pose)
-                surveyor.shoot(head_cameras, "level", placement, pose, (0.0, tilt))
+        for range_m, across, up in rings:
+            for index, (right, top) in enumerate(corners):
+                place = (eye, range_m, tilt, right * across, top * up)
+                surveyor.calibrate(pair, "level", f"{pair}-{range_m:g}m-{index}", place, (0.0, tilt))
     far = [(10.0, -0.9, -0.10), (7.0, 0.1, -0.16), (5.0, 1.0, -0.25)]
     near = [(5.0, -1.0, -0.25), (4.0, -0.4, -0.32), (3.0, 0.5, -0.45), (2.2, 1.0, -0.62), (2.0, -0.2, -0.8)]
     for index, (range_m, pan, tilt) in enumerate(far + near):
-        pose = board(eye, range_m, pan, tilt, lean())
+        pose = board(eye, range_m, pan, tilt, surveyor.lean())
         placement = f"mast-{index}"
         surveyor.place("level", placement, pose)
         spread = 0.03 if index < len(far) else 0.12
@@ -150,11 +193,9 @@ def measure(rig: Rig, head: HeadSettings, sigmas: Sigmas, rng: np.random.Generat
             goal = (pan + right * spread, tilt + up * spread)
             surveyor.shoot(head_cameras, "level", placement, pose, goal)
     surveyor.set_up("tilted back")
-    haz_eye = np.mean([rig.cameras[name].model.C for name in body_cameras], axis=0)
-    for range_m, across, down in ((1.5, 0.42, 0.25), (3.0, 0.70, 0.45)):
-        for index, (right, up) in enumerate(corners):
-            pose = board(haz_eye, range_m, right * across, np.radians(-38) + up * down, lean())
-            placement = f"hazcam-{range_m:g}m-{index}"
-            surveyor.place("tilted back", placement, pose)
-            surveyor.shoot(body_cameras, "tilted back", placement, pose, (0.0, 0.0))
+    haz_eye = np.mean([rig.cameras[name].model.C for name in rig.stereo["hazcam"]], axis=0)
+    for range_m, across, up in ((1.5, 0.45, 0.30), (3.0, 0.75, 0.48)):
+        for index, (right, top) in enumerate(corners):
+            place = (haz_eye, range_m, np.radians(-38), right * across, top * up)
+            surveyor.calibrate("hazcam", "tilted back", f"hazcam-{range_m:g}m-{index}", place, (0.0, 0.0))
     return surveyor.survey

@@ -1,0 +1,127 @@
+"""Rocks: irregular, nearly convex stones as closed triangle meshes, partly sunk into the ground."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drivers.sim.compiled import kernels
+
+Float64 = NDArray[np.float64]
+
+NEAREST_M = 1.5
+FARTHEST_M = 20.0
+AZIMUTH_RAD = 1.5
+DIAMETERS_M = (0.05, 0.60)
+DIVISIONS = 3  # of the icosahedron's 20 faces: 1280 triangles; kernels.Rocks counts on it
+CUTS = 13
+FACES = """0 11 5  0 5 1  0 1 7  0 7 10  0 10 11  1 5 9  5 11 4  11 10 2  10 7 6  7 1 8
+    3 9 4  3 4 2  3 2 6  3 6 8  3 8 9  4 9 5  2 4 11  6 2 10  8 6 7  9 8 1"""  # corners of the icosahedron
+
+
+def divided_icosahedron() -> Float64:
+    """Return the corners (1280, 3, 3) of triangles on the unit sphere; four in a row have one parent."""
+    g = (1.0 + np.sqrt(5.0)) / 2.0
+    edges = np.array([[-1, g, 0], [1, g, 0], [-1, -g, 0], [1, -g, 0]])
+    corners = np.concatenate([edges, np.roll(edges, 1, axis=1), np.roll(edges, 2, axis=1)])
+    faces = np.array(FACES.split(), dtype=np.int64).reshape(20, 3)
+    triangles: Float64 = corners[faces] / np.linalg.norm(corners[0])
+    for _ in range(DIVISIONS):
+        a, b, c = triangles[:, 0], triangles[:, 1], triangles[:, 2]
+        ab, bc, ca = (unit(p + q) for p, q in ((a, b), (b, c), (c, a)))
+        children = np.stack([[a, ab, ca], [ab, b, bc], [ca, bc, c], [ab, bc, ca]])  # (4, 3, n, 3)
+        triangles = children.transpose(2, 0, 1, 3).reshape(-1, 3, 3)
+    return triangles
+
+
+def unit(vectors: Float64) -> Float64:
+    """Vectors (..., 3) at length one."""
+    return np.asarray(vectors / np.linalg.norm(vectors, axis=-1, keepdims=True))
+
+
+def shape(directions: Float64, rng: np.random.Generator) -> Float64:
+    """Return how far (...,) a stone reaches along unit directions (..., 3): a ball cut and worn."""
+    normals = unit(rng.normal(size=(CUTS, 3)))
+    depths = rng.uniform(0.62, 1.0, CUTS)
+    cosines = np.maximum(directions @ normals.T, 1e-3)
+    limits = np.concatenate([depths / cosines, np.full((*directions.shape[:-1], 1), 1.05)], axis=-1)
+    sharpness = rng.uniform(14.0, 40.0)
+    reach = np.power(np.power(limits, -sharpness).sum(axis=-1), -1.0 / sharpness)
+    for scale, height in ((2.5, 0.05), (6.0, 0.022), (13.0, 0.010)):
+        waves, phases = rng.normal(0.0, scale, (3, 3)), rng.uniform(0.0, 2 * np.pi, 3)
+        reach *= 1.0 + height * np.sin(directions @ waves.T + phases).mean(axis=-1)
+    return np.asarray(reach)
+
+
+def corner_normals(corners_m: Float64) -> Float64:
+    """Return outward normals (n, 3, 3) at the corners of n triangles: halfway between flat and rounded."""
+    a, b, c = corners_m[:, 0], corners_m[:, 1], corners_m[:, 2]
+    flat = np.cross(b - a, c - a)
+    keys = np.rint(corners_m.reshape(-1, 3) * 1e7).astype(np.int64)
+    _, index = np.unique(keys, axis=0, return_inverse=True)
+    index = index.ravel()
+    rounded = np.zeros((index.max() + 1, 3))
+    np.add.at(rounded, index, np.repeat(flat, 3, axis=0))
+    return unit(unit(rounded[index]).reshape(-1, 3, 3) + 0.5 * unit(flat)[:, None, :])
+
+
+def places(count: int, rng: np.random.Generator) -> Float64:
+    """Return (count, 3): x, y and diameter in metres of rocks that do not stand in each other."""
+    found: list[tuple[float, float, float]] = []
+    for _ in range(200 * count):
+        if len(found) == count:
+            break
+        distance = NEAREST_M * (FARTHEST_M / NEAREST_M) ** (rng.random() ** 0.75)
+        azimuth = rng.uniform(-AZIMUTH_RAD, AZIMUTH_RAD)
+        low, high = DIAMETERS_M
+        diameter = low * (high / low) ** (rng.random() ** 1.1)
+        diameter = max(low, min(diameter, 0.09 * distance))
+        x, y = distance * np.cos(azimuth), distance * np.sin(azimuth)
+        if distance - diameter < NEAREST_M:
+            continue
+        if all(np.hypot(x - a, y - b) > 0.75 * (diameter + d) for a, b, d in found):
+            found.append((x, y, diameter))
+    return np.array(found, dtype=np.float64).reshape(-1, 3)
+
+
+def make_rocks(count: int, rng: np.random.Generator, ground_z_m: Any) -> Any:
+    """Return ``kernels.Rocks``: ``count`` stones standing on the ground.
+
+    ``ground_z_m(x_m, y_m)`` gives the ground's z in the site frame, metres.
+    """
+    sphere = divided_icosahedron()
+    where = places(count, rng)
+    corners = np.empty((len(where), len(sphere), 3, 3))
+    normals = np.empty((len(where), len(sphere), 3, 3), dtype=np.float32)
+    for k, (x, y, diameter) in enumerate(where):
+        stone = sphere * shape(sphere, rng)[..., None]
+        stone *= rng.uniform([0.8, 0.65, 0.5], [1.0, 0.95, 0.85])
+        turn = rng.uniform(0.0, 2 * np.pi)
+        cos, sin = np.cos(turn), np.sin(turn)
+        stone = stone @ np.array([[cos, sin, 0.0], [-sin, cos, 0.0], [0.0, 0.0, 1.0]])
+        stone *= diameter / (stone[..., :2].max() - stone[..., :2].min())
+        low, high = stone[..., 2].max(), stone[..., 2].min()  # z is down
+        sunk = rng.uniform(0.2, 0.42) * (low - high)
+        corners[k] = stone + np.array([x, y, float(ground_z_m(x, y)) - low + sunk])
+        normals[k] = corner_normals(corners[k])
+    tones = np.exp(rng.normal(0.0, 0.16, len(where))).astype(np.float32)
+    return kernels().Rocks(
+        spheres(corners), *(boxes(corners, 4**level) for level in (3, 2, 1)), corners, normals, tones
+    )
+
+
+def boxes(corners_m: Float64, together: int) -> Float64:
+    """Return (k, n / together, 6) boxes around runs of triangles of corners_m (k, n, 3, 3)."""
+    count, triangles = corners_m.shape[:2]
+    points = corners_m.reshape(count, triangles // together, together * 3, 3)
+    return np.ascontiguousarray(np.concatenate([points.min(axis=2), points.max(axis=2)], axis=-1))
+
+
+def spheres(corners_m: Float64) -> Float64:
+    """Return (k, 4) centre and radius of balls around meshes of corners_m (k, n, 3, 3)."""
+    points = corners_m.reshape(corners_m.shape[0], 3 * corners_m.shape[1], 3)
+    centre = 0.5 * (points.min(axis=1) + points.max(axis=1))
+    radius = np.linalg.norm(points - centre[:, None], axis=-1).max(axis=1)
+    return np.column_stack([centre, radius * (1.0 + 1e-9)])

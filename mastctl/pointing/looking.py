@@ -1,0 +1,265 @@
+"""New pictures and what they show: frames of a resting head, the clicked thing found again in them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+
+from calib.cahvor import CameraModel
+from calib.epipolar import UP, StereoMatch, find_partner
+from calib.errors import CalibError
+from calib.mast import Rig
+from calib.match import Match, match
+from calib.rigid import FloatArray
+from calib.warp import Grey, Plane, carry, facing_plane, grey
+from drivers.interfaces import Reading
+from mastctl.frames import StampedFrame
+from mastctl.pointing.requests import PointingError, PointingSettings, rounded
+
+
+class CamerasLike(Protocol):
+    """What of `mastctl.devices.Devices` brings pictures."""
+
+    def frames(
+        self, cameras: Sequence[str], exposed_after_s: float, timeout_s: float
+    ) -> dict[str, StampedFrame]: ...
+    def frame_by_id(self, frame_id: str) -> StampedFrame: ...
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """A frame as the geometry needs it: grey values, and the camera in the rover frame at its moment."""
+
+    frame: StampedFrame
+    image: Grey
+    camera: CameraModel
+
+
+@dataclass(frozen=True, eq=False)
+class Clicked:
+    """The thing that was clicked: where in which view, and the surface around it in the rover frame."""
+
+    view: View
+    pixel_px: FloatArray
+    plane: Plane
+
+
+class Eyes:
+    """The cameras during one request; all geometry by the mast file and measured joint angles."""
+
+    def __init__(self, cameras: CamerasLike, rig: Rig, settings: PointingSettings) -> None:
+        self._cameras = cameras
+        self._rig = rig
+        self._settings = settings
+
+    def partner(self, camera: str) -> str | None:
+        """Return the other eye of a camera's stereo pair, None if it has none."""
+        for left, right in self._rig.stereo.values():
+            if camera in (left, right):
+                return right if camera == left else left
+        return None
+
+    def named(self, frame_id: str) -> View:
+        """Return a kept frame by its id. Raises FrameGone."""
+        return self._view(self._cameras.frame_by_id(frame_id))
+
+    def new(self, names: Sequence[str], after_s: float, resting: Reading) -> dict[str, View]:
+        """Return frames exposed after a moment, by a head that rests where it was read.
+
+        Raises
+        ------
+        PointingError
+            ``head_moving`` if the head moved in an exposure or is not where it rested.
+        DriverError
+            If a frame does not come, or cannot be used.
+        """
+        views = {}
+        for name, frame in self._cameras.frames(names, after_s, self._settings.frame_timeout_s).items():
+            if frame.exposure_began_s < after_s:
+                words = (
+                    f"frame {frame.frame_id} was exposed {after_s - frame.exposure_began_s:.3f} s too early"
+                )
+                raise PointingError("no_fresh_frame", words)
+            apart = max(abs(frame.pan_rad - resting.pan_rad), abs(frame.tilt_rad - resting.tilt_rad))
+            if frame.moving or not apart <= self._settings.rest_tolerance_rad:
+                words = (
+                    f"the head moved while frame {frame.frame_id} was exposed ({apart:.4f} rad off its rest)"
+                )
+                raise PointingError("head_moving", words)
+            views[name] = self._view(frame)
+        return views
+
+    def again(self, view: View, pixel_px: FloatArray, now: View) -> Match:
+        """Find a clicked pixel in a new frame of the same camera, before its range is known.
+
+        Raises
+        ------
+        PointingError
+            ``not_in_view`` if the head has turned away since, ``target_...`` if the match is not good.
+        """
+        settings = self._settings
+        here = max(abs(view.frame.pan_rad - now.frame.pan_rad), abs(view.frame.tilt_rad - now.frame.tilt_rad))
+        planes = [_plane_at(view.camera, pixel_px, range_m) for range_m in (1.0, 2.0, 1e3)]
+        if here <= settings.same_pose_rad:
+            return _good(match(view.image, view.camera, pixel_px, planes[1], now.image, now.camera, 12.0,
+                               settings.match), now)  # fmt: skip
+        places = np.array([carry(pixel_px, view.camera, plane, now.camera)[0] for plane in planes])
+        size = np.array(now.camera.size_px)
+        if not np.isfinite(places).all() or (places[1] < 0).any() or (places[1] > size - 1).any():
+            raise PointingError(
+                "not_in_view",
+                f"the head has turned by {here:.3f} rad since frame {view.frame.frame_id}: "
+                "the clicked pixel is out of view, click in a new picture",
+            )
+        spread = float(np.ptp(places, axis=0).max())
+        search = min(settings.wide_search_px, settings.search_px / 2 + spread)
+        normals: list[FloatArray | None] = [None, UP]
+        found = [
+            match(
+                view.image, view.camera, pixel_px,
+                planes[1] if normal is None else Plane(planes[1].point_m, normal),
+                now.image, now.camera, search, settings.match,
+            )
+            for normal in normals
+        ]  # fmt: skip
+        return _good(_best(found), now)
+
+    def stereo(self, view: View, pixel_px: FloatArray, other: View) -> StereoMatch:
+        """Find the other eye's pixel along the epipolar line.
+
+        Raises
+        ------
+        PointingError
+            ``target_...`` if the match is not good, ``eyes_disagree`` if it lies off the line.
+        """
+        settings = self._settings
+        found = find_partner(
+            view.image, view.camera, pixel_px, other.image, other.camera, settings.nearest_m, settings.match
+        )
+        _good(found.match, other)
+        if abs(found.across_px) > settings.eyes_px + 5.0 * found.across_sigma_px:
+            raise PointingError(
+                "eyes_disagree",
+                f"{other.frame.camera} sees the target {found.across_px:+.2f} px off the line on which "
+                f"{view.frame.camera} puts it, at most {settings.eyes_px:g} px is expected",
+            )
+        return found
+
+    def look_for(self, clicked: Clicked, now: View) -> Match:
+        """Find the clicked thing in a new view: near where it should be, then further around.
+
+        Raises
+        ------
+        PointingError
+            ``target_...`` if no match is good.
+        """
+        settings = self._settings
+        planes = [clicked.plane]
+        ray = clicked.view.camera.ray(clicked.pixel_px)
+        if abs(float(ray.directions @ clicked.plane.normal)) < 0.97:
+            planes.append(Plane(clicked.plane.point_m, -ray.directions))  # if the slope was misjudged
+        found: list[Match] = []
+        for search in (settings.search_px, settings.wide_search_px):
+            for plane in planes:
+                found.append(
+                    match(
+                        clicked.view.image, clicked.view.camera, clicked.pixel_px, plane,
+                        now.image, now.camera, search, settings.match,
+                    )
+                )  # fmt: skip
+                if found[-1].verdict == "good":
+                    return found[-1]
+            if found[0].verdict in ("flat", "ambiguous"):
+                break
+        return _good(_best(found), now)
+
+    def agree(
+        self, clicked: Clicked, now: View, seen: Match, other: View, same_pair: bool
+    ) -> tuple[Match, dict[str, Any]]:
+        """Find the clicked thing in the other eye too and check that both mean the same place.
+
+        One eye alone would believe a shifted picture. A wrong joint angle moves both alike; what is
+        compared is how far each is from its own prediction.
+
+        Returns
+        -------
+        match, detail
+            In the other eye, and the difference across and along the epipolar line.
+
+        Raises
+        ------
+        PointingError
+            ``eyes_disagree`` if the other eye does not confirm the place.
+        """
+        settings = self._settings
+        try:
+            confirmed = self.look_for(clicked, other)
+        except PointingError as error:
+            raise PointingError(
+                "eyes_disagree",
+                f"{now.frame.camera} finds the target, {other.frame.camera} does not confirm it: {error}",
+            ) from None
+        between = (confirmed.pixel_px - confirmed.predicted_px) - (seen.pixel_px - seen.predicted_px)
+        towards = other.camera.project(clicked.plane.point_m + (clicked.plane.point_m - now.camera.C) * 0.02)[
+            0
+        ]
+        along = towards - other.camera.project(clicked.plane.point_m)[0]
+        along /= max(float(np.linalg.norm(along)), 1e-12)
+        along_px, across_px = float(between @ along), float(along[0] * between[1] - along[1] * between[0])
+        detail = {
+            "other_frame_id": other.frame.frame_id,
+            "other_px": rounded(confirmed.pixel_px),
+            "eyes_across_px": round(across_px, 3),
+            "eyes_along_px": round(along_px, 3),
+        }
+        if abs(across_px) > settings.eyes_px or (same_pair and abs(along_px) > settings.range_px):
+            raise PointingError(
+                "eyes_disagree",
+                f"{now.frame.camera} and {other.frame.camera} put the target {across_px:+.2f} px across and "
+                f"{along_px:+.2f} px along the epipolar line apart, at most {settings.eyes_px:g} px across "
+                f"and {settings.range_px:g} px along is expected",
+            )
+        return confirmed, detail
+
+    def _view(self, frame: StampedFrame) -> View:
+        if not (math.isfinite(frame.pan_rad) and math.isfinite(frame.tilt_rad)):
+            raise PointingError("bad_reading", f"frame {frame.frame_id} has no finite joint angles")
+        camera = self._rig.camera_in_rover(frame.camera, frame.pan_rad, frame.tilt_rad)
+        return View(frame, grey(frame.image), camera)
+
+
+def facts(found: Match) -> Mapping[str, Any]:
+    """Return a match's numbers for a step's detail."""
+    return {
+        "pixel_px": rounded(found.pixel_px),
+        "sigma_px": rounded(found.sigma_px),
+        "correlation": round(found.correlation, 3),
+        "second": round(found.second, 3),
+    }
+
+
+def _best(found: Sequence[Match]) -> Match:
+    """Return the good match of several, else the one that came nearest to one."""
+    ranks = {"good": 0, "ambiguous": 1, "flat": 2, "weak": 3, "border": 4}
+    return min(found, key=lambda one: (ranks[one.verdict], -one.correlation))
+
+
+def _good(found: Match, view: View) -> Match:
+    """Pass a good match. Raises PointingError with the verdict in its code."""
+    if found.verdict == "good":
+        return found
+    lost = found.verdict in ("weak", "border") and np.isfinite(found.predicted_px).all()
+    code = "target_not_found" if lost and found.correlation > 0.0 else f"target_{found.verdict}"
+    raise PointingError(code, f"the target is not found in {view.frame.frame_id}: {found.reason}")
+
+
+def _plane_at(camera: CameraModel, pixel_px: FloatArray, range_m: float) -> Plane:
+    """Return the facing plane at a range. Raises PointingError for a pixel without a ray."""
+    try:
+        return facing_plane(camera, pixel_px, range_m)
+    except CalibError as error:
+        raise PointingError("outside_image", str(error)) from None

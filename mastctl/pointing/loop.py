@@ -1,0 +1,395 @@
+"""The pointing loop: see, measure, solve, move, settle, see again, measure what is left.
+
+Steps of a pixel request, as they stand in the record: ``rest``, ``frames``, ``target``, ``stereo``,
+``triangulate``; then for each pointing ``solve``, ``limits``, ``move``, ``settle``, ``look``, ``measure``,
+``eyes`` (and ``triangulate``, ``rest`` before the second). A position needs ``rest``, ``solve`` to ``settle``
+and ``look``; joint angles ``rest`` and ``limits`` to ``settle``, no picture.
+
+A named frame's other eye may not be kept, and what was clicked may have been seen from another pose; so a
+fresh pair is always taken, the clicked patch is found in it, and range comes from that pair. The clicked
+patch itself, never a later copy of it, is what is looked for after each move, so nothing drifts.
+
+What the loop does not do: it does not retry, and it reports no residual on a match that is not good.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any, Protocol
+
+import numpy as np
+
+from calib.errors import CalibError
+from calib.mast import Rig
+from calib.match import Match
+from calib.pointing import Solution, choose, solve
+from calib.rigid import FloatArray
+from calib.stereo import triangulate
+from drivers.clock import Clock
+from drivers.errors import DriverError
+from drivers.interfaces import Reading
+from mastctl.errors import MastctlError
+from mastctl.limits import Limits
+from mastctl.pointing.looking import CamerasLike, Clicked, Eyes, View, facts
+from mastctl.pointing.motion import Head, HeadLike
+from mastctl.pointing.requests import (
+    Aim,
+    AnglesTarget,
+    Pair,
+    PixelTarget,
+    Pointing,
+    PointingError,
+    PointingResult,
+    PointingSettings,
+    PointRequest,
+    PositionTarget,
+    Step,
+    pair,
+    rounded,
+    triple,
+)
+from mastctl.pointing.wanted import aim_of, check_pointings, clicked_px, position_in_rover_m
+
+__all__ = [
+    "Aim",
+    "AnglesTarget",
+    "PixelTarget",
+    "PointRequest",
+    "Pointing",
+    "PointingError",
+    "PointingLoop",
+    "PointingResult",
+    "PointingSettings",
+    "PositionTarget",
+    "Step",
+]
+
+log = logging.getLogger(__name__)
+
+
+NO_PICTURE_OF_A_POSITION = "no residual: a position has no picture that could be looked for"
+NO_TARGET = "no residual: joint angles name no target; no picture was taken"
+
+
+class DevicesLike(HeadLike, CamerasLike, Protocol):
+    """What the loop needs of `mastctl.devices.Devices`."""
+
+
+class PointingLoop:
+    """Points the head at what it is asked, and measures how well it did.
+
+    Parameters
+    ----------
+    rig
+        The mast file in use.
+    devices
+        Head and cameras.
+    limits
+        Soft limits, for the choice among solutions; `devices` checks them again.
+    clock
+        The clock that stamps readings and frames.
+    settings
+        Times and tolerances.
+    """
+
+    def __init__(
+        self,
+        rig: Rig,
+        devices: DevicesLike,
+        limits: Limits,
+        clock: Clock,
+        settings: PointingSettings | None = None,
+    ) -> None:
+        self._rig = rig
+        self._devices = devices
+        self._limits = limits
+        self._clock = clock
+        self._settings = settings or PointingSettings()
+
+    def run(
+        self, request: PointRequest, record: Callable[[Step], None], cancelled: threading.Event
+    ) -> PointingResult:
+        """Carry out a request; blocks until it is done, at most the sum of its deadlines.
+
+        Parameters
+        ----------
+        request
+            Target, aim, number of pointings.
+        record
+            Called with each step when it ends.
+        cancelled
+            Set by somebody else to end the request; the mast is stopped.
+
+        Raises
+        ------
+        PointingError
+            For everything that goes wrong on purpose: its code and one sentence, the step, and the
+            pointings done before. The mast was told to stop.
+        """
+        return _Run(
+            self._rig, self._devices, self._limits, self._clock, self._settings, record, cancelled
+        ).all(request)
+
+
+class _Run:
+    """One request."""
+
+    def __init__(
+        self,
+        rig: Rig,
+        devices: DevicesLike,
+        limits: Limits,
+        clock: Clock,
+        settings: PointingSettings,
+        record: Callable[[Step], None],
+        cancelled: threading.Event,
+    ) -> None:
+        self._rig = rig
+        self._devices = devices
+        self._limits = limits
+        self._clock = clock
+        self._settings = settings
+        self._record = record
+        self._head = Head(devices, limits, clock, settings, cancelled)
+        self._eyes = Eyes(devices, rig, settings)
+        self._step_name = "request"
+        self._position_m: FloatArray | None = None
+        self._range_m: float | None = None
+        self._pointings: list[Pointing] = []
+
+    def all(self, request: PointRequest) -> PointingResult:
+        """Do it, or stop the mast and say what went wrong."""
+        try:
+            self._do(request)
+        except (MastctlError, DriverError, CalibError) as error:
+            self._stop()
+            code = getattr(error, "code", "failed")
+            raise PointingError(
+                code, " ".join(str(error).split()), self._step_name, self._so_far()
+            ) from error
+        except BaseException:
+            self._stop()
+            raise
+        result = self._so_far()
+        assert result is not None
+        return result
+
+    def _do(self, request: PointRequest) -> None:
+        target, rig = request.target, self._rig
+        check_pointings(request)
+        if isinstance(target, AnglesTarget):
+            self._rest()
+            settled = self._go(target.pan_rad, target.tilt_rad)
+            self._pointings.append(_without_picture(target, settled))
+            return
+        aim = aim_of(request, rig)
+        aim_px = np.array([aim.x_px, aim.y_px])
+        if isinstance(target, PositionTarget):
+            self._position_m = position_in_rover_m(target)
+            commanded, settled = self._solve_and_go(aim, aim_px, self._rest())
+            now = self._look((aim.camera,), settled)[aim.camera]
+            self._pointings.append(self._pointing(commanded, now, aim_px, None))
+            return
+        self._point_at(self._see(target), aim, aim_px, request.pointings)
+
+    # Steps
+
+    def _rest(self) -> Reading:
+        with self._step("rest") as detail:
+            resting = self._head.resting()
+            detail.update(pan_rad=resting.pan_rad, tilt_rad=resting.tilt_rad)
+        return resting
+
+    def _see(self, target: PixelTarget) -> Clicked:
+        """From the clicked pixel to a position in the rover frame."""
+        pixel = clicked_px(target, self._rig)
+        partner = self._eyes.partner(target.camera)
+        if partner is None:
+            words = f"{target.camera} is in no stereo pair of the mast file: no range"
+            raise PointingError("no_stereo", words)
+        view = self._eyes.named(target.frame_id)
+        if view.frame.camera != target.camera:
+            words = f"frame {target.frame_id} is of camera {view.frame.camera}, not of {target.camera}"
+            raise PointingError("wrong_camera", words)
+        if view.frame.moving:
+            words = f"the head moved while frame {target.frame_id} was exposed; click in another"
+            raise PointingError("head_moving", words)
+        resting = self._rest()
+        with self._step("frames") as detail:
+            fresh = self._eyes.new((target.camera, partner), self._clock.now_s(), resting)
+            now, other = fresh[target.camera], fresh[partner]
+            detail.update(frame_ids=[now.frame.frame_id, other.frame.frame_id])
+            if view.frame.mast_digest != now.frame.mast_digest:
+                raise PointingError(
+                    "other_mast_file", f"frame {target.frame_id} was taken with another mast file"
+                )
+        with self._step("target") as detail:
+            again = self._eyes.again(view, pixel, now)
+            detail.update(facts(again))
+        with self._step("stereo") as detail:
+            partnered = self._eyes.stereo(now, again.pixel_px, other)
+            detail.update(facts(partnered.match), across_px=round(partnered.across_px, 3))
+        assert partnered.plane is not None
+        self._triangulate(now, again.pixel_px, other, partnered.match.pixel_px)
+        return Clicked(view, pixel, partnered.plane)
+
+    def _triangulate(self, one: View, one_px: FloatArray, other: View, other_px: FloatArray) -> None:
+        with self._step("triangulate") as detail:
+            sigma_px = self._settings.triangulation_sigma_px
+            point = triangulate(one.camera, other.camera, one_px, other_px, sigma_px)
+            self._position_m = point.position_m
+            detail.update(
+                position_m=rounded(point.position_m, 5),
+                sigma_m=rounded(np.sqrt(np.diag(point.covariance_m2)), 5),
+                ray_gap_m=round(point.ray_gap_m, 6),
+                range_m=round(point.ranges_m[0], 5),
+            )
+
+    def _point_at(self, clicked: Clicked, aim: Aim, aim_px: FloatArray, pointings: int) -> None:
+        """Point once or twice at the clicked thing and measure each time."""
+        partner = self._eyes.partner(aim.camera)
+        if partner is None and pointings == 2:
+            words = f"a second pointing needs a stereo pair, and {aim.camera} is in none"
+            raise PointingError("no_stereo", words)
+        same_pair = clicked.view.frame.camera in (aim.camera, partner)
+        for number in range(1, pointings + 1):
+            commanded, settled = self._solve_and_go(aim, aim_px, self._rest() if number > 1 else None)
+            views = self._look((aim.camera,) if partner is None else (aim.camera, partner), settled)
+            now = views[aim.camera]
+            with self._step("measure") as detail:
+                seen = self._eyes.look_for(clicked, now)
+                detail.update(facts(seen), predicted_px=rounded(seen.predicted_px))
+                detail.update(residual_px=rounded(seen.pixel_px - aim_px))
+            confirmed = None
+            if partner is not None:
+                with self._step("eyes") as detail:
+                    confirmed, told = self._eyes.agree(clicked, now, seen, views[partner], same_pair)
+                    detail.update(told)
+            self._pointings.append(self._pointing(commanded, now, aim_px, seen))
+            if number < pointings and partner is not None and confirmed is not None:
+                self._triangulate(now, seen.pixel_px, views[partner], confirmed.pixel_px)
+
+    def _solve_and_go(self, aim: Aim, aim_px: FloatArray, resting: Reading | None) -> tuple[Pair, Reading]:
+        """Solve for the present position, move, settle; return the commanded angles and the arrival."""
+        assert self._position_m is not None
+        here = resting or self._head.read()
+        with self._step("solve") as detail:
+            solutions = solve(
+                self._rig.mast,
+                self._rig.cameras[aim.camera].model,
+                self._position_m,
+                aim_px,
+                from_pan_rad=here.pan_rad,
+                from_tilt_rad=here.tilt_rad,
+            )
+            detail.update(solutions=[_told(one) for one in solutions])
+            best = choose(solutions, self._limits.pan_rad, self._limits.tilt_rad, here.pan_rad, here.tilt_rad)
+            detail.update(chosen=_told(best))
+        self._range_m = best.range_m
+        return (best.pan_rad, best.tilt_rad), self._go(best.pan_rad, best.tilt_rad)
+
+    def _go(self, pan_rad: float, tilt_rad: float) -> Reading:
+        """Check the limits, move, wait until settled; return the reading there."""
+        with self._step("limits") as detail:
+            detail.update(pan_rad=pan_rad, tilt_rad=tilt_rad)
+            self._limits.check(pan_rad, tilt_rad)
+        with self._step("move") as detail:
+            allowed_s = self._head.time_allowed_s(pan_rad, tilt_rad)
+            detail.update(pan_rad=pan_rad, tilt_rad=tilt_rad, allowed_s=round(allowed_s, 3))
+            begun_s = self._clock.now_s()
+            self._head.send(pan_rad, tilt_rad)
+        with self._step("settle") as detail:
+            settled = self._head.arrived(pan_rad, tilt_rad, begun_s + allowed_s)
+            detail.update(pan_rad=settled.pan_rad, tilt_rad=settled.tilt_rad)
+        return settled
+
+    def _look(self, cameras: Sequence[str], settled: Reading) -> dict[str, View]:
+        """Take new pictures, exposed after the head had settled."""
+        with self._step("look") as detail:
+            views = self._eyes.new(cameras, settled.time_s, settled)
+            detail.update(frame_ids=[view.frame.frame_id for view in views.values()])
+        return views
+
+    def _pointing(self, commanded: Pair, now: View, aim_px: FloatArray, seen: Match | None) -> Pointing:
+        """Put together what one pointing did."""
+        assert self._position_m is not None
+        place, valid = now.camera.project(self._position_m)
+        return Pointing(
+            commanded_pan_rad=commanded[0],
+            commanded_tilt_rad=commanded[1],
+            measured_pan_rad=now.frame.pan_rad,
+            measured_tilt_rad=now.frame.tilt_rad,
+            camera=now.frame.camera,
+            frame_id=now.frame.frame_id,
+            aim_px=pair(aim_px),
+            predicted_px=pair(place) if bool(valid) else None,
+            target_px=None if seen is None else pair(seen.pixel_px),
+            residual_px=None if seen is None else pair(seen.pixel_px - aim_px),
+            residual_sigma_px=None if seen is None else pair(seen.sigma_px),
+            note=NO_PICTURE_OF_A_POSITION if seen is None else "",
+        )
+
+    # The record
+
+    @contextmanager
+    def _step(self, name: str) -> Iterator[dict[str, Any]]:
+        """Record what happens inside as one step."""
+        self._step_name = name
+        started_s = self._clock.now_s()
+        detail: dict[str, Any] = {}
+        if self._pointings and name != "rest":
+            detail["pointing"] = len(self._pointings) + 1
+        try:
+            self._head.check_not_stopped()
+            yield detail
+        except BaseException as error:
+            code = getattr(error, "code", "internal")
+            detail.update(code=code, message=" ".join(str(error).split()))
+            self._record(Step(name, "failed", started_s, self._clock.now_s() - started_s, detail))
+            raise
+        self._record(Step(name, "done", started_s, self._clock.now_s() - started_s, detail))
+
+    def _so_far(self) -> PointingResult | None:
+        """Return the result with the pointings done, None without any."""
+        if not self._pointings:
+            return None
+        position = None if self._position_m is None else triple(self._position_m)
+        return PointingResult(position, self._range_m, tuple(self._pointings))
+
+    def _stop(self) -> None:
+        """Stop the mast whatever happened; what stops it must not hide why."""
+        try:
+            self._devices.stop()
+        except (MastctlError, DriverError) as error:
+            log.error("the head did not confirm the stop: %s", error)
+
+
+def _told(solution: Solution) -> dict[str, float]:
+    """Return a solution for a step's detail."""
+    return {
+        "pan_rad": round(solution.pan_rad, 6),
+        "tilt_rad": round(solution.tilt_rad, 6),
+        "range_m": round(solution.range_m, 4) if math.isfinite(solution.range_m) else math.nan,
+    }
+
+
+def _without_picture(target: AnglesTarget, settled: Reading) -> Pointing:
+    """Return the pointing of joint angles: where the head rests, and nothing measured."""
+    return Pointing(
+        commanded_pan_rad=target.pan_rad,
+        commanded_tilt_rad=target.tilt_rad,
+        measured_pan_rad=settled.pan_rad,
+        measured_tilt_rad=settled.tilt_rad,
+        camera="",
+        frame_id="",
+        aim_px=None,
+        predicted_px=None,
+        target_px=None,
+        residual_px=None,
+        residual_sigma_px=None,
+        note=NO_TARGET,
+    )

@@ -1,0 +1,175 @@
+"""Moving the head and knowing that it has arrived: deadlines from distance and speed, readings judged."""
+
+from __future__ import annotations
+
+import math
+import threading
+from typing import Protocol
+
+from drivers.clock import Clock
+from drivers.interfaces import Reading
+from mastctl.limits import Limits
+from mastctl.pointing.requests import PointingError, PointingSettings
+
+
+class HeadLike(Protocol):
+    """What of `mastctl.devices.Devices` moves the head."""
+
+    def read(self) -> Reading: ...
+    def move(self, pan_rad: float, tilt_rad: float, speed_rad_per_s: float | None = None) -> None: ...
+    def stop(self) -> None: ...
+
+
+class Head:
+    """The head during one request.
+
+    A reading must be finite, of now, not before the last one, and free of faults; it must be reachable from
+    the last one at twice the speed cap, or lie on the way to the commanded angles (a replayed head is there
+    at once). The head has settled when for a dwell it says that it does not move and its angles
+    rest; it has arrived when it rests where it was sent.
+    """
+
+    def __init__(
+        self,
+        head: HeadLike,
+        limits: Limits,
+        clock: Clock,
+        settings: PointingSettings,
+        cancelled: threading.Event,
+    ) -> None:
+        self._head = head
+        self._limits = limits
+        self._clock = clock
+        self._settings = settings
+        self._cancelled = cancelled
+        self._last: Reading | None = None
+        self._goal: tuple[float, float] | None = None
+
+    def check_not_stopped(self) -> None:
+        """Pass unless the request was cancelled. Raises PointingError ``stopped``."""
+        if self._cancelled.is_set():
+            raise PointingError("stopped", "the operation was stopped")
+
+    def resting(self) -> Reading:
+        """Return the reading of a head that rests now.
+
+        Raises
+        ------
+        PointingError
+            ``head_moving`` if it still moves after ``rest_wait_s``; else as for a reading.
+        DriverError
+            If the head does not answer.
+        """
+        settled, last = self._rests(self._clock.now_s() + self._settings.rest_wait_s, dwell_s=0.0)
+        if not settled:
+            raise PointingError(
+                "head_moving", f"the head still moves after {self._settings.rest_wait_s:g} s of waiting"
+            )
+        return last
+
+    def time_allowed_s(self, pan_rad: float, tilt_rad: float) -> float:
+        """Return the deadline of a move to these angles: distance over speed, ramps, dwell, margin."""
+        here = self.read()
+        distance = max(abs(pan_rad - here.pan_rad), abs(tilt_rad - here.tilt_rad))
+        settings = self._settings
+        return (
+            distance / self._limits.speed_rad_per_s
+            + settings.acceleration_s
+            + settings.dwell_s
+            + settings.margin_s
+        )
+
+    def send(self, pan_rad: float, tilt_rad: float) -> None:
+        """Start the move at the speed cap. Raises OutsideLimits, Stopped, DriverError."""
+        self.check_not_stopped()
+        self._goal = (pan_rad, tilt_rad)
+        self._head.move(pan_rad, tilt_rad)
+
+    def arrived(self, pan_rad: float, tilt_rad: float, deadline_s: float) -> Reading:
+        """Wait until the head rests at these angles and return the reading.
+
+        Raises
+        ------
+        PointingError
+            ``did_not_arrive`` with how far it is off, ``did_not_settle`` if it never rests before the
+            deadline (clock time, seconds), ``stopped``; else as for a reading.
+        DriverError
+            If the head does not answer.
+        """
+        tolerance = self._settings.arrival_tolerance_rad
+        while True:
+            settled, last = self._rests(deadline_s, self._settings.dwell_s)
+            off = last.pan_rad - pan_rad, last.tilt_rad - tilt_rad
+            if settled and max(map(abs, off)) <= tolerance:
+                return last
+            if self._clock.now_s() < deadline_s:
+                continue  # a head that rests elsewhere may not have started yet
+            where = f"pan {off[0]:+.4f} rad and tilt {off[1]:+.4f} rad from the commanded angles"
+            if max(map(abs, off)) > tolerance:
+                words = f"at its deadline the head is {where}, at most {tolerance:g} rad is expected"
+                raise PointingError("did_not_arrive", words)
+            raise PointingError("did_not_settle", f"at its deadline the head still moves, {where}")
+
+    def read(self) -> Reading:
+        """Return a reading that can be true.
+
+        Raises
+        ------
+        PointingError
+            ``bad_reading`` or ``head_fault``.
+        DriverError
+            If the head does not answer.
+        """
+        reading, before = self._head.read(), self._last
+        now_s = self._clock.now_s()
+        if not all(map(math.isfinite, (reading.pan_rad, reading.tilt_rad, reading.time_s))):
+            words = f"the head reads pan {reading.pan_rad}, tilt {reading.tilt_rad} at {reading.time_s} s"
+            raise PointingError("bad_reading", f"{words}: not finite numbers")
+        if reading.faults:
+            raise PointingError("head_fault", f"the head reports: {'; '.join(reading.faults)}")
+        if now_s - reading.time_s > self._settings.reading_age_s:
+            words = f"the head's reading is {now_s - reading.time_s:.2f} s old"
+            raise PointingError(
+                "bad_reading", f"{words}, at most {self._settings.reading_age_s:g} s is taken"
+            )
+        if before is not None:
+            passed_s = reading.time_s - before.time_s
+            if passed_s < 0:
+                raise PointingError("bad_reading", f"the head's time went back by {-passed_s:.3f} s")
+            reach = 2.0 * self._limits.speed_rad_per_s * passed_s + self._settings.jump_rad
+            goal = self._goal or (before.pan_rad, before.tilt_rad)
+            jump = max(
+                _outside(reading.pan_rad, before.pan_rad, goal[0]),
+                _outside(reading.tilt_rad, before.tilt_rad, goal[1]),
+            )
+            if jump > reach:
+                words = f"the head's reading jumped {jump:.3f} rad off its way in {passed_s:.3f} s"
+                raise PointingError("bad_reading", f"{words}, at most {reach:.3f} rad is possible")
+        self._last = reading
+        return reading
+
+    def _rests(self, deadline_s: float, dwell_s: float) -> tuple[bool, Reading]:
+        """Read until the angles rest for a dwell (True) or the deadline passes; return the last reading."""
+        since: Reading | None = None
+        while True:
+            self.check_not_stopped()
+            reading = self.read()
+            if reading.moving or (since is not None and not self._same(reading, since)):
+                since = None
+            elif since is None:
+                since = reading
+            if since is not None and reading.time_s - since.time_s >= dwell_s:
+                return True, reading
+            if self._clock.now_s() >= deadline_s:
+                return False, reading
+            self._clock.sleep(self._settings.poll_s)
+
+    def _same(self, one: Reading, other: Reading) -> bool:
+        """Tell whether two readings differ by no more than a resting head flickers."""
+        apart = max(abs(one.pan_rad - other.pan_rad), abs(one.tilt_rad - other.tilt_rad))
+        return apart <= self._settings.rest_tolerance_rad
+
+
+def _outside(value: float, one: float, other: float) -> float:
+    """Return how far a value lies outside the range between two others."""
+    return max(min(one, other) - value, value - max(one, other), 0.0)
