@@ -26,7 +26,7 @@ from drivers.interfaces import Image
 SAME_RAD = 1e-7
 """Frames whose angles differ by less were taken at one pointing; labels print no finer."""
 
-SCALE_PERCENTILES = (0.1, 99.9)
+SCALE_PERCENTILES = (0.5, 99.5)
 """Of all pixels of a camera's frames: what becomes 0 and 255 where no ``grey_range_dn`` is given."""
 
 SAMPLE_EVERY = 5
@@ -34,6 +34,7 @@ SAMPLE_EVERY = 5
 
 CSV_COLUMNS = ("camera", "pan_rad", "tilt_rad", "file")
 MAX_CSV_BYTES = 1 << 24
+MAX_IMAGE_BYTES = 1 << 30
 
 
 @dataclass(frozen=True)
@@ -187,7 +188,7 @@ def _same_place(one: RecordedFrame, other: RecordedFrame) -> bool:
 def _pixels(path: Path) -> NDArray[np.generic]:
     """The pixels of a PDS3 product or an ordinary image file."""
     try:
-        data = read_bytes(path, pds3.MAX_FILE_BYTES)
+        data = read_bytes(path, MAX_IMAGE_BYTES)
         if pds3.looks_like_pds3(data):
             image: NDArray[np.generic] | None = pds3.read_product(path).image
         else:

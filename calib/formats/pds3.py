@@ -21,8 +21,7 @@ from calib.cahvor import CameraModel, Kind
 from calib.errors import BadFile
 from calib.formats import LARGEST_IMAGE_PX, CameraFile, build_model, digest_of, read_bytes
 from calib.formats.odl import Block, Quantity, integer_in, number_in, parse_label, vector_in
-from calib.formats.pds3_image import MAX_FILE_BYTES as MAX_FILE_BYTES
-from calib.formats.pds3_image import read_pixels
+from calib.formats.pds3_image import MAX_FILE_BYTES, read_pixels
 
 #: A label is looked for in the first bytes of a file; the longest known have some 60 kB.
 MAX_LABEL_BYTES = 1_000_000

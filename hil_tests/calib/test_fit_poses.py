@@ -104,7 +104,7 @@ def test_gauges_of_the_models_change_nothing() -> None:
 
 
 def with_other_r0(model: CameraModel, r0: float) -> CameraModel:
-    """The same camera with R0 replaced: P' = (1 + s) parallel... written out with M = I + s (I - O Oᵀ)."""
+    """The same camera with another R0: A, H, V absorb I + s (I - O Oᵀ), 1 + s = (1 + R0) / (1 + r0)."""
     old = 1.0 + model.R[0]
     s = old / (1.0 + r0) - 1.0
     absorb = np.eye(3) + s * (np.eye(3) - np.outer(model.O, model.O))
