@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import product
 from typing import Any, Protocol
 
 import numpy as np
@@ -13,7 +14,7 @@ from calib.cahvor import CameraModel
 from calib.epipolar import UP, StereoMatch, find_partner
 from calib.errors import CalibError
 from calib.mast import Rig
-from calib.match import Match, match
+from calib.match import Match, MatchSettings, match
 from calib.rigid import FloatArray
 from calib.warp import Grey, Plane, carry, facing_plane, grey
 from drivers.interfaces import Reading
@@ -28,6 +29,7 @@ class CamerasLike(Protocol):
         self, cameras: Sequence[str], exposed_after_s: float, timeout_s: float
     ) -> dict[str, StampedFrame]: ...
     def frame_by_id(self, frame_id: str) -> StampedFrame: ...
+    def newest_frames(self) -> dict[str, StampedFrame | None]: ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,6 +64,23 @@ class Eyes:
             if camera in (left, right):
                 return right if camera == left else left
         return None
+
+    def companions(
+        self, aiming: str, clicked: str, position_m: FloatArray, resting: Reading
+    ) -> tuple[str, ...]:
+        """Return the eyes that can confirm what the aiming one will see: its partner where that sees it too.
+
+        A near target in the middle of one eye may be out of the other's picture (a Pancam at 2 m); then
+        both eyes of another pair on the head serve, the clicked pair first. Empty if none sees it.
+        """
+        partner = self.partner(aiming)
+        if partner is not None and self._sees(partner, position_m, resting):
+            return (partner,)
+        pairs = sorted(self._rig.stereo.values(), key=lambda pair: clicked not in pair)
+        for pair in pairs:
+            if aiming not in pair and all(self._sees(name, position_m, resting) for name in pair):
+                return pair
+        return ()
 
     def named(self, frame_id: str) -> View:
         """Return a kept frame by its id. Raises FrameGone."""
@@ -137,9 +156,12 @@ class Eyes:
             ``target_...`` if the match is not good, ``eyes_disagree`` if it lies off the line.
         """
         settings = self._settings
-        found = find_partner(
-            view.image, view.camera, pixel_px, other.image, other.camera, settings.nearest_m, settings.match
-        )
+        for sizes in self._sizes():
+            found = find_partner(
+                view.image, view.camera, pixel_px, other.image, other.camera, settings.nearest_m, sizes
+            )
+            if found.match.verdict != "weak":
+                break
         _good(found.match, other)
         if abs(found.across_px) > settings.eyes_px + 5.0 * found.across_sigma_px:
             raise PointingError(
@@ -164,11 +186,11 @@ class Eyes:
             planes.append(Plane(clicked.plane.point_m, -ray.directions))  # if the slope was misjudged
         found: list[Match] = []
         for search in (settings.search_px, settings.wide_search_px):
-            for plane in planes:
+            for plane, sizes in product(planes, self._sizes()):
                 found.append(
                     match(
                         clicked.view.image, clicked.view.camera, clicked.pixel_px, plane,
-                        now.image, now.camera, search, settings.match,
+                        now.image, now.camera, search, sizes,
                     )
                 )  # fmt: skip
                 if found[-1].verdict == "good":
@@ -211,10 +233,10 @@ class Eyes:
         along /= max(float(np.linalg.norm(along)), 1e-12)
         along_px, across_px = float(between @ along), float(along[0] * between[1] - along[1] * between[0])
         detail = {
-            "other_frame_id": other.frame.frame_id,
-            "other_px": rounded(confirmed.pixel_px),
-            "eyes_across_px": round(across_px, 3),
-            "eyes_along_px": round(along_px, 3),
+            "frame_id": other.frame.frame_id,
+            "pixel_px": rounded(confirmed.pixel_px),
+            "across_px": round(across_px, 3),
+            "along_px": round(along_px, 3),
         }
         if abs(across_px) > settings.eyes_px or (same_pair and abs(along_px) > settings.range_px):
             raise PointingError(
@@ -224,6 +246,20 @@ class Eyes:
                 f"and {settings.range_px:g} px along is expected",
             )
         return confirmed, detail
+
+    def _sees(self, name: str, position_m: FloatArray, resting: Reading) -> bool:
+        """Tell whether a configured camera has a position well inside its picture."""
+        if name not in self._cameras.newest_frames():
+            return False
+        camera = self._rig.camera_in_rover(name, resting.pan_rad, resting.tilt_rad)
+        place, valid = camera.project(position_m)
+        margin, size = 2.0 * self._settings.match.half_px, np.array(camera.size_px)
+        return bool(valid) and bool(((place >= margin) & (place <= size - 1 - margin)).all())
+
+    def _sizes(self) -> tuple[MatchSettings, MatchSettings]:
+        """Return the matching with the usual patch, and with one that may fit beside an edge."""
+        usual = self._settings.match
+        return usual, replace(usual, half_px=self._settings.small_half_px)
 
     def _view(self, frame: StampedFrame) -> View:
         if not (math.isfinite(frame.pan_rad) and math.isfinite(frame.tilt_rad)):
@@ -252,8 +288,7 @@ def _good(found: Match, view: View) -> Match:
     """Pass a good match. Raises PointingError with the verdict in its code."""
     if found.verdict == "good":
         return found
-    lost = found.verdict in ("weak", "border") and np.isfinite(found.predicted_px).all()
-    code = "target_not_found" if lost and found.correlation > 0.0 else f"target_{found.verdict}"
+    code = "target_not_found" if found.verdict == "weak" else f"target_{found.verdict}"
     raise PointingError(code, f"the target is not found in {view.frame.frame_id}: {found.reason}")
 
 

@@ -17,8 +17,8 @@ from __future__ import annotations
 import logging
 import math
 import threading
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager
 from typing import Any, Protocol
 
 import numpy as np
@@ -36,6 +36,7 @@ from mastctl.errors import MastctlError
 from mastctl.limits import Limits
 from mastctl.pointing.looking import CamerasLike, Clicked, Eyes, View, facts
 from mastctl.pointing.motion import Head, HeadLike
+from mastctl.pointing.record import Recorder
 from mastctl.pointing.requests import (
     Aim,
     AnglesTarget,
@@ -153,10 +154,9 @@ class _Run:
         self._limits = limits
         self._clock = clock
         self._settings = settings
-        self._record = record
         self._head = Head(devices, limits, clock, settings, cancelled)
         self._eyes = Eyes(devices, rig, settings)
-        self._step_name = "request"
+        self._recorder = Recorder(record, clock, self._head.check_not_stopped)
         self._position_m: FloatArray | None = None
         self._range_m: float | None = None
         self._pointings: list[Pointing] = []
@@ -169,7 +169,7 @@ class _Run:
             self._stop()
             code = getattr(error, "code", "failed")
             raise PointingError(
-                code, " ".join(str(error).split()), self._step_name, self._so_far()
+                code, " ".join(str(error).split()), self._recorder.last, self._so_far()
             ) from error
         except BaseException:
             self._stop()
@@ -197,6 +197,10 @@ class _Run:
         self._point_at(self._see(target), aim, aim_px, request.pointings)
 
     # Steps
+
+    def _step(self, name: str) -> AbstractContextManager[dict[str, Any]]:
+        number = len(self._pointings) + 1
+        return self._recorder.step(name, **({"pointing": number} if number > 1 else {}))
 
     def _rest(self) -> Reading:
         with self._step("rest") as detail:
@@ -251,27 +255,36 @@ class _Run:
 
     def _point_at(self, clicked: Clicked, aim: Aim, aim_px: FloatArray, pointings: int) -> None:
         """Point once or twice at the clicked thing and measure each time."""
-        partner = self._eyes.partner(aim.camera)
-        if partner is None and pointings == 2:
-            words = f"a second pointing needs a stereo pair, and {aim.camera} is in none"
-            raise PointingError("no_stereo", words)
-        same_pair = clicked.view.frame.camera in (aim.camera, partner)
+        source = clicked.view.frame.camera
         for number in range(1, pointings + 1):
             commanded, settled = self._solve_and_go(aim, aim_px, self._rest() if number > 1 else None)
-            views = self._look((aim.camera,) if partner is None else (aim.camera, partner), settled)
-            now = views[aim.camera]
+            assert self._position_m is not None
+            companions = self._eyes.companions(aim.camera, source, self._position_m, settled)
+            views = self._look((aim.camera, *companions), settled)
+            now = views.pop(aim.camera)
             with self._step("measure") as detail:
                 seen = self._eyes.look_for(clicked, now)
                 detail.update(facts(seen), predicted_px=rounded(seen.predicted_px))
                 detail.update(residual_px=rounded(seen.pixel_px - aim_px))
-            confirmed = None
-            if partner is not None:
-                with self._step("eyes") as detail:
-                    confirmed, told = self._eyes.agree(clicked, now, seen, views[partner], same_pair)
-                    detail.update(told)
+            confirmed: list[tuple[View, FloatArray]] = [(now, seen.pixel_px)]
+            with self._step("eyes") as detail:
+                detail.update(confirmed_by=list(companions))
+                for name, other in views.items():
+                    same_pair = {aim.camera, name} == {source, self._eyes.partner(source)}
+                    found, detail[name] = self._eyes.agree(clicked, now, seen, other, same_pair)
+                    confirmed.append((other, found.pixel_px))
             self._pointings.append(self._pointing(commanded, now, aim_px, seen))
-            if number < pointings and partner is not None and confirmed is not None:
-                self._triangulate(now, seen.pixel_px, views[partner], confirmed.pixel_px)
+            if number < pointings:
+                self._again(confirmed)
+
+    def _again(self, confirmed: Sequence[tuple[View, FloatArray]]) -> None:
+        """Triangulate from the new pictures: the aiming eye and its partner, or the pair that stood in."""
+        if len(confirmed) < 2:
+            with self._step("triangulate"):
+                words = "a second pointing needs two eyes of a pair that see the target after the first one"
+                raise PointingError("no_stereo", words)
+        (one, one_px), (other, other_px) = confirmed[-2:]
+        self._triangulate(one, one_px, other, other_px)
 
     def _solve_and_go(self, aim: Aim, aim_px: FloatArray, resting: Reading | None) -> tuple[Pair, Reading]:
         """Solve for the present position, move, settle; return the commanded angles and the arrival."""
@@ -332,26 +345,6 @@ class _Run:
             residual_sigma_px=None if seen is None else pair(seen.sigma_px),
             note=NO_PICTURE_OF_A_POSITION if seen is None else "",
         )
-
-    # The record
-
-    @contextmanager
-    def _step(self, name: str) -> Iterator[dict[str, Any]]:
-        """Record what happens inside as one step."""
-        self._step_name = name
-        started_s = self._clock.now_s()
-        detail: dict[str, Any] = {}
-        if self._pointings and name != "rest":
-            detail["pointing"] = len(self._pointings) + 1
-        try:
-            self._head.check_not_stopped()
-            yield detail
-        except BaseException as error:
-            code = getattr(error, "code", "internal")
-            detail.update(code=code, message=" ".join(str(error).split()))
-            self._record(Step(name, "failed", started_s, self._clock.now_s() - started_s, detail))
-            raise
-        self._record(Step(name, "done", started_s, self._clock.now_s() - started_s, detail))
 
     def _so_far(self) -> PointingResult | None:
         """Return the result with the pointings done, None without any."""

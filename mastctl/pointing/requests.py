@@ -140,8 +140,8 @@ class PointingError(MastctlError):
     code
         For programs. Own codes: ``stopped``, ``unknown_camera``, ``wrong_camera``, ``bad_aim``,
         ``bad_request``, ``outside_image``, ``other_mast_file``, ``no_stereo``, ``head_fault``,
-        ``head_moving``, ``bad_reading``, ``did_not_arrive``, ``did_not_settle``, ``not_in_view``,
-        ``target_flat``, ``target_ambiguous``, ``target_weak``, ``target_border``, ``target_not_found``,
+        ``head_moving``, ``bad_reading``, ``no_fresh_frame``, ``did_not_arrive``, ``did_not_settle``,
+        ``not_in_view``, ``target_flat``, ``target_ambiguous``, ``target_border``, ``target_not_found``,
         ``eyes_disagree``. A code of a driver, of the limits or of the geometry passes through.
     step
         The step that failed.
@@ -186,7 +186,7 @@ class PointingSettings:
     rest_wait_s
         How long a request waits for a head that still moves.
     frame_timeout_s
-        For a new picture.
+        For a new picture: some frames of a slow camera, on a busy machine.
     same_pose_rad
         Joint angles nearer than this are one pose: a tenth of a Pancam pixel.
     nearest_m
@@ -200,8 +200,9 @@ class PointingSettings:
         put down to calibration: the paper's mast fit leaves 1.1 px rms.
     triangulation_sigma_px
         Of a pixel for the position's covariance: matching and calibration together.
-    match
-        Of the matching itself.
+    match, small_half_px
+        Of the matching itself; and the half patch that is tried where the usual one fits nowhere, because
+        part of it lies on something nearer or farther.
     """
 
     poll_s: float = 0.02
@@ -213,7 +214,7 @@ class PointingSettings:
     reading_age_s: float = 1.0
     jump_rad: float = 0.035
     rest_wait_s: float = 2.0
-    frame_timeout_s: float = 5.0
+    frame_timeout_s: float = 8.0
     same_pose_rad: float = 3e-5
     nearest_m: float = 0.4
     search_px: float = 48.0
@@ -221,6 +222,7 @@ class PointingSettings:
     eyes_px: float = 2.0
     range_px: float = 4.0
     triangulation_sigma_px: float = 0.2
+    small_half_px: int = 12
     match: MatchSettings = field(default_factory=MatchSettings)
 
 
