@@ -36,7 +36,7 @@ _LETTERS = {
 
 
 class Prediction(NamedTuple):
-    """Pixels (n, 2), their derivatives to the camera's step (n, 2, p) and to the points (n, 2, 3), valid (n,)."""
+    """Pixels (n, 2), d pixel / d step (n, 2, p), d pixel / d point (n, 2, 3), and which are valid (n,)."""
 
     pixels_px: FloatArray
     d_step: FloatArray
@@ -130,7 +130,7 @@ def predict(model: CameraModel, points_m: FloatArray) -> Prediction:
 
 
 class Slopes(NamedTuple):
-    """Of one call: d pixel / d q (n, 2, 3), q / (A.q) (n, 3), pixels (n, 2), d_q along O and times lambda (n, 2)."""
+    """d pixel / d q (n, 2, 3), q / (A.q) (n, 3), pixels (n, 2), and d_q along O and times lambda (n, 2)."""
 
     d_q: FloatArray
     q: FloatArray
