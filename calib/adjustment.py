@@ -46,7 +46,7 @@ E_SIGMA_M = 0.01
 these; a survey that sees a lens well does not feel them, and one that does not cannot run away with it."""
 
 HUBER = 3.0
-"""Length of a residual, in sigmas, from which its pull no longer grows while blunders are still looked for."""
+"""Length of a residual, in sigmas, from which its pull no longer grows while blunders are looked for."""
 
 Key = Hashable
 MAST: Key = ("mast",)
@@ -246,7 +246,7 @@ class Adjustment:
         )
 
     def cost(self, state: Estimate) -> float:
-        """Return the weighted sum of squares, pulls bounded if asked for; infinite where a dot has no pixel."""
+        """Return the weighted sum of squares (pulls bounded if asked); infinite where a dot has no pixel."""
         total = 0.0
         for residual, width in self._residuals(state):
             if not np.isfinite(residual).all():
@@ -282,7 +282,7 @@ class Adjustment:
         return Normal(cost, matrix, gradient)
 
     def blocks(self, state: Estimate) -> Iterator[tuple[ImageTerm | StationTerm | str, Block]]:
-        """Yield every group that counts with its residuals and Jacobian; a name for what is known beforehand."""
+        """Yield every group that counts, residuals and Jacobian; a name for what is known beforehand."""
         for image in self.images:
             if image.keep.any():
                 yield image, self.image_block(state, image)
@@ -323,7 +323,7 @@ class Adjustment:
         keep = image.keep
         board = state.rover_from_board[image.board]
         points = board.points(image.in_board_m[keep])
-        parts, columns = [], [self._at(("camera", image.camera))]
+        parts, columns = [], [self.at(("camera", image.camera))]
         if image.attitude is None:
             seen = predict(state.cameras[image.camera], points)
             in_rover = seen.d_points
@@ -334,13 +334,13 @@ class Adjustment:
             in_rover = seen.d_points @ head.rotation.T
             parts.append(seen.d_step)
             wanted = list(self.mast_free)
-            columns.append(self._at(MAST))
+            columns.append(self.at(MAST))
             if self.joint_rad > 0:
                 wanted += [8, 9]
-                columns.append(self._at(("attitude", image.attitude)))
+                columns.append(self.at(("attitude", image.attitude)))
             parts.append(-gimbal_rates(in_rover, points, head, np.array(wanted, dtype=int)))
-        parts.append(_rigid_rates(in_rover, points, board.translation_m))
-        columns.append(self._at(("board", image.board)))
+        parts.append(rigid_rates(in_rover, points, board.translation_m))
+        columns.append(self.at(("board", image.board)))
         sigma = image.sigma_px[keep]
         residual = (seen.pixels_px - image.pixels_px[keep]) / sigma[:, None]
         jacobian = np.concatenate(parts, axis=2) / sigma[:, None, None]
@@ -359,15 +359,15 @@ class Adjustment:
         """One point of the station."""
         setup = state.rover_from_station[point.setup]
         eye = np.eye(3)[None]
-        parts = [_rigid_rates(eye, setup.points(point.position_m)[None], setup.translation_m)]
-        columns = [self._at(("setup", point.setup))]
+        parts = [rigid_rates(eye, setup.points(point.position_m)[None], setup.translation_m)]
+        columns = [self.at(("setup", point.setup))]
         if point.board is not None:
             board = state.rover_from_board[point.board]
-            parts.append(-_rigid_rates(eye, board.points(point.in_board_m)[None], board.translation_m))
-            columns.append(self._at(("board", point.board)))
+            parts.append(-rigid_rates(eye, board.points(point.in_board_m)[None], board.translation_m))
+            columns.append(self.at(("board", point.board)))
         elif self.prism_cad_m > 0:
             parts.append(-eye)
-            columns.append(self._at(("prism", point.point)))
+            columns.append(self.at(("prism", point.point)))
         jacobian = np.concatenate(parts, axis=2)[0] / point.sigma_m
         return Block(self.station_residual(state, point), jacobian, np.concatenate(columns), width=3)
 
@@ -376,23 +376,24 @@ class Adjustment:
         for name, model in state.cameras.items():
             if "O" in model.kind:
                 residual, jacobian = lens_knowledge(model)
-                yield f"lens {name}", Block(residual, jacobian, self._at(("camera", name)), width=1)
+                yield f"lens {name}", Block(residual, jacobian, self.at(("camera", name)), width=1)
         if self.prism_cad_m > 0:
             for name, place in state.prisms_in_rover_m.items():
                 residual = (place - self.prisms_cad_m[name]) / self.prism_cad_m
                 yield (
                     f"prism {name}",
-                    Block(residual, np.eye(3) / self.prism_cad_m, self._at(("prism", name)), width=1),
+                    Block(residual, np.eye(3) / self.prism_cad_m, self.at(("prism", name)), width=1),
                 )
         if self.joint_rad > 0:
             for index, joints in enumerate(state.joints_rad):
-                at = self._at(("attitude", index))
+                at = self.at(("attitude", index))
                 yield (
                     f"attitude {index}",
                     Block(joints / self.joint_rad, np.eye(2) / self.joint_rad, at, width=1),
                 )
 
-    def _at(self, key: Key) -> np.ndarray:
+    def at(self, key: Key) -> np.ndarray:
+        """Return the indices of an unknown's numbers."""
         part = self.parts[key]
         return np.arange(part.start, part.stop)
 
@@ -435,7 +436,7 @@ def gimbal_rates(per_point: FloatArray, points_m: FloatArray, head: Gimbal, want
     return np.stack(columns, axis=-1) if columns else np.zeros((*per_point.shape[:2], 0))
 
 
-def _rigid_rates(per_point: FloatArray, points_m: FloatArray, origin_m: FloatArray) -> FloatArray:
+def rigid_rates(per_point: FloatArray, points_m: FloatArray, origin_m: FloatArray) -> FloatArray:
     """(n, m, 6): rates of something per point (n, m, 3) for a shift and a turn about ``origin_m``."""
     arm = points_m - origin_m
     moment = np.cross(arm[:, None, :], per_point)

@@ -86,7 +86,7 @@ def stepped(model: CameraModel, step: FloatArray) -> CameraModel:
         changed["R"] = model.R + np.concatenate([[0.0], parts["R"]])
     if "E" in parts:
         changed["E"] = model.E + parts["E"]
-    return replace(model, **changed)
+    return replace(model, **changed)  # type: ignore[arg-type]  # letters only
 
 
 def predict(model: CameraModel, points_m: FloatArray) -> Prediction:

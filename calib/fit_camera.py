@@ -241,7 +241,8 @@ class _Points:
         cost, matrix, gradient = float(residual @ residual), jacobian.T @ jacobian, jacobian.T @ residual
         if "O" in state.kind:
             known, rows = lens_knowledge(state)
-            cost, matrix, gradient = cost + known @ known, matrix + rows.T @ rows, gradient + rows.T @ known
+            cost, matrix = cost + float(known @ known), matrix + rows.T @ rows
+            gradient = gradient + rows.T @ known
         return Normal(cost if np.isfinite(cost) else float("inf"), matrix, gradient)
 
     def cost(self, state: CameraModel) -> float:
@@ -295,4 +296,5 @@ def _fit_from(
     freedom = max(2 * int(used.sum()) - len(weak), 1)
     unit_weight = float(np.sum((residuals[used] / sigma_px) ** 2)) / freedom
     covariance = max(unit_weight, 1.0) * np.linalg.inv(found.normal.matrix + np.diag(weak))
-    return CameraFit(model, covariance, residuals, used, np.sqrt((residuals[used] ** 2).mean(axis=0)))
+    rms_px = np.asarray(np.sqrt(np.mean(residuals[used] ** 2, axis=0)), dtype=np.float64)
+    return CameraFit(model, covariance, residuals, used, rms_px)

@@ -68,8 +68,8 @@ def fit_joint(survey: Survey, mast_parameters: int = 6) -> Calibration:
 
 
 def joint_problem(survey: Survey, from_here: Start, mast_parameters: int) -> Adjustment:
-    """Return the least-squares problem of a survey, doubtful images and bent tapes left out."""
-    return Adjustment(
+    """Return the least-squares problem of a survey, without images that disagree with the start."""
+    problem = Adjustment(
         with_kept(from_here.images, from_here.doubtful),
         from_here.station,
         from_here.estimate,
@@ -79,6 +79,10 @@ def joint_problem(survey: Survey, from_here: Start, mast_parameters: int) -> Adj
         joint_rad=survey.sigma.joint_rad,
         huber=HUBER,
     )
+    unseen = {
+        t.name for t in problem.images if not np.isfinite(problem.image_residual(from_here.estimate, t)).all()
+    }
+    return problem.with_terms(with_kept(problem.images, unseen), problem.station)
 
 
 def without_blunders(problem: Adjustment, from_here: Start) -> tuple[Adjustment, Minimum[Estimate]]:

@@ -70,6 +70,7 @@ def fit_mast(
     *,
     expected_px: float = 1.0,
     rough: FloatArray | None = None,
+    keep_all: bool = False,
 ) -> MastFit:
     """Fit 4, 6 or 8 numbers of the mast to images at many joint angles, the cameras taken as known.
 
@@ -83,6 +84,8 @@ def fit_mast(
         Residual rms to expect.
     rough
         (8,) where to start; else an upright mast under the cameras.
+    keep_all
+        Leave no image out and refuse no fit: for a mast of four parameters, which need not explain anything.
 
     Raises
     ------
@@ -95,16 +98,16 @@ def fit_mast(
     for start in [rough] if rough is not None else _starts(views):
         if mast_parameters == 4 and start[3:5].any() and rough is None:
             continue
-        found = _fit_from(start, views, mast_parameters, expected_px)
+        found = _fit_from(start, views, mast_parameters, expected_px, keep_all)
         if best is None or found[0] < best[0]:
             best = found
         if best[0] < 3 * expected_px:
             break
-    if best is None or (best[0] > GROSS * expected_px and mast_parameters != 4):
+    if best is None or (best[0] > GROSS * expected_px and not keep_all):
         left = np.inf if best is None else best[0]
         raise MastNotFitted(
             f"no mast explains the images: the best one leaves {left:.1f} px where some {expected_px:.2g} px "
-            "are expected; check pan and tilt (radians, right and up positive) and the placement of each image"
+            "are expected; check pan and tilt (radians, right and up positive) and each image's placement"
         )
     return best[1]
 
@@ -115,7 +118,7 @@ def _starts(views: Sequence[MastView]) -> list[FloatArray]:
     starts = []
     for lean in LEAN_STARTS_RAD:
         for height in HEIGHT_STARTS_M:
-            starts.append(np.array([*centre, *lean, 0.0, 0.0, 0.0]) + [0, 0, height, 0, 0, 0, 0, 0])
+            starts.append(np.array([*centre[:2], centre[2] + height, *lean, 0.0, 0.0, 0.0]))
     return starts
 
 
@@ -158,7 +161,7 @@ def mast_residual(view: MastView, mast: FloatArray) -> FloatArray:
 
 
 def _carried(view: MastView, mast: FloatArray, free: np.ndarray) -> tuple[FloatArray, FloatArray]:
-    """Points as they would lie in the rover frame were the head at its reference, and d / d mast (n, 3, k)."""
+    """Points as they would lie in the rover frame were the head at its reference; d / d mast (n, 3, k)."""
     now, then = gimbal(mast, *view.joints_rad), gimbal(mast, *view.reference_rad)
     back_from_now = then.rotation @ now.rotation.T
     carried = (view.points_m - now.translation_m) @ back_from_now.T + then.translation_m
@@ -171,7 +174,7 @@ def _carried(view: MastView, mast: FloatArray, free: np.ndarray) -> tuple[FloatA
 
 
 def _fit_from(
-    start: FloatArray, views: Sequence[MastView], mast_parameters: int, expected_px: float
+    start: FloatArray, views: Sequence[MastView], mast_parameters: int, expected_px: float, keep_all: bool
 ) -> tuple[float, MastFit]:
     """Typical residual of an image and the fit, from a start."""
     free = np.array(MAST_FREE[mast_parameters])
@@ -184,7 +187,7 @@ def _fit_from(
         ).state
     rms = np.array([_rms(mast_residual(view, mast)) for view in views])
     typical = float(np.median(rms))
-    good = rms <= GROSS * max(typical, expected_px)
+    good = (rms <= GROSS * max(typical, expected_px)) | keep_all
     kept = [view for view, keep in zip(views, good, strict=True) if keep]
     if np.isfinite(typical) and kept:
         sigmas = [np.ones(len(view.points_m)) for view in kept]

@@ -9,13 +9,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import combinations
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from calib.adjustment import MAST_NAMES, Estimate, ImageTerm, StationTerm
 from calib.cahvor import CameraModel
+from calib.calibration import Outlier
 from calib.errors import CalibError
 from calib.fit_camera import CameraNotFitted, fit_camera
 from calib.fit_mast import MastNotFitted, MastView, fit_mast
@@ -27,7 +28,7 @@ SAME_ANGLE_RAD = 1e-3
 """Joint readings this close are one joint setting for a start."""
 
 SHAPE = 5.0
-"""Tapes or prisms whose mutual distances are off by more than this many sigmas are not trusted for a start."""
+"""Tapes or prisms that are off their drawing by more than this many sigmas are not trusted for a start."""
 
 
 class SurveyNotFitted(CalibError):
@@ -39,7 +40,8 @@ class Start:
     """A start: terms of the fit, the state to begin with, and images that did not agree with it.
 
     ``reference_rad`` holds, for each head camera, the joint setting at which it was calibrated, and
-    ``in_rover`` the cameras there, in the rover frame.
+    ``in_rover`` the cameras there, in the rover frame. ``bent`` are placements whose tapes do not fit the
+    board, ``blunders`` prisms that the set-ups' poses were found without.
     """
 
     images: tuple[ImageTerm, ...]
@@ -50,6 +52,8 @@ class Start:
     reference_rad: Mapping[str, tuple[float, float]]
     in_rover: Mapping[str, CameraModel]
     expected_px: Mapping[str, float]
+    bent: frozenset[tuple[str, str]]
+    blunders: tuple[Outlier, ...]
     notes: tuple[str, ...]
 
 
@@ -64,8 +68,9 @@ def start(survey: Survey, mast_parameters: int, *, only_camera_images: bool = Fa
         If a set-up, a camera or the mast cannot be started; the sentence says what is missing.
     """
     notes: list[str] = []
-    rover_from_station, crooked = _setups(survey)
-    rover_from_board, bent = _boards(survey, rover_from_station)
+    blunders: list[Outlier] = []
+    rover_from_station = _setups(survey, blunders, notes)
+    rover_from_board, bent = _boards(survey, rover_from_station, notes)
     images, checks, joints = _image_terms(survey, rover_from_board, notes)
     doubtful: set[str] = set()
     in_rover, reference, expected = {}, {}, {}
@@ -105,12 +110,14 @@ def start(survey: Survey, mast_parameters: int, *, only_camera_images: bool = Fa
     return Start(
         tuple(images),
         tuple(t for t in checks if t.camera in cameras),
-        _station_terms(survey, rover_from_board, crooked),
+        _station_terms(survey, rover_from_board),
         estimate,
         frozenset(doubtful),
         reference,
         in_rover,
         expected,
+        frozenset(bent),
+        tuple(blunders),
         tuple(notes),
     )
 
@@ -122,26 +129,32 @@ def aligned(to_m: FloatArray, from_m: FloatArray) -> Rigid:
     return Rigid(rotation.as_matrix(), to_mean - rotation.apply(from_mean))
 
 
-def _aligned_without_blunder(to_m: FloatArray, from_m: FloatArray, sigma_m: float) -> tuple[Rigid, bool]:
-    """The alignment, leaving out the one point (of four or more) whose leaving helps by far; is it good?"""
+class Alignment(NamedTuple):
+    """An alignment, how many sigmas its worst coordinate is off, and the point left out, if any."""
 
-    def misfit(rows: Sequence[int]) -> tuple[float, Rigid]:
-        pose = aligned(to_m[list(rows)], from_m[list(rows)])
-        worst = np.abs(to_m[list(rows)] - pose.points(from_m[list(rows)])).max()
-        return float(worst) / sigma_m, pose
-
-    everything, pose = misfit(range(len(to_m)))
-    if everything <= SHAPE or len(to_m) < 4:
-        return pose, everything <= SHAPE
-    best, pose = min(
-        (misfit(rows) for rows in combinations(range(len(to_m)), len(to_m) - 1)), key=lambda f: f[0]
-    )
-    return pose, best <= SHAPE
+    pose: Rigid
+    misfit: float
+    left_out: int | None
 
 
-def _setups(survey: Survey) -> tuple[dict[str, Rigid], set[str]]:
-    """rover_from_station of every set-up, and set-ups whose prisms do not fit the drawing."""
-    found, crooked = {}, set()
+def _aligned_without_blunder(to_m: FloatArray, from_m: FloatArray, sigma_m: float) -> Alignment:
+    """The alignment, without the one point (of four or more) whose leaving helps by far."""
+
+    def without(row: int | None) -> Alignment:
+        rows = np.array([i for i in range(len(to_m)) if i != row])
+        pose = aligned(to_m[rows], from_m[rows])
+        worst = float(np.abs(to_m[rows] - pose.points(from_m[rows])).max())
+        return Alignment(pose, worst / sigma_m, row)
+
+    found = without(None)
+    if found.misfit <= SHAPE or len(to_m) < 4:
+        return found
+    return min((without(row) for row in range(len(to_m))), key=lambda a: a.misfit)
+
+
+def _setups(survey: Survey, blunders: list[Outlier], notes: list[str]) -> dict[str, Rigid]:
+    """rover_from_station of every set-up."""
+    found = {}
     sigma = float(np.hypot(survey.sigma.station_m, survey.sigma.prism_cad_m))
     for setup in dict.fromkeys(p.setup for p in survey.station):
         prisms = [p for p in survey.station if p.setup == setup and p.kind == "prism"]
@@ -152,14 +165,22 @@ def _setups(survey: Survey) -> tuple[dict[str, Rigid], set[str]]:
             )
         cad = np.array([survey.prisms_in_rover_m[p.point] for p in prisms])
         measured = np.array([p.position_m for p in prisms])
-        found[setup], good = _aligned_without_blunder(cad, measured, sigma)
-        if not good:
-            crooked.add(setup)
-    return found, crooked
+        pose, misfit, row = _aligned_without_blunder(cad, measured, sigma)
+        found[setup] = pose
+        if row is not None and misfit <= SHAPE:
+            off = float(np.linalg.norm(pose.points(measured[row]) - cad[row]))
+            name = f"prism {prisms[row].point} of set-up {setup}"
+            blunders.append(Outlier("prism", name, (off / sigma) ** 2, SHAPE**2, off))
+        elif misfit > SHAPE:
+            notes.append(
+                f"the prisms of set-up {setup} are off their CAD positions by {misfit:.0f} sigmas, and "
+                "leaving out no single one helps: measure them again"
+            )
+    return found
 
 
 def _boards(
-    survey: Survey, rover_from_station: Mapping[str, Rigid]
+    survey: Survey, rover_from_station: Mapping[str, Rigid], notes: list[str]
 ) -> tuple[dict[tuple[str, str], Rigid], set[tuple[str, str]]]:
     """rover_from_board of every placement with three tapes, and those whose tapes do not fit the board."""
     found, bent = {}, set()
@@ -173,9 +194,14 @@ def _boards(
         if len(points) < 3:
             continue
         measured, drawn = (np.array(part) for part in zip(*points, strict=True))
-        found[board], good = _aligned_without_blunder(measured, drawn, survey.sigma.station_m)
-        if not good:
+        pose, misfit, _ = _aligned_without_blunder(measured, drawn, survey.sigma.station_m)
+        found[board] = pose
+        if misfit > SHAPE:
             bent.add(board)
+            notes.append(
+                f"the tapes of placement {board[1]} (set-up {board[0]}) are off the board's by "
+                f"{misfit:.0f} sigmas"
+            )
     return found, bent
 
 
@@ -183,7 +209,8 @@ def _image_terms(
     survey: Survey, boards: Mapping[tuple[str, str], Rigid], notes: list[str]
 ) -> tuple[list[ImageTerm], list[ImageTerm], dict[tuple[object, ...], int]]:
     """Terms of the fitted and of the check images, and the head's attitudes among the former."""
-    fitted, checks = [], []
+    fitted: list[ImageTerm] = []
+    checks: list[ImageTerm] = []
     joints: dict[tuple[object, ...], int] = {}
     for image in survey.images:
         dots = survey.dots.get(image.name)
@@ -191,7 +218,8 @@ def _image_terms(
             continue
         if (image.setup, image.placement) not in boards:
             notes.append(
-                f"image {image.name} is not used: placement {image.placement} of set-up {image.setup} has no three tapes"
+                f"image {image.name} is not used: placement {image.placement} of set-up {image.setup} "
+                "has no three tapes"
             )
             continue
         attitude = None
@@ -218,9 +246,7 @@ def _image_terms(
     return fitted, checks, joints
 
 
-def _station_terms(
-    survey: Survey, boards: Mapping[tuple[str, str], Rigid], crooked: set[str]
-) -> tuple[StationTerm, ...]:
+def _station_terms(survey: Survey, boards: Mapping[tuple[str, str], Rigid]) -> tuple[StationTerm, ...]:
     """Terms of prisms and of the tapes of every board."""
     terms = []
     for p in survey.station:
@@ -259,7 +285,7 @@ def _largest_setting(
 def _expected_px(
     survey: Survey, name: str, group: Sequence[ImageTerm], boards: Mapping[tuple[str, str], Rigid]
 ) -> float:
-    """Residual to expect with boards taken as exact: the station's noise seen from the camera, and the dots'."""
+    """Residual to expect with boards taken as exact: the noise of station and dots, seen by the camera."""
     sigma = survey.sigma
     prisms = np.mean(list(survey.prisms_in_rover_m.values()), axis=0)
     ranges = [np.linalg.norm(boards[t.board].translation_m - prisms) for t in group]
@@ -329,11 +355,11 @@ def _mast(
         return np.array([*centre, 0.0, 0.0, 0.0, 0.0, 0.0])
     # Cameras fitted to few boards are off by more, away from where these stood, than their own residuals.
     try:
-        fit = fit_mast(away, min(mast_parameters, 6), expected_px=3 * max(expected[n] for n in reference))
+        typical = 3 * max(expected[n] for n in reference)
+        fit = fit_mast(away, min(mast_parameters, 6), expected_px=typical, keep_all=mast_parameters == 4)
     except MastNotFitted as error:
         raise SurveyNotFitted(f"mast: {error}") from None
-    if mast_parameters != 4:
-        doubtful.update(fit.left_out)
+    doubtful.update(fit.left_out)
     return fit.mast
 
 

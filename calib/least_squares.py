@@ -19,7 +19,7 @@ State = TypeVar("State")
 FIRST_DAMPING, LARGEST_DAMPING = 1e-4, 1e9
 
 NOTHING = 1e-18
-"""A gain in the weighted sum of squares that is none, whatever the cost: data without noise have none left."""
+"""A gain in the weighted sum of squares that is none, whatever the cost: noise-free data have none left."""
 
 
 class Normal(NamedTuple):

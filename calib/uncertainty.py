@@ -84,7 +84,7 @@ def pixel_rates(
 def pixel_covariance(
     calibration: Calibration, camera: str, pan_rad: float, tilt_rad: float, points_m: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Return predicted pixels (n, 2) of rover-frame points (n, 3), metres, and their covariances (n, 2, 2), px².
+    """Return predicted pixels (n, 2) of rover-frame points (n, 3), metres, and covariances (n, 2, 2), px².
 
     What is uncertain is the calibration; points and joint angles count as exact. Points that have no
     pixel come out as not-a-number.
@@ -158,7 +158,7 @@ def pointing_covariance(
 
 
 def moved_rig(calibration: Calibration, columns: np.ndarray, step: FloatArray) -> Rig:
-    """Return the rig with the parameters at ``columns`` moved by ``step``: a draw from the covariance, say."""
+    """Return the rig with the parameters at ``columns`` moved by ``step``, such as a draw from the covariance."""
     rig = calibration.rig
     whole = np.zeros(len(calibration.parameter_names))
     whole[columns] = step
@@ -213,8 +213,8 @@ def _reason(problem: Adjustment, parameters: Sequence[str]) -> str:
         if still:
             return (
                 f"{what}: {' and '.join(still)} hardly moved between the head images "
-                f"(pan {np.degrees(pan):.1f}°, tilt {np.degrees(tilt):.1f}°); take images of purpose mast over "
-                f"the range of {' and '.join(still)} that will be used"
+                f"(pan {np.degrees(pan):.1f}°, tilt {np.degrees(tilt):.1f}°); take images of purpose mast "
+                f"over the range of {' and '.join(still)} that will be used"
             )
     if cameras:
         name = sorted(cameras)[0]
@@ -236,11 +236,11 @@ def _words(parameter: str) -> str:
 def lens_notes(
     rig: Rig, sigma: Mapping[str, Any], limits: Mapping[str, Sequence[float]], part: float = 0.7
 ) -> tuple[str, ...]:
-    """Return a sentence for each lens that the survey hardly sees, so that usual lenses decide.
+    """Return a sentence for what the survey hardly sees of lenses, so that usual lenses decide.
 
     ``limits`` gives the sigma of what lenses are usually like, by letter.
     """
-    notes = []
+    by_words: dict[str, list[str]] = {}
     for name, camera in rig.cameras.items():
         held = []
         for letter, word in (("O", "lens axis"), ("R", "distortion"), ("E", "entrance point")):
@@ -251,8 +251,9 @@ def lens_notes(
             if (found > part * np.array(limits[letter])[: len(found)]).any():
                 held.append(word)
         if held:
-            notes.append(
-                f"camera {name}: the survey hardly shows its {' and '.join(held)}, so what lenses are usually "
-                "like decides; pixels beyond the dots suffer"
-            )
-    return tuple(notes)
+            by_words.setdefault(" and ".join(held), []).append(name)
+    return tuple(
+        f"the survey hardly shows {words} of {', '.join(names)}, so what lenses are usually like decides; "
+        "pixels beyond the dots suffer"
+        for words, names in by_words.items()
+    )

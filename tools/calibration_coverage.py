@@ -2,9 +2,9 @@
 
     .venv/bin/python tools/calibration_coverage.py --surveys 100 --seed 1
 
-Prints, over the surveys, how often the 95 % interval of each mast parameter and of predicted pixels (points
-at 2 to 10 m, three directions, every camera) holds the truth, both pooled, and how the weighted sum of squares
-compares with its chi-square.
+Prints, over the surveys, how often the 95 % interval of each mast parameter and of predicted pixels
+(points at 2 to 10 m, three directions, every camera) holds the truth, both pooled, and how the weighted sum
+of squares compares with its chi-square.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Surveys made in memory from a true rig: station, boards and pixels by numpy and SciPy's rotations alone.
 
-The plan is the paper's (section III, Table II, Fig. 4): both head pairs at one joint setting each, eight boards
-for each pair; eight boards over the mast's range of pan and tilt; the Hazcams in a second set-up.
+The plan is the paper's (section III, Table II, Fig. 4): both head pairs at one joint setting each, eight
+boards for each pair; eight boards over the mast's range of pan and tilt; the Hazcams in a second set-up.
 """
 
 from __future__ import annotations
@@ -51,6 +51,7 @@ class Plan:
     tilt_rad: tuple[float, float] = (-0.1, -0.8)
     checks: int = 3
     hazcam: bool = True
+    one_tilt_rad: float | None = None
     setups: int = 1
 
 
@@ -108,7 +109,7 @@ class _Making:
     def _place(
         self, setup: str, placement: str, view: Rigid, range_m: float, right: float, up: float
     ) -> Rigid:
-        """A board seen from a head-like frame (x ahead) some radians aside, facing it within some 20 degrees."""
+        """A board seen from a head-like frame (x ahead) some radians aside, facing it within 30 degrees."""
         base = Rotation.from_matrix(view.rotation)
         ahead = base * Rotation.from_rotvec([0, 0, right]) * Rotation.from_rotvec([0, up, 0])
         facing = ahead * Rotation.from_matrix([[0, 0, 1], [1, 0, 0], [0, 1, 0]])
@@ -163,6 +164,7 @@ class _Making:
             self._set_up(setup)
         for pair, (tilt, parts) in rings.items():
             cameras = [n for n in head if n.startswith(pair)]
+            tilt = tilt if plan.one_tilt_rad is None else plan.one_tilt_rad
             view = rover_from_head(self.rig.mast, 0.0, tilt)
             for range_m, right, up in parts if cameras else ():
                 for index, (x, y) in enumerate(corners[: plan.ring]):
@@ -175,6 +177,7 @@ class _Making:
         downs = downs[np.argsort(np.arange(count) * 7 % max(count, 1), kind="stable")]
         for index, place in enumerate(rng.permutation(np.linspace(-1, 1, count))):
             tilt = plan.tilt_rad[0] + (plan.tilt_rad[1] - plan.tilt_rad[0]) * downs[index]
+            tilt = tilt if plan.one_tilt_rad is None else plan.one_tilt_rad
             range_m = float(np.clip(1.2 / np.sin(max(-tilt, 0.1) + 0.02), 2.0, 10.0))
             purpose = "mast" if index < plan.mast_boards else "check"
             setup = setups[index % len(setups)]
