@@ -62,7 +62,10 @@ class SurveyCamera:
 
 @dataclass(frozen=True, eq=False)
 class StationPoint:
-    """A row of station.csv: a point (3,), metres, in the station frame of its set-up."""
+    """A row of station.csv: a point (3,), metres, in the station frame of its set-up.
+
+    ``row`` is the line of the file, the header being line 1.
+    """
 
     setup: str
     kind: Literal["prism", "tape", "check"]
@@ -74,7 +77,12 @@ class StationPoint:
 
 @dataclass(frozen=True, eq=False)
 class SurveyImage:
-    """A row of images.csv; body cameras have no angles (None)."""
+    """A row of images.csv; body cameras have no angles (None).
+
+    ``file`` is relative to the survey's folder, ``Path()`` where there is no picture but only dots.
+    ``placement`` is empty for a check image without a board. ``row`` is the line of the file, the header
+    being line 1.
+    """
 
     name: str
     camera: str
