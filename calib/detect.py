@@ -1,15 +1,15 @@
 """Find the dot board in an image: which dots, where to a few hundredths of a pixel, and how surely.
 
-Spots that look like dots (``dot_candidates``) are grown into a grid (``dot_grid``), counted in the order that
-the prediction tells (``dot_order``), fitted to the grey levels (``dot_refine``), and corrected for the difference
-between the middle of a circle's image and the image of its centre (``dot_shape``).
+Spots that look like dots (``dot_candidates``) are grown into a grid (``dot_grid``), counted in the order
+that the prediction tells (``dot_order``), fitted to the grey levels (``dot_refine``), and corrected for the
+difference between the middle of a circle's image and the image of its centre (``dot_shape``).
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -83,7 +83,7 @@ class Predicted:
 
 @dataclass(frozen=True, eq=False)
 class Upright:
-    """Only that the camera stands upright: its rough focal length, and the rover's z axis in the board frame."""
+    """Only that the camera stands upright: rough focal length, and the rover's z axis in the board frame."""
 
     focal_px: float
     down_in_board: FloatArray
@@ -124,7 +124,7 @@ def find_dots(
     for search in _searches(image, board, expected):
         left, top, right, bottom = search.box_px
         found = dot_candidates(image[top:bottom, left:right], *search.size_px, search.uneven)
-        found = Candidates(found.middles_px + [left, top], found.shapes_px)
+        found = Candidates(found.middles_px + np.array([left, top]), found.shapes_px)
         grid = _best_grid(image, found, board)
         if isinstance(grid, _Grid):
             best = grid
@@ -238,7 +238,8 @@ def _best_grid(image: Image, found: Candidates, board: Board) -> _Grid | Detecti
     spots = len(found.middles_px)
     largest = len(lattices[0].spots) if lattices else 0
     return DetectionFailure(
-        f"{spots} spots look like dots, and at most {largest} of them stand in a grid, where {wanted} are expected"
+        f"{spots} spots look like dots, and at most {largest} of them stand in a grid, "
+        f"where {wanted} are expected"
     )
 
 
@@ -249,7 +250,10 @@ def _clustered(found: Candidates, board: Board) -> Lattice | None:
         return None
     points = found.middles_px.astype(np.float32).reshape(-1, 1, 2)
     flags = cv2.CALIB_CB_SYMMETRIC_GRID + cv2.CALIB_CB_CLUSTERING
-    done, corners = cv2.findCirclesGrid(points, (board.columns, board.rows), flags=flags, blobDetector=None)
+    size = (board.columns, board.rows)
+    # Without a detector OpenCV takes the picture for the points; its type hints do not know.
+    finder: Any = cv2.findCirclesGrid
+    done, corners = finder(points, size, flags, None, cv2.CirclesGridFinderParameters())
     if not done or corners is None:
         return None
     corners = corners.reshape(-1, 2)

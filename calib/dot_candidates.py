@@ -1,4 +1,4 @@
-"""Spots of an image that may be dots of the board: dark, of the expected size, elliptic, in even bright paper.
+"""Spots of an image that may be dots of the board: dark, of the expected size, elliptic, in even paper.
 
 A loose blob detector finds thousands of blobs on gravel, and a grid search among them takes half a minute.
 Here each spot must be a filled ellipse with an even ring of paper around it, which gravel hardly ever offers.
@@ -6,7 +6,7 @@ Here each spot must be a filled ellipse with an even ring of paper around it, wh
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -46,13 +46,13 @@ def dot_candidates(
     image
         (h, w) grey levels.
     diameter_px
-        Of the largest dot to be found, along its longer axis; it sets the window in which paper is looked for.
+        Of the largest dot to be found, along its longer axis; sets the window in which paper is looked for.
     area_px2
         Smallest and largest area of a dot.
     uneven
         How uneven the paper around a dot may be, in units of its contrast to the dot.
     """
-    smooth = cv2.GaussianBlur(image, (0, 0), 0.8)
+    smooth = np.asarray(cv2.GaussianBlur(image, (0, 0), 0.8), dtype=np.uint8)
     window = 2 * int(np.ceil(0.8 * diameter_px + 1)) + 1
     kernel = cv2.getStructuringElement(cv2.MORPH_RECT, (window, window))
     paper = cv2.morphologyEx(smooth, cv2.MORPH_CLOSE, kernel)
@@ -69,7 +69,7 @@ def dot_candidates(
     good[0] = False
     if not good.any():
         return Candidates(np.empty((0, 2)), np.empty((0, 2, 2)))
-    kept = _ellipses(labels, np.flatnonzero(good), count)
+    kept = _ellipses(np.asarray(labels, dtype=np.int32), np.flatnonzero(good), count)
     kept = _in_paper(smooth, kept, uneven)
     if len(kept.middles_px) > MOST_CANDIDATES:
         return Candidates(np.empty((0, 2)), np.empty((0, 2, 2)))
@@ -85,7 +85,7 @@ def _ellipses(labels: NDArray[np.int32], wanted: NDArray[np.int64], count: int) 
     inside = which >= 0
     which, x, y = which[inside], x[inside].astype(np.float64), y[inside].astype(np.float64)
 
-    def mean(values: FloatArray) -> FloatArray:
+    def mean(values: NDArray[Any]) -> FloatArray:
         return np.bincount(which, values, len(wanted)) / area
 
     area = np.bincount(which, minlength=len(wanted)).astype(np.float64)

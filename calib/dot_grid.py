@@ -8,7 +8,7 @@ the last, so perspective and lens distortion bend it freely.
 from __future__ import annotations
 
 from collections import deque
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -55,8 +55,8 @@ def _links(found: Candidates, spacing_over_radius: float) -> list[list[int]]:
     count = len(found.middles_px)
     if count < 2:
         return [[] for _ in range(count)]
-    _, near = cKDTree(found.middles_px).query(found.middles_px, k=min(LOOK_AT + 1, count))
-    near = near[:, 1:]
+    nearest = cKDTree(found.middles_px).query(found.middles_px, k=min(LOOK_AT + 1, count))[1]
+    near = np.asarray(nearest)[:, 1:]
     offsets = found.middles_px[near] - found.middles_px[:, None, :]
     there = _in_circles(np.linalg.inv(found.shapes_px)[:, None], offsets)
     back = _in_circles(np.linalg.inv(found.shapes_px)[near], offsets)
@@ -67,7 +67,7 @@ def _links(found: Candidates, spacing_over_radius: float) -> list[list[int]]:
     return [near[i][good[i]].tolist() for i in range(count)]
 
 
-def _in_circles(undo: FloatArray, offsets: FloatArray) -> FloatArray:
+def _in_circles(undo: NDArray[Any], offsets: FloatArray) -> FloatArray:
     """Lengths of offsets with the tilt undone, in dot radii."""
     return np.asarray(np.linalg.norm(np.einsum("...ij,...j->...i", undo, offsets), axis=-1))
 
@@ -100,16 +100,37 @@ def _grown(middles: FloatArray, links: list[list[int]], start: int) -> Lattice |
             queue.append(j)
     if len(place) < LEAST_GRID:
         return None
-    places = np.array(list(place.values()))
-    return Lattice(np.array(list(place)), places - places.min(axis=0))
+    return Lattice(np.array(list(place)), _unsheared(np.array(list(place.values()))))
+
+
+def _unsheared(places: IntArray) -> IntArray:
+    """The same lattice counted so that it fills the smallest box, from 0.
+
+    A small dot seen at a slant is blurred round, and a neighbour across the diagonal taken for the one
+    beside: such a grid is whole but counted aslant.
+    """
+    turns = [np.eye(2, dtype=np.int64)]
+    for k in (-1, 1):
+        turns += [np.array([[1, k], [0, 1]]), np.array([[1, 0], [k, 1]])]
+    while True:
+        box = [int(np.prod(np.ptp(places @ turn.T, axis=0) + 1)) for turn in turns]
+        best = int(np.argmin(box))
+        if best == 0:
+            return np.asarray(places - places.min(axis=0))
+        places = places @ turns[best].T
 
 
 def _first_basis(middles: FloatArray, links: list[list[int]], start: int) -> FloatArray | None:
-    """Two steps to neighbours that are not opposite to each other, as columns."""
+    """Two steps to neighbours as columns: those that span the smallest cell, nearest to a right angle."""
     steps = [middles[j] - middles[start] for j in links[start]]
-    for first in range(len(steps)):
-        for second in range(first + 1, len(steps)):
-            a, b = steps[first], steps[second]
-            if abs(a[0] * b[1] - a[1] * b[0]) > 0.3 * np.linalg.norm(a) * np.linalg.norm(b):
-                return np.stack([a, b], axis=-1)
-    return None
+    pairs = []
+    for k, a in enumerate(steps):
+        for b in steps[:k]:
+            cell = abs(a[0] * b[1] - a[1] * b[0])
+            lengths = np.linalg.norm(a) * np.linalg.norm(b)
+            if cell > 0.3 * lengths:
+                pairs.append((cell, cell / lengths, np.stack([a, b], axis=-1)))
+    if not pairs:
+        return None
+    smallest = min(pair[0] for pair in pairs)
+    return max((pair for pair in pairs if pair[0] < 1.4 * smallest), key=lambda pair: pair[1])[2]

@@ -69,7 +69,7 @@ def fit_plane_map(points_m: FloatArray, pixels_px: FloatArray) -> PlaneMap | Non
     if H is None or not np.isfinite(H).all():
         return None
     back = np.array([[1.0, 0.0, middle[0]], [0.0, 1.0, middle[1]], [0.0, 0.0, 1.0]])
-    homography = back @ H @ np.diag([1 / scale, 1 / scale, 1.0])
+    homography = np.asarray(back @ H @ np.diag([1 / scale, 1 / scale, 1.0]), dtype=np.float64)
     degree = max(d for d, least in zip(DEGREES, DOTS_FOR_DEGREE, strict=True) if len(points_m) >= least)
     flat = PlaneMap(homography, np.empty((0, 2)), 0, scale)
     if not degree:
@@ -78,7 +78,7 @@ def fit_plane_map(points_m: FloatArray, pixels_px: FloatArray) -> PlaneMap | Non
     bend, _, rank, _ = np.linalg.lstsq(powers, pixels_px - flat.pixels(points_m), rcond=1e-9)
     if rank < powers.shape[1]:
         return flat
-    return PlaneMap(homography, bend, degree, scale)
+    return PlaneMap(homography, np.asarray(bend, dtype=np.float64), degree, scale)
 
 
 def _powers(points: FloatArray, degree: int) -> FloatArray:

@@ -1,10 +1,10 @@
 """Dots to a few hundredths of a pixel: each one's ellipse fitted to the grey levels around its outline.
 
-Model of a dot, in pixels u from its middle: paper b0 + b·u, less a contrast times the share of the pixel that
-the dot covers. For a straight edge blurred by a normal distribution that share is Phi(-d / s), with d the
-distance from the outline. The shape is given (the board's map tells it); middle, size, blur, paper and contrast
-are fitted, for all dots at once. What is found is the middle of the ellipse; where the dot's centre is, the
-exact relation of ``dot_shape`` says.
+Model of a dot, in pixels u from its middle: paper b0 + b·u, less a contrast times the share of the pixel
+that the dot covers. For a straight edge blurred by a normal distribution that share is Phi(-d / s), with d
+the distance from the outline. The shape is given (the board's map tells it); middle, size, blur, paper and
+contrast are fitted, for all dots at once. What is found is the middle of the ellipse; where the dot's centre
+is, the exact relation of ``dot_shape`` says.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ REACH = 2.0
 BLURS = 5.0
 """How far beyond the outline the fit looks, in blurs or pixels, for dots large enough."""
 
-MOST_POINTS_ACROSS = 44
+MOST_POINTS_ACROSS = 60
 """Of the pixels across a large dot only every second (third, ...) is used beyond this."""
 
 ITERATIONS = 8

@@ -1,9 +1,9 @@
 """The image of a circle: where a round dot's image lies when its centre's image is known.
 
-A camera does not carry the centre of a circle to the middle of the circle's image. Through a pinhole the image
-is a conic, and its centre has a closed form; through a lens with distortion the boundary is carried over point
-by point and the centroid of the area inside is taken. Both are exact; the difference to the centre's own image
-is what a measurement of dots must be corrected by.
+A camera does not carry the centre of a circle to the middle of the circle's image. Through a pinhole the
+image is a conic, and its centre has a closed form; through a lens with distortion the boundary is carried
+over point by point and the centroid of the area inside is taken. Both are exact; the difference to the
+centre's own image is what a measurement of dots must be corrected by.
 
 Sources: Heikkilä 2000, "Geometric camera calibration using circular control points", section 3 (conic);
 Song et al. 2024, arXiv 2403.04583 (centroid of the distorted area).

@@ -1,8 +1,8 @@
 """Pictures of the dot board, by casting the camera's own rays at the board's plane.
 
-The centre of the top-left pixel is (0, 0). A pixel's value is the mean of samples x samples rays spread evenly
-over its square: offsets (i + 0.5) / samples - 0.5 in x and in y. The board is thin and flat, hides what is
-behind it and is hidden by nothing. Pictures are noise-free until ``photograph`` is called.
+The centre of the top-left pixel is (0, 0). A pixel's value is the mean of samples x samples rays spread
+evenly over its square: offsets (i + 0.5) / samples - 0.5 in x and in y. The board is thin and flat, hides
+what is behind it and is hidden by nothing. Pictures are noise-free until ``photograph`` is called.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ RAYS_AT_ONCE = 200_000
 
 @dataclass(frozen=True)
 class BoardLook:
-    """How a board looks: grey levels 0 to 255 of paper and dots, and the paper beyond the outer dots' centres."""
+    """Grey levels, 0 to 255, of paper and dots; how far the paper reaches beyond the outer dots' centres."""
 
     paper_dn: float = 205.0
     dot_dn: float = 35.0
