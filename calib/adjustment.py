@@ -408,12 +408,10 @@ def lens_knowledge(model: CameraModel) -> tuple[FloatArray, FloatArray]:
     """Return how far a lens is from usual, in sigmas, and the Jacobian to the camera's step."""
     kind = model.kind
     size = len(parameter_names(kind))
-    across, on_o = tangents(model.A), tangents(model.O)
-    aside = np.zeros((2, size))
-    aside[:, parameter_part(kind, "O")] = across @ on_o.T / O_SIGMA_RAD
-    # across turns with A so that across.A stays 0: a step a of A changes across.O by -(across.a)(A.O)
-    aside[:, parameter_part(kind, "A")] = -np.eye(2) * (model.A @ model.O) / O_SIGMA_RAD
-    residuals, rows = [across @ model.O / O_SIGMA_RAD, model.R[1:] / np.array(R_SIGMA)], [aside]
+    aside = np.zeros((3, size))
+    aside[:, parameter_part(kind, "O")] = tangents(model.O).T / O_SIGMA_RAD
+    aside[:, parameter_part(kind, "A")] = -tangents(model.A).T / O_SIGMA_RAD
+    residuals, rows = [(model.O - model.A) / O_SIGMA_RAD, model.R[1:] / np.array(R_SIGMA)], [aside]
     bends = np.zeros((2, size))
     bends[:, parameter_part(kind, "R")] = np.diag(1 / np.array(R_SIGMA))
     rows.append(bends)

@@ -295,6 +295,7 @@ def _fit_from(
     residuals = seen - pixels_px
     freedom = max(2 * int(used.sum()) - len(weak), 1)
     unit_weight = float(np.sum((residuals[used] / sigma_px) ** 2)) / freedom
-    covariance = max(unit_weight, 1.0) * np.linalg.inv(found.normal.matrix + np.diag(weak))
-    rms_px = np.asarray(np.sqrt(np.mean(residuals[used] ** 2, axis=0)), dtype=np.float64)
+    inverse = np.asarray(np.linalg.inv(found.normal.matrix + np.diag(weak)), dtype=np.float64)
+    covariance = max(unit_weight, 1.0) * inverse
+    rms_px: FloatArray = np.sqrt((residuals[used] ** 2).mean(axis=0)).astype(np.float64)
     return CameraFit(model, covariance, residuals, used, rms_px)

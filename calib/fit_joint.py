@@ -131,8 +131,8 @@ def _refuse_wrong_minimum(problem: Adjustment, state: Estimate) -> None:
         kept = [t for t in mine if t.keep.any()]
         if len(kept) < max(2, len(mine) // 2):
             raise SurveyNotFitted(
-                f"camera {name}: {len(mine) - len(kept)} of its {len(mine)} images do not agree with the rest; "
-                "check which placement each belongs to and the joint angles"
+                f"camera {name}: {len(mine) - len(kept)} of its {len(mine)} images do not agree with the "
+                "rest; check which placement each belongs to and the joint angles"
             )
         lengths = [np.linalg.norm(problem.image_residual(state, t).reshape(-1, 2), axis=1) for t in kept]
         typical = float(np.median(np.concatenate(lengths))) / np.sqrt(chi2.median(2))

@@ -107,7 +107,8 @@ def fit_mast(
         left = np.inf if best is None else best[0]
         raise MastNotFitted(
             f"no mast explains the images: the best one leaves {left:.1f} px where some {expected_px:.2g} px "
-            "are expected; check pan and tilt (radians, right and up positive) and each image's placement"
+            "are expected; check pan and tilt (radians, right and up positive) and each image's placement; "
+            "axes that do not meet at a right angle need eight parameters"
         )
     return best[1]
 
@@ -177,11 +178,11 @@ def _fit_from(
     start: FloatArray, views: Sequence[MastView], mast_parameters: int, expected_px: float, keep_all: bool
 ) -> tuple[float, MastFit]:
     """Typical residual of an image and the fit, from a start."""
-    free = np.array(MAST_FREE[mast_parameters])
-    weak = np.full(len(free), 1e-4)
     mast = start
     few = [_thinned(view) for view in views]
-    for steps in (15, 10, 8):
+    for steps, count in ((15, min(mast_parameters, 6)), (10, mast_parameters), (8, mast_parameters)):
+        free = np.array(MAST_FREE[count])
+        weak = np.full(len(free), 1e-4)
         mast = minimise(
             _Images(few, free, _cauchy(few, mast, expected_px)), mast, weak=weak, steps=steps
         ).state

@@ -356,7 +356,7 @@ def _mast(
     # Cameras fitted to few boards are off by more, away from where these stood, than their own residuals.
     try:
         typical = 3 * max(expected[n] for n in reference)
-        fit = fit_mast(away, min(mast_parameters, 6), expected_px=typical, keep_all=mast_parameters == 4)
+        fit = fit_mast(away, mast_parameters, expected_px=typical, keep_all=mast_parameters == 4)
     except MastNotFitted as error:
         raise SurveyNotFitted(f"mast: {error}") from None
     doubtful.update(fit.left_out)

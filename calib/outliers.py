@@ -104,7 +104,7 @@ def judge(
         if not judged.freedom:
             continue
         ratio = float(judged.statistic[()]) / (float(chi2.isf(share, judged.freedom)) * point_scale)
-        if point.keep and ratio > worst_ratio and _may_go(problem.station, point):
+        if point.keep and ratio > worst_ratio and _may_go(problem, point):
             worst, worst_ratio = ("station", index), ratio
         if not point.keep and ratio <= 1.0:
             readmitted.append(index)
@@ -183,11 +183,15 @@ def _point(problem: Adjustment, state: Estimate, covariance: FloatArray, term: S
     return Judged(np.asarray(np.sum(along[tested] ** 2 / values[tested])), int(tested.sum()))
 
 
-def _may_go(station: Sequence[StationTerm], point: StationTerm) -> bool:
-    """Whether a set-up has prisms enough without this one; tapes may always go."""
+def _may_go(problem: Adjustment, point: StationTerm) -> bool:
+    """Whether a set-up has prisms enough without this one; tapes may always go.
+
+    Prisms are all that contradicts a mast taken as upright (four parameters): there they stay.
+    """
     if point.board is not None:
         return True
-    return sum(p.setup == point.setup and p.board is None and p.keep for p in station) > PRISMS_LEFT
+    kept = sum(p.setup == point.setup and p.board is None and p.keep for p in problem.station)
+    return kept > PRISMS_LEFT and len(problem.mast_free) != 4
 
 
 def _scale(statistics: Sequence[FloatArray], freedom: int) -> float:

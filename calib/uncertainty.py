@@ -158,7 +158,7 @@ def pointing_covariance(
 
 
 def moved_rig(calibration: Calibration, columns: np.ndarray, step: FloatArray) -> Rig:
-    """Return the rig with the parameters at ``columns`` moved by ``step``, such as a draw from the covariance."""
+    """Return the rig with the parameters at ``columns`` moved by ``step``."""
     rig = calibration.rig
     whole = np.zeros(len(calibration.parameter_names))
     whole[columns] = step
