@@ -40,6 +40,9 @@ ROUNDS = 40
 WRONG_MINIMUM = 3.0
 """A fit is refused if the typical dot is this many times farther off than its sigma says."""
 
+MANY = 0.15
+"""More than this part of the tapes left out (and more than three) are no blunders: the model fails."""
+
 LENS_LIMITS = {"O": (O_SIGMA_RAD,) * 3, "R": R_SIGMA, "E": (E_SIGMA_M,) * 3}
 
 
@@ -125,7 +128,15 @@ def _refuse_lost(fit: Minimum[Estimate]) -> None:
 
 
 def _refuse_wrong_minimum(problem: Adjustment, state: Estimate) -> None:
-    """Raise if a camera's typical dot is far above its noise."""
+    """Raise if a camera's typical dot is far above its noise, or if the station contradicts the rest."""
+    tapes = [p for p in problem.station if p.board is not None]
+    left_out = sum(not p.keep for p in tapes)
+    if left_out > max(3, MANY * len(tapes)) and len(problem.mast_free) != 4:
+        raise SurveyNotFitted(
+            f"{left_out} of {len(tapes)} tapes do not agree with the images: too many for blunders; check "
+            "the sigmas and the joint angles, and whether the mast's axes meet at a right angle (else fit "
+            "eight parameters)"
+        )
     for name in state.cameras:
         mine = [t for t in problem.images if t.camera == name]
         kept = [t for t in mine if t.keep.any()]

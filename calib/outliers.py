@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.stats import chi2
 
-from calib.adjustment import Adjustment, Estimate, ImageTerm, StationTerm
+from calib.adjustment import Adjustment, Estimate, ImageTerm, StationTerm, moved_rigid
 from calib.calibration import Outlier
 from calib.rigid import FloatArray
 
@@ -29,6 +29,9 @@ BAD_IMAGE = 0.25
 
 REDUNDANT = 0.02
 """Directions of a residual with less than this part of the noise left in them cannot be tested."""
+
+BOARD_STEPS = 4
+"""Gauss-Newton steps of a board's pose: it starts within millimetres."""
 
 PRISMS_LEFT = 3
 """A set-up keeps at least so many prisms: with fewer nothing says which of them is wrong."""
@@ -99,12 +102,14 @@ def judge(
         elif (good != term.keep).any():
             bad_dots.append((index, good))
     readmitted = []
+    image_failed = worst is not None
     share = FALSE_ALARMS / max(len(points), 1)
     for index, (point, judged) in enumerate(zip(problem.station, points, strict=True)):
         if not judged.freedom:
             continue
         ratio = float(judged.statistic[()]) / (float(chi2.isf(share, judged.freedom)) * point_scale)
-        if point.keep and ratio > worst_ratio and _may_go(problem, point):
+        # A tape or prism cannot pull hundreds of dots along: where an image fails, it goes first.
+        if point.keep and not image_failed and ratio > worst_ratio and _may_go(problem, point):
             worst, worst_ratio = ("station", index), ratio
         if not point.keep and ratio <= 1.0:
             readmitted.append(index)
@@ -112,6 +117,7 @@ def judge(
     for index in readmitted:
         station[index] = replace(station[index], keep=True)
     if worst is not None and worst[0] == "image":
+        worst = ("image", _culprit(problem, state, worst[1]))
         images[worst[1]] = replace(images[worst[1]], keep=np.zeros_like(images[worst[1]].keep))
     elif worst is not None:
         station[worst[1]] = replace(station[worst[1]], keep=False)
@@ -181,6 +187,40 @@ def _point(problem: Adjustment, state: Estimate, covariance: FloatArray, term: S
     tested = values > REDUNDANT
     along = vectors.T @ block.residual
     return Judged(np.asarray(np.sum(along[tested] ** 2 / values[tested])), int(tested.sum()))
+
+
+def _culprit(problem: Adjustment, state: Estimate, suspect: int) -> int:
+    """Which image of the suspect's board is to blame: the one without which the others and the tapes agree.
+
+    Two images that contradict each other look equally bad where the fit has ended between them.
+    """
+    board = problem.images[suspect].board
+    together = [i for i, t in enumerate(problem.images) if t.board == board and t.keep.any()]
+    if len(together) < 2:
+        return suspect
+    misfits = {i: _board_misfit(problem, state, board, [j for j in together if j != i]) for i in together}
+    best = min(misfits, key=lambda i: misfits[i])
+    return best if misfits[best] < misfits[suspect] else suspect
+
+
+def _board_misfit(
+    problem: Adjustment, state: Estimate, board: tuple[str, str], images: Sequence[int]
+) -> float:
+    """Sum of squares of a board's tapes and some of its images with its pose fitted to these alone."""
+    tapes = [p for p in problem.station if p.board == board and p.keep]
+    cost = float("inf")
+    for _ in range(BOARD_STEPS):
+        blocks = [problem.image_block(state, problem.images[i]) for i in images]
+        blocks += [problem.station_block(state, p) for p in tapes]
+        cost = float(sum(b.residual @ b.residual for b in blocks))
+        if not np.isfinite(cost):
+            return float("inf")
+        jacobian = np.concatenate([b.jacobian[:, -6:] for b in blocks])  # a board's pose comes last
+        residual = np.concatenate([b.residual for b in blocks])
+        step = np.linalg.lstsq(jacobian, -residual, rcond=None)[0]
+        moved = moved_rigid(state.rover_from_board[board], step)
+        state = replace(state, rover_from_board={**state.rover_from_board, board: moved})
+    return cost
 
 
 def _may_go(problem: Adjustment, point: StationTerm) -> bool:

@@ -11,7 +11,7 @@ from made_survey import BOARD, COLUMNS, ROWS, Plan, make_survey, rover_from_head
 from calib.adjustment import MAST, Adjustment, lens_knowledge
 from calib.camera_parameters import parameter_names, stepped
 from calib.fit_joint import fit_joint, joint_problem
-from calib.fit_start import start
+from calib.fit_start import SurveyNotFitted, start
 from calib.least_squares import Normal, minimise
 from calib.mast import Rig
 from calib.survey import Sigma, Survey
@@ -102,6 +102,12 @@ def test_eight_parameters_find_skew_axes(true_rig: Rig) -> None:
     fit = fit_joint(make_survey(replace(true_rig, mast=mast), 3, EXACT, SMALL, noise=0.0), 8)
     assert fit.rig.mast.axis_offset_m == pytest.approx(0.021, abs=RECOVERED_M)
     assert fit.rig.mast.axis_twist_rad == pytest.approx(-0.034, abs=RECOVERED_M)
+
+
+def test_skew_axes_fitted_as_if_they_met_are_refused(navcams: Rig) -> None:
+    mast = replace(navcams.mast, axis_offset_m=0.05, axis_twist_rad=0.03)
+    with pytest.raises(SurveyNotFitted, match="eight parameters"):
+        fit_joint(make_survey(replace(navcams, mast=mast), 3), 6)
 
 
 def test_a_mast_of_four_parameters_stays_upright(true_rig: Rig) -> None:
