@@ -21,7 +21,9 @@ from calib.survey.records import (
     Board,
     Click,
     Dots,
+    Purpose,
     Sigma,
+    StationKind,
     StationPoint,
     Survey,
     SurveyCamera,
@@ -42,9 +44,6 @@ LARGEST_ANGLE_RAD = 1e4
 
 EDGE_PX = 1.0
 """How far outside its image a dot may have been found: noise at the border."""
-
-StationKind = Literal["prism", "tape", "check"]
-Purpose = Literal["camera", "mast", "check"]
 
 
 def read_survey(folder: str | Path) -> Survey:

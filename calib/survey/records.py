@@ -14,6 +14,8 @@ from calib.cahvor import Kind
 from calib.rigid import FloatArray
 
 IntArray = NDArray[np.int64]
+StationKind = Literal["prism", "tape", "check"]
+Purpose = Literal["camera", "mast", "check"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,7 +70,7 @@ class StationPoint:
     """
 
     setup: str
-    kind: Literal["prism", "tape", "check"]
+    kind: StationKind
     placement: str
     point: str
     position_m: FloatArray
@@ -88,7 +90,7 @@ class SurveyImage:
     camera: str
     setup: str
     placement: str
-    purpose: Literal["camera", "mast", "check"]
+    purpose: Purpose
     pan_rad: float | None
     tilt_rad: float | None
     file: Path
