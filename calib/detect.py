@@ -119,27 +119,35 @@ def find_dots(
         if hopeless:
             return DetectionFailure(hopeless)
         steps_px = expected_steps_px(expected.camera, expected.frame_from_board)
-    best: _Grid | DetectionFailure = DetectionFailure("no spot of the image looks like a dot of the board")
-    most = 0
+    failure = DetectionFailure("no spot of the image looks like a dot of the board")
+    furthest = 0
     for search in _searches(image, board, expected):
         left, top, right, bottom = search.box_px
         found = dot_candidates(image[top:bottom, left:right], *search.size_px, search.uneven)
         found = Candidates(found.middles_px + np.array([left, top]), found.shapes_px)
         grid = _best_grid(image, found, board)
         if isinstance(grid, _Grid):
-            best = grid
-            break
-        if len(found.middles_px) > most:
-            most, best = len(found.middles_px), grid
-    if isinstance(best, DetectionFailure):
-        return best
-    ordered = _ordered(best, board, expected, steps_px, image.shape)
-    if ordered is None:
-        return DetectionFailure(
-            "the grid is found but not which corner is the first: it is turned by about 45 degrees against "
-            + ("the predicted pose" if steps_px is not None else "the upright")
-        )
-    return _measured(image, board, best, ordered)
+            ordered = _ordered(grid, board, expected, steps_px, image.shape)
+            result = (
+                DetectionFailure(_unsure(steps_px))
+                if ordered is None
+                else _measured(image, board, grid, ordered)
+            )
+            if isinstance(result, DotsFound):
+                return result
+            reached = 1 + board.rows * board.columns + len(found.middles_px)
+        else:
+            result, reached = grid, len(found.middles_px)
+        # The search that came furthest tells best what is wrong.
+        if reached > furthest:
+            furthest, failure = reached, result
+    return failure
+
+
+def _unsure(steps_px: FloatArray | None) -> str:
+    """A sentence about an order that could be another."""
+    against = "the upright" if steps_px is None else "the predicted pose"
+    return f"the grid is found but not which corner is the first: it stands aslant against {against}"
 
 
 class _Search(NamedTuple):
@@ -223,7 +231,11 @@ def _best_grid(image: Image, found: Candidates, board: Board) -> _Grid | Detecti
     grids = [
         _complete(image, found, lattice, board) for lattice in lattices[:3] if len(lattice.spots) > wanted / 3
     ]
-    whole = [grid for grid in grids if isinstance(grid, _Grid)]
+    whole: list[_Grid] = []
+    for grid in grids:
+        # Two pieces of one board are both filled up to the same grid.
+        if isinstance(grid, _Grid) and not any(_same(grid, other) for other in whole):
+            whole.append(grid)
     if len(whole) > 1:
         return DetectionFailure(f"{len(whole)} grids of {board.rows} x {board.columns} dots are in the image")
     if whole:
@@ -241,6 +253,12 @@ def _best_grid(image: Image, found: Candidates, board: Board) -> _Grid | Detecti
         f"{spots} spots look like dots, and at most {largest} of them stand in a grid, "
         f"where {wanted} are expected"
     )
+
+
+def _same(one: _Grid, other: _Grid) -> bool:
+    """Whether two grids stand at the same place."""
+    apart = np.linalg.norm(one.middles_px.mean(axis=0) - other.middles_px.mean(axis=0))
+    return bool(apart < 0.25 * np.ptp(one.middles_px, axis=0).max())
 
 
 def _clustered(found: Candidates, board: Board) -> Lattice | None:
@@ -398,6 +416,8 @@ def _measured(image: Image, board: Board, grid: _Grid, ordered: Ordered) -> Dots
     height, width = image.shape
     reach = np.linalg.norm(shapes, axis=-1)  # of each dot's outline in x and y
     inside = ((fit.middles_px > reach) & (fit.middles_px < [width - 1, height - 1] - reach)).all(axis=1)
+    if not np.isfinite(fit.sizes).any():
+        return DetectionFailure("the grid is found but its spots do not look like dots from near")
     with np.errstate(invalid="ignore"):
         good = inside & (fit.contrast_dn > 0.4 * np.nanmedian(fit.contrast_dn))
         good &= np.abs(fit.sizes / np.nanmedian(fit.sizes) - 1.0) < 0.25

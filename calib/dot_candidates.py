@@ -52,7 +52,7 @@ def dot_candidates(
     uneven
         How uneven the paper around a dot may be, in units of its contrast to the dot.
     """
-    smooth = np.asarray(cv2.GaussianBlur(image, (0, 0), 0.8), dtype=np.uint8)
+    smooth = np.asarray(cv2.GaussianBlur(image, (0, 0), min(0.8, 0.08 * diameter_px)), dtype=np.uint8)
     window = 2 * int(np.ceil(0.8 * diameter_px + 1)) + 1
     kernel = cv2.getStructuringElement(cv2.MORPH_RECT, (window, window))
     paper = cv2.morphologyEx(smooth, cv2.MORPH_CLOSE, kernel)

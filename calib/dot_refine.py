@@ -1,10 +1,10 @@
 """Dots to a few hundredths of a pixel: each one's ellipse fitted to the grey levels around its outline.
 
-Model of a dot, in pixels u from its middle: paper b0 + b·u, less a contrast times the share of the pixel
-that the dot covers. For a straight edge blurred by a normal distribution that share is Phi(-d / s), with d
-the distance from the outline. The shape is given (the board's map tells it); middle, size, blur, paper and
-contrast are fitted, for all dots at once. What is found is the middle of the ellipse; where the dot's centre
-is, the exact relation of ``dot_shape`` says.
+Model of a dot, in pixels u from its middle: lit paper b0 + b·u, times 1 less a contrast times the share of
+the pixel that the dot covers. For a straight edge blurred by a normal distribution that share is Phi(-d / s),
+with d the distance from the outline. The shape is given (the board's map tells it); middle, size, blur, light
+and contrast are fitted, for all dots at once. What is found is the middle of the ellipse; where the dot's
+centre is, the exact relation of ``dot_shape`` says.
 """
 
 from __future__ import annotations
@@ -33,6 +33,9 @@ START_BLUR_PX = 0.8
 BLUR_PX = (0.25, 6.0)
 FARTHEST_PX = 2.0
 """A fit that moves farther than this, or than half the radius, has not found the dot that was expected."""
+
+SIZE_SIGMA = 0.1
+"""Relative, of a dot's printed size."""
 
 PARAMETERS = 8
 
@@ -73,14 +76,20 @@ def refine_dots(image: Image, middles_px: FloatArray, shapes_px: FloatArray) -> 
     square = np.full(count, np.nan)
     radius = np.sqrt(np.abs(np.linalg.det(shapes_px)))
     farthest = np.minimum(FARTHEST_PX, 0.5 * radius)
+    freedom = weights.sum(axis=1) - PARAMETERS
     for _ in range(ITERATIONS):
         some = np.flatnonzero(open_)
         residual, J = _model(state[some], u[some], form[some], levels[some], weights[some])
         JT = J.transpose(0, 2, 1)
         normal[some] = JT @ J
         square[some] = (residual**2).sum(axis=1)
+        gradient = JT @ residual[..., None]
+        # The board's drawing says how large its dots are; a small blurred dot does not tell by itself.
+        weight = square[some] / np.maximum(freedom[some], 1.0) / SIZE_SIGMA**2
+        normal[some, 2, 2] += weight
+        gradient[:, 2, 0] += weight * (1.0 - state[some, 2])
         damped = normal[some] + 1e-4 * _diagonals(normal[some]) + 1e-9 * np.eye(PARAMETERS)
-        step = np.linalg.solve(damped, JT @ residual[..., None])[..., 0]
+        step = np.linalg.solve(damped, gradient)[..., 0]
         step[:, :2] = np.clip(step[:, :2], -0.5, 0.5)
         state[some] = state[some] + step
         state[some, 2] = np.clip(state[some, 2], 0.5, 2.0)
@@ -88,14 +97,13 @@ def refine_dots(image: Image, middles_px: FloatArray, shapes_px: FloatArray) -> 
         open_[some] = np.abs(step[:, :2]).max(axis=1) > SETTLED_PX
         if not open_.any():
             break
-    freedom = weights.sum(axis=1) - PARAMETERS
     noise = np.sqrt(square / np.maximum(freedom, 1.0))
     covariance = np.linalg.inv(normal + 1e-6 * _diagonals(normal) + 1e-12 * np.eye(PARAMETERS))
     sigma = noise * np.sqrt((covariance[:, 0, 0] + covariance[:, 1, 1]) / 2)
     good = (freedom > 0) & (np.linalg.norm(state[:, :2], axis=1) < farthest)
     good &= (state[:, 7] > 0.0) & (state[:, 2] > 0.5) & (state[:, 2] < 2.0)
     out = [middles_px + state[:, :2], sigma]
-    out += [state[:, 2], state[:, 7], noise]
+    out += [state[:, 2], state[:, 4] * state[:, 7], noise]
     for values in out:
         values[~good] = np.nan
     return Refined(*out)
@@ -128,7 +136,7 @@ def _start(levels: FloatArray, weights: FloatArray, u: FloatArray, form: FloatAr
     dot = _mean_where(levels, weights * (q < 0.7))
     state = np.zeros((len(levels), PARAMETERS))
     state[:, 2], state[:, 3] = 1.0, START_BLUR_PX
-    state[:, 4], state[:, 7] = paper, paper - dot
+    state[:, 4], state[:, 7] = paper, 1.0 - dot / np.maximum(paper, 1.0)
     return state
 
 
@@ -149,15 +157,17 @@ def _model(
     distance = (q - size) * q / steep
     z = distance / blur
     covered = ndtr(-z)
-    edge = contrast * np.exp(-0.5 * z * z) * (1.0 / np.sqrt(2.0 * np.pi)) / blur
+    light = state[:, 4, None] + np.einsum("npi,ni->np", u, state[:, 5:7])
+    shade = 1.0 - contrast * covered
+    edge = light * contrast * np.exp(-0.5 * z * z) * (1.0 / np.sqrt(2.0 * np.pi)) / blur
     J = np.empty((*levels.shape, PARAMETERS))
     J[..., :2] = -edge[..., None] * slope / steep[..., None]
     J[..., 2] = -edge * q / steep
     J[..., 3] = -edge * z
-    J[..., 4] = 1.0
-    J[..., 5:7] = u
-    J[..., 7] = -covered
-    fitted = state[:, 4, None] + np.einsum("npi,ni->np", u, state[:, 5:7]) - contrast * covered
+    J[..., 4] = shade
+    J[..., 5:7] = u * shade[..., None]
+    J[..., 7] = -light * covered
+    fitted = light * shade
     J *= weights[..., None]
     return (levels - fitted) * weights, J
 
