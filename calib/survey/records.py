@@ -144,3 +144,28 @@ class Survey:
     dots: Mapping[str, Dots]
     clicks: tuple[Click, ...] = ()
     digest: str = ""
+
+
+@dataclass(frozen=True)
+class Finding:
+    """Something about a survey that a person should know before it is fitted.
+
+    Attributes
+    ----------
+    severity
+        ``error``: do not fit this; ``warning``: the fit can go on and may be worse for it.
+    place
+        Where: a file with its line, a camera, a set-up, a placement.
+    message
+        What is so, with its numbers.
+    advice
+        What to measure or correct.
+    """
+
+    severity: Literal["error", "warning"]
+    place: str
+    message: str
+    advice: str
+
+    def __str__(self) -> str:
+        return f"{self.severity}: {self.place}: {self.message}. {self.advice}."
