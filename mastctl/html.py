@@ -63,9 +63,9 @@ h1 { font-size: 1.6em; } h2 { font-size: 1.2em; margin-top: 2em; border-bottom: 
 table { border-collapse: collapse; font-variant-numeric: tabular-nums; }
 th, td { padding: .25em .7em; text-align: right; border-bottom: 1px solid #eee; white-space: nowrap; }
 td:last-child, th:last-child { text-align: left; white-space: normal; } th { background: #f4f1ee; }
-table.words td:first-child, table.words th:first-child { text-align: left; }
 img { max-width: 100%; } .row { display: flex; gap: 12px; margin-bottom: 1.2em; align-items: flex-start; }
 figure { margin: 0; flex: 1 1 0; min-width: 0; } .row figure:first-child { flex: 1.35 1 0; }
+.row.pairs figure:first-child { flex: 1 1 0; }
 figcaption { font-size: .85em; color: #555; }
 .badge { font-size: .55em; vertical-align: middle; padding: .3em .7em; border-radius: 1em;
   background: #777; color: #fff; }
