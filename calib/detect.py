@@ -20,7 +20,7 @@ from calib.dot_candidates import UNEVEN, UNEVEN_AT_MOST, Candidates, contrasts, 
 from calib.dot_grid import Lattice, grow_lattices
 from calib.dot_map import PlaneMap, fit_plane_map
 from calib.dot_order import Ordered, expected_steps_px, order_by_gravity, order_by_steps
-from calib.dot_refine import refine_dots
+from calib.dot_refine import centred, refine_dots
 from calib.dot_shape import bias_through
 from calib.rigid import FloatArray, Rigid
 from calib.survey import Board, Dots
@@ -83,9 +83,13 @@ class Predicted:
 
 @dataclass(frozen=True, eq=False)
 class Upright:
-    """Only that the camera stands upright: rough focal length, and the rover's z axis in the board frame."""
+    """Only that the camera stands upright.
 
-    focal_px: float
+    ``camera`` is a rough one in its own frame (x right, y down, z along A); ``down_in_board`` (3,) the
+    direction in the board's frame that is down in an upright camera's image.
+    """
+
+    camera: CameraModel
     down_in_board: FloatArray
 
 
@@ -120,14 +124,14 @@ def find_dots(
             return DetectionFailure(hopeless)
         steps_px = expected_steps_px(expected.camera, expected.frame_from_board)
     failure = DetectionFailure("no spot of the image looks like a dot of the board")
-    furthest = 0
+    furthest = -1
     for search in _searches(image, board, expected):
         left, top, right, bottom = search.box_px
         found = dot_candidates(image[top:bottom, left:right], *search.size_px, search.uneven)
         found = Candidates(found.middles_px + np.array([left, top]), found.shapes_px)
-        grid = _best_grid(image, found, board)
+        grid, reached = _best_grid(image, found, board)
         if isinstance(grid, _Grid):
-            ordered = _ordered(grid, board, expected, steps_px, image.shape)
+            ordered = _ordered(grid, board, expected, steps_px)
             result = (
                 DetectionFailure(_unsure(steps_px))
                 if ordered is None
@@ -135,9 +139,9 @@ def find_dots(
             )
             if isinstance(result, DotsFound):
                 return result
-            reached = 1 + board.rows * board.columns + len(found.middles_px)
+            reached += 1
         else:
-            result, reached = grid, len(found.middles_px)
+            result = grid
         # The search that came furthest tells best what is wrong.
         if reached > furthest:
             furthest, failure = reached, result
@@ -224,10 +228,11 @@ def _predicted_search(
     return (int(box[0]), int(box[1]), int(box[2]), int(box[3])), size
 
 
-def _best_grid(image: Image, found: Candidates, board: Board) -> _Grid | DetectionFailure:
-    """The board's grid among the candidates: grown, else by OpenCV's clustering."""
+def _best_grid(image: Image, found: Candidates, board: Board) -> tuple[_Grid | DetectionFailure, int]:
+    """The board's grid, grown, else by OpenCV's clustering; and how many spots hang together."""
     wanted = board.rows * board.columns
     lattices = grow_lattices(found, 2.0 * board.spacing_m / board.dot_diameter_m)
+    largest = len(lattices[0].spots) if lattices else 0
     grids = [
         _complete(image, found, lattice, board) for lattice in lattices[:3] if len(lattice.spots) > wanted / 3
     ]
@@ -237,22 +242,23 @@ def _best_grid(image: Image, found: Candidates, board: Board) -> _Grid | Detecti
         if isinstance(grid, _Grid) and not any(_same(grid, other) for other in whole):
             whole.append(grid)
     if len(whole) > 1:
-        return DetectionFailure(f"{len(whole)} grids of {board.rows} x {board.columns} dots are in the image")
+        told = f"{len(whole)} grids of {board.rows} x {board.columns} dots are in the image"
+        return DetectionFailure(told), largest
     if whole:
-        return whole[0]
+        return whole[0], largest
     clustered = _clustered(found, board)
     if clustered is not None:
         grid = _complete(image, found, clustered, board)
         if isinstance(grid, _Grid):
-            return grid
+            return grid, wanted
     if grids:
-        return grids[0]
+        return grids[0], largest
     spots = len(found.middles_px)
-    largest = len(lattices[0].spots) if lattices else 0
-    return DetectionFailure(
+    told = (
         f"{spots} spots look like dots, and at most {largest} of them stand in a grid, "
         f"where {wanted} are expected"
     )
+    return DetectionFailure(told), largest
 
 
 def _same(one: _Grid, other: _Grid) -> bool:
@@ -326,7 +332,8 @@ def _gaps(
     darker, spread = contrasts(image, at, shapes)
     with np.errstate(invalid="ignore"):
         dots = (darker > 0.5 * contrast_dn) & (spread < UNEVEN_AT_MOST * darker)
-    return free[dots], at[dots]
+    at = at[dots]
+    return free[dots], centred(image, at, shapes[dots]) if len(at) else at
 
 
 def _cut_out(image: Image, places: IntArray, middles: FloatArray, board: Board) -> _Grid | DetectionFailure:
@@ -383,18 +390,11 @@ def _ordered(
     board: Board,
     expected: Predicted | Upright | None,
     steps_px: FloatArray | None,
-    shape: tuple[int, ...],
 ) -> Ordered | None:
     """Rows and columns of the grid's dots, or None if not sure."""
     if isinstance(expected, Upright):
-        centre = np.array([shape[1] - 1, shape[0] - 1]) / 2
         return order_by_gravity(
-            grid.places,
-            grid.counts,
-            grid.map.homography,
-            board,
-            (expected.focal_px, centre),
-            expected.down_in_board,
+            grid.places, grid.counts, grid.middles_px, board, expected.camera, expected.down_in_board
         )
     steps = grid.map.jacobian((np.array(grid.counts) - 1) / 2)
     return order_by_steps(grid.places, grid.counts, steps, board, np.eye(2) if steps_px is None else steps_px)

@@ -24,6 +24,7 @@ UNEVEN = 0.22  # spread of the ring of paper, in units of its contrast to the do
 UNEVEN_AT_MOST = 0.4  # the same where the strict search found no grid
 RING = 1.6  # of the ring, in dot radii; neighbours begin at 3
 RING_POINTS = 16
+LEAST_RING = 2 / 3
 LEAST_CONTRAST_DN = 14.0
 LEAST_AREA_PX = 6
 MOST_CANDIDATES = 3000
@@ -108,7 +109,7 @@ def _ellipses(labels: NDArray[np.int32], wanted: NDArray[np.int64], count: int) 
 def contrasts(smooth: Image, middles_px: FloatArray, shapes_px: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return how much darker each middle is than the ring around it, and the ring's spread, grey levels.
 
-    Not-a-number where the ring leaves the image.
+    Not-a-number where more than a third of the ring is outside the image.
     """
     angle = np.arange(RING_POINTS) * (2 * np.pi / RING_POINTS)
     circle = np.stack([np.cos(angle), np.sin(angle)])
@@ -119,9 +120,13 @@ def contrasts(smooth: Image, middles_px: FloatArray, shapes_px: FloatArray) -> t
     columns, rows = np.moveaxis(points.astype(np.float32), -1, 0)
     values = _sampled(smooth, columns, rows)
     height, width = smooth.shape
-    outside = (columns < 0) | (rows < 0) | (columns > width - 1) | (rows > height - 1)
-    values[outside.any(axis=1)] = np.nan
-    return values[:, 1:].mean(axis=1) - values[:, 0], values[:, 1:].std(axis=1)
+    inside = (columns >= 0) & (rows >= 0) & (columns <= width - 1) & (rows <= height - 1)
+    seen = inside[:, 1:].sum(axis=1)
+    paper = np.where(inside[:, 1:], values[:, 1:], 0.0)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        mean = np.where(inside[:, 0] & (seen >= LEAST_RING * RING_POINTS), paper.sum(axis=1) / seen, np.nan)
+        spread = np.where(inside[:, 1:], paper - mean[:, None], 0.0)
+        return mean - values[:, 0], np.sqrt((spread**2).sum(axis=1) / seen)
 
 
 def _sampled(image: Image, columns: NDArray[np.float32], rows: NDArray[np.float32]) -> FloatArray:
@@ -138,5 +143,6 @@ def _in_paper(smooth: Image, spots: Candidates, uneven: float) -> Candidates:
     if not len(spots.middles_px):
         return spots
     contrast, spread = contrasts(smooth, *spots)
-    good = (contrast > LEAST_CONTRAST_DN) & (spread < uneven * contrast)
+    with np.errstate(invalid="ignore"):
+        good = (contrast > LEAST_CONTRAST_DN) & (spread < uneven * contrast)
     return Candidates(spots.middles_px[good], spots.shapes_px[good])

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -64,28 +65,28 @@ def order_by_steps(
 def order_by_gravity(
     places: IntArray,
     counts: tuple[int, int],
-    pixel_from_place: FloatArray,
+    middles_px: FloatArray,
     board: Board,
-    camera: tuple[float, FloatArray],
+    camera: CameraModel,
     down_in_board: FloatArray,
 ) -> Ordered | None:
     """Count rows and columns so that the camera that took the picture stands upright.
 
     Parameters
     ----------
-    pixel_from_place
-        (3, 3), homography from (i, j) to pixels.
+    middles_px
+        (n, 2) of the dots.
     camera
-        Rough focal length, px, and image centre (2,), px.
+        A rough camera in its own frame: x right, y down, z along A.
     down_in_board
-        (3,), unit vector of the rover's z axis in the board's frame.
+        (3,), the direction in the board's frame that is down in an upright camera's image.
 
     Other arguments and the result as ``order_by_steps``. None also if the camera looks so steeply that its
     uprightness tells nothing.
     """
-    focal_px, centre_px = camera
-    slope_from_pixel = np.diag([1 / focal_px, 1 / focal_px, 1.0])
-    slope_from_pixel[:2, 2] = -centre_px / focal_px
+    homography = _camera_from_places(camera, places, middles_px)
+    if homography is None:
+        return None
     best: Ordered | None = None
     for columns, rows, c_from_ij in _ways(places, counts, board):
         affine = np.eye(3)  # from metres on the board to (i, j)
@@ -93,8 +94,8 @@ def order_by_gravity(
         middle = np.array([board.columns - 1, board.rows - 1]) / 2
         affine[:2, :2] = np.linalg.inv(c_from_ij) / board.spacing_m
         affine[:2, 2] = np.linalg.inv(c_from_ij) @ (middle - shift)
-        H = slope_from_pixel @ pixel_from_place @ affine
-        H *= np.sign(H[2, 2]) / np.linalg.norm(H[:, 0])
+        H = homography @ affine
+        H = H / np.linalg.norm(H[:, 0])
         if np.linalg.det(H) <= 0.0:  # seen from behind
             continue
         U, _, Vt = np.linalg.svd(np.column_stack([H[:, 0], H[:, 1], np.cross(H[:, 0], H[:, 1])]))
@@ -105,6 +106,23 @@ def order_by_gravity(
         if best is None or abs(turned) < abs(best.turned_rad):
             best = Ordered(columns, rows, turned)
     return best if best is not None and abs(best.turned_rad) < SURE_RAD else None
+
+
+def _camera_from_places(camera: CameraModel, places: IntArray, middles_px: FloatArray) -> FloatArray | None:
+    """(3, 3) that carries (i, j, 1) to points ahead of the camera, up to one positive factor."""
+    rays = camera.ray(middles_px)
+    if not rays.valid.all():
+        return None
+    ahead = rays.directions.mean(axis=0)
+    # Slopes are taken about the board's own direction, so that a board far aside is as good as one in front.
+    across = np.linalg.svd(ahead[None])[2][1:]
+    frame = np.array([*across, ahead / np.linalg.norm(ahead)])
+    turned = rays.directions @ frame.T
+    H, _ = cv2.findHomography(places.astype(np.float64), turned[:, :2] / turned[:, 2:], 0)
+    if H is None or not np.isfinite(H).all():
+        return None
+    depth = places.mean(axis=0) @ H[2, :2] + H[2, 2]
+    return np.asarray(frame.T @ H * np.sign(depth), dtype=np.float64)
 
 
 def expected_steps_px(camera: CameraModel, frame_from_board: Rigid) -> FloatArray | None:

@@ -68,7 +68,7 @@ def _expected_px2(
     _, rates, _ = model.project_jacobian(points)
     in_station = rates @ setup.b_from_a.rotation @ _moves(board.b_from_a.vectors(in_board))
     by_board = np.einsum("nip,pq,niq->ni", in_station, board.covariance, in_station)
-    in_rover = rates @ _moves(points)
+    in_rover = rates @ _moves(points - setup.b_from_a.translation_m)
     common = np.einsum("nip,pq,niq->ni", in_rover, setup.covariance, in_rover)
     _, by_fit = pixel_covariance(calibration, image.camera, pan, tilt, points)
     relative = np.maximum(np.einsum("nii->ni", by_fit) - common, 0.0)
