@@ -9,8 +9,8 @@ from multiprocessing import get_context
 from pathlib import Path
 
 import cv2
-from calib.detect_survey import Progress, detect_survey
 
+from calib.detect_survey import Progress, detect_survey
 from calib.survey import Survey
 
 

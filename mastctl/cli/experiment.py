@@ -81,7 +81,7 @@ def run_pointing(args: argparse.Namespace) -> int:
     from mastctl.cli.service import client_of
 
     if args.out is not None:
-        _check_writable(args.out)
+        check_writable(args.out)
     with client_of(args) as client:
         return _report(args, _run(args, client, tuple(args.distances), None, ()))
 
