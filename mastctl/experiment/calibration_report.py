@@ -156,7 +156,7 @@ def _parts(experiment: CalibrationExperiment) -> Iterator[str]:
     yield html.table(*study_rows(experiment.summaries))
     yield (
         "<p>Pointing: clicks of 0.2 px noise in the Navcam pair, at 10, 6 and 2 m, x and y; exact clicks "
-        "leave the calibration's part. Hand-off: against exact projection, both eyes of the taking pair, worst "
+        "leave the calibration's part. Hand-off: against exact projection, both eyes of that pair, worst "
         "of all. Navcam to Hazcam is held by the second prism set-up, as in the paper.</p>"
     )
     failures = [(o.variant, o.failure) for o in experiment.outcomes if o.failure]
