@@ -220,6 +220,11 @@ class CameraModel:
         return model, shift_px
 
     @property
+    def lens(self) -> Lens:
+        """Distortion, entrance point and reach: what stays when the camera moves."""
+        return self._projection.lens
+
+    @property
     def image_center_px(self) -> tuple[float, float]:
         """((w-1)/2, (h-1)/2): the middle of the image in pixel-centre coordinates."""
         return ((self.size_px[0] - 1) / 2, (self.size_px[1] - 1) / 2)

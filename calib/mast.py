@@ -88,6 +88,11 @@ class Rig:
         for name in ("cameras", "stereo", "fit", "provenance"):
             object.__setattr__(self, name, MappingProxyType(dict(getattr(self, name))))
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Travel between processes: read-only views cannot be pickled."""
+        views = (self.cameras, self.stereo, self.fit, self.provenance)
+        return Rig, (self.name, self.mast, *map(dict, views))
+
     def camera_in_rover(self, name: str, pan_rad: float, tilt_rad: float) -> CameraModel:
         """Return camera ``name`` in the rover frame at the given joint angles; body cameras ignore them.
 

@@ -8,6 +8,7 @@ Contract section 2. A and O are normalised on load; a note says so when that mov
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, cast
@@ -23,7 +24,7 @@ from calib.mast import Mast, Rig, RigCamera
 MAST_SCHEMA = "mastctl/mast/1"
 CAMERA_SCHEMA = "mastctl/camera/1"
 
-_CAMERA_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]*_(?:left|right)")
+CAMERA_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]*_(?:left|right)")
 _PAIR_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]*")
 _LETTERS: dict[str, str] = {"CAHV": "CAHV", "CAHVOR": "CAHVOR", "CAHVORE": "CAHVORE"}
 _MODEL_KEYS = ("size_px", "model", "C", "A", "H", "V")
@@ -60,7 +61,7 @@ def parse_rig(data: bytes, path: str | Path) -> StoredRig:
     cameras: dict[str, RigCamera] = {}
     notes: tuple[str, ...] = ()
     for name in top.mapping("cameras"):
-        if not _CAMERA_NAME.fullmatch(name):
+        if not CAMERA_NAME.fullmatch(name):
             raise top.bad(f"cameras.{name}", "a camera's name is <pair>_left or <pair>_right")
         place = f"cameras.{name}"
         section = Section(path, place, top.mapping("cameras")[name], ("on", *_MODEL_KEYS), _MODEL_OPTIONS)
@@ -79,7 +80,7 @@ def parse_rig(data: bytes, path: str | Path) -> StoredRig:
             axis_twist_rad=mast.number("axis_twist_rad") if "axis_twist_rad" in mast else 0.0,
         ),
         cameras=cameras,
-        stereo=_stereo(top, cameras),
+        stereo=read_stereo(top, cameras),
         fit=top.free("fit"),
         provenance=top.free("provenance"),
     )
@@ -209,8 +210,14 @@ def _model_keys(model: CameraModel) -> dict[str, Any]:
     return keys
 
 
-def _stereo(top: Section, cameras: dict[str, RigCamera]) -> dict[str, tuple[str, str]]:
-    """Read the stereo pairs: (left, right) names of cameras that are there."""
+def read_stereo(top: Section, cameras: Mapping[str, object]) -> dict[str, tuple[str, str]]:
+    """Return the stereo pairs under ``stereo``: (left, right) names of cameras that are there.
+
+    Raises
+    ------
+    BadFile
+        For a pair that is not two known cameras, left and right.
+    """
     pairs: dict[str, tuple[str, str]] = {}
     for pair, names in top.mapping("stereo").items():
         key = f"stereo.{pair}"

@@ -23,7 +23,7 @@ from calib.rigid import FloatArray
 
 MAX_BYTES = 1 << 29
 
-_NUMBER = re.compile(
+NUMBER = re.compile(
     r"[-+]?(?:(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][-+]?[0-9]+)?|inf|infinity|nan)", re.IGNORECASE
 )
 _OTHER_DELIMITERS = {";": "';'", "\t": "tab", "|": "'|'"}
@@ -61,7 +61,7 @@ def parse_table(data: bytes, path: str | Path, columns: Sequence[str]) -> FloatA
     values: list[list[float]] = []
     blank_line = 0
     try:
-        _check_header(next(lines, []), path, columns)
+        check_header(next(lines, []), path, columns)
         for cells in lines:
             if not cells:
                 blank_line = blank_line or lines.line_num
@@ -90,7 +90,8 @@ def write_table(stream: TextIO, columns: Sequence[str], values: FloatArray) -> N
     stream.writelines(",".join(map(repr, row)) + "\n" if good else empty for row, good in rows)
 
 
-def _check_header(cells: Sequence[str], path: str | Path, columns: Sequence[str]) -> None:
+def check_header(cells: Sequence[str], path: str | Path, columns: Sequence[str]) -> None:
+    """Refuse a header that does not name exactly these columns in this order. Raises BadFile."""
     found = [cell.strip() for cell in cells]
     if found == list(columns):
         return
@@ -114,6 +115,6 @@ def _row(cells: Sequence[str], path: str | Path, place: str, columns: Sequence[s
     if not any(words):
         return [np.nan] * len(words)
     for word, column in zip(words, columns, strict=True):
-        if not _NUMBER.fullmatch(word):
+        if not NUMBER.fullmatch(word):
             raise BadFile(path, f"{place}, {column}", f"'{word[:40]}' where a number is expected")
     return [float(word) for word in words]

@@ -25,10 +25,19 @@ from drivers.errors import BadFrame, BadOptions, BadReply, DriverError
 from drivers.faults import Fault as SetFault
 from drivers.faults import FaultPanel
 from mastctl.api_guard import Guard, error_response
-from mastctl.api_requests import ErrorBody, FaultBody, FaultsQuery, PointBody, SnapshotQuery, sentence
+from mastctl.api_requests import (
+    ErrorBody,
+    FaultBody,
+    FaultsQuery,
+    MastBody,
+    PointBody,
+    SnapshotQuery,
+    sentence,
+)
 from mastctl.errors import MastctlError
 from mastctl.frames import StampedFrame
 from mastctl.limits import OutsideLimits
+from mastctl.mast_in_use import MastInUse
 from mastctl.operations import as_json, error_body
 from mastctl.service import Service
 
@@ -38,6 +47,8 @@ PNG_COMPRESSION = 1  # a noisy picture gains 10 % from more, and takes five time
 
 STATUS_OF_CODE: Mapping[str, int] = {
     "busy": 409,
+    "moving": 409,
+    "no_former_mast": 409,
     "stopped": 409,
     "frame_moving": 409,
     "other_mast_file": 409,
@@ -47,6 +58,7 @@ STATUS_OF_CODE: Mapping[str, int] = {
     "unknown_camera": 404,
     "not_simulated": 404,
     "bad_aim": 422,
+    "bad_mast_file": 422,
     "outside_image": 422,
     "outside_limits": 422,
     "wrong_camera": 422,
@@ -126,11 +138,24 @@ def _add_pictures(app: FastAPI, service: Service) -> None:
 
     @app.get(f"{PREFIX}/mast", summary="The mast file in use, byte for byte", response_class=Response)
     async def mast() -> Response:
+        in_use = service.mast
         return Response(
-            service.mast_bytes,
+            in_use.data,
             media_type="application/yaml",
-            headers={"X-Mastctl-Mast-Digest": service.stored.digest},
+            headers={"X-Mastctl-Mast-Digest": in_use.stored.digest},
         )
+
+    @app.post(f"{PREFIX}/mast", summary="Use another mast file, or the former one, from now on")
+    def load_mast(body: MastBody) -> dict[str, Any]:
+        return told(service.former_mast() if body.file is None else service.load_mast(body.file))
+
+    @app.post(f"{PREFIX}/mast/back", summary="Go back to the former mast file")
+    def back() -> dict[str, Any]:
+        return told(service.former_mast())
+
+    def told(mast: MastInUse) -> dict[str, Any]:
+        former = service.former
+        return {"mast": mast.told(), "former_mast": None if former is None else former.told()}
 
 
 def _add_simulation(app: FastAPI, service: Service) -> None:
@@ -221,7 +246,7 @@ def _add_errors(app: FastAPI) -> None:
     @app.exception_handler(RequestValidationError)
     async def invalid(request: Request, error: RequestValidationError) -> JSONResponse:
         path = request.url.path.removeprefix(PREFIX)
-        route = next((word for word in ("point", "faults", "snapshot") if word in path), "")
+        route = next((word for word in ("point", "faults", "snapshot", "mast") if word in path), "")
         sentences = [sentence(problem, route) for problem in error.errors()[:10]]
         return error_response(422, "bad_request", sentences[0], {"problems": sentences})
 

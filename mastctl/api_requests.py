@@ -91,6 +91,19 @@ class PointBody(_Strict):
         return PointRequest(target=target, aim=aim, pointings=self.pointings)
 
 
+class MastBody(_Strict):
+    """``POST /mast``: the name of a file beside the configured mast file, or ``previous``: true."""
+
+    file: Name | None = None
+    previous: bool = False
+
+    @model_validator(mode="after")
+    def _one(self) -> MastBody:
+        if (self.file is not None) == self.previous:
+            raise ValueError("file, or previous: true, is expected, and not both")
+        return self
+
+
 class FaultBody(_Strict):
     """``POST /simulation/faults``: a fault word for a simulated device, with its parameters."""
 
@@ -144,6 +157,7 @@ _KEYS: Mapping[tuple[str, ...], Sequence[str]] = {
 }
 _ROUTE_KEYS: Mapping[tuple[str, str], Sequence[str]] = {
     ("body", "point"): tuple(PointBody.model_fields),
+    ("body", "mast"): tuple(MastBody.model_fields),
     ("body", "faults"): tuple(FaultBody.model_fields),
     ("query", "snapshot"): tuple(SnapshotQuery.model_fields),
     ("query", "faults"): tuple(FaultsQuery.model_fields),

@@ -88,15 +88,14 @@ class Devices:
         self._pan_tilt = hardware.pan_tilt
         self._cameras = dict(hardware.cameras)
         self._limits = limits
-        self._digest = mast_digest
         self._clock = clock
-        self._sizes_px = {name: camera.model.size_px for name, camera in rig.cameras.items()} if rig else {}
-        self._on_head = (
-            {name for name, camera in rig.cameras.items() if camera.on == "head"} if rig else set()
-        )
         self._grace_s = CAMERA_GRACE_S if camera_grace_s is None else camera_grace_s
         self._history = JointHistory()
         self._store = FrameStore(mast_digest)
+        self._sizes_px: dict[str, tuple[int, int]] = {}
+        self._on_head: set[str] = set()
+        if rig is not None:
+            self._take_rig(rig)
         self._still_since: dict[str, StampedFrame] = {}  # per camera the first frame of the same content
         self._stamping = {name: threading.Lock() for name in self._cameras}
         self._gate = threading.Lock()
@@ -253,6 +252,15 @@ class Devices:
 
     # All
 
+    def use_rig(self, rig: Rig, mast_digest: str) -> None:
+        """Stamp frames with another mast file from now on, and forget those that were stamped before."""
+        self._take_rig(rig)
+        self._store.change_mast(mast_digest)
+
+    def _take_rig(self, rig: Rig) -> None:
+        self._sizes_px = {name: camera.model.size_px for name, camera in rig.cameras.items()}
+        self._on_head = {name for name, camera in rig.cameras.items() if camera.on == "head"}
+
     def faults(self) -> tuple[Fault, ...]:
         """Return what is wrong with any device now, what the head reports about itself included."""
         found = list(self._head.faults())
@@ -339,8 +347,9 @@ class Devices:
             if time.monotonic() > until_s:
                 raise BadReply("the readings stay behind the frame's exposure", device=HEAD)
         joints = self._history.at_exposure(began_s, frame.mid_exposure_s, ended_s, HEAD)
+        frame_id, mast_digest = self._store.name(camera, frame.sequence)
         stamped = StampedFrame(
-            frame_id=self._store.frame_id(camera, frame.sequence),
+            frame_id=frame_id,
             camera=camera,
             image=frame.image,
             sequence=frame.sequence,
@@ -349,7 +358,7 @@ class Devices:
             pan_rad=joints.pan_rad,
             tilt_rad=joints.tilt_rad,
             moving=joints.moving,
-            mast_digest=self._digest,
+            mast_digest=mast_digest,
         )
         with self._stamping[camera]:
             self._check_alive(stamped)

@@ -139,17 +139,28 @@ class FrameStore:
     """The newest frames of each camera, found again by id. Safe to use from any thread."""
 
     def __init__(self, mast_digest: str, kept: int = KEPT_FRAMES) -> None:
-        self._mast = mast_digest[:8]
+        self._digest = mast_digest
         self._runs: dict[str, str] = {}
         self._kept = kept
         self._frames: dict[str, deque[StampedFrame]] = {}
         self._lock = threading.Lock()
 
-    def frame_id(self, camera: str, sequence: int) -> str:
-        """Return the id of a camera's frame in this run."""
+    def name(self, camera: str, sequence: int) -> tuple[str, str]:
+        """Return the id of a camera's frame in this run, and the digest of the mast file that is in it."""
         with self._lock:
             run = self._runs.setdefault(camera, secrets.token_hex(2))
-        return f"{camera}-{sequence:06d}-{self._mast}-{run}"
+            digest = self._digest
+        return f"{camera}-{sequence:06d}-{digest[:8]}-{run}", digest
+
+    def change_mast(self, mast_digest: str) -> None:
+        """Forget every frame and name the coming ones by another mast file.
+
+        The run is a new one too: a frame from before must not be found again after a change and back.
+        """
+        with self._lock:
+            self._digest = mast_digest
+            self._frames.clear()
+            self._runs.clear()
 
     def begin_again(self, camera: str) -> None:
         """Forget a camera's frames, because its count went back: one number must not name two pictures."""
@@ -160,6 +171,8 @@ class FrameStore:
     def add(self, frame: StampedFrame) -> StampedFrame:
         """Keep a frame and return it; if a frame of that id is kept already, that one is returned."""
         with self._lock:
+            if frame.mast_digest != self._digest:  # the mast file changed while it was on its way
+                return frame
             frames = self._frames.setdefault(frame.camera, deque(maxlen=self._kept))
             for known in frames:
                 if known.frame_id == frame.frame_id:
@@ -189,13 +202,14 @@ class FrameStore:
                         return frame
             newest = {camera: frames[-1].sequence for camera, frames in self._frames.items() if frames}
             runs = dict(self._runs)
+            in_use = self._digest[:8]
         named = _FRAME_ID.fullmatch(frame_id)
         if named is not None:
             camera, sequence, mast, run = named.groups()
-            if mast != self._mast:
+            if mast != in_use:
                 raise FrameGone(
                     "other_mast_file",
-                    f"frame {frame_id} was taken with mast file {mast}..., the one in use is {self._mast}...",
+                    f"frame {frame_id} was taken with mast file {mast}..., the one in use is {in_use}...",
                 )
             if run == runs.get(camera) and int(sequence) <= newest.get(camera, -1):
                 raise FrameGone(

@@ -10,17 +10,16 @@ from dataclasses import replace
 from importlib.metadata import version
 from typing import Any
 
-from calib.formats import read_bytes
-from calib.formats.yaml_text import MAX_BYTES
 from calib.mast import Rig
-from calib.store import StoredRig, parse_rig
+from calib.store import StoredRig
 from drivers.clock import Clock, SystemClock
 from drivers.open_hardware import Hardware, open_hardware
-from mastctl.config import Config, check_cameras
+from mastctl.config import Config
 from mastctl.devices import HEAD, Devices, UnknownCamera
 from mastctl.errors import FrameGone, MastctlError
 from mastctl.frames import StampedFrame
-from mastctl.operations import Operation, Operations
+from mastctl.mast_in_use import MastInUse, read_mast, read_next
+from mastctl.operations import Busy, Operation, Operations
 from mastctl.pointing.loop import PointingLoop
 from mastctl.pointing.requests import Aim, AnglesTarget, PixelTarget, PointRequest
 from mastctl.state import State
@@ -43,6 +42,18 @@ class Refused(MastctlError):
         super().__init__(message)
 
 
+class NoFormerMast(MastctlError):
+    """There is no former mast file to go back to."""
+
+    code = "no_former_mast"
+
+
+class HeadMoves(MastctlError):
+    """Something that needs a head at rest was asked for while it moves."""
+
+    code = "moving"
+
+
 class Service:
     """The devices, the pointing loop and the operations of one daemon; safe to use from any thread.
 
@@ -50,8 +61,8 @@ class Service:
     ----------
     config
         The configuration.
-    stored, mast_bytes
-        The mast file as read, and its bytes.
+    mast
+        The mast file that the configuration names.
     hardware
         The opened drivers; closed by `close`.
     clock
@@ -59,24 +70,25 @@ class Service:
 
     Attributes
     ----------
+    mast, former
+        The mast file in use, and the one before it; replaced as a whole, never edited.
     stop_threads
         Where the web side calls `stop`: threads that nothing else can keep busy.
     """
 
-    def __init__(
-        self, config: Config, stored: StoredRig, mast_bytes: bytes, hardware: Hardware, clock: Clock
-    ) -> None:
+    def __init__(self, config: Config, mast: MastInUse, hardware: Hardware, clock: Clock) -> None:
         self.config = config
-        self.stored = stored
-        self.mast_bytes = mast_bytes
+        self.mast = mast
+        self.former: MastInUse | None = None
+        self._mast_lock = threading.Lock()  # no operation starts between one mast file and the next
         self.hardware = hardware
         self.clock = clock
         self.started_s = clock.now_s()
         grace_s = None if hardware.simulation is None else RENDERING_S
-        self.devices = Devices(hardware, config.limits, stored.digest, clock, stored.rig, grace_s)
+        self.devices = Devices(hardware, config.limits, mast.stored.digest, clock, mast.stored.rig, grace_s)
         self.operations = Operations(self.devices, clock)
         self.stop_threads = ThreadPoolExecutor(STOP_THREADS, thread_name_prefix="stop")
-        self._rig = _configured(stored.rig, config.hardware.cameras)
+        self._rig = _configured(mast.stored.rig, config.hardware.cameras)
         self._loop = PointingLoop(self._rig, self.devices, config.limits, clock)
         self._version = version("mastctl")
 
@@ -92,17 +104,20 @@ class Service:
             If a driver refuses its options or cannot reach its device.
         """
         clock = clock or SystemClock()
-        mast_bytes = read_bytes(config.mast_file, MAX_BYTES)
-        stored = parse_rig(mast_bytes, config.mast_file)
-        for note in stored.notes:
+        mast = read_mast(config.mast_file, config)
+        for note in mast.stored.notes:
             log.warning("%s", note)
-        check_cameras(config, stored.rig)
         hardware = open_hardware(config.hardware, clock)
         try:
-            return cls(config, stored, mast_bytes, hardware, clock)
+            return cls(config, mast, hardware, clock)
         except BaseException:
             hardware.close()
             raise
+
+    @property
+    def stored(self) -> StoredRig:
+        """The mast file in use, as read."""
+        return self.mast.stored
 
     @property
     def head(self) -> str:
@@ -111,14 +126,14 @@ class Service:
 
     def state(self) -> State:
         """Return what is known at this moment."""
+        mast, former = self.mast, self.former
         return State(
             now_s=self.clock.now_s(),
             started_s=self.started_s,
             version=self._version,
             hardware=self.hardware.kind,
-            mast_file=self.config.mast_file.name,
-            mast_name=self.stored.rig.name,
-            mast_digest=self.stored.digest,
+            mast=mast.told(),
+            former_mast=None if former is None else former.told(),
             limits=self.config.limits,
             reading=self.devices.last_reading,
             frames=self.devices.newest_frames(),
@@ -178,6 +193,62 @@ class Service:
         Busy
             If another operation runs.
         """
+        with self._mast_lock:
+            self._check(request, mast_digest)
+            loop = self._loop
+            return self.operations.start(told, lambda record, cancelled: loop.run(request, record, cancelled))
+
+    def load_mast(self, name: str) -> MastInUse:
+        """Use another mast file of the configured one's folder from now on, and return it.
+
+        Frames taken before are refused from then on. The file before it stays at hand for `former_mast`.
+
+        Raises
+        ------
+        BadMastFile
+            If it cannot be used; nothing has changed.
+        Busy, HeadMoves
+            If an operation runs or the head moves.
+        DriverError
+            If the head does not say whether it moves.
+        """
+        return self._use(read_next(name, self.config, self.mast))
+
+    def former_mast(self) -> MastInUse:
+        """Go back to the mast file that was in use before, as it was then; the second time forth again.
+
+        Raises
+        ------
+        NoFormerMast
+            If none was loaded since the start.
+        Busy, HeadMoves, DriverError
+            As for `load_mast`.
+        """
+        former = self.former
+        if former is None:
+            raise NoFormerMast("no other mast file was in use since the daemon started")
+        return self._use(former)
+
+    def _use(self, mast: MastInUse) -> MastInUse:
+        """Put a mast file into use while the head rests and nothing runs."""
+        reading = self.devices.read()
+        with self._mast_lock:
+            running = self.operations.motion.operation
+            if running is not None:
+                raise Busy(running)
+            if reading.moving:
+                raise HeadMoves("the head moves; a mast file is changed while it rests")
+            self.devices.use_rig(mast.stored.rig, mast.stored.digest)
+            self._rig = _configured(mast.stored.rig, self.config.hardware.cameras)
+            self._loop = PointingLoop(self._rig, self.devices, self.config.limits, self.clock)
+            self.mast, self.former = mast, self.mast
+        for note in mast.stored.notes:
+            log.warning("%s", note)
+        log.info("mast file %s (%s) is in use", mast.path.name, mast.stored.digest[:12])
+        return mast
+
+    def _check(self, request: PointRequest, mast_digest: str | None) -> None:
+        """Refuse a request that does not fit the mast file in use; see `point`."""
         target = request.target
         if mast_digest is not None and mast_digest != self.stored.digest:
             raise FrameGone(
@@ -191,9 +262,6 @@ class Service:
             self.config.limits.check(target.pan_rad, target.tilt_rad)
         if request.aim is not None:
             self._check_aim(request.aim)
-        return self.operations.start(
-            told, lambda record, cancelled: self._loop.run(request, record, cancelled)
-        )
 
     def stop(self) -> str | None:
         """Stop the mast and what runs; return the stopped operation's id. Raises DriverError."""

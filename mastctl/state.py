@@ -58,6 +58,8 @@ class State:
         When it was taken, and when the service started.
     hardware
         ``real``, ``simulated``, ``replayed`` or ``mixed``.
+    mast, former_mast
+        File, name and digest of the mast file in use and of the one before it.
     reading
         The last good reading of the head, None before the first.
     frames
@@ -68,9 +70,8 @@ class State:
     started_s: float
     version: str
     hardware: str
-    mast_file: str
-    mast_name: str
-    mast_digest: str
+    mast: Mapping[str, Any]
+    former_mast: Mapping[str, Any] | None
     limits: Limits
     reading: Reading | None
     frames: Mapping[str, StampedFrame | None]
@@ -124,7 +125,8 @@ class State:
             },
             "control": None,
             "cameras": {name: self._camera_told(frame) for name, frame in self.frames.items()},
-            "mast": {"file": self.mast_file, "name": self.mast_name, "digest": self.mast_digest},
+            "mast": dict(self.mast),
+            "former_mast": None if self.former_mast is None else dict(self.former_mast),
             "faults": [
                 {
                     "device": fault.device,

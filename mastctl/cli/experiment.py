@@ -1,4 +1,4 @@
-"""``mastctl experiment pointing`` on any daemon, ``mastctl demo`` on the packaged simulated rover."""
+"""``mastctl experiment`` (pointing on any daemon, calibration), ``mastctl demo`` on the simulated rover."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ DEFAULT_DISTANCES_M = (10.0, 6.0, 2.0)
 
 def add_commands(subparsers: Any) -> None:
     """Add ``experiment`` and ``demo``."""
-    experiment = subparsers.add_parser("experiment", help="the paper's experiments on a running daemon")
+    experiment = subparsers.add_parser("experiment", help="the paper's experiments")
     kinds = experiment.add_subparsers(dest="experiment", metavar="EXPERIMENT", required=True)
     pointing = kinds.add_parser("pointing", help="point at random textured targets and measure the residuals")
     from mastctl.cli.service import add_daemon_options
@@ -32,6 +32,9 @@ def add_commands(subparsers: Any) -> None:
         help="ranges in metres (default 10 6 2)",
     )  # fmt: skip
     pointing.set_defaults(run=run_pointing)
+    from mastctl.cli import experiment_calibration
+
+    experiment_calibration.add_parser(kinds)
 
     demo = subparsers.add_parser("demo", help="the pointing experiment on the packaged simulated rover")
     _add_common(demo, out_help="folder for the report (default mastctl_demo)")
@@ -45,23 +48,23 @@ def _add_common(parser: argparse.ArgumentParser, out_help: str) -> None:
     """Options that both commands take."""
     parser.add_argument(
         "--targets",
-        type=_count,
+        type=at_least_one,
         default=DEFAULT_TARGETS,
         metavar="N",
         help="targets at each distance (default 10)",
     )
     parser.add_argument(
-        "--seed", type=_seed, default=1, metavar="S", help="chooses views and pixels (default 1)"
+        "--seed", type=seed, default=1, metavar="S", help="chooses views and pixels (default 1)"
     )
     parser.add_argument("--out", type=Path, metavar="DIR", help=out_help)
 
 
-def _count(text: str) -> int:
+def at_least_one(text: str) -> int:
     """Read a count above zero."""
     return _whole(text, 1)
 
 
-def _seed(text: str) -> int:
+def seed(text: str) -> int:
     """Read a seed: zero or above."""
     return _whole(text, 0)
 
@@ -78,7 +81,7 @@ def run_pointing(args: argparse.Namespace) -> int:
     from mastctl.cli.service import client_of
 
     if args.out is not None:
-        _check_writable(args.out)
+        check_writable(args.out)
     with client_of(args) as client:
         return _report(args, _run(args, client, tuple(args.distances), None, ()))
 
@@ -91,7 +94,7 @@ def run_demo(args: argparse.Namespace) -> int:
     from mastctl.experiment.demo import SimulationTruth, demo_config, head_note
     from mastctl.experiment.pointing import head_pair
 
-    _check_writable(args.out)
+    check_writable(args.out)
     config = demo_config(load_config(None), head=args.head, seed=args.seed)
     with _waiting(
         args, "building the simulated rover and its ground (the first time also compiling the renderer)"
@@ -179,7 +182,7 @@ def turned(headings: list[str], rows: list[list[str]]) -> tuple[list[str], list[
     return table[0], table[1:]
 
 
-def _check_writable(folder: Path) -> None:
+def check_writable(folder: Path) -> None:
     """Refuse an impossible --out before the minutes of the run, not after them."""
     try:
         folder.mkdir(parents=True, exist_ok=True)

@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import base64
 import csv
-import html
-import io
 import json
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +13,7 @@ import cv2
 import numpy as np
 
 from drivers.interfaces import Image
+from mastctl import html
 from mastctl.experiment.pointing import PAPER_TABLE_VI, DistanceSummary, PointingExperiment, TargetRecord
 
 PICTURES_PER_DISTANCE = 4
@@ -116,12 +114,12 @@ def _page(experiment: PointingExperiment) -> str:
         ("took", f"{experiment.seconds:.0f} s"),
     ]
     headings, rows = table_rows(experiment.summaries)
-    badge = f'<span class="badge {html.escape(kind)}">{html.escape(kind.upper())}</span>'
+    badge = html.badge(kind.upper(), kind)
     parts = [
         f"<h1>Pointing experiment {badge}</h1>",
         "<p>" + " · ".join(f"{k} <b>{html.escape(v)}</b>" for k, v in facts) + "</p>",
         "<h2>Rms residual in pixels, beside the paper's Table VI</h2>",
-        _html_table(headings, rows),
+        html.table(headings, rows),
         "<p>First and second: residuals that the daemon measured in new images, about the aim pixel "
         f"({experiment.aim_px[0]:g}, {experiment.aim_px[1]:g}), the middle of the image. True: where the "
         "clicked point really was, which only a simulation knows. The paper's figures are from hardware.</p>",
@@ -131,7 +129,7 @@ def _page(experiment: PointingExperiment) -> str:
     if failures:
         parts.append(f"<h2>Failed targets ({len(failures)})</h2>")
         parts.append(
-            _html_table(
+            html.table(
                 ["distance", "target", "reason"],
                 [[f"{r.distance_m:g} m", str(r.index), r.error] for r in failures],
             )
@@ -153,7 +151,7 @@ def _page(experiment: PointingExperiment) -> str:
             )
     parts.append("<h2>Every target</h2>")
     parts.append(
-        _html_table(
+        html.table(
             [
                 "distance",
                 "target",
@@ -167,7 +165,7 @@ def _page(experiment: PointingExperiment) -> str:
             [_target_row(record) for record in experiment.records],
         )
     )
-    return _HEAD + "\n".join(parts) + "\n</body></html>\n"
+    return html.page("Pointing experiment", parts)
 
 
 def _target_row(record: TargetRecord) -> list[str]:
@@ -185,13 +183,6 @@ def _target_row(record: TargetRecord) -> list[str]:
         f"{record.seconds:.1f}",
         record.error,
     ]
-
-
-def _html_table(headings: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
-    """A table with escaped cells."""
-    head = "".join(f"<th>{html.escape(cell)}</th>" for cell in headings)
-    body = "".join("<tr>" + "".join(f"<td>{html.escape(c)}</td>" for c in row) + "</tr>" for row in rows)
-    return f"<table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>"
 
 
 def _scatter(experiment: PointingExperiment) -> str:
@@ -228,9 +219,7 @@ def _scatter(experiment: PointingExperiment) -> str:
         axis.get_legend_handles_labels() for axis in figure.axes if axis.get_legend_handles_labels()[0]
     )
     figure.axes[0].legend(handles, labels, loc="upper left", fontsize=8)
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=110)
-    return _image_tag(buffer.getvalue(), "png", "scatter of the residuals")
+    return html.plot_tag(figure, "scatter of the residuals")
 
 
 def _pictures(experiment: PointingExperiment, record: TargetRecord) -> str:
@@ -242,10 +231,12 @@ def _pictures(experiment: PointingExperiment, record: TargetRecord) -> str:
     cv2.circle(view, clicked, 3, (0, 140, 255), -1, cv2.LINE_AA)
     small = np.asarray(cv2.resize(view, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA), dtype=np.uint8)
     tags = [
-        _figure(_jpeg_tag(small, "the target chosen"), f"target {record.index}: clicked in {record.frame_id}")
+        html.figure(
+            _jpeg_tag(small, "the target chosen"), f"target {record.index}: clicked in {record.frame_id}"
+        )
     ]
     chosen = _crop(_bgr(record.clicked_image), record.clicked_px)
-    tags.append(_figure(_jpeg_tag(chosen, "the target, enlarged"), "the target, enlarged"))
+    tags.append(html.figure(_jpeg_tag(chosen, "the target, enlarged"), "the target, enlarged"))
     for name, landing, image in zip(("first", "second"), record.landings, record.landed_images, strict=False):
         piece = _crop(_bgr(image), experiment.aim_px)
         middle = CROP_PX * CROP_SCALE
@@ -254,7 +245,7 @@ def _pictures(experiment: PointingExperiment, record: TargetRecord) -> str:
         cv2.circle(piece, found, 12, (0, 140, 255), 2, cv2.LINE_AA)
         x, y = landing.residual_px
         tags.append(
-            _figure(
+            html.figure(
                 _jpeg_tag(piece, f"{name} pointing"), f"{name}: {x:+.2f}, {y:+.2f} px from the cross-hair"
             )
         )
@@ -282,36 +273,6 @@ def _bgr(image: Image) -> Image:
 
 def _jpeg_tag(image: Image, alt: str) -> str:
     """An inlined JPEG."""
-    return _image_tag(cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, 80])[1].tobytes(), "jpeg", alt)
-
-
-def _image_tag(content: bytes, kind: str, alt: str) -> str:
-    """An inlined image."""
-    return (
-        f'<img alt="{html.escape(alt)}" src="data:image/{kind};base64,{base64.b64encode(content).decode()}">'
+    return html.image_tag(
+        cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, 80])[1].tobytes(), "jpeg", alt
     )
-
-
-def _figure(tag: str, caption: str) -> str:
-    """A picture with its caption."""
-    return f"<figure>{tag}<figcaption>{html.escape(caption)}</figcaption></figure>"
-
-
-_HEAD = """<!doctype html>
-<html lang="en"><head><meta charset="utf-8"><title>Pointing experiment</title>
-<meta name="viewport" content="width=device-width, initial-scale=1">
-<style>
-body { font: 15px/1.5 system-ui, sans-serif; color: #222;
-  max-width: 1200px; margin: 2em auto; padding: 0 1em; }
-h1 { font-size: 1.6em; } h2 { font-size: 1.2em; margin-top: 2em; border-bottom: 1px solid #ddd; }
-table { border-collapse: collapse; font-variant-numeric: tabular-nums; }
-th, td { padding: .25em .7em; text-align: right; border-bottom: 1px solid #eee; white-space: nowrap; }
-td:last-child, th:last-child { text-align: left; white-space: normal; } th { background: #f4f1ee; }
-img { max-width: 100%; } .row { display: flex; gap: 12px; margin-bottom: 1.2em; align-items: flex-start; }
-figure { margin: 0; flex: 1 1 0; min-width: 0; } .row figure:first-child { flex: 1.35 1 0; }
-figcaption { font-size: .85em; color: #555; }
-.badge { font-size: .55em; vertical-align: middle; padding: .3em .7em; border-radius: 1em;
-  background: #777; color: #fff; }
-.badge.simulated { background: #1f6f8b; } .badge.real { background: #c1440e; }
-</style></head><body>
-"""

@@ -1,0 +1,252 @@
+"""Rigid alignment of measured points with points of a design, and which of them was mis-measured.
+
+The pose is closed form: the rotation from the weighted singular value decomposition (Kabsch 1976; Umeyama
+1991 for the sign). Its covariance is of a small turn and shift in frame b, which move the pose (R, t) to
+Exp(turn) R and t + shift, and so a point by turn x (R x_in_a) + shift.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import combinations
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.stats import chi2
+
+from calib.errors import CalibError
+from calib.rigid import FloatArray, Rigid
+from calib.survey import Survey
+
+FALSE_ALARM = 1e-4
+"""How often points without a blunder are called in doubt."""
+
+ON_A_LINE = 1e-3
+"""Points are on one line if they spread less across it than so much of their spread along it."""
+
+
+class NotAligned(CalibError):
+    """Points that no pose follows from: fewer than three, or on one line."""
+
+
+@dataclass(frozen=True, eq=False)
+class Alignment:
+    """The pose that carries points of frame a onto points of frame b.
+
+    Attributes
+    ----------
+    b_from_a
+        The pose.
+    covariance
+        (6, 6) of its turn (rotation vector in b, radians) and shift (metres), from the stated sigmas.
+    names, residuals_m
+        The points, and (n, 3) what was measured in b less what the pose says, also of the rejected.
+    rejected
+        Names of points that were left out: with them the rest is off, without them it fits.
+    doubt
+        '' where all that was used agrees; else a sentence that says which points disagree, and how much.
+    chi2, degrees_of_freedom
+        Of the points that were used.
+    """
+
+    b_from_a: Rigid
+    covariance: FloatArray
+    names: tuple[str, ...]
+    residuals_m: FloatArray
+    rejected: tuple[str, ...]
+    doubt: str
+    chi2: float
+    degrees_of_freedom: int
+
+
+def align(
+    points_in_a_m: ArrayLike, points_in_b_m: ArrayLike, sigma_m: ArrayLike, names: Sequence[str]
+) -> Alignment:
+    """Fit the pose between two sets of points, and leave out those that were mis-measured.
+
+    With four points or more, while chi-square is beyond what chance makes of it once in 10,000 times, the one
+    point is left out without which the others fit, provided that no other point's leaving would do. Else, and
+    with three points, the distances between points say which disagree, and nothing is left out.
+
+    Parameters
+    ----------
+    points_in_a_m, points_in_b_m
+        (n, 3) the same points in both frames, metres.
+    sigma_m
+        Standard deviation of the difference of a point, one axis; one number or (n,).
+    names
+        (n,) for the refusals.
+
+    Raises
+    ------
+    NotAligned
+        If there are fewer than three points, or they stand on one line.
+    """
+    a, b = (np.asarray(points, dtype=np.float64).reshape(-1, 3) for points in (points_in_a_m, points_in_b_m))
+    sigma = np.broadcast_to(np.asarray(sigma_m, dtype=np.float64), len(a))
+    used = np.ones(len(a), dtype=bool)
+    rejected: list[str] = []
+    while True:
+        pose = _pose(a[used], b[used], sigma[used], [n for n, use in zip(names, used, strict=True) if use])
+        total = _chi2(pose, a[used], b[used], sigma[used])
+        freedom = 3 * int(used.sum()) - 6
+        doubt = ""
+        if total <= _limit(freedom):
+            break
+        culprit = _culprit(a, b, sigma, used)
+        if culprit is None:
+            doubt = _doubt(a, b, sigma, used, names)
+            break
+        used[culprit] = False
+        rejected.append(names[culprit])
+    return Alignment(
+        pose,
+        _covariance(pose, a[used], sigma[used]),
+        tuple(names),
+        b - pose.points(a),
+        tuple(rejected),
+        doubt,
+        total,
+        freedom,
+    )
+
+
+def mirrored(points_in_a_m: ArrayLike, points_in_b_m: ArrayLike, sigma_m: float) -> bool:
+    """Return whether only a mirror image of a fits b: two coordinates swapped, or one with the wrong sign."""
+    a, b = (np.asarray(points, dtype=np.float64).reshape(-1, 3) for points in (points_in_a_m, points_in_b_m))
+    if len(a) < 4:
+        return False
+    sigma = np.full(len(a), sigma_m)
+    image = a * np.array([1.0, 1.0, -1.0])
+    try:
+        fits = [_chi2(_pose(c, b, sigma, []), c, b, sigma) for c in (a, image)]
+    except NotAligned:
+        return False
+    return fits[1] <= _limit(3 * len(a) - 6) < fits[0]
+
+
+def rover_from_station(survey: Survey) -> dict[str, Alignment]:
+    """Return the pose of every set-up from its prisms, by the set-up's name.
+
+    Raises
+    ------
+    NotAligned
+        Naming the set-up with fewer than three prisms.
+    """
+    sigma_m = float(np.hypot(survey.sigma.station_m, survey.sigma.prism_cad_m))
+    measured: dict[str, dict[str, FloatArray]] = {point.setup: {} for point in survey.station}
+    for point in survey.station:
+        if point.kind == "prism":
+            measured[point.setup][point.point] = point.position_m
+    poses: dict[str, Alignment] = {}
+    for setup, points in measured.items():
+        design = [survey.prisms_in_rover_m[name] for name in points]
+        try:
+            poses[setup] = align(list(points.values()), design, sigma_m, list(points))
+        except NotAligned as error:
+            raise NotAligned(f"prisms of set-up {setup}: {error}") from None
+    return poses
+
+
+def station_from_board(survey: Survey) -> dict[tuple[str, str], Alignment]:
+    """Return the pose of every placement from its tapes, by set-up and placement.
+
+    Raises
+    ------
+    NotAligned
+        Naming the placement with fewer than three tapes.
+    """
+    measured: dict[tuple[str, str], dict[str, FloatArray]] = {}
+    for point in survey.station:
+        if point.kind == "tape":
+            measured.setdefault((point.setup, point.placement), {})[point.point] = point.position_m
+    poses: dict[tuple[str, str], Alignment] = {}
+    for (setup, placement), points in measured.items():
+        design = [survey.board.tapes_in_board_m[name] for name in points]
+        try:
+            aligned = align(design, list(points.values()), survey.sigma.station_m, list(points))
+        except NotAligned as error:
+            raise NotAligned(f"tapes of placement {placement} in set-up {setup}: {error}") from None
+        poses[setup, placement] = aligned
+    return poses
+
+
+def _pose(a: FloatArray, b: FloatArray, sigma: FloatArray, names: Sequence[str]) -> Rigid:
+    """The pose of least weighted squares."""
+    if len(a) < 3:
+        raise NotAligned(f"{len(a)} points ({', '.join(names)}) where at least three are expected")
+    weight = (1 / sigma**2) / np.sum(1 / sigma**2)
+    middle_a, middle_b = weight @ a, weight @ b
+    from_a, from_b = a - middle_a, b - middle_b
+    for points in (from_a, from_b):
+        spread = np.linalg.svd(points, compute_uv=False)
+        if not spread[1] > ON_A_LINE * spread[0]:
+            raise NotAligned(f"the points {', '.join(names)} stand on one line, or in one place")
+    u, _, vt = np.linalg.svd(from_b.T @ (weight[:, None] * from_a))
+    rotation = u @ np.diag([1.0, 1.0, np.linalg.det(u) * np.linalg.det(vt)]) @ vt
+    return Rigid(rotation, middle_b - rotation @ middle_a)
+
+
+def _chi2(pose: Rigid, a: FloatArray, b: FloatArray, sigma: FloatArray) -> float:
+    return float(np.sum(((b - pose.points(a)) / sigma[:, None]) ** 2))
+
+
+def _limit(freedom: int) -> float:
+    return float(chi2.isf(FALSE_ALARM, freedom))
+
+
+def _covariance(pose: Rigid, a: FloatArray, sigma: FloatArray) -> FloatArray:
+    """Inverse of the weighted normal matrix of turn and shift."""
+    normal = np.zeros((6, 6))
+    for arm, one in zip(pose.vectors(a), sigma, strict=True):
+        rates = np.hstack([-_cross(arm), np.eye(3)])
+        normal += rates.T @ rates / one**2
+    return np.asarray(np.linalg.inv(normal))
+
+
+def _cross(v: FloatArray) -> FloatArray:
+    """(3, 3) with ``_cross(v) @ w`` the cross product of v and w."""
+    return np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
+
+
+def _culprit(a: FloatArray, b: FloatArray, sigma: FloatArray, used: np.ndarray) -> int | None:
+    """The one point without which the rest fits; None if there is none, or more than one may be it."""
+    indices = np.flatnonzero(used)
+    if len(indices) < 4:
+        return None
+    left: dict[int, float] = {}
+    for index in indices:
+        rest = indices[indices != index]
+        try:
+            left[int(index)] = _chi2(_pose(a[rest], b[rest], sigma[rest], []), a[rest], b[rest], sigma[rest])
+        except NotAligned:
+            left[int(index)] = np.inf
+    best, second = sorted(left, key=left.__getitem__)[:2]
+    limit = _limit(3 * (len(indices) - 1) - 6)
+    # With five points or more a second blunder may still be among the rest: the next round looks for it.
+    fits = left[best] <= limit or len(indices) > 5
+    return best if fits and left[second] > limit and left[second] > left[best] + _limit(1) else None
+
+
+def _doubt(a: FloatArray, b: FloatArray, sigma: FloatArray, used: np.ndarray, names: Sequence[str]) -> str:
+    """Say which distances between points disagree."""
+    lines: list[tuple[float, int, int, float, float]] = []
+    for i, j in combinations(map(int, np.flatnonzero(used)), 2):
+        in_a, in_b = (float(np.linalg.norm(points[i] - points[j])) for points in (a, b))
+        lines.append((abs(in_a - in_b) / float(np.hypot(sigma[i], sigma[j])), i, j, in_a, in_b))
+    lines.sort(reverse=True)
+    limit = float(np.sqrt(chi2.isf(FALSE_ALARM, 1)))
+    off = [line for line in lines if line[0] > limit]
+    if not off:
+        one = [name for name, use in zip(names, used, strict=True) if use]
+        return f"the distances agree but the shape does not; any of {', '.join(one)} may be off"
+    size, first, second, in_a, in_b = lines[0]
+    told = (
+        f"{names[first]} and {names[second]} are {in_a:.4f} m apart in one list and {in_b:.4f} m in the other"
+        f" ({1000 * abs(in_a - in_b):.1f} mm, {size:.0f} sigma)"
+    )
+    shared = set(off[0][1:3]).intersection(*(line[1:3] for line in off[1:]))
+    if len(off) > 1 and len(shared) == 1:
+        told += f"; every distance that disagrees is one of {names[shared.pop()]}"
+    return told

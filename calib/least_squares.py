@@ -1,0 +1,122 @@
+"""Levenberg and Marquardt's method on normal equations, for unknowns that are not plain vectors.
+
+A camera, a rotation or a rig is moved by a *step*; the problem says how, and gives the normal equations of
+its weighted residuals at a state. Columns are scaled to one, so that metres, radians and pixels mix.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Generic, NamedTuple, Protocol, TypeVar
+
+import numpy as np
+from scipy.linalg import cho_factor, cho_solve
+
+from calib.rigid import FloatArray
+
+State = TypeVar("State")
+
+FIRST_DAMPING, LARGEST_DAMPING = 1e-4, 1e9
+
+NOTHING = 1e-18
+"""A gain in the weighted sum of squares that is none, whatever the cost: noise-free data have none left."""
+
+
+class Normal(NamedTuple):
+    """Cost (weighted sum of squares), JᵀJ (p, p) and Jᵀr (p,) at a state."""
+
+    cost: float
+    matrix: FloatArray
+    gradient: FloatArray
+
+
+class Problem(Protocol[State]):
+    """What a fit needs to know; costs are infinite where a state is impossible."""
+
+    def normal(self, state: State) -> Normal:
+        """Return cost and normal equations."""
+        ...
+
+    def cost(self, state: State) -> float:
+        """Return the cost alone."""
+        ...
+
+    def stepped(self, state: State, step: FloatArray) -> State:
+        """Return the state moved by a step (p,); ValueError if there is no such state."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class Minimum(Generic[State]):
+    """Where a fit ended: its state, the normal equations there, and whether it settled within its steps."""
+
+    state: State
+    normal: Normal
+    settled: bool
+    steps: int
+
+
+def minimise(
+    problem: Problem[State],
+    start: State,
+    *,
+    weak: FloatArray | None = None,
+    steps: int = 60,
+    gain: float = 1e-10,
+) -> Minimum[State]:
+    """Minimise a problem's cost from a start.
+
+    Parameters
+    ----------
+    problem, start
+        What to fit, and from where.
+    weak
+        (p,) added to the diagonal of JᵀJ without any pull: unknowns that the data leave open stay where
+        they are. None adds nothing.
+    steps
+        Most steps to take.
+    gain
+        It has settled when a step is expected to lower the cost by less than this part of it.
+    """
+    state, normal = start, problem.normal(start)
+    damping, rejected_in_a_row = FIRST_DAMPING, 0
+    extra = np.zeros(len(normal.gradient)) if weak is None else weak
+    for count in range(steps):
+        if not np.isfinite(normal.cost):
+            break
+        scale = 1.0 / np.sqrt(np.maximum(np.diag(normal.matrix) + extra, 1e-300))
+        scaled = (normal.matrix + np.diag(extra)) * np.outer(scale, scale)
+        scaled_gradient = scale * normal.gradient
+        moved = None
+        while moved is None and damping <= LARGEST_DAMPING:
+            try:
+                factor = cho_factor(scaled + damping * np.eye(len(scale)), check_finite=False)
+            except np.linalg.LinAlgError:
+                damping = max(10 * damping, 1e-12)
+                continue
+            step = -cho_solve(factor, scaled_gradient, check_finite=False)
+            expected = float(-step @ (2 * scaled_gradient + scaled @ step))
+            if expected <= gain * normal.cost + NOTHING and damping <= FIRST_DAMPING:
+                moved = _try(problem, state, scale * step, normal.cost)
+                return Minimum(state if moved is None else moved, normal, True, count)
+            moved = _try(problem, state, scale * step, normal.cost)
+            if moved is None:
+                damping, rejected_in_a_row = max(10 * damping, 1e-12), rejected_in_a_row + 1
+            else:
+                damping = damping / 10 if damping > 1e-14 else damping
+                rejected_in_a_row = 0
+        if moved is None:
+            # No step of any size lowers the cost any more: rounding, or a place where it has a kink.
+            return Minimum(state, normal, expected <= 1e-6 * normal.cost + 1e6 * NOTHING, count)
+        state = moved
+        normal = problem.normal(state)
+    return Minimum(state, normal, False, steps)
+
+
+def _try(problem: Problem[State], state: State, step: FloatArray, cost: float) -> State | None:
+    """The state a step leads to, or None if that is no better."""
+    try:
+        moved = problem.stepped(state, step)
+    except ValueError:
+        return None
+    return moved if problem.cost(moved) < cost else None

@@ -1,0 +1,41 @@
+"""Width and height of a PNG or JPEG file from its first bytes, without decoding it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+_PNG = b"\x89PNG\r\n\x1a\n"
+_WITHOUT_LENGTH = {0x01, *range(0xD0, 0xD9)}
+_NO_FRAME = {0xC4, 0xC8, 0xCC}
+
+
+def picture_size_px(path: Path) -> tuple[int, int] | None:
+    """Return (width, height) in pixels; None where the file is neither PNG nor JPEG, or is cut short.
+
+    Raises
+    ------
+    OSError
+        If the file cannot be read.
+    """
+    with path.open("rb") as file:
+        head = file.read(1 << 18)
+    if head.startswith(_PNG) and head[12:16] == b"IHDR" and len(head) >= 24:
+        return int.from_bytes(head[16:20], "big"), int.from_bytes(head[20:24], "big")
+    return _jpeg_size_px(head) if head.startswith(b"\xff\xd8") else None
+
+
+def _jpeg_size_px(head: bytes) -> tuple[int, int] | None:
+    """Walk the segments to the frame header (ISO 10918-1, B.2.2: SOF, length, precision, height, width)."""
+    at = 2
+    while at + 9 <= len(head) and head[at] == 0xFF:
+        marker = head[at + 1]
+        if marker == 0xFF:
+            at += 1
+        elif marker in _WITHOUT_LENGTH:
+            at += 2
+        elif 0xC0 <= marker <= 0xCF and marker not in _NO_FRAME:
+            height, width = (int.from_bytes(head[i : i + 2], "big") for i in (at + 5, at + 7))
+            return width, height
+        else:
+            at += 2 + int.from_bytes(head[at + 2 : at + 4], "big")
+    return None

@@ -1,0 +1,171 @@
+"""A survey: the measurements of one calibration (the folder of contract section 2)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from calib.cahvor import Kind
+from calib.rigid import FloatArray
+
+IntArray = NDArray[np.int64]
+StationKind = Literal["prism", "tape", "check"]
+Purpose = Literal["camera", "mast", "check"]
+
+
+@dataclass(frozen=True, eq=False)
+class Board:
+    """The dot board; its frame has the origin at the grid's centre, x along a row, y down a column.
+
+    Attributes
+    ----------
+    rows, columns
+        Number of dots down and across.
+    spacing_m, dot_diameter_m
+        Metres.
+    tapes_in_board_m
+        Name of a tape to its place (3,) in the board frame, metres.
+    """
+
+    rows: int
+    columns: int
+    spacing_m: float
+    dot_diameter_m: float
+    tapes_in_board_m: Mapping[str, FloatArray]
+
+    def dots_in_board_m(self, rows: ArrayLike, columns: ArrayLike) -> FloatArray:
+        """Return the centres (n, 3), metres, of dots (rows (n,), columns (n,)), counted from 0."""
+        x = (np.asarray(columns, dtype=np.float64) - (self.columns - 1) / 2) * self.spacing_m
+        y = (np.asarray(rows, dtype=np.float64) - (self.rows - 1) / 2) * self.spacing_m
+        return np.stack([x, y, np.zeros_like(x)], axis=-1)
+
+
+@dataclass(frozen=True, eq=False)
+class SurveyCamera:
+    """What is known of a camera beforehand.
+
+    ``rough_C_m`` and ``rough_A`` (3,) are in the rover frame at the angles of its first image, good to
+    20 cm and 10 degrees, or None; ``focal_px`` is rough too.
+    """
+
+    name: str
+    on: Literal["head", "rover"]
+    size_px: tuple[int, int]
+    kind: Kind
+    focal_px: float
+    rough_C_m: FloatArray | None = None
+    rough_A: FloatArray | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class StationPoint:
+    """A row of station.csv: a point (3,), metres, in the station frame of its set-up.
+
+    ``row`` is the line of the file, the header being line 1.
+    """
+
+    setup: str
+    kind: StationKind
+    placement: str
+    point: str
+    position_m: FloatArray
+    row: int
+
+
+@dataclass(frozen=True, eq=False)
+class SurveyImage:
+    """A row of images.csv; body cameras have no angles (None).
+
+    ``file`` is relative to the survey's folder, ``Path()`` where there is no picture but only dots.
+    ``placement`` is empty for a check image without a board. ``row`` is the line of the file, the header
+    being line 1.
+    """
+
+    name: str
+    camera: str
+    setup: str
+    placement: str
+    purpose: Purpose
+    pan_rad: float | None
+    tilt_rad: float | None
+    file: Path
+    row: int
+
+
+@dataclass(frozen=True, eq=False)
+class Dots:
+    """Dots found in one image: rows (n,), columns (n,), pixels_px (n, 2), sigma_px (n,) or None."""
+
+    rows: IntArray
+    columns: IntArray
+    pixels_px: FloatArray
+    sigma_px: FloatArray | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Click:
+    """A check point (kind ``check`` of the station) at ``pixel_px`` (2,) of an image."""
+
+    image: str
+    point: str
+    pixel_px: FloatArray
+
+
+@dataclass(frozen=True)
+class Sigma:
+    """Standard deviations of the measurements, one axis each."""
+
+    station_m: float
+    dot_px: float
+    joint_rad: float = 0.0
+    prism_cad_m: float = 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class Survey:
+    """Everything that was measured.
+
+    ``dots`` maps an image's name to its dots; ``digest`` identifies the folder's contents.
+    """
+
+    folder: Path
+    board: Board
+    prisms_in_rover_m: Mapping[str, FloatArray]
+    sigma: Sigma
+    cameras: Mapping[str, SurveyCamera]
+    stereo: Mapping[str, tuple[str, str]]
+    station: tuple[StationPoint, ...]
+    images: tuple[SurveyImage, ...]
+    dots: Mapping[str, Dots]
+    clicks: tuple[Click, ...] = ()
+    digest: str = ""
+
+
+@dataclass(frozen=True)
+class Finding:
+    """Something about a survey that a person should know before it is fitted.
+
+    Attributes
+    ----------
+    severity
+        ``error``: do not fit this; ``warning``: the fit can go on and may be worse for it.
+    place
+        Where: a file with its line, a camera, a set-up, a placement.
+    message
+        What is so, with its numbers.
+    advice
+        What to measure or correct.
+    """
+
+    severity: Literal["error", "warning"]
+    place: str
+    message: str
+    advice: str
+
+    def __str__(self) -> str:
+        return f"{self.severity}: {self.place}: {self.message}. {self.advice}."

@@ -1,0 +1,40 @@
+"""Fits of simulated surveys that several tests read."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from made_survey import make_survey
+
+from calib.calibration import Calibration
+from calib.fit_joint import fit_joint
+from calib.fit_paper import fit_paper
+from calib.mast import Rig
+from calib.store import load_rig
+
+
+@pytest.fixture(scope="session")
+def true_rig() -> Rig:
+    """The rover that surveys are made of: six cameras, the paper's mast."""
+    return load_rig(Path(__file__).resolve().parents[2] / "configs" / "sim" / "rocky8.yaml").rig
+
+
+@pytest.fixture(scope="session")
+def navcams(true_rig: Rig) -> Rig:
+    """The same rover with its Navcams alone: surveys that are fitted in a moment."""
+    pair = {n: c for n, c in true_rig.cameras.items() if n.startswith("navcam")}
+    return replace(true_rig, cameras=pair, stereo={"navcam": ("navcam_left", "navcam_right")})
+
+
+@pytest.fixture(scope="session")
+def joint(true_rig: Rig) -> Calibration:
+    """The joint fit of survey 1."""
+    return fit_joint(make_survey(true_rig, 1))
+
+
+@pytest.fixture(scope="session")
+def paper(true_rig: Rig) -> Calibration:
+    """The paper's fit of survey 1."""
+    return fit_paper(make_survey(true_rig, 1))

@@ -1,0 +1,1 @@
+"""From a survey folder to a mast file and a report that says whether to trust it."""

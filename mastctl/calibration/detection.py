@@ -1,0 +1,56 @@
+"""Dots of the images that dots.csv does not name, found in their files by one process for each processor."""
+
+from __future__ import annotations
+
+import os
+from concurrent.futures import Executor, ProcessPoolExecutor
+from dataclasses import replace
+from multiprocessing import get_context
+from pathlib import Path
+
+import cv2
+
+from calib.detect_survey import Progress, detect_survey
+from calib.survey import Survey
+
+
+def missing(survey: Survey) -> tuple[str, ...]:
+    """Return the names of images with a file whose dots are not known."""
+    return tuple(
+        image.name for image in survey.images if image.name not in survey.dots and image.file != Path()
+    )
+
+
+def with_dots(
+    survey: Survey, progress: Progress | None = None, executor: Executor | None = None
+) -> tuple[Survey, tuple[tuple[str, str], ...]]:
+    """Return the survey with the dots of every image that shows them, and (image, reason) of the others.
+
+    Parameters
+    ----------
+    survey
+        As read; not changed.
+    progress
+        Called after each image: how many are done, of how many, and its name.
+    executor
+        Where images are searched; by default one process for each processor.
+    """
+    clicked = {click.image for click in survey.clicks}  # a picture of a check point need not show a board
+    if executor is not None:
+        found = detect_survey(survey, executor, progress)
+    else:
+        workers = max(1, min(len(missing(survey)), os.cpu_count() or 1))
+        # Started afresh: a progress bar's thread runs here already, which a fork would copy half.
+        with ProcessPoolExecutor(workers, get_context("spawn"), _one_thread) as pool:
+            try:
+                found = detect_survey(survey, pool, progress)
+            except BaseException:
+                pool.shutdown(cancel_futures=True)
+                raise
+    failures = [(name, reason) for name, reason in found.failures.items() if name not in clicked]
+    return replace(survey, dots=found.dots), tuple(failures)
+
+
+def _one_thread() -> None:
+    """One process a processor is enough."""
+    cv2.setNumThreads(1)

@@ -1,0 +1,83 @@
+"""What residuals of check images a survey's own noise explains: dots and tapes by their sigmas."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from scipy.stats import chi2
+
+from calib.align import Alignment, NotAligned, rover_from_station, station_from_board
+from calib.calibration import Calibration, ImageResiduals
+from calib.rigid import FloatArray
+from calib.survey import Survey
+from calib.uncertainty import pixel_covariance
+
+RARELY = 0.001
+
+
+class CheckSize(NamedTuple):
+    """Rms per axis of what was seen, and of what noise and the covariance of the fit make of it; pixels.
+
+    ``limit_px`` is passed once in a thousand times, if the sigmas are right.
+    """
+
+    seen_px: float
+    expected_px: float
+    limit_px: float
+
+
+def check_sizes(survey: Survey, calibration: Calibration) -> dict[str, CheckSize]:
+    """Return by camera how large the residuals of its check images are, and what would explain them.
+
+    Their boards stand as the station measured them, and one board's error moves all its dots together: a
+    board counts as two measurements, not as two hundred.
+    """
+    try:
+        setups, boards = rover_from_station(survey), station_from_board(survey)
+    except NotAligned:
+        return {}
+    squares: dict[str, list[tuple[float, float]]] = {}
+    for image in calibration.images:
+        key = (image.setup, image.placement)
+        if image.purpose == "check" and key in boards and image.setup in setups:
+            seen = float(np.mean(image.residuals_px**2))
+            expected = _expected_px2(survey, calibration, image, setups[image.setup], boards[key])
+            squares.setdefault(image.camera, []).append((seen, expected))
+    sizes = {}
+    for camera, pairs in squares.items():
+        seen, expected = np.sqrt(np.mean(pairs, axis=0))
+        freedom = 2 * len(pairs)
+        limit = expected * np.sqrt(chi2.isf(RARELY, freedom) / freedom)
+        sizes[camera] = CheckSize(float(seen), float(expected), float(limit))
+    return sizes
+
+
+def _expected_px2(
+    survey: Survey, calibration: Calibration, image: ImageResiduals, setup: Alignment, board: Alignment
+) -> float:
+    """Mean square per axis that dots, tapes and the fit's covariance explain.
+
+    What prisms got wrong turns and shifts rig and board together and shows in no residual: it is taken out
+    of the fit's covariance again.
+    """
+    pan, tilt = image.pan_rad or 0.0, image.tilt_rad or 0.0
+    in_board = survey.board.dots_in_board_m(image.rows, image.columns)
+    points = calibration.rover_from_board[image.setup, image.placement].points(in_board)
+    model = calibration.rig.camera_in_rover(image.camera, pan, tilt)
+    _, rates, _ = model.project_jacobian(points)
+    in_station = rates @ setup.b_from_a.rotation @ _moves(board.b_from_a.vectors(in_board))
+    by_board = np.einsum("nip,pq,niq->ni", in_station, board.covariance, in_station)
+    in_rover = rates @ _moves(points - setup.b_from_a.translation_m)
+    common = np.einsum("nip,pq,niq->ni", in_rover, setup.covariance, in_rover)
+    _, by_fit = pixel_covariance(calibration, image.camera, pan, tilt, points)
+    relative = np.maximum(np.einsum("nii->ni", by_fit) - common, 0.0)
+    return float(np.nanmean(by_board + relative + image.sigma_px[:, None] ** 2))
+
+
+def _moves(points_m: FloatArray) -> FloatArray:
+    """How points (n, 3) follow a small turn and shift of their frame: (n, 3, 6)."""
+    x, y, z = points_m.T
+    zero, one = np.zeros_like(x), np.ones_like(x)
+    rows = [zero, z, -y, one, zero, zero, -z, zero, x, zero, one, zero, y, -x, zero, zero, zero, one]
+    return np.stack(rows, axis=-1).reshape(-1, 3, 6)

@@ -1,0 +1,226 @@
+"""The report's pictures, by matplotlib: each function returns a figure."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from calib.calibration import Calibration, ImageResiduals
+from calib.mast import Rig
+from calib.rigid import Rigid
+from calib.survey import Board
+from mastctl.calibration.maps import PointingMap
+
+FITTED, CHECK, LEFT_OUT = "#1f6f8b", "#c1440e", "#999999"
+COLOURS = ("#1f6f8b", "#c1440e", "#2d7d46", "#7a4b9d", "#b26a00", "#555555")
+ARROW_PART = 0.05
+"""The typical residual is drawn this part of the image's width long; check images have their own scale."""
+
+MANY_DOTS = 2500
+
+
+def residuals(calibration: Calibration, camera: str) -> Any:
+    """Draw the residuals of a camera's dots as arrows over its image: fitted, and of check images."""
+    figure = _figure(5.6, 4.4)
+    axis = figure.subplots()
+    width, height = calibration.rig.cameras[camera].model.size_px
+    mine = [image for image in calibration.images if image.camera == camera]
+    fitted = _dots(mine, lambda image: image.used)
+    check = _dots(mine, lambda image: np.full(len(image.used), image.purpose == "check"))
+    out = _dots(mine, lambda image: ~image.used & (image.purpose != "check"))
+    length_px = ARROW_PART * width
+    for (places, arrows), colour, word in ((check, CHECK, "check"), (fitted, FITTED, "fitted")):
+        if not len(places):
+            continue
+        typical = max(float(np.sqrt(np.mean(np.sum(arrows**2, axis=1)))), 1e-9)
+        step = -(-len(places) // MANY_DOTS)
+        axis.quiver(
+            *places[::step].T, *arrows[::step].T, color=colour, angles="xy", scale_units="xy",
+            label=f"{word}: {length_px:.0f} px long is {typical:.2g} px",
+            scale=typical / length_px, width=0.0016, headwidth=4, alpha=0.75,
+        )  # fmt: skip
+    if len(out[0]):
+        axis.scatter(*out[0].T, marker="x", s=16, color=LEFT_OUT, label="left out", zorder=3)
+    axis.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5), aspect="equal", title=camera)
+    axis.set_xlabel("x, px")
+    axis.set_ylabel("y, px")
+    if axis.get_legend_handles_labels()[0]:
+        axis.legend(loc="upper right", fontsize=7, framealpha=0.8)
+    return figure
+
+
+def boards(calibration: Calibration, board: Board) -> Any:
+    """Draw every board and camera in the rover frame, from above and from the side."""
+    figure = _figure(10.5, 5.2)
+    plan, side = figure.subplots(1, 2)
+    corners = board.dots_in_board_m(
+        [0, 0, board.rows - 1, board.rows - 1, 0], [0, board.columns - 1, board.columns - 1, 0, 0]
+    )
+    purposes: dict[tuple[str, str], str] = {}
+    for image in calibration.images:
+        purposes.setdefault((image.setup, image.placement), image.purpose)
+    colour_of = {"camera": COLOURS[0], "mast": COLOURS[2], "check": COLOURS[1]}
+    labelled: set[str] = set()
+    for key, pose in calibration.rover_from_board.items():
+        purpose = purposes.get(key, "camera")
+        outline = pose.points(corners)
+        label = None if purpose in labelled else f"boards: {purpose}"
+        labelled.add(purpose)
+        for axis, (across, up) in ((plan, (1, 0)), (side, (0, 2))):
+            axis.plot(outline[:, across], outline[:, up], color=colour_of[purpose], lw=1.5, label=label)
+        if purpose != "camera":  # those of a ring stand too close together for names
+            plan.annotate(
+                key[1],
+                outline[1, [1, 0]],
+                fontsize=5.5,
+                color="0.35",
+                xytext=(2, 2),
+                textcoords="offset points",
+            )
+    _eyes(calibration.rig, plan, side)
+    plan.set(xlabel="y (right), m", ylabel="x (ahead), m", title="from above", aspect="equal")
+    side.set(xlabel="x (ahead), m", ylabel="z (down), m", title="from the right side", aspect="equal")
+    side.invert_yaxis()
+    for axis in (plan, side):
+        axis.grid(alpha=0.25)
+    plan.legend(fontsize=7, loc="best")
+    return figure
+
+
+def errors_by(calibration: Calibration) -> Any:
+    """Draw each image's rms over the board's range, its angle to the line of sight, pan and tilt."""
+    figure = _figure(11.5, 3.6)
+    axes = figure.subplots(1, 4, sharey=True)
+    values: Sequence[tuple[str, Any]] = (
+        ("range, m", lambda image: image.range_m),
+        ("board turned away, deg", lambda image: np.degrees(image.incidence_rad)),
+        ("pan, deg", lambda image: None if image.pan_rad is None else np.degrees(image.pan_rad)),
+        ("tilt, deg", lambda image: None if image.tilt_rad is None else np.degrees(image.tilt_rad)),
+    )
+    cameras = list(calibration.rig.cameras)
+    for axis, (label, value) in zip(axes, values, strict=True):
+        for index, camera in enumerate(cameras):
+            for purpose, marker in (("fitted", "o"), ("check", "^")):
+                points = [
+                    (value(image), _image_rms(image))
+                    for image in calibration.images
+                    if image.camera == camera
+                    and (image.purpose == "check") == (purpose == "check")
+                    and value(image) is not None
+                    and (image.purpose == "check" or image.used.any())
+                ]
+                if points:
+                    colour = COLOURS[index % len(COLOURS)]
+                    name = camera if purpose == "fitted" else None
+                    axis.scatter(*np.array(points, dtype=float).T, s=18, marker=marker, color=colour,
+                                 alpha=0.75, label=name)  # fmt: skip
+        axis.set_xlabel(label)
+        axis.set_yscale("log")
+        axis.grid(alpha=0.25, which="both")
+    axes[0].set_ylabel("rms of an image, px an axis")
+    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside upper center", ncols=6, fontsize=8)
+    return figure
+
+
+def correlation(names: Sequence[str], covariance: np.ndarray, title: str) -> Any:
+    """Draw the correlation of parameters as a coloured square; numbers where they are few."""
+    spread = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
+    matrix = covariance / np.outer(spread, spread)
+    few = len(names) <= 10
+    figure = _figure(5.6 if few else 7.4, 4.8 if few else 6.6)
+    axis = figure.subplots()
+    shown = axis.imshow(matrix, vmin=-1, vmax=1, cmap="RdBu_r", interpolation="nearest")
+    if few:
+        ticks, labels = list(map(float, range(len(names)))), [_short(name) for name in names]
+        for i in range(len(names)):
+            for j in range(len(names)):
+                strong = abs(matrix[i, j]) > 0.6
+                axis.text(j, i, f"{matrix[i, j]:.2f}", ha="center", va="center", fontsize=7,
+                          color="white" if strong else "black")  # fmt: skip
+    else:
+        groups = _groups(names)
+        ticks, labels = [(a + b) / 2 - 0.5 for a, b in groups.values()], list(groups)
+        for a, _ in groups.values():
+            axis.axhline(a - 0.5, color="0.4", lw=0.5)
+            axis.axvline(a - 0.5, color="0.4", lw=0.5)
+    axis.set_xticks(ticks, labels, rotation=45, ha="right", fontsize=7)
+    axis.set_yticks(ticks, labels, fontsize=7)
+    axis.set_title(title)
+    figure.colorbar(shown, ax=axis, shrink=0.8)
+    return figure
+
+
+def pointing_map(found: PointingMap, calibration: Calibration, what: str) -> Any:
+    """Draw a map over pan and tilt, both ways of naming a target, with the survey's own joint angles."""
+    figure = _figure(11.5, 3.9)
+    axes = figure.subplots(1, 2, sharey=True)
+    joints = {
+        (image.pan_rad, image.tilt_rad)
+        for image in calibration.images
+        if image.pan_rad is not None and image.tilt_rad is not None and image.used.any()
+    }
+    for axis, values, title in (
+        (axes[0], found.by_click, "clicked in the pair, off the middle"),
+        (axes[1], found.by_position, "given as a position in the rover frame"),
+    ):
+        pan, tilt = np.degrees(found.pan_rad), np.degrees(found.tilt_rad)
+        shown = axis.pcolormesh(pan, tilt, values, shading="nearest", cmap="viridis")
+        figure.colorbar(shown, ax=axis, label=f"{what}, px")
+        if np.isfinite(values).any() and np.nanmax(values) > 1.0001 * np.nanmin(values):
+            lines = axis.contour(pan, tilt, values, colors="white", linewidths=0.7)
+            axis.clabel(lines, fontsize=7)
+        if joints:
+            axis.scatter(*np.degrees(np.array(sorted(joints))).T, s=12, c="white", edgecolors="black", lw=0.5)
+        axis.set(xlabel="pan, deg", title=f"{found.camera}, {found.range_m:g} m: {title}")
+        axis.title.set_fontsize(9)
+    axes[0].set_ylabel("tilt, deg")
+    return figure
+
+
+def _figure(width: float, height: float) -> Any:
+    from matplotlib.figure import Figure
+
+    return Figure(figsize=(width, height), layout="constrained")
+
+
+def _dots(images: Sequence[ImageResiduals], which: Any) -> tuple[np.ndarray, np.ndarray]:
+    places = [image.pixels_px[which(image)] for image in images]
+    arrows = [image.residuals_px[which(image)] for image in images]
+    if not places:
+        return np.empty((0, 2)), np.empty((0, 2))
+    return np.concatenate(places), np.concatenate(arrows)
+
+
+def _image_rms(image: ImageResiduals) -> float:
+    which = np.ones(len(image.used), dtype=bool) if image.purpose == "check" else image.used
+    return float(np.sqrt(np.mean(image.residuals_px[which] ** 2)))
+
+
+def _eyes(rig: Rig, plan: Any, side: Any) -> None:
+    """The cameras with the head straight ahead, and the mast's foot of the pan axis."""
+    for index, name in enumerate(rig.cameras):
+        model = rig.camera_in_rover(name, 0.0, 0.0)
+        ahead = Rigid(np.eye(3), model.C).points(0.8 * np.asarray(model.A))
+        for axis, (across, up) in ((plan, (1, 0)), (side, (0, 2))):
+            axis.plot([model.C[across], ahead[across]], [model.C[up], ahead[up]], lw=1,
+                      color="black", label="cameras at pan 0, tilt 0" if index == 0 else None)  # fmt: skip
+            axis.plot(model.C[across], model.C[up], "k.", ms=4)
+
+
+def _short(name: str) -> str:
+    """``mast.translation_m.x`` as ``t x``."""
+    words: Mapping[str, str] = {"translation_m": "t", "rotation_rad": "θ"}
+    _, key, *axis = name.split(".")
+    return " ".join([words.get(key, key), *axis])
+
+
+def _groups(names: Sequence[str]) -> dict[str, tuple[int, int]]:
+    """First and last + 1 index of the mast's and of each camera's parameters."""
+    groups: dict[str, tuple[int, int]] = {}
+    for index, name in enumerate(names):
+        first, second, *_ = name.split(".")
+        group = first if first == "mast" else second
+        groups[group] = (groups.get(group, (index, 0))[0], index + 1)
+    return groups

@@ -1,0 +1,111 @@
+"""The way from a survey folder to a saved mast file; refusals on the way leave every file as it was."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+from calib.calibration import Calibration
+from calib.fit_joint import fit_joint
+from calib.fit_paper import fit_paper
+from calib.store import StoredRig, save_rig
+from calib.survey import Finding, Survey
+from calib.survey_check import check_survey
+from mastctl.calibration.mast_file import with_fit
+from mastctl.calibration.verdict import Verdict, judge
+from mastctl.errors import MastctlError
+
+Method = Literal["paper", "joint"]
+
+FITS: dict[Method, Callable[[Survey, int], Calibration]] = {"paper": fit_paper, "joint": fit_joint}
+
+
+class SurveyRefused(MastctlError):
+    """A survey that cannot be fitted as it is; ``detail`` holds every finding of the check."""
+
+    code = "survey_refused"
+    exit_code = 2
+
+    def __init__(self, survey: Survey, findings: Sequence[Finding]) -> None:
+        errors = [finding for finding in findings if finding.severity == "error"]
+        self.findings = tuple(findings)
+        self.detail = {"findings": [finding_told(finding) for finding in findings]}
+        more = f" There are {len(errors) - 1} more errors." if len(errors) > 1 else ""
+        super().__init__(f"{survey.folder}: {sentence_of(errors[0])}{more}")
+
+
+@dataclass(frozen=True, eq=False)
+class Calibrated:
+    """What came of a survey: the fit, the verdict, and the file that holds it."""
+
+    survey: Survey
+    calibration: Calibration
+    verdict: Verdict
+    warnings: tuple[str, ...]
+    undetected: tuple[tuple[str, str], ...]
+    saved: StoredRig
+
+
+def checked(survey: Survey) -> tuple[str, ...]:
+    """Return the sentences of the check's warnings.
+
+    Raises
+    ------
+    SurveyRefused
+        If the check found an error.
+    """
+    findings = check_survey(survey)
+    if any(finding.severity == "error" for finding in findings):
+        raise SurveyRefused(survey, findings)
+    return tuple(sentence_of(finding) for finding in findings)
+
+
+def calibrate(
+    survey: Survey,
+    out: Path,
+    method: Method = "joint",
+    mast_parameters: int = 6,
+    warnings: tuple[str, ...] = (),
+    undetected: tuple[tuple[str, str], ...] = (),
+) -> Calibrated:
+    """Fit a checked survey, judge the result, and save it as a mast file.
+
+    Parameters
+    ----------
+    survey
+        With dots for every image that shall be fitted.
+    out
+        The mast file; the version before it is kept as ``NAME.previous.yaml``.
+    method, mast_parameters
+        ``paper`` or ``joint``; 4, 6 or 8.
+    warnings, undetected
+        From the check and from the search for dots, for the verdict.
+
+    Raises
+    ------
+    SurveyNotFitted
+        If the fit finds no good minimum; nothing is written.
+    BadFile
+        If ``out`` cannot be written; it holds what it held before.
+    """
+    calibration = FITS[method](survey, mast_parameters)
+    verdict = judge(survey, calibration, warnings, [name for name, _ in undetected])
+    saved = save_rig(with_fit(calibration, survey, verdict.told()), out)
+    return Calibrated(survey, calibration, verdict, warnings, undetected, saved)
+
+
+def sentence_of(finding: Finding) -> str:
+    """Return a finding as one sentence: where, what, and what to measure next."""
+    return str(finding).removeprefix(f"{finding.severity}: ")
+
+
+def finding_told(finding: Finding) -> dict[str, Any]:
+    """Return a finding as JSON."""
+    return {
+        "severity": finding.severity,
+        "place": finding.place,
+        "message": finding.message,
+        "advice": finding.advice,
+    }

@@ -1,0 +1,199 @@
+"""Whether to trust a calibration, and why: a few tests, each one sentence."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from calib.calibration import Calibration
+from calib.errors import CalibError
+from calib.survey import Survey
+from calib.uncertainty import pointing_covariance
+from mastctl.calibration.expected import RARELY, check_sizes
+
+Grade = Literal["good", "care", "bad"]
+
+WORDS: Mapping[Grade, str] = {
+    "good": "trust it",
+    "care": "use it with care",
+    "bad": "do not trust it",
+}
+
+POINTING_RANGE_M = 6.0
+POINTING_GOOD_PX = 0.5
+POINTING_BAD_PX = 2.0
+"""Rms per axis that the calibration alone may add to pointing at a click; the paper reached 1.3 in all."""
+
+MANY_LEFT_OUT = 0.05
+"""Share of dots or images left out above which the survey itself is in doubt."""
+
+PAPER_GOOD_PX = 2.0
+"""Rms of fitted images that the paper's method may leave: station errors of 2 mm are 1.4 px at 5 m."""
+
+
+@dataclass(frozen=True)
+class Reason:
+    """One test's outcome in words."""
+
+    grade: Grade
+    sentence: str
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """The worst of the reasons decides."""
+
+    grade: Grade
+    reasons: tuple[Reason, ...]
+
+    @property
+    def words(self) -> str:
+        """The grade as a person says it."""
+        return WORDS[self.grade]
+
+    def told(self) -> dict[str, object]:
+        """Return it as JSON or YAML."""
+        reasons = [{"grade": reason.grade, "sentence": reason.sentence} for reason in self.reasons]
+        return {"grade": self.grade, "words": self.words, "reasons": reasons}
+
+
+def judge(
+    survey: Survey,
+    calibration: Calibration,
+    warnings: Sequence[str] = (),
+    undetected: Sequence[str] = (),
+) -> Verdict:
+    """Return whether to trust a calibration.
+
+    Parameters
+    ----------
+    survey
+        With the dots that were fitted.
+    calibration
+        What came of it.
+    warnings
+        What the check of the survey warned of.
+    undetected
+        Names of images in which no dots were found.
+    """
+    reasons = [
+        *_noise(survey, calibration),
+        *_checks(survey, calibration),
+        *_open(calibration),
+        *_pointing(calibration),
+        *_left_out(calibration),
+    ]
+    if undetected:
+        reasons.append(Reason("care", f"no dots were found in {len(undetected)} images: {_some(undetected)}"))
+    if warnings:
+        reasons.append(Reason("care", f"the check of the survey warned {len(warnings)} times"))
+    grades = {reason.grade for reason in reasons}
+    grade: Grade = "bad" if "bad" in grades else "care" if "care" in grades else "good"
+    return Verdict(grade, tuple(reasons))
+
+
+def _noise(survey: Survey, calibration: Calibration) -> list[Reason]:
+    """Whether the residuals are what the stated sigmas make them."""
+    if not np.isfinite(calibration.chi2_probability):
+        worst = max((max(xy), name) for name, xy in calibration.rms_px.items())
+        words = f"the largest residual of the fitted images is {worst[0]:.2f} px rms ({worst[1]})"
+        if worst[0] > PAPER_GOOD_PX:
+            upright = calibration.mast_parameters == 4
+            why = "the mast is not upright: use --mast 6" if upright else "station and boards do not agree"
+            return [Reason("bad", f"{words}: {why}")]
+        return [Reason("good", f"{words}, within what station errors of some mm leave")]
+    factor = np.sqrt(calibration.chi2 / max(calibration.degrees_of_freedom, 1.0))
+    words = (
+        f"chi-square is {calibration.chi2:.0f} for {calibration.degrees_of_freedom:.0f} degrees of freedom: "
+        f"the residuals are {factor:.2f} times what the stated sigmas make them"
+    )
+    if calibration.chi2_probability < RARELY:
+        return [Reason("bad" if factor > 2.0 else "care", words)]
+    return [Reason("good", words)]
+
+
+def _checks(survey: Survey, calibration: Calibration) -> list[Reason]:
+    """Whether images that were not fitted are predicted as well as they should be."""
+    if not calibration.check_rms_px:
+        return [Reason("care", "there is no check image: nothing shows how well the result predicts")]
+    reasons = []
+    for camera, size in check_sizes(survey, calibration).items():
+        words = (
+            f"check images of {camera} are off by {size.seen_px:.2f} px rms an axis where the survey's noise "
+            f"explains {size.expected_px:.2f}"
+        )
+        grade: Grade = "good" if size.seen_px <= size.limit_px else "bad"
+        reasons.append(Reason(grade, f"{words}; more than {size.limit_px:.2f} would be bad"))
+    return reasons
+
+
+def _open(calibration: Calibration) -> list[Reason]:
+    return [Reason("bad", direction.sentence) for direction in calibration.degenerate]
+
+
+def _pointing(calibration: Calibration) -> list[Reason]:
+    """How much the calibration alone adds to a pointing from a click."""
+    reasons = []
+    for pair, names in calibration.rig.stereo.items():
+        if calibration.rig.cameras[names[0]].on != "head":
+            continue
+        sigma = pointing_sigma_px(calibration, names)
+        if sigma is None:
+            reasons.append(Reason("care", f"pointing by {pair} at {POINTING_RANGE_M:g} m is not possible"))
+            continue
+        grade: Grade = "good" if sigma <= POINTING_GOOD_PX else "care" if sigma <= POINTING_BAD_PX else "bad"
+        words = f"pointing {pair} at what was clicked near a corner at {POINTING_RANGE_M:g} m"
+        reasons.append(
+            Reason(grade, f"{words} is uncertain by {sigma:.2f} px an axis from calibration alone")
+        )
+    return reasons
+
+
+def pointing_sigma_px(calibration: Calibration, pair: tuple[str, str]) -> float | None:
+    """Return the sigma (rms per axis, pixels) of pointing at targets clicked near the image's corners.
+
+    None if no such target can be pointed at.
+    """
+    width, height = calibration.rig.cameras[pair[0]].model.size_px
+    seen = [i for i in calibration.images if i.camera == pair[0] and i.pan_rad is not None]
+    pan = float(np.median([i.pan_rad for i in seen])) if seen else 0.0
+    tilt = float(np.median([i.tilt_rad for i in seen])) if seen else 0.0
+    variances = []
+    for x, y in ((0.2, 0.2), (0.8, 0.2), (0.2, 0.8), (0.8, 0.8)):
+        try:
+            left_px = np.array([x * width, y * height])
+            covariance = pointing_covariance(calibration, pair, pan, tilt, left_px, POINTING_RANGE_M)
+        except CalibError:
+            continue
+        variances.append(np.trace(covariance) / 2)
+    return float(np.sqrt(np.mean(variances))) if variances else None
+
+
+def _left_out(calibration: Calibration) -> list[Reason]:
+    """Whether too much was rejected."""
+    by_kind = {
+        kind: [outlier for outlier in calibration.outliers if outlier.kind == kind]
+        for kind in ("dot", "image", "tape", "prism")
+    }
+    fitted = [image for image in calibration.images if image.purpose != "check"]
+    dots = sum(len(image.used) for image in fitted)
+    reasons = []
+    for kind, count in (("dot", dots), ("image", len(fitted))):
+        left = len(by_kind[kind])
+        if left > MANY_LEFT_OUT * max(count, 1):
+            reasons.append(Reason("care", f"{left} of {count} {kind}s were left out; look for the cause"))
+    tapes = sum(point.kind == "tape" for point in calibration.station)
+    if by_kind["prism"] or len(by_kind["tape"]) > MANY_LEFT_OUT * tapes:
+        names = _some([outlier.name for kind in ("prism", "tape") for outlier in by_kind[kind]])
+        reasons.append(Reason("care", f"measure again: {names}"))
+    if not reasons and calibration.outliers:
+        reasons.append(Reason("good", f"{len(calibration.outliers)} measurements were left out, each named"))
+    return reasons
+
+
+def _some(names: Sequence[str], most: int = 4) -> str:
+    more = f" and {len(names) - most} more" if len(names) > most else ""
+    return ", ".join(names[:most]) + more

@@ -1,0 +1,222 @@
+"""``mastctl calibrate``: from a survey folder to a mast file and a report."""
+
+from __future__ import annotations
+
+import argparse
+from contextlib import AbstractContextManager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from mastctl.cli import output
+
+if TYPE_CHECKING:
+    from calib.store import StoredRig
+    from calib.survey import Survey
+    from mastctl.calibration.run import Calibrated
+
+OUTLIERS_SHOWN = 20
+
+
+def add_commands(subparsers: Any) -> None:
+    """Add ``calibrate``."""
+    parser = subparsers.add_parser(
+        "calibrate",
+        help="fit cameras and mast to a survey, and write the mast file",
+        description="Reads a survey folder (docs/calibration.md), checks it, finds dots where there are "
+        "none, fits cameras and mast, and writes the mast file with its uncertainty. The file's former "
+        "version is kept as NAME.previous.yaml.",
+    )
+    parser.add_argument("survey", type=Path, metavar="SURVEY", help="the survey folder")
+    parser.add_argument("--out", type=Path, required=True, metavar="MAST.yaml", help="the mast file to write")
+    parser.add_argument("--report", type=Path, metavar="DIR", help="folder for calibration.html")
+    parser.add_argument(
+        "--method",
+        choices=("paper", "joint"),
+        default="joint",
+        help="paper: cameras first, then the mast; joint (default): everything together, weighted",
+    )
+    parser.add_argument(
+        "--mast",
+        type=int,
+        choices=(4, 6, 8),
+        default=6,
+        help="mast parameters: 4 upright, 6 the paper's (default), 8 two skew axes",
+    )
+    parser.add_argument(
+        "--in-use",
+        type=Path,
+        metavar="MAST.yaml",
+        help="the mast file to compare with (default: what --out held before)",
+    )
+    parser.set_defaults(run=run)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Read, check, find dots, fit, save, report; nothing is written before the fit is good."""
+    from calib.survey import read_survey
+    from mastctl.calibration.run import calibrate, checked
+
+    survey = read_survey(args.survey)
+    checked(survey)
+    _check_out(args.out)
+    in_use = _in_use(args)
+    survey, undetected = _with_dots(args, survey)
+    warnings = checked(survey)  # once more, with the dots that were found
+    for warning in warnings:
+        output.tell(f"warning: {warning}")
+    with _waiting(args, f"fitting {len(survey.images)} images ({args.method})"):
+        done = calibrate(survey, args.out, args.method, args.mast, warnings, undetected)
+    page = _report(args, done, in_use)
+    if args.json:
+        output.print_json(_document(done, in_use, page))
+    else:
+        _show(done, in_use, page)
+    return 0
+
+
+def _check_out(out: Path) -> None:
+    """Refuse an impossible --out before the minutes of the search, not after them."""
+    if not out.resolve().parent.is_dir():
+        raise output.CommandError(
+            "file_system", f"--out {out}: there is no folder {out.parent}; make it first", exit_code=2
+        )
+    if out.is_dir():
+        raise output.CommandError("file_system", f"--out {out}: is a folder; a file is expected", exit_code=2)
+
+
+def _in_use(args: argparse.Namespace) -> StoredRig | None:
+    """The mast file to compare with; one at --out that cannot be read is no reason to stop."""
+    from calib.errors import BadFile
+    from calib.store import load_rig
+
+    if args.in_use is not None:
+        return load_rig(args.in_use)
+    if not args.out.exists():
+        return None
+    try:
+        return load_rig(args.out)
+    except BadFile as error:
+        output.tell(f"warning: nothing to compare with: {error}")
+        return None
+
+
+def _with_dots(args: argparse.Namespace, survey: Survey) -> tuple[Survey, tuple[tuple[str, str], ...]]:
+    """Find dots in the images that dots.csv does not name, with a progress bar on stderr."""
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
+    from mastctl.calibration.detection import missing, with_dots
+
+    count = len(missing(survey))
+    if not count:
+        return survey, ()
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+    with Progress(*columns, console=Console(stderr=True, quiet=args.json)) as progress:
+        task = progress.add_task("finding dots", total=count)
+        survey, undetected = with_dots(survey, lambda done, _, name: progress.update(task, completed=done))
+    for name, reason in undetected:
+        output.tell(f"warning: no dots in image {name}: {reason}")
+    return survey, undetected
+
+
+def _waiting(args: argparse.Namespace, what: str) -> AbstractContextManager[Any]:
+    """Show on stderr what a person is waiting for."""
+    from rich.console import Console
+
+    return Console(stderr=True, quiet=args.json).status(what)
+
+
+def _report(args: argparse.Namespace, done: Calibrated, in_use: StoredRig | None) -> Path | None:
+    if args.report is None:
+        return None
+    from mastctl.calibration.report import Told, write_report
+
+    with _waiting(args, "writing the report"):
+        told = Told(
+            done.survey, done.calibration, done.verdict, done.warnings, done.undetected, in_use, done.saved
+        )
+        return write_report(told, args.report)
+
+
+def _document(done: Calibrated, in_use: StoredRig | None, page: Path | None) -> dict[str, Any]:
+    """The contract's keys, and what else a program may want."""
+    from mastctl.calibration.mast_file import as_lists, mast_keys, plain
+    from mastctl.calibration.report import change_summary
+
+    fit = done.calibration
+    sigma = plain(fit.sigma)
+    document: dict[str, Any] = {
+        "rms_px": as_lists(fit.rms_px),
+        "check_rms_px": as_lists(fit.check_rms_px),
+        "mast": mast_keys(fit.rig),
+        # The mast's own keys stand at the top beside the file's two sections.
+        "sigma": {**sigma["mast"], **sigma},
+        "seconds": fit.seconds,
+        "method": fit.method,
+        "mast_parameters": fit.mast_parameters,
+        "mast_file": {"path": str(done.saved.path), "digest": done.saved.digest},
+        "survey_digest": done.survey.digest,
+        "chi2": _finite(fit.chi2),
+        "degrees_of_freedom": _finite(fit.degrees_of_freedom),
+        "chi2_probability": _finite(fit.chi2_probability),
+        "outliers": [
+            {"kind": o.kind, "name": o.name, "sentence": o.sentence, "size": float(o.size)}
+            for o in fit.outliers
+        ],
+        "degenerate": [{"parameters": list(d.parameters), "sentence": d.sentence} for d in fit.degenerate],
+        "warnings": list(done.warnings),
+        "undetected": [{"image": name, "reason": reason} for name, reason in done.undetected],
+        "notes": list(fit.notes),
+        "verdict": done.verdict.told(),
+        "report": None if page is None else str(page),
+    }
+    if in_use is not None:
+        document["in_use"] = {
+            "path": str(in_use.path),
+            "digest": in_use.digest,
+            "pointing_change": change_summary(fit, in_use),
+        }
+    return document
+
+
+def _finite(number: float) -> float | None:
+    import math
+
+    return float(number) if math.isfinite(number) else None
+
+
+def _show(done: Calibrated, in_use: StoredRig | None, page: Path | None) -> None:
+    """Tables for people."""
+    from mastctl.calibration.report import CAMERA_HEADINGS, camera_rows, change_summary, mast_rows
+
+    fit = done.calibration
+    output.print_table(
+        f"Mast ({fit.method}, {fit.mast_parameters} parameters, {fit.seconds:.1f} s)",
+        ["parameter", "value", "sigma"],
+        mast_rows(fit),
+    )
+    output.print_table("Cameras", list(CAMERA_HEADINGS), camera_rows(fit), fit.notes)
+    if fit.outliers:
+        shown = [[outlier.name, _off(outlier)] for outlier in fit.outliers[:OUTLIERS_SHOWN]]
+        more = len(fit.outliers) - len(shown)
+        notes = [f"and {more} more, all in the mast file under fit.outliers"] if more > 0 else []
+        output.print_table(f"Left out ({len(fit.outliers)})", ["measurement", "off by"], shown, notes)
+    if fit.degenerate:
+        rows = [[", ".join(d.parameters[:4]), d.sentence] for d in fit.degenerate]
+        output.print_table("Left open by the survey", ["parameters", "why"], rows)
+    if in_use is not None and (changes := change_summary(fit, in_use)):
+        rows = [[pair, *(f"{change[key]:.2f}" for key in change)] for pair, change in changes.items()]
+        output.print_table(
+            f"Pointing would change against {in_use.path.name}, px",
+            ["pair", "clicked, median", "most", "position, median", "most"],
+            rows,
+        )
+    reasons = [[reason.grade, reason.sentence] for reason in done.verdict.reasons]
+    notes = [f"mast file: {done.saved.path} ({done.saved.digest[:12]})"]
+    notes += [f"report: {page}"] if page is not None else []
+    output.print_table(f"Verdict: {done.verdict.words}", ["", "reason"], reasons, notes)
+
+
+def _off(outlier: Any) -> str:
+    pixels = outlier.kind in ("dot", "image")
+    return f"{outlier.size:.2f} px" if pixels else f"{1000 * outlier.size:.1f} mm"

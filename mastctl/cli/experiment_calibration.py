@@ -1,0 +1,123 @@
+"""``mastctl experiment calibration``: how good a survey must be."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from mastctl.cli import output
+
+if TYPE_CHECKING:
+    from mastctl.experiment.calibration import CalibrationExperiment, Outcome, Variant
+
+DEFAULT_SURVEYS = 10
+DEFAULT_TARGETS = 20
+
+
+def add_parser(kinds: Any) -> None:
+    """Add ``calibration`` to the experiments."""
+    from mastctl.cli.experiment import at_least_one, seed
+
+    parser = kinds.add_parser(
+        "calibration",
+        help="simulated surveys, larger and smaller, better and worse: what pointing by them is worth",
+    )
+    parser.add_argument(
+        "--rig", type=Path, metavar="MAST.yaml", help="the true rig (default: the packaged simulated rover's)"
+    )
+    parser.add_argument(
+        "--surveys", type=at_least_one, default=DEFAULT_SURVEYS, metavar="N",
+        help="surveys of each kind (default 10, some 5 minutes on two processors)",
+    )  # fmt: skip
+    parser.add_argument(
+        "--targets", type=at_least_one, default=DEFAULT_TARGETS, metavar="N",
+        help="targets of each survey at each distance (default 20)",
+    )  # fmt: skip
+    parser.add_argument(
+        "--study", action="append", choices=("placements", "station", "prisms", "mast"), metavar="NAME",
+        help="placements, station, prisms or mast; may be given several times (default: all)",
+    )  # fmt: skip
+    parser.add_argument("--seed", type=seed, default=1, metavar="S", help="of everything random (default 1)")
+    parser.add_argument(
+        "--executor", default="local", metavar="WHERE",
+        help="local: processes of this machine (default); dask:ADDRESS: a Dask cluster",
+    )  # fmt: skip
+    parser.add_argument(
+        "--workers", type=at_least_one, metavar="N", help="local processes (default: one a processor)"
+    )
+    parser.add_argument(
+        "--out", type=Path, metavar="DIR", help="folder for report.html, surveys.csv and record.json"
+    )
+    parser.set_defaults(run=run)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Run the study; 1 if no survey at all could be fitted."""
+    from calib.store import load_rig
+    from mastctl.cli.experiment import check_writable
+    from mastctl.experiment.calibration import variants
+    from mastctl.packaged import config_folder
+
+    rig = load_rig(args.rig or config_folder() / "sim" / "rocky8.yaml").rig
+    if "navcam" not in rig.stereo:
+        raise output.CommandError(
+            "no_navcam", "the rig has no stereo pair navcam, which the study clicks in", exit_code=2
+        )
+    if args.out is not None:
+        check_writable(args.out)
+    chosen = [v for v in variants() if args.study is None or v.study.startswith(tuple(args.study))]
+    experiment = _run(args, rig, chosen)
+    return _tell(args, experiment)
+
+
+def _run(args: argparse.Namespace, rig: Any, chosen: list[Variant]) -> CalibrationExperiment:
+    """Run with a progress bar on stderr, one step a survey."""
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
+    from mastctl.experiment.calibration import run_calibration_experiment
+    from mastctl.experiment.executors import open_executor
+
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+    with (
+        open_executor(args.executor, args.workers) as executor,
+        Progress(*columns, console=Console(stderr=True, quiet=args.json)) as progress,
+    ):
+        task = progress.add_task("surveys", total=len(chosen) * args.surveys)
+
+        def done(outcome: Outcome) -> None:
+            if outcome.failure:
+                words = f"{outcome.variant.study} {outcome.variant.label}: {outcome.failure}"
+                progress.console.print(words, style="yellow", markup=False)
+            progress.advance(task)
+
+        return run_calibration_experiment(
+            rig,
+            surveys=args.surveys,
+            targets=args.targets,
+            seed=args.seed,
+            executor=executor,
+            chosen=chosen,
+            done=done,
+        )
+
+
+def _tell(args: argparse.Namespace, experiment: CalibrationExperiment) -> int:
+    from mastctl.cli.experiment import turned
+    from mastctl.experiment.calibration_report import as_json, short_rows, table_iv, table_v, write_report
+
+    page = write_report(experiment, args.out) if args.out is not None else None
+    if args.json:
+        document = as_json(experiment)
+        if page is not None:
+            document["report"] = str(page)
+        output.print_json(document)
+    else:
+        headings, rows = table_iv(experiment)
+        if len(rows) > 1:
+            output.print_table("Table IV, mast parameters", *turned(headings, rows))
+            output.print_table("Table V, rms residuals of the mast's images, px", *table_v(experiment))
+        notes = [f"report: {page}"] if page is not None else []
+        output.print_table("Errors, px: rms an axis, and worst", *short_rows(experiment.summaries), notes)
+    return 0 if any(not outcome.failure for outcome in experiment.outcomes) else 1

@@ -1,0 +1,384 @@
+"""How good a survey must be: simulated surveys, fitted, and judged by the pointing and hand-off they give.
+
+One thing at a time differs from the paper's survey (section III, Table II): how many placements the mast is
+calibrated with, how well the station measures, how many prisms there are, whether the mast is taken as
+upright. The paper's Tables IV and V come from the same runs.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Executor
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from calib.calibration import Calibration
+from calib.errors import CalibError
+from calib.mast import Rig
+from calib.pointing import solve
+from calib.rigid import FloatArray
+from calib.survey import Sigma
+from drivers.sim.survey import SurveyPlan, simulate_survey
+from mastctl.calibration.landing import click, handoff_errors_px, pointing_error_px, seen
+from mastctl.calibration.run import FITS, Method
+from mastctl.experiment.executors import run_all
+
+DISTANCES_M = (10.0, 6.0, 2.0)
+CLICK_PX = 0.2
+PAN_RAD, TILT_RAD = (-1.0, 1.0), (-0.6, -0.05)
+MARGIN = 0.1
+"""Targets keep so far from the images' edges, as part of the width and height."""
+
+PANCAM_HANDOFF_M, HAZCAM_HANDOFF_M = 6.0, 2.0
+PAPER_STATION_M = 0.002
+
+PAPER_TABLE_V: Mapping[int, Mapping[str, tuple[float, float]]] = {
+    6: {"pancam": (0.854, 1.102), "navcam": (1.129, 1.002)},
+    4: {"pancam": (2.871, 22.294), "navcam": (2.784, 7.934)},
+}
+
+
+@dataclass(frozen=True)
+class Variant:
+    """One point of a study: what the survey is like and how it is fitted."""
+
+    study: str
+    label: str
+    value: float
+    method: Method = "joint"
+    mast_parameters: int = 6
+    plan: SurveyPlan = field(default_factory=SurveyPlan)
+
+
+@dataclass(frozen=True, eq=False)
+class Task:
+    """One survey of one variant; ``seed`` is its own."""
+
+    rig: Rig
+    variant: Variant
+    seed: np.random.SeedSequence
+    targets: int
+
+
+@dataclass(frozen=True, eq=False)
+class Outcome:
+    """What one survey came to; ``failure`` says why there is nothing else.
+
+    Attributes
+    ----------
+    pointing_px, exact_px
+        By distance, (n, 2) errors of pointing after clicks of 0.2 px noise, and after exact clicks.
+    handoff_px
+        By ``pancam to navcam`` and the like, (n, 2) errors against exact projection.
+    mast, sigma
+        The six (or eight) numbers, estimated, and their standard deviations.
+    mast_rms_px
+        By pair, (x, y) rms over the images of purpose ``mast``.
+    seconds
+        Of the fit.
+    """
+
+    variant: Variant
+    failure: str = ""
+    pointing_px: Mapping[float, FloatArray] = field(default_factory=dict)
+    exact_px: Mapping[float, FloatArray] = field(default_factory=dict)
+    handoff_px: Mapping[str, FloatArray] = field(default_factory=dict)
+    mast: FloatArray = field(default_factory=lambda: np.full(8, np.nan))
+    sigma: FloatArray = field(default_factory=lambda: np.full(8, np.nan))
+    mast_rms_px: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    seconds: float = 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class Summary:
+    """All surveys of one variant together."""
+
+    variant: Variant
+    surveys: int
+    failed: int
+    pointing_rms_px: Mapping[float, tuple[float, float]]
+    exact_rms_px: Mapping[float, tuple[float, float]]
+    handoff_rms_px: Mapping[str, tuple[float, float]]
+    handoff_worst_px: Mapping[str, float]
+    seconds: float
+
+    @property
+    def exact_px(self) -> float:
+        """Rms an axis of pointing after exact clicks, over all distances."""
+        return _together(self.exact_rms_px)
+
+    def handoff_px(self, key: str) -> float:
+        """Rms an axis of a hand-off; not-a-number where there was none."""
+        return float(np.sqrt(np.mean(np.square(self.handoff_rms_px.get(key, np.nan)))))
+
+    @property
+    def pointing_px(self) -> float:
+        """Rms an axis of pointing after clicks with noise, over all distances."""
+        return _together(self.pointing_rms_px)
+
+
+@dataclass(frozen=True, eq=False)
+class CalibrationExperiment:
+    """The whole study."""
+
+    rig: Rig
+    seed: int
+    surveys: int
+    outcomes: tuple[Outcome, ...]
+    seconds: float
+
+    @property
+    def summaries(self) -> tuple[Summary, ...]:
+        """One a variant, in the order of the study."""
+        variants = list(dict.fromkeys(id(o.variant) for o in self.outcomes))
+        return tuple(_summary([o for o in self.outcomes if id(o.variant) == variant]) for variant in variants)
+
+    def of(self, study: str) -> tuple[Outcome, ...]:
+        """Return the outcomes of one study."""
+        return tuple(outcome for outcome in self.outcomes if outcome.variant.study == study)
+
+
+def variants() -> tuple[Variant, ...]:
+    """Return everything that is varied, one thing at a time from the paper's survey."""
+    base = SurveyPlan()
+    found: list[Variant] = []
+    for method in ("paper", "joint"):
+        for count in (2, 3, 4, 5, 6, 8, 12, 18):
+            plan = replace(base, mast_boards=count)
+            found.append(Variant(f"placements, {method}", f"{count}", count, method, 6, plan))
+    for station_m in (0.0005, 0.001, 0.002, 0.004):
+        plan = replace(base, sigma=Sigma(station_m, 0.1))
+        found.append(Variant("station", f"{1000 * station_m:g} mm", 1000 * station_m, "joint", 6, plan))
+    for prisms in (3, 4):
+        found.append(Variant("prisms", f"{prisms}", prisms, "joint", 6, replace(base, prisms=prisms)))
+    paper = replace(base, sigma=Sigma(PAPER_STATION_M, 0.1))
+    for parameters in (4, 6, 8):
+        found.append(Variant("mast parameters", f"{parameters}", parameters, "paper", parameters, paper))
+    return tuple(found)
+
+
+def run_calibration_experiment(
+    rig: Rig,
+    *,
+    surveys: int,
+    targets: int,
+    seed: int,
+    executor: Executor,
+    chosen: Sequence[Variant] | None = None,
+    done: Callable[[Outcome], None] = lambda _: None,
+) -> CalibrationExperiment:
+    """Survey a rig many times over, fit each survey, and point and hand off by the result.
+
+    Parameters
+    ----------
+    rig
+        The true one.
+    surveys
+        Of each variant.
+    targets
+        Of each survey, at each distance, and for each hand-off.
+    seed
+        The same seed gives the same numbers, whatever the executor and its workers.
+    executor
+        Runs the surveys.
+    chosen
+        Variants; all of `variants` by default.
+    done
+        Called with each outcome as it comes, in any order.
+    """
+    began = time.monotonic()
+    every = variants() if chosen is None else tuple(chosen)
+    seeds = np.random.SeedSequence(seed).spawn(len(every) * surveys)
+    tasks = [
+        Task(rig, variant, own, targets)
+        for variant, own in zip((v for v in every for _ in range(surveys)), seeds, strict=True)
+    ]
+    outcomes = run_all(executor, one_survey, tasks, done)
+    by_variant = [
+        replace(outcome, variant=task.variant) for outcome, task in zip(outcomes, tasks, strict=True)
+    ]
+    return CalibrationExperiment(rig, seed, surveys, tuple(by_variant), time.monotonic() - began)
+
+
+def one_survey(task: Task) -> Outcome:
+    """Simulate one survey, fit it, and measure what pointing and hand-off by the result are worth."""
+    variant = task.variant
+    of_survey, of_targets = task.seed.spawn(2)
+    survey, _ = simulate_survey(task.rig, int(of_survey.generate_state(1)[0]), variant.plan)
+    try:
+        fit = FITS[variant.method](survey, variant.mast_parameters)
+    except CalibError as error:
+        return Outcome(variant, failure=str(error))
+    rng = np.random.default_rng(of_targets)
+    pointing, exact = _pointing(task.rig, fit.rig, task.targets, rng)
+    mast, sigma = fit.rig.mast, fit.sigma["mast"]
+    return Outcome(
+        variant,
+        "",
+        pointing,
+        exact,
+        _handoffs(task.rig, fit.rig, task.targets, rng),
+        np.array([*mast.translation_m, *mast.rotation_rad, mast.axis_offset_m, mast.axis_twist_rad]),
+        np.array(
+            [*sigma["translation_m"], *sigma["rotation_rad"], sigma["axis_offset_m"], sigma["axis_twist_rad"]]
+        ),
+        _mast_rms(fit),
+        fit.seconds,
+    )
+
+
+def _pointing(
+    true: Rig, believed: Rig, targets: int, rng: np.random.Generator
+) -> tuple[dict[float, FloatArray], dict[float, FloatArray]]:
+    """Errors by distance, (targets, 2): of noisy clicks, and of exact ones at the same targets."""
+    pair = true.stereo["navcam"]
+    noisy: dict[float, FloatArray] = {}
+    exact: dict[float, FloatArray] = {}
+    for range_m in DISTANCES_M:
+        rows: list[list[FloatArray]] = []
+        while len(rows) < targets:
+            pan, tilt = rng.uniform(*PAN_RAD), rng.uniform(*TILT_RAD)
+            left_px = _pixel(true, pair[0], rng)
+            noise = CLICK_PX * rng.standard_normal((2, 2))
+            target, left, right = click(true, pair, pan, tilt, left_px, range_m)
+            if not _inside(true, pair[1], right):
+                continue
+            rows.append(
+                [
+                    _pointed(believed, true, pair, pan, tilt, target, left + n[0], right + n[1])
+                    for n in (noise, 0 * noise)
+                ]
+            )
+        both = np.array(rows)
+        noisy[range_m], exact[range_m] = both[:, 0], both[:, 1]
+    return noisy, exact
+
+
+def _pointed(believed: Rig, true: Rig, *rest: Any) -> FloatArray:
+    """As `pointing_error_px`; not-a-number where the believed rig finds no answer."""
+    try:
+        return pointing_error_px(believed, true, *rest)
+    except CalibError:
+        return np.full(2, np.nan)
+
+
+def _handoffs(true: Rig, believed: Rig, targets: int, rng: np.random.Generator) -> dict[str, FloatArray]:
+    """Errors (n, 2) of both eyes of the receiving pair, by hand-off; clicks have noise."""
+    found: dict[str, FloatArray] = {}
+    for giver, taker, range_m in (
+        ("pancam", "navcam", PANCAM_HANDOFF_M),
+        ("navcam", "hazcam", HAZCAM_HANDOFF_M),
+    ):
+        if giver not in true.stereo or taker not in true.stereo:
+            continue
+        rows: list[FloatArray] = []
+        for _ in range(targets):
+            shot = _shared_view(true, true.stereo[giver], true.stereo[taker], range_m, rng)
+            if shot is None:
+                continue
+            pan, tilt, target, left, right = shot
+            noise = CLICK_PX * rng.standard_normal((2, 2))
+            pair, takers = true.stereo[giver], true.stereo[taker]
+            try:
+                errors = handoff_errors_px(
+                    believed, true, pair, takers, pan, tilt, target, left + noise[0], right + noise[1]
+                )
+            except CalibError:
+                rows.append(np.full(2, np.nan))
+                continue
+            rows += errors.values()
+        if rows:
+            found[f"{giver} to {taker}"] = np.array(rows)
+    return found
+
+
+def _shared_view(
+    true: Rig, pair: tuple[str, str], takers: tuple[str, str], range_m: float, rng: np.random.Generator
+) -> tuple[float, float, FloatArray, FloatArray, FloatArray] | None:
+    """Joint angles, and a target that both eyes of a pair see there and the taking camera too.
+
+    Takers on the body: a target of theirs, and the head turned to it. Takers on the head: any view.
+    """
+    for _ in range(100):
+        pan, tilt = rng.uniform(*PAN_RAD), rng.uniform(*TILT_RAD)
+        if true.cameras[takers[0]].on == "rover":
+            rays = true.cameras[takers[0]].model.ray(_pixel(true, takers[0], rng))
+            place = rays.origins_m + range_m * rays.directions
+            aim_px = _pixel(true, pair[0], rng)
+            try:
+                angles = solve(true.mast, true.cameras[pair[0]].model, place, aim_px)[0]
+            except CalibError:
+                continue
+            pan, tilt = angles.pan_rad, angles.tilt_rad
+            if not np.isfinite(place).all() or abs(pan) > 1.5 or not -1.2 < tilt < 0.3:
+                continue
+            left_px = seen(true, pair[0], pan, tilt, place)
+            eye = true.camera_in_rover(pair[0], pan, tilt).ray(left_px)
+            away_m = float(np.linalg.norm(place - eye.origins_m))
+        else:
+            left_px, away_m = _pixel(true, pair[0], rng), range_m
+        try:
+            target, left, right = click(true, pair, pan, tilt, left_px, away_m)
+        except CalibError:
+            continue
+        if _inside(true, pair[1], right):
+            return pan, tilt, target, left, right
+    return None
+
+
+def _pixel(rig: Rig, camera: str, rng: np.random.Generator) -> FloatArray:
+    """A pixel (2,) anywhere but at the edges."""
+    size = np.array(rig.cameras[camera].model.size_px, dtype=np.float64)
+    return np.asarray(size * rng.uniform(MARGIN, 1.0 - MARGIN, 2))
+
+
+def _inside(rig: Rig, camera: str, pixel: FloatArray) -> bool:
+    width, height = rig.cameras[camera].model.size_px
+    return bool(0 <= pixel[0] <= width - 1 and 0 <= pixel[1] <= height - 1)
+
+
+def _mast_rms(fit: Calibration) -> dict[str, tuple[float, float]]:
+    """Rms by pair over the images of purpose ``mast``, those that were left out included."""
+    found = {}
+    for pair, names in fit.rig.stereo.items():
+        residuals = [i.residuals_px for i in fit.images if i.camera in names and i.purpose == "mast"]
+        if residuals:
+            found[pair] = _rms(np.concatenate(residuals))
+    return found
+
+
+def _summary(outcomes: Sequence[Outcome]) -> Summary:
+    good = [outcome for outcome in outcomes if not outcome.failure]
+
+    def rms(name: str) -> dict[Any, tuple[float, float]]:
+        keys = dict.fromkeys(key for outcome in good for key in getattr(outcome, name))
+        return {key: _rms(np.concatenate([getattr(o, name)[key] for o in good])) for key in keys}
+
+    handoffs = dict.fromkeys(key for outcome in good for key in outcome.handoff_px)
+    worst = {
+        key: float(np.nanmax([np.linalg.norm(o.handoff_px[key], axis=1).max() for o in good]))
+        for key in handoffs
+    }
+    return Summary(
+        outcomes[0].variant,
+        len(outcomes),
+        len(outcomes) - len(good),
+        rms("pointing_px"),
+        rms("exact_px"),
+        rms("handoff_px"),
+        worst,
+        float(np.mean([o.seconds for o in good])) if good else 0.0,
+    )
+
+
+def _rms(errors: FloatArray) -> tuple[float, float]:
+    x, y = np.sqrt(np.nanmean(errors**2, axis=0))
+    return float(x), float(y)
+
+
+def _together(by_distance: Mapping[float, tuple[float, float]]) -> float:
+    values = np.array(list(by_distance.values()))
+    return float(np.sqrt(np.mean(values**2))) if values.size else float("nan")

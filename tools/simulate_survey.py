@@ -1,0 +1,100 @@
+"""Write the survey of a simulated rover as a folder, for calibration to be tried on.
+
+Same arguments, same folder. The truth is not written: a calibration that reads it proves nothing.
+
+    .venv/bin/python tools/simulate_survey.py --rig configs/sim/rocky8.yaml --out survey --seed 1 --render
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from calib.errors import BadFile
+from calib.store import load_rig
+from calib.survey import Sigma, Survey, write_survey
+from drivers.sim.board import draw_board, photograph
+from drivers.sim.render import Renderer
+from drivers.sim.scene import build_scene
+from drivers.sim.survey import SurveyPlan, SurveyTruth, simulate_survey
+
+BLUR_PX, NOISE_DN = 0.7, 2.0
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--rig", required=True, type=Path, help="the true rig, a mast file")
+    parser.add_argument("--out", required=True, type=Path, help="the folder to write; new or empty")
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--render", action="store_true", help="pictures instead of dots.csv")
+    parser.add_argument(
+        "--plain", action="store_true", help="with --render: boards before grey, no landscape"
+    )
+    parser.add_argument("--mast-boards", type=int, default=SurveyPlan.mast_boards)
+    parser.add_argument("--check-boards", type=int, default=SurveyPlan.check_boards)
+    parser.add_argument("--prisms", type=int, choices=(3, 4), default=SurveyPlan.prisms)
+    parser.add_argument("--station-sigma-m", type=float, default=0.001)
+    parser.add_argument("--dot-sigma-px", type=float, default=0.1)
+    parser.add_argument("--joint-sigma-rad", type=float, default=0.0)
+    parser.add_argument("--prism-cad-sigma-m", type=float, default=0.0)
+    options = parser.parse_args()
+    try:
+        rig = load_rig(options.rig).rig
+        sigma = Sigma(
+            options.station_sigma_m, options.dot_sigma_px, options.joint_sigma_rad, options.prism_cad_sigma_m
+        )
+        plan = SurveyPlan(
+            mast_boards=options.mast_boards,
+            check_boards=options.check_boards,
+            prisms=options.prisms,
+            sigma=sigma,
+        )
+        survey, truth = simulate_survey(rig, options.seed, plan)
+        if options.render:
+            images = pictures(survey, truth, options.seed, options.plain)
+            written = write_survey(replace(survey, dots={}), options.out, images)
+        else:
+            nameless = tuple(replace(image, file=Path()) for image in survey.images)
+            written = write_survey(replace(survey, images=nameless), options.out)
+    except BadFile as error:
+        print(error, file=sys.stderr)
+        return 2
+    boards = len({(image.setup, image.placement) for image in written.images})
+    kind = "pictures" if options.render else "images by their dots alone"
+    print(f"wrote {options.out}: {boards} boards, {len(written.images)} {kind}, digest {written.digest[:12]}")
+    return 0
+
+
+def pictures(survey: Survey, truth: SurveyTruth, seed: int, plain: bool) -> Iterator[tuple[str, bytes]]:
+    """Yield file name and PNG of every image: the board before the landscape, with a camera's noise."""
+    renderer = None if plain else Renderer(build_scene())
+    rng = np.random.default_rng([seed, 2])
+    for image in survey.images:
+        model = truth.rig.cameras[image.camera].model
+        _, camera_from_board = truth.camera_from_board(survey, image.name)
+        if renderer is None:
+            ground = np.full(model.size_px[::-1], 120.0, dtype=np.float32)
+        else:
+            site_from_board = (
+                truth.site_from_rover[image.setup] @ truth.rover_from_board[image.setup, image.placement]
+            )
+            ground = renderer.image(model, site_from_board @ camera_from_board.inverse, samples=1)
+        picture = photograph(
+            draw_board(ground, model, camera_from_board, survey.board), BLUR_PX, NOISE_DN, rng
+        )
+        good, data = cv2.imencode(".png", picture)
+        assert good
+        print(image.file.as_posix(), file=sys.stderr)
+        yield image.file.as_posix(), data.tobytes()
+
+
+if __name__ == "__main__":
+    sys.exit(main())
