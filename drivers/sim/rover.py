@@ -29,7 +29,7 @@ from drivers.errors import BadOptions, NoFreshFrame
 from drivers.faults import FaultPanel, nearest
 from drivers.sim.cameras import CameraSettings, SimulatedCamera
 from drivers.sim.pan_tilt import HeadSettings, SimulatedPanTilt, head_settings
-from drivers.sim.render import Renderer
+from drivers.sim.render import Renderer, compile_renderer
 from drivers.sim.scene import SceneSettings, build_scene
 
 TRUTH_FRAMES = 512
@@ -201,6 +201,8 @@ class SimulatedRover:
         self.site_from_rover = Rigid.identity()
         self.faults = FaultPanel(clock.now_s, self.rig.cameras)
         self.faults.set_all(settings.faults)
+        # Before any camera is asked: a frame's deadline is no time for a compiler.
+        compile_renderer()
         self.scene = build_scene(settings.scene)
         self._renderer = Renderer(self.scene)
         self._render_lock = threading.Lock()  # one picture at a time: each keeps all processors busy
