@@ -19,10 +19,10 @@ from calib.survey import Board
 IntArray = NDArray[np.int64]
 
 SURE_RAD = np.radians(32.0)
-"""The nearest order is taken if it is off by less than this; the next is then at least 58 degrees off."""
+"""The nearest order is taken if it is off by less than this; the next is then 58 degrees off or more."""
 
 STEEPEST = 0.3
-"""A camera that looks down so steeply that less than this of the vertical is in its image tells no upright."""
+"""A camera that looks down so steeply that less than this of the vertical is in its image tells nothing."""
 
 
 class Ordered(NamedTuple):

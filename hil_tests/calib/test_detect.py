@@ -8,7 +8,7 @@ import pytest
 from boards import BOARD, COLUMNS, NAVCAM_PX, PANCAM_PX, ROWS, Shot, camera, gravel, pose, shoot
 from scipy.spatial.transform import Rotation
 
-import calib.detect
+import calib.dot_board
 from calib.cahvor import CameraModel
 from calib.detect import DetectionFailure, DotsFound, Predicted, Upright, find_dots
 from calib.rigid import Rigid
@@ -207,7 +207,7 @@ def test_a_board_seen_from_behind_by_the_survey_is_said() -> None:
 def test_where_the_grid_does_not_grow_the_clustering_finder_helps(monkeypatch: pytest.MonkeyPatch) -> None:
     rng = np.random.default_rng(25)
     shot = shoot(rng, SIDE, pose(4.0, (20, 10), 5))
-    monkeypatch.setattr(calib.detect, "grow_lattices", lambda found, spacing: [])
+    monkeypatch.setattr(calib.dot_board, "grow_lattices", lambda found, spacing: [])
     check(shot, find_dots(shot.image, BOARD, shot.roughly(rng)), WANTED_PX)
 
 
