@@ -83,11 +83,11 @@ def table_iv(experiment: CalibrationExperiment) -> Table:
         good = _with_parameters(experiment, parameters)
         if good:
             found = np.array([outcome.mast[:6] for outcome in good])
-            rows.append([f"{parameters}, first survey", *_numbers(found[0])])
+            rows.append([f"{parameters}: first survey", *_numbers(found[0])])
             error = np.sqrt(np.mean((found - _six(experiment.rig)) ** 2, axis=0))
-            rows.append([f"rms error of {len(good)}", *_numbers(error, sign=False)])
+            rows.append([f"{parameters}: rms error of {len(good)}", *_numbers(error, sign=False)])
             sigma = np.sqrt(np.mean([outcome.sigma[:6] ** 2 for outcome in good], axis=0))
-            rows.append(["stated sigma", *_numbers(sigma, sign=False)])
+            rows.append([f"{parameters}: stated sigma", *_numbers(sigma, sign=False)])
     return headings, rows
 
 
@@ -199,6 +199,9 @@ def _plots(experiment: CalibrationExperiment) -> Iterator[str]:
         for axis, title in zip(axes, titles, strict=True):
             axis.set(title=title, xlabel=label)
             axis.set_yscale("log")
+            for side in (axis.yaxis.set_major_formatter, axis.yaxis.set_minor_formatter):
+                side("{x:g}")
+            axis.tick_params(which="both", labelsize=8)
             axis.grid(alpha=0.25, which="both")
             if axis.get_legend_handles_labels()[0]:
                 axis.legend(fontsize=7)
