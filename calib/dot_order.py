@@ -19,7 +19,10 @@ from calib.survey import Board
 IntArray = NDArray[np.int64]
 
 SURE_RAD = np.radians(32.0)
-"""The nearest order is taken if it is off by less than this; the next is then at least 58 degrees off."""
+"""The nearest order is taken if it is off by less than this; the next is then 58 degrees off or more."""
+
+STEEPEST = 0.3
+"""A camera that looks down so steeply that less than this of the vertical is in its image tells nothing."""
 
 
 class Ordered(NamedTuple):
@@ -81,8 +84,8 @@ def order_by_gravity(
     down_in_board
         (3,), the direction in the board's frame that is down in an upright camera's image.
 
-    Other arguments and the result as ``order_by_steps``. None also if the camera looks so steeply that its
-    uprightness tells nothing.
+    Other arguments and the result as ``order_by_steps``. None also if the camera looks down so steeply
+    that its uprightness tells nothing.
     """
     homography = _camera_from_places(camera, places, middles_px)
     if homography is None:
@@ -100,8 +103,8 @@ def order_by_gravity(
             continue
         U, _, Vt = np.linalg.svd(np.column_stack([H[:, 0], H[:, 1], np.cross(H[:, 0], H[:, 1])]))
         down = U @ Vt @ down_in_board
-        if np.hypot(down[0], down[1]) < 0.3:
-            return None
+        if np.hypot(down[0], down[1]) < STEEPEST:
+            continue
         turned = float(np.arctan2(-down[0], down[1]))
         if best is None or abs(turned) < abs(best.turned_rad):
             best = Ordered(columns, rows, turned)

@@ -31,8 +31,9 @@ CORNER = (0.2, 0.25)
 class PointingMap:
     """Pixels over pan (n,) and tilt (m,), radians: ``by_click`` and ``by_position`` (m, n).
 
-    ``by_click``: a target clicked in the stereo pair at these joint angles. ``by_position``: a target whose
-    place in the rover frame is given. Not-a-number where there is no answer.
+    ``by_click``: a target clicked in the stereo pair at these joint angles; it is the same at every pan,
+    since all of it happens beyond the pan axis. ``by_position``: a target whose place in the rover frame is
+    given. Not-a-number where there is no answer.
     """
 
     pair: str
@@ -69,9 +70,9 @@ def change_map(new: Rig, old: Rig, pair: str, range_m: float) -> PointingMap | N
         return None
     middle = np.array(new.cameras[names[0]].model.image_center_px)
 
-    def by_click(pan: float, tilt: float) -> float:
-        target, left, right = click(new, names, pan, tilt, _corner(new, names[0]), range_m)
-        return float(np.linalg.norm(pointing_error_px(old, new, names, pan, tilt, target, left, right)))
+    def by_click(tilt: float) -> float:
+        target, left, right = click(new, names, 0.0, tilt, _corner(new, names[0]), range_m)
+        return float(np.linalg.norm(pointing_error_px(old, new, names, 0.0, tilt, target, left, right)))
 
     def by_position(pan: float, tilt: float) -> float:
         rays = new.camera_in_rover(names[0], pan, tilt).ray(middle)
@@ -115,7 +116,7 @@ class _Clicks:
             found = triangulate(left, right, clicks[0], clicks[1]).position_m
             self.believed.append((moved.mast, left, found))
 
-    def sigma_px(self, pan: float, tilt: float) -> float:
+    def sigma_px(self, tilt: float, pan: float = 0.0) -> float:
         """Rms per axis of where the target lands; CalibError where it cannot be pointed at."""
         target = self.rig.mast.rover_from_head(pan, tilt).points(self.target_in_head_m)
         landed = [self._landed(*rig, pan, tilt, target) for rig in self.believed]
@@ -141,20 +142,18 @@ def _map(
     pair: str,
     camera: str,
     range_m: float,
-    by_click: Callable[[float, float], float],
+    by_click: Callable[[float], float],
     by_position: Callable[[float, float], float],
 ) -> PointingMap:
     pans, tilts = np.linspace(*PAN_RAD, STEPS[0]), np.linspace(*TILT_RAD, STEPS[1])
-    grids = []
-    for value in (by_click, by_position):
-        rows = [[_or_nan(value, float(pan), float(tilt)) for pan in pans] for tilt in tilts]
-        grids.append(np.array(rows))
-    return PointingMap(pair, camera, range_m, pans, tilts, grids[0], grids[1])
+    clicked = np.array([_or_nan(by_click, float(tilt)) for tilt in tilts])
+    placed = np.array([[_or_nan(by_position, float(pan), float(tilt)) for pan in pans] for tilt in tilts])
+    return PointingMap(pair, camera, range_m, pans, tilts, np.tile(clicked[:, None], len(pans)), placed)
 
 
-def _or_nan(value: Callable[[float, float], float], pan: float, tilt: float) -> float:
+def _or_nan(value: Callable[..., float], *joints_rad: float) -> float:
     try:
-        return value(pan, tilt)
+        return value(*joints_rad)
     except CalibError:
         return float("nan")
 

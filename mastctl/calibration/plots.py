@@ -118,6 +118,7 @@ def errors_by(calibration: Calibration) -> Any:
                                  alpha=0.75, label=name)  # fmt: skip
         axis.set_xlabel(label)
         axis.set_yscale("log")
+        axis.yaxis.set_major_formatter("{x:g}")
         axis.grid(alpha=0.25, which="both")
     axes[0].set_ylabel("rms of an image, px an axis")
     figure.legend(*axes[0].get_legend_handles_labels(), loc="outside upper center", ncols=6, fontsize=8)

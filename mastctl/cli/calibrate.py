@@ -54,10 +54,15 @@ def add_commands(subparsers: Any) -> None:
 def run(args: argparse.Namespace) -> int:
     """Read, check, find dots, fit, save, report; nothing is written before the fit is good."""
     from calib.survey import read_survey
-    from mastctl.calibration.run import calibrate, checked
+    from mastctl.calibration.run import SurveyRefused, calibrate, checked
 
     survey = read_survey(args.survey)
-    checked(survey)
+    try:
+        checked(survey)
+    except SurveyRefused as refusal:
+        for finding in refusal.findings[1:]:
+            output.tell(str(finding))  # the first is told last, as the reason
+        raise
     _check_out(args.out)
     in_use = _in_use(args)
     survey, undetected = _with_dots(args, survey)

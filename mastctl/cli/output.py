@@ -109,7 +109,9 @@ def as_command_error(error: BaseException) -> CommandError:
     if isinstance(error, BadOptions):
         return CommandError("bad_options", str(error), 2)
     if isinstance(error, (CalibError, DriverError)) or isinstance(getattr(error, "code", None), str):
-        return CommandError(_code_of(error), str(error), int(getattr(error, "exit_code", 1)))
+        detail = getattr(error, "detail", None)
+        told = detail if isinstance(detail, Mapping) else None
+        return CommandError(_code_of(error), str(error), int(getattr(error, "exit_code", 1)), told)
     if isinstance(error, OSError):
         where = f"{error.filename}: " if error.filename is not None else ""
         return CommandError("file_system", f"{where}{error.strerror or error}", 1)

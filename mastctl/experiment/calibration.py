@@ -272,7 +272,7 @@ def _handoffs(true: Rig, believed: Rig, targets: int, rng: np.random.Generator) 
         ("pancam", "navcam", PANCAM_HANDOFF_M),
         ("navcam", "hazcam", HAZCAM_HANDOFF_M),
     ):
-        if giver not in true.stereo or taker not in true.stereo:
+        if not {giver, taker} <= set(true.stereo) & set(believed.stereo):
             continue
         rows: list[FloatArray] = []
         for _ in range(targets):

@@ -83,11 +83,11 @@ def table_iv(experiment: CalibrationExperiment) -> Table:
         good = _with_parameters(experiment, parameters)
         if good:
             found = np.array([outcome.mast[:6] for outcome in good])
-            rows.append([f"{parameters}, first survey", *_numbers(found[0])])
+            rows.append([f"{parameters}: first survey", *_numbers(found[0])])
             error = np.sqrt(np.mean((found - _six(experiment.rig)) ** 2, axis=0))
-            rows.append([f"rms error of {len(good)}", *_numbers(error, sign=False)])
+            rows.append([f"{parameters}: rms error of {len(good)}", *_numbers(error, sign=False)])
             sigma = np.sqrt(np.mean([outcome.sigma[:6] ** 2 for outcome in good], axis=0))
-            rows.append(["stated sigma", *_numbers(sigma, sign=False)])
+            rows.append([f"{parameters}: stated sigma", *_numbers(sigma, sign=False)])
     return headings, rows
 
 
@@ -156,8 +156,8 @@ def _parts(experiment: CalibrationExperiment) -> Iterator[str]:
     yield html.table(*study_rows(experiment.summaries))
     yield (
         "<p>Pointing: clicks of 0.2 px noise in the Navcam pair, at 10, 6 and 2 m, x and y; exact clicks "
-        "leave the calibration's part. Hand-off: against exact projection, both eyes of that pair, worst "
-        "of all. Navcam to Hazcam is held by the second prism set-up, as in the paper.</p>"
+        "leave the calibration's part. Hand-off: against exact projection, both eyes of the taking pair, "
+        "worst of all. Navcam to Hazcam is held by the second prism set-up, as in the paper.</p>"
     )
     failures = [(o.variant, o.failure) for o in experiment.outcomes if o.failure]
     if failures:
@@ -180,6 +180,8 @@ def _plots(experiment: CalibrationExperiment) -> Iterator[str]:
         axes = figure.subplots(1, 3)
         for colour, name in zip(COLOURS, names, strict=False):
             mine = [s for s in summaries if s.variant.study == name and s.failed < s.surveys]
+            if not mine:
+                continue
             x = [s.variant.value for s in mine]
             word = name.rpartition(", ")[2] if len(names) > 1 else f"method {mine[0].variant.method}"
             axes[0].plot(x, [s.pointing_px for s in mine], "o-", color=colour, label=f"{word}, clicks 0.2 px")
@@ -197,8 +199,12 @@ def _plots(experiment: CalibrationExperiment) -> Iterator[str]:
         for axis, title in zip(axes, titles, strict=True):
             axis.set(title=title, xlabel=label)
             axis.set_yscale("log")
+            for side in (axis.yaxis.set_major_formatter, axis.yaxis.set_minor_formatter):
+                side("{x:g}")
+            axis.tick_params(which="both", labelsize=8)
             axis.grid(alpha=0.25, which="both")
-            axis.legend(fontsize=7)
+            if axis.get_legend_handles_labels()[0]:
+                axis.legend(fontsize=7)
             if study == "placements":
                 axis.axvspan(5, 8, color="#c1440e", alpha=0.08)
         yield html.plot_tag(figure, f"errors against {label}")
