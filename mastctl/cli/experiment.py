@@ -32,8 +32,9 @@ def add_commands(subparsers: Any) -> None:
         help="ranges in metres (default 10 6 2)",
     )  # fmt: skip
     pointing.set_defaults(run=run_pointing)
-    from mastctl.cli import experiment_calibration
+    from mastctl.cli import experiment_calibration, experiment_handoff
 
+    experiment_handoff.add_parser(kinds)
     experiment_calibration.add_parser(kinds)
 
     demo = subparsers.add_parser("demo", help="the pointing experiment on the packaged simulated rover")
