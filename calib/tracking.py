@@ -58,8 +58,8 @@ class TrackSettings:
     most_px: float = 80.0
     model_px: float = 0.3
     worst_chi2: float = 18.5
-    renew_scale: float = 1.6
-    renew_turn_rad: float = 0.25
+    renew_scale: float = 1.3
+    renew_turn_rad: float = 0.12
 
 
 @dataclass(frozen=True, eq=False)

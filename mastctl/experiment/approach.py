@@ -11,6 +11,7 @@ import numpy as np
 
 from calib.errors import CalibError
 from calib.mast import Rig
+from calib.match import MatchSettings
 from calib.pointing import solve
 from calib.rigid import FloatArray
 from calib.tracking import Track, moved, seen_by, start_track
@@ -29,6 +30,7 @@ SUN_MOVES_RAD = math.radians(8.0)
 LOST_LOOKS = 3
 """How often a lost target is looked for at one stop, before the rover drives on."""
 
+SIZES = MatchSettings()
 GIVE_UP = 4
 """Stops without the target after which the run ends as lost."""
 
@@ -222,7 +224,7 @@ def _look(world: World, track: Track, target: FloatArray) -> tuple[Track, Stop]:
     pair = rig.stereo[name]
     for _ in range(LOST_LOOKS):
         eyes = world.look(pair, pan, tilt)
-        look = seen_by(track, eyes)
+        look = seen_by(track, eyes, match_settings=SIZES)
         if look.track.state == "tracked":
             break
     track = look.track
