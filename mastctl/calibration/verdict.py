@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from calib.calibration import Calibration
 from calib.errors import CalibError
@@ -29,6 +30,9 @@ POINTING_BAD_PX = 2.0
 
 MANY_LEFT_OUT = 0.05
 """Share of dots or images left out above which the survey itself is in doubt."""
+
+TURNED_RAD = 2.0
+"""A mast turned further against the rover is one whose joints count the other way."""
 
 PAPER_GOOD_PX = 2.0
 """Rms of fitted images that the paper's method may leave: station errors of 2 mm are 1.4 px at 5 m."""
@@ -83,6 +87,7 @@ def judge(
         *_noise(survey, calibration),
         *_checks(survey, calibration),
         *_open(calibration),
+        *_turned(calibration),
         *_pointing(calibration),
         *_left_out(calibration),
     ]
@@ -132,6 +137,15 @@ def _checks(survey: Survey, calibration: Calibration) -> list[Reason]:
 
 def _open(calibration: Calibration) -> list[Reason]:
     return [Reason("bad", direction.sentence) for direction in calibration.degenerate]
+
+
+def _turned(calibration: Calibration) -> list[Reason]:
+    """Whether the mast is turned about: a tilt that counts down fits as well, with the head half a turn off."""
+    angle = float(np.linalg.norm(Rotation.from_euler("XYZ", calibration.rig.mast.rotation_rad).as_rotvec()))
+    if angle < TURNED_RAD:
+        return []
+    words = f"the mast comes out turned by {np.degrees(angle):.0f} degrees against the rover"
+    return [Reason("bad", f"{words}: pan or tilt has the wrong sign (right and up are positive)")]
 
 
 def _pointing(calibration: Calibration) -> list[Reason]:
