@@ -123,10 +123,10 @@ def grid_doubts(survey: Survey) -> Iterator[Finding]:
             yield Finding(
                 "error",
                 f"survey.yaml board.{what}s",
-                f"the board has {count} {what}s, 0 to {count - 1}, but the dots of all {len(survey.dots)} images "
-                f"are in {what}s {seen.min()} to {seen.max()}",
-                f"Correct board.{what}s or dots.csv ({what}s count from 0), and tapes_in_board_m, which count from "
-                "the middle of the grid",
+                f"the board has {count} {what}s, 0 to {count - 1}, but the dots of all {len(survey.dots)} "
+                f"images are in {what}s {seen.min()} to {seen.max()}",
+                f"Correct board.{what}s or dots.csv ({what}s count from 0), and tapes_in_board_m, which "
+                "count from the middle of the grid",
             )
 
 

@@ -1,4 +1,4 @@
-"""Columns of joint angles with the wrong sign, or exchanged: the boards then stand where the head does not look.
+"""Joint angles with the wrong sign, or exchanged: the boards then stand where the head does not look.
 
 A mast whose tilt counts downwards fits a survey as well as the true one, with its head turned by half a
 turn: no residual shows it. The station does.
@@ -53,8 +53,8 @@ def joint_doubts(survey: Survey) -> Iterator[Finding]:
         yield Finding(
             "error",
             "images.csv",
-            f"{' and '.join(told)}: the boards are spread by {np.degrees(given[axis]):.0f} degrees about where "
-            f"the head looks as written, and by {np.degrees(better[axis]):.0f} degrees the other way",
+            f"{' and '.join(told)}: the boards are spread by {np.degrees(given[axis]):.0f} degrees about "
+            f"where the head looks as written, and by {np.degrees(better[axis]):.0f} degrees the other way",
             "Write radians; positive pan turns right, positive tilt looks up",
         )
 

@@ -140,7 +140,10 @@ def _open(calibration: Calibration) -> list[Reason]:
 
 
 def _turned(calibration: Calibration) -> list[Reason]:
-    """Whether the mast is turned about: a tilt that counts down fits as well, with the head half a turn off."""
+    """Whether the mast is turned about: a tilt that counts down fits as well, with the head half a turn off.
+
+    `calib.survey_joints` mostly refuses such a survey before.
+    """
     angle = float(np.linalg.norm(Rotation.from_euler("XYZ", calibration.rig.mast.rotation_rad).as_rotvec()))
     if angle < TURNED_RAD:
         return []
