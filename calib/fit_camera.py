@@ -16,12 +16,12 @@ from itertools import combinations
 import cv2
 import numpy as np
 
-from calib.adjustment import lens_knowledge
 from calib.cahvor import CameraModel, Kind
 from calib.camera_parameters import parameter_names, parameter_part, predict, stepped
 from calib.errors import CalibError
-from calib.least_squares import Normal, minimise
+from calib.least_squares import Normal, covariance_of, minimise
 from calib.rigid import FloatArray
+from calib.usual_lens import lens_knowledge
 
 SAMPLES = 30
 """Samples of images tried for a start."""
@@ -295,7 +295,6 @@ def _fit_from(
     residuals = seen - pixels_px
     freedom = max(2 * int(used.sum()) - len(weak), 1)
     unit_weight = float(np.sum((residuals[used] / sigma_px) ** 2)) / freedom
-    inverse = np.asarray(np.linalg.inv(found.normal.matrix + np.diag(weak)), dtype=np.float64)
-    covariance = max(unit_weight, 1.0) * inverse
+    covariance = max(unit_weight, 1.0) * covariance_of(found.normal.matrix, weak)
     rms_px: FloatArray = np.sqrt((residuals[used] ** 2).mean(axis=0)).astype(np.float64)
     return CameraFit(model, covariance, residuals, used, rms_px)

@@ -8,21 +8,22 @@ is judged again by the fit's own test.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from calib.adjustment import MAST_NAMES, Estimate, ImageTerm, StationTerm
+from calib.adjustment import Estimate
 from calib.cahvor import CameraModel
 from calib.calibration import Outlier
 from calib.errors import CalibError
 from calib.fit_camera import CameraNotFitted, fit_camera
 from calib.fit_mast import MastNotFitted, MastView, fit_mast
-from calib.mast import Mast
+from calib.gimbal import MAST_NAMES, mast_of
 from calib.rigid import FloatArray, Rigid
 from calib.survey import Survey
+from calib.terms import ImageTerm, StationTerm, image_terms, station_terms
 
 SAME_ANGLE_RAD = 1e-3
 """Joint readings this close are one joint setting for a start."""
@@ -71,7 +72,7 @@ def start(survey: Survey, mast_parameters: int, *, only_camera_images: bool = Fa
     blunders: list[Outlier] = []
     rover_from_station = _setups(survey, blunders, notes)
     rover_from_board, bent = _boards(survey, rover_from_station, notes)
-    images, checks, joints = _image_terms(survey, rover_from_board, notes)
+    images, checks, joints = image_terms(survey, rover_from_board, notes)
     doubtful: set[str] = set()
     in_rover, reference, expected = {}, {}, {}
     for name in survey.cameras:
@@ -95,8 +96,7 @@ def start(survey: Survey, mast_parameters: int, *, only_camera_images: bool = Fa
     cameras = {}
     for name, model in in_rover.items():
         if name in reference:
-            carrying = Mast(mast[:3], mast[3:6], float(mast[6]), float(mast[7]))
-            model = model.moved(carrying.rover_from_head(*reference[name]).inverse)
+            model = model.moved(mast_of(mast).rover_from_head(*reference[name]).inverse)
         cameras[name] = model
     images = [t for t in images if t.camera in cameras]
     estimate = Estimate(
@@ -110,7 +110,7 @@ def start(survey: Survey, mast_parameters: int, *, only_camera_images: bool = Fa
     return Start(
         tuple(images),
         tuple(t for t in checks if t.camera in cameras),
-        _station_terms(survey, rover_from_board),
+        station_terms(survey, rover_from_board),
         estimate,
         frozenset(doubtful),
         reference,
@@ -203,64 +203,6 @@ def _boards(
                 f"{misfit:.0f} sigmas"
             )
     return found, bent
-
-
-def _image_terms(
-    survey: Survey, boards: Mapping[tuple[str, str], Rigid], notes: list[str]
-) -> tuple[list[ImageTerm], list[ImageTerm], dict[tuple[object, ...], int]]:
-    """Terms of the fitted and of the check images, and the head's attitudes among the former."""
-    fitted: list[ImageTerm] = []
-    checks: list[ImageTerm] = []
-    joints: dict[tuple[object, ...], int] = {}
-    for image in survey.images:
-        dots = survey.dots.get(image.name)
-        if dots is None or not len(dots.rows):
-            continue
-        if (image.setup, image.placement) not in boards:
-            notes.append(
-                f"image {image.name} is not used: placement {image.placement} of set-up {image.setup} "
-                "has no three tapes"
-            )
-            continue
-        attitude = None
-        on_head = survey.cameras[image.camera].on == "head"
-        if on_head:
-            key = (image.setup, image.placement, image.pan_rad, image.tilt_rad)
-            attitude = joints.setdefault(key, len(joints)) if image.purpose != "check" else -1
-        sigma = dots.sigma_px if dots.sigma_px is not None else np.full(len(dots.rows), survey.sigma.dot_px)
-        term = ImageTerm(
-            image.name,
-            image.camera,
-            (image.setup, image.placement),
-            attitude,
-            float(image.pan_rad or 0.0) if on_head else 0.0,
-            float(image.tilt_rad or 0.0) if on_head else 0.0,
-            dots.rows,
-            dots.columns,
-            survey.board.dots_in_board_m(dots.rows, dots.columns),
-            dots.pixels_px,
-            np.asarray(sigma, dtype=np.float64),
-            np.ones(len(dots.rows), dtype=bool),
-        )
-        (checks if image.purpose == "check" else fitted).append(term)
-    return fitted, checks, joints
-
-
-def _station_terms(survey: Survey, boards: Mapping[tuple[str, str], Rigid]) -> tuple[StationTerm, ...]:
-    """Terms of prisms and of the tapes of every board."""
-    terms = []
-    for p in survey.station:
-        if p.kind == "prism" and p.point in survey.prisms_in_rover_m:
-            terms.append(
-                StationTerm(p.setup, None, p.point, p.position_m, np.zeros(3), survey.sigma.station_m)
-            )
-        elif (
-            p.kind == "tape" and (p.setup, p.placement) in boards and p.point in survey.board.tapes_in_board_m
-        ):
-            place = survey.board.tapes_in_board_m[p.point]
-            board = (p.setup, p.placement)
-            terms.append(StationTerm(p.setup, board, p.point, p.position_m, place, survey.sigma.station_m))
-    return tuple(terms)
 
 
 def _largest_setting(
@@ -382,8 +324,3 @@ def mast_views(
         for t in images
         if t.camera in reference
     ]
-
-
-def with_kept(images: Sequence[ImageTerm], left_out: frozenset[str] | set[str]) -> tuple[ImageTerm, ...]:
-    """Return the terms with whole images left out by name."""
-    return tuple(replace(t, keep=np.zeros_like(t.keep)) if t.name in left_out else t for t in images)

@@ -17,9 +17,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.stats import chi2
 
-from calib.adjustment import Adjustment, Estimate, ImageTerm, StationTerm, moved_rigid
+from calib.adjustment import Adjustment, Estimate
 from calib.calibration import Outlier
-from calib.rigid import FloatArray
+from calib.rigid import FloatArray, moved_rigid
+from calib.terms import ImageTerm, StationTerm
 
 FALSE_ALARMS = 0.01
 """Chance, for each of the three kinds of measurement, that a survey without blunders loses any."""

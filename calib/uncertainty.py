@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from scipy.optimize import approx_fprime
 
-from calib.adjustment import MAST_NAMES, Adjustment, Estimate, gimbal, gimbal_rates
+from calib.adjustment import Adjustment, Estimate
 from calib.cahvor import CameraModel
 from calib.calibration import Calibration, Degenerate
 from calib.camera_parameters import parameter_part, predict, stepped, tangents
 from calib.errors import CalibError
-from calib.mast import Mast, Rig
+from calib.gimbal import MAST_NAMES, gimbal, gimbal_rates, mast_of, numbers_of
+from calib.mast import Rig
 from calib.pointing import solve
 from calib.rigid import FloatArray
 from calib.stereo import triangulate
@@ -69,9 +70,7 @@ def pixel_rates(
     if held.on == "rover":
         seen = predict(held.model, points_m)
     else:
-        m = calibration.rig.mast
-        numbers = np.array([*m.translation_m, *m.rotation_rad, m.axis_offset_m, m.axis_twist_rad])
-        head = gimbal(numbers, pan_rad, tilt_rad)
+        head = gimbal(numbers_of(calibration.rig.mast), pan_rad, tilt_rad)
         seen = predict(held.model, (points_m - head.translation_m) @ head.rotation)
         at = {n: i for i, n in enumerate(calibration.parameter_names)}
         free = np.array([i for i, n in enumerate(MAST_NAMES) if f"mast.{n}" in at], dtype=int)
@@ -163,8 +162,7 @@ def moved_rig(calibration: Calibration, columns: np.ndarray, step: FloatArray) -
     whole = np.zeros(len(calibration.parameter_names))
     whole[columns] = step
     at = {n: i for i, n in enumerate(calibration.parameter_names)}
-    m = rig.mast
-    numbers = np.array([*m.translation_m, *m.rotation_rad, m.axis_offset_m, m.axis_twist_rad])
+    numbers = numbers_of(rig.mast)
     for index, name in enumerate(MAST_NAMES):
         if f"mast.{name}" in at:
             numbers[index] += whole[at[f"mast.{name}"]]
@@ -173,8 +171,7 @@ def moved_rig(calibration: Calibration, columns: np.ndarray, step: FloatArray) -
         part = calibration.part(f"cameras.{name}.")
         model: CameraModel = stepped(camera.model, whole[part]) if len(part) else camera.model
         cameras[name] = replace(camera, model=model)
-    mast = Mast(numbers[:3], numbers[3:6], float(numbers[6]), float(numbers[7]))
-    return replace(rig, mast=mast, cameras=cameras)
+    return replace(rig, mast=mast_of(numbers), cameras=cameras)
 
 
 def open_directions(
@@ -231,29 +228,3 @@ def _words(parameter: str) -> str:
     if first == "mast":
         return "the mast's " + " ".join(rest).replace("_m", "").replace("_rad", "").replace("_", " ")
     return f"{rest[1]} of {rest[0]}"
-
-
-def lens_notes(
-    rig: Rig, sigma: Mapping[str, Any], limits: Mapping[str, Sequence[float]], part: float = 0.7
-) -> tuple[str, ...]:
-    """Return a sentence for what the survey hardly sees of lenses, so that usual lenses decide.
-
-    ``limits`` gives the sigma of what lenses are usually like, by letter.
-    """
-    by_words: dict[str, list[str]] = {}
-    for name, camera in rig.cameras.items():
-        held = []
-        for letter, word in (("O", "lens axis"), ("R", "distortion"), ("E", "entrance point")):
-            if letter not in camera.model.kind or name not in sigma["cameras"]:
-                continue
-            found = np.array(sigma["cameras"][name][letter])
-            found = found[1:] if letter == "R" else found[:1] if letter == "E" else found
-            if (found > part * np.array(limits[letter])[: len(found)]).any():
-                held.append(word)
-        if held:
-            by_words.setdefault(" and ".join(held), []).append(name)
-    return tuple(
-        f"the survey hardly shows {words} of {', '.join(names)}, so what lenses are usually like decides; "
-        "pixels beyond the dots suffer"
-        for words, names in by_words.items()
-    )

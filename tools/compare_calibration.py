@@ -43,12 +43,13 @@ import numpy as np
 from scipy.optimize import OptimizeResult, least_squares
 from scipy.spatial.transform import Rotation
 
-from calib.adjustment import Adjustment, Estimate, ImageTerm
+from calib.adjustment import Adjustment, Estimate
 from calib.cahvor import CameraModel
 from calib.camera_parameters import parameter_names, parameter_part, stepped
 from calib.fit_camera import FixedPoints, fit_camera, pinhole
 from calib.least_squares import minimise
 from calib.rigid import Rigid
+from calib.terms import ImageTerm
 from tools.compare_points import (
     COLUMNS,
     NOISE_PX,
