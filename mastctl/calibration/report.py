@@ -10,6 +10,7 @@ import numpy as np
 
 from calib.calibration import Calibration
 from calib.formats.atomic import save_bytes
+from calib.formats.atomic import save_bytes
 from calib.store import StoredRig
 from calib.survey import Survey
 from mastctl import html
