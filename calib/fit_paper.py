@@ -73,9 +73,10 @@ def fit_paper(survey: Survey, mast_parameters: int = 6) -> Calibration:
     fitted = {t.name for t in (*camera_images, *mast_images)} - doubtful
     skipped = {t.name for t in from_here.images if t.name not in fitted}
     state = replace(from_here.estimate, cameras=_to_head(cameras, from_here, mast), mast=mast)
+    wrong = {o.name for o in from_here.blunders}
     problem = Adjustment(
         with_kept(from_here.images, skipped),
-        from_here.station,
+        [replace(p, keep=False) if p.name in wrong else p for p in from_here.station],
         state,
         mast_parameters=mast_parameters if from_here.reference_rad else 0,
         prisms_cad_m=survey.prisms_in_rover_m,

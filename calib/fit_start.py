@@ -3,18 +3,23 @@
 Each step takes the one before as exact, as the paper does, and is robust: a prism or tape that disagrees with
 its drawing is left out of the start, and so is an image that belongs to another board. What is left out here
 is judged again by the fit's own test.
+
+Cameras start from their rough focal length and the surveyed points alone (``calib.fit_camera``). A camera's
+rough place and direction are not used: they help to find dots (``calib.detect_survey``) and to see what was
+mixed up (``calib.survey_mixups``), while a fit that needed them would hide that they are wrong.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Literal
 
 import numpy as np
-from scipy.spatial.transform import Rotation
+from scipy.stats import chi2
 
 from calib.adjustment import Estimate
+from calib.align import Alignment, NotAligned, align
 from calib.cahvor import CameraModel
 from calib.calibration import Outlier
 from calib.errors import CalibError
@@ -28,8 +33,9 @@ from calib.terms import ImageTerm, StationTerm, image_terms, station_terms
 SAME_ANGLE_RAD = 1e-3
 """Joint readings this close are one joint setting for a start."""
 
-SHAPE = 5.0
-"""Tapes or prisms that are off their drawing by more than this many sigmas are not trusted for a start."""
+GROSS = 1e-9
+"""Tapes or prisms whose shape chance alone makes so seldom are not trusted for a start: only gross errors,
+since the stated sigmas may be too small. The finer ones are the fit's to judge."""
 
 
 class SurveyNotFitted(CalibError):
@@ -42,7 +48,7 @@ class Start:
 
     ``reference_rad`` holds, for each head camera, the joint setting at which it was calibrated, and
     ``in_rover`` the cameras there, in the rover frame. ``bent`` are placements whose tapes do not fit the
-    board, ``blunders`` prisms that the set-ups' poses were found without.
+    board, ``blunders`` prisms and tapes that the poses were found without.
     """
 
     images: tuple[ImageTerm, ...]
@@ -71,7 +77,7 @@ def start(survey: Survey, mast_parameters: int, *, only_camera_images: bool = Fa
     notes: list[str] = []
     blunders: list[Outlier] = []
     rover_from_station = _setups(survey, blunders, notes)
-    rover_from_board, bent = _boards(survey, rover_from_station, notes)
+    rover_from_board, bent = _boards(survey, rover_from_station, blunders, notes)
     images, checks, joints = image_terms(survey, rover_from_board, notes)
     doubtful: set[str] = set()
     in_rover, reference, expected = {}, {}, {}
@@ -122,87 +128,64 @@ def start(survey: Survey, mast_parameters: int, *, only_camera_images: bool = Fa
     )
 
 
-def aligned(to_m: FloatArray, from_m: FloatArray) -> Rigid:
-    """Return the rigid transform that carries points (n, 3) best onto others (Kabsch)."""
-    to_mean, from_mean = to_m.mean(axis=0), from_m.mean(axis=0)
-    rotation, _ = Rotation.align_vectors(to_m - to_mean, from_m - from_mean)
-    return Rigid(rotation.as_matrix(), to_mean - rotation.apply(from_mean))
-
-
-class Alignment(NamedTuple):
-    """An alignment, how many sigmas its worst coordinate is off, and the point left out, if any."""
-
-    pose: Rigid
-    misfit: float
-    left_out: int | None
-
-
-def _aligned_without_blunder(to_m: FloatArray, from_m: FloatArray, sigma_m: float) -> Alignment:
-    """The alignment, without the one point (of four or more) whose leaving helps by far."""
-
-    def without(row: int | None) -> Alignment:
-        rows = np.array([i for i in range(len(to_m)) if i != row])
-        pose = aligned(to_m[rows], from_m[rows])
-        worst = float(np.abs(to_m[rows] - pose.points(from_m[rows])).max())
-        return Alignment(pose, worst / sigma_m, row)
-
-    found = without(None)
-    if found.misfit <= SHAPE or len(to_m) < 4:
-        return found
-    return min((without(row) for row in range(len(to_m))), key=lambda a: a.misfit)
-
-
 def _setups(survey: Survey, blunders: list[Outlier], notes: list[str]) -> dict[str, Rigid]:
     """rover_from_station of every set-up."""
     found = {}
-    sigma = float(np.hypot(survey.sigma.station_m, survey.sigma.prism_cad_m))
+    sigma_m = float(np.hypot(survey.sigma.station_m, survey.sigma.prism_cad_m))
     for setup in dict.fromkeys(p.setup for p in survey.station):
         prisms = [p for p in survey.station if p.setup == setup and p.kind == "prism"]
         prisms = [p for p in prisms if p.point in survey.prisms_in_rover_m]
-        if len(prisms) < 3:
-            raise SurveyNotFitted(
-                f"set-up {setup} has {len(prisms)} prisms where at least 3 are expected: measure the prisms"
+        cad = [survey.prisms_in_rover_m[p.point] for p in prisms]
+        try:
+            pose = align(
+                [p.position_m for p in prisms], cad, sigma_m, [p.point for p in prisms], false_alarm=GROSS
             )
-        cad = np.array([survey.prisms_in_rover_m[p.point] for p in prisms])
-        measured = np.array([p.position_m for p in prisms])
-        pose, misfit, row = _aligned_without_blunder(cad, measured, sigma)
-        found[setup] = pose
-        if row is not None and misfit <= SHAPE:
-            off = float(np.linalg.norm(pose.points(measured[row]) - cad[row]))
-            name = f"prism {prisms[row].point} of set-up {setup}"
-            blunders.append(Outlier("prism", name, (off / sigma) ** 2, SHAPE**2, off))
-        elif misfit > SHAPE:
-            notes.append(
-                f"the prisms of set-up {setup} are off their CAD positions by {misfit:.0f} sigmas, and "
-                "leaving out no single one helps: measure them again"
-            )
+        except NotAligned as error:
+            raise SurveyNotFitted(f"set-up {setup}: {error}; measure at least 3 of its prisms") from None
+        found[setup] = pose.b_from_a
+        blunders += _blunders("prism", pose, sigma_m, f"of set-up {setup}")
+        if pose.doubt:
+            notes.append(f"the prisms of set-up {setup} do not agree with their CAD positions: {pose.doubt}")
     return found
 
 
 def _boards(
-    survey: Survey, rover_from_station: Mapping[str, Rigid], notes: list[str]
+    survey: Survey, rover_from_station: Mapping[str, Rigid], blunders: list[Outlier], notes: list[str]
 ) -> tuple[dict[tuple[str, str], Rigid], set[tuple[str, str]]]:
     """rover_from_board of every placement with three tapes, and those whose tapes do not fit the board."""
     found, bent = {}, set()
-    tapes: dict[tuple[str, str], list[tuple[FloatArray, FloatArray]]] = {}
+    tapes: dict[tuple[str, str], dict[str, FloatArray]] = {}
     for p in survey.station:
         if p.kind == "tape" and p.point in survey.board.tapes_in_board_m:
             in_rover = rover_from_station[p.setup].points(p.position_m)
-            pair = (in_rover, survey.board.tapes_in_board_m[p.point])
-            tapes.setdefault((p.setup, p.placement), []).append(pair)
+            tapes.setdefault((p.setup, p.placement), {})[p.point] = in_rover
     for board, points in tapes.items():
         if len(points) < 3:
             continue
-        measured, drawn = (np.array(part) for part in zip(*points, strict=True))
-        pose, misfit, _ = _aligned_without_blunder(measured, drawn, survey.sigma.station_m)
-        found[board] = pose
-        if misfit > SHAPE:
-            bent.add(board)
-            notes.append(
-                f"the tapes of placement {board[1]} (set-up {board[0]}) are off the board's by "
-                f"{misfit:.0f} sigmas"
+        drawn = [survey.board.tapes_in_board_m[name] for name in points]
+        where = f"of placement {board[1]} (set-up {board[0]})"
+        try:
+            pose = align(
+                drawn, list(points.values()), survey.sigma.station_m, list(points), false_alarm=GROSS
             )
+        except NotAligned as error:
+            raise SurveyNotFitted(f"the tapes {where}: {error}") from None
+        found[board] = pose.b_from_a
+        blunders += _blunders("tape", pose, survey.sigma.station_m, where)
+        if pose.doubt:
+            bent.add(board)
+            notes.append(f"the tapes {where} do not agree with the board's: {pose.doubt}")
     return found, bent
+
+
+def _blunders(kind: Literal["prism", "tape"], pose: Alignment, sigma_m: float, where: str) -> list[Outlier]:
+    """The points that an alignment left out."""
+    found = []
+    for name in pose.rejected:
+        off = float(np.linalg.norm(pose.residuals_m[pose.names.index(name)]))
+        limit = float(chi2.isf(GROSS, 3))
+        found.append(Outlier(kind, f"{kind} {name} {where}", (off / sigma_m) ** 2, limit, off))
+    return found
 
 
 def _largest_setting(

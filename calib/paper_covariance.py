@@ -81,6 +81,8 @@ class TwoSteps:
         problem = self.problem
         matrix = np.diag(problem.weak)
         for point in problem.station:
+            if not point.keep:
+                continue
             block = problem.station_block(self.state, point)
             matrix[np.ix_(block.columns, block.columns)] += block.jacobian.T @ block.jacobian
         for name, block in problem.known(self.state):

@@ -41,6 +41,13 @@ class StationTerm:
     sigma_m: float
     keep: bool = True
 
+    @property
+    def name(self) -> str:
+        """The point as a person says it."""
+        if self.board is None:
+            return f"prism {self.point} of set-up {self.setup}"
+        return f"tape {self.point} of placement {self.board[1]} (set-up {self.setup})"
+
 
 def image_terms(
     survey: Survey, boards: Mapping[tuple[str, str], Rigid], notes: list[str]
