@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from concurrent.futures import Executor, ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from dataclasses import replace
 from multiprocessing import get_context
 from pathlib import Path
@@ -12,6 +13,13 @@ import cv2
 
 from calib.detect_survey import Progress, detect_survey
 from calib.survey import Survey
+from mastctl.errors import MastctlError
+
+
+class SearchCutShort(MastctlError):
+    """A process that searched pictures for dots was ended from outside."""
+
+    code = "search_cut_short"
 
 
 def missing(survey: Survey) -> tuple[str, ...]:
@@ -34,6 +42,11 @@ def with_dots(
         Called after each image: how many are done, of how many, and its name.
     executor
         Where images are searched; by default one process for each processor.
+
+    Raises
+    ------
+    SearchCutShort
+        If such a process ends before its work does.
     """
     clicked = {click.image for click in survey.clicks}  # a picture of a check point need not show a board
     if executor is not None:
@@ -44,6 +57,11 @@ def with_dots(
         with ProcessPoolExecutor(workers, get_context("spawn"), _one_thread) as pool:
             try:
                 found = detect_survey(survey, pool, progress)
+            except BrokenProcessPool:
+                raise SearchCutShort(
+                    "a process that searched the pictures for dots was ended from outside, as the system does "
+                    "where memory runs out; nothing is written: close other programs and try again"
+                ) from None
             except BaseException:
                 pool.shutdown(cancel_futures=True)
                 raise

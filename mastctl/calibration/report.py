@@ -10,7 +10,6 @@ import numpy as np
 
 from calib.calibration import Calibration
 from calib.formats.atomic import save_bytes
-from calib.formats.atomic import save_bytes
 from calib.store import StoredRig
 from calib.survey import Survey
 from mastctl import html
