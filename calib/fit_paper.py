@@ -17,10 +17,9 @@ import numpy as np
 from calib.adjustment import MAST, Adjustment
 from calib.cahvor import CameraModel
 from calib.calibration import Calibration, Outlier
-from calib.fit_camera import CameraNotFitted, fit_camera
 from calib.fit_joint import estimate_values, mast_first, rig_of
 from calib.fit_mast import MastNotFitted, fit_mast
-from calib.fit_start import Start, SurveyNotFitted, mast_views, start
+from calib.fit_start import Start, SurveyNotFitted, at_setting, camera_from_points, mast_views, start
 from calib.gimbal import gimbal, mast_of
 from calib.paper_covariance import TwoSteps
 from calib.residuals import check_rms, image_residuals, rms_by_camera, station_residuals
@@ -127,15 +126,13 @@ def _at_reference(
     survey: Survey, from_here: Start, purposes: Mapping[str, str], left_out: set[str]
 ) -> list[ImageTerm]:
     """Camera images taken at their camera's reference setting."""
-    near = max(1e-3, 4 * survey.sigma.joint_rad)
-    found = []
-    for term in from_here.images:
-        if purposes[term.name] != "camera" or term.name in left_out:
-            continue
-        pan, tilt = from_here.reference_rad.get(term.camera, (0.0, 0.0))
-        if abs(term.pan_rad - pan) <= near and abs(term.tilt_rad - tilt) <= near:
-            found.append(term)
-    return found
+    return [
+        t
+        for t in from_here.images
+        if purposes[t.name] == "camera"
+        and t.name not in left_out
+        and at_setting(t, from_here.reference_rad.get(t.camera, (0.0, 0.0)), survey.sigma.joint_rad)
+    ]
 
 
 def _mast_of(
@@ -188,20 +185,7 @@ def _cameras_again(
         return found
     for name in from_here.reference_rad:
         group = [t for t in camera_images if t.camera == name and t.name not in doubtful]
-        camera = survey.cameras[name]
-        try:
-            found[name] = fit_camera(
-                np.concatenate([points[t.name] for t in group]),
-                np.concatenate([t.pixels_px for t in group]),
-                np.concatenate([np.full(len(t.rows), i) for i, t in enumerate(group)]),
-                kind=camera.kind,
-                size_px=camera.size_px,
-                focal_px=camera.focal_px,
-                sigma_px=survey.sigma.dot_px,
-                expected_px=from_here.expected_px[name],
-            ).model
-        except CameraNotFitted as error:
-            raise SurveyNotFitted(f"camera {name}: {error}") from None
+        found[name] = camera_from_points(survey, name, group, points, from_here.expected_px[name]).model
     return found
 
 

@@ -13,29 +13,24 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
-from scipy.stats import chi2
 
 from calib.adjustment import Estimate
-from calib.align import Alignment, NotAligned, align
+from calib.align import NotAligned
 from calib.cahvor import CameraModel
 from calib.calibration import Outlier
 from calib.errors import CalibError
-from calib.fit_camera import CameraNotFitted, fit_camera
+from calib.fit_camera import CameraFit, CameraNotFitted, fit_camera
 from calib.fit_mast import MastNotFitted, MastView, fit_mast
 from calib.gimbal import MAST_NAMES, mast_of
 from calib.rigid import FloatArray, Rigid
+from calib.station_poses import station_poses
 from calib.survey import Survey
 from calib.terms import ImageTerm, StationTerm, image_terms, station_terms
 
 SAME_ANGLE_RAD = 1e-3
 """Joint readings this close are one joint setting for a start."""
-
-GROSS = 1e-9
-"""Tapes or prisms whose shape chance alone makes so seldom are not trusted for a start: only gross errors,
-since the stated sigmas may be too small. The finer ones are the fit's to judge."""
 
 
 class SurveyNotFitted(CalibError):
@@ -74,10 +69,11 @@ def start(survey: Survey, mast_parameters: int, *, only_camera_images: bool = Fa
     SurveyNotFitted
         If a set-up, a camera or the mast cannot be started; the sentence says what is missing.
     """
-    notes: list[str] = []
-    blunders: list[Outlier] = []
-    rover_from_station = _setups(survey, blunders, notes)
-    rover_from_board, bent = _boards(survey, rover_from_station, blunders, notes)
+    try:
+        station = station_poses(survey)
+    except NotAligned as error:
+        raise SurveyNotFitted(str(error)) from None
+    notes, rover_from_board, bent = list(station.notes), station.rover_from_board, station.bent
     images, checks, joints = image_terms(survey, rover_from_board, notes)
     doubtful: set[str] = set()
     in_rover, reference, expected = {}, {}, {}
@@ -108,7 +104,7 @@ def start(survey: Survey, mast_parameters: int, *, only_camera_images: bool = Fa
     estimate = Estimate(
         cameras,
         mast,
-        rover_from_station,
+        station.rover_from_station,
         rover_from_board,
         {n: np.array(p) for n, p in survey.prisms_in_rover_m.items()},
         np.zeros((len(joints) if survey.sigma.joint_rad > 0 else 0, 2)),
@@ -122,84 +118,25 @@ def start(survey: Survey, mast_parameters: int, *, only_camera_images: bool = Fa
         reference,
         in_rover,
         expected,
-        frozenset(bent),
-        tuple(blunders),
+        bent,
+        station.blunders,
         tuple(notes),
     )
 
 
-def _setups(survey: Survey, blunders: list[Outlier], notes: list[str]) -> dict[str, Rigid]:
-    """rover_from_station of every set-up."""
-    found = {}
-    sigma_m = float(np.hypot(survey.sigma.station_m, survey.sigma.prism_cad_m))
-    for setup in dict.fromkeys(p.setup for p in survey.station):
-        prisms = [p for p in survey.station if p.setup == setup and p.kind == "prism"]
-        prisms = [p for p in prisms if p.point in survey.prisms_in_rover_m]
-        cad = [survey.prisms_in_rover_m[p.point] for p in prisms]
-        try:
-            pose = align(
-                [p.position_m for p in prisms], cad, sigma_m, [p.point for p in prisms], false_alarm=GROSS
-            )
-        except NotAligned as error:
-            raise SurveyNotFitted(f"set-up {setup}: {error}; measure at least 3 of its prisms") from None
-        found[setup] = pose.b_from_a
-        blunders += _blunders("prism", pose, sigma_m, f"of set-up {setup}")
-        if pose.doubt:
-            notes.append(f"the prisms of set-up {setup} do not agree with their CAD positions: {pose.doubt}")
-    return found
-
-
-def _boards(
-    survey: Survey, rover_from_station: Mapping[str, Rigid], blunders: list[Outlier], notes: list[str]
-) -> tuple[dict[tuple[str, str], Rigid], set[tuple[str, str]]]:
-    """rover_from_board of every placement with three tapes, and those whose tapes do not fit the board."""
-    found, bent = {}, set()
-    tapes: dict[tuple[str, str], dict[str, FloatArray]] = {}
-    for p in survey.station:
-        if p.kind == "tape" and p.point in survey.board.tapes_in_board_m:
-            in_rover = rover_from_station[p.setup].points(p.position_m)
-            tapes.setdefault((p.setup, p.placement), {})[p.point] = in_rover
-    for board, points in tapes.items():
-        if len(points) < 3:
-            continue
-        drawn = [survey.board.tapes_in_board_m[name] for name in points]
-        where = f"of placement {board[1]} (set-up {board[0]})"
-        try:
-            pose = align(
-                drawn, list(points.values()), survey.sigma.station_m, list(points), false_alarm=GROSS
-            )
-        except NotAligned as error:
-            raise SurveyNotFitted(f"the tapes {where}: {error}") from None
-        found[board] = pose.b_from_a
-        blunders += _blunders("tape", pose, survey.sigma.station_m, where)
-        if pose.doubt:
-            bent.add(board)
-            notes.append(f"the tapes {where} do not agree with the board's: {pose.doubt}")
-    return found, bent
-
-
-def _blunders(kind: Literal["prism", "tape"], pose: Alignment, sigma_m: float, where: str) -> list[Outlier]:
-    """The points that an alignment left out."""
-    found = []
-    for name in pose.rejected:
-        off = float(np.linalg.norm(pose.residuals_m[pose.names.index(name)]))
-        limit = float(chi2.isf(GROSS, 3))
-        found.append(Outlier(kind, f"{kind} {name} {where}", (off / sigma_m) ** 2, limit, off))
-    return found
+def at_setting(image: ImageTerm, setting_rad: tuple[float, float], joint_rad: float) -> bool:
+    """Return whether an image's joint readings are a setting's, but for their noise."""
+    off = np.abs(np.subtract((image.pan_rad, image.tilt_rad), setting_rad))
+    return bool(off.max() <= max(SAME_ANGLE_RAD, 4 * joint_rad))
 
 
 def _largest_setting(
     images: Sequence[ImageTerm], joint_rad: float
 ) -> tuple[tuple[float, float], list[ImageTerm]]:
     """The joint setting with the most images, and those."""
-    near = max(SAME_ANGLE_RAD, 4 * joint_rad)
     best: tuple[tuple[float, float], list[ImageTerm]] = ((0.0, 0.0), [])
     for one in images:
-        group = [
-            t
-            for t in images
-            if abs(t.pan_rad - one.pan_rad) <= near and abs(t.tilt_rad - one.tilt_rad) <= near
-        ]
+        group = [t for t in images if at_setting(t, (one.pan_rad, one.tilt_rad), joint_rad)]
         if len(group) > len(best[1]):
             pan = float(np.median([t.pan_rad for t in group]))
             tilt = float(np.median([t.tilt_rad for t in group]))
@@ -237,9 +174,34 @@ def _camera(
             f"camera {name} sees {len(placements)} boards{where} where at least 2, better 8, are expected: "
             "take more images of boards at two distances without moving the head"
         )
+    points = {t.name: boards[t.board].points(t.in_board_m) for t in group}
+    fit = camera_from_points(survey, name, group, points, expected_px)
+    first = 0
+    for term in group:
+        if not fit.used[first : first + len(term.rows)].any():
+            doubtful.add(term.name)
+        first += len(term.rows)
+    return fit.model
+
+
+def camera_from_points(
+    survey: Survey,
+    name: str,
+    group: Sequence[ImageTerm],
+    points_m: Mapping[str, FloatArray],
+    expected_px: float,
+) -> CameraFit:
+    """Return a camera fitted to the dots of some images, at ``points_m`` by image, in one frame.
+
+    Raises
+    ------
+    SurveyNotFitted
+        If no camera explains them.
+    """
+    camera = survey.cameras[name]
     try:
-        fit = fit_camera(
-            np.concatenate([boards[t.board].points(t.in_board_m) for t in group]),
+        return fit_camera(
+            np.concatenate([points_m[t.name] for t in group]),
             np.concatenate([t.pixels_px for t in group]),
             np.concatenate([np.full(len(t.rows), i) for i, t in enumerate(group)]),
             kind=camera.kind,
@@ -250,12 +212,6 @@ def _camera(
         )
     except CameraNotFitted as error:
         raise SurveyNotFitted(f"camera {name}: {error}") from None
-    first = 0
-    for term in group:
-        if not fit.used[first : first + len(term.rows)].any():
-            doubtful.add(term.name)
-        first += len(term.rows)
-    return fit.model
 
 
 def _mast(
@@ -263,7 +219,7 @@ def _mast(
     in_rover: Mapping[str, CameraModel],
     reference: Mapping[str, tuple[float, float]],
     boards: Mapping[tuple[str, str], Rigid],
-    bent: set[tuple[str, str]],
+    bent: frozenset[tuple[str, str]],
     expected: Mapping[str, float],
     mast_parameters: int,
     doubtful: set[str],
