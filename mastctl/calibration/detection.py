@@ -59,8 +59,8 @@ def with_dots(
                 found = detect_survey(survey, pool, progress)
             except BrokenProcessPool:
                 raise SearchCutShort(
-                    "a process that searched the pictures for dots was ended from outside, as the system does "
-                    "where memory runs out; nothing is written: close other programs and try again"
+                    "a process that searched the pictures for dots was ended from outside, as happens where "
+                    "memory runs out; nothing is written: close other programs and try again"
                 ) from None
             except BaseException:
                 pool.shutdown(cancel_futures=True)
