@@ -1,8 +1,8 @@
 """How good a survey must be: simulated surveys, fitted, and judged by the pointing and hand-off they give.
 
 One thing at a time differs from the paper's survey (section III, Table II): how many placements the mast is
-calibrated with, how well the station measures, how many prisms there are, whether the mast is taken as
-upright. The paper's Tables IV and V come from the same runs.
+calibrated with, how many boards the cameras, how well the station measures, how many prisms there are,
+whether the mast is taken as upright. The paper's Tables IV and V come from the same runs.
 """
 
 from __future__ import annotations
@@ -29,6 +29,7 @@ from mastctl.experiment.executors import run_all
 DISTANCES_M = (10.0, 6.0, 2.0)
 CLICK_PX = 0.2
 PAN_RAD, TILT_RAD = (-1.0, 1.0), (-0.6, -0.05)
+METHODS: tuple[Method, ...] = ("paper", "joint")
 MARGIN = 0.1
 """Targets keep so far from the images' edges, as part of the width and height."""
 
@@ -156,13 +157,19 @@ def variants() -> tuple[Variant, ...]:
     """Return everything that is varied, one thing at a time from the paper's survey."""
     base = SurveyPlan()
     found: list[Variant] = []
-    for method in ("paper", "joint"):
+    for method in METHODS:
         for count in (2, 3, 4, 5, 6, 8, 12, 18):
             plan = replace(base, mast_boards=count)
             found.append(Variant(f"placements, {method}", f"{count}", count, method, 6, plan))
-    for station_m in (0.0005, 0.001, 0.002, 0.004):
-        plan = replace(base, sigma=Sigma(station_m, 0.1))
-        found.append(Variant("station", f"{1000 * station_m:g} mm", 1000 * station_m, "joint", 6, plan))
+    for method in METHODS:
+        for count in (2, 4, 8, 12):
+            plan = replace(base, rings=tuple(replace(ring, boards=count) for ring in base.rings))
+            found.append(Variant(f"boards, {method}", f"{count}", count, method, 6, plan))
+    for method in METHODS:
+        for station_m in (0.0005, 0.001, 0.002, 0.004):
+            plan = replace(base, sigma=Sigma(station_m, 0.1))
+            label = f"{1000 * station_m:g} mm"
+            found.append(Variant(f"station, {method}", label, 1000 * station_m, method, 6, plan))
     for prisms in (3, 4):
         found.append(Variant("prisms", f"{prisms}", prisms, "joint", 6, replace(base, prisms=prisms)))
     paper = replace(base, sigma=Sigma(PAPER_STATION_M, 0.1))

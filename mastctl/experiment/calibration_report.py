@@ -28,6 +28,7 @@ from mastctl.experiment.calibration import (
 SIX = ("txm, m", "tym, m", "tzm, m", "θxm, rad", "θym, rad", "θzm, rad")
 STUDIES = {
     "placements": "placements of the board for the mast",
+    "boards": "boards of each ring (two rings a camera pair)",
     "station": "sigma of the station, mm an axis",
     "prisms": "prisms on the rover",
     "mast parameters": "mast parameters (4: the mast taken as upright)",
