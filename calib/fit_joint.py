@@ -183,7 +183,7 @@ def _calibration(
         check_rms_px=check_rms(survey, state, images),
         outliers=named(problem, state, covariance, from_here.images),
         false_alarms=3 * FALSE_ALARMS,
-        degenerate=open_directions(problem, state, problem.names[:size], covariance[:size, :size]),
+        degenerate=open_directions(problem, problem.names[:size], covariance[:size, :size]),
         notes=tuple(notes),
         chi2=chi_square,
         degrees_of_freedom=freedom,

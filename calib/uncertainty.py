@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from scipy.optimize import approx_fprime
 
-from calib.adjustment import Adjustment, Estimate
+from calib.adjustment import Adjustment
 from calib.cahvor import CameraModel
 from calib.calibration import Calibration, Degenerate
 from calib.camera_parameters import parameter_part, predict, stepped, tangents
@@ -174,32 +174,42 @@ def moved_rig(calibration: Calibration, columns: np.ndarray, step: FloatArray) -
     return replace(rig, mast=mast_of(numbers), cameras=cameras)
 
 
-def open_directions(
-    problem: Adjustment, state: Estimate, names: Sequence[str], covariance: FloatArray
-) -> tuple[Degenerate, ...]:
-    """Return the directions of mast and cameras that the data leave open, in words.
+def open_parameters(
+    names: Sequence[str], covariance: FloatArray, weak: FloatArray
+) -> tuple[tuple[str, ...], ...]:
+    """Return the directions that the data leave open, the worst first, each as the parameters it moves most.
 
-    ``covariance`` is of ``names``, the first of the problem's unknowns, with the problem's weak knowledge
+    ``covariance`` (p, p) is of ``names`` with the weak knowledge (p,) of ``calib.least_squares.minimise``
     added: an unknown that the data do not see keeps a sigma of 1 m, 1 rad or one focal length.
     """
-    shown = [i for i, n in enumerate(names) if n.startswith("mast.") or n.split(".")[2] not in "ORE"]
-    scale = np.sqrt(problem.weak[shown])
-    values, vectors = np.linalg.eigh(covariance[np.ix_(shown, shown)] * np.outer(scale, scale))
+    scale = np.sqrt(weak)
+    values, vectors = np.linalg.eigh(covariance * np.outer(scale, scale))
     found = []
     for value, vector in zip(values[::-1], vectors.T[::-1], strict=True):
         if np.sqrt(max(value, 0.0)) < OPEN:
             break
-        size = np.abs(vector) * np.array([3.0 if names[i].startswith("mast.") else 1.0 for i in shown])
+        size = np.abs(vector) * np.array([3.0 if n.startswith("mast.") else 1.0 for n in names])
         order = [i for i in np.argsort(-size) if size[i] >= PART] or [int(np.argmax(size))]
-        parts = tuple(names[shown[i]] for i in order)
-        found.append(Degenerate(parts, _reason(problem, parts)))
+        found.append(tuple(names[i] for i in order))
     return tuple(found)
+
+
+def open_directions(
+    problem: Adjustment, names: Sequence[str], covariance: FloatArray
+) -> tuple[Degenerate, ...]:
+    """Return the directions of mast and cameras that a survey leaves open, in words.
+
+    ``covariance`` is of ``names``, the first of the problem's unknowns, with the problem's weak knowledge
+    added.
+    """
+    shown = [i for i, n in enumerate(names) if n.startswith("mast.") or n.split(".")[2] not in "ORE"]
+    found = open_parameters([names[i] for i in shown], covariance[np.ix_(shown, shown)], problem.weak[shown])
+    return tuple(Degenerate(parts, _reason(problem, parts)) for parts in found)
 
 
 def _reason(problem: Adjustment, parameters: Sequence[str]) -> str:
     """Why a direction is open, and what to measure."""
-    named = list(dict.fromkeys(_words(p) for p in parameters))
-    what = "the survey does not fix " + ", ".join(named[:4]) + (" and more" if len(named) > 4 else "")
+    what = f"the survey does not fix {in_words(parameters)}"
     head = [t for t in problem.images if t.attitude is not None and t.keep.any()]
     on_mast = any(p.startswith("mast.") for p in parameters)
     cameras = {p.split(".")[1] for p in parameters if p.startswith("cameras.")}
@@ -222,9 +232,15 @@ def _reason(problem: Adjustment, parameters: Sequence[str]) -> str:
     return f"{what}; take more images of purpose mast, spread over pan and tilt"
 
 
+def in_words(parameters: Sequence[str]) -> str:
+    """Return some parameters as a person says them."""
+    named = list(dict.fromkeys(_words(p) for p in parameters))
+    return ", ".join(named[:4]) + (" and more" if len(named) > 4 else "")
+
+
 def _words(parameter: str) -> str:
     """A parameter as a person says it."""
     first, *rest = parameter.split(".")
     if first == "mast":
         return "the mast's " + " ".join(rest).replace("_m", "").replace("_rad", "").replace("_", " ")
-    return f"{rest[1]} of {rest[0]}"
+    return f"{rest[1]} of {rest[0]}" if first == "cameras" else f"the {first}'s {rest[0].split('_')[0]}"

@@ -19,8 +19,9 @@ import flight_mer as mer
 import flight_msl as msl
 import numpy as np
 
-from calib.fit_poses import ModelDifference, PoseFit, model_difference
+from calib.fit_poses import PoseFit
 from calib.formats.pds3 import PdsProduct
+from calib.model_difference import ModelDifference, model_difference
 from calib.store import save_rig
 from drivers.clock import ManualClock
 from drivers.errors import DriverError
