@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import os
+import threading
 from concurrent.futures import Executor, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import replace
-from multiprocessing import get_context
+from multiprocessing import get_context, parent_process
+from multiprocessing.connection import wait
 from pathlib import Path
 
 import cv2
@@ -54,7 +56,7 @@ def with_dots(
     else:
         workers = max(1, min(len(missing(survey)), os.cpu_count() or 1))
         # Started afresh: a progress bar's thread runs here already, which a fork would copy half.
-        with ProcessPoolExecutor(workers, get_context("spawn"), _one_thread) as pool:
+        with ProcessPoolExecutor(workers, get_context("spawn"), _worker) as pool:
             try:
                 found = detect_survey(survey, pool, progress)
             except BrokenProcessPool:
@@ -69,6 +71,14 @@ def with_dots(
     return replace(survey, dots=found.dots), tuple(failures)
 
 
-def _one_thread() -> None:
-    """One process a processor is enough."""
+def _worker() -> None:
+    """One process a processor is enough; and none outlives a command that was killed."""
     cv2.setNumThreads(1)
+    parent = parent_process()
+    if parent is not None:
+        threading.Thread(target=_end_with, args=(parent.sentinel,), daemon=True).start()
+
+
+def _end_with(sentinel: int) -> None:
+    wait([sentinel])
+    os._exit(1)
