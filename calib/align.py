@@ -133,7 +133,7 @@ def mirrored(points_in_a_m: ArrayLike, points_in_b_m: ArrayLike, sigma_m: float)
     return fits[1] <= _limit(3 * len(a) - 6, FALSE_ALARM) < fits[0]
 
 
-def rover_from_station(survey: Survey) -> dict[str, Alignment]:
+def rover_from_station(survey: Survey, *, false_alarm: float = FALSE_ALARM) -> dict[str, Alignment]:
     """Return the pose of every set-up from its prisms, by the set-up's name.
 
     Raises
@@ -144,38 +144,49 @@ def rover_from_station(survey: Survey) -> dict[str, Alignment]:
     sigma_m = float(np.hypot(survey.sigma.station_m, survey.sigma.prism_cad_m))
     measured: dict[str, dict[str, FloatArray]] = {point.setup: {} for point in survey.station}
     for point in survey.station:
-        if point.kind == "prism":
+        if point.kind == "prism" and point.point in survey.prisms_in_rover_m:
             measured[point.setup][point.point] = point.position_m
     poses: dict[str, Alignment] = {}
     for setup, points in measured.items():
         design = [survey.prisms_in_rover_m[name] for name in points]
         try:
-            poses[setup] = align(list(points.values()), design, sigma_m, list(points))
+            poses[setup] = align(
+                list(points.values()), design, sigma_m, list(points), false_alarm=false_alarm
+            )
         except NotAligned as error:
             raise NotAligned(f"prisms of set-up {setup}: {error}") from None
     return poses
 
 
-def station_from_board(survey: Survey) -> dict[tuple[str, str], Alignment]:
-    """Return the pose of every placement from its tapes, by set-up and placement.
+def station_from_board(
+    survey: Survey, *, false_alarm: float = FALSE_ALARM
+) -> dict[tuple[str, str], Alignment]:
+    """Return the pose of every placement with three tapes, by set-up and placement.
 
     Raises
     ------
     NotAligned
-        Naming the placement with fewer than three tapes.
+        Naming the placement whose tapes are on one line.
     """
     measured: dict[tuple[str, str], dict[str, FloatArray]] = {}
     for point in survey.station:
-        if point.kind == "tape":
+        if point.kind == "tape" and point.point in survey.board.tapes_in_board_m:
             measured.setdefault((point.setup, point.placement), {})[point.point] = point.position_m
     poses: dict[tuple[str, str], Alignment] = {}
     for (setup, placement), points in measured.items():
+        if len(points) < 3:
+            continue
         design = [survey.board.tapes_in_board_m[name] for name in points]
         try:
-            aligned = align(design, list(points.values()), survey.sigma.station_m, list(points))
+            poses[setup, placement] = align(
+                design,
+                list(points.values()),
+                survey.sigma.station_m,
+                list(points),
+                false_alarm=false_alarm,
+            )
         except NotAligned as error:
             raise NotAligned(f"tapes of placement {placement} in set-up {setup}: {error}") from None
-        poses[setup, placement] = aligned
     return poses
 
 

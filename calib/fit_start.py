@@ -106,7 +106,7 @@ def start(survey: Survey, mast_parameters: int, *, only_camera_images: bool = Fa
         mast,
         station.rover_from_station,
         rover_from_board,
-        {n: np.array(p) for n, p in survey.prisms_in_rover_m.items()},
+        station.prisms_in_rover_m,
         np.zeros((len(joints) if survey.sigma.joint_rad > 0 else 0, 2)),
     )
     return Start(

@@ -9,8 +9,9 @@ from typing import Literal
 import numpy as np
 from scipy.stats import chi2
 
-from calib.align import Alignment, NotAligned, align
+from calib.align import Alignment, rover_from_station, station_from_board
 from calib.calibration import Outlier
+from calib.prisms import refine_prisms
 from calib.rigid import FloatArray, Rigid
 from calib.survey import Survey
 
@@ -25,17 +26,22 @@ class StationPoses:
 
     ``rover_from_board`` is by set-up and placement, of placements with three tapes; ``bent`` are those whose
     tapes do not fit the board, ``blunders`` prisms and tapes that the poses were found without.
+    ``prisms_in_rover_m`` is refined where the drawing has a sigma.
     """
 
     rover_from_station: Mapping[str, Rigid]
     rover_from_board: Mapping[tuple[str, str], Rigid]
+    prisms_in_rover_m: Mapping[str, FloatArray]
     bent: frozenset[tuple[str, str]]
     blunders: tuple[Outlier, ...]
     notes: tuple[str, ...]
 
 
 def station_poses(survey: Survey) -> StationPoses:
-    """Return the poses that prisms and tapes give, each set-up's and placement's alone.
+    """Return the poses that prisms and tapes give, each placement's alone.
+
+    Set-ups are taken each alone where the drawing of the prisms is exact, else together
+    (``calib.prisms``), as the paper does.
 
     Raises
     ------
@@ -44,66 +50,62 @@ def station_poses(survey: Survey) -> StationPoses:
     """
     blunders: list[Outlier] = []
     notes: list[str] = []
-    rover_from_station = _setups(survey, blunders, notes)
-    rover_from_board, bent = _boards(survey, rover_from_station, blunders, notes)
-    return StationPoses(rover_from_station, rover_from_board, frozenset(bent), tuple(blunders), tuple(notes))
+    if survey.sigma.prism_cad_m > 0:
+        setups, prisms = _refined(survey, blunders, notes)
+    else:
+        setups, prisms = _as_drawn(survey, blunders, notes)
+    boards, bent = {}, set()
+    for (setup, placement), pose in station_from_board(survey, false_alarm=GROSS).items():
+        where = f"of placement {placement} (set-up {setup})"
+        boards[setup, placement] = setups[setup] @ pose.b_from_a
+        blunders += _left_out("tape", pose, survey.sigma.station_m, where)
+        if pose.doubt:
+            bent.add((setup, placement))
+            notes.append(f"the tapes {where} do not agree with the board's: {pose.doubt}")
+    return StationPoses(setups, boards, prisms, frozenset(bent), tuple(blunders), tuple(notes))
 
 
-def _setups(survey: Survey, blunders: list[Outlier], notes: list[str]) -> dict[str, Rigid]:
-    """rover_from_station of every set-up."""
+def _as_drawn(
+    survey: Survey, blunders: list[Outlier], notes: list[str]
+) -> tuple[dict[str, Rigid], dict[str, FloatArray]]:
+    """Set-ups by prisms that are where the drawing says, and these."""
     found = {}
-    sigma_m = float(np.hypot(survey.sigma.station_m, survey.sigma.prism_cad_m))
-    for setup in dict.fromkeys(p.setup for p in survey.station):
-        prisms = [p for p in survey.station if p.setup == setup and p.kind == "prism"]
-        prisms = [p for p in prisms if p.point in survey.prisms_in_rover_m]
-        cad = [survey.prisms_in_rover_m[p.point] for p in prisms]
-        try:
-            pose = align(
-                [p.position_m for p in prisms], cad, sigma_m, [p.point for p in prisms], false_alarm=GROSS
-            )
-        except NotAligned as error:
-            raise NotAligned(f"set-up {setup}: {error}; measure at least 3 of its prisms") from None
+    for setup, pose in rover_from_station(survey, false_alarm=GROSS).items():
         found[setup] = pose.b_from_a
-        blunders += _blunders("prism", pose, sigma_m, f"of set-up {setup}")
+        blunders += _left_out("prism", pose, survey.sigma.station_m, f"of set-up {setup}")
         if pose.doubt:
             notes.append(f"the prisms of set-up {setup} do not agree with their CAD positions: {pose.doubt}")
-    return found
+    return found, {name: np.array(place) for name, place in survey.prisms_in_rover_m.items()}
 
 
-def _boards(
-    survey: Survey, rover_from_station: Mapping[str, Rigid], blunders: list[Outlier], notes: list[str]
-) -> tuple[dict[tuple[str, str], Rigid], set[tuple[str, str]]]:
-    """rover_from_board of every placement with three tapes, and those whose tapes do not fit the board."""
-    found, bent = {}, set()
-    tapes: dict[tuple[str, str], dict[str, FloatArray]] = {}
-    for p in survey.station:
-        if p.kind == "tape" and p.point in survey.board.tapes_in_board_m:
-            in_rover = rover_from_station[p.setup].points(p.position_m)
-            tapes.setdefault((p.setup, p.placement), {})[p.point] = in_rover
-    for board, points in tapes.items():
-        if len(points) < 3:
-            continue
-        drawn = [survey.board.tapes_in_board_m[name] for name in points]
-        where = f"of placement {board[1]} (set-up {board[0]})"
-        try:
-            pose = align(
-                drawn, list(points.values()), survey.sigma.station_m, list(points), false_alarm=GROSS
-            )
-        except NotAligned as error:
-            raise NotAligned(f"the tapes {where}: {error}") from None
-        found[board] = pose.b_from_a
-        blunders += _blunders("tape", pose, survey.sigma.station_m, where)
-        if pose.doubt:
-            bent.add(board)
-            notes.append(f"the tapes {where} do not agree with the board's: {pose.doubt}")
-    return found, bent
+def _refined(
+    survey: Survey, blunders: list[Outlier], notes: list[str]
+) -> tuple[dict[str, Rigid], dict[str, FloatArray]]:
+    """Set-ups and prisms by all set-ups and the drawing together."""
+    refined = refine_prisms(survey, false_alarm=GROSS)
+    prisms = dict(zip(refined.names, refined.places_in_rover_m, strict=True))
+    measured = {(p.setup, p.point): p.position_m for p in survey.station if p.kind == "prism"}
+    for setup, name in refined.rejected:
+        if setup is None:
+            off = prisms[name] - survey.prisms_in_rover_m[name]
+            sigma_m, where = survey.sigma.prism_cad_m, "in the drawing"
+        else:
+            off = refined.rover_from_station[setup].points(measured[setup, name]) - prisms[name]
+            sigma_m, where = survey.sigma.station_m, f"of set-up {setup}"
+        blunders.append(_outlier("prism", name, where, off, sigma_m))
+    if refined.doubt:
+        notes.append(refined.doubt)
+    return dict(refined.rover_from_station), prisms
 
 
-def _blunders(kind: Literal["prism", "tape"], pose: Alignment, sigma_m: float, where: str) -> list[Outlier]:
+def _left_out(kind: Literal["prism", "tape"], pose: Alignment, sigma_m: float, where: str) -> list[Outlier]:
     """The points that an alignment left out."""
-    found = []
-    for name in pose.rejected:
-        off = float(np.linalg.norm(pose.residuals_m[pose.names.index(name)]))
-        limit = float(chi2.isf(GROSS, 3))
-        found.append(Outlier(kind, f"{kind} {name} {where}", (off / sigma_m) ** 2, limit, off))
-    return found
+    rows = [pose.names.index(name) for name in pose.rejected]
+    return [_outlier(kind, pose.names[row], where, pose.residuals_m[row], sigma_m) for row in rows]
+
+
+def _outlier(
+    kind: Literal["prism", "tape"], name: str, where: str, off_m: FloatArray, sigma_m: float
+) -> Outlier:
+    off = float(np.linalg.norm(off_m))
+    return Outlier(kind, f"{kind} {name} {where}", (off / sigma_m) ** 2, float(chi2.isf(GROSS, 3)), off)
