@@ -3,7 +3,8 @@
 Cameras are fitted to images of purpose ``camera``, set-ups and boards taken from the station as they are.
 The mast is fitted to images of purpose ``mast`` with those cameras (eq. (9)), which it then carries to the
 head. All dots weigh the same; what the station got wrong shows as residuals. The covariance
-is that of this estimator (``calib.paper_covariance``).
+is that of this estimator (``calib.paper_covariance``). Dots that disagree with the rest of their image are
+left out beforehand (``calib.stray_dots``).
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ from calib.gimbal import gimbal, mast_of
 from calib.paper_covariance import TwoSteps
 from calib.residuals import check_rms, image_residuals, rms_by_camera, station_residuals
 from calib.rigid import FloatArray
+from calib.stray_dots import without_stray_dots
 from calib.survey import Survey
 from calib.terms import ImageTerm, with_kept
 from calib.uncertainty import open_directions, sigma_by_key
@@ -52,6 +54,13 @@ def fit_paper(survey: Survey, mast_parameters: int = 6) -> Calibration:
         If the survey does not determine a camera or the mast, or no start leads near the noise.
     """
     began = time.perf_counter()
+    survey, strays = without_stray_dots(survey)
+    fit = _fit(survey, mast_parameters, began)
+    return replace(fit, outliers=(*fit.outliers, *strays))
+
+
+def _fit(survey: Survey, mast_parameters: int, began: float) -> Calibration:
+    """Cameras, then the mast, once."""
     from_here = start(survey, mast_parameters, only_camera_images=True)
     purposes = {i.name: i.purpose for i in survey.images}
     cameras = dict(from_here.in_rover)
