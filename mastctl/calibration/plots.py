@@ -98,6 +98,8 @@ def boards(calibration: Calibration, board: Board) -> Any:
 
 def errors_by(calibration: Calibration) -> Any:
     """Draw each image's rms over the board's range, its angle to the line of sight, pan and tilt."""
+    from matplotlib.ticker import LogLocator
+
     figure = _figure(11.5, 3.6)
     axes = figure.subplots(1, 4, sharey=True)
     values: Sequence[tuple[str, Any]] = (
@@ -126,6 +128,7 @@ def errors_by(calibration: Calibration) -> Any:
         axis.set_xlabel(label)
         axis.set_yscale("log")
         axis.yaxis.set_major_formatter("{x:g}")
+        axis.yaxis.set_minor_locator(LogLocator(subs=(2, 3, 5)))
         axis.yaxis.set_minor_formatter("{x:g}")
         axis.tick_params(which="both", labelsize=8)
         axis.grid(alpha=0.25, which="both")
