@@ -408,13 +408,16 @@ def test_a_prism_that_may_be_any_is_refused(tmp_path: Path, capsys: pytest.Captu
     assert "Measure the prisms of this set-up again" in told["error"]["message"]
 
 
+@pytest.mark.parametrize("method", ["joint", "paper"])
 @pytest.mark.parametrize("distance_px", [1.0, 40.0])
-def test_a_wrong_dot_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str], distance_px: float) -> None:
+def test_a_wrong_dot_is_named(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], distance_px: float, method: str
+) -> None:
     rng = np.random.default_rng(5)
     survey, places = with_outlier_dots(navcam_survey(1)[0], IMAGE, 1, distance_px, rng)
     row, column = places[0]
     name = f"image {IMAGE} dot (row {row}, column {column})"
-    assert outliers(written(survey, tmp_path), capsys) == [name]
+    assert outliers(written(survey, tmp_path), capsys, "--method", method) == [name]
 
 
 @pytest.mark.parametrize("shift_px", [0.5, 3.0, 30.0])
@@ -426,6 +429,19 @@ def test_a_shifted_image_is_named(
     moved = replace(dots, pixels_px=dots.pixels_px + np.array([shift_px, -shift_px]))
     folder = written(replace(survey, dots={**survey.dots, IMAGE: moved}), tmp_path)
     assert outliers(folder, capsys) == [f"image {IMAGE}"]
+
+
+def test_a_shifted_image_that_the_papers_method_keeps_is_told(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    survey = navcam_survey(1)[0]
+    dots = survey.dots[IMAGE]
+    moved = replace(dots, pixels_px=dots.pixels_px + np.array([3.0, -3.0]))
+    folder = written(replace(survey, dots={**survey.dots, IMAGE: moved}), tmp_path)
+    code, told = calibrate(capsys, folder, "--method", "paper")
+    assert code == 0
+    assert told["verdict"]["grade"] == "care"
+    assert f"image {IMAGE} is off by" in " ".join(r["sentence"] for r in told["verdict"]["reasons"])
 
 
 @pytest.mark.parametrize("method", ["joint", "paper"])

@@ -37,6 +37,11 @@ TURNED_RAD = 2.0
 PAPER_GOOD_PX = 2.0
 """Rms of fitted images that the paper's method may leave: station errors of 2 mm are 1.4 px at 5 m."""
 
+ODD_IMAGE = 6.0
+"""An image this many times farther off than others of its camera and purpose; good surveys reach 3.4."""
+
+FEW_IMAGES = 4
+
 
 @dataclass(frozen=True)
 class Reason:
@@ -85,6 +90,7 @@ def judge(
     """
     reasons = [
         *_noise(survey, calibration),
+        *_odd_images(calibration),
         *_checks(survey, calibration),
         *_open(calibration),
         *_turned(calibration),
@@ -118,6 +124,26 @@ def _noise(survey: Survey, calibration: Calibration) -> list[Reason]:
     if calibration.chi2_probability < RARELY:
         return [Reason("bad" if factor > 2.0 else "care", words)]
     return [Reason("good", words)]
+
+
+def _odd_images(calibration: Calibration) -> list[Reason]:
+    """Images that the paper's method kept, though they are far from the others (joint tests each of them)."""
+    if np.isfinite(calibration.chi2_probability) or calibration.mast_parameters == 4:
+        return []
+    groups: dict[tuple[str, str], list[tuple[float, str]]] = {}
+    for image in calibration.images:
+        if image.purpose != "check" and image.used.any():
+            rms_px = float(np.sqrt(np.mean(image.residuals_px[image.used] ** 2)))
+            groups.setdefault((image.camera, image.purpose), []).append((rms_px, image.name))
+    reasons = []
+    for group in groups.values():
+        usual = float(np.median([rms_px for rms_px, _ in group]))
+        odd = [(rms_px, name) for rms_px, name in group if rms_px > ODD_IMAGE * usual]
+        if len(group) >= FEW_IMAGES and odd:
+            rms_px, name = max(odd)
+            words = f"image {name} is off by {rms_px:.2f} px rms where others like it are by {usual:.2f}"
+            reasons.append(Reason("care", f"{words}: check its tapes, its angles and its dots"))
+    return reasons
 
 
 def _checks(survey: Survey, calibration: Calibration) -> list[Reason]:
