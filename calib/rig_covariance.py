@@ -13,15 +13,11 @@ import numpy as np
 
 from calib.camera_parameters import parameter_names, stepped
 from calib.errors import CalibError
-from calib.mast import Mast, Rig
+from calib.gimbal import MAST_NAMES, mast_of, numbers_of
+from calib.mast import Rig
 from calib.rigid import FloatArray
 
-_MAST = (
-    *(f"mast.translation_m.{axis}" for axis in "xyz"),
-    *(f"mast.rotation_rad.{axis}" for axis in "xyz"),
-    "mast.axis_offset_m",
-    "mast.axis_twist_rad",
-)
+_MAST = tuple(f"mast.{name}" for name in MAST_NAMES)
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,14 +69,11 @@ def stored_covariance(rig: Rig) -> RigCovariance | None:
 def moved_rig(rig: Rig, names: Sequence[str], step: FloatArray) -> Rig:
     """Return the rig with the named parameters moved by ``step`` (p,), in the names' units."""
     at = dict(zip(names, step.tolist(), strict=True))
-    m = rig.mast
-    numbers = [*m.translation_m, *m.rotation_rad, m.axis_offset_m, m.axis_twist_rad]
-    numbers = [value + at.get(name, 0.0) for value, name in zip(numbers, _MAST, strict=True)]
+    numbers = numbers_of(rig.mast) + np.array([at.get(name, 0.0) for name in _MAST])
     cameras = dict(rig.cameras)
     for name, camera in rig.cameras.items():
         mine = [f"cameras.{name}.{part}" for part in parameter_names(camera.model.kind)]
         if any(part in at for part in mine):
             model = stepped(camera.model, np.array([at.get(part, 0.0) for part in mine]))
             cameras[name] = replace(camera, model=model)
-    mast = Mast(np.array(numbers[:3]), np.array(numbers[3:6]), float(numbers[6]), float(numbers[7]))
-    return replace(rig, mast=mast, cameras=cameras)
+    return replace(rig, mast=mast_of(numbers), cameras=cameras)

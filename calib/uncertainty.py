@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from scipy.optimize import approx_fprime
 
+from calib import rig_covariance
 from calib.adjustment import Adjustment
-from calib.cahvor import CameraModel
 from calib.calibration import Calibration, Degenerate
-from calib.camera_parameters import parameter_part, predict, stepped, tangents
+from calib.camera_parameters import parameter_part, predict, tangents
 from calib.errors import CalibError
-from calib.gimbal import MAST_NAMES, gimbal, gimbal_rates, mast_of, numbers_of
+from calib.gimbal import MAST_NAMES, gimbal, gimbal_rates, numbers_of
 from calib.mast import Rig
 from calib.pointing import solve
 from calib.rigid import FloatArray
@@ -158,20 +157,7 @@ def pointing_covariance(
 
 def moved_rig(calibration: Calibration, columns: np.ndarray, step: FloatArray) -> Rig:
     """Return the rig with the parameters at ``columns`` moved by ``step``."""
-    rig = calibration.rig
-    whole = np.zeros(len(calibration.parameter_names))
-    whole[columns] = step
-    at = {n: i for i, n in enumerate(calibration.parameter_names)}
-    numbers = numbers_of(rig.mast)
-    for index, name in enumerate(MAST_NAMES):
-        if f"mast.{name}" in at:
-            numbers[index] += whole[at[f"mast.{name}"]]
-    cameras = {}
-    for name, camera in rig.cameras.items():
-        part = calibration.part(f"cameras.{name}.")
-        model: CameraModel = stepped(camera.model, whole[part]) if len(part) else camera.model
-        cameras[name] = replace(camera, model=model)
-    return replace(rig, mast=mast_of(numbers), cameras=cameras)
+    return rig_covariance.moved_rig(calibration.rig, [calibration.parameter_names[i] for i in columns], step)
 
 
 def open_parameters(
