@@ -32,6 +32,10 @@ from calib.warp import Plane
 
 State = Literal["tracked", "lost"]
 
+SIZES = MatchSettings(half_px=12)
+"""Smaller patches than a single match takes: seen flat from 10 m, 41 px of ground are 0.8 m long and no
+plane, and what lies off the plane pulls the place along as the view steepens."""
+
 
 @dataclass(frozen=True)
 class TrackSettings:
@@ -205,7 +209,7 @@ def seen_by(
         rover frame. A frame that is missing is left out; one eye alone serves while the target is tracked.
     """
     settings = settings or TrackSettings()
-    sizes = match_settings or MatchSettings()
+    sizes = match_settings or SIZES
     key = _anchored(track)
     if key is None:
         return _lost(

@@ -32,9 +32,10 @@ def add_commands(subparsers: Any) -> None:
         help="ranges in metres (default 10 6 2)",
     )  # fmt: skip
     pointing.set_defaults(run=run_pointing)
-    from mastctl.cli import experiment_calibration, experiment_handoff
+    from mastctl.cli import experiment_approach, experiment_calibration, experiment_handoff
 
     experiment_handoff.add_parser(kinds)
+    experiment_approach.add_parser(kinds)
     experiment_calibration.add_parser(kinds)
 
     demo = subparsers.add_parser("demo", help="the pointing experiment on the packaged simulated rover")

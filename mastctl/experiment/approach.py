@@ -1,17 +1,19 @@
-"""The paper's approach (its Fig. 1): a target picked in Pancam at 10 m, followed to 1 m, from camera to camera."""
+"""The paper's approach (its Fig. 1): a target picked in Pancam at 10 m, followed to 1 m."""
 
 from __future__ import annotations
 
+import csv
+import json
 import math
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 
 from calib.errors import CalibError
 from calib.mast import Rig
-from calib.match import MatchSettings
 from calib.pointing import solve
 from calib.rigid import FloatArray
 from calib.tracking import Track, moved, seen_by, start_track
@@ -30,7 +32,6 @@ SUN_MOVES_RAD = math.radians(8.0)
 LOST_LOOKS = 3
 """How often a lost target is looked for at one stop, before the rover drives on."""
 
-SIZES = MatchSettings()
 GIVE_UP = 4
 """Stops without the target after which the run ends as lost."""
 
@@ -48,7 +49,7 @@ class Stop:
     state
         ``tracked`` or ``lost``, and ``reason`` why.
     error_m
-        (3,) believed less true position in the rover frame: along the line of sight of the pair, to its right,
+        (3,) believed less true position in the rover frame: along the pair's line of sight, to its right,
         below it.
     sigma_m
         What the track says of the same three.
@@ -224,7 +225,7 @@ def _look(world: World, track: Track, target: FloatArray) -> tuple[Track, Stop]:
     pair = rig.stereo[name]
     for _ in range(LOST_LOOKS):
         eyes = world.look(pair, pan, tilt)
-        look = seen_by(track, eyes, match_settings=SIZES)
+        look = seen_by(track, eyes)
         if look.track.state == "tracked":
             break
     track = look.track
@@ -280,3 +281,58 @@ def summary(runs: Sequence[ApproachRun]) -> dict[str, float]:
         "below_rms_m": float(rms[2]),
         "position_rms_m": float(np.sqrt(np.sum(rms**2))),
     }
+
+
+def table_rows(runs: Sequence[ApproachRun]) -> tuple[list[str], list[list[str]]]:
+    """Return headings and rows: what was measured beside the paper's Table I, theory, for a Pancam start."""
+    from calib.budget import target_approach_budget
+
+    found = summary(runs)
+    theory = next(row for row in target_approach_budget() if row.name == "pancam")
+    cm = {key: f"{300 * value:.2f}" for key, value in found.items() if key.endswith("_m")}
+    rows = [
+        ["runs, kept, silently wrong", f"{found['runs']}, {found['kept']}, {found['silently_wrong']}", ""],
+        [
+            "3 rms along the line of sight, cm",
+            cm["along_rms_m"],
+            f"{theory.tracked_cm:.2f}",
+        ],
+        ["3 rms to its right, cm", cm["right_rms_m"], ""],
+        ["3 rms below it, cm", cm["below_rms_m"], ""],
+        ["3 rms of the position, cm", cm["position_rms_m"], ""],
+    ]
+    return ["", "measured", "theory (Table I)"], rows
+
+
+STOPS_CSV = (
+    "seed", "stop", "range_m", "pair", "state", "along_m", "right_m", "below_m",
+    "sigma_along_m", "sigma_right_m", "sigma_below_m", "pixel_error_px", "renewed", "reason",
+)  # fmt: skip
+
+
+def write_record(runs: Sequence[ApproachRun], folder: Path) -> None:
+    """Write stops.csv and record.json into ``folder`` (made if need be).
+
+    Raises
+    ------
+    OSError
+        If the folder or a file in it cannot be written.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    with (folder / "stops.csv").open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(STOPS_CSV)
+        for one in runs:
+            for index, stop in enumerate(one.stops):
+                numbers = [*stop.error_m.tolist(), *stop.sigma_m.tolist()]
+                pixel = "" if math.isnan(stop.pixel_error_px) else stop.pixel_error_px
+                start = [one.seed, index, stop.range_m, stop.pair, stop.state]
+                writer.writerow([*start, *numbers, pixel, int(stop.renewed), stop.reason])
+    document = {
+        "summary": {key: None if math.isnan(value) else value for key, value in summary(runs).items()},
+        "runs": [
+            {"seed": one.seed, "kept": one.kept, "error": one.error, "seconds": round(one.seconds, 1)}
+            for one in runs
+        ],
+    }
+    (folder / "record.json").write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")

@@ -1,7 +1,7 @@
-"""A simulated rover that drives up to a target and looks at every stop: truth on one side, belief on the other.
+"""A simulated rover that drives up to a target and looks at every stop: truth and belief apart.
 
-No daemon and no clock: a stop is a pose, a look is two pictures. What errs is what errs on a rover: the mast file
-against the true rig, the joints' readings and counts, the reported motion, grey noise, gain, the sun's place.
+No daemon and no clock: a stop is a pose, a look is two pictures. What errs is what errs on a rover: the mast
+file against the true rig, the joints' readings and counts, the reported motion, grey noise, gain, the sun.
 """
 
 from __future__ import annotations
