@@ -28,7 +28,7 @@ def add_parser(kinds: Any) -> None:
     )
     parser.add_argument(
         "--surveys", type=at_least_one, default=DEFAULT_SURVEYS, metavar="N",
-        help="surveys of each kind (default 10, some 10 minutes on two processors)",
+        help="surveys of each kind (default 10, some 6 minutes on two processors)",
     )  # fmt: skip
     parser.add_argument(
         "--targets", type=at_least_one, default=DEFAULT_TARGETS, metavar="N",
