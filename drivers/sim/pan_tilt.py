@@ -152,7 +152,7 @@ def _play(load_rad: float, motor_rad: float, gap_rad: float) -> float:
 
 
 @dataclass(frozen=True)
-class _Axis:
+class Axis:
     """One axis through time: the motor's motion, and the load's angle at the start of each leg."""
 
     settings: AxisSettings
@@ -160,9 +160,9 @@ class _Axis:
     loads_rad: tuple[float, ...] = field(default=())
 
     @staticmethod
-    def resting(settings: AxisSettings, time_s: float) -> _Axis:
+    def resting(settings: AxisSettings, time_s: float) -> Axis:
         """At zero, last moved in the positive direction."""
-        return _Axis(settings, Motion.at_rest(time_s, 0.0), (-settings.backlash_rad / 2,))
+        return Axis(settings, Motion.at_rest(time_s, 0.0), (-settings.backlash_rad / 2,))
 
     def load_rad(self, time_s: float) -> float:
         """The load's angle behind the backlash."""
@@ -179,7 +179,7 @@ class _Axis:
         load = self.load_rad(time_s)
         return load - self.settings.sag_rad * math.cos(load)
 
-    def followed_by(self, motion: Motion, time_s: float) -> _Axis:
+    def followed_by(self, motion: Motion, time_s: float) -> Axis:
         """With a motion that continues this one from ``time_s``; the load's state is carried over."""
         first, last = self.motion.kept(time_s), self.motion.leg_index(time_s)
         loads = list(self.loads_rad[first : last + 1])
@@ -187,7 +187,7 @@ class _Axis:
             loads.append(self._load_on(motion, loads, index - 1, motion.legs[index].start_s))
         return replace(self, motion=motion, loads_rad=tuple(loads))
 
-    def moved(self, time_s: float, goal_rad: float, speed_rad_per_s: float, factor: float) -> _Axis:
+    def moved(self, time_s: float, goal_rad: float, speed_rad_per_s: float, factor: float) -> Axis:
         """Commanded to a goal, rounded to the nearest count, by way of the approach if there is one."""
         s = self.settings
         goal = round(goal_rad / s.count_rad) * s.count_rad
@@ -223,7 +223,7 @@ class SimulatedPanTilt:
         self._faults = faults or FaultPanel(clock.now_s, ())
         self._lock = threading.RLock()
         now_s = clock.now_s()
-        self._axes = (_Axis.resting(head.pan, now_s), _Axis.resting(head.tilt, now_s))
+        self._axes = (Axis.resting(head.pan, now_s), Axis.resting(head.tilt, now_s))
         self._command: tuple[float, float, float] | None = None
         self._jam: Fault | None = None
         self._factor = 1.0
