@@ -9,9 +9,9 @@ axis should be.
 from __future__ import annotations
 
 import math
-from typing import Protocol
 
 from drivers.sim.motion import Motion
+from drivers.sim.wire.axis import WireAxis
 from drivers.sim.wire.dynamixel_registers import Model
 from drivers.sim.wire.dynamixel_table import ControlTable
 
@@ -23,30 +23,6 @@ STEP_RAD_PER_S2 = 60.0
 _IN_POSITION_RAD = 4 * math.tau / 4096  # the manual names no bound; this is four counts of an X
 _FOLLOWING_RAD = 40 * math.tau / 4096  # as above
 _HOMING_LIMIT = 1024  # beyond it position control ignores the homing offset
-
-
-class Axis(Protocol):
-    """What the servo turns."""
-
-    def goal(
-        self, time_s: float, angle_rad: float, speed_rad_per_s: float, acceleration_rad_per_s2: float
-    ) -> None:
-        """Start towards an angle."""
-
-    def velocity(self, time_s: float, velocity_rad_per_s: float, acceleration_rad_per_s2: float) -> None:
-        """Start to turn for ever."""
-
-    def halt(self, time_s: float) -> None:
-        """Stop and hold."""
-
-    def limp(self, time_s: float) -> None:
-        """Let go."""
-
-    def angle_rad(self, time_s: float) -> float:
-        """Return where the motor is."""
-
-    def velocity_rad_per_s(self, time_s: float) -> float:
-        """Return how fast it turns."""
 
 
 class Drive:
@@ -67,7 +43,7 @@ class Drive:
     """
 
     def __init__(
-        self, model: Model, table: ControlTable, axis: Axis, zero_counts: int, sign: int, time_s: float
+        self, model: Model, table: ControlTable, axis: WireAxis, zero_counts: int, sign: int, time_s: float
     ) -> None:
         self.axis = axis
         self._model = model
@@ -243,6 +219,12 @@ class Drive:
         """Return Velocity Trajectory."""
         speed = self._sign * self._direction() * self._trajectory(time_s)[1]
         return round(speed / self._model.velocity_unit_rad_per_s)
+
+    def pushes(self, time_s: float) -> bool:
+        """Return whether the motor pushes in vain: something is in the way of where it shall go."""
+        if not self._on() or not self.axis.blocked(time_s):
+            return False
+        return not self._positioning() or abs(self.error_rad(time_s)) > _IN_POSITION_RAD
 
     def effort(self, time_s: float) -> float:
         """Return the share of its strength that the motor uses, -1 to 1, in the servo's direction.

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 
-from drivers.sim.wire.dynamixel_drive import Axis, Drive
+from drivers.sim.wire.axis import WireAxis
+from drivers.sim.wire.dynamixel_drive import Drive
 from drivers.sim.wire.dynamixel_registers import BAUD_RATES, MODELS, Model
 from drivers.sim.wire.dynamixel_table import (
     DATA_LENGTH,
@@ -26,21 +26,12 @@ BOOT_S = 0.3
 """How long a servo is deaf after a reboot, seconds (assumed; the manual gives none)."""
 
 OVERLOAD_S = 0.5
-"""How long full effort lasts before it counts as overload, seconds (assumed)."""
+"""How long an axis pushes in vain before it counts as overload, seconds (assumed)."""
 
 _WATCHDOG_UNIT_S = 0.02
 _ANSWER_BITS = 120.0  # of an answer without data, and a byte to spare
 _CLEAR_KEY = bytes((0x01, 0x44, 0x58, 0x4C, 0x22))
 _BACKUP_KEY = b"\x43\x54\x52\x4c"
-
-
-@dataclass(frozen=True)
-class Senses:
-    """What a servo feels besides its angle; a fault script changes it."""
-
-    voltage_v: float
-    temperature_c: float = 32.0
-    overload: bool = False
 
 
 class SimulatedServo:
@@ -73,7 +64,7 @@ class SimulatedServo:
         self,
         model: str,
         servo_id: int,
-        axis: Axis,
+        axis: WireAxis,
         *,
         zero_counts: int | None = None,
         sign: int = 1,
@@ -334,21 +325,17 @@ class SimulatedServo:
         if startup & 1:
             self._torque(True, time_s)
 
-    def senses(self, time_s: float) -> Senses:
-        """Return voltage, temperature and load at a moment, as the axis's faults leave them."""
-        felt = getattr(self._axis, "senses", None)
-        plain = Senses(self.model.voltage_v)
-        return plain if felt is None else felt(time_s, plain)
+    def _voltage(self, time_s: float) -> int:
+        return round(10 * self.model.voltage_v * self._axis.supply(time_s))
 
     def _protect(self, time_s: float) -> None:
         """Set hardware errors, and drop the torque for those in the shutdown mask."""
-        felt, table = self.senses(time_s), self.table
-        found = self._raised
-        if not table["min_voltage_limit"] <= round(10 * felt.voltage_v) <= table["max_voltage_limit"]:
+        table, found = self.table, self._raised
+        if not table["min_voltage_limit"] <= self._voltage(time_s) <= table["max_voltage_limit"]:
             found |= VOLTAGE
-        if felt.temperature_c > table["temperature_limit"]:
+        if self._axis.temperature_c(time_s) > table["temperature_limit"]:
             found |= HEAT
-        if felt.overload or abs(self.drive.effort(time_s)) >= 1.0:
+        if self.drive.pushes(time_s):
             self._since_s = time_s if self._since_s is None else self._since_s
             if time_s - self._since_s >= OVERLOAD_S:
                 found |= OVERLOAD
@@ -371,8 +358,8 @@ class SimulatedServo:
             "present_position": lambda t: self.drive.position(t),
             "velocity_trajectory": lambda t: self.drive.trajectory_velocity(t),
             "position_trajectory": lambda t: self.drive.trajectory_position(t),
-            "present_input_voltage": lambda t: round(10 * self.senses(t).voltage_v),
-            "present_temperature": lambda t: round(self.senses(t).temperature_c),
+            "present_input_voltage": lambda t: self._voltage(t),
+            "present_temperature": lambda t: round(self._axis.temperature_c(t)),
         }
 
     def _current_limit(self) -> int:
