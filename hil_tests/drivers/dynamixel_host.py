@@ -123,8 +123,10 @@ class Host:
         packet = [0] * (10 + len(parameters))
         packet[4:8] = [servo_id, 3 + len(parameters), 0, code]
         packet[8 : 8 + len(parameters)] = parameters
-        _, result, error = self.sdk.txRxPacket(self.port, packet)
-        return result, error
+        assert self.sdk.txPacket(self.port, packet) == 0  # txRxPacket does not wait for every answer
+        self.port.is_using = False
+        answer, result = self.sdk.rxPacket(self.port, False)
+        return result, answer[8] if result == 0 else 0
 
     def sync_read(self, address: int, size: int, *ids: int, fast: bool = False) -> tuple[int, dict[int, int]]:
         """The result, and the values of those that the SDK calls available."""
