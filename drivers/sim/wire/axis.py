@@ -150,6 +150,11 @@ class WireAxis:
         """Return when the motor comes to rest, if nothing new happens."""
         return self._axis.motion.end_s
 
+    def rest_rad(self) -> float:
+        """Return where the motor comes to rest, if nothing new happens."""
+        motion = self._axis.motion
+        return motion.at(motion.end_s)[0]
+
     def blocked(self, time_s: float) -> bool:
         """Return whether the motor pushes against something: an obstacle, or seized gears."""
         with self._lock:
