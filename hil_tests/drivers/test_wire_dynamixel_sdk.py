@@ -1,0 +1,102 @@
+"""The plain SDK, unchanged, on a real pseudo terminal in front of the simulated bus."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+
+import pytest
+from dynamixel_host import servo
+from dynamixel_sdk import (
+    COMM_SUCCESS,
+    GroupBulkRead,
+    GroupSyncRead,
+    GroupSyncWrite,
+    PacketHandler,
+    PortHandler,
+)
+
+from drivers.clock import SystemClock
+from drivers.sim.wire.dynamixel_bus import DynamixelBus
+from drivers.sim.wire.line import PtyLine
+
+SDK = PacketHandler(2.0)
+PATIENCE_S = 20.0
+
+
+@pytest.fixture
+def port() -> Iterator[PortHandler]:
+    """An open port; id 1 is an XL330, id 2 a PH54, id 3 an MX-106, all at 1 Mbaud."""
+    bus = DynamixelBus([servo("xl330_m288", 1), servo("ph54_200_s500", 2), servo("mx_106", 3)])
+    with PtyLine(bus, SystemClock()) as line:
+        handler = PortHandler(line.path)
+        assert handler.openPort()
+        assert handler.setBaudRate(1_000_000)
+        yield handler
+        handler.closePort()
+
+
+def until(port: PortHandler, servo_id: int, address: int, value: int) -> None:
+    """Read 4 bytes until they hold the value."""
+    end_s = time.monotonic() + PATIENCE_S
+    while SDK.read4ByteTxRx(port, servo_id, address) != (value, COMM_SUCCESS, 0):
+        assert time.monotonic() < end_s, SDK.read4ByteTxRx(port, servo_id, address)
+
+
+def test_ping_and_broadcast_ping(port: PortHandler) -> None:
+    assert SDK.ping(port, 2) == (2020, COMM_SUCCESS, 0)
+    assert SDK.broadcastPing(port) == ({1: [1200, 52], 2: [2020, 14], 3: [321, 45]}, COMM_SUCCESS)
+
+
+def test_both_move_and_are_read_together(port: PortHandler) -> None:
+    assert SDK.write1ByteTxRx(port, 1, 64, 1) == (COMM_SUCCESS, 0)
+    assert SDK.write1ByteTxRx(port, 3, 64, 1) == (COMM_SUCCESS, 0)
+    goals = GroupSyncWrite(port, SDK, 116, 4)
+    for servo_id, goal in ((1, 2248), (3, 1848)):
+        assert goals.addParam(servo_id, list(goal.to_bytes(4, "little")))
+    assert goals.txPacket() == COMM_SUCCESS
+    until(port, 1, 132, 2248)
+    until(port, 3, 132, 1848)
+    both = GroupSyncRead(port, SDK, 132, 4)
+    assert both.addParam(3)
+    assert both.addParam(1)
+    assert both.txRxPacket() == COMM_SUCCESS
+    assert [both.getData(i, 132, 4) for i in (1, 3)] == [2248, 1848]
+
+
+def test_bulk_and_fast_reads(port: PortHandler) -> None:
+    bulk = GroupBulkRead(port, SDK)
+    assert bulk.addParam(2, 592, 3)
+    assert bulk.addParam(1, 132, 4)
+    for read in (bulk.txRxPacket, bulk.fastBulkRead):
+        assert read() == COMM_SUCCESS
+        assert [bulk.getData(2, 592, 2), bulk.getData(2, 594, 1), bulk.getData(1, 132, 4)] == [240, 35, 2048]
+    fast = GroupSyncRead(port, SDK, 0, 7)
+    assert fast.addParam(2)
+    assert fast.addParam(1)
+    assert fast.fastSyncRead() == COMM_SUCCESS
+    assert [fast.getData(i, 0, 2) for i in (1, 2)] == [1200, 2020]
+
+
+def test_errors_come_through(port: PortHandler) -> None:
+    assert SDK.write1ByteTxRx(port, 1, 64, 1) == (COMM_SUCCESS, 0)
+    assert SDK.write1ByteTxRx(port, 1, 11, 4) == (COMM_SUCCESS, 7)
+    assert SDK.write4ByteTxRx(port, 1, 116, 5000) == (COMM_SUCCESS, 6)
+    assert SDK.write1ByteTxRx(port, 1, 68, 3) == (COMM_SUCCESS, 4)
+    assert SDK.write2ByteTxRx(port, 1, 116, 1) == (COMM_SUCCESS, 5)
+
+
+def test_reboot(port: PortHandler) -> None:
+    assert SDK.write1ByteTxRx(port, 1, 65, 1) == (COMM_SUCCESS, 0)
+    assert SDK.reboot(port, 1) == (COMM_SUCCESS, 0)
+    end_s = time.monotonic() + PATIENCE_S
+    while SDK.ping(port, 1)[1] != COMM_SUCCESS:
+        assert time.monotonic() < end_s
+    assert SDK.read1ByteTxRx(port, 1, 65) == (0, COMM_SUCCESS, 0)
+
+
+def test_the_wrong_baud_rate_is_silence(port: PortHandler) -> None:
+    assert port.setBaudRate(57600)
+    assert SDK.ping(port, 1)[1] != COMM_SUCCESS
+    assert port.setBaudRate(1_000_000)
+    assert SDK.ping(port, 1)[1] == COMM_SUCCESS
