@@ -104,7 +104,7 @@ def options_from(values: Mapping[str, Any]) -> Options:
 def _axis(name: str, values: Any) -> AxisOptions:
     """Read one axis."""
     if not isinstance(values, Mapping):
-        raise BadOptions(f"options.{name} is {values!r}, expected a mapping with limits_rad", device=DEVICE)
+        raise BadOptions(f"options.{name} is {values!r}, expected a mapping with limits_rad")
     read = _Reader(f"{name}.", values, tuple(AxisOptions.__dataclass_fields__), ("limits_rad",))
     ends = values["limits_rad"]
     if not isinstance(ends, list | tuple) or len(ends) != 2 or not all(_is_number(end) for end in ends):
@@ -135,15 +135,15 @@ class _Reader:
         for key in values:
             if key not in known:
                 words = f"options.{place}{key}: there is no such option{nearest(str(key), known)}"
-                raise BadOptions(words, device=DEVICE)
+                raise BadOptions(words)
         for key in needed:
             if key not in values:
-                raise BadOptions(f"options.{place}{key} is missing", device=DEVICE)
+                raise BadOptions(f"options.{place}{key} is missing")
 
     def bad(self, key: str, expected: str) -> BadOptions:
         """The refusal of a key's value."""
         words = f"options.{self._place}{key} is {self._values.get(key)!r}, expected {expected}"
-        return BadOptions(words, device=DEVICE)
+        return BadOptions(words)
 
     def number(self, key: str, default: Any, low: float, high: float) -> Any:
         """A number within bounds."""
