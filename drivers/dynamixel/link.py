@@ -28,7 +28,7 @@ from dynamixel_sdk import (
 from drivers.dynamixel.models import Register
 from drivers.dynamixel.packets import ERROR_WORDS, PacketHandler, Status, crc16, instruction_packet
 from drivers.dynamixel.port import Port
-from drivers.errors import BadReply, DriverError, LineLost, NoReply, Refused
+from drivers.errors import DriverError, LineLost, NoReply, Refused
 
 log = logging.getLogger(__name__)
 
@@ -59,7 +59,7 @@ class Part:
 class GroupAnswer:
     """The replies to a group read: by id what came, and why the rest did not.
 
-    ``sent_s`` and ``received_s`` are seconds of CLOCK_MONOTONIC around the measurement.
+    The servos measured after ``sent_s`` and before ``received_s``, seconds of CLOCK_MONOTONIC.
     """
 
     statuses: Mapping[int, Status]
@@ -209,8 +209,9 @@ class Link:
             packet = self._group_packets[instruction, parts] = _group_read_packet(instruction, parts, alike)
         self.counts.transactions += 1
         try:
-            self._packets.send_packet(self._port, packet)
-            sent_s = time.monotonic() + len(packet) * self._port.byte_s
+            self._port.clearPort()
+            sent_s = time.monotonic()
+            self._port.writePort(packet)
             self._port.setPacketTimeout(len(packet) + sum(11 + part.length for part in parts))
             statuses, wrong = self._fast_replies(parts) if fast else self._replies(parts)
         except LineLost as error:
@@ -220,7 +221,9 @@ class Link:
         for part in parts:
             if part.servo_id not in statuses:
                 missing[part.servo_id] = wrong.get(part.servo_id) or self._none(
-                    part.servo_id, "group read", f"addresses {part.address} to {part.address + part.length - 1}"
+                    part.servo_id,
+                    "group read",
+                    f"addresses {part.address} to {part.address + part.length - 1}",
                 )
         return GroupAnswer(statuses, missing, sent_s, received_s)
 

@@ -277,9 +277,7 @@ class Block:
 
     def __init__(self, registers: Mapping[str, Register], first: str, last: str) -> None:
         start, end = registers[first].address, registers[last].address
-        inside = sorted(
-            (r for r in registers.values() if start <= r.address <= end), key=lambda r: r.address
-        )
+        inside = sorted((r for r in registers.values() if start <= r.address <= end), key=lambda r: r.address)
         codes, at = "<", start
         for register in inside:
             codes += "x" * (register.address - at)

@@ -216,7 +216,12 @@ class PacketHandler(Protocol2PacketHandler):  # type: ignore[misc]
         if result == COMM_SUCCESS and packet and asked and len(packet) != SHORTEST_STATUS + asked:
             port.suspect = True  # an error without data, or the reply to another question
             return packet, int(COMM_RX_CORRUPT), error
-        if result == COMM_SUCCESS and packet and txpacket[7] == INST_PING and len(packet) < SHORTEST_STATUS + 3:
+        if (
+            result == COMM_SUCCESS
+            and packet
+            and txpacket[7] == INST_PING
+            and len(packet) < SHORTEST_STATUS + 3
+        ):
             port.suspect = True
             return packet, int(COMM_RX_CORRUPT), error
         return packet, int(result), error

@@ -14,6 +14,7 @@ import select
 import termios
 import time
 from collections.abc import Iterator
+from typing import Any
 
 import serial
 from dynamixel_sdk import PortHandler
@@ -45,6 +46,10 @@ class Port(PortHandler):  # type: ignore[misc]
     BadOptions
         For a URL or baud rate that cannot be.
     """
+
+    is_open: bool
+    port_name: str
+    ser: Any
 
     def __init__(self, name: str, baud: int, reply_timeout_s: float) -> None:
         super().__init__(name)
@@ -194,7 +199,7 @@ class Port(PortHandler):  # type: ignore[misc]
             self.buffer.clear()
             if time.monotonic() > until_s:
                 raise BadReply(
-                    f"{self.port_name} is never quiet: {dropped} bytes in {longest_s:g} s that nobody asked for",
+                    f"{self.port_name} is never quiet: {dropped} bytes in {longest_s:g} s that nobody wants",
                     detail={"port": self.port_name},
                 )
         self.suspect = False
@@ -251,7 +256,12 @@ class Port(PortHandler):  # type: ignore[misc]
 
 def _words(error: BaseException) -> str:
     """What a low-level exception says, on one line."""
-    if isinstance(error, OSError) and error.errno and error.strerror and not isinstance(error, serial.SerialException):
+    if (
+        isinstance(error, OSError)
+        and error.errno
+        and error.strerror
+        and not isinstance(error, serial.SerialException)
+    ):
         return f"{os.strerror(error.errno)}"
     if isinstance(error, termios.error) and len(error.args) > 1:
         return str(error.args[1])
