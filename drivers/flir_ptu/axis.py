@@ -105,7 +105,7 @@ class Axis:
                 self.rad_from_position(end) for end in (self.lowest, self.highest)
             )  # fmt: skip
             raise WrongDevice(
-                f"option {self.name}.limits_rad is {wanted[0]:.4f} to {wanted[1]:.4f} rad, "
+                f"options.{self.name}.limits_rad is {wanted[0]:.4f} to {wanted[1]:.4f} rad, "
                 f"the unit itself goes from {own[0]:.4f} to {own[1]:.4f} rad",
                 device=DEVICE,
             )

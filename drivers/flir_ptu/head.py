@@ -401,10 +401,10 @@ class FlirPtu:
             return
         ways = [before.angle_rad]
         slack_rad = 1.5 * max(before.position_rad, after.position_rad)
-        if not before.rests:  # it may have gone on to its target, and braked
+        if before.next_target is not None or not before.at_target:  # it may have gone on, and braked
             ends = (before.target, before.next_target)
             ways += [before.rad_from_position(end) for end in ends if end is not None]
-            slack_rad += BRAKING_S * before.fastest * before.position_rad
+            slack_rad += BRAKING_S * (before.speed or before.fastest) * before.position_rad
         if not min(ways) - slack_rad <= after.angle_rad <= max(ways) + slack_rad:
             words = JUMPED.format(axis=after.name, before=before.angle_rad, after=after.angle_rad)
             self._lost_count[after.name] = words
