@@ -15,13 +15,13 @@ import logging
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, TypeVar
+from typing import Any, NoReturn, TypeVar
 
 from drivers.clock import Clock, SystemClock
 from drivers.dynamixel.bus import Bus
 from drivers.dynamixel.link import GroupAnswer, Link, Part
-from drivers.dynamixel.models import Block, Register
-from drivers.dynamixel.motion import AxisMotion, AxisReport, Sample, Truth
+from drivers.dynamixel.models import Register
+from drivers.dynamixel.motion import AxisMotion, AxisReport, Sample, Truth, motion_block
 from drivers.dynamixel.servo import WATCHDOG_TRIPPED, Servo, hardware_fault_words, velocity_counts
 from drivers.dynamixel.settings import AxisSettings, HeadSettings, head_settings
 from drivers.errors import (
@@ -85,7 +85,7 @@ class DynamixelHead:
         names = [f"{axis} (servo {s.servo_id})" for axis, s in zip(AXES, self._axes, strict=True)]
         self._motions = [AxisMotion(n, s, settings.settle_s) for n, s in zip(names, self._axes, strict=True)]
         self._truths = [Truth(n, s) for n, s in zip(names, self._axes, strict=True)]
-        self._blocks = [Block(s.model.registers, "goal_velocity", "present_temperature") for s in self._axes]
+        self._blocks = [motion_block(s) for s in self._axes]
         self._parts = tuple(
             Part(s.servo_id, block.address, block.length)
             for s, block in zip(self._axes, self._blocks, strict=True)
@@ -202,6 +202,7 @@ class DynamixelHead:
                 servo.check_place()
             for servo in servos:
                 servo.set_up()
+                servo.check_set_up()
             goals = [servo.take_hold() for servo in servos]
             self._link, self._servos = link, servos
             self._arm()
@@ -298,6 +299,7 @@ class DynamixelHead:
             goal = motion.next_leg()
             if goal is not None:
                 self._servos[index].set("goal_position", goal)
+                motion.begin_leg()
 
     def _ask_singly(self, answer: GroupAnswer) -> GroupAnswer:
         """Ask the servos that a group read left out one by one, so that the right one is named."""
@@ -346,6 +348,9 @@ class DynamixelHead:
         for register in ("bus_watchdog", "torque_enable"):
             for index, value in enumerate(self._read_together(register)):
                 self._judge_watched(index, register, value)
+        for motion in self._motions:
+            if (words := motion.other_goal_words()) and not self._tripped and not any(self._hardware_errors):
+                self._distrust(words)
 
     def _judge_watched(self, index: int, register: str, value: int | None) -> None:
         motion = self._motions[index]
@@ -359,9 +364,13 @@ class DynamixelHead:
             WATCHDOG_TRIPPED,
         )
         if changed or (register == "torque_enable" and bool(value) != motion.holds):
-            error = BadReply(f"{motion.name} has {value} in {register}: it restarted or somebody else set it")
-            self._give_up(error)
-            raise error
+            self._distrust(f"{motion.name} has {value} in {register}")
+
+    def _distrust(self, words: str) -> NoReturn:
+        """Set both servos up anew: something changed them that was not this driver."""
+        error = BadReply(f"{words}: it restarted, or somebody else set it")
+        self._give_up(error)
+        raise error
 
     def _read_together(self, register: str) -> list[int | None]:
         """One register of both servos; None where no answer came."""
@@ -465,7 +474,9 @@ class DynamixelHead:
         self._watch()
         if self._tripped:
             raise WatchdogTripped("the servos' bus watchdog stopped the head before the goals came")
-        raise NoReply(f"the servos hold the goals {held} where {list(goals)} were sent {ATTEMPTS} times")
+        error = NoReply(f"the servos hold the goals {held} where {list(goals)} were sent {ATTEMPTS} times")
+        self._give_up(error)  # one axis may be under way: silence stops it
+        raise error
 
     def _hold_where_they_are(self, indices: Sequence[int]) -> None:
         """Brake some axes."""

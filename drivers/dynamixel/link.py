@@ -176,6 +176,10 @@ class Link:
         self._packets.send(self._port, servo_id, INST_WRITE, data)
         self._port.drain()
 
+    def quiet(self, quiet_s: float) -> None:
+        """Drop what comes until nothing has come for ``quiet_s``: late replies. Raises LineLost, BadReply."""
+        self._port.drain(quiet_s, 1.0)
+
     def reboot(self, servo_id: int) -> None:
         """Restart a servo: torque drops. Raises NoReply, BadReply, Refused, LineLost."""
         self._ask(servo_id, INST_REBOOT, b"", 0, "reboot", "")

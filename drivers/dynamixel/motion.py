@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal
 
+from drivers.dynamixel.models import Block
 from drivers.dynamixel.settings import AxisSettings
 from drivers.errors import BadReply
 
@@ -20,6 +21,11 @@ STUCK_S = 1.0
 IN_POSITION_BIT, PROFILE_BIT = 0x01, 0x02
 
 Side = Literal["positive", "negative", "unknown"]
+
+
+def motion_block(settings: AxisSettings) -> Block:
+    """Return what is read of a servo all the time: from its goals to its temperature."""
+    return Block(settings.model.registers, "goal_velocity", "present_temperature")
 
 
 @dataclass(frozen=True)
@@ -114,8 +120,8 @@ class Truth:
             over_ms = (advance_ms - least_ms + slack_ms) % TICK_MODULUS_MS
             if over_ms > most_ms - least_ms + 2 * slack_ms:
                 raise BadReply(
-                    f"{self._name}: a reply from another moment (late, repeated, or the servo restarted): since "
-                    f"the last one its counter advanced {advance_ms % TICK_MODULUS_MS} ms, but "
+                    f"{self._name}: a reply from another moment (late, repeated, or the servo restarted): "
+                    f"since the last one its counter advanced {advance_ms % TICK_MODULUS_MS} ms, but "
                     f"{least_ms:.0f} to {most_ms:.0f} ms have passed"
                 )
             leap_rad = abs(sample.counts - last.counts) * self._settings.model.count_rad
@@ -149,6 +155,7 @@ class AxisMotion:
         self._side: Side = "unknown"
         self._rest: tuple[int, float] | None = None  # counts and since when
         self._sample: Sample | None = None
+        self._sampled = False  # since the goal was sent
         self.goal = 0
         self.holds = True
 
@@ -159,7 +166,8 @@ class AxisMotion:
 
     def begin(self, goal: int) -> None:
         """Stand at a goal, nothing commanded: after start-up."""
-        self._legs, self._commanded_rad, self._rest, self._sample = [], None, None, None
+        self._legs, self._commanded_rad, self._rest = [], None, None
+        self._sample, self._sampled = None, False
         self._side = "unknown"
         self.goal, self.holds = goal, True
 
@@ -196,15 +204,18 @@ class AxisMotion:
         here = self._sample.counts if self._sample else legs[0]
         self.goal, self._legs = legs[0], legs[1:]
         self._note_side(self.goal - here)
-        self._rest = None
+        self._rest, self._sampled = None, False
 
     def next_leg(self) -> int | None:
-        """Return the next goal to send when the present leg has ended, and take it as the goal."""
+        """Return the next goal to send when the present leg has ended; `begin_leg` when it was sent."""
         sample = self._sample
         if not self._legs or sample is None or not self._arrived(sample) or self._speed(sample) > 1:
             return None
+        return self._legs[0]
+
+    def begin_leg(self) -> None:
+        """Take the next leg's goal as the goal."""
         self._set(self._legs)
-        return self.goal
 
     def stopping_counts(self, acceleration_rad_per_s2: float) -> int:
         """Return where the axis would stand if it braked now, within its limits."""
@@ -221,7 +232,7 @@ class AxisMotion:
         still = self._speed(sample) <= 1
         if not still or self._rest is None or abs(sample.counts - self._rest[0]) > noise:
             self._rest = (sample.counts, sample.received_s)
-        self._sample = sample
+        self._sample, self._sampled = sample, True
 
     def settled(self, now_s: float) -> bool:
         """Whether the axis is in position (or let go) and has stood for the dwell."""
@@ -240,6 +251,13 @@ class AxisMotion:
             return ""
         left_rad = (self.goal - sample.counts) * self.settings.model.count_rad
         return f"{self.name} stands still {abs(left_rad):.4f} rad from its goal: something holds it"
+
+    def other_goal_words(self) -> str:
+        """Say that the servo holds another goal than was sent; empty if it does not."""
+        held = self._sample.values["goal_position"] if self._sample else self.goal
+        if held == self.goal or not self.holds or not self._sampled:
+            return ""
+        return f"{self.name} holds the goal {held} where {self.goal} was sent"
 
     def report(self) -> AxisReport | None:
         """Return where it was sent and where it stands; None before the first sample."""

@@ -9,6 +9,7 @@ flag can never stay set; whatever pyserial raises becomes `LineLost` with the po
 from __future__ import annotations
 
 import contextlib
+import errno
 import os
 import select
 import termios
@@ -255,17 +256,12 @@ class Port(PortHandler):  # type: ignore[misc]
 
 
 def _words(error: BaseException) -> str:
-    """What a low-level exception says, on one line."""
-    if (
-        isinstance(error, OSError)
-        and error.errno
-        and error.strerror
-        and not isinstance(error, serial.SerialException)
-    ):
-        return f"{os.strerror(error.errno)}"
-    if isinstance(error, termios.error) and len(error.args) > 1:
-        return str(error.args[1])
-    if isinstance(error, BlockingIOError):
+    """What a low-level exception says, on one line, without what the caller says already."""
+    number = (
+        error.args[0] if isinstance(error, termios.error) and error.args else getattr(error, "errno", None)
+    )
+    if number in (errno.EAGAIN, errno.EBUSY):
         return "held by another program"
-    words = " ".join(str(error).split()) or type(error).__name__
-    return "held by another program" if "exclusively lock" in words else words[:200]
+    if isinstance(number, int):
+        return os.strerror(number).lower()
+    return " ".join(str(error).split())[:200] or type(error).__name__

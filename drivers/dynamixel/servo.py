@@ -8,18 +8,23 @@ from __future__ import annotations
 
 import logging
 import time
+from collections.abc import Callable
+from typing import TypeVar
 
-from drivers.dynamixel.link import Link
+from drivers.dynamixel.link import Link, Part
 from drivers.dynamixel.models import (
     HARDWARE_ERRORS,
     MODELS_BY_NUMBER,
     OPERATING_MODES,
+    Block,
     hardware_error_words,
 )
+from drivers.dynamixel.motion import Sample, Truth, motion_block
 from drivers.dynamixel.settings import AxisSettings, HeadSettings
 from drivers.errors import DriverError, HardwareFault, NoReply, Refused, WrongDevice
 
 log = logging.getLogger(__name__)
+T = TypeVar("T")
 
 POSITION_MODE = 3
 FULL_STATUS_RETURN = 2
@@ -29,6 +34,8 @@ WATCHDOG_TRIPPED = 255
 HOMING_LIMIT = 1024  # what position mode honours of an X servo's homing offset, counts
 REBOOT_S = 2.0  # how long a servo may be deaf after a reboot
 ATTEMPTS = 3
+LATE_S = 0.1  # a reply that did not come is waited out this long before the next question
+COME_TO_REST_S = 0.5
 
 
 class Servo:
@@ -54,13 +61,7 @@ class Servo:
 
     def get(self, register: str) -> int:
         """Return a register's value; a lost reply is asked for again. Raises as `Link.read`."""
-        for attempt in range(ATTEMPTS):
-            try:
-                return self._link.read(self._settings.servo_id, self._registers[register])
-            except NoReply:
-                if attempt == ATTEMPTS - 1:
-                    raise
-        raise AssertionError("unreachable")
+        return self._repeated(lambda: self._link.read(self._settings.servo_id, self._registers[register]))
 
     def set(self, register: str, value: int) -> None:
         """Set a register and see that it holds the value.
@@ -73,16 +74,14 @@ class Servo:
             If the servo says that it did but holds another value.
         """
         entry = self._registers[register]
-        for attempt in range(ATTEMPTS):
-            try:
-                self._link.write(self._settings.servo_id, entry, value)
-                break
-            except NoReply:  # the write may have been done and only the reply lost: writing again is the same
-                if attempt == ATTEMPTS - 1:
-                    raise
-        held = self.get(register)
-        if held != value:
-            raise WrongDevice(f"{self.name} holds {held} in {register} after {value} was written to it")
+        for _ in range(ATTEMPTS):
+            # a write may have been done and only its reply lost: writing again is the same
+            self._repeated(lambda: self._link.write(self._settings.servo_id, entry, value))
+            held = self.get(register)
+            if held == value:
+                return
+            self._link.quiet(LATE_S)
+        raise WrongDevice(f"{self.name} holds {held} in {register} after {value} was written to it")
 
     def check_identity(self) -> None:
         """See that the servo is the one configured, and that it answers every instruction.
@@ -95,13 +94,7 @@ class Servo:
             If it does not answer.
         """
         model = self._settings.model
-        for attempt in range(ATTEMPTS):
-            try:
-                pinged = self._link.ping(self._settings.servo_id)
-                break
-            except NoReply:
-                if attempt == ATTEMPTS - 1:
-                    raise
+        pinged = self._repeated(lambda: self._link.ping(self._settings.servo_id))
         if pinged.model_number != model.number:
             other = MODELS_BY_NUMBER.get(pinged.model_number)
             found = f"a {other.name}" if other else f"of the unknown model number {pinged.model_number}"
@@ -147,6 +140,29 @@ class Servo:
                 if time.monotonic() > until_s:
                     raise
 
+    def look(self) -> Sample:
+        """Return what the servo says about its motion now, proven by its counter not to be an old reply.
+
+        Raises
+        ------
+        NoReply, BadReply, Refused, LineLost
+            As `Link.group_read`.
+        """
+        block, truth = motion_block(self._settings), Truth(self.name, self._settings)
+        part = Part(self._settings.servo_id, block.address, block.length)
+
+        def read() -> Sample:
+            answer = self._link.group_read([part])
+            if answer.missing:
+                raise answer.missing[part.servo_id]
+            status = answer.statuses[part.servo_id]
+            return Sample(block.decode(status.data), status.alert, answer.sent_s, answer.received_s)
+
+        truth.check(self._repeated(read))
+        sample = self._repeated(read)
+        truth.check(sample)
+        return sample
+
     def check_place(self) -> int:
         """See that the axis stands within its limits; returns its position, counts.
 
@@ -155,14 +171,14 @@ class Servo:
         WrongDevice
             If it stands outside: moving from there could go the wrong way round.
         """
-        counts = self.get("present_position")
+        counts = self.look().counts
         settings = self._settings
         low, high = settings.limit_counts
         if not low <= counts <= high:
             raise WrongDevice(
                 f"{self.name} stands at {counts} counts ({settings.angle_rad(counts):.4f} rad), outside its "
-                f"limits {low} to {high} ({settings.limits_rad[0]:.4f} to {settings.limits_rad[1]:.4f} rad): with "
-                "torque off turn it inside by hand, or correct zero_counts or limits_rad"
+                f"limits {low} to {high} ({settings.limits_rad[0]:.4f} to {settings.limits_rad[1]:.4f} rad): "
+                "with torque off turn it inside by hand, or correct zero_counts or limits_rad"
             )
         return counts
 
@@ -193,6 +209,28 @@ class Servo:
         for name in sorted(different, key=lambda n: n != "operating_mode"):  # a new mode resets others
             self.set(name, different[name])
 
+    def check_set_up(self) -> None:
+        """See once more, in reads of another shape, that the settings that keep the head safe are right.
+
+        Raises
+        ------
+        WrongDevice
+            If one is not; only possible if an earlier answer was not the servo's answer to its question.
+        """
+        low, high = self._settings.limit_counts
+        modes = Block(self._registers, "return_delay", "operating_mode")
+        limits = Block(self._registers, "max_position_limit", "min_position_limit")
+        for block in (modes, limits):
+            part = Part(self._settings.servo_id, block.address, block.length)
+            answer = self._link.group_read([part])
+            if answer.missing:
+                raise answer.missing[part.servo_id]
+            held = block.decode(answer.statuses[part.servo_id].data)
+            wanted = {"operating_mode": POSITION_MODE, "max_position_limit": high, "min_position_limit": low}
+            for name in held.keys() & wanted.keys():
+                if held[name] != wanted[name]:
+                    raise WrongDevice(f"{self.name} holds {held[name]} in {name} instead of {wanted[name]}")
+
     def _wanted(self) -> dict[str, int]:
         """The permanent settings, by register."""
         settings, model = self._settings, self._settings.model
@@ -209,8 +247,8 @@ class Servo:
         homing = self.get("homing_offset")
         if model.low_count == 0 and abs(homing) > HOMING_LIMIT:
             raise WrongDevice(
-                f"{self.name} has a homing offset of {homing} counts; position mode honours {HOMING_LIMIT} at "
-                "most: set it to 0 and give the place as zero_counts"
+                f"{self.name} has a homing offset of {homing} counts; position mode honours {HOMING_LIMIT} "
+                "at most: set it to 0 and give the place as zero_counts"
             )
         low, high = settings.limit_counts
         wanted = {
@@ -250,15 +288,28 @@ class Servo:
                 raise HardwareFault(
                     f"{self.name} does not switch its torque on; it may be shut down by a hardware error"
                 ) from None
-            goal, present = self.get("goal_position"), self.get("present_position")
-            if abs(goal - present) * model.count_rad > 10 * settings.settle_rad:
-                self.set("torque_enable", 0)
-                raise WrongDevice(
-                    f"{self.name} took {goal} counts as its goal while it stands at {present}; its torque is "
-                    "off again"
-                )
-            counts = goal
-        return counts
+        return self._come_to_rest()
+
+    def _come_to_rest(self) -> int:
+        """Wait until the axis stands (it may have been falling) and hold it there; returns the goal."""
+        until_s = time.monotonic() + COME_TO_REST_S
+        sample = self.look()
+        while abs(sample.values["present_velocity"]) > 1 and time.monotonic() < until_s:
+            sample = self.look()
+        low, high = self._settings.limit_counts
+        goal = min(max(sample.counts, low), high)
+        if sample.values["goal_position"] != goal:
+            self.set("goal_position", goal)
+        return goal
+
+    def _repeated(self, ask: Callable[[], T]) -> T:
+        """Ask again after a lost reply, when one that is merely late can be no answer any more."""
+        for _ in range(ATTEMPTS - 1):
+            try:
+                return ask()
+            except NoReply:
+                self._link.quiet(LATE_S)
+        return ask()
 
     def facts(self) -> dict[str, int]:
         """Return every register of the table that this servo has, by name; raises as `get`."""
