@@ -1,8 +1,8 @@
-"""One physical axis behind a byte simulator: motor, gears, load, and the faults of the mechanism.
+"""One physical axis of a simulated head: motor, gears, load, and the faults of the mechanism.
 
-The byte simulator says where the motor shall go and reads its encoder; the cameras ride on the mechanical
-angle. Angles are those of the mast (positive pan right, positive tilt up). The simulator's own counts,
-units and limits are left to it.
+A head in memory or a byte simulator says where the motor shall go and reads its encoder; the cameras ride on
+the mechanical angle. Angles are those of the mast (positive pan right, positive tilt up). A byte simulator's
+own counts, units and limits are left to it.
 """
 
 from __future__ import annotations
@@ -13,8 +13,8 @@ from collections.abc import Callable
 from typing import Literal
 
 from drivers.faults import PAN_TILT, Fault, FaultPanel
+from drivers.sim.axis import Axis, AxisSettings
 from drivers.sim.motion import Motion
-from drivers.sim.pan_tilt import Axis, AxisSettings
 
 WARM_C = 35.0
 """Temperature of a motor without a fault."""
@@ -38,8 +38,8 @@ class WireAxis:
     Parameters
     ----------
     settings
-        Backlash and sag; its acceleration is what ``halt`` brakes with. Its counts, range and speed are
-        not used here.
+        Backlash and sag; its acceleration is what ``halt`` brakes with. Counts, speed and approach are for
+        ``to_count`` only; the range is not used here.
     faults
         The panel that is asked for faults of ``pan_tilt``; none when left out.
     number
@@ -48,6 +48,8 @@ class WireAxis:
         Where a limp axis falls to; None: friction holds it.
     start_rad, time_s
         Where the motor is at first, and since when.
+    resumes
+        Whether it goes on to where it was sent when a fault that held it is over.
     """
 
     def __init__(
@@ -59,11 +61,13 @@ class WireAxis:
         falls_to_rad: float | None = None,
         start_rad: float = 0.0,
         time_s: float = 0.0,
+        resumes: bool = True,
     ) -> None:
         self.settings = settings
         self._faults = faults
         self._number = number
         self._falls_to_rad = falls_to_rad
+        self._resumes = resumes
         self._lock = threading.RLock()
         load_rad = start_rad - settings.backlash_rad / 2
         self._axis = Axis(settings, Motion.at_rest(time_s, start_rad), (load_rad,))
@@ -72,6 +76,11 @@ class WireAxis:
         self._factor = 1.0
         self._obstacle: tuple[Fault, float] | None = None  # and on which side of it the axis is, 1 or -1
         self._seen_s = time_s
+
+    @property
+    def motion(self) -> Motion:
+        """The motor's motion as it is planned now."""
+        return self._axis.motion
 
     def goal(
         self, time_s: float, angle_rad: float, speed_rad_per_s: float, acceleration_rad_per_s2: float
@@ -83,6 +92,14 @@ class WireAxis:
         def drive(now_s: float) -> Motion:
             motion, factor = self._axis.motion, self._factor
             return motion.moved(now_s, [angle_rad], factor * speed, factor * acceleration)
+
+        self._take(time_s, drive)
+
+    def to_count(self, time_s: float, angle_rad: float, speed_rad_per_s: float) -> None:
+        """Start towards the nearest count, by way of the approach, with the settings' acceleration."""
+
+        def drive(now_s: float) -> Motion:
+            return self._axis.moved(now_s, angle_rad, speed_rad_per_s, self._factor).motion
 
         self._take(time_s, drive)
 
@@ -100,6 +117,7 @@ class WireAxis:
         with self._lock:
             self._follow(time_s)
             self._order = None
+            self._pressing = False
             acceleration = min(
                 acceleration_rad_per_s2 or self.settings.acceleration_rad_per_s2, _STEEPEST_RAD_PER_S2
             )
@@ -122,8 +140,7 @@ class WireAxis:
             angle_rad += fault.number("offset_rad")
         if fault := self._fault("drifting", time_s):
             angle_rad += fault.number("rate_rad_per_s") * (time_s - fault.begin_s)
-        if fault := self._fault("garbage", time_s):
-            assert self._faults is not None
+        if (fault := self._fault("garbage", time_s)) and self._faults is not None:
             kind, value = self._faults.draw(fault), self._faults.draw(fault)
             angle_rad = (2 * value - 1) * (1e3 if kind < 0.5 else math.pi)
         return angle_rad
@@ -155,11 +172,28 @@ class WireAxis:
         motion = self._axis.motion
         return motion.at(motion.end_s)[0]
 
+    def seized(self, time_s: float) -> bool:
+        """Return whether the gears do not turn at all."""
+        with self._lock:
+            self._follow(time_s)
+            return self._jammed
+
+    def pressing(self, time_s: float) -> bool:
+        """Return whether the motor pushes against an obstacle."""
+        with self._lock:
+            self._follow(time_s)
+            return self._pressing
+
     def blocked(self, time_s: float) -> bool:
-        """Return whether the motor pushes against something: an obstacle, or seized gears."""
+        """Return whether something keeps the motor from where it was sent."""
         with self._lock:
             self._follow(time_s)
             return self._order is not None and (self._jammed or self._pressing)
+
+    def follow(self, time_s: float) -> None:
+        """Let faults act until a moment; every question asked about the axis does so too."""
+        with self._lock:
+            self._follow(time_s)
 
     def supply(self, time_s: float) -> float:
         """Return the supply voltage as a fraction of the nominal one."""
@@ -177,6 +211,8 @@ class WireAxis:
         """Do as ordered, as far as faults allow."""
         with self._lock:
             self._follow(time_s)
+            if self._jammed and not self._resumes:
+                return
             self._order = order
             self._pressing = False
             if not self._jammed:
@@ -203,6 +239,7 @@ class WireAxis:
             if jam is not None:
                 since_s = min(time_s, max(jam.begin_s, self._axis.motion.legs[0].start_s))
                 self._continue(self._axis.motion.jammed(since_s), since_s)
+                self._order = self._order if self._resumes else None
             elif self._order is not None:
                 self._continue(self._order(time_s), time_s)
         slow = self._fault("slow", time_s)
@@ -239,4 +276,5 @@ class WireAxis:
             else:
                 high_s = middle_s
         self._continue(motion.jammed(low_s), low_s)
+        self._order = self._order if self._resumes else None
         self._pressing = True

@@ -227,6 +227,8 @@ class _Line:
     def _deliver(self, data: bytes, time_s: float) -> None:
         if self._observer is not None:
             self._observer("host", data, time_s)
+        if self._faults.deaf(time_s):
+            return
         self._answer(self.device.receive(data, time_s), time_s)
 
     def _answer(self, replies: Sequence[Reply], time_s: float) -> None:
