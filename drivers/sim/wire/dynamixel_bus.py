@@ -128,6 +128,9 @@ class DynamixelBus:
     ) -> list[Reply]:
         """Sync, bulk and fast reads, answered in the order of the list."""
         fast = code in (FAST_SYNC_READ, FAST_BULK_READ)
+        total = sum(length + 4 for _, _, length in wanted)
+        if fast and total > packets.MAX_PACKET:
+            return []
         blocks: list[tuple[int, int, bytes]] = []
         replies: list[Reply] = []
         for servo_id, address, length in wanted:
@@ -153,7 +156,6 @@ class DynamixelBus:
                 packed = [Reply(packets.status_packet(i, e, d), delay_s, i) for e, i, d in answers]
                 replies += _collided(packed)
         if fast:
-            total = sum(length + 4 for _, _, length in wanted)
             pieces = packets.fast_status_packets(blocks, total)
             return [Reply(p, r.delay_s, r.sender) for p, r in zip(pieces, replies, strict=True)]
         return replies
