@@ -384,12 +384,20 @@ class SimulatedPtu:
         axes[0].reset(time_s)
         self._waiting = (lambda now_s: not self._sweeping, "*")
 
-    def _await(self, time_s: float) -> None:
-        """A: start what is slaved, and answer when both axes stand."""
+    def _immediate(self, time_s: float) -> None:
+        """I: slaved mode is over, and what was slaved starts (D46 manual, slaved execution mode)."""
+        self._slaved = False
+        self._start_slaved(time_s)
+
+    def _start_slaved(self, time_s: float) -> None:
         for axis in self._axes.values():
             if axis.slaved is not None:
                 axis.go(time_s, axis.slaved)
                 axis.slaved = None
+
+    def _await(self, time_s: float) -> None:
+        """A: start what is slaved, and answer when both axes stand."""
+        self._start_slaved(time_s)
         self._waiting = (lambda now_s: self.pan.resting(now_s) and self.tilt.resting(now_s), "*")
 
     def _halt(self, axes: Sequence[PtuAxis], time_s: float) -> None:
@@ -457,7 +465,7 @@ _Numeric = Callable[[SimulatedPtu, PtuAxis, int | None, float], str | None]
 _PLAIN: Mapping[str, _Plain] = {
     "A": lambda u, t: u._await(t),
     "S": lambda u, t: u._set("_slaved", True),
-    "I": lambda u, t: u._set("_slaved", False),
+    "I": lambda u, t: u._immediate(t),
     "H": lambda u, t: u._halt((u.pan, u.tilt), t),
     "HP": lambda u, t: u._halt((u.pan,), t),
     "HT": lambda u, t: u._halt((u.tilt,), t),
