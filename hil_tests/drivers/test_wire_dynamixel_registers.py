@@ -9,7 +9,7 @@ from pathlib import Path
 import dynamixel_easy_sdk
 import pytest
 
-from drivers.sim.wire.dynamixel_registers import MODELS, Model
+from drivers.sim.wire.dynamixel_models import MODELS, Model
 
 FOLDER = Path(dynamixel_easy_sdk.__file__).parent / "control_table"
 FILES = {name: f"{name}.model" for name in MODELS} | {

@@ -12,7 +12,7 @@ import math
 
 from drivers.sim.motion import Motion
 from drivers.sim.wire.axis import WireAxis
-from drivers.sim.wire.dynamixel_registers import Model
+from drivers.sim.wire.dynamixel_models import Model
 from drivers.sim.wire.dynamixel_table import ControlTable
 
 POSITION_MODES = frozenset({3, 4, 5})

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 
+from drivers.errors import BadOptions
 from drivers.sim.wire.axis import WireAxis
 from drivers.sim.wire.dynamixel_drive import Drive
-from drivers.sim.wire.dynamixel_registers import BAUD_RATES, MODELS, Model
+from drivers.sim.wire.dynamixel_models import Model, model_named
+from drivers.sim.wire.dynamixel_registers import BAUD_RATES
 from drivers.sim.wire.dynamixel_table import (
     DATA_LENGTH,
     GOALS,
@@ -40,7 +42,7 @@ class SimulatedServo:
     Parameters
     ----------
     model
-        A key of `dynamixel_registers.MODELS`.
+        Its name, in any spelling that `dynamixel_models.model_named` takes.
     servo_id
         Its id at first.
     axis
@@ -56,7 +58,7 @@ class SimulatedServo:
 
     Raises
     ------
-    ValueError
+    BadOptions
         For an unknown model or register.
     """
 
@@ -71,14 +73,12 @@ class SimulatedServo:
         settings: Mapping[str, int] | None = None,
         time_s: float = 0.0,
     ) -> None:
-        if model not in MODELS:
-            raise ValueError(f"there is no servo model {model!r}; there is {', '.join(MODELS)}")
-        self.model: Model = MODELS[model]
+        self.model: Model = model_named(model)
         self.powered = True
         self.table = ControlTable(self.model, self._live())
         unknown = set(settings or {}) - set(self.table.values)
         if unknown:
-            raise ValueError(f"{model} has no register {', '.join(sorted(unknown))}")
+            raise BadOptions(f"servo model {self.model.name} has no register {', '.join(sorted(unknown))}")
         self.table.values.update({"model_number": self.model.number, "firmware_version": self.model.firmware})
         self.table.values.update({"id": servo_id, **(settings or {})})
         zero = self.model.zero_counts if zero_counts is None else zero_counts

@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
-from drivers.sim.wire.dynamixel_registers import Model, Register
+from drivers.sim.wire.dynamixel_models import Model
+from drivers.sim.wire.dynamixel_registers import Register
 
 RESULT_FAIL = 0x01
 INSTRUCTION_ERROR = 0x02
