@@ -9,7 +9,7 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 from dynamixel_sdk import (
     BROADCAST_ID,
@@ -33,6 +33,8 @@ from drivers.errors import DriverError, LineLost, NoReply, Refused
 log = logging.getLogger(__name__)
 
 REPLY_TIMEOUT_S = 0.05  # USB adapters hold bytes back for up to 16 ms, the servo for up to 0.5 ms
+
+PING_REPLY_BYTES = 14
 
 
 @dataclass(frozen=True)
@@ -76,7 +78,6 @@ class LineCounts:
     timeouts: int = 0
     strays: int = 0
     refusals: int = 0
-    by_word: dict[str, int] = field(default_factory=dict)
 
 
 class Link:
@@ -140,17 +141,14 @@ class Link:
         slots_s = 253 * (0.003 + 14 * self._port.byte_s)
         self._port.setPacketTimeoutMillis(1000 * (slots_s + self._port.reply_timeout_s))
         found: dict[int, Pinged] = {}
-        noise = 0
-        while True:
-            before = len(self._port.buffer)
-            status = self._packets.receive(self._port)
-            if status is None:
-                break
-            noise += max(0, before - len(self._port.buffer) - 14)
+        before, understood = self._port.received_bytes, 0
+        while (status := self._packets.receive(self._port)) is not None:
+            understood += PING_REPLY_BYTES
             if len(status.data) == 3:
                 model = int.from_bytes(status.data[:2], "little")
                 found[status.servo_id] = Pinged(status.servo_id, model, status.data[2], status.alert)
         self._port.suspect = False
+        noise = max(0, self._port.received_bytes - before - understood)
         return [found[servo_id] for servo_id in sorted(found)], noise
 
     def read(self, servo_id: int, register: Register) -> int:

@@ -60,6 +60,7 @@ _REGISTERS = """
     temperature_limit         31   31   1
     max_voltage_limit         32   32   2
     min_voltage_limit         34   34   2
+    pwm_limit                 36   36   2
     current_limit             38   38   2
     velocity_limit            44   44   4
     max_position_limit        48   48   4   signed

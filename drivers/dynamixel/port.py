@@ -59,6 +59,7 @@ class Port(PortHandler):  # type: ignore[misc]
         self.suspect = False  # a reply may still be under way: listen until it is quiet before sending
         self.buffer = bytearray()
         self.deadline_s = 0.0
+        self.received_bytes = 0
         self._descriptor: int | None = None
         self._poll: select.poll | None = None
         self.openPort()
@@ -236,6 +237,7 @@ class Port(PortHandler):  # type: ignore[misc]
                 f"{self.port_name} hung up (unplugged?)", detail={"port": self.port_name, "while": "reading"}
             )
         self.buffer += data
+        self.received_bytes += len(data)
         return True
 
     def _fetch_from_object(self, wait_s: float) -> bool:
@@ -245,12 +247,14 @@ class Port(PortHandler):  # type: ignore[misc]
             while True:
                 data = self.ser.read(max(1, self.ser.in_waiting)) if wait_s or self.ser.in_waiting else b""
                 self.buffer += data
+                self.received_bytes += len(data)
                 if data or time.monotonic() >= until_s:
                     return bool(data)
 
     def _lost(self, doing: str, error: BaseException) -> LineLost:
+        what = "cannot be opened" if doing == "opening it" else f"failed in {doing} (unplugged?)"
         return LineLost(
-            f"{self.port_name} failed in {doing} ({_words(error)})",
+            f"{self.port_name} {what}: {_words(error)}",
             detail={"port": self.port_name, "while": doing},
         )
 

@@ -15,13 +15,12 @@ from drivers.dynamixel.link import Link, Part
 from drivers.dynamixel.models import (
     HARDWARE_ERRORS,
     MODELS_BY_NUMBER,
-    OPERATING_MODES,
     Block,
     hardware_error_words,
 )
 from drivers.dynamixel.motion import Sample, Truth, motion_block
 from drivers.dynamixel.settings import AxisSettings, HeadSettings
-from drivers.errors import DriverError, HardwareFault, NoReply, Refused, WrongDevice
+from drivers.errors import DriverError, HardwareFault, NoReply, WrongDevice
 
 log = logging.getLogger(__name__)
 T = TypeVar("T")
@@ -311,16 +310,6 @@ class Servo:
                 self._link.quiet(LATE_S)
         return ask()
 
-    def facts(self) -> dict[str, int]:
-        """Return every register of the table that this servo has, by name; raises as `get`."""
-        found: dict[str, int] = {}
-        for name in self._registers:
-            try:
-                found[name] = self.get(name)
-            except Refused:
-                continue  # this model has none
-        return found
-
     def release(self) -> None:
         """Switch the watchdog off, and torque too if the configuration says so; for the end."""
         for register in (
@@ -345,8 +334,3 @@ def hardware_fault_words(name: str, error: int) -> str:
         f"{name} reports {words} (hardware error 0x{error:02x}); it keeps saying so until it is rebooted or "
         "switched off and on, which drops its torque"
     )
-
-
-def mode_words(mode: int) -> str:
-    """Return an operating mode in words."""
-    return OPERATING_MODES.get(mode, f"unknown mode {mode}")
