@@ -63,6 +63,10 @@ _X = AxisSettings(
     acceleration_rad_per_s2=4.0,
 )
 
+_PH42 = replace(
+    _X, count_rad=math.tau / 607500, backlash_rad=math.radians(0.1), approach_rad=math.radians(0.3)
+)
+
 PRESETS: Mapping[str, HeadSettings] = {
     "ptu_d46_70": HeadSettings(
         "ptu_d46_70",
@@ -72,6 +76,11 @@ PRESETS: Mapping[str, HeadSettings] = {
     # The shortest way, not one-sided: the table shows what counts and backlash allow untreated.
     "dynamixel_x": HeadSettings(
         "dynamixel_x", _X, replace(_X, low_rad=-math.pi / 2, high_rad=math.pi / 2, sag_rad=_SAG_RAD)
+    ),
+    # Dynamixel PH42: counts on the motor's side (607500 a turn of the output), so the backlash (6', vendor)
+    # is what matters, and it is taken up. Speed and acceleration are assumed, as for the X.
+    "ph42": HeadSettings(
+        "ph42", _PH42, replace(_PH42, low_rad=-math.pi / 2, high_rad=math.pi / 2, sag_rad=_SAG_RAD)
     ),
 }
 

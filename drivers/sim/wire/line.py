@@ -25,7 +25,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
-from typing import Literal, Protocol, TypeVar
+from typing import Literal, Protocol, TypeVar, runtime_checkable
 
 from drivers.clock import Clock
 from drivers.errors import BadOptions
@@ -83,6 +83,13 @@ class WireDevice(Protocol):
     def poll(self, time_s: float) -> Sequence[Reply]:
         """Return what it sends by itself, or at last sends for an answer that it held back."""
         ...
+
+
+@runtime_checkable
+class ManyBauds(Protocol):
+    """A device that is a bus, with devices of several baud rates: it is told that of the host."""
+
+    host_baud: int | None
 
 
 class _Line:
@@ -342,9 +349,12 @@ class PtyLine(_Line):
         if self._master not in ready:
             return b""
         data = os.read(self._master, 4096)
-        if self._wire_time and self._host_baud() != self.device.baud:
-            return b""  # framing errors only
-        return data
+        if not self._wire_time:
+            return data
+        host_baud = self._host_baud()
+        if isinstance(self.device, ManyBauds):
+            self.device.host_baud = host_baud
+        return data if host_baud == self.device.baud else b""  # else framing errors only
 
     def _host_baud(self) -> int:
         """The speed that the host has set on its end."""

@@ -33,11 +33,15 @@ BANNER = b"\r\n### FLIR Motion Control Systems pan-tilt unit\r\n"
 """What an E series unit says to whoever connects by TCP (the wording differs with the firmware)."""
 
 _LONGEST = 100  # bytes of one command; the controller's buffer (D46 manual 7.3.2)
-_BAUD_RATES = (600, 1200, 2400, 4800, 9600, 19200, 38400, 57600, 115200)
+BAUD_RATES = (600, 1200, 2400, 4800, 9600, 19200, 38400, 57600, 115200)
 _BAUD_S = 0.02  # a new baud rate comes into force when the answer is through
 _WORDS = re.compile(r"([A-Z]+)([+-]?\d+)?")
 _STEP_NAMES = {"F": "FULL", "H": "HALF", "Q": "QUARTER", "E": "EIGHTH", "A": "AUTO"}
 _POWER_NAMES = {"R": "REGULAR", "L": "LOW", "H": "HIGH", "O": "OFF"}
+
+
+def _listed(values: Sequence[object]) -> str:
+    return ", ".join(str(value) for value in values)
 
 
 class _Refused(Exception):
@@ -58,11 +62,13 @@ class SimulatedPtu:
     signs
         Whether positions of pan and tilt grow (1) or fall (-1) with the axis angle. By default pan falls:
         the unit counts to the left, the mast to the right.
+    baud
+        Of its serial line at first.
 
     Raises
     ------
     BadOptions
-        For a model or step mode that does not exist.
+        For a model, step mode or baud rate that does not exist.
     """
 
     def __init__(
@@ -73,6 +79,7 @@ class SimulatedPtu:
         *,
         step_mode: str | None = None,
         signs: tuple[int, int] = (-1, 1),
+        baud: int = 9600,
     ) -> None:
         if model not in MODELS:
             raise BadOptions(f"there is no pan/tilt unit {model!r}{nearest(model, MODELS)}")
@@ -80,13 +87,15 @@ class SimulatedPtu:
         mode = self.model.step_mode if step_mode is None else step_mode
         if mode not in STEPS:
             raise BadOptions(f"step mode {mode!r} where one of {', '.join(STEPS)} is expected")
+        if baud not in BAUD_RATES:
+            raise BadOptions(f"a pan/tilt unit has no baud rate {baud}; there is {_listed(BAUD_RATES)}")
         known = self.model.unsure_arcsec is None
         self.pan = PtuAxis("Pan", self.model, pan, signs[0], mode, known)
         self.tilt = PtuAxis("Tilt", self.model, tilt, signs[1], mode, known)
         self._axes: Mapping[str, PtuAxis] = {"P": self.pan, "T": self.tilt}
         self.eeprom_writes = 0
         self._saved: tuple[AxisDefaults, AxisDefaults] = (self.pan.now, self.tilt.now)
-        self._baud, self._next_baud = 9600, (math.inf, 9600)
+        self._baud, self._next_baud = baud, (math.inf, baud)
         self._echo = not self.model.e_series
         self._verbose = True
         self._limits = "E"
@@ -121,7 +130,7 @@ class SimulatedPtu:
 
     def _work(self, time_s: float) -> list[Reply]:
         if time_s >= self._next_baud[0]:
-            self._baud, self._next_baud = self._next_baud[1], (math.inf, 9600)
+            self._baud, self._next_baud = self._next_baud[1], (math.inf, 0)
         sent = self._happened(time_s)
         while self._waiting is None or self._waiting[0](time_s):
             if self._waiting is not None:
@@ -429,7 +438,7 @@ class SimulatedPtu:
 
     def _set_host(self, text: str, time_s: float) -> None:
         found = re.fullmatch(r"@\((\d+),(\d+),([TF])\)", text)
-        if found is None or int(found[1]) not in _BAUD_RATES:
+        if found is None or int(found[1]) not in BAUD_RATES:
             raise _Refused("Illegal Command Entered")
         self._next_baud = (time_s + _BAUD_S, int(found[1]))
 
