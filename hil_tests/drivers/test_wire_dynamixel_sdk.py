@@ -6,6 +6,7 @@ import time
 from collections.abc import Iterator
 
 import pytest
+from dynamixel_easy_sdk import Connector, DxlRuntimeError, OperatingMode
 from dynamixel_host import servo
 from dynamixel_sdk import (
     COMM_SUCCESS,
@@ -18,6 +19,7 @@ from dynamixel_sdk import (
 
 from drivers.clock import SystemClock
 from drivers.sim.wire.dynamixel_bus import DynamixelBus
+from drivers.sim.wire.dynamixel_models import MODELS
 from drivers.sim.wire.line import PtyLine
 
 SDK = PacketHandler(2.0)
@@ -100,3 +102,35 @@ def test_the_wrong_baud_rate_is_silence(port: PortHandler) -> None:
     assert SDK.ping(port, 1)[1] != COMM_SUCCESS
     assert port.setBaudRate(1_000_000)
     assert SDK.ping(port, 1)[1] == COMM_SUCCESS
+
+
+@pytest.mark.parametrize("model", sorted(MODELS))
+def test_the_makers_easy_sdk_drives_every_model(model: str) -> None:
+    """``dynamixel_easy_sdk`` finds registers in the wheel's tables by model number, not in ours."""
+    bus = DynamixelBus([servo(model, 7)])
+    with PtyLine(bus, SystemClock()) as line:
+        connector = Connector(line.path, 1_000_000)
+        motor = connector.createMotor(7)
+        assert motor.model_name == f"{model}.model"
+        motor.setOperatingMode(OperatingMode.VELOCITY)
+        motor.enableTorque()
+        motor.setGoalVelocity(20)
+        end_s = time.monotonic() + PATIENCE_S
+        while motor.getPresentVelocity() != 20:
+            assert time.monotonic() < end_s
+        motor.setGoalVelocity(0)
+        with pytest.raises(DxlRuntimeError):
+            motor.setGoalVelocity(motor.getVelocityLimit() + 1)
+        motor.disableTorque()
+        motor.setMaxPositionLimit(3000)
+        assert motor.getMaxPositionLimit() == 3000
+        motor.setOperatingMode(OperatingMode.POSITION)
+        motor.enableTorque()
+        with pytest.raises(DxlRuntimeError):
+            motor.setGoalPosition(3001)
+        goal = motor.getPresentPosition() - 10
+        motor.setGoalPosition(goal)
+        while motor.getPresentPosition() != goal:
+            assert time.monotonic() < end_s
+        assert motor.isTorqueOn() == 1
+        connector.closePort()
