@@ -24,8 +24,8 @@ from drivers.sim.wire.dynamixel_servo import SimulatedServo
 from drivers.sim.wire.line import PtyLine, TcpLine
 from drivers.sim.wire.ptu import SimulatedPtu
 
-LIMITS_RAD = ((-1.5, 1.5), (-0.9, 0.5))
-SPEED_RAD_PER_S, ACCELERATION_RAD_PER_S2 = 1.0, 4.0
+LIMITS_RAD = ((-1.0, 1.0), (-0.6, 0.4))
+SPEED_RAD_PER_S, ACCELERATION_RAD_PER_S2 = 1.2, 20.0
 X_COUNT_RAD = math.tau / 4096  # e-manual, X series
 PTU_STEP_RAD = math.radians(324 / 7 / 3600)  # D46-70, half step of 46.2857"
 PTU_ACCELERATION = round(ACCELERATION_RAD_PER_S2 / PTU_STEP_RAD)

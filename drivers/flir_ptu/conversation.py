@@ -14,7 +14,8 @@ from __future__ import annotations
 
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 from drivers.errors import BadReply, NoReply, Refused
@@ -26,6 +27,7 @@ REPLY_S = 0.15
 REPLY_BYTES = 70  # a command, its echo and the longest answer in words
 QUIET_S = 0.06
 LONGEST_DRAIN_S = 0.4
+PATIENT_TRIES = 3
 
 
 @dataclass(frozen=True)
@@ -83,6 +85,7 @@ class Conversation:
         self._lines: deque[bytes] = deque()
         self._manners = _Manners()
         self._in_step = False
+        self._tries = 1
         self.reply_s = REPLY_S + REPLY_BYTES * line.byte_s
 
     @property
@@ -152,8 +155,26 @@ class Conversation:
         """Close the line."""
         self._line.close()
 
+    @contextmanager
+    def patient(self) -> Iterator[None]:
+        """Within this, what was not answered as it should be is asked again, some times."""
+        self._tries = PATIENT_TRIES
+        try:
+            yield
+        finally:
+            self._tries = 1
+
     def _exchange(self, command: str, patience_s: float) -> str:
-        """Send a command and wait for its answer; on any error the two sides are out of step."""
+        """Send a command and return the text of its answer."""
+        for _ in range(1, self._tries):
+            try:
+                return self._exchange_once(command, patience_s)
+            except (NoReply, BadReply):
+                self.in_step()
+        return self._exchange_once(command, patience_s)
+
+    def _exchange_once(self, command: str, patience_s: float) -> str:
+        """The same, one time; on any error the two sides are out of step."""
         if not self._in_step:
             raise BadReply("is out of step with this program", device=self._device)
         self._in_step = False
@@ -178,24 +199,33 @@ class Conversation:
         found = {}
         manners = _Manners()
         for axis, query in RESOLUTION.items():
-            self._line.send(f"{query.letters} ".encode())
-            until_s = time.monotonic() + self.reply_s
-            refusal = ""
-            while axis not in found:
+            for tries_left in reversed(range(PATIENT_TRIES)):
                 try:
-                    answer = self._next_answer(query.letters, until_s, skip=True)
+                    found[axis], manners = self._resolution(axis, query)
+                    break
                 except NoReply:
-                    if refusal:
-                        words = f"does not tell its {axis} resolution: {refusal}"
-                        raise Refused(words, device=self._device) from None
-                    raise
-                manners = _Manners(" " in answer.text, answer.echo)
-                number = number_of(answer.text, query.words, " " in answer.text) if answer.good else None
-                if number is not None:
-                    found[axis] = number
-                elif not answer.good:
-                    refusal = answer.text
+                    if not tries_left:
+                        raise
         return found, manners
+
+    def _resolution(self, axis: str, query: Query) -> tuple[float, _Manners]:
+        """One of them, and how the unit answered."""
+        self._line.send(f"{query.letters} ".encode())
+        until_s = time.monotonic() + self.reply_s
+        refusal = ""
+        while True:
+            try:
+                answer = self._next_answer(query.letters, until_s, skip=True)
+            except NoReply:
+                if refusal:
+                    words = f"does not tell its {axis} resolution: {refusal}"
+                    raise Refused(words, device=self._device) from None
+                raise
+            number = number_of(answer.text, query.words, " " in answer.text) if answer.good else None
+            if number is not None:
+                return number, _Manners(" " in answer.text, answer.echo)
+            if not answer.good:
+                refusal = answer.text
 
     def _next_answer(self, command: str, until_s: float, skip: bool) -> Answer:
         """The next answer; a line that is none is an error unless such lines are to be skipped."""

@@ -43,7 +43,7 @@ from drivers.interfaces import Reading
 log = logging.getLogger(__name__)
 
 ASKED_AGAIN = 4  # questions for one position, until two answers agree
-SILENT_CALLS = 3  # calls without an answer, after which the line is opened anew
+SILENT_CALLS = 5  # calls without an answer, after which the line is opened anew
 FIRST_BACK_OFF_S, LONGEST_BACK_OFF_S = 0.1, 2.0
 STOP_PATIENCE_S = 0.02  # how long a stop waits for a call that is under way before it goes out beside it
 RECOMPUTE_S = 10.0  # PA and TA take seconds, the manual says
@@ -256,7 +256,8 @@ class FlirPtu:
             talk = self._talk = Conversation(line, DEVICE, self._hit)
             resolutions = talk.in_step()
             self._deaf = False
-            self._check(talk, resolutions)
+            with talk.patient():
+                self._check(talk, resolutions)
         except DriverError as error:
             self._give_up(error)
             raise
