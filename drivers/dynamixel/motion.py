@@ -175,7 +175,8 @@ class AxisMotion:
         """Take a new goal and return the count to send first: the goal, or the start of the last stretch."""
         settings, sample = self.settings, self._sample
         assert sample is not None
-        final = settings.counts(angle_rad)
+        low, high = settings.limit_counts  # a goal at a limit may round to a count that the servo refuses
+        final = min(max(settings.counts(angle_rad), low), high)
         side = settings.approach_sign(angle_rad)
         stretch = math.ceil(settings.approach_rad / settings.model.count_rad)
         there = final == self.goal and not self._legs and self.settled(sample.received_s)
@@ -184,7 +185,6 @@ class AxisMotion:
             stop = self.stopping_counts(acceleration_rad_per_s2)
             short = min(side * (final - sample.counts), side * (final - stop))
             if short < stretch:
-                low, high = settings.limit_counts
                 legs = [min(max(final - side * stretch, low), high), final]
         self._commanded_rad = angle_rad
         self._set(legs)

@@ -7,6 +7,7 @@ locks them). Everything written is read back.
 from __future__ import annotations
 
 import logging
+import math
 import time
 from collections.abc import Callable
 from typing import TypeVar
@@ -323,8 +324,8 @@ class Servo:
 
 
 def velocity_counts(settings: AxisSettings, speed_rad_per_s: float) -> int:
-    """Return a profile velocity; never 0, which would mean as fast as it can."""
-    return max(1, round(speed_rad_per_s / settings.model.velocity_unit_rad_per_s))
+    """Return a profile velocity, not above the speed; never 0, which would mean as fast as it can."""
+    return max(1, math.floor(speed_rad_per_s / settings.model.velocity_unit_rad_per_s + 1e-9))
 
 
 def hardware_fault_words(name: str, error: int) -> str:
