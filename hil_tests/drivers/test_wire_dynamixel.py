@@ -635,6 +635,38 @@ def test_following_error_and_full_current_of_a_seized_axis() -> None:
     assert host.signed(1, 132, 4) == 2048
 
 
+def test_startup_torque_on_holds_where_it_has_fallen_to() -> None:
+    """Startup Configuration, bit 0: torque is on again when the servo has started, and not before."""
+    tilt = axis(falls_to_rad=-1.0, start_rad=0.3)
+    host = Host(servo("xm430_w350", 1, on=tilt, startup_configuration=1))
+    assert host.read(1, 64, 1) == 1
+    host.wait(0.5)
+    assert tilt.angle_rad(host.clock.now_s()) == pytest.approx(0.3)
+    assert host.sdk.reboot(host.port, 1)[0] == 0
+    host.wait(2.0)
+    assert host.read(1, 64, 1) == 1
+    held = tilt.angle_rad(host.clock.now_s())
+    assert -0.2 < held < 0.25
+    host.wait(1.0)
+    assert tilt.angle_rad(host.clock.now_s()) == held
+    # Braking took it a little further than it was when the torque came on.
+    assert host.read(1, 116, 4) == pytest.approx(host.read(1, 132, 4), abs=3)
+
+
+def test_an_absurd_reading_does_not_lose_a_turn() -> None:
+    class Absurd(Felt):
+        def angle_rad(self, time_s: float) -> float:
+            return 500.0 if self.held else super().angle_rad(time_s)
+
+    wild = Absurd(SETTINGS)
+    host = Host(servo("xm430_w350", 1, on=wild))
+    wild.held = True
+    assert host.signed(1, 132, 4) > 100_000
+    assert host.write(1, 64, 1, 1) == 0
+    wild.held = False
+    assert host.signed(1, 132, 4) == 2048
+
+
 def test_realtime_tick_counts_milliseconds(host: Host) -> None:
     first = host.read(1, 120, 2)
     host.wait(1.0)

@@ -179,7 +179,7 @@ def _do(
         if code == WRITE:
             servo.write(_word(parameters, 0), parameters[2:], time_s, by_group=group)
         else:
-            servo.reg_write(_word(parameters, 0), parameters[2:])
+            servo.reg_write(_word(parameters, 0), parameters[2:], by_group=group)
     elif code == ACTION:
         servo.action(time_s)
     elif code == REBOOT:

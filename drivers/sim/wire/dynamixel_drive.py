@@ -22,6 +22,7 @@ STEP_RAD_PER_S2 = 60.0
 
 _IN_POSITION_RAD = 4 * math.tau / 4096  # the manual names no bound; this is four counts of an X
 _FOLLOWING_RAD = 40 * math.tau / 4096  # as above
+_ABSURD_RAD = 0.3  # more than any backlash and sag
 _HOMING_LIMIT = 1024  # beyond it position control ignores the homing offset
 
 
@@ -51,7 +52,7 @@ class Drive:
         self._zero = zero_counts
         self._sign = sign
         self._shift = 0
-        self._motion = Motion.at_rest(time_s, axis.angle_rad(time_s))
+        self._motion = Motion.at_rest(time_s, self._place_rad(time_s))
         self._profile = 0
         self.into_one_turn(time_s)
 
@@ -77,9 +78,14 @@ class Drive:
         raw = self._direction() * (counts - self._homing() + self._shift)
         return self._sign * (raw - self._zero) * self._model.count_rad
 
+    def _place_rad(self, time_s: float) -> float:
+        """The encoder's angle; where a fault makes it absurd, the load's, so that no turn is lost."""
+        angle, load = self.axis.angle_rad(time_s), self.axis.mechanical_rad(time_s)
+        return angle if abs(angle - load) < _ABSURD_RAD else load
+
     def into_one_turn(self, time_s: float) -> None:
         """Bring the position back to one turn: 0 to a turn, or half a turn either way on a P."""
-        turn, raw = self._model.counts_per_turn, round(self._turned(self.axis.angle_rad(time_s)))
+        turn, raw = self._model.counts_per_turn, round(self._turned(self._place_rad(time_s)))
         low = 0 if self._model.zero_counts else -turn // 2
         self._shift = (raw - low) // turn * turn
 
@@ -96,7 +102,7 @@ class Drive:
 
     def rest(self, time_s: float) -> None:
         """Take the place where the axis is as the end of the trajectory."""
-        self._motion = Motion.at_rest(time_s, self.axis.angle_rad(time_s))
+        self._motion = Motion.at_rest(time_s, self._place_rad(time_s))
         self._profile = 0
 
     def torque_on(self, time_s: float) -> None:

@@ -91,6 +91,7 @@ class SimulatedServo:
         self._since_s: float | None = None
         self._started_s = self._fed_s = self._retune_s = time_s
         self._rate = self.table["baud_rate"]
+        self._starting = False
         self._start_registers(time_s)
 
     # What the bus asks
@@ -146,6 +147,9 @@ class SimulatedServo:
             self._rate = self.table["baud_rate"]
         if not self.hears(time_s):
             return
+        if self._starting:
+            self._starting = False
+            self._start_registers(self._started_s)
         limit = self.table["bus_watchdog"]
         if self.table["torque_enable"] and 0 < limit < WATCHDOG_EXPIRED:
             expiry_s = self._fed_s + limit * _WATCHDOG_UNIT_S
@@ -170,9 +174,9 @@ class SimulatedServo:
         """Write at once, or raise Refused; ``by_group`` is a packet to the secondary id."""
         self._apply(self._changes(address, data, by_group), time_s)
 
-    def reg_write(self, address: int, data: bytes) -> None:
+    def reg_write(self, address: int, data: bytes, *, by_group: bool = False) -> None:
         """Check a write and keep it for `action`, or raise Refused."""
-        self._registered = self._changes(address, data, False)
+        self._registered = self._changes(address, data, by_group)
         self.table["registered_instruction"] = 1
 
     def action(self, time_s: float) -> None:
@@ -312,7 +316,7 @@ class SimulatedServo:
         self._raised = 0
         self._since_s = None
         self._started_s = self._fed_s = self._retune_s = time_s + BOOT_S
-        self._start_registers(time_s)
+        self._starting = True
 
     def _start_registers(self, time_s: float) -> None:
         self.drive.into_one_turn(time_s)
