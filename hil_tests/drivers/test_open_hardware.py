@@ -218,7 +218,11 @@ def test_a_camera_that_fails_to_open_closes_the_head_again(outside: None) -> Non
         ({"scene": {"stones": 3}}, r"simulation.scene has no key 'stones'"),
         ({"scene": {"rocks": 3.5}}, r"simulation.scene.rocks is 3.5, expected a whole number"),
         ({"scene": {"rocks": -3}}, r"rocks -3"),
-        ({"faults": "all"}, r"simulation.faults is 'all', expected a list"),
+        ({"faults": 7}, r"simulation.faults is 7, expected a list"),
+        ({"faults": "all.yaml"}, r"all.yaml: "),
+        ({"wire": "dynamixl"}, r"simulation.wire is 'dynamixl'; did you mean 'dynamixel'"),
+        ({"wire": "dynamixel", "head": "ptu_d46_70"}, r"expected dynamixel_x or ph42"),
+        ({"wire": "flir_ptu", "head": {"preset": "ptu_d46_70", "count_rad": 0.1}}, r"cannot be changed"),
         (
             {"faults": [{"device": "pan_tilt", "word": "of"}]},
             r"pan_tilt has no fault 'of'; did you mean 'off'",

@@ -28,6 +28,7 @@ MODULES: dict[str, tuple[str, ...]] = {
     "mastctl.cli.geometry": ("camera", "solve", "triangulate", "budget"),
     "mastctl.cli.calibrate": ("calibrate",),
     "mastctl.cli.experiment": ("experiment", "demo"),
+    "mastctl.cli.sim": ("sim",),
     "mastctl.cli.servo": ("servo",),
 }
 
