@@ -7,6 +7,7 @@ import math
 import pytest
 from dynamixel_host import SETTINGS, Host, axis, servo
 
+from drivers.errors import BadOptions
 from drivers.sim.wire.axis import WireAxis
 from drivers.sim.wire.dynamixel_servo import BOOT_S, OVERLOAD_S
 
@@ -43,6 +44,25 @@ def goal(host: Host, counts: int, velocity: int = 0, acceleration: int = 0) -> N
     assert host.write(1, 108, 4, acceleration) == 0
     assert host.write(1, 112, 4, velocity) == 0
     assert host.write(1, 116, 4, counts) == 0
+
+
+# Making one
+
+
+def test_a_servo_that_cannot_be_is_refused() -> None:
+    for model, servo_id, settings, words in (
+        ("xm430_w530", 1, {}, "did you mean 'xm430_w350'"),
+        ("xm430_w350", 253, {}, "id is 253"),
+        ("xm430_w350", 1, {"baud_rate": 8}, "expected 0 to 7"),
+        ("mx_28", 1, {"goal_current": 1}, "no register 'goal_current'"),
+    ):
+        with pytest.raises(BadOptions, match=words):
+            servo(model, servo_id, **settings)
+
+
+@pytest.mark.parametrize("name", ["XM430-W350-T", "xm430_w350", "XM430-W350", "xm430-w350-r"])
+def test_spellings_of_a_model(name: str) -> None:
+    assert servo(name, 1).model.number == 1020
 
 
 # Ping, access, errors

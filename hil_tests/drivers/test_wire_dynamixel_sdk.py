@@ -104,6 +104,21 @@ def test_the_wrong_baud_rate_is_silence(port: PortHandler) -> None:
     assert SDK.ping(port, 1)[1] == COMM_SUCCESS
 
 
+def test_servos_of_different_baud_rates_on_one_line() -> None:
+    bus = DynamixelBus([servo("xm430_w350", 1), servo("xm430_w350", 2, baud_rate=1)])
+    with PtyLine(bus, SystemClock()) as line:
+        handler = PortHandler(line.path)
+        for baud, there in ((57600, 2), (1_000_000, 1), (2_000_000, 0)):
+            assert handler.setBaudRate(baud)
+            found = [i for i in (1, 2) if SDK.ping(handler, i)[1] == COMM_SUCCESS]
+            assert found == ([there] if there else [])
+        assert handler.setBaudRate(57600)
+        assert SDK.write1ByteTxRx(handler, 2, 8, 3) == (COMM_SUCCESS, 0)
+        assert handler.setBaudRate(1_000_000)
+        assert SDK.ping(handler, 2)[1] == COMM_SUCCESS
+        handler.closePort()
+
+
 @pytest.mark.parametrize("model", sorted(MODELS))
 def test_the_makers_easy_sdk_drives_every_model(model: str) -> None:
     """``dynamixel_easy_sdk`` finds registers in the wheel's tables by model number, not in ours."""

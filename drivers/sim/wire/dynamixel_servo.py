@@ -59,7 +59,7 @@ class SimulatedServo:
     Raises
     ------
     BadOptions
-        For an unknown model or register.
+        For an unknown model or register, or a value that the register cannot hold.
     """
 
     def __init__(
@@ -76,9 +76,15 @@ class SimulatedServo:
         self.model: Model = model_named(model)
         self.powered = True
         self.table = ControlTable(self.model, self._live())
-        unknown = set(settings or {}) - set(self.table.values)
-        if unknown:
-            raise BadOptions(f"servo model {self.model.name} has no register {', '.join(sorted(unknown))}")
+        for name, value in {"id": servo_id, **(settings or {})}.items():
+            register = self.model.by_name.get(name)
+            if register is None:
+                raise BadOptions(f"servo model {self.model.name} has no register {name!r}")
+            if not register.low <= value <= register.high:
+                raise BadOptions(
+                    f"{name} is {value} for a simulated {self.model.name}, "
+                    f"expected {register.low} to {register.high}"
+                )
         self.table.values.update({"model_number": self.model.number, "firmware_version": self.model.firmware})
         self.table.values.update({"id": servo_id, **(settings or {})})
         zero = self.model.zero_counts if zero_counts is None else zero_counts
