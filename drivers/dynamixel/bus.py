@@ -11,13 +11,35 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable
-from concurrent.futures import CancelledError, Future
-from typing import Any, TypeVar
+from queue import Empty, SimpleQueue
+from typing import Any, TypeVar, cast
 
 from drivers.errors import DriverError, NoReply
 
 log = logging.getLogger(__name__)
 T = TypeVar("T")
+
+
+class _Job:
+    """A call on its way; plain locks, since a call waits for little more than the thread's turn."""
+
+    def __init__(self, function: Callable[[], Any]) -> None:
+        self.function = function
+        self.result: Any = None
+        self.error: BaseException | None = None
+        self.claimed = threading.Lock()  # by the owner thread to run it, or by its caller to give it up
+        self.done = threading.Lock()
+        self.done.acquire()
+
+    def run(self) -> None:
+        """Run it, unless its caller gave it up."""
+        if not self.claimed.acquire(blocking=False):
+            return
+        try:
+            self.result = self.function()
+        except BaseException as error:  # whatever happens belongs to the caller, not to this thread
+            self.error = error
+        self.done.release()
 
 
 class Bus:
@@ -35,9 +57,9 @@ class Bus:
     def __init__(self, name: str, between: Callable[[], float]) -> None:
         self._name = name
         self._between = between
-        self._wake = threading.Condition()
-        self._jobs: deque[tuple[Callable[[], Any], Future[Any]]] = deque()
-        self._closing = False
+        self._jobs: deque[_Job] = deque()
+        self._wake: SimpleQueue[None] = SimpleQueue()
+        self._closing: _Job | None = None
         self._thread = threading.Thread(target=self._serve, name=f"bus {name}", daemon=True)
         self._thread.start()
 
@@ -62,56 +84,51 @@ class Bus:
         DriverError
             What ``function`` raises.
         """
-        future: Future[T] = Future()
-        with self._wake:
-            if self._closing:
-                raise NoReply(f"{self._name} is closed; {what} was not sent")
-            (self._jobs.appendleft if first else self._jobs.append)((function, future))
-            self._wake.notify()
-        try:
-            return future.result(timeout_s)
-        except CancelledError:
-            raise NoReply(f"{self._name} was closed before {what} was sent") from None
-        except TimeoutError:
-            words = "its turn did not come" if future.cancel() else "it is still under way"
-            raise NoReply(f"{what} on {self._name} did not end within {timeout_s:g} s: {words}") from None
+        if self._closing is not None:
+            raise NoReply(f"{self._name} is closed; {what} was not sent")
+        job = _Job(function)
+        (self._jobs.appendleft if first else self._jobs.append)(job)
+        self._wake.put(None)
+        if not job.done.acquire(timeout=timeout_s):
+            begun = not job.claimed.acquire(blocking=False)
+            words = "it is still under way" if begun else "its turn did not come"
+            raise NoReply(f"{what} on {self._name} did not end within {timeout_s:g} s: {words}")
+        if job.error is not None:
+            raise job.error
+        return cast(T, job.result)
 
     def close(self, last: Callable[[], None], timeout_s: float) -> None:
-        """Refuse what waits, run ``last`` in the thread and end it; never raises."""
-        future: Future[None] = Future()
-        with self._wake:
-            if self._closing:
-                return
-            self._closing = True
-            for _, waiting in self._jobs:
-                waiting.cancel()
-            self._jobs.clear()
-            self._jobs.append((last, future))
-            self._wake.notify()
-        self._thread.join(timeout_s)
-        if self._thread.is_alive():
-            log.warning("%s: the bus thread hangs and is left behind", self._name)
+        """Run ``last`` in the thread as the last call of all and end the thread; never raises."""
+        if self._closing is None:
+            self._closing = job = _Job(last)
+            self._jobs.append(job)
+            self._wake.put(None)
+            self._thread.join(timeout_s)
+            if self._thread.is_alive():
+                log.warning("%s: the bus thread hangs and is left behind", self._name)
+            elif job.error is not None:
+                log.warning("%s: %s", self._name, job.error)
 
     def _serve(self) -> None:
         again_s = time.monotonic()
         while True:
-            with self._wake:
-                while not self._jobs and (wait_s := again_s - time.monotonic()) > 0:
-                    self._wake.wait(wait_s)
-                job = self._jobs.popleft() if self._jobs else None
-                last = self._closing and not self._jobs
-            if job is None:
-                again_s = self._round()
-                continue
-            function, future = job
-            if future.set_running_or_notify_cancel():
+            if not self._jobs:
+                wait_s = again_s - time.monotonic()
+                if wait_s <= 0:
+                    again_s = self._round()
+                    continue
                 try:
-                    future.set_result(function())
-                except BaseException as error:  # whatever happens belongs to the caller, not to this thread
-                    future.set_exception(error)
-            del job, function, future
-            if last:
+                    self._wake.get(timeout=wait_s)
+                except Empty:
+                    continue
+            try:
+                job = self._jobs.popleft()
+            except IndexError:
+                continue  # a wake-up for a call that was served already
+            job.run()
+            if job is self._closing:
                 return
+            del job
 
     def _round(self) -> float:
         try:

@@ -223,8 +223,6 @@ def _test(args: argparse.Namespace) -> int:
             )
             for s in trial.steps
         ],
-        [
-            f"It missed its goals by {worst} counts ({worst * count_deg:.3f} deg) at most; torque is as it was"
-        ],
+        [f"It missed its goals by {worst} counts ({worst * count_deg:.3f} deg) at most."],
     )
     return 0
