@@ -340,7 +340,7 @@ def test_heat_drops_torque_and_only_a_reboot_gives_it_back() -> None:
     felt.celsius = 30.0
     assert host.write(1, 64, 1, 1) == ALERT
     assert host.sdk.readTxRx(host.port, 1, 64, 1)[0] == [0]
-    assert host.sdk.reboot(host.port, 1)[0] == 0
+    assert host.sdk.reboot(host.port, 1) == (0, ALERT)
     host.wait(BOOT_S + 0.01)
     assert host.read(1, 70, 1) == 0
     assert host.write(1, 64, 1, 1) == 0

@@ -111,7 +111,7 @@ class DynamixelBus:
             group = servo.table["secondary_id"] == instruction.packet_id <= packets.MAX_ID and not own
             if not (own or group or broadcast):
                 continue
-            error, data = 0, b""
+            error, data, alert = 0, b"", servo.alert()  # a reboot forgets the error
             level = servo.answers("ping" if code == PING else "read" if code == READ else "write")
             try:
                 data = _do(servo, instruction, time_s, broadcast=broadcast, group=group)
@@ -119,7 +119,7 @@ class DynamixelBus:
                 error = refused.error
             if level and (own or (broadcast and code == PING)):
                 # In a broadcast ping each waits for the one with the next lower id.
-                answer = packets.status_packet(servo_id, error | servo.alert(), data)
+                answer = packets.status_packet(servo_id, error | alert, data)
                 replies.append(Reply(answer, servo.return_delay_s, servo_id))
         return _collided(replies)
 
