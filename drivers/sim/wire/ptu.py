@@ -131,6 +131,8 @@ class SimulatedPtu:
     def _work(self, time_s: float) -> list[Reply]:
         if time_s >= self._next_baud[0]:
             self._baud, self._next_baud = self._next_baud[1], (math.inf, 0)
+        for axis in self._axes.values():
+            axis.axis.follow(time_s)
         sent = self._happened(time_s)
         while self._waiting is None or self._waiting[0](time_s):
             if self._waiting is not None:
