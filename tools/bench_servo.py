@@ -16,6 +16,7 @@ the machine. CPU is that of the whole process of the caller, threads included.
 from __future__ import annotations
 
 import argparse
+import importlib
 import json
 import multiprocessing as mp
 import os
@@ -188,7 +189,7 @@ def bus(path: str) -> Iterator[tuple[CALL, CALL]]:
 
 
 @contextmanager
-def lerobot(path: str) -> Iterator[tuple[CALL, CALL]]:
+def lerobot_bus(path: str) -> Iterator[tuple[CALL, CALL]]:
     """lerobot's bus class."""
     from lerobot.motors import Motor, MotorNormMode
     from lerobot.motors.dynamixel import DynamixelMotorsBus
@@ -243,9 +244,8 @@ def main() -> int:
         "bus": bus,
     }
     try:
-        import lerobot.motors.dynamixel
-
-        drivers["lerobot"] = lerobot
+        importlib.import_module("lerobot.motors.dynamixel")
+        drivers["lerobot"] = lerobot_bus
     except ImportError:
         print("lerobot is not installed here and is left out", file=sys.stderr)
     rows = []
