@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import threading
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 
 from drivers.sim.wire import dynamixel_packets as packets
 from drivers.sim.wire.dynamixel_packets import BROADCAST, Instruction, InstructionParser
@@ -66,6 +67,12 @@ class DynamixelBus:
             for servo in self.servos:
                 servo.update(time_s)
             return ()
+
+    @contextlib.contextmanager
+    def held(self) -> Iterator[None]:
+        """Keep the line from the servos meanwhile, so that somebody else may do something to them."""
+        with self._lock:
+            yield
 
     def _answer(self, instruction: Instruction, time_s: float) -> list[Reply]:
         here: list[SimulatedServo] = []
