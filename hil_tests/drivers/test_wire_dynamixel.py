@@ -9,7 +9,7 @@ from dynamixel_host import SETTINGS, Host, axis, servo
 
 from drivers.errors import BadOptions
 from drivers.sim.wire.axis import WireAxis
-from drivers.sim.wire.dynamixel_servo import BOOT_S, OVERLOAD_S
+from drivers.sim.wire.dynamixel_servo import BOOT_S, OVERLOAD_S, SimulatedServo
 
 TIMEOUT, CORRUPT = -3001, -3002
 ALERT = 0x80
@@ -598,6 +598,29 @@ def test_more_than_a_turn_is_forgotten_as_the_manual_says() -> None:
     assert host.write(1, 64, 1, 0) == 0
     assert host.write(1, 11, 1, 3) == 0  # position control: back to one turn
     assert host.signed(1, 132, 4) == 2048
+
+
+def test_a_head_parked_across_the_end_of_the_turn() -> None:
+    """Zero of the axis at count 100: a bit to the left of it the servo starts near 4095, the rollover."""
+    for sign in (1, -1):
+        parked = axis(start_rad=-sign * 200 * math.tau / 4096)
+        mast = SimulatedServo(
+            "xm430_w350",
+            1,
+            parked,
+            zero_counts=100,
+            sign=sign,
+            settings={"baud_rate": 3, "operating_mode": 4},
+        )
+        host = Host(mast)
+        assert host.signed(1, 132, 4) == 4096 - 100
+        goal(host, 4096 + 150)
+        host.wait(1.0)
+        assert parked.angle_rad(host.clock.now_s()) == pytest.approx(sign * 50 * math.tau / 4096)
+        assert host.signed(1, 132, 4) == 4096 + 150
+        assert host.sdk.reboot(host.port, 1)[0] == 0
+        host.wait(BOOT_S + 0.01)
+        assert host.signed(1, 132, 4) == 150  # after a restart the same place has another count
 
 
 def test_a_goal_without_torque_moves_nothing_and_torque_on_holds(host: Host) -> None:
