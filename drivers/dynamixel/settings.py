@@ -177,7 +177,10 @@ def _axis(place: str, value: Any) -> AxisSettings:
         "gravity_turnover_rad", "at_stop", "at_close", "on_hardware_error", "current_limit_A", "settle_rad",
     }  # fmt: skip
     read = _Options(place, value, known, ("id", "model", "limits_rad"))
-    model = model_named(value["model"])
+    try:
+        model = model_named(value["model"])
+    except BadOptions as error:
+        raise BadOptions(f"options.{place}model: {error}") from None
     axis = AxisSettings(
         servo_id=read.whole("id", 1, 0, 252),
         model=model,
