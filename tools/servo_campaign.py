@@ -40,6 +40,8 @@ DRIVERS = ("dynamixel_pty", "ptu_pty")
 MIXTURE = "mixture"
 WORDS = (*HEAD_WORDS, MIXTURE)
 LYING = ("wrong", "drifting", "garbage")
+OF_THE_MECHANISM = ("stuck", "slow", "overload", "voltage_dip", "temperature_ramp", *LYING)
+"""Words under which the head is moved once and then watched for some seconds."""
 NEVER_A_FAULT = ("duplicate", "noise", "slow", *LYING)
 """Words that a good driver may live through without a word."""
 
@@ -47,6 +49,7 @@ AWAY_PERIOD_S = 0.02  # between calls while the head is away: polled as a servic
 PERIOD_S = 0.004  # between calls otherwise
 RECOVERY_S = 20.0
 EPISODE_S = (0.3, 3.0)
+WATCHED_S = (3.0, 5.0)
 WRONG_COUNTS = 1.5
 
 
@@ -151,23 +154,36 @@ class Run:
 
     def _under_fault(self) -> float | None:
         """Use the head while the fault lasts; return when it was first told."""
-        began_s, length_s = time.monotonic(), self._rng.uniform(*EPISODE_S)
+        watched = self._row.word in OF_THE_MECHANISM
+        began_s, length_s = time.monotonic(), self._rng.uniform(*(WATCHED_S if watched else EPISODE_S))
         told: list[float] = []
-        self._drive(lambda calls, spent_s: spent_s >= length_s, told)
+        if watched:
+            with suppress(DriverError):
+                self._move()
+        self._drive(lambda calls, spent_s: spent_s >= length_s, told, only_read=watched)
         return told[0] - began_s if told else None
 
-    def _drive(self, enough: Callable[[int, float], bool], told: list[float] | None = None) -> None:
+    def _move(self) -> None:
+        """Send the head anywhere."""
+        low, high = zip(*LIMITS_RAD, strict=True)
+        self._rig.head.move(*self._rng.uniform(low, high))
+
+    def _drive(
+        self,
+        enough: Callable[[int, float], bool],
+        told: list[float] | None = None,
+        only_read: bool = False,
+    ) -> None:
         """Read, move and stop at random."""
         began_s, calls = time.monotonic(), 0
         while not enough(calls, time.monotonic() - began_s):
             calls += 1
             self._row.calls += 1
-            dice = self._rng.random()
+            dice = 1.0 if only_read else self._rng.random()
             started_s = time.monotonic()
             try:
                 if dice < 0.012:
-                    low, high = zip(*LIMITS_RAD, strict=True)
-                    self._rig.head.move(*self._rng.uniform(low, high))
+                    self._move()
                 elif dice < 0.015:
                     self._rig.head.stop()
                 else:

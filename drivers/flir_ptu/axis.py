@@ -13,6 +13,7 @@ from drivers.errors import OutOfRange, WrongDevice
 from drivers.flir_ptu.options import DEVICE, AxisOptions
 
 ARCSEC_RAD = math.pi / 180 / 3600
+SAME_RESOLUTION = 0.005
 IN_POSITION = 1
 """Positions by which an encoder-corrected axis may tremble around its target."""
 STALL_S = 1.0
@@ -59,6 +60,14 @@ class Axis:
             raise WrongDevice(
                 f"says that a {name} position is {resolution_arcsec:g} seconds of arc; "
                 "home it (mastctl ptu home), it does not know before",
+                device=DEVICE,
+            )
+        told = options.resolution_arcsec
+        if told is not None and abs(resolution_arcsec / told - 1) > SAME_RESOLUTION:
+            raise WrongDevice(
+                f"says that a {name} position is {resolution_arcsec:g} seconds of arc, "
+                f"options.{name}.resolution_arcsec {told:g}; either its step mode was changed, "
+                "or it is an E46 that was not homed yet (mastctl ptu home)",
                 device=DEVICE,
             )
         self.name = name

@@ -144,6 +144,22 @@ class Conversation:
         """
         return self._exchange(command, self.reply_s + patience_s)
 
+    def reset(self, patience_s: float) -> None:
+        """Have the unit find its limits again (``R``): both axes sweep their full range.
+
+        Raises
+        ------
+        NoReply
+            If it is not done within ``patience_s`` seconds.
+        Refused, LineLost
+            If the unit will not, or is gone.
+        """
+        self._quiet()
+        self._line.send(b"R ")
+        answer = self._next_answer("R", time.monotonic() + patience_s, skip=True)
+        if not answer.good:
+            raise Refused(f"refuses R: {answer.text or 'without words'}", device=self._device)
+
     def shout(self, command: str) -> None:
         """Send a command beside whatever is under way, from any thread; its answer upsets the other exchange.
 

@@ -9,8 +9,8 @@ for the service's soft limits and not for the decision what to do about a fault:
 - A position counts only if it can be true after the last one; if not, the unit is asked again, and two
   answers have to agree. So a damaged digit, which the protocol cannot detect, does no harm to a head at rest.
 - After a limit hit (``!P``, ``!T``) or when a position has changed while the line was down, the unit has lost
-  count. Then it is read but not moved until it was homed (`FlirPtu.home`), which sweeps the full range and
-  which this driver never does by itself.
+  count. Then it is read but not moved until it was homed (``mastctl ptu home``), which sweeps the full range
+  and which this driver never does, and opened anew.
 """
 
 from __future__ import annotations
@@ -47,7 +47,6 @@ SILENT_CALLS = 5  # calls without an answer, after which the line is opened anew
 FIRST_BACK_OFF_S, LONGEST_BACK_OFF_S = 0.1, 2.0
 STOP_PATIENCE_S = 0.02  # how long a stop waits for a call that is under way before it goes out beside it
 RECOMPUTE_S = 10.0  # PA and TA take seconds, the manual says
-HOMING_S = 60.0  # up to 30 s, the manual says
 BRAKING_S = 0.5  # an axis that was under way when it was seen last may have gone on for so long
 HIT = (
     "the {axis} axis ran into its limit switch, so the unit has lost count of its position; "
@@ -191,27 +190,6 @@ class FlirPtu:
             if free:
                 self._lock.release()
 
-    def home(self) -> None:
-        """Reset the unit: both axes SWEEP THEIR FULL RANGE, whatever limits are configured, and end at zero.
-
-        Takes up to half a minute. Afterwards the unit knows its position again.
-
-        Raises
-        ------
-        Refused, NoReply, BadReply, LineLost, WrongDevice
-            If it did not come through.
-        """
-        with self._talking() as talk:
-            self._deaf = True
-            try:
-                talk.tell("R", HOMING_S)
-            finally:
-                self._deaf = False
-            self._lost_count.clear()
-            for axis in self._axes.values():
-                axis.seen = None
-            self._check(talk, talk.in_step())
-
     def close(self) -> None:
         """Halt and let go of the line."""
         with self._lock:
@@ -292,15 +270,21 @@ class FlirPtu:
 
     def _check(self, talk: Conversation, resolutions: Mapping[str, float]) -> None:
         """Halt the unit, compare it with the options, and set limits and speeds. Moves nothing."""
+        options = {"pan": self._options.pan, "tilt": self._options.tilt}
         version = talk.tell("V")
         if self.version and version != self.version:
             words = f"another unit answers: '{version[:80]}' where '{self.version[:80]}' was"
             raise WrongDevice(words, device=DEVICE)
+        if "E46" in version and None in (options["pan"].resolution_arcsec, options["tilt"].resolution_arcsec):
+            raise WrongDevice(
+                "is an E46, which does not know its gears before it was homed: "
+                "options.pan.resolution_arcsec and options.tilt.resolution_arcsec have to say what is right",
+                device=DEVICE,
+            )
         talk.tell("H")
         self._try(talk, "CI")  # goals are positions, not speeds
         for command in ("PO0", "TO0", "I"):  # whatever was given in slaved mode and never started is void
             talk.tell(command)
-        options = {"pan": self._options.pan, "tilt": self._options.tilt}
         axes = {name: Axis(name, options[name], resolutions[name]) for name in options}
         self._try(talk, "LE")
         for axis in axes.values():

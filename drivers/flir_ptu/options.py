@@ -34,6 +34,9 @@ class AxisOptions:
         stretch turns positive), ``negative``, or ``gravity``: against the weight.
     approach_rad
         How long the last stretch is; more than the backlash.
+    resolution_arcsec
+        What a position has to be, seconds of arc; None takes what the unit says. An E46 needs it, since it
+        says something wrong before its first reset.
     gravity_turnover_rad
         The angle at which the weight changes sides, for ``gravity``: below it the last stretch turns
         positive, above it negative.
@@ -45,6 +48,7 @@ class AxisOptions:
     approach: Approach = "none"
     approach_rad: float = 0.0
     gravity_turnover_rad: float = math.pi / 2
+    resolution_arcsec: float | None = None
 
     def approach_sign(self, goal_rad: float) -> int:
         """Return the direction of the last stretch in positions: 1, -1, or 0 for none."""
@@ -119,6 +123,7 @@ def _axis(name: str, values: Any) -> AxisOptions:
         approach=read.one_of("approach", "none", ("none", "positive", "negative", "gravity")),
         approach_rad=read.number("approach_rad", 0.0, 0.0, 0.5),
         gravity_turnover_rad=read.number("gravity_turnover_rad", math.pi / 2, -math.pi, math.pi),
+        resolution_arcsec=read.number("resolution_arcsec", None, 0.1, 3600.0),
     )
     if (axis.approach == "none") != (axis.approach_rad == 0.0):
         raise read.bad("approach_rad", f"a stretch above zero beside a side, none beside {axis.approach!r}")

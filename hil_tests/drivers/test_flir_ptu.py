@@ -7,6 +7,7 @@ test_head_contract.py.
 from __future__ import annotations
 
 import itertools
+import json
 import math
 import threading
 import time
@@ -34,7 +35,9 @@ from drivers.errors import (
 from drivers.flir_ptu.head import FlirPtu, open_head
 from drivers.flir_ptu.options import options_from
 from drivers.flir_ptu.replies import LineSplitter, answer_of, hits_of, number_of
+from drivers.flir_ptu.workshop import AxisFacts, facts, home
 from drivers.sim.wire.line import PtyLine
+from mastctl.cli.main import main
 
 ARCSEC = math.pi / 180 / 3600
 PAN_STEP_RAD, TILT_STEP_RAD = 185.142857 * ARCSEC, 46.285714 * ARCSEC
@@ -374,10 +377,60 @@ def test_a_limit_hit_stops_the_head_until_it_is_homed(opened: Opener) -> None:
     with pytest.raises(HardwareFault, match="lost count of its position; home it"):
         head.move(0.1, 0.1)
     assert any("limit switch" in word for word in head.read().faults), "it does not go away by itself"
+    head.close()
     unit.answers["R"] = b"!T!T!P!P*"
-    head.home()
+    home(head._options.port, 9600)
+    assert "R" in unit.heard
+    head = open_head({**OPTIONS, "port": head._options.port})
     assert head.read().faults == ()
     head.move(0.1, 0.1)
+    head.close()
+
+
+def test_an_e46_has_to_be_told_its_resolution(opened: Opener) -> None:
+    unit = ScriptedPtu()
+    unit.answers["V"] = b"* Pan-Tilt Controller v3.2.2(E46-C14/E), (C)2011 FLIR Commercial Systems, Inc."
+    with pytest.raises(WrongDevice, match="an E46, which does not know its gears before it was homed"):
+        opened(unit)
+    right = {
+        "pan": {**OPTIONS["pan"], "resolution_arcsec": 46.2857},
+        "tilt": {**OPTIONS["tilt"], "resolution_arcsec": 46.2857},
+    }
+    with pytest.raises(WrongDevice, match=r"pan position is 185.143 .*resolution_arcsec 46.2857; either"):
+        opened(unit, **right)
+    unit.resolutions["P"], unit.limits["P"] = "46.285714", (-12366, 12366)
+    opened(unit, **right)
+
+
+def test_facts_of_a_unit_are_told_without_moving_it() -> None:
+    unit = ScriptedPtu(verbose=False, echo=False)
+    unit.answers |= {"O": b"* Input 30 VDC @ 86 degF", "WP": b"* Pan in HALF step mode"}
+    with PtyLine(unit, SystemClock(), wire_time=False) as line:
+        found = facts(line.path, 9600)
+    assert (
+        found.version.startswith("Pan-Tilt Controller v2.13.0") and found.supply == "Input 30 VDC @ 86 degF"
+    )
+    assert found.pan == AxisFacts(185.142857, 0, -3090, 3090, 1000, 2902, 2000, "Pan in HALF step mode")
+    assert found.tilt.step_mode == "", "refused by this unit"
+    assert not {"R", "I", "S"} & set(unit.heard)
+
+
+def test_homing_by_command_needs_to_be_meant(capsys: pytest.CaptureFixture[str]) -> None:
+    unit = ScriptedPtu()
+    with PtyLine(unit, SystemClock(), wire_time=False) as line:
+        assert main(["ptu", "home", line.path]) == 2
+        assert "sweeps both axes over their full range" in capsys.readouterr().err
+        assert unit.heard == []
+        unit.positions = {"P": 3, "T": 4}
+        unit.answers["R"] = lambda command: unit.positions.update(P=0, T=0) or b"!T!T!P!P*"
+        assert main(["ptu", "home", line.path, "--sweep-full-range", "--json"]) == 0
+        told = json.loads(capsys.readouterr().out)
+        assert told["pan"]["position"] == 0 and told["tilt"]["resolution_arcsec"] == 46.285714
+        assert main(["ptu", "info", line.path]) == 0
+        assert "resolution arcsec" in capsys.readouterr().out
+    assert main(["ptu", "info", line.path, "--json"]) == 1
+    assert json.loads(capsys.readouterr().out)["error"]["code"] == "line_lost"
+    assert main(["ptu", "info", "/dev/null", "--baud", "1"]) == 2
 
 
 def test_a_limit_hit_before_an_answer_does_not_hide_it(opened: Opener) -> None:
