@@ -27,7 +27,7 @@ class Register:
 
     def to_bytes(self, value: int) -> bytes:
         """Return the bytes on the wire, little end first, as many as the register has."""
-        return (value & (256**self.size - 1)).to_bytes(self.size, "little")
+        return (value & ((1 << 8 * self.size) - 1)).to_bytes(self.size, "little")
 
     def from_bytes(self, data: bytes) -> int:
         """Return the value that bytes of the wire stand for."""
