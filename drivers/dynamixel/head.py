@@ -40,7 +40,7 @@ T = TypeVar("T")
 
 CALL_TIMEOUT_S = 0.8  # the service waits 1 s
 CLOSE_TIMEOUT_S = 2.0
-ATTEMPTS = 3  # of a poll, before it counts as failed
+ATTEMPTS, PATIENCE_S = 3, 0.15  # of a poll, before it counts as failed
 FAILED_POLLS = 2  # in a row, before the servos are set up anew
 FIRST_RETRY_S, LAST_RETRY_S = 0.1, 2.0
 WATCH_S = 0.2  # how often torque and watchdog registers are looked at while all goes well
@@ -259,6 +259,7 @@ class DynamixelHead:
 
     def _poll(self) -> None:
         """Read both servos, repeating what a bad line spoilt; may give the line up. Raises DriverError."""
+        began_s = time.monotonic()
         for attempt in range(1, ATTEMPTS + 1):
             try:
                 self._attempt_poll()
@@ -268,7 +269,7 @@ class DynamixelHead:
             except DriverError as error:
                 self._polled_s = time.monotonic()
                 self._poll_due_s = self._polled_s + 1 / self.settings.poll_hz
-                if attempt < ATTEMPTS:
+                if attempt < ATTEMPTS and self._polled_s - began_s < PATIENCE_S:
                     continue
                 self._failed_polls += 1
                 if self._failed_polls >= FAILED_POLLS:

@@ -21,7 +21,7 @@ from drivers.dynamixel.models import (
 )
 from drivers.dynamixel.motion import Sample, Truth, motion_block
 from drivers.dynamixel.settings import AxisSettings, HeadSettings
-from drivers.errors import DriverError, HardwareFault, NoReply, WrongDevice
+from drivers.errors import DriverError, HardwareFault, NoReply, Refused, WrongDevice
 
 log = logging.getLogger(__name__)
 T = TypeVar("T")
@@ -270,15 +270,25 @@ class Servo:
         """
         settings, model, head = self._settings, self._settings.model, self._head
         torque = bool(self.get("torque_enable"))
-        if self.get("bus_watchdog") != 0:
-            self.set("bus_watchdog", 0)
+        tripped = self.get("bus_watchdog") != 0
         counts = self.check_place()
-        self.set("goal_position", counts)  # nothing else may come between these two
-        self.set(
-            "profile_acceleration",
-            max(1, round(head.acceleration_rad_per_s2 / model.acceleration_unit_rad_per_s2)),
-        )
-        self.set("profile_velocity", velocity_counts(settings, head.speed_rad_per_s))
+        if tripped:
+            self.set("bus_watchdog", 0)  # the servo may now go on to its old goal: void it at once
+        self.set("goal_position", counts)
+        profile = {
+            "profile_acceleration": max(
+                1, round(head.acceleration_rad_per_s2 / model.acceleration_unit_rad_per_s2)
+            ),
+            "profile_velocity": velocity_counts(settings, head.speed_rad_per_s),
+        }
+        for name, value in profile.items():
+            try:
+                self.set(name, value)
+            except Refused as error:
+                raise WrongDevice(
+                    f"{self.name} does not take {value} as its {name}: acceleration_rad_per_s2 or "
+                    f"speed_rad_per_s is more than its own limits allow ({error})"
+                ) from error
         if not torque:
             counts = self.check_place()
             self.set("goal_position", counts)

@@ -15,7 +15,8 @@ Approach = Literal["none", "positive", "negative", "gravity"]
 Rest = Literal["hold", "torque_off"]
 OnHardwareError = Literal["report", "reboot"]
 
-LONGEST_WATCHDOG_S = 0.4  # with the braking after it the head stands within 0.5 s
+STANDS_WITHIN_S = 0.5  # after this process has died: the last poll's age, the watchdog, and braking
+USUAL_WATCHDOG_S, SHORTEST_WATCHDOG_S = 0.3, 0.1
 WATCHDOG_STEP_S = 0.02
 
 
@@ -98,7 +99,8 @@ class HeadSettings:
     speed_rad_per_s, acceleration_rad_per_s2
         Of the profile inside the servos; the speed is also the cap of every move.
     watchdog_s
-        After this silence the servos stop by themselves; 0 switches that off.
+        After this silence the servos stop by themselves; 0 switches that off. Left out: 0.3 s, or as much
+        less as it takes to stand 0.5 s after the last poll, braking included.
     poll_hz
         How often the servos are read when nobody asks.
     reply_timeout_s
@@ -127,8 +129,8 @@ class HeadSettings:
 
     @property
     def watchdog_counts(self) -> int:
-        """The watchdog register's value, 0 for off."""
-        return round(self.watchdog_s / WATCHDOG_STEP_S)
+        """The watchdog register's value, rounded down; 0 for off."""
+        return math.floor(self.watchdog_s / WATCHDOG_STEP_S + 1e-6)
 
 
 def head_settings(options: Mapping[str, Any]) -> HeadSettings:
@@ -150,15 +152,26 @@ def head_settings(options: Mapping[str, Any]) -> HeadSettings:
     pan, tilt = (_axis(f"{name}.", options[name]) for name in ("pan", "tilt"))
     if pan.servo_id == tilt.servo_id:
         raise BadOptions(f"options.pan.id and options.tilt.id are both {pan.servo_id}, expected two ids")
+    poll_hz = read.number("poll_hz", 50.0, 10.0, 500.0)
+    speed = read.number("speed_rad_per_s", 1.0, 0.03, 10.0)
+    acceleration = read.number("acceleration_rad_per_s2", 4.0, 0.4, 1000.0)
+    longest_s = STANDS_WITHIN_S - 1 / poll_hz - speed / acceleration
+    watchdog_s = read.number("watchdog_s", min(USUAL_WATCHDOG_S, longest_s), 0.0, STANDS_WITHIN_S)
+    if watchdog_s and not SHORTEST_WATCHDOG_S <= watchdog_s <= longest_s:
+        raise BadOptions(
+            f"options.watchdog_s is {watchdog_s:.3g} s, and the head brakes from {speed:g} rad/s at "
+            f"{acceleration:g} rad/s2 in {speed / acceleration:.3g} s; expected {SHORTEST_WATCHDOG_S:g} "
+            f"s or more, and {STANDS_WITHIN_S:g} s in all, the last poll's age included; or 0 to do without"
+        )
     return HeadSettings(
         port=port,
         pan=pan,
         tilt=tilt,
         baud=read.whole("baud", 1_000_000, 9600, 10_500_000),
-        speed_rad_per_s=read.number("speed_rad_per_s", 1.0, 0.03, 10.0),
-        acceleration_rad_per_s2=read.number("acceleration_rad_per_s2", 4.0, 0.4, 1000.0),
-        watchdog_s=read.number("watchdog_s", 0.3, 0.0, LONGEST_WATCHDOG_S),
-        poll_hz=read.number("poll_hz", 50.0, 10.0, 500.0),
+        speed_rad_per_s=speed,
+        acceleration_rad_per_s2=acceleration,
+        watchdog_s=watchdog_s,
+        poll_hz=poll_hz,
         reply_timeout_s=read.number("reply_timeout_s", 0.05, 0.002, 1.0),
         settle_s=read.number("settle_s", 0.1, 0.0, 5.0),
         torque_off_at_start=read.flag("torque_off_at_start", False),

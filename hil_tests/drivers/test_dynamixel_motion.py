@@ -228,7 +228,9 @@ def test_options_that_cannot_be_are_refused_in_words(change: dict[str, Any], wor
     [
         ({"port": 7}, "/dev/ttyUSB0"),
         ({"baud": "fast"}, "whole number"),
-        ({"watchdog_s": 0.6}, "from 0 to 0.4"),
+        ({"watchdog_s": 0.6}, "from 0 to 0.5"),
+        ({"watchdog_s": 0.3}, "brakes from 1 rad/s at 4 rad/s2 in 0.25 s"),
+        ({"speed_rad_per_s": 2.0}, "0.5 s in all"),
         ({"poll_hz": 1}, "from 10 to 500"),
         ({"speed_rad_s": 1}, "did you mean 'speed_rad_per_s'"),
         ({"tilt": 3}, "expected a mapping"),
