@@ -15,6 +15,7 @@ from drivers.clock import ManualClock, SystemClock
 from drivers.errors import BadOptions, DriverError
 from drivers.faults import PAN_TILT
 from drivers.interfaces import Reading
+from drivers.open_hardware import DeviceSettings, HardwareSettings, open_hardware
 from drivers.sim.render import Renderer
 from drivers.sim.rover import SimulatedRover, simulation_settings
 from drivers.sim.scene import Scene
@@ -36,11 +37,12 @@ WIRES = {
 @contextmanager
 def wired(rig: Path, head: str) -> Iterator[SimulatedRover]:
     section = {"rover": rig.name, "seed": 5, "head": head, "wire": WIRES[head][0]}
-    device = SimulatedRover(simulation_settings(section, rig.parent), SystemClock())
-    try:
-        yield device
-    finally:
-        device.close()
+    sim = DeviceSettings("sim")
+    settings = HardwareSettings(sim, {"navcam_left": sim}, section, rig.parent)
+    with open_hardware(settings) as hardware:
+        rover = hardware.simulation
+        assert rover is not None and hardware.pan_tilt is rover.pan_tilt and hardware.kind == "simulated"
+        yield rover
 
 
 def until(condition: Callable[[], bool]) -> None:

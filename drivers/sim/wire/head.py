@@ -147,7 +147,9 @@ def _dynamixel(kind: _Wire, head: HeadSettings, axes: tuple[WireAxis, WireAxis],
         "acceleration_rad_per_s2": head.pan.acceleration_rad_per_s2,
     }
     for servo_id, (name, axis) in enumerate((("pan", head.pan), ("tilt", head.tilt)), 1):
-        options[name] = {"id": servo_id, "model": kind.driver_model, **_reach(axis)}
+        # Rebooted by itself, so that a fault that was taken back leaves nothing behind; nothing falls here.
+        options[name] = {"id": servo_id, "model": kind.driver_model, "on_hardware_error": "reboot"}
+        options[name] |= _reach(axis)
     return DynamixelBus(servos), open_head, options
 
 

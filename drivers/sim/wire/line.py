@@ -198,6 +198,7 @@ class _Line:
                     self._arrive(data, self._clock.now_s())
             except Exception:  # a defect of the simulator must show, and not end the line in silence
                 log.exception("the simulated line stumbled")
+                self._clock.sleep(POLL_S)
 
     def _follow(self, now_s: float) -> None:
         """Hang up or come back, poll the device, and carry out what is due."""
