@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from drivers.clock import ManualClock, SystemClock
+from drivers.clock import ManualClock
 from drivers.errors import BadOptions, DriverError
 from drivers.faults import PAN_TILT
 from drivers.interfaces import Reading
