@@ -49,6 +49,10 @@ class Rig:
         One count.
     line
         The simulated line, None in memory.
+    settle_rad
+        How far from its goal a settled head may be, beyond the rounding to counts; nothing when simulated.
+    fastest_rad_per_s
+        Bound of every move's speed, None where it is not known.
     sent
         Pieces that have passed on the line.
     """
@@ -60,11 +64,8 @@ class Rig:
     count_rad: float
     line: PtyLine | TcpLine | None = None
     sent: list[int] = field(default_factory=lambda: [0])
-
-    @property
-    def on_wire(self) -> bool:
-        """Whether bytes go over a line."""
-        return self.line is not None
+    settle_rad: float = 1e-9
+    fastest_rad_per_s: float | None = SPEED_RAD_PER_S
 
 
 @contextmanager
@@ -84,8 +85,11 @@ def in_memory() -> Iterator[Rig]:
 
 
 @contextmanager
-def dynamixel_pty() -> Iterator[Rig]:
-    """Two XM430 servos behind a pseudo terminal."""
+def dynamixel_pty(watchdog_s: float = 0.0, reply_timeout_s: float = 0.2) -> Iterator[Rig]:
+    """Two XM430 servos behind a pseudo terminal.
+
+    By default patient and without a watchdog: on a busy machine simulator and driver both come late.
+    """
     with ExitStack() as stack:
         clock, panel, axes = _axes()
         settings = {"baud_rate": 3, "return_delay_time": 0}  # 1 Mbaud
@@ -100,6 +104,7 @@ def dynamixel_pty() -> Iterator[Rig]:
         options: dict[str, Any] = {
             "port": line.path, "baud": 1_000_000, "pan": ends[0], "tilt": ends[1],
             "speed_rad_per_s": SPEED_RAD_PER_S, "acceleration_rad_per_s2": ACCELERATION_RAD_PER_S2,
+            "watchdog_s": watchdog_s, "reply_timeout_s": reply_timeout_s,
         }  # fmt: skip
         head = open_dynamixel(options, clock)
         stack.callback(head.close)
@@ -152,7 +157,8 @@ def _ptu_rig(
     }
     head = open_flir_ptu(options, clock)
     stack.callback(head.close)
-    return Rig(name, head, panel, _truth(axes), PTU_STEP_RAD, line, sent)
+    fastest = unit.pan.now.fastest * PTU_STEP_RAD  # its own; the options' speed is for moves that name none
+    return Rig(name, head, panel, _truth(axes), PTU_STEP_RAD, line, sent, fastest_rad_per_s=fastest)
 
 
 def _axes() -> tuple[SystemClock, FaultPanel, tuple[WireAxis, WireAxis]]:

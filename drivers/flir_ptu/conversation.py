@@ -22,12 +22,13 @@ from drivers.errors import BadReply, NoReply, Refused
 from drivers.flir_ptu.line import Line
 from drivers.flir_ptu.replies import Answer, LineSplitter, answer_of, hits_of, number_of, without_hits
 
-REPLY_S = 0.15
+REPLY_S = 0.3
 """How long a unit may think before its answer is complete, beyond the time the bytes take on the wire."""
 REPLY_BYTES = 70  # a command, its echo and the longest answer in words
 QUIET_S = 0.06
 LONGEST_DRAIN_S = 0.4
 PATIENT_TRIES = 3
+STEP_TRIES = 2
 
 
 @dataclass(frozen=True)
@@ -215,7 +216,7 @@ class Conversation:
         found = {}
         manners = _Manners()
         for axis, query in RESOLUTION.items():
-            for tries_left in reversed(range(PATIENT_TRIES)):
+            for tries_left in reversed(range(STEP_TRIES)):
                 try:
                     found[axis], manners = self._resolution(axis, query)
                     break

@@ -12,13 +12,23 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from drivers.errors import DriverError, LineLost, NoReply
 from drivers.interfaces import PanTilt, Reading
-from tools.servo_rigs import LIMITS_RAD, RIGS, SPEED_RAD_PER_S, Rig
+from drivers.sim import rover
+from drivers.sim.scene import SceneSettings, build_scene
+from drivers.sim.wire import head as wired_head
+from mastctl.client import Client
+from mastctl.config import load_config
+from mastctl.daemon import RunningDaemon
+from mastctl.experiment.demo import SimulationTruth, demo_config
+from mastctl.experiment.pointing import run_pointing_experiment
+from tools.servo_rigs import LIMITS_RAD, RIGS, Rig
 
 PATIENCE_S = 30.0
 """No driver needs a tenth of this; it only keeps a broken one from hanging the suite on a busy machine."""
@@ -108,16 +118,17 @@ def test_a_move_returns_at_once_and_ends_at_the_nearest_count(rig: Rig) -> None:
         assert under_way.moving
         assert abs(under_way.pan_rad - pan) > 10 * rig.count_rad or abs(pan) < 0.26
         reading = settled(rig)
-        assert abs(reading.pan_rad - pan) <= 0.5 * rig.count_rad + 1e-9, "nearest, not truncated"
-        assert abs(reading.tilt_rad - tilt) <= 0.5 * rig.count_rad + 1e-9
+        assert abs(reading.pan_rad - pan) <= 0.5 * rig.count_rad + rig.settle_rad, "nearest, not truncated"
+        assert abs(reading.tilt_rad - tilt) <= 0.5 * rig.count_rad + rig.settle_rad
         true_pan, true_tilt = rig.true_rad(time.monotonic())
-        assert (true_pan, true_tilt) == pytest.approx((reading.pan_rad, reading.tilt_rad), abs=1e-6)
+        there = pytest.approx((reading.pan_rad, reading.tilt_rad), abs=1e-6 + rig.settle_rad)
+        assert (true_pan, true_tilt) == there
 
 
 def test_goals_halfway_between_counts_go_to_either_never_further(rig: Rig) -> None:
     for counts in (10.4, 10.6, -10.4, -10.6):
         rig.head.move(counts * rig.count_rad, 0.0)
-        assert settled(rig).pan_rad == pytest.approx(round(counts) * rig.count_rad, abs=1e-9)
+        assert settled(rig).pan_rad == pytest.approx(round(counts) * rig.count_rad, abs=rig.settle_rad)
 
 
 def test_under_way_every_reading_is_true_and_times_go_forward(rig: Rig) -> None:
@@ -128,8 +139,8 @@ def test_under_way_every_reading_is_true_and_times_go_forward(rig: Rig) -> None:
         readings.append(true_reading(rig))
         assert readings[-1].time_s > readings[-2].time_s
         if not readings[-1].moving:
-            assert readings[-1].pan_rad == pytest.approx(0.5, abs=rig.count_rad)
-            assert readings[-1].tilt_rad == pytest.approx(-0.4, abs=rig.count_rad)
+            assert readings[-1].pan_rad == pytest.approx(0.5, abs=rig.count_rad + rig.settle_rad)
+            assert readings[-1].tilt_rad == pytest.approx(-0.4, abs=rig.count_rad + rig.settle_rad)
     between = [r for r in readings if 0.05 < r.pan_rad < 0.45]
     assert len(between) > 3, "it was seen on its way"
 
@@ -150,7 +161,7 @@ def test_goals_at_the_limits_are_taken_and_those_beyond_refused(rig: Rig, end: i
     assert rig.true_rad(time.monotonic()) == before
     rig.head.move(*goal)
     reading = settled(rig)
-    assert (reading.pan_rad, reading.tilt_rad) == pytest.approx(goal, abs=rig.count_rad)
+    assert (reading.pan_rad, reading.tilt_rad) == pytest.approx(goal, abs=rig.count_rad + rig.settle_rad)
 
 
 @pytest.mark.parametrize("speed", [0.0, -1.0, math.nan])
@@ -160,20 +171,22 @@ def test_a_speed_that_is_none_is_refused(rig: Rig, speed: float) -> None:
     assert rig.true_rad(time.monotonic()) == (0.0, 0.0)
 
 
-@pytest.mark.parametrize(("asked", "fastest"), [(0.3, 0.3), (50.0, SPEED_RAD_PER_S)])
-def test_no_axis_goes_faster_than_asked_or_than_its_own_bound(rig: Rig, asked: float, fastest: float) -> None:
-    if asked > fastest and rig.name.startswith("PTU"):
-        fastest = 5600 * rig.count_rad  # its own bound; the configuration's speed is for moves without one
+@pytest.mark.parametrize("asked", [0.3, 50.0])
+def test_no_axis_goes_faster_than_asked_or_than_its_own_bound(rig: Rig, asked: float) -> None:
+    if asked > 1.0 and rig.fastest_rad_per_s is None:
+        pytest.skip("the bound of this head's speed is not known")
+    fastest = asked if rig.fastest_rad_per_s is None else min(asked, rig.fastest_rad_per_s)
     rig.head.move(0.3, -0.2, asked)
     began_s = time.monotonic()
     settled(rig)
     ended_s = time.monotonic()
-    times_s = [began_s + (ended_s - began_s) * i / 200 for i in range(201)]
+    times_s = [began_s + (ended_s - began_s) * i / 12 for i in range(13)]
     pans = [rig.true_rad(moment)[0] for moment in times_s]
     step_s = times_s[1] - times_s[0]
+    unsure = 2 * (rig.count_rad + rig.settle_rad) / step_s
     rates = [abs(b - a) / step_s for a, b in itertools.pairwise(pans)]
-    assert max(rates) <= fastest * 1.02
-    assert max(rates) >= fastest * 0.5, "nor much slower"
+    assert max(rates) <= fastest * 1.02 + unsure
+    assert max(rates) >= min(fastest, 1.0) * 0.3, "nor much slower"
 
 
 def test_a_new_goal_replaces_the_old_one(rig: Rig) -> None:
@@ -189,9 +202,11 @@ def test_a_new_goal_replaces_the_old_one(rig: Rig) -> None:
         return not reading.moving
 
     eventually("settling", turned_round)
-    assert furthest < 0.6
+    assert furthest < 0.85
     reading = rig.head.read()
-    assert (reading.pan_rad, reading.tilt_rad) == pytest.approx((-0.2, -0.3), abs=rig.count_rad)
+    assert (reading.pan_rad, reading.tilt_rad) == pytest.approx(
+        (-0.2, -0.3), abs=rig.count_rad + rig.settle_rad
+    )
 
 
 def test_stop_brakes_and_holds(rig: Rig) -> None:
@@ -199,14 +214,14 @@ def test_stop_brakes_and_holds(rig: Rig) -> None:
     eventually("motion", lambda: rig.head.read().pan_rad > 0.1)
     rig.head.stop()
     reading = settled(rig)
-    assert reading.pan_rad < 0.6
+    assert reading.pan_rad < 0.85
     held = rig.true_rad(time.monotonic())
     for _ in range(20):
         true_reading(rig)
         time.sleep(0.005)
-    assert rig.true_rad(time.monotonic()) == pytest.approx(held, abs=rig.count_rad)
+    assert rig.true_rad(time.monotonic()) == pytest.approx(held, abs=rig.count_rad + rig.settle_rad)
     rig.head.move(0.0, 0.0)
-    assert settled(rig).pan_rad == pytest.approx(0.0, abs=rig.count_rad)
+    assert settled(rig).pan_rad == pytest.approx(0.0, abs=rig.count_rad + rig.settle_rad)
 
 
 def test_what_is_measured_is_told_not_what_was_commanded(rig: Rig) -> None:
@@ -252,8 +267,8 @@ def test_a_silent_device_is_an_error_and_comes_back_without_moving(rig: Rig) -> 
     rig.panel.clear()
     works_again(rig)
     reading = settled(rig)
-    assert (reading.pan_rad, reading.tilt_rad) == pytest.approx(held, abs=rig.count_rad)
-    assert rig.true_rad(time.monotonic()) == pytest.approx(held, abs=rig.count_rad)
+    assert (reading.pan_rad, reading.tilt_rad) == pytest.approx(held, abs=rig.count_rad + rig.settle_rad)
+    assert rig.true_rad(time.monotonic()) == pytest.approx(held, abs=rig.count_rad + rig.settle_rad)
     for _ in range(10):  # and goes on as before
         try:
             rig.head.stop()  # deliberate where a watchdog has stopped the head
@@ -261,7 +276,7 @@ def test_a_silent_device_is_an_error_and_comes_back_without_moving(rig: Rig) -> 
             break
         except DriverError:
             time.sleep(0.05)
-    assert settled(rig).pan_rad == pytest.approx(0.0, abs=rig.count_rad)
+    assert settled(rig).pan_rad == pytest.approx(0.0, abs=rig.count_rad + rig.settle_rad)
 
 
 def test_a_pulled_plug_is_an_error_and_the_head_comes_back_by_itself(wired: Rig) -> None:
@@ -347,7 +362,7 @@ def test_calls_from_many_threads_at_once_are_all_answered(rig: Rig) -> None:
     for thread in threads:
         thread.join(PATIENCE_S)
     assert not errors
-    assert settled(rig).pan_rad == pytest.approx(0.4, abs=rig.count_rad)
+    assert settled(rig).pan_rad == pytest.approx(0.4, abs=rig.count_rad + rig.settle_rad)
 
 
 @pytest.mark.parametrize("name", list(RIGS))
@@ -377,3 +392,38 @@ def test_close_of_a_head_that_is_gone_does_not_raise(wired: Rig) -> None:
 def _stands(rig: Rig) -> bool:
     now_s = time.monotonic()
     return rig.true_rad(now_s) == rig.true_rad(now_s - 0.05)
+
+
+@pytest.mark.parametrize(
+    ("wire", "head", "worst_px"),
+    [
+        (None, "ptu_d46_70", 1.5),
+        ("flir_ptu", "ptu_d46_70", 1.5),
+        ("dynamixel", "dynamixel_x", 6.0),
+    ],
+)
+def test_the_demos_pointing_loop_lands_with_every_head(
+    wire: str | None, head: str, worst_px: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # A count of the X is 2 px and its backlash 5.6 px of the navcam; the PTU's steps are 0.07 px.
+    monkeypatch.setattr(rover, "build_scene", lambda settings: build_scene(SceneSettings(seed=1, rocks=4)))
+    make = wired_head._dynamixel
+
+    def without_watchdog(*arguments: Any) -> Any:  # renderer and driver share one busy process here
+        device, open_head, options = make(*arguments)
+        return device, open_head, {**options, "watchdog_s": 0.0}
+
+    monkeypatch.setattr(wired_head, "_dynamixel", without_watchdog)
+    config = demo_config(load_config(None), head=head, seed=1)
+    simulation = {**config.hardware.simulation, "samples": 1} | ({"wire": wire} if wire else {})
+    cameras = {n: c for n, c in config.hardware.cameras.items() if n.startswith("navcam")}
+    hardware = replace(config.hardware, simulation=simulation, cameras=cameras)
+    with RunningDaemon(replace(config, hardware=hardware)) as daemon, Client(daemon.url) as client:
+        simulated = daemon.hardware.simulation
+        assert simulated is not None
+        found = run_pointing_experiment(
+            client, targets=1, distances_m=(6.0,), seed=1, truth=SimulationTruth(simulated)
+        )
+    assert [record.error for record in found.records] == [""]
+    worst = found.summaries[0].true_second_rms_px
+    assert worst is not None and max(worst) < worst_px, worst
