@@ -21,7 +21,7 @@ from drivers.clock import Clock, SystemClock
 from drivers.dynamixel.bus import Bus
 from drivers.dynamixel.link import GroupAnswer, Link, Part
 from drivers.dynamixel.models import Register
-from drivers.dynamixel.motion import AxisMotion, AxisReport, Sample, Truth, motion_block
+from drivers.dynamixel.motion import AxisMotion, Sample, Truth, motion_block
 from drivers.dynamixel.servo import WATCHDOG_TRIPPED, Servo, hardware_fault_words, velocity_counts
 from drivers.dynamixel.settings import AxisSettings, HeadSettings, head_settings
 from drivers.errors import (
@@ -33,7 +33,7 @@ from drivers.errors import (
     OutOfRange,
     WatchdogTripped,
 )
-from drivers.interfaces import Reading
+from drivers.interfaces import AxisReport, Reading, Reporting
 
 log = logging.getLogger(__name__)
 T = TypeVar("T")
@@ -62,7 +62,7 @@ def open_head(options: Mapping[str, Any], clock: Clock | None = None) -> Dynamix
     return DynamixelHead(head_settings(options), clock)
 
 
-class DynamixelHead:
+class DynamixelHead(Reporting):
     """The head; every method may be called from any thread.
 
     Parameters
