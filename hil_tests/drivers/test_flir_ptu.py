@@ -9,16 +9,19 @@ from __future__ import annotations
 import itertools
 import json
 import math
+import socket
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scripted_ptu import ScriptedPtu
+from serial import rfc2217
 
 from drivers.clock import SystemClock
 from drivers.errors import (
@@ -523,6 +526,54 @@ def test_a_stop_does_not_wait_for_a_call_under_way(opened: Opener) -> None:
     thread.join()
     assert unit.heard[before] == "H", "it went out beside the reading"
     assert unit.heard[-1] == "H", "and once more in order"
+
+
+def serve_rfc2217(listener: socket.socket, unit: ScriptedPtu) -> None:
+    """A serial server with a unit behind it, by pyserial's own server side, for one client."""
+    connection, _ = listener.accept()
+    lines = {"cts": True, "dsr": True, "ri": False, "cd": True, "rts": True, "dtr": True}
+    settings = {
+        "baudrate": 9600,
+        "bytesize": 8,
+        "parity": "N",
+        "stopbits": 1,
+        "xonxoff": False,
+        "rtscts": False,
+    }
+    port = SimpleNamespace(
+        **lines, **settings, break_condition=False,
+        reset_input_buffer=lambda: None, reset_output_buffer=lambda: None,
+    )  # fmt: skip
+    manager = rfc2217.PortManager(port, SimpleNamespace(write=connection.sendall))
+    with connection, suppress(OSError):
+        while data := connection.recv(4096):
+            heard = b"".join(manager.filter(data))
+            for reply in unit.receive(heard, 0.0):
+                connection.sendall(b"".join(manager.escape(reply.data)))
+
+
+def test_a_serial_server_by_rfc2217_serves_as_well() -> None:
+    unit = ScriptedPtu()
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        server = threading.Thread(target=serve_rfc2217, args=(listener, unit), daemon=True)
+        server.start()
+        head = open_head({**OPTIONS, "port": f"rfc2217://127.0.0.1:{listener.getsockname()[1]}"})
+        head.move(0.5, 0.2)
+        assert settled(head)[0] == pytest.approx(0.5, abs=PAN_STEP_RAD / 2)
+        head.close()
+        server.join(10)
+        assert not server.is_alive()
+        assert unit.heard[-1] == "H"
+
+
+@pytest.mark.parametrize("scheme", ["socket", "rfc2217"])
+def test_a_host_that_does_not_listen_is_a_lost_line(scheme: str) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        port = listener.getsockname()[1]
+    with pytest.raises(LineLost, match="cannot be opened"):
+        open_head({**OPTIONS, "port": f"{scheme}://127.0.0.1:{port}"})
+    with pytest.raises(LineLost, match="cannot be opened"):
+        open_head({**OPTIONS, "port": f"{scheme}://127.0.0.1"})
 
 
 def test_two_programs_cannot_have_the_same_line(opened: Opener) -> None:
