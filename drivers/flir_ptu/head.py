@@ -6,8 +6,10 @@ for the service's soft limits and not for the decision what to do about a fault:
 - Both axes start together: the goals are sent in slaved mode (``S``) and begin with ``I``. Each step is
   confirmed by the unit's echo, so a goal that was garbled on the way never starts. ``A`` is not used, since
   it holds back every answer until the motion is over.
-- A position counts only if it can be true after the last one; if not, the unit is asked again, and two
-  answers have to agree. So a damaged digit, which the protocol cannot detect, does no harm to a head at rest.
+- The protocol cannot detect a damaged digit. So a position is taken at once only where the axis rests by
+  all that is known. Otherwise the unit is asked three times, and the middle answer is taken if it lies
+  between the other two, and these no further apart than the axis can go meanwhile: with one of them damaged,
+  what is taken still is where the axis was during the call.
 - After a limit hit (``!P``, ``!T``) or when a position has changed while the line was down, the unit has lost
   count. Then it is read but not moved until it was homed (``mastctl ptu home``), which sweeps the full range
   and which this driver never does, and opened anew.
@@ -42,7 +44,7 @@ from drivers.interfaces import Reading
 
 log = logging.getLogger(__name__)
 
-ASKED_AGAIN = 4  # questions for one position, until two answers agree
+ASKED_AT_MOST = 7  # questions for one position
 SILENT_CALLS = 5  # calls without an answer, after which the line is opened anew
 FIRST_BACK_OFF_S, LONGEST_BACK_OFF_S = 0.1, 2.0
 STOP_PATIENCE_S = 0.02  # how long a stop waits for a call that is under way before it goes out beside it
@@ -334,18 +336,18 @@ class FlirPtu:
             axis.speed = speed
 
     def _measure(self, talk: Conversation, axis: Axis) -> Seen:
-        """Ask for a position until it can be true: after the last one, or because two answers agree."""
+        """Ask for a position until it can be taken: the one where the axis rests, or the middle of three."""
         asked: list[Seen] = []
-        while len(asked) < ASKED_AGAIN:
+        while len(asked) < ASKED_AT_MOST:
             before_s = self._clock.now_s()
             number = talk.ask(ask.POSITION[axis.name])
             # The unit looks when the question is there; its answer takes ten times as long on the wire.
             took_s = min((self._clock.now_s() - before_s) / 2, 4 * self._byte_s)
-            seen = Seen(round(number), before_s + took_s)
-            if axis.expects(seen) or (asked and axis.agree(asked[-1], seen)):
+            asked.append(Seen(round(number), before_s + took_s))
+            if axis.rests_at(asked[-1]) or (len(asked) >= 3 and axis.confirms(*asked[-3:])):
+                seen = asked[-1] if axis.rests_at(asked[-1]) else asked[-2]
                 axis.take(seen)
                 return seen
-            asked.append(seen)
         words = ", ".join(str(seen.position) for seen in asked)
         raise BadReply(f"gives {axis.name} positions that contradict each other: {words}", device=DEVICE)
 
