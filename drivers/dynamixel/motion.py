@@ -199,6 +199,13 @@ class AxisMotion:
         in_position = self._arrived(sample) or not self.holds
         return in_position and now_s - self._rest[1] >= self._settle_s
 
+    def at_goal(self) -> bool:
+        """Whether nothing is under way: it stands at its last goal, or holds nothing."""
+        sample = self._sample
+        if sample is None or self._legs or self._speed(sample) > 1:
+            return False
+        return self._arrived(sample) or not self.holds
+
     def stuck_words(self, now_s: float) -> str:
         """Say that the axis stands away from its goal; empty if it does not."""
         sample = self._sample
