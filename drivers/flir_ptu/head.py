@@ -262,11 +262,14 @@ class FlirPtu:
             talk.close()
 
     def _come_into_step(self, talk: Conversation) -> None:
-        """Go on after an error; a unit that has another resolution now was reset, and is checked anew."""
+        """Go on after an error; a unit that was reset or restarted meanwhile is checked anew."""
         resolutions = talk.in_step()
-        if any(axis.resolution_arcsec != resolutions[name] for name, axis in self._axes.items()):
-            log.warning("%s: the resolution has changed; the unit was reset or set to other steps", DEVICE)
-            self._check(talk, resolutions)
+        pan = self._axes["pan"]
+        changed = any(axis.resolution_arcsec != resolutions[name] for name, axis in self._axes.items())
+        if changed or (pan.speed is not None and round(talk.ask(ask.SPEED["pan"])) != pan.speed):
+            log.warning("%s: resolution or speed are not as they were; it was reset or restarted", DEVICE)
+            with talk.patient():
+                self._check(talk, resolutions)
 
     # The unit
 

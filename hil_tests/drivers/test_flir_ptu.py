@@ -486,6 +486,21 @@ def test_a_unit_that_lost_count_while_the_line_was_down_is_not_moved(opened: Ope
             head.move(0.1, 0.1)
 
 
+def test_a_power_cycle_behind_an_open_line_is_noticed(opened: Opener) -> None:
+    head, unit = opened(speed_rad_per_s=0.5)
+    head.move(0.5, 0.2)
+    settled(head)
+    unit.answers["PP"] = lambda command: None  # power gone for a moment; it comes back as it was delivered
+    with pytest.raises(NoReply):
+        head.read()
+    del unit.answers["PP"]
+    unit.positions, unit.speeds = {"P": 0, "T": 0}, {"P": 1000, "T": 1000}
+    unit.heard.clear()
+    words = head.read().faults
+    assert [word.split()[0] for word in words] == ["pan", "tilt"] and "home it" in words[0]
+    assert {"LU", "H"} <= set(unit.heard) and unit.positions == {"P": 0, "T": 0}
+
+
 def test_another_unit_on_the_line_is_refused(opened: Opener) -> None:
     with ExitStack() as stack:
         unit = ScriptedPtu()
