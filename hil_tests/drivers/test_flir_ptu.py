@@ -97,6 +97,7 @@ def settled(head: FlirPtu) -> tuple[float, float]:
         (b"!T!T!P!P*", True, "", False),
         (b"!P PP * 22", True, "22", True),
         (b"PP !T* 22", True, "22", True),
+        (b"!PPP * 22", True, "22", True),
         (b"! Illegal Command Entered", False, "Illegal Command Entered", False),
     ],
 )
@@ -143,6 +144,7 @@ def test_a_terse_number_stands_alone() -> None:
 def test_limit_hits_are_found_and_errors_are_none() -> None:
     assert hits_of(b"!T!T!P!P*") == ("tilt", "tilt", "pan", "pan")
     assert hits_of(b"!P* 22") == ("pan",)
+    assert hits_of(b"!PPP * 22") == ("pan",)
     assert hits_of(b"! Pan speed cannot exceed 600 pos/sec") == ()
     assert hits_of(b"!Pan") == ()
 
