@@ -170,11 +170,13 @@ def test_no_bytes_whatever_break_the_parser_and_pieces_do_not_matter(data: bytes
 @pytest.mark.parametrize("verbose", [True, False])
 @pytest.mark.parametrize("echo", [True, False])
 @pytest.mark.parametrize("obeys", [True, False])
-@pytest.mark.parametrize(("start", "end"), [(b"", b"\r"), (b"\n", b"\r\n")])
+@pytest.mark.parametrize(
+    ("start", "end", "e_series"), [(b"", b"\r", False), (b"\n", b"\r\n", False), (b"\n", b"\r\n", True)]
+)
 def test_every_way_of_answering_gives_the_same_head(
-    opened: Opener, verbose: bool, echo: bool, obeys: bool, start: bytes, end: bytes
+    opened: Opener, verbose: bool, echo: bool, obeys: bool, start: bytes, end: bytes, e_series: bool
 ) -> None:
-    unit = ScriptedPtu(verbose=verbose, echo=echo, obeys=obeys, start=start, end=end)
+    unit = ScriptedPtu(verbose=verbose, echo=echo, obeys=obeys, start=start, end=end, e_series=e_series)
     unit.positions = {"P": 100, "T": -40}
     head, _ = opened(unit)
     reading = head.read()
