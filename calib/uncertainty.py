@@ -10,7 +10,6 @@ import numpy as np
 from scipy.optimize import approx_fprime
 
 from calib.adjustment import Adjustment
-from calib.cahvor import CameraModel
 from calib.calibration import Calibration, Degenerate
 from calib.camera_parameters import parameter_part, predict, stepped, tangents
 from calib.errors import CalibError
@@ -169,8 +168,8 @@ def moved_rig(calibration: Calibration, columns: np.ndarray, step: FloatArray) -
     cameras = {}
     for name, camera in rig.cameras.items():
         part = calibration.part(f"cameras.{name}.")
-        model: CameraModel = stepped(camera.model, whole[part]) if len(part) else camera.model
-        cameras[name] = replace(camera, model=model)
+        moves = whole[part].any()
+        cameras[name] = replace(camera, model=stepped(camera.model, whole[part])) if moves else camera
     return replace(rig, mast=mast_of(numbers), cameras=cameras)
 
 
