@@ -73,7 +73,7 @@ def moved_rig(rig: Rig, names: Sequence[str], step: FloatArray) -> Rig:
     cameras = dict(rig.cameras)
     for name, camera in rig.cameras.items():
         mine = [f"cameras.{name}.{part}" for part in parameter_names(camera.model.kind)]
-        if any(part in at for part in mine):
+        if any(at.get(part, 0.0) for part in mine):
             model = stepped(camera.model, np.array([at.get(part, 0.0) for part in mine]))
             cameras[name] = replace(camera, model=model)
     return replace(rig, mast=mast_of(numbers), cameras=cameras)

@@ -16,7 +16,7 @@ from calib.formats.strict import Section, nearest
 from calib.formats.yaml_text import MAX_BYTES, kind_of, parse_mapping
 from calib.rigid import FloatArray
 from calib.store import CAMERA_NAME, read_stereo
-from calib.survey.picture_size import picture_size_px
+from calib.survey.picture_file import picture_size_px
 from calib.survey.records import (
     Board,
     Click,

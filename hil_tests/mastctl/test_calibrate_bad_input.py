@@ -458,15 +458,30 @@ def test_two_boards_mixed_up_are_named(
 # Pictures that cannot be used
 
 
-@pytest.mark.parametrize("data", [b"", b"no picture", b"\x89PNG\r\n\x1a\n" + bytes(100)])
+PNG = cv2.imencode(".png", np.random.default_rng(1).integers(0, 255, (768, 1024), np.uint8))[1].tobytes()
+
+
+@pytest.mark.parametrize(
+    ("data", "why"),
+    [
+        (b"", ""),
+        (b"no picture", ""),
+        (b"\x89PNG\r\n\x1a\n" + bytes(100), ": a part of it is damaged"),
+        (PNG[: len(PNG) // 2], ": it is cut short"),
+        (PNG[:-8], ": it is cut short"),
+        (PNG[:9999] + b"!" + PNG[10000:], ": a part of it is damaged"),
+    ],
+    ids=["empty", "no picture", "zeros", "half", "no end", "one byte"],
+)
 def test_a_picture_that_cannot_be_read_is_named_with_the_reason(
-    folder: Path, capsys: pytest.CaptureFixture[str], data: bytes
+    folder: Path, capfd: pytest.CaptureFixture[str], data: bytes, why: str
 ) -> None:
     with_picture(data)(folder)
     survey = read_survey(folder)
     with ThreadPoolExecutor(1) as executor:
         found, undetected = with_dots(survey, None, executor)
-    assert undetected == (("navcam_left-001", "one.png is not a picture that can be read"),)
+    assert capfd.readouterr().err == "", "nothing but the reason is told"
+    assert undetected == (("navcam_left-001", f"one.png is not a picture that can be read{why}"),)
     assert len(found.dots) == len(survey.images) - 1
 
 

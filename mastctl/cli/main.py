@@ -152,3 +152,7 @@ def _check_command(words: Sequence[str]) -> None:
     near = get_close_matches(wanted, known, n=1)
     hint = f"did you mean '{near[0]}'?" if near else f"known are {', '.join(known)}"
     raise output.WrongUse(f"no command '{wanted}'; {hint}")
+
+
+if __name__ == "__main__":
+    sys.exit(main())
