@@ -52,18 +52,18 @@ class TrackSettings:
     worst_chi2
         Of the innovation, four pixel coordinates against the prior: 1 in 1000 good looks with both eyes is
         above 18.5.
-    renew_scale, renew_turn_rad
-        The key picture is renewed when the target is seen this much larger (or a third as large), or from a
-        direction that differs by more.
+    renew_grown, renew_shrunk
+        The key picture is renewed when the target's surface is seen this much larger, slant included, or
+        smaller. Seen flat, a step nearer shows much that the key picture did not.
     """
 
     sigmas: float = 3.5
     least_px: float = 4.0
-    most_px: float = 80.0
+    most_px: float = 120.0
     model_px: float = 0.3
     worst_chi2: float = 18.5
-    renew_scale: float = 1.3
-    renew_turn_rad: float = 0.12
+    renew_grown: float = 1.2
+    renew_shrunk: float = 0.3
 
 
 @dataclass(frozen=True, eq=False)
@@ -239,7 +239,7 @@ def seen_by(
         )
         return replace(_lost(track, found, words), chi2=chi2)
     after = Track("tracked", position, covariance, replace(track.key, eye=key.eye))
-    renewed = _renewed(after, eyes, good, settings, sizes)
+    renewed = _renewed(after, eyes, good, settings)
     return Look(replace(after, key=renewed or after.key), found, "", chi2, renewed is not None)
 
 
@@ -298,42 +298,41 @@ def _renewed(
     eyes: Mapping[str, Eye],
     good: Mapping[str, Match],
     settings: TrackSettings,
-    sizes: MatchSettings,
 ) -> Key | None:
     """A new key from this look, where scale or view have changed enough and both eyes saw it."""
     if len(good) < 2:
         return None
     first, second = list(eyes)[:2]
     camera = eyes[first].camera
-    before = track.position_m - track.key.eye.camera.C
-    now = track.position_m - camera.C
-    scale = _pixels_per_metre(camera, track.position_m) / _pixels_per_metre(
-        track.key.eye.camera, track.position_m
-    )
-    cosine = float(before @ now) / float(np.linalg.norm(before) * np.linalg.norm(now))
-    turned = math.acos(max(-1.0, min(1.0, cosine)))
-    if 1 / 3 < scale < settings.renew_scale and turned < settings.renew_turn_rad:
+    scale = _pixels_per_metre(camera, track) / _pixels_per_metre(track.key.eye.camera, track)
+    if settings.renew_shrunk < scale < settings.renew_grown:
         return None
     pixel = good[first].pixel_px
+    return Key(eyes[first], pixel, _slope(eyes[first], eyes[second], pixel, good[second], track.key.normal))
+
+
+def _slope(left: Eye, right: Eye, left_px: FloatArray, right_match: Match, before: FloatArray) -> FloatArray:
+    """The surface's normal (3,) as the pair sees it now; as it was believed ``before`` where stereo fails."""
     try:
-        partner = find_partner(
-            eyes[first].image, camera, pixel, eyes[second].image, eyes[second].camera, settings=sizes
-        )
+        found = find_partner(left.image, left.camera, left_px, right.image, right.camera)
     except NoStereoPoint:
-        return None
-    if partner.match.verdict != "good" or partner.plane is None:
-        return None
-    if np.linalg.norm(partner.match.pixel_px - good[second].pixel_px) > 1.0:
-        return None
-    return Key(eyes[first], pixel, partner.plane.normal)
+        return before
+    if found.match.verdict != "good" or found.plane is None:
+        return before
+    apart = np.linalg.norm(found.match.pixel_px - right_match.pixel_px)
+    return found.plane.normal if apart <= 1.0 else before
 
 
-def _pixels_per_metre(camera: CameraModel, position_m: FloatArray) -> float:
-    """How large a thing at a position is seen: the geometric mean of the two rates across the ray."""
-    _, rate, valid = camera.project_jacobian(position_m)
-    if not bool(valid):
-        return math.nan
-    return math.sqrt(math.sqrt(max(float(np.linalg.det(rate @ rate.T)), 1e-30)))
+def _pixels_per_metre(camera: CameraModel, track: Track) -> float:
+    """How large a camera sees the target's surface: the root of pixels² a m² of it, slant included."""
+    _, rate, valid = camera.project_jacobian(track.position_m)
+    normal = track.key.normal
+    first = np.cross(normal, np.eye(3)[int(np.argmin(np.abs(normal)))])
+    first /= np.linalg.norm(first)
+    area = (
+        np.linalg.det(rate @ np.stack([first, np.cross(normal, first)], axis=1)) if bool(valid) else math.nan
+    )
+    return math.sqrt(abs(float(area)))
 
 
 def _lost(track: Track, found: Mapping[str, Match], reason: str) -> Look:
