@@ -60,7 +60,7 @@ def run(args: argparse.Namespace) -> int:
 
     survey = read_survey(args.survey)
     try:
-        checked(survey)
+        checked(survey, args.method)
     except SurveyRefused as refusal:
         for finding in refusal.findings[1:]:
             output.tell(str(finding))  # the first is told last, as the reason
@@ -69,7 +69,7 @@ def run(args: argparse.Namespace) -> int:
     _check_report(args.report)
     in_use = _in_use(args)
     survey, undetected = _with_dots(args, survey)
-    warnings = checked(survey)  # once more, with the dots that were found
+    warnings = checked(survey, args.method)  # once more, with the dots that were found
     for warning in warnings:
         output.tell(f"warning: {warning}")
     with _waiting(args, f"fitting {len(survey.images)} images ({args.method})"):
