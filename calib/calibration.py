@@ -11,6 +11,13 @@ import numpy as np
 from calib.mast import Rig
 from calib.rigid import FloatArray, Rigid
 
+HELD_FIXED = (
+    "R0 of every camera is held at 0: whatever it does, A, H and V do as well",
+    "an offset of pan is no parameter: it is the mast's rotation z",
+    "an offset of tilt is no parameter: it turns all head cameras together, which their own axes do as well",
+)
+"""What no survey of any kind can tell from other parameters, and which of them stands for it."""
+
 
 @dataclass(frozen=True, eq=False)
 class Outlier:

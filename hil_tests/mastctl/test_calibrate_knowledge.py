@@ -15,7 +15,7 @@ from survey_world import edit_yaml, navcam_survey, write_folder
 from calib.cahvor import CameraModel
 from calib.mast import Rig
 from calib.store import load_rig
-from calib.survey import Dots, Sigma, Survey
+from calib.survey import Dots, Sigma, Survey, SurveyImage
 from drivers.sim.survey import Ring, SurveyPlan, simulate_survey
 from drivers.sim.survey_plan import rover_from_head
 from mastctl.cli.main import main
@@ -123,6 +123,39 @@ def test_a_joint_that_stands_still_is_named_with_what_it_leaves_open(
         assert f"over the range of {joint} that will be used" in direction["sentence"]
         assert direction["sentence"] in page
     assert any(f"{joint} goes from" in warning for warning in told["warnings"])
+
+
+@pytest.mark.parametrize("method", ["joint", "paper"])
+@pytest.mark.parametrize("joint", ["pan", "tilt"])
+def test_an_offset_of_a_joint_is_absorbed_as_it_is_told(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], joint: str, method: str
+) -> None:
+    survey, _ = navcam_survey(1)
+    write_folder(survey, tmp_path / "s")
+    plain = calibrate(capsys, tmp_path, "--method", method)
+    rig = load_rig(tmp_path / "m.yaml").rig
+    assert any(f"an offset of {joint} is no parameter" in sentence for sentence in plain["held_fixed"])
+    turned_by = {"pan_rad": 0.02, "tilt_rad": 0.0} if joint == "pan" else {"pan_rad": 0.0, "tilt_rad": 0.02}
+
+    def read(image: SurveyImage) -> SurveyImage:
+        assert image.pan_rad is not None and image.tilt_rad is not None
+        return replace(image, **{key: getattr(image, key) + by for key, by in turned_by.items()})
+
+    (tmp_path / "off").mkdir()
+    write_folder(replace(survey, images=tuple(map(read, survey.images))), tmp_path / "off" / "s")
+    offset = calibrate(capsys, tmp_path / "off", "--method", method)
+    other = load_rig(tmp_path / "off" / "m.yaml").rig
+    assert offset["chi2"] == pytest.approx(plain["chi2"], rel=1e-6)
+    if joint == "pan":
+        moved = other.mast.rotation_rad - rig.mast.rotation_rad
+        np.testing.assert_allclose(moved, [0.0, 0.0, -0.02], atol=1e-6)
+    for name in rig.cameras:
+        # Same joint, same camera, though its reading is another.
+        here = rig.camera_in_rover(name, 0.3, -0.4)
+        there = other.camera_in_rover(name, 0.3 + turned_by["pan_rad"], -0.4 + turned_by["tilt_rad"])
+        rays = here.ray(np.array([[100.0, 100.0], [900.0, 300.0], [500.0, 700.0]]))
+        points = rays.origins_m + 5.0 * rays.directions
+        np.testing.assert_allclose(there.project(points)[0], here.project(points)[0], atol=1e-3)
 
 
 def test_the_papers_method_is_warned_of_camera_images_at_one_distance(

@@ -13,6 +13,7 @@ from calib.calibration import Calibration
 from calib.errors import CalibError
 from calib.survey import Survey
 from calib.uncertainty import pointing_covariance
+from mastctl.calibration.exchanged import exchanged_boards
 from mastctl.calibration.expected import RARELY, check_sizes
 
 Grade = Literal["good", "care", "bad"]
@@ -96,6 +97,7 @@ def judge(
         *_turned(calibration),
         *_pointing(calibration),
         *_left_out(calibration),
+        *(Reason("care", sentence) for sentence in exchanged_boards(survey, calibration)),
     ]
     if undetected:
         reasons.append(Reason("care", f"no dots were found in {len(undetected)} images: {_some(undetected)}"))

@@ -190,6 +190,7 @@ def _report(args: argparse.Namespace, done: Calibrated, in_use: StoredRig | None
 
 def _document(done: Calibrated, in_use: StoredRig | None, page: Path | None) -> dict[str, Any]:
     """The contract's keys, and what else a program may want."""
+    from calib.calibration import HELD_FIXED
     from mastctl.calibration.mast_file import as_lists, mast_keys, plain
     from mastctl.calibration.report import change_summary
 
@@ -218,6 +219,7 @@ def _document(done: Calibrated, in_use: StoredRig | None, page: Path | None) -> 
             for o in fit.outliers
         ],
         "degenerate": [{"parameters": list(d.parameters), "sentence": d.sentence} for d in fit.degenerate],
+        "held_fixed": list(HELD_FIXED),
         "warnings": list(done.warnings),
         "undetected": [{"image": name, "reason": reason} for name, reason in done.undetected],
         "notes": list(fit.notes),
