@@ -33,7 +33,8 @@ class Outlier:
     statistic, limit
         Sum of squares of its standardised residuals, and what it may be at the stated rate of false alarms.
     size
-        How far off it is: pixels (rms over an image) or metres.
+        How far off it is: pixels (rms over an image) or metres. Not-a-number for an image whose board,
+        as it is named, the camera cannot see.
     """
 
     kind: Literal["dot", "image", "tape", "prism"]
@@ -45,6 +46,8 @@ class Outlier:
     @property
     def sentence(self) -> str:
         """The outlier in words."""
+        if not np.isfinite(self.size):
+            return f"{self.name} cannot show the board that it names and was not used"
         off = f"{self.size:.2f} px" if self.kind in ("dot", "image") else f"{1000 * self.size:.1f} mm"
         return f"{self.name} is off by {off} and was not used"
 
@@ -118,7 +121,8 @@ class Calibration:
     rms_px
         Camera to (x, y) rms of the fitted images' dots, pixels.
     check_rms_px
-        Camera to (x, y) rms of the check images' dots and clicks, which were not fitted.
+        Camera to (x, y) rms of the check images' dots and clicks, which were not fitted; without images whose
+        board, as it is named, the camera cannot see.
     outliers
         What was left out.
     false_alarms

@@ -33,6 +33,8 @@ Cells = dict[str, str]
 IMAGE = "navcam_left-021"
 """An image for the mast, at placement mast-3."""
 
+CHECK = "navcam_left-033"
+
 
 @pytest.fixture(scope="module")
 def good(tmp_path_factory: pytest.TempPathFactory) -> Path:
@@ -452,7 +454,36 @@ def test_two_boards_mixed_up_are_named(
     survey = navcam_survey(1)[0]
     wrong = {f"image {image.name}" for image in survey.images if image.placement in boards}
     folder = written(with_swapped_boards(survey, "level", *boards), tmp_path)
-    assert set(outliers(folder, capsys, "--method", method)) == wrong
+    code, told = calibrate(capsys, folder, "--method", method)
+    assert code == 0, told
+    assert {outlier["name"] for outlier in told["outliers"]} == wrong
+    reasons = " | ".join(reason["sentence"] for reason in told["verdict"]["reasons"])
+    assert (
+        f"the boards of placements {boards[0]} and {boards[1]} (set-up level) seem to be exchanged" in reasons
+    )
+
+
+@pytest.mark.parametrize(
+    ("image", "own", "other"),
+    [
+        (IMAGE, "mast-3", "mast-4"),
+        (IMAGE, "mast-3", "mast-5"),  # behind the camera: it has no pixels at all
+        ("navcam_right-006", "navcam-3m-3", "mast-8"),
+        (CHECK, "check-1", "mast-2"),
+        (CHECK, "check-1", "mast-8"),
+    ],
+)
+@pytest.mark.parametrize("method", ["joint", "paper"])
+def test_an_image_with_the_placement_of_another_is_told_whose_it_is(
+    folder: Path, capsys: pytest.CaptureFixture[str], image: str, own: str, other: str, method: str
+) -> None:
+    rows(folder / IMAGES, lambda c, _: c | {"placement": other} if c["image"] == image else c)
+    code, told = calibrate(capsys, folder, "--method", method, "--report", str(folder.parent / "r"))
+    assert code == 0, told
+    reasons = " | ".join(reason["sentence"] for reason in told["verdict"]["reasons"])
+    assert f"image {image} cannot show placement {other} but would show {own} (set-up level)" in reasons
+    assert told["verdict"]["grade"] == ("bad" if image == CHECK else "care")
+    assert [o["name"] for o in told["outliers"]] == ([] if image == CHECK else [f"image {image}"])
 
 
 # Pictures that cannot be used

@@ -12,18 +12,22 @@ from calib.survey import Survey
 CLOSER = 0.1
 """Another board is the one that is shown if it fits the image so many times better than its own."""
 
+FAR_PX = 20.0
+"""The same where the image's own board has no pixels to compare with."""
+
 Placement = tuple[str, str]
 
 
 def exchanged_boards(survey: Survey, calibration: Calibration) -> Iterator[str]:
     """Yield a sentence for each two placements that were exchanged, and for each image of a wrong placement.
 
-    Looked at are images that the fit left out; tried is every board of their set-up where the fit has it.
+    Looked at are check images and images that the fit left out; tried is every board of their set-up, where
+    the fit has it.
     """
     left_out = {outlier.name for outlier in calibration.outliers if outlier.kind == "image"}
     shown: dict[tuple[Placement, Placement], list[str]] = {}
     for image in calibration.images:
-        if f"image {image.name}" in left_out:
+        if image.purpose == "check" or f"image {image.name}" in left_out:
             other = _shown(survey, calibration, image)
             if other is not None:
                 shown.setdefault(((image.setup, image.placement), other), []).append(image.name)
@@ -46,7 +50,8 @@ def _shown(survey: Survey, calibration: Calibration, image: ImageResiduals) -> P
     """The board of the same set-up that the image shows; None if none fits far better than its own."""
     model = calibration.rig.camera_in_rover(image.camera, image.pan_rad or 0.0, image.tilt_rad or 0.0)
     in_board = survey.board.dots_in_board_m(image.rows, image.columns)
-    best, nearest_px = None, CLOSER * float(np.sqrt(np.mean(image.residuals_px**2)))
+    own_px = float(np.sqrt(np.mean(image.residuals_px**2)))
+    best, nearest_px = None, CLOSER * own_px if np.isfinite(own_px) else FAR_PX
     for placement, pose in calibration.rover_from_board.items():
         if placement[0] != image.setup or placement[1] == image.placement:
             continue

@@ -40,7 +40,8 @@ def check_sizes(survey: Survey, calibration: Calibration) -> dict[str, CheckSize
     squares: dict[str, list[tuple[float, float]]] = {}
     for image in calibration.images:
         key = (image.setup, image.placement)
-        if image.purpose == "check" and key in boards and image.setup in setups:
+        known = key in boards and image.setup in setups
+        if image.purpose == "check" and known and np.isfinite(image.residuals_px).all():
             seen = float(np.mean(image.residuals_px**2))
             expected = _expected_px2(survey, calibration, image, setups[image.setup], boards[key])
             squares.setdefault(image.camera, []).append((seen, expected))

@@ -285,7 +285,8 @@ def _worst_images(calibration: Calibration) -> str:
     for image in calibration.images:
         which = image.used if image.purpose != "check" else np.ones(len(image.used), dtype=bool)
         if which.any():
-            sizes.append((float(np.sqrt(np.mean(image.residuals_px[which] ** 2))), image))
+            rms_px = float(np.sqrt(np.mean(image.residuals_px[which] ** 2)))
+            sizes.append((rms_px if np.isfinite(rms_px) else np.inf, image))
     sizes.sort(key=lambda pair: -pair[0])
     rows = [
         [

@@ -215,7 +215,7 @@ def _document(done: Calibrated, in_use: StoredRig | None, page: Path | None) -> 
         "degrees_of_freedom": _finite(fit.degrees_of_freedom),
         "chi2_probability": _finite(fit.chi2_probability),
         "outliers": [
-            {"kind": o.kind, "name": o.name, "sentence": o.sentence, "size": float(o.size)}
+            {"kind": o.kind, "name": o.name, "sentence": o.sentence, "size": _finite(o.size)}
             for o in fit.outliers
         ],
         "degenerate": [{"parameters": list(d.parameters), "sentence": d.sentence} for d in fit.degenerate],
@@ -275,5 +275,7 @@ def _show(done: Calibrated, in_use: StoredRig | None, page: Path | None) -> None
 
 
 def _off(outlier: Any) -> str:
+    if _finite(outlier.size) is None:
+        return "out of view"
     pixels = outlier.kind in ("dot", "image")
     return f"{outlier.size:.2f} px" if pixels else f"{1000 * outlier.size:.1f} mm"
