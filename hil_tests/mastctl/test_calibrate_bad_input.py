@@ -392,6 +392,20 @@ def test_a_tape_measured_wrongly_is_named(
     assert outliers(folder, capsys) == ["tape b of placement mast-2 (set-up level)"]
 
 
+@pytest.mark.parametrize("shift_m", [0.02, 0.05, 1.0])
+def test_the_papers_method_lists_the_images_of_a_board_with_a_wrong_tape(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], shift_m: float
+) -> None:
+    survey = navcam_survey(1)[0]
+    wrong = {f"image {image.name}" for image in survey.images if image.placement == "mast-2"}
+    shift = np.array([0.6, 0.64, 0.48]) * shift_m
+    folder = written(with_moved_tape(survey, "level", "mast-2", "b", shift), tmp_path)
+    code, told = calibrate(capsys, folder, "--method", "paper")
+    assert code == 0, told
+    assert {outlier["name"] for outlier in told["outliers"]} == wrong
+    assert any("tapes of placement mast-2 (set-up level)" in note for note in told["notes"])
+
+
 @pytest.mark.parametrize("method", ["joint", "paper"])
 @pytest.mark.parametrize("shift_m", [0.012, 0.05, 1.0])
 def test_a_prism_measured_wrongly_is_named(
