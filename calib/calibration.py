@@ -11,6 +11,13 @@ import numpy as np
 from calib.mast import Rig
 from calib.rigid import FloatArray, Rigid
 
+HELD_FIXED = (
+    "R0 of every camera is held at 0: whatever it does, A, H and V do as well",
+    "an offset of pan is no parameter: it is the mast's rotation z",
+    "an offset of tilt is no parameter: it turns all head cameras together, which their own axes do as well",
+)
+"""What no survey of any kind can tell from other parameters, and which of them stands for it."""
+
 
 @dataclass(frozen=True, eq=False)
 class Outlier:
@@ -26,7 +33,8 @@ class Outlier:
     statistic, limit
         Sum of squares of its standardised residuals, and what it may be at the stated rate of false alarms.
     size
-        How far off it is: pixels (rms over an image) or metres.
+        How far off it is: pixels (rms over an image) or metres. Not-a-number for an image whose board,
+        as it is named, the camera cannot see.
     """
 
     kind: Literal["dot", "image", "tape", "prism"]
@@ -38,6 +46,8 @@ class Outlier:
     @property
     def sentence(self) -> str:
         """The outlier in words."""
+        if not np.isfinite(self.size):
+            return f"{self.name} cannot show the board that it names and was not used"
         off = f"{self.size:.2f} px" if self.kind in ("dot", "image") else f"{1000 * self.size:.1f} mm"
         return f"{self.name} is off by {off} and was not used"
 
@@ -111,7 +121,8 @@ class Calibration:
     rms_px
         Camera to (x, y) rms of the fitted images' dots, pixels.
     check_rms_px
-        Camera to (x, y) rms of the check images' dots and clicks, which were not fitted.
+        Camera to (x, y) rms of the check images' dots and clicks, which were not fitted; without images whose
+        board, as it is named, the camera cannot see.
     outliers
         What was left out.
     false_alarms

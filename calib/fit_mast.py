@@ -183,8 +183,9 @@ def _fit_from(
     for steps, count in ((15, min(mast_parameters, 6)), (10, mast_parameters), (8, mast_parameters)):
         free = np.array(MAST_FREE[count])
         weak = np.full(len(free), 1e-4)
+        seen = _seen(few, mast)
         mast = minimise(
-            _Images(few, free, _cauchy(few, mast, expected_px)), mast, weak=weak, steps=steps
+            _Images(seen, free, _cauchy(seen, mast, expected_px)), mast, weak=weak, steps=steps
         ).state
     rms = np.array([_rms(mast_residual(view, mast)) for view in views])
     typical = float(np.median(rms))
@@ -198,6 +199,12 @@ def _fit_from(
     residuals = np.concatenate([mast_residual(view, mast) for view in kept])
     left_out = tuple(view.name for view, keep in zip(views, good, strict=True) if not keep)
     return typical, MastFit(mast, left_out, np.sqrt((residuals**2).mean(axis=0)))
+
+
+def _seen(views: Sequence[MastView], mast: FloatArray) -> Sequence[MastView]:
+    """The images whose points all have a pixel, if they are most: another board may lie behind the camera."""
+    seen = [view for view in views if np.isfinite(mast_residual(view, mast)).all()]
+    return seen if 2 * len(seen) > len(views) else views
 
 
 def _thinned(view: MastView) -> MastView:

@@ -104,7 +104,7 @@ def _fit(survey: Survey, mast_parameters: int, began: float) -> Calibration:
     ordered = [names[i] for i in order]
     rig = rig_of(survey, state)
     sigma = sigma_by_key(rig, ordered, covariance[np.ix_(order, order)])
-    notes = [*from_here.notes, *lens_notes(rig, sigma)]
+    notes = [*from_here.notes, *_bent_notes(from_here), *lens_notes(rig, sigma)]
     return Calibration(
         method="paper",
         mast_parameters=mast_parameters,
@@ -115,7 +115,7 @@ def _fit(survey: Survey, mast_parameters: int, began: float) -> Calibration:
         sigma=sigma,
         rms_px=rms_by_camera(images),
         check_rms_px=check_rms(survey, state, images),
-        outliers=(*from_here.blunders, *_left_out(images, from_here, doubtful)),
+        outliers=(*from_here.blunders, *_left_out(images, from_here, doubtful | left_out)),
         false_alarms=0.0,
         degenerate=open_directions(problem, names, mast_alone),
         notes=tuple(notes),
@@ -208,6 +208,15 @@ def _to_head(
         at = from_here.reference_rad.get(name)
         found[name] = model if at is None else model.moved(carrying.rover_from_head(*at).inverse)
     return found
+
+
+def _bent_notes(from_here: Start) -> list[str]:
+    """Why the images of a board whose tapes cannot be right were left out."""
+    return [
+        f"the tapes of placement {placement} (set-up {setup}) do not have the board's shape and three cannot "
+        "tell which is wrong: its images were not used"
+        for setup, placement in sorted(from_here.bent)
+    ]
 
 
 def _left_out(images: tuple, from_here: Start, doubtful: set[str]) -> list[Outlier]:  # type: ignore[type-arg]

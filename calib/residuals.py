@@ -96,7 +96,7 @@ def check_rms(survey: Survey, state: Estimate, images: Iterable[ImageResiduals])
             in_rover = (in_rover - head.translation_m) @ head.rotation
         pixel, _ = state.cameras[image.camera].project(in_rover)
         parts.append((image.camera, pixel - click.pixel_px))
-    return _rms(parts)
+    return _rms((camera, residual) for camera, residual in parts if np.isfinite(residual).all())
 
 
 def _rms(parts: Iterable[tuple[str, FloatArray]]) -> Rms:

@@ -37,6 +37,8 @@ def check_survey(
     survey: Survey,
     pan_limits_rad: tuple[float, float] = PAN_LIMITS_RAD,
     tilt_limits_rad: tuple[float, float] = TILT_LIMITS_RAD,
+    *,
+    only_camera_images: bool = False,
 ) -> tuple[Finding, ...]:
     """Return what is missing, too little, or at odds with itself in a survey; errors first.
 
@@ -46,7 +48,10 @@ def check_survey(
         As `calib.survey.read_survey` gives it; pictures are looked for in its folder.
     pan_limits_rad, tilt_limits_rad
         Beyond these, joint angles are refused.
+    only_camera_images
+        Whether cameras will be fitted to images of purpose camera alone, as the paper does.
     """
+    purposes = ("camera",) if only_camera_images else ("camera", "mast")
     findings = [*_missing(survey), *_set_ups(survey), *_placements(survey)]
     angles = list(_angles(survey, pan_limits_rad, tilt_limits_rad))
     units = list(unit_doubts(survey))
@@ -58,7 +63,9 @@ def check_survey(
     boards = rover_from_boards(survey)
     for name, camera in survey.cameras.items():
         mine = [image for image in survey.images if image.camera == name]
-        findings += _camera_spread(survey, camera, mine, {} if units else boards)
+        if mine:
+            fitted = [image for image in mine if image.purpose in purposes]
+            findings += _camera_spread(survey, camera, purposes, fitted, {} if units else boards)
     if not angles:
         findings += _mast_spread(survey)
     if survey.images and not any(image.purpose == "check" for image in survey.images):
@@ -197,16 +204,20 @@ def _angles(
 
 
 def _camera_spread(
-    survey: Survey, camera: SurveyCamera, mine: Sequence[SurveyImage], in_rover: Mapping[Placement, Rigid]
+    survey: Survey,
+    camera: SurveyCamera,
+    purposes: Sequence[str],
+    fitted: Sequence[SurveyImage],
+    in_rover: Mapping[Placement, Rigid],
 ) -> Iterator[Finding]:
     """Too few boards, at one distance, or in one part of the picture."""
-    fitted = [image for image in mine if image.purpose != "check"]
     boards = list(dict.fromkeys((image.setup, image.placement) for image in fitted))
-    if mine and len(boards) < ENOUGH_BOARDS:
+    of_purpose = "" if len(purposes) > 1 else f" of purpose {purposes[0]}"
+    if len(boards) < ENOUGH_BOARDS:
         yield Finding(
             "error" if len(boards) < FEWEST_BOARDS else "warning",
             f"camera {camera.name}",
-            f"{len(boards)} placements are there to fit it; {FEWEST_BOARDS} are the least and "
+            f"{len(boards)} placements{of_purpose} are there to fit it; {FEWEST_BOARDS} are the least and "
             f"{ENOUGH_BOARDS} to 8 adequate",
             "Photograph more placements, near and far, towards all corners of the picture",
         )

@@ -139,6 +139,10 @@ def test_a_blunder_is_named_in_the_tables(
     assert main(["calibrate", str(folder), "--out", str(tmp_path / "m.yaml")]) == 0
     told = capsys.readouterr().out
     assert f"image {name} dot (row 4, column 2)" in " ".join(told.replace("│", " ").split())
+    rows = [line for line in told.splitlines() if line.startswith("│")]
+    reasons = [line for line in rows if line.startswith("│ good │")]
+    assert reasons and all(line.startswith("│ good │ ") and line[9] != " " for line in reasons)
+    assert any(line.startswith("│ tx        │   +0.3") for line in rows), "numbers stand on the right"
 
 
 # Refusals

@@ -33,6 +33,8 @@ Cells = dict[str, str]
 IMAGE = "navcam_left-021"
 """An image for the mast, at placement mast-3."""
 
+CHECK = "navcam_left-033"
+
 
 @pytest.fixture(scope="module")
 def good(tmp_path_factory: pytest.TempPathFactory) -> Path:
@@ -390,6 +392,20 @@ def test_a_tape_measured_wrongly_is_named(
     assert outliers(folder, capsys) == ["tape b of placement mast-2 (set-up level)"]
 
 
+@pytest.mark.parametrize("shift_m", [0.02, 0.05, 1.0])
+def test_the_papers_method_lists_the_images_of_a_board_with_a_wrong_tape(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], shift_m: float
+) -> None:
+    survey = navcam_survey(1)[0]
+    wrong = {f"image {image.name}" for image in survey.images if image.placement == "mast-2"}
+    shift = np.array([0.6, 0.64, 0.48]) * shift_m
+    folder = written(with_moved_tape(survey, "level", "mast-2", "b", shift), tmp_path)
+    code, told = calibrate(capsys, folder, "--method", "paper")
+    assert code == 0, told
+    assert {outlier["name"] for outlier in told["outliers"]} == wrong
+    assert any("tapes of placement mast-2 (set-up level)" in note for note in told["notes"])
+
+
 @pytest.mark.parametrize("method", ["joint", "paper"])
 @pytest.mark.parametrize("shift_m", [0.012, 0.05, 1.0])
 def test_a_prism_measured_wrongly_is_named(
@@ -452,7 +468,36 @@ def test_two_boards_mixed_up_are_named(
     survey = navcam_survey(1)[0]
     wrong = {f"image {image.name}" for image in survey.images if image.placement in boards}
     folder = written(with_swapped_boards(survey, "level", *boards), tmp_path)
-    assert set(outliers(folder, capsys, "--method", method)) == wrong
+    code, told = calibrate(capsys, folder, "--method", method)
+    assert code == 0, told
+    assert {outlier["name"] for outlier in told["outliers"]} == wrong
+    reasons = " | ".join(reason["sentence"] for reason in told["verdict"]["reasons"])
+    assert (
+        f"the boards of placements {boards[0]} and {boards[1]} (set-up level) seem to be exchanged" in reasons
+    )
+
+
+@pytest.mark.parametrize(
+    ("image", "own", "other"),
+    [
+        (IMAGE, "mast-3", "mast-4"),
+        (IMAGE, "mast-3", "mast-5"),  # behind the camera: it has no pixels at all
+        ("navcam_right-006", "navcam-3m-3", "mast-8"),
+        (CHECK, "check-1", "mast-2"),
+        (CHECK, "check-1", "mast-8"),
+    ],
+)
+@pytest.mark.parametrize("method", ["joint", "paper"])
+def test_an_image_with_the_placement_of_another_is_told_whose_it_is(
+    folder: Path, capsys: pytest.CaptureFixture[str], image: str, own: str, other: str, method: str
+) -> None:
+    rows(folder / IMAGES, lambda c, _: c | {"placement": other} if c["image"] == image else c)
+    code, told = calibrate(capsys, folder, "--method", method, "--report", str(folder.parent / "r"))
+    assert code == 0, told
+    reasons = " | ".join(reason["sentence"] for reason in told["verdict"]["reasons"])
+    assert f"image {image} cannot show placement {other} but would show {own} (set-up level)" in reasons
+    assert told["verdict"]["grade"] == ("bad" if image == CHECK else "care")
+    assert [o["name"] for o in told["outliers"]] == ([] if image == CHECK else [f"image {image}"])
 
 
 # Pictures that cannot be used

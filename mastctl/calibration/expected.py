@@ -31,7 +31,8 @@ def check_sizes(survey: Survey, calibration: Calibration) -> dict[str, CheckSize
     """Return by camera how large the residuals of its check images are, and what would explain them.
 
     Their boards stand as the station measured them, and one board's error moves all its dots together: a
-    board counts as two measurements, not as two hundred.
+    board counts as two measurements, not as two hundred, and the near ones, which move most, for most of
+    all (Satterthwaite's degrees of freedom).
     """
     try:
         setups, boards = rover_from_station(survey), station_from_board(survey)
@@ -40,14 +41,16 @@ def check_sizes(survey: Survey, calibration: Calibration) -> dict[str, CheckSize
     squares: dict[str, list[tuple[float, float]]] = {}
     for image in calibration.images:
         key = (image.setup, image.placement)
-        if image.purpose == "check" and key in boards and image.setup in setups:
+        known = key in boards and image.setup in setups
+        if image.purpose == "check" and known and np.isfinite(image.residuals_px).all():
             seen = float(np.mean(image.residuals_px**2))
             expected = _expected_px2(survey, calibration, image, setups[image.setup], boards[key])
             squares.setdefault(image.camera, []).append((seen, expected))
     sizes = {}
     for camera, pairs in squares.items():
         seen, expected = np.sqrt(np.mean(pairs, axis=0))
-        freedom = 2 * len(pairs)
+        each = np.array([part for _, part in pairs])
+        freedom = 2 * each.sum() ** 2 / np.sum(each**2)
         limit = expected * np.sqrt(chi2.isf(RARELY, freedom) / freedom)
         sizes[camera] = CheckSize(float(seen), float(expected), float(limit))
     return sizes

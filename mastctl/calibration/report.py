@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from calib.calibration import Calibration
+from calib.calibration import HELD_FIXED, Calibration
 from calib.formats.atomic import save_bytes
 from calib.store import StoredRig
 from calib.survey import Survey
@@ -133,6 +133,7 @@ def _parts(told: Told) -> Iterator[str]:
         "the total station show in them: 1 mm at 5 m is 0.7 px of a 16 mm lens.</p>"
     )
     yield from _words("Notes of the fit", calibration.notes)
+    yield from _words("Held fixed, since no survey can tell it", HELD_FIXED)
     yield from _words("Warnings of the survey's check", told.warnings)
     yield from _words(
         f"Left out ({len(calibration.outliers)})", [outlier.sentence for outlier in calibration.outliers]
@@ -284,7 +285,8 @@ def _worst_images(calibration: Calibration) -> str:
     for image in calibration.images:
         which = image.used if image.purpose != "check" else np.ones(len(image.used), dtype=bool)
         if which.any():
-            sizes.append((float(np.sqrt(np.mean(image.residuals_px[which] ** 2))), image))
+            rms_px = float(np.sqrt(np.mean(image.residuals_px[which] ** 2)))
+            sizes.append((rms_px if np.isfinite(rms_px) else np.inf, image))
     sizes.sort(key=lambda pair: -pair[0])
     rows = [
         [

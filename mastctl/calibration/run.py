@@ -51,15 +51,15 @@ class Calibrated:
     previous: Path | None
 
 
-def checked(survey: Survey) -> tuple[str, ...]:
-    """Return the sentences of the check's warnings.
+def checked(survey: Survey, method: Method = "joint") -> tuple[str, ...]:
+    """Return the sentences of the check's warnings; ``method`` decides which images have to show a camera.
 
     Raises
     ------
     SurveyRefused
         If the check found an error.
     """
-    findings = check_survey(survey)
+    findings = check_survey(survey, only_camera_images=method == "paper")
     if any(finding.severity == "error" for finding in findings):
         raise SurveyRefused(survey, findings)
     return tuple(sentence_of(finding) for finding in findings)

@@ -13,6 +13,7 @@ from calib.calibration import Calibration
 from calib.errors import CalibError
 from calib.survey import Survey
 from calib.uncertainty import pointing_covariance
+from mastctl.calibration.exchanged import exchanged_boards
 from mastctl.calibration.expected import RARELY, check_sizes
 
 Grade = Literal["good", "care", "bad"]
@@ -96,6 +97,7 @@ def judge(
         *_turned(calibration),
         *_pointing(calibration),
         *_left_out(calibration),
+        *(Reason("care", sentence) for sentence in exchanged_boards(survey, calibration)),
     ]
     if undetected:
         reasons.append(Reason("care", f"no dots were found in {len(undetected)} images: {_some(undetected)}"))
@@ -150,7 +152,11 @@ def _checks(survey: Survey, calibration: Calibration) -> list[Reason]:
     """Whether images that were not fitted are predicted as well as they should be."""
     if not calibration.check_rms_px:
         return [Reason("care", "there is no check image: nothing shows how well the result predicts")]
-    reasons = []
+    reasons = [
+        Reason("bad", f"check image {image.name} cannot show placement {image.placement}, which it names")
+        for image in calibration.images
+        if image.purpose == "check" and not np.isfinite(image.residuals_px).all()
+    ]
     for camera, size in check_sizes(survey, calibration).items():
         words = (
             f"check images of {camera} are off by {size.seen_px:.2f} px rms an axis where the survey's noise "

@@ -60,7 +60,7 @@ def run(args: argparse.Namespace) -> int:
 
     survey = read_survey(args.survey)
     try:
-        checked(survey)
+        checked(survey, args.method)
     except SurveyRefused as refusal:
         for finding in refusal.findings[1:]:
             output.tell(str(finding))  # the first is told last, as the reason
@@ -69,7 +69,7 @@ def run(args: argparse.Namespace) -> int:
     _check_report(args.report)
     in_use = _in_use(args)
     survey, undetected = _with_dots(args, survey)
-    warnings = checked(survey)  # once more, with the dots that were found
+    warnings = checked(survey, args.method)  # once more, with the dots that were found
     for warning in warnings:
         output.tell(f"warning: {warning}")
     with _waiting(args, f"fitting {len(survey.images)} images ({args.method})"):
@@ -190,6 +190,7 @@ def _report(args: argparse.Namespace, done: Calibrated, in_use: StoredRig | None
 
 def _document(done: Calibrated, in_use: StoredRig | None, page: Path | None) -> dict[str, Any]:
     """The contract's keys, and what else a program may want."""
+    from calib.calibration import HELD_FIXED
     from mastctl.calibration.mast_file import as_lists, mast_keys, plain
     from mastctl.calibration.report import change_summary
 
@@ -214,10 +215,11 @@ def _document(done: Calibrated, in_use: StoredRig | None, page: Path | None) -> 
         "degrees_of_freedom": _finite(fit.degrees_of_freedom),
         "chi2_probability": _finite(fit.chi2_probability),
         "outliers": [
-            {"kind": o.kind, "name": o.name, "sentence": o.sentence, "size": float(o.size)}
+            {"kind": o.kind, "name": o.name, "sentence": o.sentence, "size": _finite(o.size)}
             for o in fit.outliers
         ],
         "degenerate": [{"parameters": list(d.parameters), "sentence": d.sentence} for d in fit.degenerate],
+        "held_fixed": list(HELD_FIXED),
         "warnings": list(done.warnings),
         "undetected": [{"image": name, "reason": reason} for name, reason in done.undetected],
         "notes": list(fit.notes),
@@ -273,5 +275,7 @@ def _show(done: Calibrated, in_use: StoredRig | None, page: Path | None) -> None
 
 
 def _off(outlier: Any) -> str:
+    if _finite(outlier.size) is None:
+        return "out of view"
     pixels = outlier.kind in ("dot", "image")
     return f"{outlier.size:.2f} px" if pixels else f"{1000 * outlier.size:.1f} mm"
