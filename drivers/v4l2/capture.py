@@ -1,0 +1,342 @@
+"""The thread of one camera: always dequeues, checks, keeps the newest good frames, reopens what went away.
+
+Frames are copied once, out of the kernel's buffer, which goes back at once; nobody's slowness holds one up.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import select
+import threading
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drivers.clock import Clock
+from drivers.errors import DriverError
+from drivers.v4l2 import abi, pixels
+from drivers.v4l2.errors import StreamFailed
+from drivers.v4l2.node import Dequeued, PictureFormat
+from drivers.v4l2.options import CameraOptions
+from drivers.v4l2.stamps import StampCheck, Window, exposure_window
+from drivers.v4l2.stream import Stream
+from drivers.v4l2.uevents import UeventSocket
+
+log = logging.getLogger(__name__)
+
+KEPT_FRAMES = 4
+SILENT_PERIODS = 3
+STALLED_S = 5.0  # a camera that is there but gives nothing for so long is opened again
+LATE_S = 0.005  # a frame is late if it comes more than a period and this after its stamp
+FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.05, 1.0
+
+
+@dataclass(frozen=True, eq=False)
+class RawFrame:
+    """A frame as the camera gave it.
+
+    Attributes
+    ----------
+    raw, format
+        The bytes of the picture, uint8 (n,), and what they mean.
+    sequence
+        Our own count: it grows over every reopening.
+    driver_sequence, stream
+        The driver's count, which starts anew with each stream, and the stream's number.
+    stamp_s, received_s
+        The driver's stamp, and when the frame was dequeued, seconds of CLOCK_MONOTONIC.
+    window
+        In which the whole exposure lay.
+    exposure_s
+        The exposure time if it is known.
+    """
+
+    raw: NDArray[np.uint8]
+    format: PictureFormat
+    sequence: int
+    driver_sequence: int
+    stream: int
+    stamp_s: float
+    received_s: float
+    window: Window
+    exposure_s: float | None
+
+
+@dataclass(frozen=True)
+class Counters:
+    """What happened to a camera's frames since it was opened.
+
+    Attributes
+    ----------
+    good, damaged
+        Frames that were published, and frames that were refused (error flag, length, stamp).
+    dropped
+        Frames that never came, by gaps in the driver's count.
+    late
+        Good frames that came more than a period and 5 ms after their stamp.
+    reopened
+        How often the camera was lost and opened again.
+    last_damage
+        What was wrong with the last refused frame.
+    """
+
+    good: int = 0
+    damaged: int = 0
+    dropped: int = 0
+    late: int = 0
+    reopened: int = 0
+    last_damage: str = ""
+
+
+@dataclass(eq=False)
+class _Shared:
+    """What the thread and its callers share, under one lock."""
+
+    changed: threading.Condition = field(default_factory=threading.Condition)
+    frames: deque[RawFrame] = field(default_factory=lambda: deque(maxlen=KEPT_FRAMES))
+    counters: Counters = field(default_factory=Counters)
+    lost: str = ""
+    closed: bool = False
+
+
+class Capture:
+    """Streams from one camera until it is closed; safe from any thread.
+
+    Parameters
+    ----------
+    options, name, clock
+        How the camera is opened, its name, and the clock that its stamps are judged by.
+    between
+        Called in the capture thread after each good frame, with the stream: the automatic exposure. What
+        it takes delays the next frame.
+
+    Raises
+    ------
+    DriverError
+        If the camera cannot be opened now. Once it was, it is opened again whenever it comes back.
+    """
+
+    def __init__(
+        self,
+        options: CameraOptions,
+        name: str,
+        clock: Clock,
+        between: Callable[[Stream, RawFrame], None] | None = None,
+        exposure_s: Callable[[], float] | None = None,
+    ) -> None:
+        self._options = options
+        self._name = name
+        self._clock = clock
+        self._between = between
+        self._exposure_s = exposure_s
+        self._shared = _Shared()
+        self._pause_s = FIRST_PAUSE_S
+        self._streams = 0
+        self._offset: int | None = 0  # from the driver's count to ours; None until a new stream's first frame
+        self._last_sequence = -1
+        self._check = StampCheck()
+        stream = self._open()
+        self.format = stream.format
+        self.period_s = stream.period_s
+        self.problems = tuple(stream.problems)
+        self.identity = stream.node.identity
+        self._wake = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
+        self._uevents = UeventSocket()
+        self._thread = threading.Thread(target=self._run, args=(stream,), name=f"capture {name}", daemon=True)
+        self._thread.start()
+
+    @property
+    def counters(self) -> Counters:
+        """What happened to the frames so far."""
+        with self._shared.changed:
+            return self._shared.counters
+
+    @property
+    def lost(self) -> str:
+        """Why there are no frames now: the camera is gone or its stream failed; empty while it streams."""
+        with self._shared.changed:
+            return self._shared.lost
+
+    def frames(self) -> tuple[RawFrame, ...]:
+        """Return the newest good frames, oldest first."""
+        with self._shared.changed:
+            return tuple(self._shared.frames)
+
+    def wait(
+        self, wanted: Callable[[RawFrame], bool], timeout_s: float, lost_ends_it: bool = True
+    ) -> RawFrame | None:
+        """Return the newest frame that is ``wanted``; None after ``timeout_s``, or when lost or closed."""
+        shared = self._shared
+
+        def newest() -> RawFrame | None:
+            return next((frame for frame in reversed(shared.frames) if wanted(frame)), None)
+
+        with shared.changed:
+            shared.changed.wait_for(
+                lambda: newest() or shared.closed or (lost_ends_it and shared.lost), max(0.0, timeout_s)
+            )
+            return newest()
+
+    def refuse(self, frame: RawFrame, why: str) -> None:
+        """Take a frame back that turned out damaged when it was decoded."""
+        with self._shared.changed:
+            if frame in self._shared.frames:
+                self._shared.frames.remove(frame)
+                counters = self._shared.counters
+                self._count(good=counters.good - 1, damaged=counters.damaged + 1, last_damage=why)
+
+    def close(self) -> None:
+        """End the thread and let go of the camera."""
+        with self._shared.changed:
+            if self._shared.closed:
+                return
+            self._shared.closed = True
+            self._shared.changed.notify_all()
+        os.eventfd_write(self._wake, 1)
+        self._thread.join()
+        self._uevents.close()
+        os.close(self._wake)
+
+    # In the capture thread
+
+    def _run(self, stream: Stream | None) -> None:
+        """Stream, and open again after every failure, until closed."""
+        while True:
+            if stream is not None:
+                try:
+                    self._stream(stream)
+                    return
+                except DriverError as error:
+                    self._lose(str(error))
+                except Exception as error:  # a defect here must not end in a thread that is silently gone
+                    log.exception("%s: the capture failed", self._name)
+                    self._lose(f"{self._name}: the capture failed: {type(error).__name__}: {error}")
+                finally:
+                    stream.close()
+            if self._closing_after(self._pause_s):
+                return
+            self._pause_s = min(2 * self._pause_s, LONGEST_PAUSE_S)
+            stream = self._reopened()
+
+    def _stream(self, stream: Stream) -> None:
+        """Take frames until closed. Raises DriverError when the camera fails."""
+        poll = select.poll()
+        poll.register(stream.node.fileno(), select.POLLIN)
+        poll.register(self._wake, select.POLLIN)
+        silent_since_s = self._clock.now_s()
+        while True:
+            events = dict(poll.poll(max(1.0, 1e3 * SILENT_PERIODS * stream.period_s)))
+            if self._wake in events:
+                return
+            took = 0
+            while (buffer := stream.node.dequeue()) is not None:
+                self._take(stream, buffer)
+                took += 1
+            now_s = self._clock.now_s()
+            if took:
+                silent_since_s = now_s
+            elif events:
+                raise StreamFailed("its driver reports an error and gives no frame", device=self._name)
+            else:
+                stream.node.check_there()
+                if now_s - silent_since_s > max(STALLED_S, 2 * SILENT_PERIODS * stream.period_s):
+                    raise StreamFailed(f"gave no frame for {now_s - silent_since_s:.1f} s", device=self._name)
+
+    def _take(self, stream: Stream, buffer: Dequeued) -> None:
+        """Check one buffer, copy it if it is good, give it back, publish."""
+        received_s = self._clock.now_s()
+        dropped = self._check.dropped_before(buffer.sequence)
+        wrong = self._check.wrong_stamp(buffer.flags, buffer.stamp_s, received_s)
+        if buffer.flags & abi.BUF_FLAG_ERROR:
+            wrong = "its driver marks it as damaged"
+        data = stream.node.bytes_of(buffer)
+        wrong = wrong or pixels.wrong_length(stream.format, data)
+        raw = None if wrong else np.frombuffer(data, np.uint8).copy()
+        del data
+        stream.node.queue(buffer.index)
+        if self._offset is None:
+            self._offset = self._last_sequence + 1 - buffer.sequence
+        sequence = self._offset + buffer.sequence
+        if sequence <= self._last_sequence:  # the driver's count wrapped or began again
+            self._offset += self._last_sequence + 1 - sequence
+            sequence = self._last_sequence + 1
+        self._last_sequence = sequence
+        frame = None
+        if raw is not None:
+            window = exposure_window(stream.rule, buffer.flags, buffer.stamp_s, received_s)
+            frame = RawFrame(
+                raw, stream.format, sequence, buffer.sequence, self._streams, buffer.stamp_s, received_s,
+                window, stream.exposure_s,
+            )  # fmt: skip
+        self._publish(stream, frame, dropped, wrong)
+        if frame is not None:
+            self._pause_s = FIRST_PAUSE_S
+            if self._between is not None:
+                self._between(stream, frame)
+
+    def _publish(self, stream: Stream, frame: RawFrame | None, dropped: int, wrong: str) -> None:
+        with self._shared.changed:
+            c = self._shared.counters
+            if frame is None:
+                self._count(dropped=c.dropped + dropped, damaged=c.damaged + 1, last_damage=wrong)
+                return
+            late = frame.received_s - frame.stamp_s > stream.period_s + LATE_S
+            self._count(dropped=c.dropped + dropped, good=c.good + 1, late=c.late + late)
+            self._shared.frames.append(frame)
+            self._shared.changed.notify_all()
+
+    def _count(self, **changes: int | str) -> None:
+        self._shared.counters = replace(self._shared.counters, **changes)  # type: ignore[arg-type]
+
+    def _lose(self, why: str) -> None:
+        """Say that there are no frames for now."""
+        with self._shared.changed:
+            if not self._shared.lost:
+                log.warning("%s; it is opened again when it is back", why)
+            self._shared.lost = why
+            self._shared.frames.clear()
+            self._shared.changed.notify_all()
+
+    def _closing_after(self, pause_s: float) -> bool:
+        """Wait before the next try, shorter if the kernel says that a node came; True when closed."""
+        poll = select.poll()
+        poll.register(self._wake, select.POLLIN)
+        if self._uevents.available:
+            poll.register(self._uevents, select.POLLIN)
+        until_s = self._clock.now_s() + pause_s
+        while (left_s := until_s - self._clock.now_s()) > 0:
+            events = dict(poll.poll(1e3 * left_s))
+            if self._wake in events:
+                return True
+            if any(event.action == "add" for event in self._uevents.read()):
+                self._pause_s = FIRST_PAUSE_S
+                until_s = min(until_s, self._clock.now_s() + FIRST_PAUSE_S / 5)  # for udev to make its links
+        return False
+
+    def _reopened(self) -> Stream | None:
+        """Try to open the camera again; None if it is not back."""
+        try:
+            stream = self._open()
+        except DriverError as error:
+            with self._shared.changed:
+                self._shared.lost = str(error)
+            return None
+        with self._shared.changed:
+            self._shared.lost = ""
+            self._count(reopened=self._shared.counters.reopened + 1)
+            self._shared.changed.notify_all()
+        log.warning("%s is back at %s", self._name, stream.node.path)
+        return stream
+
+    def _open(self) -> Stream:
+        exposure_s = None if self._exposure_s is None else self._exposure_s()
+        stream = Stream(self._options, self._name, exposure_s)
+        self._check = StampCheck()
+        self._streams += 1
+        if self._streams > 1:
+            self._offset = None
+        return stream
