@@ -1,6 +1,6 @@
 """The one door to hardware: from a configuration's driver names to open devices.
 
-Nothing else knows real and simulated drivers both. A name is ``sim``, ``replay``, or
+Nothing else knows real and simulated drivers both. A name is ``sim``, ``replay``, ``v4l2``, or
 ``package.module:factory`` for a driver from outside this repository (contract section 5).
 """
 
@@ -26,8 +26,8 @@ log = logging.getLogger(__name__)
 
 Kind = Literal["real", "simulated", "replayed", "mixed"]
 
-NOT_YET = ("dynamixel", "flir_ptu", "v4l2")
-BUILT_IN = ("sim", "replay", *NOT_YET)
+NOT_YET = ("dynamixel", "flir_ptu")
+BUILT_IN = ("sim", "replay", "v4l2", *NOT_YET)
 
 
 @dataclass(frozen=True)
@@ -157,6 +157,9 @@ class _Opener:
         if device.driver == "replay":
             self._kinds.add("replayed")
             return self._replayed(name, device)
+        if device.driver == "v4l2":
+            self._kinds.add("real")
+            return self._v4l2(name, device)
         if device.driver in NOT_YET:
             raise BadOptions(f"driver {device.driver!r} is not in this version", device=name)
         raise BadOptions(
@@ -199,6 +202,14 @@ class _Opener:
         if name not in replay.cameras:
             raise BadOptions(f"the recording has no such camera{nearest(name, replay.cameras)}", device=name)
         return replay.cameras[name]
+
+    def _v4l2(self, name: str, device: DeviceSettings) -> Any:
+        """A camera of this machine."""
+        if name == PAN_TILT:
+            raise BadOptions("driver 'v4l2' is for cameras, it moves nothing", device=name)
+        from drivers.v4l2.camera import open_camera
+
+        return open_camera(device.options, self._clock, name)
 
 
 def _factory(name: str, driver: str) -> Callable[..., Any]:

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import ctypes
+import difflib
 import errno
 import fcntl
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from drivers.faults import nearest
 from drivers.v4l2 import abi
 from drivers.v4l2.node import Node
 
@@ -132,8 +132,9 @@ def set_by_name(node: Node, wanted: Mapping[str, Value]) -> list[Problem]:
     for name, value in wanted.items():
         control = known.get(plain_name(name))
         if control is None:
-            near = nearest(plain_name(name), known)
-            problems.append(Problem(name, f"the camera has no control {name!r}{near}"))
+            near = difflib.get_close_matches(plain_name(name), known, n=1)
+            hint = f"did you mean {near[0]!r}?" if near else "mastctl camera check lists what it has"
+            problems.append(Problem(name, f"the camera has no control {name!r}; {hint}"))
         elif problem := set_value(node, control, value):
             problems.append(problem)
     return problems

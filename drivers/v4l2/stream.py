@@ -10,6 +10,7 @@ from drivers.v4l2.controls import Control, Problem, first_of, get_value, list_co
 from drivers.v4l2.errors import UnsupportedFormat
 from drivers.v4l2.node import Node, PictureFormat
 from drivers.v4l2.options import CameraOptions
+from drivers.v4l2.pixels import FORMATS
 from drivers.v4l2.stamps import StampRule
 
 log = logging.getLogger(__name__)
@@ -132,8 +133,14 @@ def set_format(node: Node, code: str, size_px: tuple[int, int], name: str) -> Pi
     """
     answer = node.set_format(code, size_px)
     if answer.code != code:
-        offered = ", ".join(node.formats()) or "none"
-        raise UnsupportedFormat(f"the camera has no format {code}; it has {offered}", device=name)
+        offered = node.formats()
+        read = ", ".join(f for f in offered if f in FORMATS) or "none that this driver reads"
+        others = (
+            f" and {rest} that this driver does not read"
+            if (rest := len(set(offered) - set(FORMATS)))
+            else ""
+        )
+        raise UnsupportedFormat(f"the camera has no format {code}; it has {read}{others}", device=name)
     if answer.size_px != size_px:
         raise UnsupportedFormat(
             f"the camera has no {size_px[0]}x{size_px[1]} in {code}; it has {sizes_text(node, code)}",

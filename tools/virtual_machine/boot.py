@@ -111,7 +111,7 @@ def run(
 
 
 def _memory_folder(otherwise: str, memory_mb: int) -> str:
-    """Where the machine's memory lives as a file: in memory if it has the room, else on disk, which is slower."""
+    """Where the machine's memory lives as a file: in memory if there is room, else on disk: slower."""
     shm = Path("/dev/shm")
     if shm.is_dir():
         room = os.statvfs(shm)
