@@ -11,12 +11,13 @@ from typing import Any
 from drivers.clock import Clock, SystemClock
 from drivers.errors import BadFrame, NoFreshFrame
 from drivers.interfaces import Frame
-from drivers.v4l2 import pixels
+from drivers.v4l2 import find, pixels
 from drivers.v4l2.capture import Capture, Counters, RawFrame
+from drivers.v4l2.controls import get_value, list_controls
 from drivers.v4l2.errors import NoCamera
 from drivers.v4l2.exposure import GROUPS, ExposureControl
 from drivers.v4l2.options import CameraOptions, parse_options
-from drivers.v4l2.stream import Stream
+from drivers.v4l2.stream import Stream, sizes_text
 
 JUDGE_EVERY_S = 0.25  # how often the automatic exposure looks at a frame
 SETTLE_PERIODS = 3  # a new exposure time shows this many frames later at most
@@ -139,6 +140,24 @@ class V4l2Camera:
         )
         self._converted = (raw, frame)
         return frame
+
+    def abilities(self) -> dict[str, Any]:
+        """Return what the camera offers, as JSON: ``formats`` and ``controls`` with their values now."""
+        with find.open_node(self._options.address, self.name) as node:
+            controls = list_controls(node)
+            return {
+                "formats": [
+                    {"code": code, "readable": code in pixels.FORMATS, "sizes": sizes_text(node, code)}
+                    for code in dict.fromkeys(node.formats())
+                ],
+                "controls": [
+                    {
+                        "name": c.name, "kind": c.kind, "value": get_value(node, c), "minimum": c.minimum,
+                        "maximum": c.maximum, "step": c.step, "default": c.default, "menu": dict(c.menu),
+                    }
+                    for c in controls
+                ],
+            }  # fmt: skip
 
     @contextmanager
     def exposure_held(self) -> Iterator[None]:

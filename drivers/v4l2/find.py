@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -103,6 +103,17 @@ def list_cameras() -> list[Found]:
             continue  # an output, a metadata node, or one of somebody else's
         found.append(Found(path, who.driver, who.card, who.bus, tuple(stable_links(path))))
     return found
+
+
+def refused_nodes(nodes: Iterable[Path]) -> Iterator[str]:
+    """Yield a sentence for each node that this user may not open."""
+    for path in nodes:
+        try:
+            Node(path).close()
+        except NoPermission as error:
+            yield str(error)
+        except DriverError:
+            continue
 
 
 def stable_links(node: Path) -> list[Path]:

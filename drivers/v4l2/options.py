@@ -33,7 +33,7 @@ class CameraOptions:
     address
         Which camera.
     format, size_px, rate_hz
-        What is asked of it; None leaves the rate as it is. The camera's answer is checked against them.
+        What is asked of it; a rate of None (null) stays as it is. The answer is checked against them.
     colour
         Whether frames are BGR; grey otherwise.
     controls
@@ -94,7 +94,7 @@ def parse_options(options: Mapping[str, Any], name: str) -> CameraOptions:
         address=address,
         format=code,
         size_px=read.size("size_px") or CameraOptions.size_px,
-        rate_hz=read.number("rate_hz", 0.1, 1000.0) or CameraOptions.rate_hz,
+        rate_hz=None if options.get("rate_hz", 0) is None else _rate(read),
         colour=read.flag("colour"),
         controls=read.controls("controls"),
         exposure_s=exposure_s,
@@ -105,6 +105,10 @@ def parse_options(options: Mapping[str, Any], name: str) -> CameraOptions:
         margin_s=_or(read.number("margin_s", 0.0, 1.0), CameraOptions.margin_s),
         buffers=_or(read.whole("buffers", 3, 32), CameraOptions.buffers),
     )
+
+
+def _rate(read: _Reader) -> float | None:
+    return read.number("rate_hz", 0.1, 1000.0) or CameraOptions.rate_hz
 
 
 def _or(value: T | None, default: T) -> T:

@@ -1,8 +1,8 @@
 """Stereo pairs from two cameras: which two frames belong together, and whether they may serve a measurement.
 
-Free-running cameras expose up to half a period apart, by an offset that stays nearly the same. It is learned, so
-that the same partner is taken every time even where the offset is near half a period. Cameras with one hardware
-trigger are paired by their counts instead.
+Free-running cameras expose up to half a period apart, by an offset that stays nearly the same. It is learned,
+so that the same partner is taken each time even where the offset is near half a period. Cameras with one
+hardware trigger are paired by their counts instead.
 """
 
 from __future__ import annotations

@@ -80,7 +80,8 @@ def run(
     with tempfile.TemporaryDirectory(prefix="mastctl-vm-") as name:
         arguments = [
             str(kernel), f"mem={memory_mb}M", "root=none", "rootfstype=hostfs", "rootflags=/", "ro",
-            f"init={INIT}", "con=null", "con0=fd:0,fd:1", "quiet", "panic=-1", f"uml_dir={name}", *vivid, f"VM_OUT={out}",
+            f"init={INIT}", "con=null", "con0=fd:0,fd:1", "quiet", "panic=-1", f"uml_dir={name}",
+            *vivid, f"VM_OUT={out}",
         ]  # fmt: skip
         process = subprocess.Popen(
             arguments,
