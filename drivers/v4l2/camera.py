@@ -73,7 +73,7 @@ class V4l2Camera:
         self._exposure: ExposureControl | None = None
         self._judge_after_s = 0.0
         if options.auto_exposure is not None and options.exposure_s is not None:
-            self._exposure = GROUPS.join(options.auto_exposure, options.exposure_s)
+            self._exposure = GROUPS.join(name, options.auto_exposure, options.exposure_s)
         try:
             self.capture = Capture(
                 options,
@@ -183,22 +183,20 @@ class V4l2Camera:
     def _leave_group(self) -> None:
         if self._exposure is not None and self._options.auto_exposure is not None:
             self._exposure = None
-            GROUPS.leave(self._options.auto_exposure)
+            GROUPS.leave(self.name, self._options.auto_exposure)
 
     def _judge(self, stream: Stream, raw: RawFrame) -> None:
         """In the capture thread: look at a frame now and then, and set the exposure that its group wants."""
         control = self._exposure
-        if control is None or raw.window.begin_s < self._judge_after_s or stream.exposure_s is None:
+        if control is None or stream.exposure_s is None:
             return
-        self._judge_after_s = raw.received_s + JUDGE_EVERY_S
-        had_s = control.exposure_s
-        wanted_s = control.see(self.name, pixels.grey(raw.format, raw.raw), had_s)
-        if abs(wanted_s - self._set_s(stream)) > 0.5e-4:
-            stream.set_exposure(wanted_s)
+        if control.exposure_s == stream.asked_exposure_s and raw.window.begin_s >= self._judge_after_s:
+            self._judge_after_s = raw.received_s + JUDGE_EVERY_S
+            if not control.held:
+                control.see(self.name, pixels.grey(raw.format, raw.raw), control.exposure_s)
+        if control.exposure_s != stream.asked_exposure_s:  # also when another camera of the group wanted it
+            stream.set_exposure(control.exposure_s)
             self._judge_after_s = raw.received_s + SETTLE_PERIODS * stream.period_s
-
-    def _set_s(self, stream: Stream) -> float:
-        return stream.exposure_s or 0.0
 
     def _instead(self, exposed_after_s: float, timeout_s: float, before: Counters) -> str:
         """What to say when no fresh frame came."""

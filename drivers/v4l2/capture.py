@@ -9,6 +9,7 @@ import logging
 import os
 import select
 import threading
+import time
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
@@ -227,7 +228,7 @@ class Capture:
         poll = select.poll()
         poll.register(stream.node.fileno(), select.POLLIN)
         poll.register(self._wake, select.POLLIN)
-        silent_since_s = self._clock.now_s()
+        silent_since_s = time.monotonic()
         while True:
             events = dict(poll.poll(max(1.0, 1e3 * SILENT_PERIODS * stream.period_s)))
             if self._wake in events:
@@ -236,7 +237,7 @@ class Capture:
             while (buffer := stream.node.dequeue()) is not None:
                 self._take(stream, buffer)
                 took += 1
-            now_s = self._clock.now_s()
+            now_s = time.monotonic()
             if took:
                 silent_since_s = now_s
             elif events:
@@ -307,14 +308,14 @@ class Capture:
         poll.register(self._wake, select.POLLIN)
         if self._uevents.available:
             poll.register(self._uevents, select.POLLIN)
-        until_s = self._clock.now_s() + pause_s
-        while (left_s := until_s - self._clock.now_s()) > 0:
+        until_s = time.monotonic() + pause_s
+        while (left_s := until_s - time.monotonic()) > 0:
             events = dict(poll.poll(1e3 * left_s))
             if self._wake in events:
                 return True
             if any(event.action == "add" for event in self._uevents.read()):
                 self._pause_s = FIRST_PAUSE_S
-                until_s = min(until_s, self._clock.now_s() + FIRST_PAUSE_S / 5)  # for udev to make its links
+                until_s = min(until_s, time.monotonic() + FIRST_PAUSE_S / 5)  # for udev to make its links
         return False
 
     def _reopened(self) -> Stream | None:

@@ -15,6 +15,7 @@ import numpy as np
 from drivers.interfaces import Image
 
 SATURATED = 250
+PATIENCE = 6  # so many looks of one camera without one of the others: that one gives no pictures now
 MOST_STEP = 4.0  # no change by more than this factor at once: levels far from the target tell little
 
 
@@ -60,7 +61,9 @@ class ExposureControl:
     def __init__(self, settings: ExposureSettings, exposure_s: float) -> None:
         self._settings = settings
         self._exposure_s = exposure_s
+        self._members: set[str] = set()
         self._levels: dict[str, float] = {}
+        self._looks: dict[str, int] = {}
         self._holds = 0
         self._lock = threading.Lock()
 
@@ -85,7 +88,18 @@ class ExposureControl:
         """End one `hold`."""
         with self._lock:
             self._holds = max(0, self._holds - 1)
-            self._levels.clear()
+            self._begin_again()
+
+    def join(self, camera: str) -> None:
+        """Count a camera in: its pictures are waited for before anything changes."""
+        with self._lock:
+            self._members.add(camera)
+
+    def leave(self, camera: str) -> None:
+        """Count a camera out."""
+        with self._lock:
+            self._members.discard(camera)
+            self._begin_again()
 
     def see(self, camera: str, image: Image, exposure_s: float) -> float:
         """Take in a grey picture that was taken with ``exposure_s`` and return the exposure time to have now.
@@ -98,6 +112,9 @@ class ExposureControl:
             if self._holds or abs(exposure_s - self._exposure_s) > 1e-9:
                 return self._exposure_s
             self._levels[camera] = seen
+            self._looks[camera] = self._looks.get(camera, 0) + 1
+            if self._members - set(self._levels) and self._looks[camera] < PATIENCE:
+                return self._exposure_s
             brightest = max(self._levels.values())
             if abs(brightest - s.target) <= s.tolerance:
                 return self._exposure_s
@@ -106,8 +123,13 @@ class ExposureControl:
             wanted_s = min(max(self._exposure_s * factor, s.shortest_s), s.longest_s)
             if wanted_s != self._exposure_s:
                 self._exposure_s = wanted_s
-                self._levels.clear()  # all were taken with the exposure before
+                self._begin_again()
             return self._exposure_s
+
+    def _begin_again(self) -> None:
+        """Forget what was seen: it was taken with another exposure, or of another time."""
+        self._levels.clear()
+        self._looks.clear()
 
 
 class _Groups:
@@ -117,20 +139,22 @@ class _Groups:
         self._known: dict[str, tuple[ExposureControl, int]] = {}
         self._lock = threading.Lock()
 
-    def join(self, settings: ExposureSettings, exposure_s: float) -> ExposureControl:
+    def join(self, camera: str, settings: ExposureSettings, exposure_s: float) -> ExposureControl:
         """Return the control of a group, made by its first camera; a camera without group has its own."""
         if not settings.group:
             return ExposureControl(settings, exposure_s)
         with self._lock:
             control, users = self._known.get(settings.group, (ExposureControl(settings, exposure_s), 0))
             self._known[settings.group] = (control, users + 1)
+            control.join(camera)
             return control
 
-    def leave(self, settings: ExposureSettings) -> None:
+    def leave(self, camera: str, settings: ExposureSettings) -> None:
         """Let go of a group; the last one out forgets it."""
         with self._lock:
             if settings.group in self._known:
                 control, users = self._known.pop(settings.group)
+                control.leave(camera)
                 if users > 1:
                     self._known[settings.group] = (control, users - 1)
 

@@ -85,7 +85,7 @@ class Node:
 
     def __init__(self, path: str | Path, name: str = "") -> None:
         self.path = Path(path)
-        self.name = name or str(path)
+        self.name = "" if name == str(path) else name  # messages name the path themselves
         self._maps: list[mmap.mmap] = []
         self._streaming = False
         self._fd = _open(self.path, self.name)

@@ -31,6 +31,8 @@ class Stream:
         The rate that the camera answered, or the asked one where it does not tell.
     exposure_s
         The exposure time by the camera's own word, None if unknown.
+    asked_exposure_s
+        The exposure time that was set last, before the camera rounded it.
     problems
         Controls that are missing or not as asked.
 
@@ -46,6 +48,7 @@ class Stream:
         self._options = options
         self._name = name
         self.exposure_s: float | None = None
+        self.asked_exposure_s: float | None = None
         self.problems: list[Problem] = []
         self._exposure: Control | None = None
         self.node = find.open_node(options.address, name)
@@ -70,6 +73,7 @@ class Stream:
 
     def set_exposure(self, exposure_s: float) -> None:
         """Set the exposure time; `exposure_s` is then what the camera made of it. Raises DriverError."""
+        self.asked_exposure_s = exposure_s
         if self._exposure is None:
             return
         steps = max(1, round(exposure_s / EXPOSURE_UNIT_S))

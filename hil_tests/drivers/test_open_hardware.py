@@ -109,7 +109,7 @@ def test_real_and_simulated_together_are_mixed(outside: None, small_rig: Path) -
         assert hardware.kind == "mixed" and hardware.simulation is not None
 
 
-@pytest.mark.parametrize("driver", ["dynamixel", "flir_ptu", "v4l2"])
+@pytest.mark.parametrize("driver", ["dynamixel", "flir_ptu"])
 def test_drivers_of_later_versions_are_refused_by_name(driver: str) -> None:
     with pytest.raises(BadOptions, match=f"pan_tilt: driver '{driver}' is not in this version"):
         open_hardware(head_only(driver))
