@@ -233,14 +233,12 @@ class Capture:
             events = dict(poll.poll(max(1.0, 1e3 * SILENT_PERIODS * stream.period_s)))
             if self._wake in events:
                 return
-            took = 0
-            while (buffer := stream.node.dequeue()) is not None:
-                self._take(stream, buffer)
-                took += 1
             now_s = time.monotonic()
-            if took:
+            # One frame a round: asking for another that is not there costs as much as the poll that tells it.
+            if events and (buffer := stream.node.dequeue()) is not None:
+                self._take(stream, buffer)
                 silent_since_s = now_s
-            elif events:
+            elif events.get(stream.node.fileno(), 0) & ~select.POLLIN:
                 raise StreamFailed("its driver reports an error and gives no frame", device=self._name)
             else:
                 stream.node.check_there()
@@ -322,9 +320,11 @@ class Capture:
         """Try to open the camera again; None if it is not back."""
         try:
             stream = self._open()
-        except DriverError as error:
+        except Exception as error:
+            if not isinstance(error, DriverError):  # a defect: the thread goes on trying, and says so
+                log.exception("%s: opening again failed", self._name)
             with self._shared.changed:
-                self._shared.lost = str(error)
+                self._shared.lost = str(error) or type(error).__name__
             return None
         with self._shared.changed:
             self._shared.lost = ""

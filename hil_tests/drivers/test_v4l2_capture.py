@@ -53,7 +53,7 @@ class FakeNode:
     path = Path("/dev/video7")
 
     def __init__(self) -> None:
-        self.ready = os.eventfd(0, os.EFD_NONBLOCK)
+        self.ready = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_SEMAPHORE)
         self.waiting: deque[tuple[Dequeued, bytes] | DriverError] = deque()
         self.queued: list[int] = []
         self.lock = threading.Lock()
@@ -70,9 +70,9 @@ class FakeNode:
 
     def dequeue(self) -> Dequeued | None:
         with self.lock:
+            with contextlib.suppress(BlockingIOError):
+                os.eventfd_read(self.ready)
             if not self.waiting:
-                with contextlib.suppress(BlockingIOError):
-                    os.eventfd_read(self.ready)
                 return None
             what = self.waiting.popleft()
         if isinstance(what, DriverError):

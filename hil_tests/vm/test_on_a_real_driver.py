@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import sys
 from pathlib import Path
 from xml.etree import ElementTree
@@ -23,8 +22,9 @@ def test_the_cameras_behave_on_the_kernels_own_driver(tmp_path: Path, repository
     command = [sys.executable, "-m", "pytest", "hil_tests/vm/inside", "-q", "-p", "no:cacheprovider",
                "--junitxml=/run/out/results.xml"]  # fmt: skip
     environment = {"PYTHONPATH": str(repository), "OPENBLAS_NUM_THREADS": "1"}
-    os.chdir(repository)
-    result = boot.run(found, command, tmp_path, timeout_s=TIMEOUT_S, environment=environment)
+    result = boot.run(
+        found, command, tmp_path, folder=repository, timeout_s=TIMEOUT_S, environment=environment
+    )
     report = tmp_path / "results.xml"
     assert report.is_file(), f"no results came out of the machine:\n{result.console[-3000:]}"
     cases = list(ElementTree.parse(report).getroot().iter("testcase"))

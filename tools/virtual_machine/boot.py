@@ -42,6 +42,7 @@ def run(
     kernel: Path,
     command: Sequence[str],
     out: Path,
+    folder: Path | None = None,
     cameras: str = CAMERAS["webcams"],
     timeout_s: float = 300.0,
     memory_mb: int = 1536,
@@ -55,9 +56,11 @@ def run(
     kernel
         From `tools.virtual_machine.kernel`.
     command
-        Program and arguments, run in the present folder.
+        Program and arguments.
     out
         An existing folder, ``$VM_OUT`` in the machine.
+    folder
+        Where the command runs; the present folder when left out.
     cameras
         Options of vivid, separated by spaces.
     timeout_s
@@ -74,7 +77,11 @@ def run(
     """
     status_file = out / ".status"
     status_file.unlink(missing_ok=True)
-    job = {"command": list(command), "folder": str(Path.cwd()), "environment": dict(environment or {})}
+    job = {
+        "command": list(command),
+        "folder": str(folder or Path.cwd()),
+        "environment": dict(environment or {}),
+    }
     (out / ".job.json").write_text(json.dumps(job))
     vivid = [f"vivid.{option}" for option in cameras.split()]
     with tempfile.TemporaryDirectory(prefix="mastctl-vm-") as name:
