@@ -6,6 +6,7 @@ Times are seconds of CLOCK_MONOTONIC. Calls may block; the service gives each de
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
@@ -97,4 +98,13 @@ class Camera(Protocol):
 
     def close(self) -> None:
         """Let go of the device."""
+        ...
+
+
+@runtime_checkable
+class HoldsExposure(Protocol):
+    """A camera with an automatic exposure that can be told to wait; not every camera has this."""
+
+    def exposure_held(self) -> AbstractContextManager[None]:
+        """Return a context in which the exposure does not change: a measurement compares its pictures."""
         ...

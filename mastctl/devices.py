@@ -10,8 +10,9 @@ from __future__ import annotations
 import logging
 import threading
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future
+from contextlib import ExitStack, contextmanager
 from typing import Protocol
 
 import numpy as np
@@ -19,7 +20,7 @@ import numpy as np
 from calib.mast import Rig
 from drivers.clock import Clock
 from drivers.errors import BadFrame, BadReply, DriverError, NoReply
-from drivers.interfaces import Camera, PanTilt, Reading
+from drivers.interfaces import Camera, HoldsExposure, PanTilt, Reading
 from mastctl import frames as frame_checks
 from mastctl import joint_history
 from mastctl.device_thread import DeviceThread, Fault
@@ -249,6 +250,15 @@ class Devices:
     def newest_frames(self) -> dict[str, StampedFrame | None]:
         """Return each configured camera's newest frame, None where there is none yet; asks no camera."""
         return {camera: self._store.newest(camera) for camera in self._cameras}
+
+    @contextmanager
+    def exposure_held(self) -> Iterator[None]:
+        """Keep every camera's exposure as it is inside the block: a measurement compares its pictures."""
+        with ExitStack() as stack:
+            for camera in self._cameras.values():
+                if isinstance(camera, HoldsExposure):
+                    stack.enter_context(camera.exposure_held())
+            yield
 
     # All
 

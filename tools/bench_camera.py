@@ -12,6 +12,7 @@ import argparse
 import json
 import os
 import resource
+import signal
 import statistics
 import subprocess
 import sys
@@ -59,7 +60,7 @@ def main() -> None:
     options = [chosen(device, tuple(args.size), args.rate) for device in devices]
     say = (lambda *words: None) if args.json else print
     say(
-        f"load {os.getloadavg()[0]:.1f}; {options[0]['rate_hz']:g} Hz {args.size[0]}x{args.size[1]}, {len(options)} cameras"
+        f"load {os.getloadavg()[0]:.1f}; {len(options)} cameras, {args.size} px at {options[0]['rate_hz']:g} Hz"
     )
     told: dict[str, Any] = {"rate_hz": options[0]["rate_hz"], "size_px": args.size, "cameras": len(options)}
     told["gaps"] = [
@@ -119,12 +120,7 @@ def gaps(
                 while time.monotonic() < busy_until_s:
                     sum(i * i for i in range(20_000))  # Python's lock held nearly all the time
             else:
-                stopped = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(60)"])
-                thread = threading.Thread(target=stopped.wait)
-                thread.start()
-                time.sleep(STOPPED_S)
-                stopped.kill()
-                thread.join()
+                pass_to_stopped_consumer(cameras)
         span_s = time.monotonic() - began_s
         counted = [camera.counters for camera in cameras]
     row = {
@@ -137,9 +133,22 @@ def gaps(
     }
     rates = ", ".join(f"{frames / span_s:.2f}" for frames in row["frames"])
     say(
-        f"consumer {what}: {rates} Hz over {span_s:.0f} s, dropped {row['dropped']}, damaged {row['damaged']}, late {row['late']}"
+        f"consumer {what}: {rates} Hz over {span_s:.0f} s, "
+        f"dropped {row['dropped']}, damaged {row['damaged']}, late {row['late']}"
     )
     return row
+
+
+def pass_to_stopped_consumer(cameras: list[V4l2Camera]) -> None:
+    """Hand frames to another process that is stopped for two seconds: the hand-over hangs that long."""
+    reads = "import sys\nwhile sys.stdin.buffer.read(65536): pass"
+    with subprocess.Popen([sys.executable, "-c", reads], stdin=subprocess.PIPE) as consumer:
+        assert consumer.stdin is not None
+        consumer.send_signal(signal.SIGSTOP)
+        threading.Timer(STOPPED_S, consumer.send_signal, [signal.SIGCONT]).start()
+        for camera in cameras:
+            frame = camera.next_frame(time.monotonic(), 10.0)
+            consumer.stdin.write(frame.image.tobytes())  # more than a pipe holds: waits for the reader
 
 
 def age_after_pause(options: dict[str, Any], pauses: int, say: Callable[..., None]) -> dict[str, Any]:
@@ -161,7 +170,8 @@ def age_after_pause(options: dict[str, Any], pauses: int, say: Callable[..., Non
     for who, values in ages.items():
         table[who] = {"median_s": statistics.median(values), "most_s": max(values)}
         say(
-            f"age after a pause, {who}: median {1e3 * table[who]['median_s']:.1f} ms, most {1e3 * max(values):.1f} ms"
+            f"age after a pause, {who}: "
+            f"median {1e3 * table[who]['median_s']:.1f} ms, most {1e3 * max(values):.1f} ms"
         )
     table["bound_s"] = 1 / options["rate_hz"] + 0.005
     say(f"  bound (a period and 5 ms): {1e3 * table['bound_s']:.1f} ms")
@@ -234,7 +244,8 @@ def memory(options: list[dict[str, Any]], frames: int, say: Callable[..., None])
             time.sleep(0.05)
     growth = samples[-1] - samples[len(samples) // 4] if samples else 0
     say(
-        f"memory: {sum(taken)} frames, {[round(s / 2**20, 1) for s in samples]} MB; last 3/4 grew by {growth / 2**20:.2f} MB"
+        f"memory: {sum(taken)} frames, {[round(s / 2**20, 1) for s in samples]} MB; "
+        f"grew by {growth / 2**20:.2f} MB over the last three quarters"
     )
     return {"frames": sum(taken), "samples_bytes": samples, "growth_bytes": growth}
 
@@ -246,7 +257,7 @@ def resident_bytes() -> int:
 
 
 def descriptors(options: dict[str, Any], opens: int, say: Callable[..., None]) -> dict[str, Any]:
-    """Descriptors, threads and mappings left after opening again and again; with vivid every third open fails."""
+    """Descriptors, threads, mappings left after opening again and again; with vivid every third open fails."""
     address = parse_options(options, "opens").address
     with open_node(address, "opens") as node:
         is_vivid = node.identity.driver == "vivid"
@@ -272,7 +283,8 @@ def descriptors(options: dict[str, Any], opens: int, say: Callable[..., None]) -
             refused += 1
     after = held()
     say(
-        f"{opens} opens, {refused} of them refused: descriptors, threads, mappings {before} before, {after} after"
+        f"{opens} opens, {refused} of them refused: "
+        f"descriptors, threads, mappings {before} before, {after} after"
     )
     return {"opens": opens, "refused": refused, "before": before, "after": after}
 
