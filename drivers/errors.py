@@ -6,14 +6,29 @@ device, what happened, value and bound.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 
 class DriverError(Exception):
-    """Base of every fault that a device or its stand-in reports."""
+    """Base of every fault that a device or its stand-in reports.
+
+    Parameters
+    ----------
+    message
+        One plain sentence.
+    device
+        The device's name, put before the message.
+    detail
+        What programs may want to know (port, servo id, register, instruction); must be JSON.
+    """
 
     code = "driver_error"
 
-    def __init__(self, message: str, *, device: str = "") -> None:
+    def __init__(
+        self, message: str, *, device: str = "", detail: Mapping[str, object] | None = None
+    ) -> None:
         self.device = device
+        self.detail = dict(detail or {})
         super().__init__(f"{device}: {message}" if device else message)
 
 
@@ -33,6 +48,42 @@ class BadReply(DriverError):
     """The device answered, but the answer cannot be true (not finite, out of range, wrong size)."""
 
     code = "bad_reply"
+
+
+class LineLost(DriverError):
+    """The line to the device is gone or cannot be opened (unplugged, no permission, held by another)."""
+
+    code = "line_lost"
+
+
+class WrongDevice(DriverError):
+    """The device that answers does not fit the configuration: another model, firmware, mode or place."""
+
+    code = "wrong_device"
+
+
+class Refused(DriverError):
+    """The device understood the instruction and refused it; the message says why it says so."""
+
+    code = "refused_by_device"
+
+
+class OutOfRange(DriverError):
+    """A goal or speed that the device's own limits do not allow; nothing moves."""
+
+    code = "out_of_range"
+
+
+class HardwareFault(DriverError):
+    """The device reports damage or danger to itself: overload, overheating, voltage, encoder, shock."""
+
+    code = "hardware_fault"
+
+
+class WatchdogTripped(DriverError):
+    """The device stopped by itself since its host was silent; moving again must be asked for anew."""
+
+    code = "watchdog_tripped"
 
 
 class NoFreshFrame(DriverError):

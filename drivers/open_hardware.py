@@ -1,7 +1,7 @@
 """The one door to hardware: from a configuration's driver names to open devices.
 
-Nothing else knows real and simulated drivers both. A name is ``sim``, ``replay``, ``v4l2``, or
-``package.module:factory`` for a driver from outside this repository (contract section 5).
+Nothing else knows real and simulated drivers both. A name is ``dynamixel``, ``flir_ptu``, ``v4l2``, ``sim``,
+``replay``, or ``package.module:factory`` for a driver from outside this repository (contract section 5).
 """
 
 from __future__ import annotations
@@ -26,8 +26,10 @@ log = logging.getLogger(__name__)
 
 Kind = Literal["real", "simulated", "replayed", "mixed"]
 
-NOT_YET = ("dynamixel", "flir_ptu")
-BUILT_IN = ("sim", "replay", "v4l2", *NOT_YET)
+HEADS = {"dynamixel": "drivers.dynamixel.head", "flir_ptu": "drivers.flir_ptu.head"}
+"""Pan/tilt drivers of this repository: the module whose ``open_head(options, clock)`` opens them."""
+
+BUILT_IN = (*HEADS, "v4l2", "sim", "replay")
 
 
 @dataclass(frozen=True)
@@ -160,13 +162,24 @@ class _Opener:
         if device.driver == "v4l2":
             self._kinds.add("real")
             return self._v4l2(name, device)
-        if device.driver in NOT_YET:
-            raise BadOptions(f"driver {device.driver!r} is not in this version", device=name)
+        if device.driver in HEADS:
+            if protocol is not PanTilt:
+                raise BadOptions(f"driver {device.driver!r} is for a pan/tilt head", device=name)
+            self._kinds.add("real")
+            return self._head(name, device)
         raise BadOptions(
             f"there is no driver {device.driver!r}{nearest(device.driver, BUILT_IN)}; "
             "a driver from outside is named package.module:factory",
             device=name,
         )
+
+    def _head(self, name: str, device: DeviceSettings) -> Any:
+        """A real head; what it raises is told with the device's name in front."""
+        module = importlib.import_module(HEADS[device.driver])
+        try:
+            return module.open_head(device.options, clock=self._clock)
+        except BadOptions as error:
+            raise BadOptions(f"driver {device.driver!r}: {error}", device=name) from None
 
     def _simulated(self, name: str, device: DeviceSettings) -> Any:
         """The head or a camera of the one simulated rover."""

@@ -10,6 +10,11 @@ REPOSITORY = Path(__file__).resolve().parent.parent
 SHARED_DATA = REPOSITORY.parent / "shared" / "data"
 
 
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """Name the real hardware that hil_tests/bench moves."""
+    parser.addoption("--hardware", metavar="FILE", help="configuration of a real head for hil_tests/bench")
+
+
 @pytest.fixture(scope="session")
 def repository() -> Path:
     """The checkout that holds these tests."""

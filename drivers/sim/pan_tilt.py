@@ -1,24 +1,19 @@
-"""The simulated pan/tilt head: encoder counts, backlash, sag, and approach from one side.
-
-Three angles are kept apart. The *motor* angle follows a trapezoid profile to the goal, rounded to the
-nearest count. The *reading* is the motor angle in whole counts, since the encoder sits on the motor's side
-of the gears. The *mechanical* angle is what the cameras ride on: the motor angle through the backlash,
-less the sag of the tilt axis. Only the simulated cameras and the experiments see it.
-"""
+"""The simulated pan/tilt head in memory: what it is made of, and its calls; ``drivers.sim.axis`` moves it."""
 
 from __future__ import annotations
 
 import math
 import threading
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, fields, replace
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, fields, replace
 from typing import Any, TypeVar
 
 from drivers.clock import Clock
-from drivers.errors import BadOptions, DriverError, NoReply
+from drivers.errors import BadOptions, BadReply, DriverError, NoReply
 from drivers.faults import PAN_TILT, Fault, FaultPanel, nearest
 from drivers.interfaces import Reading
-from drivers.sim.motion import Motion
+from drivers.sim.axis import AxisSettings
+from drivers.sim.wire.axis import WireAxis
 
 _T = TypeVar("_T")
 
@@ -27,37 +22,11 @@ ARCSEC = math.radians(1 / 3600)
 REPLY_TIMEOUT_S = 0.1
 """How long a caller waits for a head that does not answer, seconds."""
 
+LOWEST_SUPPLY = 0.8
+"""Fraction of the nominal voltage under which the head complains: 9.5 V of 12 V, a Dynamixel X's default."""
 
-@dataclass(frozen=True)
-class AxisSettings:
-    """One axis of a head.
-
-    Attributes
-    ----------
-    count_rad
-        One encoder count or motor step.
-    backlash_rad
-        Full width of the gap between motor and load.
-    low_rad, high_rad
-        Goals that the device accepts.
-    speed_rad_per_s, acceleration_rad_per_s2
-        Largest speed, and the acceleration of every move.
-    approach_rad
-        0: the shortest way. Positive: every goal is reached moving in the positive direction, over at least
-        this distance, which has to be more than the backlash.
-        The way round may pass ``low_rad`` by as much.
-    sag_rad
-        Drop of a level load under gravity; at tilt t it is sag·cos(t), downwards.
-    """
-
-    count_rad: float
-    backlash_rad: float
-    low_rad: float
-    high_rad: float
-    speed_rad_per_s: float
-    acceleration_rad_per_s2: float
-    approach_rad: float = 0.0
-    sag_rad: float = 0.0
+HOTTEST_C = 80.0
+"""Temperature over which the head complains, degrees Celsius: a Dynamixel X's default."""
 
 
 @dataclass(frozen=True)
@@ -94,6 +63,10 @@ _X = AxisSettings(
     acceleration_rad_per_s2=4.0,
 )
 
+_PH42 = replace(
+    _X, count_rad=math.tau / 607500, backlash_rad=math.radians(0.1), approach_rad=math.radians(0.3)
+)
+
 PRESETS: Mapping[str, HeadSettings] = {
     "ptu_d46_70": HeadSettings(
         "ptu_d46_70",
@@ -103,6 +76,11 @@ PRESETS: Mapping[str, HeadSettings] = {
     # The shortest way, not one-sided: the table shows what counts and backlash allow untreated.
     "dynamixel_x": HeadSettings(
         "dynamixel_x", _X, replace(_X, low_rad=-math.pi / 2, high_rad=math.pi / 2, sag_rad=_SAG_RAD)
+    ),
+    # Dynamixel PH42: counts on the motor's side (607500 a turn of the output), so the backlash (6', vendor)
+    # is what matters, and it is taken up. Speed and acceleration are assumed, as for the X.
+    "ph42": HeadSettings(
+        "ph42", _PH42, replace(_PH42, low_rad=-math.pi / 2, high_rad=math.pi / 2, sag_rad=_SAG_RAD)
     ),
 }
 
@@ -146,62 +124,6 @@ def head_settings(value: Any) -> HeadSettings:
     return head
 
 
-def _play(load_rad: float, motor_rad: float, gap_rad: float) -> float:
-    """Where the load ends when the motor has gone one way to ``motor_rad`` from within the gap."""
-    return min(max(load_rad, motor_rad - gap_rad / 2), motor_rad + gap_rad / 2)
-
-
-@dataclass(frozen=True)
-class _Axis:
-    """One axis through time: the motor's motion, and the load's angle at the start of each leg."""
-
-    settings: AxisSettings
-    motion: Motion
-    loads_rad: tuple[float, ...] = field(default=())
-
-    @staticmethod
-    def resting(settings: AxisSettings, time_s: float) -> _Axis:
-        """At zero, last moved in the positive direction."""
-        return _Axis(settings, Motion.at_rest(time_s, 0.0), (-settings.backlash_rad / 2,))
-
-    def load_rad(self, time_s: float) -> float:
-        """The load's angle behind the backlash."""
-        return self._load_on(self.motion, self.loads_rad, self.motion.leg_index(time_s), time_s)
-
-    def _load_on(self, motion: Motion, loads_rad: Sequence[float], index: int, time_s: float) -> float:
-        leg, load, gap = motion.legs[index], loads_rad[index], self.settings.backlash_rad
-        if leg.turn_rad is not None and time_s >= leg.turn_s:
-            load = _play(load, leg.turn_rad, gap)
-        return _play(load, leg.at(time_s)[0], gap)
-
-    def mechanical_rad(self, time_s: float) -> float:
-        """What the cameras ride on."""
-        load = self.load_rad(time_s)
-        return load - self.settings.sag_rad * math.cos(load)
-
-    def followed_by(self, motion: Motion, time_s: float) -> _Axis:
-        """With a motion that continues this one from ``time_s``; the load's state is carried over."""
-        first, last = self.motion.kept(time_s), self.motion.leg_index(time_s)
-        loads = list(self.loads_rad[first : last + 1])
-        for index in range(len(loads), len(motion.legs)):
-            loads.append(self._load_on(motion, loads, index - 1, motion.legs[index].start_s))
-        return replace(self, motion=motion, loads_rad=tuple(loads))
-
-    def moved(self, time_s: float, goal_rad: float, speed_rad_per_s: float, factor: float) -> _Axis:
-        """Commanded to a goal, rounded to the nearest count, by way of the approach if there is one."""
-        s = self.settings
-        goal = round(goal_rad / s.count_rad) * s.count_rad
-        position, velocity = self.motion.at(time_s)
-        goals = [goal]
-        if s.approach_rad > 0 and not (position == goal and velocity == 0):
-            stop_rad = position + velocity * abs(velocity) / (2 * factor * s.acceleration_rad_per_s2)
-            if max(position, stop_rad) > goal - s.approach_rad:
-                goals = [goal - s.approach_rad, goal]
-        speed = factor * min(speed_rad_per_s, s.speed_rad_per_s)
-        motion = self.motion.moved(time_s, goals, speed, factor * s.acceleration_rad_per_s2)
-        return self.followed_by(motion, time_s)
-
-
 class SimulatedPanTilt:
     """A head in memory that fulfils ``drivers.interfaces.PanTilt``; safe from any thread.
 
@@ -223,10 +145,10 @@ class SimulatedPanTilt:
         self._faults = faults or FaultPanel(clock.now_s, ())
         self._lock = threading.RLock()
         now_s = clock.now_s()
-        self._axes = (_Axis.resting(head.pan, now_s), _Axis.resting(head.tilt, now_s))
-        self._command: tuple[float, float, float] | None = None
-        self._jam: Fault | None = None
-        self._factor = 1.0
+        self._axes = (
+            WireAxis(head.pan, self._faults, number=0, resumes=False, time_s=now_s),
+            WireAxis(head.tilt, self._faults, number=1, resumes=False, time_s=now_s),
+        )
         self._closed = False
 
     def read(self) -> Reading:
@@ -235,7 +157,9 @@ class SimulatedPanTilt:
         Raises
         ------
         NoReply
-            Under the faults ``off`` and ``intermittent``, and after ``close``.
+            Under faults that keep the answer away, and after ``close``.
+        BadReply
+            Under faults that damage it.
         """
         return self._call(self._reading)
 
@@ -249,7 +173,7 @@ class SimulatedPanTilt:
         DriverError
             For a goal outside the device's own range, or an angle or speed that is not a usable number;
             nothing moves then.
-        NoReply
+        NoReply, BadReply
             As ``read``.
         """
         axes = (("pan", self.head.pan, pan_rad), ("tilt", self.head.tilt, tilt_rad))
@@ -267,69 +191,59 @@ class SimulatedPanTilt:
             )
 
         def start(now_s: float) -> None:
-            if self._jam is None:
-                self._command = (pan_rad, tilt_rad, speed)
-                self._drive(now_s)
+            for axis, goal_rad in zip(self._axes, (pan_rad, tilt_rad), strict=True):
+                axis.to_count(now_s, goal_rad, speed)
 
         self._call(start)
 
     def stop(self) -> None:
-        """Brake both axes and hold where they come to rest. Raises NoReply as ``read``."""
+        """Brake both axes and hold where they come to rest. Raises NoReply and BadReply as ``read``."""
         self._call(self._halt)
 
     def close(self) -> None:
         """Stop and let go; further calls fail with NoReply."""
         with self._lock:
-            now_s = self._follow_faults()
             if not self._closed:
-                self._halt(now_s)
+                self._halt(self._clock.now_s())
             self._closed = True
 
     def true_joints(self, time_s: float) -> tuple[float, float]:
         """Return the mechanical pan and tilt at a moment of the last minute, radians. Never fails."""
         with self._lock:
-            self._follow_faults()
-            pan, tilt = self._axes
-        return pan.mechanical_rad(time_s), tilt.mechanical_rad(time_s)
+            now_s = self._clock.now_s()
+            for axis in self._axes:
+                axis.follow(now_s)
+            pan, tilt = (axis.mechanical_rad(time_s) for axis in self._axes)
+        return pan, tilt
 
     def _halt(self, now_s: float) -> None:
-        """Brake both axes; seized ones stand already."""
-        if self._jam is not None:
-            return
-        self._command = None
-        pan, tilt = (
-            axis.followed_by(
-                axis.motion.stopped(now_s, self._factor * axis.settings.acceleration_rad_per_s2), now_s
-            )
-            for axis in self._axes
-        )
-        self._axes = (pan, tilt)
-
-    def _drive(self, now_s: float) -> None:
-        """Send both axes to the command."""
-        if self._command is None:
-            return
-        pan_rad, tilt_rad, speed = self._command
-        pan, tilt = self._axes
-        self._axes = (
-            pan.moved(now_s, pan_rad, speed, self._factor),
-            tilt.moved(now_s, tilt_rad, speed, self._factor),
-        )
+        for axis in self._axes:
+            axis.halt(now_s)
 
     def _reading(self, now_s: float) -> Reading:
         """The reading of a moment, as a fault leaves it."""
         counts = []
         for axis in self._axes:
             count = axis.settings.count_rad
-            counts.append(round(axis.motion.at(now_s)[0] / count) * count)
-        moving = any(now_s < axis.motion.end_s for axis in self._axes)
-        if self._jam is not None and self._jam.word == "stuck":
-            moving = self._jam.number("moving") > 0
-        if fault := self._faults.find(PAN_TILT, "wrong", now_s):
-            counts = [angle + fault.number("offset_rad") for angle in counts]
+            counts.append(round(axis.angle_rad(now_s) / count) * count)
+        moving = any(axis.under_way(now_s) for axis in self._axes)
+        stuck = self._faults.find(PAN_TILT, "stuck", now_s)
+        if stuck is not None and not self._faults.find(PAN_TILT, "off", now_s):
+            seized = all(axis.seized(now_s) for axis in self._axes)
+            moving = stuck.number("moving") > 0 or (moving and not seized)
         if fault := self._faults.find(PAN_TILT, "garbage", now_s):
             counts = [self._absurd(fault) for _ in counts]
-        return Reading(counts[0], counts[1], moving, now_s)
+        return Reading(counts[0], counts[1], moving, now_s, tuple(self._complaints(now_s)))
+
+    def _complaints(self, now_s: float) -> Iterator[str]:
+        """What the head itself reports as wrong."""
+        for name, axis in zip(("pan", "tilt"), self._axes, strict=True):
+            if axis.pressing(now_s):
+                yield f"{name}: overload"
+            if axis.supply(now_s) < LOWEST_SUPPLY:
+                yield f"{name}: input voltage {axis.supply(now_s):.0%} of what it should be"
+            if axis.temperature_c(now_s) > HOTTEST_C:
+                yield f"{name}: overheating, {axis.temperature_c(now_s):.0f} °C"
 
     def _absurd(self, fault: Fault) -> float:
         """One of the angles that a head full of garbage reports."""
@@ -338,37 +252,29 @@ class SimulatedPanTilt:
             return math.nan
         return (2 * value - 1) * (1e6 if kind < 0.6 else math.pi)
 
-    def _follow_faults(self) -> float:
-        """Seize, free, slow down or speed up the axes as the panel says; return the time now."""
-        now_s = self._clock.now_s()
-        jam = self._faults.find(PAN_TILT, "off", now_s) or self._faults.find(PAN_TILT, "stuck", now_s)
-        if jam is not None and self._jam is None:
-            since_s = min(now_s, max(jam.begin_s, *(a.motion.legs[0].start_s for a in self._axes)))
-            pan, tilt = (axis.followed_by(axis.motion.jammed(since_s), since_s) for axis in self._axes)
-            self._axes, self._command = (pan, tilt), None
-        self._jam = jam
-        slow = self._faults.find(PAN_TILT, "slow", now_s)
-        factor = slow.number("factor") if slow else 1.0
-        if factor != self._factor:
-            self._factor = factor
-            if any(now_s < axis.motion.end_s for axis in self._axes):
-                self._drive(now_s)
-        return now_s
-
     def _call(self, action: Callable[[float], _T]) -> _T:
-        """Do what a caller asked, at the moment of the call, unless the head does not answer."""
+        """Do what a caller asked, at the moment of the call; then let the answer fail if a fault says so."""
+        faults, name = self._faults, self.head.name
         with self._lock:
-            now_s = self._follow_faults()
-            closed = self._closed
-            silent = self._faults.find(PAN_TILT, "off", now_s) or self._faults.strikes(PAN_TILT, now_s)
-            late = self._faults.find(PAN_TILT, "delayed", now_s)
-            if not closed and not silent:
+            now_s = self._clock.now_s()
+            for axis in self._axes:
+                axis.follow(now_s)
+            if self._closed:
+                raise NoReply("it is closed", device=name)
+            gone = faults.find(PAN_TILT, "hang_up", now_s)
+            deaf = gone or faults.find(PAN_TILT, "off", now_s) or faults.strikes(PAN_TILT, now_s)
+            if not deaf:
                 result = action(now_s)
-        if closed:
-            raise NoReply("it is closed", device=self.head.name)
-        if silent:
+                silent = faults.takes(PAN_TILT, "mute", now_s) or faults.takes(PAN_TILT, "half", now_s)
+                damaged = faults.takes(PAN_TILT, "corrupt", now_s) or faults.takes(PAN_TILT, "swapped", now_s)
+                late = faults.find(PAN_TILT, "delayed", now_s) or faults.takes(PAN_TILT, "late", now_s)
+        if gone:
+            raise NoReply("the line is gone", device=name)
+        wait_s = late.number("delay_s") if not deaf and late else 0.0
+        if deaf or silent or (late and late.word == "late" and wait_s > REPLY_TIMEOUT_S):
             self._clock.sleep(REPLY_TIMEOUT_S)
-            raise NoReply(f"no answer within {REPLY_TIMEOUT_S:g} s", device=self.head.name)
-        if late:
-            self._clock.sleep(late.number("delay_s"))
+            raise NoReply(f"no answer within {REPLY_TIMEOUT_S:g} s", device=name)
+        self._clock.sleep(wait_s)
+        if damaged:
+            raise BadReply(f"the answer was damaged ({damaged.word})", device=name)
         return result

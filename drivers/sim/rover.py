@@ -26,11 +26,13 @@ from calib.rigid import FloatArray, Rigid
 from calib.store import load_rig
 from drivers.clock import Clock
 from drivers.errors import BadOptions, NoFreshFrame
-from drivers.faults import FaultPanel, nearest
+from drivers.faults import FaultPanel, nearest, read_script
+from drivers.interfaces import PanTilt
 from drivers.sim.cameras import CameraSettings, SimulatedCamera
 from drivers.sim.pan_tilt import HeadSettings, SimulatedPanTilt, head_settings
 from drivers.sim.render import Renderer, compile_renderer
 from drivers.sim.scene import SceneSettings, build_scene
+from drivers.sim.wire.head import DEFAULT_HEADS, WiredHead, check_head
 
 TRUTH_FRAMES = 512
 """How many frames of each camera ``frame_truth`` remembers."""
@@ -60,6 +62,9 @@ class SimulationSettings:
         What is rendered.
     faults
         Faults set from the start, as ``FaultPanel.set_all`` reads them.
+    wire
+        None: the head is in memory. ``dynamixel`` or ``flir_ptu``: the real driver turns it through a
+        simulated line.
     """
 
     rover: Path
@@ -68,9 +73,10 @@ class SimulationSettings:
     samples: int = 2
     scene: SceneSettings = field(default_factory=SceneSettings)
     faults: tuple[Mapping[str, Any], ...] = ()
+    wire: str | None = None
 
 
-_KEYS = ("rover", "head", "seed", "samples", "scene", "cameras", "faults")
+_KEYS = ("rover", "head", "seed", "samples", "scene", "cameras", "faults", "wire")
 
 
 def simulation_settings(section: Mapping[str, Any], folder: Path) -> SimulationSettings:
@@ -81,8 +87,8 @@ def simulation_settings(section: Mapping[str, Any], folder: Path) -> SimulationS
     section
         Keys ``rover`` (a mast file, relative to ``folder``), ``head`` (a preset, see
         ``drivers.sim.pan_tilt.head_settings``), ``seed`` (of scene and noise), ``samples``, ``scene``
-        (fields of ``SceneSettings``), ``cameras`` (fields of ``CameraSettings``), ``faults`` (a list). Only
-        ``rover`` is needed.
+        (fields of ``SceneSettings``), ``cameras`` (fields of ``CameraSettings``), ``faults`` (a list, or a
+        script's name), ``wire``. Only ``rover`` is needed.
     folder
         Where relative paths start.
 
@@ -99,6 +105,8 @@ def simulation_settings(section: Mapping[str, Any], folder: Path) -> SimulationS
         raise BadOptions(f"simulation.rover is {rover!r}, expected the file of the true rig")
     seed = _whole(section.get("seed", 1), "simulation.seed", 0, 2**31 - 1)
     faults = section.get("faults", [])
+    if isinstance(faults, str):
+        faults = read_script(folder / faults)
     if not isinstance(faults, list | tuple):
         raise BadOptions(f"simulation.faults is {faults!r}, expected a list of {{device, word, ...}}")
     camera: CameraSettings = _filled(CameraSettings(), section.get("cameras", {}), "simulation.cameras")
@@ -114,13 +122,20 @@ def simulation_settings(section: Mapping[str, Any], folder: Path) -> SimulationS
     scene = section.get("scene", {})
     if isinstance(scene, Mapping) and "seed" not in scene:
         scene = {**scene, "seed": seed}
+    wire = section.get("wire")
+    if wire is not None and wire not in DEFAULT_HEADS:
+        raise BadOptions(f"simulation.wire is {wire!r}{nearest(str(wire), DEFAULT_HEADS)}")
+    head = head_settings(section.get("head", DEFAULT_HEADS.get(str(wire), "ptu_d46_70")))
+    if wire is not None:
+        check_head(wire, head)
     return SimulationSettings(
         rover=folder / rover,
-        head=head_settings(section.get("head", "ptu_d46_70")),
+        head=head,
         camera=replace(camera, seed=seed),
         samples=_whole(section.get("samples", 2), "simulation.samples", 1, 6),
         scene=_filled(SceneSettings(), scene, "simulation.scene"),
         faults=tuple(faults),
+        wire=wire,
     )
 
 
@@ -209,7 +224,14 @@ class SimulatedRover:
         self._closed = False
         self._truth_lock = threading.Lock()
         self._truth: dict[str, OrderedDict[int, FrameTruth]] = {n: OrderedDict() for n in self.rig.cameras}
-        self.pan_tilt = SimulatedPanTilt(settings.head, clock, self.faults)
+        self.pan_tilt: PanTilt
+        self._head: SimulatedPanTilt | WiredHead
+        if settings.wire is None:
+            head = SimulatedPanTilt(settings.head, clock, self.faults)
+            self.pan_tilt, self._head = head, head
+        else:
+            wired = WiredHead(settings.wire, settings.head, clock, self.faults)
+            self.pan_tilt, self._head = wired.pan_tilt, wired
         start_s = clock.now_s()
         self.cameras: Mapping[str, SimulatedCamera] = MappingProxyType(
             {name: self._camera(name, clock, start_s) for name in self.rig.cameras}
@@ -217,7 +239,7 @@ class SimulatedRover:
 
     def true_joints(self, time_s: float) -> tuple[float, float]:
         """Return the mechanical pan and tilt at a moment of the last minute, radians."""
-        return self.pan_tilt.true_joints(time_s)
+        return self._head.true_joints(time_s)
 
     def frame_truth(self, camera: str, sequence: int) -> FrameTruth:
         """Return where a camera was when a frame was taken.
@@ -262,7 +284,7 @@ class SimulatedRover:
 
     def close(self) -> None:
         """Stop the head and let waiting camera calls end."""
-        self.pan_tilt.close()
+        self._head.close()
         for camera in self.cameras.values():
             camera.close()
         with self._render_lock:

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from drivers.clock import ManualClock
-from drivers.errors import BadOptions, DriverError, NoFreshFrame, NoReply
-from drivers.faults import CAMERA_WORDS, HEAD_WORDS, PAN_TILT, WHEN, FaultPanel
+from drivers.errors import BadOptions, BadReply, DriverError, NoFreshFrame, NoReply
+from drivers.faults import CAMERA_WORDS, HEAD_WORDS, PAN_TILT, WHEN, FaultPanel, read_script
 from drivers.sim.cameras import CameraSettings, SimulatedCamera
 from drivers.sim.pan_tilt import PRESETS, REPLY_TIMEOUT_S, SimulatedPanTilt
 
@@ -145,6 +145,141 @@ def test_head_intermittent_fails_some_calls(bench: Bench) -> None:
         except NoReply:
             failures += 1
     assert 60 < failures < 120, "0.3 of 300, four sigma either way"
+
+
+def test_head_mute_half_and_hang_up_give_no_reply(bench: Bench) -> None:
+    for word in ("mute", "half"):
+        bench.panel.set(PAN_TILT, word, replies=2)
+        for _ in range(2):
+            with pytest.raises(NoReply, match="no answer within"):
+                bench.head.read()
+        bench.head.read()
+    bench.panel.set(PAN_TILT, "hang_up", for_s=2.0)
+    with pytest.raises(NoReply, match="the line is gone"):
+        bench.head.move(0.3, 0.0)
+    bench.clock.advance(2.0)
+    assert bench.head.read().pan_rad == 0.0, "the command did not reach it"
+
+
+def test_head_mute_did_what_it_was_asked(bench: Bench) -> None:
+    bench.panel.set(PAN_TILT, "mute")
+    with pytest.raises(NoReply):
+        bench.head.move(0.3, 0.0)
+    bench.clock.advance(5.0)
+    assert bench.head.read().pan_rad == pytest.approx(0.3, abs=1e-4)
+
+
+@pytest.mark.parametrize("word", ["corrupt", "swapped"])
+def test_head_damaged_replies_are_bad_ones(bench: Bench, word: str) -> None:
+    bench.panel.set(PAN_TILT, word)
+    with pytest.raises(BadReply, match=word):
+        bench.head.read()
+    bench.head.read()
+
+
+@pytest.mark.parametrize("word", ["duplicate", "noise"])
+def test_head_harmless_faults_of_a_line_do_nothing_in_memory(bench: Bench, word: str) -> None:
+    bench.panel.set(PAN_TILT, word, replies=5)
+    assert bench.head.read().pan_rad == 0.0
+
+
+def test_head_late_replies_come_late_or_too_late(bench: Bench) -> None:
+    bench.panel.set(PAN_TILT, "late", delay_s=REPLY_TIMEOUT_S / 2)
+    asked_s = bench.clock.now_s()
+    assert bench.head.read().time_s == asked_s
+    assert bench.clock.now_s() == pytest.approx(asked_s + REPLY_TIMEOUT_S / 2)
+    bench.panel.set(PAN_TILT, "late", delay_s=10.0)
+    with pytest.raises(NoReply):
+        bench.head.read()
+    assert bench.clock.now_s() == pytest.approx(asked_s + REPLY_TIMEOUT_S * 1.5), "nobody waits longer"
+
+
+def test_head_drifting_reads_away_from_where_it_stands(bench: Bench) -> None:
+    assert bench.settled(0.3, 0.1)
+    bench.panel.set(PAN_TILT, "drifting", rate_rad_per_s=0.01, axis=0)
+    bench.clock.advance(5.0)
+    reading = bench.head.read()
+    assert reading.pan_rad == pytest.approx(0.35, abs=1e-4)
+    assert reading.tilt_rad == pytest.approx(0.1, abs=1e-4)
+    assert bench.head.true_joints(bench.clock.now_s())[0] == pytest.approx(0.3, abs=5e-4)
+
+
+def test_head_overload_stops_at_the_obstacle_and_says_so(bench: Bench) -> None:
+    bench.panel.set(PAN_TILT, "overload", angle_rad=0.2, axis=1)
+    bench.head.move(0.3, 0.4)
+    bench.clock.advance(5.0)
+    reading = bench.head.read()
+    assert reading.faults == ("tilt: overload",) and not reading.moving
+    assert reading.tilt_rad == pytest.approx(0.2, abs=1e-4)
+    assert reading.pan_rad == pytest.approx(0.3, abs=1e-4)
+    assert bench.settled(0.3, -0.1)
+    assert bench.head.read().faults == ()
+
+
+def test_head_voltage_and_temperature_are_told(bench: Bench) -> None:
+    bench.panel.set(PAN_TILT, "voltage_dip", factor=0.75)
+    assert bench.head.read().faults == (
+        "pan: input voltage 75% of what it should be",
+        "tilt: input voltage 75% of what it should be",
+    )
+    bench.panel.clear()
+    bench.panel.set(PAN_TILT, "temperature_ramp", rate_c_per_s=5.0, axis=0)
+    bench.clock.advance(8.9)  # 35 °C and 44.5 more
+    assert bench.head.read().faults == ()
+    bench.clock.advance(0.15)
+    assert bench.head.read().faults == ("pan: overheating, 80 °C",)
+
+
+@pytest.mark.parametrize("word", sorted(HEAD_WORDS))
+def test_a_cleared_head_is_as_before(bench: Bench, word: str) -> None:
+    assert bench.settled(0.1, 0.0)
+    bench.panel.set(PAN_TILT, word, for_s=1.0)
+    with contextlib.suppress(DriverError):
+        bench.head.read()
+    bench.clock.advance(2.0)
+    assert bench.panel.active() == ()
+    bench.head.read()
+    assert bench.settled(0.3, 0.1)
+    reading = bench.head.read()
+    assert (reading.pan_rad, reading.tilt_rad) == pytest.approx((0.3, 0.1), abs=1e-4)
+    assert not reading.faults
+
+
+def test_a_script_runs_by_its_own_times_and_may_repeat_a_word(bench: Bench, tmp_path: Path) -> None:
+    path = tmp_path / "bad_day.yaml"
+    path.write_text(
+        "faults:\n"
+        "  - {at_s: 1, device: pan_tilt, word: slow, factor: 0.5, for_s: 2}\n"
+        "  - {at_s: 5, device: pan_tilt, word: slow, factor: 0.25, for_s: 2}\n"
+        "  - {device: cam_left, word: dark}\n"
+    )
+    bench.panel.set_all(read_script(path))
+    factors = []
+    for after_s in (0.5, 1.5, 4.0, 6.0, 8.0):
+        found = bench.panel.find(PAN_TILT, "slow", START + after_s)
+        factors.append(found and found.number("factor"))
+    assert factors == [None, 0.5, None, 0.25, None]
+    assert len(bench.panel.active()) == 3
+    bench.panel.set(PAN_TILT, "slow", factor=0.1)
+    assert len(bench.panel.active()) == 2, "set by hand, a word is there once"
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("faults: 3\n", "expected the one key 'faults'"),
+        ("- {word: off}\n", "script.yaml"),
+        ("faults: []\nmore: 1\n", "expected the one key 'faults'"),
+        ("faults: [", "script.yaml"),
+    ],
+)
+def test_a_script_that_is_none_is_refused(tmp_path: Path, text: str, message: str) -> None:
+    path = tmp_path / "script.yaml"
+    path.write_text(text)
+    with pytest.raises(BadOptions, match=message):
+        read_script(path)
+    with pytest.raises(BadOptions, match=r"nowhere\.yaml"):
+        read_script(tmp_path / "nowhere.yaml")
 
 
 def test_camera_off_gives_no_frame_and_says_so(bench: Bench) -> None:
@@ -298,6 +433,7 @@ def test_a_fault_that_does_not_exist_is_refused_by_name(
         [{"device": "pan_tilt", "word": 3}],
         [{"device": "cam_left", "word": "dark"}, {"device": "pan_tilt", "word": "nonsense"}],
         [{"device": "cam_left", "word": "dark", 5: 6}],
+        [{"device": "cam_left", "word": "dark", "at_s": 1, "after_s": 1}],
     ],
 )
 def test_a_bad_list_of_faults_sets_none(bench: Bench, faults: object) -> None:

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from drivers.clock import ManualClock
-from drivers.errors import BadOptions, NoReply
+from drivers.errors import BadOptions, LineLost, NoReply
 from drivers.interfaces import Frame, Reading
 from drivers.open_hardware import DeviceSettings, HardwareSettings, open_hardware
 
@@ -109,10 +109,41 @@ def test_real_and_simulated_together_are_mixed(outside: None, small_rig: Path) -
         assert hardware.kind == "mixed" and hardware.simulation is not None
 
 
+def test_a_v4l2_camera_is_no_head() -> None:
+    with pytest.raises(BadOptions, match="pan_tilt: driver 'v4l2' is for cameras"):
+        open_hardware(head_only("v4l2"))
+
+
 @pytest.mark.parametrize("driver", ["dynamixel", "flir_ptu"])
-def test_drivers_of_later_versions_are_refused_by_name(driver: str) -> None:
-    with pytest.raises(BadOptions, match=f"pan_tilt: driver '{driver}' is not in this version"):
-        open_hardware(head_only(driver))
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({}, "options.port is missing"),
+        ({"port": 5, "pan": {}, "tilt": {}}, "options.port is 5, expected a serial device"),
+        ({"prot": "x"}, "options.prot: there is no such option; did you mean 'port'"),
+        ({"port": "/dev/x", "pan": 1, "tilt": {}}, "options.pan is 1, expected a mapping with"),
+    ],
+)
+def test_options_of_the_real_heads_are_refused_by_name(
+    driver: str, options: dict[str, object], message: str
+) -> None:
+    with pytest.raises(BadOptions, match=f"pan_tilt: driver '{driver}': .*{message}") as caught:
+        open_hardware(head_only(driver, **options))
+    assert "\n" not in str(caught.value)
+
+
+def test_a_real_head_is_no_camera(outside: None) -> None:
+    settings = HardwareSettings(
+        DeviceSettings("outside_drivers:Head"), {"cam_left": DeviceSettings("flir_ptu")}
+    )
+    with pytest.raises(BadOptions, match="cam_left: driver 'flir_ptu' is for a pan/tilt head"):
+        open_hardware(settings)
+
+
+def test_a_port_that_is_not_there_is_a_lost_line(tmp_path: Path) -> None:
+    limits = {"limits_rad": [-1.0, 1.0]}
+    with pytest.raises(LineLost, match=r"port .*/nothing cannot be opened .*No such file"):
+        open_hardware(head_only("flir_ptu", port=str(tmp_path / "nothing"), pan=limits, tilt=limits))
 
 
 @pytest.mark.parametrize(
@@ -187,7 +218,11 @@ def test_a_camera_that_fails_to_open_closes_the_head_again(outside: None) -> Non
         ({"scene": {"stones": 3}}, r"simulation.scene has no key 'stones'"),
         ({"scene": {"rocks": 3.5}}, r"simulation.scene.rocks is 3.5, expected a whole number"),
         ({"scene": {"rocks": -3}}, r"rocks -3"),
-        ({"faults": "all"}, r"simulation.faults is 'all', expected a list"),
+        ({"faults": 7}, r"simulation.faults is 7, expected a list"),
+        ({"faults": "all.yaml"}, r"all.yaml: "),
+        ({"wire": "dynamixl"}, r"simulation.wire is 'dynamixl'; did you mean 'dynamixel'"),
+        ({"wire": "dynamixel", "head": "ptu_d46_70"}, r"expected dynamixel_x or ph42"),
+        ({"wire": "flir_ptu", "head": {"preset": "ptu_d46_70", "count_rad": 0.1}}, r"cannot be changed"),
         (
             {"faults": [{"device": "pan_tilt", "word": "of"}]},
             r"pan_tilt has no fault 'of'; did you mean 'off'",

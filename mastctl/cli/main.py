@@ -28,6 +28,9 @@ MODULES: dict[str, tuple[str, ...]] = {
     "mastctl.cli.geometry": ("camera", "solve", "triangulate", "budget"),
     "mastctl.cli.calibrate": ("calibrate",),
     "mastctl.cli.experiment": ("experiment", "demo"),
+    "mastctl.cli.sim": ("sim",),
+    "mastctl.cli.servo": ("servo",),
+    "mastctl.cli.ptu": ("ptu",),
 }
 
 # argparse's own pattern knows -1 and -1.5 but takes -1e-3 for an option; "not finite" words get our message.

@@ -1,0 +1,390 @@
+"""Transactions with servos on one line: an instruction, its replies, and typed errors that say where.
+
+A `Link` belongs to one thread at a time. Every failure names port, servo id, register and instruction, in
+its sentence and in ``detail``. No value is ever made up: what a servo did not say is an error.
+"""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+from dynamixel_sdk import (
+    BROADCAST_ID,
+    INST_BULK_READ,
+    INST_BULK_WRITE,
+    INST_FAST_BULK_READ,
+    INST_FAST_SYNC_READ,
+    INST_PING,
+    INST_READ,
+    INST_REBOOT,
+    INST_SYNC_READ,
+    INST_SYNC_WRITE,
+    INST_WRITE,
+)
+
+from drivers.dynamixel.models import Register
+from drivers.dynamixel.packets import ERROR_WORDS, PacketHandler, Status, crc16, instruction_packet
+from drivers.dynamixel.port import Port
+from drivers.errors import DriverError, LineLost, NoReply, Refused
+
+log = logging.getLogger(__name__)
+
+REPLY_TIMEOUT_S = 0.05  # USB adapters hold bytes back for up to 16 ms, the servo for up to 0.5 ms
+
+PING_REPLY_BYTES = 14
+
+
+@dataclass(frozen=True)
+class Pinged:
+    """What a servo says to a ping."""
+
+    servo_id: int
+    model_number: int
+    firmware: int
+    alert: bool
+
+
+@dataclass(frozen=True)
+class Part:
+    """What is read of, or written to, one servo in a group: the address, and length or data."""
+
+    servo_id: int
+    address: int
+    length: int
+    data: bytes = b""
+
+
+@dataclass(frozen=True)
+class GroupAnswer:
+    """The replies to a group read: by id what came, and why the rest did not.
+
+    The servos measured after ``sent_s`` and before ``received_s``, seconds of CLOCK_MONOTONIC.
+    """
+
+    statuses: Mapping[int, Status]
+    missing: Mapping[int, DriverError]
+    sent_s: float
+    received_s: float
+
+
+@dataclass
+class LineCounts:
+    """How the line has been since it was opened."""
+
+    transactions: int = 0
+    timeouts: int = 0
+    strays: int = 0
+    refusals: int = 0
+
+
+class Link:
+    """One open line and its transactions.
+
+    Parameters
+    ----------
+    port
+        A serial device or a URL that pyserial understands.
+    baud
+        Bits per second.
+    reply_timeout_s
+        How long a reply may take beyond its time on the wire.
+
+    Raises
+    ------
+    LineLost, BadOptions
+        As `Port`.
+    """
+
+    def __init__(self, port: str, baud: int, reply_timeout_s: float = REPLY_TIMEOUT_S) -> None:
+        self.name = port
+        self.counts = LineCounts()
+        self._port = Port(port, baud, reply_timeout_s)
+        self._packets = PacketHandler()
+        self._group_packets: dict[tuple[int, tuple[Part, ...]], bytes] = {}
+
+    @property
+    def baud(self) -> int:
+        """Bits per second."""
+        return int(self._port.baudrate)
+
+    def set_baud(self, baud: int) -> None:
+        """Open the line anew at another speed. Raises LineLost, BadOptions."""
+        self._port.setBaudRate(baud)
+
+    def close(self) -> None:
+        """Let go of the line; never raises."""
+        self._port.closePort()
+
+    def ping(self, servo_id: int) -> Pinged:
+        """Ask one servo who it is. Raises NoReply, BadReply, LineLost."""
+        status = self._ask(servo_id, INST_PING, b"", 3, "ping", "")
+        model = int.from_bytes(status.data[:2], "little")
+        return Pinged(servo_id, model, status.data[2], status.alert)
+
+    def ping_all(self) -> tuple[list[Pinged], int]:
+        """Ask who is on the line; takes its whole window of about a second.
+
+        Returns
+        -------
+        list of Pinged, int
+            Who answered, by id; and how many bytes came that were no reply (two servos of one id?).
+
+        Raises
+        ------
+        LineLost
+            If the line is gone.
+        """
+        self._packets.send(self._port, BROADCAST_ID, INST_PING)
+        slots_s = 253 * (0.003 + 14 * self._port.byte_s)
+        self._port.setPacketTimeoutMillis(1000 * (slots_s + self._port.reply_timeout_s))
+        found: dict[int, Pinged] = {}
+        before, understood = self._port.received_bytes, 0
+        while (status := self._packets.receive(self._port)) is not None:
+            understood += PING_REPLY_BYTES
+            if len(status.data) == 3:
+                model = int.from_bytes(status.data[:2], "little")
+                found[status.servo_id] = Pinged(status.servo_id, model, status.data[2], status.alert)
+        self._port.suspect = False
+        noise = max(0, self._port.received_bytes - before - understood)
+        return [found[servo_id] for servo_id in sorted(found)], noise
+
+    def read(self, servo_id: int, register: Register) -> int:
+        """Return a register's value, signed where the register is.
+
+        Raises
+        ------
+        NoReply, BadReply, Refused, LineLost
+            With port, id, register and instruction.
+        """
+        asked = register.address.to_bytes(2, "little") + register.size.to_bytes(2, "little")
+        status = self._ask(servo_id, INST_READ, asked, register.size, "read", register.name)
+        return register.decode(status.data)
+
+    def write(self, servo_id: int, register: Register, value: int) -> None:
+        """Set a register and wait for the servo's word that it did. Raises as `read`."""
+        data = register.address.to_bytes(2, "little") + register.encode(value)
+        self._ask(servo_id, INST_WRITE, data, 0, "write", register.name)
+
+    def write_unanswered(self, servo_id: int, register: Register, value: int) -> None:
+        """Set a register of a servo that is set to keep silent; an answer is dropped. Raises LineLost."""
+        data = register.address.to_bytes(2, "little") + register.encode(value)
+        self._packets.send(self._port, servo_id, INST_WRITE, data)
+        self._port.drain()
+
+    def quiet(self, quiet_s: float) -> None:
+        """Drop what comes until nothing has come for ``quiet_s``: late replies. Raises LineLost, BadReply."""
+        self._port.drain(quiet_s, 1.0)
+
+    def reboot(self, servo_id: int) -> None:
+        """Restart a servo: torque drops. Raises NoReply, BadReply, Refused, LineLost."""
+        self._ask(servo_id, INST_REBOOT, b"", 0, "reboot", "")
+
+    def group_read(self, parts: Sequence[Part], *, fast: bool = False) -> GroupAnswer:
+        """Read one block of each of several servos in one transaction.
+
+        Servos whose blocks have one address and length are asked by Sync Read, others by Bulk Read. Each
+        servo waits for the one before it, so one that is missing may silence those behind it.
+
+        Parameters
+        ----------
+        parts
+            One per servo.
+        fast
+            Ask for one common reply (Fast Sync or Bulk Read); newer firmware only.
+
+        Raises
+        ------
+        LineLost, BadReply
+            If the line is gone or never quiet; everything else stands in the answer's ``missing``.
+        """
+        parts = tuple(parts)
+        alike = len({(part.address, part.length) for part in parts}) == 1
+        if fast:
+            instruction = INST_FAST_SYNC_READ if alike else INST_FAST_BULK_READ
+        else:
+            instruction = INST_SYNC_READ if alike else INST_BULK_READ
+        packet = self._group_packets.get((instruction, parts))
+        if packet is None:
+            packet = self._group_packets[instruction, parts] = _group_read_packet(instruction, parts, alike)
+        self.counts.transactions += 1
+        try:
+            self._port.clearPort()
+            sent_s = time.monotonic()
+            self._port.writePort(packet)
+            self._port.setPacketTimeout(len(packet) + sum(11 + part.length for part in parts))
+            statuses, wrong = self._fast_replies(parts) if fast else self._replies(parts)
+        except LineLost as error:
+            raise self._placed(error, [part.servo_id for part in parts], "group read", "") from error
+        received_s = time.monotonic()
+        missing = {}
+        for part in parts:
+            if part.servo_id not in statuses:
+                missing[part.servo_id] = wrong.get(part.servo_id) or self._none(
+                    part.servo_id,
+                    "group read",
+                    f"addresses {part.address} to {part.address + part.length - 1}",
+                )
+        return GroupAnswer(statuses, missing, sent_s, received_s)
+
+    def group_write(self, parts: Sequence[Part]) -> None:
+        """Write to several servos with one packet; nobody answers, so read back what must be certain.
+
+        Raises
+        ------
+        LineLost, BadReply
+            If the line is gone or never quiet.
+        """
+        if len({(part.address, part.length) for part in parts}) == 1:
+            first = parts[0]
+            body = first.address.to_bytes(2, "little") + first.length.to_bytes(2, "little")
+            body += b"".join(bytes((part.servo_id,)) + part.data for part in parts)
+            instruction = INST_SYNC_WRITE
+        else:
+            body = b"".join(
+                bytes((part.servo_id,))
+                + part.address.to_bytes(2, "little")
+                + part.length.to_bytes(2, "little")
+                + part.data
+                for part in parts
+            )
+            instruction = INST_BULK_WRITE
+        self.counts.transactions += 1
+        try:
+            self._packets.send(self._port, BROADCAST_ID, instruction, body)
+        except LineLost as error:
+            raise self._placed(error, [part.servo_id for part in parts], "group write", "") from error
+
+    def _ask(
+        self, servo_id: int, instruction: int, parameters: bytes, length: int, word: str, register: str
+    ) -> Status:
+        """One instruction to one servo and its reply of ``length`` bytes."""
+        self.counts.transactions += 1
+        port = self._port
+        try:
+            self._packets.send(port, servo_id, instruction, parameters)
+            port.setPacketTimeout(12 + len(parameters) + 11 + length)
+            while (status := self._packets.receive(port)) is not None:
+                if status.servo_id != servo_id:
+                    self._stray(status)
+                elif status.refused:
+                    raise self._refusal(status, word, register)
+                elif len(status.data) == length:
+                    return status
+                else:
+                    self._stray(status)
+        except LineLost as error:
+            raise self._placed(error, [servo_id], word, register) from error
+        raise self._none(servo_id, word, register)
+
+    def _replies(self, parts: Sequence[Part]) -> tuple[dict[int, Status], dict[int, DriverError]]:
+        """The replies to a group read until all have come or the deadline passes."""
+        waited = {part.servo_id: part.length for part in parts}
+        statuses: dict[int, Status] = {}
+        wrong: dict[int, DriverError] = {}
+        while waited:
+            status = self._packets.receive(self._port)
+            if status is None:
+                break
+            length = waited.get(status.servo_id)
+            if length is None:
+                self._stray(status)
+            elif status.refused:
+                wrong[status.servo_id] = self._refusal(status, "group read", "")
+                del waited[status.servo_id]
+            elif len(status.data) == length:
+                statuses[status.servo_id] = status
+                del waited[status.servo_id]
+            else:
+                self._stray(status)
+        return statuses, wrong
+
+    def _fast_replies(self, parts: Sequence[Part]) -> tuple[dict[int, Status], dict[int, DriverError]]:
+        """The blocks of the common reply to a fast group read; every block has a checksum of its own.
+
+        Blocks are error, id, data and the checksum of all bytes so far; the last checksum is the packet's.
+        """
+        status = self._packets.receive(self._port, fast=True)
+        if status is None:
+            return {}, {}
+        body = bytes((status.error,)) + status.data
+        total = len(body) + 10 - 7
+        header = b"\xff\xff\xfd\x00" + bytes((status.servo_id,)) + total.to_bytes(2, "little") + b"\x55"
+        crc, at = crc16(header), 0
+        statuses: dict[int, Status] = {}
+        wrong: dict[int, DriverError] = {}
+        for number, part in enumerate(parts):
+            end = at + 2 + part.length
+            block = body[at:end]
+            last = number == len(parts) - 1
+            crc = crc16(block, crc)
+            stated = body[end : end + 2]
+            good = len(block) == 2 + part.length and block[1] == part.servo_id
+            if not good or not (last or stated == crc.to_bytes(2, "little")) or (last and end != len(body)):
+                self._port.suspect = True
+                break
+            crc = crc16(stated, crc)
+            at = end + 2
+            answer = Status(part.servo_id, block[0], block[2:])
+            if answer.refused:
+                wrong[part.servo_id] = self._refusal(answer, "fast group read", "")
+            else:
+                statuses[part.servo_id] = answer
+        return statuses, wrong
+
+    def _stray(self, status: Status) -> None:
+        """Note a reply to another question; the line is listened to until quiet before the next one."""
+        self.counts.strays += 1
+        self._port.suspect = True
+        log.debug("%s: dropped a reply of id %d that nobody waits for", self.name, status.servo_id)
+
+    def _none(self, servo_id: int, word: str, register: str) -> NoReply:
+        self.counts.timeouts += 1
+        self._port.suspect = True
+        what = f"{word} of {register}" if register else word
+        return NoReply(
+            f"servo {servo_id} on {self.name} at {self.baud} baud gave no usable answer to {what} within "
+            f"{1000 * self._port.reply_timeout_s:g} ms",
+            detail=self._where(servo_id, word, register),
+        )
+
+    def _refusal(self, status: Status, word: str, register: str) -> Refused:
+        self.counts.refusals += 1
+        what = f"{word} of {register}" if register else word
+        reason = ERROR_WORDS.get(status.refused, f"unknown error {status.refused}")
+        alert = ", and it reports a hardware error" if status.alert else ""
+        return Refused(
+            f"servo {status.servo_id} on {self.name} refused the {what}: {reason}{alert}",
+            detail={**self._where(status.servo_id, word, register), "error": status.error},
+        )
+
+    def _placed(self, error: LineLost, servo_ids: Sequence[int], word: str, register: str) -> LineLost:
+        """The same loss, saying what was being asked."""
+        servos = " and ".join(str(servo_id) for servo_id in servo_ids)
+        what = f"{word} of {register}" if register else word
+        where = self._where(servo_ids[0], word, register)
+        return LineLost(f"{error} during {what} of servo {servos}", detail={**where, **error.detail})
+
+    def _where(self, servo_id: int, word: str, register: str) -> dict[str, object]:
+        return {
+            "port": self.name,
+            "baud": self.baud,
+            "servo_id": servo_id,
+            "register": register,
+            "instruction": word,
+        }
+
+
+def _group_read_packet(instruction: int, parts: Sequence[Part], alike: bool) -> bytes:
+    """The bytes of a group read."""
+    if alike:
+        body = parts[0].address.to_bytes(2, "little") + parts[0].length.to_bytes(2, "little")
+        body += bytes(part.servo_id for part in parts)
+    else:
+        body = b"".join(
+            bytes((part.servo_id,)) + part.address.to_bytes(2, "little") + part.length.to_bytes(2, "little")
+            for part in parts
+        )
+    return instruction_packet(BROADCAST_ID, instruction, body)

@@ -1,0 +1,302 @@
+"""What one axis is doing, judged from its samples: legs of a move, settling, truth of a sample. No I/O."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Literal
+
+from drivers.dynamixel.models import Block
+from drivers.dynamixel.settings import AxisSettings
+from drivers.errors import BadReply
+
+TICK_MODULUS_MS = 32768
+TICK_SLACK_MS = 3.0
+TICK_DRIFT = 0.03  # the servo's oscillator against ours
+FASTEST_RAD_PER_S = 15.0  # no servo of the table turns faster
+LEAP_RAD = 0.05
+STILL_RAD = 5e-4
+STUCK_S = 1.0
+IN_POSITION_BIT, PROFILE_BIT = 0x01, 0x02
+
+Side = Literal["positive", "negative", "unknown"]
+
+
+def motion_block(settings: AxisSettings) -> Block:
+    """Return what is read of a servo all the time: from its goals to its temperature."""
+    return Block(settings.model.registers, "goal_velocity", "present_temperature")
+
+
+@dataclass(frozen=True)
+class Sample:
+    """What one servo said about itself in one transaction, in its own units.
+
+    ``sent_s`` and ``received_s`` are seconds of CLOCK_MONOTONIC; it was measured between them.
+    """
+
+    values: Mapping[str, int]
+    alert: bool
+    sent_s: float
+    received_s: float
+
+    @property
+    def counts(self) -> int:
+        """Present position."""
+        return self.values["present_position"]
+
+
+@dataclass(frozen=True)
+class AxisReport:
+    """Where an axis was sent and where it stands.
+
+    Attributes
+    ----------
+    commanded_rad
+        The angle that was asked for; None before the first move, and after a stop.
+    goal_counts, measured_counts
+        The nearest count to it, and what the servo measures.
+    goal_rad, measured_rad
+        The same as angles.
+    side
+        From which side the axis came last: on which flank the gears rest.
+    backlash_rad
+        Of the model, as its maker states it; None where nothing is stated.
+    current_A, temperature_C, voltage_V
+        As the servo measures them; no current for a servo that has none.
+    """
+
+    commanded_rad: float | None
+    goal_counts: int
+    goal_rad: float
+    measured_counts: int
+    measured_rad: float
+    side: Side
+    backlash_rad: float | None
+    current_A: float | None
+    temperature_C: int
+    voltage_V: float
+
+    @property
+    def left_rad(self) -> float | None:
+        """What the counts leave: measured minus commanded angle."""
+        return None if self.commanded_rad is None else self.measured_rad - self.commanded_rad
+
+    def left_px(self, focal_px: float) -> float | None:
+        """The same in the pixels of a camera whose focal length is ``focal_px``, near its image centre."""
+        return None if self.left_rad is None else focal_px * math.tan(self.left_rad)
+
+
+class Truth:
+    """Judges whether a servo's sample can be the answer to the question just asked.
+
+    A status packet does not say which question it answers. The servo's own millisecond counter tells: from
+    one sample to the next it must advance by the time between the questions.
+    """
+
+    def __init__(self, name: str, settings: AxisSettings) -> None:
+        self._name = name
+        self._settings = settings
+        self._last: Sample | None = None
+
+    def forget(self) -> None:
+        """Begin anew, after the line or the servo was away."""
+        self._last = None
+
+    def check(self, sample: Sample) -> None:
+        """Take a sample as true.
+
+        Raises
+        ------
+        BadReply
+            If it is older than the question (a late or repeated reply), or the position has leapt.
+        """
+        last = self._last
+        if last is not None:
+            least_ms = 1000 * (sample.sent_s - last.received_s)
+            most_ms = 1000 * (sample.received_s - last.sent_s)
+            slack_ms = TICK_SLACK_MS + TICK_DRIFT * most_ms
+            advance_ms = sample.values["realtime_tick"] - last.values["realtime_tick"]
+            over_ms = (advance_ms - least_ms + slack_ms) % TICK_MODULUS_MS
+            if over_ms > most_ms - least_ms + 2 * slack_ms:
+                raise BadReply(
+                    f"{self._name}: a reply from another moment (late, repeated, or the servo restarted): "
+                    f"since the last one its counter advanced {advance_ms % TICK_MODULUS_MS} ms, but "
+                    f"{least_ms:.0f} to {most_ms:.0f} ms have passed"
+                )
+            leap_rad = abs(sample.counts - last.counts) * self._settings.model.count_rad
+            if leap_rad > LEAP_RAD + FASTEST_RAD_PER_S * most_ms / 1000:
+                raise BadReply(
+                    f"{self._name}: the position leapt from {last.counts} to {sample.counts} counts in "
+                    f"{most_ms:.0f} ms, which no servo can"
+                )
+        self._last = sample
+
+
+class AxisMotion:
+    """One axis' goals and whether it has come to rest.
+
+    Parameters
+    ----------
+    name
+        For messages.
+    settings
+        The axis.
+    settle_s
+        How long it must stand.
+    """
+
+    def __init__(self, name: str, settings: AxisSettings, settle_s: float) -> None:
+        self.name = name
+        self.settings = settings
+        self._settle_s = settle_s
+        self._legs: list[int] = []  # goals still to come, counts
+        self._commanded_rad: float | None = None
+        self._side: Side = "unknown"
+        self._rest: tuple[int, float] | None = None  # counts and since when
+        self._sample: Sample | None = None
+        self._sampled = False  # since the goal was sent
+        self.goal = 0
+        self.holds = True
+
+    @property
+    def sample(self) -> Sample | None:
+        """The last true sample."""
+        return self._sample
+
+    def begin(self, goal: int) -> None:
+        """Stand at a goal, nothing commanded: after start-up."""
+        self._legs, self._commanded_rad, self._rest = [], None, None
+        self._sample, self._sampled = None, False
+        self._side = "unknown"
+        self.goal, self.holds = goal, True
+
+    def plan(self, angle_rad: float, speed_rad_per_s: float, acceleration_rad_per_s2: float) -> int:
+        """Take a new goal and return the count to send first: the goal, or the start of the last stretch."""
+        settings, sample = self.settings, self._sample
+        assert sample is not None
+        low, high = settings.limit_counts  # a goal at a limit may round to a count that the servo refuses
+        final = min(max(settings.counts(angle_rad), low), high)
+        side = settings.approach_sign(angle_rad)
+        stretch = math.ceil(settings.approach_rad / settings.model.count_rad)
+        there = final == self.goal and not self._legs and self.settled(sample.received_s)
+        legs = [final]
+        if side and not (there and self._side == _side(side * settings.sign)):
+            stop = self.stopping_counts(acceleration_rad_per_s2)
+            short = min(side * (final - sample.counts), side * (final - stop))
+            if short < stretch:
+                legs = [min(max(final - side * stretch, low), high), final]
+        self._commanded_rad = angle_rad
+        self._set(legs)
+        return self.goal
+
+    def halt(self, goal: int) -> None:
+        """Take where a stop will end as the goal."""
+        self._commanded_rad = None
+        self._set([goal])
+
+    def limp(self) -> None:
+        """Torque is off: the axis holds nothing."""
+        self.halt(self._sample.counts if self._sample else self.goal)
+        self.holds, self._side = False, "unknown"
+
+    def _set(self, legs: list[int]) -> None:
+        here = self._sample.counts if self._sample else legs[0]
+        self.goal, self._legs = legs[0], legs[1:]
+        self._note_side(self.goal - here)
+        self._rest, self._sampled = None, False
+
+    def next_leg(self) -> int | None:
+        """Return the next goal to send when the present leg has ended; `begin_leg` when it was sent."""
+        sample = self._sample
+        if not self._legs or sample is None or not self._arrived(sample) or self._speed(sample) > 1:
+            return None
+        return self._legs[0]
+
+    def begin_leg(self) -> None:
+        """Take the next leg's goal as the goal."""
+        self._set(self._legs)
+
+    def stopping_counts(self, acceleration_rad_per_s2: float) -> int:
+        """Return where the axis would stand if it braked now, within its limits."""
+        sample, model = self._sample, self.settings.model
+        assert sample is not None
+        velocity = sample.values["present_velocity"] * model.velocity_unit_rad_per_s
+        way_rad = velocity * abs(velocity) / (2 * acceleration_rad_per_s2)
+        low, high = self.settings.limit_counts
+        return min(max(sample.counts + round(way_rad / model.count_rad), low), high)
+
+    def take(self, sample: Sample) -> None:
+        """Take a true sample."""
+        noise = max(1, round(STILL_RAD / self.settings.model.count_rad))
+        still = self._speed(sample) <= 1
+        if not still or self._rest is None or abs(sample.counts - self._rest[0]) > noise:
+            self._rest = (sample.counts, sample.received_s)
+        self._sample, self._sampled = sample, True
+
+    def settled(self, now_s: float) -> bool:
+        """Whether the axis is in position (or let go) and has stood for the dwell."""
+        sample = self._sample
+        if sample is None or self._legs or self._rest is None or self._speed(sample) > 1:
+            return False
+        in_position = self._arrived(sample) or not self.holds
+        return in_position and now_s - self._rest[1] >= self._settle_s
+
+    def stuck_words(self, now_s: float) -> str:
+        """Say that the axis stands away from its goal; empty if it does not."""
+        sample = self._sample
+        if sample is None or self._rest is None or not self.holds or self._arrived(sample):
+            return ""
+        if self._speed(sample) > 1 or now_s - self._rest[1] < STUCK_S:
+            return ""
+        left_rad = (self.goal - sample.counts) * self.settings.model.count_rad
+        return f"{self.name} stands still {abs(left_rad):.4f} rad from its goal: something holds it"
+
+    def other_goal_words(self) -> str:
+        """Say that the servo holds another goal than was sent; empty if it does not."""
+        held = self._sample.values["goal_position"] if self._sample else self.goal
+        if held == self.goal or not self.holds or not self._sampled:
+            return ""
+        return f"{self.name} holds the goal {held} where {self.goal} was sent"
+
+    def report(self) -> AxisReport | None:
+        """Return where it was sent and where it stands; None before the first sample."""
+        sample, settings = self._sample, self.settings
+        if sample is None:
+            return None
+        final = self._legs[-1] if self._legs else self.goal
+        unit = settings.model.current_unit_A
+        return AxisReport(
+            commanded_rad=self._commanded_rad,
+            goal_counts=final,
+            goal_rad=settings.angle_rad(final),
+            measured_counts=sample.counts,
+            measured_rad=settings.angle_rad(sample.counts),
+            side=self._side,
+            backlash_rad=settings.model.backlash_rad,
+            current_A=None if unit is None else sample.values["present_current"] * unit,
+            temperature_C=sample.values["present_temperature"],
+            voltage_V=sample.values["present_voltage"] / 10,
+        )
+
+    def _arrived(self, sample: Sample) -> bool:
+        """In position: the servo says so or it is near enough, and no profile is under way."""
+        status = sample.values["moving_status"]
+        near = abs(sample.counts - self.goal) * self.settings.model.count_rad <= self.settings.settle_rad
+        close = abs(sample.counts - self.goal) * self.settings.model.count_rad <= 4 * self.settings.settle_rad
+        return (near or (close and bool(status & IN_POSITION_BIT))) and not status & PROFILE_BIT
+
+    def _speed(self, sample: Sample) -> int:
+        return abs(sample.values["present_velocity"])
+
+    def _note_side(self, way_counts: int) -> None:
+        """Remember which way the axis turns last, if that takes the backlash up."""
+        backlash_rad = self.settings.model.backlash_rad or 0.0
+        if abs(way_counts) * self.settings.model.count_rad > backlash_rad:
+            self._side = _side(self.settings.sign * way_counts)
+        elif way_counts and self._side != _side(self.settings.sign * way_counts):
+            self._side = "unknown"
+
+
+def _side(way: int) -> Side:
+    return "positive" if way > 0 else "negative"

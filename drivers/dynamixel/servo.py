@@ -1,0 +1,347 @@
+"""One servo made ready: who it is, what is in its way, its settings checked and set, without moving it.
+
+Permanent settings are written only where they differ (they wear) and only while torque is off (the servo
+locks them). Everything written is read back.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+import time
+from collections.abc import Callable
+from typing import TypeVar
+
+from drivers.dynamixel.link import Link, Part
+from drivers.dynamixel.models import (
+    HARDWARE_ERRORS,
+    MODELS_BY_NUMBER,
+    Block,
+    hardware_error_words,
+)
+from drivers.dynamixel.motion import Sample, Truth, motion_block
+from drivers.dynamixel.settings import AxisSettings, HeadSettings
+from drivers.errors import DriverError, HardwareFault, NoReply, Refused, WrongDevice
+
+log = logging.getLogger(__name__)
+T = TypeVar("T")
+
+POSITION_MODE = 3
+FULL_STATUS_RETURN = 2
+NO_SECONDARY_ID = 253  # and above
+REVERSE_BIT, SLAVE_BIT = 0x01, 0x02
+WATCHDOG_TRIPPED = 255
+HOMING_LIMIT = 1024  # what position mode honours of an X servo's homing offset, counts
+REBOOT_S = 2.0  # how long a servo may be deaf after a reboot
+ATTEMPTS = 3
+LATE_S = 0.1  # a reply that did not come is waited out this long before the next question
+COME_TO_REST_S = 0.5
+
+
+class Servo:
+    """One configured servo on an open line.
+
+    Parameters
+    ----------
+    link
+        The open line.
+    axis
+        ``pan`` or ``tilt``, for messages.
+    settings, head
+        What the configuration says.
+    """
+
+    def __init__(self, link: Link, axis: str, settings: AxisSettings, head: HeadSettings) -> None:
+        self._link = link
+        self._axis = axis
+        self._settings = settings
+        self._head = head
+        self._registers = settings.model.registers
+        self.name = f"{axis} (servo {settings.servo_id})"
+
+    def get(self, register: str) -> int:
+        """Return a register's value; a lost reply is asked for again. Raises as `Link.read`."""
+        return self._repeated(lambda: self._link.read(self._settings.servo_id, self._registers[register]))
+
+    def set(self, register: str, value: int) -> None:
+        """Set a register and see that it holds the value.
+
+        Raises
+        ------
+        Refused, NoReply, LineLost
+            As `Link.write`.
+        WrongDevice
+            If the servo says that it did but holds another value.
+        """
+        entry = self._registers[register]
+        for _ in range(ATTEMPTS):
+            # a write may have been done and only its reply lost: writing again is the same
+            self._repeated(lambda: self._link.write(self._settings.servo_id, entry, value))
+            held = self.get(register)
+            if held == value:
+                return
+            self._link.quiet(LATE_S)
+        raise WrongDevice(f"{self.name} holds {held} in {register} after {value} was written to it")
+
+    def check_identity(self) -> None:
+        """See that the servo is the one configured, and that it answers every instruction.
+
+        Raises
+        ------
+        WrongDevice
+            For another model, or a firmware without a bus watchdog where one is configured.
+        NoReply, LineLost
+            If it does not answer.
+        """
+        model = self._settings.model
+        pinged = self._repeated(lambda: self._link.ping(self._settings.servo_id))
+        if pinged.model_number != model.number:
+            other = MODELS_BY_NUMBER.get(pinged.model_number)
+            found = f"a {other.name}" if other else f"of the unknown model number {pinged.model_number}"
+            raise WrongDevice(f"{self.name} is {found}, the configuration says {model.name}")
+        if self._head.watchdog_s > 0 and pinged.firmware < model.watchdog_firmware:
+            raise WrongDevice(
+                f"{self.name} has firmware {pinged.firmware}; the bus watchdog needs "
+                f"{model.watchdog_firmware} or newer: update it, or set watchdog_s: 0 and do without"
+            )
+        level = self._registers["status_return_level"]
+        try:
+            answering = self._link.read(self._settings.servo_id, level) == FULL_STATUS_RETURN
+        except NoReply:
+            answering = False
+        if not answering:
+            self._link.write_unanswered(self._settings.servo_id, level, FULL_STATUS_RETURN)
+
+    def check_health(self) -> None:
+        """See that the servo reports no hardware error; restart it if the configuration says so.
+
+        Raises
+        ------
+        HardwareFault
+            In plain words.
+        """
+        error = self.get("hardware_error")
+        if error and self._settings.on_hardware_error == "reboot":
+            log.warning("%s: %s; rebooting it", self.name, ", ".join(hardware_error_words(error)))
+            self.reboot()
+            error = self.get("hardware_error")
+        if error:
+            raise HardwareFault(hardware_fault_words(self.name, error), detail={"hardware_error": error})
+
+    def reboot(self) -> None:
+        """Restart the servo and wait until it answers; torque drops. Raises NoReply, LineLost."""
+        self._link.reboot(self._settings.servo_id)
+        until_s = time.monotonic() + REBOOT_S
+        while True:
+            try:
+                self._link.ping(self._settings.servo_id)
+                return
+            except NoReply:
+                if time.monotonic() > until_s:
+                    raise
+
+    def look(self) -> Sample:
+        """Return what the servo says about its motion now, proven by its counter not to be an old reply.
+
+        Raises
+        ------
+        NoReply, BadReply, Refused, LineLost
+            As `Link.group_read`.
+        """
+        block, truth = motion_block(self._settings), Truth(self.name, self._settings)
+        part = Part(self._settings.servo_id, block.address, block.length)
+
+        def read() -> Sample:
+            answer = self._link.group_read([part])
+            if answer.missing:
+                raise answer.missing[part.servo_id]
+            status = answer.statuses[part.servo_id]
+            return Sample(block.decode(status.data), status.alert, answer.sent_s, answer.received_s)
+
+        truth.check(self._repeated(read))
+        sample = self._repeated(read)
+        truth.check(sample)
+        return sample
+
+    def check_place(self) -> int:
+        """See that the axis stands within its limits; returns its position, counts.
+
+        Raises
+        ------
+        WrongDevice
+            If it stands outside: moving from there could go the wrong way round.
+        """
+        counts = self.look().counts
+        settings = self._settings
+        low, high = settings.limit_counts
+        if not low <= counts <= high:
+            raise WrongDevice(
+                f"{self.name} stands at {counts} counts ({settings.angle_rad(counts):.4f} rad), outside its "
+                f"limits {low} to {high} ({settings.limits_rad[0]:.4f} to {settings.limits_rad[1]:.4f} rad): "
+                "with torque off turn it inside by hand, or correct zero_counts or limits_rad"
+            )
+        return counts
+
+    def set_up(self) -> None:
+        """Bring the servo's permanent settings to what the configuration says.
+
+        Raises
+        ------
+        WrongDevice
+            If a setting cannot be used, or must change while torque may not be dropped.
+        Refused
+            If the servo refuses a value.
+        """
+        wanted = self._wanted()
+        different = {name: value for name, value in wanted.items() if self.get(name) != value}
+        if not different:
+            return
+        told = ", ".join(f"{name} {value}" for name, value in different.items())
+        if self.get("torque_enable"):
+            if not self._head.torque_off_at_start:
+                raise WrongDevice(
+                    f"{self.name} must be set to {told}, which it takes only with torque off, but torque is "
+                    "on and the axis may fall: support it and set torque_off_at_start: true, or switch the "
+                    "servo off and on"
+                )
+            self.set("torque_enable", 0)
+        log.info("%s: setting %s", self.name, told)
+        for name in sorted(different, key=lambda n: n != "operating_mode"):  # a new mode resets others
+            self.set(name, different[name])
+
+    def check_set_up(self) -> None:
+        """See once more, in reads of another shape, that the settings that keep the head safe are right.
+
+        Raises
+        ------
+        WrongDevice
+            If one is not; only possible if an earlier answer was not the servo's answer to its question.
+        """
+        low, high = self._settings.limit_counts
+        modes = Block(self._registers, "return_delay", "operating_mode")
+        limits = Block(self._registers, "max_position_limit", "min_position_limit")
+        for block in (modes, limits):
+            part = Part(self._settings.servo_id, block.address, block.length)
+            answer = self._link.group_read([part])
+            if answer.missing:
+                raise answer.missing[part.servo_id]
+            held = block.decode(answer.statuses[part.servo_id].data)
+            wanted = {"operating_mode": POSITION_MODE, "max_position_limit": high, "min_position_limit": low}
+            for name in held.keys() & wanted.keys():
+                if held[name] != wanted[name]:
+                    raise WrongDevice(f"{self.name} holds {held[name]} in {name} instead of {wanted[name]}")
+
+    def _wanted(self) -> dict[str, int]:
+        """The permanent settings, by register."""
+        settings, model = self._settings, self._settings.model
+        drive = self.get("drive_mode")
+        if drive & SLAVE_BIT:
+            raise WrongDevice(
+                f"{self.name} is the slave of a pair (drive mode {drive}); a head needs single servos"
+            )
+        secondary = self.get("secondary_id")
+        if secondary < NO_SECONDARY_ID:
+            raise WrongDevice(
+                f"{self.name} also obeys writes to id {secondary} (its secondary id); set that to 255 first"
+            )
+        homing = self.get("homing_offset")
+        if model.low_count == 0 and abs(homing) > HOMING_LIMIT:
+            raise WrongDevice(
+                f"{self.name} has a homing offset of {homing} counts; position mode honours {HOMING_LIMIT} "
+                "at most: set it to 0 and give the place as zero_counts"
+            )
+        low, high = settings.limit_counts
+        wanted = {
+            "operating_mode": POSITION_MODE,
+            "drive_mode": drive & REVERSE_BIT,  # speeds instead of times; torque never on by a goal
+            "return_delay": 0,
+            "min_position_limit": low,
+            "max_position_limit": high,
+        }
+        if settings.current_limit_A is not None and model.current_unit_A is not None:
+            wanted["current_limit"] = round(settings.current_limit_A / model.current_unit_A)
+        return wanted
+
+    def take_hold(self) -> int:
+        """Switch torque on where the axis stands, with the profile set; returns the goal, counts.
+
+        An old goal is void: the present position is the goal before anything can move. A watchdog that has
+        tripped is cleared here, which makes this the deliberate act of arming anew.
+        """
+        settings, model, head = self._settings, self._settings.model, self._head
+        torque = bool(self.get("torque_enable"))
+        tripped = self.get("bus_watchdog") != 0
+        counts = self.check_place()
+        if tripped:
+            self.set("bus_watchdog", 0)  # the servo may now go on to its old goal: void it at once
+        self.set("goal_position", counts)
+        profile = {
+            "profile_acceleration": max(
+                1, round(head.acceleration_rad_per_s2 / model.acceleration_unit_rad_per_s2)
+            ),
+            "profile_velocity": velocity_counts(settings, head.speed_rad_per_s),
+        }
+        for name, value in profile.items():
+            try:
+                self.set(name, value)
+            except Refused as error:
+                raise WrongDevice(
+                    f"{self.name} does not take {value} as its {name}: acceleration_rad_per_s2 or "
+                    f"speed_rad_per_s is more than its own limits allow ({error})"
+                ) from error
+        if not torque:
+            counts = self.check_place()
+            self.set("goal_position", counts)
+            try:
+                self.set("torque_enable", 1)
+            except WrongDevice:
+                raise HardwareFault(
+                    f"{self.name} does not switch its torque on; it may be shut down by a hardware error"
+                ) from None
+        return self._come_to_rest()
+
+    def _come_to_rest(self) -> int:
+        """Wait until the axis stands (it may have been falling) and hold it there; returns the goal."""
+        until_s = time.monotonic() + COME_TO_REST_S
+        sample = self.look()
+        while abs(sample.values["present_velocity"]) > 1 and time.monotonic() < until_s:
+            sample = self.look()
+        low, high = self._settings.limit_counts
+        goal = min(max(sample.counts, low), high)
+        if sample.values["goal_position"] != goal:
+            self.set("goal_position", goal)
+        return goal
+
+    def _repeated(self, ask: Callable[[], T]) -> T:
+        """Ask again after a lost reply, when one that is merely late can be no answer any more."""
+        for _ in range(ATTEMPTS - 1):
+            try:
+                return ask()
+            except NoReply:
+                self._link.quiet(LATE_S)
+        return ask()
+
+    def release(self) -> None:
+        """Switch the watchdog off, and torque too if the configuration says so; for the end."""
+        for register in (
+            "bus_watchdog",
+            *(("torque_enable",) if self._settings.at_close == "torque_off" else ()),
+        ):
+            try:
+                self.set(register, 0)
+            except DriverError as error:
+                log.warning("%s: could not set %s at the end: %s", self.name, register, error)
+
+
+def velocity_counts(settings: AxisSettings, speed_rad_per_s: float) -> int:
+    """Return a profile velocity, not above the speed; never 0, which would mean as fast as it can."""
+    return max(1, math.floor(speed_rad_per_s / settings.model.velocity_unit_rad_per_s + 1e-9))
+
+
+def hardware_fault_words(name: str, error: int) -> str:
+    """Return one sentence for a hardware error."""
+    words = " and ".join(hardware_error_words(error & sum(HARDWARE_ERRORS)) or [f"bits 0x{error:02x}"])
+    return (
+        f"{name} reports {words} (hardware error 0x{error:02x}); it keeps saying so until it is rebooted or "
+        "switched off and on, which drops its torque"
+    )

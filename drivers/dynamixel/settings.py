@@ -1,0 +1,293 @@
+"""The options of a Dynamixel head as a configuration gives them, checked strictly."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+from drivers.dynamixel.models import Model, model_named
+from drivers.errors import BadOptions
+from drivers.faults import nearest
+
+Approach = Literal["none", "positive", "negative", "gravity"]
+Rest = Literal["hold", "torque_off"]
+OnHardwareError = Literal["report", "reboot"]
+
+STANDS_WITHIN_S = 0.5  # after this process has died: the last poll's age, the watchdog, and braking
+USUAL_WATCHDOG_S, SHORTEST_WATCHDOG_S = 0.3, 0.1
+WATCHDOG_STEP_S = 0.02
+
+
+@dataclass(frozen=True)
+class AxisSettings:
+    """One axis of the head. Angles are the mast's: pan positive to the right, tilt positive up.
+
+    Attributes
+    ----------
+    servo_id, model
+        Which servo.
+    zero_counts
+        The servo's position where the axis is at zero.
+    sign
+        1 if the servo counts up where the axis turns positive, else -1.
+    limits_rad
+        What may be commanded; also written to the servo as its position limits.
+    approach
+        From which side a goal is approached, to take the backlash up: ``none``, ``positive`` (the last
+        stretch turns positive), ``negative``, or ``gravity``: against the weight, so that gear and weight
+        press on the same flank.
+    approach_rad
+        How long the last stretch is; more than the backlash.
+    gravity_turnover_rad
+        The angle at which the weight changes sides, for ``gravity``: below it the weight pulls the axis
+        down (the last stretch turns positive), above it up.
+    at_stop, at_close
+        Whether the servo then holds, or its torque is switched off (a tilt axis may fall).
+    on_hardware_error
+        ``report`` leaves the servo as it is; ``reboot`` restarts it, which drops its torque.
+    current_limit_A
+        Written to the servo; None leaves it as it is.
+    settle_rad
+        How near to its goal the axis counts as in position.
+    """
+
+    servo_id: int
+    model: Model
+    zero_counts: int
+    limits_rad: tuple[float, float]
+    sign: int = 1
+    approach: Approach = "none"
+    approach_rad: float = 0.0
+    gravity_turnover_rad: float = math.pi / 2
+    at_stop: Rest = "hold"
+    at_close: Rest = "hold"
+    on_hardware_error: OnHardwareError = "report"
+    current_limit_A: float | None = None
+    settle_rad: float = 0.01
+
+    def counts(self, angle_rad: float) -> int:
+        """Return the nearest count to an angle."""
+        return self.zero_counts + round(self.sign * angle_rad / self.model.count_rad)
+
+    def angle_rad(self, counts: float) -> float:
+        """Return the angle of a position."""
+        return self.sign * (counts - self.zero_counts) * self.model.count_rad
+
+    @property
+    def limit_counts(self) -> tuple[int, int]:
+        """The limits in counts, lower first; rounded inwards."""
+        ends = sorted(self.zero_counts + self.sign * a / self.model.count_rad for a in self.limits_rad)
+        return math.ceil(ends[0] - 1e-6), math.floor(ends[1] + 1e-6)
+
+    def approach_sign(self, goal_rad: float) -> int:
+        """Return the direction of the last stretch in counts: 1, -1, or 0 for none."""
+        if self.approach == "gravity":
+            return self.sign if goal_rad < self.gravity_turnover_rad else -self.sign
+        return {"none": 0, "positive": self.sign, "negative": -self.sign}[self.approach]
+
+
+@dataclass(frozen=True)
+class HeadSettings:
+    """A head of two servos on one bus.
+
+    Attributes
+    ----------
+    port, baud
+        The line: a serial device or a pyserial URL, and its bits per second.
+    speed_rad_per_s, acceleration_rad_per_s2
+        Of the profile inside the servos; the speed is also the cap of every move.
+    watchdog_s
+        After this silence the servos stop by themselves; 0 switches that off. Left out: 0.3 s, or as much
+        less as it takes to stand 0.5 s after the last poll, braking included.
+    poll_hz
+        How often the servos are read when nobody asks.
+    reply_timeout_s
+        What a reply may take beyond its time on the wire.
+    settle_s
+        How long both axes must stand in position to count as settled.
+    torque_off_at_start
+        Whether torque may be dropped at start-up where permanent settings must be changed.
+    fast_read
+        Try the servos' fast group read at start-up and use it if it proves itself.
+    """
+
+    port: str
+    pan: AxisSettings
+    tilt: AxisSettings
+    baud: int = 1_000_000
+    speed_rad_per_s: float = 1.0
+    acceleration_rad_per_s2: float = 4.0
+    watchdog_s: float = 0.3
+    poll_hz: float = 50.0
+    reply_timeout_s: float = 0.05
+    settle_s: float = 0.1
+    torque_off_at_start: bool = False
+    fast_read: bool = False
+    name: str = field(default="dynamixel", init=False)
+
+    @property
+    def watchdog_counts(self) -> int:
+        """The watchdog register's value, rounded down; 0 for off."""
+        return math.floor(self.watchdog_s / WATCHDOG_STEP_S + 1e-6)
+
+
+def head_settings(options: Mapping[str, Any]) -> HeadSettings:
+    """Return the head that the options of ``driver: dynamixel`` describe.
+
+    Raises
+    ------
+    BadOptions
+        For an unknown or missing key or a value that cannot be: which, what it is, what would be right.
+    """
+    known = {
+        "port", "baud", "pan", "tilt", "speed_rad_per_s", "acceleration_rad_per_s2", "watchdog_s", "poll_hz",
+        "reply_timeout_s", "settle_s", "torque_off_at_start", "fast_read",
+    }  # fmt: skip
+    read = _Options("", options, known, ("port", "pan", "tilt"))
+    port = options["port"]
+    if not isinstance(port, str) or not port:
+        raise BadOptions(f"options.port is {port!r}, expected a serial device such as /dev/ttyUSB0 or a URL")
+    pan, tilt = (_axis(f"{name}.", options[name]) for name in ("pan", "tilt"))
+    if pan.servo_id == tilt.servo_id:
+        raise BadOptions(f"options.pan.id and options.tilt.id are both {pan.servo_id}, expected two ids")
+    poll_hz = read.number("poll_hz", 50.0, 10.0, 500.0)
+    speed = read.number("speed_rad_per_s", 1.0, 0.03, 10.0)
+    acceleration = read.number("acceleration_rad_per_s2", 4.0, 0.4, 1000.0)
+    longest_s = STANDS_WITHIN_S - 1 / poll_hz - speed / acceleration
+    watchdog_s = read.number("watchdog_s", min(USUAL_WATCHDOG_S, longest_s), 0.0, STANDS_WITHIN_S)
+    if watchdog_s and not SHORTEST_WATCHDOG_S <= watchdog_s <= longest_s:
+        raise BadOptions(
+            f"options.watchdog_s is {watchdog_s:.3g} s, and the head brakes from {speed:g} rad/s at "
+            f"{acceleration:g} rad/s2 in {speed / acceleration:.3g} s; expected {SHORTEST_WATCHDOG_S:g} "
+            f"s or more, and {STANDS_WITHIN_S:g} s in all, the last poll's age included; or 0 to do without"
+        )
+    return HeadSettings(
+        port=port,
+        pan=pan,
+        tilt=tilt,
+        baud=read.whole("baud", 1_000_000, 9600, 10_500_000),
+        speed_rad_per_s=speed,
+        acceleration_rad_per_s2=acceleration,
+        watchdog_s=watchdog_s,
+        poll_hz=poll_hz,
+        reply_timeout_s=read.number("reply_timeout_s", 0.05, 0.002, 1.0),
+        settle_s=read.number("settle_s", 0.1, 0.0, 5.0),
+        torque_off_at_start=read.flag("torque_off_at_start", False),
+        fast_read=read.flag("fast_read", False),
+    )
+
+
+def _axis(place: str, value: Any) -> AxisSettings:
+    """One axis of the options."""
+    if not isinstance(value, Mapping):
+        raise BadOptions(
+            f"options.{place[:-1]} is {value!r}, expected a mapping with id, model, zero_counts ..."
+        )
+    known = {
+        "id", "model", "zero_counts", "sign", "limits_rad", "approach", "approach_rad",
+        "gravity_turnover_rad", "at_stop", "at_close", "on_hardware_error", "current_limit_A", "settle_rad",
+    }  # fmt: skip
+    read = _Options(place, value, known, ("id", "model", "limits_rad"))
+    try:
+        model = model_named(value["model"])
+    except BadOptions as error:
+        raise BadOptions(f"options.{place}model: {error}") from None
+    axis = AxisSettings(
+        servo_id=read.whole("id", 1, 0, 252),
+        model=model,
+        zero_counts=read.whole("zero_counts", model.centre_count, -(2**31), 2**31 - 1),
+        limits_rad=read.pair("limits_rad"),
+        sign=read.word("sign", 1, (1, -1)),
+        approach=read.word("approach", "none", ("none", "positive", "negative", "gravity")),
+        approach_rad=read.number("approach_rad", 0.0, 0.0, 0.5),
+        gravity_turnover_rad=read.number("gravity_turnover_rad", math.pi / 2, -math.pi, math.pi),
+        at_stop=read.word("at_stop", "hold", ("hold", "torque_off")),
+        at_close=read.word("at_close", "hold", ("hold", "torque_off")),
+        on_hardware_error=read.word("on_hardware_error", "report", ("report", "reboot")),
+        current_limit_A=read.number("current_limit_A", None, 0.001, 20.0),
+        settle_rad=read.number("settle_rad", max(0.001, 3 * model.count_rad), model.count_rad, 0.1),
+    )
+    low, high = axis.limit_counts
+    if low < model.low_count or high > model.high_count:
+        reach = sorted((axis.angle_rad(model.low_count), axis.angle_rad(model.high_count)))
+        raise BadOptions(
+            f"options.{place}limits_rad are the servo's counts {low} to {high}, but a {model.name} in "
+            f"position mode holds {model.low_count} to {model.high_count}, which with zero_counts "
+            f"{axis.zero_counts} is {reach[0]:.4f} to {reach[1]:.4f} rad; mount the horn so that the range "
+            "does not cross the seam"
+        )
+    if (axis.approach == "none") != (axis.approach_rad == 0.0):
+        raise BadOptions(
+            f"options.{place}approach is {axis.approach!r} with approach_rad {axis.approach_rad:g}; "
+            "expected a stretch above zero with a side, and neither or both"
+        )
+    least = model.backlash_rad or 0.0
+    if axis.approach != "none" and axis.approach_rad <= least:
+        raise BadOptions(
+            f"options.{place}approach_rad {axis.approach_rad:g} rad does not take up the backlash of a "
+            f"{model.name}, {least:.4f} rad; expected more"
+        )
+    if axis.current_limit_A is not None and model.current_unit_A is None:
+        raise BadOptions(f"options.{place}current_limit_A: a {model.name} has no current limit")
+    return axis
+
+
+class _Options:
+    """One mapping of options, read key by key."""
+
+    def __init__(
+        self, place: str, given: Mapping[str, Any], known: set[str], needed: tuple[str, ...]
+    ) -> None:
+        self._place, self._given = place, given
+        for key in given:
+            if key not in known:
+                raise BadOptions(f"options.{place}{key}: there is no such option{nearest(str(key), known)}")
+        for key in needed:
+            if key not in given:
+                raise BadOptions(f"options.{place}{key} is missing")
+
+    def number(self, key: str, default: Any, low: float, high: float) -> Any:
+        value = self._given.get(key, default)
+        if value is default and key not in self._given:
+            return default
+        good = isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+        if not good or not low <= value <= high:
+            raise BadOptions(
+                f"options.{self._place}{key} is {value!r}, expected a number from {low:g} to {high:g}"
+            )
+        return float(value)
+
+    def whole(self, key: str, default: int, low: int, high: int) -> int:
+        value = self._given.get(key, default)
+        if not isinstance(value, int) or isinstance(value, bool) or not low <= value <= high:
+            raise BadOptions(
+                f"options.{self._place}{key} is {value!r}, expected a whole number from {low} to {high}"
+            )
+        return value
+
+    def flag(self, key: str, default: bool) -> bool:
+        value = self._given.get(key, default)
+        if not isinstance(value, bool):
+            raise BadOptions(f"options.{self._place}{key} is {value!r}, expected true or false")
+        return value
+
+    def word(self, key: str, default: Any, words: tuple[Any, ...]) -> Any:
+        value = self._given.get(key, default)
+        if isinstance(value, bool) or value not in words:
+            listed = " or ".join(str(word) for word in words)
+            raise BadOptions(f"options.{self._place}{key} is {value!r}, expected {listed}")
+        return value
+
+    def pair(self, key: str) -> tuple[float, float]:
+        value = self._given[key]
+        numbers = isinstance(value, list | tuple) and len(value) == 2
+        if not numbers or not all(isinstance(v, int | float) and not isinstance(v, bool) for v in value):
+            raise BadOptions(f"options.{self._place}{key} is {value!r}, expected [low, high] in radians")
+        low, high = (float(v) for v in value)
+        if not (math.isfinite(low) and math.isfinite(high) and low < high):
+            raise BadOptions(
+                f"options.{self._place}{key} is {value!r}, expected [low, high] with low below high"
+            )
+        return low, high

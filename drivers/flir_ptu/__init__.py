@@ -1,0 +1,1 @@
+"""Directed Perception / FLIR pan/tilt units (D46, D47, D48E, E46) over their ASCII protocol."""

@@ -1,0 +1,114 @@
+"""What a unit says, line by line: answers, error replies, and limit hits that may stand before any of them.
+
+From the manuals (PTU-D46 v2.14, section 4.2; E series v6.00): a command that succeeds is answered ``*``, a
+query ``* <text>``, a failure ``! <words>``, each ended by CR or LF or both. An axis that runs into a limit
+switch puts ``!P`` or ``!T`` in between whenever it happens; a reset gives ``!T!T!P!P*``. With echo on the
+command itself stands first: ``PP * Current Pan position is 22``.
+
+The protocol has no checksum. So a line counts only if all of it fits: the echo is the command that was sent,
+the words are those of the quantity that was asked for, and there is one number and nothing else with digits.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+
+_HIT = re.compile(rb"\s*!([PTpt])(?![A-Za-z])")
+_NUMBER = re.compile(r"-?\d+(?:\.\d+)?\Z")
+_LONGEST_LINE = 400
+
+
+@dataclass(frozen=True)
+class Answer:
+    """One answer of the unit.
+
+    Attributes
+    ----------
+    good
+        ``*``, as opposed to ``!``.
+    text
+        The words behind it.
+    echo
+        Whether the command stood in front.
+    """
+
+    good: bool
+    text: str
+    echo: bool
+
+
+class LineSplitter:
+    """Cuts a stream of bytes into lines, whatever the pieces it comes in."""
+
+    def __init__(self) -> None:
+        self._rest = b""
+
+    def feed(self, data: bytes) -> list[bytes]:
+        """Return the lines that are now complete, without their ends and without empty ones."""
+        *whole, self._rest = re.split(rb"[\r\n]", self._rest + data)
+        self._rest = self._rest[-_LONGEST_LINE:]
+        return [line for line in whole if line.strip()]
+
+    def clear(self) -> bytes:
+        """Forget and return the unfinished line."""
+        rest, self._rest = self._rest, b""
+        return rest
+
+
+def hits_of(line: bytes) -> tuple[str, ...]:
+    """Return the axes, ``pan`` or ``tilt``, whose limit hits stand anywhere in a line."""
+    found = re.findall(rb"!([PTpt])(?![A-Za-z])", line)
+    return tuple("pan" if letter in b"Pp" else "tilt" for letter in found)
+
+
+def answer_of(line: bytes, command: str) -> Answer | None:
+    """Return a line's answer to a command; None if it is not one.
+
+    Parameters
+    ----------
+    line
+        Without its end; limit hits in it are passed over.
+    command
+        What was sent, without its delimiter.
+    """
+    rest, echo = without_hits(line), False
+    if not all(32 <= byte < 127 for byte in rest):
+        return None
+    sent = command.encode("ascii")
+    if rest[: len(sent)].upper() == sent.upper() and not rest.startswith((b"*", b"!")):
+        rest, echo = without_hits(rest[len(sent) :]), True
+    if rest.strip() == b"*":
+        return Answer(True, "", echo)
+    if rest.startswith((b"* ", b"! ")):
+        return Answer(rest.startswith(b"*"), rest[2:].decode("ascii").strip(), echo)
+    return None
+
+
+def number_of(text: str, words: tuple[str, ...], verbose: bool) -> float | None:
+    """Return the one number in a query's answer; None if the answer is not to that query.
+
+    Parameters
+    ----------
+    text
+        The answer's text.
+    words
+        Lower-case words that a verbose answer to this query holds: ``("current", "pan", "position")``.
+    verbose
+        Whether the unit answers in words; a terse answer is the number alone.
+    """
+    tokens = text.split()
+    if not verbose:
+        return float(text) if _NUMBER.match(text) else None
+    numbers = [token for token in tokens if _NUMBER.match(token)]
+    others = [token.lower().replace("sec^2", "") for token in tokens if not _NUMBER.match(token)]
+    if len(numbers) != 1 or any(character.isdigit() for token in others for character in token):
+        return None
+    return float(numbers[0]) if set(words) <= set(others) else None
+
+
+def without_hits(data: bytes) -> bytes:
+    """Return bytes without the limit hits and spaces in front of them."""
+    while found := _HIT.match(data):
+        data = data[found.end() :]
+    return data.strip()

@@ -1,0 +1,103 @@
+"""One axis through time: motor in counts, backlash, sag, and approach from one side.
+
+Three angles are kept apart. The *motor* angle follows a trapezoid profile to the goal, rounded to the
+nearest count. The *reading* is the motor angle in whole counts, since the encoder sits on the motor's side
+of the gears. The *mechanical* angle is what the cameras ride on: the motor angle through the backlash,
+less the sag of the tilt axis. Only the simulated cameras and the experiments see it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+from drivers.sim.motion import Motion
+
+
+@dataclass(frozen=True)
+class AxisSettings:
+    """One axis of a head.
+
+    Attributes
+    ----------
+    count_rad
+        One encoder count or motor step.
+    backlash_rad
+        Full width of the gap between motor and load.
+    low_rad, high_rad
+        Goals that the device accepts.
+    speed_rad_per_s, acceleration_rad_per_s2
+        Largest speed, and the acceleration of every move.
+    approach_rad
+        0: the shortest way. Positive: every goal is reached moving in the positive direction, over at least
+        this distance, which has to be more than the backlash.
+        The way round may pass ``low_rad`` by as much.
+    sag_rad
+        Drop of a level load under gravity; at tilt t it is sag·cos(t), downwards.
+    """
+
+    count_rad: float
+    backlash_rad: float
+    low_rad: float
+    high_rad: float
+    speed_rad_per_s: float
+    acceleration_rad_per_s2: float
+    approach_rad: float = 0.0
+    sag_rad: float = 0.0
+
+
+def _play(load_rad: float, motor_rad: float, gap_rad: float) -> float:
+    """Where the load ends when the motor has gone one way to ``motor_rad`` from within the gap."""
+    return min(max(load_rad, motor_rad - gap_rad / 2), motor_rad + gap_rad / 2)
+
+
+@dataclass(frozen=True)
+class Axis:
+    """One axis through time: the motor's motion, and the load's angle at the start of each leg."""
+
+    settings: AxisSettings
+    motion: Motion
+    loads_rad: tuple[float, ...] = field(default=())
+
+    @staticmethod
+    def resting(settings: AxisSettings, time_s: float) -> Axis:
+        """At zero, last moved in the positive direction."""
+        return Axis(settings, Motion.at_rest(time_s, 0.0), (-settings.backlash_rad / 2,))
+
+    def load_rad(self, time_s: float) -> float:
+        """The load's angle behind the backlash."""
+        return self._load_on(self.motion, self.loads_rad, self.motion.leg_index(time_s), time_s)
+
+    def _load_on(self, motion: Motion, loads_rad: Sequence[float], index: int, time_s: float) -> float:
+        leg, load, gap = motion.legs[index], loads_rad[index], self.settings.backlash_rad
+        if leg.turn_rad is not None and time_s >= leg.turn_s:
+            load = _play(load, leg.turn_rad, gap)
+        return _play(load, leg.at(time_s)[0], gap)
+
+    def mechanical_rad(self, time_s: float) -> float:
+        """What the cameras ride on."""
+        load = self.load_rad(time_s)
+        return load - self.settings.sag_rad * math.cos(load)
+
+    def followed_by(self, motion: Motion, time_s: float) -> Axis:
+        """With a motion that continues this one from ``time_s``; the load's state is carried over."""
+        first, last = self.motion.kept(time_s), self.motion.leg_index(time_s)
+        loads = list(self.loads_rad[first : last + 1])
+        for index in range(len(loads), len(motion.legs)):
+            loads.append(self._load_on(motion, loads, index - 1, motion.legs[index].start_s))
+        return replace(self, motion=motion, loads_rad=tuple(loads))
+
+    def moved(self, time_s: float, goal_rad: float, speed_rad_per_s: float, factor: float) -> Axis:
+        """Commanded to a goal, rounded to the nearest count, by way of the approach if there is one."""
+        s = self.settings
+        goal = round(goal_rad / s.count_rad) * s.count_rad
+        position, velocity = self.motion.at(time_s)
+        goals = [goal]
+        if s.approach_rad > 0 and not (position == goal and velocity == 0):
+            stop_rad = position + velocity * abs(velocity) / (2 * factor * s.acceleration_rad_per_s2)
+            if max(position, stop_rad) > goal - s.approach_rad:
+                goals = [goal - s.approach_rad, goal]
+        speed = factor * min(speed_rad_per_s, s.speed_rad_per_s)
+        motion = self.motion.moved(time_s, goals, speed, factor * s.acceleration_rad_per_s2)
+        return self.followed_by(motion, time_s)

@@ -1,0 +1,259 @@
+"""A simulated Dynamixel bus: bytes of the host in, answers of the servos out, in their order."""
+
+from __future__ import annotations
+
+import contextlib
+import threading
+from collections.abc import Iterable, Iterator, Sequence
+
+from drivers.sim.wire import dynamixel_packets as packets
+from drivers.sim.wire.dynamixel_packets import BROADCAST, Instruction, InstructionParser
+from drivers.sim.wire.dynamixel_servo import SimulatedServo
+from drivers.sim.wire.dynamixel_table import ACCESS, CRC_ERROR, DATA_LENGTH, INSTRUCTION_ERROR, Refused
+from drivers.sim.wire.line import Reply
+
+PING, READ, WRITE, REG_WRITE, ACTION, FACTORY_RESET, REBOOT, CLEAR, BACKUP = 1, 2, 3, 4, 5, 6, 8, 0x10, 0x20
+SYNC_READ, SYNC_WRITE, FAST_SYNC_READ, BULK_READ, BULK_WRITE, FAST_BULK_READ = (
+    0x82,
+    0x83,
+    0x8A,
+    0x92,
+    0x93,
+    0x9A,
+)
+
+
+class DynamixelBus:
+    """Servos on one line, a ``WireDevice``; safe from any thread.
+
+    Parameters
+    ----------
+    servos
+        Those on the line. Two may have the same id: then their answers collide.
+    waits_for_predecessor
+        In a sync or bulk read a servo answers after the one before it in the list; when that one is not
+        there, it and all behind it stay silent. False: the list is answered without the missing one.
+
+    Attributes
+    ----------
+    host_baud
+        Bits a second of the host, set by who knows it; a servo with another rate hears nothing. None: the
+        rate of the first servo.
+    """
+
+    def __init__(self, servos: Iterable[SimulatedServo], *, waits_for_predecessor: bool = True) -> None:
+        self.servos = list(servos)
+        self.waits_for_predecessor = waits_for_predecessor
+        self.host_baud: int | None = None
+        self._parser = InstructionParser()
+        self._lock = threading.RLock()
+
+    @property
+    def baud(self) -> int:
+        """Bits a second that the line is listened to at."""
+        return self.host_baud or (self.servos[0].baud if self.servos else 57600)
+
+    def receive(self, data: bytes, time_s: float) -> Sequence[Reply]:
+        """Take bytes of the host, return what the servos answer to the packets that they complete."""
+        with self._lock:
+            replies: list[Reply] = []
+            for instruction in self._parser.feed(data):
+                replies += self._answer(instruction, time_s)
+            return replies
+
+    def poll(self, time_s: float) -> Sequence[Reply]:
+        """Let happen what happens without a packet (watchdog, protection); servos never speak unasked."""
+        with self._lock:
+            for servo in self.servos:
+                servo.update(time_s)
+            return ()
+
+    @contextlib.contextmanager
+    def held(self) -> Iterator[None]:
+        """Keep the line from the servos meanwhile, so that somebody else may do something to them."""
+        with self._lock:
+            yield
+
+    def _answer(self, instruction: Instruction, time_s: float) -> list[Reply]:
+        here: list[SimulatedServo] = []
+        for servo in self.servos:
+            servo.update(time_s)
+            if servo.hears(time_s) and servo.baud == self.baud:
+                here.append(servo)
+        code, parameters = instruction.code, instruction.parameters
+        if not instruction.intact:
+            return self._damaged(instruction, here)
+        if code == packets.STATUS:
+            return []  # an answer that came back to the servos
+        for servo in here:
+            servo.feed(time_s)
+        if code in (SYNC_READ, FAST_SYNC_READ, BULK_READ, FAST_BULK_READ):
+            wanted = _wanted(code, parameters) if instruction.packet_id == BROADCAST else []
+            return self._group_read(code, wanted, here, time_s)
+        if code in (SYNC_WRITE, BULK_WRITE):
+            if instruction.packet_id == BROADCAST:
+                _group_write(code, parameters, here, time_s)
+            return []
+        return self._single(instruction, here, time_s)
+
+    def _damaged(self, instruction: Instruction, here: list[SimulatedServo]) -> list[Reply]:
+        """A CRC that does not match: the servo that seems to be meant says so."""
+        return _collided(
+            Reply(
+                packets.status_packet(servo.servo_id, CRC_ERROR | servo.alert()),
+                servo.return_delay_s,
+                servo.servo_id,
+            )
+            for servo in here
+            if servo.servo_id == instruction.packet_id and servo.answers("write")
+        )
+
+    def _single(self, instruction: Instruction, here: list[SimulatedServo], time_s: float) -> list[Reply]:
+        """An instruction to one servo, to a group by its secondary id, or to all."""
+        code, broadcast = instruction.code, instruction.packet_id == BROADCAST
+        replies: list[Reply] = []
+        for servo in sorted(here, key=lambda s: s.servo_id):
+            servo_id = servo.servo_id
+            own = servo_id == instruction.packet_id
+            group = servo.table["secondary_id"] == instruction.packet_id <= packets.MAX_ID and not own
+            if not (own or group or broadcast):
+                continue
+            error, data, alert = 0, b"", servo.alert()  # a reboot forgets the error
+            level = servo.answers("ping" if code == PING else "read" if code == READ else "write")
+            try:
+                data = _do(servo, instruction, time_s, broadcast=broadcast, group=group)
+            except Refused as refused:
+                error = refused.error
+            if level and (own or (broadcast and code == PING)):
+                # In a broadcast ping each waits for the one with the next lower id.
+                answer = packets.status_packet(servo_id, error | alert, data)
+                replies.append(Reply(answer, servo.return_delay_s, servo_id))
+        return _collided(replies)
+
+    def _group_read(
+        self, code: int, wanted: list[tuple[int, int, int]], here: list[SimulatedServo], time_s: float
+    ) -> list[Reply]:
+        """Sync, bulk and fast reads, answered in the order of the list."""
+        fast = code in (FAST_SYNC_READ, FAST_BULK_READ)
+        total = sum(length + 4 for _, _, length in wanted)
+        if fast and total > packets.MAX_PACKET:
+            return []
+        blocks: list[tuple[int, int, bytes]] = []
+        replies: list[Reply] = []
+        for servo_id, address, length in wanted:
+            found = [s for s in here if s.servo_id == servo_id and s.answers("read")]
+            if not found or (fast and not all(s.model.fast for s in found)):
+                if self.waits_for_predecessor or fast:
+                    break
+                continue
+            delay_s = found[0].return_delay_s
+            answers = []
+            for servo in found:
+                error, data = 0, b""
+                try:
+                    data = servo.read(address, length, time_s)
+                except Refused as refused:
+                    # A fast answer has fixed places, so the block is there, with an error and zeros.
+                    error, data = refused.error, bytes(length) if fast else b""
+                answers.append((error | servo.alert(), servo_id, data))
+            if fast:
+                blocks.append(answers[0])
+                replies.append(Reply(b"", delay_s, servo_id))
+            else:
+                packed = [Reply(packets.status_packet(i, e, d), delay_s, i) for e, i, d in answers]
+                replies += _collided(packed)
+        if fast:
+            pieces = packets.fast_status_packets(blocks, total)
+            return [Reply(p, r.delay_s, r.sender) for p, r in zip(pieces, replies, strict=True)]
+        return replies
+
+
+def _do(
+    servo: SimulatedServo, instruction: Instruction, time_s: float, *, broadcast: bool, group: bool
+) -> bytes:
+    """Carry out one instruction on one servo and return the parameters of its answer."""
+    code, parameters = instruction.code, instruction.parameters
+    if code == PING:
+        return servo.ping()
+    if code == READ:
+        if len(parameters) != 4:
+            raise Refused(DATA_LENGTH)
+        address, length = _word(parameters, 0), _word(parameters, 2)
+        return b"" if broadcast else servo.read(address, length, time_s)
+    if code in (WRITE, REG_WRITE):
+        if len(parameters) < 3:
+            raise Refused(DATA_LENGTH)
+        if code == WRITE:
+            servo.write(_word(parameters, 0), parameters[2:], time_s, by_group=group)
+        else:
+            servo.reg_write(_word(parameters, 0), parameters[2:], by_group=group)
+    elif code == ACTION:
+        servo.action(time_s)
+    elif code == REBOOT:
+        servo.reboot(time_s)
+    elif group:
+        raise Refused(ACCESS)  # a group can write to the RAM area, no more
+    elif code == FACTORY_RESET:
+        servo.factory_reset(parameters, time_s, broadcast=broadcast)
+    elif code == CLEAR:
+        servo.clear(parameters, time_s)
+    elif code == BACKUP:
+        servo.backup(parameters, time_s)
+    else:
+        raise Refused(INSTRUCTION_ERROR)
+    return b""
+
+
+def _word(data: bytes, at: int) -> int:
+    return int.from_bytes(data[at : at + 2], "little")
+
+
+def _wanted(code: int, parameters: bytes) -> list[tuple[int, int, int]]:
+    """Id, address and length for each servo of a sync or bulk read; what is left over is ignored."""
+    if code in (SYNC_READ, FAST_SYNC_READ):
+        address, length = _word(parameters, 0), _word(parameters, 2)
+        return [(servo_id, address, length) for servo_id in dict.fromkeys(parameters[4:])]
+    whole = len(parameters) // 5 * 5
+    found: dict[int, tuple[int, int, int]] = {}
+    for at in range(0, whole, 5):
+        found.setdefault(
+            parameters[at], (parameters[at], _word(parameters, at + 1), _word(parameters, at + 3))
+        )
+    return list(found.values())
+
+
+def _group_write(code: int, parameters: bytes, here: list[SimulatedServo], time_s: float) -> None:
+    """Write to each servo of a sync or bulk write; nobody answers, refused values are dropped."""
+    at = 4 if code == SYNC_WRITE else 0
+    address, length = _word(parameters, 0), _word(parameters, 2)
+    while at < len(parameters):
+        servo_id = parameters[at]
+        at += 1
+        if code == BULK_WRITE:
+            address, length = _word(parameters, at), _word(parameters, at + 2)
+            at += 4
+        data = parameters[at : at + length]
+        at += length
+        if len(data) < length:
+            return
+        for servo in here:
+            if servo.servo_id == servo_id:
+                try:
+                    servo.write(address, data, time_s)
+                except Refused:
+                    continue
+
+
+def _collided(replies: Iterable[Reply]) -> list[Reply]:
+    """Answers of servos with the same id lie on one another: a line is low when one pulls it low."""
+    merged: dict[int, Reply] = {}
+    for reply in replies:
+        other = merged.get(reply.sender)
+        if other is None:
+            merged[reply.sender] = reply
+            continue
+        size = max(len(reply.data), len(other.data))
+        one, two = reply.data.ljust(size, b"\xff"), other.data.ljust(size, b"\xff")
+        both = bytes(a & b for a, b in zip(one, two, strict=True))
+        merged[reply.sender] = Reply(both, min(reply.delay_s, other.delay_s), reply.sender)
+    return list(merged.values())

@@ -1,0 +1,381 @@
+"""The models of Dynamixel servo that can be simulated: tables, counts, units, modes.
+
+Source: ROBOTIS e-Manual, the page of each model. Where pages differ between editions the newest was taken.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+from drivers.errors import BadOptions
+from drivers.faults import nearest
+from drivers.sim.wire.dynamixel_registers import (
+    MX_MORE,
+    P_EEPROM,
+    P_RAM,
+    X330_MORE,
+    X540_MORE,
+    X_EEPROM,
+    X_RAM,
+    Register,
+    rows,
+)
+
+
+@dataclass(frozen=True)
+class IndirectBlock:
+    """A run of indirect addresses (2 bytes each) and of the data bytes (1 each) that stand for them."""
+
+    address: int
+    data: int
+    count: int
+
+
+@dataclass(frozen=True)
+class Model:
+    """One model of servo.
+
+    Attributes
+    ----------
+    name, number, firmware
+        As a ping answers.
+    registers
+        Its control table, without the indirect blocks.
+    indirect
+        The indirect blocks; ``indirect_low`` to ``indirect_high`` is what they may point to.
+    counts_per_turn
+        Counts of one turn of the output shaft.
+    zero_counts
+        Count in the middle of the turn that position control uses.
+    velocity_unit_rad_per_s, acceleration_unit_rad_per_s2, current_unit_a
+        One unit of the velocity, acceleration and current registers.
+    modes
+        Operating modes: 0 current, 1 velocity, 3 position, 4 extended, 5 current-based position, 16 PWM.
+    drive_bits
+        Bits that Drive Mode takes.
+    fast
+        It answers fast sync and bulk reads.
+    voltage_v
+        What it is fed with, the manual's recommendation.
+    """
+
+    name: str
+    number: int
+    firmware: int
+    registers: tuple[Register, ...]
+    indirect: tuple[IndirectBlock, ...]
+    indirect_low: int
+    indirect_high: int
+    ram_from: int
+    counts_per_turn: int
+    zero_counts: int
+    velocity_unit_rad_per_s: float
+    acceleration_unit_rad_per_s2: float
+    current_unit_a: float
+    modes: frozenset[int]
+    drive_bits: int
+    fast: bool
+    voltage_v: float
+
+    @property
+    def count_rad(self) -> float:
+        """One count at the output shaft."""
+        return math.tau / self.counts_per_turn
+
+    @cached_property
+    def by_name(self) -> Mapping[str, Register]:
+        """Registers by name."""
+        return {register.name: register for register in self.registers}
+
+    @cached_property
+    def by_byte(self) -> Mapping[int, tuple[Register, int]]:
+        """Register and offset within it for every defined byte, indirect blocks aside."""
+        return {r.address + i: (r, i) for r in self.registers for i in range(r.size)}
+
+    @cached_property
+    def indirect_bytes(self) -> Mapping[int, tuple[str, int]]:
+        """What each byte of the indirect blocks is: ("address", 2 · number + byte) or ("data", number)."""
+        table: dict[int, tuple[str, int]] = {}
+        number = 0
+        for block in self.indirect:
+            for i in range(block.count):
+                table[block.address + 2 * i] = ("address", 2 * number)
+                table[block.address + 2 * i + 1] = ("address", 2 * number + 1)
+                table[block.data + i] = ("data", number)
+                number += 1
+        return table
+
+
+_RPM = math.tau / 60
+_X_MODES = frozenset({0, 1, 3, 4, 5, 16})
+_X_INDIRECT = (IndirectBlock(168, 224, 28), IndirectBlock(578, 634, 28))
+
+
+def _changed(table: Sequence[Register], changes: Mapping[str, tuple[int, int, int]]) -> tuple[Register, ...]:
+    """Rows with other ``(initial, low, high)`` for some names."""
+    assert changes.keys() <= {row.name for row in table}
+    return tuple(
+        Register(r.address, r.size, r.name, r.writable, *changes[r.name]) if r.name in changes else r
+        for r in sorted(table, key=lambda row: row.address)
+    )
+
+
+def _x(
+    name: str,
+    number: int,
+    changes: Mapping[str, tuple[int, int, int]],
+    *,
+    more: str = "",
+    without: frozenset[str] = frozenset(),
+    firmware: int = 45,
+    indirect: tuple[IndirectBlock, ...] = _X_INDIRECT,
+    current_unit_a: float = 0.00269,
+    modes: frozenset[int] = _X_MODES,
+    drive_bits: int = 0b1101,
+    fast: bool = True,
+    voltage_v: float = 12.0,
+) -> Model:
+    table = [r for r in rows(X_EEPROM + X_RAM + more) if r.name not in without]
+    return Model(
+        name=name,
+        number=number,
+        firmware=firmware,
+        registers=_changed(table, changes),
+        indirect=indirect,
+        indirect_low=64,
+        indirect_high=max(block.data + block.count for block in indirect) - 1,
+        ram_from=64,
+        counts_per_turn=4096,
+        zero_counts=2048,
+        velocity_unit_rad_per_s=0.229 * _RPM,
+        acceleration_unit_rad_per_s2=214.577 * _RPM / 60,
+        current_unit_a=current_unit_a,
+        modes=modes,
+        drive_bits=drive_bits,
+        fast=fast,
+        voltage_v=voltage_v,
+    )
+
+
+def _x330(
+    name: str, number: int, changes: Mapping[str, tuple[int, int, int]], voltage_v: float, **initial: int
+) -> Model:
+    gains = {key: (value, 0, 16383) for key, value in initial.items()}
+    return _x(
+        name,
+        number,
+        {"baud_rate": (1, 0, 6), "temperature_limit": (70, 0, 100), **changes, **gains},
+        more=X330_MORE,
+        firmware=52,
+        indirect=(IndirectBlock(168, 208, 20),),
+        current_unit_a=0.001,
+        voltage_v=voltage_v,
+    )
+
+
+_XL330 = {
+    "max_voltage_limit": (70, 31, 70),
+    "min_voltage_limit": (35, 31, 70),
+    "current_limit": (1750, 0, 1750),
+    "shutdown": (53, 0, 63),
+}
+_XC330 = {
+    "max_voltage_limit": (140, 55, 140),
+    "min_voltage_limit": (55, 55, 140),
+    "current_limit": (910, 0, 910),
+    "pwm_slope": (255, 1, 255),
+}
+_XC330_M = {
+    "max_voltage_limit": (70, 31, 70),
+    "min_voltage_limit": (35, 31, 70),
+    "current_limit": (2352, 0, 2352),
+}
+_MX = {"position_p_gain": (850, 0, 16383)}
+_MX_WITHOUT = frozenset({"startup_configuration", "backup_ready"})
+_540 = {"current_limit": (2047, 0, 2047)}
+
+
+def _velocity(initial: int, high: int = 1023) -> dict[str, tuple[int, int, int]]:
+    return {"velocity_limit": (initial, 0, high)}
+
+
+def _p(
+    name: str, number: int, half_turn: int, limit: int, changes: Mapping[str, tuple[int, int, int]]
+) -> Model:
+    positions = {
+        "max_position_limit": (limit, -half_turn, half_turn),
+        "min_position_limit": (-limit, -half_turn, half_turn),
+    }
+    return Model(
+        name=name,
+        number=number,
+        firmware=14,
+        registers=_changed(rows(P_EEPROM + P_RAM), {**positions, **changes}),
+        indirect=(IndirectBlock(168, 634, 128),),
+        indirect_low=512,
+        indirect_high=1023,
+        ram_from=512,
+        counts_per_turn=2 * half_turn,
+        zero_counts=0,
+        velocity_unit_rad_per_s=0.01 * _RPM,
+        acceleration_unit_rad_per_s2=_RPM / 60,
+        current_unit_a=0.001,
+        modes=frozenset({0, 1, 3, 4, 16}),
+        drive_bits=0b0001,
+        fast=True,
+        voltage_v=24.0,
+    )
+
+
+def _gains(i: int, p: int, position_p: int) -> dict[str, tuple[int, int, int]]:
+    return {
+        "velocity_i_gain": (i, 0, 32767),
+        "velocity_p_gain": (p, 0, 32767),
+        "position_p_gain": (position_p, 0, 32767),
+    }
+
+
+_ALL = (
+    _x330(
+        "xl330_m077",
+        1190,
+        {**_XL330, **_velocity(1620, 2047)},
+        5.0,
+        velocity_i_gain=400,
+        velocity_p_gain=40,
+        position_i_gain=400,
+        position_p_gain=400,
+    ),
+    _x330(
+        "xl330_m288",
+        1200,
+        {**_XL330, **_velocity(445, 2047)},
+        5.0,
+        velocity_i_gain=1600,
+        velocity_p_gain=180,
+        position_p_gain=400,
+    ),
+    _x330(
+        "xc330_t181",
+        1210,
+        {**_XC330, **_velocity(510, 2047)},
+        12.0,
+        velocity_i_gain=1200,
+        velocity_p_gain=40,
+        position_p_gain=900,
+    ),
+    _x330(
+        "xc330_t288",
+        1220,
+        {**_XC330, **_velocity(320, 2047)},
+        12.0,
+        velocity_i_gain=1200,
+        velocity_p_gain=40,
+        position_p_gain=900,
+    ),
+    _x330(
+        "xc330_m181",
+        1230,
+        {**_XC330_M, **_velocity(545, 2047)},
+        5.0,
+        velocity_i_gain=1400,
+        velocity_p_gain=100,
+        position_d_gain=500,
+        position_p_gain=1200,
+    ),
+    _x330(
+        "xc330_m288",
+        1240,
+        {**_XC330_M, **_velocity(350, 2047)},
+        5.0,
+        velocity_i_gain=1600,
+        velocity_p_gain=50,
+        position_d_gain=500,
+        position_p_gain=1100,
+    ),
+    _x("xm430_w210", 1030, _velocity(330)),
+    _x("xm430_w350", 1020, {}),
+    _x("xm540_w150", 1130, {**_540, **_velocity(230)}, more=X540_MORE, drive_bits=0b1111),
+    _x("xm540_w270", 1120, {**_540, **_velocity(128)}, more=X540_MORE, drive_bits=0b1111),
+    _x("xh540_w270", 1100, {**_540, **_velocity(167)}, more=X540_MORE, drive_bits=0b1111),
+    _x("xh540_w150", 1110, {**_540, **_velocity(300)}, more=X540_MORE, drive_bits=0b1111),
+    # No current sensor: address 126 is Present Load (0.1 %), and there is nothing at 38 and 102.
+    _x(
+        "mx_28",
+        30,
+        {**_MX, **_velocity(230)},
+        more=MX_MORE + "126 2 present_load r - -1000 1000\n",
+        without=_MX_WITHOUT | {"current_limit", "goal_current", "present_current"},
+        modes=frozenset({1, 3, 4, 16}),
+        drive_bits=0b0101,
+        fast=False,
+    ),
+    _x(
+        "mx_64",
+        311,
+        {**_MX, **_velocity(435), "current_limit": (1941, 0, 1941)},
+        more=MX_MORE,
+        without=_MX_WITHOUT,
+        current_unit_a=0.00336,
+        drive_bits=0b0101,
+        fast=False,
+    ),
+    _x(
+        "mx_106",
+        321,
+        {**_MX, **_velocity(360), "current_limit": (2047, 0, 2047)},
+        more=MX_MORE,
+        without=_MX_WITHOUT,
+        current_unit_a=0.00336,
+        drive_bits=0b0111,
+        fast=False,
+    ),
+    _p("ph42_020_s300", 2000, 303750, 303454, {}),
+    _p(
+        "ph54_100_s500",
+        2010,
+        501923,
+        501433,
+        {
+            "current_limit": (15900, 0, 15900),
+            "acceleration_limit": (4255632, 0, 4255632),
+            **_gains(1290, 3593, 502),
+        },
+    ),
+    _p(
+        "ph54_200_s500",
+        2020,
+        501923,
+        501433,
+        {
+            "moving_threshold": (20, 0, 2900),
+            "current_limit": (22740, 0, 22740),
+            "acceleration_limit": (9982, 0, 3992644),
+            "velocity_limit": (2900, 0, 2900),
+            "shutdown": (52, 0, 63),
+            **_gains(2209, 6153, 314),
+        },
+    ),
+)
+
+MODELS: Mapping[str, Model] = {model.name: model for model in _ALL}
+"""Every model that can be simulated, by name."""
+
+
+def model_named(name: str) -> Model:
+    """Return a model by its name in any common spelling: ``XM430-W350-T``, ``xm430_w350``.
+
+    Raises
+    ------
+    BadOptions
+        If there is none, with the nearest name.
+    """
+    plain = str(name).lower().replace("-", "_")
+    for suffix in ("", "_t", "_r"):
+        known = plain.removesuffix(suffix)
+        if known in MODELS:
+            return MODELS[known]
+    raise BadOptions(f"there is no servo model {name!r} to simulate{nearest(plain, MODELS)}")

@@ -1,0 +1,379 @@
+"""One simulated Dynamixel servo: its instructions, its watchdog, its protection, its start."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+
+from drivers.errors import BadOptions
+from drivers.sim.wire.axis import WireAxis
+from drivers.sim.wire.dynamixel_drive import Drive
+from drivers.sim.wire.dynamixel_models import Model, model_named
+from drivers.sim.wire.dynamixel_registers import BAUD_RATES
+from drivers.sim.wire.dynamixel_table import (
+    DATA_LENGTH,
+    GOALS,
+    INSTRUCTION_ERROR,
+    RESULT_FAIL,
+    WATCHDOG_EXPIRED,
+    Change,
+    ControlTable,
+    Refused,
+)
+
+ALERT = 0x80
+VOLTAGE, HALL, HEAT, ENCODER, SHOCK, OVERLOAD = (1 << bit for bit in range(6))
+"""Bits of Hardware Error Status."""
+
+BOOT_S = 0.3
+"""How long a servo is deaf after a reboot, seconds (assumed; the manual gives none)."""
+
+OVERLOAD_S = 0.5
+"""How long an axis pushes in vain before it counts as overload, seconds (assumed)."""
+
+_WATCHDOG_UNIT_S = 0.02
+_ANSWER_BITS = 120.0  # of an answer without data, and a byte to spare
+_CLEAR_KEY = bytes((0x01, 0x44, 0x58, 0x4C, 0x22))
+_BACKUP_KEY = b"\x43\x54\x52\x4c"
+
+
+class SimulatedServo:
+    """One servo; every method is given the time and nothing runs by itself.
+
+    Parameters
+    ----------
+    model
+        Its name, in any spelling that `dynamixel_models.model_named` takes.
+    servo_id
+        Its id at first.
+    axis
+        What it turns.
+    zero_counts
+        Count at axis angle 0 (with homing offset 0 and normal direction); left out, the middle of the range.
+    sign
+        1 or -1: whether counts grow with the axis angle.
+    settings
+        Initial values of registers, by name; those of the EEPROM outlast a reboot.
+    time_s
+        When it is switched on.
+
+    Raises
+    ------
+    BadOptions
+        For an unknown model or register, or a value that the register cannot hold.
+    """
+
+    def __init__(
+        self,
+        model: str,
+        servo_id: int,
+        axis: WireAxis,
+        *,
+        zero_counts: int | None = None,
+        sign: int = 1,
+        settings: Mapping[str, int] | None = None,
+        time_s: float = 0.0,
+    ) -> None:
+        self.model: Model = model_named(model)
+        self.powered = True
+        self.table = ControlTable(self.model, self._live())
+        for name, value in {"id": servo_id, **(settings or {})}.items():
+            register = self.model.by_name.get(name)
+            if register is None:
+                raise BadOptions(f"servo model {self.model.name} has no register {name!r}")
+            if not register.low <= value <= register.high:
+                raise BadOptions(
+                    f"{name} is {value} for a simulated {self.model.name}, "
+                    f"expected {register.low} to {register.high}"
+                )
+        self.table.values.update({"model_number": self.model.number, "firmware_version": self.model.firmware})
+        self.table.values.update({"id": servo_id, **(settings or {})})
+        zero = self.model.zero_counts if zero_counts is None else zero_counts
+        self.drive = Drive(self.model, self.table, axis, zero, sign, time_s)
+        self._axis = axis
+        self._backup: dict[str, int] = {}
+        self._backup_pointers: list[int] = []
+        self._registered: list[Change] = []
+        self._raised = 0
+        self._since_s: float | None = None
+        self._started_s = self._fed_s = self._retune_s = time_s
+        self._rate = self.table["baud_rate"]
+        self._starting = False
+        self._start_registers(time_s)
+
+    # What the bus asks
+
+    @property
+    def servo_id(self) -> int:
+        """The id that it answers to."""
+        return self.table["id"]
+
+    @property
+    def baud(self) -> int:
+        """Bits a second that it talks at; a new rate holds once the write was answered at the old one."""
+        return BAUD_RATES[self._rate]
+
+    @property
+    def return_delay_s(self) -> float:
+        """How long it waits before it answers."""
+        return self.table["return_delay_time"] * 2e-6
+
+    def hears(self, time_s: float) -> bool:
+        """Return whether it takes part in the traffic: has power and is not starting."""
+        return self.powered and time_s >= self._started_s
+
+    def alert(self) -> int:
+        """Return the bit that every answer of a servo with a hardware error carries."""
+        return ALERT if self.table["hardware_error_status"] else 0
+
+    def feed(self, time_s: float) -> None:
+        """Feed the bus watchdog: an instruction packet, to whomever, was on the bus."""
+        self._fed_s = time_s
+
+    def answers(self, code: str) -> bool:
+        """Return whether the status return level lets it answer ``ping``, ``read`` or another word."""
+        return self.table["status_return_level"] >= {"ping": 0, "read": 1}.get(code, 2)
+
+    def set_power(self, on: bool, time_s: float) -> None:
+        """Switch it off, or on again with what the EEPROM holds."""
+        if on == self.powered:
+            return
+        self.powered = on
+        self.table["torque_enable"] = 0
+        self.drive.torque_off(time_s)
+        if on:
+            self._boot(time_s)
+
+    def raise_error(self, bits: int) -> None:
+        """Let a hardware error happen, for example ``ENCODER`` or ``SHOCK``; it stays until a reboot."""
+        self._raised |= bits
+
+    def update(self, time_s: float) -> None:
+        """Let happen what happened by itself until now: the watchdog, and the servo's own protection."""
+        if self._rate != self.table["baud_rate"] and time_s >= self._retune_s:
+            self._rate = self.table["baud_rate"]
+        if not self.hears(time_s):
+            return
+        if self._starting:
+            self._starting = False
+            self._start_registers(self._started_s)
+        limit = self.table["bus_watchdog"]
+        if self.table["torque_enable"] and 0 < limit < WATCHDOG_EXPIRED:
+            expiry_s = self._fed_s + limit * _WATCHDOG_UNIT_S
+            if time_s > expiry_s:
+                # The stop is put where it belongs in time, so that pictures between show it too.
+                self.table["bus_watchdog"] = WATCHDOG_EXPIRED
+                self.table["goal_velocity"] = 0
+                self.drive.stop(expiry_s)
+        self._protect(time_s)
+
+    # Instructions
+
+    def ping(self) -> bytes:
+        """Return the parameters of the answer to a ping."""
+        return self.model.number.to_bytes(2, "little") + bytes((self.model.firmware,))
+
+    def read(self, address: int, length: int, time_s: float) -> bytes:
+        """Return the bytes of a range, or raise Refused."""
+        return self.table.read(address, length, time_s)
+
+    def write(self, address: int, data: bytes, time_s: float, *, by_group: bool = False) -> None:
+        """Write at once, or raise Refused; ``by_group`` is a packet to the secondary id."""
+        self._apply(self._changes(address, data, by_group), time_s)
+
+    def reg_write(self, address: int, data: bytes, *, by_group: bool = False) -> None:
+        """Check a write and keep it for `action`, or raise Refused."""
+        self._registered = self._changes(address, data, by_group)
+        self.table["registered_instruction"] = 1
+
+    def action(self, time_s: float) -> None:
+        """Carry out what `reg_write` kept; raise Refused when there is nothing."""
+        if not self._registered:
+            raise Refused(INSTRUCTION_ERROR)
+        changes, self._registered = self._registered, []
+        self.table["registered_instruction"] = 0
+        self._apply(changes, time_s)
+
+    def reboot(self, time_s: float) -> None:
+        """Start anew: torque drops at once, errors are gone, the RAM area is as from the factory."""
+        self.table["torque_enable"] = 0
+        self.drive.torque_off(time_s)
+        self._boot(time_s)
+
+    def factory_reset(self, parameters: bytes, time_s: float, *, broadcast: bool) -> None:
+        """Reset the table: 0xFF all, 0x01 all but the id, 0x02 all but id and baud rate; then start anew."""
+        if len(parameters) != 1:
+            raise Refused(DATA_LENGTH)
+        kept = {0xFF: (), 0x01: ("id",), 0x02: ("id", "baud_rate")}.get(parameters[0])
+        if kept is None or (broadcast and parameters[0] == 0xFF):
+            raise Refused(RESULT_FAIL)
+        values = {name: self.table[name] for name in (*kept, "model_number", "firmware_version")}
+        self.table.values.update({r.name: r.initial for r in self.model.registers} | values)
+        self.table.reset_pointers()
+        self.reboot(time_s)
+
+    def clear(self, parameters: bytes, time_s: float) -> None:
+        """Bring the position back to one turn; refused while it moves."""
+        if parameters != _CLEAR_KEY or self.drive.moving(time_s):
+            raise Refused(RESULT_FAIL)
+        before = self.drive.position(time_s)
+        self.drive.into_one_turn(time_s)
+        self.table["goal_position"] += self.drive.position(time_s) - before
+
+    def backup(self, parameters: bytes, time_s: float) -> None:
+        """Store the EEPROM area and the settings of the control loop (1), or restore and start anew (2)."""
+        if self.table["torque_enable"] or parameters[1:] != _BACKUP_KEY or parameters[0] not in (1, 2):
+            raise Refused(RESULT_FAIL)
+        if "backup_ready" not in self.table.values:
+            raise Refused(INSTRUCTION_ERROR)
+        if parameters[0] == 1:
+            names = [r.name for r in self.model.registers if r.writable and self._is_kept(r.name)]
+            self._backup = {name: self.table[name] for name in names}
+            self._backup_pointers = list(self.table.pointers)
+            self.table["backup_ready"] = 1
+        elif not self._backup:
+            raise Refused(RESULT_FAIL)
+        else:
+            eeprom = {n: v for n, v in self._backup.items() if self._is_eeprom(n)}
+            self.table.values.update(eeprom)
+            self.reboot(time_s)
+
+    # Inside
+
+    def _is_eeprom(self, name: str) -> bool:
+        return self.model.by_name[name].address < self.model.ram_from
+
+    def _is_kept(self, name: str) -> bool:
+        return self._is_eeprom(name) or "gain" in name or name.startswith("profile_")
+
+    def _expired(self) -> bool:
+        return self.table["bus_watchdog"] == WATCHDOG_EXPIRED
+
+    def _changes(self, address: int, data: bytes, by_group: bool) -> list[Change]:
+        locked = by_group or self.table["torque_enable"] == 1
+        return self.table.changes(address, data, locked=locked, expired=self._expired())
+
+    def _apply(self, changes: list[Change], time_s: float) -> None:
+        """Store accepted changes and act on them, goals last and once each."""
+        goals = []
+        for change in changes:
+            name = "" if change.register is None else change.register.name
+            if name == "torque_enable":
+                self._torque(change.value == 1, time_s)
+                continue
+            if name in GOALS and self._expired():
+                continue  # an action that was registered before the watchdog expired
+            self.table.apply(change)
+            if name in GOALS:
+                goals.append(name)
+            elif name == "operating_mode":
+                self._reset_mode(time_s)
+            elif name == "drive_mode":
+                self.drive.into_one_turn(time_s)
+            elif name == "baud_rate":
+                self._retune_s = time_s + self.return_delay_s + _ANSWER_BITS / self.baud
+        for name in goals:
+            if not self.table["torque_enable"] and self.table["drive_mode"] & 8:
+                self._torque_by_goal(name, time_s)
+            if self.table["torque_enable"]:
+                self.drive.obey(name, time_s)
+
+    def _torque_by_goal(self, name: str, time_s: float) -> None:
+        """Torque On by Goal Update: keep the goal that switches the torque on."""
+        goal = self.table[name]
+        self._torque(True, time_s)
+        self.table[name] = goal
+
+    def _torque(self, on: bool, time_s: float) -> None:
+        """Switch the torque; after a shutdown it stays off without a word, only the alert bit tells."""
+        if on == bool(self.table["torque_enable"]):
+            return
+        if on and self.table["hardware_error_status"] & self.table["shutdown"]:
+            return
+        self.table["torque_enable"] = int(on)
+        self._fed_s = time_s
+        if on:
+            self.drive.torque_on(time_s)
+        else:
+            self.drive.torque_off(time_s)
+
+    def _reset_mode(self, time_s: float) -> None:
+        """A new operating mode: the profile and the limits of the goals are reset."""
+        self.table["profile_velocity"] = self.table["profile_acceleration"] = 0
+        self._reset_goals(time_s)
+        if self.table["operating_mode"] in (3, 4):
+            self.drive.into_one_turn(time_s)
+            self.table["goal_position"] = self.drive.position(time_s)
+
+    def _reset_goals(self, time_s: float) -> None:
+        self.table["goal_pwm"] = self.table["pwm_limit"]
+        if "goal_current" in self.table.values:
+            self.table["goal_current"] = self.table["current_limit"]
+        self.table["goal_velocity"] = 0
+        self.table["goal_position"] = self.drive.position(time_s)
+
+    def _boot(self, time_s: float) -> None:
+        """Everything that is not EEPROM as from the factory; deaf for a while."""
+        for register in self.model.registers:
+            if register.address >= self.model.ram_from and register.name != "backup_ready":
+                self.table[register.name] = register.initial
+        if self.model.ram_from == 64:
+            self.table.reset_pointers()
+        self._registered = []
+        self._raised = 0
+        self._since_s = None
+        self._started_s = self._fed_s = self._retune_s = time_s + BOOT_S
+        self._starting = True
+
+    def _start_registers(self, time_s: float) -> None:
+        self.drive.into_one_turn(time_s)
+        self._reset_goals(time_s)
+        startup = self.table.get("startup_configuration", 0)
+        if startup & 2 and self._backup:
+            self.table.values.update({n: v for n, v in self._backup.items() if not self._is_eeprom(n)})
+            if self.model.ram_from == 64:
+                self.table.pointers = list(self._backup_pointers)
+        if startup & 1:
+            self._torque(True, time_s)
+
+    def _voltage(self, time_s: float) -> int:
+        return round(10 * self.model.voltage_v * self._axis.supply(time_s))
+
+    def _protect(self, time_s: float) -> None:
+        """Set hardware errors, and drop the torque for those in the shutdown mask."""
+        table, found = self.table, self._raised
+        if not table["min_voltage_limit"] <= self._voltage(time_s) <= table["max_voltage_limit"]:
+            found |= VOLTAGE
+        if self._axis.temperature_c(time_s) > table["temperature_limit"]:
+            found |= HEAT
+        if self.drive.pushes(time_s):
+            self._since_s = time_s if self._since_s is None else self._since_s
+            if time_s - self._since_s >= OVERLOAD_S:
+                found |= OVERLOAD
+        else:
+            self._since_s = None
+        table["hardware_error_status"] |= found
+        if table["hardware_error_status"] & table["shutdown"] and table["torque_enable"]:
+            self._torque(False, time_s)
+
+    def _live(self) -> Mapping[str, Callable[[float], int]]:
+        """The registers that are measured, by name."""
+        return {
+            "realtime_tick": lambda t: int((t - self._started_s) * 1000) % 32768,
+            "moving": lambda t: self.drive.moving(t),
+            "moving_status": lambda t: self.drive.moving_status(t),
+            "present_pwm": lambda t: round(self.drive.effort(t) * self.table["pwm_limit"]),
+            "present_current": lambda t: round(self.drive.effort(t) * self._current_limit()),
+            "present_load": lambda t: round(self.drive.effort(t) * 1000),
+            "present_velocity": lambda t: self.drive.velocity(t),
+            "present_position": lambda t: self.drive.position(t),
+            "velocity_trajectory": lambda t: self.drive.trajectory_velocity(t),
+            "position_trajectory": lambda t: self.drive.trajectory_position(t),
+            "present_input_voltage": lambda t: self._voltage(t),
+            "present_temperature": lambda t: round(self._axis.temperature_c(t)),
+        }
+
+    def _current_limit(self) -> int:
+        """The largest current: what current-based position control is given, else the limit."""
+        if self.table["operating_mode"] == 5:
+            return abs(self.table["goal_current"])
+        return self.table["current_limit"]

@@ -1,0 +1,487 @@
+"""A Dynamixel head on simulated servos behind a pseudo terminal: start-up, faults, watchdog, unplugging.
+
+The simulator's registers and packets are its own (``drivers/sim/wire``), not the driver's. Nothing is timed:
+what must happen is waited for, and a wait that is long enough for a busy machine ends in a failure.
+"""
+
+from __future__ import annotations
+
+import multiprocessing as mp
+import os
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from drivers.clock import SystemClock
+from drivers.dynamixel.head import DynamixelHead, open_head
+from drivers.errors import (
+    DriverError,
+    HardwareFault,
+    LineLost,
+    NoReply,
+    OutOfRange,
+    WatchdogTripped,
+    WrongDevice,
+)
+from drivers.interfaces import PanTilt, Reading
+from drivers.sim.pan_tilt import AxisSettings
+from drivers.sim.wire.axis import WireAxis
+from drivers.sim.wire.dynamixel_bus import DynamixelBus
+from drivers.sim.wire.dynamixel_servo import HEAT, OVERLOAD, SimulatedServo
+from drivers.sim.wire.line import PtyLine
+
+COUNT_RAD = 2 * 3.141592653589793 / 4096
+LONG_S = 20.0
+SLOW_TO_BRAKE, QUICK_TO_BRAKE = (AxisSettings(COUNT_RAD, 0.0, -3.0, 3.0, 1.0, a) for a in (4.0, 20.0))
+X = "xm430_w350"
+
+
+@dataclass
+class Rig:
+    """Servos, what turns on them, their line, and the options of a head that drives them."""
+
+    axes: tuple[WireAxis, WireAxis]
+    servos: list[SimulatedServo]
+    line: PtyLine
+    options: dict[str, Any]
+
+    def open(self, **changes: Any) -> DynamixelHead:
+        return open_head({**self.options, **changes})
+
+
+@contextmanager
+def rig(
+    models: tuple[str, str] = (X, X),
+    starts_rad: tuple[float, float] = (0.0, 0.0),
+    pan: dict[str, int] | None = None,
+    mechanism: AxisSettings = QUICK_TO_BRAKE,
+) -> Iterator[Rig]:
+    """Two servos of a 12-bit or other kind; ``pan`` are initial registers of the pan servo."""
+    clock = SystemClock()
+    now_s = clock.now_s()
+    axes = (
+        WireAxis(mechanism, number=0, start_rad=starts_rad[0], time_s=now_s),
+        WireAxis(mechanism, number=1, start_rad=starts_rad[1], time_s=now_s),
+    )
+    extra: list[dict[str, int]] = [pan or {}, {}]
+    servos = [
+        SimulatedServo(model, i + 1, axis, settings={"baud_rate": 3, **extra[i]}, time_s=now_s)
+        for i, (model, axis) in enumerate(zip(models, axes, strict=True))
+    ]
+    with PtyLine(DynamixelBus(servos), clock, wire_time=False) as line:
+        options = {
+            "port": line.path,
+            "pan": {"id": 1, "model": models[0], "limits_rad": [-2.5, 2.5]},
+            "tilt": {"id": 2, "model": models[1], "limits_rad": [-1.2, 1.0]},
+            "reply_timeout_s": 0.1,
+            "acceleration_rad_per_s2": 15.0,
+            "watchdog_s": 0.4,  # the machine may be busy
+        }
+        yield Rig(axes, servos, line, options)
+
+
+@contextmanager
+def opened(**how: Any) -> Iterator[tuple[Rig, DynamixelHead]]:
+    """A rig and its open head; ``options`` change the head's, everything else is the rig's."""
+    options = how.pop("options", {})
+    with rig(**how) as it:
+        head = it.open(**options)
+        try:
+            yield it, head
+        finally:
+            head.close()
+
+
+def until(true: Callable[[], Any], what: str) -> Any:
+    """Wait for something that must come."""
+    end_s = time.monotonic() + LONG_S
+    while time.monotonic() < end_s:
+        if found := true():
+            return found
+        time.sleep(0.005)
+    raise AssertionError(f"{what} did not come in {LONG_S:g} s")
+
+
+def settled(head: PanTilt) -> Reading:
+    def look() -> Reading | None:
+        reading = head.read()
+        return None if reading.moving else reading
+
+    found: Reading = until(look, "rest")
+    return found
+
+
+def read_or_none(head: PanTilt) -> Reading | None:
+    try:
+        return head.read()
+    except DriverError:
+        return None
+
+
+def failed(head: PanTilt) -> DriverError | None:
+    try:
+        head.read()
+    except DriverError as error:
+        return error
+    return None
+
+
+# Start-up
+
+
+@pytest.mark.parametrize(
+    "models", [(X, X), (X, "mx_28"), ("mx_64", "ph42_020_s300"), ("ph54_200_s500", "xl330_m288")]
+)
+def test_start_up_sets_the_servos_and_moves_neither(models: tuple[str, str]) -> None:
+    with opened(models=models, starts_rad=(0.4, -0.3)) as (it, head):
+        assert isinstance(head, PanTilt)
+        reading = head.read()
+        assert reading.pan_rad == pytest.approx(0.4, abs=COUNT_RAD)
+        assert reading.tilt_rad == pytest.approx(-0.3, abs=COUNT_RAD)
+        now_s = time.monotonic()
+        assert [axis.angle_rad(now_s) for axis in it.axes] == [0.4, -0.3]
+        for servo, (low, high) in zip(it.servos, ((-2.5, 2.5), (-1.2, 1.0)), strict=True):
+            table, count_rad, zero = servo.table, servo.model.count_rad, servo.model.zero_counts
+            assert table["operating_mode"] == 3
+            assert table["return_delay_time"] == 0
+            assert table["torque_enable"] == 1
+            assert table["bus_watchdog"] == 20  # 0.4 s in steps of 20 ms
+            assert (table["min_position_limit"] - zero) * count_rad == pytest.approx(low, abs=count_rad)
+            assert (table["max_position_limit"] - zero) * count_rad == pytest.approx(high, abs=count_rad)
+            assert table["profile_velocity"] > 0  # 0 would mean as fast as it can
+            assert table["profile_acceleration"] > 0
+
+
+def test_settings_that_fit_are_not_written_again() -> None:
+    with rig() as it:
+        it.open().close()
+        before = [dict(servo.table.values) for servo in it.servos]
+        head = it.open()  # torque is still on: any permanent setting would be refused
+        head.close()
+        for servo, values in zip(it.servos, before, strict=True):
+            assert servo.table["min_position_limit"] == values["min_position_limit"]
+            assert servo.table["torque_enable"] == 1
+
+
+@pytest.mark.parametrize(
+    ("how", "changes", "words"),
+    [
+        ({"models": ("xm540_w270", X)}, {"pan": {"model": X}}, "is a XM540-W270, the configuration says"),
+        ({"pan": {"torque_enable": 1}}, {}, "torque is on and the axis may fall"),
+        ({"pan": {"secondary_id": 2}}, {}, "also obeys writes to id 2"),
+        ({"pan": {"homing_offset": 1100}}, {}, "position mode honours 1024"),
+        ({"starts_rad": (2.8, 0.0)}, {}, "outside its limits"),
+        ({"starts_rad": (3.3, 0.0)}, {}, "outside its limits"),  # parked across the seam of 0 and 4095
+        ({}, {"pan": {"id": 9}}, "servo 9 .* gave no usable answer to ping"),
+    ],
+)
+def test_what_does_not_fit_is_refused_in_words_and_the_line_is_let_go(
+    how: dict[str, Any], changes: dict[str, dict[str, Any]], words: str
+) -> None:
+    with rig(**how) as it:
+        options = {**it.options, **{k: {**it.options[k], **v} for k, v in changes.items()}}
+        for _ in range(2):  # the second time shows that the port was let go
+            with pytest.raises((WrongDevice, NoReply), match=words):
+                open_head(options)
+        now_s = time.monotonic()
+        assert [axis.angle_rad(now_s) for axis in it.axes] == list(how.get("starts_rad", (0.0, 0.0)))
+
+
+def test_more_than_the_servo_can_is_refused_in_words() -> None:
+    words = "acceleration_rad_per_s2 or speed_rad_per_s is more than"
+    with rig(models=("ph42_020_s300", X)) as it, pytest.raises(WrongDevice, match=words):
+        it.open(acceleration_rad_per_s2=30.0)  # 17189 rev/min2; from the factory it takes 10765
+
+
+def test_torque_may_be_dropped_at_the_start_where_the_configuration_allows_it() -> None:
+    with opened(pan={"torque_enable": 1}, options={"torque_off_at_start": True}) as (it, head):
+        assert it.servos[0].table["min_position_limit"] == 419  # 2048 - 2.5 rad, inwards
+        assert head.read().faults == ()
+
+
+def test_silent_servos_are_told_to_answer() -> None:
+    with opened(pan={"status_return_level": 0}) as (it, head):
+        assert it.servos[0].table["status_return_level"] == 2
+        assert head.read().faults == ()
+
+
+def test_a_hardware_error_at_the_start_is_refused_or_rebooted_as_configured() -> None:
+    with rig() as it:
+        it.servos[0].raise_error(OVERLOAD)
+        with pytest.raises(HardwareFault, match=r"pan .servo 1. reports overload"):
+            it.open()
+        head = it.open(pan={**it.options["pan"], "on_hardware_error": "reboot"})
+        assert head.read().faults == ()
+        head.close()
+
+
+# Moving
+
+
+def test_both_axes_go_to_the_nearest_count_and_the_report_says_what_is_left() -> None:
+    with opened() as (it, head):
+        head.move(0.5, -0.3)
+        reading = settled(head)
+        assert reading.pan_rad == pytest.approx(0.5, abs=COUNT_RAD / 2)
+        report = head.report()
+        for axis, commanded in (("pan", 0.5), ("tilt", -0.3)):
+            assert report[axis].commanded_rad == commanded
+            left_rad = report[axis].left_rad
+            assert left_rad is not None
+            assert abs(left_rad) <= COUNT_RAD / 2
+            left_px = report[axis].left_px(1280.0)
+            assert left_px is not None
+            assert abs(left_px) < 1.0  # half a count is 0.98 pixels (facts, section 4)
+        assert it.servos[0].table["goal_position"] == report["pan"].goal_counts
+
+
+def test_a_goal_is_approached_from_the_configured_side() -> None:
+    with rig() as it:
+        it.options["tilt"].update(approach="positive", approach_rad=0.05)
+        head = it.open()
+        head.move(0.0, 0.5)
+        settled(head)
+        lowest = [1.0]
+        head.move(0.0, 0.2)
+        while (reading := head.read()).moving:
+            lowest.append(reading.tilt_rad)
+        assert min(lowest) < 0.2 - 0.03
+        assert reading.tilt_rad == pytest.approx(0.2, abs=COUNT_RAD)
+        assert head.report()["tilt"].side == "positive"
+        head.close()
+
+
+@pytest.mark.parametrize("goal", [(2.6, 0.0), (0.0, -1.3), (float("nan"), 0.0), (0.0, float("inf"))])
+def test_goals_outside_the_limits_are_refused_before_anything_is_sent(goal: tuple[float, float]) -> None:
+    with opened() as (it, head):
+        with pytest.raises(OutOfRange, match="outside the head's limits"):
+            head.move(*goal)
+        with pytest.raises(OutOfRange, match="positive number"):
+            head.move(0.0, 0.0, 0.0)
+        assert it.servos[0].table["goal_position"] == 2048
+
+
+def test_stop_brakes_holds_and_forgets_the_goal() -> None:
+    with opened() as (it, head):
+        head.move(2.0, 0.0)
+        until(lambda: head.read().pan_rad > 0.2, "motion")
+        head.stop()
+        reading = settled(head)
+        assert reading.pan_rad < 1.5
+        assert head.report()["pan"].commanded_rad is None
+        assert it.servos[0].table["torque_enable"] == 1
+
+
+def test_stop_may_let_an_axis_go_and_a_move_takes_hold_of_it_again() -> None:
+    with rig() as it:
+        it.options["pan"]["at_stop"] = "torque_off"
+        head = it.open()
+        head.stop()
+        assert [servo.table["torque_enable"] for servo in it.servos] == [0, 1]
+        assert head.read().faults == ()
+        head.move(0.3, 0.0)
+        assert settled(head).pan_rad == pytest.approx(0.3, abs=COUNT_RAD)
+        head.close()
+
+
+@pytest.mark.parametrize(("at_close", "torque"), [("hold", 1), ("torque_off", 0)])
+def test_close_leaves_the_servos_as_configured(at_close: str, torque: int) -> None:
+    with rig() as it:
+        it.options["pan"]["at_close"] = at_close
+        head = it.open()
+        head.move(2.0, 0.0)
+        head.close()
+        assert [servo.table["torque_enable"] for servo in it.servos] == [torque, 1]
+        assert [servo.table["bus_watchdog"] for servo in it.servos] == [0, 0]
+        with pytest.raises(NoReply, match="closed"):
+            head.read()
+
+
+def test_the_watchdog_is_fed_while_nobody_calls() -> None:
+    with opened() as (it, head):
+        head.read()
+        before = head._link.counts.transactions if head._link else 0
+        until(lambda: head._link and head._link.counts.transactions > before + 60, "a second of polls")
+        assert it.servos[0].table["bus_watchdog"] == 20
+        assert head.read().faults == ()
+
+
+def test_fast_reads_are_used_only_after_they_proved_themselves() -> None:
+    with opened(options={"fast_read": True}) as (_, head):
+        assert head._fast
+        assert head.read().faults == ()
+    with opened(options={"fast_read": True}, models=("mx_28", X)) as (_, head):
+        assert head.read().faults == ()
+
+
+# Bad days
+
+
+def test_a_silent_host_stops_the_head_and_moving_again_is_deliberate() -> None:
+    with opened() as (it, head):
+        head.move(2.0, 0.0)
+        until(lambda: head.read().pan_rad > 0.1, "motion")
+        free = threading.Event()
+        tripped = lambda: it.servos[0].table["bus_watchdog"] == 255  # noqa: E731
+        stalled = threading.Thread(target=lambda: head._bus.call("stall", lambda: free.wait(LONG_S), LONG_S))
+        stalled.start()
+        until(tripped, "the watchdog")
+        free.set()
+        stalled.join()
+        reading = until(lambda: (r := read_or_none(head)) and r.faults and r, "the fault")
+        assert "watchdog" in reading.faults[0]
+        with pytest.raises(WatchdogTripped, match="stop arms it anew"):
+            head.move(0.0, 0.0)
+        until(lambda: it.axes[0].velocity_rad_per_s(time.monotonic()) == 0, "rest")
+        stood_rad = it.axes[0].angle_rad(time.monotonic())
+        head.stop()
+        reading = settled(head)
+        assert reading.faults == ()
+        assert reading.pan_rad == pytest.approx(stood_rad, abs=2 * COUNT_RAD)  # it did not go on
+        head.move(0.1, 0.0)
+        assert settled(head).pan_rad == pytest.approx(0.1, abs=COUNT_RAD)
+
+
+def drive_and_wait(path: str, options: dict[str, Any], ready: Any) -> None:
+    """A process that moves the head far and is then killed."""
+    head = open_head({**options, "port": path})
+    head.move(2.4, 0.0)
+    while head.read().pan_rad < 0.05:
+        pass
+    ready.set()
+    threading.Event().wait()
+
+
+def test_a_killed_process_leaves_a_head_that_stops_by_itself() -> None:
+    with rig(mechanism=SLOW_TO_BRAKE) as it:
+        del it.options["acceleration_rad_per_s2"], it.options["watchdog_s"]  # as they come
+        context = mp.get_context("spawn")
+        ready = context.Event()
+        process = context.Process(target=drive_and_wait, args=(it.line.path, it.options, ready), daemon=True)
+        process.start()
+        assert ready.wait(LONG_S)
+        assert process.pid is not None
+        killed_s = time.monotonic()
+        os.kill(process.pid, signal.SIGKILL)
+        process.join()
+        until(lambda: it.servos[0].table["bus_watchdog"] == 255, "the watchdog")
+        until(lambda: it.axes[0].velocity_rad_per_s(time.monotonic()) == 0, "rest")
+        # What the axis did between is known to the simulator for every moment, whenever we look.
+        assert it.axes[0].velocity_rad_per_s(killed_s + 0.5) == 0
+        stood_rad = it.axes[0].angle_rad(time.monotonic())
+        assert stood_rad < 2.0
+        head = it.open()  # a new start is deliberate: it arms anew, and does not go on to the old goal
+        assert settled(head).pan_rad == pytest.approx(stood_rad, abs=2 * COUNT_RAD)
+        head.move(0.0, 0.0)
+        assert settled(head).pan_rad == pytest.approx(0.0, abs=COUNT_RAD)
+        head.close()
+
+
+def test_unplugged_and_plugged_in_again_it_comes_back_without_moving() -> None:
+    with opened() as (it, head):
+        head.move(2.0, 0.0)
+        until(lambda: head.read().pan_rad > 0.1, "motion")
+        it.line.hang_up()
+        error = until(lambda: failed(head), "the fault")
+        assert isinstance(error, LineLost)
+        assert it.line.path in str(error)
+        for act in (head.read, head.stop, lambda: head.move(0.0, 0.0)):
+            with pytest.raises(LineLost):
+                act()
+        until(lambda: it.servos[0].table["bus_watchdog"] == 255, "the watchdog")
+        until(lambda: it.axes[0].velocity_rad_per_s(time.monotonic()) == 0, "rest")
+        stood_rad = it.axes[0].angle_rad(time.monotonic())
+        it.line.come_back()
+        reading = until(lambda: read_or_none(head), "the head")
+        assert reading.pan_rad == pytest.approx(stood_rad, abs=2 * COUNT_RAD)
+        assert settled(head).faults == ()
+        assert it.axes[0].angle_rad(time.monotonic()) == pytest.approx(stood_rad, abs=2 * COUNT_RAD)
+        head.move(0.1, 0.0)
+        assert settled(head).pan_rad == pytest.approx(0.1, abs=COUNT_RAD)
+
+
+def test_a_servo_that_lost_its_power_is_set_up_anew() -> None:
+    with opened() as (it, head):
+        servo = it.servos[1]
+        servo.set_power(False, time.monotonic())
+        assert isinstance(until(lambda: failed(head), "the fault"), DriverError)
+        servo.set_power(True, time.monotonic())
+        assert servo.table["profile_velocity"] == 0  # as fast as it can: must not be left so
+        until(lambda: read_or_none(head), "the head")
+        assert servo.table["profile_velocity"] > 0
+        assert servo.table["torque_enable"] == 1
+        assert servo.table["bus_watchdog"] == 20
+        head.move(0.0, 0.2)
+        assert settled(head).tilt_rad == pytest.approx(0.2, abs=COUNT_RAD)
+
+
+def test_a_servo_that_is_exchanged_is_refused_when_it_comes_back() -> None:
+    with opened() as (it, head):
+        it.line.hang_up()
+        it.servos[0].table["model_number"] = 1120
+        it.servos[0].model = it.servos[0].model.__class__(**{**vars_of(it.servos[0].model), "number": 1120})
+        it.line.come_back()
+        error = until(lambda: isinstance(e := failed(head), WrongDevice) and e, "the refusal")
+        assert "XM540-W270" in str(error)
+
+
+def vars_of(instance: Any) -> dict[str, Any]:
+    return {name: getattr(instance, name) for name in instance.__dataclass_fields__}
+
+
+def test_a_hardware_error_is_a_fault_stops_the_other_axis_and_blocks_moves() -> None:
+    with opened() as (it, head):
+        head.move(2.0, 0.9)
+        until(lambda: head.read().pan_rad > 0.1, "motion")
+        it.servos[1].raise_error(OVERLOAD)
+        reading = until(lambda: (r := head.read()).faults and r, "the fault")
+        assert reading.faults[0].startswith("tilt (servo 2) reports overload (hardware error 0x20)")
+        assert "torque is off" in reading.faults[0]
+        assert settled(head).pan_rad < 1.9
+        with pytest.raises(HardwareFault, match="overload"):
+            head.move(0.0, 0.0)
+        head.stop()  # must work all the same
+
+
+def test_a_hardware_error_is_rebooted_away_where_the_configuration_says_so() -> None:
+    with rig() as it:
+        for axis in ("pan", "tilt"):
+            it.options[axis]["on_hardware_error"] = "reboot"
+        head = it.open()
+        it.servos[0].raise_error(HEAT)
+        until(lambda: failed(head), "the fault")
+        reading = until(lambda: read_or_none(head), "the head")
+        assert reading.faults == ()
+        assert it.servos[0].table["hardware_error_status"] == 0
+        assert it.servos[0].table["torque_enable"] == 1
+        head.close()
+
+
+def test_a_setting_changed_behind_the_drivers_back_is_noticed_and_put_right() -> None:
+    with opened() as (it, head):
+        it.servos[0].table["torque_enable"] = 0
+        until(lambda: failed(head), "the fault")
+        until(lambda: read_or_none(head), "the head")
+        assert it.servos[0].table["torque_enable"] == 1
+
+
+def test_two_heads_cannot_have_one_line() -> None:
+    with opened() as (it, _), pytest.raises(LineLost, match="held by another program"):
+        it.open()
+
+
+def test_closing_leaves_no_thread_and_no_descriptor() -> None:
+    with rig() as it:
+        it.open().close()
+        threads, descriptors = threading.active_count(), len(list(Path("/proc/self/fd").iterdir()))
+        for _ in range(3):
+            it.open().close()
+        assert threading.active_count() == threads
+        assert len(list(Path("/proc/self/fd").iterdir())) == descriptors

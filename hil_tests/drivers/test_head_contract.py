@@ -1,0 +1,429 @@
+"""What every pan/tilt driver has to do, whatever stands behind it: one suite for all of them.
+
+In memory; Dynamixel servos over a pseudo terminal; a PTU over a pseudo terminal and over TCP. What is true is
+known from the simulated motors, never from the driver. The last case is the demo's pointing loop.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from drivers.errors import DriverError, LineLost, NoReply
+from drivers.interfaces import PanTilt, Reading
+from drivers.sim import rover
+from drivers.sim.scene import SceneSettings, build_scene
+from drivers.sim.wire import head as wired_head
+from mastctl.client import Client
+from mastctl.config import load_config
+from mastctl.daemon import RunningDaemon
+from mastctl.experiment.demo import SimulationTruth, demo_config
+from mastctl.experiment.pointing import run_pointing_experiment
+from tools.servo_rigs import LIMITS_RAD, RIGS, Rig
+
+PATIENCE_S = 30.0
+"""No driver needs a tenth of this; it only keeps a broken one from hanging the suite on a busy machine."""
+
+WIRES = [name for name in RIGS if name != "in_memory"]
+
+
+@pytest.fixture(params=list(RIGS))
+def rig(request: pytest.FixtureRequest) -> Iterator[Rig]:
+    with RIGS[request.param]() as made:
+        yield made
+
+
+@pytest.fixture(params=WIRES)
+def wired(request: pytest.FixtureRequest) -> Iterator[Rig]:
+    with RIGS[request.param]() as made:
+        yield made
+
+
+def eventually(what: str, condition: Callable[[], object]) -> None:
+    """Wait until something holds."""
+    until_s = time.monotonic() + PATIENCE_S
+    while not condition():
+        assert time.monotonic() < until_s, f"{what} did not happen"
+        time.sleep(0.005)
+
+
+def settled(rig: Rig) -> Reading:
+    """Read until the head has settled."""
+    readings: list[Reading] = []
+
+    def stands() -> bool:
+        readings.append(rig.head.read())
+        return not readings[-1].moving
+
+    eventually("settling", stands)
+    return readings[-1]
+
+
+def works_again(rig: Rig) -> Reading:
+    """Read until the head answers again."""
+    readings: list[Reading] = []
+
+    def answers() -> bool:
+        try:
+            readings.append(rig.head.read())
+        except DriverError:
+            return False
+        return True
+
+    eventually("an answer", answers)
+    return readings[-1]
+
+
+def true_enough(rig: Rig, reading: Reading, began_s: float, ended_s: float) -> bool:
+    """Whether the motors were where a reading has them, at some moment of the call."""
+    steps = [began_s + (ended_s - began_s) * i / 20 for i in range(21)]
+    truths = [rig.true_rad(step) for step in steps]
+    for axis, angle in enumerate((reading.pan_rad, reading.tilt_rad)):
+        seen = [truth[axis] for truth in truths]
+        if not min(seen) - rig.count_rad <= angle <= max(seen) + rig.count_rad:
+            return False
+    return True
+
+
+def true_reading(rig: Rig) -> Reading:
+    """Read, and see that it is true."""
+    began_s = time.monotonic()
+    reading = rig.head.read()
+    ended_s = time.monotonic()
+    assert true_enough(rig, reading, began_s, ended_s), (reading, rig.true_rad(ended_s))
+    assert began_s <= reading.time_s <= ended_s
+    return reading
+
+
+def test_a_reading_is_measured_now_and_healthy(rig: Rig) -> None:
+    assert isinstance(rig.head, PanTilt)
+    reading = true_reading(rig)
+    assert isinstance(reading.moving, bool)
+    assert tuple(reading.faults) == ()
+
+
+def test_a_move_returns_at_once_and_ends_at_the_nearest_count(rig: Rig) -> None:
+    for pan, tilt in ((0.3, -0.2), (0.25033, -0.25047), (-0.0007, 0.0004)):
+        rig.head.move(pan, tilt)
+        under_way = rig.head.read()
+        assert under_way.moving
+        assert abs(under_way.pan_rad - pan) > 10 * rig.count_rad or abs(pan) < 0.26
+        reading = settled(rig)
+        assert abs(reading.pan_rad - pan) <= 0.5 * rig.count_rad + rig.settle_rad, "nearest, not truncated"
+        assert abs(reading.tilt_rad - tilt) <= 0.5 * rig.count_rad + rig.settle_rad
+        true_pan, true_tilt = rig.true_rad(time.monotonic())
+        there = pytest.approx((reading.pan_rad, reading.tilt_rad), abs=1e-6 + rig.settle_rad)
+        assert (true_pan, true_tilt) == there
+
+
+def test_goals_halfway_between_counts_go_to_either_never_further(rig: Rig) -> None:
+    for counts in (10.4, 10.6, -10.4, -10.6):
+        rig.head.move(counts * rig.count_rad, 0.0)
+        assert settled(rig).pan_rad == pytest.approx(round(counts) * rig.count_rad, abs=rig.settle_rad)
+
+
+def test_under_way_every_reading_is_true_and_times_go_forward(rig: Rig) -> None:
+    rig.head.move(0.5, -0.4)
+    readings = [true_reading(rig)]
+    until_s = time.monotonic() + PATIENCE_S
+    while readings[-1].moving and time.monotonic() < until_s:
+        readings.append(true_reading(rig))
+        assert readings[-1].time_s > readings[-2].time_s
+        if not readings[-1].moving:
+            assert readings[-1].pan_rad == pytest.approx(0.5, abs=rig.count_rad + rig.settle_rad)
+            assert readings[-1].tilt_rad == pytest.approx(-0.4, abs=rig.count_rad + rig.settle_rad)
+    between = [r for r in readings if 0.05 < r.pan_rad < 0.45]
+    assert len(between) > 3, "it was seen on its way"
+
+
+@pytest.mark.parametrize("end", [0, 1])
+def test_goals_at_the_limits_are_taken_and_those_beyond_refused(rig: Rig, end: int) -> None:
+    goal = (LIMITS_RAD[0][end], LIMITS_RAD[1][end])
+    before = rig.true_rad(time.monotonic())
+    for beyond in (
+        (math.nextafter(goal[0], 2 * goal[0]), 0.0),
+        (0.0, math.nextafter(goal[1], 2 * goal[1])),
+        (math.nan, 0.0),
+        (0.0, math.inf),
+        (-math.inf, 0.0),
+    ):
+        with pytest.raises(DriverError, match=r"(pan|tilt) .* rad is outside"):
+            rig.head.move(*beyond)
+    assert rig.true_rad(time.monotonic()) == before
+    rig.head.move(*goal)
+    reading = settled(rig)
+    assert (reading.pan_rad, reading.tilt_rad) == pytest.approx(goal, abs=rig.count_rad + rig.settle_rad)
+
+
+@pytest.mark.parametrize("speed", [0.0, -1.0, math.nan])
+def test_a_speed_that_is_none_is_refused(rig: Rig, speed: float) -> None:
+    with pytest.raises(DriverError, match="not a positive number"):
+        rig.head.move(0.1, 0.1, speed)
+    assert rig.true_rad(time.monotonic()) == (0.0, 0.0)
+
+
+@pytest.mark.parametrize("asked", [0.3, 50.0])
+def test_no_axis_goes_faster_than_asked_or_than_its_own_bound(rig: Rig, asked: float) -> None:
+    if asked > 1.0 and rig.fastest_rad_per_s is None:
+        pytest.skip("the bound of this head's speed is not known")
+    fastest = asked if rig.fastest_rad_per_s is None else min(asked, rig.fastest_rad_per_s)
+    rig.head.move(0.3, -0.2, asked)
+    began_s = time.monotonic()
+    settled(rig)
+    ended_s = time.monotonic()
+    times_s = [began_s + (ended_s - began_s) * i / 12 for i in range(13)]
+    pans = [rig.true_rad(moment)[0] for moment in times_s]
+    step_s = times_s[1] - times_s[0]
+    unsure = 2 * (rig.count_rad + rig.settle_rad) / step_s
+    rates = [abs(b - a) / step_s for a, b in itertools.pairwise(pans)]
+    assert max(rates) <= fastest * 1.02 + unsure
+    assert max(rates) >= min(fastest, 1.0) * 0.3, "nor much slower"
+
+
+def test_a_new_goal_replaces_the_old_one(rig: Rig) -> None:
+    rig.head.move(0.9, 0.3)
+    eventually("motion", lambda: rig.head.read().pan_rad > 0.1)
+    rig.head.move(-0.2, -0.3)
+    furthest = 0.0
+
+    def turned_round() -> bool:
+        nonlocal furthest
+        reading = rig.head.read()
+        furthest = max(furthest, reading.pan_rad)
+        return not reading.moving
+
+    eventually("settling", turned_round)
+    assert furthest < 0.85
+    reading = rig.head.read()
+    assert (reading.pan_rad, reading.tilt_rad) == pytest.approx(
+        (-0.2, -0.3), abs=rig.count_rad + rig.settle_rad
+    )
+
+
+def test_stop_brakes_and_holds(rig: Rig) -> None:
+    rig.head.move(0.9, -0.5, 0.5)
+    eventually("motion", lambda: rig.head.read().pan_rad > 0.1)
+    rig.head.stop()
+    reading = settled(rig)
+    assert reading.pan_rad < 0.85
+    held = rig.true_rad(time.monotonic())
+    for _ in range(20):
+        true_reading(rig)
+        time.sleep(0.005)
+    assert rig.true_rad(time.monotonic()) == pytest.approx(held, abs=rig.count_rad + rig.settle_rad)
+    rig.head.move(0.0, 0.0)
+    assert settled(rig).pan_rad == pytest.approx(0.0, abs=rig.count_rad + rig.settle_rad)
+
+
+def test_what_is_measured_is_told_not_what_was_commanded(rig: Rig) -> None:
+    rig.head.move(0.2, 0.1)
+    at = settled(rig)
+    rig.panel.set("pan_tilt", "stuck")
+    rig.head.move(0.6, -0.2)
+    for _ in range(10):
+        reading = true_reading(rig)
+        time.sleep(0.01)
+    assert (reading.pan_rad, reading.tilt_rad) == pytest.approx((at.pan_rad, at.tilt_rad), abs=1e-9)
+
+
+def test_an_axis_that_does_not_follow_is_told_in_words(wired: Rig) -> None:
+    settled(wired)
+    wired.panel.set("pan_tilt", "stuck")
+    wired.head.move(0.5, -0.3)
+    words: list[str] = []
+
+    def told() -> bool:
+        try:
+            words[:] = wired.head.read().faults
+        except DriverError as error:
+            words[:] = [str(error)]
+        return bool(words)
+
+    eventually("a fault in words", told)
+    assert all(" " in word and "\n" not in word for word in words)
+    assert any("pan" in word or "tilt" in word for word in words), words
+
+
+def test_a_silent_device_is_an_error_and_comes_back_without_moving(rig: Rig) -> None:
+    rig.head.move(0.2, 0.1)
+    settled(rig)
+    held = rig.true_rad(time.monotonic())
+    rig.panel.set("pan_tilt", "off")
+    for _ in range(2):
+        with pytest.raises((NoReply, LineLost)) as caught:
+            rig.head.read()
+        assert "\n" not in str(caught.value)
+    with pytest.raises((NoReply, LineLost)):
+        rig.head.move(0.4, 0.2)
+    rig.panel.clear()
+    works_again(rig)
+    reading = settled(rig)
+    assert (reading.pan_rad, reading.tilt_rad) == pytest.approx(held, abs=rig.count_rad + rig.settle_rad)
+    assert rig.true_rad(time.monotonic()) == pytest.approx(held, abs=rig.count_rad + rig.settle_rad)
+    for _ in range(10):  # and goes on as before
+        try:
+            rig.head.stop()  # deliberate where a watchdog has stopped the head
+            rig.head.move(0.0, 0.0)
+            break
+        except DriverError:
+            time.sleep(0.05)
+    assert settled(rig).pan_rad == pytest.approx(0.0, abs=rig.count_rad + rig.settle_rad)
+
+
+def test_a_pulled_plug_is_an_error_and_the_head_comes_back_by_itself(wired: Rig) -> None:
+    assert wired.line is not None
+    wired.head.move(0.2, 0.1)
+    settled(wired)
+    held = wired.true_rad(time.monotonic())
+    for _ in range(2):
+        wired.line.hang_up()
+
+        def fails() -> bool:
+            try:
+                wired.head.read()
+            except (LineLost, NoReply):
+                return True
+            return False
+
+        eventually("an error", fails)
+        wired.line.come_back()
+        works_again(wired)
+    reading = settled(wired)
+    assert (reading.pan_rad, reading.tilt_rad) == pytest.approx(held, abs=wired.count_rad)
+    assert wired.true_rad(time.monotonic()) == pytest.approx(held, abs=wired.count_rad)
+
+
+def test_a_late_reply_is_never_taken_for_the_next(wired: Rig) -> None:
+    settled(wired)
+    wired.panel.set("pan_tilt", "delayed", delay_s=0.4)
+    for goal in (0.5, -0.5):
+        with suppress(DriverError):
+            wired.head.move(goal, 0.0)
+        for _ in range(2):
+            began_s = time.monotonic()
+            try:
+                reading = wired.head.read()
+            except DriverError:
+                continue
+            assert true_enough(wired, reading, began_s, time.monotonic())
+    wired.panel.clear()
+    for _ in range(40):
+        began_s = time.monotonic()
+        try:
+            reading = wired.head.read()
+        except DriverError:
+            continue
+        assert true_enough(wired, reading, began_s, time.monotonic())
+
+
+def test_replies_lost_now_and_then_cost_errors_but_no_wrong_angle(rig: Rig) -> None:
+    rig.panel.set("pan_tilt", "intermittent", probability=0.1, seed=5)
+    good = 0
+    for index in range(24):
+        if index % 6 == 0:
+            with suppress(DriverError):
+                rig.head.move(0.3 if index % 12 else -0.3, 0.1)
+        began_s = time.monotonic()
+        try:
+            reading = rig.head.read()
+        except DriverError:
+            continue
+        good += 1
+        assert true_enough(rig, reading, began_s, time.monotonic())
+    assert good > 5
+    rig.panel.clear()
+    works_again(rig)
+
+
+def test_calls_from_many_threads_at_once_are_all_answered(rig: Rig) -> None:
+    errors: list[BaseException] = []
+
+    def work(number: int) -> None:
+        try:
+            for step in range(5):
+                rig.head.read()
+                if number == 0:
+                    rig.head.move(0.1 * step, 0.0)
+        except BaseException as error:
+            errors.append(error)
+
+    threads = [threading.Thread(target=work, args=(number,)) for number in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join(PATIENCE_S)
+    assert not errors
+    assert settled(rig).pan_rad == pytest.approx(0.4, abs=rig.count_rad + rig.settle_rad)
+
+
+@pytest.mark.parametrize("name", list(RIGS))
+def test_close_stops_the_head_and_leaves_no_thread_and_no_descriptor(name: str) -> None:
+    threads, descriptors = set(threading.enumerate()), len(list(Path("/proc/self/fd").iterdir()))
+    with RIGS[name]() as rig:
+        rig.head.move(0.9, 0.3, 0.5)
+        eventually("motion", lambda: rig.head.read().pan_rad > 0.05)
+        rig.head.close()
+        rig.head.close()
+        for call in (rig.head.read, rig.head.stop, lambda: rig.head.move(0.0, 0.0)):
+            with pytest.raises(NoReply, match="closed"):
+                call()
+        eventually("standing", lambda: _stands(rig))
+        assert rig.true_rad(time.monotonic())[0] < 0.6
+    eventually("the end of every thread", lambda: set(threading.enumerate()) <= threads)
+    assert len(list(Path("/proc/self/fd").iterdir())) == descriptors
+
+
+def test_close_of_a_head_that_is_gone_does_not_raise(wired: Rig) -> None:
+    assert wired.line is not None
+    wired.line.hang_up()
+    wired.head.close()
+    wired.head.close()
+
+
+def _stands(rig: Rig) -> bool:
+    now_s = time.monotonic()
+    return rig.true_rad(now_s) == rig.true_rad(now_s - 0.05)
+
+
+@pytest.mark.parametrize(
+    ("wire", "head", "worst_px"),
+    [
+        (None, "ptu_d46_70", 1.5),
+        ("flir_ptu", "ptu_d46_70", 1.5),
+        ("dynamixel", "dynamixel_x", 6.0),
+    ],
+)
+def test_the_demos_pointing_loop_lands_with_every_head(
+    wire: str | None, head: str, worst_px: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # A count of the X is 2 px and its backlash 5.6 px of the navcam; the PTU's steps are 0.07 px.
+    monkeypatch.setattr(rover, "build_scene", lambda settings: build_scene(SceneSettings(seed=1, rocks=4)))
+    make = wired_head._dynamixel
+
+    def without_watchdog(*arguments: Any) -> Any:  # renderer and driver share one busy process here
+        device, open_head, options = make(*arguments)
+        return device, open_head, {**options, "watchdog_s": 0.0}
+
+    monkeypatch.setattr(wired_head, "_dynamixel", without_watchdog)
+    config = demo_config(load_config(None), head=head, seed=1)
+    simulation = {**config.hardware.simulation, "samples": 1} | ({"wire": wire} if wire else {})
+    cameras = {n: c for n, c in config.hardware.cameras.items() if n.startswith("navcam")}
+    hardware = replace(config.hardware, simulation=simulation, cameras=cameras)
+    with RunningDaemon(replace(config, hardware=hardware)) as daemon, Client(daemon.url) as client:
+        simulated = daemon.hardware.simulation
+        assert simulated is not None
+        found = run_pointing_experiment(
+            client, targets=1, distances_m=(6.0,), seed=1, truth=SimulationTruth(simulated)
+        )
+    assert [record.error for record in found.records] == [""]
+    worst = found.summaries[0].true_second_rms_px
+    assert worst is not None and max(worst) < worst_px, worst

@@ -1,0 +1,33 @@
+"""A short share of tools/servo_campaign.py: a few episodes of some faults with each real driver."""
+
+from __future__ import annotations
+
+import pytest
+
+from tools.servo_campaign import DRIVERS, WORDS, Judge, Row, run_word
+from tools.servo_rigs import in_memory
+
+
+@pytest.mark.parametrize("driver", list(DRIVERS))
+@pytest.mark.parametrize("word", ["corrupt", "swapped", "hang_up", "mixture"])
+def test_no_fault_makes_a_driver_tell_a_wrong_angle_or_leave_anything_behind(driver: str, word: str) -> None:
+    assert word in WORDS
+    row = run_word(driver, word, transactions=60, seed=7)
+    assert row.calls >= 60 and row.episodes > 0
+    assert row.good, row
+
+
+def test_the_judge_finds_a_wrong_reading_and_a_passed_limit() -> None:
+    row = Row("in_memory", "corrupt", 1)
+    with in_memory() as rig:
+        judge = Judge(rig, row, lying=False)
+        reading = rig.head.read()
+        judge.reading(reading, reading.time_s, reading.time_s)
+        judge.limits()
+        assert row.good
+        wrong = type(reading)(reading.pan_rad + 3 * rig.count_rad, reading.tilt_rad, False, reading.time_s)
+        judge.reading(wrong, reading.time_s, reading.time_s)
+        assert row.wrong == 1 and "away from the truth" in row.complaints[0]
+        rig.true_rad = lambda time_s: (5.0, 0.0)
+        judge.limits()
+        assert row.outside > 0 and not row.good

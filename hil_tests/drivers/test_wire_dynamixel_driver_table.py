@@ -1,0 +1,56 @@
+"""The driver's servo table against the simulator's: two people wrote them from the manual, apart."""
+
+from __future__ import annotations
+
+import pytest
+
+from drivers.dynamixel import models as ours
+from drivers.sim.wire import dynamixel_models as theirs
+from drivers.sim.wire.dynamixel_registers import BAUD_RATES
+
+NAMES = {
+    "firmware": "firmware_version",
+    "baud": "baud_rate",
+    "return_delay": "return_delay_time",
+    "hardware_error": "hardware_error_status",
+    "present_voltage": "present_input_voltage",
+}
+CURRENT = {"current_limit", "goal_current", "present_current"}
+
+
+@pytest.mark.parametrize("name", ours.MODELS)
+def test_a_model(name: str) -> None:
+    driver, simulator = ours.MODELS[name], theirs.model_named(name)
+    assert driver.number == simulator.number
+    assert driver.counts_per_turn == simulator.counts_per_turn
+    assert driver.centre_count == simulator.zero_counts
+    assert driver.velocity_unit_rad_per_s == pytest.approx(simulator.velocity_unit_rad_per_s)
+    assert driver.acceleration_unit_rad_per_s2 == pytest.approx(simulator.acceleration_unit_rad_per_s2)
+    assert simulator.firmware >= driver.watchdog_firmware
+    limits = [simulator.by_name[f"{end}_position_limit"] for end in ("min", "max")]
+    assert {(limit.low, limit.high) for limit in limits} == {(driver.low_count, driver.high_count)}
+    if driver.current_unit_A is None:
+        assert "present_current" not in simulator.by_name
+    else:
+        assert driver.current_unit_A == simulator.current_unit_a
+
+
+@pytest.mark.parametrize("name", ours.MODELS)
+def test_its_registers(name: str) -> None:
+    driver, simulator = ours.MODELS[name], theirs.model_named(name)
+    for register in driver.registers.values():
+        if register.name in CURRENT and driver.current_unit_A is None:
+            continue
+        other = simulator.by_name[NAMES.get(register.name, register.name)]
+        assert (register.address, register.size) == (other.address, other.size), register.name
+        assert register.permanent == (other.address < simulator.ram_from), register.name
+        if other.low < 0:
+            assert register.signed, register.name
+
+
+def test_every_simulated_model_is_one_of_the_drivers() -> None:
+    assert {m.number for m in theirs.MODELS.values()} == set(ours.MODELS_BY_NUMBER)
+
+
+def test_baud_rates() -> None:
+    assert tuple(ours.BAUD_RATES.values()) == BAUD_RATES

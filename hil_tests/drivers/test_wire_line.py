@@ -1,0 +1,281 @@
+"""The simulated line as a plain pyserial host sees it, and what each fault of a line does to replies."""
+
+from __future__ import annotations
+
+import socket
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+
+import pytest
+import serial
+
+from drivers.clock import ManualClock, SystemClock
+from drivers.errors import BadOptions
+from drivers.faults import PAN_TILT, FaultPanel
+from drivers.sim.wire.line import PtyLine, Reply, TcpLine
+from drivers.sim.wire.line_faults import LineFaults
+
+PATIENCE_S = 5.0
+
+
+class Parrot:
+    """Answers every line of text with the same line; after ``!`` it speaks by itself."""
+
+    def __init__(self, baud: int = 115200) -> None:
+        self.baud = baud
+        self.heard = b""
+        self._unasked: list[Reply] = []
+
+    def receive(self, data: bytes, time_s: float) -> Sequence[Reply]:
+        self.heard += data
+        *lines, self.heard = self.heard.split(b"\n")
+        if b"!" in lines:
+            self._unasked.append(Reply(b"?\n"))
+        return [Reply(line + b"\n", sender=line[:1].isdigit() and int(line[:1])) for line in lines]
+
+    def poll(self, time_s: float) -> Sequence[Reply]:
+        unasked, self._unasked = self._unasked, []
+        return unasked
+
+
+@pytest.fixture(autouse=True)
+def nothing_left() -> Iterator[None]:
+    def held() -> tuple[int, int]:
+        return threading.active_count(), sum(1 for _ in Path("/proc/self/fd").iterdir())
+
+    before = held()
+    yield
+    assert held() == before
+
+
+@pytest.fixture
+def panel() -> FaultPanel:
+    return FaultPanel(SystemClock().now_s, ())
+
+
+def ask(host: serial.Serial, text: bytes, lines: int = 1) -> bytes:
+    host.write(text)
+    return b"".join(host.read_until(b"\n") for _ in range(lines))
+
+
+def wait_for(condition: Callable[[], bool]) -> None:
+    deadline_s = time.monotonic() + PATIENCE_S
+    while not condition():
+        assert time.monotonic() < deadline_s
+        time.sleep(0.005)
+
+
+def test_a_host_talks_to_the_device_and_others_find_it_after_him() -> None:
+    with PtyLine(Parrot(), SystemClock()) as line:
+        for _ in range(2):
+            with serial.Serial(line.path, 115200, timeout=PATIENCE_S) as host:
+                assert ask(host, b"one\ntwo\n", 2) == b"one\ntwo\n"
+        with serial.Serial(line.path, 115200, timeout=PATIENCE_S) as host:
+            assert ask(host, b"!\n", 2) == b"!\n?\n", "the device speaks by itself"
+
+
+def test_every_byte_value_passes_unchanged() -> None:
+    every = bytes(byte for byte in range(256) if byte != 10)
+    with PtyLine(Parrot(), SystemClock()) as line, serial.Serial(line.path, 115200, timeout=5) as host:
+        assert ask(host, every + b"\n") == every + b"\n"
+
+
+def test_bytes_take_their_time_both_ways() -> None:
+    with PtyLine(Parrot(9600), SystemClock()) as line, serial.Serial(line.path, 9600, timeout=5) as host:
+        began_s = time.monotonic()
+        ask(host, b"x" * 47 + b"\n")
+        assert time.monotonic() - began_s >= 2 * 48 * 10 / 9600, "10 bits a byte, there and back"
+
+
+def test_a_host_at_another_baud_rate_is_not_understood() -> None:
+    device = Parrot(57600)
+    with PtyLine(device, SystemClock()) as line:
+        with serial.Serial(line.path, 115200, timeout=0.1) as host:
+            assert ask(host, b"one\n") == b""
+        assert device.heard == b""
+        with serial.Serial(line.path, 57600, timeout=PATIENCE_S) as host:
+            assert ask(host, b"one\n") == b"one\n"
+    with (
+        PtyLine(Parrot(57600), SystemClock(), wire_time=False) as line,
+        serial.Serial(line.path, 115200, timeout=PATIENCE_S) as host,
+    ):
+        assert ask(host, b"one\n") == b"one\n", "where bytes take no time every rate is right"
+
+
+def test_a_rate_that_no_table_of_the_kernel_has_is_understood() -> None:
+    baud = 4_500_000
+    with PtyLine(Parrot(baud), SystemClock()) as line, serial.Serial(line.path, baud, timeout=5) as host:
+        assert ask(host, b"fast\n") == b"fast\n"
+
+
+def test_the_link_is_made_gone_while_hung_up_and_removed(tmp_path: Path) -> None:
+    link = tmp_path / "tty"
+    link.symlink_to("/dev/pts/99999")  # left by one that was killed
+    with PtyLine(Parrot(), SystemClock(), link=link) as line:
+        assert line.path == str(link) and link.resolve().parent == Path("/dev/pts")
+        with serial.Serial(str(link), 115200, timeout=PATIENCE_S) as host:
+            line.hang_up()
+            assert not link.is_symlink()
+            with pytest.raises(serial.SerialException):
+                host.write(b"x\n")
+        line.come_back()
+        with serial.Serial(str(link), 115200, timeout=PATIENCE_S) as host:
+            assert ask(host, b"again\n") == b"again\n"
+    assert not link.is_symlink()
+
+
+@pytest.mark.parametrize("kind", ["file", "no folder"])
+def test_a_link_that_cannot_be_made_is_refused(tmp_path: Path, kind: str) -> None:
+    link = tmp_path / "there"
+    if kind == "file":
+        link.write_text("mine")
+    else:
+        link = link / "tty"
+    with pytest.raises(BadOptions, match=f"the link {link} to a simulated line cannot be made"):
+        PtyLine(Parrot(), SystemClock(), link=link)
+    assert kind != "file" or link.read_text() == "mine"
+
+
+def test_tcp_greets_and_serves_one_host_at_a_time() -> None:
+    with TcpLine(Parrot(), SystemClock(), banner=b"hello\n") as line:
+        for _ in range(2):
+            with socket.create_connection((line.host, line.port), PATIENCE_S) as host:
+                assert host.recv(100) == b"hello\n"
+                with socket.create_connection((line.host, line.port), PATIENCE_S) as other:
+                    assert other.recv(100) == b"", "taken"
+                host.sendall(b"one\n")
+                assert host.recv(100) == b"one\n"
+            wait_for(lambda: line._connection is None)
+
+
+def test_tcp_hangs_up_and_comes_back_at_the_same_port() -> None:
+    with TcpLine(Parrot(), SystemClock()) as line:
+        url = f"socket://127.0.0.1:{line.port}"
+        with serial.serial_for_url(url, timeout=PATIENCE_S) as host:
+            assert ask(host, b"one\n") == b"one\n"
+            line.hang_up()
+            with pytest.raises(serial.SerialException):
+                host.read(1)
+        with pytest.raises(serial.SerialException):
+            serial.serial_for_url(url, timeout=0.1)
+        line.come_back()
+        with serial.serial_for_url(url, timeout=PATIENCE_S) as host:
+            assert ask(host, b"two\n") == b"two\n"
+
+
+def test_a_port_that_is_taken_is_refused() -> None:
+    with (
+        TcpLine(Parrot(), SystemClock()) as line,
+        pytest.raises(BadOptions, match=f"cannot listen at 127.0.0.1:{line.port}"),
+    ):
+        TcpLine(Parrot(), SystemClock(), port=line.port)
+
+
+def test_the_observer_sees_both_sides() -> None:
+    seen: list[tuple[str, bytes]] = []
+    with (
+        PtyLine(Parrot(), SystemClock(), observer=lambda who, data, time_s: seen.append((who, data))) as line,
+        serial.Serial(line.path, 115200, timeout=PATIENCE_S) as host,
+    ):
+        ask(host, b"one\n")
+    assert b"".join(data for who, data in seen if who == "host") == b"one\n"
+    assert ("device", b"one\n") in seen
+
+
+def test_the_fault_hang_up_pulls_the_cable_and_puts_it_back(panel: FaultPanel) -> None:
+    with PtyLine(Parrot(), SystemClock(), panel) as line:
+        panel.set(PAN_TILT, "hang_up")
+        wait_for(lambda: not Path(line.path).is_symlink())
+        panel.clear()
+        wait_for(lambda: Path(line.path).is_symlink())
+        with serial.Serial(line.path, 115200, timeout=PATIENCE_S) as host:
+            assert ask(host, b"one\n") == b"one\n"
+
+
+def test_a_late_reply_comes_when_the_host_has_asked_something_else(panel: FaultPanel) -> None:
+    with (
+        PtyLine(Parrot(), SystemClock(), panel, wire_time=False) as line,
+        serial.Serial(line.path, 115200, timeout=PATIENCE_S) as host,
+    ):
+        panel.set(PAN_TILT, "late", delay_s=0.2)
+        assert ask(host, b"one\ntwo\n", 2) == b"two\none\n"
+
+
+def test_a_device_without_power_hears_nothing(panel: FaultPanel) -> None:
+    device = Parrot()
+    with (
+        PtyLine(device, SystemClock(), panel, wire_time=False) as line,
+        serial.Serial(line.path, 115200, timeout=0.1) as host,
+    ):
+        panel.set(PAN_TILT, "off")
+        assert ask(host, b"one") == b"" and device.heard == b""
+
+
+class Replies:
+    """Replies through the faults of a line, on a clock that stands still."""
+
+    def __init__(self) -> None:
+        self.clock = ManualClock(10.0)
+        self.panel = FaultPanel(self.clock.now_s, ())
+        self._faults = LineFaults(self.panel)
+
+    def sent(self, *texts: bytes) -> list[bytes]:
+        replies = [Reply(text, sender=place) for place, text in enumerate(texts, 1)]
+        return [one.data for one in self._faults.apply(replies, self.clock.now_s())]
+
+
+@pytest.fixture
+def replies() -> Replies:
+    return Replies()
+
+
+def test_without_a_fault_replies_pass(replies: Replies) -> None:
+    assert replies.sent(b"one", b"two") == [b"one", b"two"]
+
+
+def test_mute_falls_on_so_many_replies_and_is_over(replies: Replies) -> None:
+    replies.panel.set(PAN_TILT, "mute", replies=3)
+    assert [replies.sent(b"x") for _ in range(5)] == [[], [], [], [b"x"], [b"x"]]
+    assert replies.panel.active() == ()
+
+
+def test_a_fault_can_be_of_one_sender_only(replies: Replies) -> None:
+    replies.panel.set(PAN_TILT, "mute", replies=2, sender=2)
+    assert [replies.sent(b"one", b"two") for _ in range(3)] == [[b"one"], [b"one"], [b"one", b"two"]]
+
+
+def test_corrupt_changes_one_byte(replies: Replies) -> None:
+    replies.panel.set(PAN_TILT, "corrupt", replies=50, seed=3)
+    for _ in range(50):
+        (data,) = replies.sent(b"0123456789")
+        assert len(data) == 10 and sum(a != b for a, b in zip(data, b"0123456789", strict=True)) == 1
+    assert replies.sent(b"0123456789") == [b"0123456789"]
+
+
+def test_duplicate_half_and_noise(replies: Replies) -> None:
+    replies.panel.set(PAN_TILT, "duplicate")
+    assert replies.sent(b"one", b"two") == [b"one", b"one", b"two"]
+    replies.panel.set(PAN_TILT, "half")
+    assert replies.sent(b"123456") == [b"123"]
+    replies.panel.set(PAN_TILT, "noise", seed=1)
+    (data,) = replies.sent(b"123456")
+    assert data.endswith(b"123456") and len(data) > 6
+
+
+def test_swapped_replies_change_places_in_one_exchange_or_over_two(replies: Replies) -> None:
+    replies.panel.set(PAN_TILT, "swapped")
+    assert replies.sent(b"one", b"two", b"three") == [b"two", b"one", b"three"]
+    replies.panel.set(PAN_TILT, "swapped")
+    assert replies.sent(b"one") == []
+    assert replies.sent(b"two") == [b"two", b"one"]
+
+
+def test_probability_and_seed_choose_the_same_replies_again(replies: Replies) -> None:
+    runs = []
+    for _ in range(2):
+        replies.panel.set(PAN_TILT, "mute", replies=1000, probability=0.3, seed=7)
+        runs.append([bool(replies.sent(b"x")) for _ in range(300)])
+    assert runs[0] == runs[1]
+    assert 60 < runs[0].count(False) < 120, "0.3 of 300, four sigma either way"

@@ -1,0 +1,113 @@
+"""The simulated rover with the real driver and bytes between: pictures follow the bytes, faults too."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from drivers.clock import ManualClock
+from drivers.errors import BadOptions, DriverError
+from drivers.faults import PAN_TILT
+from drivers.interfaces import Reading
+from drivers.open_hardware import DeviceSettings, HardwareSettings, open_hardware
+from drivers.sim.render import Renderer
+from drivers.sim.rover import SimulatedRover, simulation_settings
+from drivers.sim.scene import Scene
+
+pytestmark = pytest.mark.usefixtures("one_scene")
+
+PATIENCE_S = 20.0
+NOISE_DN = 2.2
+"""Mean square of the noise at the brightest ground, as a level."""
+
+# What a settled reading may be off the true angle: the count, half the backlash, and the sag.
+WIRES = {
+    "dynamixel_x": ("dynamixel", 0.0016 + 0.0022 + 1e-4),
+    "ph42": ("dynamixel", 0.0009 + 1e-4),
+    "ptu_d46_70": ("flir_ptu", 0.00006 + 0.0001 + 1e-4),
+}
+
+
+@contextmanager
+def wired(rig: Path, head: str) -> Iterator[SimulatedRover]:
+    section = {"rover": rig.name, "seed": 5, "head": head, "wire": WIRES[head][0]}
+    sim = DeviceSettings("sim")
+    settings = HardwareSettings(sim, {"navcam_left": sim}, section, rig.parent)
+    with open_hardware(settings) as hardware:
+        rover = hardware.simulation
+        assert rover is not None and hardware.pan_tilt is rover.pan_tilt and hardware.kind == "simulated"
+        yield rover
+
+
+def until(condition: Callable[[], bool]) -> None:
+    deadline_s = time.monotonic() + PATIENCE_S
+    while not condition():
+        assert time.monotonic() < deadline_s
+        time.sleep(0.01)
+
+
+def settled(device: SimulatedRover, pan: float, tilt: float) -> Reading:
+    device.pan_tilt.move(pan, tilt)
+    until(lambda: not device.pan_tilt.read().moving)
+    return device.pan_tilt.read()
+
+
+def fails(device: SimulatedRover) -> bool:
+    try:
+        device.pan_tilt.read()
+    except DriverError:
+        return True
+    return False
+
+
+@pytest.mark.parametrize("head", WIRES)
+def test_pictures_are_taken_from_where_the_bytes_sent_the_axes(
+    small_rig: Path, scene: Scene, head: str
+) -> None:
+    threads, descriptors = threading.active_count(), sum(1 for _ in Path("/proc/self/fd").iterdir())
+    with wired(small_rig, head) as device:
+        reading = settled(device, 0.3, -0.4)
+        now_s = time.monotonic()
+        true = device.true_joints(now_s)
+        for read, truly, goal in zip((reading.pan_rad, reading.tilt_rad), true, (0.3, -0.4), strict=True):
+            assert abs(read - truly) < WIRES[head][1] and abs(truly - goal) < WIRES[head][1]
+        frame = device.cameras["navcam_left"].next_frame(now_s, 5.0)
+        model = device.rig.cameras["navcam_left"].model
+        renderer = Renderer(scene)
+        errors = []
+        for joints in (true, (0.0, 0.0)):
+            clean = renderer.image(model, device.rig.mast.rover_from_head(*joints), 2)
+            errors.append(float(np.sqrt(np.mean((clean - frame.image) ** 2))))
+        renderer.close()
+        assert errors[0] < NOISE_DN < 4 * NOISE_DN < errors[1]
+    assert threading.active_count() == threads
+    assert sum(1 for _ in Path("/proc/self/fd").iterdir()) == descriptors
+
+
+@pytest.mark.parametrize("head", ["dynamixel_x", "ptu_d46_70"])
+def test_faults_of_the_rover_reach_line_and_axes(small_rig: Path, head: str) -> None:
+    with wired(small_rig, head) as device:
+        settled(device, 0.1, 0.0)
+        for word in ("off", "hang_up"):
+            device.faults.set(PAN_TILT, word)
+            until(lambda: fails(device))
+            device.faults.clear()
+            until(lambda: not fails(device))
+        device.faults.set(PAN_TILT, "stuck", axis=0)
+        before = device.true_joints(time.monotonic())
+        device.pan_tilt.move(0.4, -0.2)
+        until(lambda: abs(device.true_joints(time.monotonic())[1] - before[1]) > 0.15)
+        assert device.true_joints(time.monotonic())[0] == before[0]
+
+
+def test_a_wire_needs_the_machines_own_clock(small_rig: Path) -> None:
+    settings = simulation_settings({"rover": small_rig.name, "wire": "dynamixel"}, small_rig.parent)
+    assert settings.head.name == "dynamixel_x"
+    with pytest.raises(BadOptions, match="goes with the machine's own clock only"):
+        SimulatedRover(settings, ManualClock())

@@ -1,0 +1,228 @@
+"""Commands for Dynamixel servos on the bench: ``mastctl servo scan|info|set-id|test``."""
+
+from __future__ import annotations
+
+import argparse
+import math
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any
+
+from mastctl.cli import output
+from mastctl.cli.output import CommandError, WrongUse, positive_number
+
+if TYPE_CHECKING:
+    from drivers.dynamixel.link import Link
+
+SCANNED_BAUDS = (57_600, 115_200, 1_000_000, 2_000_000, 3_000_000, 4_000_000)
+FACTORY_BAUD = 57_600
+FARTHEST_DEG = 20.0
+
+
+def add_commands(subparsers: argparse._SubParsersAction[Any]) -> None:
+    """Add servo with its four commands."""
+    servo = subparsers.add_parser("servo", help="find, read, number and try Dynamixel servos on the bench")
+    commands = servo.add_subparsers(dest="servo_command", metavar="WHAT", required=True)
+
+    scan = commands.add_parser("scan", help="ask at every baud rate which servos are there; moves nothing")
+    _add_port(scan)
+    scan.add_argument(
+        "--baud", nargs="+", type=_whole, metavar="B", default=list(SCANNED_BAUDS),
+        help="the rates to try (default: all usual ones)",
+    )  # fmt: skip
+    scan.set_defaults(run=_scan)
+
+    info = commands.add_parser("info", help="show everything that a servo says about itself; moves nothing")
+    _add_port(info)
+    info.add_argument("id", type=_whole, metavar="ID")
+    _add_baud(info)
+    info.set_defaults(run=_info)
+
+    set_id = commands.add_parser("set-id", help="give a servo another id (connect that servo alone)")
+    _add_port(set_id)
+    set_id.add_argument("id", type=_whole, metavar="ID", help="its id now")
+    set_id.add_argument("new_id", type=_whole, metavar="NEW", help="the id that it shall have")
+    _add_baud(set_id)
+    set_id.add_argument("--new-baud", type=_whole, metavar="B", help="and the baud rate that it shall have")
+    set_id.add_argument(
+        "--torque-off", action="store_true", help="switch its torque off for that (what hangs on it may fall)"
+    )
+    set_id.set_defaults(run=_set_id)
+
+    test = commands.add_parser(
+        "test", help="turn a servo a few degrees to each side and back, slowly and weakly"
+    )
+    _add_port(test)
+    test.add_argument("id", type=_whole, metavar="ID")
+    _add_baud(test)
+    test.add_argument(
+        "--degrees", type=positive_number, default=5.0, metavar="DEG", help="how far (default 5, at most 20)"
+    )
+    test.add_argument(
+        "--torque-percent", type=positive_number, default=30.0, metavar="P",
+        help="bound of the motor's drive, percent of full (default 30)",
+    )  # fmt: skip
+    test.set_defaults(run=_test)
+
+
+def _add_port(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("port", metavar="PORT", help="serial device, or a URL such as socket://host:port")
+
+
+def _add_baud(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--baud", type=_whole, default=FACTORY_BAUD, metavar="B",
+        help=f"bits per second (default {FACTORY_BAUD}, as servos come from the factory)",
+    )  # fmt: skip
+
+
+def _whole(text: str) -> int:
+    """Read an option's value as a whole number, zero or more (argparse ``type``)."""
+    if not (text.isascii() and text.isdigit() and len(text) < 10):
+        raise argparse.ArgumentTypeError(f"'{text}' where a whole number is expected")
+    return int(text)
+
+
+@contextmanager
+def _line(args: argparse.Namespace) -> Iterator[Link]:
+    """The open line of a command."""
+    from drivers.dynamixel.link import Link
+
+    link = Link(args.port, args.baud)
+    try:
+        yield link
+    finally:
+        link.close()
+
+
+def _scan(args: argparse.Namespace) -> int:
+    """List the servos of a line."""
+    from drivers.dynamixel.link import REPLY_TIMEOUT_S
+    from drivers.dynamixel.workshop import scan
+
+    result = scan(args.port, args.baud, REPLY_TIMEOUT_S)
+    bauds = ", ".join(str(baud) for baud in result.bauds)
+    garbled = [
+        f"at {baud} baud something answered that cannot be understood: two servos of one id, or a bad line"
+        for baud in result.garbled
+    ]
+    if not result.found:
+        raise CommandError(
+            "no_servo",
+            f"no servo answered on {args.port} at {bauds} baud"
+            + (f"; {'; '.join(garbled)}" if garbled else "; is its power on, is it protocol 2.0?"),
+        )
+    if args.json:
+        rows = [
+            {
+                "id": servo.servo_id,
+                "baud": servo.baud,
+                "model": servo.model,
+                "model_number": servo.model_number,
+                "firmware": servo.firmware,
+                "hardware_errors": list(servo.hardware_errors),
+            }
+            for servo in result.found
+        ]
+        output.print_json({"port": args.port, "servos": rows, "garbled_bauds": list(result.garbled)})
+        return 0
+    output.print_table(
+        f"Servos on {args.port}",
+        ("id", "baud", "model", "firmware", "hardware errors"),
+        [
+            (str(s.servo_id), str(s.baud), s.model, str(s.firmware), ", ".join(s.hardware_errors) or "none")
+            for s in result.found
+        ],
+        garbled,
+    )
+    return 0
+
+
+def _info(args: argparse.Namespace) -> int:
+    """Show a servo's registers."""
+    from drivers.dynamixel.workshop import facts
+
+    with _line(args) as link:
+        found = facts(link, args.id)
+    if args.json:
+        output.print_json(
+            {
+                "id": found.servo_id,
+                "model": found.model,
+                "firmware": found.firmware,
+                "registers": found.values,
+                "words": found.words,
+            }
+        )
+        return 0
+    output.print_table(
+        f"Servo {found.servo_id}: {found.model}, firmware {found.firmware}",
+        ("register", "value", "meaning"),
+        [(name, str(value), found.words.get(name, "")) for name, value in found.values.items()],
+    )
+    return 0
+
+
+def _set_id(args: argparse.Namespace) -> int:
+    """Change a servo's id and baud rate."""
+    from drivers.dynamixel.workshop import set_id
+
+    with _line(args) as link:
+        set_id(link, args.id, args.new_id, args.new_baud, torque_off=args.torque_off)
+        baud = link.baud
+    if args.json:
+        output.print_json({"id": args.new_id, "old_id": args.id, "baud": baud})
+    else:
+        output.tell(f"the servo now answers to id {args.new_id} at {baud} baud")
+    return 0
+
+
+def _test(args: argparse.Namespace) -> int:
+    """Turn a servo a little."""
+    from drivers.dynamixel.workshop import try_out
+
+    if args.degrees > FARTHEST_DEG:
+        raise WrongUse(f"--degrees is {args.degrees:g}, expected at most {FARTHEST_DEG:g} for a careful test")
+    if args.torque_percent > 100:
+        raise WrongUse(f"--torque-percent is {args.torque_percent:g}, expected at most 100")
+    output.tell(
+        f"servo {args.id} turns {args.degrees:g} degrees to each side and back, at most "
+        f"{args.torque_percent:g} % of its strength"
+    )
+    with _line(args) as link:
+        trial = try_out(link, args.id, math.radians(args.degrees), args.torque_percent)
+    count_deg = math.degrees(trial.count_rad)
+    worst = max(abs(step.left_counts) for step in trial.steps)
+    if args.json:
+        rows = [
+            {
+                "goal_counts": step.goal_counts,
+                "measured_counts": step.measured_counts,
+                "left_counts": step.left_counts,
+                "seconds": step.seconds,
+                "most_current_A": step.most_current_A,
+                "voltage_V": step.voltage_V,
+                "temperature_C": step.temperature_C,
+            }
+            for step in trial.steps
+        ]
+        output.print_json({"id": trial.servo_id, "model": trial.model, "count_deg": count_deg, "steps": rows})
+        return 0
+    output.print_table(
+        f"Servo {trial.servo_id}: {trial.model}, one count is {count_deg:.4f} degrees",
+        ("goal", "measured", "left", "seconds", "most A", "V", "C"),
+        [
+            (
+                str(s.goal_counts),
+                str(s.measured_counts),
+                str(s.left_counts),
+                f"{s.seconds:.2f}",
+                "-" if s.most_current_A is None else f"{s.most_current_A:.3f}",
+                f"{s.voltage_V:.1f}",
+                str(s.temperature_C),
+            )
+            for s in trial.steps
+        ],
+        [f"It missed its goals by {worst} counts ({worst * count_deg:.3f} deg) at most."],
+    )
+    return 0

@@ -1,0 +1,285 @@
+"""Simulated servos behind real bytes, for any driver: `mastctl sim dynamixel` and `mastctl sim ptu`.
+
+The command runs until SIGTERM, SIGINT (Ctrl-C) or, with --until-eof, the end of its standard input. JSON
+lines on standard input switch faults on and off while it runs.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import json
+import os
+import select
+import signal
+import sys
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+from mastctl.cli import output
+from mastctl.cli.output import WrongUse
+
+if TYPE_CHECKING:
+    from drivers.clock import Clock
+    from drivers.faults import FaultPanel
+    from drivers.sim.axis import AxisSettings
+    from drivers.sim.wire.line import PtyLine, TcpLine, WireDevice
+
+_LIVE = """\
+JSON lines on standard input, one order each, answered on standard error:
+  {"word": "mute", "replies": 5}                       a fault of the head, with parameters
+  {"word": "overload", "angle_rad": 0.3, "at_s": 2}    from two seconds on
+  {"clear": true}                                      all faults off
+The words are those of docs/drivers.md. SIGTERM or Ctrl-C ends it."""
+
+
+_PAN_TILT: tuple[Literal[0], Literal[1]] = (0, 1)
+
+
+def add_commands(subparsers: argparse._SubParsersAction[Any]) -> None:
+    """Add sim dynamixel and sim ptu."""
+    sim = subparsers.add_parser("sim", help="simulated servos behind a serial line or a TCP port")
+    kinds = sim.add_subparsers(dest="kind", metavar="KIND", required=True)
+    shape = argparse.RawDescriptionHelpFormatter
+
+    dynamixel = kinds.add_parser(
+        "dynamixel",
+        help="a bus of Dynamixel servos (protocol 2.0)",
+        epilog=_LIVE,
+        formatter_class=shape,
+    )
+    dynamixel.add_argument(
+        "--servo",
+        action="append",
+        metavar="MODEL:ID",
+        help="a servo on the bus; may be repeated: the first is pan, the second tilt "
+        "(default: xm430_w350:1 and xm430_w350:2)",
+    )
+    dynamixel.add_argument("--baud", type=int, default=57600, help="of all servos (default 57600)")
+    dynamixel.add_argument(
+        "--return-delay", type=int, default=250, metavar="N", help="in units of 2 us (default 250)"
+    )
+    dynamixel.set_defaults(run=_dynamixel)
+
+    ptu = kinds.add_parser(
+        "ptu", help="a FLIR / Directed Perception pan/tilt unit", epilog=_LIVE, formatter_class=shape
+    )
+    ptu.add_argument("--model", default="d46_70", help="the unit (default d46_70)")
+    ptu.add_argument("--step-mode", metavar="F|H|Q|E|A", help="as delivered when left out")
+    ptu.add_argument("--baud", type=int, default=9600, help="of the serial line (default 9600)")
+    ptu.set_defaults(run=_ptu)
+
+    for kind in (dynamixel, ptu):
+        where = kind.add_mutually_exclusive_group(required=True)
+        where.add_argument("--pty", action="store_true", help="a serial line as a pseudo terminal")
+        if kind is ptu:
+            where.add_argument("--tcp", metavar="[HOST:]PORT", help="a TCP port; 0 is any free one")
+        kind.add_argument("--link", metavar="PATH", help="with --pty: a stable name for the terminal")
+        kind.add_argument("--faults", metavar="FILE", help="a fault script, which begins at once")
+        kind.add_argument(
+            "--no-wire-time", action="store_true", help="bytes take no time, and any baud rate is right"
+        )
+        kind.add_argument("--verbose", action="store_true", help="every piece that passes, on standard error")
+        kind.add_argument(
+            "--until-eof", action="store_true", help="end when standard input ends (default: go on)"
+        )
+
+
+def _dynamixel(args: argparse.Namespace) -> int:
+    from drivers.sim.wire.axis import WireAxis
+    from drivers.sim.wire.dynamixel_bus import DynamixelBus
+    from drivers.sim.wire.dynamixel_registers import BAUD_RATES
+    from drivers.sim.wire.dynamixel_servo import SimulatedServo
+
+    if args.baud not in BAUD_RATES:
+        raise WrongUse(f"--baud is {args.baud}, expected one of {', '.join(str(b) for b in BAUD_RATES)}")
+    if not 0 <= args.return_delay <= 254:
+        raise WrongUse(f"--return-delay is {args.return_delay}, expected 0 to 254")
+    wanted = [_servo(text) for text in args.servo or ("xm430_w350:1", "xm430_w350:2")]
+    panel, clock = _panel()
+    registers = {"baud_rate": BAUD_RATES.index(args.baud), "return_delay_time": args.return_delay}
+    servos = []
+    for place, (model, servo_id) in enumerate(wanted):
+        settings = _axis_settings("ph42" if model.startswith("ph") else "dynamixel_x", place)
+        number: Literal[0, 1] = 1 if place % 2 else 0
+        axis = WireAxis(settings, panel, number=number, time_s=clock.now_s())
+        try:
+            servos.append(SimulatedServo(model, servo_id, axis, settings=registers, time_s=clock.now_s()))
+        except ValueError as error:
+            raise WrongUse(f"--servo {model}:{servo_id}: {error}") from None
+    facts = {"servos": [{"model": model, "id": servo_id} for model, servo_id in wanted], "baud": args.baud}
+    return _serve(args, DynamixelBus(servos), panel, clock, facts)
+
+
+def _ptu(args: argparse.Namespace) -> int:
+    from drivers.errors import BadOptions
+    from drivers.sim.wire.axis import WireAxis
+    from drivers.sim.wire.ptu import SimulatedPtu
+
+    panel, clock = _panel()
+    pan, tilt = (
+        WireAxis(_axis_settings("ptu_d46_70", place), panel, number=place, time_s=clock.now_s())
+        for place in _PAN_TILT
+    )
+    try:
+        unit = SimulatedPtu(args.model, pan, tilt, step_mode=args.step_mode, baud=args.baud)
+    except BadOptions as error:
+        raise WrongUse(str(error)) from None
+    facts = {"model": args.model, "step_mode": unit.pan.mode, "baud": args.baud}
+    return _serve(args, unit, panel, clock, facts, unit.banner)
+
+
+def _servo(text: str) -> tuple[str, int]:
+    """``MODEL:ID`` of --servo."""
+    model, _, number = text.partition(":")
+    if not (number.isascii() and number.isdigit() and int(number) <= 252):
+        raise WrongUse(f"--servo is '{text}', expected MODEL:ID with an id from 0 to 252")
+    return model.lower().replace("-", "_"), int(number)
+
+
+def _panel() -> tuple[FaultPanel, Clock]:
+    """A panel of faults on the machine's clock."""
+    from drivers.clock import SystemClock
+    from drivers.faults import FaultPanel
+
+    clock = SystemClock()
+    return FaultPanel(clock.now_s, ()), clock
+
+
+def _axis_settings(preset: str, place: int) -> AxisSettings:
+    """Backlash and sag of pan (even places) or tilt."""
+    from drivers.sim.pan_tilt import PRESETS
+
+    return PRESETS[preset].tilt if place % 2 else PRESETS[preset].pan
+
+
+def _serve(
+    args: argparse.Namespace,
+    device: WireDevice,
+    panel: FaultPanel,
+    clock: Clock,
+    facts: Mapping[str, Any],
+    banner: bytes = b"",
+) -> int:
+    """Open the line, say where it is, and keep it up until told to end."""
+    from drivers.faults import read_script
+    from drivers.sim.wire.line import PtyLine, TcpLine
+
+    tcp = getattr(args, "tcp", None)
+    if tcp is not None and args.link is not None:
+        raise WrongUse("--link goes with --pty")
+    observer = _observer(clock.now_s()) if args.verbose else None
+    with _signals() as wake:
+        if args.faults is not None:
+            panel.set_all(read_script(Path(args.faults)), origin=args.faults)
+        line: PtyLine | TcpLine
+        if tcp is None:
+            line = PtyLine(
+                device, clock, panel, link=args.link, wire_time=not args.no_wire_time, observer=observer
+            )
+            port = line.path
+        else:
+            host, number = _address(tcp)
+            line = TcpLine(device, clock, panel, host, number, banner=banner, observer=observer)
+            port = f"socket://{f'[{host}]' if ':' in host else host}:{line.port}"
+        with line:
+            if args.json:
+                output.print_json({"port": port, **facts})
+            else:
+                sys.stdout.write(f"{port}\n")
+            sys.stdout.flush()
+            _follow_orders(panel, wake, args.until_eof)
+    return 0
+
+
+def _address(text: str) -> tuple[str, int]:
+    """``[HOST:]PORT`` of --tcp."""
+    host, _, number = text.rpartition(":")
+    if not (number.isascii() and number.isdigit() and int(number) <= 65535):
+        raise WrongUse(f"--tcp is '{text}', expected [HOST:]PORT with a port from 0 to 65535")
+    return host.strip("[]") or "127.0.0.1", int(number)
+
+
+@contextlib.contextmanager
+def _signals() -> Iterator[int]:
+    """SIGTERM and SIGINT make the descriptor that is given readable."""
+    read, write = os.pipe()
+    os.set_blocking(write, False)
+    before = {number: signal.signal(number, lambda *_: None) for number in (signal.SIGTERM, signal.SIGINT)}
+    old = signal.set_wakeup_fd(write, warn_on_full_buffer=False)
+    try:
+        yield read
+    finally:
+        signal.set_wakeup_fd(old)
+        for number, handler in before.items():
+            signal.signal(number, handler)
+        os.close(read)
+        os.close(write)
+
+
+def _follow_orders(panel: FaultPanel, wake: int, until_eof: bool) -> None:
+    """Carry out the lines of standard input until a signal comes."""
+    source: list[int] = []
+    with contextlib.suppress(OSError, ValueError, AttributeError):  # closed, or none at all
+        source = [sys.stdin.fileno()]
+    rest = b""
+    while True:
+        try:
+            ready = select.select([wake, *source], [], [])[0]
+        except OSError:
+            source = []
+            continue
+        if wake in ready:
+            return
+        data = b""
+        with contextlib.suppress(OSError):
+            data = os.read(source[0], 65536)
+        lines = (rest + data).split(b"\n")
+        rest = lines.pop()
+        if not data:
+            lines.append(rest)
+        for line in lines:
+            if line.strip():
+                _order(panel, line)
+        if not data:
+            if until_eof:
+                return
+            source, rest = [], b""
+
+
+def _order(panel: FaultPanel, line: bytes) -> None:
+    """Switch a fault on, or faults off; what cannot be done is told and changes nothing."""
+    from drivers.errors import BadOptions
+    from drivers.faults import PAN_TILT
+
+    try:
+        order = json.loads(line)
+        if not isinstance(order, dict):
+            raise ValueError("an object is expected")
+    except ValueError as error:
+        output.tell(f"standard input: no JSON line ({error})")
+        return
+    try:
+        if "clear" in order:
+            if len(order) > 1 or order["clear"] not in (True, PAN_TILT):
+                raise BadOptions('expected {"clear": true} and nothing else')
+            panel.clear()
+            output.tell("all faults off")
+            return
+        panel.set_all([{"device": PAN_TILT, **order}], origin="standard input")
+        output.tell(f"fault {order['word']} set")
+    except BadOptions as error:
+        output.tell(f"standard input: {error}")
+
+
+def _observer(start_s: float) -> Callable[[Literal["host", "device"], bytes, float], None]:
+    """A log of what passes: seconds, who sent it, the bytes in hex and, where it is text, as text."""
+
+    def observe(sender: Literal["host", "device"], data: bytes, time_s: float) -> None:
+        plain = all(32 <= byte < 127 or byte in b"\r\n" for byte in data)
+        shown = repr(data)[1:] if plain else data.hex(" ")
+        with contextlib.suppress(OSError):
+            sys.stderr.write(f"{time_s - start_s:10.4f} {'->' if sender == 'host' else '<-'} {shown}\n")
+
+    return observe

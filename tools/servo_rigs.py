@@ -1,0 +1,197 @@
+"""Heads to be tried: each pan/tilt driver on a simulated device whose true angles are known.
+
+Backlash and sag are nothing here, so the angle that the mechanism stands at is the angle of the motor, which
+a reading has to tell; a reading rounds it to the device's count.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, field
+from typing import Any
+
+from drivers.clock import SystemClock
+from drivers.dynamixel.head import open_head as open_dynamixel
+from drivers.faults import FaultPanel
+from drivers.flir_ptu.head import open_head as open_flir_ptu
+from drivers.interfaces import PanTilt
+from drivers.sim.pan_tilt import AxisSettings, HeadSettings, SimulatedPanTilt
+from drivers.sim.wire.axis import WireAxis
+from drivers.sim.wire.dynamixel_bus import DynamixelBus
+from drivers.sim.wire.dynamixel_servo import SimulatedServo
+from drivers.sim.wire.line import PtyLine, TcpLine
+from drivers.sim.wire.ptu import SimulatedPtu
+
+LIMITS_RAD = ((-1.0, 1.0), (-0.6, 0.4))
+SPEED_RAD_PER_S, ACCELERATION_RAD_PER_S2 = 1.2, 20.0
+X_COUNT_RAD = math.tau / 4096  # e-manual, X series
+PTU_STEP_RAD = math.radians(324 / 7 / 3600)  # D46-70, half step of 46.2857"
+PTU_ACCELERATION = round(ACCELERATION_RAD_PER_S2 / PTU_STEP_RAD)
+
+
+@dataclass
+class Rig:
+    """A head, and what only the tester knows about it.
+
+    Attributes
+    ----------
+    name
+        What it is.
+    head
+        The driver under test.
+    panel
+        Where faults are set.
+    true_rad
+        Pan and tilt of the motors at a moment of the last minute.
+    count_rad
+        One count.
+    line
+        The simulated line, None in memory.
+    settle_rad
+        How far from its goal a settled head may be, beyond the rounding to counts; nothing when simulated.
+    fastest_rad_per_s
+        Bound of every move's speed, None where it is not known.
+    sent
+        Pieces that have passed on the line.
+    """
+
+    name: str
+    head: PanTilt
+    panel: FaultPanel
+    true_rad: Callable[[float], tuple[float, float]]
+    count_rad: float
+    line: PtyLine | TcpLine | None = None
+    sent: list[int] = field(default_factory=lambda: [0])
+    settle_rad: float = 1e-9
+    fastest_rad_per_s: float | None = SPEED_RAD_PER_S
+
+
+@contextmanager
+def in_memory() -> Iterator[Rig]:
+    """The simulated head without any bytes."""
+    clock = SystemClock()
+    axes = [
+        AxisSettings(X_COUNT_RAD, 0.0, low, high, SPEED_RAD_PER_S, ACCELERATION_RAD_PER_S2)
+        for low, high in LIMITS_RAD
+    ]
+    panel = FaultPanel(clock.now_s, ())
+    head = SimulatedPanTilt(HeadSettings("in memory", *axes), clock, panel)
+    try:
+        yield Rig("in memory", head, panel, head.true_joints, X_COUNT_RAD)
+    finally:
+        head.close()
+
+
+@contextmanager
+def dynamixel_pty(watchdog_s: float = 0.0, reply_timeout_s: float = 0.2) -> Iterator[Rig]:
+    """Two XM430 servos behind a pseudo terminal.
+
+    By default patient and without a watchdog: on a busy machine simulator and driver both come late.
+    """
+    with ExitStack() as stack:
+        clock, panel, axes = _axes()
+        settings = {"baud_rate": 3, "return_delay_time": 0}  # 1 Mbaud
+        servos = [
+            SimulatedServo("xm430_w350", number, axis, settings=settings, time_s=clock.now_s())
+            for number, axis in enumerate(axes, start=1)
+        ]
+        sent = [0]
+        bus = DynamixelBus(servos)
+        line = stack.enter_context(PtyLine(bus, clock, panel, wire_time=False, observer=_counter(sent)))
+        ends = [{"id": n, "model": "XM430-W350", "limits_rad": list(LIMITS_RAD[n - 1])} for n in (1, 2)]
+        options: dict[str, Any] = {
+            "port": line.path, "baud": 1_000_000, "pan": ends[0], "tilt": ends[1],
+            "speed_rad_per_s": SPEED_RAD_PER_S, "acceleration_rad_per_s2": ACCELERATION_RAD_PER_S2,
+            "watchdog_s": watchdog_s, "reply_timeout_s": reply_timeout_s,
+        }  # fmt: skip
+        head = open_dynamixel(options, clock)
+        stack.callback(head.close)
+        yield Rig("Dynamixel, pty", head, panel, _truth(axes), X_COUNT_RAD, line, sent)
+
+
+@contextmanager
+def ptu_pty() -> Iterator[Rig]:
+    """A D46-70 behind a pseudo terminal."""
+    with ExitStack() as stack:
+        clock, panel, axes = _axes()
+        sent = [0]
+        unit = SimulatedPtu("d46_70", *axes)
+        line = stack.enter_context(PtyLine(unit, clock, panel, wire_time=False, observer=_counter(sent)))
+        yield _ptu_rig(stack, "PTU, pty", line.path, line, unit, clock, panel, axes, sent)
+
+
+@contextmanager
+def ptu_tcp() -> Iterator[Rig]:
+    """A D46-70 behind a TCP port."""
+    with ExitStack() as stack:
+        clock, panel, axes = _axes()
+        sent = [0]
+        unit = SimulatedPtu("d46_70", *axes)
+        line = stack.enter_context(TcpLine(unit, clock, panel, observer=_counter(sent)))
+        yield _ptu_rig(
+            stack, "PTU, TCP", f"socket://127.0.0.1:{line.port}", line, unit, clock, panel, axes, sent
+        )
+
+
+def _ptu_rig(
+    stack: ExitStack,
+    name: str,
+    port: str,
+    line: PtyLine | TcpLine,
+    unit: SimulatedPtu,
+    clock: SystemClock,
+    panel: FaultPanel,
+    axes: tuple[WireAxis, WireAxis],
+    sent: list[int],
+) -> Rig:
+    """The driver on a simulated unit; positions of its pan grow to the left."""
+    for axis in (unit.pan, unit.tilt):  # as somebody left it; setting it by PA would take the unit seconds
+        axis.now = axis.factory.__class__(**{**vars(axis.now), "acceleration": PTU_ACCELERATION})
+    options = {
+        "port": port,
+        "pan": {"limits_rad": list(LIMITS_RAD[0]), "sign": -1},
+        "tilt": {"limits_rad": list(LIMITS_RAD[1])},
+        "speed_rad_per_s": SPEED_RAD_PER_S,
+    }
+    head = open_flir_ptu(options, clock)
+    stack.callback(head.close)
+    fastest = unit.pan.now.fastest * PTU_STEP_RAD  # its own; the options' speed is for moves that name none
+    return Rig(name, head, panel, _truth(axes), PTU_STEP_RAD, line, sent, fastest_rad_per_s=fastest)
+
+
+def _axes() -> tuple[SystemClock, FaultPanel, tuple[WireAxis, WireAxis]]:
+    """The two motors."""
+    clock = SystemClock()
+    panel = FaultPanel(clock.now_s, ())
+    settings = [
+        AxisSettings(X_COUNT_RAD, 0.0, low, high, SPEED_RAD_PER_S, ACCELERATION_RAD_PER_S2)
+        for low, high in LIMITS_RAD
+    ]
+    now_s = clock.now_s()
+    pan = WireAxis(settings[0], panel, number=0, time_s=now_s)
+    tilt = WireAxis(settings[1], panel, number=1, time_s=now_s)
+    return clock, panel, (pan, tilt)
+
+
+def _truth(axes: tuple[WireAxis, WireAxis]) -> Callable[[float], tuple[float, float]]:
+    """The mechanism's angles, which no fault of an encoder or a line touches."""
+    return lambda time_s: (axes[0].mechanical_rad(time_s), axes[1].mechanical_rad(time_s))
+
+
+def _counter(sent: list[int]) -> Callable[..., None]:
+    """An observer that counts what the host sends."""
+
+    def count(who: str, data: bytes, time_s: float) -> None:
+        sent[0] += who == "host"
+
+    return count
+
+
+RIGS: dict[str, Callable[[], Any]] = {
+    "in_memory": in_memory,
+    "dynamixel_pty": dynamixel_pty,
+    "ptu_pty": ptu_pty,
+    "ptu_tcp": ptu_tcp,
+}
