@@ -35,6 +35,7 @@ from drivers.v4l2.options import parse_options
 
 STOPPED_S = 2.0
 WARM_S = 2.0  # so long the first touch of every buffer costs more than its frame
+VIVID = Path("/sys/bus/platform/drivers/vivid")
 VIVID_CONTROLS = {"timestamp_source": 1, "osd_text_mode": 2}
 
 
@@ -52,6 +53,7 @@ def main() -> None:
     parser.add_argument("--pauses", type=int, default=30, help="for the age of frames")
     parser.add_argument("--frames", type=int, default=100_000, help="for the memory; 0 leaves it out")
     parser.add_argument("--opens", type=int, default=1000, help="for the descriptors; 0 leaves it out")
+    parser.add_argument("--unplugs", type=int, default=10, help="vivid only, as root")
     parser.add_argument("--json", action="store_true")
     args = parser.parse_args()
     devices = args.device or [camera.bus for camera in find.list_cameras()[:2]]
@@ -60,7 +62,7 @@ def main() -> None:
     options = [chosen(device, tuple(args.size), args.rate) for device in devices]
     say = (lambda *words: None) if args.json else print
     say(
-        f"load {os.getloadavg()[0]:.1f}; {len(options)} cameras, {args.size} px at {options[0]['rate_hz']:g} Hz"
+        f"{len(options)} cameras, {args.size} px at {options[0]['rate_hz']:g} Hz, load {os.getloadavg()[0]:.1f}"
     )
     told: dict[str, Any] = {"rate_hz": options[0]["rate_hz"], "size_px": args.size, "cameras": len(options)}
     told["gaps"] = [
@@ -70,6 +72,8 @@ def main() -> None:
     told["cpu"] = cpu_per_frame(options[0], say)
     if args.frames:
         told["memory"] = memory(options, args.frames, say)
+    if VIVID.exists():
+        told["unplugged"] = unplugged(options, args.unplugs, say)
     if args.opens:
         told["opens"] = descriptors(options[0], args.opens, say)
     if args.json:
@@ -256,8 +260,39 @@ def resident_bytes() -> int:
     return pages * resource.getpagesize()
 
 
+def unplugged(options: list[dict[str, Any]], times: int, say: Callable[..., None]) -> dict[str, Any]:
+    """From the moment that the driver lets the camera go until it is known, and from its return to a frame."""
+    noticed_s, back_s = [], []
+    with opened(options) as cameras:
+        camera = cameras[0]
+        for _ in range(times):
+            began_s = time.monotonic()
+            unbind = threading.Thread(target=(VIVID / "unbind").write_text, args=("vivid.0",))
+            unbind.start()
+            while not camera.capture.lost:
+                time.sleep(0.0005)
+            noticed_s.append(time.monotonic() - began_s)
+            unbind.join()
+            time.sleep(0.5)
+            (VIVID / "bind").write_text("vivid.0")
+            began_s = time.monotonic()
+            while camera.capture.lost:
+                time.sleep(0.0005)
+            camera.next_frame(time.monotonic(), 10.0)
+            back_s.append(time.monotonic() - began_s)
+            for other in cameras:
+                while other.capture.lost:
+                    time.sleep(0.01)
+    period_s = 1 / options[0]["rate_hz"]
+    say(
+        f"unplugged {times} times: noticed after at most {1e3 * max(noticed_s):.0f} ms "
+        f"({max(noticed_s) / period_s:.1f} periods), frames again at most {1e3 * max(back_s):.0f} ms after its return"
+    )
+    return {"noticed_s": noticed_s, "back_s": back_s, "period_s": period_s}
+
+
 def descriptors(options: dict[str, Any], opens: int, say: Callable[..., None]) -> dict[str, Any]:
-    """Descriptors, threads, mappings left after opening again and again; with vivid every third open fails."""
+    """Descriptors, threads, mappings left after opening again and again; with vivid a third of them fail."""
     address = parse_options(options, "opens").address
     with open_node(address, "opens") as node:
         is_vivid = node.identity.driver == "vivid"
