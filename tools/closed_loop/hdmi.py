@@ -19,8 +19,8 @@ BUF_TYPE_VIDEO_OUTPUT = 2
 BUFFERS = 2  # fewer the driver does not start with
 
 # struct v4l2_dv_timings of 640x480 at 59.94 Hz (CEA-861 format 1): type BT.656/1120, width, height,
-# interlaced, polarities, pixel clock, front porch, sync and back porch across and down, those of a second field,
-# standards, flags; zeros fill it up.
+# interlaced, polarities, pixel clock, front porch, sync and back porch across and down, those of a second
+# field, standards, flags; zeros fill it up.
 _TIMINGS = struct.pack("=I4IQ11I", 0, *SIZE_PX, 0, 0, 25_175_000, 16, 96, 48, 10, 2, 33, 0, 0, 0, 0, 0)
 _TIMINGS = _TIMINGS.ljust(132, b"\0")
 _VIDIOC_S_DV_TIMINGS = 3 << 30 | len(_TIMINGS) << 16 | ord("V") << 8 | 87

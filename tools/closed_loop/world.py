@@ -37,7 +37,7 @@ Joints = tuple[float, float]
 
 BAUD = 1_000_000
 LOOK_EVERY_S = 0.01
-REFRESH_EVERY_S = 0.2
+REFRESH_EVERY_S = 0.5
 
 
 class World:
@@ -135,7 +135,8 @@ class Eye:
 
     A frame of the capture node must show what was there at its stamp. Drawing takes longer than a frame, so
     the node gives none (the driver's own control drops them) from the moment the head is seen to stand at a
-    new place until the picture from there is on the screen. While the head moves, the last picture stays.
+    new place until the picture from there is on the screen and the head still stands there. While the head
+    moves, the last picture stays.
 
     Attributes
     ----------
@@ -171,9 +172,10 @@ class Eye:
         self._screen = hdmi.HdmiOutput(output)
         self._node = open_node(Address(bus=f"platform:vivid-{index:03}"), name)
         controls = {control.name: control for control in list_controls(self._node)}
-        self._dropped_percent = controls["percentage_of_dropped_buffers"]
+        self._dropped = controls["percentage_of_dropped_buffers"]
         self._end = threading.Event()
-        self._show()
+        self._through = False
+        self._show(self._shown)
         self._thread = threading.Thread(target=self._run, name=f"screen {name}", daemon=True)
         self._thread.start()
 
@@ -197,29 +199,28 @@ class Eye:
         while not self._end.wait(LOOK_EVERY_S):
             now_s = self._clock.now_s()
             joints = self._world.true_joints(now_s)
-            self.worst_blind_s = max(self.worst_blind_s, now_s - looked_s)
+            if self._through:
+                self.worst_blind_s = max(self.worst_blind_s, now_s - looked_s)
             looked_s = now_s
             stands, before = joints == before, joints
-            if stands and joints != self._shown:
-                self._let_through(False)
-                self._shown, self._clean = joints, self._world.drawn(self._name, joints)
-                self._show()
+            if stands and (joints != self._shown or now_s - refreshed_s > REFRESH_EVERY_S):
+                self._show(joints)
                 looked_s = refreshed_s = self._clock.now_s()
                 self.worst_drawing_s = max(self.worst_drawing_s, looked_s - now_s)
-            elif stands and now_s - refreshed_s > REFRESH_EVERY_S:
-                self._show()
-                refreshed_s = now_s
 
-    def _show(self) -> None:
-        """Put the present picture on the screen, with noise of its own."""
-        image = self._noisy.next_frame(self._clock.now_s(), 5.0).image
+    def _show(self, joints: Joints) -> None:
+        """Put the picture from here on the screen, with new noise, and let it be seen if it is true."""
         self._let_through(False)
-        self._screen.show(image)
-        self._let_through(True)
+        if joints != self._shown:
+            self._shown, self._clean = joints, self._world.drawn(self._name, joints)
+        self._screen.show(self._noisy.next_frame(self._clock.now_s(), 5.0).image)
         self.pictures += 1
+        if self._world.true_joints(self._clock.now_s()) == joints:
+            self._let_through(True)
 
     def _let_through(self, frames: bool) -> None:
-        if problem := set_value(self._node, self._dropped_percent, 0 if frames else 100):
+        self._through = frames
+        if problem := set_value(self._node, self._dropped, 0 if frames else 100):
             raise RuntimeError(problem.message)
 
 
