@@ -62,7 +62,7 @@ def main() -> None:
     options = [chosen(device, tuple(args.size), args.rate) for device in devices]
     say = (lambda *words: None) if args.json else print
     say(
-        f"{len(options)} cameras, {args.size} px at {options[0]['rate_hz']:g} Hz, load {os.getloadavg()[0]:.1f}"
+        f"{len(options)} cameras, {args.size} px, {options[0]['rate_hz']:g} Hz, load {os.getloadavg()[0]:.1f}"
     )
     told: dict[str, Any] = {"rate_hz": options[0]["rate_hz"], "size_px": args.size, "cameras": len(options)}
     told["gaps"] = [
@@ -109,7 +109,11 @@ def gaps(
     options: list[dict[str, Any]], what: str, seconds: float, say: Callable[..., None]
 ) -> dict[str, Any]:
     """Drops while the consumer does something else than take frames."""
-    with opened(options) as cameras:
+    reads = "import sys\nwhile sys.stdin.buffer.read(65536): pass"
+    with (
+        subprocess.Popen([sys.executable, "-c", reads], stdin=subprocess.PIPE) as consumer,
+        opened(options) as cameras,
+    ):
         before = [camera.counters for camera in cameras]
         began_s = time.monotonic()
         until_s = began_s + seconds
@@ -124,7 +128,7 @@ def gaps(
                 while time.monotonic() < busy_until_s:
                     sum(i * i for i in range(20_000))  # Python's lock held nearly all the time
             else:
-                pass_to_stopped_consumer(cameras)
+                pass_to_stopped(consumer, cameras)
         span_s = time.monotonic() - began_s
         counted = [camera.counters for camera in cameras]
     row = {
@@ -143,16 +147,14 @@ def gaps(
     return row
 
 
-def pass_to_stopped_consumer(cameras: list[V4l2Camera]) -> None:
+def pass_to_stopped(consumer: subprocess.Popen[bytes], cameras: list[V4l2Camera]) -> None:
     """Hand frames to another process that is stopped for two seconds: the hand-over hangs that long."""
-    reads = "import sys\nwhile sys.stdin.buffer.read(65536): pass"
-    with subprocess.Popen([sys.executable, "-c", reads], stdin=subprocess.PIPE) as consumer:
-        assert consumer.stdin is not None
-        consumer.send_signal(signal.SIGSTOP)
-        threading.Timer(STOPPED_S, consumer.send_signal, [signal.SIGCONT]).start()
-        for camera in cameras:
-            frame = camera.next_frame(time.monotonic(), 10.0)
-            consumer.stdin.write(frame.image.tobytes())  # more than a pipe holds: waits for the reader
+    assert consumer.stdin is not None
+    consumer.send_signal(signal.SIGSTOP)
+    threading.Timer(STOPPED_S, consumer.send_signal, [signal.SIGCONT]).start()
+    for camera in cameras:
+        frame = camera.next_frame(time.monotonic(), 10.0)
+        consumer.stdin.write(frame.image.tobytes())  # more than a pipe holds: waits for the reader
 
 
 def age_after_pause(options: dict[str, Any], pauses: int, say: Callable[..., None]) -> dict[str, Any]:
@@ -261,7 +263,7 @@ def resident_bytes() -> int:
 
 
 def unplugged(options: list[dict[str, Any]], times: int, say: Callable[..., None]) -> dict[str, Any]:
-    """From the moment that the driver lets the camera go until it is known, and from its return to a frame."""
+    """From the driver letting the camera go until it is known, and from its return to a frame."""
     noticed_s, back_s = [], []
     with opened(options) as cameras:
         camera = cameras[0]
@@ -286,13 +288,13 @@ def unplugged(options: list[dict[str, Any]], times: int, say: Callable[..., None
     period_s = 1 / options[0]["rate_hz"]
     say(
         f"unplugged {times} times: noticed after at most {1e3 * max(noticed_s):.0f} ms "
-        f"({max(noticed_s) / period_s:.1f} periods), frames again at most {1e3 * max(back_s):.0f} ms after its return"
+        f"({max(noticed_s) / period_s:.1f} periods), frames at most {1e3 * max(back_s):.0f} ms after its return"
     )
     return {"noticed_s": noticed_s, "back_s": back_s, "period_s": period_s}
 
 
 def descriptors(options: dict[str, Any], opens: int, say: Callable[..., None]) -> dict[str, Any]:
-    """Descriptors, threads, mappings left after opening again and again; with vivid a third of them fail."""
+    """Descriptors, threads, mappings left after many opens; with vivid a third of them fail."""
     address = parse_options(options, "opens").address
     with open_node(address, "opens") as node:
         is_vivid = node.identity.driver == "vivid"
