@@ -288,7 +288,7 @@ def unplugged(options: list[dict[str, Any]], times: int, say: Callable[..., None
     period_s = 1 / options[0]["rate_hz"]
     say(
         f"unplugged {times} times: noticed after at most {1e3 * max(noticed_s):.0f} ms "
-        f"({max(noticed_s) / period_s:.1f} periods), frames at most {1e3 * max(back_s):.0f} ms after its return"
+        f"({max(noticed_s) / period_s:.1f} periods), frames at most {1e3 * max(back_s):.0f} ms after return"
     )
     return {"noticed_s": noticed_s, "back_s": back_s, "period_s": period_s}
 
