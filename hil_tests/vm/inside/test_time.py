@@ -65,7 +65,7 @@ def test_what_came_instead_is_told(camera: V4l2Camera) -> None:
 
 FRAMES_OF_A_FULL_RING = 6
 """A gap of the reader's making needs all eight buffers full, so at least so many frames come late with it.
-A gap without them is vivid's own: it skips frames, free buffers at hand, when the machine below holds it up."""
+A gap without them is vivid's own: it skips frames while buffers are free when the machine below stalls."""
 
 
 def test_two_cameras_stream_on_while_the_consumer_sleeps_and_computes() -> None:
