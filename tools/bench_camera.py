@@ -20,6 +20,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing, contextmanager
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -68,6 +69,7 @@ def main() -> None:
     told["gaps"] = [
         gaps(options, what, args.seconds, say) for what in ("sleeps", "computes", "is stopped for 2 s")
     ]
+    told["opencv_gaps"] = opencv_gaps(options[0], args.seconds, say)
     told["age"] = age_after_pause(options[0], args.pauses, say)
     told["cpu"] = cpu_per_frame(options[0], say)
     if args.frames:
@@ -114,6 +116,10 @@ def gaps(
         subprocess.Popen([sys.executable, "-c", reads], stdin=subprocess.PIPE) as consumer,
         opened(options) as cameras,
     ):
+        over = threading.Event()
+        conductor = threading.Thread(target=stop_and_go, args=(consumer, over))
+        if what.startswith("is stopped"):
+            conductor.start()
         before = [camera.counters for camera in cameras]
         began_s = time.monotonic()
         until_s = began_s + seconds
@@ -128,9 +134,12 @@ def gaps(
                 while time.monotonic() < busy_until_s:
                     sum(i * i for i in range(20_000))  # Python's lock held nearly all the time
             else:
-                pass_to_stopped(consumer, cameras)
+                hand_over(consumer, cameras)
         span_s = time.monotonic() - began_s
         counted = [camera.counters for camera in cameras]
+        over.set()
+        if conductor.is_alive():
+            conductor.join()
     row = {
         "consumer": what,
         "seconds": span_s,
@@ -147,14 +156,32 @@ def gaps(
     return row
 
 
-def pass_to_stopped(consumer: subprocess.Popen[bytes], cameras: list[V4l2Camera]) -> None:
-    """Hand frames to another process that is stopped for two seconds: the hand-over hangs that long."""
+def opencv_gaps(options: dict[str, Any], seconds: float, say: Callable[..., None]) -> dict[str, Any]:
+    """Frames that OpenCV misses while it does nothing but read: what camera and machine lose by themselves."""
+    with opencv(options) as reader:
+        until_s, stamps_s = time.monotonic() + seconds, []
+        while time.monotonic() < until_s:
+            reader.grab()
+            stamps_s.append(reader.get(cv2.CAP_PROP_POS_MSEC) / 1e3)
+    period_s = 1 / options["rate_hz"]
+    missed = sum(round((b - a) / period_s) - 1 for a, b in pairwise(stamps_s))
+    say(f"beside it, OpenCV that only reads: {len(stamps_s)} frames in {seconds:.0f} s, missed {missed}")
+    return {"frames": len(stamps_s), "missed": missed}
+
+
+def stop_and_go(consumer: subprocess.Popen[bytes], over: threading.Event) -> None:
+    """Stop a process for two seconds, again and again."""
+    while not over.wait(0.5):
+        consumer.send_signal(signal.SIGSTOP)
+        over.wait(STOPPED_S)
+        consumer.send_signal(signal.SIGCONT)
+
+
+def hand_over(consumer: subprocess.Popen[bytes], cameras: list[V4l2Camera]) -> None:
+    """Hand frames to another process; while it is stopped this hangs, since a pipe does not hold a frame."""
     assert consumer.stdin is not None
-    consumer.send_signal(signal.SIGSTOP)
-    threading.Timer(STOPPED_S, consumer.send_signal, [signal.SIGCONT]).start()
     for camera in cameras:
-        frame = camera.next_frame(time.monotonic(), 10.0)
-        consumer.stdin.write(frame.image.tobytes())  # more than a pipe holds: waits for the reader
+        consumer.stdin.write(camera.next_frame(time.monotonic(), 10.0).image.tobytes())
 
 
 def age_after_pause(options: dict[str, Any], pauses: int, say: Callable[..., None]) -> dict[str, Any]:
