@@ -157,7 +157,7 @@ def gaps(
 
 
 def opencv_gaps(options: dict[str, Any], seconds: float, say: Callable[..., None]) -> dict[str, Any]:
-    """Frames that OpenCV misses while it does nothing but read: what camera and machine lose by themselves."""
+    """Frames that OpenCV misses while it does nothing but read: what the machine loses by itself."""
     with opencv(options) as reader:
         until_s, stamps_s = time.monotonic() + seconds, []
         while time.monotonic() < until_s:
@@ -165,7 +165,7 @@ def opencv_gaps(options: dict[str, Any], seconds: float, say: Callable[..., None
             stamps_s.append(reader.get(cv2.CAP_PROP_POS_MSEC) / 1e3)
     period_s = 1 / options["rate_hz"]
     missed = sum(round((b - a) / period_s) - 1 for a, b in pairwise(stamps_s))
-    say(f"beside it, OpenCV that only reads: {len(stamps_s)} frames in {seconds:.0f} s, missed {missed}")
+    say(f"OpenCV that only reads: {len(stamps_s)} frames in {seconds:.0f} s, missed {missed}")
     return {"frames": len(stamps_s), "missed": missed}
 
 
