@@ -20,6 +20,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing, contextmanager
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -62,17 +63,18 @@ def main() -> None:
     options = [chosen(device, tuple(args.size), args.rate) for device in devices]
     say = (lambda *words: None) if args.json else print
     say(
-        f"{len(options)} cameras, {args.size} px at {options[0]['rate_hz']:g} Hz, load {os.getloadavg()[0]:.1f}"
+        f"{len(options)} cameras, {args.size} px, {options[0]['rate_hz']:g} Hz, load {os.getloadavg()[0]:.1f}"
     )
     told: dict[str, Any] = {"rate_hz": options[0]["rate_hz"], "size_px": args.size, "cameras": len(options)}
     told["gaps"] = [
         gaps(options, what, args.seconds, say) for what in ("sleeps", "computes", "is stopped for 2 s")
     ]
+    told["opencv_gaps"] = opencv_gaps(options[0], args.seconds, say)
     told["age"] = age_after_pause(options[0], args.pauses, say)
     told["cpu"] = cpu_per_frame(options[0], say)
     if args.frames:
         told["memory"] = memory(options, args.frames, say)
-    if VIVID.exists():
+    if VIVID.exists() and args.unplugs:
         told["unplugged"] = unplugged(options, args.unplugs, say)
     if args.opens:
         told["opens"] = descriptors(options[0], args.opens, say)
@@ -109,7 +111,15 @@ def gaps(
     options: list[dict[str, Any]], what: str, seconds: float, say: Callable[..., None]
 ) -> dict[str, Any]:
     """Drops while the consumer does something else than take frames."""
-    with opened(options) as cameras:
+    reads = "import sys\nwhile sys.stdin.buffer.read(65536): pass"
+    with (
+        subprocess.Popen([sys.executable, "-c", reads], stdin=subprocess.PIPE) as consumer,
+        opened(options) as cameras,
+    ):
+        over = threading.Event()
+        conductor = threading.Thread(target=stop_and_go, args=(consumer, over))
+        if what.startswith("is stopped"):
+            conductor.start()
         before = [camera.counters for camera in cameras]
         began_s = time.monotonic()
         until_s = began_s + seconds
@@ -124,9 +134,12 @@ def gaps(
                 while time.monotonic() < busy_until_s:
                     sum(i * i for i in range(20_000))  # Python's lock held nearly all the time
             else:
-                pass_to_stopped_consumer(cameras)
+                hand_over(consumer, cameras)
         span_s = time.monotonic() - began_s
         counted = [camera.counters for camera in cameras]
+        over.set()
+        if conductor.is_alive():
+            conductor.join()
     row = {
         "consumer": what,
         "seconds": span_s,
@@ -143,16 +156,32 @@ def gaps(
     return row
 
 
-def pass_to_stopped_consumer(cameras: list[V4l2Camera]) -> None:
-    """Hand frames to another process that is stopped for two seconds: the hand-over hangs that long."""
-    reads = "import sys\nwhile sys.stdin.buffer.read(65536): pass"
-    with subprocess.Popen([sys.executable, "-c", reads], stdin=subprocess.PIPE) as consumer:
-        assert consumer.stdin is not None
+def opencv_gaps(options: dict[str, Any], seconds: float, say: Callable[..., None]) -> dict[str, Any]:
+    """Frames that OpenCV misses while it does nothing but read: what the machine loses by itself."""
+    with opencv(options) as reader:
+        until_s, stamps_s = time.monotonic() + seconds, []
+        while time.monotonic() < until_s:
+            reader.grab()
+            stamps_s.append(reader.get(cv2.CAP_PROP_POS_MSEC) / 1e3)
+    period_s = 1 / options["rate_hz"]
+    missed = sum(round((b - a) / period_s) - 1 for a, b in pairwise(stamps_s))
+    say(f"OpenCV that only reads: {len(stamps_s)} frames in {seconds:.0f} s, missed {missed}")
+    return {"frames": len(stamps_s), "missed": missed}
+
+
+def stop_and_go(consumer: subprocess.Popen[bytes], over: threading.Event) -> None:
+    """Stop a process for two seconds, again and again."""
+    while not over.wait(0.5):
         consumer.send_signal(signal.SIGSTOP)
-        threading.Timer(STOPPED_S, consumer.send_signal, [signal.SIGCONT]).start()
-        for camera in cameras:
-            frame = camera.next_frame(time.monotonic(), 10.0)
-            consumer.stdin.write(frame.image.tobytes())  # more than a pipe holds: waits for the reader
+        over.wait(STOPPED_S)
+        consumer.send_signal(signal.SIGCONT)
+
+
+def hand_over(consumer: subprocess.Popen[bytes], cameras: list[V4l2Camera]) -> None:
+    """Hand frames to another process; while it is stopped this hangs, since a pipe does not hold a frame."""
+    assert consumer.stdin is not None
+    for camera in cameras:
+        consumer.stdin.write(camera.next_frame(time.monotonic(), 10.0).image.tobytes())
 
 
 def age_after_pause(options: dict[str, Any], pauses: int, say: Callable[..., None]) -> dict[str, Any]:
@@ -194,6 +223,11 @@ def cpu_per_frame(options: dict[str, Any], say: Callable[..., None], frames: int
             while frame.sequence < first + frames:
                 frame = camera.next_frame(frame.mid_exposure_s, 10.0)
             table[who] = (time.process_time() - began_s) / (frame.sequence - first)
+    with opened([options]) as (camera,):
+        time.sleep(WARM_S)
+        began_s, first = time.process_time(), camera.counters.good
+        time.sleep(frames / options["rate_hz"])
+        table["ours, nobody asks"] = (time.process_time() - began_s) / (camera.counters.good - first)
     with opencv(options) as reader:
         warm_until_s = time.monotonic() + WARM_S
         while time.monotonic() < warm_until_s:
@@ -261,7 +295,7 @@ def resident_bytes() -> int:
 
 
 def unplugged(options: list[dict[str, Any]], times: int, say: Callable[..., None]) -> dict[str, Any]:
-    """From the moment that the driver lets the camera go until it is known, and from its return to a frame."""
+    """From the driver letting the camera go until it is known, and from its return to a frame."""
     noticed_s, back_s = [], []
     with opened(options) as cameras:
         camera = cameras[0]
@@ -286,13 +320,13 @@ def unplugged(options: list[dict[str, Any]], times: int, say: Callable[..., None
     period_s = 1 / options[0]["rate_hz"]
     say(
         f"unplugged {times} times: noticed after at most {1e3 * max(noticed_s):.0f} ms "
-        f"({max(noticed_s) / period_s:.1f} periods), frames again at most {1e3 * max(back_s):.0f} ms after its return"
+        f"({max(noticed_s) / period_s:.1f} periods), frames at most {1e3 * max(back_s):.0f} ms after return"
     )
     return {"noticed_s": noticed_s, "back_s": back_s, "period_s": period_s}
 
 
 def descriptors(options: dict[str, Any], opens: int, say: Callable[..., None]) -> dict[str, Any]:
-    """Descriptors, threads, mappings left after opening again and again; with vivid a third of them fail."""
+    """Descriptors, threads, mappings left after many opens; with vivid a third of them fail."""
     address = parse_options(options, "opens").address
     with open_node(address, "opens") as node:
         is_vivid = node.identity.driver == "vivid"

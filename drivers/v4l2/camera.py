@@ -10,7 +10,7 @@ from typing import Any
 
 from drivers.clock import Clock, SystemClock
 from drivers.errors import BadFrame, NoFreshFrame
-from drivers.interfaces import Frame
+from drivers.interfaces import Frame, Image
 from drivers.v4l2 import find, pixels
 from drivers.v4l2.capture import Capture, Counters, RawFrame
 from drivers.v4l2.controls import get_value, list_controls
@@ -40,6 +40,8 @@ class V4l2Frame(Frame):
         The kernel's stamp, and when the frame was dequeued, seconds of CLOCK_MONOTONIC.
     driver_sequence, stream
         The driver's count, which starts anew with each stream, and the stream's number.
+    raw
+        The camera's own bytes.
     """
 
     mid_uncertainty_s: float
@@ -48,6 +50,11 @@ class V4l2Frame(Frame):
     received_s: float
     driver_sequence: int
     stream: int
+    raw: RawFrame
+
+    def colour(self) -> Image:
+        """Return the same picture in colour, uint8 (h, w, 3) BGR, for people to look at."""
+        return self.image if self.image.ndim == 3 else pixels.colour(self.raw.format, self.raw.raw)
 
 
 def open_camera(options: Mapping[str, Any], clock: Clock | None = None, name: str = "v4l2") -> V4l2Camera:
@@ -137,6 +144,7 @@ class V4l2Camera:
             received_s=raw.received_s,
             driver_sequence=raw.driver_sequence,
             stream=raw.stream,
+            raw=raw,
         )
         self._converted = (raw, frame)
         return frame

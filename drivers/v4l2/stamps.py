@@ -108,11 +108,11 @@ class StampCheck:
 
     def wrong_stamp(self, flags: int, stamp_s: float, received_s: float) -> str:
         """Return why a stamp cannot be true; empty if it can."""
-        last_s, self._stamp_s = self._stamp_s, stamp_s
         if flags & abi.BUF_FLAG_TIMESTAMP_MASK != abi.BUF_FLAG_TIMESTAMP_MONOTONIC:
             return "its stamp is not of the monotonic clock"
         if stamp_s > received_s + AHEAD_S:
             return f"its stamp is {1e3 * (stamp_s - received_s):.1f} ms ahead of the clock"
+        last_s, self._stamp_s = self._stamp_s, stamp_s
         if last_s is not None and stamp_s <= last_s:
             return f"its stamp is {1e3 * (last_s - stamp_s):.1f} ms before the last frame's"
         return ""

@@ -171,6 +171,7 @@ def test_a_frame_carries_sequence_window_and_picture(bench: Bench, camera: V4l2C
     assert frame.mid_exposure_s + frame.exposure_s / 2 == pytest.approx(100.03)
     assert frame.mid_uncertainty_s == pytest.approx(0.01) and frame.set_exposure_s == 0.01
     assert not frame.image.flags.writeable
+    assert np.array_equal(frame.colour(), np.full((8, 16, 3), 77))
 
 
 def test_an_old_frame_is_never_given(bench: Bench, camera: V4l2Camera) -> None:

@@ -88,7 +88,7 @@ def test_a_stream_error_while_it_is_opened_again_is_tried_again(camera: V4l2Came
     fresh(camera)
 
 
-def test_a_disconnected_camera_is_lost_within_three_periods_and_comes_back(camera: V4l2Camera) -> None:
+def test_a_disconnected_camera_is_lost_and_comes_back_while_the_other_goes_on(camera: V4l2Camera) -> None:
     other = open_camera(options(1), name="right")
     fresh(camera)
     fresh(other)
@@ -107,7 +107,7 @@ def test_a_camera_that_is_unplugged_is_told_and_found_under_its_new_number() -> 
     holder = os.open(f"/dev/{numbers_before[BUS[0]]}", os.O_RDWR)  # keeps the old number taken
     fresh(camera)
     (VIVID / "unbind").write_text("vivid.0")
-    noticed_s = until(lambda: camera.capture.lost)
+    until(lambda: camera.capture.lost)
     with pytest.raises(NoCamera, match="left"):
         camera.next_frame(time.monotonic(), PATIENCE_S)
     time.sleep(0.5)
@@ -124,7 +124,6 @@ def test_a_camera_that_is_unplugged_is_told_and_found_under_its_new_number() -> 
         "the nodes were not renumbered: the test shows nothing"
     )
     assert value["brightness"] == 99 and value["timestamp_source"] == 1
-    assert noticed_s < 1.0
     with open_node(Address(bus=BUS[0]), "after") as node:
         set_by_name(node, {"brightness": 128})
 
