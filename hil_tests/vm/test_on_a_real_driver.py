@@ -6,24 +6,19 @@ import sys
 from pathlib import Path
 from xml.etree import ElementTree
 
-import pytest
-
-from tools.virtual_machine import boot, kernel
+from tools.virtual_machine import boot
 
 TIMEOUT_S = 900.0
 
 
-def test_the_cameras_behave_on_the_kernels_own_driver(tmp_path: Path, repository: Path) -> None:
-    found = kernel.find()
-    if found is None or kernel.why_not():
-        pytest.skip(
-            kernel.why_not() or "the kernel with virtual cameras is not built: tools/vm setup builds it"
-        )
+def test_the_cameras_behave_on_the_kernels_own_driver(
+    vm_kernel: Path, tmp_path: Path, repository: Path
+) -> None:
     command = [sys.executable, "-m", "pytest", "hil_tests/vm/inside", "-q", "-p", "no:cacheprovider",
                "--junitxml=/run/out/results.xml"]  # fmt: skip
     environment = {"PYTHONPATH": str(repository), "OPENBLAS_NUM_THREADS": "1"}
     result = boot.run(
-        found, command, tmp_path, folder=repository, timeout_s=TIMEOUT_S, environment=environment
+        vm_kernel, command, tmp_path, folder=repository, timeout_s=TIMEOUT_S, environment=environment
     )
     report = tmp_path / "results.xml"
     assert report.is_file(), f"no results came out of the machine:\n{result.console[-3000:]}"
