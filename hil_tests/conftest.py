@@ -16,7 +16,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption(
         "--require-vm",
         action="store_true",
-        help="fail, not skip, where the kernel of hil_tests/vm is missing",
+        help="fail, not skip, without the kernel of hil_tests/vm",
     )
 
 
