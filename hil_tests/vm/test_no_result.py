@@ -11,7 +11,7 @@ from tools.virtual_machine import boot, suite
 
 
 def test_a_machine_that_ends_under_the_command_is_a_failure(vm_kernel: Path, tmp_path: Path) -> None:
-    crash = "import ctypes; ctypes.CDLL(None).reboot(0x1234567)"
+    crash = "import ctypes; ctypes.CDLL(None).reboot(0x4321FEDC)"
     with pytest.raises(boot.VmFailed, match="before the command did"):
         boot.run(vm_kernel, ["python3", "-c", crash], tmp_path, timeout_s=120.0)
 

@@ -109,7 +109,7 @@ def table(memory: dict[str, Any], devices: dict[str, Any]) -> str:
     rows.append(["failed: in memory, through devices", *cells])
     lines = [f"| {' | '.join(cells)} |" for cells in rows]
     facts = f"{devices['pictures']} pictures drawn, the slowest in {devices['drawing_s']} s"
-    return "\n".join([*lines, "", f"{facts}; the head went unseen for at most {devices['blind_s']} s"])
+    return "\n".join([*lines, "", f"{facts}; the head moved unseen for at most {devices['blind_s']} s"])
 
 
 def differences(memory: dict[str, Any], devices: dict[str, Any], distance_m: float, number: int) -> Any:

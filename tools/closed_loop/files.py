@@ -20,7 +20,7 @@ CONFIGS = Path(__file__).resolve().parents[2] / "configs"
 CAMERAS = ("navcam_left", "navcam_right")
 HEAD = "ph42"
 SAMPLES = 1
-MARGIN_S = 0.5
+MARGIN_S = 0.8
 """How long the world may take to notice that the head has moved: until then it shows the picture before."""
 
 _LIMITS = {"pan_rad": [-2.6, 2.6], "tilt_rad": [-1.2, 0.5], "speed_rad_per_s": 1.0}

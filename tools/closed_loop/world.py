@@ -120,8 +120,8 @@ class World:
         blind_s = max(eye.worst_blind_s for eye in self._eyes)
         if blind_s > files.MARGIN_S:
             raise RuntimeError(
-                f"the world did not look at the head for {blind_s:.3f} s, at most {files.MARGIN_S:g} s is "
-                "expected: the machine is too busy"
+                f"the head moved unseen for {blind_s:.3f} s, at most {files.MARGIN_S:g} s is expected: "
+                "the machine is too busy"
             )
         return {
             "pictures": sum(eye.pictures for eye in self._eyes),
@@ -143,7 +143,7 @@ class Eye:
     pictures
         How many were shown.
     worst_blind_s
-        The longest between two looks at the head while frames were let through.
+        The longest between two looks at the head in which it moved while frames were let through.
     worst_drawing_s
         The longest that no frame was let through.
     broken
@@ -199,7 +199,7 @@ class Eye:
         while not self._end.wait(LOOK_EVERY_S):
             now_s = self._clock.now_s()
             joints = self._world.true_joints(now_s)
-            if self._through:
+            if self._through and joints != before:
                 self.worst_blind_s = max(self.worst_blind_s, now_s - looked_s)
             looked_s = now_s
             stands, before = joints == before, joints
