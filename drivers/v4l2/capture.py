@@ -1,6 +1,7 @@
-"""The thread of one camera: always dequeues, checks, keeps the newest good frames, reopens what went away.
+"""The thread of one camera: always dequeues, checks, keeps the newest good frame, reopens what went away.
 
-Frames are copied once, out of the kernel's buffer, which goes back at once; nobody's slowness holds one up.
+The newest frame stays in the kernel's buffer until the next one is there, and is copied only if somebody asks
+for it; nobody's slowness holds more than that one buffer up.
 """
 
 from __future__ import annotations
@@ -10,7 +11,6 @@ import os
 import select
 import threading
 import time
-from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
@@ -29,7 +29,6 @@ from drivers.v4l2.uevents import UeventSocket
 
 log = logging.getLogger(__name__)
 
-KEPT_FRAMES = 4
 SILENT_PERIODS = 3
 STALLED_S = 5.0  # a camera that is there but gives nothing for so long is opened again
 LATE_S = 0.005  # a frame is late if it comes more than a period and this after its stamp
@@ -98,7 +97,8 @@ class _Shared:
     """What the thread and its callers share, under one lock."""
 
     changed: threading.Condition = field(default_factory=threading.Condition)
-    frames: deque[RawFrame] = field(default_factory=lambda: deque(maxlen=KEPT_FRAMES))
+    newest: RawFrame | None = None
+    copied: bool = False  # whether it is in memory of its own, or still in the kernel's
     counters: Counters = field(default_factory=Counters)
     lost: str = ""
     closed: bool = False
@@ -113,7 +113,7 @@ class Capture:
         How the camera is opened, its name, and the clock that its stamps are judged by.
     between
         Called in the capture thread after each good frame, with the stream: the automatic exposure. What
-        it takes delays the next frame.
+        it takes delays the next frame. The frame's bytes are the kernel's: good until it returns.
 
     Raises
     ------
@@ -139,6 +139,7 @@ class Capture:
         self._streams = 0
         self._offset: int | None = 0  # from the driver's count to ours; None until a new stream's first frame
         self._last_sequence = -1
+        self._held: int | None = None  # the buffer of the newest good frame
         self._check = StampCheck()
         stream = self._open()
         self.format = stream.format
@@ -162,10 +163,10 @@ class Capture:
         with self._shared.changed:
             return self._shared.lost
 
-    def frames(self) -> tuple[RawFrame, ...]:
-        """Return the newest good frames, oldest first."""
-        with self._shared.changed:
-            return tuple(self._shared.frames)
+    @property
+    def newest(self) -> RawFrame | None:
+        """The newest good frame, however old; None if there is none."""
+        return self.wait(lambda frame: True, 0.0)
 
     def wait(
         self, wanted: Callable[[RawFrame], bool], timeout_s: float, lost_ends_it: bool = True
@@ -173,20 +174,25 @@ class Capture:
         """Return the newest frame that is ``wanted``; None after ``timeout_s``, or when lost or closed."""
         shared = self._shared
 
-        def newest() -> RawFrame | None:
-            return next((frame for frame in reversed(shared.frames) if wanted(frame)), None)
+        def there() -> bool:
+            return shared.newest is not None and wanted(shared.newest)
 
         with shared.changed:
             shared.changed.wait_for(
-                lambda: newest() or shared.closed or (lost_ends_it and shared.lost), max(0.0, timeout_s)
+                lambda: there() or shared.closed or (lost_ends_it and bool(shared.lost)), max(0.0, timeout_s)
             )
-            return newest()
+            if shared.newest is None or not there():
+                return None
+            if not shared.copied:  # under the lock, so that its buffer does not go back meanwhile
+                shared.newest = replace(shared.newest, raw=shared.newest.raw.copy())
+                shared.copied = True
+            return shared.newest
 
     def refuse(self, frame: RawFrame, why: str) -> None:
         """Take a frame back that turned out damaged when it was decoded."""
         with self._shared.changed:
-            if frame in self._shared.frames:
-                self._shared.frames.remove(frame)
+            if frame is self._shared.newest:
+                self._shared.newest = None
                 counters = self._shared.counters
                 self._count(good=counters.good - 1, damaged=counters.damaged + 1, last_damage=why)
 
@@ -217,6 +223,7 @@ class Capture:
                     log.exception("%s: the capture failed", self._name)
                     self._lose(f"{self._name}: the capture failed: {type(error).__name__}: {error}")
                 finally:
+                    self._let_go()
                     stream.close()
             if self._closing_after(self._pause_s):
                 return
@@ -228,25 +235,26 @@ class Capture:
         poll = select.poll()
         poll.register(stream.node.fileno(), select.POLLIN)
         poll.register(self._wake, select.POLLIN)
-        silent_since_s = time.monotonic()
+        silent_since_s: float | None = None
         while True:
             events = dict(poll.poll(max(1.0, 1e3 * SILENT_PERIODS * stream.period_s)))
             if self._wake in events:
                 return
-            now_s = time.monotonic()
             # One frame a round: asking for another that is not there costs as much as the poll that tells it.
             if events and (buffer := stream.node.dequeue()) is not None:
                 self._take(stream, buffer)
-                silent_since_s = now_s
+                silent_since_s = None
             elif events.get(stream.node.fileno(), 0) & ~select.POLLIN:
                 raise StreamFailed("its driver reports an error and gives no frame", device=self._name)
             else:
                 stream.node.check_there()
+                now_s = time.monotonic()
+                silent_since_s = now_s if silent_since_s is None else silent_since_s
                 if now_s - silent_since_s > max(STALLED_S, 2 * SILENT_PERIODS * stream.period_s):
                     raise StreamFailed(f"gave no frame for {now_s - silent_since_s:.1f} s", device=self._name)
 
     def _take(self, stream: Stream, buffer: Dequeued) -> None:
-        """Check one buffer, copy it if it is good, give it back, publish."""
+        """Check one buffer; publish it if it is good, and give the last one back, else itself."""
         received_s = self._clock.now_s()
         dropped = self._check.dropped_before(buffer.sequence)
         wrong = self._check.wrong_stamp(buffer.flags, buffer.stamp_s, received_s)
@@ -254,9 +262,6 @@ class Capture:
             wrong = "its driver marks it as damaged"
         data = stream.node.bytes_of(buffer)
         wrong = wrong or pixels.wrong_length(stream.format, data)
-        raw = None if wrong else np.frombuffer(data, np.uint8).copy()
-        del data
-        stream.node.queue(buffer.index)
         if self._offset is None:
             self._offset = self._last_sequence + 1 - buffer.sequence
         sequence = self._offset + buffer.sequence
@@ -265,14 +270,19 @@ class Capture:
             sequence = self._last_sequence + 1
         self._last_sequence = sequence
         frame = None
-        if raw is not None:
+        if not wrong:
             window = exposure_window(stream.rule, buffer.flags, buffer.stamp_s, received_s)
             frame = RawFrame(
-                raw, stream.format, sequence, buffer.sequence, self._streams, buffer.stamp_s, received_s,
-                window, stream.exposure_s,
+                np.frombuffer(data, np.uint8), stream.format, sequence, buffer.sequence, self._streams,
+                buffer.stamp_s, received_s, window, stream.exposure_s,
             )  # fmt: skip
         self._publish(stream, frame, dropped, wrong)
-        if frame is not None:
+        if frame is None:
+            stream.node.queue(buffer.index)
+        else:
+            if self._held is not None:
+                stream.node.queue(self._held)
+            self._held = buffer.index
             self._pause_s = FIRST_PAUSE_S
             if self._between is not None:
                 self._between(stream, frame)
@@ -285,7 +295,7 @@ class Capture:
                 return
             late = frame.received_s - frame.stamp_s > stream.period_s + LATE_S
             self._count(dropped=c.dropped + dropped, good=c.good + 1, late=c.late + late)
-            self._shared.frames.append(frame)
+            self._shared.newest, self._shared.copied = frame, False
             self._shared.changed.notify_all()
 
     def _count(self, **changes: int | str) -> None:
@@ -297,8 +307,14 @@ class Capture:
             if not self._shared.lost:
                 log.warning("%s; it is opened again when it is back", why)
             self._shared.lost = why
-            self._shared.frames.clear()
+            self._shared.newest = None
             self._shared.changed.notify_all()
+
+    def _let_go(self) -> None:
+        """Forget the frame that lies in the memory of a stream that ends."""
+        with self._shared.changed:
+            self._shared.newest = None
+        self._held = None
 
     def _closing_after(self, pause_s: float) -> bool:
         """Wait before the next try, shorter if the kernel says that a node came; True when closed."""
