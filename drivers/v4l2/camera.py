@@ -12,10 +12,11 @@ from drivers.clock import Clock, SystemClock
 from drivers.errors import BadFrame, NoFreshFrame
 from drivers.interfaces import Frame, Image
 from drivers.v4l2 import find, pixels
-from drivers.v4l2.capture import Capture, Counters, RawFrame
+from drivers.v4l2.capture import Capture
 from drivers.v4l2.controls import get_value, list_controls
 from drivers.v4l2.errors import NoCamera
 from drivers.v4l2.exposure import GROUPS, ExposureControl
+from drivers.v4l2.frames import Counters, RawFrame
 from drivers.v4l2.options import CameraOptions, parse_options
 from drivers.v4l2.stream import Stream, sizes_text
 
@@ -112,7 +113,7 @@ class V4l2Camera:
         before = self.counters
         began_s, left_s = time.monotonic(), timeout_s
         while True:
-            raw = self.capture.wait(lambda frame: frame.window.begin_s > exposed_after_s, left_s)
+            raw = self.capture.wait(exposed_after_s, left_s)
             if raw is None:
                 if lost := self.capture.lost:
                     raise NoCamera(lost)

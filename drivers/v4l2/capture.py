@@ -7,23 +7,22 @@ for it; nobody's slowness holds more than that one buffer up.
 from __future__ import annotations
 
 import logging
+import math
 import os
 import select
 import threading
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
-
-import numpy as np
-from numpy.typing import NDArray
+from dataclasses import dataclass, field
 
 from drivers.clock import Clock
 from drivers.errors import DriverError
 from drivers.v4l2 import abi, pixels
 from drivers.v4l2.errors import StreamFailed
-from drivers.v4l2.node import Dequeued, PictureFormat
+from drivers.v4l2.frames import Arrived, Counters, RawFrame
+from drivers.v4l2.node import Dequeued
 from drivers.v4l2.options import CameraOptions
-from drivers.v4l2.stamps import StampCheck, Window, exposure_window
+from drivers.v4l2.stamps import StampCheck
 from drivers.v4l2.stream import Stream
 from drivers.v4l2.uevents import UeventSocket
 
@@ -35,71 +34,19 @@ LATE_S = 0.005  # a frame is late if it comes more than a period and this after 
 FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.05, 1.0
 
 
-@dataclass(frozen=True, eq=False)
-class RawFrame:
-    """A frame as the camera gave it.
+@dataclass(eq=False)
+class _Shared:
+    """What the thread and its callers share, under one lock."""
 
-    Attributes
-    ----------
-    raw, format
-        The bytes of the picture, uint8 (n,), and what they mean.
-    sequence
-        Our own count: it grows over every reopening.
-    driver_sequence, stream
-        The driver's count, which starts anew with each stream, and the stream's number.
-    stamp_s, received_s
-        The driver's stamp, and when the frame was dequeued, seconds of CLOCK_MONOTONIC.
-    window
-        In which the whole exposure lay.
-    exposure_s
-        The exposure time if it is known.
-    """
-
-    raw: NDArray[np.uint8]
-    format: PictureFormat
-    sequence: int
-    driver_sequence: int
-    stream: int
-    stamp_s: float
-    received_s: float
-    window: Window
-    exposure_s: float | None
-
-
-@dataclass(frozen=True)
-class Counters:
-    """What happened to a camera's frames since it was opened.
-
-    Attributes
-    ----------
-    good, damaged
-        Frames that were published, and frames that were refused (error flag, length, stamp).
-    dropped
-        Frames that never came, by gaps in the driver's count.
-    late
-        Good frames that came more than a period and 5 ms after their stamp.
-    reopened
-        How often the camera was lost and opened again.
-    last_damage
-        What was wrong with the last refused frame.
-    """
-
+    changed: threading.Condition = field(default_factory=threading.Condition)
+    newest: Arrived | None = None
+    copied: RawFrame | None = None  # the newest in memory of its own, once somebody asked
     good: int = 0
     damaged: int = 0
     dropped: int = 0
     late: int = 0
     reopened: int = 0
     last_damage: str = ""
-
-
-@dataclass(eq=False)
-class _Shared:
-    """What the thread and its callers share, under one lock."""
-
-    changed: threading.Condition = field(default_factory=threading.Condition)
-    newest: RawFrame | None = None
-    copied: bool = False  # whether it is in memory of its own, or still in the kernel's
-    counters: Counters = field(default_factory=Counters)
     lost: str = ""
     closed: bool = False
 
@@ -154,8 +101,10 @@ class Capture:
     @property
     def counters(self) -> Counters:
         """What happened to the frames so far."""
-        with self._shared.changed:
-            return self._shared.counters
+        with (shared := self._shared).changed:
+            return Counters(
+                shared.good, shared.damaged, shared.dropped, shared.late, shared.reopened, shared.last_damage
+            )
 
     @property
     def lost(self) -> str:
@@ -166,35 +115,34 @@ class Capture:
     @property
     def newest(self) -> RawFrame | None:
         """The newest good frame, however old; None if there is none."""
-        return self.wait(lambda frame: True, 0.0)
+        return self.wait(-math.inf, 0.0)
 
-    def wait(
-        self, wanted: Callable[[RawFrame], bool], timeout_s: float, lost_ends_it: bool = True
-    ) -> RawFrame | None:
-        """Return the newest frame that is ``wanted``; None after ``timeout_s``, or when lost or closed."""
+    def wait(self, exposed_after_s: float, timeout_s: float) -> RawFrame | None:
+        """Return the newest frame once it began after that; None after ``timeout_s``, when lost or closed."""
         shared = self._shared
 
         def there() -> bool:
-            return shared.newest is not None and wanted(shared.newest)
+            return shared.newest is not None and shared.newest.window().begin_s > exposed_after_s
 
         with shared.changed:
-            shared.changed.wait_for(
-                lambda: there() or shared.closed or (lost_ends_it and bool(shared.lost)), max(0.0, timeout_s)
-            )
+            if not there():
+                shared.changed.wait_for(
+                    lambda: there() or shared.closed or bool(shared.lost), max(0.0, timeout_s)
+                )
             if shared.newest is None or not there():
                 return None
-            if not shared.copied:  # under the lock, so that its buffer does not go back meanwhile
-                shared.newest = replace(shared.newest, raw=shared.newest.raw.copy())
-                shared.copied = True
-            return shared.newest
+            if shared.copied is None:  # copied under the lock: its buffer does not go back meanwhile
+                shared.copied = shared.newest.frame(copy=True)
+            return shared.copied
 
     def refuse(self, frame: RawFrame, why: str) -> None:
         """Take a frame back that turned out damaged when it was decoded."""
-        with self._shared.changed:
-            if frame is self._shared.newest:
-                self._shared.newest = None
-                counters = self._shared.counters
-                self._count(good=counters.good - 1, damaged=counters.damaged + 1, last_damage=why)
+        with (shared := self._shared).changed:
+            if frame is shared.copied:
+                shared.newest = shared.copied = None
+                shared.good -= 1
+                shared.damaged += 1
+                shared.last_damage = why
 
     def close(self) -> None:
         """End the thread and let go of the camera."""
@@ -235,9 +183,10 @@ class Capture:
         poll = select.poll()
         poll.register(stream.node.fileno(), select.POLLIN)
         poll.register(self._wake, select.POLLIN)
+        timeout_ms = max(1.0, 1e3 * SILENT_PERIODS * stream.period_s)
         silent_since_s: float | None = None
         while True:
-            events = dict(poll.poll(max(1.0, 1e3 * SILENT_PERIODS * stream.period_s)))
+            events = dict(poll.poll(timeout_ms))
             if self._wake in events:
                 return
             # One frame a round: asking for another that is not there costs as much as the poll that tells it.
@@ -269,37 +218,31 @@ class Capture:
             self._offset += self._last_sequence + 1 - sequence
             sequence = self._last_sequence + 1
         self._last_sequence = sequence
-        frame = None
+        arrived = None
         if not wrong:
-            window = exposure_window(stream.rule, buffer.flags, buffer.stamp_s, received_s)
-            frame = RawFrame(
-                np.frombuffer(data, np.uint8), stream.format, sequence, buffer.sequence, self._streams,
-                buffer.stamp_s, received_s, window, stream.exposure_s,
-            )  # fmt: skip
-        self._publish(stream, frame, dropped, wrong)
-        if frame is None:
-            stream.node.queue(buffer.index)
-        else:
-            if self._held is not None:
-                stream.node.queue(self._held)
-            self._held = buffer.index
-            self._pause_s = FIRST_PAUSE_S
-            if self._between is not None:
-                self._between(stream, frame)
+            arrived = Arrived(data, buffer, stream.format, stream.rule, sequence, self._streams, received_s)
+        self._publish(stream, arrived, dropped, wrong)
+        if arrived is None:
+            stream.node.queue(buffer.number)
+            return
+        if self._held is not None:
+            stream.node.queue(self._held)
+        self._held = buffer.number
+        self._pause_s = FIRST_PAUSE_S
+        if self._between is not None:
+            self._between(stream, arrived.frame(copy=False))
 
-    def _publish(self, stream: Stream, frame: RawFrame | None, dropped: int, wrong: str) -> None:
-        with self._shared.changed:
-            c = self._shared.counters
-            if frame is None:
-                self._count(dropped=c.dropped + dropped, damaged=c.damaged + 1, last_damage=wrong)
+    def _publish(self, stream: Stream, arrived: Arrived | None, dropped: int, wrong: str) -> None:
+        with (shared := self._shared).changed:
+            shared.dropped += dropped
+            if arrived is None:
+                shared.damaged += 1
+                shared.last_damage = wrong
                 return
-            late = frame.received_s - frame.stamp_s > stream.period_s + LATE_S
-            self._count(dropped=c.dropped + dropped, good=c.good + 1, late=c.late + late)
-            self._shared.newest, self._shared.copied = frame, False
-            self._shared.changed.notify_all()
-
-    def _count(self, **changes: int | str) -> None:
-        self._shared.counters = replace(self._shared.counters, **changes)  # type: ignore[arg-type]
+            shared.good += 1
+            shared.late += arrived.received_s - arrived.buffer.stamp_s > stream.period_s + LATE_S
+            shared.newest, shared.copied = arrived, None
+            shared.changed.notify_all()
 
     def _lose(self, why: str) -> None:
         """Say that there are no frames for now."""
@@ -307,13 +250,13 @@ class Capture:
             if not self._shared.lost:
                 log.warning("%s; it is opened again when it is back", why)
             self._shared.lost = why
-            self._shared.newest = None
+            self._shared.newest = self._shared.copied = None
             self._shared.changed.notify_all()
 
     def _let_go(self) -> None:
         """Forget the frame that lies in the memory of a stream that ends."""
         with self._shared.changed:
-            self._shared.newest = None
+            self._shared.newest = self._shared.copied = None
         self._held = None
 
     def _closing_after(self, pause_s: float) -> bool:
@@ -344,7 +287,7 @@ class Capture:
             return None
         with self._shared.changed:
             self._shared.lost = ""
-            self._count(reopened=self._shared.counters.reopened + 1)
+            self._shared.reopened += 1
             self._shared.changed.notify_all()
         log.warning("%s is back at %s", self._name, stream.node.path)
         return stream
