@@ -12,10 +12,11 @@ from drivers.clock import Clock, SystemClock
 from drivers.errors import BadFrame, NoFreshFrame
 from drivers.interfaces import Frame, Image
 from drivers.v4l2 import find, pixels
-from drivers.v4l2.capture import Capture, Counters, RawFrame
+from drivers.v4l2.capture import Capture
 from drivers.v4l2.controls import get_value, list_controls
 from drivers.v4l2.errors import NoCamera
 from drivers.v4l2.exposure import GROUPS, ExposureControl
+from drivers.v4l2.frames import Counters, RawFrame
 from drivers.v4l2.options import CameraOptions, parse_options
 from drivers.v4l2.stream import Stream, sizes_text
 
@@ -110,11 +111,9 @@ class V4l2Camera:
             At once, if the camera is gone.
         """
         before = self.counters
-        deadline_s = time.monotonic() + max(0.0, timeout_s)
+        began_s, left_s = time.monotonic(), timeout_s
         while True:
-            raw = self.capture.wait(
-                lambda frame: frame.window.begin_s > exposed_after_s, deadline_s - time.monotonic()
-            )
+            raw = self.capture.wait(exposed_after_s, left_s)
             if raw is None:
                 if lost := self.capture.lost:
                     raise NoCamera(lost)
@@ -123,6 +122,7 @@ class V4l2Camera:
                 return self.converted(raw)
             except BadFrame as error:
                 self.capture.refuse(raw, str(error))
+                left_s = began_s + timeout_s - time.monotonic()
 
     def converted(self, raw: RawFrame) -> V4l2Frame:
         """Return a raw frame as a picture: grey, or BGR by the options. Raises BadFrame for a broken JPEG."""
@@ -213,8 +213,8 @@ class V4l2Camera:
         damaged = counters.damaged - before.damaged
         if damaged:
             message += f"; {damaged} came damaged ({counters.last_damage})"
-        frames = self.capture.frames()
-        if not frames:
+        last = self.capture.newest
+        if last is None:
             return message if damaged else f"{message}; none came at all"
-        age_s = exposed_after_s - frames[-1].window.begin_s
-        return f"{message}; the last good one is frame {frames[-1].sequence}, exposed {age_s:.3f} s before"
+        age_s = exposed_after_s - last.window.begin_s
+        return f"{message}; the last good one is frame {last.sequence}, exposed {age_s:.3f} s before"

@@ -1,96 +1,37 @@
-"""The thread of one camera: always dequeues, checks, keeps the newest good frames, reopens what went away.
+"""The thread of one camera: always dequeues, checks, keeps the newest good frame, reopens what went away.
 
-Frames are copied once, out of the kernel's buffer, which goes back at once; nobody's slowness holds one up.
+The newest frame stays in the kernel's buffer until the next one is there, and is copied only if somebody asks
+for it; nobody's slowness holds more than that one buffer up.
 """
 
 from __future__ import annotations
 
 import logging
+import math
 import os
 import select
 import threading
 import time
-from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
-
-import numpy as np
-from numpy.typing import NDArray
+from dataclasses import dataclass, field
 
 from drivers.clock import Clock
 from drivers.errors import DriverError
 from drivers.v4l2 import abi, pixels
 from drivers.v4l2.errors import StreamFailed
-from drivers.v4l2.node import Dequeued, PictureFormat
+from drivers.v4l2.frames import Arrived, Counters, RawFrame
+from drivers.v4l2.node import Dequeued
 from drivers.v4l2.options import CameraOptions
-from drivers.v4l2.stamps import StampCheck, Window, exposure_window
+from drivers.v4l2.stamps import StampCheck
 from drivers.v4l2.stream import Stream
 from drivers.v4l2.uevents import UeventSocket
 
 log = logging.getLogger(__name__)
 
-KEPT_FRAMES = 4
 SILENT_PERIODS = 3
 STALLED_S = 5.0  # a camera that is there but gives nothing for so long is opened again
 LATE_S = 0.005  # a frame is late if it comes more than a period and this after its stamp
 FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.05, 1.0
-
-
-@dataclass(frozen=True, eq=False)
-class RawFrame:
-    """A frame as the camera gave it.
-
-    Attributes
-    ----------
-    raw, format
-        The bytes of the picture, uint8 (n,), and what they mean.
-    sequence
-        Our own count: it grows over every reopening.
-    driver_sequence, stream
-        The driver's count, which starts anew with each stream, and the stream's number.
-    stamp_s, received_s
-        The driver's stamp, and when the frame was dequeued, seconds of CLOCK_MONOTONIC.
-    window
-        In which the whole exposure lay.
-    exposure_s
-        The exposure time if it is known.
-    """
-
-    raw: NDArray[np.uint8]
-    format: PictureFormat
-    sequence: int
-    driver_sequence: int
-    stream: int
-    stamp_s: float
-    received_s: float
-    window: Window
-    exposure_s: float | None
-
-
-@dataclass(frozen=True)
-class Counters:
-    """What happened to a camera's frames since it was opened.
-
-    Attributes
-    ----------
-    good, damaged
-        Frames that were published, and frames that were refused (error flag, length, stamp).
-    dropped
-        Frames that never came, by gaps in the driver's count.
-    late
-        Good frames that came more than a period and 5 ms after their stamp.
-    reopened
-        How often the camera was lost and opened again.
-    last_damage
-        What was wrong with the last refused frame.
-    """
-
-    good: int = 0
-    damaged: int = 0
-    dropped: int = 0
-    late: int = 0
-    reopened: int = 0
-    last_damage: str = ""
 
 
 @dataclass(eq=False)
@@ -98,8 +39,14 @@ class _Shared:
     """What the thread and its callers share, under one lock."""
 
     changed: threading.Condition = field(default_factory=threading.Condition)
-    frames: deque[RawFrame] = field(default_factory=lambda: deque(maxlen=KEPT_FRAMES))
-    counters: Counters = field(default_factory=Counters)
+    newest: Arrived | None = None
+    copied: RawFrame | None = None  # the newest in memory of its own, once somebody asked
+    good: int = 0
+    damaged: int = 0
+    dropped: int = 0
+    late: int = 0
+    reopened: int = 0
+    last_damage: str = ""
     lost: str = ""
     closed: bool = False
 
@@ -113,7 +60,7 @@ class Capture:
         How the camera is opened, its name, and the clock that its stamps are judged by.
     between
         Called in the capture thread after each good frame, with the stream: the automatic exposure. What
-        it takes delays the next frame.
+        it takes delays the next frame. The frame's bytes are the kernel's: good until it returns.
 
     Raises
     ------
@@ -139,6 +86,7 @@ class Capture:
         self._streams = 0
         self._offset: int | None = 0  # from the driver's count to ours; None until a new stream's first frame
         self._last_sequence = -1
+        self._held: int | None = None  # the buffer of the newest good frame
         self._check = StampCheck()
         stream = self._open()
         self.format = stream.format
@@ -153,8 +101,10 @@ class Capture:
     @property
     def counters(self) -> Counters:
         """What happened to the frames so far."""
-        with self._shared.changed:
-            return self._shared.counters
+        with (shared := self._shared).changed:
+            return Counters(
+                shared.good, shared.damaged, shared.dropped, shared.late, shared.reopened, shared.last_damage
+            )
 
     @property
     def lost(self) -> str:
@@ -162,33 +112,37 @@ class Capture:
         with self._shared.changed:
             return self._shared.lost
 
-    def frames(self) -> tuple[RawFrame, ...]:
-        """Return the newest good frames, oldest first."""
-        with self._shared.changed:
-            return tuple(self._shared.frames)
+    @property
+    def newest(self) -> RawFrame | None:
+        """The newest good frame, however old; None if there is none."""
+        return self.wait(-math.inf, 0.0)
 
-    def wait(
-        self, wanted: Callable[[RawFrame], bool], timeout_s: float, lost_ends_it: bool = True
-    ) -> RawFrame | None:
-        """Return the newest frame that is ``wanted``; None after ``timeout_s``, or when lost or closed."""
+    def wait(self, exposed_after_s: float, timeout_s: float) -> RawFrame | None:
+        """Return the newest frame once it began after that; None after ``timeout_s``, when lost or closed."""
         shared = self._shared
 
-        def newest() -> RawFrame | None:
-            return next((frame for frame in reversed(shared.frames) if wanted(frame)), None)
+        def there() -> bool:
+            return shared.newest is not None and shared.newest.window().begin_s > exposed_after_s
 
         with shared.changed:
-            shared.changed.wait_for(
-                lambda: newest() or shared.closed or (lost_ends_it and shared.lost), max(0.0, timeout_s)
-            )
-            return newest()
+            if not there():
+                shared.changed.wait_for(
+                    lambda: there() or shared.closed or bool(shared.lost), max(0.0, timeout_s)
+                )
+            if shared.newest is None or not there():
+                return None
+            if shared.copied is None:  # copied under the lock: its buffer does not go back meanwhile
+                shared.copied = shared.newest.frame(copy=True)
+            return shared.copied
 
     def refuse(self, frame: RawFrame, why: str) -> None:
         """Take a frame back that turned out damaged when it was decoded."""
-        with self._shared.changed:
-            if frame in self._shared.frames:
-                self._shared.frames.remove(frame)
-                counters = self._shared.counters
-                self._count(good=counters.good - 1, damaged=counters.damaged + 1, last_damage=why)
+        with (shared := self._shared).changed:
+            if frame is shared.copied:
+                shared.newest = shared.copied = None
+                shared.good -= 1
+                shared.damaged += 1
+                shared.last_damage = why
 
     def close(self) -> None:
         """End the thread and let go of the camera."""
@@ -217,6 +171,7 @@ class Capture:
                     log.exception("%s: the capture failed", self._name)
                     self._lose(f"{self._name}: the capture failed: {type(error).__name__}: {error}")
                 finally:
+                    self._let_go()
                     stream.close()
             if self._closing_after(self._pause_s):
                 return
@@ -228,25 +183,27 @@ class Capture:
         poll = select.poll()
         poll.register(stream.node.fileno(), select.POLLIN)
         poll.register(self._wake, select.POLLIN)
-        silent_since_s = time.monotonic()
+        timeout_ms = max(1.0, 1e3 * SILENT_PERIODS * stream.period_s)
+        silent_since_s: float | None = None
         while True:
-            events = dict(poll.poll(max(1.0, 1e3 * SILENT_PERIODS * stream.period_s)))
+            events = dict(poll.poll(timeout_ms))
             if self._wake in events:
                 return
-            now_s = time.monotonic()
             # One frame a round: asking for another that is not there costs as much as the poll that tells it.
             if events and (buffer := stream.node.dequeue()) is not None:
                 self._take(stream, buffer)
-                silent_since_s = now_s
+                silent_since_s = None
             elif events.get(stream.node.fileno(), 0) & ~select.POLLIN:
                 raise StreamFailed("its driver reports an error and gives no frame", device=self._name)
             else:
                 stream.node.check_there()
+                now_s = time.monotonic()
+                silent_since_s = now_s if silent_since_s is None else silent_since_s
                 if now_s - silent_since_s > max(STALLED_S, 2 * SILENT_PERIODS * stream.period_s):
                     raise StreamFailed(f"gave no frame for {now_s - silent_since_s:.1f} s", device=self._name)
 
     def _take(self, stream: Stream, buffer: Dequeued) -> None:
-        """Check one buffer, copy it if it is good, give it back, publish."""
+        """Check one buffer; publish it if it is good, and give the last one back, else itself."""
         received_s = self._clock.now_s()
         dropped = self._check.dropped_before(buffer.sequence)
         wrong = self._check.wrong_stamp(buffer.flags, buffer.stamp_s, received_s)
@@ -254,9 +211,6 @@ class Capture:
             wrong = "its driver marks it as damaged"
         data = stream.node.bytes_of(buffer)
         wrong = wrong or pixels.wrong_length(stream.format, data)
-        raw = None if wrong else np.frombuffer(data, np.uint8).copy()
-        del data
-        stream.node.queue(buffer.index)
         if self._offset is None:
             self._offset = self._last_sequence + 1 - buffer.sequence
         sequence = self._offset + buffer.sequence
@@ -264,32 +218,31 @@ class Capture:
             self._offset += self._last_sequence + 1 - sequence
             sequence = self._last_sequence + 1
         self._last_sequence = sequence
-        frame = None
-        if raw is not None:
-            window = exposure_window(stream.rule, buffer.flags, buffer.stamp_s, received_s)
-            frame = RawFrame(
-                raw, stream.format, sequence, buffer.sequence, self._streams, buffer.stamp_s, received_s,
-                window, stream.exposure_s,
-            )  # fmt: skip
-        self._publish(stream, frame, dropped, wrong)
-        if frame is not None:
-            self._pause_s = FIRST_PAUSE_S
-            if self._between is not None:
-                self._between(stream, frame)
+        arrived = None
+        if not wrong:
+            arrived = Arrived(data, buffer, stream.format, stream.rule, sequence, self._streams, received_s)
+        self._publish(stream, arrived, dropped, wrong)
+        if arrived is None:
+            stream.node.queue(buffer.number)
+            return
+        if self._held is not None:
+            stream.node.queue(self._held)
+        self._held = buffer.number
+        self._pause_s = FIRST_PAUSE_S
+        if self._between is not None:
+            self._between(stream, arrived.frame(copy=False))
 
-    def _publish(self, stream: Stream, frame: RawFrame | None, dropped: int, wrong: str) -> None:
-        with self._shared.changed:
-            c = self._shared.counters
-            if frame is None:
-                self._count(dropped=c.dropped + dropped, damaged=c.damaged + 1, last_damage=wrong)
+    def _publish(self, stream: Stream, arrived: Arrived | None, dropped: int, wrong: str) -> None:
+        with (shared := self._shared).changed:
+            shared.dropped += dropped
+            if arrived is None:
+                shared.damaged += 1
+                shared.last_damage = wrong
                 return
-            late = frame.received_s - frame.stamp_s > stream.period_s + LATE_S
-            self._count(dropped=c.dropped + dropped, good=c.good + 1, late=c.late + late)
-            self._shared.frames.append(frame)
-            self._shared.changed.notify_all()
-
-    def _count(self, **changes: int | str) -> None:
-        self._shared.counters = replace(self._shared.counters, **changes)  # type: ignore[arg-type]
+            shared.good += 1
+            shared.late += arrived.received_s - arrived.buffer.stamp_s > stream.period_s + LATE_S
+            shared.newest, shared.copied = arrived, None
+            shared.changed.notify_all()
 
     def _lose(self, why: str) -> None:
         """Say that there are no frames for now."""
@@ -297,8 +250,14 @@ class Capture:
             if not self._shared.lost:
                 log.warning("%s; it is opened again when it is back", why)
             self._shared.lost = why
-            self._shared.frames.clear()
+            self._shared.newest = self._shared.copied = None
             self._shared.changed.notify_all()
+
+    def _let_go(self) -> None:
+        """Forget the frame that lies in the memory of a stream that ends."""
+        with self._shared.changed:
+            self._shared.newest = self._shared.copied = None
+        self._held = None
 
     def _closing_after(self, pause_s: float) -> bool:
         """Wait before the next try, shorter if the kernel says that a node came; True when closed."""
@@ -328,7 +287,7 @@ class Capture:
             return None
         with self._shared.changed:
             self._shared.lost = ""
-            self._count(reopened=self._shared.counters.reopened + 1)
+            self._shared.reopened += 1
             self._shared.changed.notify_all()
         log.warning("%s is back at %s", self._name, stream.node.path)
         return stream

@@ -13,6 +13,7 @@ import stat
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 from drivers.errors import DriverError
 from drivers.v4l2 import abi
@@ -56,11 +57,10 @@ class PictureFormat:
     field: int = abi.FIELD_NONE
 
 
-@dataclass(frozen=True)
-class Dequeued:
+class Dequeued(NamedTuple):
     """A filled buffer, still ours until it is queued again."""
 
-    index: int
+    number: int
     used_bytes: int
     flags: int
     sequence: int
@@ -88,6 +88,7 @@ class Node:
         self.name = "" if name == str(path) else name  # messages name the path themselves
         self._maps: list[mmap.mmap] = []
         self._streaming = False
+        self._exchanged = self._buffer(0)  # for the requests made for every frame; made once, as each costs
         self._fd = _open(self.path, self.name)
         try:
             self.identity = self._identify()
@@ -220,23 +221,25 @@ class Node:
 
     def queue(self, index: int) -> None:
         """Give a buffer back to the driver. Raises DriverError."""
-        self.call(abi.VIDIOC_QBUF, self._buffer(index), f"take buffer {index} back")
+        self._exchanged.index = index
+        self.call(abi.VIDIOC_QBUF, self._exchanged, f"take buffer {index} back")
 
     def dequeue(self) -> Dequeued | None:
         """Return the next filled buffer, None if there is none yet. Raises DriverError."""
-        buffer = self._buffer(0)
+        buffer = self._exchanged
         try:
             fcntl.ioctl(self._fd, abi.VIDIOC_DQBUF, buffer)
         except OSError as error:
             if error.errno == errno.EAGAIN:
                 return None
             raise self.failure(error, "give a frame") from None
-        stamp_s = buffer.timestamp.tv_sec + buffer.timestamp.tv_usec * 1e-6
+        stamp = buffer.timestamp
+        stamp_s = stamp.tv_sec + stamp.tv_usec * 1e-6
         return Dequeued(buffer.index, buffer.bytesused, buffer.flags, buffer.sequence, stamp_s)
 
     def bytes_of(self, buffer: Dequeued) -> memoryview:
         """Return a dequeued buffer's bytes, in the driver's own memory: good until it is queued again."""
-        return memoryview(self._maps[buffer.index])[: buffer.used_bytes]
+        return memoryview(self._maps[buffer.number])[: buffer.used_bytes]
 
     def check_there(self) -> None:
         """Raise NoCamera if the camera was unplugged."""

@@ -27,8 +27,10 @@ class Stream:
     ----------
     node, format
         The open node, and the format that frames have.
-    rate_hz
-        The rate that the camera answered, or the asked one where it does not tell.
+    rate_hz, period_s
+        The rate that the camera answered, or the asked one where it does not tell; from frame to frame.
+    rule
+        How the time stamps are to be read, at the exposure time of now.
     exposure_s
         The exposure time by the camera's own word, None if unknown.
     asked_exposure_s
@@ -55,21 +57,13 @@ class Stream:
         try:
             self.format = set_format(self.node, options.format, options.size_px, name)
             self.rate_hz = _set_rate(self.node, options, name)
+            self.period_s = 1 / self.rate_hz
+            self.rule = self._rule()
             self._set_controls(options, options.exposure_s if exposure_s is None else exposure_s)
             self.node.start(options.buffers)
         except BaseException:
             self.node.close()
             raise
-
-    @property
-    def period_s(self) -> float:
-        """From frame to frame, seconds."""
-        return 1 / self.rate_hz
-
-    @property
-    def rule(self) -> StampRule:
-        """How this stream's time stamps are to be read."""
-        return StampRule(self.period_s, self.exposure_s, self._options.margin_s, self.node.identity.driver)
 
     def set_exposure(self, exposure_s: float) -> None:
         """Set the exposure time; `exposure_s` is then what the camera made of it. Raises DriverError."""
@@ -82,6 +76,10 @@ class Stream:
             log.warning("%s: %s", self._name, problem.message)
         became = get_value(self.node, self._exposure)
         self.exposure_s = None if became is None else became * EXPOSURE_UNIT_S
+        self.rule = self._rule()
+
+    def _rule(self) -> StampRule:
+        return StampRule(self.period_s, self.exposure_s, self._options.margin_s, self.node.identity.driver)
 
     def close(self) -> None:
         """Stop and let go; never raises for a camera that is gone."""

@@ -54,16 +54,16 @@ class FakeNode:
 
     def __init__(self) -> None:
         self.ready = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_SEMAPHORE)
-        self.waiting: deque[tuple[Dequeued, bytes] | DriverError] = deque()
+        self.waiting: deque[tuple[Dequeued, bytes | bytearray] | DriverError] = deque()
         self.queued: list[int] = []
         self.lock = threading.Lock()
-        self.taken: tuple[Dequeued, bytes] | None = None
+        self.taken: tuple[Dequeued, bytes | bytearray] | None = None
         self.closed = False
 
     def fileno(self) -> int:
         return self.ready
 
-    def put(self, what: tuple[Dequeued, bytes] | DriverError) -> None:
+    def put(self, what: tuple[Dequeued, bytes | bytearray] | DriverError) -> None:
         with self.lock:
             self.waiting.append(what)
             os.eventfd_write(self.ready, 1)
@@ -225,8 +225,8 @@ def test_a_damaged_frame_is_refused_counted_and_given_back(
     bench.streams[0].frame(1, **{"stamp_s": 100.04, **damage})  # type: ignore[arg-type]
     until(lambda: camera.counters.damaged == 1)
     assert camera.counters.last_damage == words
-    assert bench.streams[0].node.queued == [0, 1]
-    assert [frame.sequence for frame in camera.capture.frames()] == [0]
+    until(lambda: bench.streams[0].node.queued == [1])  # and frame 0 is still held
+    assert camera.next_frame(0.0, 0.0).sequence == 0
 
 
 def test_a_call_that_saw_only_damage_says_so(bench: Bench, camera: V4l2Camera) -> None:
@@ -281,7 +281,7 @@ def test_the_count_grows_when_the_drivers_count_begins_again(bench: Bench, camer
     for index, count in enumerate((2**32 - 1, 0, 1, 0)):
         bench.streams[0].frame(count, 100.0 + 0.04 * index)
         until(lambda wanted=index + 1: camera.counters.good == wanted)
-        sequences.append(camera.capture.frames()[-1].sequence)
+        sequences.append(camera.next_frame(0.0, 0.0).sequence)
     assert all(b > a for a, b in pairwise(sequences))
 
 
@@ -306,13 +306,28 @@ def test_a_camera_that_cannot_be_opened_leaves_nothing(bench: Bench) -> None:
     assert held() == before
 
 
-def test_frames_are_kept_a_few_at_a_time(bench: Bench, camera: V4l2Camera) -> None:
+def test_only_the_newest_frames_buffer_is_held(bench: Bench, camera: V4l2Camera) -> None:
     bench.clock.time_s = 200.0
     for n in range(50):
-        bench.streams[0].frame(n, 100.0 + 0.04 * n)
-    until(lambda: camera.counters.good == 50)
-    assert [frame.sequence for frame in camera.capture.frames()] == [46, 47, 48, 49]
-    assert np.array_equal(camera.capture.frames()[-1].raw, np.full(128, 50))
+        bench.streams[0].frame(n, 100.0 + 0.04 * n, level=n)
+    until(lambda: len(bench.streams[0].node.queued) == 49)
+    assert bench.streams[0].node.queued == [n % 4 for n in range(49)]
+    frame = camera.next_frame(0.0, 0.0)
+    assert frame.sequence == 49 and (frame.image == 49).all()
+
+
+def test_a_frame_that_was_given_does_not_change_when_its_buffer_is_filled_again(
+    bench: Bench, camera: V4l2Camera
+) -> None:
+    bench.clock.time_s = 200.0
+    memory = bytearray([1]) * 128
+    for n in range(2):
+        memory[:] = bytes([n + 1]) * 128
+        bench.streams[0].node.put((Dequeued(0, 128, START, n, 100.0 + 0.04 * n), memory))
+        frame = camera.next_frame(100.0 + 0.04 * n - 0.01, PATIENCE_S)
+        memory[:] = bytes([99]) * 128
+        assert (frame.image == n + 1).all() and (frame.raw.raw == n + 1).all()
+        assert (frame.colour() == n + 1).all()
 
 
 @pytest.mark.parametrize(
