@@ -1,7 +1,8 @@
 """Builds and finds the User Mode Linux kernel with the virtual cameras of the kernel's own vivid driver.
 
 The source is Debian's package linux-source-6.1, fetched by apt-get and checked against the digest in
-hil_tests/vm/kernel/source.txt. The result is kept outside the tree, in
+hil_tests/vm/kernel/source.txt; when Debian offers none of the versions there any more, it is the newest that
+it does offer, checked against Debian's signed index. The result is kept outside the tree, in
 ``~/.cache/mastctl/vm/DIGEST/linux``, where DIGEST is over the source's digest, configuration and patches.
 """
 
@@ -10,6 +11,7 @@ from __future__ import annotations
 import hashlib
 import os
 import platform
+import re
 import shutil
 import subprocess
 import tempfile
@@ -38,6 +40,15 @@ def sources() -> dict[str, str]:
     return {words[0]: words[1] for words in lines if words and not words[0].startswith("#")}
 
 
+def offered() -> dict[str, str]:
+    """Return the source packages that apt offers, digest by version, by Debian's signed index."""
+    if not shutil.which("apt-cache"):
+        return {}
+    told = _run(["apt-cache", "show", PACKAGE], check=False).stdout
+    fields = dict(re.findall(r"^Version: (\S+)$.*?^SHA256: ([0-9a-f]{64})$", told, re.MULTILINE | re.DOTALL))
+    return {str(version): str(digest) for version, digest in fields.items()}
+
+
 def path_for(source_digest: str) -> Path:
     """Return where the kernel that is built from a source package is kept."""
     digest = hashlib.sha256(source_digest.encode())
@@ -48,8 +59,12 @@ def path_for(source_digest: str) -> Path:
 
 
 def find() -> Path | None:
-    """Return the kernel if it has been built, else None."""
-    return next((path for path in map(path_for, sources().values()) if path.is_file()), None)
+    """Return the kernel if it has been built, from a known source or one that apt offers, else None."""
+    for digests in (sources, offered):
+        for digest in digests().values():
+            if (path := path_for(digest)).is_file():
+                return path
+    return None
 
 
 def why_not() -> str:
@@ -76,19 +91,31 @@ def build(package: Path | None = None) -> Path:
         raise CannotBuild(reason)
     if package is None and (found := find()):
         return found
+    if package is None and (reason := _no_source()):
+        raise CannotBuild(reason)
     _install_programs()
     with tempfile.TemporaryDirectory(prefix="mastctl-kernel-") as name:
         folder = Path(name)
         deb = _fetch(folder) if package is None else package
         digest = hashlib.sha256(deb.read_bytes()).hexdigest()
-        if digest not in sources().values():
+        if digest not in sources().values() and digest not in offered().values():
             raise CannotBuild(
-                f"{deb.name} has the digest {digest}, which {INPUTS / 'source.txt'} does not know"
+                f"{deb.name} has the digest {digest}, which neither {INPUTS / 'source.txt'} "
+                "nor Debian's index knows"
             )
         kernel = path_for(digest)
         if not kernel.is_file():
             _make(deb, folder, kernel)
     return kernel
+
+
+def _no_source() -> str:
+    """Why there is no source package to fetch here; empty if there is one."""
+    system = platform.freedesktop_os_release() if Path("/etc/os-release").exists() else {}
+    if (system.get("ID"), system.get("VERSION_ID")) == ("debian", "12") and shutil.which("apt-get"):
+        return ""
+    here = system.get("PRETTY_NAME", "another system")
+    return f"{PACKAGE} comes from Debian 12, this is {here}: give the package by tools/vm setup --source FILE"
 
 
 def _install_programs() -> None:
@@ -104,25 +131,20 @@ def _install_programs() -> None:
 
 
 def _fetch(folder: Path) -> Path:
-    """Fetch the first known source package that the package source offers."""
-    if not shutil.which("apt-get"):
-        raise CannotBuild(f"there is no apt-get to fetch {PACKAGE} with; give the package by --source FILE")
+    """Fetch the first known source package that apt offers, or else the newest that it offers."""
     failed = ""
     for update_first in (False, True):
         if update_first:
             if os.geteuid() != 0:
                 break
             _run(["apt-get", "update", "-qq"], check=False)
-        for version in sources():
+        # With lists of yesterday a known version may be gone: only fresh ones say that none is left.
+        for version in [*sources(), *(offered() if update_first else ())]:
             done = _run(["apt-get", "download", "-qq", f"{PACKAGE}={version}"], cwd=folder, check=False)
             if deb := next(folder.glob("*.deb"), None):
                 return deb
             failed = " ".join(done.stderr.split())[-200:]
-    versions = ", ".join(sources())
-    raise CannotBuild(
-        f"apt-get offers no {PACKAGE} of the known versions ({versions}): {failed}; "
-        "on Debian 12 with its security archive it does, or give the package by --source FILE"
-    )
+    raise CannotBuild(f"apt-get fetches no {PACKAGE}: {failed}; give the package by --source FILE")
 
 
 def _make(deb: Path, folder: Path, kernel: Path) -> None:
