@@ -102,6 +102,16 @@ class Camera(Protocol):
 
 
 @runtime_checkable
+class KnowsSize(Protocol):
+    """A camera that knows the size of its pictures before the first one; not every camera has this."""
+
+    @property
+    def size_px(self) -> tuple[int, int]:
+        """(width, height) of every picture that it gives."""
+        ...
+
+
+@runtime_checkable
 class HoldsExposure(Protocol):
     """A camera with an automatic exposure that can be told to wait; not every camera has this."""
 

@@ -20,7 +20,7 @@ import numpy as np
 from calib.mast import Rig
 from drivers.clock import Clock
 from drivers.errors import BadFrame, BadReply, DriverError, NoReply
-from drivers.interfaces import Camera, HoldsExposure, PanTilt, Reading
+from drivers.interfaces import Camera, HoldsExposure, KnowsSize, PanTilt, Reading
 from mastctl import frames as frame_checks
 from mastctl import joint_history
 from mastctl.device_thread import DeviceThread, Fault
@@ -268,6 +268,9 @@ class Devices:
         self._store.change_mast(mast_digest)
 
     def _take_rig(self, rig: Rig) -> None:
+        for name, camera in self._cameras.items():
+            if isinstance(camera, KnowsSize) and name in rig.cameras:
+                frame_checks.check_size(name, camera.size_px, rig.cameras[name].model.size_px)
         self._sizes_px = {name: camera.model.size_px for name, camera in rig.cameras.items()}
         self._on_head = {name for name, camera in rig.cameras.items() if camera.on == "head"}
 

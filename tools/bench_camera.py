@@ -11,7 +11,9 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import re
 import resource
+import shutil
 import signal
 import statistics
 import subprocess
@@ -33,7 +35,10 @@ from drivers.v4l2.choice import options_for
 from drivers.v4l2.controls import set_by_name
 from drivers.v4l2.find import open_node
 from drivers.v4l2.options import parse_options
+from drivers.v4l2.stream import set_format
 
+PARTS = ("gaps", "age", "cpu", "memory", "unplugged", "opens")
+CONSUMERS = ("sleeps", "computes", "is stopped for 2 s")
 STOPPED_S = 2.0
 WARM_S = 2.0  # so long the first touch of every buffer costs more than its frame
 VIVID = Path("/sys/bus/platform/drivers/vivid")
@@ -52,9 +57,13 @@ def main() -> None:
     parser.add_argument("--rate", type=float, metavar="HZ", help="default: the highest the camera has")
     parser.add_argument("--seconds", type=float, default=60.0, help="of each of the three runs for gaps")
     parser.add_argument("--pauses", type=int, default=30, help="for the age of frames")
-    parser.add_argument("--frames", type=int, default=100_000, help="for the memory; 0 leaves it out")
-    parser.add_argument("--opens", type=int, default=1000, help="for the descriptors; 0 leaves it out")
+    parser.add_argument("--repeats", type=int, default=3, help="of the processor time")
+    parser.add_argument("--frames", type=int, default=100_000, help="for the memory")
+    parser.add_argument("--opens", type=int, default=1000, help="for the descriptors")
     parser.add_argument("--unplugs", type=int, default=10, help="vivid only, as root")
+    parser.add_argument(
+        "--only", choices=PARTS, nargs="+", default=list(PARTS), metavar="PART", help=", ".join(PARTS)
+    )
     parser.add_argument("--json", action="store_true")
     args = parser.parse_args()
     devices = args.device or [camera.bus for camera in find.list_cameras()[:2]]
@@ -66,17 +75,20 @@ def main() -> None:
         f"{len(options)} cameras, {args.size} px, {options[0]['rate_hz']:g} Hz, load {os.getloadavg()[0]:.1f}"
     )
     told: dict[str, Any] = {"rate_hz": options[0]["rate_hz"], "size_px": args.size, "cameras": len(options)}
-    told["gaps"] = [
-        gaps(options, what, args.seconds, say) for what in ("sleeps", "computes", "is stopped for 2 s")
-    ]
-    told["opencv_gaps"] = opencv_gaps(options[0], args.seconds, say)
-    told["age"] = age_after_pause(options[0], args.pauses, say)
-    told["cpu"] = cpu_per_frame(options[0], say)
-    if args.frames:
+    if "gaps" in args.only:
+        told["gaps"] = [gaps(options, what, args.seconds, say) for what in CONSUMERS]
+        told["opencv_gaps"] = opencv_gaps(options[0], args.seconds, say)
+        if len(options) == 2 and shutil.which("v4l2-ctl"):
+            told["gaps_beside"] = gaps_beside(options, args.seconds, say)
+    if "age" in args.only:
+        told["age"] = age_after_pause(options[0], args.pauses, say)
+    if "cpu" in args.only:
+        told["cpu"] = [cpu_per_frame(options[0], say) for _ in range(args.repeats)]
+    if "memory" in args.only:
         told["memory"] = memory(options, args.frames, say)
-    if VIVID.exists() and args.unplugs:
+    if "unplugged" in args.only and VIVID.exists():
         told["unplugged"] = unplugged(options, args.unplugs, say)
-    if args.opens:
+    if "opens" in args.only:
         told["opens"] = descriptors(options[0], args.opens, say)
     if args.json:
         print(json.dumps(told))
@@ -167,6 +179,25 @@ def opencv_gaps(options: dict[str, Any], seconds: float, say: Callable[..., None
     missed = sum(round((b - a) / period_s) - 1 for a, b in pairwise(stamps_s))
     say(f"OpenCV that only reads: {len(stamps_s)} frames in {seconds:.0f} s, missed {missed}")
     return {"frames": len(stamps_s), "missed": missed}
+
+
+def gaps_beside(options: list[dict[str, Any]], seconds: float, say: Callable[..., None]) -> dict[str, Any]:
+    """Drops of one camera that we read, and at the same time of the other, which v4l2-ctl reads."""
+    with open_node(parse_options(options[1], "beside").address, "beside") as node:
+        path = str(node.path)
+        set_format(node, options[1]["format"], tuple(options[1]["size_px"]), "beside")
+        node.set_rate(options[1]["rate_hz"])
+    count = round(seconds * options[1]["rate_hz"])
+    command = ["v4l2-ctl", "-d", path, "--stream-mmap=8", f"--stream-count={count}"]
+    with opened(options[:1]) as (camera,):
+        before = camera.counters
+        done = subprocess.run(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+        now = camera.counters
+    theirs = sum(map(int, re.findall(r"dropped buffers: (\d+)", done.stdout)))
+    ours = now.dropped - before.dropped
+    say(f"at the same time: ours {now.good - before.good} frames, missed {ours}; v4l2-ctl {count}, {theirs}")
+    return {"ours": {"frames": now.good - before.good, "missed": ours},
+            "v4l2-ctl": {"frames": count, "missed": theirs}}  # fmt: skip
 
 
 def stop_and_go(consumer: subprocess.Popen[bytes], over: threading.Event) -> None:

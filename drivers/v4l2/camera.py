@@ -100,6 +100,11 @@ class V4l2Camera:
         """What happened to the frames so far."""
         return self.capture.counters
 
+    @property
+    def size_px(self) -> tuple[int, int]:
+        """(width, height) of every picture."""
+        return self.capture.format.size_px
+
     def next_frame(self, exposed_after_s: float, timeout_s: float) -> V4l2Frame:
         """Return the newest frame whose exposure surely began after ``exposed_after_s``, waiting if need be.
 
