@@ -18,32 +18,17 @@ from __future__ import annotations
 
 from collections.abc import Hashable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from calib.cahvor import CameraModel
-from calib.camera_parameters import parameter_names, parameter_part, predict, stepped, tangents
+from calib.camera_parameters import parameter_names, parameter_part, predict, stepped
+from calib.gimbal import MAST_FREE, MAST_NAMES, gimbal, gimbal_rates, mast_of
 from calib.least_squares import Normal
 from calib.mast import Mast
-from calib.rigid import FloatArray, Rigid, rot_x, rot_y, rot_z
-
-MAST_NAMES = (
-    *(f"translation_m.{axis}" for axis in "xyz"),
-    *(f"rotation_rad.{axis}" for axis in "xyz"),
-    "axis_offset_m",
-    "axis_twist_rad",
-)
-
-MAST_FREE = {4: (0, 1, 2, 5), 6: (0, 1, 2, 3, 4, 5), 8: (0, 1, 2, 3, 4, 5, 6, 7)}
-"""Which of the mast's eight numbers a fit of so many parameters moves; 4 is the mast taken as vertical."""
-
-O_SIGMA_RAD = 0.02
-R_SIGMA = (0.5, 1.0)
-E_SIGMA_M = 0.01
-"""What lenses are like, one sigma: O beside A, R1 and R2, E0 to E2. Flight cameras stay within some 2.5 of
-these; a survey that sees a lens well does not feel them, and one that does not cannot run away with it."""
+from calib.rigid import FloatArray, Rigid, moved_rigid, rigid_rates
+from calib.terms import ImageTerm, StationTerm
+from calib.usual_lens import lens_knowledge
 
 HUBER = 3.0
 """Length of a residual, in sigmas, from which its pull no longer grows while blunders are looked for."""
@@ -67,38 +52,7 @@ class Estimate:
     @property
     def as_mast(self) -> Mast:
         """The mast of ``calib.mast``."""
-        return Mast(self.mast[:3], self.mast[3:6], float(self.mast[6]), float(self.mast[7]))
-
-
-@dataclass(frozen=True, eq=False)
-class ImageTerm:
-    """The dots of one image: board points (n, 3), pixels (n, 2), their sigma (n,), and which count (n,)."""
-
-    name: str
-    camera: str
-    board: tuple[str, str]
-    attitude: int | None
-    pan_rad: float
-    tilt_rad: float
-    rows: np.ndarray
-    columns: np.ndarray
-    in_board_m: FloatArray
-    pixels_px: FloatArray
-    sigma_px: FloatArray
-    keep: np.ndarray
-
-
-@dataclass(frozen=True, eq=False)
-class StationTerm:
-    """One point measured by the station: a prism (``board`` None) or a tape."""
-
-    setup: str
-    board: tuple[str, str] | None
-    point: str
-    position_m: FloatArray
-    in_board_m: FloatArray
-    sigma_m: float
-    keep: bool = True
+        return mast_of(self.mast)
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,34 +64,6 @@ class Block:
     columns: np.ndarray
     width: int
     """How many residuals belong together (2: a dot, 3: a point of the station, 1: a single number)."""
-
-
-class Gimbal(NamedTuple):
-    """rover_from_head and its rates: what turns about which axis through which point, in the rover frame."""
-
-    rotation: FloatArray
-    translation_m: FloatArray
-    axes: FloatArray
-    """(10, 3): the eight numbers of the mast, pan, tilt; for a shift its direction, for an angle its axis."""
-    mast_origin_m: FloatArray
-
-
-_ABOUT_MAST, _ABOUT_HEAD = (3, 4, 5, 8), (7, 9)
-"""Which of a gimbal's ten numbers are angles about axes through the mast's or the head's origin."""
-
-
-def gimbal(mast: FloatArray, pan_rad: float, tilt_rad: float) -> Gimbal:
-    """Return rover_from_head of the mast's eight numbers at joint angles, with its rates."""
-    x = rot_x(mast[3])
-    xy = x @ rot_y(mast[4])
-    xyz = xy @ rot_z(mast[5])
-    panned = xyz @ rot_z(pan_rad)
-    twisted = panned @ rot_x(mast[7])
-    origin = mast[:3]
-    place = origin + mast[6] * panned[:, 0]
-    eye = np.eye(3)
-    axes = np.array([*eye, eye[0], x[:, 1], xy[:, 2], panned[:, 0], panned[:, 0], xyz[:, 2], twisted[:, 1]])
-    return Gimbal(twisted @ rot_y(tilt_rad), place, axes, origin)
 
 
 class Adjustment:
@@ -396,46 +322,3 @@ class Adjustment:
         """Return the indices of an unknown's numbers."""
         part = self.parts[key]
         return np.arange(part.start, part.stop)
-
-
-def moved_rigid(pose: Rigid, step: FloatArray) -> Rigid:
-    """Return a pose shifted by step[:3] and turned by the rotation vector step[3:] about its origin."""
-    turned = Rotation.from_rotvec(step[3:]).as_matrix() @ pose.rotation
-    return Rigid(turned, pose.translation_m + step[:3])
-
-
-def lens_knowledge(model: CameraModel) -> tuple[FloatArray, FloatArray]:
-    """Return how far a lens is from usual, in sigmas, and the Jacobian to the camera's step."""
-    kind = model.kind
-    size = len(parameter_names(kind))
-    aside = np.zeros((3, size))
-    aside[:, parameter_part(kind, "O")] = tangents(model.O).T / O_SIGMA_RAD
-    aside[:, parameter_part(kind, "A")] = -tangents(model.A).T / O_SIGMA_RAD
-    residuals, rows = [(model.O - model.A) / O_SIGMA_RAD, model.R[1:] / np.array(R_SIGMA)], [aside]
-    bends = np.zeros((2, size))
-    bends[:, parameter_part(kind, "R")] = np.diag(1 / np.array(R_SIGMA))
-    rows.append(bends)
-    if "E" in kind:
-        enters = np.zeros((3, size))
-        enters[:, parameter_part(kind, "E")] = np.eye(3) / E_SIGMA_M
-        rows.append(enters)
-        residuals.append(model.E / E_SIGMA_M)
-    return np.concatenate(residuals), np.concatenate(rows)
-
-
-def gimbal_rates(per_point: FloatArray, points_m: FloatArray, head: Gimbal, wanted: np.ndarray) -> FloatArray:
-    """(n, m, k): rates of something per rover-frame point (n, m, 3) as the head carries points along."""
-    about_mast = np.cross((points_m - head.mast_origin_m)[:, None, :], per_point)
-    about_head = np.cross((points_m - head.translation_m)[:, None, :], per_point)
-    columns = []
-    for index in wanted:
-        kind = about_head if index in _ABOUT_HEAD else about_mast if index in _ABOUT_MAST else per_point
-        columns.append(kind @ head.axes[index])
-    return np.stack(columns, axis=-1) if columns else np.zeros((*per_point.shape[:2], 0))
-
-
-def rigid_rates(per_point: FloatArray, points_m: FloatArray, origin_m: FloatArray) -> FloatArray:
-    """(n, m, 6): rates of something per point (n, m, 3) for a shift and a turn about ``origin_m``."""
-    arm = points_m - origin_m
-    moment = np.cross(arm[:, None, :], per_point)
-    return np.concatenate([np.broadcast_to(per_point, moment.shape), moment], axis=2)

@@ -61,13 +61,18 @@ class Alignment:
 
 
 def align(
-    points_in_a_m: ArrayLike, points_in_b_m: ArrayLike, sigma_m: ArrayLike, names: Sequence[str]
+    points_in_a_m: ArrayLike,
+    points_in_b_m: ArrayLike,
+    sigma_m: ArrayLike,
+    names: Sequence[str],
+    *,
+    false_alarm: float = FALSE_ALARM,
 ) -> Alignment:
     """Fit the pose between two sets of points, and leave out those that were mis-measured.
 
-    With four points or more, while chi-square is beyond what chance makes of it once in 10,000 times, the one
-    point is left out without which the others fit, provided that no other point's leaving would do. Else, and
-    with three points, the distances between points say which disagree, and nothing is left out.
+    With four points or more, while chi-square is beyond what chance makes of it, the one point is left out
+    without which the others fit, provided that no other point's leaving would do. Else, and with three
+    points, the distances between points say which disagree, and nothing is left out.
 
     Parameters
     ----------
@@ -77,6 +82,8 @@ def align(
         Standard deviation of the difference of a point, one axis; one number or (n,).
     names
         (n,) for the refusals.
+    false_alarm
+        How often points without a blunder may be called in doubt.
 
     Raises
     ------
@@ -92,11 +99,11 @@ def align(
         total = _chi2(pose, a[used], b[used], sigma[used])
         freedom = 3 * int(used.sum()) - 6
         doubt = ""
-        if total <= _limit(freedom):
+        if total <= _limit(freedom, false_alarm):
             break
-        culprit = _culprit(a, b, sigma, used)
+        culprit = _culprit(a, b, sigma, used, false_alarm)
         if culprit is None:
-            doubt = _doubt(a, b, sigma, used, names)
+            doubt = _doubt(a, b, sigma, used, names, false_alarm)
             break
         used[culprit] = False
         rejected.append(names[culprit])
@@ -123,10 +130,10 @@ def mirrored(points_in_a_m: ArrayLike, points_in_b_m: ArrayLike, sigma_m: float)
         fits = [_chi2(_pose(c, b, sigma, []), c, b, sigma) for c in (a, image)]
     except NotAligned:
         return False
-    return fits[1] <= _limit(3 * len(a) - 6) < fits[0]
+    return fits[1] <= _limit(3 * len(a) - 6, FALSE_ALARM) < fits[0]
 
 
-def rover_from_station(survey: Survey) -> dict[str, Alignment]:
+def rover_from_station(survey: Survey, *, false_alarm: float = FALSE_ALARM) -> dict[str, Alignment]:
     """Return the pose of every set-up from its prisms, by the set-up's name.
 
     Raises
@@ -137,38 +144,49 @@ def rover_from_station(survey: Survey) -> dict[str, Alignment]:
     sigma_m = float(np.hypot(survey.sigma.station_m, survey.sigma.prism_cad_m))
     measured: dict[str, dict[str, FloatArray]] = {point.setup: {} for point in survey.station}
     for point in survey.station:
-        if point.kind == "prism":
+        if point.kind == "prism" and point.point in survey.prisms_in_rover_m:
             measured[point.setup][point.point] = point.position_m
     poses: dict[str, Alignment] = {}
     for setup, points in measured.items():
         design = [survey.prisms_in_rover_m[name] for name in points]
         try:
-            poses[setup] = align(list(points.values()), design, sigma_m, list(points))
+            poses[setup] = align(
+                list(points.values()), design, sigma_m, list(points), false_alarm=false_alarm
+            )
         except NotAligned as error:
             raise NotAligned(f"prisms of set-up {setup}: {error}") from None
     return poses
 
 
-def station_from_board(survey: Survey) -> dict[tuple[str, str], Alignment]:
-    """Return the pose of every placement from its tapes, by set-up and placement.
+def station_from_board(
+    survey: Survey, *, false_alarm: float = FALSE_ALARM
+) -> dict[tuple[str, str], Alignment]:
+    """Return the pose of every placement with three tapes, by set-up and placement.
 
     Raises
     ------
     NotAligned
-        Naming the placement with fewer than three tapes.
+        Naming the placement whose tapes are on one line.
     """
     measured: dict[tuple[str, str], dict[str, FloatArray]] = {}
     for point in survey.station:
-        if point.kind == "tape":
+        if point.kind == "tape" and point.point in survey.board.tapes_in_board_m:
             measured.setdefault((point.setup, point.placement), {})[point.point] = point.position_m
     poses: dict[tuple[str, str], Alignment] = {}
     for (setup, placement), points in measured.items():
+        if len(points) < 3:
+            continue
         design = [survey.board.tapes_in_board_m[name] for name in points]
         try:
-            aligned = align(design, list(points.values()), survey.sigma.station_m, list(points))
+            poses[setup, placement] = align(
+                design,
+                list(points.values()),
+                survey.sigma.station_m,
+                list(points),
+                false_alarm=false_alarm,
+            )
         except NotAligned as error:
             raise NotAligned(f"tapes of placement {placement} in set-up {setup}: {error}") from None
-        poses[setup, placement] = aligned
     return poses
 
 
@@ -192,8 +210,8 @@ def _chi2(pose: Rigid, a: FloatArray, b: FloatArray, sigma: FloatArray) -> float
     return float(np.sum(((b - pose.points(a)) / sigma[:, None]) ** 2))
 
 
-def _limit(freedom: int) -> float:
-    return float(chi2.isf(FALSE_ALARM, freedom))
+def _limit(freedom: int, false_alarm: float) -> float:
+    return float(chi2.isf(false_alarm, freedom))
 
 
 def _covariance(pose: Rigid, a: FloatArray, sigma: FloatArray) -> FloatArray:
@@ -210,7 +228,9 @@ def _cross(v: FloatArray) -> FloatArray:
     return np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
 
 
-def _culprit(a: FloatArray, b: FloatArray, sigma: FloatArray, used: np.ndarray) -> int | None:
+def _culprit(
+    a: FloatArray, b: FloatArray, sigma: FloatArray, used: np.ndarray, false_alarm: float
+) -> int | None:
     """The one point without which the rest fits; None if there is none, or more than one may be it."""
     indices = np.flatnonzero(used)
     if len(indices) < 4:
@@ -223,20 +243,28 @@ def _culprit(a: FloatArray, b: FloatArray, sigma: FloatArray, used: np.ndarray) 
         except NotAligned:
             left[int(index)] = np.inf
     best, second = sorted(left, key=left.__getitem__)[:2]
-    limit = _limit(3 * (len(indices) - 1) - 6)
+    limit = _limit(3 * (len(indices) - 1) - 6, false_alarm)
     # With five points or more a second blunder may still be among the rest: the next round looks for it.
     fits = left[best] <= limit or len(indices) > 5
-    return best if fits and left[second] > limit and left[second] > left[best] + _limit(1) else None
+    alone = left[second] > limit and left[second] > left[best] + _limit(1, false_alarm)
+    return best if fits and alone else None
 
 
-def _doubt(a: FloatArray, b: FloatArray, sigma: FloatArray, used: np.ndarray, names: Sequence[str]) -> str:
+def _doubt(
+    a: FloatArray,
+    b: FloatArray,
+    sigma: FloatArray,
+    used: np.ndarray,
+    names: Sequence[str],
+    false_alarm: float,
+) -> str:
     """Say which distances between points disagree."""
     lines: list[tuple[float, int, int, float, float]] = []
     for i, j in combinations(map(int, np.flatnonzero(used)), 2):
         in_a, in_b = (float(np.linalg.norm(points[i] - points[j])) for points in (a, b))
         lines.append((abs(in_a - in_b) / float(np.hypot(sigma[i], sigma[j])), i, j, in_a, in_b))
     lines.sort(reverse=True)
-    limit = float(np.sqrt(chi2.isf(FALSE_ALARM, 1)))
+    limit = float(np.sqrt(chi2.isf(false_alarm, 1)))
     off = [line for line in lines if line[0] > limit]
     if not off:
         one = [name for name, use in zip(names, used, strict=True) if use]

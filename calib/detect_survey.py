@@ -20,6 +20,7 @@ from calib.cahvor import CameraModel
 from calib.detect import DetectionFailure, DotsFound, Predicted, Upright, find_dots
 from calib.rigid import FloatArray, Rigid, rot_y, rot_z
 from calib.survey import Board, Dots, Survey, SurveyCamera, SurveyImage
+from calib.survey.picture_file import spoiled_png
 
 AHEAD = np.array([1.0, 0.0, 0.0])
 DOWN = np.array([0.0, 0.0, 1.0])
@@ -93,9 +94,13 @@ def find_in_file(
 ) -> DotsFound | DetectionFailure:
     """Find the dots in a picture file; a file that cannot be used is a failure with a reason."""
     try:
-        content = np.frombuffer(path.read_bytes(), dtype=np.uint8)
+        data = path.read_bytes()
     except OSError as error:
         return DetectionFailure(f"{path.name} cannot be read: {error.strerror or error}")
+    spoiled = spoiled_png(data)
+    if spoiled is not None:
+        return DetectionFailure(f"{path.name} is not a picture that can be read: {spoiled}")
+    content = np.frombuffer(data, dtype=np.uint8)
     image = cv2.imdecode(content, cv2.IMREAD_GRAYSCALE) if len(content) else None
     if image is None:
         return DetectionFailure(f"{path.name} is not a picture that can be read")

@@ -56,3 +56,14 @@ class NoStereoPoint(CalibError):
     def __init__(self, code: str, message: str) -> None:
         self.code = code
         super().__init__(message)
+
+
+class NoHandoff(CalibError):
+    """A target that cannot be handed to another camera; ``code`` names the cause for programs.
+
+    Codes: ``too_near``, ``too_far``, ``not_seen``.
+    """
+
+    def __init__(self, code: str, message: str) -> None:
+        self.code = code
+        super().__init__(message)

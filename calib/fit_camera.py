@@ -16,12 +16,12 @@ from itertools import combinations
 import cv2
 import numpy as np
 
-from calib.adjustment import lens_knowledge
 from calib.cahvor import CameraModel, Kind
 from calib.camera_parameters import parameter_names, parameter_part, predict, stepped
 from calib.errors import CalibError
-from calib.least_squares import Normal, minimise
+from calib.least_squares import Normal, covariance_of, minimise
 from calib.rigid import FloatArray
+from calib.usual_lens import lens_knowledge
 
 SAMPLES = 30
 """Samples of images tried for a start."""
@@ -228,8 +228,8 @@ def pinhole(
     )[0]
 
 
-class _Points:
-    """The problem of one camera and fixed points, with weights."""
+class FixedPoints:
+    """The problem (``calib.least_squares.Problem``) of one camera and fixed points, with weights."""
 
     def __init__(self, points_m: FloatArray, pixels_px: FloatArray, sigma_px: FloatArray) -> None:
         self.points_m, self.pixels_px, self.sigma_px = points_m, pixels_px, sigma_px
@@ -279,7 +279,7 @@ def _fit_from(
             return None
         typical = max(float(np.median(residual[used])), expected_px)
         weighted = typical * np.sqrt(1 + (residual[used] / (2 * typical)) ** 2)
-        problem = _Points(points_m[used], pixels_px[used], np.maximum(weighted, sigma_px))
+        problem = FixedPoints(points_m[used], pixels_px[used], np.maximum(weighted, sigma_px))
         model = minimise(problem, model, weak=weak, steps=rounds, gain=1e-6).state
     seen, valid = model.project(points_m)
     rms = _image_rms(seen - pixels_px, images)
@@ -288,14 +288,13 @@ def _fit_from(
     if used.sum() < 8 or len(np.unique(images[used])) < 2:
         return None
     found = minimise(
-        _Points(points_m[used], pixels_px[used], np.full(int(used.sum()), sigma_px)), model, weak=weak
+        FixedPoints(points_m[used], pixels_px[used], np.full(int(used.sum()), sigma_px)), model, weak=weak
     )
     model = found.state
     seen, _ = model.project(points_m)
     residuals = seen - pixels_px
     freedom = max(2 * int(used.sum()) - len(weak), 1)
     unit_weight = float(np.sum((residuals[used] / sigma_px) ** 2)) / freedom
-    inverse = np.asarray(np.linalg.inv(found.normal.matrix + np.diag(weak)), dtype=np.float64)
-    covariance = max(unit_weight, 1.0) * inverse
+    covariance = max(unit_weight, 1.0) * covariance_of(found.normal.matrix, weak)
     rms_px: FloatArray = np.sqrt((residuals[used] ** 2).mean(axis=0)).astype(np.float64)
     return CameraFit(model, covariance, residuals, used, rms_px)

@@ -13,26 +13,18 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.stats import chi2
 
-from calib.adjustment import (
-    E_SIGMA_M,
-    HUBER,
-    MAST,
-    O_SIGMA_RAD,
-    R_SIGMA,
-    Adjustment,
-    Estimate,
-    ImageTerm,
-    StationTerm,
-)
+from calib.adjustment import HUBER, MAST, Adjustment, Estimate
 from calib.calibration import Calibration
-from calib.fit_start import Start, SurveyNotFitted, start, with_kept
-from calib.least_squares import Minimum, minimise
+from calib.fit_start import Start, SurveyNotFitted, start
+from calib.least_squares import Minimum, covariance_of, minimise
 from calib.mast import Rig, RigCamera
 from calib.outliers import FALSE_ALARMS, judge, named
 from calib.residuals import check_rms, image_residuals, rms_by_camera, station_residuals
 from calib.rigid import FloatArray
 from calib.survey import Survey
-from calib.uncertainty import lens_notes, open_directions, sigma_by_key
+from calib.terms import ImageTerm, StationTerm, with_kept
+from calib.uncertainty import open_directions, sigma_by_key
+from calib.usual_lens import lens_notes
 
 ROUNDS = 40
 """Times that measurements are judged and the fit done again, at most."""
@@ -42,8 +34,6 @@ WRONG_MINIMUM = 3.0
 
 MANY = 0.15
 """More than this part of the tapes left out (and more than three) are no blunders: the model fails."""
-
-LENS_LIMITS = {"O": (O_SIGMA_RAD,) * 3, "R": R_SIGMA, "E": (E_SIGMA_M,) * 3}
 
 
 def fit_joint(survey: Survey, mast_parameters: int = 6) -> Calibration:
@@ -65,7 +55,7 @@ def fit_joint(survey: Survey, mast_parameters: int = 6) -> Calibration:
     from_here = start(survey, mast_parameters)
     problem = joint_problem(survey, from_here, mast_parameters)
     problem, fit = without_blunders(problem, from_here)
-    covariance = covariance_of(problem, fit)
+    covariance = covariance_of(fit.normal.matrix, problem.weak)
     _refuse_wrong_minimum(problem, fit.state)
     return _calibration(survey, mast_parameters, from_here, problem, fit, covariance, began)
 
@@ -97,7 +87,9 @@ def without_blunders(problem: Adjustment, from_here: Start) -> tuple[Adjustment,
         fit = minimise(problem, fit.state, weak=problem.weak, gain=1e-7 if huber else 1e-11)
         kept = {_kept(problem.images, problem.station)}
         for _ in range(ROUNDS):
-            verdict = judge(problem, fit.state, covariance_of(problem, fit), from_here.images)
+            verdict = judge(
+                problem, fit.state, covariance_of(fit.normal.matrix, problem.weak), from_here.images
+            )
             pattern = _kept(verdict.images, verdict.station)
             if pattern in kept:  # nothing new, or a measurement on its limit that comes and goes
                 break
@@ -111,13 +103,6 @@ def without_blunders(problem: Adjustment, from_here: Start) -> tuple[Adjustment,
 def _kept(images: Sequence[ImageTerm], station: Sequence[StationTerm]) -> bytes:
     """Which measurements count, as something to compare."""
     return b"".join(t.keep.tobytes() for t in images) + bytes(p.keep for p in station)
-
-
-def covariance_of(problem: Adjustment, fit: Minimum[Estimate]) -> FloatArray:
-    """Return the covariance of all unknowns, weak knowledge of the open ones added."""
-    matrix = fit.normal.matrix + np.diag(problem.weak)
-    scale = 1.0 / np.sqrt(np.diag(matrix))
-    return np.asarray(np.linalg.inv(matrix * np.outer(scale, scale)) * np.outer(scale, scale))
 
 
 def _refuse_lost(fit: Minimum[Estimate]) -> None:
@@ -184,7 +169,7 @@ def _calibration(
     names = [names[i] for i in order]
     mine = mine[np.ix_(order, order)]
     sigma = sigma_by_key(rig, names, mine)
-    notes += lens_notes(rig, sigma, LENS_LIMITS)
+    notes += lens_notes(rig, sigma)
     images = image_residuals(survey, problem, state, from_here.images, from_here.checks)
     return Calibration(
         method="joint",
@@ -198,7 +183,7 @@ def _calibration(
         check_rms_px=check_rms(survey, state, images),
         outliers=named(problem, state, covariance, from_here.images),
         false_alarms=3 * FALSE_ALARMS,
-        degenerate=open_directions(problem, state, problem.names[:size], covariance[:size, :size]),
+        degenerate=open_directions(problem, problem.names[:size], covariance[:size, :size]),
         notes=tuple(notes),
         chi2=chi_square,
         degrees_of_freedom=freedom,

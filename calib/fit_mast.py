@@ -12,9 +12,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calib.adjustment import MAST_FREE, gimbal, gimbal_rates
 from calib.cahvor import CameraModel
 from calib.errors import CalibError
+from calib.gimbal import MAST_FREE, gimbal, gimbal_rates
 from calib.least_squares import Normal, minimise
 from calib.rigid import FloatArray
 
@@ -52,7 +52,7 @@ class MastFit:
     Attributes
     ----------
     mast
-        (8,) numbers in the order of ``calib.adjustment.MAST_NAMES``.
+        (8,) numbers in the order of ``calib.gimbal.MAST_NAMES``.
     left_out
         Names of images that another board or other angles must belong to.
     rms_px

@@ -2,14 +2,9 @@
 
 Cameras are fitted to images of purpose ``camera``, set-ups and boards taken from the station as they are.
 The mast is fitted to images of purpose ``mast`` with those cameras (eq. (9)), which it then carries to the
-head. All dots weigh the same; what the station got wrong shows as residuals.
-
-The covariance is that of this estimator: the station's noise moves boards and set-ups, the cameras follow,
-and the mast follows both. Written with normal equations (k cameras, m mast, s station: boards and joints)
-
-    dk = -Nkk⁻¹ (Nks ds + dots),    dm = -Nmm⁻¹ (Nms ds + Nmk dk + dots),
-
-k from the camera images, m from the mast images, ds with the covariance that prisms and tapes give.
+head. All dots weigh the same; what the station got wrong shows as residuals. The covariance
+is that of this estimator (``calib.paper_covariance``). Dots that disagree with the rest of their image are
+left out beforehand (``calib.stray_dots``).
 """
 
 from __future__ import annotations
@@ -17,32 +12,24 @@ from __future__ import annotations
 import time
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import NamedTuple
 
 import numpy as np
 
-from calib.adjustment import (
-    MAST,
-    Adjustment,
-    Estimate,
-    ImageTerm,
-    gimbal,
-    gimbal_rates,
-    lens_knowledge,
-    rigid_rates,
-)
+from calib.adjustment import MAST, Adjustment
 from calib.cahvor import CameraModel
 from calib.calibration import Calibration, Outlier
-from calib.camera_parameters import parameter_names, parameter_part, predict, stepped, tangents
-from calib.fit_camera import CameraNotFitted, fit_camera
-from calib.fit_joint import LENS_LIMITS, estimate_values, mast_first, rig_of
+from calib.fit_joint import estimate_values, mast_first, rig_of
 from calib.fit_mast import MastNotFitted, fit_mast
-from calib.fit_start import Start, SurveyNotFitted, mast_views, start, with_kept
-from calib.mast import Mast
+from calib.fit_start import Start, SurveyNotFitted, at_setting, camera_from_points, mast_views, start
+from calib.gimbal import gimbal, mast_of
+from calib.paper_covariance import TwoSteps
 from calib.residuals import check_rms, image_residuals, rms_by_camera, station_residuals
 from calib.rigid import FloatArray
+from calib.stray_dots import without_stray_dots
 from calib.survey import Survey
-from calib.uncertainty import lens_notes, open_directions, sigma_by_key
+from calib.terms import ImageTerm, with_kept
+from calib.uncertainty import open_directions, sigma_by_key
+from calib.usual_lens import lens_notes
 
 SAME_SETTING_RAD = 1e-9
 """Camera images whose joint angles differ by more are carried to one setting by the mast, once known."""
@@ -67,6 +54,13 @@ def fit_paper(survey: Survey, mast_parameters: int = 6) -> Calibration:
         If the survey does not determine a camera or the mast, or no start leads near the noise.
     """
     began = time.perf_counter()
+    survey, strays = without_stray_dots(survey)
+    fit = _fit(survey, mast_parameters, began)
+    return replace(fit, outliers=(*fit.outliers, *strays))
+
+
+def _fit(survey: Survey, mast_parameters: int, began: float) -> Calibration:
+    """Cameras, then the mast, once."""
     from_here = start(survey, mast_parameters, only_camera_images=True)
     purposes = {i.name: i.purpose for i in survey.images}
     cameras = dict(from_here.in_rover)
@@ -87,16 +81,17 @@ def fit_paper(survey: Survey, mast_parameters: int = 6) -> Calibration:
     fitted = {t.name for t in (*camera_images, *mast_images)} - doubtful
     skipped = {t.name for t in from_here.images if t.name not in fitted}
     state = replace(from_here.estimate, cameras=_to_head(cameras, from_here, mast), mast=mast)
+    wrong = {o.name for o in from_here.blunders}
     problem = Adjustment(
         with_kept(from_here.images, skipped),
-        from_here.station,
+        [replace(p, keep=False) if p.name in wrong else p for p in from_here.station],
         state,
         mast_parameters=mast_parameters if from_here.reference_rad else 0,
         prisms_cad_m=survey.prisms_in_rover_m,
         prism_cad_m=survey.sigma.prism_cad_m,
         joint_rad=survey.sigma.joint_rad,
     )
-    parts = _Parts(problem, state, cameras, from_here.reference_rad)
+    parts = TwoSteps(problem, state, cameras, from_here.reference_rad)
     covariance, mast_alone = parts.covariance({t.name for t in camera_images})
     size = problem.parts[MAST].stop
     names = problem.names[:size]
@@ -109,7 +104,7 @@ def fit_paper(survey: Survey, mast_parameters: int = 6) -> Calibration:
     ordered = [names[i] for i in order]
     rig = rig_of(survey, state)
     sigma = sigma_by_key(rig, ordered, covariance[np.ix_(order, order)])
-    notes = [*from_here.notes, *lens_notes(rig, sigma, LENS_LIMITS)]
+    notes = [*from_here.notes, *lens_notes(rig, sigma)]
     return Calibration(
         method="paper",
         mast_parameters=mast_parameters,
@@ -122,7 +117,7 @@ def fit_paper(survey: Survey, mast_parameters: int = 6) -> Calibration:
         check_rms_px=check_rms(survey, state, images),
         outliers=(*from_here.blunders, *_left_out(images, from_here, doubtful)),
         false_alarms=0.0,
-        degenerate=open_directions(problem, state, names, mast_alone),
+        degenerate=open_directions(problem, names, mast_alone),
         notes=tuple(notes),
         chi2=float(sum(in_sigmas)),
         degrees_of_freedom=float(count - size),
@@ -140,15 +135,13 @@ def _at_reference(
     survey: Survey, from_here: Start, purposes: Mapping[str, str], left_out: set[str]
 ) -> list[ImageTerm]:
     """Camera images taken at their camera's reference setting."""
-    near = max(1e-3, 4 * survey.sigma.joint_rad)
-    found = []
-    for term in from_here.images:
-        if purposes[term.name] != "camera" or term.name in left_out:
-            continue
-        pan, tilt = from_here.reference_rad.get(term.camera, (0.0, 0.0))
-        if abs(term.pan_rad - pan) <= near and abs(term.tilt_rad - tilt) <= near:
-            found.append(term)
-    return found
+    return [
+        t
+        for t in from_here.images
+        if purposes[t.name] == "camera"
+        and t.name not in left_out
+        and at_setting(t, from_here.reference_rad.get(t.camera, (0.0, 0.0)), survey.sigma.joint_rad)
+    ]
 
 
 def _mast_of(
@@ -201,20 +194,7 @@ def _cameras_again(
         return found
     for name in from_here.reference_rad:
         group = [t for t in camera_images if t.camera == name and t.name not in doubtful]
-        camera = survey.cameras[name]
-        try:
-            found[name] = fit_camera(
-                np.concatenate([points[t.name] for t in group]),
-                np.concatenate([t.pixels_px for t in group]),
-                np.concatenate([np.full(len(t.rows), i) for i, t in enumerate(group)]),
-                kind=camera.kind,
-                size_px=camera.size_px,
-                focal_px=camera.focal_px,
-                sigma_px=survey.sigma.dot_px,
-                expected_px=from_here.expected_px[name],
-            ).model
-        except CameraNotFitted as error:
-            raise SurveyNotFitted(f"camera {name}: {error}") from None
+        found[name] = camera_from_points(survey, name, group, points, from_here.expected_px[name]).model
     return found
 
 
@@ -222,7 +202,7 @@ def _to_head(
     cameras: Mapping[str, CameraModel], from_here: Start, mast: FloatArray
 ) -> dict[str, CameraModel]:
     """Head cameras carried from the rover frame, at their reference, to the head."""
-    carrying = Mast(mast[:3], mast[3:6], float(mast[6]), float(mast[7]))
+    carrying = mast_of(mast)
     found = {}
     for name, model in cameras.items():
         at = from_here.reference_rad.get(name)
@@ -241,149 +221,3 @@ def _left_out(images: tuple, from_here: Start, doubtful: set[str]) -> list[Outli
         limit = len(in_sigmas) * 2 * (6 * from_here.expected_px[image.camera] / image.sigma_px.mean()) ** 2
         found.append(Outlier("image", f"image {image.name}", float(np.sum(in_sigmas**2)), float(limit), size))
     return found
-
-
-class _Block(NamedTuple):
-    """Weighted Jacobian (2n, k) of an image on the unknowns (k,) of the two steps."""
-
-    jacobian: FloatArray
-    columns: np.ndarray
-
-
-class _Parts:
-    """Normal equations of the two steps at the solution, cameras in the rover frame at their references."""
-
-    def __init__(
-        self,
-        problem: Adjustment,
-        state: Estimate,
-        cameras: Mapping[str, CameraModel],
-        reference_rad: Mapping[str, tuple[float, float]],
-    ) -> None:
-        self.problem, self.state = problem, state
-        self.cameras, self.reference_rad = cameras, reference_rad
-
-    def covariance(self, camera_images: set[str]) -> tuple[FloatArray, FloatArray]:
-        """Covariance of cameras in the head (or rover) and mast: all of it, and for noise of dots alone."""
-        problem = self.problem
-        size, total = problem.parts[MAST].stop, len(problem.names)
-        first, second = np.zeros((total, total)), np.zeros((total, total))
-        for term in problem.images:
-            if term.keep.any():
-                block = self._block(term)
-                at = np.ix_(block.columns, block.columns)
-                (first if term.name in camera_images else second)[at] += block.jacobian.T @ block.jacobian
-        k, m = np.arange(problem.parts[MAST].start), np.arange(problem.parts[MAST].start, size)
-        s = np.arange(size, total)
-        camera_matrix = first[np.ix_(k, k)] + np.diag(problem.weak[k])
-        for name, model in self.cameras.items():
-            if "O" in model.kind:
-                _, rows = lens_knowledge(model)
-                part = problem.parts["camera", name]
-                camera_matrix[part, part] += rows.T @ rows
-        by_dots_k = _inverse(camera_matrix)
-        k_by_s = -by_dots_k @ first[np.ix_(k, s)]
-        by_dots_m = _inverse(second[np.ix_(m, m)] + np.diag(problem.weak[m])) if len(m) else np.zeros((0, 0))
-        m_by_k = -by_dots_m @ second[np.ix_(m, k)]
-        m_by_s = -by_dots_m @ second[np.ix_(m, s)] + m_by_k @ k_by_s
-        follow = np.concatenate([np.eye(len(k)), m_by_k])
-        dots = follow @ by_dots_k @ follow.T
-        dots[len(k) :, len(k) :] += by_dots_m
-        by_s = np.concatenate([k_by_s, m_by_s])
-        to_head = self._to_head(size)
-        station = by_s @ self._station(s) @ by_s.T
-        return to_head @ (dots + station) @ to_head.T, to_head @ dots @ to_head.T
-
-    def _station(self, s: np.ndarray) -> FloatArray:
-        """Covariance of set-ups, boards, prisms and joints from the station and what is known beforehand."""
-        problem = self.problem
-        matrix = np.diag(problem.weak)
-        for point in problem.station:
-            block = problem.station_block(self.state, point)
-            matrix[np.ix_(block.columns, block.columns)] += block.jacobian.T @ block.jacobian
-        for name, block in problem.known(self.state):
-            if not name.startswith("lens "):
-                matrix[np.ix_(block.columns, block.columns)] += block.jacobian.T @ block.jacobian
-        return _inverse(matrix[np.ix_(s, s)])
-
-    def _block(self, term: ImageTerm) -> _Block:
-        """One image: what its pixels do as the camera (at its reference), mast, board and joints move."""
-        problem, state, keep = self.problem, self.state, term.keep
-        board = state.rover_from_board[term.board]
-        points = board.points(term.in_board_m[keep])
-        camera = self.cameras[term.camera]
-        columns = [problem.at(("camera", term.camera))]
-        if term.attitude is None:
-            seen = predict(camera, points)
-            parts, in_rover = [seen.d_step], seen.d_points
-        else:
-            now = gimbal(state.mast, term.pan_rad, term.tilt_rad)
-            then = gimbal(state.mast, *self.reference_rad[term.camera])
-            turn = then.rotation @ now.rotation.T
-            carried = (points - now.translation_m) @ turn.T + then.translation_m
-            seen = predict(camera, carried)
-            in_rover = seen.d_points @ turn
-            free = problem.mast_free
-            parts = [
-                seen.d_step,
-                gimbal_rates(seen.d_points, carried, then, free) - gimbal_rates(in_rover, points, now, free),
-            ]
-            columns.append(problem.at(MAST))
-            if problem.joint_rad > 0:
-                parts.append(-gimbal_rates(in_rover, points, now, np.array([8, 9])))
-                columns.append(problem.at(("attitude", term.attitude)))
-        parts.append(rigid_rates(in_rover, points, board.translation_m))
-        columns.append(problem.at(("board", term.board)))
-        jacobian = np.concatenate(parts, axis=2) / term.sigma_px[keep, None, None]
-        return _Block(jacobian.reshape(2 * len(points), -1), np.concatenate(columns))
-
-    def _to_head(self, size: int) -> FloatArray:
-        """(size, size): from steps of cameras in the rover frame and of the mast to those of head cameras."""
-        matrix = np.eye(size)
-        for name, at in self.reference_rad.items():
-            part = self.problem.parts["camera", name]
-            columns = np.concatenate([self.problem.at(("camera", name)), self.problem.at(MAST)])
-            count = part.stop - part.start
-            nominal, in_rover = self.state.cameras[name], self.cameras[name]
-            scale = np.full(len(columns), 1e-6)
-            for letter in "HV":
-                scale[parameter_part(nominal.kind, letter)] = 1e-3
-            for index, column in enumerate(columns):
-                step = np.zeros(len(columns))
-                step[index] = scale[index]
-                ends = [self._in_head(in_rover, at, nominal, sign * step, count) for sign in (1.0, -1.0)]
-                matrix[part, column] = (ends[0] - ends[1]) / (2 * scale[index])
-        return matrix
-
-    def _in_head(
-        self,
-        in_rover: CameraModel,
-        at: tuple[float, float],
-        nominal: CameraModel,
-        step: FloatArray,
-        count: int,
-    ) -> FloatArray:
-        """The step of the head camera that a step of camera and mast makes."""
-        numbers = self.state.mast.copy()
-        numbers[self.problem.mast_free] += step[count:]
-        head = gimbal(numbers, *at)
-        model = stepped(in_rover, step[:count])
-        parts = {letter: getattr(model, letter) @ head.rotation for letter in "AHVO"}
-        out = np.zeros(len(parameter_names(nominal.kind)))
-        out[parameter_part(nominal.kind, "C")] = (model.C - head.translation_m) @ head.rotation - nominal.C
-        for letter in "HV":
-            out[parameter_part(nominal.kind, letter)] = parts[letter] - getattr(nominal, letter)
-        for letter in "AO":
-            if letter in nominal.kind:
-                out[parameter_part(nominal.kind, letter)] = tangents(getattr(nominal, letter)) @ parts[letter]
-        if "R" in nominal.kind:
-            out[parameter_part(nominal.kind, "R")] = (model.R - nominal.R)[1:]
-        if "E" in nominal.kind:
-            out[parameter_part(nominal.kind, "E")] = model.E - nominal.E
-        return out
-
-
-def _inverse(matrix: FloatArray) -> FloatArray:
-    """The inverse, columns scaled first."""
-    scale = 1.0 / np.sqrt(np.diag(matrix))
-    return np.asarray(np.linalg.inv(matrix * np.outer(scale, scale)) * np.outer(scale, scale))

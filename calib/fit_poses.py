@@ -13,69 +13,47 @@ Gauges: this form of the kinematics leaves none open unless the two axes are par
 lies along the common perpendicular of the axes at pan zero and the head's origin is the foot of that
 perpendicular, which fixes pan zero, tilt zero and the place along the tilt axis. With six parameters
 the axes meet at a right angle, and a real mast's offset and twist show up in the residuals.
+
+Least squares, the kinematics' rates and the test for directions that the data leave open are those of the
+survey's fits. The pixels of a model are not independent measurements: they say where one camera stands, and
+what may be off is its place and its direction, each by as much along every axis. How much, the residuals
+tell; the covariance is what such errors of the models make of the parameters.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from calib.cahvor import CameraModel
 from calib.errors import CalibError
+from calib.gimbal import MAST_FREE, MAST_NAMES, gimbal, gimbal_rates, mast_of, numbers_of
+from calib.least_squares import Minimum, Normal, covariance_of, minimise
 from calib.mast import Mast
-from calib.rigid import FloatArray, Rigid, rot_x, rot_y, rot_z
-
-GRID = 5
-"""Pixels of the comparison along each side of the image."""
-
-RANGES_M = (1.0, 100.0)
-"""Near and far range of the comparison, metres.
-
-At 1 m a shift of 1 µm moves a pixel as much as a turn of 1 µrad. Labels of six digits round positions
-and joint angles above 1 m and 1 rad to 2.9 µm and 2.9 µrad (one sigma), so these ranges weigh them as
-they deserve.
-"""
+from calib.model_difference import RANGES_M, ModelDifference, camera_axes, model_difference, pixel_grid
+from calib.rigid import FloatArray, Rigid, moved_rigid, rigid_rates, rot_x, rot_y, rot_z
+from calib.uncertainty import SEEN_RAD, in_words, open_parameters
 
 TWISTS_RAD = np.linspace(-1.4, 1.4, 15)
 """Twists tried for a start, since the closed form of the start needs one."""
 
-MAX_CONDITION = 1e4
-"""Condition number of the column-scaled Jacobian beyond which the poses do not fix the mast."""
+MODEL_PX = 0.01
+"""Camera models are taken as no better than this where it is asked what they leave open. Six printed digits
+round a Navcam's pixels by some 0.002."""
 
-LOST_PX = 1e4
-"""Residual of a point that the camera does not see at all: a step that leads there is never taken."""
+WEAK = 1.0
+"""One over the square of how far an unknown could be off at all: 1 m, 1 rad."""
 
-TOLERANCE = 1e-12
-"""Of the solver, relative: far below what six printed digits leave. 1e-15 changes no reported number."""
+CAMERA_NAMES = (*(f"camera.shift_m.{a}" for a in "xyz"), *(f"camera.turn_rad.{a}" for a in "xyz"))
 
 
 class PosesTooFew(CalibError):
     """The given poses do not determine a mast: too few, or one of the joints hardly moves."""
-
-
-@dataclass(frozen=True, eq=False)
-class ModelDifference:
-    """How far one model of a camera is from another one, by where they project.
-
-    Attributes
-    ----------
-    position_m
-        (3,) the other's C minus the reference's, in their common frame.
-    rotation_rad
-        (3,) rotation vector that turns the reference's rays onto the other's, same frame.
-    shift_px
-        (n, 2) how far the other projects points far away from where the reference does, pixels of the other.
-    """
-
-    position_m: FloatArray
-    rotation_rad: FloatArray
-    shift_px: FloatArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,11 +68,16 @@ class PoseFit:
         The head camera in the head frame.
     residuals
         For each given model, how far the fitted one is from it.
+    parameter_names, covariance
+        (p,) ``mast.translation_m.x`` and so on, then the camera's shift and its turn about C in the head
+        frame; and (p, p) of these, as the residuals show the models' errors to be.
     """
 
     mast: Mast
     camera_in_head: CameraModel
     residuals: tuple[ModelDifference, ...]
+    parameter_names: tuple[str, ...]
+    covariance: FloatArray
 
     def camera_in_rover(self, pan_rad: float, tilt_rad: float) -> CameraModel:
         """Return the fitted camera in the rover frame at the given joint angles, radians."""
@@ -113,7 +96,8 @@ def fit_poses(
 
     Unknown are the mast and the six of the camera's place in the head; the camera's lens (focal
     lengths, centre, distortion) is the first model's. Every pixel residual weighs the same. Where the
-    lens itself changes from model to model, ``with_one_lens`` takes that out first.
+    lens itself changes from model to model, ``calib.model_difference.with_one_lens``
+    takes that out first.
 
     Parameters
     ----------
@@ -129,7 +113,8 @@ def fit_poses(
     Raises
     ------
     PosesTooFew
-        If the poses do not fix the parameters: fewer than three, or a joint that hardly moves.
+        If the poses do not fix the parameters: fewer than three, a joint that hardly moves, or no mast
+        near which the camera sees what the models see.
     ValueError
         If the numbers of models and angles differ, or an angle is not finite.
     """
@@ -146,75 +131,99 @@ def fit_poses(
     camera = models[0].moved(start.rover_from_head(pan[0], tilt[0]).inverse)
     points_m, wanted_px, seen = _targets(models, camera.size_px, ranges_m)
 
-    def residual(x: NDArray[np.float64]) -> NDArray[np.float64]:
-        mast, head_from_moved = _unpack(x, start, parameters)
-        in_camera_m = np.stack(
-            [
-                (mast.rover_from_head(p, t) @ head_from_moved).inverse.points(points)
-                for p, t, points in zip(pan, tilt, points_m, strict=True)
-            ]
+    problem = _Poses(points_m, wanted_px, seen, pan, tilt, np.array(MAST_FREE[parameters]))
+    fit = minimise(problem, _State(numbers_of(start), camera))
+    if not np.isfinite(fit.normal.cost):
+        raise PosesTooFew(
+            "no mast was found from which the camera sees what its models see; "
+            "check the joint angles (radians, right and up positive) and that the models are of one camera"
         )
-        px, valid = camera.project(in_camera_m)
-        shift = np.where(valid[..., None], px - wanted_px, LOST_PX)
-        return np.asarray(shift[seen].ravel(), dtype=np.float64)
-
-    fit = least_squares(
-        residual,
-        np.zeros(6 + parameters),
-        jac="3-point",
-        x_scale="jac",
-        xtol=TOLERANCE,
-        ftol=TOLERANCE,
-        gtol=TOLERANCE,
-    )
-    _check_determined(np.asarray(fit.jac))
-    mast, head_from_moved = _unpack(fit.x, start, parameters)
-    fitted = camera.moved(head_from_moved)
+    names = (*(f"mast.{MAST_NAMES[i]}" for i in problem.free), *CAMERA_NAMES)
+    weak = np.full(len(names), WEAK)
+    _check_determined(names, covariance_of(fit.normal.matrix, weak), weak, pan, tilt)
+    state = fit.state
     differences = (
-        model_difference(model, fitted.moved(mast.rover_from_head(p, t)))
+        model_difference(model, state.camera.moved(mast_of(state.mast).rover_from_head(p, t)))
         for model, p, t in zip(models, pan, tilt, strict=True)
     )
-    return PoseFit(mast, fitted, tuple(differences))
+    return PoseFit(mast_of(state.mast), state.camera, tuple(differences), names, problem.covariance(fit))
 
 
-def model_difference(reference: CameraModel, other: CameraModel) -> ModelDifference:
-    """Return how far ``other`` is from ``reference`` (two models of one camera in one frame), by where
-    they project.
+class _State(NamedTuple):
+    """The mast's eight numbers, and the camera in the head frame."""
 
-    The rotation is the one that turns a grid of the reference's rays onto the other's best (Kabsch).
-    Sizes may differ where one image is the other one binned.
+    mast: FloatArray
+    camera: CameraModel
+
+
+class _Poses:
+    """The problem (``calib.least_squares.Problem``) of the mast and the camera's place in the head.
+
+    Points (n, m, 3) of n models in the rover frame, the pixels (m, 2) to see them at, and which exist (n, m).
     """
-    wanted_px = pixel_grid(other.size_px)
-    rays, other_rays = reference.ray(pixel_grid(reference.size_px)), other.ray(wanted_px)
-    px, valid = other.project(rays.origins_m + RANGES_M[1] * rays.directions)
-    both = rays.valid & other_rays.valid & valid
-    rotation, _ = Rotation.align_vectors(other_rays.directions[both], rays.directions[both])
-    return ModelDifference(other.C - reference.C, rotation.as_rotvec(), (px - wanted_px)[both])
 
+    def __init__(
+        self,
+        points_m: FloatArray,
+        wanted_px: FloatArray,
+        seen: NDArray[np.bool_],
+        pan_rad: FloatArray,
+        tilt_rad: FloatArray,
+        free: np.ndarray,
+    ) -> None:
+        self.views = [
+            (points[there], wanted_px[there], float(p), float(t))
+            for points, there, p, t in zip(points_m, seen, pan_rad, tilt_rad, strict=True)
+        ]
+        self.free = free
 
-def with_one_lens(models: Sequence[CameraModel], lens: CameraModel) -> tuple[CameraModel, ...]:
-    """Return ``lens`` put where each of the models stands, as told by its C, A and H.
+    def normal(self, state: _State) -> Normal:
+        size = len(self.free) + len(CAMERA_NAMES)
+        cost, matrix, gradient = 0.0, np.zeros((size, size)), np.zeros(size)
+        for residual, jacobian in self._rows(state):
+            cost += float(residual @ residual)
+            matrix += jacobian.T @ jacobian
+            gradient += jacobian.T @ residual
+        return Normal(cost if np.isfinite(cost) else float("inf"), matrix, gradient)
 
-    For models whose lens changes from one to the next (interpolated over temperature): what stays of them is
-    position and orientation. It trusts parameters, so it holds within one calibration only: A means the same
-    direction in two models only if their R0 is the same.
-    """
-    from_lens = Rigid(camera_axes(lens), lens.C).inverse
-    return tuple(lens.moved(Rigid(camera_axes(model), model.C) @ from_lens) for model in models)
+    def _rows(self, state: _State) -> Iterator[tuple[FloatArray, FloatArray]]:
+        """Yield residuals (2m,) and Jacobian (2m, p) of each model; the camera's six come last."""
+        for points, wanted, pan, tilt in self.views:
+            head = gimbal(state.mast, pan, tilt)
+            in_head = (points - head.translation_m) @ head.rotation
+            pixels, per_point, _ = state.camera.project_jacobian(in_head)
+            by_mast = gimbal_rates(per_point @ head.rotation.T, points, head, self.free)
+            by_camera = rigid_rates(per_point, in_head, state.camera.C)
+            # What moves the camera moves points the other way.
+            jacobian = -np.concatenate([by_mast, by_camera], axis=2) / MODEL_PX
+            yield (pixels - wanted).ravel() / MODEL_PX, jacobian.reshape(2 * len(points), -1)
 
+    def covariance(self, fit: Minimum[_State]) -> FloatArray:
+        """Return the covariance (p, p) that errors of the models make, as large as residuals show them."""
+        rows = list(self._rows(fit.state))
+        errors = np.array([np.linalg.lstsq(rates[:, -6:], left, rcond=None)[0] for left, rates in rows])
+        count = errors.size
+        spread = np.repeat([np.mean(part**2) for part in (errors[:, :3], errors[:, 3:])], 3)
+        spread *= count / max(count - rows[0][1].shape[1], 1)
+        inverse = covariance_of(fit.normal.matrix)
+        moved = [inverse @ (rates.T @ rates[:, -6:]) for _, rates in rows]
+        return np.asarray(sum((m * spread) @ m.T for m in moved))
 
-def camera_axes(model: CameraModel) -> FloatArray:
-    """Return the rotation (3, 3) from camera axes (x right, y down, z along A) to the model's frame."""
-    across = model.H - (model.H @ model.A) * model.A
-    x = across / np.linalg.norm(across)
-    return np.stack([x, np.cross(model.A, x), model.A], axis=-1)
+    def cost(self, state: _State) -> float:
+        cost = 0.0
+        for points, wanted, pan, tilt in self.views:
+            head = gimbal(state.mast, pan, tilt)
+            pixels, _ = state.camera.project((points - head.translation_m) @ head.rotation)
+            cost += float(np.sum(((pixels - wanted) / MODEL_PX) ** 2))
+        return cost if np.isfinite(cost) else float("inf")
 
-
-def pixel_grid(size_px: tuple[int, int]) -> FloatArray:
-    """Return (25, 2) pixels spread evenly over an image: the same places of the view for a binned image."""
-    fractions = (np.arange(GRID) + 0.5) / GRID
-    x, y = np.meshgrid(fractions * size_px[0] - 0.5, fractions * size_px[1] - 0.5)
-    return np.stack([x.ravel(), y.ravel()], axis=-1)
+    def stepped(self, state: _State, step: FloatArray) -> _State:
+        mast = state.mast.copy()
+        mast[self.free] += step[: len(self.free)]
+        pose = moved_rigid(Rigid(np.eye(3), state.camera.C), step[len(self.free) :])
+        # The turn is about C, which the shift then carries.
+        about_c = Rigid(pose.rotation, pose.translation_m - pose.rotation @ state.camera.C)
+        return _State(mast, state.camera.moved(about_c))
 
 
 def _targets(
@@ -227,19 +236,6 @@ def _targets(
         points.append(np.concatenate([rays.origins_m + r * rays.directions for r in ranges_m]))
     points_m = np.stack(points)
     return points_m, np.tile(pixel_grid(size_px), (len(ranges_m), 1)), np.isfinite(points_m).all(axis=-1)
-
-
-def _unpack(x: FloatArray, start: Mast, parameters: int) -> tuple[Mast, Rigid]:
-    """The mast that a step from the start leads to, and the camera's own step in the head."""
-    rotation = start.rover_from_mast.rotation @ Rotation.from_rotvec(x[3:6]).as_matrix()
-    offset_m, twist_rad = (x[12], x[13]) if parameters == 8 else (0.0, 0.0)
-    mast = Mast(
-        start.translation_m + x[:3],
-        Rotation.from_matrix(rotation).as_euler("XYZ"),
-        float(start.axis_offset_m + offset_m),
-        float(start.axis_twist_rad + twist_rad),
-    )
-    return mast, Rigid(Rotation.from_rotvec(x[6:9]).as_matrix(), x[9:12])
 
 
 def _start(
@@ -280,13 +276,16 @@ def _start(
     return Mast(solved[:3], angles_rad, float(solved[3]) if with_offset else 0.0, twist)
 
 
-def _check_determined(jacobian: FloatArray) -> None:
+def _check_determined(
+    names: Sequence[str], covariance: FloatArray, weak: FloatArray, pan_rad: FloatArray, tilt_rad: FloatArray
+) -> None:
     """Raise PosesTooFew where the data leave a combination of parameters open."""
-    norms = np.linalg.norm(jacobian, axis=0)
-    values = np.linalg.svd(jacobian / np.where(norms > 0, norms, 1.0), compute_uv=False)
-    condition = values[0] / values[-1] if values[-1] > 0 else np.inf
-    if not condition < MAX_CONDITION:
-        raise PosesTooFew(
-            f"the joint angles vary too little to fix the mast: condition {condition:.1e} of the fit, "
-            f"at most {MAX_CONDITION:.0e} is expected; add poses that move both joints"
-        )
+    found = open_parameters(names, covariance, weak)
+    if not found:
+        return
+    moves = {"pan": float(np.ptp(pan_rad)), "tilt": float(np.ptp(tilt_rad))}
+    still = [f"{joint} by {moved:.2g} rad" for joint, moved in moves.items() if moved < SEEN_RAD]
+    how = f" ({' and '.join(still)} in all)" if still else ""
+    raise PosesTooFew(
+        f"the joint angles vary too little{how} to fix {in_words(found[0])}; add poses that move both joints"
+    )

@@ -3,32 +3,34 @@
 Each step takes the one before as exact, as the paper does, and is robust: a prism or tape that disagrees with
 its drawing is left out of the start, and so is an image that belongs to another board. What is left out here
 is judged again by the fit's own test.
+
+Cameras start from their rough focal length and the surveyed points alone (``calib.fit_camera``). A camera's
+rough place and direction are not used: they help to find dots (``calib.detect_survey``) and to see what was
+mixed up (``calib.survey_mixups``), while a fit that needed them would hide that they are wrong.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
-from typing import NamedTuple
+from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
-from calib.adjustment import MAST_NAMES, Estimate, ImageTerm, StationTerm
+from calib.adjustment import Estimate
+from calib.align import NotAligned
 from calib.cahvor import CameraModel
 from calib.calibration import Outlier
 from calib.errors import CalibError
-from calib.fit_camera import CameraNotFitted, fit_camera
+from calib.fit_camera import CameraFit, CameraNotFitted, fit_camera
 from calib.fit_mast import MastNotFitted, MastView, fit_mast
-from calib.mast import Mast
+from calib.gimbal import MAST_NAMES, mast_of
 from calib.rigid import FloatArray, Rigid
+from calib.station_poses import station_poses
 from calib.survey import Survey
+from calib.terms import ImageTerm, StationTerm, image_terms, station_terms
 
 SAME_ANGLE_RAD = 1e-3
 """Joint readings this close are one joint setting for a start."""
-
-SHAPE = 5.0
-"""Tapes or prisms that are off their drawing by more than this many sigmas are not trusted for a start."""
 
 
 class SurveyNotFitted(CalibError):
@@ -41,7 +43,7 @@ class Start:
 
     ``reference_rad`` holds, for each head camera, the joint setting at which it was calibrated, and
     ``in_rover`` the cameras there, in the rover frame. ``bent`` are placements whose tapes do not fit the
-    board, ``blunders`` prisms that the set-ups' poses were found without.
+    board, ``blunders`` prisms and tapes that the poses were found without.
     """
 
     images: tuple[ImageTerm, ...]
@@ -67,11 +69,12 @@ def start(survey: Survey, mast_parameters: int, *, only_camera_images: bool = Fa
     SurveyNotFitted
         If a set-up, a camera or the mast cannot be started; the sentence says what is missing.
     """
-    notes: list[str] = []
-    blunders: list[Outlier] = []
-    rover_from_station = _setups(survey, blunders, notes)
-    rover_from_board, bent = _boards(survey, rover_from_station, notes)
-    images, checks, joints = _image_terms(survey, rover_from_board, notes)
+    try:
+        station = station_poses(survey)
+    except NotAligned as error:
+        raise SurveyNotFitted(str(error)) from None
+    notes, rover_from_board, bent = list(station.notes), station.rover_from_board, station.bent
+    images, checks, joints = image_terms(survey, rover_from_board, notes)
     doubtful: set[str] = set()
     in_rover, reference, expected = {}, {}, {}
     for name in survey.cameras:
@@ -95,186 +98,45 @@ def start(survey: Survey, mast_parameters: int, *, only_camera_images: bool = Fa
     cameras = {}
     for name, model in in_rover.items():
         if name in reference:
-            carrying = Mast(mast[:3], mast[3:6], float(mast[6]), float(mast[7]))
-            model = model.moved(carrying.rover_from_head(*reference[name]).inverse)
+            model = model.moved(mast_of(mast).rover_from_head(*reference[name]).inverse)
         cameras[name] = model
     images = [t for t in images if t.camera in cameras]
     estimate = Estimate(
         cameras,
         mast,
-        rover_from_station,
+        station.rover_from_station,
         rover_from_board,
-        {n: np.array(p) for n, p in survey.prisms_in_rover_m.items()},
+        station.prisms_in_rover_m,
         np.zeros((len(joints) if survey.sigma.joint_rad > 0 else 0, 2)),
     )
     return Start(
         tuple(images),
         tuple(t for t in checks if t.camera in cameras),
-        _station_terms(survey, rover_from_board),
+        station_terms(survey, rover_from_board),
         estimate,
         frozenset(doubtful),
         reference,
         in_rover,
         expected,
-        frozenset(bent),
-        tuple(blunders),
+        bent,
+        station.blunders,
         tuple(notes),
     )
 
 
-def aligned(to_m: FloatArray, from_m: FloatArray) -> Rigid:
-    """Return the rigid transform that carries points (n, 3) best onto others (Kabsch)."""
-    to_mean, from_mean = to_m.mean(axis=0), from_m.mean(axis=0)
-    rotation, _ = Rotation.align_vectors(to_m - to_mean, from_m - from_mean)
-    return Rigid(rotation.as_matrix(), to_mean - rotation.apply(from_mean))
-
-
-class Alignment(NamedTuple):
-    """An alignment, how many sigmas its worst coordinate is off, and the point left out, if any."""
-
-    pose: Rigid
-    misfit: float
-    left_out: int | None
-
-
-def _aligned_without_blunder(to_m: FloatArray, from_m: FloatArray, sigma_m: float) -> Alignment:
-    """The alignment, without the one point (of four or more) whose leaving helps by far."""
-
-    def without(row: int | None) -> Alignment:
-        rows = np.array([i for i in range(len(to_m)) if i != row])
-        pose = aligned(to_m[rows], from_m[rows])
-        worst = float(np.abs(to_m[rows] - pose.points(from_m[rows])).max())
-        return Alignment(pose, worst / sigma_m, row)
-
-    found = without(None)
-    if found.misfit <= SHAPE or len(to_m) < 4:
-        return found
-    return min((without(row) for row in range(len(to_m))), key=lambda a: a.misfit)
-
-
-def _setups(survey: Survey, blunders: list[Outlier], notes: list[str]) -> dict[str, Rigid]:
-    """rover_from_station of every set-up."""
-    found = {}
-    sigma = float(np.hypot(survey.sigma.station_m, survey.sigma.prism_cad_m))
-    for setup in dict.fromkeys(p.setup for p in survey.station):
-        prisms = [p for p in survey.station if p.setup == setup and p.kind == "prism"]
-        prisms = [p for p in prisms if p.point in survey.prisms_in_rover_m]
-        if len(prisms) < 3:
-            raise SurveyNotFitted(
-                f"set-up {setup} has {len(prisms)} prisms where at least 3 are expected: measure the prisms"
-            )
-        cad = np.array([survey.prisms_in_rover_m[p.point] for p in prisms])
-        measured = np.array([p.position_m for p in prisms])
-        pose, misfit, row = _aligned_without_blunder(cad, measured, sigma)
-        found[setup] = pose
-        if row is not None and misfit <= SHAPE:
-            off = float(np.linalg.norm(pose.points(measured[row]) - cad[row]))
-            name = f"prism {prisms[row].point} of set-up {setup}"
-            blunders.append(Outlier("prism", name, (off / sigma) ** 2, SHAPE**2, off))
-        elif misfit > SHAPE:
-            notes.append(
-                f"the prisms of set-up {setup} are off their CAD positions by {misfit:.0f} sigmas, and "
-                "leaving out no single one helps: measure them again"
-            )
-    return found
-
-
-def _boards(
-    survey: Survey, rover_from_station: Mapping[str, Rigid], notes: list[str]
-) -> tuple[dict[tuple[str, str], Rigid], set[tuple[str, str]]]:
-    """rover_from_board of every placement with three tapes, and those whose tapes do not fit the board."""
-    found, bent = {}, set()
-    tapes: dict[tuple[str, str], list[tuple[FloatArray, FloatArray]]] = {}
-    for p in survey.station:
-        if p.kind == "tape" and p.point in survey.board.tapes_in_board_m:
-            in_rover = rover_from_station[p.setup].points(p.position_m)
-            pair = (in_rover, survey.board.tapes_in_board_m[p.point])
-            tapes.setdefault((p.setup, p.placement), []).append(pair)
-    for board, points in tapes.items():
-        if len(points) < 3:
-            continue
-        measured, drawn = (np.array(part) for part in zip(*points, strict=True))
-        pose, misfit, _ = _aligned_without_blunder(measured, drawn, survey.sigma.station_m)
-        found[board] = pose
-        if misfit > SHAPE:
-            bent.add(board)
-            notes.append(
-                f"the tapes of placement {board[1]} (set-up {board[0]}) are off the board's by "
-                f"{misfit:.0f} sigmas"
-            )
-    return found, bent
-
-
-def _image_terms(
-    survey: Survey, boards: Mapping[tuple[str, str], Rigid], notes: list[str]
-) -> tuple[list[ImageTerm], list[ImageTerm], dict[tuple[object, ...], int]]:
-    """Terms of the fitted and of the check images, and the head's attitudes among the former."""
-    fitted: list[ImageTerm] = []
-    checks: list[ImageTerm] = []
-    joints: dict[tuple[object, ...], int] = {}
-    for image in survey.images:
-        dots = survey.dots.get(image.name)
-        if dots is None or not len(dots.rows):
-            continue
-        if (image.setup, image.placement) not in boards:
-            notes.append(
-                f"image {image.name} is not used: placement {image.placement} of set-up {image.setup} "
-                "has no three tapes"
-            )
-            continue
-        attitude = None
-        on_head = survey.cameras[image.camera].on == "head"
-        if on_head:
-            key = (image.setup, image.placement, image.pan_rad, image.tilt_rad)
-            attitude = joints.setdefault(key, len(joints)) if image.purpose != "check" else -1
-        sigma = dots.sigma_px if dots.sigma_px is not None else np.full(len(dots.rows), survey.sigma.dot_px)
-        term = ImageTerm(
-            image.name,
-            image.camera,
-            (image.setup, image.placement),
-            attitude,
-            float(image.pan_rad or 0.0) if on_head else 0.0,
-            float(image.tilt_rad or 0.0) if on_head else 0.0,
-            dots.rows,
-            dots.columns,
-            survey.board.dots_in_board_m(dots.rows, dots.columns),
-            dots.pixels_px,
-            np.asarray(sigma, dtype=np.float64),
-            np.ones(len(dots.rows), dtype=bool),
-        )
-        (checks if image.purpose == "check" else fitted).append(term)
-    return fitted, checks, joints
-
-
-def _station_terms(survey: Survey, boards: Mapping[tuple[str, str], Rigid]) -> tuple[StationTerm, ...]:
-    """Terms of prisms and of the tapes of every board."""
-    terms = []
-    for p in survey.station:
-        if p.kind == "prism" and p.point in survey.prisms_in_rover_m:
-            terms.append(
-                StationTerm(p.setup, None, p.point, p.position_m, np.zeros(3), survey.sigma.station_m)
-            )
-        elif (
-            p.kind == "tape" and (p.setup, p.placement) in boards and p.point in survey.board.tapes_in_board_m
-        ):
-            place = survey.board.tapes_in_board_m[p.point]
-            board = (p.setup, p.placement)
-            terms.append(StationTerm(p.setup, board, p.point, p.position_m, place, survey.sigma.station_m))
-    return tuple(terms)
+def at_setting(image: ImageTerm, setting_rad: tuple[float, float], joint_rad: float) -> bool:
+    """Return whether an image's joint readings are a setting's, but for their noise."""
+    off = np.abs(np.subtract((image.pan_rad, image.tilt_rad), setting_rad))
+    return bool(off.max() <= max(SAME_ANGLE_RAD, 4 * joint_rad))
 
 
 def _largest_setting(
     images: Sequence[ImageTerm], joint_rad: float
 ) -> tuple[tuple[float, float], list[ImageTerm]]:
     """The joint setting with the most images, and those."""
-    near = max(SAME_ANGLE_RAD, 4 * joint_rad)
     best: tuple[tuple[float, float], list[ImageTerm]] = ((0.0, 0.0), [])
     for one in images:
-        group = [
-            t
-            for t in images
-            if abs(t.pan_rad - one.pan_rad) <= near and abs(t.tilt_rad - one.tilt_rad) <= near
-        ]
+        group = [t for t in images if at_setting(t, (one.pan_rad, one.tilt_rad), joint_rad)]
         if len(group) > len(best[1]):
             pan = float(np.median([t.pan_rad for t in group]))
             tilt = float(np.median([t.tilt_rad for t in group]))
@@ -312,9 +174,34 @@ def _camera(
             f"camera {name} sees {len(placements)} boards{where} where at least 2, better 8, are expected: "
             "take more images of boards at two distances without moving the head"
         )
+    points = {t.name: boards[t.board].points(t.in_board_m) for t in group}
+    fit = camera_from_points(survey, name, group, points, expected_px)
+    first = 0
+    for term in group:
+        if not fit.used[first : first + len(term.rows)].any():
+            doubtful.add(term.name)
+        first += len(term.rows)
+    return fit.model
+
+
+def camera_from_points(
+    survey: Survey,
+    name: str,
+    group: Sequence[ImageTerm],
+    points_m: Mapping[str, FloatArray],
+    expected_px: float,
+) -> CameraFit:
+    """Return a camera fitted to the dots of some images, at ``points_m`` by image, in one frame.
+
+    Raises
+    ------
+    SurveyNotFitted
+        If no camera explains them.
+    """
+    camera = survey.cameras[name]
     try:
-        fit = fit_camera(
-            np.concatenate([boards[t.board].points(t.in_board_m) for t in group]),
+        return fit_camera(
+            np.concatenate([points_m[t.name] for t in group]),
             np.concatenate([t.pixels_px for t in group]),
             np.concatenate([np.full(len(t.rows), i) for i, t in enumerate(group)]),
             kind=camera.kind,
@@ -325,12 +212,6 @@ def _camera(
         )
     except CameraNotFitted as error:
         raise SurveyNotFitted(f"camera {name}: {error}") from None
-    first = 0
-    for term in group:
-        if not fit.used[first : first + len(term.rows)].any():
-            doubtful.add(term.name)
-        first += len(term.rows)
-    return fit.model
 
 
 def _mast(
@@ -338,7 +219,7 @@ def _mast(
     in_rover: Mapping[str, CameraModel],
     reference: Mapping[str, tuple[float, float]],
     boards: Mapping[tuple[str, str], Rigid],
-    bent: set[tuple[str, str]],
+    bent: frozenset[tuple[str, str]],
     expected: Mapping[str, float],
     mast_parameters: int,
     doubtful: set[str],
@@ -382,8 +263,3 @@ def mast_views(
         for t in images
         if t.camera in reference
     ]
-
-
-def with_kept(images: Sequence[ImageTerm], left_out: frozenset[str] | set[str]) -> tuple[ImageTerm, ...]:
-    """Return the terms with whole images left out by name."""
-    return tuple(replace(t, keep=np.zeros_like(t.keep)) if t.name in left_out else t for t in images)

@@ -120,3 +120,13 @@ def _try(problem: Problem[State], state: State, step: FloatArray, cost: float) -
     except ValueError:
         return None
     return moved if problem.cost(moved) < cost else None
+
+
+def covariance_of(matrix: FloatArray, weak: FloatArray | None = None) -> FloatArray:
+    """Return the inverse of JᵀJ (p, p), with ``weak`` (p,) added to its diagonal as in ``minimise``.
+
+    An unknown that the data leave open so keeps the variance 1 / weak. Columns are scaled to one first.
+    """
+    whole = matrix if weak is None else matrix + np.diag(weak)
+    scale = 1.0 / np.sqrt(np.diag(whole))
+    return np.asarray(np.linalg.inv(whole * np.outer(scale, scale)) * np.outer(scale, scale))

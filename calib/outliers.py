@@ -13,13 +13,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 from scipy.stats import chi2
 
-from calib.adjustment import Adjustment, Estimate, ImageTerm, StationTerm, moved_rigid
+from calib.adjustment import Adjustment, Estimate
 from calib.calibration import Outlier
-from calib.rigid import FloatArray
+from calib.rigid import FloatArray, moved_rigid
+from calib.terms import ImageTerm, StationTerm
 
 FALSE_ALARMS = 0.01
 """Chance, for each of the three kinds of measurement, that a survey without blunders loses any."""
@@ -153,12 +155,8 @@ def named(
         judged = _point(problem, state, covariance, point)
         limit = float(chi2.isf(FALSE_ALARMS / len(problem.station), 3))
         size = float(np.linalg.norm(problem.station_residual(state, point)) * point.sigma_m)
-        if point.board is None:
-            name = f"prism {point.point} of set-up {point.setup}"
-        else:
-            name = f"tape {point.point} of placement {point.board[1]} (set-up {point.setup})"
-        kind = "prism" if point.board is None else "tape"
-        found.append(Outlier(kind, name, float(judged.statistic[()]), limit, size))  # type: ignore[arg-type]
+        kind: Literal["prism", "tape"] = "prism" if point.board is None else "tape"
+        found.append(Outlier(kind, point.name, float(judged.statistic[()]), limit, size))
     return tuple(found)
 
 

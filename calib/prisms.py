@@ -36,8 +36,8 @@ class RefinedPrisms:
     rover_from_station
         The pose of every set-up.
     rejected
-        Measurements left out: ``p2 in set-up level``, or ``p2 in the drawing`` where the set-ups agree with
-        each other on another place.
+        Measurements left out: set-up and prism, or None and prism where the set-ups agree with each other
+        on another place than the drawing's.
     doubt
         '' if what was used agrees; else a sentence.
     chi2, degrees_of_freedom
@@ -48,7 +48,7 @@ class RefinedPrisms:
     places_in_rover_m: FloatArray
     covariance: FloatArray
     rover_from_station: Mapping[str, Rigid]
-    rejected: tuple[str, ...]
+    rejected: tuple[tuple[str | None, str], ...]
     doubt: str
     chi2: float
     degrees_of_freedom: int
@@ -67,13 +67,15 @@ Seen = dict[str, dict[int, FloatArray]]
 """Set-up to prism's index to its place in the station frame."""
 
 
-def refine_prisms(survey: Survey) -> RefinedPrisms:
+def refine_prisms(survey: Survey, *, false_alarm: float = FALSE_ALARM) -> RefinedPrisms:
     """Fit the places of the prisms to all set-ups of a survey and to the drawing.
 
     Parameters
     ----------
     survey
         With ``sigma.prism_cad_m`` above 0; at 0 the drawing is exact and there is nothing to refine.
+    false_alarm
+        How often measurements without a blunder may be called in doubt.
 
     Raises
     ------
@@ -86,27 +88,26 @@ def refine_prisms(survey: Survey) -> RefinedPrisms:
         raise ValueError("sigma.prism_cad_m is 0: the drawing is taken as exact, nothing can be refined")
     names = tuple(survey.prisms_in_rover_m)
     drawing = np.array([survey.prisms_in_rover_m[name] for name in names])
-    seen: Seen = {}
+    seen: Seen = {point.setup: {} for point in survey.station}
     for point in survey.station:
-        if point.kind == "prism":
-            seen.setdefault(point.setup, {})[names.index(point.point)] = point.position_m
+        if point.kind == "prism" and point.point in names:
+            seen[point.setup][names.index(point.point)] = point.position_m
     for setup, points in seen.items():
         if len(points) < 3:
             raise NotAligned(f"set-up {setup}: {len(points)} prisms where at least three are expected")
     drawn = np.ones(len(names), dtype=bool)
     sigmas = survey.sigma.station_m, survey.sigma.prism_cad_m
     fit = _fit(drawing, drawn, seen, *sigmas)
-    rejected: list[str] = []
-    while fit.chi2 > _limit(fit.freedom):
-        found = _culprit(drawing, drawn, seen, sigmas, fit.chi2)
+    rejected: list[tuple[str | None, str]] = []
+    while fit.chi2 > _limit(fit.freedom, false_alarm):
+        found = _culprit(drawing, drawn, seen, sigmas, fit.chi2, false_alarm)
         if found is None:
             break
-        where = f"set-up {found[0]}" if found[0] is not None else "the drawing"
-        rejected.append(f"{names[found[1]]} in {where}")
+        rejected.append((found[0], names[found[1]]))
         drawn, seen = _without(drawn, seen, *found)
         fit = _fit(drawing, drawn, seen, *sigmas)
     doubt = ""
-    if fit.chi2 > _limit(fit.freedom):
+    if fit.chi2 > _limit(fit.freedom, false_alarm):
         rms = np.sqrt(fit.chi2 / fit.freedom)
         doubt = f"the set-ups and the drawing of the prisms disagree by {rms:.1f} times their sigmas"
     return RefinedPrisms(
@@ -114,8 +115,8 @@ def refine_prisms(survey: Survey) -> RefinedPrisms:
     )
 
 
-def _limit(freedom: int) -> float:
-    return float(chi_square.isf(FALSE_ALARM, freedom))
+def _limit(freedom: int, false_alarm: float) -> float:
+    return float(chi_square.isf(false_alarm, freedom))
 
 
 def _without(drawn: np.ndarray, seen: Seen, setup: str | None, index: int) -> tuple[np.ndarray, Seen]:
@@ -129,7 +130,12 @@ def _without(drawn: np.ndarray, seen: Seen, setup: str | None, index: int) -> tu
 
 
 def _culprit(
-    drawing: FloatArray, drawn: np.ndarray, seen: Seen, sigmas: tuple[float, float], now: float
+    drawing: FloatArray,
+    drawn: np.ndarray,
+    seen: Seen,
+    sigmas: tuple[float, float],
+    now: float,
+    false_alarm: float,
 ) -> tuple[str | None, int] | None:
     """The measurement whose leaving helps by far the most; None if two would do about as well."""
     left: list[tuple[float, str | None, int]] = []
@@ -142,8 +148,8 @@ def _culprit(
         fit = _fit(drawing, *_without(drawn, seen, setup, index), *sigmas)
         left.append((fit.chi2, setup, index))
     left.sort(key=lambda entry: entry[0])
-    clear = _limit(3)
-    if len(left) < 2 or now - left[0][0] < clear or left[1][0] - left[0][0] < _limit(1):
+    clear = _limit(3, false_alarm)
+    if len(left) < 2 or now - left[0][0] < clear or left[1][0] - left[0][0] < _limit(1, false_alarm):
         return None
     return left[0][1], left[0][2]
 

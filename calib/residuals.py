@@ -6,10 +6,12 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 
-from calib.adjustment import Adjustment, Estimate, ImageTerm, gimbal
+from calib.adjustment import Adjustment, Estimate
 from calib.calibration import ImageResiduals, StationResidual
+from calib.gimbal import gimbal
 from calib.rigid import FloatArray
 from calib.survey import Survey
+from calib.terms import ImageTerm
 
 Rms = dict[str, tuple[float, float]]
 

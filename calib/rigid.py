@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.spatial.transform import Rotation
 
 FloatArray = NDArray[np.float64]
 
@@ -100,3 +101,16 @@ class Rigid:
             and np.array_equal(self.rotation, other.rotation)
             and np.array_equal(self.translation_m, other.translation_m)
         )
+
+
+def moved_rigid(pose: Rigid, step: FloatArray) -> Rigid:
+    """Return a pose shifted by step[:3] and turned by the rotation vector step[3:] about its origin."""
+    turned = Rotation.from_rotvec(step[3:]).as_matrix() @ pose.rotation
+    return Rigid(turned, pose.translation_m + step[:3])
+
+
+def rigid_rates(per_point: FloatArray, points_m: FloatArray, origin_m: FloatArray) -> FloatArray:
+    """Return (n, m, 6): rates of something per point (n, m, 3) for a shift and a turn about ``origin_m``."""
+    arm = points_m - origin_m
+    moment = np.cross(arm[:, None, :], per_point)
+    return np.concatenate([np.broadcast_to(per_point, moment.shape), moment], axis=2)

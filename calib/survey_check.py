@@ -13,7 +13,8 @@ import numpy as np
 from calib.formats.strict import nearest
 from calib.rigid import FloatArray, Rigid
 from calib.survey import Finding, Survey, SurveyCamera, SurveyImage
-from calib.survey_doubts import dot_doubts, station_doubts, unit_doubts
+from calib.survey_doubts import dot_doubts, grid_doubts, station_doubts, unit_doubts
+from calib.survey_joints import joint_doubts
 from calib.survey_mixups import Placement, eyes_in_rover_m, mixups, rover_from_boards
 
 FEWEST_BOARDS, ENOUGH_BOARDS = 3, 5
@@ -49,11 +50,11 @@ def check_survey(
     findings = [*_missing(survey), *_set_ups(survey), *_placements(survey)]
     angles = list(_angles(survey, pan_limits_rad, tilt_limits_rad))
     units = list(unit_doubts(survey))
-    findings += [*angles, *units, *dot_doubts(survey)]
+    findings += [*angles, *units, *grid_doubts(survey), *dot_doubts(survey)]
     if not units:
         findings += station_doubts(survey)
     if not units and not angles:
-        findings += mixups(survey)
+        findings += list(joint_doubts(survey)) or mixups(survey)
     boards = rover_from_boards(survey)
     for name, camera in survey.cameras.items():
         mine = [image for image in survey.images if image.camera == name]

@@ -17,6 +17,12 @@ UNITS = {"feet": 3.28084, "inches": 39.3701, "centimetres": 100.0, "millimetres"
 SCALE = 0.03
 """Distances that differ from the design's by more than this in the median are no noise."""
 
+ALIKE = 0.6
+"""A wrong unit stretches every distance; with fewer alike than this part of them, single points are wrong."""
+
+FEWEST_IMAGES = 5
+"""So many images together show every row and column of a board."""
+
 SAME_PLACE_M = 1e-6
 NEAR_DOT = 0.25
 """Two dots nearer than this part of the usual distance are one dot found twice."""
@@ -107,6 +113,23 @@ def dot_doubts(survey: Survey) -> Iterator[Finding]:
         )
 
 
+def grid_doubts(survey: Survey) -> Iterator[Finding]:
+    """Yield a board that is said to be larger than any image shows it; its middle would be elsewhere."""
+    if len(survey.dots) < FEWEST_IMAGES:
+        return
+    for what, count in (("row", survey.board.rows), ("column", survey.board.columns)):
+        seen = np.concatenate([getattr(dots, f"{what}s") for dots in survey.dots.values()])
+        if seen.min() > 0 or seen.max() < count - 1:
+            yield Finding(
+                "error",
+                f"survey.yaml board.{what}s",
+                f"the board has {count} {what}s, 0 to {count - 1}, but the dots of all {len(survey.dots)} "
+                f"images are in {what}s {seen.min()} to {seen.max()}",
+                f"Correct board.{what}s or dots.csv ({what}s count from 0), and tapes_in_board_m, which "
+                "count from the middle of the grid",
+            )
+
+
 def prism_groups(survey: Survey) -> dict[Group, dict[str, FloatArray]]:
     """Return set-up (with '') to the prisms measured there, metres."""
     groups: dict[Group, dict[str, FloatArray]] = {}
@@ -126,14 +149,18 @@ def tape_groups(survey: Survey) -> dict[Group, dict[str, FloatArray]]:
 
 
 def _ratio(design: Mapping[str, FloatArray], groups: Iterable[Mapping[str, FloatArray]]) -> float | None:
-    """Median of measured to designed distances; None if there are none."""
+    """Median of measured to designed distances; None if there are none, or they do not agree on one."""
     ratios = [
         float(np.linalg.norm(seen[a] - seen[b]) / np.linalg.norm(design[a] - design[b]))
         for seen in groups
         for a, b in combinations(seen, 2)
         if np.linalg.norm(design[a] - design[b]) > 0
     ]
-    return float(np.median(ratios)) if ratios else None
+    if not ratios:
+        return None
+    median = float(np.median(ratios))
+    alike = np.abs(np.array(ratios) / median - 1) < SCALE / 2
+    return median if alike.mean() >= ALIKE else None
 
 
 def _as_unit(ratio: float, measured: str, designed: str) -> str:

@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 from scipy.optimize import approx_fprime
 
-from calib.adjustment import MAST_NAMES, Adjustment, Estimate, gimbal, gimbal_rates
-from calib.cahvor import CameraModel
+from calib import rig_covariance
+from calib.adjustment import Adjustment
 from calib.calibration import Calibration, Degenerate
-from calib.camera_parameters import parameter_part, predict, stepped, tangents
+from calib.camera_parameters import parameter_part, predict, tangents
 from calib.errors import CalibError
-from calib.mast import Mast, Rig
+from calib.gimbal import MAST_NAMES, gimbal, gimbal_rates, numbers_of
+from calib.mast import Rig
 from calib.pointing import solve
 from calib.rigid import FloatArray
 from calib.stereo import triangulate
@@ -69,9 +69,7 @@ def pixel_rates(
     if held.on == "rover":
         seen = predict(held.model, points_m)
     else:
-        m = calibration.rig.mast
-        numbers = np.array([*m.translation_m, *m.rotation_rad, m.axis_offset_m, m.axis_twist_rad])
-        head = gimbal(numbers, pan_rad, tilt_rad)
+        head = gimbal(numbers_of(calibration.rig.mast), pan_rad, tilt_rad)
         seen = predict(held.model, (points_m - head.translation_m) @ head.rotation)
         at = {n: i for i, n in enumerate(calibration.parameter_names)}
         free = np.array([i for i, n in enumerate(MAST_NAMES) if f"mast.{n}" in at], dtype=int)
@@ -159,50 +157,45 @@ def pointing_covariance(
 
 def moved_rig(calibration: Calibration, columns: np.ndarray, step: FloatArray) -> Rig:
     """Return the rig with the parameters at ``columns`` moved by ``step``."""
-    rig = calibration.rig
-    whole = np.zeros(len(calibration.parameter_names))
-    whole[columns] = step
-    at = {n: i for i, n in enumerate(calibration.parameter_names)}
-    m = rig.mast
-    numbers = np.array([*m.translation_m, *m.rotation_rad, m.axis_offset_m, m.axis_twist_rad])
-    for index, name in enumerate(MAST_NAMES):
-        if f"mast.{name}" in at:
-            numbers[index] += whole[at[f"mast.{name}"]]
-    cameras = {}
-    for name, camera in rig.cameras.items():
-        part = calibration.part(f"cameras.{name}.")
-        model: CameraModel = stepped(camera.model, whole[part]) if len(part) else camera.model
-        cameras[name] = replace(camera, model=model)
-    mast = Mast(numbers[:3], numbers[3:6], float(numbers[6]), float(numbers[7]))
-    return replace(rig, mast=mast, cameras=cameras)
+    return rig_covariance.moved_rig(calibration.rig, [calibration.parameter_names[i] for i in columns], step)
 
 
-def open_directions(
-    problem: Adjustment, state: Estimate, names: Sequence[str], covariance: FloatArray
-) -> tuple[Degenerate, ...]:
-    """Return the directions of mast and cameras that the data leave open, in words.
+def open_parameters(
+    names: Sequence[str], covariance: FloatArray, weak: FloatArray
+) -> tuple[tuple[str, ...], ...]:
+    """Return the directions that the data leave open, the worst first, each as the parameters it moves most.
 
-    ``covariance`` is of ``names``, the first of the problem's unknowns, with the problem's weak knowledge
+    ``covariance`` (p, p) is of ``names`` with the weak knowledge (p,) of ``calib.least_squares.minimise``
     added: an unknown that the data do not see keeps a sigma of 1 m, 1 rad or one focal length.
     """
-    shown = [i for i, n in enumerate(names) if n.startswith("mast.") or n.split(".")[2] not in "ORE"]
-    scale = np.sqrt(problem.weak[shown])
-    values, vectors = np.linalg.eigh(covariance[np.ix_(shown, shown)] * np.outer(scale, scale))
+    scale = np.sqrt(weak)
+    values, vectors = np.linalg.eigh(covariance * np.outer(scale, scale))
     found = []
     for value, vector in zip(values[::-1], vectors.T[::-1], strict=True):
         if np.sqrt(max(value, 0.0)) < OPEN:
             break
-        size = np.abs(vector) * np.array([3.0 if names[i].startswith("mast.") else 1.0 for i in shown])
+        size = np.abs(vector) * np.array([3.0 if n.startswith("mast.") else 1.0 for n in names])
         order = [i for i in np.argsort(-size) if size[i] >= PART] or [int(np.argmax(size))]
-        parts = tuple(names[shown[i]] for i in order)
-        found.append(Degenerate(parts, _reason(problem, parts)))
+        found.append(tuple(names[i] for i in order))
     return tuple(found)
+
+
+def open_directions(
+    problem: Adjustment, names: Sequence[str], covariance: FloatArray
+) -> tuple[Degenerate, ...]:
+    """Return the directions of mast and cameras that a survey leaves open, in words.
+
+    ``covariance`` is of ``names``, the first of the problem's unknowns, with the problem's weak knowledge
+    added.
+    """
+    shown = [i for i, n in enumerate(names) if n.startswith("mast.") or n.split(".")[2] not in "ORE"]
+    found = open_parameters([names[i] for i in shown], covariance[np.ix_(shown, shown)], problem.weak[shown])
+    return tuple(Degenerate(parts, _reason(problem, parts)) for parts in found)
 
 
 def _reason(problem: Adjustment, parameters: Sequence[str]) -> str:
     """Why a direction is open, and what to measure."""
-    named = list(dict.fromkeys(_words(p) for p in parameters))
-    what = "the survey does not fix " + ", ".join(named[:4]) + (" and more" if len(named) > 4 else "")
+    what = f"the survey does not fix {in_words(parameters)}"
     head = [t for t in problem.images if t.attitude is not None and t.keep.any()]
     on_mast = any(p.startswith("mast.") for p in parameters)
     cameras = {p.split(".")[1] for p in parameters if p.startswith("cameras.")}
@@ -225,35 +218,15 @@ def _reason(problem: Adjustment, parameters: Sequence[str]) -> str:
     return f"{what}; take more images of purpose mast, spread over pan and tilt"
 
 
+def in_words(parameters: Sequence[str]) -> str:
+    """Return some parameters as a person says them."""
+    named = list(dict.fromkeys(_words(p) for p in parameters))
+    return ", ".join(named[:4]) + (" and more" if len(named) > 4 else "")
+
+
 def _words(parameter: str) -> str:
     """A parameter as a person says it."""
     first, *rest = parameter.split(".")
     if first == "mast":
         return "the mast's " + " ".join(rest).replace("_m", "").replace("_rad", "").replace("_", " ")
-    return f"{rest[1]} of {rest[0]}"
-
-
-def lens_notes(
-    rig: Rig, sigma: Mapping[str, Any], limits: Mapping[str, Sequence[float]], part: float = 0.7
-) -> tuple[str, ...]:
-    """Return a sentence for what the survey hardly sees of lenses, so that usual lenses decide.
-
-    ``limits`` gives the sigma of what lenses are usually like, by letter.
-    """
-    by_words: dict[str, list[str]] = {}
-    for name, camera in rig.cameras.items():
-        held = []
-        for letter, word in (("O", "lens axis"), ("R", "distortion"), ("E", "entrance point")):
-            if letter not in camera.model.kind or name not in sigma["cameras"]:
-                continue
-            found = np.array(sigma["cameras"][name][letter])
-            found = found[1:] if letter == "R" else found[:1] if letter == "E" else found
-            if (found > part * np.array(limits[letter])[: len(found)]).any():
-                held.append(word)
-        if held:
-            by_words.setdefault(" and ".join(held), []).append(name)
-    return tuple(
-        f"the survey hardly shows {words} of {', '.join(names)}, so what lenses are usually like decides; "
-        "pixels beyond the dots suffer"
-        for words, names in by_words.items()
-    )
+    return f"{rest[1]} of {rest[0]}" if first == "cameras" else f"the {first}'s {rest[0].split('_')[0]}"

@@ -24,9 +24,7 @@ class DriverError(Exception):
 
     code = "driver_error"
 
-    def __init__(
-        self, message: str, *, device: str = "", detail: Mapping[str, object] | None = None
-    ) -> None:
+    def __init__(self, message: str, *, device: str = "", detail: Mapping[str, object] | None = None) -> None:
         self.device = device
         self.detail = dict(detail or {})
         super().__init__(f"{device}: {message}" if device else message)

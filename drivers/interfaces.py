@@ -5,10 +5,12 @@ Times are seconds of CLOCK_MONOTONIC. Calls may block; the service gives each de
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
+from typing import Literal, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -59,6 +61,60 @@ class Frame:
     sequence: int
     mid_exposure_s: float
     exposure_s: float
+
+
+Side = Literal["positive", "negative", "unknown"]
+
+
+@dataclass(frozen=True)
+class AxisReport:
+    """Where an axis was sent and where it stands, in the device's own counts.
+
+    Attributes
+    ----------
+    commanded_rad
+        The angle that was asked for; None before the first move, and after a stop.
+    goal_counts, measured_counts
+        The nearest count to it, and what the servo measures.
+    goal_rad, measured_rad
+        The same as angles.
+    side
+        From which side the axis came last: on which flank the gears rest.
+    backlash_rad
+        Of the gears, as their maker states it; None where nothing is stated.
+    current_A, temperature_C, voltage_V
+        As the device measures them; None for what it does not.
+    """
+
+    commanded_rad: float | None
+    goal_counts: int
+    goal_rad: float
+    measured_counts: int
+    measured_rad: float
+    side: Side
+    backlash_rad: float | None
+    current_A: float | None
+    temperature_C: float | None
+    voltage_V: float | None
+
+    @property
+    def left_rad(self) -> float | None:
+        """What the counts leave: measured minus commanded angle."""
+        return None if self.commanded_rad is None else self.measured_rad - self.commanded_rad
+
+    def left_px(self, focal_px: float) -> float | None:
+        """Return it in pixels at the image centre of a camera of focal length ``focal_px`` that looks at
+        right angles to the axis.
+        """
+        return None if self.left_rad is None else focal_px * math.tan(self.left_rad)
+
+
+class Reporting(ABC):
+    """What a head may be beside a `PanTilt`: one that knows its counts."""
+
+    @abstractmethod
+    def report(self) -> Mapping[str, AxisReport]:
+        """Return ``pan`` and ``tilt`` as they were last read; empty before that. Asks nobody, never fails."""
 
 
 @runtime_checkable

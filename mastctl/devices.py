@@ -20,7 +20,7 @@ import numpy as np
 from calib.mast import Rig
 from drivers.clock import Clock
 from drivers.errors import BadFrame, BadReply, DriverError, NoReply
-from drivers.interfaces import Camera, HoldsExposure, KnowsSize, PanTilt, Reading
+from drivers.interfaces import AxisReport, Camera, HoldsExposure, KnowsSize, PanTilt, Reading, Reporting
 from mastctl import frames as frame_checks
 from mastctl import joint_history
 from mastctl.device_thread import DeviceThread, Fault
@@ -124,6 +124,10 @@ class Devices:
             If the head does not answer in 1 s, or answers what cannot be true.
         """
         return self._head.call("read", self._read_once, READ_TIMEOUT_S)
+
+    def report(self) -> Mapping[str, AxisReport]:
+        """Return where each axis was sent and stands in counts; empty for a head that does not know."""
+        return self._pan_tilt.report() if isinstance(self._pan_tilt, Reporting) else {}
 
     def move(self, pan_rad: float, tilt_rad: float, speed_rad_per_s: float | None = None) -> None:
         """Start the head towards the angles, radians, and return; at most at the speed cap.

@@ -200,7 +200,10 @@ def lerobot_bus(path: str) -> Iterator[tuple[CALL, CALL]]:
     motors.set_baudrate(BAUD)
 
     def read() -> None:
-        motors.sync_read("Present_Position", normalize=False)
+        try:
+            motors.sync_read("Present_Position", normalize=False)
+        except ConnectionError as error:  # its one try was not answered in time
+            raise Failed(str(error)) from error
 
     def write_read() -> None:
         motors.sync_write("Goal_Position", dict.fromkeys(names, 2048), normalize=False)

@@ -19,8 +19,9 @@ import flight_mer as mer
 import flight_msl as msl
 import numpy as np
 
-from calib.fit_poses import ModelDifference, PoseFit, model_difference
+from calib.fit_poses import PoseFit
 from calib.formats.pds3 import PdsProduct
+from calib.model_difference import ModelDifference, model_difference
 from calib.store import save_rig
 from drivers.clock import ManualClock
 from drivers.errors import DriverError
@@ -101,6 +102,8 @@ def msl_blocks(folder: Path, pictures: bool) -> dict[str, str]:
     ]
     axes = msl.against_flight_software(fitted.mast, folder)
     offset, twist = axes.offset_mm, axes.twist_mrad
+    place = [fitted.parameter_names.index(f"mast.{name}") for name in ("axis_offset_m", "axis_twist_rad")]
+    sigma = 1e3 * np.sqrt(np.diag(fitted.covariance)[place])
     if pictures:
         from flight_pictures import prediction
 
@@ -134,11 +137,16 @@ def msl_blocks(folder: Path, pictures: bool) -> dict[str, str]:
                 f"direction of the tilt axis | {axes.tilt_axis_mrad:.4f} mrad apart",
                 f"mast origin from the pan axis | {axes.pan_line_mm:.4f} mm",
                 f"head origin from the tilt axis | {axes.tilt_line_mm:.4f} mm",
-                f"axis offset a | {offset[0]:.4f} mm, flight software {offset[1]:.4f} mm",
-                f"axis twist k | {twist[0]:.4f} mrad, flight software {twist[1]:.4f} mrad",
+                f"axis offset a | {told(offset[0], sigma[0])} mm, flight software {offset[1]:.4f} mm",
+                f"axis twist k | {told(twist[0], sigma[1])} mrad, flight software {twist[1]:.4f} mrad",
             ],
         ),
     }
+
+
+def told(value: float, sigma: float) -> str:
+    """Return a number with its sigma."""
+    return f"{value:.4f} (sigma {sigma:.4f})"
 
 
 def turns_mrad(fitted: PoseFit, labels: list[msl.Label]) -> np.ndarray:

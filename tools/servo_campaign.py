@@ -89,7 +89,7 @@ class Judge:
     """Compares readings with the true angles, and true angles with the limits."""
 
     def __init__(self, rig: Rig, row: Row, lying: bool) -> None:
-        self._rig, self._row, self._lying = rig, row, lying
+        self._rig, self._row, self.lying = rig, row, lying
         self._seen_s = time.monotonic()
 
     def reading(self, reading: Reading, began_s: float, ended_s: float) -> None:
@@ -101,7 +101,7 @@ class Judge:
         for axis, angle in enumerate((reading.pan_rad, reading.tilt_rad)):
             seen = [truth[axis] for truth in truths]
             away = max(away, min(seen) - angle, angle - max(seen))
-        if self._lying:
+        if self.lying:
             if not reading.moving:
                 self._row.worst_lie_rad = max(self._row.worst_lie_rad, away)
         elif not away <= WRONG_COUNTS * self._rig.count_rad:
@@ -133,7 +133,7 @@ class Run:
 
     def __init__(self, rig: Rig, row: Row, rng: np.random.Generator) -> None:
         self._rig, self._row, self._rng = rig, row, rng
-        self._judge = Judge(rig, row, row.word in (*LYING, MIXTURE))
+        self._judge = Judge(rig, row, row.word in LYING)
 
     def episode(self) -> bool:
         """Healthy, faulty, healthy again; return whether the head came back without being switched off."""
@@ -153,6 +153,7 @@ class Run:
         mixed = self._row.word == MIXTURE
         words = tuple(rng.choice(list(HEAD_WORDS), int(rng.integers(2, 4)), replace=False)) if mixed else ()
         words = words or (self._row.word,)
+        self._judge.lying = bool(set(words) & set(LYING))  # and until the next fault is set
         for word in words:
             self._rig.panel.set("pan_tilt", word, **_parameters(word, rng))
         return words

@@ -27,8 +27,8 @@ from drivers.sim.wire.ptu import SimulatedPtu
 LIMITS_RAD = ((-1.0, 1.0), (-0.6, 0.4))
 SPEED_RAD_PER_S, ACCELERATION_RAD_PER_S2 = 1.2, 20.0
 X_COUNT_RAD = math.tau / 4096  # e-manual, X series
-PTU_STEP_RAD = math.radians(324 / 7 / 3600)  # D46-70, half step of 46.2857"
-PTU_ACCELERATION = round(ACCELERATION_RAD_PER_S2 / PTU_STEP_RAD)
+D46_STEP_RAD = math.radians(324 / 7 / 3600)  # D46-70, half step of 46.2857"
+D48E_STEP_RAD = math.radians(162 / 7 / 3600)  # eighth step of 23.142857"
 
 
 @dataclass
@@ -124,12 +124,12 @@ def ptu_pty() -> Iterator[Rig]:
 
 @contextmanager
 def ptu_tcp() -> Iterator[Rig]:
-    """A D46-70 behind a TCP port."""
+    """A D48E, whose answers look otherwise, behind a TCP port."""
     with ExitStack() as stack:
         clock, panel, axes = _axes()
         sent = [0]
-        unit = SimulatedPtu("d46_70", *axes)
-        line = stack.enter_context(TcpLine(unit, clock, panel, observer=_counter(sent)))
+        unit = SimulatedPtu("d48e", *axes)
+        line = stack.enter_context(TcpLine(unit, clock, panel, banner=unit.banner, observer=_counter(sent)))
         yield _ptu_rig(
             stack, "PTU, TCP", f"socket://127.0.0.1:{line.port}", line, unit, clock, panel, axes, sent
         )
@@ -147,8 +147,10 @@ def _ptu_rig(
     sent: list[int],
 ) -> Rig:
     """The driver on a simulated unit; positions of its pan grow to the left."""
+    step_rad = D48E_STEP_RAD if name == "PTU, TCP" else D46_STEP_RAD
+    acceleration = round(ACCELERATION_RAD_PER_S2 / step_rad)
     for axis in (unit.pan, unit.tilt):  # as somebody left it; setting it by PA would take the unit seconds
-        axis.now = axis.factory.__class__(**{**vars(axis.now), "acceleration": PTU_ACCELERATION})
+        axis.now = axis.factory.__class__(**{**vars(axis.now), "acceleration": acceleration})
     options = {
         "port": port,
         "pan": {"limits_rad": list(LIMITS_RAD[0]), "sign": -1},
@@ -157,8 +159,8 @@ def _ptu_rig(
     }
     head = open_flir_ptu(options, clock)
     stack.callback(head.close)
-    fastest = unit.pan.now.fastest * PTU_STEP_RAD  # its own; the options' speed is for moves that name none
-    return Rig(name, head, panel, _truth(axes), PTU_STEP_RAD, line, sent, fastest_rad_per_s=fastest)
+    fastest = unit.pan.now.fastest * step_rad  # its own; the options' speed is for moves that name none
+    return Rig(name, head, panel, _truth(axes), step_rad, line, sent, fastest_rad_per_s=fastest)
 
 
 def _axes() -> tuple[SystemClock, FaultPanel, tuple[WireAxis, WireAxis]]:

@@ -8,10 +8,12 @@ the folder may hold a hidden ``.NAME.*.new`` or ``.NAME.*.old`` beside the file;
 from __future__ import annotations
 
 import contextlib
+import errno
 import os
 import secrets
 import shutil
 import stat
+from itertools import count
 from pathlib import Path
 
 from calib.errors import BadFile
@@ -20,6 +22,31 @@ from calib.errors import BadFile
 def previous_path(path: Path) -> Path:
     """Return where the version before the last save is kept: ``rig.yaml`` -> ``rig.previous.yaml``."""
     return path.with_name(f"{path.stem}.previous{path.suffix}")
+
+
+def keep_previous(path: str | Path) -> Path | None:
+    """Give the kept version before the last save a name that no save takes, and return it.
+
+    ``rig.previous.yaml`` is then ``rig.previous-1.yaml`` too (the first free number). None if there is none.
+
+    Raises
+    ------
+    BadFile
+        If the file system refuses.
+    """
+    try:
+        previous = previous_path(Path(path).resolve())
+        if not previous.is_file():
+            return None
+        for number in count(1):
+            kept = previous.with_name(f"{previous.stem}-{number}{previous.suffix}")
+            with contextlib.suppress(FileExistsError):
+                _second_name(previous, kept)
+                return kept
+    except (OSError, ValueError) as error:
+        reason = error.strerror if isinstance(error, OSError) else error
+        raise BadFile(path, "", f"its former version cannot be kept: {reason or error}") from None
+    return None
 
 
 def save_bytes(path: str | Path, data: bytes) -> None:
@@ -89,7 +116,11 @@ def _second_name(target: Path, old: Path) -> None:
     """Give the file a second name; file systems without hard links get a copy."""
     try:
         os.link(target, old)
+    except FileExistsError:
+        raise
     except OSError:
+        if old.exists():
+            raise FileExistsError(errno.EEXIST, "is there already", str(old)) from None
         shutil.copy2(target, old)
         descriptor = os.open(old, os.O_RDONLY)
         try:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal, cast
 
@@ -16,7 +16,7 @@ from calib.formats.strict import Section, nearest
 from calib.formats.yaml_text import MAX_BYTES, kind_of, parse_mapping
 from calib.rigid import FloatArray
 from calib.store import CAMERA_NAME, read_stereo
-from calib.survey.picture_size import picture_size_px
+from calib.survey.picture_file import picture_size_px
 from calib.survey.records import (
     Board,
     Click,
@@ -126,6 +126,12 @@ class _Reader:
             return iter(())
         return rows_of(self._bytes(name, CSV_MAX_BYTES), path, columns)
 
+    def _some(self, rows: Sequence[object], name: str, what: str) -> None:
+        if not rows:
+            raise BadFile(
+                self.folder / name, "", f"has a header and no rows; one for each of {what} is expected"
+            )
+
     def _station(self, board: Board, prisms: Mapping[str, FloatArray]) -> tuple[StationPoint, ...]:
         points: list[StationPoint] = []
         seen: dict[tuple[str, ...], int] = {}
@@ -149,6 +155,7 @@ class _Reader:
             points.append(
                 StationPoint(setup, cast(StationKind, kind), placement, point, position_m, row.line)
             )
+        self._some(points, "station.csv", "the prisms and tapes that were measured")
         return tuple(points)
 
     def _images(self, cameras: Mapping[str, SurveyCamera], setups: list[str]) -> tuple[SurveyImage, ...]:
@@ -169,6 +176,7 @@ class _Reader:
                 self._check_picture(row, file, camera)
             image = (name, camera.name, setup, placement, purpose, pan_rad, tilt_rad, Path(file), row.line)
             images.append(SurveyImage(*image))
+        self._some(images, "images.csv", "the images that were taken")
         return tuple(images)
 
     def _check_picture(self, row: Row, file: str, camera: SurveyCamera) -> None:

@@ -51,7 +51,7 @@ class Bus:
         Of the thread and in errors.
     between
         Called in the thread whenever nothing is asked; returns the time of CLOCK_MONOTONIC, seconds, at
-        which it wants to run again. What it raises is logged: it must keep its own state.
+        which it wants to run again. It must keep what goes wrong itself; what it raises is only logged.
     """
 
     def __init__(self, name: str, between: Callable[[], float]) -> None:
@@ -133,8 +133,8 @@ class Bus:
     def _round(self) -> float:
         try:
             return self._between()
-        except DriverError as error:
-            log.warning("%s: %s", self._name, error)
+        except DriverError as error:  # its owner keeps and tells it
+            log.debug("%s: %s", self._name, error)
         except Exception:  # a defect must not end the thread that feeds the watchdogs
             log.exception("%s: the bus thread's own round failed", self._name)
         return time.monotonic() + 0.1

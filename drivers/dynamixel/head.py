@@ -4,9 +4,10 @@ One thread owns the bus: it reads both servos in one transaction, at least ``pol
 feeds their watchdogs; sends the second leg of a move that approaches its goal from one side; and comes back
 after the line was lost. If this process dies, the servos stop by themselves within ``watchdog_s``.
 
-Nothing here moves the head but `move`. A stop of the servos by their watchdog is latched: moving again needs
-a `stop` (or a new start) first. A servo's reboot drops its torque and is done only where the configuration
-says ``on_hardware_error: reboot``.
+Nothing here moves the head but `move`. When the servos' watchdog has stopped a motion, that is latched:
+moving again needs a `stop` (or a new start) first. One that trips while the head stands at its goal has
+interrupted nothing and is armed anew with a line in the log. A servo's reboot drops its torque and is done
+only where the configuration says ``on_hardware_error: reboot``.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from drivers.clock import Clock, SystemClock
 from drivers.dynamixel.bus import Bus
 from drivers.dynamixel.link import GroupAnswer, Link, Part
 from drivers.dynamixel.models import Register
-from drivers.dynamixel.motion import AxisMotion, AxisReport, Sample, Truth, motion_block
+from drivers.dynamixel.motion import AxisMotion, Sample, Truth, motion_block
 from drivers.dynamixel.servo import WATCHDOG_TRIPPED, Servo, hardware_fault_words, velocity_counts
 from drivers.dynamixel.settings import AxisSettings, HeadSettings, head_settings
 from drivers.errors import (
@@ -33,7 +34,7 @@ from drivers.errors import (
     OutOfRange,
     WatchdogTripped,
 )
-from drivers.interfaces import Reading
+from drivers.interfaces import AxisReport, Reading, Reporting
 
 log = logging.getLogger(__name__)
 T = TypeVar("T")
@@ -62,7 +63,7 @@ def open_head(options: Mapping[str, Any], clock: Clock | None = None) -> Dynamix
     return DynamixelHead(head_settings(options), clock)
 
 
-class DynamixelHead:
+class DynamixelHead(Reporting):
     """The head; every method may be called from any thread.
 
     Parameters
@@ -347,7 +348,10 @@ class DynamixelHead:
             return
         self._watched_s = now_s
         for register in ("bus_watchdog", "torque_enable"):
-            for index, value in enumerate(self._read_together(register)):
+            values = self._read_together(register)
+            if register == "bus_watchdog" and WATCHDOG_TRIPPED in values:
+                self._note_trip()
+            for index, value in enumerate(values):
                 self._judge_watched(index, register, value)
         for motion in self._motions:
             if (words := motion.other_goal_words()) and not self._tripped and not any(self._hardware_errors):
@@ -357,15 +361,25 @@ class DynamixelHead:
         motion = self._motions[index]
         if value is None or self._hardware_errors[index]:
             return  # asked again soon, or known
-        if register == "bus_watchdog" and value == WATCHDOG_TRIPPED and not self._tripped:
-            self._tripped = True
-            log.error("the bus watchdog has stopped the head: this process was silent for too long")
         changed = register == "bus_watchdog" and value not in (
             self.settings.watchdog_counts,
             WATCHDOG_TRIPPED,
         )
         if changed or (register == "torque_enable" and bool(value) != motion.holds):
             self._distrust(f"{motion.name} has {value} in {register}")
+
+    def _note_trip(self) -> None:
+        """The watchdog of a servo has tripped: latch it if a motion was stopped, else arm it anew."""
+        if self._tripped:
+            return
+        if not all(motion.at_goal() for motion in self._motions):
+            self._tripped = True
+            log.error("the bus watchdog has stopped the head: this process was silent for too long")
+            return
+        log.warning("the bus watchdog tripped while the head stood at its goal; it is armed anew")
+        for servo in self._servos:
+            servo.set("bus_watchdog", 0)
+        self._arm()
 
     def _distrust(self, words: str) -> NoReturn:
         """Set both servos up anew: something changed them that was not this driver."""

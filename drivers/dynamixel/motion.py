@@ -5,11 +5,11 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Literal
 
 from drivers.dynamixel.models import Block
 from drivers.dynamixel.settings import AxisSettings
 from drivers.errors import BadReply
+from drivers.interfaces import AxisReport, Side
 
 TICK_MODULUS_MS = 32768
 TICK_SLACK_MS = 3.0
@@ -19,8 +19,6 @@ LEAP_RAD = 0.05
 STILL_RAD = 5e-4
 STUCK_S = 1.0
 IN_POSITION_BIT, PROFILE_BIT = 0x01, 0x02
-
-Side = Literal["positive", "negative", "unknown"]
 
 
 def motion_block(settings: AxisSettings) -> Block:
@@ -44,47 +42,6 @@ class Sample:
     def counts(self) -> int:
         """Present position."""
         return self.values["present_position"]
-
-
-@dataclass(frozen=True)
-class AxisReport:
-    """Where an axis was sent and where it stands.
-
-    Attributes
-    ----------
-    commanded_rad
-        The angle that was asked for; None before the first move, and after a stop.
-    goal_counts, measured_counts
-        The nearest count to it, and what the servo measures.
-    goal_rad, measured_rad
-        The same as angles.
-    side
-        From which side the axis came last: on which flank the gears rest.
-    backlash_rad
-        Of the model, as its maker states it; None where nothing is stated.
-    current_A, temperature_C, voltage_V
-        As the servo measures them; no current for a servo that has none.
-    """
-
-    commanded_rad: float | None
-    goal_counts: int
-    goal_rad: float
-    measured_counts: int
-    measured_rad: float
-    side: Side
-    backlash_rad: float | None
-    current_A: float | None
-    temperature_C: int
-    voltage_V: float
-
-    @property
-    def left_rad(self) -> float | None:
-        """What the counts leave: measured minus commanded angle."""
-        return None if self.commanded_rad is None else self.measured_rad - self.commanded_rad
-
-    def left_px(self, focal_px: float) -> float | None:
-        """The same in the pixels of a camera whose focal length is ``focal_px``, near its image centre."""
-        return None if self.left_rad is None else focal_px * math.tan(self.left_rad)
 
 
 class Truth:
@@ -241,6 +198,13 @@ class AxisMotion:
             return False
         in_position = self._arrived(sample) or not self.holds
         return in_position and now_s - self._rest[1] >= self._settle_s
+
+    def at_goal(self) -> bool:
+        """Whether nothing is under way: it stands at its last goal, or holds nothing."""
+        sample = self._sample
+        if sample is None or self._legs or self._speed(sample) > 1:
+            return False
+        return self._arrived(sample) or not self.holds
 
     def stuck_words(self, now_s: float) -> str:
         """Say that the axis stands away from its goal; empty if it does not."""

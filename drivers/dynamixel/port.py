@@ -2,8 +2,9 @@
 
 What it changes of ``dynamixel_sdk.PortHandler``: a wait sleeps in the kernel instead of spinning; the
 deadline runs on CLOCK_MONOTONIC; the line is opened for this process alone; pyserial's URLs
-(``socket://host:port``, ``rfc2217://...``) and every baud rate that the adapter can do are taken; the busy
-flag can never stay set; whatever pyserial raises becomes `LineLost` with the port's name.
+(``socket://host:port``, ``rfc2217://...``) and every baud rate that the adapter can do are taken; a USB
+adapter's latency timer is set to its least; the busy flag can never stay set; whatever pyserial raises
+becomes `LineLost` with the port's name.
 """
 
 from __future__ import annotations
@@ -89,8 +90,7 @@ class Port(PortHandler):  # type: ignore[misc]
                 self.port_name,
                 baudrate=cflag_baud,
                 timeout=0.01,
-                write_timeout=WRITE_TIMEOUT_S,
-                **({} if url else {"exclusive": True}),
+                **({} if url else {"exclusive": True, "write_timeout": WRITE_TIMEOUT_S}),
             )
         except (ValueError, TypeError, OverflowError, NotImplementedError) as error:
             raise BadOptions(f"{self.port_name} at {cflag_baud} baud: {_words(error)}") from error
@@ -102,6 +102,8 @@ class Port(PortHandler):  # type: ignore[misc]
             self._poll.register(self._descriptor, select.POLLIN)
         except (OSError, AttributeError, ValueError):  # rfc2217 has no file behind it
             self._descriptor = self._poll = None
+        with contextlib.suppress(OSError, ValueError, NotImplementedError, AttributeError):
+            self.ser.set_low_latency_mode(True)  # 1 ms instead of 16 ms, where the adapter has such a timer
         self.is_open = True
         self.tx_time_per_byte = 10_000.0 / cflag_baud
         self.buffer.clear()

@@ -18,6 +18,7 @@ OnHardwareError = Literal["report", "reboot"]
 STANDS_WITHIN_S = 0.5  # after this process has died: the last poll's age, the watchdog, and braking
 USUAL_WATCHDOG_S, SHORTEST_WATCHDOG_S = 0.3, 0.1
 WATCHDOG_STEP_S = 0.02
+POLL_BYTES = 20 + 2 * (11 + 43)  # the longer of the two instructions, and two replies of 43 bytes of data
 
 
 @dataclass(frozen=True)
@@ -153,6 +154,14 @@ def head_settings(options: Mapping[str, Any]) -> HeadSettings:
     if pan.servo_id == tilt.servo_id:
         raise BadOptions(f"options.pan.id and options.tilt.id are both {pan.servo_id}, expected two ids")
     poll_hz = read.number("poll_hz", 50.0, 10.0, 500.0)
+    baud = read.whole("baud", 1_000_000, 9600, 10_500_000)
+    wire_s = POLL_BYTES * 10 / baud
+    if wire_s > 1 / poll_hz:
+        raise BadOptions(
+            f"options.baud {baud}: reading both servos takes {1000 * wire_s:.1f} ms, too long for "
+            f"poll_hz {poll_hz:g}; expected {math.ceil(POLL_BYTES * 10 * poll_hz)} baud or more "
+            "(mastctl servo set-id has --new-baud)"
+        )
     speed = read.number("speed_rad_per_s", 1.0, 0.03, 10.0)
     acceleration = read.number("acceleration_rad_per_s2", 4.0, 0.4, 1000.0)
     longest_s = STANDS_WITHIN_S - 1 / poll_hz - speed / acceleration
@@ -167,7 +176,7 @@ def head_settings(options: Mapping[str, Any]) -> HeadSettings:
         port=port,
         pan=pan,
         tilt=tilt,
-        baud=read.whole("baud", 1_000_000, 9600, 10_500_000),
+        baud=baud,
         speed_rad_per_s=speed,
         acceleration_rad_per_s2=acceleration,
         watchdog_s=watchdog_s,

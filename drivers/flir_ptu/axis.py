@@ -165,16 +165,15 @@ class Axis:
         if self.seen is not None:
             self._still = Seen(self.seen.position, time_s)
 
-    def expects(self, seen: Seen) -> bool:
-        """Return whether a position can be true after what was seen last."""
-        return self.seen is not None and self.agree(self.seen, seen)
+    def rests_at(self, seen: Seen) -> bool:
+        """Return whether a position is the one where the axis has come to rest."""
+        return self.rests and self.seen is not None and seen.position == self.seen.position
 
-    def agree(self, before: Seen, after: Seen) -> bool:
-        """Return whether the axis can have gone from one position to another in the time between."""
-        way = abs(after.position - before.position)
-        if self.rests:
-            return way == 0
-        return way <= self.fastest * (after.time_s - before.time_s) + 1
+    def confirms(self, first: Seen, middle: Seen, last: Seen) -> bool:
+        """Return whether the middle of three positions can be taken: see the module `head`."""
+        low, high = sorted((first.position, last.position))
+        furthest = self.fastest * (last.time_s - first.time_s) + 1
+        return low <= middle.position <= high and high - low <= furthest
 
     @property
     def rests(self) -> bool:

@@ -16,7 +16,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from drivers.errors import BadReply, NoReply, Refused
 from drivers.flir_ptu.line import Line
@@ -48,7 +48,7 @@ def _axis_query(letter: str, *words: str) -> dict[str, Query]:
 
 
 POSITION = _axis_query("P", "current", "AXIS", "position")
-RESOLUTION = _axis_query("R", "arc", "AXIS", "position")
+RESOLUTION = _axis_query("R", "arc", "position")  # the E series does not say of which axis
 LOWEST = _axis_query("N", "minimum", "AXIS", "position")
 HIGHEST = _axis_query("X", "maximum", "AXIS", "position")
 SPEED = _axis_query("S", "AXIS", "speed")
@@ -238,7 +238,10 @@ class Conversation:
                     words = f"does not tell its {axis} resolution: {refusal}"
                     raise Refused(words, device=self._device) from None
                 raise
+            other = {"pan": "tilt", "tilt": "pan"}[axis]
             number = number_of(answer.text, query.words, " " in answer.text) if answer.good else None
+            if other in answer.text.lower().split():
+                number = None
             if number is not None:
                 return number, _Manners(" " in answer.text, answer.echo)
             if not answer.good:
@@ -246,12 +249,15 @@ class Conversation:
 
     def _next_answer(self, command: str, until_s: float, skip: bool) -> Answer:
         """The next answer; a line that is none is an error unless such lines are to be skipped."""
+        echo = False
         while True:
             line = self._next_line(command, until_s)
             answer = answer_of(line, command)
             if answer is not None:
-                return answer
-            if not skip and without_hits(line):
+                return replace(answer, echo=answer.echo or echo)
+            if without_hits(line).upper() == command.encode("ascii"):
+                echo = True  # on a line of its own, as the E series has it
+            elif not skip and without_hits(line):
                 raise BadReply(f"answered {command} with {_shown(line)}", device=self._device)
 
     def _next_line(self, command: str, until_s: float) -> bytes:

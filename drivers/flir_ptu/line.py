@@ -133,7 +133,8 @@ def _opened(port: str, baud: int) -> serial.SerialBase:
     """The pyserial port, for this program alone where the kind of port allows it."""
     if port.startswith("socket://"):
         return _SocketPort(port, timeout=SLICE_S, write_timeout=CONNECT_TIMEOUT_S)
-    options = {"baudrate": baud, "timeout": SLICE_S, "write_timeout": CONNECT_TIMEOUT_S}
-    if urlsplit(port).scheme == "":
-        options["exclusive"] = True
-    return serial.serial_for_url(port, **options)
+    if urlsplit(port).scheme:  # rfc2217 refuses a write timeout, and a network port has no lock
+        return serial.serial_for_url(port, baudrate=baud, timeout=SLICE_S)
+    return serial.Serial(
+        port, baudrate=baud, timeout=SLICE_S, write_timeout=CONNECT_TIMEOUT_S, exclusive=True
+    )

@@ -14,7 +14,8 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass
 
-_HIT = re.compile(rb"\s*!([PTpt])(?![A-Za-z])")
+# No space follows the "!", as it does in an error; a capital may, the first letter of an echo.
+_HIT = re.compile(rb"\s*!([PTpt])(?![a-z])")
 _NUMBER = re.compile(r"-?\d+(?:\.\d+)?\Z")
 _LONGEST_LINE = 400
 
@@ -58,7 +59,7 @@ class LineSplitter:
 
 def hits_of(line: bytes) -> tuple[str, ...]:
     """Return the axes, ``pan`` or ``tilt``, whose limit hits stand anywhere in a line."""
-    found = re.findall(rb"!([PTpt])(?![A-Za-z])", line)
+    found = re.findall(rb"!([PTpt])(?![a-z])", line)
     return tuple("pan" if letter in b"Pp" else "tilt" for letter in found)
 
 

@@ -49,13 +49,7 @@ def facts(port: str, baud: int) -> Facts:
         If it cannot be talked to.
     """
     with _talking(port, baud) as talk:
-        resolutions = talk.in_step()
-        return Facts(
-            version=talk.tell("V"),
-            supply=_told(talk, "O"),
-            pan=_axis(talk, "pan", resolutions["pan"]),
-            tilt=_axis(talk, "tilt", resolutions["tilt"]),
-        )
+        return _facts(talk)
 
 
 def home(port: str, baud: int) -> Facts:
@@ -70,7 +64,7 @@ def home(port: str, baud: int) -> Facts:
     """
     with _talking(port, baud) as talk:
         talk.reset(HOMING_S)
-    return facts(port, baud)
+        return _facts(talk)
 
 
 @contextmanager
@@ -82,6 +76,17 @@ def _talking(port: str, baud: int) -> Iterator[Conversation]:
             yield talk
     finally:
         talk.close()
+
+
+def _facts(talk: Conversation) -> Facts:
+    """Ask everything."""
+    resolutions = talk.in_step()
+    return Facts(
+        version=talk.tell("V"),
+        supply=_told(talk, "O"),
+        pan=_axis(talk, "pan", resolutions["pan"]),
+        tilt=_axis(talk, "tilt", resolutions["tilt"]),
+    )
 
 
 def _axis(talk: Conversation, name: str, resolution_arcsec: float) -> AxisFacts:

@@ -8,13 +8,14 @@ import numpy as np
 import pytest
 from made_survey import BOARD, COLUMNS, ROWS, Plan, make_survey, rover_from_head
 
-from calib.adjustment import MAST, Adjustment, lens_knowledge
+from calib.adjustment import MAST, Adjustment
 from calib.camera_parameters import parameter_names, stepped
 from calib.fit_joint import fit_joint, joint_problem
 from calib.fit_start import SurveyNotFitted, start
 from calib.least_squares import Normal, minimise
 from calib.mast import Rig
 from calib.survey import Sigma, Survey
+from calib.usual_lens import lens_knowledge
 
 RELATIVE = 1e-5
 """Of central differences with steps of a few sigmas' thousandths."""

@@ -14,6 +14,7 @@ from survey_case import write_files
 from calib.align import NotAligned, align, mirrored, rover_from_station, station_from_board
 from calib.prisms import refine_prisms
 from calib.rigid import Rigid
+from calib.station_poses import station_poses
 from calib.survey import Sigma, StationPoint, Survey, read_survey
 
 PRISMS = np.array([(0.10, -0.25, -0.75), (0.10, 0.25, -0.80), (-0.30, -0.25, -0.90), (-0.30, 0.25, -0.70)])
@@ -220,7 +221,7 @@ def test_a_prism_wrong_in_one_set_up_is_named(base: Survey) -> None:
     survey, true = several_set_ups(base, np.random.default_rng(11))
     survey.station[6].position_m[:] += (0.05, 0.03, 0.0)
     refined = refine_prisms(survey)
-    assert refined.rejected == ("p3 in set-up s1",)
+    assert refined.rejected == (("s1", "p3"),)
     assert refined.doubt == ""
     assert _spacing(refined.places_in_rover_m) == pytest.approx(_spacing(true), abs=0.002)
 
@@ -229,8 +230,25 @@ def test_a_prism_wrong_in_the_drawing_is_named(base: Survey) -> None:
     survey, true = several_set_ups(base, np.random.default_rng(12))
     drawing = dict(survey.prisms_in_rover_m) | {"p2": PRISMS[1] + (0.2, 0.0, 0.1)}
     refined = refine_prisms(Survey(**(vars(survey) | {"prisms_in_rover_m": drawing})))
-    assert refined.rejected == ("p2 in the drawing",)
+    assert refined.rejected == ((None, "p2"),)
     assert np.linalg.norm(refined.places_in_rover_m[1] - true[1]) < 0.05
+
+
+def test_a_fit_starts_from_refined_prisms_and_names_the_wrong_one(base: Survey) -> None:
+    survey, true = several_set_ups(base, np.random.default_rng(13))
+    survey.station[6].position_m[:] += (0.05, 0.03, 0.0)
+    found = station_poses(survey)
+    assert [(o.kind, o.name) for o in found.blunders] == [("prism", "prism p3 of set-up s1")]
+    assert found.blunders[0].size == pytest.approx(np.hypot(0.05, 0.03), abs=0.01)
+    places = np.array([found.prisms_in_rover_m[name] for name in NAMES])
+    assert _spacing(places) == pytest.approx(_spacing(true), abs=0.003)
+
+
+def test_a_set_up_without_prisms_is_named(base: Survey) -> None:
+    survey, _ = several_set_ups(base, np.random.default_rng(14))
+    check = StationPoint("bare", "check", "", "c1", np.zeros(3), 99)
+    with pytest.raises(NotAligned, match="set-up bare"):
+        station_poses(Survey(**(vars(survey) | {"station": (*survey.station, check)})))
 
 
 def test_an_exact_drawing_is_not_refined(base: Survey) -> None:

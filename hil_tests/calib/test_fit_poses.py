@@ -9,7 +9,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from calib.cahvor import CameraModel
-from calib.fit_poses import PosesTooFew, fit_poses, model_difference, with_one_lens
+from calib.fit_poses import PosesTooFew, fit_poses
+from calib.gimbal import numbers_of
+from calib.model_difference import model_difference, with_one_lens
 from calib.rigid import Rigid
 
 POSITION_M = 1e-9
@@ -158,6 +160,35 @@ def test_a_joint_that_never_moves_is_refused(still: str) -> None:
     angles[:, 0 if still == "pan" else 1] = 0.2
     with pytest.raises(PosesTooFew, match="vary too little"):
         fit_poses([mast.camera(p, t) for p, t in angles], *angles.T)
+
+
+def test_a_joint_that_hardly_moves_is_named() -> None:
+    mast = TwoLines(2, skew=True)
+    angles = mast.angles.copy()
+    angles[:, 1] = 0.2 + 1e-5 * np.arange(len(angles))
+    with pytest.raises(PosesTooFew, match=r"tilt by 8e-05 rad in all.*the mast's"):
+        fit_poses([mast.camera(p, t) for p, t in angles], *angles.T)
+
+
+def test_covariance_is_the_scatter() -> None:
+    """Labels of exact poses, each off by 20 µm and 20 µrad, an axis: errors are as the covariance says."""
+    mast = TwoLines(3, skew=True)
+    pan, tilt = mast.angles.T
+    exact = [mast.camera(p, t) for p, t in mast.angles]
+    true = fit_poses(exact, pan, tilt)
+    squares, parts = [], range(8)
+    for seed in range(40):
+        rng = np.random.default_rng(seed)
+        noisy = []
+        for model in exact:
+            turn = Rotation.from_rotvec(rng.normal(0, 20e-6, 3)).as_matrix()
+            shift = model.C + rng.normal(0, 20e-6, 3) - turn @ model.C
+            noisy.append(model.moved(Rigid(turn, shift)))
+        fit = fit_poses(noisy, pan, tilt)
+        assert fit.parameter_names[7] == "mast.axis_twist_rad"
+        error = (numbers_of(fit.mast) - numbers_of(true.mast))[parts]
+        squares.append(float(error @ np.linalg.solve(fit.covariance[np.ix_(parts, parts)], error)))
+    assert np.mean(squares) == pytest.approx(8, rel=0.25)
 
 
 def test_two_poses_are_refused_and_unequal_numbers_are_a_mistake() -> None:

@@ -274,11 +274,50 @@ def test_two_boards_mixed_up(good: Survey, rig: Rig) -> None:
     assert "times" in findings[0].message
 
 
-def test_pan_with_the_wrong_sign(good: Survey) -> None:
-    changed = with_images(good, lambda i: i if i.pan_rad is None else replace(i, pan_rad=-i.pan_rad))
-    findings = check_survey(changed)
-    assert findings
-    assert all("degrees aside" in f.message for f in findings)
+def with_joints(survey: Survey, read: Callable[[float, float], tuple[float, float]]) -> Survey:
+    def change(image: SurveyImage) -> SurveyImage:
+        if image.pan_rad is None or image.tilt_rad is None:
+            return image
+        pan_rad, tilt_rad = read(image.pan_rad, image.tilt_rad)
+        return replace(image, pan_rad=pan_rad, tilt_rad=tilt_rad)
+
+    return with_images(survey, change)
+
+
+@pytest.mark.parametrize(
+    ("read", "words"),
+    [
+        (lambda p, t: (-p, t), "the sign of pan_rad is wrong:"),
+        (lambda p, t: (p, -t), "the sign of tilt_rad is wrong:"),
+        (lambda p, t: (-p, -t), "the sign of pan_rad is wrong and the sign of tilt_rad is wrong:"),
+        (lambda p, t: (t, p), "pan_rad and tilt_rad are exchanged:"),
+        (lambda p, t: (-t, p), "pan_rad and tilt_rad are exchanged:"),
+    ],
+)
+def test_joints_that_count_the_other_way(
+    good: Survey, read: Callable[[float, float], tuple[float, float]], words: str
+) -> None:
+    finding = only(check_survey(with_joints(good, read)))
+    assert finding.severity == "error"
+    assert finding.message.startswith(words)
+
+
+def test_a_board_larger_than_any_image_shows(good: Survey) -> None:
+    tall = check_survey(replace(good, board=replace(good.board, rows=12)))
+    assert "12 rows, 0 to 11" in only(tuple(f for f in tall if f.severity == "error")).message
+    shifted = {n: replace(d, columns=d.columns + 1) for n, d in good.dots.items()}
+    wide = check_survey(replace(good, dots=shifted, board=replace(good.board, columns=11)))
+    assert "are in columns 1 to 10" in only(tuple(f for f in wide if f.severity == "error")).message
+
+
+@pytest.mark.parametrize("shift_m", [0.05, 1.0])
+def test_one_wrong_prism_is_no_matter_of_units(good: Survey, shift_m: float) -> None:
+    wrong = with_wrong_prism(good, "level", "p2", (0.6 * shift_m, 0.64 * shift_m, 0.48 * shift_m))
+    one_setup = with_station(wrong, lambda p: p if p.setup == "level" else None)
+    one_setup = with_images(one_setup, lambda i: i if i.setup == "level" else None)
+    cameras = {n: c for n, c in good.cameras.items() if c.on == "head"}
+    finding = only(check_survey(replace(one_setup, cameras=cameras)))
+    assert "prism p2" in finding.message
 
 
 def test_copies_are_named(good: Survey) -> None:

@@ -157,7 +157,7 @@ def test_pointing_from_the_fitted_rig(joint: Calibration, true_rig: Rig, distanc
     assert rms.max() < POINTING_PX
 
 
-@pytest.mark.parametrize("distance_m", [10.0, 6.0])
+@pytest.mark.parametrize("distance_m", [10.0, 6.0, 2.0])
 def test_hand_off_from_pancam_to_navcam(joint: Calibration, true_rig: Rig, distance_m: float) -> None:
     rng, worst, count = np.random.default_rng(3), 0.0, 0
     while count < 60:

@@ -33,10 +33,12 @@ class ScriptedPtu:
         obeys: bool = True,
         start: bytes = b"",
         end: bytes = b"\r",
+        e_series: bool = False,
     ) -> None:
         self.verbose, self.echo = verbose, echo
         self.obeys = obeys  # FV, FT, EE, ED
         self.start, self.end = start, end
+        self.e_series = e_series  # the echo on a line of its own, resolutions without the axis's name
         self.positions = {"P": 0, "T": 0}
         self.slaved: dict[str, int] | None = None
         self.resolutions = {"P": "185.142857", "T": "46.285714"}
@@ -64,7 +66,8 @@ class ScriptedPtu:
         text = answer(command) if callable(answer) else answer
         if text is None:
             return None
-        return self.start + (f"{command} ".encode() if echo else b"") + text + self.end
+        echoed = f"{command} ".encode() if echo else b""
+        return (echoed + self.start if self.e_series else self.start + echoed) + text + self.end
 
     def _usual(self, command: str) -> bytes | None:
         letters, argument = re.fullmatch(r"([A-Z]*)(-?\d*)", command).groups()  # type: ignore[union-attr]
@@ -117,6 +120,8 @@ class ScriptedPtu:
             "L": f"Minimum {name} speed is 31 positions/sec",
             "A": f"{name} acceleration is 2000 positions/sec^2",
         }.get(rest)
+        if rest == "R" and self.e_series:
+            said = f"{self.resolutions.get(axis)} seconds arc per position"
         if not name or said is None:
             return b"! Illegal Command Entered"
         if not self.verbose:

@@ -324,7 +324,7 @@ def test_fast_reads_are_used_only_after_they_proved_themselves() -> None:
 # Bad days
 
 
-def test_a_silent_host_stops_the_head_and_moving_again_is_deliberate() -> None:
+def test_a_silent_host_stops_a_motion_and_moving_again_is_deliberate() -> None:
     with opened() as (it, head):
         head.move(2.0, 0.0)
         until(lambda: head.read().pan_rad > 0.1, "motion")
@@ -345,6 +345,23 @@ def test_a_silent_host_stops_the_head_and_moving_again_is_deliberate() -> None:
         reading = settled(head)
         assert reading.faults == ()
         assert reading.pan_rad == pytest.approx(stood_rad, abs=2 * COUNT_RAD)  # it did not go on
+        head.move(0.1, 0.0)
+        assert settled(head).pan_rad == pytest.approx(0.1, abs=COUNT_RAD)
+
+
+def test_a_silent_host_at_rest_has_interrupted_nothing() -> None:
+    with opened() as (it, head):
+        head.move(0.3, 0.0)
+        settled(head)
+        free = threading.Event()
+        stalled = threading.Thread(target=lambda: head._bus.call("stall", lambda: free.wait(LONG_S), LONG_S))
+        stalled.start()
+        until(lambda: it.servos[0].table["bus_watchdog"] == 255, "the watchdog")
+        free.set()
+        stalled.join()
+        until(lambda: it.servos[0].table["bus_watchdog"] == 20, "the watchdog armed again")
+        assert settled(head).faults == ()
+        assert it.axes[0].angle_rad(time.monotonic()) == pytest.approx(0.3, abs=COUNT_RAD)
         head.move(0.1, 0.0)
         assert settled(head).pan_rad == pytest.approx(0.1, abs=COUNT_RAD)
 

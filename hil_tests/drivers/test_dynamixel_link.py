@@ -10,6 +10,8 @@ from collections.abc import Callable, Sequence
 
 import dynamixel_sdk as sdk
 import pytest
+import serial
+import serial.rfc2217
 
 from drivers.clock import SystemClock
 from drivers.dynamixel.bus import Bus
@@ -208,6 +210,58 @@ def test_over_a_socket() -> None:  # defect 17
             for _ in range(3):  # the first bytes into a dead connection may still seem to leave
                 link.read(1, POSITION)
         link.close()
+
+
+class NoModemLines(serial.Serial):  # type: ignore[misc]
+    """A pseudo terminal as pyserial's server wants a port: with modem lines."""
+
+    cts = dsr = ri = cd = True
+
+    def _update_rts_state(self) -> None:
+        pass
+
+    def _update_dtr_state(self) -> None:
+        pass
+
+
+class SerialServer:
+    """pyserial's RFC 2217 server between one connection and a line."""
+
+    def __init__(self, path: str) -> None:
+        self.listener = socket.create_server(("127.0.0.1", 0))
+        self.url = f"rfc2217://127.0.0.1:{self.listener.getsockname()[1]}"
+        self._path = path
+        threading.Thread(target=self._serve, daemon=True).start()
+
+    def write(self, data: bytes) -> None:
+        self._connection.sendall(data)
+
+    def _serve(self) -> None:
+        self._connection, _ = self.listener.accept()
+        port = NoModemLines(self._path, BAUD_RATE, timeout=0.01)
+        manager = serial.rfc2217.PortManager(port, self)
+        self._connection.settimeout(0.005)
+        while True:
+            try:
+                data = self._connection.recv(1024)
+                if not data:
+                    break
+                port.write(b"".join(manager.filter(data)))
+            except TimeoutError:
+                pass
+            self.write(b"".join(manager.escape(port.read(port.in_waiting))))
+        port.close()
+
+
+def test_over_rfc2217() -> None:
+    with scripted(always(says(1, number(-7)), says(2, b"\xff\xff\xfd\xff"))) as (line, _):
+        server = SerialServer(line.path)
+        link = Link(server.url, BAUD_RATE, PATIENT_S)
+        assert link.read(1, POSITION) == -7
+        answer = link.group_read(BOTH)
+        assert answer.statuses[2].data == b"\xff\xff\xfd\xff"
+        link.close()
+        server.listener.close()
 
 
 def test_a_host_that_is_not_there_is_a_lost_line() -> None:

@@ -9,16 +9,19 @@ from __future__ import annotations
 import itertools
 import json
 import math
+import socket
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scripted_ptu import ScriptedPtu
+from serial import rfc2217
 
 from drivers.clock import SystemClock
 from drivers.errors import (
@@ -94,6 +97,7 @@ def settled(head: FlirPtu) -> tuple[float, float]:
         (b"!T!T!P!P*", True, "", False),
         (b"!P PP * 22", True, "22", True),
         (b"PP !T* 22", True, "22", True),
+        (b"!PPP * 22", True, "22", True),
         (b"! Illegal Command Entered", False, "Illegal Command Entered", False),
     ],
 )
@@ -140,6 +144,7 @@ def test_a_terse_number_stands_alone() -> None:
 def test_limit_hits_are_found_and_errors_are_none() -> None:
     assert hits_of(b"!T!T!P!P*") == ("tilt", "tilt", "pan", "pan")
     assert hits_of(b"!P* 22") == ("pan",)
+    assert hits_of(b"!PPP * 22") == ("pan",)
     assert hits_of(b"! Pan speed cannot exceed 600 pos/sec") == ()
     assert hits_of(b"!Pan") == ()
 
@@ -165,11 +170,13 @@ def test_no_bytes_whatever_break_the_parser_and_pieces_do_not_matter(data: bytes
 @pytest.mark.parametrize("verbose", [True, False])
 @pytest.mark.parametrize("echo", [True, False])
 @pytest.mark.parametrize("obeys", [True, False])
-@pytest.mark.parametrize(("start", "end"), [(b"", b"\r"), (b"\n", b"\r\n")])
+@pytest.mark.parametrize(
+    ("start", "end", "e_series"), [(b"", b"\r", False), (b"\n", b"\r\n", False), (b"\n", b"\r\n", True)]
+)
 def test_every_way_of_answering_gives_the_same_head(
-    opened: Opener, verbose: bool, echo: bool, obeys: bool, start: bytes, end: bytes
+    opened: Opener, verbose: bool, echo: bool, obeys: bool, start: bytes, end: bytes, e_series: bool
 ) -> None:
-    unit = ScriptedPtu(verbose=verbose, echo=echo, obeys=obeys, start=start, end=end)
+    unit = ScriptedPtu(verbose=verbose, echo=echo, obeys=obeys, start=start, end=end, e_series=e_series)
     unit.positions = {"P": 100, "T": -40}
     head, _ = opened(unit)
     reading = head.read()
@@ -368,6 +375,7 @@ def test_positions_that_contradict_each_other_are_refused(opened: Opener) -> Non
 def test_a_limit_hit_stops_the_head_until_it_is_homed(opened: Opener) -> None:
     head, unit = opened()
     settled(head)
+    head.move(0.2, 0.0)
     unit.heard.clear()
     unit.unasked = b"!P"
     time.sleep(0.05)
@@ -385,6 +393,67 @@ def test_a_limit_hit_stops_the_head_until_it_is_homed(opened: Opener) -> None:
     assert head.read().faults == ()
     head.move(0.1, 0.1)
     head.close()
+
+
+def rested(head: FlirPtu) -> None:
+    """Read until the head has stood for so long that it cannot be anywhere else."""
+    until_s = time.monotonic() + 20
+    while not all(axis.rests for axis in head._axes.values()):
+        head.read()
+        assert time.monotonic() < until_s
+
+
+def test_a_limit_hit_of_a_resting_head_is_looked_into_and_forgotten(opened: Opener) -> None:
+    head, unit = opened()
+    rested(head)
+    before = head.read()
+    unit.heard.clear()
+    unit.unasked = b"!P"
+    time.sleep(0.05)
+    head.read()
+    reading = head.read()
+    assert reading.faults == () and (reading.pan_rad, reading.tilt_rad) == (before.pan_rad, before.tilt_rad)
+    assert {"V", "LU", "PP"} <= set(unit.heard), "the unit was checked from version to limits"
+    assert not [c for c in unit.heard if c.startswith(("PP", "TP")) and c[2:]], "and not moved"
+    head.move(0.1, 0.1)
+
+
+def test_a_limit_hit_of_a_resting_head_that_has_moved_meanwhile_stays(opened: Opener) -> None:
+    head, unit = opened()
+    rested(head)
+    unit.unasked, unit.positions = b"!T!T!P!P*\r", {"P": 400, "T": 0}
+    time.sleep(0.05)
+    head.read()
+    assert any("unit may have lost count" in word for word in head.read().faults)
+    with pytest.raises(HardwareFault, match="home it"):
+        head.move(0.1, 0.1)
+
+
+@pytest.mark.parametrize(
+    ("options", "answer", "words"),
+    [
+        ({}, "Input 23 VDC @ 95 degF", "the supply is 23.0 V, expected 24.0 V or more"),
+        ({"supply_V": [26, 32]}, "Input 25 VDC @ 95 degF", "25.0 V, expected 26.0 to 32.0 V"),
+        ({}, "Input 30 VDC @ 167 degF", "the unit is at 75 °C, expected 60 °C at most"),
+        ({}, "30.1V,90F,158F,88F", "the unit is at 70 °C"),
+        ({"hottest_C": 80}, "Input 30 VDC @ 167 degF", ""),
+        ({}, "something else", ""),
+    ],
+)
+def test_supply_and_temperature_are_watched_while_the_head_rests(
+    opened: Opener, monkeypatch: pytest.MonkeyPatch, options: dict[str, Any], answer: str, words: str
+) -> None:
+    monkeypatch.setattr("drivers.flir_ptu.head.EVERY_S", 0.0)
+    unit = ScriptedPtu()
+    unit.answers["O"] = b"* Input 30 VDC @ 86 degF"
+    head, _ = opened(unit, **options)
+    settled(head)
+    assert head.read().faults == ()
+    unit.answers["O"] = f"* {answer}".encode()
+    faults = head.read().faults
+    assert words in "; ".join(faults) and bool(faults) == bool(words)
+    unit.answers["O"] = b"* Input 30 VDC @ 86 degF"
+    assert head.read().faults == ()
 
 
 def test_an_e46_has_to_be_told_its_resolution(opened: Opener) -> None:
@@ -476,11 +545,28 @@ def test_a_unit_that_lost_count_while_the_line_was_down_is_not_moved(opened: Ope
                 break
             except LineLost:
                 time.sleep(0.02)
-        assert reading.faults[0].startswith("pan was at 0.5000 rad before the line was lost and is at 0.0000")
+        assert reading.faults[0].startswith(
+            "pan was at 0.5000 rad before the unit or its line was away and is at 0.0"
+        )
         assert unit.positions == {"P": 0, "T": round(0.2 / TILT_STEP_RAD)}, "it comes back without moving"
         assert {"LU", "PN", "PR", "H"} <= set(unit.heard), "and is checked again"
-        with pytest.raises(HardwareFault, match="before the line was lost"):
+        with pytest.raises(HardwareFault, match="before the unit or its line was away"):
             head.move(0.1, 0.1)
+
+
+def test_a_power_cycle_behind_an_open_line_is_noticed(opened: Opener) -> None:
+    head, unit = opened(speed_rad_per_s=0.5)
+    head.move(0.5, 0.2)
+    settled(head)
+    unit.answers["PP"] = lambda command: None  # power gone for a moment; it comes back as it was delivered
+    with pytest.raises(NoReply):
+        head.read()
+    del unit.answers["PP"]
+    unit.positions, unit.speeds = {"P": 0, "T": 0}, {"P": 1000, "T": 1000}
+    unit.heard.clear()
+    words = head.read().faults
+    assert [word.split()[0] for word in words] == ["pan", "tilt"] and "home it" in words[0]
+    assert {"LU", "H"} <= set(unit.heard) and unit.positions == {"P": 0, "T": 0}
 
 
 def test_another_unit_on_the_line_is_refused(opened: Opener) -> None:
@@ -523,6 +609,54 @@ def test_a_stop_does_not_wait_for_a_call_under_way(opened: Opener) -> None:
     thread.join()
     assert unit.heard[before] == "H", "it went out beside the reading"
     assert unit.heard[-1] == "H", "and once more in order"
+
+
+def serve_rfc2217(listener: socket.socket, unit: ScriptedPtu) -> None:
+    """A serial server with a unit behind it, by pyserial's own server side, for one client."""
+    connection, _ = listener.accept()
+    lines = {"cts": True, "dsr": True, "ri": False, "cd": True, "rts": True, "dtr": True}
+    settings = {
+        "baudrate": 9600,
+        "bytesize": 8,
+        "parity": "N",
+        "stopbits": 1,
+        "xonxoff": False,
+        "rtscts": False,
+    }
+    port = SimpleNamespace(
+        **lines, **settings, break_condition=False,
+        reset_input_buffer=lambda: None, reset_output_buffer=lambda: None,
+    )  # fmt: skip
+    manager = rfc2217.PortManager(port, SimpleNamespace(write=connection.sendall))
+    with connection, suppress(OSError):
+        while data := connection.recv(4096):
+            heard = b"".join(manager.filter(data))
+            for reply in unit.receive(heard, 0.0):
+                connection.sendall(b"".join(manager.escape(reply.data)))
+
+
+def test_a_serial_server_by_rfc2217_serves_as_well() -> None:
+    unit = ScriptedPtu()
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        server = threading.Thread(target=serve_rfc2217, args=(listener, unit), daemon=True)
+        server.start()
+        head = open_head({**OPTIONS, "port": f"rfc2217://127.0.0.1:{listener.getsockname()[1]}"})
+        head.move(0.5, 0.2)
+        assert settled(head)[0] == pytest.approx(0.5, abs=PAN_STEP_RAD / 2)
+        head.close()
+        server.join(10)
+        assert not server.is_alive()
+        assert unit.heard[-1] == "H"
+
+
+@pytest.mark.parametrize("scheme", ["socket", "rfc2217"])
+def test_a_host_that_does_not_listen_is_a_lost_line(scheme: str) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        port = listener.getsockname()[1]
+    with pytest.raises(LineLost, match="cannot be opened"):
+        open_head({**OPTIONS, "port": f"{scheme}://127.0.0.1:{port}"})
+    with pytest.raises(LineLost, match="cannot be opened"):
+        open_head({**OPTIONS, "port": f"{scheme}://127.0.0.1"})
 
 
 def test_two_programs_cannot_have_the_same_line(opened: Opener) -> None:

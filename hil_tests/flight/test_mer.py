@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from calib.fit_poses import model_difference
+from calib.model_difference import model_difference
 from calib.store import load_rig, save_rig
 from drivers.clock import ManualClock
 

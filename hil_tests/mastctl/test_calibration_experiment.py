@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import sys
 from collections.abc import Iterator
 from concurrent.futures import Executor, ProcessPoolExecutor, ThreadPoolExecutor
@@ -92,8 +93,20 @@ def test_the_study_varies_one_thing_at_a_time() -> None:
         ]
         assert len(differing) + (variant.plan.sigma != base.sigma) <= 1, variant
     studies = {variant.study for variant in found}
-    assert studies == {"placements, paper", "placements, joint", "station", "prisms", "mast parameters"}
+    both = {f"{study}, {method}" for study in ("placements", "boards", "station") for method in FITS}
+    assert studies == both | {"prisms", "mast parameters"}
     assert {5, 8} <= {v.value for v in found if v.study == "placements, paper"}
+
+
+def test_variants_are_compared_on_the_same_surveys() -> None:
+    """What differs between two variants is what they vary, and not the draw."""
+    rig = load_rig(RIG_FILE).rig
+    twice = (CHOSEN[1], replace(CHOSEN[1], label="again"))
+    with ThreadPoolExecutor(1) as executor:
+        found = run_calibration_experiment(rig, surveys=1, targets=2, seed=5, executor=executor, chosen=twice)
+    one, other = found.outcomes
+    np.testing.assert_array_equal(one.mast, other.mast)
+    np.testing.assert_array_equal(one.exact_px[6.0], other.exact_px[6.0])
 
 
 def test_a_survey_that_cannot_be_fitted_is_counted_and_told(
@@ -115,6 +128,12 @@ def test_the_report_and_the_document(experiment: CalibrationExperiment, tmp_path
     record = json.loads((tmp_path / "record.json").read_text())
     assert record["variants"][1]["mast_parameters"] == 6
     assert set(record["variants"][1]["pointing_rms_px"]) == {"10", "6", "2"}
+    assert set(record["variants"][1]["handoff_worst_px"]) == {
+        "pancam to navcam, 10 m",
+        "pancam to navcam, 6 m",
+        "pancam to navcam, 2 m",
+        "navcam to hazcam, 2 m",
+    }
     assert (tmp_path / "surveys.csv").read_text().count("\n") > 10
 
 
@@ -128,6 +147,16 @@ def test_the_command(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.Mon
 
 
 # Executors
+
+
+def test_linear_algebra_has_one_thread_in_every_worker(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Sums of more threads differ in their last digits, and so would the study's numbers."""
+    monkeypatch.setenv("OMP_NUM_THREADS", "3")
+    monkeypatch.delenv("OPENBLAS_NUM_THREADS", raising=False)
+    names = ["OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"]
+    with open_executor("local", 1) as executor:
+        assert list(executor.map(os.getenv, names)) == ["1", "1"]
+    assert list(map(os.getenv, names)) == ["3", None]
 
 
 @pytest.mark.parametrize("name", ["dask", "dask:", "threads", ""])

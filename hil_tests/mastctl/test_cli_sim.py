@@ -56,7 +56,7 @@ def sim(repository: Path, *words: str) -> Iterator[Sim]:
         yield Sim(process, process.stdout.readline().decode().strip())
     finally:
         if process.poll() is None:
-            process.kill()
+            process.terminate()
             process.communicate()
 
 

@@ -15,40 +15,50 @@ from mastctl.calibration.maps import PointingMap
 
 FITTED, CHECK, LEFT_OUT = "#1f6f8b", "#c1440e", "#999999"
 COLOURS = ("#1f6f8b", "#c1440e", "#2d7d46", "#7a4b9d", "#b26a00", "#555555")
-ARROW_PART = 0.05
+ARROW_PART = 0.025
 """The typical residual is drawn this part of the image's width long; check images have their own scale."""
 
 MANY_DOTS = 2500
+NAME_ROOM_M = 0.5
+"""A board's name is left out where another name is nearer than this."""
 
 
 def residuals(calibration: Calibration, camera: str) -> Any:
-    """Draw the residuals of a camera's dots as arrows over its image: fitted, and of check images."""
-    figure = _figure(5.6, 4.4)
-    axis = figure.subplots()
-    width, height = calibration.rig.cameras[camera].model.size_px
+    """Draw the residuals of a camera's dots as arrows over its image: fitted images, and check images."""
     mine = [image for image in calibration.images if image.camera == camera]
     fitted = _dots(mine, lambda image: image.used)
     check = _dots(mine, lambda image: np.full(len(image.used), image.purpose == "check"))
     out = _dots(mine, lambda image: ~image.used & (image.purpose != "check"))
-    length_px = ARROW_PART * width
-    for (places, arrows), colour, word in ((check, CHECK, "check"), (fitted, FITTED, "fitted")):
-        if not len(places):
-            continue
-        typical = max(float(np.sqrt(np.mean(np.sum(arrows**2, axis=1)))), 1e-9)
-        step = -(-len(places) // MANY_DOTS)
-        axis.quiver(
-            *places[::step].T, *arrows[::step].T, color=colour, angles="xy", scale_units="xy",
-            label=f"{word}: {length_px:.0f} px long is {typical:.2g} px",
-            scale=typical / length_px, width=0.0016, headwidth=4, alpha=0.75,
-        )  # fmt: skip
+    shown = [("fitted images", fitted, FITTED)] + ([("check images", check, CHECK)] if len(check[0]) else [])
+    figure = _figure(11.5, 4.3)
+    axes = figure.subplots(1, 2, sharey=True)
+    for axis, (title, (places, arrows), colour) in zip(axes, shown, strict=False):
+        _arrows(axis, places, arrows, colour, calibration.rig.cameras[camera].model.size_px)
+        axis.set_title(f"{camera}, {title}", fontsize=10)
     if len(out[0]):
-        axis.scatter(*out[0].T, marker="x", s=16, color=LEFT_OUT, label="left out", zorder=3)
-    axis.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5), aspect="equal", title=camera)
-    axis.set_xlabel("x, px")
-    axis.set_ylabel("y, px")
-    if axis.get_legend_handles_labels()[0]:
-        axis.legend(loc="upper right", fontsize=7, framealpha=0.8)
+        axes[0].scatter(*out[0].T, marker="x", s=16, color=LEFT_OUT, label="left out", zorder=3)
+        axes[0].legend(loc="upper right", fontsize=7, framealpha=0.8)
+    for axis in axes[len(shown) :]:
+        axis.set_axis_off()
+    axes[0].set_ylabel("y, px")
     return figure
+
+
+def _arrows(axis: Any, places: np.ndarray, arrows: np.ndarray, colour: str, size_px: tuple[int, int]) -> None:
+    """Residuals at their dots, the typical one a fixed part of the image long, and how long that is."""
+    width, height = size_px
+    axis.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5), aspect="equal")
+    if not len(places):
+        axis.set_xlabel("x, px")
+        return
+    typical = max(float(np.sqrt(np.mean(np.sum(arrows**2, axis=1)))), 1e-9)
+    length_px = ARROW_PART * width
+    step = -(-len(places) // MANY_DOTS)
+    axis.quiver(
+        *places[::step].T, *arrows[::step].T, color=colour, angles="xy", scale_units="xy",
+        scale=typical / length_px, width=0.0018, headwidth=4, headlength=5, alpha=0.8,
+    )  # fmt: skip
+    axis.set_xlabel(f"x, px; arrows drawn {length_px / typical:.0f} times as long")
 
 
 def boards(calibration: Calibration, board: Board) -> Any:
@@ -63,6 +73,7 @@ def boards(calibration: Calibration, board: Board) -> Any:
         purposes.setdefault((image.setup, image.placement), image.purpose)
     colour_of = {"camera": COLOURS[0], "mast": COLOURS[2], "check": COLOURS[1]}
     labelled: set[str] = set()
+    names: list[np.ndarray] = []
     for key, pose in calibration.rover_from_board.items():
         purpose = purposes.get(key, "camera")
         outline = pose.points(corners)
@@ -70,15 +81,11 @@ def boards(calibration: Calibration, board: Board) -> Any:
         labelled.add(purpose)
         for axis, (across, up) in ((plan, (1, 0)), (side, (0, 2))):
             axis.plot(outline[:, across], outline[:, up], color=colour_of[purpose], lw=1.5, label=label)
-        if purpose != "camera":  # those of a ring stand too close together for names
-            plan.annotate(
-                key[1],
-                outline[1, [1, 0]],
-                fontsize=5.5,
-                color="0.35",
-                xytext=(2, 2),
-                textcoords="offset points",
-            )
+        place = outline[1, [1, 0]]
+        free = all(abs(place - other) @ (0.35, 1.0) > NAME_ROOM_M for other in names)
+        if purpose != "camera" and free:  # those of a ring stand too close together for names
+            names.append(place)
+            plan.annotate(key[1], place, fontsize=7, color="0.25", xytext=(2, 2), textcoords="offset points")
     _eyes(calibration.rig, plan, side)
     plan.set(xlabel="y (right), m", ylabel="x (ahead), m", title="from above", aspect="equal")
     side.set(xlabel="x (ahead), m", ylabel="z (down), m", title="from the right side", aspect="equal")
@@ -91,6 +98,8 @@ def boards(calibration: Calibration, board: Board) -> Any:
 
 def errors_by(calibration: Calibration) -> Any:
     """Draw each image's rms over the board's range, its angle to the line of sight, pan and tilt."""
+    from matplotlib.ticker import LogLocator
+
     figure = _figure(11.5, 3.6)
     axes = figure.subplots(1, 4, sharey=True)
     values: Sequence[tuple[str, Any]] = (
@@ -119,6 +128,9 @@ def errors_by(calibration: Calibration) -> Any:
         axis.set_xlabel(label)
         axis.set_yscale("log")
         axis.yaxis.set_major_formatter("{x:g}")
+        axis.yaxis.set_minor_locator(LogLocator(subs=(2, 3, 5)))
+        axis.yaxis.set_minor_formatter("{x:g}")
+        axis.tick_params(which="both", labelsize=8)
         axis.grid(alpha=0.25, which="both")
     axes[0].set_ylabel("rms of an image, px an axis")
     figure.legend(*axes[0].get_legend_handles_labels(), loc="outside upper center", ncols=6, fontsize=8)

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from calib.calibration import Calibration
+from calib.formats.atomic import save_bytes
 from calib.store import StoredRig
 from calib.survey import Survey
 from mastctl import html
@@ -37,16 +38,19 @@ class Told:
 
 
 def write_report(told: Told, folder: Path) -> Path:
-    """Write calibration.html into ``folder`` (made if need be) and return it.
+    """Write calibration.html into ``folder`` (made if need be) in one step and return it.
+
+    A report that was there is kept as calibration.previous.html.
 
     Raises
     ------
-    OSError
-        If it cannot be written.
+    OSError, BadFile
+        If it cannot be written; then the file is as it was.
     """
+    page = html.page("Mast calibration", _parts(told)).encode()
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / "calibration.html"
-    path.write_text(html.page("Mast calibration", _parts(told)), encoding="utf-8")
+    save_bytes(path, page)
     return path
 
 
@@ -108,7 +112,7 @@ def _parts(told: Told) -> Iterator[str]:
         ("fitted in", f"{calibration.seconds:.1f} s"),
         (
             "made",
-            f"{told.saved.rig.provenance.get('date', '')} by {told.saved.rig.provenance.get('program')}",
+            f"{_when(told.saved)} by {told.saved.rig.provenance.get('program')}",
         ),
     ]
     yield "<p>" + " · ".join(f"{k} <b>{html.escape(v)}</b>" for k, v in facts) + "</p>"
@@ -144,6 +148,12 @@ def _parts(told: Told) -> Iterator[str]:
     yield _worst_images(calibration)
 
 
+def _when(saved: StoredRig) -> str:
+    """The date of the mast file as a person writes it."""
+    date = str(saved.rig.provenance.get("date", ""))
+    return date.replace("T", " ").replace("+00:00", " UTC")
+
+
 def _words(title: str, sentences: Sequence[str]) -> Iterator[str]:
     if sentences:
         yield f"<h2>{html.escape(title)}</h2>" + html.bullets(sentences)
@@ -157,19 +167,14 @@ def _pictures(told: Told) -> Iterator[str]:
 
     calibration = told.calibration
     yield "<h2>Residuals over the image (predicted less measured)</h2>"
-    tags = [
-        html.figure(
-            html.plot_tag(plots.residuals(calibration, name), f"residuals of {name}"), _mean(told, name)
-        )
-        for name in calibration.rig.cameras
-    ]
-    for at in range(0, len(tags), 2):
-        yield '<div class="row pairs">' + "".join(tags[at : at + 2]) + "</div>"
+    for name in calibration.rig.cameras:
+        picture = html.plot_tag(plots.residuals(calibration, name), f"residuals of {name}")
+        yield html.figure(picture, _mean(told, name))
     yield "<h2>Where the boards stood</h2>"
     yield html.plot_tag(plots.boards(calibration, told.survey.board), "boards in plan and side view")
     yield (
         "<p>In the rover frame, so boards that the rover saw while it was tilted back stand low. "
-        "Boards for the mast and for checks are named.</p>"
+        "Boards for the mast and for checks are named where there is room.</p>"
     )
     yield "<h2>Error by distance and angle</h2>"
     yield html.plot_tag(plots.errors_by(calibration), "rms of images over range, angle, pan and tilt")
@@ -177,7 +182,7 @@ def _pictures(told: Told) -> Iterator[str]:
     yield "<h2>Correlation of parameters</h2>"
     mast = calibration.part("mast.")
     names = calibration.parameter_names
-    tags = []
+    tags: list[str] = []
     if len(mast):
         mine = calibration.covariance[np.ix_(mast, mast)]
         one = plots.correlation([names[i] for i in mast], mine, "mast")

@@ -10,6 +10,8 @@ from typing import Any, Literal
 from calib.calibration import Calibration
 from calib.fit_joint import fit_joint
 from calib.fit_paper import fit_paper
+from calib.formats.atomic import keep_previous, previous_path
+from calib.mast import Rig
 from calib.store import StoredRig, save_rig
 from calib.survey import Finding, Survey
 from calib.survey_check import check_survey
@@ -38,7 +40,7 @@ class SurveyRefused(MastctlError):
 
 @dataclass(frozen=True, eq=False)
 class Calibrated:
-    """What came of a survey: the fit, the verdict, and the file that holds it."""
+    """What came of a survey: the fit, the verdict, the file that holds it, and its former version."""
 
     survey: Survey
     calibration: Calibration
@@ -46,6 +48,7 @@ class Calibrated:
     warnings: tuple[str, ...]
     undetected: tuple[tuple[str, str], ...]
     saved: StoredRig
+    previous: Path | None
 
 
 def checked(survey: Survey) -> tuple[str, ...]:
@@ -77,7 +80,8 @@ def calibrate(
     survey
         With dots for every image that shall be fitted.
     out
-        The mast file; the version before it is kept as ``NAME.previous.yaml``.
+        The mast file. The version before it is kept as ``NAME.previous.yaml``, and what had that name as
+        ``NAME.previous-1.yaml`` and so on: none is lost.
     method, mast_parameters
         ``paper`` or ``joint``; 4, 6 or 8.
     warnings, undetected
@@ -92,8 +96,20 @@ def calibrate(
     """
     calibration = FITS[method](survey, mast_parameters)
     verdict = judge(survey, calibration, warnings, [name for name, _ in undetected])
-    saved = save_rig(with_fit(calibration, survey, verdict.told()), out)
-    return Calibrated(survey, calibration, verdict, warnings, undetected, saved)
+    saved, previous = _save(with_fit(calibration, survey, verdict.told()), out)
+    return Calibrated(survey, calibration, verdict, warnings, undetected, saved, previous)
+
+
+def _save(rig: Rig, out: Path) -> tuple[StoredRig, Path | None]:
+    """Save the mast file; return it, and the name of the file's former version."""
+    was_there = out.exists()
+    kept = keep_previous(out) if was_there else None
+    try:
+        return save_rig(rig, out), previous_path(out) if was_there else None
+    except BaseException:
+        if kept is not None:
+            kept.unlink(missing_ok=True)
+        raise
 
 
 def sentence_of(finding: Finding) -> str:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from calib.calibration import Calibration
 from calib.errors import CalibError
@@ -30,8 +31,16 @@ POINTING_BAD_PX = 2.0
 MANY_LEFT_OUT = 0.05
 """Share of dots or images left out above which the survey itself is in doubt."""
 
+TURNED_RAD = 2.0
+"""A mast turned further against the rover is one whose joints count the other way."""
+
 PAPER_GOOD_PX = 2.0
 """Rms of fitted images that the paper's method may leave: station errors of 2 mm are 1.4 px at 5 m."""
+
+ODD_IMAGE = 6.0
+"""An image this many times farther off than others of its camera and purpose; good surveys reach 3.4."""
+
+FEW_IMAGES = 4
 
 
 @dataclass(frozen=True)
@@ -81,8 +90,10 @@ def judge(
     """
     reasons = [
         *_noise(survey, calibration),
+        *_odd_images(calibration),
         *_checks(survey, calibration),
         *_open(calibration),
+        *_turned(calibration),
         *_pointing(calibration),
         *_left_out(calibration),
     ]
@@ -115,6 +126,26 @@ def _noise(survey: Survey, calibration: Calibration) -> list[Reason]:
     return [Reason("good", words)]
 
 
+def _odd_images(calibration: Calibration) -> list[Reason]:
+    """Images that the paper's method kept, though they are far from the others (joint tests each of them)."""
+    if np.isfinite(calibration.chi2_probability) or calibration.mast_parameters == 4:
+        return []
+    groups: dict[tuple[str, str], list[tuple[float, str]]] = {}
+    for image in calibration.images:
+        if image.purpose != "check" and image.used.any():
+            rms_px = float(np.sqrt(np.mean(image.residuals_px[image.used] ** 2)))
+            groups.setdefault((image.camera, image.purpose), []).append((rms_px, image.name))
+    reasons = []
+    for group in groups.values():
+        usual = float(np.median([rms_px for rms_px, _ in group]))
+        odd = [(rms_px, name) for rms_px, name in group if rms_px > ODD_IMAGE * usual]
+        if len(group) >= FEW_IMAGES and odd:
+            rms_px, name = max(odd)
+            words = f"image {name} is off by {rms_px:.2f} px rms where others like it are by {usual:.2f}"
+            reasons.append(Reason("care", f"{words}: check its tapes, its angles and its dots"))
+    return reasons
+
+
 def _checks(survey: Survey, calibration: Calibration) -> list[Reason]:
     """Whether images that were not fitted are predicted as well as they should be."""
     if not calibration.check_rms_px:
@@ -132,6 +163,18 @@ def _checks(survey: Survey, calibration: Calibration) -> list[Reason]:
 
 def _open(calibration: Calibration) -> list[Reason]:
     return [Reason("bad", direction.sentence) for direction in calibration.degenerate]
+
+
+def _turned(calibration: Calibration) -> list[Reason]:
+    """Whether the mast is turned about: a tilt that counts down fits as well, with the head half a turn off.
+
+    `calib.survey_joints` mostly refuses such a survey before.
+    """
+    angle = float(np.linalg.norm(Rotation.from_euler("XYZ", calibration.rig.mast.rotation_rad).as_rotvec()))
+    if angle < TURNED_RAD:
+        return []
+    words = f"the mast comes out turned by {np.degrees(angle):.0f} degrees against the rover"
+    return [Reason("bad", f"{words}: pan or tilt has the wrong sign (right and up are positive)")]
 
 
 def _pointing(calibration: Calibration) -> list[Reason]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import tempfile
 from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -15,6 +16,7 @@ if TYPE_CHECKING:
     from mastctl.calibration.run import Calibrated
 
 OUTLIERS_SHOWN = 20
+SURVEY_FILES = ("survey.yaml", "station.csv", "images.csv", "dots.csv", "clicks.csv")
 
 
 def add_commands(subparsers: Any) -> None:
@@ -23,8 +25,8 @@ def add_commands(subparsers: Any) -> None:
         "calibrate",
         help="fit cameras and mast to a survey, and write the mast file",
         description="Reads a survey folder (docs/calibration.md), checks it, finds dots where there are "
-        "none, fits cameras and mast, and writes the mast file with its uncertainty. The file's former "
-        "version is kept as NAME.previous.yaml.",
+        "none, fits cameras and mast, and writes the mast file with its uncertainty. Every former version "
+        "is kept: the last as NAME.previous.yaml, those before as NAME.previous-1.yaml and so on.",
     )
     parser.add_argument("survey", type=Path, metavar="SURVEY", help="the survey folder")
     parser.add_argument("--out", type=Path, required=True, metavar="MAST.yaml", help="the mast file to write")
@@ -63,7 +65,8 @@ def run(args: argparse.Namespace) -> int:
         for finding in refusal.findings[1:]:
             output.tell(str(finding))  # the first is told last, as the reason
         raise
-    _check_out(args.out)
+    _check_out(args.out, survey)
+    _check_report(args.report)
     in_use = _in_use(args)
     survey, undetected = _with_dots(args, survey)
     warnings = checked(survey)  # once more, with the dots that were found
@@ -79,14 +82,51 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _check_out(out: Path) -> None:
+def _check_out(out: Path, survey: Survey) -> None:
     """Refuse an impossible --out before the minutes of the search, not after them."""
-    if not out.resolve().parent.is_dir():
-        raise output.CommandError(
-            "file_system", f"--out {out}: there is no folder {out.parent}; make it first", exit_code=2
-        )
-    if out.is_dir():
-        raise output.CommandError("file_system", f"--out {out}: is a folder; a file is expected", exit_code=2)
+    try:
+        target = out.resolve()
+        if not target.parent.is_dir():
+            raise _unusable(f"--out {out}", f"there is no folder {out.parent}; make it first")
+        if target.is_dir():
+            raise _unusable(f"--out {out}", "is a folder; a file is expected")
+        if target.exists() and not target.is_file():
+            raise _unusable(f"--out {out}", "is no regular file; a file is expected")
+        pictures = (survey.folder / image.file for image in survey.images if image.file != Path())
+        texts = (survey.folder / name for name in SURVEY_FILES)
+        if target in {path.resolve() for path in (*texts, *pictures)}:
+            raise _unusable(f"--out {out}", "is a file of the survey itself; name another one")
+        _try_to_write(target.parent, f"--out {out}")
+    except (OSError, ValueError) as error:
+        raise _unusable(f"--out {out}", str(error)) from None
+
+
+def _check_report(report: Path | None) -> None:
+    """Refuse an impossible --report as well."""
+    if report is None:
+        return
+    try:
+        folder = report.resolve()
+        while not folder.exists() and folder != folder.parent:
+            folder = folder.parent
+        if not folder.is_dir():
+            raise _unusable(f"--report {report}", f"{folder} is a file; a folder is expected")
+        _try_to_write(folder, f"--report {report}")
+    except (OSError, ValueError) as error:
+        raise _unusable(f"--report {report}", str(error)) from None
+
+
+def _try_to_write(folder: Path, what: str) -> None:
+    """Write a nameless file there: permissions alone do not tell (read-only disks, root)."""
+    try:
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except OSError as error:
+        raise _unusable(what, f"nothing can be written to {folder}: {error.strerror or error}") from None
+
+
+def _unusable(what: str, why: str) -> output.CommandError:
+    return output.CommandError("file_system", f"{what}: {why}", exit_code=2)
 
 
 def _in_use(args: argparse.Namespace) -> StoredRig | None:
@@ -134,13 +174,18 @@ def _waiting(args: argparse.Namespace, what: str) -> AbstractContextManager[Any]
 def _report(args: argparse.Namespace, done: Calibrated, in_use: StoredRig | None) -> Path | None:
     if args.report is None:
         return None
+    from calib.errors import BadFile
     from mastctl.calibration.report import Told, write_report
 
     with _waiting(args, "writing the report"):
         told = Told(
             done.survey, done.calibration, done.verdict, done.warnings, done.undetected, in_use, done.saved
         )
-        return write_report(told, args.report)
+        try:
+            return write_report(told, args.report)
+        except (OSError, BadFile) as error:
+            saved = f"the mast file {done.saved.path} is saved, but its report is not"
+            raise output.CommandError("report_not_written", f"{saved}: {error}") from None
 
 
 def _document(done: Calibrated, in_use: StoredRig | None, page: Path | None) -> dict[str, Any]:
@@ -159,7 +204,11 @@ def _document(done: Calibrated, in_use: StoredRig | None, page: Path | None) -> 
         "seconds": fit.seconds,
         "method": fit.method,
         "mast_parameters": fit.mast_parameters,
-        "mast_file": {"path": str(done.saved.path), "digest": done.saved.digest},
+        "mast_file": {
+            "path": str(done.saved.path),
+            "digest": done.saved.digest,
+            "previous": None if done.previous is None else str(done.previous),
+        },
         "survey_digest": done.survey.digest,
         "chi2": _finite(fit.chi2),
         "degrees_of_freedom": _finite(fit.degrees_of_freedom),
@@ -218,6 +267,7 @@ def _show(done: Calibrated, in_use: StoredRig | None, page: Path | None) -> None
         )
     reasons = [[reason.grade, reason.sentence] for reason in done.verdict.reasons]
     notes = [f"mast file: {done.saved.path} ({done.saved.digest[:12]})"]
+    notes += [f"kept from before: {done.previous}"] if done.previous is not None else []
     notes += [f"report: {page}"] if page is not None else []
     output.print_table(f"Verdict: {done.verdict.words}", ["", "reason"], reasons, notes)
 

@@ -28,15 +28,16 @@ def add_parser(kinds: Any) -> None:
     )
     parser.add_argument(
         "--surveys", type=at_least_one, default=DEFAULT_SURVEYS, metavar="N",
-        help="surveys of each kind (default 10, some 5 minutes on two processors)",
+        help="surveys of each kind (default 10, some 6 minutes on two processors)",
     )  # fmt: skip
     parser.add_argument(
         "--targets", type=at_least_one, default=DEFAULT_TARGETS, metavar="N",
         help="targets of each survey at each distance (default 20)",
     )  # fmt: skip
     parser.add_argument(
-        "--study", action="append", choices=("placements", "station", "prisms", "mast"), metavar="NAME",
-        help="placements, station, prisms or mast; may be given several times (default: all)",
+        "--study", action="append", metavar="NAME",
+        choices=("placements", "boards", "station", "prisms", "mast"),
+        help="placements, boards, station, prisms or mast; may be given several times (default: all)",
     )  # fmt: skip
     parser.add_argument("--seed", type=seed, default=1, metavar="S", help="of everything random (default 1)")
     parser.add_argument(

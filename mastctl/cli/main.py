@@ -26,6 +26,7 @@ log = logging.getLogger(__name__)
 MODULES: dict[str, tuple[str, ...]] = {
     "mastctl.cli.service": ("run", "status", "point", "stop", "snapshot"),
     "mastctl.cli.geometry": ("camera", "solve", "triangulate", "budget"),
+    "mastctl.cli.handoff": ("handoff",),
     "mastctl.cli.calibrate": ("calibrate",),
     "mastctl.cli.experiment": ("experiment", "demo"),
     "mastctl.cli.sim": ("sim",),
@@ -151,3 +152,7 @@ def _check_command(words: Sequence[str]) -> None:
     near = get_close_matches(wanted, known, n=1)
     hint = f"did you mean '{near[0]}'?" if near else f"known are {', '.join(known)}"
     raise output.WrongUse(f"no command '{wanted}'; {hint}")
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -5,9 +5,13 @@ from __future__ import annotations
 import argparse
 import json
 import math
+import re
 import sys
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
+
+# How a cell with a number begins; a lone dash stands for a number that there is not.
+_NUMBER = re.compile(r"[-+±]? ?\.?\d|[-–—]$|nan$")
 
 
 class CommandError(Exception):
@@ -49,14 +53,16 @@ def print_json(document: Mapping[str, Any]) -> None:
 def print_table(
     title: str, columns: Sequence[str], rows: Iterable[Sequence[str]], notes: Sequence[str] = ()
 ) -> None:
-    """Write a table for people to stdout, numbers on the right, notes under it."""
+    """Write a table for people to stdout, numbers to the right and words to the left, notes under it."""
     from rich.console import Console
     from rich.table import Table
     from rich.text import Text
 
+    rows = list(rows)
     table = Table(title=Text(title), title_justify="left")
-    for column in columns:
-        table.add_column(Text(column), justify="right")
+    for column, cells in zip(columns, zip(*rows, strict=True) if rows else [()] * len(columns), strict=True):
+        words = not all(_NUMBER.match(cell) for cell in cells if cell)
+        table.add_column(Text(column), justify="left" if words else "right")
     for row in rows:
         table.add_row(*(Text(cell) for cell in row))
     console = Console(file=sys.stdout, soft_wrap=True)

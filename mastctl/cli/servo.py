@@ -186,7 +186,7 @@ def _test(args: argparse.Namespace) -> int:
     if args.torque_percent > 100:
         raise WrongUse(f"--torque-percent is {args.torque_percent:g}, expected at most 100")
     output.tell(
-        f"servo {args.id} turns {args.degrees:g} degrees to each side and back, at most "
+        f"servo {args.id} is to turn {args.degrees:g} degrees to each side and back, at most "
         f"{args.torque_percent:g} % of its strength"
     )
     with _line(args) as link:

@@ -1,8 +1,8 @@
 """How good a survey must be: simulated surveys, fitted, and judged by the pointing and hand-off they give.
 
 One thing at a time differs from the paper's survey (section III, Table II): how many placements the mast is
-calibrated with, how well the station measures, how many prisms there are, whether the mast is taken as
-upright. The paper's Tables IV and V come from the same runs.
+calibrated with, how many boards the cameras, how well the station measures, how many prisms there are,
+whether the mast is taken as upright. The paper's Tables IV and V come from the same runs.
 """
 
 from __future__ import annotations
@@ -29,10 +29,18 @@ from mastctl.experiment.executors import run_all
 DISTANCES_M = (10.0, 6.0, 2.0)
 CLICK_PX = 0.2
 PAN_RAD, TILT_RAD = (-1.0, 1.0), (-0.6, -0.05)
+METHODS: tuple[Method, ...] = ("paper", "joint")
 MARGIN = 0.1
 """Targets keep so far from the images' edges, as part of the width and height."""
 
-PANCAM_HANDOFF_M, HAZCAM_HANDOFF_M = 6.0, 2.0
+PANCAM_TO_NAVCAM, NAVCAM_TO_HAZCAM = "pancam to navcam", "navcam to hazcam"
+HANDOFFS = (
+    *((PANCAM_TO_NAVCAM, range_m) for range_m in DISTANCES_M),
+    (NAVCAM_TO_HAZCAM, 2.0),
+)
+"""What is handed off, and how far away it is."""
+
+Handoff = tuple[str, float]
 PAPER_STATION_M = 0.002
 
 PAPER_TABLE_V: Mapping[int, Mapping[str, tuple[float, float]]] = {
@@ -55,11 +63,11 @@ class Variant:
 
 @dataclass(frozen=True, eq=False)
 class Task:
-    """One survey of one variant; ``seed`` is its own."""
+    """One survey of one variant; ``seed`` is the study's and the survey's number."""
 
     rig: Rig
     variant: Variant
-    seed: np.random.SeedSequence
+    seed: tuple[int, int]
     targets: int
 
 
@@ -72,7 +80,7 @@ class Outcome:
     pointing_px, exact_px
         By distance, (n, 2) errors of pointing after clicks of 0.2 px noise, and after exact clicks.
     handoff_px
-        By ``pancam to navcam`` and the like, (n, 2) errors against exact projection.
+        By ``HANDOFFS``, (n, 2) errors against exact projection.
     mast, sigma
         The six (or eight) numbers, estimated, and their standard deviations.
     mast_rms_px
@@ -85,7 +93,7 @@ class Outcome:
     failure: str = ""
     pointing_px: Mapping[float, FloatArray] = field(default_factory=dict)
     exact_px: Mapping[float, FloatArray] = field(default_factory=dict)
-    handoff_px: Mapping[str, FloatArray] = field(default_factory=dict)
+    handoff_px: Mapping[Handoff, FloatArray] = field(default_factory=dict)
     mast: FloatArray = field(default_factory=lambda: np.full(8, np.nan))
     sigma: FloatArray = field(default_factory=lambda: np.full(8, np.nan))
     mast_rms_px: Mapping[str, tuple[float, float]] = field(default_factory=dict)
@@ -101,8 +109,8 @@ class Summary:
     failed: int
     pointing_rms_px: Mapping[float, tuple[float, float]]
     exact_rms_px: Mapping[float, tuple[float, float]]
-    handoff_rms_px: Mapping[str, tuple[float, float]]
-    handoff_worst_px: Mapping[str, float]
+    handoff_rms_px: Mapping[Handoff, tuple[float, float]]
+    handoff_worst_px: Mapping[Handoff, float]
     seconds: float
 
     @property
@@ -110,9 +118,13 @@ class Summary:
         """Rms an axis of pointing after exact clicks, over all distances."""
         return _together(self.exact_rms_px)
 
-    def handoff_px(self, key: str) -> float:
-        """Rms an axis of a hand-off; not-a-number where there was none."""
-        return float(np.sqrt(np.mean(np.square(self.handoff_rms_px.get(key, np.nan)))))
+    def handoff_px(self, name: str) -> float:
+        """Rms an axis of a hand-off, over all its distances; not-a-number where there was none."""
+        return _together({d: xy for (n, d), xy in self.handoff_rms_px.items() if n == name})
+
+    def handoff_most_px(self, name: str) -> float:
+        """Worst of a hand-off, over all its distances; not-a-number where there was none."""
+        return max((worst for (n, _), worst in self.handoff_worst_px.items() if n == name), default=np.nan)
 
     @property
     def pointing_px(self) -> float:
@@ -145,13 +157,19 @@ def variants() -> tuple[Variant, ...]:
     """Return everything that is varied, one thing at a time from the paper's survey."""
     base = SurveyPlan()
     found: list[Variant] = []
-    for method in ("paper", "joint"):
+    for method in METHODS:
         for count in (2, 3, 4, 5, 6, 8, 12, 18):
             plan = replace(base, mast_boards=count)
             found.append(Variant(f"placements, {method}", f"{count}", count, method, 6, plan))
-    for station_m in (0.0005, 0.001, 0.002, 0.004):
-        plan = replace(base, sigma=Sigma(station_m, 0.1))
-        found.append(Variant("station", f"{1000 * station_m:g} mm", 1000 * station_m, "joint", 6, plan))
+    for method in METHODS:
+        for count in (2, 4, 8, 12):
+            plan = replace(base, rings=tuple(replace(ring, boards=count) for ring in base.rings))
+            found.append(Variant(f"boards, {method}", f"{count}", count, method, 6, plan))
+    for method in METHODS:
+        for station_m in (0.0005, 0.001, 0.002, 0.004):
+            plan = replace(base, sigma=Sigma(station_m, 0.1))
+            label = f"{1000 * station_m:g} mm"
+            found.append(Variant(f"station, {method}", label, 1000 * station_m, method, 6, plan))
     for prisms in (3, 4):
         found.append(Variant("prisms", f"{prisms}", prisms, "joint", 6, replace(base, prisms=prisms)))
     paper = replace(base, sigma=Sigma(PAPER_STATION_M, 0.1))
@@ -191,11 +209,8 @@ def run_calibration_experiment(
     """
     began = time.monotonic()
     every = variants() if chosen is None else tuple(chosen)
-    seeds = np.random.SeedSequence(seed).spawn(len(every) * surveys)
-    tasks = [
-        Task(rig, variant, own, targets)
-        for variant, own in zip((v for v in every for _ in range(surveys)), seeds, strict=True)
-    ]
+    # Every variant has the same seeds: what differs between two is then the variant rather than the draw.
+    tasks = [Task(rig, variant, (seed, number), targets) for variant in every for number in range(surveys)]
     outcomes = run_all(executor, one_survey, tasks, done)
     by_variant = [
         replace(outcome, variant=task.variant) for outcome, task in zip(outcomes, tasks, strict=True)
@@ -206,13 +221,13 @@ def run_calibration_experiment(
 def one_survey(task: Task) -> Outcome:
     """Simulate one survey, fit it, and measure what pointing and hand-off by the result are worth."""
     variant = task.variant
-    of_survey, of_targets = task.seed.spawn(2)
-    survey, _ = simulate_survey(task.rig, int(of_survey.generate_state(1)[0]), variant.plan)
+    of_survey = np.random.SeedSequence([*task.seed, 0]).generate_state(1)[0]
+    survey, _ = simulate_survey(task.rig, int(of_survey), variant.plan)
     try:
         fit = FITS[variant.method](survey, variant.mast_parameters)
     except CalibError as error:
         return Outcome(variant, failure=str(error))
-    rng = np.random.default_rng(of_targets)
+    rng = np.random.default_rng([*task.seed, 1])
     pointing, exact = _pointing(task.rig, fit.rig, task.targets, rng)
     mast, sigma = fit.rig.mast, fit.sigma["mast"]
     return Outcome(
@@ -265,13 +280,11 @@ def _pointed(believed: Rig, true: Rig, *rest: Any) -> FloatArray:
         return np.full(2, np.nan)
 
 
-def _handoffs(true: Rig, believed: Rig, targets: int, rng: np.random.Generator) -> dict[str, FloatArray]:
+def _handoffs(true: Rig, believed: Rig, targets: int, rng: np.random.Generator) -> dict[Handoff, FloatArray]:
     """Errors (n, 2) of both eyes of the receiving pair, by hand-off; clicks have noise."""
-    found: dict[str, FloatArray] = {}
-    for giver, taker, range_m in (
-        ("pancam", "navcam", PANCAM_HANDOFF_M),
-        ("navcam", "hazcam", HAZCAM_HANDOFF_M),
-    ):
+    found: dict[Handoff, FloatArray] = {}
+    for name, range_m in HANDOFFS:
+        giver, taker = name.split(" to ")
         if not {giver, taker} <= set(true.stereo) & set(believed.stereo):
             continue
         rows: list[FloatArray] = []
@@ -291,7 +304,7 @@ def _handoffs(true: Rig, believed: Rig, targets: int, rng: np.random.Generator) 
                 continue
             rows += errors.values()
         if rows:
-            found[f"{giver} to {taker}"] = np.array(rows)
+            found[name, range_m] = np.array(rows)
     return found
 
 
@@ -359,7 +372,7 @@ def _summary(outcomes: Sequence[Outcome]) -> Summary:
 
     handoffs = dict.fromkeys(key for outcome in good for key in outcome.handoff_px)
     worst = {
-        key: float(np.nanmax([np.linalg.norm(o.handoff_px[key], axis=1).max() for o in good]))
+        key: float(np.nanmax(np.linalg.norm(np.concatenate([o.handoff_px[key] for o in good]), axis=1)))
         for key in handoffs
     }
     return Summary(
@@ -380,5 +393,6 @@ def _rms(errors: FloatArray) -> tuple[float, float]:
 
 
 def _together(by_distance: Mapping[float, tuple[float, float]]) -> float:
+    """Rms an axis over all distances; not-a-number where there are none."""
     values = np.array(list(by_distance.values()))
     return float(np.sqrt(np.mean(values**2))) if values.size else float("nan")

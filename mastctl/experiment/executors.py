@@ -1,13 +1,14 @@
 """Where the tasks of a Monte Carlo run: processes of this machine, or a Dask cluster.
 
 Whatever runs them, a task carries its own seed and results are put in the order of the tasks, so the numbers
-are the same.
+are the same. To the last digit they are if linear algebra runs in one thread everywhere, as it does in
+the workers of Dask and in those that are started here: more threads add up in another order.
 """
 
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor, ProcessPoolExecutor, as_completed
 from contextlib import contextmanager
 from multiprocessing import get_context
@@ -19,6 +20,7 @@ Task = TypeVar("Task")
 Result = TypeVar("Result")
 
 DASK = "dask:"
+ONE_THREAD = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 
 
 class NoExecutor(MastctlError):
@@ -47,7 +49,8 @@ def open_executor(name: str, workers: int | None = None) -> Iterator[Executor]:
     """
     if name == "local":
         # Started afresh: the threads of a progress bar run here, which a fork would copy half.
-        with ProcessPoolExecutor(workers or os.cpu_count() or 1, get_context("spawn")) as pool:
+        context = get_context("spawn")
+        with _environment(ONE_THREAD), ProcessPoolExecutor(workers or os.cpu_count() or 1, context) as pool:
             try:
                 yield pool
             except BaseException:
@@ -69,6 +72,21 @@ def open_executor(name: str, workers: int | None = None) -> Iterator[Executor]:
         raise NoExecutor(f"no Dask scheduler answers at {address[:80]}: {error}") from None
     with client:
         yield cast(Executor, client.get_executor())
+
+
+@contextmanager
+def _environment(values: Mapping[str, str]) -> Iterator[None]:
+    """Variables that processes started meanwhile inherit."""
+    before = {name: os.environ.get(name) for name in values}
+    os.environ.update(values)
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value
 
 
 def run_all(

@@ -15,13 +15,12 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from calib import pointing
-from calib.errors import Unreachable
 from calib.mast import Rig
 from calib.store import parse_rig
 from drivers.interfaces import Image
 from mastctl.client import Client, ClientError
-from mastctl.experiment.targets import Target, choose_target
+from mastctl.experiment.targets import Target
+from mastctl.experiment.views import OPERATION_TIMEOUT_S, VIEWS_PER_TARGET, Views
 
 # Rms pixel errors (x, y) of the paper's Table VI: first and second pointing at each distance in metres.
 PAPER_TABLE_VI: Mapping[float, tuple[tuple[float, float], tuple[float, float]]] = {
@@ -32,9 +31,6 @@ PAPER_TABLE_VI: Mapping[float, tuple[tuple[float, float], tuple[float, float]]] 
 
 # Targets lie this far to either side of straight ahead: the pan range of the paper's calibration (III.C).
 PAN_RANGE_RAD = 1.0
-# A view that offers no usable target is left for another; after this many in a row the distance is given up.
-VIEWS_PER_TARGET = 12
-OPERATION_TIMEOUT_S = 60.0
 
 
 class Truth(Protocol):
@@ -271,9 +267,7 @@ class _Bench:
         self._client = client
         self._rig = rig
         self._pair = pair
-        self._pan_limits_rad = (float(limits["pan_rad"][0]), float(limits["pan_rad"][1]))
-        self._tilt_limits_rad = (float(limits["tilt_rad"][0]), float(limits["tilt_rad"][1]))
-        self._rng = rng
+        self._views = Views(client, rig, pair, limits, rng, PAN_RANGE_RAD)
         self._truth = truth
 
     def one_target(self, distance_m: float, index: int, with_pictures: bool) -> TargetRecord:
@@ -282,7 +276,7 @@ class _Bench:
         reason = ""
         for _ in range(VIEWS_PER_TARGET):
             try:
-                target = self._look_for_target(distance_m)
+                target = self._views.find_target(distance_m)
             except ClientError as error:
                 reason = f"looking for a target: {error}"
                 break
@@ -303,46 +297,6 @@ class _Bench:
             reason,
             time.monotonic() - begun_s,
         )
-
-    def _look_for_target(self, distance_m: float) -> Target | None:
-        """Turn to a random piece of ground at the distance and choose a pixel there, if it offers one."""
-        angles = self._angles_towards(distance_m)
-        if angles is None:
-            return None
-        operation = self._client.wait(
-            self._client.point(pan_rad=angles[0], tilt_rad=angles[1]), timeout_s=OPERATION_TIMEOUT_S
-        )
-        if operation["state"] != "done":
-            error = operation.get("error") or {}
-            raise ClientError(
-                str(error.get("code", operation["state"])), str(error.get("message", "the move was stopped"))
-            )
-        left, right = (self._client.snapshot(camera) for camera in self._pair)
-        models = tuple(
-            self._rig.camera_in_rover(shot.camera, shot.pan_rad, shot.tilt_rad) for shot in (left, right)
-        )
-        return choose_target(left, right, models[0], models[1], distance_m, self._rng)
-
-    def _angles_towards(self, distance_m: float) -> tuple[float, float] | None:
-        """Joint angles that look at level ground at the range, anywhere ahead; None outside the limits."""
-        mast = self._rig.mast
-        head_in_rover_m = mast.rover_from_head(0.0, 0.0).translation_m
-        height_m = -float(head_in_rover_m[2])
-        along_m = math.sqrt(max(distance_m**2 - height_m**2, 0.0))
-        azimuth_rad = self._rng.uniform(-PAN_RANGE_RAD, PAN_RANGE_RAD)
-        point_m = np.array(
-            [
-                head_in_rover_m[0] + along_m * math.cos(azimuth_rad),
-                head_in_rover_m[1] + along_m * math.sin(azimuth_rad),
-                0.0,
-            ]
-        )
-        try:
-            solutions = pointing.solve(mast, self._rig.cameras[self._pair[0]].model, point_m)
-            chosen = pointing.choose(solutions, self._pan_limits_rad, self._tilt_limits_rad)
-        except Unreachable:
-            return None
-        return chosen.pan_rad, chosen.tilt_rad
 
     def _point_at(
         self, target: Target, distance_m: float, index: int, begun_s: float, with_pictures: bool

@@ -225,20 +225,20 @@ def _scatter(experiment: PointingExperiment) -> str:
 def _pictures(experiment: PointingExperiment, record: TargetRecord) -> str:
     """The view with the click, and what the cross-hair then saw after each pointing."""
     assert record.clicked_image is not None
-    view = _bgr(record.clicked_image)
+    view = bgr(record.clicked_image)
     clicked = tuple(round(v) for v in record.clicked_px)
     cv2.circle(view, clicked, 22, (0, 140, 255), 3, cv2.LINE_AA)
     cv2.circle(view, clicked, 3, (0, 140, 255), -1, cv2.LINE_AA)
     small = np.asarray(cv2.resize(view, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA), dtype=np.uint8)
     tags = [
         html.figure(
-            _jpeg_tag(small, "the target chosen"), f"target {record.index}: clicked in {record.frame_id}"
+            jpeg_tag(small, "the target chosen"), f"target {record.index}: clicked in {record.frame_id}"
         )
     ]
-    chosen = _crop(_bgr(record.clicked_image), record.clicked_px)
-    tags.append(html.figure(_jpeg_tag(chosen, "the target, enlarged"), "the target, enlarged"))
+    chosen = _crop(bgr(record.clicked_image), record.clicked_px)
+    tags.append(html.figure(jpeg_tag(chosen, "the target, enlarged"), "the target, enlarged"))
     for name, landing, image in zip(("first", "second"), record.landings, record.landed_images, strict=False):
-        piece = _crop(_bgr(image), experiment.aim_px)
+        piece = _crop(bgr(image), experiment.aim_px)
         middle = CROP_PX * CROP_SCALE
         cv2.drawMarker(piece, (middle, middle), (255, 255, 255), cv2.MARKER_CROSS, 90, 1, cv2.LINE_AA)
         found = tuple(round(middle + v * CROP_SCALE) for v in landing.residual_px)
@@ -246,7 +246,7 @@ def _pictures(experiment: PointingExperiment, record: TargetRecord) -> str:
         x, y = landing.residual_px
         tags.append(
             html.figure(
-                _jpeg_tag(piece, f"{name} pointing"), f"{name}: {x:+.2f}, {y:+.2f} px from the cross-hair"
+                jpeg_tag(piece, f"{name} pointing"), f"{name}: {x:+.2f}, {y:+.2f} px from the cross-hair"
             )
         )
     return '<div class="row">' + "".join(tags) + "</div>"
@@ -264,14 +264,14 @@ def _crop(image: Image, center_px: tuple[float, float]) -> Image:
     return np.asarray(cv2.warpAffine(image, matrix, (side, side), flags=cv2.INTER_LINEAR), dtype=np.uint8)
 
 
-def _bgr(image: Image) -> Image:
+def bgr(image: Image) -> Image:
     """A copy in colour to draw on."""
     return np.asarray(
         cv2.cvtColor(image, cv2.COLOR_GRAY2BGR) if image.ndim == 2 else image.copy(), dtype=np.uint8
     )
 
 
-def _jpeg_tag(image: Image, alt: str) -> str:
+def jpeg_tag(image: Image, alt: str) -> str:
     """An inlined JPEG."""
     return html.image_tag(
         cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, 80])[1].tobytes(), "jpeg", alt

@@ -25,12 +25,14 @@ NOISE_DN = 2.0
 
 @dataclass(frozen=True, eq=False)
 class Target:
-    """A pixel of a snapshot and the range that stereo gives it."""
+    """A pixel of a snapshot, its partner in the other eye (``right_px`` of ``right``), and stereo's range."""
 
     shot: Snapshot
     x_px: float
     y_px: float
     range_m: float
+    right: Snapshot
+    right_px: tuple[float, float]
 
 
 def choose_target(
@@ -73,7 +75,8 @@ def choose_target(
             continue
         range_m = float(np.linalg.norm(point - left_in_rover.C))
         if abs(range_m - distance_m) <= RANGE_SLACK * distance_m:
-            return Target(left, float(pixel[0]), float(pixel[1]), range_m)
+            partner = (float(found.match.pixel_px[0]), float(found.match.pixel_px[1]))
+            return Target(left, float(pixel[0]), float(pixel[1]), range_m, right, partner)
     return None
 
 

@@ -34,6 +34,7 @@ from drivers.errors import DriverError
 from drivers.interfaces import Reading
 from mastctl.errors import MastctlError
 from mastctl.limits import Limits
+from mastctl.pointing.counts import counts_told
 from mastctl.pointing.looking import CamerasLike, Clicked, Eyes, View, facts
 from mastctl.pointing.motion import Head, HeadLike
 from mastctl.pointing.record import Recorder
@@ -313,10 +314,13 @@ class _Run:
             best = choose(solutions, self._limits.pan_rad, self._limits.tilt_rad, here.pan_rad, here.tilt_rad)
             detail.update(chosen=_told(best))
         self._range_m = best.range_m
-        return (best.pan_rad, best.tilt_rad), self._go(best.pan_rad, best.tilt_rad)
+        return (best.pan_rad, best.tilt_rad), self._go(best.pan_rad, best.tilt_rad, aim.camera)
 
-    def _go(self, pan_rad: float, tilt_rad: float) -> Reading:
-        """Check the limits, move, wait until settled; return the reading there."""
+    def _go(self, pan_rad: float, tilt_rad: float, camera: str | None = None) -> Reading:
+        """Check the limits, move, wait until settled; return the reading there.
+
+        Where the head knows its counts, the record says what these leave, in pixels of ``camera``.
+        """
         with self._step("limits") as detail:
             detail.update(pan_rad=pan_rad, tilt_rad=tilt_rad)
             self._limits.check(pan_rad, tilt_rad)
@@ -328,6 +332,8 @@ class _Run:
         with self._step("settle") as detail:
             settled = self._head.arrived(pan_rad, tilt_rad, begun_s + allowed_s)
             detail.update(pan_rad=settled.pan_rad, tilt_rad=settled.tilt_rad)
+            model = None if camera is None else self._rig.cameras[camera].model
+            detail.update(counts_told(self._devices, settled.tilt_rad, model))
         return settled
 
     def _look(self, cameras: Sequence[str], settled: Reading) -> dict[str, View]:

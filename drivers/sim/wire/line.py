@@ -1,8 +1,7 @@
-"""The line between a host and simulated devices: a pseudo terminal or a TCP port, wire time, and faults.
+"""The ends of a simulated line that a host can open: a pseudo terminal or a TCP port.
 
-A device is a pure state machine (``WireDevice``): bytes and a time in, replies out. A line owns the one
-thread that carries bytes to it and from it. On a pseudo terminal the host's bytes count only at the device's
-baud rate, as on a real line, and both directions take 10 bits a byte.
+On a pseudo terminal the host's bytes count only at the device's baud rate, as on a real line, and both
+directions take 10 bits a byte.
 """
 
 from __future__ import annotations
@@ -10,257 +9,26 @@ from __future__ import annotations
 import contextlib
 import errno
 import fcntl
-import heapq
-import itertools
-import logging
 import os
-import select
 import shutil
 import socket
 import struct
 import tempfile
-import threading
 import tty
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 from pathlib import Path
-from types import TracebackType
-from typing import Literal, Protocol, TypeVar, runtime_checkable
 
 from drivers.clock import Clock
 from drivers.errors import BadOptions
 from drivers.faults import FaultPanel
-from drivers.sim.wire.line_faults import LineFaults
+from drivers.sim.wire.carrier import Line, ManyBauds, Observer
+from drivers.sim.wire.carrier import Reply as Reply
+from drivers.sim.wire.carrier import WireDevice as WireDevice
 
-log = logging.getLogger(__name__)
-
-POLL_S = 0.005
-"""How often a device is asked for what it sends by itself, and the faults of the line are looked at."""
-
-_BITS_PER_BYTE = 10  # 8N1: start, eight, stop
 _TCGETS2 = 0x802C542A  # asm-generic/ioctls.h; struct termios2: 4 flags, line, 19 characters, 2 speeds
 
-Observer = Callable[[Literal["host", "device"], bytes, float], None]
-"""Called in the line's thread with who sent it, the bytes, and when they were through."""
 
-_L = TypeVar("_L", bound="_Line")
-
-
-@dataclass(frozen=True)
-class Reply:
-    """Bytes that a simulated device sends, a whole packet or line of text.
-
-    Attributes
-    ----------
-    data
-        The bytes as they leave the device.
-    delay_s
-        From the end of what it answers: of the received packet, or of the reply before it in the sequence.
-    sender
-        The servo's id; 0 for a pan/tilt unit.
-    """
-
-    data: bytes
-    delay_s: float = 0.0
-    sender: int = 0
-
-
-class WireDevice(Protocol):
-    """Everything at the device's end of a line, as a state machine without threads and without sleeping.
-
-    The line calls it from one thread, with times that never run backwards.
-    """
-
-    @property
-    def baud(self) -> int:
-        """Bits a second that it listens and answers at, now."""
-        ...
-
-    def receive(self, data: bytes, time_s: float) -> Sequence[Reply]:
-        """Take bytes, in chunks of any size, and return what it answers."""
-        ...
-
-    def poll(self, time_s: float) -> Sequence[Reply]:
-        """Return what it sends by itself, or at last sends for an answer that it held back."""
-        ...
-
-
-@runtime_checkable
-class ManyBauds(Protocol):
-    """A device that is a bus, with devices of several baud rates: it is told that of the host."""
-
-    host_baud: int | None
-
-
-class _Line:
-    """The thread, the schedule of bytes on the wire, and the faults of the replies; ends are subclasses."""
-
-    def __init__(
-        self,
-        device: WireDevice,
-        clock: Clock,
-        faults: FaultPanel | None,
-        wire_time: bool,
-        observer: Observer | None,
-    ) -> None:
-        self.device = device
-        self._clock = clock
-        self._faults = LineFaults(faults)
-        self._wire_time = wire_time
-        self._observer = observer
-        self._schedule: list[tuple[float, int, bool, bytes]] = []  # when, order, to the device?, bytes
-        self._order = itertools.count()
-        self._to_device_free_s = self._to_host_free_s = -float("inf")
-        self._changed = threading.Condition()
-        self._up = self._wanted_up = True
-        self._closing = False
-        self._wake_read, self._wake_write = os.pipe()
-        self._thread = threading.Thread(target=self._run, name="simulated line", daemon=True)
-
-    def hang_up(self) -> None:
-        """Break the connection, as if the cable were pulled; return when it is broken."""
-        self._want(up=False)
-
-    def come_back(self) -> None:
-        """Make the connection again; return when it can be opened."""
-        self._want(up=True)
-
-    def close(self) -> None:
-        """End the thread and let go of every descriptor; a second call does nothing."""
-        if self._closing:
-            return
-        with self._changed:
-            self._closing = True
-        os.write(self._wake_write, b"x")
-        self._thread.join()
-        self._disconnect()
-        self._dismantle()
-        os.close(self._wake_read)
-        os.close(self._wake_write)
-
-    def __enter__(self: _L) -> _L:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
-        self.close()
-
-    def _connect(self) -> None:
-        """Make the end that a host can open."""
-        raise NotImplementedError
-
-    def _disconnect(self) -> None:
-        """Break it; nothing if it is broken."""
-        raise NotImplementedError
-
-    def _dismantle(self) -> None:
-        """Let go of what outlives a hang-up."""
-
-    def _readable(self) -> list[int]:
-        """The descriptors that may have something for ``_take``."""
-        raise NotImplementedError
-
-    def _take(self, ready: Sequence[int]) -> bytes:
-        """What the host has sent, empty for nothing that the device would understand."""
-        raise NotImplementedError
-
-    def _give(self, data: bytes) -> None:
-        """Hand bytes to the host; what it does not make room for is lost, as on a real line."""
-        raise NotImplementedError
-
-    def _want(self, up: bool) -> None:
-        with self._changed:
-            self._wanted_up = up
-            if self._closing or threading.current_thread() is self._thread:
-                return
-            os.write(self._wake_write, b"x")
-            self._changed.wait_for(lambda: self._up == up or self._closing, timeout=10.0)
-
-    def _run(self) -> None:
-        """Carry bytes until the line is closed."""
-        while not self._closing:
-            now_s = self._clock.now_s()
-            try:
-                self._follow(now_s)
-                wait_s = POLL_S
-                if self._schedule:
-                    wait_s = min(wait_s, max(0.0, self._schedule[0][0] - self._clock.now_s()))
-                ends = self._readable() if self._up else []
-                ready = select.select([self._wake_read, *ends], [], [], wait_s)[0]
-                if self._wake_read in ready:
-                    os.read(self._wake_read, 4096)
-                data = self._take(ready) if self._up else b""
-                if data:
-                    self._arrive(data, self._clock.now_s())
-            except Exception:  # a defect of the simulator must show, and not end the line in silence
-                log.exception("the simulated line stumbled")
-                self._clock.sleep(POLL_S)
-
-    def _follow(self, now_s: float) -> None:
-        """Hang up or come back, poll the device, and carry out what is due."""
-        up = self._wanted_up and not self._faults.hung_up(now_s)
-        if up != self._up:
-            if up:
-                self._connect()
-            else:
-                self._disconnect()
-                self._schedule.clear()
-            with self._changed:
-                self._up = up
-                self._changed.notify_all()
-        while self._schedule and self._schedule[0][0] <= now_s:
-            time_s, _, to_device, data = heapq.heappop(self._schedule)
-            if to_device:
-                self._deliver(data, time_s)
-            else:
-                self._send(data, time_s)
-        self._answer(self.device.poll(now_s), now_s)
-
-    def _wire_s(self, size: int) -> float:
-        return size * _BITS_PER_BYTE / self.device.baud if self._wire_time else 0.0
-
-    def _arrive(self, data: bytes, now_s: float) -> None:
-        """Bytes have left the host; they are through to the device after their wire time."""
-        through_s = max(now_s, self._to_device_free_s) + self._wire_s(len(data))
-        self._to_device_free_s = through_s
-        if through_s <= now_s:
-            self._deliver(data, now_s)
-        else:
-            heapq.heappush(self._schedule, (through_s, next(self._order), True, data))
-
-    def _deliver(self, data: bytes, time_s: float) -> None:
-        if self._observer is not None:
-            self._observer("host", data, time_s)
-        if self._faults.deaf(time_s):
-            return
-        self._answer(self.device.receive(data, time_s), time_s)
-
-    def _answer(self, replies: Sequence[Reply], time_s: float) -> None:
-        """Put replies on the wire one after the other, as the faults leave them."""
-        if not replies or not self._up:
-            return
-        for sent in self._faults.apply(replies, time_s):
-            start_s = max(time_s, self._to_host_free_s) + sent.delay_s
-            through_s = start_s + self._wire_s(len(sent.data))
-            self._to_host_free_s = through_s
-            through_s += sent.late_s
-            if through_s <= time_s:
-                self._send(sent.data, time_s)
-            else:
-                heapq.heappush(self._schedule, (through_s, next(self._order), False, sent.data))
-
-    def _send(self, data: bytes, time_s: float) -> None:
-        if self._observer is not None:
-            self._observer("device", data, time_s)
-        if self._up:
-            self._give(data)
-
-
-class PtyLine(_Line):
+class PtyLine(Line):
     """A serial line as a pseudo terminal; a context manager.
 
     Parameters
@@ -372,7 +140,7 @@ class PtyLine(_Line):
                 raise
 
 
-class TcpLine(_Line):
+class TcpLine(Line):
     """A device behind a TCP port, one host at a time; a context manager.
 
     Parameters

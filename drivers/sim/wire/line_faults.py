@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from drivers.faults import PAN_TILT, Fault, FaultPanel
 
 if TYPE_CHECKING:
-    from drivers.sim.wire.line import Reply
+    from drivers.sim.wire.carrier import Reply
 
 MOST_NOISE = 12
 """The longest garbage in front of a reply, bytes."""

@@ -1,0 +1,232 @@
+"""Camera hand-off: where a target that one stereo pair sees falls in other cameras (the paper's section V).
+
+Three steps: a ray through each picked pixel of the pair; the point nearest to both rays; that point projected
+into each next camera, on the body or on the head, the head turned or not. The covariance goes the same way:
+of the clicks to first order in closed form, of joint angles and calibration by differences of the whole
+chain, so that errors which both sides share cancel as they do in the rig.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from calib.cahvor import CameraModel
+from calib.errors import CalibError, NoHandoff
+from calib.mast import Rig
+from calib.rig_covariance import RigCovariance, moved_rig
+from calib.rigid import FloatArray
+from calib.stereo import Triangulation, triangulate
+
+STEP = 0.1
+"""Of a sigma, for numerical derivatives."""
+
+
+@dataclass(frozen=True, eq=False)
+class Joints:
+    """Measured joint angles, and the sigma of each reading; radians."""
+
+    pan_rad: float
+    tilt_rad: float
+    sigma_rad: float = 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class Predicted:
+    """Where a camera sees the target.
+
+    Attributes
+    ----------
+    pixel_px
+        (2,) pixel x, y.
+    covariance_px2
+        (2, 2) of the clicks' noise alone.
+    search_px2
+        (2, 2) of everything that was said to be uncertain: clicks, joint readings, calibration. Its ellipse
+        is where to search for the target.
+    """
+
+    pixel_px: FloatArray
+    covariance_px2: FloatArray
+    search_px2: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class Handoff:
+    """A target handed to other cameras.
+
+    Attributes
+    ----------
+    seen
+        What the source pair gives: position in the rover frame and its covariance from the clicks.
+    covariance_m2
+        (3, 3) of the position from everything that was said to be uncertain, rover frame.
+    pixels
+        By destination camera; None where it does not see the target.
+    reasons
+        For each None, why, in words.
+    pan_rad, tilt_rad
+        Joint angles of the destination images.
+    """
+
+    seen: Triangulation
+    covariance_m2: FloatArray
+    pixels: Mapping[str, Predicted | None]
+    reasons: Mapping[str, str]
+    pan_rad: float
+    tilt_rad: float
+
+
+def hand_off(
+    rig: Rig,
+    pair: tuple[str, str],
+    to: Sequence[str],
+    joints: Joints,
+    left_px: ArrayLike,
+    right_px: ArrayLike,
+    *,
+    to_joints: Joints | None = None,
+    sigma_px: float = 0.2,
+    calibration: RigCovariance | None = None,
+) -> Handoff:
+    """Hand a target over from a stereo pair to other cameras.
+
+    Parameters
+    ----------
+    rig
+        Mast and cameras.
+    pair
+        The source's left and right camera.
+    to
+        Destination cameras, on the body or on the head.
+    joints
+        Joint angles of the source images.
+    left_px, right_px
+        (2,) pixels of the target in the source images.
+    to_joints
+        Joint angles of the destination images; the same reading as ``joints`` when left out, and then its
+        error is the same too.
+    sigma_px
+        Sigma of each pixel coordinate of a click.
+    calibration
+        Covariance of the rig; exact when left out.
+
+    Raises
+    ------
+    NoStereoPoint
+        As `calib.stereo.triangulate`.
+    NoHandoff
+        ``too_near``: nearer than the pair's baseline. ``too_far``: infinity is within three sigma of the
+        range. ``not_seen``: no destination camera sees the target.
+    """
+    models = [rig.camera_in_rover(name, joints.pan_rad, joints.tilt_rad) for name in pair]
+    seen = triangulate(models[0], models[1], left_px, right_px, sigma_px)
+    _refuse_range(seen, models, pair)
+    there = to_joints or joints
+    cameras = {name: rig.camera_in_rover(name, there.pan_rad, there.tilt_rad) for name in to}
+    reasons = {name: why for name, model in cameras.items() if (why := _unseen(model, seen.position_m))}
+    shown = [name for name in to if name not in reasons]
+    if not shown:
+        words = "; ".join(f"{name}: {why}" for name, why in reasons.items())
+        raise NoHandoff("not_seen", f"no destination camera sees the target: {words}")
+
+    total = _other_covariance(
+        rig, pair, shown, joints, to_joints, np.array([left_px, right_px], dtype=np.float64), calibration
+    )
+    pixels: dict[str, Predicted | None] = dict.fromkeys(to)
+    for row, name in enumerate(shown):
+        pixel, rate, _ = cameras[name].project_jacobian(seen.position_m)
+        clicks = rate @ seen.covariance_m2 @ rate.T
+        part = slice(3 + 2 * row, 5 + 2 * row)
+        pixels[name] = Predicted(np.asarray(pixel), clicks, clicks + total[part, part])
+    return Handoff(seen, seen.covariance_m2 + total[:3, :3], pixels, reasons, there.pan_rad, there.tilt_rad)
+
+
+def _refuse_range(seen: Triangulation, models: Sequence[CameraModel], pair: tuple[str, str]) -> None:
+    """Refuse a point for which the pair is no stereo pair."""
+    baseline = models[1].C - models[0].C
+    baseline_m = float(np.linalg.norm(baseline))
+    between = seen.position_m - (models[0].C + models[1].C) / 2
+    range_m = float(np.linalg.norm(between))
+    if range_m < baseline_m:
+        raise NoHandoff(
+            "too_near",
+            f"the target is {range_m:.3g} m away, nearer than the {baseline_m:.3g} m between {pair[0]} and "
+            f"{pair[1]}; use a pair that sees near",
+        )
+    along = between / range_m
+    sigma_m = math.sqrt(max(float(along @ seen.covariance_m2 @ along), 0.0))
+    if 3.0 * sigma_m >= range_m:
+        raise NoHandoff(
+            "too_far",
+            f"the target is {range_m:.3g} m away and its range uncertain by {sigma_m:.3g} m (one sigma), so "
+            f"that {pair[0]} and {pair[1]} cannot tell it from infinity; use a pair that sees far",
+        )
+
+
+def _unseen(model: CameraModel, position_m: FloatArray) -> str:
+    """Why a camera does not see a point; empty if it does."""
+    pixel, valid = model.project(position_m)
+    if not valid:
+        return "the target is behind the camera or beyond what its lens images"
+    width, height = model.size_px
+    if -0.5 <= pixel[0] <= width - 0.5 and -0.5 <= pixel[1] <= height - 0.5:
+        return ""
+    return (
+        f"the target falls on pixel ({pixel[0]:.1f}, {pixel[1]:.1f}), outside the image of {width} x {height}"
+    )
+
+
+def _other_covariance(
+    rig: Rig,
+    pair: tuple[str, str],
+    to: Sequence[str],
+    joints: Joints,
+    to_joints: Joints | None,
+    clicks_px: FloatArray,
+    calibration: RigCovariance | None,
+) -> FloatArray:
+    """Covariance (3 + 2n, 3 + 2n) of position and pixels from joint readings and calibration."""
+    known = calibration.of((*pair, *to)) if calibration else RigCovariance((), np.zeros((0, 0)))
+    readings = [joints] if to_joints is None else [joints, to_joints]
+    size, calibrated = 3 + 2 * len(to), len(known.names)
+
+    def chain(step: FloatArray) -> FloatArray:
+        believed = moved_rig(rig, known.names, step[:calibrated]) if calibrated else rig
+        turned = [
+            (at.pan_rad + off[0], at.tilt_rad + off[1])
+            for at, off in zip(readings, step[calibrated:].reshape(-1, 2), strict=True)
+        ]
+        left, right = (believed.camera_in_rover(name, *turned[0]) for name in pair)
+        position = triangulate(left, right, *clicks_px).position_m
+        out = np.empty(size)
+        out[:3] = position
+        for row, name in enumerate(to):
+            pixel, valid = believed.camera_in_rover(name, *turned[-1]).project(position)
+            if not valid:
+                raise CalibError(f"{name} loses the target within a tenth of a sigma of the calibration")
+            out[3 + 2 * row : 5 + 2 * row] = pixel
+        return out
+
+    # The columns of a square root of the covariance are steps of one sigma, each on its own.
+    values, vectors = np.linalg.eigh(known.covariance)
+    steps = np.zeros((calibrated + 2 * len(readings),) * 2)
+    steps[:calibrated, :calibrated] = (vectors * np.sqrt(np.maximum(values, 0.0))).T
+    for index, reading in enumerate(readings):
+        for axis in range(2):
+            place = calibrated + 2 * index + axis
+            steps[place, place] = reading.sigma_rad
+    moved = [_slope(chain, step) for step in steps if step.any()]
+    if not moved:
+        return np.zeros((size, size))
+    rates = np.array(moved)
+    return np.asarray(rates.T @ rates)
+
+
+def _slope(chain: Callable[[FloatArray], FloatArray], step: FloatArray) -> FloatArray:
+    """Derivative of a chain along a step, by central differences."""
+    return (chain(STEP * step) - chain(-STEP * step)) / (2 * STEP)

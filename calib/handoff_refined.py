@@ -1,0 +1,245 @@
+"""Hand-off refined by image: the geometric hand-off's pixels, looked up in the destination's pictures.
+
+The source pair gives the surface around the target (`calib.epipolar`); the source patch is warped over it
+into each destination camera and correlated inside the ellipse that the geometric hand-off leaves
+(`calib.match`). What is found there counts only if it is the one thing that fits, and if the destination's
+two eyes and the source's range mean the same point.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+
+from calib.cahvor import CameraModel
+from calib.epipolar import find_partner
+from calib.handoff import Handoff, Predicted
+from calib.match import Match, MatchSettings, match
+from calib.rigid import FloatArray
+from calib.warp import Grey, Plane
+
+Verdict = Literal["accepted", "ambiguous", "flat", "occluded", "unseen"]
+
+_WORDS: Mapping[str, Verdict] = {
+    "good": "accepted",
+    "ambiguous": "ambiguous",
+    "flat": "flat",
+    "weak": "occluded",
+    "border": "unseen",
+}
+
+
+@dataclass(frozen=True)
+class RefineSettings:
+    """Thresholds of the refinement, with the reasons for their values.
+
+    Attributes
+    ----------
+    sigmas
+        Half axes of the search ellipse in standard deviations.
+    least_px, most_px
+        Bounds of the search window's half side; below, the ellipse would be smaller than what the warp can
+        be wrong by.
+    model_px
+        One sigma of what camera models are wrong by, for comparing what eyes see. Flight cameras: 0.2 to 0.5.
+    click_px
+        How far the second click may lie from where the pair's pictures put the first, beyond four sigma.
+    worst_chi2
+        Of four degrees of freedom: 1 in 1000 good pairs is above 18.5.
+    """
+
+    sigmas: float = 3.0
+    least_px: float = 3.0
+    most_px: float = 60.0
+    model_px: float = 0.4
+    click_px: float = 2.0
+    worst_chi2: float = 18.5
+
+
+@dataclass(frozen=True, eq=False)
+class Eye:
+    """A picture (h, w) grey, and its camera at that moment in the rover frame."""
+
+    image: Grey
+    camera: CameraModel
+
+
+@dataclass(frozen=True, eq=False)
+class RefinedPixel:
+    """Where a destination camera sees the target, by its picture.
+
+    Attributes
+    ----------
+    verdict, reason
+        Only ``accepted`` is a measurement; the reason is one sentence, empty for ``accepted``.
+    pixel_px, covariance_px2
+        (2,) and (2, 2); not-a-number unless accepted.
+    off_px
+        (2,) from the geometric hand-off's pixel to the found one.
+    correlation, second
+        At the best place and at the second best.
+    """
+
+    verdict: Verdict
+    reason: str
+    pixel_px: FloatArray
+    covariance_px2: FloatArray
+    off_px: FloatArray
+    correlation: float = 0.0
+    second: float = 0.0
+
+
+def refine_handoff(
+    handoff: Handoff,
+    source: tuple[Eye, Eye],
+    clicks_px: FloatArray,
+    destinations: Mapping[str, Eye],
+    settings: RefineSettings | None = None,
+    match_settings: MatchSettings | None = None,
+) -> dict[str, RefinedPixel]:
+    """Look a handed-over target up in the destination's pictures.
+
+    Parameters
+    ----------
+    handoff
+        The geometric hand-off of the same target.
+    source
+        Left and right eye of the pair that sees the target.
+    clicks_px
+        (2, 2) the target in both.
+    destinations
+        By name as in ``handoff.pixels``; all those there that see the target.
+
+    Returns
+    -------
+    refined
+        By destination camera.
+    """
+    settings = settings or RefineSettings()
+    sizes = match_settings or MatchSettings()
+    surface = _surface(source, np.asarray(clicks_px, dtype=np.float64), sizes, settings)
+    refined: dict[str, RefinedPixel] = {}
+    for name, eye in destinations.items():
+        predicted = handoff.pixels.get(name)
+        if predicted is None:
+            refined[name] = _none("unseen", handoff.reasons.get(name, "the hand-off has no such camera"))
+        elif not isinstance(surface, Plane):
+            refined[name] = surface
+        else:
+            refined[name] = _looked_up(source[0], clicks_px[0], surface, eye, predicted, settings, sizes)
+    return _agreeing(refined, handoff, destinations, settings)
+
+
+def _surface(
+    source: tuple[Eye, Eye], clicks_px: FloatArray, sizes: MatchSettings, settings: RefineSettings
+) -> Plane | RefinedPixel:
+    """The surface around the target from the source pair, or why there is none."""
+    left, right = source
+    found = find_partner(left.image, left.camera, clicks_px[0], right.image, right.camera, settings=sizes)
+    if found.match.verdict != "good" or found.plane is None:
+        return _none(_WORDS[found.match.verdict], f"in the source pair: {found.match.reason}")
+    apart = found.match.pixel_px - clicks_px[1]
+    worst = settings.click_px + 4.0 * math.sqrt(float(np.linalg.eigvalsh(found.match.covariance_px2)[-1]))
+    if np.linalg.norm(apart) > worst:
+        return _none(
+            "ambiguous",
+            f"in the source pair: the right eye's pixel lies {np.linalg.norm(apart):.1f} px from where the "
+            f"pictures put the left eye's target, at most {worst:.1f} px is expected",
+        )
+    return found.plane
+
+
+def _looked_up(
+    source: Eye,
+    pixel_px: FloatArray,
+    surface: Plane,
+    eye: Eye,
+    predicted: Predicted,
+    settings: RefineSettings,
+    sizes: MatchSettings,
+) -> RefinedPixel:
+    """Search one destination picture."""
+    search = settings.sigmas * math.sqrt(float(np.linalg.eigvalsh(predicted.search_px2)[-1]))
+    search = min(max(search, settings.least_px), settings.most_px)
+    found: Match = match(source.image, source.camera, pixel_px, surface, eye.image, eye.camera, search, sizes)
+    if found.verdict != "good":
+        return _none(_WORDS[found.verdict], found.reason, found.correlation, found.second)
+    off = found.pixel_px - predicted.pixel_px
+    allowed = predicted.search_px2 + found.covariance_px2 + settings.model_px**2 * np.eye(2)
+    distance = math.sqrt(float(off @ np.linalg.solve(allowed, off)))
+    if distance > settings.sigmas + 1.0:
+        return _none(
+            "occluded",
+            f"what fits best lies {np.linalg.norm(off):.1f} px from the geometric hand-off, {distance:.1f} "
+            "of its standard deviations: something else, or a wrong calibration",
+            found.correlation,
+            found.second,
+        )
+    return RefinedPixel(
+        "accepted", "", found.pixel_px, found.covariance_px2, off, found.correlation, found.second
+    )
+
+
+def _agreeing(
+    refined: dict[str, RefinedPixel],
+    handoff: Handoff,
+    destinations: Mapping[str, Eye],
+    settings: RefineSettings,
+) -> dict[str, RefinedPixel]:
+    """Take back what the other destination eyes, or the source's range, do not confirm."""
+    accepted = {name: one for name, one in refined.items() if one.verdict == "accepted"}
+    doubting = [name for name, one in refined.items() if one.verdict in ("ambiguous", "occluded", "flat")]
+    if not accepted:
+        return refined
+    if doubting:
+        words = f"{doubting[0]} does not confirm it: {refined[doubting[0]].reason}"
+        return {**refined, **{name: _taken_back(one, words) for name, one in accepted.items()}}
+    chi2 = _disagreement(accepted, handoff, destinations, settings)
+    if chi2 > settings.worst_chi2:
+        words = (
+            f"{' and '.join(accepted)} and the source pair do not mean one point: weighted misfit "
+            f"{chi2:.0f}, at most {settings.worst_chi2:g} is expected"
+        )
+        return {**refined, **{name: _taken_back(one, words) for name, one in accepted.items()}}
+    return refined
+
+
+def _disagreement(
+    accepted: Mapping[str, RefinedPixel],
+    handoff: Handoff,
+    destinations: Mapping[str, Eye],
+    settings: RefineSettings,
+) -> float:
+    """Weighted sum of squares of the one point that fits the found pixels and the source's position best."""
+    start = handoff.seen.position_m
+    position = start.copy()
+    prior = np.linalg.inv(handoff.covariance_m2 + 1e-12 * np.eye(3))
+    for _ in range(5):
+        normal, right, chi2 = prior.copy(), prior @ (start - position), 0.0
+        off = start - position
+        chi2 += float(off @ prior @ off)
+        for name, one in accepted.items():
+            pixel, rate, valid = destinations[name].camera.project_jacobian(position)
+            if not valid:
+                return math.inf
+            weight = np.linalg.inv(one.covariance_px2 + settings.model_px**2 * np.eye(2))
+            rest = one.pixel_px - pixel
+            normal += rate.T @ weight @ rate
+            right += rate.T @ weight @ rest
+            chi2 += float(rest @ weight @ rest)
+        position = position + np.linalg.solve(normal, right)
+    return chi2
+
+
+def _taken_back(one: RefinedPixel, words: str) -> RefinedPixel:
+    nothing = _none("occluded", words)
+    return replace(nothing, off_px=one.off_px, correlation=one.correlation, second=one.second)
+
+
+def _none(verdict: Verdict, reason: str, correlation: float = 0.0, second: float = 0.0) -> RefinedPixel:
+    nowhere = np.full(2, np.nan)
+    return RefinedPixel(verdict, reason, nowhere, np.full((2, 2), np.nan), nowhere, correlation, second)

@@ -1,0 +1,112 @@
+"""A survey's measurements as a fit takes them: the dots of an image, a point of the station."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from calib.rigid import FloatArray, Rigid
+from calib.survey import Survey
+
+
+@dataclass(frozen=True, eq=False)
+class ImageTerm:
+    """The dots of one image: board points (n, 3), pixels (n, 2), their sigma (n,), and which count (n,)."""
+
+    name: str
+    camera: str
+    board: tuple[str, str]
+    attitude: int | None
+    pan_rad: float
+    tilt_rad: float
+    rows: np.ndarray
+    columns: np.ndarray
+    in_board_m: FloatArray
+    pixels_px: FloatArray
+    sigma_px: FloatArray
+    keep: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class StationTerm:
+    """One point measured by the station: a prism (``board`` None) or a tape."""
+
+    setup: str
+    board: tuple[str, str] | None
+    point: str
+    position_m: FloatArray
+    in_board_m: FloatArray
+    sigma_m: float
+    keep: bool = True
+
+    @property
+    def name(self) -> str:
+        """The point as a person says it."""
+        if self.board is None:
+            return f"prism {self.point} of set-up {self.setup}"
+        return f"tape {self.point} of placement {self.board[1]} (set-up {self.setup})"
+
+
+def image_terms(
+    survey: Survey, boards: Mapping[tuple[str, str], Rigid], notes: list[str]
+) -> tuple[list[ImageTerm], list[ImageTerm], dict[tuple[object, ...], int]]:
+    """Return terms of the fitted and of the check images, and the head's attitudes among the former."""
+    fitted: list[ImageTerm] = []
+    checks: list[ImageTerm] = []
+    joints: dict[tuple[object, ...], int] = {}
+    for image in survey.images:
+        dots = survey.dots.get(image.name)
+        if dots is None or not len(dots.rows):
+            continue
+        if (image.setup, image.placement) not in boards:
+            notes.append(
+                f"image {image.name} is not used: placement {image.placement} of set-up {image.setup} "
+                "has no three tapes"
+            )
+            continue
+        attitude = None
+        on_head = survey.cameras[image.camera].on == "head"
+        if on_head:
+            key = (image.setup, image.placement, image.pan_rad, image.tilt_rad)
+            attitude = joints.setdefault(key, len(joints)) if image.purpose != "check" else -1
+        sigma = dots.sigma_px if dots.sigma_px is not None else np.full(len(dots.rows), survey.sigma.dot_px)
+        term = ImageTerm(
+            image.name,
+            image.camera,
+            (image.setup, image.placement),
+            attitude,
+            float(image.pan_rad or 0.0) if on_head else 0.0,
+            float(image.tilt_rad or 0.0) if on_head else 0.0,
+            dots.rows,
+            dots.columns,
+            survey.board.dots_in_board_m(dots.rows, dots.columns),
+            dots.pixels_px,
+            np.asarray(sigma, dtype=np.float64),
+            np.ones(len(dots.rows), dtype=bool),
+        )
+        (checks if image.purpose == "check" else fitted).append(term)
+    return fitted, checks, joints
+
+
+def station_terms(survey: Survey, boards: Mapping[tuple[str, str], Rigid]) -> tuple[StationTerm, ...]:
+    """Return terms of prisms and of the tapes of every board."""
+    terms = []
+    for p in survey.station:
+        if p.kind == "prism" and p.point in survey.prisms_in_rover_m:
+            terms.append(
+                StationTerm(p.setup, None, p.point, p.position_m, np.zeros(3), survey.sigma.station_m)
+            )
+        elif (
+            p.kind == "tape" and (p.setup, p.placement) in boards and p.point in survey.board.tapes_in_board_m
+        ):
+            place = survey.board.tapes_in_board_m[p.point]
+            board = (p.setup, p.placement)
+            terms.append(StationTerm(p.setup, board, p.point, p.position_m, place, survey.sigma.station_m))
+    return tuple(terms)
+
+
+def with_kept(images: Sequence[ImageTerm], left_out: frozenset[str] | set[str]) -> tuple[ImageTerm, ...]:
+    """Return the terms with whole images left out by name."""
+    return tuple(replace(t, keep=np.zeros_like(t.keep)) if t.name in left_out else t for t in images)

@@ -1,0 +1,340 @@
+"""Follow one target while the rover moves: predicted, found in both eyes, filtered, or said to be lost.
+
+The state is the target's position in the rover frame with its covariance. A motion of the rover carries it
+over and adds the motion's own covariance (`moved`). A look (`seen_by`) warps the key picture of the target
+through its surface into each eye as that eye would see it now (`calib.match`), so that neither scale nor
+slant nor the change to another camera spoils the correlation; finds it near the prediction; and takes it only
+if both eyes, the prediction and the picture mean the same point. The key picture is renewed when scale or
+view have changed, not at every step: each renewal hands on its error.
+
+A target that is not found is ``lost``: the state goes on by rover motion alone, its covariance grows, and
+with it the window of the next look. It is found again by the same rules, so that another rock does not take
+its place.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import Literal
+
+import numpy as np
+
+from calib.cahvor import CameraModel
+from calib.epipolar import find_partner
+from calib.errors import CalibError, NoStereoPoint
+from calib.handoff_refined import Eye
+from calib.match import Match, MatchSettings, match
+from calib.rigid import FloatArray, Rigid
+from calib.stereo import triangulate
+from calib.warp import Plane
+
+State = Literal["tracked", "lost"]
+
+SIZES = MatchSettings(half_px=12)
+"""Smaller patches than a single match takes: seen flat from 10 m, 41 px of ground are 0.8 m long and no
+plane, and what lies off the plane pulls the place along as the view steepens."""
+
+
+@dataclass(frozen=True)
+class TrackSettings:
+    """Thresholds of the tracking, with the reasons for their values.
+
+    Attributes
+    ----------
+    sigmas
+        Half width of the search window in standard deviations of the prediction.
+    least_px, most_px
+        Bounds of the window's half side.
+    model_px
+        One sigma of what the cameras' models are wrong by between two eyes and two pairs.
+    worst_chi2
+        Of the innovation, four pixel coordinates against the prior: 1 in 1000 good looks with both eyes is
+        above 18.5.
+    renew_scale, renew_turn_rad
+        The key picture is renewed when the target is seen this much larger (or a third as large), or from a
+        direction that differs by more.
+    """
+
+    sigmas: float = 3.5
+    least_px: float = 4.0
+    most_px: float = 80.0
+    model_px: float = 0.3
+    worst_chi2: float = 18.5
+    renew_scale: float = 1.3
+    renew_turn_rad: float = 0.12
+
+
+@dataclass(frozen=True, eq=False)
+class Key:
+    """The picture that templates are cut from, its camera in the rover frame, the target's place in it."""
+
+    eye: Eye
+    pixel_px: FloatArray
+    normal: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class Track:
+    """A followed target. Immutable: every step gives a new one.
+
+    Attributes
+    ----------
+    state
+        ``tracked``: the last look found it. ``lost``: it did not.
+    position_m, covariance_m2
+        (3,) and (3, 3) in the rover frame of the last motion.
+    key
+        The key picture.
+    misses
+        Looks since it was last found.
+    """
+
+    state: State
+    position_m: FloatArray
+    covariance_m2: FloatArray
+    key: Key
+    misses: int = 0
+
+
+@dataclass(frozen=True, eq=False)
+class Look:
+    """What one look told.
+
+    Attributes
+    ----------
+    track
+        The track after it.
+    found
+        By camera name: the match in that eye, with its verdict.
+    reason
+        Why the target counts as lost, one sentence; empty while it is tracked.
+    chi2
+        The weighted misfit of pixels and prediction; not-a-number if nothing was found.
+    renewed
+        Whether the key picture is now from this look.
+    """
+
+    track: Track
+    found: Mapping[str, Match] = field(default_factory=dict)
+    reason: str = ""
+    chi2: float = math.nan
+    renewed: bool = False
+
+
+def start_track(
+    left: Eye, right: Eye, left_px: FloatArray, settings: MatchSettings | None = None, sigma_px: float = 0.2
+) -> Track:
+    """Begin a track from a click in the left picture of a pair.
+
+    Parameters
+    ----------
+    left, right
+        Pictures of one moment with their cameras in the rover frame.
+    left_px
+        (2,) the target.
+    sigma_px
+        Of the click; it says how well the place of what was meant is known.
+
+    Raises
+    ------
+    CalibError
+        With the reason, if the target cannot be followed: sky, plain surface, an edge, repeated pattern,
+        hidden from the other eye, outside the picture.
+    """
+    pixel = np.asarray(left_px, dtype=np.float64)
+    if pixel.shape != (2,) or not np.isfinite(pixel).all():
+        raise CalibError(f"target pixel {pixel.tolist()} is not two finite numbers")
+    width, height = left.camera.size_px
+    if not (0 <= pixel[0] <= width - 1 and 0 <= pixel[1] <= height - 1):
+        raise CalibError(
+            f"the target pixel ({pixel[0]:.1f}, {pixel[1]:.1f}) is outside the picture of {width} x {height}"
+        )
+    found = find_partner(left.image, left.camera, pixel, right.image, right.camera, settings=settings)
+    if found.match.verdict != "good" or found.plane is None:
+        raise CalibError(f"the target cannot be followed: {found.match.reason}")
+    noise = max(sigma_px, float(found.match.sigma_px.max()))
+    seen = triangulate(left.camera, right.camera, pixel, found.match.pixel_px, noise)
+    key = Key(left, pixel, found.plane.normal)
+    return Track("tracked", seen.position_m, seen.covariance_m2, key)
+
+
+def moved(track: Track, now_from_then: Rigid, covariance: FloatArray) -> Track:
+    """Carry a track over a motion of the rover.
+
+    Parameters
+    ----------
+    now_from_then
+        The rover frame of before in the one of now.
+    covariance
+        (6, 6) of that motion: small rotation (radians), then translation (metres), both in the frame of now:
+        true = (1 + rotation) believed + translation.
+
+    Raises
+    ------
+    CalibError
+        If the covariance is not (6, 6), finite and without negative variances.
+    """
+    spread = np.asarray(covariance, dtype=np.float64)
+    if spread.shape != (6, 6) or not np.isfinite(spread).all() or (np.diag(spread) < 0).any():
+        raise CalibError(
+            "a motion's covariance is 6 rows of 6 finite numbers: rotation in rad², then translation in m²"
+        )
+    position = now_from_then.points(track.position_m)
+    x, y, z = position
+    rate = np.hstack([np.array([[0.0, z, -y], [-z, 0.0, x], [y, -x, 0.0]]), np.eye(3)])
+    turned = now_from_then.rotation
+    carried = turned @ track.covariance_m2 @ turned.T + rate @ spread @ rate.T
+    key = replace(
+        track.key,
+        eye=replace(track.key.eye, camera=track.key.eye.camera.moved(now_from_then)),
+        normal=now_from_then.vectors(track.key.normal),
+    )
+    return replace(track, position_m=position, covariance_m2=carried, key=key)
+
+
+def seen_by(
+    track: Track,
+    eyes: Mapping[str, Eye],
+    settings: TrackSettings | None = None,
+    match_settings: MatchSettings | None = None,
+) -> Look:
+    """Look for the target in one or two new pictures, and update the track.
+
+    Parameters
+    ----------
+    eyes
+        By camera name: one picture, or those of a stereo pair (left first) of one moment, cameras in the
+        rover frame. A frame that is missing is left out; one eye alone serves while the target is tracked.
+    """
+    settings = settings or TrackSettings()
+    sizes = match_settings or SIZES
+    key = _anchored(track)
+    if key is None:
+        return _lost(
+            track, {}, "the surface of the target is not visible from where its key picture was taken"
+        )
+    plane = Plane(track.position_m, track.key.normal)
+    found = {name: _found(track, key, plane, eye, settings, sizes) for name, eye in eyes.items()}
+    good = {name: one for name, one in found.items() if one.verdict == "good"}
+    doubt = next((f"{n}: {m.reason}" for n, m in found.items() if m.verdict in ("weak", "ambiguous")), "")
+    if not good:
+        words = "; ".join(f"{name}: {one.reason}" for name, one in found.items())
+        return _lost(track, found, words or "no picture was given")
+    if doubt:
+        return _lost(track, found, f"one eye does not confirm the other: {doubt}")
+    if len(good) == 1 and track.state == "lost":
+        return _lost(track, found, "one eye alone does not find a lost target again")
+    updated = _updated(track, {n: (eyes[n].camera, m) for n, m in good.items()}, settings)
+    if updated is None:
+        return _lost(track, found, "the found pixels and the prediction have no point in common")
+    position, covariance, chi2 = updated
+    # Each eye beyond the first adds a constraint; one eye alone has two.
+    allowed = settings.worst_chi2 if len(good) > 1 else 13.8
+    if chi2 > allowed:
+        words = (
+            f"what was found does not fit the prediction: weighted misfit {chi2:.0f}, at most "
+            f"{allowed:g} is expected"
+        )
+        return replace(_lost(track, found, words), chi2=chi2)
+    after = Track("tracked", position, covariance, replace(track.key, eye=key.eye))
+    renewed = _renewed(after, eyes, good, settings, sizes)
+    return Look(replace(after, key=renewed or after.key), found, "", chi2, renewed is not None)
+
+
+def _anchored(track: Track) -> Key | None:
+    """The key with its camera shifted so that the target's ray meets the believed position.
+
+    Rover motion is never exact: what counts is how the key camera stood to the target, and the shift across
+    the ray is small beside the range.
+    """
+    camera = track.key.eye.camera
+    ray = camera.ray(track.key.pixel_px)
+    between = track.position_m - ray.origins_m
+    along = float(between @ ray.directions)
+    if not bool(ray.valid) or along <= 0:
+        return None
+    shift = Rigid(np.eye(3), between - along * ray.directions)
+    return replace(track.key, eye=replace(track.key.eye, camera=camera.moved(shift)))
+
+
+def _found(
+    track: Track, key: Key, plane: Plane, eye: Eye, settings: TrackSettings, sizes: MatchSettings
+) -> Match:
+    """Look in one picture, in the window that the prediction's covariance asks for."""
+    _, rate, valid = eye.camera.project_jacobian(track.position_m)
+    spread = rate @ track.covariance_m2 @ rate.T if bool(valid) else np.eye(2)
+    reach = settings.sigmas * math.sqrt(max(float(np.linalg.eigvalsh(spread)[-1]), 0.0))
+    search = min(max(reach + 2 * settings.model_px, settings.least_px), settings.most_px)
+    return match(key.eye.image, key.eye.camera, key.pixel_px, plane, eye.image, eye.camera, search, sizes)
+
+
+def _updated(
+    track: Track, found: Mapping[str, tuple[CameraModel, Match]], settings: TrackSettings
+) -> tuple[FloatArray, FloatArray, float] | None:
+    """The position that fits prediction and pixels best, its covariance, and the weighted misfit."""
+    start, position = track.position_m, track.position_m.copy()
+    prior = np.linalg.inv(track.covariance_m2 + 1e-12 * np.eye(3))
+    chi2, normal = math.inf, prior
+    for _ in range(6):
+        off = start - position
+        normal, right, chi2 = prior.copy(), prior @ off, float(off @ prior @ off)
+        for camera, one in found.values():
+            pixel, rate, valid = camera.project_jacobian(position)
+            if not bool(valid):
+                return None
+            weight = np.linalg.inv(one.covariance_px2 + settings.model_px**2 * np.eye(2))
+            rest = one.pixel_px - pixel
+            normal += rate.T @ weight @ rate
+            right += rate.T @ weight @ rest
+            chi2 += float(rest @ weight @ rest)
+        position = position + np.linalg.solve(normal, right)
+    return position, np.linalg.inv(normal), chi2
+
+
+def _renewed(
+    track: Track,
+    eyes: Mapping[str, Eye],
+    good: Mapping[str, Match],
+    settings: TrackSettings,
+    sizes: MatchSettings,
+) -> Key | None:
+    """A new key from this look, where scale or view have changed enough and both eyes saw it."""
+    if len(good) < 2:
+        return None
+    first, second = list(eyes)[:2]
+    camera = eyes[first].camera
+    before = track.position_m - track.key.eye.camera.C
+    now = track.position_m - camera.C
+    scale = _pixels_per_metre(camera, track.position_m) / _pixels_per_metre(
+        track.key.eye.camera, track.position_m
+    )
+    cosine = float(before @ now) / float(np.linalg.norm(before) * np.linalg.norm(now))
+    turned = math.acos(max(-1.0, min(1.0, cosine)))
+    if 1 / 3 < scale < settings.renew_scale and turned < settings.renew_turn_rad:
+        return None
+    pixel = good[first].pixel_px
+    try:
+        partner = find_partner(
+            eyes[first].image, camera, pixel, eyes[second].image, eyes[second].camera, settings=sizes
+        )
+    except NoStereoPoint:
+        return None
+    if partner.match.verdict != "good" or partner.plane is None:
+        return None
+    if np.linalg.norm(partner.match.pixel_px - good[second].pixel_px) > 1.0:
+        return None
+    return Key(eyes[first], pixel, partner.plane.normal)
+
+
+def _pixels_per_metre(camera: CameraModel, position_m: FloatArray) -> float:
+    """How large a thing at a position is seen: the geometric mean of the two rates across the ray."""
+    _, rate, valid = camera.project_jacobian(position_m)
+    if not bool(valid):
+        return math.nan
+    return math.sqrt(math.sqrt(max(float(np.linalg.det(rate @ rate.T)), 1e-30)))
+
+
+def _lost(track: Track, found: Mapping[str, Match], reason: str) -> Look:
+    return Look(replace(track, state="lost", misses=track.misses + 1), found, reason)

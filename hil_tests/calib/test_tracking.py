@@ -1,0 +1,162 @@
+"""Following a target over motions of the rover, on exact pictures of a textured plane."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from calib.errors import CalibError
+from calib.handoff_refined import Eye
+from calib.rigid import Rigid, rot_z
+from calib.tracking import Track, moved, seen_by, start_track
+from hil_tests.calib.pictures import Pinhole, TexturedPlane, picture, random_texture
+
+TARGET = np.array([3.0, 0.1, 0.0])
+GROUND = TexturedPlane(TARGET, np.array([0.02, -0.03, -1.0]), random_texture(5), 0.002)
+NAMES = ("left", "right")
+EXACT = np.zeros((6, 6))
+
+
+def pinholes(rover_x_m: float, heading_rad: float = 0.0) -> dict[str, Pinhole]:
+    """The pair in the site frame, the rover ``rover_x_m`` ahead and turned."""
+    turned = rot_z(heading_rad)
+    down = float(np.arctan2(1.2, TARGET[0] - rover_x_m))
+    return {
+        name: Pinhole(
+            turned @ np.array([0.0, y, -1.2]) + [rover_x_m, 0.0, 0.0], heading_rad, -down, 900.0, (321, 241)
+        )
+        for name, y in zip(NAMES, (-0.1, 0.1), strict=True)
+    }
+
+
+def eyes(
+    rover_x_m: float, heading_rad: float = 0.0, plane: TexturedPlane = GROUND, seed: int = 0
+) -> dict[str, Eye]:
+    """Pictures with their cameras in the rover frame."""
+    rover_from_site = pose(rover_x_m, heading_rad).inverse
+    return {
+        name: Eye(picture(camera, plane, noise_dn=1.5, seed=seed + i), camera.model.moved(rover_from_site))
+        for i, (name, camera) in enumerate(pinholes(rover_x_m, heading_rad).items())
+    }
+
+
+def pose(rover_x_m: float, heading_rad: float = 0.0) -> Rigid:
+    """site_from_rover."""
+    return Rigid(rot_z(heading_rad), np.array([rover_x_m, 0.0, 0.0]))
+
+
+@pytest.fixture(scope="module")
+def begun() -> Track:
+    first = eyes(0.0)
+    return start_track(first["left"], first["right"], pinholes(0.0)["left"].pixel(TARGET))
+
+
+def step(track: Track, before: Rigid, now: Rigid, covariance: NDArray[np.float64] = EXACT) -> Track:
+    return moved(track, now.inverse @ before, covariance)
+
+
+def test_a_start_knows_the_position(begun: Track) -> None:
+    off = begun.position_m - TARGET
+    assert off @ np.linalg.solve(begun.covariance_m2, off) < 16.0
+    assert np.linalg.norm(off) < 0.03
+
+
+def test_motion_carries_position_and_covariance(begun: Track) -> None:
+    """Against draws of the motion's error by matrix exponentials."""
+    from scipy.spatial.transform import Rotation
+
+    motion = Rigid(rot_z(0.2), np.array([-0.5, 0.1, 0.02]))
+    sigma = np.array([0.004, 0.006, 0.008, 0.01, 0.02, 0.005])
+    after = moved(begun, motion, np.diag(sigma**2))
+    rng = np.random.default_rng(2)
+    root = np.linalg.cholesky(begun.covariance_m2)
+    drawn = []
+    for _ in range(4000):
+        off = rng.normal(0.0, sigma)
+        point = motion.points(begun.position_m + root @ rng.standard_normal(3))
+        drawn.append(Rotation.from_rotvec(off[:3]).apply(point) + off[3:])
+    np.testing.assert_allclose(after.position_m, motion.points(begun.position_m), atol=1e-12)
+    ratio = np.linalg.solve(after.covariance_m2, np.cov(np.array(drawn).T))
+    assert np.abs(np.linalg.eigvals(ratio) - 1.0).max() < 0.12
+
+
+def test_a_target_is_kept_while_the_rover_nears_it_with_wrong_odometry(begun: Track) -> None:
+    track, rng = begun, np.random.default_rng(7)
+    before, renewed = pose(0.0), 0
+    spread = np.diag(np.array([0.009] * 3 + [0.01] * 3) ** 2)
+    for index, (x, heading) in enumerate([(0.3, 0.03), (0.6, -0.02), (0.85, 0.04), (1.1, 0.0), (1.3, 0.02)]):
+        now = pose(x, heading)
+        wrong = Rigid(rot_z(rng.normal(0.0, 0.009)), rng.normal(0.0, 0.01, 3))
+        track = moved(track, wrong @ now.inverse @ before, spread)
+        predicted = np.linalg.norm(track.position_m - now.inverse.points(TARGET))
+        look = seen_by(track, eyes(x, heading, seed=10 * index + 10))
+        assert look.track.state == "tracked", look.reason
+        track, before = look.track, now
+        renewed += look.renewed
+        off = np.linalg.norm(track.position_m - now.inverse.points(TARGET))
+        assert off < 0.02 and (off < predicted or predicted < 0.01)
+        exact = pinholes(x, heading)["left"].pixel(TARGET)
+        assert np.linalg.norm(look.found["left"].pixel_px - exact) < 0.6
+    assert renewed >= 1
+
+
+def test_a_hidden_target_is_lost_and_found_again(begun: Track) -> None:
+    other = replace(GROUND, grey=random_texture(77))
+    now = pose(0.2)
+    track = step(begun, pose(0.0), now, np.diag([1e-5] * 3 + [1e-5] * 3))
+    hidden = seen_by(track, eyes(0.2, plane=other))
+    assert hidden.track.state == "lost" and hidden.track.misses == 1 and hidden.reason
+    np.testing.assert_array_equal(hidden.track.position_m, track.position_m)
+    again = seen_by(hidden.track, eyes(0.2))
+    assert again.track.state == "tracked" and again.track.misses == 0
+
+
+def test_one_hidden_eye_is_enough_to_doubt(begun: Track) -> None:
+    both = eyes(0.0, seed=3)
+    both["right"] = eyes(0.0, plane=replace(GROUND, grey=random_texture(78)))["right"]
+    look = seen_by(begun, both)
+    assert look.track.state == "lost"
+    assert "does not confirm" in look.reason
+
+
+def test_a_missing_frame_of_one_eye_is_borne_while_tracked(begun: Track) -> None:
+    look = seen_by(begun, {"left": eyes(0.0, seed=3)["left"]})
+    assert look.track.state == "tracked"
+    lost = replace(begun, state="lost")
+    assert "one eye alone" in seen_by(lost, {"left": eyes(0.0, seed=3)["left"]}).reason
+    assert "no picture" in seen_by(begun, {}).reason
+
+
+def test_a_shifted_world_does_not_fit_the_prediction(begun: Track) -> None:
+    """The whole ground moved by 3 cm while the rover says that it stood still: not the target's place."""
+    slid = replace(GROUND, point_m=GROUND.point_m + np.array([0.0, 0.03, 0.0]))
+    look = seen_by(begun, eyes(0.0, plane=slid, seed=4))
+    assert look.track.state == "lost"
+
+
+@pytest.mark.parametrize(
+    ("pixel", "words"),
+    [
+        ((500.0, 10.0), "outside the picture of 321 x 241"),
+        ((float("nan"), 3.0), "not two finite numbers"),
+    ],
+)
+def test_a_click_that_is_no_target_is_refused(pixel: tuple[float, float], words: str) -> None:
+    first = eyes(0.0)
+    with pytest.raises(CalibError, match=words):
+        start_track(first["left"], first["right"], np.array(pixel))
+
+
+def test_a_plain_surface_cannot_be_followed() -> None:
+    plain = eyes(0.0, plane=replace(GROUND, grey=np.full((64, 64), 130.0)))
+    with pytest.raises(CalibError, match="too little texture"):
+        start_track(plain["left"], plain["right"], np.array([160.0, 120.0]))
+
+
+@pytest.mark.parametrize("spread", [np.eye(3), np.full((6, 6), np.nan), -np.eye(6)])
+def test_a_motion_without_a_usable_covariance_is_refused(begun: Track, spread: NDArray[np.float64]) -> None:
+    with pytest.raises(CalibError, match="6 rows of 6"):
+        moved(begun, Rigid.identity(), spread)

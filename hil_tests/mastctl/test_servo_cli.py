@@ -1,0 +1,216 @@
+"""`mastctl servo`: finding, reading, numbering and trying simulated servos behind a pseudo terminal."""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+import time
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+
+from drivers.clock import SystemClock
+from drivers.dynamixel import workshop
+from drivers.dynamixel.link import Link
+from drivers.sim.pan_tilt import AxisSettings
+from drivers.sim.wire.axis import WireAxis
+from drivers.sim.wire.dynamixel_bus import DynamixelBus
+from drivers.sim.wire.dynamixel_servo import OVERLOAD, SimulatedServo
+from drivers.sim.wire.line import PtyLine
+from mastctl.cli.main import main
+
+BAUD = "1000000"
+PLAIN = AxisSettings(math.tau / 4096, 0.0, -3.0, 3.0, 1.0, 4.0)
+
+
+class Bench:
+    """Two servos of different models on one line."""
+
+    def __init__(self) -> None:
+        clock = SystemClock()
+        now_s = clock.now_s()
+        self.axes = [WireAxis(PLAIN, number=n, time_s=now_s) for n in (0, 1)]
+        self.servos = [
+            SimulatedServo(model, i + 1, axis, settings={"baud_rate": 3}, time_s=now_s)
+            for i, (model, axis) in enumerate(zip(("xm430_w350", "ph42_020_s300"), self.axes, strict=True))
+        ]
+        self.line = PtyLine(DynamixelBus(self.servos), clock)
+
+
+@pytest.fixture
+def bench() -> Iterator[Bench]:
+    it = Bench()
+    with it.line:
+        yield it
+
+
+def run(capsys: pytest.CaptureFixture[str], *words: str) -> tuple[int, Any, str]:
+    """The exit code, what was printed (JSON where asked for), and what was told."""
+    code = main(["servo", *words])
+    out, err = capsys.readouterr()
+    return code, json.loads(out) if "--json" in words else out, err
+
+
+def test_scan_finds_every_servo_with_its_rate_and_moves_none(
+    bench: Bench, capsys: pytest.CaptureFixture[str]
+) -> None:
+    bench.servos[1].raise_error(OVERLOAD)
+    code, told, _ = run(capsys, "scan", bench.line.path, "--baud", "3000000", BAUD, "--json")
+    assert code == 0
+    assert [(s["id"], s["model"], s["baud"]) for s in told["servos"]] == [
+        (1, "XM430-W350", 1_000_000),
+        (2, "PH42-020-S300", 1_000_000),
+    ]
+    assert [s["hardware_errors"] for s in told["servos"]] == [[], ["overload"]]
+    now_s = time.monotonic()
+    assert [axis.angle_rad(now_s) for axis in bench.axes] == [0.0, 0.0]
+
+
+def test_scan_that_finds_nobody_says_what_to_look_at(
+    bench: Bench, capsys: pytest.CaptureFixture[str]
+) -> None:
+    code, out, err = run(capsys, "scan", bench.line.path, "--baud", "3000000")
+    assert (code, out) == (1, "")
+    assert "no servo answered" in err
+    assert "is its power on" in err
+
+
+def test_info_tells_every_register_in_numbers_and_words(
+    bench: Bench, capsys: pytest.CaptureFixture[str]
+) -> None:
+    code, told, _ = run(capsys, "info", bench.line.path, "1", "--baud", BAUD, "--json")
+    assert code == 0
+    for name, value in told["registers"].items():
+        known = bench.servos[0].table.values.get(name)
+        measured = name.startswith(("present_", "realtime", "moving")) or name.endswith("trajectory")
+        if known is not None and not measured:
+            assert value == known, name
+    assert told["words"]["operating_mode"] == "position"
+    assert told["words"]["baud"] == "1000000 baud"
+    assert told["words"]["profile_velocity"] == "as fast as it can"
+    assert told["words"]["present_voltage"] == "12.0 V"
+    code, out, _ = run(capsys, "info", bench.line.path, "2", "--baud", BAUD)
+    assert code == 0
+    assert "PH42-020-S300" in out
+
+
+def test_set_id_changes_id_and_rate_and_checks_both(bench: Bench, capsys: pytest.CaptureFixture[str]) -> None:
+    words = ("set-id", bench.line.path, "1", "7", "--baud", BAUD, "--json")
+    code, told, _ = run(capsys, *words)
+    assert (code, told) == (0, {"id": 7, "old_id": 1, "baud": 1_000_000})
+    assert bench.servos[0].servo_id == 7
+    code, told, _ = run(capsys, "set-id", bench.line.path, "7", "7", *words[4:], "--new-baud", "2000000")
+    assert (code, told) == (0, {"id": 7, "old_id": 7, "baud": 2_000_000})
+    assert bench.servos[0].baud == 2_000_000
+
+
+@pytest.mark.parametrize(
+    ("words", "code", "error"),
+    [
+        (("1", "2"), 1, "id 2 is taken by a PH42-020-S300"),
+        (("1", "253"), 2, "an id is 0 to 252"),
+        (("1", "1"), 2, "there is nothing to do"),
+        (("1", "3", "--new-baud", "1234"), 2, "1234 baud cannot be"),
+        (("9", "3"), 1, "servo 9 .* no usable answer to ping"),
+    ],
+)
+def test_set_id_refuses_what_cannot_be(
+    bench: Bench, capsys: pytest.CaptureFixture[str], words: tuple[str, ...], code: int, error: str
+) -> None:
+    got, out, err = run(capsys, "set-id", bench.line.path, *words, "--baud", BAUD)
+    assert (got, out) == (code, "")
+    assert re.search(error, err), err
+    assert [servo.servo_id for servo in bench.servos] == [1, 2]
+
+
+def test_set_id_drops_torque_only_when_told_to(bench: Bench, capsys: pytest.CaptureFixture[str]) -> None:
+    bench.servos[0].table["torque_enable"] = 1
+    words = ("set-id", bench.line.path, "1", "5", "--baud", BAUD)
+    code, _, err = run(capsys, *words)
+    assert code == 1
+    assert "--torque-off" in err
+    assert bench.servos[0].table["torque_enable"] == 1
+    code, _, err = run(capsys, *words, "--torque-off")
+    assert code == 0
+    assert (bench.servos[0].servo_id, bench.servos[0].table["torque_enable"]) == (5, 0)
+
+
+def test_test_turns_a_little_to_each_side_and_leaves_the_servo_as_it_was(
+    bench: Bench, capsys: pytest.CaptureFixture[str]
+) -> None:
+    before = dict(bench.servos[0].table.values)
+    words = ("test", bench.line.path, "1", "--baud", BAUD, "--degrees", "3", "--json")
+    code, told, err = run(capsys, *words)
+    assert code == 0, err
+    assert "servo 1 is to turn 3 degrees to each side" in err
+    reach = math.ceil(3 / told["count_deg"])
+    assert [step["goal_counts"] for step in told["steps"]] == [2048 + reach, 2048 - reach, 2048]
+    assert all(abs(step["left_counts"]) <= 1 for step in told["steps"])
+    for name in ("torque_enable", "profile_velocity", "profile_acceleration", "goal_pwm", "bus_watchdog"):
+        assert bench.servos[0].table[name] == before[name], name
+
+
+@pytest.mark.parametrize(
+    ("change", "error"),
+    [
+        ({"operating_mode": 1}, "is in velocity mode"),
+        ({"hardware_error_status": 32}, "reports overload"),
+        ({"max_position_limit": 2060}, "position limits 0 to 2060"),
+        ({"temperature_limit": 40}, "near its limit of 40 C"),
+        ({"min_voltage_limit": 130}, "reports input voltage out of its limits"),
+    ],
+)
+def test_test_refuses_an_unfit_servo_and_moves_nothing(
+    bench: Bench, capsys: pytest.CaptureFixture[str], change: dict[str, int], error: str
+) -> None:
+    for name, value in change.items():
+        bench.servos[0].table[name] = value
+    code, _, err = run(capsys, "test", bench.line.path, "1", "--baud", BAUD)
+    assert code == 1
+    assert error in err
+    assert bench.axes[0].angle_rad(time.monotonic()) == 0.0
+    assert bench.servos[0].table["torque_enable"] == 0
+
+
+def test_test_stops_at_its_fence(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    # A servo that does not stand where it was sent: here one whose place is misread by 100 counts.
+    link = Link(bench.line.path, int(BAUD))
+    true_decode = workshop.Block.decode
+
+    def misread(block: workshop.Block, data: bytes) -> dict[str, int]:
+        values = true_decode(block, data)
+        return {**values, "present_position": values["present_position"] + 100}
+
+    monkeypatch.setattr(workshop.Block, "decode", misread)
+    with pytest.raises(workshop.OutOfRange, match="left the fence"):
+        workshop.try_out(link, 1, math.radians(3), 30.0)
+    link.close()
+    assert bench.servos[0].table["torque_enable"] == 0
+
+
+@pytest.mark.parametrize(
+    ("words", "error"),
+    [
+        (("test", "PORT", "1", "--degrees", "90"), "at most 20"),
+        (("test", "PORT", "1", "--torque-percent", "101"), "at most 100"),
+        (("info", "PORT", "one"), "whole number"),
+        (("info", "foo://x", "1"), "protocol 'foo' not known"),
+        ((), "WHAT"),
+    ],
+)
+def test_wrong_use_is_one_line_and_exit_2(
+    capsys: pytest.CaptureFixture[str], words: tuple[str, ...], error: str
+) -> None:
+    code, out, err = run(capsys, *words)
+    assert (code, out) == (2, "")
+    assert error in err
+    assert err.count("\n") == 1
+
+
+def test_a_port_that_is_not_there_is_told_with_its_name(capsys: pytest.CaptureFixture[str]) -> None:
+    code, told, _ = run(capsys, "info", "/dev/no-such-port", "1", "--json")
+    assert code == 1
+    assert told["error"]["code"] == "line_lost"
+    assert told["error"]["message"] == "/dev/no-such-port cannot be opened: no such file or directory"

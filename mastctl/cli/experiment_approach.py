@@ -1,0 +1,64 @@
+"""``mastctl experiment approach``: follow rocks from ten metres to one on the simulated rover."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+from mastctl.cli import output
+
+
+def add_parser(kinds: Any) -> None:
+    """Add ``approach`` to the experiments."""
+    from mastctl.cli.experiment import at_least_one, seed
+
+    parser = kinds.add_parser(
+        "approach", help="follow a target from Pancam at 10 m to Hazcam at 1 m, simulated, some minute a run"
+    )
+    parser.add_argument(
+        "--mast", type=Path, metavar="MAST.yaml",
+        help="the mast file that is believed (default: the packaged one, from a simulated survey)",
+    )  # fmt: skip
+    parser.add_argument("--runs", type=at_least_one, default=5, metavar="N", help="approaches (default 5)")
+    parser.add_argument(
+        "--seed", type=seed, default=1, metavar="S", help="of the first run's scene and errors (default 1)"
+    )
+    parser.add_argument(
+        "--out", type=Path, metavar="DIR", help="folder for stops.csv, a line each stop, and record.json"
+    )
+    parser.set_defaults(run=run)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Run the approaches; 1 if no target at all was kept."""
+    from rich.console import Console
+
+    from calib.store import load_rig
+    from mastctl.cli.experiment import check_writable
+    from mastctl.experiment.approach import run_approach, summary, table_rows, write_record
+    from mastctl.packaged import config_folder
+
+    if args.out is not None:
+        check_writable(args.out)
+    true = load_rig(config_folder() / "sim" / "rocky8.yaml").rig
+    believed = load_rig(args.mast or config_folder() / "masts" / "rocky8_simulated.yaml").rig
+    if lacking := [pair for pair in true.stereo if pair not in believed.stereo]:
+        raise output.WrongUse(f"--mast {args.mast} has no stereo pair '{lacking[0]}'")
+    runs = []
+    console = Console(stderr=True, quiet=args.json)
+    for index in range(args.runs):
+        with console.status(f"approach {index + 1} of {args.runs}"):
+            runs.append(run_approach(true, believed, args.seed + index))
+        one = runs[-1]
+        told = one.error or ("kept" if one.kept else f"lost: {one.stops[-1].reason}" if one.stops else "lost")
+        console.print(f"seed {one.seed}: {told}", markup=False)
+    if args.out is not None:
+        write_record(runs, args.out)
+    if args.json:
+        output.print_json(summary(runs))
+    else:
+        notes = ["errors in the rover frame at the last stop, rms over the runs that kept the target"]
+        notes += [f"record: {args.out}"] if args.out is not None else []
+        output.print_table("Approach from 10 m to 1 m, simulated rover", *table_rows(runs), notes)
+    return 0 if any(one.kept for one in runs) else 1

@@ -1,0 +1,128 @@
+"""``mastctl experiment handoff``: the paper's hand-offs on a daemon, or on the packaged simulated rover."""
+
+from __future__ import annotations
+
+import argparse
+from contextlib import ExitStack
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from mastctl.cli import output
+
+if TYPE_CHECKING:
+    from mastctl.client import Client
+    from mastctl.experiment.handoff import HandoffExperiment, HandoffRecord, Truth
+
+PICTURES_PER_STEP = 4
+
+
+def add_parser(kinds: Any) -> None:
+    """Add ``handoff`` to the experiments."""
+    from mastctl.cli.experiment import at_least_one, seed
+    from mastctl.cli.service import add_daemon_options
+
+    parser = kinds.add_parser(
+        "handoff",
+        help="hand targets from Pancam to Navcam at 6 m and on to Hazcam at 2 m, and measure the errors",
+    )
+    add_daemon_options(parser)
+    parser.add_argument(
+        "--simulated", action="store_true",
+        help="start the packaged simulated rover for it, and compare with the truth",
+    )  # fmt: skip
+    parser.add_argument(
+        "--targets", type=at_least_one, default=10, metavar="N", help="targets of each hand-off (default 10)"
+    )
+    parser.add_argument(
+        "--click-px", type=output.finite_number, default=0.2, metavar="PX",
+        help="sigma of the noise added to the clicks (default 0.2)",
+    )  # fmt: skip
+    parser.add_argument(
+        "--seed", type=seed, default=1, metavar="S", help="chooses views and pixels (default 1)"
+    )
+    parser.add_argument(
+        "--out", type=Path, metavar="DIR", help="folder for report.html, targets.csv and record.json"
+    )
+    parser.set_defaults(run=run)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Run the experiment; 1 if no target at all was handed over."""
+    from mastctl.cli.experiment import check_writable
+    from mastctl.cli.service import client_of
+
+    if args.click_px < 0:
+        raise output.WrongUse(f"--click-px {args.click_px:g} where 0 or more is expected")
+    if args.out is not None:
+        check_writable(args.out)
+    with ExitStack() as stack:
+        if args.simulated:
+            client, truth = _simulated(args, stack)
+        else:
+            client, truth = stack.enter_context(client_of(args)), None
+        experiment = _run(args, client, truth)
+    return _tell(args, experiment)
+
+
+def _simulated(args: argparse.Namespace, stack: ExitStack) -> tuple[Client, Truth]:
+    """The packaged simulated rover behind a daemon on a free port."""
+    from mastctl.client import Client
+    from mastctl.config import load_config
+    from mastctl.daemon import RunningDaemon
+    from mastctl.experiment.demo import SimulationTruth, demo_config
+
+    config = demo_config(load_config(None), head="ptu_d46_70", seed=args.seed)
+    daemon = stack.enter_context(RunningDaemon(config))
+    rover = daemon.hardware.simulation
+    assert rover is not None  # the packaged configuration is a simulated rover
+    return stack.enter_context(Client(daemon.url)), SimulationTruth(rover)
+
+
+def _run(args: argparse.Namespace, client: Client, truth: Truth | None) -> HandoffExperiment:
+    """Run with a progress bar on stderr, one step a target."""
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
+    from mastctl.experiment.handoff import STEPS, run_handoff_experiment
+
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+    with Progress(*columns, console=Console(stderr=True, quiet=args.json)) as progress:
+        task = progress.add_task("hand-off", total=args.targets * len(STEPS))
+
+        def show(record: HandoffRecord) -> None:
+            if record.error:
+                words = f"{record.step}, target {record.index}: {record.error}"
+                progress.console.print(words, style="red", markup=False)
+            progress.update(task, advance=1, description=record.step)
+
+        return run_handoff_experiment(
+            client,
+            targets=args.targets,
+            seed=args.seed,
+            click_px=args.click_px,
+            truth=truth,
+            on_target=show,
+            pictures=PICTURES_PER_STEP if args.out is not None else 0,
+        )
+
+
+def _tell(args: argparse.Namespace, experiment: HandoffExperiment) -> int:
+    from mastctl.cli.experiment import turned
+    from mastctl.experiment.handoff_report import table_rows, write_report
+
+    page = write_report(experiment, args.out) if args.out is not None else None
+    if args.json:
+        document = experiment.as_json()
+        if page is not None:
+            document["report"] = str(page)
+        output.print_json(document)
+    else:
+        headings, rows = table_rows(experiment.summaries)
+        notes = [f"clicks with {experiment.click_px:g} px of noise; lengths in px of the destination camera"]
+        notes += [f"report: {page}"] if page is not None else []
+        output.print_table(
+            f"Hand-off errors, px ({experiment.status.get('hardware')} hardware)",
+            *turned(headings, rows),
+            notes,
+        )
+    return 0 if any(record.handed for record in experiment.records) else 1

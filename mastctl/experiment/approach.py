@@ -1,0 +1,338 @@
+"""The paper's approach (its Fig. 1): a target picked in Pancam at 10 m, followed to 1 m."""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from calib.errors import CalibError
+from calib.mast import Rig
+from calib.pointing import solve
+from calib.rigid import FloatArray
+from calib.tracking import Track, moved, seen_by, start_track
+from drivers.sim.scene import SceneSettings, build_scene
+from mastctl.experiment.approach_world import World, WorldErrors
+from mastctl.experiment.targets import textured
+
+START_M, END_M = 10.0, 1.0
+STEP = 0.1
+"""Of the range, driven in one step."""
+
+HANDOFFS_M: Mapping[str, float] = {"pancam": 6.0, "navcam": 2.0, "hazcam": 0.0}
+"""Down to which range each pair is used, from the longest focal length to the shortest."""
+
+SUN_MOVES_RAD = math.radians(8.0)
+LOST_LOOKS = 3
+"""How often a lost target is looked for at one stop, before the rover drives on."""
+
+GIVE_UP = 4
+"""Stops without the target after which the run ends as lost."""
+
+
+@dataclass(frozen=True, eq=False)
+class Stop:
+    """One stop of an approach.
+
+    Attributes
+    ----------
+    range_m
+        True distance from the middle of the pair's cameras.
+    pair
+        What looked.
+    state
+        ``tracked`` or ``lost``, and ``reason`` why.
+    error_m
+        (3,) believed less true position in the rover frame: along the pair's line of sight, to its right,
+        below it.
+    sigma_m
+        What the track says of the same three.
+    pixel_error_px
+        Of the left eye's match, against the truth; not-a-number where there was none.
+    """
+
+    range_m: float
+    pair: str
+    state: str
+    reason: str
+    error_m: FloatArray
+    sigma_m: FloatArray
+    pixel_error_px: float
+    renewed: bool
+
+
+@dataclass(frozen=True, eq=False)
+class ApproachRun:
+    """One approach: its stops, or why it did not begin."""
+
+    seed: int
+    stops: tuple[Stop, ...]
+    error: str = ""
+    seconds: float = 0.0
+
+    @property
+    def kept(self) -> bool:
+        """Whether the target was tracked at the last stop, near its end."""
+        return bool(self.stops) and self.stops[-1].state == "tracked" and self.stops[-1].range_m < 1.3
+
+    @property
+    def final_error_m(self) -> FloatArray:
+        """(3,) of the last stop: along, right, below."""
+        return self.stops[-1].error_m if self.stops else np.full(3, np.nan)
+
+
+def run_approach(true: Rig, believed: Rig, seed: int, errors: WorldErrors | None = None) -> ApproachRun:
+    """Drive one approach to a random target.
+
+    Parameters
+    ----------
+    true, believed
+        The rig that takes the pictures, and the mast file's.
+    seed
+        Of scene, target, path and every error.
+    """
+    begun_s = time.monotonic()
+    rng = np.random.default_rng([seed, 6])
+    light = SceneSettings(seed=seed)
+    world = World(build_scene(light), true, believed, errors or WorldErrors(), rng)
+    try:
+        begun = _begin(world, rng)
+        if isinstance(begun, str):
+            return ApproachRun(seed, (), begun, time.monotonic() - begun_s)
+        stops = _drive(world, *begun, light, rng)
+        return ApproachRun(seed, tuple(stops), "", time.monotonic() - begun_s)
+    finally:
+        world.close()
+
+
+def _begin(world: World, rng: np.random.Generator) -> tuple[Track, FloatArray] | str:
+    """Pick a textured pixel of the left Pancam at the start range; the track, and the truth in the site."""
+    pair = world.believed.stereo["pancam"]
+    reason = "no view offered a target"
+    for _ in range(12):
+        azimuth = rng.uniform(-0.5, 0.5)
+        ground = np.array([START_M * math.cos(azimuth), START_M * math.sin(azimuth), 0.0])
+        angles = solve(world.believed.mast, world.believed.cameras[pair[0]].model, ground)[0]
+        eyes = world.look(pair, angles.pan_rad, angles.tilt_rad)
+        left, right = (eyes[name] for name in pair)
+        rows, columns = np.nonzero(textured(left.image.astype(np.uint8)))
+        for pick in rng.integers(len(rows), size=4) if len(rows) else ():
+            pixel = np.array([float(columns[pick]), float(rows[pick])])
+            # Who looks at exact joints sees what the true camera saw: counts are the same for both.
+            count = world.errors.count_rad
+            at = [round(angles.pan_rad / count) * count, round(angles.tilt_rad / count) * count]
+            target = world.point_at(pair[0], at[0], at[1], pixel)
+            if target is None:
+                continue
+            range_m = float(np.linalg.norm(world.site_from_rover.inverse.points(target) - left.camera.C))
+            if abs(range_m - START_M) > 0.15 * START_M:
+                continue
+            try:
+                return start_track(left, right, pixel), target
+            except CalibError as error:
+                reason = str(error)
+    return reason
+
+
+def _drive(
+    world: World, track: Track, target: FloatArray, light: SceneSettings, rng: np.random.Generator
+) -> list[Stop]:
+    """Step by step up to the target."""
+    stops: list[Stop] = []
+    missed, relit = 0, False
+    for _ in range(60):
+        here = world.site_from_rover
+        away = target[:2] - here.translation_m[:2]
+        distance = float(np.linalg.norm(away))
+        # Where the front cameras stand, ahead of the rover's origin, is where 1 m counts from.
+        ahead = _front_m(world)
+        left_m = distance - ahead
+        if left_m <= END_M * 1.02 or missed >= GIVE_UP:
+            break
+        step = min(STEP * left_m, left_m - END_M)
+        bearing = math.atan2(away[1], away[0]) + rng.normal(0.0, 0.15)
+        x, y = here.translation_m[:2] + step * np.array([math.cos(bearing), math.sin(bearing)])
+        facing = math.atan2(target[1] - y, target[0] - x) + rng.normal(0.0, 0.08)
+        motion, covariance = world.drive(float(x), float(y), facing)
+        track = moved(track, motion, covariance)
+        if not relit and left_m < 4.0:
+            sun = light.sun_azimuth_rad + SUN_MOVES_RAD
+            world.relight(build_scene(replace(light, sun_azimuth_rad=sun)))
+            relit = True
+        track, stop = _look(world, track, target)
+        stops.append(stop)
+        missed = 0 if stop.state == "tracked" else missed + 1
+    return stops
+
+
+def _front_m(world: World) -> float:
+    """How far ahead of the rover's origin the last pair stands."""
+    left, right = (world.believed.cameras[n].model.C[0] for n in world.believed.stereo["hazcam"])
+    return float(left + right) / 2
+
+
+def choose_pair(rig: Rig, position_m: FloatArray, ranges_m: Mapping[str, float]) -> tuple[str, float, float]:
+    """Return the pair that should look at a position, and the joint angles that bring it into its middle.
+
+    Pairs are tried from the longest focal length on: the first whose range reaches so near, and whose cameras
+    see it well inside their pictures.
+
+    Raises
+    ------
+    CalibError
+        If none sees it.
+    """
+    best: tuple[str, float, float] | None = None
+    for name, least_m in ranges_m.items():
+        pair = rig.stereo[name]
+        pan = tilt = 0.0
+        if rig.cameras[pair[0]].on == "head":
+            try:
+                angles = solve(rig.mast, rig.cameras[pair[0]].model, position_m)[0]
+            except CalibError:
+                continue
+            pan, tilt = angles.pan_rad, angles.tilt_rad
+        models = [rig.camera_in_rover(camera, pan, tilt) for camera in pair]
+        if not all(_inside(model.project(position_m), model.size_px) for model in models):
+            continue
+        best = (name, pan, tilt)
+        range_m = float(np.linalg.norm(position_m - (models[0].C + models[1].C) / 2))
+        if range_m >= least_m:
+            return best
+    if best is None:
+        raise CalibError(f"no stereo pair sees the target at {np.round(position_m, 2).tolist()} m")
+    return best
+
+
+def _inside(projected: tuple[FloatArray, np.ndarray], size_px: tuple[int, int]) -> bool:
+    pixel, valid = projected
+    margin = 30
+    return (
+        bool(valid) and margin <= pixel[0] < size_px[0] - margin and margin <= pixel[1] < size_px[1] - margin
+    )
+
+
+def _look(world: World, track: Track, target: FloatArray) -> tuple[Track, Stop]:
+    """Look for the target with the pair of its range, again if it is lost; the track and the record."""
+    rig = world.believed
+    name, pan, tilt = choose_pair(rig, track.position_m, HANDOFFS_M)
+    pair = rig.stereo[name]
+    for _ in range(LOST_LOOKS):
+        eyes = world.look(pair, pan, tilt)
+        look = seen_by(track, eyes)
+        if look.track.state == "tracked":
+            break
+    track = look.track
+    true = world.site_from_rover.inverse.points(target)
+    middle = (eyes[pair[0]].camera.C + eyes[pair[1]].camera.C) / 2
+    axes = _axes(true - middle)
+    found = look.found.get(pair[0])
+    pixel_error = math.nan
+    if found is not None and found.verdict == "good":
+        count = world.errors.count_rad
+        exact = world.true_pixel(pair[0], round(pan / count) * count, round(tilt / count) * count, target)
+        pixel_error = float(np.linalg.norm(found.pixel_px - exact))
+    return track, Stop(
+        float(np.linalg.norm(true - middle)),
+        name,
+        track.state,
+        look.reason,
+        axes @ (track.position_m - true),
+        np.sqrt(np.diag(axes @ track.covariance_m2 @ axes.T)),
+        pixel_error,
+        look.renewed,
+    )
+
+
+def _axes(sight: FloatArray) -> FloatArray:
+    """Rows: along a line of sight, to its right, below it."""
+    along = sight / np.linalg.norm(sight)
+    right = np.cross([0.0, 0.0, 1.0], along)
+    right /= np.linalg.norm(right)
+    return np.stack([along, right, np.cross(along, right)])
+
+
+def summary(runs: Sequence[ApproachRun]) -> dict[str, float]:
+    """Numbers over all runs: kept, lost, silently wrong, and the final error's components, metres rms."""
+    kept = [r for r in runs if r.kept]
+    finals = np.array([r.final_error_m for r in kept]).reshape(-1, 3)
+    # Silently wrong: it says tracked, and is farther off than five of its own sigmas and 3 cm.
+    wrong = [
+        r
+        for r in runs
+        for s in r.stops
+        if s.state == "tracked"
+        and np.linalg.norm(s.error_m) > max(0.03, 0.01 * s.range_m)
+        and (np.abs(s.error_m) > 5 * s.sigma_m).any()
+    ]
+    rms = np.sqrt(np.mean(finals**2, axis=0)) if len(finals) else np.full(3, math.nan)
+    return {
+        "runs": len(runs),
+        "kept": len(kept),
+        "silently_wrong": len({id(r) for r in wrong}),
+        "along_rms_m": float(rms[0]),
+        "right_rms_m": float(rms[1]),
+        "below_rms_m": float(rms[2]),
+        "position_rms_m": float(np.sqrt(np.sum(rms**2))),
+    }
+
+
+def table_rows(runs: Sequence[ApproachRun]) -> tuple[list[str], list[list[str]]]:
+    """Return headings and rows: what was measured beside the paper's Table I, theory, for a Pancam start."""
+    from calib.budget import target_approach_budget
+
+    found = summary(runs)
+    theory = next(row for row in target_approach_budget() if row.name == "pancam")
+    cm = {key: f"{300 * value:.2f}" for key, value in found.items() if key.endswith("_m")}
+    rows = [
+        ["runs, kept, silently wrong", f"{found['runs']}, {found['kept']}, {found['silently_wrong']}", ""],
+        [
+            "3 rms along the line of sight, cm",
+            cm["along_rms_m"],
+            f"{theory.tracked_cm:.2f}",
+        ],
+        ["3 rms to its right, cm", cm["right_rms_m"], ""],
+        ["3 rms below it, cm", cm["below_rms_m"], ""],
+        ["3 rms of the position, cm", cm["position_rms_m"], ""],
+    ]
+    return ["", "measured", "theory (Table I)"], rows
+
+
+STOPS_CSV = (
+    "seed", "stop", "range_m", "pair", "state", "along_m", "right_m", "below_m",
+    "sigma_along_m", "sigma_right_m", "sigma_below_m", "pixel_error_px", "renewed", "reason",
+)  # fmt: skip
+
+
+def write_record(runs: Sequence[ApproachRun], folder: Path) -> None:
+    """Write stops.csv and record.json into ``folder`` (made if need be).
+
+    Raises
+    ------
+    OSError
+        If the folder or a file in it cannot be written.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    with (folder / "stops.csv").open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(STOPS_CSV)
+        for one in runs:
+            for index, stop in enumerate(one.stops):
+                numbers = [*stop.error_m.tolist(), *stop.sigma_m.tolist()]
+                pixel = "" if math.isnan(stop.pixel_error_px) else stop.pixel_error_px
+                start = [one.seed, index, stop.range_m, stop.pair, stop.state]
+                writer.writerow([*start, *numbers, pixel, int(stop.renewed), stop.reason])
+    document = {
+        "summary": {key: None if math.isnan(value) else value for key, value in summary(runs).items()},
+        "runs": [
+            {"seed": one.seed, "kept": one.kept, "error": one.error, "seconds": round(one.seconds, 1)}
+            for one in runs
+        ],
+    }
+    (folder / "record.json").write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")

@@ -1,0 +1,135 @@
+"""A simulated rover that drives up to a target and looks at every stop: truth and belief apart.
+
+No daemon and no clock: a stop is a pose, a look is two pictures. What errs is what errs on a rover: the mast
+file against the true rig, the joints' readings and counts, the reported motion, grey noise, gain, the sun.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from calib.cahvor import CameraModel
+from calib.handoff_refined import Eye
+from calib.mast import Rig
+from calib.rigid import FloatArray, Rigid, rot_x, rot_y, rot_z
+from calib.warp import Grey
+from drivers.sim.render import Renderer
+from drivers.sim.scene import Scene
+
+
+@dataclass(frozen=True)
+class WorldErrors:
+    """What errs, one sigma each.
+
+    Attributes
+    ----------
+    odometry
+        Of the reported motion, as a part of the way driven.
+    heading_rad
+        Of the reported turn of a step, each axis.
+    joint_rad
+        Of a joint reading.
+    count_rad
+        Counts to which goals are rounded.
+    gain
+        Of each picture's brightness.
+    noise_dn
+        Of each pixel.
+    """
+
+    odometry: float = 0.02
+    heading_rad: float = math.radians(0.5)
+    joint_rad: float = 1.5e-5
+    count_rad: float = 11.57 / 3600 * math.pi / 180
+    gain: float = 0.05
+    noise_dn: float = 1.5
+
+
+class World:
+    """The rover in its scene.
+
+    Parameters
+    ----------
+    scene
+        What is seen; it may be exchanged while driving (the sun moves).
+    true, believed
+        The rig that takes the pictures, and the mast file's.
+    rng
+        Of everything random.
+    """
+
+    def __init__(
+        self, scene: Scene, true: Rig, believed: Rig, errors: WorldErrors, rng: np.random.Generator
+    ) -> None:
+        self.true = true
+        self.believed = believed
+        self.errors = errors
+        self._rng = rng
+        self._renderer = Renderer(scene)
+        self.site_from_rover = self._standing(0.0, 0.0, 0.0)
+
+    def close(self) -> None:
+        """Let go of the renderer's threads."""
+        self._renderer.close()
+
+    def relight(self, scene: Scene) -> None:
+        """Put the same ground under another sun."""
+        self._renderer.close()
+        self._renderer = Renderer(scene)
+
+    def _standing(self, x_m: float, y_m: float, heading_rad: float) -> Rigid:
+        """A pose on the ground, tilted as by stones under the wheels."""
+        pitch, roll = self._rng.normal(0.0, math.radians(1.5), 2)
+        rotation = rot_z(heading_rad) @ rot_y(pitch) @ rot_x(roll)
+        return Rigid(rotation, np.array([x_m, y_m, self._renderer.scene.ground_z_m(x_m, y_m)]))
+
+    def drive(self, x_m: float, y_m: float, heading_rad: float) -> tuple[Rigid, FloatArray]:
+        """Drive to a place of the site; return the motion as reported (now_from_then) and its covariance."""
+        before = self.site_from_rover
+        self.site_from_rover = self._standing(x_m, y_m, heading_rad)
+        true = self.site_from_rover.inverse @ before
+        way_m = float(np.linalg.norm(true.translation_m))
+        sigma = np.array([self.errors.heading_rad] * 3 + [self.errors.odometry * way_m] * 3)
+        off = self._rng.normal(0.0, sigma)
+        wrong = Rigid(rot_x(off[0]) @ rot_y(off[1]) @ rot_z(off[2]), off[3:])
+        # The motion's error moves what was ahead, not the whole rover frame: it is of the displacement.
+        return wrong.inverse @ true, np.diag(sigma**2)
+
+    def look(self, pair: tuple[str, str], pan_rad: float, tilt_rad: float) -> dict[str, Eye]:
+        """Point the head and take both pictures; the cameras are where the mast file says they are."""
+        count = self.errors.count_rad
+        at = np.array([round(pan_rad / count), round(tilt_rad / count)]) * count
+        read = at + self._rng.normal(0.0, self.errors.joint_rad, 2)
+        eyes = {}
+        for name in pair:
+            camera = self.true.cameras[name]
+            frame = self.site_from_rover
+            if camera.on == "head":
+                frame = frame @ self.true.mast.rover_from_head(float(at[0]), float(at[1]))
+            image = self._exposed(camera.model, frame)
+            eyes[name] = Eye(image, self.believed.camera_in_rover(name, float(read[0]), float(read[1])))
+        return eyes
+
+    def true_pixel(
+        self, name: str, pan_rad: float, tilt_rad: float, target_in_site_m: FloatArray
+    ) -> FloatArray:
+        """Where a point of the site truly is in a camera; not-a-number if it cannot be seen."""
+        model = self.true.camera_in_rover(name, pan_rad, tilt_rad)
+        return np.asarray(model.project(self.site_from_rover.inverse.points(target_in_site_m))[0])
+
+    def point_at(self, name: str, pan_rad: float, tilt_rad: float, pixel_px: FloatArray) -> FloatArray | None:
+        """The point of the site, (3,) metres, that a pixel truly shows; None for the sky."""
+        rays = self.true.camera_in_rover(name, pan_rad, tilt_rad).ray(pixel_px)
+        origin = self.site_from_rover.points(rays.origins_m)
+        along = self.site_from_rover.vectors(rays.directions)
+        range_m = float(self._renderer.scene.cast(origin, along))
+        return np.asarray(origin + range_m * along) if math.isfinite(range_m) else None
+
+    def _exposed(self, model: CameraModel, site_from_frame: Rigid) -> Grey:
+        image = self._renderer.image(model, site_from_frame, 2)
+        gain = 1.0 + self._rng.normal(0.0, self.errors.gain)
+        noisy = gain * image + self._rng.normal(0.0, self.errors.noise_dn, image.shape)
+        return np.clip(np.rint(noisy), 0, 255).astype(np.float32)
