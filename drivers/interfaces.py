@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from typing import Literal, Protocol, runtime_checkable
 
@@ -153,4 +154,23 @@ class Camera(Protocol):
 
     def close(self) -> None:
         """Let go of the device."""
+        ...
+
+
+@runtime_checkable
+class KnowsSize(Protocol):
+    """A camera that knows the size of its pictures before the first one; not every camera has this."""
+
+    @property
+    def size_px(self) -> tuple[int, int]:
+        """(width, height) of every picture that it gives."""
+        ...
+
+
+@runtime_checkable
+class HoldsExposure(Protocol):
+    """A camera with an automatic exposure that can be told to wait; not every camera has this."""
+
+    def exposure_held(self) -> AbstractContextManager[None]:
+        """Return a context in which the exposure does not change: a measurement compares its pictures."""
         ...

@@ -1,6 +1,6 @@
 """The one door to hardware: from a configuration's driver names to open devices.
 
-Nothing else knows real and simulated drivers both. A name is ``dynamixel``, ``flir_ptu``, ``sim``,
+Nothing else knows real and simulated drivers both. A name is ``dynamixel``, ``flir_ptu``, ``v4l2``, ``sim``,
 ``replay``, or ``package.module:factory`` for a driver from outside this repository (contract section 5).
 """
 
@@ -29,8 +29,7 @@ Kind = Literal["real", "simulated", "replayed", "mixed"]
 HEADS = {"dynamixel": "drivers.dynamixel.head", "flir_ptu": "drivers.flir_ptu.head"}
 """Pan/tilt drivers of this repository: the module whose ``open_head(options, clock)`` opens them."""
 
-NOT_YET = ("v4l2",)
-BUILT_IN = (*HEADS, "sim", "replay", *NOT_YET)
+BUILT_IN = (*HEADS, "v4l2", "sim", "replay")
 
 
 @dataclass(frozen=True)
@@ -160,13 +159,14 @@ class _Opener:
         if device.driver == "replay":
             self._kinds.add("replayed")
             return self._replayed(name, device)
+        if device.driver == "v4l2":
+            self._kinds.add("real")
+            return self._v4l2(name, device)
         if device.driver in HEADS:
             if protocol is not PanTilt:
                 raise BadOptions(f"driver {device.driver!r} is for a pan/tilt head", device=name)
             self._kinds.add("real")
             return self._head(name, device)
-        if device.driver in NOT_YET:
-            raise BadOptions(f"driver {device.driver!r} is not in this version", device=name)
         raise BadOptions(
             f"there is no driver {device.driver!r}{nearest(device.driver, BUILT_IN)}; "
             "a driver from outside is named package.module:factory",
@@ -215,6 +215,14 @@ class _Opener:
         if name not in replay.cameras:
             raise BadOptions(f"the recording has no such camera{nearest(name, replay.cameras)}", device=name)
         return replay.cameras[name]
+
+    def _v4l2(self, name: str, device: DeviceSettings) -> Any:
+        """A camera of this machine."""
+        if name == PAN_TILT:
+            raise BadOptions("driver 'v4l2' is for cameras, it moves nothing", device=name)
+        from drivers.v4l2.camera import open_camera
+
+        return open_camera(device.options, self._clock, name)
 
 
 def _factory(name: str, driver: str) -> Callable[..., Any]:

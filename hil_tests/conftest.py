@@ -11,8 +11,13 @@ SHARED_DATA = REPOSITORY.parent / "shared" / "data"
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
-    """Name the real hardware that hil_tests/bench moves."""
+    """Name the real hardware that hil_tests/bench moves, and insist on the kernel of hil_tests/vm."""
     parser.addoption("--hardware", metavar="FILE", help="configuration of a real head for hil_tests/bench")
+    parser.addoption(
+        "--require-vm",
+        action="store_true",
+        help="fail, not skip, without the kernel of hil_tests/vm",
+    )
 
 
 @pytest.fixture(scope="session")

@@ -10,8 +10,9 @@ from __future__ import annotations
 import logging
 import threading
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future
+from contextlib import ExitStack, contextmanager
 from typing import Protocol
 
 import numpy as np
@@ -19,7 +20,7 @@ import numpy as np
 from calib.mast import Rig
 from drivers.clock import Clock
 from drivers.errors import BadFrame, BadReply, DriverError, NoReply
-from drivers.interfaces import AxisReport, Camera, PanTilt, Reading, Reporting
+from drivers.interfaces import AxisReport, Camera, HoldsExposure, KnowsSize, PanTilt, Reading, Reporting
 from mastctl import frames as frame_checks
 from mastctl import joint_history
 from mastctl.device_thread import DeviceThread, Fault
@@ -254,6 +255,15 @@ class Devices:
         """Return each configured camera's newest frame, None where there is none yet; asks no camera."""
         return {camera: self._store.newest(camera) for camera in self._cameras}
 
+    @contextmanager
+    def exposure_held(self) -> Iterator[None]:
+        """Keep every camera's exposure as it is inside the block: a measurement compares its pictures."""
+        with ExitStack() as stack:
+            for camera in self._cameras.values():
+                if isinstance(camera, HoldsExposure):
+                    stack.enter_context(camera.exposure_held())
+            yield
+
     # All
 
     def use_rig(self, rig: Rig, mast_digest: str) -> None:
@@ -262,6 +272,9 @@ class Devices:
         self._store.change_mast(mast_digest)
 
     def _take_rig(self, rig: Rig) -> None:
+        for name, camera in self._cameras.items():
+            if isinstance(camera, KnowsSize) and name in rig.cameras:
+                frame_checks.check_size(name, camera.size_px, rig.cameras[name].model.size_px)
         self._sizes_px = {name: camera.model.size_px for name, camera in rig.cameras.items()}
         self._on_head = {name for name, camera in rig.cameras.items() if camera.on == "head"}
 

@@ -72,6 +72,13 @@ class CheckedFrame:
     exposure_s: float
 
 
+def check_size(camera: str, size_px: tuple[int, int], wanted_px: tuple[int, int]) -> None:
+    """Raise BadFrame if a camera's pictures, (width, height), are not of the mast file's size."""
+    if size_px != wanted_px:
+        words = "the image is {}x{} px where the mast file has {}x{} px".format(*size_px, *wanted_px)
+        raise BadFrame(words, device=camera)
+
+
 def checked(
     answer: object, camera: str, size_px: tuple[int, int] | None, exposed_after_s: float, now_s: float
 ) -> CheckedFrame:
@@ -107,12 +114,8 @@ def checked(
     if not (image.ndim == 2 or (image.ndim == 3 and image.shape[2] == 3)) or image.size == 0:
         words = f"the image has shape {image.shape} where (h, w) or (h, w, 3) is expected"
         raise BadFrame(words, device=camera)
-    if size_px is not None and (image.shape[1], image.shape[0]) != size_px:
-        width, height = size_px
-        words = (
-            f"the image is {image.shape[1]}x{image.shape[0]} px where the mast file has {width}x{height} px"
-        )
-        raise BadFrame(words, device=camera)
+    if size_px is not None:
+        check_size(camera, (image.shape[1], image.shape[0]), size_px)
     if sequence < 0 or exposure_s < 0.0:
         words = f"sequence {sequence} and exposure {exposure_s} s where neither may be below 0"
         raise BadFrame(words, device=camera)

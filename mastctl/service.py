@@ -196,7 +196,12 @@ class Service:
         with self._mast_lock:
             self._check(request, mast_digest)
             loop = self._loop
-            return self.operations.start(told, lambda record, cancelled: loop.run(request, record, cancelled))
+
+            def run(record: Callable[[Any], None], cancelled: threading.Event) -> Any:
+                with self.devices.exposure_held():
+                    return loop.run(request, record, cancelled)
+
+            return self.operations.start(told, run)
 
     def load_mast(self, name: str) -> MastInUse:
         """Use another mast file of the configured one's folder from now on, and return it.

@@ -10,9 +10,11 @@ for the service's soft limits and not for the decision what to do about a fault:
   all that is known. Otherwise the unit is asked three times, and the middle answer is taken if it lies
   between the other two, and these no further apart than the axis can go meanwhile: with one of them damaged,
   what is taken still is where the axis was during the call.
-- After a limit hit (``!P``, ``!T``) or when a position has changed while the line was down, the unit has lost
-  count. Then it is read but not moved until it was homed (``mastctl ptu home``), which sweeps the full range
-  and which this driver never does, and opened anew.
+- A limit hit (``!P``, ``!T``) of an axis that stands still is damaged bytes or a restart: all of the unit is
+  checked again, its positions too.
+- After a limit hit of a moving axis, or when a position has changed while the line was down, the unit has
+  lost count. Then it is read but not moved until it was homed (``mastctl ptu home``), which sweeps the full
+  range and which this driver never does, and opened anew.
 """
 
 from __future__ import annotations
@@ -40,6 +42,7 @@ from drivers.flir_ptu.axis import Axis, Seen
 from drivers.flir_ptu.conversation import Conversation
 from drivers.flir_ptu.line import Line
 from drivers.flir_ptu.options import DEVICE, Options, options_from
+from drivers.flir_ptu.supply import EVERY_S, Supply, supply_of, supply_words
 from drivers.interfaces import Reading
 
 log = logging.getLogger(__name__)
@@ -55,7 +58,7 @@ HIT = (
     "home it (mastctl ptu home)"
 )
 JUMPED = (
-    "{axis} was at {before:.4f} rad before the line was lost and is at {after:.4f} rad now, "
+    "{axis} was at {before:.4f} rad before the unit or its line was away and is at {after:.4f} rad now, "
     "so the unit may have lost count; home it (mastctl ptu home)"
 )
 
@@ -98,6 +101,7 @@ class FlirPtu:
         self._stop_asked = threading.Event()
         self._lost_count: dict[str, str] = {}
         self._halt_owed = False
+        self._doubted: dict[str, float] = {}  # where the axes stood when a limit hit was told of one, rad
         self._deaf = False  # to limit hits
         self._closed = False
         self._silent = 0  # calls in a row without an answer
@@ -106,6 +110,9 @@ class FlirPtu:
         self._byte_s = 0.0
         self._talk: Conversation | None = None
         self._axes: dict[str, Axis] = {}
+        self._first_supply: Supply | None = None  # None: this unit does not tell
+        self._supply_words: tuple[str, ...] = ()
+        self._supply_due_s = 0.0
         self.version = ""
         self._connect()
 
@@ -129,6 +136,8 @@ class FlirPtu:
             for axis in (pan, tilt):
                 self._go_on(talk, axis)
             settled = all(axis.settled(self._options.settle_s) for axis in (pan, tilt))
+            if settled:  # a moving head is asked for nothing but its place
+                self._watch_supply(talk)
             return Reading(pan.angle_rad, tilt.angle_rad, not settled, sum(times_s) / 2, self._faults())
 
     def move(self, pan_rad: float, tilt_rad: float, speed_rad_per_s: float | None = None) -> None:
@@ -160,6 +169,9 @@ class FlirPtu:
             talk.tell("S")
             for name, (target, _) in ways.items():
                 talk.tell(f"{name[0].upper()}P{target}")
+            if self._doubted:
+                words = "told of a limit hit while it stood still; it is checked before it moves"
+                raise BadReply(words, device=DEVICE)
             if self._stop_asked.is_set():
                 raise DriverError("a stop came before the move was started", device=DEVICE)
             for name, axis in self._axes.items():
@@ -215,7 +227,9 @@ class FlirPtu:
                 raise NoReply("it is closed", device=DEVICE)
             talk = self._talk or self._connect()
             try:
-                if not talk.is_in_step:
+                if self._doubted:
+                    self._look_again(talk)
+                elif not talk.is_in_step:
                     self._come_into_step(talk)
                 yield talk
             except (LineLost, NoReply) as error:
@@ -271,6 +285,17 @@ class FlirPtu:
             with talk.patient():
                 self._check(talk, resolutions)
 
+    def _look_again(self, talk: Conversation) -> None:
+        """Check the unit anew, its positions too: it may have restarted, or only some bytes were damaged."""
+        resolutions = talk.in_step()
+        with talk.patient():
+            self._check(talk, resolutions)
+        stood, self._doubted = self._doubted, {}
+        for name, before_rad in stood.items():
+            axis = self._axes[name]
+            if abs(axis.angle_rad - before_rad) > 1.5 * axis.position_rad:
+                self._note_jump(name, before_rad, axis.angle_rad)
+
     # The unit
 
     def _check(self, talk: Conversation, resolutions: Mapping[str, float]) -> None:
@@ -310,6 +335,11 @@ class FlirPtu:
             if known is not None:
                 self._compare(known, axis)
         self.version, self._axes = version, axes
+        if self._first_supply is None:
+            first, again = self._ask_supply(talk), self._ask_supply(talk)
+            if first is not None and again is not None:  # the middle, should a digit be damaged
+                third = self._ask_supply(talk) or again
+                self._first_supply = sorted((first, again, third), key=lambda supply: supply.volts)[1]
 
     def _limit(self, talk: Conversation, axes: Mapping[str, Axis]) -> None:
         """Put the configuration's limits into the unit, if it has user limits."""
@@ -367,6 +397,28 @@ class FlirPtu:
             talk.tell(f"{axis.name[0].upper()}P{axis.next_target}")
             axis.sent(axis.next_target, self._clock.now_s())
 
+    def _watch_supply(self, talk: Conversation) -> None:
+        """Judge supply and temperature now and then; a fault is told only if it is measured twice."""
+        if self._first_supply is None or time.monotonic() < self._supply_due_s:
+            return
+        words: tuple[str, ...] = ()
+        for _ in range(2):
+            supply = self._ask_supply(talk)
+            if supply is None:
+                return  # damaged: asked again by the next reading
+            words = supply_words(supply, self._first_supply, self._options)
+            if not words:
+                break
+        self._supply_words, self._supply_due_s = words, time.monotonic() + EVERY_S
+
+    def _ask_supply(self, talk: Conversation) -> Supply | None:
+        """Supply and temperature; None where the unit does not tell, or in words nobody knows."""
+        try:
+            return supply_of(talk.tell("O"))
+        except Refused as error:
+            log.info("%s: it does not tell its supply (%s)", DEVICE, error)
+            return None
+
     def _try(self, talk: Conversation, command: str) -> None:
         """Send a command that not every firmware has."""
         try:
@@ -377,8 +429,17 @@ class FlirPtu:
     # What is wrong
 
     def _hit(self, axis: str) -> None:
-        """An axis ran into its limit switch; inside its limits that happens only when it has lost count."""
+        """An axis ran into its limit switch; inside its limits that happens only when it has lost count.
+
+        A head that stood still cannot have: that is a restart, or noise, and is looked into.
+        """
         if self._deaf:
+            return
+        if self._doubted:
+            return
+        if self._axes and all(one.rests for one in self._axes.values()):
+            log.warning("%s: a limit hit is told of the %s axis, which stands still", DEVICE, axis)
+            self._doubted = {name: one.angle_rad for name, one in self._axes.items()}
             return
         self._halt_owed = True
         if axis not in self._lost_count:
@@ -396,14 +457,19 @@ class FlirPtu:
             ways += [before.rad_from_position(end) for end in ends if end is not None]
             slack_rad += BRAKING_S * (before.speed or before.fastest) * before.position_rad
         if not min(ways) - slack_rad <= after.angle_rad <= max(ways) + slack_rad:
-            words = JUMPED.format(axis=after.name, before=before.angle_rad, after=after.angle_rad)
-            self._lost_count[after.name] = words
-            log.warning("%s: %s", DEVICE, words)
+            self._note_jump(after.name, before.angle_rad, after.angle_rad)
+
+    def _note_jump(self, axis: str, before_rad: float, after_rad: float) -> None:
+        """An axis is where it cannot be by itself."""
+        words = JUMPED.format(axis=axis, before=before_rad, after=after_rad)
+        self._lost_count[axis] = words
+        log.warning("%s: %s", DEVICE, words)
 
     def _faults(self) -> tuple[str, ...]:
         """What is wrong, in plain words."""
         return (
             *self._lost_count.values(),
+            *self._supply_words,
             *(
                 f"{axis.name} stands at {axis.angle_rad:.4f} rad and does not reach its target "
                 f"{axis.rad_from_position(axis.target):.4f} rad"

@@ -69,6 +69,10 @@ class Options:
         Of moves that name no speed, and of all; None leaves them as the unit has them.
     settle_s
         How long both axes must stand at their targets to count as settled.
+    supply_V
+        Lowest and highest supply; None: not below 0.8 of what it was when the unit was opened.
+    hottest_C
+        Above this temperature of the unit, °C, there is a fault.
     """
 
     port: str
@@ -78,6 +82,8 @@ class Options:
     speed_rad_per_s: float | None = None
     acceleration_rad_per_s2: float | None = None
     settle_s: float = 0.1
+    supply_V: tuple[float, float] | None = None
+    hottest_C: float = 60.0
 
 
 def options_from(values: Mapping[str, Any]) -> Options:
@@ -88,7 +94,7 @@ def options_from(values: Mapping[str, Any]) -> Options:
     BadOptions
         For an unknown or missing key or a value that cannot be: which, what it is, what would be right.
     """
-    known = ("port", "pan", "tilt", "baud", "speed_rad_per_s", "acceleration_rad_per_s2", "settle_s")
+    known = tuple(Options.__dataclass_fields__)
     read = _Reader("", values, known, ("port", "pan", "tilt"))
     port = values["port"]
     foreign = isinstance(port, str) and "://" in port and not port.startswith(("socket://", "rfc2217://"))
@@ -102,6 +108,8 @@ def options_from(values: Mapping[str, Any]) -> Options:
         speed_rad_per_s=read.number("speed_rad_per_s", None, 1e-4, 20.0),
         acceleration_rad_per_s2=read.number("acceleration_rad_per_s2", None, 1e-4, 100.0),
         settle_s=read.number("settle_s", 0.1, 0.0, 10.0),
+        supply_V=read.pair("supply_V", "[low, high] in volts, low below high"),
+        hottest_C=read.number("hottest_C", 60.0, 0.0, 150.0),
     )
 
 
@@ -158,6 +166,16 @@ class _Reader:
         if not _is_number(value) or not low <= value <= high:
             raise self.bad(key, f"a number from {low:g} to {high:g}")
         return float(value)
+
+    def pair(self, key: str, expected: str) -> tuple[float, float] | None:
+        """Two rising numbers, or None where there are none."""
+        value = self._values.get(key)
+        if value is None:
+            return None
+        good = isinstance(value, list | tuple) and len(value) == 2 and all(_is_number(one) for one in value)
+        if not good or not value[0] < value[1]:
+            raise self.bad(key, expected)
+        return float(value[0]), float(value[1])
 
     def one_of(self, key: str, default: Any, allowed: tuple[Any, ...]) -> Any:
         """One of a few values."""

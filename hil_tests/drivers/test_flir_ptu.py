@@ -375,6 +375,7 @@ def test_positions_that_contradict_each_other_are_refused(opened: Opener) -> Non
 def test_a_limit_hit_stops_the_head_until_it_is_homed(opened: Opener) -> None:
     head, unit = opened()
     settled(head)
+    head.move(0.2, 0.0)
     unit.heard.clear()
     unit.unasked = b"!P"
     time.sleep(0.05)
@@ -392,6 +393,67 @@ def test_a_limit_hit_stops_the_head_until_it_is_homed(opened: Opener) -> None:
     assert head.read().faults == ()
     head.move(0.1, 0.1)
     head.close()
+
+
+def rested(head: FlirPtu) -> None:
+    """Read until the head has stood for so long that it cannot be anywhere else."""
+    until_s = time.monotonic() + 20
+    while not all(axis.rests for axis in head._axes.values()):
+        head.read()
+        assert time.monotonic() < until_s
+
+
+def test_a_limit_hit_of_a_resting_head_is_looked_into_and_forgotten(opened: Opener) -> None:
+    head, unit = opened()
+    rested(head)
+    before = head.read()
+    unit.heard.clear()
+    unit.unasked = b"!P"
+    time.sleep(0.05)
+    head.read()
+    reading = head.read()
+    assert reading.faults == () and (reading.pan_rad, reading.tilt_rad) == (before.pan_rad, before.tilt_rad)
+    assert {"V", "LU", "PP"} <= set(unit.heard), "the unit was checked from version to limits"
+    assert not [c for c in unit.heard if c.startswith(("PP", "TP")) and c[2:]], "and not moved"
+    head.move(0.1, 0.1)
+
+
+def test_a_limit_hit_of_a_resting_head_that_has_moved_meanwhile_stays(opened: Opener) -> None:
+    head, unit = opened()
+    rested(head)
+    unit.unasked, unit.positions = b"!T!T!P!P*\r", {"P": 400, "T": 0}
+    time.sleep(0.05)
+    head.read()
+    assert any("unit may have lost count" in word for word in head.read().faults)
+    with pytest.raises(HardwareFault, match="home it"):
+        head.move(0.1, 0.1)
+
+
+@pytest.mark.parametrize(
+    ("options", "answer", "words"),
+    [
+        ({}, "Input 23 VDC @ 95 degF", "the supply is 23.0 V, expected 24.0 V or more"),
+        ({"supply_V": [26, 32]}, "Input 25 VDC @ 95 degF", "25.0 V, expected 26.0 to 32.0 V"),
+        ({}, "Input 30 VDC @ 167 degF", "the unit is at 75 °C, expected 60 °C at most"),
+        ({}, "30.1V,90F,158F,88F", "the unit is at 70 °C"),
+        ({"hottest_C": 80}, "Input 30 VDC @ 167 degF", ""),
+        ({}, "something else", ""),
+    ],
+)
+def test_supply_and_temperature_are_watched_while_the_head_rests(
+    opened: Opener, monkeypatch: pytest.MonkeyPatch, options: dict[str, Any], answer: str, words: str
+) -> None:
+    monkeypatch.setattr("drivers.flir_ptu.head.EVERY_S", 0.0)
+    unit = ScriptedPtu()
+    unit.answers["O"] = b"* Input 30 VDC @ 86 degF"
+    head, _ = opened(unit, **options)
+    settled(head)
+    assert head.read().faults == ()
+    unit.answers["O"] = f"* {answer}".encode()
+    faults = head.read().faults
+    assert words in "; ".join(faults) and bool(faults) == bool(words)
+    unit.answers["O"] = b"* Input 30 VDC @ 86 degF"
+    assert head.read().faults == ()
 
 
 def test_an_e46_has_to_be_told_its_resolution(opened: Opener) -> None:
@@ -483,10 +545,12 @@ def test_a_unit_that_lost_count_while_the_line_was_down_is_not_moved(opened: Ope
                 break
             except LineLost:
                 time.sleep(0.02)
-        assert reading.faults[0].startswith("pan was at 0.5000 rad before the line was lost and is at 0.0000")
+        assert reading.faults[0].startswith(
+            "pan was at 0.5000 rad before the unit or its line was away and is at 0.0"
+        )
         assert unit.positions == {"P": 0, "T": round(0.2 / TILT_STEP_RAD)}, "it comes back without moving"
         assert {"LU", "PN", "PR", "H"} <= set(unit.heard), "and is checked again"
-        with pytest.raises(HardwareFault, match="before the line was lost"):
+        with pytest.raises(HardwareFault, match="before the unit or its line was away"):
             head.move(0.1, 0.1)
 
 

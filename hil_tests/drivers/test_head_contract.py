@@ -14,7 +14,6 @@ from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -22,7 +21,6 @@ from drivers.errors import DriverError, LineLost, NoReply
 from drivers.interfaces import PanTilt, Reading
 from drivers.sim import rover
 from drivers.sim.scene import SceneSettings, build_scene
-from drivers.sim.wire import head as wired_head
 from mastctl.client import Client
 from mastctl.config import load_config
 from mastctl.daemon import RunningDaemon
@@ -400,6 +398,7 @@ def _stands(rig: Rig) -> bool:
         (None, "ptu_d46_70", 1.5),
         ("flir_ptu", "ptu_d46_70", 1.5),
         ("dynamixel", "dynamixel_x", 6.0),
+        ("dynamixel", "ph42", 1.5),
     ],
 )
 def test_the_demos_pointing_loop_lands_with_every_head(
@@ -407,15 +406,8 @@ def test_the_demos_pointing_loop_lands_with_every_head(
 ) -> None:
     # A count of the X is 2 px and its backlash 5.6 px of the navcam; the PTU's steps are 0.07 px.
     monkeypatch.setattr(rover, "build_scene", lambda settings: build_scene(SceneSettings(seed=1, rocks=4)))
-    make = wired_head._dynamixel
-
-    def without_watchdog(*arguments: Any) -> Any:  # renderer and driver share one busy process here
-        device, open_head, options = make(*arguments)
-        return device, open_head, {**options, "watchdog_s": 0.0}
-
-    monkeypatch.setattr(wired_head, "_dynamixel", without_watchdog)
-    config = demo_config(load_config(None), head=head, seed=1)
-    simulation = {**config.hardware.simulation, "samples": 1} | ({"wire": wire} if wire else {})
+    config = demo_config(load_config(None), head=head, wire=wire, seed=1)
+    simulation = {**config.hardware.simulation, "samples": 1}
     cameras = {n: c for n, c in config.hardware.cameras.items() if n.startswith("navcam")}
     hardware = replace(config.hardware, simulation=simulation, cameras=cameras)
     with RunningDaemon(replace(config, hardware=hardware)) as daemon, Client(daemon.url) as client:

@@ -109,8 +109,8 @@ def test_real_and_simulated_together_are_mixed(outside: None, small_rig: Path) -
         assert hardware.kind == "mixed" and hardware.simulation is not None
 
 
-def test_drivers_of_later_versions_are_refused_by_name() -> None:
-    with pytest.raises(BadOptions, match="pan_tilt: driver 'v4l2' is not in this version"):
+def test_a_v4l2_camera_is_no_head() -> None:
+    with pytest.raises(BadOptions, match="pan_tilt: driver 'v4l2' is for cameras"):
         open_hardware(head_only("v4l2"))
 
 

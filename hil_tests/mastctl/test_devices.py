@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from service_fakes import FakeHardware, Hang, eventually, rig
+from service_fakes import FakeCamera, FakeHardware, Hang, eventually, rig
 
 from drivers.clock import SystemClock
 from drivers.errors import BadFrame, BadReply, DriverError, NoFreshFrame, NoReply
@@ -474,6 +474,21 @@ def test_a_move_sent_between_the_readings_counts_even_if_they_are_alike() -> Non
     still = history((1.0, 0.0, 0.0, False), (1.05, 0.0, 0.0, False))
     still.move_sent(1.04)
     assert still.at_exposure(1.01, 1.015, 1.02, "head").moving
+
+
+class SizedCamera(FakeCamera):
+    """A camera that tells its size before the first picture."""
+
+    size_px = (64, 47)
+
+
+def test_a_camera_of_another_size_than_the_mast_files_is_refused_at_the_start() -> None:
+    hardware = FakeHardware()
+    hardware.fake_cameras["navcam_left"] = SizedCamera("navcam_left", 0)
+    with pytest.raises(
+        BadFrame, match=r"navcam_left: the image is 64x47 px where the mast file has 64x48 px"
+    ):
+        Devices(hardware, LIMITS, DIGEST, SystemClock(), rig())
 
 
 # The end

@@ -41,8 +41,13 @@ def add_commands(subparsers: Any) -> None:
     demo = subparsers.add_parser("demo", help="the pointing experiment on the packaged simulated rover")
     _add_common(demo, out_help="folder for the report (default mastctl_demo)")
     demo.add_argument(
-        "--head", choices=("ptu_d46_70", "dynamixel_x"), default="ptu_d46_70", help="simulated head"
-    )
+        "--head", choices=("ptu_d46_70", "dynamixel_x", "ph42"),
+        help="simulated head (default ptu_d46_70; dynamixel_x behind --wire dynamixel)",
+    )  # fmt: skip
+    demo.add_argument(
+        "--wire", choices=("dynamixel", "flir_ptu"),
+        help="drive the head through the real driver and a byte simulator (default: in memory)",
+    )  # fmt: skip
     demo.set_defaults(run=run_demo, out=Path("mastctl_demo"))
 
 
@@ -97,7 +102,7 @@ def run_demo(args: argparse.Namespace) -> int:
     from mastctl.experiment.pointing import head_pair
 
     check_writable(args.out)
-    config = demo_config(load_config(None), head=args.head, seed=args.seed)
+    config = demo_config(load_config(None), head=args.head, wire=args.wire, seed=args.seed)
     with _waiting(
         args, "building the simulated rover and its ground (the first time also compiling the renderer)"
     ):
@@ -108,7 +113,8 @@ def run_demo(args: argparse.Namespace) -> int:
         rig = daemon.service.stored.rig
         camera = head_pair(rig, set(config.hardware.cameras))[0]
         notes = (head_note(rover, rig, camera),)
-        output.tell(f"simulated rover at {daemon.url}, head {args.head}")
+        behind = f" behind {args.wire} bytes" if args.wire else ""
+        output.tell(f"simulated rover at {daemon.url}, head {rover.settings.head.name}{behind}")
         experiment = _run(args, client, DEFAULT_DISTANCES_M, SimulationTruth(rover), notes)
     return _report(args, experiment)
 

@@ -1,4 +1,6 @@
-"""Commands on files alone, no rover needed: camera project, ray, convert; solve; triangulate; budget."""
+"""Commands on files alone, no rover needed: camera project, ray, convert; solve; triangulate; budget.
+
+The other actions of ``camera``, on connected cameras, are in `mastctl.cli.cameras`."""
 
 from __future__ import annotations
 
@@ -9,7 +11,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from mastctl.cli import output
+from mastctl.cli import cameras, output
 from mastctl.cli.output import finite_number, positive_number
 
 if TYPE_CHECKING:
@@ -20,7 +22,9 @@ if TYPE_CHECKING:
 
 def add_commands(subparsers: Any) -> None:
     """Add the commands of this module to the parser's commands."""
-    camera = subparsers.add_parser("camera", help="project points, give rays, convert camera files")
+    camera = subparsers.add_parser(
+        "camera", help="camera files (project, ray, convert), cameras (list, check, grab, focus)"
+    )
     actions = camera.add_subparsers(dest="action", metavar="ACTION", required=True)
 
     project = actions.add_parser("project", help="points x_m,y_m,z_m to pixels x_px,y_px, CSV to CSV")
@@ -40,6 +44,8 @@ def add_commands(subparsers: Any) -> None:
     convert.add_argument("target", type=Path, metavar="OUT", help="a .yaml or .cahvor file")
     convert.add_argument("--camera", metavar="NAME", help="which camera, where IN holds several")
     convert.set_defaults(run=camera_convert)
+
+    cameras.add_actions(actions)
 
     solve = subparsers.add_parser("solve", help="the joint angles that bring a target onto a pixel")
     solve.add_argument("mast", type=Path, metavar="MAST.yaml")

@@ -1,0 +1,48 @@
+"""What a unit says about its supply and its temperature, and when that is a fault.
+
+The manuals' answer to ``O`` is ``Input 30 VDC @ 86 degF``; units with more sensors list more temperatures.
+They give no bounds for all models, so these are the configuration's, or what was there at the start.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+
+from drivers.flir_ptu.options import Options
+
+EVERY_S = 5.0
+"""How often a resting unit is asked."""
+DIP = 0.8
+"""Below this part of what it was at the start a supply counts as fallen, where no bounds are configured."""
+
+_VOLTS = re.compile(r"(\d+(?:\.\d+)?) ?V")
+_DEGREES_F = re.compile(r"(-?\d+(?:\.\d+)?) ?(?:deg)?F\b")
+
+
+@dataclass(frozen=True)
+class Supply:
+    """Supply, volts, and the hottest temperature that the unit tells, °C."""
+
+    volts: float
+    hottest_c: float
+
+
+def supply_of(text: str) -> Supply | None:
+    """Return what an answer to ``O`` says; None if it says something else."""
+    volts, degrees = _VOLTS.findall(text), _DEGREES_F.findall(text)
+    if len(volts) != 1 or not degrees:
+        return None
+    return Supply(float(volts[0]), (max(float(one) for one in degrees) - 32) / 1.8)
+
+
+def supply_words(now: Supply, at_start: Supply, options: Options) -> tuple[str, ...]:
+    """Say what is wrong with the supply or the temperature; empty if nothing is."""
+    words = []
+    low, high = options.supply_V or (DIP * at_start.volts, float("inf"))
+    if not low <= now.volts <= high:
+        expected = f"{low:.1f} to {high:.1f} V" if options.supply_V else f"{low:.1f} V or more"
+        words.append(f"the supply is {now.volts:.1f} V, expected {expected}")
+    if now.hottest_c > options.hottest_C:
+        words.append(f"the unit is at {now.hottest_c:.0f} °C, expected {options.hottest_C:.0f} °C at most")
+    return tuple(words)

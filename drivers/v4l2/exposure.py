@@ -1,0 +1,162 @@
+"""Automatic exposure of our own: between measurements it brings a percentile of the grey levels to a target.
+
+The camera's own automatic is off, because it would change pictures in the middle of a measurement and the two
+eyes of a pair apart from each other. One `ExposureControl` serves all cameras of a group, which so always
+have the same exposure; it looks at the brightest of them.
+"""
+
+from __future__ import annotations
+
+import threading
+from dataclasses import dataclass
+
+import numpy as np
+
+from drivers.interfaces import Image
+
+SATURATED = 250
+PATIENCE = 6  # so many looks of one camera without one of the others: that one gives no pictures now
+MOST_STEP = 4.0  # no change by more than this factor at once: levels far from the target tell little
+
+
+@dataclass(frozen=True)
+class ExposureSettings:
+    """What the automatic exposure aims at.
+
+    Attributes
+    ----------
+    group
+        Cameras of one name share their exposure; empty for a camera by itself.
+    percentile, target, tolerance
+        The percentile of the grey levels is brought to ``target``, and left alone within ``tolerance`` of it
+        (the hysteresis: without it, noise alone would change the exposure again and again).
+    shortest_s, longest_s
+        Bounds of the exposure time, seconds.
+    """
+
+    group: str = ""
+    percentile: float = 95.0
+    target: float = 180.0
+    tolerance: float = 25.0
+    shortest_s: float = 1e-4
+    longest_s: float = 0.03
+
+
+def level(image: Image, percentile: float) -> float:
+    """Return a percentile of a (h, w) picture's grey levels, from every fourth pixel of every fourth row."""
+    return float(np.percentile(image[::4, ::4], percentile))
+
+
+class ExposureControl:
+    """Finds the exposure time for a group of cameras; safe from any thread.
+
+    Parameters
+    ----------
+    settings
+        The target.
+    exposure_s
+        The exposure time to begin with, seconds.
+    """
+
+    def __init__(self, settings: ExposureSettings, exposure_s: float) -> None:
+        self._settings = settings
+        self._exposure_s = exposure_s
+        self._members: set[str] = set()
+        self._levels: dict[str, float] = {}
+        self._looks: dict[str, int] = {}
+        self._holds = 0
+        self._lock = threading.Lock()
+
+    @property
+    def exposure_s(self) -> float:
+        """The exposure time that all cameras of the group are to have, seconds."""
+        with self._lock:
+            return self._exposure_s
+
+    @property
+    def held(self) -> bool:
+        """Whether a measurement is under way, during which nothing changes."""
+        with self._lock:
+            return self._holds > 0
+
+    def hold(self) -> None:
+        """Keep the exposure as it is until `release`; calls nest."""
+        with self._lock:
+            self._holds += 1
+
+    def release(self) -> None:
+        """End one `hold`."""
+        with self._lock:
+            self._holds = max(0, self._holds - 1)
+            self._begin_again()
+
+    def join(self, camera: str) -> None:
+        """Count a camera in: its pictures are waited for before anything changes."""
+        with self._lock:
+            self._members.add(camera)
+
+    def leave(self, camera: str) -> None:
+        """Count a camera out."""
+        with self._lock:
+            self._members.discard(camera)
+            self._begin_again()
+
+    def see(self, camera: str, image: Image, exposure_s: float) -> float:
+        """Take in a grey picture that was taken with ``exposure_s`` and return the exposure time to have now.
+
+        Pictures taken with another exposure than the present one are not judged.
+        """
+        s = self._settings
+        seen = level(image, s.percentile)
+        with self._lock:
+            if self._holds or abs(exposure_s - self._exposure_s) > 1e-9:
+                return self._exposure_s
+            self._levels[camera] = seen
+            self._looks[camera] = self._looks.get(camera, 0) + 1
+            if self._members - set(self._levels) and self._looks[camera] < PATIENCE:
+                return self._exposure_s
+            brightest = max(self._levels.values())
+            if abs(brightest - s.target) <= s.tolerance:
+                return self._exposure_s
+            factor = 1 / MOST_STEP if brightest >= SATURATED else s.target / max(brightest, 1.0)
+            factor = min(max(factor, 1 / MOST_STEP), MOST_STEP)
+            wanted_s = min(max(self._exposure_s * factor, s.shortest_s), s.longest_s)
+            if wanted_s != self._exposure_s:
+                self._exposure_s = wanted_s
+                self._begin_again()
+            return self._exposure_s
+
+    def _begin_again(self) -> None:
+        """Forget what was seen: it was taken with another exposure, or of another time."""
+        self._levels.clear()
+        self._looks.clear()
+
+
+class _Groups:
+    """The exposure controls that cameras share, by group name, as long as a camera uses them."""
+
+    def __init__(self) -> None:
+        self._known: dict[str, tuple[ExposureControl, int]] = {}
+        self._lock = threading.Lock()
+
+    def join(self, camera: str, settings: ExposureSettings, exposure_s: float) -> ExposureControl:
+        """Return the control of a group, made by its first camera; a camera without group has its own."""
+        if not settings.group:
+            return ExposureControl(settings, exposure_s)
+        with self._lock:
+            control, users = self._known.get(settings.group, (ExposureControl(settings, exposure_s), 0))
+            self._known[settings.group] = (control, users + 1)
+            control.join(camera)
+            return control
+
+    def leave(self, camera: str, settings: ExposureSettings) -> None:
+        """Let go of a group; the last one out forgets it."""
+        with self._lock:
+            if settings.group in self._known:
+                control, users = self._known.pop(settings.group)
+                control.leave(camera)
+                if users > 1:
+                    self._known[settings.group] = (control, users - 1)
+
+
+GROUPS = _Groups()

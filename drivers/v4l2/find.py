@@ -1,0 +1,162 @@
+"""Which node is which camera: by a stable link or by name, never by its number, which changes."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from drivers.errors import BadOptions, DriverError
+from drivers.v4l2.errors import NoCamera, NoPermission
+from drivers.v4l2.node import Node, capture_nodes
+
+LINKS = Path("/dev/v4l")
+SYSFS = Path("/sys/class/video4linux")
+
+_NUMBERED = re.compile(r"/dev/video\d+")
+
+
+@dataclass(frozen=True)
+class Address:
+    """How a configuration names a camera: by a link, or by card name and bus (one of them, or both).
+
+    Attributes
+    ----------
+    link
+        A path under /dev/v4l/by-id or by-path, or another link that udev keeps.
+    card
+        The name that the driver gives, as `mastctl camera list` shows it.
+    bus
+        Where it is plugged in, as `mastctl camera list` shows it.
+    """
+
+    link: Path | None = None
+    card: str = ""
+    bus: str = ""
+
+    def __str__(self) -> str:
+        if self.link is not None:
+            return str(self.link)
+        card = f"card {self.card!r}" if self.card else "any card"
+        return f"{card} at {self.bus}" if self.bus else card
+
+
+@dataclass(frozen=True)
+class Found:
+    """One connected camera: its node now, its names, and its stable links."""
+
+    node: Path
+    driver: str
+    card: str
+    bus: str
+    links: tuple[Path, ...]
+
+
+def check_address(address: Address, name: str) -> None:
+    """Refuse a bare node number, and name what is stable instead. Raises BadOptions."""
+    if address.link is None and not address.card and not address.bus:
+        raise BadOptions("'device', 'card' or 'bus' is expected: which camera it is", device=name)
+    if address.link is not None and _NUMBERED.fullmatch(str(address.link)):
+        links = stable_links(address.link)
+        instead = f"give {links[0]}" if links else "give a link under /dev/v4l/by-id, or 'card' and 'bus'"
+        raise BadOptions(
+            f"{address.link} is a number that changes when cameras are plugged in; {instead} "
+            "(mastctl camera list shows them)",
+            device=name,
+        )
+
+
+def open_node(address: Address, name: str) -> Node:
+    """Open the camera of an address.
+
+    Raises
+    ------
+    NoCamera
+        If nothing of that name is connected.
+    BadOptions
+        If several cameras bear it.
+    DriverError
+        If it cannot be opened.
+    """
+    if address.link is not None:
+        return Node(address.link, name)
+    matches = list(_named(address, name))
+    if len(matches) == 1:
+        return matches[0]
+    busses = ", ".join(node.identity.bus for node in matches)
+    for node in matches:
+        node.close()
+    if matches:
+        raise BadOptions(f"several cameras match {address}: at {busses}; add 'bus'", device=name)
+    raise NoCamera(f"no camera matches {address}; connected are {_connected()}", device=name)
+
+
+def list_cameras() -> list[Found]:
+    """Return the cameras that are connected and may be opened, in the kernel's order."""
+    found = []
+    for path in capture_nodes():
+        try:
+            with Node(path) as node:
+                who = node.identity
+        except DriverError:
+            continue  # an output, a metadata node, or one of somebody else's
+        found.append(Found(path, who.driver, who.card, who.bus, tuple(stable_links(path))))
+    return found
+
+
+def refused_nodes(nodes: Iterable[Path]) -> Iterator[str]:
+    """Yield a sentence for each node that this user may not open."""
+    for path in nodes:
+        try:
+            Node(path).close()
+        except NoPermission as error:
+            yield str(error)
+        except DriverError:
+            continue
+
+
+def stable_links(node: Path) -> list[Path]:
+    """Return the links under /dev/v4l that lead to a node now: by identity first, then by socket."""
+    found = []
+    for kind in ("by-id", "by-path"):
+        folder = LINKS / kind
+        if folder.is_dir():
+            found += [link for link in sorted(folder.iterdir()) if link.resolve() == node]
+    return found
+
+
+def _named(address: Address, name: str) -> Iterable[Node]:
+    """Open the nodes that bear the address's names."""
+    refused: NoPermission | None = None
+    any_match = False
+    for path in capture_nodes():
+        label = _sysfs_name(path)
+        try:
+            node = Node(path, name)
+        except NoPermission as error:
+            refused = error
+            continue
+        except DriverError:
+            continue
+        who = node.identity
+        if address.card in ("", who.card, label) and address.bus in ("", who.bus):
+            any_match = True
+            yield node
+        else:
+            node.close()
+    if refused is not None and not any_match:
+        raise refused
+
+
+def _sysfs_name(path: Path) -> str:
+    """The name that the kernel gives a node; it tells the nodes of one card apart."""
+    try:
+        return (SYSFS / path.name / "name").read_text().strip()
+    except OSError:
+        return ""
+
+
+def _connected() -> str:
+    """The connected cameras in words."""
+    return ", ".join(f"{c.card!r} at {c.bus}" for c in list_cameras()) or "none"

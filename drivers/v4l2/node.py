@@ -1,0 +1,362 @@
+"""One open video node: the kernel's requests as methods, and its refusals as plain sentences."""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import errno
+import fcntl
+import grp
+import mmap
+import os
+import stat
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+from drivers.errors import DriverError
+from drivers.v4l2 import abi
+from drivers.v4l2.errors import CameraBusy, NoCamera, NoPermission, NotACamera, StreamFailed
+
+_MOST_ENTRIES = 1024  # of any enumeration: a driver that never ends one must not hang us
+
+
+@dataclass(frozen=True)
+class Identity:
+    """What a node says of itself: driver, card (the name for people), bus (where it is plugged in)."""
+
+    driver: str
+    card: str
+    bus: str
+    capabilities: int
+
+
+@dataclass(frozen=True)
+class PictureFormat:
+    """A format as the driver set it.
+
+    Attributes
+    ----------
+    code
+        Four-character code.
+    size_px
+        (width, height).
+    stride_bytes
+        From one row to the next, of the first plane; 0 for compressed formats.
+    length_bytes
+        The most that one picture takes.
+    field
+        1 for whole pictures; other values are interlaced.
+    """
+
+    code: str
+    size_px: tuple[int, int]
+    stride_bytes: int
+    length_bytes: int
+    field: int = abi.FIELD_NONE
+
+
+class Dequeued(NamedTuple):
+    """A filled buffer, still ours until it is queued again."""
+
+    number: int
+    used_bytes: int
+    flags: int
+    sequence: int
+    stamp_s: float
+
+
+class Node:
+    """An open video node. A context manager; closing it stops the stream and gives everything back.
+
+    Parameters
+    ----------
+    path
+        The node or a link to it. That it captures is checked here.
+    name
+        The camera's name in messages.
+
+    Raises
+    ------
+    NoCamera, NoPermission, CameraBusy, NotACamera
+        If it cannot be opened or gives no pictures.
+    """
+
+    def __init__(self, path: str | Path, name: str = "") -> None:
+        self.path = Path(path)
+        self.name = "" if name == str(path) else name  # messages name the path themselves
+        self._maps: list[mmap.mmap] = []
+        self._streaming = False
+        self._exchanged = self._buffer(0)  # for the requests made for every frame; made once, as each costs
+        self._fd = _open(self.path, self.name)
+        try:
+            self.identity = self._identify()
+        except BaseException:
+            os.close(self._fd)
+            raise
+
+    def fileno(self) -> int:
+        """Return the descriptor, for poll."""
+        return self._fd
+
+    def close(self) -> None:
+        """Stop and give back buffers, mappings and descriptor, each even if another refuses."""
+        if self._fd < 0:
+            return
+        fd, self._fd = self._fd, -1
+        try:
+            if self._streaming:
+                fcntl.ioctl(fd, abi.VIDIOC_STREAMOFF, ctypes.c_int32(abi.BUF_TYPE_VIDEO_CAPTURE))
+        except OSError:
+            pass  # a camera that is gone has no stream to stop
+        finally:
+            self._unmap()
+            os.close(fd)  # the kernel frees the buffers with it
+
+    def __enter__(self) -> Node:
+        return self
+
+    def __exit__(self, *ignored: object) -> None:
+        self.close()
+
+    # What it can do
+
+    def formats(self) -> list[str]:
+        """Return the codes of the formats that it offers, in the driver's order."""
+        found = []
+        for index in range(_MOST_ENTRIES):
+            entry = abi.FmtDesc(index=index, type=abi.BUF_TYPE_VIDEO_CAPTURE)
+            if not self._next(abi.VIDIOC_ENUM_FMT, entry):
+                break
+            found.append(abi.fourcc_text(entry.pixelformat))
+        return found
+
+    def sizes(self, code: str) -> tuple[list[tuple[int, int]], tuple[int, ...] | None]:
+        """Return a format's (width, height), or (min_w, max_w, step_w, min_h, max_h, step_h) of a range."""
+        found = []
+        for index in range(_MOST_ENTRIES):
+            entry = abi.FrmSizeEnum(index=index, pixel_format=abi.fourcc(code))
+            if not self._next(abi.VIDIOC_ENUM_FRAMESIZES, entry):
+                break
+            if entry.type != abi.FRMSIZE_DISCRETE:
+                return [], tuple(entry.sizes)
+            found.append((int(entry.sizes[0]), int(entry.sizes[1])))
+        return found, None
+
+    def rates_hz(self, code: str, size_px: tuple[int, int]) -> list[float]:
+        """Return the frame rates at a format and size; of a range its two ends."""
+        found = []
+        for index in range(_MOST_ENTRIES):
+            entry = abi.FrmIvalEnum(
+                index=index, pixel_format=abi.fourcc(code), width=size_px[0], height=size_px[1]
+            )
+            if not self._next(abi.VIDIOC_ENUM_FRAMEINTERVALS, entry):
+                break
+            intervals = entry.intervals[:1] if entry.type == abi.FRMIVAL_DISCRETE else entry.intervals[:2]
+            found += [i.denominator / i.numerator for i in intervals if i.numerator and i.denominator]
+            if entry.type != abi.FRMIVAL_DISCRETE:
+                break
+        return found
+
+    # What it shall do
+
+    def set_format(self, code: str, size_px: tuple[int, int]) -> PictureFormat:
+        """Ask for a format and return the driver's, which may be another. Raises DriverError."""
+        wanted = abi.Format(type=abi.BUF_TYPE_VIDEO_CAPTURE)
+        pix = wanted.fmt.pix
+        pix.width, pix.height = size_px
+        pix.pixelformat, pix.field = abi.fourcc(code), abi.FIELD_NONE
+        self.call(abi.VIDIOC_S_FMT, wanted, f"set the format {code} {size_px[0]}x{size_px[1]}")
+        return _picture_format(wanted)
+
+    def current_format(self) -> PictureFormat:
+        """Return the format that is set now. Raises DriverError."""
+        found = abi.Format(type=abi.BUF_TYPE_VIDEO_CAPTURE)
+        self.call(abi.VIDIOC_G_FMT, found, "tell its format")
+        return _picture_format(found)
+
+    def set_rate(self, rate_hz: float) -> float | None:
+        """Ask for a frame rate and return the driver's, None if it has no say in it. Raises DriverError."""
+        parm = abi.StreamParm(type=abi.BUF_TYPE_VIDEO_CAPTURE)
+        parm.parm.capture.timeperframe = abi.Fract(1000, round(rate_hz * 1000))
+        try:
+            fcntl.ioctl(self._fd, abi.VIDIOC_S_PARM, parm)
+        except OSError as error:
+            if error.errno in (errno.EINVAL, errno.ENOTTY):
+                return None
+            raise self.failure(error, f"set the rate {rate_hz:g} Hz") from None
+        return _rate(parm)
+
+    def current_rate(self) -> float | None:
+        """Return the frame rate that is set now, None where the driver does not tell."""
+        parm = abi.StreamParm(type=abi.BUF_TYPE_VIDEO_CAPTURE)
+        return _rate(parm) if self._next(abi.VIDIOC_G_PARM, parm) else None
+
+    # The stream
+
+    def start(self, buffers: int) -> None:
+        """Get buffers, queue them all, start. Raises DriverError; `close` gives back what was got."""
+        request = abi.RequestBuffers(count=buffers, type=abi.BUF_TYPE_VIDEO_CAPTURE, memory=abi.MEMORY_MMAP)
+        self.call(abi.VIDIOC_REQBUFS, request, f"give {buffers} buffers")
+        if request.count < 2:
+            raise StreamFailed(
+                f"its driver gives {request.count} buffers where at least 2 are needed", device=self.name
+            )
+        for index in range(request.count):
+            buffer = self._buffer(index)
+            self.call(abi.VIDIOC_QUERYBUF, buffer, f"tell where buffer {index} is")
+            try:
+                self._maps.append(
+                    mmap.mmap(
+                        self._fd, buffer.length, mmap.MAP_SHARED, mmap.PROT_READ, offset=buffer.m.offset
+                    )
+                )
+            except OSError as error:
+                raise self.failure(error, f"map buffer {index}") from None
+            self.queue(index)
+        on = ctypes.c_int32(abi.BUF_TYPE_VIDEO_CAPTURE)
+        self.call(abi.VIDIOC_STREAMON, on, "start the stream")
+        self._streaming = True
+
+    def queue(self, index: int) -> None:
+        """Give a buffer back to the driver. Raises DriverError."""
+        self._exchanged.index = index
+        self.call(abi.VIDIOC_QBUF, self._exchanged, f"take buffer {index} back")
+
+    def dequeue(self) -> Dequeued | None:
+        """Return the next filled buffer, None if there is none yet. Raises DriverError."""
+        buffer = self._exchanged
+        try:
+            fcntl.ioctl(self._fd, abi.VIDIOC_DQBUF, buffer)
+        except OSError as error:
+            if error.errno == errno.EAGAIN:
+                return None
+            raise self.failure(error, "give a frame") from None
+        stamp = buffer.timestamp
+        stamp_s = stamp.tv_sec + stamp.tv_usec * 1e-6
+        return Dequeued(buffer.index, buffer.bytesused, buffer.flags, buffer.sequence, stamp_s)
+
+    def bytes_of(self, buffer: Dequeued) -> memoryview:
+        """Return a dequeued buffer's bytes, in the driver's own memory: good until it is queued again."""
+        return memoryview(self._maps[buffer.number])[: buffer.used_bytes]
+
+    def check_there(self) -> None:
+        """Raise NoCamera if the camera was unplugged."""
+        self.call(abi.VIDIOC_QUERYCAP, abi.Capability(), "answer")
+
+    def call(self, request: int, argument: ctypes.Structure | ctypes.c_int32, what: str) -> None:
+        """Make one request; a refusal becomes a typed error that says what the camera did not do."""
+        try:
+            fcntl.ioctl(self._fd, request, argument)
+        except OSError as error:
+            raise self.failure(error, what) from None
+
+    def _buffer(self, index: int) -> abi.Buffer:
+        return abi.Buffer(index=index, type=abi.BUF_TYPE_VIDEO_CAPTURE, memory=abi.MEMORY_MMAP)
+
+    def _next(self, request: int, entry: ctypes.Structure) -> bool:
+        """Fill one entry of an enumeration; False at its end."""
+        try:
+            fcntl.ioctl(self._fd, request, entry)
+        except OSError as error:
+            if error.errno in (errno.EINVAL, errno.ENOTTY, errno.ENODATA):
+                return False
+            raise self.failure(error, "tell what it offers") from None
+        return True
+
+    def _identify(self) -> Identity:
+        found = abi.Capability()
+        try:
+            fcntl.ioctl(self._fd, abi.VIDIOC_QUERYCAP, found)
+        except OSError as error:
+            if error.errno in (errno.ENOTTY, errno.EINVAL):
+                raise NotACamera(f"{self.path} is no video device", device=self.name) from None
+            raise self.failure(error, "tell what it is") from None
+        flags = found.capabilities
+        flags = found.device_caps if flags & abi.CAP_DEVICE_CAPS else flags
+        driver, card, bus = (f.decode(errors="replace") for f in (found.driver, found.card, found.bus_info))
+        if not flags & abi.CAP_VIDEO_CAPTURE or not flags & abi.CAP_STREAMING:
+            raise NotACamera(f"{self.path} ({card}) {_what_else(flags)}", device=self.name)
+        return Identity(driver, card, bus, flags)
+
+    def failure(self, error: OSError, what: str) -> DriverError:
+        """Return the typed error for a refused request; ``what`` says what the camera did not do."""
+        if error.errno in (errno.ENODEV, errno.ENXIO):
+            return NoCamera(f"{self.path} is gone", device=self.name)
+        if error.errno == errno.EBUSY:
+            return CameraBusy(f"{self.path} is in use by another program", device=self.name)
+        return StreamFailed(f"{self.path} does not {what}: {os.strerror(error.errno or 0)}", device=self.name)
+
+    def _unmap(self) -> None:
+        for mapping in self._maps:
+            with contextlib.suppress(BufferError):  # somebody still looks at a frame: it goes with that
+                mapping.close()
+        self._maps = []
+
+
+def capture_nodes(folder: Path = Path("/sys/class/video4linux")) -> Iterator[Path]:
+    """Yield the paths of all video nodes that exist now, in the kernel's order; not all of them capture."""
+    if folder.is_dir():
+        numbered = [(int(p.name[5:]), p.name) for p in folder.glob("video*") if p.name[5:].isdecimal()]
+        for _, name in sorted(numbered):
+            yield Path("/dev") / name
+
+
+def _open(path: Path, name: str) -> int:
+    """Open a node without waiting; each refusal as one sentence."""
+    try:
+        status = path.stat()
+        if not stat.S_ISCHR(status.st_mode):
+            raise NotACamera(f"{path} is no video device", device=name)
+        return os.open(path, os.O_RDWR | os.O_NONBLOCK | os.O_CLOEXEC)
+    except OSError as error:
+        if error.errno in (errno.ENOENT, errno.ENODEV, errno.ENXIO, errno.ENOTDIR):
+            raise NoCamera(f"there is no {path}; is the camera connected?", device=name) from None
+        if error.errno in (errno.EACCES, errno.EPERM):
+            raise NoPermission(f"no permission to open {path}{_who_may(path)}", device=name) from None
+        if error.errno == errno.EBUSY:
+            raise CameraBusy(f"{path} is in use by another program", device=name) from None
+        raise StreamFailed(f"{path} cannot be opened: {os.strerror(error.errno or 0)}", device=name) from None
+
+
+def _who_may(path: Path) -> str:
+    """Which group may open a node, and how to join it."""
+    try:
+        status = path.stat()
+    except OSError:
+        return ""
+    try:
+        group = grp.getgrgid(status.st_gid).gr_name
+    except KeyError:
+        group = str(status.st_gid)
+    if status.st_mode & 0o060 != 0o060 or status.st_gid == 0:
+        return "; its mode lets root alone do so, a udev rule (docs/cameras.md) gives it to the group video"
+    return f"; the group {group} may: add the user to it (usermod -aG {group} USER) and log in again"
+
+
+def _what_else(flags: int) -> str:
+    """What a node is that gives no pictures."""
+    if flags & abi.CAP_META_CAPTURE:
+        return "is a metadata node; the pictures come from the camera's other node"
+    if flags & abi.CAP_VIDEO_CAPTURE_MPLANE:
+        return "captures in several planes, which this driver does not read"
+    if flags & abi.CAP_VIDEO_OUTPUT:
+        return "is a video output, it gives no pictures"
+    if flags & abi.CAP_VIDEO_CAPTURE:
+        return "cannot stream"
+    return "is no camera: it captures no video"
+
+
+def _picture_format(answer: abi.Format) -> PictureFormat:
+    pix = answer.fmt.pix
+    code = abi.fourcc_text(pix.pixelformat)
+    return PictureFormat(code, (pix.width, pix.height), pix.bytesperline, pix.sizeimage, pix.field)
+
+
+def _rate(parm: abi.StreamParm) -> float | None:
+    """The frame rate in an answer, if it holds one."""
+    period = parm.parm.capture.timeperframe
+    if not parm.parm.capture.capability & abi.CAPTURE_TIMEPERFRAME or not period.numerator:
+        return None
+    return float(period.denominator / period.numerator)

@@ -1,0 +1,185 @@
+"""What a format's bytes mean: how many there must be, the grey picture, and the colour picture.
+
+Formats of more than 8 bits keep their upper 8. Bayer formats are demosaiced by OpenCV; raw 16-bit words are
+little-endian with the value in the low bits, as the kernel defines them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import Literal
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from drivers.errors import BadFrame
+from drivers.interfaces import Image
+from drivers.v4l2.node import PictureFormat
+
+Kind = Literal["grey", "bayer", "yuyv", "nv12", "jpeg"]
+
+
+@dataclass(frozen=True)
+class Layout:
+    """How a format is laid out: ``bits`` a sample, and for Bayer the order of the first two by two."""
+
+    kind: Kind
+    bits: int = 8
+    order: str = ""
+
+
+FORMATS = MappingProxyType(
+    {
+        "GREY": Layout("grey"),
+        "Y10": Layout("grey", 10),
+        "Y12": Layout("grey", 12),
+        "Y16": Layout("grey", 16),
+        "YUYV": Layout("yuyv"),
+        "NV12": Layout("nv12"),
+        "MJPG": Layout("jpeg"),
+        "JPEG": Layout("jpeg"),
+        "BA81": Layout("bayer", 8, "BGGR"),
+        "GBRG": Layout("bayer", 8, "GBRG"),
+        "GRBG": Layout("bayer", 8, "GRBG"),
+        "RGGB": Layout("bayer", 8, "RGGB"),
+        "BG10": Layout("bayer", 10, "BGGR"),
+        "GB10": Layout("bayer", 10, "GBRG"),
+        "BA10": Layout("bayer", 10, "GRBG"),
+        "RG10": Layout("bayer", 10, "RGGB"),
+        "BG12": Layout("bayer", 12, "BGGR"),
+        "GB12": Layout("bayer", 12, "GBRG"),
+        "BA12": Layout("bayer", 12, "GRBG"),
+        "RG12": Layout("bayer", 12, "RGGB"),
+        "BYR2": Layout("bayer", 16, "BGGR"),
+        "GB16": Layout("bayer", 16, "GBRG"),
+        "GR16": Layout("bayer", 16, "GRBG"),
+        "RG16": Layout("bayer", 16, "RGGB"),
+    }
+)
+
+_JPEG_BEGIN, _JPEG_END = b"\xff\xd8", b"\xff\xd9"
+_JPEG_PADDING_BYTES = 4096  # some cameras fill up to their packet size with zeros
+
+
+def least_bytes(format: PictureFormat) -> int:
+    """Return the bytes of the picture itself, without padding at its end; 0 for compressed formats."""
+    width, height = format.size_px
+    layout = FORMATS[format.code]
+    if layout.kind == "jpeg":
+        return 0
+    if layout.kind == "nv12":
+        return _stride(format, width) * (height + (height + 1) // 2)
+    return _stride(format, _row_bytes(layout, width)) * height
+
+
+def wrong_length(format: PictureFormat, data: memoryview) -> str:
+    """Return what is wrong with the length, or a JPEG's ends, of a picture's bytes; empty if nothing."""
+    least = least_bytes(format)
+    if least:
+        if len(data) in (least, format.length_bytes):
+            return ""
+        return f"{len(data)} bytes where {least} are expected"
+    if bytes(data[:2]) != _JPEG_BEGIN:
+        return "no JPEG: it does not begin like one"
+    tail = bytes(data[-_JPEG_PADDING_BYTES:]).rstrip(b"\0")
+    return "" if tail.endswith(_JPEG_END) else f"a JPEG cut off after {len(data)} bytes"
+
+
+def grey(format: PictureFormat, raw: NDArray[np.uint8]) -> Image:
+    """Return the grey picture, uint8 (h, w), in memory of its own. Raises BadFrame for a broken JPEG.
+
+    Parameters
+    ----------
+    format
+        As the driver set it; its code must be among `FORMATS`.
+    raw
+        The bytes of one picture, uint8 (n,).
+    """
+    layout = FORMATS[format.code]
+    if layout.kind == "jpeg":
+        return _decoded(format, raw, cv2.IMREAD_GRAYSCALE)
+    if layout.kind == "yuyv":
+        width, height = format.size_px
+        stride = _stride(format, 2 * width)
+        words = raw[: stride * height].reshape(height, stride)[:, : 2 * width].view("<u2")
+        return words.astype(np.uint8)  # keeps the low byte, the luma; seven times as fast as extractChannel
+    if layout.kind == "nv12":
+        width, height = format.size_px
+        stride = _stride(format, width)
+        return np.ascontiguousarray(raw[: stride * height].reshape(height, stride)[:, :width])
+    samples = _samples(format, layout, raw)
+    if layout.kind == "bayer":
+        return _image(cv2.cvtColor(samples, getattr(cv2, f"COLOR_Bayer{layout.order}2GRAY")))
+    return samples if samples.base is None else samples.copy()
+
+
+def colour(format: PictureFormat, raw: NDArray[np.uint8]) -> Image:
+    """Return the colour picture, uint8 (h, w, 3) BGR; of a grey format the grey three times. Like `grey`."""
+    layout = FORMATS[format.code]
+    if layout.kind == "jpeg":
+        return _decoded(format, raw, cv2.IMREAD_COLOR)
+    if layout.kind == "yuyv":
+        return _image(cv2.cvtColor(_rows(format, raw, 2), cv2.COLOR_YUV2BGR_YUY2))
+    if layout.kind == "nv12":
+        width = format.size_px[0]
+        stride = _stride(format, width)
+        planes = raw[: least_bytes(format)].reshape(-1, stride)[:, :width]
+        return _image(cv2.cvtColor(np.ascontiguousarray(planes), cv2.COLOR_YUV2BGR_NV12))
+    samples = _samples(format, layout, raw)
+    if layout.kind == "bayer":
+        return _image(cv2.cvtColor(samples, getattr(cv2, f"COLOR_Bayer{layout.order}2BGR")))
+    return _image(cv2.cvtColor(samples, cv2.COLOR_GRAY2BGR))
+
+
+def _rows(format: PictureFormat, raw: NDArray[np.uint8], channels: int) -> NDArray[np.uint8]:
+    """The picture as (h, w, channels), its rows where they are."""
+    width, height = format.size_px
+    stride = _stride(format, width * channels)
+    rows = raw[: stride * height].reshape(height, stride)[:, : width * channels]
+    return rows.reshape(height, width, channels) if stride == width * channels else _packed(rows, channels)
+
+
+def _packed(rows: NDArray[np.uint8], channels: int) -> NDArray[np.uint8]:
+    """Rows without the padding at their ends."""
+    return np.ascontiguousarray(rows).reshape(rows.shape[0], -1, channels)
+
+
+def _samples(format: PictureFormat, layout: Layout, raw: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """One sample a pixel, its upper 8 bits, (h, w)."""
+    width, height = format.size_px
+    stride = _stride(format, _row_bytes(layout, width))
+    rows = raw[: stride * height].reshape(height, stride)[:, : _row_bytes(layout, width)]
+    if layout.bits == 8:
+        return rows
+    if layout.bits == 16:
+        return rows[:, 1::2].copy()
+    words = rows.view("<u2") >> (layout.bits - 8)
+    return _image(np.minimum(words, 255, out=words).astype(np.uint8))
+
+
+def _decoded(format: PictureFormat, raw: NDArray[np.uint8], flags: int) -> Image:
+    """A JPEG's picture, of the size that the driver promised."""
+    image = cv2.imdecode(raw, flags | cv2.IMREAD_IGNORE_ORIENTATION)
+    if image is None:
+        raise BadFrame(f"{len(raw)} bytes that are no JPEG")
+    if image.shape[1::-1] != format.size_px:
+        raise BadFrame(f"a JPEG of {image.shape[1]}x{image.shape[0]} px where {format.size_px} px were set")
+    return _image(image)
+
+
+def _row_bytes(layout: Layout, width: int) -> int:
+    """Bytes of a row without padding."""
+    if layout.kind == "yuyv":
+        return 2 * width
+    return width if layout.bits == 8 else 2 * width
+
+
+def _stride(format: PictureFormat, row_bytes: int) -> int:
+    """Bytes from row to row; a driver that leaves it 0 means no padding."""
+    return format.stride_bytes or row_bytes
+
+
+def _image(array: object) -> Image:
+    return np.asarray(array, dtype=np.uint8)

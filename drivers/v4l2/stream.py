@@ -1,0 +1,184 @@
+"""One opened and streaming camera: what was asked, what the camera answered, and what it lacks."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+
+from drivers.v4l2 import abi, find
+from drivers.v4l2.controls import Control, Problem, first_of, get_value, list_controls, set_by_name, set_value
+from drivers.v4l2.errors import UnsupportedFormat
+from drivers.v4l2.node import Node, PictureFormat
+from drivers.v4l2.options import CameraOptions
+from drivers.v4l2.pixels import FORMATS
+from drivers.v4l2.stamps import StampRule
+
+log = logging.getLogger(__name__)
+
+EXPOSURE_UNIT_S = 1e-4  # of V4L2_CID_EXPOSURE_ABSOLUTE
+RATE_TOLERANCE = 0.02  # 30 Hz is often 30000/1001
+UNKNOWN_RATE_HZ = 5.0  # a period longer than any that a camera without a rate is likely to have
+
+
+class Stream:
+    """A camera with its format, rate and controls set, streaming. Closing it gives everything back.
+
+    Attributes
+    ----------
+    node, format
+        The open node, and the format that frames have.
+    rate_hz, period_s
+        The rate that the camera answered, or the asked one where it does not tell; from frame to frame.
+    rule
+        How the time stamps are to be read, at the exposure time of now.
+    exposure_s
+        The exposure time by the camera's own word, None if unknown.
+    asked_exposure_s
+        The exposure time that was set last, before the camera rounded it.
+    problems
+        Controls that are missing or not as asked.
+
+    Raises
+    ------
+    UnsupportedFormat
+        If format, size or rate are not to be had; the message says what is.
+    DriverError
+        If the camera cannot be opened or does not start.
+    """
+
+    def __init__(self, options: CameraOptions, name: str, exposure_s: float | None = None) -> None:
+        self._options = options
+        self._name = name
+        self.exposure_s: float | None = None
+        self.asked_exposure_s: float | None = None
+        self.problems: list[Problem] = []
+        self._exposure: Control | None = None
+        self.node = find.open_node(options.address, name)
+        try:
+            self.format = set_format(self.node, options.format, options.size_px, name)
+            self.rate_hz = _set_rate(self.node, options, name)
+            self.period_s = 1 / self.rate_hz
+            self.rule = self._rule()
+            self._set_controls(options, options.exposure_s if exposure_s is None else exposure_s)
+            self.node.start(options.buffers)
+        except BaseException:
+            self.node.close()
+            raise
+
+    def set_exposure(self, exposure_s: float) -> None:
+        """Set the exposure time; `exposure_s` is then what the camera made of it. Raises DriverError."""
+        self.asked_exposure_s = exposure_s
+        if self._exposure is None:
+            return
+        steps = max(1, round(exposure_s / EXPOSURE_UNIT_S))
+        bounded = min(max(steps, self._exposure.minimum), self._exposure.maximum)
+        if problem := set_value(self.node, self._exposure, bounded):
+            log.warning("%s: %s", self._name, problem.message)
+        became = get_value(self.node, self._exposure)
+        self.exposure_s = None if became is None else became * EXPOSURE_UNIT_S
+        self.rule = self._rule()
+
+    def _rule(self) -> StampRule:
+        return StampRule(self.period_s, self.exposure_s, self._options.margin_s, self.node.identity.driver)
+
+    def close(self) -> None:
+        """Stop and let go; never raises for a camera that is gone."""
+        self.node.close()
+
+    def _set_controls(self, options: CameraOptions, exposure_s: float | None) -> None:
+        """Set the named controls, then those that go by meaning; keep a problem for each that is missing."""
+        self.problems += set_by_name(self.node, options.controls)
+        controls = list_controls(self.node)
+        if exposure_s is not None:
+            self._turn_off(controls, abi.CID_EXPOSURE_AUTO, abi.EXPOSURE_MANUAL)
+            self._turn_off(controls, abi.CID_EXPOSURE_AUTO_PRIORITY, 0)
+            self._exposure = first_of(controls, (abi.CID_EXPOSURE_ABSOLUTE,))
+            if self._exposure is None:
+                self._missing("exposure", "exposure_s")
+            self.set_exposure(exposure_s)
+        for word, auto, which, value in (
+            ("gain", abi.CID_AUTOGAIN, abi.CID_GAIN, options.gain),
+            (
+                "white balance",
+                abi.CID_AUTO_WHITE_BALANCE,
+                abi.CID_WHITE_BALANCE_TEMPERATURE,
+                options.white_balance_k,
+            ),
+            ("focus", abi.CID_FOCUS_AUTO, abi.CID_FOCUS_ABSOLUTE, options.focus),
+        ):
+            if value is None:
+                continue
+            self._turn_off(controls, auto, 0)
+            if (control := first_of(controls, (which,))) is None:
+                self._missing(word, word)
+            elif problem := set_value(self.node, control, value):
+                self.problems.append(problem)
+        for problem in self.problems:
+            log.warning("%s: %s", self._name, problem.message)
+
+    def _turn_off(self, controls: Sequence[Control], which: int, value: int) -> None:
+        """Turn an automatic off, where the camera has one."""
+        if (control := first_of(controls, (which,))) and (problem := set_value(self.node, control, value)):
+            self.problems.append(problem)
+
+    def _missing(self, word: str, option: str) -> None:
+        self.problems.append(Problem(option, f"the camera has no control for {word}; it stays as it is"))
+
+
+def set_format(node: Node, code: str, size_px: tuple[int, int], name: str) -> PictureFormat:
+    """Set format and size and check the answer.
+
+    Raises
+    ------
+    UnsupportedFormat
+        If the camera answers with another one; the message says what it offers.
+    """
+    answer = node.set_format(code, size_px)
+    if answer.code != code:
+        offered = node.formats()
+        read = ", ".join(f for f in offered if f in FORMATS) or "none that this driver reads"
+        others = (
+            f" and {rest} that this driver does not read"
+            if (rest := len(set(offered) - set(FORMATS)))
+            else ""
+        )
+        raise UnsupportedFormat(f"the camera has no format {code}; it has {read}{others}", device=name)
+    if answer.size_px != size_px:
+        raise UnsupportedFormat(
+            f"the camera has no {size_px[0]}x{size_px[1]} in {code}; it has {sizes_text(node, code)}",
+            device=name,
+        )
+    if answer.field not in (abi.FIELD_ANY, abi.FIELD_NONE):
+        raise UnsupportedFormat(
+            f"the camera's pictures are interlaced (field {answer.field}); whole pictures are needed",
+            device=name,
+        )
+    return answer
+
+
+def sizes_text(node: Node, code: str) -> str:
+    """Return the sizes of a format in words."""
+    sizes, steps = node.sizes(code)
+    if steps is not None:
+        least_w, most_w, step_w, least_h, most_h, step_h = steps
+        return f"{least_w}x{least_h} to {most_w}x{most_h} in steps of {step_w} and {step_h}"
+    return ", ".join(f"{w}x{h}" for w, h in sizes) or "only what is set"
+
+
+def _set_rate(node: Node, options: CameraOptions, name: str) -> float:
+    """Set the rate, and check the answer if one was asked for."""
+    if options.rate_hz is None:
+        return node.current_rate() or UNKNOWN_RATE_HZ
+    answer = node.set_rate(options.rate_hz)
+    if answer is None:  # no say in it: an industrial camera with a fixed rate, or a trigger
+        log.warning("%s: the camera does not take a frame rate", name)
+        return options.rate_hz
+    if abs(answer - options.rate_hz) > RATE_TOLERANCE * options.rate_hz:
+        offered = ", ".join(f"{rate:g}" for rate in node.rates_hz(options.format, options.size_px))
+        width, height = options.size_px
+        raise UnsupportedFormat(
+            f"the camera has no rate of {options.rate_hz:g} Hz at {width}x{height} in {options.format}; "
+            f"it has {offered or f'{answer:g}'} Hz",
+            device=name,
+        )
+    return answer

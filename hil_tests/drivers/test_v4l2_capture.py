@@ -1,0 +1,390 @@
+"""The capture thread and the camera over it, with a made-up stream in place of the kernel's.
+
+What only a real driver shows (mapping, faults, unplugging) is tested in hil_tests/vm.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Iterator
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from drivers.errors import BadOptions, DriverError, NoFreshFrame
+from drivers.interfaces import Camera
+from drivers.v4l2 import abi, capture
+from drivers.v4l2.camera import V4l2Camera, open_camera
+from drivers.v4l2.capture import Capture
+from drivers.v4l2.errors import NoCamera, StreamFailed
+from drivers.v4l2.node import Dequeued, Identity, PictureFormat
+from drivers.v4l2.options import parse_options
+from drivers.v4l2.stamps import StampRule
+from drivers.v4l2.uevents import Uevent, parse
+
+SIZE_PX = (16, 8)
+PATIENCE_S = 20.0  # far longer than anything here takes on a loaded machine
+START = abi.BUF_FLAG_TIMESTAMP_MONOTONIC | abi.BUF_FLAG_TSTAMP_SRC_SOE
+
+
+class TurnedClock:
+    """A clock that tests set."""
+
+    def __init__(self) -> None:
+        self.time_s = 100.0
+
+    def now_s(self) -> float:
+        return self.time_s
+
+    def sleep(self, duration_s: float) -> None:
+        self.time_s += duration_s
+
+
+class FakeNode:
+    """A node whose frames a test puts in."""
+
+    identity = Identity("fake", "Fake camera", "nowhere", 0)
+    path = Path("/dev/video7")
+
+    def __init__(self) -> None:
+        self.ready = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_SEMAPHORE)
+        self.waiting: deque[tuple[Dequeued, bytes | bytearray] | DriverError] = deque()
+        self.queued: list[int] = []
+        self.lock = threading.Lock()
+        self.taken: tuple[Dequeued, bytes | bytearray] | None = None
+        self.closed = False
+
+    def fileno(self) -> int:
+        return self.ready
+
+    def put(self, what: tuple[Dequeued, bytes | bytearray] | DriverError) -> None:
+        with self.lock:
+            self.waiting.append(what)
+            os.eventfd_write(self.ready, 1)
+
+    def dequeue(self) -> Dequeued | None:
+        with self.lock:
+            with contextlib.suppress(BlockingIOError):
+                os.eventfd_read(self.ready)
+            if not self.waiting:
+                return None
+            what = self.waiting.popleft()
+        if isinstance(what, DriverError):
+            raise what
+        self.taken = what
+        return what[0]
+
+    def bytes_of(self, buffer: Dequeued) -> memoryview:
+        assert self.taken is not None
+        return memoryview(self.taken[1])
+
+    def queue(self, index: int) -> None:
+        self.queued.append(index)
+
+    def check_there(self) -> None:
+        pass
+
+
+class FakeStream:
+    """A stream over such a node."""
+
+    def __init__(self) -> None:
+        self.node = FakeNode()
+        self.format = PictureFormat("GREY", SIZE_PX, SIZE_PX[0], SIZE_PX[0] * SIZE_PX[1])
+        self.rate_hz = 25.0
+        self.period_s = 0.04
+        self.exposure_s: float | None = 0.01
+        self.problems: list[object] = []
+        self.rule = StampRule(0.04, 0.01, 0.0)
+        self.closed = False
+
+    def close(self) -> None:
+        self.closed = True
+
+    def frame(
+        self, sequence: int, stamp_s: float, level: int = 50, flags: int = START, length: int | None = None
+    ) -> None:
+        data = bytes([level]) * (SIZE_PX[0] * SIZE_PX[1] if length is None else length)
+        self.node.put((Dequeued(sequence % 4, len(data), flags, sequence, stamp_s), data))
+
+
+class Bench:
+    """What opens: the streams in order, or the error that opening raises."""
+
+    def __init__(self) -> None:
+        self.clock = TurnedClock()
+        self.streams: list[FakeStream] = []
+        self.refusals: deque[DriverError] = deque()
+
+    def open(self, *ignored: object) -> FakeStream:
+        if self.refusals:
+            raise self.refusals.popleft()
+        self.streams.append(FakeStream())
+        return self.streams[-1]
+
+
+@pytest.fixture
+def bench(monkeypatch: pytest.MonkeyPatch) -> Bench:
+    bench = Bench()
+    monkeypatch.setattr(capture, "Stream", bench.open)
+    return bench
+
+
+@pytest.fixture
+def camera(bench: Bench) -> Iterator[V4l2Camera]:
+    made = V4l2Camera(
+        parse_options({"card": "Fake", "format": "GREY"}, "navcam_left"), "navcam_left", bench.clock
+    )
+    yield made
+    made.close()
+
+
+def held() -> tuple[int, int]:
+    """Open descriptors and running threads of this process."""
+    return len(list(Path("/proc/self/fd").iterdir())), threading.active_count()
+
+
+def until(done: Callable[[], object]) -> None:
+    """Wait for the capture thread to get there."""
+    end_s = time.monotonic() + PATIENCE_S
+    while not done():
+        assert time.monotonic() < end_s, "it did not come to that"
+        time.sleep(0.001)
+
+
+def test_it_is_a_camera(camera: V4l2Camera) -> None:
+    assert isinstance(camera, Camera)
+
+
+def test_a_frame_carries_sequence_window_and_picture(bench: Bench, camera: V4l2Camera) -> None:
+    bench.clock.time_s = 100.03
+    bench.streams[0].frame(5, 100.0, level=77)
+    frame = camera.next_frame(99.9, PATIENCE_S)
+    assert frame.sequence == 5 and frame.image.shape == SIZE_PX[::-1] and (frame.image == 77).all()
+    assert frame.mid_exposure_s - frame.exposure_s / 2 == pytest.approx(100.0)
+    assert frame.mid_exposure_s + frame.exposure_s / 2 == pytest.approx(100.03)
+    assert frame.mid_uncertainty_s == pytest.approx(0.01) and frame.set_exposure_s == 0.01
+    assert not frame.image.flags.writeable
+    assert np.array_equal(frame.colour(), np.full((8, 16, 3), 77))
+
+
+def test_an_old_frame_is_never_given(bench: Bench, camera: V4l2Camera) -> None:
+    bench.clock.time_s = 101.0
+    bench.streams[0].frame(0, 100.0)
+    until(lambda: camera.counters.good == 1)
+    with pytest.raises(
+        NoFreshFrame, match=r"no frame exposed after 100.000 s .* is frame 0, exposed 0.000 s before"
+    ):
+        camera.next_frame(100.0, 0.01)  # began at that very moment, not after it
+    bench.streams[0].frame(1, 100.04)
+    assert camera.next_frame(100.0, PATIENCE_S).sequence == 1
+
+
+def test_the_newest_frame_is_given_not_the_first_that_fits(bench: Bench, camera: V4l2Camera) -> None:
+    bench.clock.time_s = 101.0
+    for n in range(10):
+        bench.streams[0].frame(n, 100.0 + 0.04 * n)
+    until(lambda: camera.counters.good == 10)
+    assert camera.next_frame(99.0, 0.0).sequence == 9
+
+
+def test_a_waiting_call_gets_the_frame_that_comes(bench: Bench, camera: V4l2Camera) -> None:
+    bench.clock.time_s = 100.5
+    threading.Timer(0.05, lambda: bench.streams[0].frame(3, 100.45)).start()
+    assert camera.next_frame(100.4, PATIENCE_S).sequence == 3
+
+
+def test_nothing_at_all_is_told(camera: V4l2Camera) -> None:
+    with pytest.raises(NoFreshFrame, match=r"came within 0\.01 s; none came at all"):
+        camera.next_frame(0.0, 0.01)
+
+
+@pytest.mark.parametrize(
+    ("damage", "words"),
+    [
+        ({"flags": START | abi.BUF_FLAG_ERROR}, "its driver marks it as damaged"),
+        ({"length": 100}, "100 bytes where 128 are expected"),
+        ({"length": 0}, "0 bytes where 128 are expected"),
+        ({"stamp_s": 100.2}, "its stamp is 100.0 ms ahead of the clock"),
+        ({"stamp_s": 99.0}, "its stamp is 1000.0 ms before the last frame's"),
+        ({"flags": 0}, "its stamp is not of the monotonic clock"),
+    ],
+)
+def test_a_damaged_frame_is_refused_counted_and_given_back(
+    bench: Bench, camera: V4l2Camera, damage: dict[str, float], words: str
+) -> None:
+    bench.clock.time_s = 100.1
+    bench.streams[0].frame(0, 100.0)
+    until(lambda: camera.counters.good == 1)
+    bench.streams[0].frame(1, **{"stamp_s": 100.04, **damage})  # type: ignore[arg-type]
+    until(lambda: camera.counters.damaged == 1)
+    assert camera.counters.last_damage == words
+    until(lambda: bench.streams[0].node.queued == [1])  # and frame 0 is still held
+    assert camera.next_frame(0.0, 0.0).sequence == 0
+
+
+def test_a_call_that_saw_only_damage_says_so(bench: Bench, camera: V4l2Camera) -> None:
+    bench.clock.time_s = 100.1
+
+    def damaged() -> None:
+        bench.streams[0].frame(1, 100.0, length=3)
+
+    threading.Timer(0.02, damaged).start()
+    with pytest.raises(NoFreshFrame, match=r"1 came damaged \(3 bytes where 128 are expected\)"):
+        camera.next_frame(0.0, 1.0)
+
+
+def test_dropped_and_late_frames_are_counted(bench: Bench, camera: V4l2Camera) -> None:
+    bench.clock.time_s = 100.01
+    bench.streams[0].frame(0, 100.0)
+    until(lambda: camera.counters.good == 1)
+    bench.clock.time_s = 100.2
+    bench.streams[0].frame(4, 100.1)
+    until(lambda: camera.counters.good == 2)
+    counters = camera.counters
+    assert (counters.dropped, counters.late) == (3, 1)
+
+
+def test_a_lost_camera_is_told_at_once_and_opened_again(bench: Bench, camera: V4l2Camera) -> None:
+    bench.clock.time_s = 100.1
+    bench.streams[0].frame(41, 100.0)
+    assert camera.next_frame(0.0, PATIENCE_S).sequence == 41
+    bench.refusals += [NoCamera("/dev/v4l/by-id/x is not there")] * 2
+    bench.streams[0].node.put(NoCamera("/dev/video7 is gone", device="navcam_left"))
+    until(lambda: camera.capture.lost)
+    with pytest.raises(NoCamera):
+        camera.next_frame(0.0, PATIENCE_S)
+    until(lambda: len(bench.streams) == 2)
+    assert bench.streams[0].closed
+    until(lambda: not camera.capture.lost)
+    bench.clock.time_s = 103.0
+    bench.streams[1].frame(0, 102.99)
+    frame = camera.next_frame(102.0, PATIENCE_S)
+    assert frame.sequence > 41 and frame.driver_sequence == 0 and frame.stream == 2
+    assert camera.counters.reopened == 1
+
+
+def test_a_failed_stream_is_opened_again(bench: Bench, camera: V4l2Camera) -> None:
+    bench.streams[0].node.put(StreamFailed("/dev/video7 does not give a frame: Input/output error"))
+    until(lambda: len(bench.streams) == 2)
+
+
+def test_the_count_grows_when_the_drivers_count_begins_again(bench: Bench, camera: V4l2Camera) -> None:
+    bench.clock.time_s = 101.0
+    sequences = []
+    for index, count in enumerate((2**32 - 1, 0, 1, 0)):
+        bench.streams[0].frame(count, 100.0 + 0.04 * index)
+        until(lambda wanted=index + 1: camera.counters.good == wanted)
+        sequences.append(camera.next_frame(0.0, 0.0).sequence)
+    assert all(b > a for a, b in pairwise(sequences))
+
+
+def test_nothing_is_left_after_closing(bench: Bench) -> None:
+    before = held()
+    options = parse_options({"card": "Fake", "format": "GREY"}, "c")
+    for _ in range(20):
+        V4l2Camera(options, "c", bench.clock).close()
+    for stream in bench.streams:
+        assert stream.closed
+        os.close(stream.node.ready)
+    assert held() == before
+
+
+def test_a_camera_that_cannot_be_opened_leaves_nothing(bench: Bench) -> None:
+    before = held()
+    options = parse_options({"card": "Fake"}, "c")
+    for _ in range(5):
+        bench.refusals.append(NoCamera("gone"))
+        with pytest.raises(NoCamera):
+            Capture(options, "c", bench.clock)
+    assert held() == before
+
+
+def test_only_the_newest_frames_buffer_is_held(bench: Bench, camera: V4l2Camera) -> None:
+    bench.clock.time_s = 200.0
+    for n in range(50):
+        bench.streams[0].frame(n, 100.0 + 0.04 * n, level=n)
+    until(lambda: len(bench.streams[0].node.queued) == 49)
+    assert bench.streams[0].node.queued == [n % 4 for n in range(49)]
+    frame = camera.next_frame(0.0, 0.0)
+    assert frame.sequence == 49 and (frame.image == 49).all()
+
+
+def test_a_frame_that_was_given_does_not_change_when_its_buffer_is_filled_again(
+    bench: Bench, camera: V4l2Camera
+) -> None:
+    bench.clock.time_s = 200.0
+    memory = bytearray([1]) * 128
+    for n in range(2):
+        memory[:] = bytes([n + 1]) * 128
+        bench.streams[0].node.put((Dequeued(0, 128, START, n, 100.0 + 0.04 * n), memory))
+        frame = camera.next_frame(100.0 + 0.04 * n - 0.01, PATIENCE_S)
+        memory[:] = bytes([99]) * 128
+        assert (frame.image == n + 1).all() and (frame.raw.raw == n + 1).all()
+        assert (frame.colour() == n + 1).all()
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({}, "'device', 'card' or 'bus' is expected"),
+        ({"device": "/dev/video0"}, "/dev/video0 is a number that changes when cameras are plugged in"),
+        ({"device": "/dev/v4l/by-id/a", "card": "b"}, "'device' stands beside 'card' or 'bus'"),
+        ({"card": "a", "frmat": "YUYV"}, "no option 'frmat'; did you mean 'format'"),
+        ({"card": "a", "format": "H264"}, "'format' is 'H264', which this driver does not read"),
+        ({"card": "a", "size_px": [640]}, r"'size_px' is \[640\] where \[width, height\] in pixels"),
+        ({"card": "a", "size_px": [640, -1]}, r"'size_px' is \[640, -1\]"),
+        ({"card": "a", "size_px": [640.0, True]}, "'size_px' is"),
+        ({"card": "a", "rate_hz": "fast"}, "'rate_hz' is 'fast' where a number"),
+        ({"card": "a", "rate_hz": float("nan")}, "'rate_hz' is nan"),
+        ({"card": "a", "rate_hz": 0}, "'rate_hz' is 0 where a number"),
+        ({"card": 7}, "'card' is 7 where a text is expected"),
+        ({"card": "a", "colour": 1}, "'colour' is 1 where true or false"),
+        ({"card": "a", "controls": {"gain": 1.5}}, "'controls' is"),
+        ({"card": "a", "controls": [1]}, "'controls' is"),
+        ({"card": "a", "gain": True}, "'gain' is True where a whole number"),
+        ({"card": "a", "exposure_s": -1}, "'exposure_s' is -1"),
+        ({"card": "a", "margin_s": 5}, "'margin_s' is 5"),
+        ({"card": "a", "buffers": 1}, "'buffers' is 1 where a whole number 3 to 32"),
+        ({"card": "a", "auto_exposure": True}, "'auto_exposure' needs 'exposure_s'"),
+        ({"card": "a", "auto_exposure": 3, "exposure_s": 0.01}, "'auto_exposure' is 3"),
+        (
+            {"card": "a", "auto_exposure": {"aim": 3}, "exposure_s": 0.01},
+            "'auto_exposure' has no setting 'aim'",
+        ),
+        (
+            {"card": "a", "auto_exposure": {"target": 900}, "exposure_s": 0.01},
+            "'auto_exposure.target' is 900 where a number 10 to 245",
+        ),
+        (
+            {"card": "a", "auto_exposure": {"shortest_s": 0.1}, "exposure_s": 0.01},
+            "'auto_exposure.shortest_s' is 0.1 s, which is not below",
+        ),
+    ],
+)
+def test_bad_options_are_told_in_one_line(options: dict[str, object], message: str) -> None:
+    with pytest.raises(BadOptions, match=message) as caught:
+        open_camera(options, name="navcam_left")
+    assert str(caught.value).startswith("navcam_left: ") and "\n" not in str(caught.value)
+
+
+def test_a_rate_of_none_is_left_as_it_is() -> None:
+    assert parse_options({"card": "a", "rate_hz": None}, "c").rate_hz is None
+    assert parse_options({"card": "a"}, "c").rate_hz == 30.0
+
+
+def test_uevents_of_video_nodes_are_read_and_others_ignored() -> None:
+    told = (
+        b"remove@/devices/platform/vivid.0/video4linux/video1\0ACTION=remove\0"
+        b"DEVPATH=/devices/platform/vivid.0/video4linux/video1\0SUBSYSTEM=video4linux\0MAJOR=81\0MINOR=1\0"
+        b"DEVNAME=video1\0SEQNUM=512\0"
+    )
+    assert parse(told) == Uevent("remove", "video1")
+    assert parse(told.replace(b"=video4linux", b"=usb")) is None
+    assert parse(b"") is None and parse(b"\xff\0\0garbage") is None

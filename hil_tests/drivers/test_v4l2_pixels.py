@@ -1,0 +1,141 @@
+"""Formats to pictures: against numpy arithmetic, the colour standard's formula, and another JPEG decoder."""
+
+from __future__ import annotations
+
+import io
+
+import cv2
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from PIL import Image as PillowImage
+
+from drivers.errors import BadFrame
+from drivers.v4l2 import pixels
+from drivers.v4l2.node import PictureFormat
+
+WIDTH, HEIGHT = 32, 24
+ROUNDING_DN = 2  # two 8-bit roundings and a fixed-point matrix
+JPEG_DN = 3  # decoders differ in their inverse transforms
+NOISE = np.random.default_rng(5).integers(0, 256, (HEIGHT, WIDTH), dtype=np.uint8)
+
+
+def picture_format(code: str, stride_bytes: int = 0, length_bytes: int = 0) -> PictureFormat:
+    return PictureFormat(code, (WIDTH, HEIGHT), stride_bytes, length_bytes)
+
+
+def bt601(y: int, u: int, v: int) -> NDArray[np.float64]:
+    """Blue, green, red of limited-range BT.601, as ITU-R BT.601 writes it."""
+    luma = 255 / 219 * (y - 16)
+    blue = luma + 255 / 224 * 1.772 * (u - 128)
+    red = luma + 255 / 224 * 1.402 * (v - 128)
+    green = luma - 255 / 224 * (1.772 * 0.114 / 0.587 * (u - 128) + 1.402 * 0.299 / 0.587 * (v - 128))
+    return np.clip([blue, green, red], 0, 255)
+
+
+def test_grey_is_taken_as_it_is() -> None:
+    assert np.array_equal(pixels.grey(picture_format("GREY"), NOISE.ravel()), NOISE)
+
+
+def test_padding_at_the_end_of_rows_is_left_out() -> None:
+    padded = np.pad(NOISE, ((0, 0), (0, 16)), constant_values=77)
+    assert np.array_equal(pixels.grey(picture_format("GREY", WIDTH + 16), padded.ravel()), NOISE)
+    yuyv = np.stack([NOISE, np.full_like(NOISE, 128)], axis=-1).reshape(HEIGHT, -1)
+    padded = np.pad(yuyv, ((0, 0), (0, 8)), constant_values=77)
+    assert np.array_equal(pixels.grey(picture_format("YUYV", 2 * WIDTH + 8), padded.ravel()), NOISE)
+
+
+@pytest.mark.parametrize(("code", "bits"), [("Y10", 10), ("Y12", 12), ("Y16", 16)])
+def test_wide_grey_keeps_its_upper_eight_bits(code: str, bits: int) -> None:
+    words = np.random.default_rng(bits).integers(0, 2**bits, (HEIGHT, WIDTH)).astype("<u2")
+    image = pixels.grey(picture_format(code), words.view(np.uint8).ravel())
+    assert np.array_equal(image, words // 2 ** (bits - 8))
+
+
+def test_grey_of_yuyv_is_its_luma() -> None:
+    raw = np.stack([NOISE, NOISE[::-1]], axis=-1)
+    assert np.array_equal(pixels.grey(picture_format("YUYV"), raw.ravel()), NOISE)
+
+
+@pytest.mark.parametrize(("y", "u", "v"), [(16, 128, 128), (235, 128, 128), (81, 90, 240), (120, 200, 60)])
+@pytest.mark.parametrize("code", ["YUYV", "NV12"])
+def test_colour_follows_the_standard(code: str, y: int, u: int, v: int) -> None:
+    if code == "YUYV":
+        raw = np.tile(np.array([y, u, y, v], np.uint8), WIDTH * HEIGHT // 2)
+    else:
+        chroma = np.tile(np.array([u, v], np.uint8), WIDTH * HEIGHT // 4)
+        raw = np.concatenate([np.full(WIDTH * HEIGHT, y, np.uint8), chroma])
+    image = pixels.colour(picture_format(code), raw)
+    assert image.shape == (HEIGHT, WIDTH, 3)
+    assert np.abs(image.astype(float) - bt601(y, u, v)).max() <= ROUNDING_DN
+    assert (pixels.grey(picture_format(code), raw) == y).all()
+
+
+@pytest.mark.parametrize("code", [c for c, layout in pixels.FORMATS.items() if layout.kind == "bayer"])
+def test_an_evenly_coloured_bayer_picture_has_that_colour(code: str) -> None:
+    colour = {"R": 200, "G": 120, "B": 40}
+    layout = pixels.FORMATS[code]
+    mosaic = np.empty((HEIGHT, WIDTH), np.uint16)
+    for place, letter in enumerate(layout.order):  # of the kernel: the first row, then the second
+        mosaic[place // 2 :: 2, place % 2 :: 2] = colour[letter] << (layout.bits - 8)
+    raw = mosaic.astype(np.uint8) if layout.bits == 8 else mosaic.astype("<u2").view(np.uint8)
+    image = pixels.colour(picture_format(code), raw.ravel())
+    assert (image == [40, 120, 200]).all()
+    grey = pixels.grey(picture_format(code), raw.ravel())
+    assert np.abs(grey.astype(float) - (0.299 * 200 + 0.587 * 120 + 0.114 * 40)).max() <= ROUNDING_DN
+
+
+def smooth_jpeg() -> bytes:
+    x = np.linspace(20, 230, WIDTH)
+    y = np.linspace(0.5, 1.0, HEIGHT)[:, None]
+    picture = np.stack([x * y, 250 - x * y, 0 * x + 128 * y], axis=-1).astype(np.uint8)
+    return bytes(cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, 95])[1])
+
+
+def test_a_jpeg_is_what_another_decoder_makes_of_it() -> None:
+    data = smooth_jpeg()
+    raw = np.frombuffer(data, np.uint8)
+    with PillowImage.open(io.BytesIO(data)) as opened:
+        rgb, luma = np.asarray(opened.convert("RGB")), np.asarray(opened.convert("YCbCr"))[..., 0]
+    assert np.abs(pixels.colour(picture_format("MJPG"), raw)[..., ::-1].astype(int) - rgb).max() <= JPEG_DN
+    assert np.abs(pixels.grey(picture_format("MJPG"), raw).astype(int) - luma).max() <= JPEG_DN
+
+
+def test_a_jpeg_of_another_size_is_refused() -> None:
+    raw = np.frombuffer(smooth_jpeg(), np.uint8)
+    with pytest.raises(BadFrame, match=r"a JPEG of 32x24 px where \(64, 48\) px were set"):
+        pixels.grey(PictureFormat("MJPG", (64, 48), 0, 10000), raw)
+
+
+def test_bytes_that_are_no_jpeg_are_refused() -> None:
+    with pytest.raises(BadFrame, match="no JPEG"):
+        pixels.grey(picture_format("MJPG"), NOISE.ravel())
+
+
+@pytest.mark.parametrize(
+    ("code", "good_bytes"), [("GREY", 768), ("YUYV", 1536), ("Y16", 1536), ("NV12", 1152), ("BA10", 1536)]
+)
+def test_a_picture_that_is_too_short_is_found(code: str, good_bytes: int) -> None:
+    form = picture_format(code, 0, good_bytes + 64)
+    assert pixels.wrong_length(form, memoryview(bytes(good_bytes))) == ""
+    assert (
+        pixels.wrong_length(form, memoryview(bytes(good_bytes + 64))) == ""
+    )  # padded to the buffer's length
+    words = pixels.wrong_length(form, memoryview(bytes(good_bytes - 2)))
+    assert words == f"{good_bytes - 2} bytes where {good_bytes} are expected"
+
+
+def test_a_cut_off_jpeg_is_found() -> None:
+    form, data = picture_format("MJPG", 0, 100000), smooth_jpeg()
+    assert pixels.wrong_length(form, memoryview(data)) == ""
+    assert pixels.wrong_length(form, memoryview(data + bytes(300))) == ""  # filled up by the camera
+    assert "cut off" in pixels.wrong_length(form, memoryview(data[: len(data) // 2]))
+    assert "no JPEG" in pixels.wrong_length(form, memoryview(data[10:]))
+    assert "no JPEG" in pixels.wrong_length(form, memoryview(b""))
+
+
+def test_pictures_own_their_memory() -> None:
+    raw = NOISE.ravel().copy()
+    image = pixels.grey(picture_format("GREY"), raw)
+    raw[:] = 0
+    assert np.array_equal(image, NOISE)

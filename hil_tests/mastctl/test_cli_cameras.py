@@ -1,0 +1,80 @@
+"""camera list, check, grab and focus on a machine without the named camera, and what a PNG carries."""
+
+from __future__ import annotations
+
+import io
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from PIL import Image as PillowImage
+
+from mastctl.cli.main import main
+from mastctl.picture_quality import quality_of, sharpness
+from mastctl.png_text import read_text, with_text
+
+PICTURE = np.random.default_rng(2).integers(0, 256, (48, 64), dtype=np.uint8)
+PNG = bytes(cv2.imencode(".png", PICTURE)[1])
+WORDS = {"time_utc": "2026-01-02T03:04:05.678+00:00", "pan_rad": "0.1", "name": "mât, 日本"}
+
+
+def test_another_reader_finds_the_words_and_the_picture() -> None:
+    with PillowImage.open(io.BytesIO(with_text(PNG, WORDS))) as opened:
+        opened.load()
+        assert opened.text == WORDS  # type: ignore[attr-defined]
+        assert np.array_equal(np.asarray(opened), PICTURE)
+
+
+def test_words_come_back() -> None:
+    assert read_text(with_text(PNG, WORDS)) == WORDS
+    assert read_text(PNG) == {}
+
+
+@pytest.mark.parametrize("broken", [b"", b"GIF89a", PNG[1:]])
+def test_what_is_no_png_is_refused(broken: bytes) -> None:
+    with pytest.raises(ValueError, match="no PNG"):
+        with_text(broken, WORDS)
+
+
+def test_the_quality_of_a_picture_is_plain_arithmetic() -> None:
+    quality = quality_of(PICTURE)
+    assert quality.mean == pytest.approx(PICTURE.mean())
+    assert quality.median == pytest.approx(np.median(PICTURE), abs=1)
+    assert quality.saturated_share == pytest.approx((PICTURE >= 250).mean())
+    assert quality.dark_share == pytest.approx((PICTURE <= 5).mean())
+    counts, _ = np.histogram(PICTURE, bins=16, range=(0, 256))
+    assert quality.histogram == pytest.approx(counts / PICTURE.size)
+    assert sharpness(PICTURE) > 10 * sharpness(np.asarray(cv2.GaussianBlur(PICTURE, (9, 9), 3)))
+
+
+def refused(words: list[str], capsys: pytest.CaptureFixture[str]) -> tuple[int, str]:
+    code = main(words)
+    captured = capsys.readouterr()
+    assert captured.out == "" and captured.err.count("\n") == 1 and captured.err.startswith("mastctl: ")
+    return code, captured.err
+
+
+def test_a_camera_that_is_not_there_is_told(capsys: pytest.CaptureFixture[str]) -> None:
+    code, words = refused(["camera", "check", "/dev/v4l/by-id/none"], capsys)
+    assert code == 1 and "there is no /dev/v4l/by-id/none; is the camera connected?" in words
+    code, words = refused(["camera", "focus", "No such card"], capsys)
+    assert code == 1 and "no camera of this card or bus is connected" in words
+
+
+def test_what_is_no_camera_is_bad_input(capsys: pytest.CaptureFixture[str]) -> None:
+    code, words = refused(["camera", "check", "/dev/null"], capsys)
+    assert code == 2 and "/dev/null is no video device" in words
+
+
+def test_wrong_use_is_told(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    code, words = refused(["camera", "grab", "x", "--out", str(tmp_path / "a.jpg")], capsys)
+    assert code == 2 and "a .png is expected" in words
+    code, words = refused(["camera", "check", "x", "--set", "gain"], capsys)
+    assert code == 2 and "--set gain: CONTROL=VALUE is expected" in words
+
+
+def test_a_list_is_one_document(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["camera", "list", "--json"]) == 0
+    assert set(json.loads(capsys.readouterr().out)) == {"cameras", "refused"}

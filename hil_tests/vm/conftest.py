@@ -1,0 +1,24 @@
+"""The kernel with virtual cameras, for the tests that boot it; those in `inside` run in it only."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+
+from tools.virtual_machine import kernel
+
+collect_ignore = [] if os.environ.get("VM_OUT") else ["inside"]
+
+
+@pytest.fixture(scope="session")
+def vm_kernel(request: pytest.FixtureRequest) -> Path:
+    """The kernel; without it the test skips, or fails under --require-vm."""
+    found = kernel.find()
+    if found is not None and not kernel.why_not():
+        return found
+    reason = kernel.why_not() or "the kernel with virtual cameras is not built: tools/vm setup builds it"
+    if request.config.getoption("--require-vm"):
+        pytest.fail(reason)
+    pytest.skip(reason)

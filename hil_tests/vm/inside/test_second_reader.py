@@ -1,0 +1,59 @@
+"""Our reader beside v4l2-ctl, which shares nothing with it: the same still picture to the last bit."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from drivers.v4l2 import find
+from drivers.v4l2.camera import open_camera
+from hil_tests.vm.inside.conftest import BUS, options
+
+pytestmark = pytest.mark.skipif(
+    shutil.which("v4l2-ctl") is None, reason="v4l2-ctl is not installed: apt-get install v4l-utils"
+)
+
+
+def by_v4l2_ctl(file: Path, code: str, size_px: tuple[int, int]) -> NDArray[np.uint8]:
+    """The bytes of the tenth frame of a stream that v4l2-ctl takes, in the size and format set by it."""
+    node = next(camera.node for camera in find.list_cameras() if camera.bus == BUS[0])
+    size = f"width={size_px[0]},height={size_px[1]}"
+    done = subprocess.run(
+        ["v4l2-ctl", "-d", str(node), f"--set-fmt-video={size},pixelformat={code.ljust(4)}",
+         "--set-parm=25", "--stream-mmap=4", "--stream-skip=9", "--stream-count=1", f"--stream-to={file}"],
+        capture_output=True, text=True, timeout=60,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    return np.fromfile(file, np.uint8)
+
+
+@pytest.mark.parametrize("pattern", ["75% Colorbar", "Gray Ramp"])
+@pytest.mark.parametrize(
+    "code", ["YUYV", "GREY", "Y10", "Y12", "Y16", "NV12", "BA81", "RG10", "GB12", "BYR2"]
+)
+def test_frames_are_the_same_to_the_last_bit(tmp_path: Path, code: str, pattern: str) -> None:
+    size_px = (640, 480)
+    camera = open_camera(
+        options(format=code, size_px=list(size_px), controls={"test_pattern": pattern}), name="left"
+    )
+    ours = camera.next_frame(time.monotonic(), 10.0).raw.raw
+    camera.close()
+    theirs = by_v4l2_ctl(tmp_path / "frame", code, size_px)
+    assert len(np.unique(theirs)) > 1  # a picture, not an empty buffer
+    assert np.array_equal(ours, theirs)
+
+
+def test_moved_pictures_are_told_apart(tmp_path: Path) -> None:
+    """The comparison can fail: of two pictures of a moving scene one at least is not theirs."""
+    camera = open_camera(options(controls={"horizontal_movement": "Move Left"}), name="left")
+    first = camera.next_frame(time.monotonic(), 10.0)
+    second = camera.next_frame(first.mid_exposure_s, 10.0)
+    camera.close()
+    theirs = by_v4l2_ctl(tmp_path / "frame", "YUYV", (640, 480))
+    assert not (np.array_equal(first.raw.raw, theirs) and np.array_equal(second.raw.raw, theirs))

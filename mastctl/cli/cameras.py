@@ -1,0 +1,352 @@
+"""Commands on connected cameras: camera list, check, grab, focus."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from mastctl.cli import output
+from mastctl.cli.output import finite_number, positive_number
+
+if TYPE_CHECKING:
+    from drivers.interfaces import Image
+    from drivers.v4l2.camera import V4l2Camera
+    from mastctl.frames import StampedFrame
+
+FRAME_TIMEOUT_S = 5.0
+
+
+def add_actions(actions: Any) -> None:
+    """Add list, check, grab and focus to the actions of ``camera``."""
+    listing = actions.add_parser("list", help="which cameras are connected, and their stable names")
+    listing.set_defaults(run=camera_list)
+
+    check = actions.add_parser("check", help="what a camera can do, and what it really delivers")
+    _add_camera(check)
+    check.add_argument(
+        "--seconds", type=positive_number, default=5.0, metavar="S", help="how long (default 5)"
+    )
+    check.set_defaults(run=camera_check)
+
+    grab = actions.add_parser(
+        "grab", help="one fresh picture as PNG, with time, joints and mast digest in it"
+    )
+    _add_camera(grab)
+    grab.add_argument("--out", required=True, type=Path, metavar="FILE.png")
+    grab.add_argument("--aim", nargs=2, type=finite_number, metavar=("X", "Y"), help="mark this pixel")
+    grab.set_defaults(run=camera_grab)
+
+    focus = actions.add_parser("focus", help="sharpness again and again, while the lens is turned")
+    _add_camera(focus)
+    focus.add_argument(
+        "--aim", nargs=2, type=finite_number, metavar=("X", "Y"), help="around this pixel only"
+    )
+    focus.add_argument("--seconds", type=positive_number, default=60.0, metavar="S", help="default 60")
+    focus.set_defaults(run=camera_focus)
+
+
+def _add_camera(parser: argparse.ArgumentParser) -> None:
+    """Add the options that choose and set up a camera."""
+    parser.add_argument(
+        "camera", metavar="CAMERA", help="link, node, card name or bus; with --config its name there"
+    )
+    parser.add_argument("--config", metavar="FILE", help="a configuration that has the camera")
+    parser.add_argument("--format", metavar="CODE", help="YUYV, MJPG, GREY ... (default: the first it has)")
+    parser.add_argument("--size", nargs=2, type=int, metavar=("W", "H"), help="default: as it is set")
+    parser.add_argument("--rate", type=positive_number, metavar="HZ", help="default: as it is set")
+    parser.add_argument(
+        "--set", action="append", default=[], metavar="CONTROL=VALUE", help="a control; may be given often"
+    )
+
+
+def camera_list(args: argparse.Namespace) -> int:
+    """Show the connected cameras."""
+    from drivers.v4l2 import find
+    from drivers.v4l2.node import capture_nodes
+
+    found = find.list_cameras()
+    told: list[dict[str, Any]] = [
+        {
+            "node": str(c.node), "driver": c.driver, "card": c.card, "bus": c.bus,
+            "links": [str(link) for link in c.links],
+        }
+        for c in found
+    ]  # fmt: skip
+    refused = list(find.refused_nodes(capture_nodes()))
+    if args.json:
+        output.print_json({"cameras": told, "refused": refused})
+        return 0
+    if not found:
+        sys.stdout.write("no camera is connected\n")
+    else:
+        rows = [(c["card"], c["bus"], c["driver"], c["node"], "\n".join(c["links"]) or "-") for c in told]
+        output.print_table("cameras", ("card", "bus", "driver", "node now", "stable links"), rows)
+    for line in refused:
+        output.tell(line)
+    return 0
+
+
+def camera_check(args: argparse.Namespace) -> int:
+    """Measure what a camera delivers, and show what it can do."""
+    from mastctl.picture_quality import quality_of
+
+    with _opened(args) as camera:
+        measured = _measured(camera, args.seconds)
+        frame = camera.next_frame(time.monotonic(), FRAME_TIMEOUT_S)
+        quality = quality_of(frame.image)
+        problems = [problem.message for problem in camera.capture.problems]
+        document: dict[str, Any] = {
+            "card": camera.capture.identity.card,
+            "bus": camera.capture.identity.bus,
+            "driver": camera.capture.identity.driver,
+            "format": camera.capture.format.code,
+            "size_px": list(camera.capture.format.size_px),
+            "asked_rate_hz": 1 / camera.capture.period_s,
+            **measured,
+            "quality": quality.told(),
+            "problems": problems,
+            **camera.abilities(),
+        }
+    if args.json:
+        output.print_json(document)
+    else:
+        _print_check(document)
+    return 0
+
+
+def camera_grab(args: argparse.Namespace) -> int:
+    """Write one fresh picture with its facts."""
+    from mastctl.api import encoded
+    from mastctl.png_text import with_text
+
+    if args.out.suffix.lower() != ".png":
+        raise output.WrongUse(
+            f"--out {args.out}: a .png is expected, which keeps every grey level and the facts"
+        )
+    if args.config is not None:
+        frame = _configured_frame(args)
+        facts = {
+            "camera": frame.camera,
+            "frame_id": frame.frame_id,
+            "pan_rad": repr(frame.pan_rad),
+            "tilt_rad": repr(frame.tilt_rad),
+            "moving": str(frame.moving).lower(),
+            "mast_digest": frame.mast_digest,
+        }
+        image, mid_s, window_s, sequence = frame.image, frame.mid_exposure_s, frame.exposure_s, frame.sequence
+    else:
+        with _opened(args) as camera:
+            taken = camera.next_frame(time.monotonic(), FRAME_TIMEOUT_S)
+            facts = {"camera": camera.capture.identity.card, "bus": camera.capture.identity.bus}
+        image, mid_s, window_s, sequence = taken.image, taken.mid_exposure_s, taken.exposure_s, taken.sequence
+    facts |= {
+        "sequence": str(sequence),
+        "mid_exposure_s": repr(mid_s),
+        "exposure_s": repr(window_s),
+        "time_utc": _utc(mid_s),
+    }
+    if args.aim is not None:
+        x, y = args.aim
+        if not (-0.5 <= x < image.shape[1] - 0.5 and -0.5 <= y < image.shape[0] - 0.5):
+            size = f"{image.shape[1]}x{image.shape[0]}"
+            raise output.WrongUse(f"--aim {x:g} {y:g} is outside the picture of {size} px")
+        facts |= {"aim_x_px": repr(x), "aim_y_px": repr(y)}
+        image = _with_cross(image, x, y)
+    args.out.write_bytes(with_text(encoded(image, "png"), facts))
+    if args.json:
+        output.print_json({"out": str(args.out), "size_px": [image.shape[1], image.shape[0]], **facts})
+    else:
+        sys.stdout.write(
+            f"{args.out}: {image.shape[1]}x{image.shape[0]} px, frame {sequence}, {facts['time_utc']}\n"
+        )
+    return 0
+
+
+def camera_focus(args: argparse.Namespace) -> int:
+    """Show the sharpness twice a second, and the best so far."""
+    from mastctl.picture_quality import sharpness
+
+    best, seen = 0.0, []
+    with _opened(args) as camera:
+        until_s = time.monotonic() + args.seconds
+        while True:
+            frame = camera.next_frame(time.monotonic(), FRAME_TIMEOUT_S)
+            now = sharpness(frame.image, None if args.aim is None else tuple(args.aim))
+            best = max(best, now)
+            seen.append(now)
+            if not args.json:
+                bar = "#" * round(50 * now / best) if best else ""
+                sys.stdout.write(f"sharpness {now:10.1f}   best {best:10.1f}  {bar}\n")
+                sys.stdout.flush()
+            if time.monotonic() + 0.5 > until_s:
+                break
+            time.sleep(0.5)
+    if args.json:
+        output.print_json({"sharpness": seen, "best": best})
+    return 0
+
+
+@contextmanager
+def _opened(args: argparse.Namespace) -> Iterator[V4l2Camera]:
+    """The camera of the arguments, open; by itself or by its name in a configuration."""
+    from drivers.v4l2.camera import open_camera
+    from drivers.v4l2.choice import options_for
+
+    if args.config is not None:
+        options = _configured_options(args)
+    else:
+        options = options_for(
+            args.camera,
+            args.format,
+            None if args.size is None else tuple(args.size),
+            args.rate,
+            _settings(args.set),
+        )
+    camera = open_camera(options, name=args.camera)
+    try:
+        yield camera
+    finally:
+        camera.close()
+
+
+def _settings(words: list[str]) -> dict[str, int | str]:
+    """``CONTROL=VALUE`` words."""
+    settings: dict[str, int | str] = {}
+    for word in words:
+        name, equals, value = word.partition("=")
+        if not name or not equals or not value:
+            raise output.WrongUse(f"--set {word}: CONTROL=VALUE is expected")
+        try:
+            settings[name] = int(value)
+        except ValueError:
+            settings[name] = value
+    return settings
+
+
+def _configured_options(args: argparse.Namespace) -> dict[str, Any]:
+    """A v4l2 camera's options in a configuration."""
+    from mastctl.config import load_config
+
+    config = load_config(args.config)
+    device = config.hardware.cameras.get(args.camera)
+    if device is None:
+        known = ", ".join(config.hardware.cameras)
+        raise output.WrongUse(f"{config.path} has no camera {args.camera}; it has {known}")
+    if device.driver != "v4l2":
+        raise output.WrongUse(f"{args.camera} in {config.path} is of driver {device.driver!r}, not 'v4l2'")
+    _refuse_settings(args)
+    return dict(device.options)
+
+
+def _configured_frame(args: argparse.Namespace) -> StampedFrame:
+    """One fresh frame of a configured camera (of any driver) with the joint angles of its moment."""
+    from dataclasses import replace
+
+    from drivers.clock import SystemClock
+    from drivers.open_hardware import open_hardware
+    from mastctl.config import load_config
+    from mastctl.devices import Devices
+    from mastctl.mast_in_use import read_mast
+
+    _refuse_settings(args)
+    config = load_config(args.config)
+    if args.camera not in config.hardware.cameras:
+        known = ", ".join(config.hardware.cameras)
+        raise output.WrongUse(f"{config.path} has no camera {args.camera}; it has {known}")
+    mast = read_mast(config.mast_file, config)
+    settings = replace(config.hardware, cameras={args.camera: config.hardware.cameras[args.camera]})
+    clock = SystemClock()
+    with open_hardware(settings, clock) as hardware:
+        devices = Devices(hardware, config.limits, mast.stored.digest, clock, mast.stored.rig)
+        try:
+            return devices.frames([args.camera], clock.now_s(), FRAME_TIMEOUT_S)[args.camera]
+        finally:
+            devices.close()
+
+
+def _refuse_settings(args: argparse.Namespace) -> None:
+    for option in ("format", "size", "rate", "set"):
+        if getattr(args, option):
+            raise output.WrongUse(f"--{option} does not go with --config, which says it")
+
+
+def _measured(camera: V4l2Camera, seconds: float) -> dict[str, Any]:
+    """Rate, losses and delays over some seconds."""
+    before = camera.counters
+    frame = camera.next_frame(time.monotonic(), FRAME_TIMEOUT_S)
+    first, until_s = frame, time.monotonic() + seconds
+    delays_s, count = [frame.received_s - frame.stamp_s], 0
+    while time.monotonic() < until_s:
+        after_s = frame.mid_exposure_s - frame.exposure_s / 2
+        frame = camera.next_frame(after_s, FRAME_TIMEOUT_S)
+        delays_s.append(frame.received_s - frame.stamp_s)
+        count += 1
+    counters = camera.counters
+    span_s = frame.stamp_s - first.stamp_s
+    return {
+        "rate_hz": (frame.sequence - first.sequence) / span_s if span_s > 0 else None,
+        "dropped": counters.dropped - before.dropped,
+        "damaged": counters.damaged - before.damaged,
+        "late": counters.late - before.late,
+        "delay_s": [min(delays_s), sorted(delays_s)[len(delays_s) // 2], max(delays_s)],
+        "mid_exposure_uncertainty_s": frame.mid_uncertainty_s,
+        "seconds": seconds,
+    }
+
+
+def _print_check(told: dict[str, Any]) -> None:
+    """The check as tables for people."""
+    quality = told["quality"]
+    low, median, high = (1e3 * delay_s for delay_s in told["delay_s"])
+    rate = "-" if told["rate_hz"] is None else f"{told['rate_hz']:.2f} Hz"
+    width, height = told["size_px"]
+    rows = [
+        ("camera", f"{told['card']} at {told['bus']} ({told['driver']})"),
+        ("format", f"{told['format']} {width}x{height}, {told['asked_rate_hz']:.4g} Hz promised"),
+        ("rate", f"{rate} over {told['seconds']:g} s"),
+        ("dropped, damaged, late", f"{told['dropped']}, {told['damaged']}, {told['late']}"),
+        ("stamp to here", f"{low:.1f} to {high:.1f} ms, median {median:.1f} ms"),
+        ("mid-exposure known to", f"+-{1e3 * told['mid_exposure_uncertainty_s']:.1f} ms"),
+        ("grey levels", f"mean {quality['mean']:.0f}, median {quality['median']:.0f}"),
+        ("dark, saturated", f"{quality['dark_share']:.1%}, {quality['saturated_share']:.1%} of the pixels"),
+        ("sharpness", f"{quality['sharpness']:.1f}"),
+    ]
+    output.print_table("check", ("what", "found"), rows, [f"problem: {p}" for p in told["problems"]])
+    most = max(quality["histogram"]) or 1.0
+    bars = [
+        (f"{16 * i:3d}-{16 * i + 15:3d}", f"{share:6.1%}", "#" * round(40 * share / most))
+        for i, share in enumerate(quality["histogram"])
+    ]
+    output.print_table("grey levels", ("level", "share", ""), bars)
+    output.print_table(
+        "formats", ("code", "sizes"), [(f["code"], f["sizes"]) for f in told["formats"] if f["readable"]]
+    )
+    controls = [
+        (c["name"], c["kind"], str(c["value"]), f"{c['minimum']} to {c['maximum']}") for c in told["controls"]
+    ]
+    output.print_table("controls", ("name", "kind", "value", "range"), controls)
+
+
+def _with_cross(image: Image, x_px: float, y_px: float) -> Image:
+    """A colour copy with a cross that leaves the aim pixel itself free."""
+    import cv2
+    import numpy as np
+
+    drawn = cv2.cvtColor(image, cv2.COLOR_GRAY2BGR) if image.ndim == 2 else image.copy()
+    x, y = round(x_px), round(y_px)
+    for dx, dy in ((1, 0), (-1, 0), (0, 1), (0, -1)):
+        cv2.line(drawn, (x + 4 * dx, y + 4 * dy), (x + 16 * dx, y + 16 * dy), (0, 255, 255), 1)
+    return np.asarray(drawn, dtype=np.uint8)
+
+
+def _utc(monotonic_s: float) -> str:
+    """A moment of the monotonic clock as UTC, by the difference of the clocks now."""
+    from datetime import UTC, datetime
+
+    moment = datetime.fromtimestamp(time.time() - (time.monotonic() - monotonic_s), UTC)
+    return moment.isoformat(timespec="milliseconds")

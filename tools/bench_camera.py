@@ -1,0 +1,393 @@
+"""Measure the V4L2 cameras: gaps, the age of frames, processor time beside OpenCV, memory, descriptors.
+
+    tools/vm run --timeout 3000 .venv/bin/python tools/bench_camera.py
+    .venv/bin/python tools/bench_camera.py --device /dev/v4l/by-id/...   (once or twice)
+
+Without --device the first two cameras that are connected are taken; in the virtual machine these are vivid's.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import re
+import resource
+import shutil
+import signal
+import statistics
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, closing, contextmanager
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import cv2
+
+from drivers.errors import DriverError
+from drivers.v4l2 import find
+from drivers.v4l2.camera import V4l2Camera, open_camera
+from drivers.v4l2.choice import options_for
+from drivers.v4l2.controls import set_by_name
+from drivers.v4l2.find import open_node
+from drivers.v4l2.options import parse_options
+from drivers.v4l2.stream import set_format
+
+PARTS = ("gaps", "age", "cpu", "memory", "unplugged", "opens")
+CONSUMERS = ("sleeps", "computes", "is stopped for 2 s")
+STOPPED_S = 2.0
+WARM_S = 2.0  # so long the first touch of every buffer costs more than its frame
+VIVID = Path("/sys/bus/platform/drivers/vivid")
+VIVID_CONTROLS = {"timestamp_source": 1, "osd_text_mode": 2}
+
+
+def main() -> None:
+    """Print the tables, and with --json one document."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "--device", action="append", default=[], help="link, card or bus; give two for stereo"
+    )
+    parser.add_argument("--size", nargs=2, type=int, default=[640, 480], metavar=("W", "H"))
+    parser.add_argument("--rate", type=float, metavar="HZ", help="default: the highest the camera has")
+    parser.add_argument("--seconds", type=float, default=60.0, help="of each of the three runs for gaps")
+    parser.add_argument("--pauses", type=int, default=30, help="for the age of frames")
+    parser.add_argument("--repeats", type=int, default=3, help="of the processor time")
+    parser.add_argument("--frames", type=int, default=100_000, help="for the memory")
+    parser.add_argument("--opens", type=int, default=1000, help="for the descriptors")
+    parser.add_argument("--unplugs", type=int, default=10, help="vivid only, as root")
+    parser.add_argument(
+        "--only", choices=PARTS, nargs="+", default=list(PARTS), metavar="PART", help=", ".join(PARTS)
+    )
+    parser.add_argument("--json", action="store_true")
+    args = parser.parse_args()
+    devices = args.device or [camera.bus for camera in find.list_cameras()[:2]]
+    if not devices:
+        sys.exit("no camera is connected")
+    options = [chosen(device, tuple(args.size), args.rate) for device in devices]
+    say = (lambda *words: None) if args.json else print
+    say(
+        f"{len(options)} cameras, {args.size} px, {options[0]['rate_hz']:g} Hz, load {os.getloadavg()[0]:.1f}"
+    )
+    told: dict[str, Any] = {"rate_hz": options[0]["rate_hz"], "size_px": args.size, "cameras": len(options)}
+    if "gaps" in args.only:
+        told["gaps"] = [gaps(options, what, args.seconds, say) for what in CONSUMERS]
+        told["opencv_gaps"] = opencv_gaps(options[0], args.seconds, say)
+        if len(options) == 2 and shutil.which("v4l2-ctl"):
+            told["gaps_beside"] = gaps_beside(options, args.seconds, say)
+    if "age" in args.only:
+        told["age"] = age_after_pause(options[0], args.pauses, say)
+    if "cpu" in args.only:
+        told["cpu"] = [cpu_per_frame(options[0], say) for _ in range(args.repeats)]
+    if "memory" in args.only:
+        told["memory"] = memory(options, args.frames, say)
+    if "unplugged" in args.only and VIVID.exists():
+        told["unplugged"] = unplugged(options, args.unplugs, say)
+    if "opens" in args.only:
+        told["opens"] = descriptors(options[0], args.opens, say)
+    if args.json:
+        print(json.dumps(told))
+
+
+def chosen(device: str, size_px: tuple[int, int], rate_hz: float | None) -> dict[str, Any]:
+    """Options for a device at YUYV if it has that, at its highest rate unless one is given."""
+    options = options_for(device, None, size_px, rate_hz, {})
+    with open_node(parse_options(options, device).address, device) as node:
+        if "YUYV" in node.formats():
+            options["format"] = "YUYV"
+        if node.identity.driver == "vivid":
+            options["controls"] = dict(VIVID_CONTROLS)
+        if rate_hz is None:
+            options["rate_hz"] = max(node.rates_hz(options["format"], size_px), default=30.0)
+    return options
+
+
+@contextmanager
+def opened(options: list[dict[str, Any]]) -> Iterator[list[V4l2Camera]]:
+    """All cameras, each with a first frame."""
+    with ExitStack() as stack:
+        cameras = [
+            stack.enter_context(closing(open_camera(o, name=f"camera {i}"))) for i, o in enumerate(options)
+        ]
+        for camera in cameras:
+            camera.next_frame(time.monotonic(), 10.0)
+        yield cameras
+
+
+def gaps(
+    options: list[dict[str, Any]], what: str, seconds: float, say: Callable[..., None]
+) -> dict[str, Any]:
+    """Drops while the consumer does something else than take frames."""
+    reads = "import sys\nwhile sys.stdin.buffer.read(65536): pass"
+    with (
+        subprocess.Popen([sys.executable, "-c", reads], stdin=subprocess.PIPE) as consumer,
+        opened(options) as cameras,
+    ):
+        over = threading.Event()
+        conductor = threading.Thread(target=stop_and_go, args=(consumer, over))
+        if what.startswith("is stopped"):
+            conductor.start()
+        before = [camera.counters for camera in cameras]
+        began_s = time.monotonic()
+        until_s = began_s + seconds
+        while time.monotonic() < until_s:
+            after_s = time.monotonic()
+            for camera in cameras:
+                camera.next_frame(after_s, 10.0)
+            if what == "sleeps":
+                time.sleep(0.7)
+            elif what == "computes":
+                busy_until_s = time.monotonic() + 0.7
+                while time.monotonic() < busy_until_s:
+                    sum(i * i for i in range(20_000))  # Python's lock held nearly all the time
+            else:
+                hand_over(consumer, cameras)
+        span_s = time.monotonic() - began_s
+        counted = [camera.counters for camera in cameras]
+        over.set()
+        if conductor.is_alive():
+            conductor.join()
+    row = {
+        "consumer": what,
+        "seconds": span_s,
+        "frames": [now.good - then.good for now, then in zip(counted, before, strict=True)],
+        "dropped": [now.dropped - then.dropped for now, then in zip(counted, before, strict=True)],
+        "damaged": [now.damaged - then.damaged for now, then in zip(counted, before, strict=True)],
+        "late": [now.late - then.late for now, then in zip(counted, before, strict=True)],
+    }
+    rates = ", ".join(f"{frames / span_s:.2f}" for frames in row["frames"])
+    say(
+        f"consumer {what}: {rates} Hz over {span_s:.0f} s, "
+        f"dropped {row['dropped']}, damaged {row['damaged']}, late {row['late']}"
+    )
+    return row
+
+
+def opencv_gaps(options: dict[str, Any], seconds: float, say: Callable[..., None]) -> dict[str, Any]:
+    """Frames that OpenCV misses while it does nothing but read: what the machine loses by itself."""
+    with opencv(options) as reader:
+        until_s, stamps_s = time.monotonic() + seconds, []
+        while time.monotonic() < until_s:
+            reader.grab()
+            stamps_s.append(reader.get(cv2.CAP_PROP_POS_MSEC) / 1e3)
+    period_s = 1 / options["rate_hz"]
+    missed = sum(round((b - a) / period_s) - 1 for a, b in pairwise(stamps_s))
+    say(f"OpenCV that only reads: {len(stamps_s)} frames in {seconds:.0f} s, missed {missed}")
+    return {"frames": len(stamps_s), "missed": missed}
+
+
+def gaps_beside(options: list[dict[str, Any]], seconds: float, say: Callable[..., None]) -> dict[str, Any]:
+    """Drops of one camera that we read, and at the same time of the other, which v4l2-ctl reads."""
+    with open_node(parse_options(options[1], "beside").address, "beside") as node:
+        path = str(node.path)
+        set_format(node, options[1]["format"], tuple(options[1]["size_px"]), "beside")
+        node.set_rate(options[1]["rate_hz"])
+    count = round(seconds * options[1]["rate_hz"])
+    command = ["v4l2-ctl", "-d", path, "--stream-mmap=8", f"--stream-count={count}"]
+    with opened(options[:1]) as (camera,):
+        before = camera.counters
+        done = subprocess.run(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+        now = camera.counters
+    theirs = sum(map(int, re.findall(r"dropped buffers: (\d+)", done.stdout)))
+    ours = now.dropped - before.dropped
+    say(f"at the same time: ours {now.good - before.good} frames, missed {ours}; v4l2-ctl {count}, {theirs}")
+    return {"ours": {"frames": now.good - before.good, "missed": ours},
+            "v4l2-ctl": {"frames": count, "missed": theirs}}  # fmt: skip
+
+
+def stop_and_go(consumer: subprocess.Popen[bytes], over: threading.Event) -> None:
+    """Stop a process for two seconds, again and again."""
+    while not over.wait(0.5):
+        consumer.send_signal(signal.SIGSTOP)
+        over.wait(STOPPED_S)
+        consumer.send_signal(signal.SIGCONT)
+
+
+def hand_over(consumer: subprocess.Popen[bytes], cameras: list[V4l2Camera]) -> None:
+    """Hand frames to another process; while it is stopped this hangs, since a pipe does not hold a frame."""
+    assert consumer.stdin is not None
+    for camera in cameras:
+        consumer.stdin.write(camera.next_frame(time.monotonic(), 10.0).image.tobytes())
+
+
+def age_after_pause(options: dict[str, Any], pauses: int, say: Callable[..., None]) -> dict[str, Any]:
+    """How old a frame is when it is returned after a pause of a second: stamp to return."""
+    ages: dict[str, list[float]] = {"next_frame": [], "next_frame, exposed after the call": [], "OpenCV": []}
+    with opened([options]) as (camera,):
+        for _ in range(pauses):
+            time.sleep(1.0)
+            frame = camera.next_frame(0.0, 10.0)
+            ages["next_frame"].append(time.monotonic() - frame.stamp_s)
+            frame = camera.next_frame(time.monotonic(), 10.0)
+            ages["next_frame, exposed after the call"].append(time.monotonic() - frame.stamp_s)
+    with opencv(options) as reader:
+        for _ in range(min(pauses, 10)):
+            time.sleep(1.0)
+            reader.read()
+            ages["OpenCV"].append(time.monotonic() - reader.get(cv2.CAP_PROP_POS_MSEC) / 1e3)
+    table = {}
+    for who, values in ages.items():
+        table[who] = {"median_s": statistics.median(values), "most_s": max(values)}
+        say(
+            f"age after a pause, {who}: "
+            f"median {1e3 * table[who]['median_s']:.1f} ms, most {1e3 * max(values):.1f} ms"
+        )
+    table["bound_s"] = 1 / options["rate_hz"] + 0.005
+    say(f"  bound (a period and 5 ms): {1e3 * table['bound_s']:.1f} ms")
+    return table
+
+
+def cpu_per_frame(options: dict[str, Any], say: Callable[..., None], frames: int = 150) -> dict[str, float]:
+    """Processor time of this process for each frame, each frame converted."""
+    table = {}
+    for who, colour in (("ours, grey", False), ("ours, BGR", True)):
+        with opened([{**options, "colour": colour}]) as (camera,):
+            warm_until_s = time.monotonic() + WARM_S
+            while time.monotonic() < warm_until_s:
+                frame = camera.next_frame(time.monotonic(), 10.0)
+            began_s, first = time.process_time(), frame.sequence
+            while frame.sequence < first + frames:
+                frame = camera.next_frame(frame.mid_exposure_s, 10.0)
+            table[who] = (time.process_time() - began_s) / (frame.sequence - first)
+    with opened([options]) as (camera,):
+        time.sleep(WARM_S)
+        began_s, first = time.process_time(), camera.counters.good
+        time.sleep(frames / options["rate_hz"])
+        table["ours, nobody asks"] = (time.process_time() - began_s) / (camera.counters.good - first)
+    with opencv(options) as reader:
+        warm_until_s = time.monotonic() + WARM_S
+        while time.monotonic() < warm_until_s:
+            reader.read()
+        began_s = time.process_time()
+        for _ in range(frames):
+            reader.read()
+        table["OpenCV, BGR"] = (time.process_time() - began_s) / frames
+    for who, cpu_s in table.items():
+        ratio = cpu_s / table["OpenCV, BGR"]
+        say(f"processor time a frame, {who}: {1e3 * cpu_s:.2f} ms ({ratio:.2f} of OpenCV)")
+    return table
+
+
+@contextmanager
+def opencv(options: dict[str, Any]) -> Iterator[cv2.VideoCapture]:
+    """The same camera at the same settings, read by OpenCV."""
+    with open_node(parse_options(options, "opencv").address, "opencv") as node:
+        path = str(node.path)
+        set_by_name(node, options["controls"])
+    reader = cv2.VideoCapture(path, cv2.CAP_V4L2)
+    width, height = options["size_px"]
+    reader.set(cv2.CAP_PROP_FOURCC, cv2.VideoWriter.fourcc(*options["format"].ljust(4)))
+    reader.set(cv2.CAP_PROP_FRAME_WIDTH, width)
+    reader.set(cv2.CAP_PROP_FRAME_HEIGHT, height)
+    reader.set(cv2.CAP_PROP_FPS, options["rate_hz"])
+    try:
+        yield reader
+    finally:
+        reader.release()
+
+
+def memory(options: list[dict[str, Any]], frames: int, say: Callable[..., None]) -> dict[str, Any]:
+    """Resident memory over many frames, every one converted; sampled twenty times."""
+    samples = []
+    with opened(options) as cameras:
+        taken = [0] * len(cameras)
+
+        def take(index: int) -> None:
+            after_s = 0.0
+            while sum(taken) < frames:
+                frame = cameras[index].next_frame(after_s, 10.0)
+                after_s = frame.mid_exposure_s
+                taken[index] += 1
+
+        threads = [threading.Thread(target=take, args=(i,)) for i in range(len(cameras))]
+        for thread in threads:
+            thread.start()
+        while any(thread.is_alive() for thread in threads):
+            if sum(taken) >= frames * (len(samples) + 1) / 20:
+                samples.append(resident_bytes())
+            time.sleep(0.05)
+    growth = samples[-1] - samples[len(samples) // 4] if samples else 0
+    say(
+        f"memory: {sum(taken)} frames, {[round(s / 2**20, 1) for s in samples]} MB; "
+        f"grew by {growth / 2**20:.2f} MB over the last three quarters"
+    )
+    return {"frames": sum(taken), "samples_bytes": samples, "growth_bytes": growth}
+
+
+def resident_bytes() -> int:
+    """Resident memory of this process."""
+    pages = int(Path("/proc/self/statm").read_text().split()[1])
+    return pages * resource.getpagesize()
+
+
+def unplugged(options: list[dict[str, Any]], times: int, say: Callable[..., None]) -> dict[str, Any]:
+    """From the driver letting the camera go until it is known, and from its return to a frame."""
+    noticed_s, back_s = [], []
+    with opened(options) as cameras:
+        camera = cameras[0]
+        for _ in range(times):
+            began_s = time.monotonic()
+            unbind = threading.Thread(target=(VIVID / "unbind").write_text, args=("vivid.0",))
+            unbind.start()
+            while not camera.capture.lost:
+                time.sleep(0.0005)
+            noticed_s.append(time.monotonic() - began_s)
+            unbind.join()
+            time.sleep(0.5)
+            (VIVID / "bind").write_text("vivid.0")
+            began_s = time.monotonic()
+            while camera.capture.lost:
+                time.sleep(0.0005)
+            camera.next_frame(time.monotonic(), 10.0)
+            back_s.append(time.monotonic() - began_s)
+            for other in cameras:
+                while other.capture.lost:
+                    time.sleep(0.01)
+    period_s = 1 / options[0]["rate_hz"]
+    say(
+        f"unplugged {times} times: noticed after at most {1e3 * max(noticed_s):.0f} ms "
+        f"({max(noticed_s) / period_s:.1f} periods), frames at most {1e3 * max(back_s):.0f} ms after return"
+    )
+    return {"noticed_s": noticed_s, "back_s": back_s, "period_s": period_s}
+
+
+def descriptors(options: dict[str, Any], opens: int, say: Callable[..., None]) -> dict[str, Any]:
+    """Descriptors, threads, mappings left after many opens; with vivid a third of them fail."""
+    address = parse_options(options, "opens").address
+    with open_node(address, "opens") as node:
+        is_vivid = node.identity.driver == "vivid"
+
+    def held() -> tuple[int, int, int]:
+        maps = Path("/proc/self/maps").read_text().count("/dev/video")
+        return len(list(Path("/proc/self/fd").iterdir())), threading.active_count(), maps
+
+    open_camera(options, name="opens").close()
+    before, refused = held(), 0
+    for index in range(opens):
+        if is_vivid and index % 3 == 1:
+            control = (
+                "inject_vidioc_reqbufs_error",
+                "inject_vidioc_streamon_error",
+                "inject_vidioc_qbuf_error",
+            )
+            with open_node(address, "opens") as node:
+                set_by_name(node, {control[index // 3 % 3]: 1})
+        try:
+            open_camera(options, name="opens").close()
+        except DriverError:
+            refused += 1
+    after = held()
+    say(
+        f"{opens} opens, {refused} of them refused: "
+        f"descriptors, threads, mappings {before} before, {after} after"
+    )
+    return {"opens": opens, "refused": refused, "before": before, "after": after}
+
+
+if __name__ == "__main__":
+    main()
