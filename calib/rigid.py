@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.spatial.transform import Rotation
 
 FloatArray = NDArray[np.float64]
 
@@ -105,6 +104,8 @@ class Rigid:
 
 def moved_rigid(pose: Rigid, step: FloatArray) -> Rigid:
     """Return a pose shifted by step[:3] and turned by the rotation vector step[3:] about its origin."""
+    from scipy.spatial.transform import Rotation  # slow to load, and a command on files needs no fit
+
     turned = Rotation.from_rotvec(step[3:]).as_matrix() @ pose.rotation
     return Rigid(turned, pose.translation_m + step[:3])
 

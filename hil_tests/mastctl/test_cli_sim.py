@@ -159,13 +159,14 @@ def test_wrong_use_is_one_line_and_exit_code_2(
     capsys: pytest.CaptureFixture[str], words: list[str], message: str
 ) -> None:
     descriptors = len(list(Path("/proc/self/fd").iterdir()))
+    handler = signal.getsignal(signal.SIGTERM)
     assert main(["sim", *words]) == 2
     out, log = capsys.readouterr()
     assert out == "" and message in log and log.count("\n") == 1
     assert main(["sim", *words, "--json"]) == 2
     assert message in json.loads(capsys.readouterr().out)["error"]["message"]
     assert len(list(Path("/proc/self/fd").iterdir())) == descriptors
-    assert signal.getsignal(signal.SIGTERM) == signal.SIG_DFL
+    assert signal.getsignal(signal.SIGTERM) == handler
 
 
 def test_no_line_is_left_of_one_that_was_killed_but_its_link(repository: Path, tmp_path: Path) -> None:

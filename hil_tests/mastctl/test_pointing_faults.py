@@ -266,6 +266,9 @@ CASES = [
 ]
 HARMLESS = [
     *[("pan_tilt", word) for word in ("slow", "delayed", "intermittent")],
+    # Lines that lose or repeat a reply now and then; and what has not yet grown enough to harm.
+    *[("pan_tilt", word) for word in ("mute", "half", "corrupt", "late", "duplicate", "swapped", "noise")],
+    *[("pan_tilt", word) for word in ("drifting", "overload", "temperature_ramp")],
     *[("navcam_left", word) for word in ("slow", "delayed", "intermittent", "dropped")],
     ("navcam_left", "frozen", "settle"),
 ]

@@ -149,6 +149,7 @@ def _dynamixel(kind: _Wire, head: HeadSettings, axes: tuple[WireAxis, WireAxis],
     speed_rad_per_s = head.pan.speed_rad_per_s
     options: dict[str, Any] = {
         "baud": baud,
+        "reply_timeout_s": 0.25,  # the simulator shares its processors with a renderer
         "speed_rad_per_s": speed_rad_per_s,
         "acceleration_rad_per_s2": max(head.pan.acceleration_rad_per_s2, speed_rad_per_s / _BRAKING_S),
         "watchdog_s": USUAL_WATCHDOG_S,
