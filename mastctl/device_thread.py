@@ -19,7 +19,7 @@ from concurrent.futures import Future
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
-from drivers.errors import DriverError, NoReply
+from drivers.errors import DriverError, LineLost, NoReply
 from mastctl.errors import MastctlError
 
 log = logging.getLogger(__name__)
@@ -129,7 +129,10 @@ class DeviceThread:
         return self.wait(what, self.submit(what, function, timeout_s), deadline_s)
 
     def faults(self) -> tuple[Fault, ...]:
-        """Return what is wrong at this moment; a call that succeeds takes back its own earlier fault."""
+        """Return what is wrong at this moment; a call that succeeds takes back its own earlier fault.
+
+        It also takes back every call's lost line.
+        """
         with self._wake:
             overdue = self._overdue()
             faults = dict(self._faults)
@@ -220,6 +223,9 @@ class DeviceThread:
             known = self._faults.get(what)
             if error is None:
                 self._faults.pop(what, None)
+                for other, fault in list(self._faults.items()):
+                    if fault.code == LineLost.code:  # the line is back, whichever call found it gone
+                        del self._faults[other]
             else:
                 since_s = known.since_s if known else time.monotonic()
                 code = getattr(error, "code", DriverError.code)

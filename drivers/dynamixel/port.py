@@ -268,6 +268,8 @@ def _words(error: BaseException) -> str:
     )
     if number in (errno.EAGAIN, errno.EBUSY):
         return "held by another program"
+    if number == errno.ENOTTY or "Inappropriate ioctl" in str(error):
+        return "it is no serial line"
     if isinstance(number, int):
         return os.strerror(number).lower()
     return " ".join(str(error).split())[:200] or type(error).__name__

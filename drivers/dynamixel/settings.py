@@ -165,6 +165,14 @@ def head_settings(options: Mapping[str, Any]) -> HeadSettings:
     speed = read.number("speed_rad_per_s", 1.0, 0.03, 10.0)
     acceleration = read.number("acceleration_rad_per_s2", 4.0, 0.4, 1000.0)
     longest_s = STANDS_WITHIN_S - 1 / poll_hz - speed / acceleration
+    if longest_s < SHORTEST_WATCHDOG_S and options.get("watchdog_s") != 0:
+        brakes_s = STANDS_WITHIN_S - 1 / poll_hz - SHORTEST_WATCHDOG_S
+        raise BadOptions(
+            f"options.acceleration_rad_per_s2 is {acceleration:g}: braking from {speed:g} rad/s takes "
+            f"{speed / acceleration:.3g} s, so that the bus watchdog cannot stop the head within "
+            f"{STANDS_WITHIN_S:g} s in all; expected {speed / brakes_s:.3g} or more, a lower "
+            "speed_rad_per_s, or watchdog_s: 0 to do without"
+        )
     watchdog_s = read.number("watchdog_s", min(USUAL_WATCHDOG_S, longest_s), 0.0, STANDS_WITHIN_S)
     if watchdog_s and not SHORTEST_WATCHDOG_S <= watchdog_s <= longest_s:
         raise BadOptions(

@@ -16,7 +16,7 @@ import pytest
 from service_fakes import FakeCamera, FakeHardware, Hang, eventually, rig
 
 from drivers.clock import SystemClock
-from drivers.errors import BadFrame, BadReply, DriverError, NoFreshFrame, NoReply
+from drivers.errors import BadFrame, BadReply, DriverError, LineLost, NoFreshFrame, NoReply
 from drivers.interfaces import Reading
 from mastctl import devices as devices_module
 from mastctl.devices import Devices, UnknownCamera
@@ -169,6 +169,25 @@ def test_a_hanging_read_ends_in_no_reply_and_the_cameras_go_on(
     hang.let_go()
     eventually(lambda: devices.faults() == (), "the head working again")
     assert devices.frames(["navcam_left"], now(), 1.0)
+
+
+def test_a_lost_line_is_forgotten_when_any_call_finds_it_back(
+    devices: Devices, hardware: FakeHardware
+) -> None:
+    gone = True
+
+    def unplugged(name: str) -> None:
+        if gone:
+            raise LineLost("/dev/mast hung up")
+
+    hardware.head.hook = unplugged
+    for call in (devices.read, lambda: devices.move(0.1, 0.1)):
+        with pytest.raises(LineLost):
+            call()
+    assert {fault.code for fault in devices.faults()} == {"line_lost"}
+    gone = False
+    devices.read()
+    assert devices.faults() == ()
 
 
 def test_a_late_answer_is_dropped(devices: Devices, hardware: FakeHardware) -> None:

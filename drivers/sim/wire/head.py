@@ -28,9 +28,9 @@ from drivers.sim.wire.ptu import SimulatedPtu
 _MARGIN_RAD = math.radians(0.5)
 """How far inside the simulator's own range the driver's limits are."""
 
-_BRAKING_S = 0.17
-"""From full speed to rest at most, so that the servos' watchdog may wait for its usual 0.3 s and the head
-still stands 0.5 s after the last packet. Renderer and driver share one busy process: less trips too often."""
+_WATCHDOG_S, _BRAKING_S = 0.38, 0.095
+"""Renderer, simulator and driver share one process, which on a busy machine is silent for 0.3 s now and then.
+So the servos wait longer than usual, and brake harder, since they must stand 0.5 s after the last packet."""
 
 
 @dataclass(frozen=True)
@@ -133,7 +133,6 @@ _Made = tuple[WireDevice, Callable[[Mapping[str, Any], Clock], PanTilt], dict[st
 def _dynamixel(kind: _Wire, head: HeadSettings, axes: tuple[WireAxis, WireAxis], time_s: float) -> _Made:
     """Two servos at 1 Mbaud, ids 1 and 2."""
     from drivers.dynamixel.head import open_head
-    from drivers.dynamixel.settings import USUAL_WATCHDOG_S
 
     baud = 1_000_000
     servos = [
@@ -152,7 +151,7 @@ def _dynamixel(kind: _Wire, head: HeadSettings, axes: tuple[WireAxis, WireAxis],
         "reply_timeout_s": 0.25,  # the simulator shares its processors with a renderer
         "speed_rad_per_s": speed_rad_per_s,
         "acceleration_rad_per_s2": max(head.pan.acceleration_rad_per_s2, speed_rad_per_s / _BRAKING_S),
-        "watchdog_s": USUAL_WATCHDOG_S,
+        "watchdog_s": _WATCHDOG_S,
     }
     for servo_id, (name, axis) in enumerate((("pan", head.pan), ("tilt", head.tilt)), 1):
         # Rebooted by itself, so that a fault that was taken back leaves nothing behind; nothing falls here.
