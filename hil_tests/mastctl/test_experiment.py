@@ -11,7 +11,11 @@ import numpy as np
 import pytest
 
 from calib.store import load_rig
+from drivers.sim.rover import simulation_settings
 from mastctl.cli.experiment import turned
+from mastctl.cli.main import main
+from mastctl.config import load_config
+from mastctl.experiment.demo import demo_config
 from mastctl.experiment.pointing import Landing, PointingExperiment, TargetRecord, rms, summarise
 from mastctl.experiment.report import CSV_COLUMNS, table_rows, write_report
 from mastctl.experiment.targets import on_level_ground, textured
@@ -116,3 +120,26 @@ def test_level_ground_at_the_distance_is_where_geometry_puts_it(repository: Path
         pixel, valid = camera.project(np.array([camera.C[0], camera.C[1], 0.0]) + along_m * direction)
         assert valid
         assert mask[round(pixel[1]), round(pixel[0])] == seen, along_m
+
+
+@pytest.mark.parametrize(
+    ("wire", "head", "stands"),
+    [
+        ("flir_ptu", None, "ptu_d46_70"),
+        ("dynamixel", None, "dynamixel_x"),
+        ("dynamixel", "ph42", "ph42"),
+        (None, None, "ptu_d46_70"),
+    ],
+)
+def test_the_demo_takes_the_head_of_its_wire(wire: str | None, head: str | None, stands: str) -> None:
+    config = demo_config(load_config(None), head=head, wire=wire, seed=3)
+    settings = simulation_settings(config.hardware.simulation, config.hardware.folder)
+    assert (settings.wire, settings.head.name) == (wire, stands)
+
+
+def test_the_demo_refuses_a_head_that_is_not_behind_its_wire(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["demo", "--wire", "flir_ptu", "--head", "ph42", "--out", str(tmp_path / "demo")]) == 2
+    told = capsys.readouterr().err
+    assert "'ph42', which is not behind simulation.wire 'flir_ptu'; expected ptu_d46_70" in told
