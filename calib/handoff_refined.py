@@ -19,6 +19,7 @@ from calib.cahvor import CameraModel
 from calib.epipolar import find_partner
 from calib.handoff import Handoff, Predicted
 from calib.match import Match, MatchSettings, match
+from calib.one_point import Sighting, one_point
 from calib.rigid import FloatArray
 from calib.warp import Grey, Plane
 
@@ -198,7 +199,13 @@ def _agreeing(
     if doubting:
         words = f"{doubting[0]} does not confirm it: {refined[doubting[0]].reason}"
         return {**refined, **{name: _taken_back(one, words) for name, one in accepted.items()}}
-    chi2 = _disagreement(accepted, handoff, destinations, settings)
+    point = one_point(
+        handoff.seen.position_m,
+        handoff.covariance_m2,
+        [Sighting(destinations[n].camera, o.pixel_px, o.covariance_px2) for n, o in accepted.items()],
+        settings.model_px,
+    )
+    chi2 = math.inf if point is None else point.chi2
     if chi2 > settings.worst_chi2:
         words = (
             f"{' and '.join(accepted)} and the source pair do not mean one point: weighted misfit "
@@ -206,33 +213,6 @@ def _agreeing(
         )
         return {**refined, **{name: _taken_back(one, words) for name, one in accepted.items()}}
     return refined
-
-
-def _disagreement(
-    accepted: Mapping[str, RefinedPixel],
-    handoff: Handoff,
-    destinations: Mapping[str, Eye],
-    settings: RefineSettings,
-) -> float:
-    """Weighted sum of squares of the one point that fits the found pixels and the source's position best."""
-    start = handoff.seen.position_m
-    position = start.copy()
-    prior = np.linalg.inv(handoff.covariance_m2 + 1e-12 * np.eye(3))
-    for _ in range(5):
-        normal, right, chi2 = prior.copy(), prior @ (start - position), 0.0
-        off = start - position
-        chi2 += float(off @ prior @ off)
-        for name, one in accepted.items():
-            pixel, rate, valid = destinations[name].camera.project_jacobian(position)
-            if not valid:
-                return math.inf
-            weight = np.linalg.inv(one.covariance_px2 + settings.model_px**2 * np.eye(2))
-            rest = one.pixel_px - pixel
-            normal += rate.T @ weight @ rate
-            right += rate.T @ weight @ rest
-            chi2 += float(rest @ weight @ rest)
-        position = position + np.linalg.solve(normal, right)
-    return chi2
 
 
 def _taken_back(one: RefinedPixel, words: str) -> RefinedPixel:

@@ -26,6 +26,7 @@ from calib.epipolar import find_partner
 from calib.errors import CalibError, NoStereoPoint
 from calib.handoff_refined import Eye
 from calib.match import Match, MatchSettings, match
+from calib.one_point import Sighting, one_point
 from calib.rigid import FloatArray, Rigid
 from calib.stereo import triangulate
 from calib.warp import Plane
@@ -226,10 +227,15 @@ def seen_by(
         return _lost(track, found, f"one eye does not confirm the other: {doubt}")
     if len(good) == 1 and track.state == "lost":
         return _lost(track, found, "one eye alone does not find a lost target again")
-    updated = _updated(track, {n: (eyes[n].camera, m) for n, m in good.items()}, settings)
-    if updated is None:
+    point = one_point(
+        track.position_m,
+        track.covariance_m2,
+        [Sighting(eyes[n].camera, m.pixel_px, m.covariance_px2) for n, m in good.items()],
+        settings.model_px,
+    )
+    if point is None:
         return _lost(track, found, "the found pixels and the prediction have no point in common")
-    position, covariance, chi2 = updated
+    chi2 = point.chi2
     # Each eye beyond the first adds a constraint; one eye alone has two.
     allowed = settings.worst_chi2 if len(good) > 1 else 13.8
     if chi2 > allowed:
@@ -238,7 +244,7 @@ def seen_by(
             f"{allowed:g} is expected"
         )
         return replace(_lost(track, found, words), chi2=chi2)
-    after = Track("tracked", position, covariance, replace(track.key, eye=key.eye))
+    after = Track("tracked", point.position_m, point.covariance_m2, replace(track.key, eye=key.eye))
     renewed = _renewed(after, eyes, good, settings)
     return Look(replace(after, key=renewed or after.key), found, "", chi2, renewed is not None)
 
@@ -268,29 +274,6 @@ def _found(
     reach = settings.sigmas * math.sqrt(max(float(np.linalg.eigvalsh(spread)[-1]), 0.0))
     search = min(max(reach + 2 * settings.model_px, settings.least_px), settings.most_px)
     return match(key.eye.image, key.eye.camera, key.pixel_px, plane, eye.image, eye.camera, search, sizes)
-
-
-def _updated(
-    track: Track, found: Mapping[str, tuple[CameraModel, Match]], settings: TrackSettings
-) -> tuple[FloatArray, FloatArray, float] | None:
-    """The position that fits prediction and pixels best, its covariance, and the weighted misfit."""
-    start, position = track.position_m, track.position_m.copy()
-    prior = np.linalg.inv(track.covariance_m2 + 1e-12 * np.eye(3))
-    chi2, normal = math.inf, prior
-    for _ in range(6):
-        off = start - position
-        normal, right, chi2 = prior.copy(), prior @ off, float(off @ prior @ off)
-        for camera, one in found.values():
-            pixel, rate, valid = camera.project_jacobian(position)
-            if not bool(valid):
-                return None
-            weight = np.linalg.inv(one.covariance_px2 + settings.model_px**2 * np.eye(2))
-            rest = one.pixel_px - pixel
-            normal += rate.T @ weight @ rate
-            right += rate.T @ weight @ rest
-            chi2 += float(rest @ weight @ rest)
-        position = position + np.linalg.solve(normal, right)
-    return position, np.linalg.inv(normal), chi2
 
 
 def _renewed(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import resource
+import select
 import shutil
 import signal
 import subprocess
@@ -162,8 +163,8 @@ from mastctl.calibration.detection import _worker
 if __name__ == "__main__":
     with ProcessPoolExecutor(1, get_context("spawn"), _worker) as pool:
         print(pool.submit(os.getpid).result(), flush=True)
-        pool.submit(time.sleep, 100.0)
-        time.sleep(100.0)
+        pool.submit(time.sleep, 3600.0)
+        time.sleep(3600.0)
 """
 
 
@@ -177,7 +178,11 @@ def test_no_searching_process_outlives_the_command(tmp_path: Path) -> None:
         worker = int(it.stdout.readline())
         assert Path(f"/proc/{worker}").exists()
         it.kill()
-        it.stdout.read()  # ends when the last process that holds it does
+        # Its end comes when the last process that holds it has gone; the worker alone would sleep an hour.
+        gone = select.select([it.stdout], [], [], 60.0)[0]
+        if not gone:
+            os.kill(worker, signal.SIGKILL)
+        assert gone, "the worker outlived the command"
     assert it.returncode == -signal.SIGKILL
 
 

@@ -147,16 +147,13 @@ def _in_use(args: argparse.Namespace) -> StoredRig | None:
 
 def _with_dots(args: argparse.Namespace, survey: Survey) -> tuple[Survey, tuple[tuple[str, str], ...]]:
     """Find dots in the images that dots.csv does not name, with a progress bar on stderr."""
-    from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
     from mastctl.calibration.detection import missing, with_dots
 
     count = len(missing(survey))
     if not count:
         return survey, ()
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
-    with Progress(*columns, console=Console(stderr=True, quiet=args.json)) as progress:
+    with output.progress_bar(args.json) as progress:
         task = progress.add_task("finding dots", total=count)
         survey, undetected = with_dots(survey, lambda done, _, name: progress.update(task, completed=done))
     for name, reason in undetected:

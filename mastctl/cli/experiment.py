@@ -134,14 +134,11 @@ def _run(
     notes: tuple[str, ...],
 ) -> PointingExperiment:
     """Run with a progress bar on stderr, one step a target."""
-    from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
     from mastctl.experiment.pointing import TargetRecord, run_pointing_experiment
     from mastctl.experiment.report import PICTURES_PER_DISTANCE
 
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
-    with Progress(*columns, console=Console(stderr=True, quiet=args.json)) as progress:
+    with output.progress_bar(args.json) as progress:
         task = progress.add_task("pointing", total=args.targets * len(distances_m))
 
         def show(record: TargetRecord) -> None:

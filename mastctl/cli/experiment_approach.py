@@ -14,7 +14,8 @@ def add_parser(kinds: Any) -> None:
     from mastctl.cli.experiment import at_least_one, seed
 
     parser = kinds.add_parser(
-        "approach", help="follow a target from Pancam at 10 m to Hazcam at 1 m, simulated, some minute a run"
+        "approach",
+        help="follow a target from Pancam at 10 m to Hazcam at 1 m (simulated, a minute a run)",
     )
     parser.add_argument(
         "--mast", type=Path, metavar="MAST.yaml",

@@ -74,16 +74,13 @@ def run(args: argparse.Namespace) -> int:
 
 def _run(args: argparse.Namespace, rig: Any, chosen: list[Variant]) -> CalibrationExperiment:
     """Run with a progress bar on stderr, one step a survey."""
-    from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
     from mastctl.experiment.calibration import run_calibration_experiment
     from mastctl.experiment.executors import open_executor
 
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
     with (
         open_executor(args.executor, args.workers) as executor,
-        Progress(*columns, console=Console(stderr=True, quiet=args.json)) as progress,
+        output.progress_bar(args.json) as progress,
     ):
         task = progress.add_task("surveys", total=len(chosen) * args.surveys)
 

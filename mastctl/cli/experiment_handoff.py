@@ -11,7 +11,8 @@ from mastctl.cli import output
 
 if TYPE_CHECKING:
     from mastctl.client import Client
-    from mastctl.experiment.handoff import HandoffExperiment, HandoffRecord, Truth
+    from mastctl.experiment.handoff import HandoffExperiment, HandoffRecord
+    from mastctl.experiment.pointing import Truth
 
 PICTURES_PER_STEP = 4
 
@@ -80,13 +81,10 @@ def _simulated(args: argparse.Namespace, stack: ExitStack) -> tuple[Client, Trut
 
 def _run(args: argparse.Namespace, client: Client, truth: Truth | None) -> HandoffExperiment:
     """Run with a progress bar on stderr, one step a target."""
-    from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
     from mastctl.experiment.handoff import STEPS, run_handoff_experiment
 
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
-    with Progress(*columns, console=Console(stderr=True, quiet=args.json)) as progress:
+    with output.progress_bar(args.json) as progress:
         task = progress.add_task("hand-off", total=args.targets * len(STEPS))
 
         def show(record: HandoffRecord) -> None:

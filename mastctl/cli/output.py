@@ -8,7 +8,10 @@ import math
 import re
 import sys
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from rich.progress import Progress
 
 # How a cell with a number begins; a lone dash stands for a number that there is not.
 _NUMBER = re.compile(r"[-+±]? ?\.?\d|[-–—]$|nan$")
@@ -133,6 +136,15 @@ def _code_of(error: BaseException) -> str:
         return code
     name = type(error).__name__
     return "".join(f"_{c.lower()}" if c.isupper() and i else c.lower() for i, c in enumerate(name))
+
+
+def progress_bar(quiet: bool) -> Progress:
+    """Return a progress bar on stderr: what, how many of how many, since when. ``quiet`` shows nothing."""
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+    return Progress(*columns, console=Console(stderr=True, quiet=quiet))
 
 
 def finite_number(text: str) -> float:

@@ -124,10 +124,7 @@ def _begin(world: World, rng: np.random.Generator) -> tuple[Track, FloatArray] |
         rows, columns = np.nonzero(textured(left.image.astype(np.uint8)))
         for pick in rng.integers(len(rows), size=4) if len(rows) else ():
             pixel = np.array([float(columns[pick]), float(rows[pick])])
-            # Who looks at exact joints sees what the true camera saw: counts are the same for both.
-            count = world.errors.count_rad
-            at = [round(angles.pan_rad / count) * count, round(angles.tilt_rad / count) * count]
-            target = world.point_at(pair[0], at[0], at[1], pixel)
+            target = world.point_at(pair[0], angles.pan_rad, angles.tilt_rad, pixel)
             if target is None:
                 continue
             range_m = float(np.linalg.norm(world.site_from_rover.inverse.points(target) - left.camera.C))
@@ -235,8 +232,7 @@ def _look(world: World, track: Track, target: FloatArray) -> tuple[Track, Stop]:
     found = look.found.get(pair[0])
     pixel_error = math.nan
     if found is not None and found.verdict == "good":
-        count = world.errors.count_rad
-        exact = world.true_pixel(pair[0], round(pan / count) * count, round(tilt / count) * count, target)
+        exact = world.true_pixel(pair[0], pan, tilt, target)
         pixel_error = float(np.linalg.norm(found.pixel_px - exact))
     return track, Stop(
         float(np.linalg.norm(true - middle)),

@@ -100,8 +100,7 @@ class World:
 
     def look(self, pair: tuple[str, str], pan_rad: float, tilt_rad: float) -> dict[str, Eye]:
         """Point the head and take both pictures; the cameras are where the mast file says they are."""
-        count = self.errors.count_rad
-        at = np.array([round(pan_rad / count), round(tilt_rad / count)]) * count
+        at = self._turned(pan_rad, tilt_rad)
         read = at + self._rng.normal(0.0, self.errors.joint_rad, 2)
         eyes = {}
         for name in pair:
@@ -113,16 +112,21 @@ class World:
             eyes[name] = Eye(image, self.believed.camera_in_rover(name, float(read[0]), float(read[1])))
         return eyes
 
+    def _turned(self, pan_rad: float, tilt_rad: float) -> FloatArray:
+        """Where the head comes to stand: goals (2,), radians, rounded to counts."""
+        count = self.errors.count_rad
+        return np.array([round(pan_rad / count), round(tilt_rad / count)]) * count
+
     def true_pixel(
         self, name: str, pan_rad: float, tilt_rad: float, target_in_site_m: FloatArray
     ) -> FloatArray:
         """Where a point of the site truly is in a camera; not-a-number if it cannot be seen."""
-        model = self.true.camera_in_rover(name, pan_rad, tilt_rad)
+        model = self.true.camera_in_rover(name, *self._turned(pan_rad, tilt_rad).tolist())
         return np.asarray(model.project(self.site_from_rover.inverse.points(target_in_site_m))[0])
 
     def point_at(self, name: str, pan_rad: float, tilt_rad: float, pixel_px: FloatArray) -> FloatArray | None:
         """The point of the site, (3,) metres, that a pixel truly shows; None for the sky."""
-        rays = self.true.camera_in_rover(name, pan_rad, tilt_rad).ray(pixel_px)
+        rays = self.true.camera_in_rover(name, *self._turned(pan_rad, tilt_rad).tolist()).ray(pixel_px)
         origin = self.site_from_rover.points(rays.origins_m)
         along = self.site_from_rover.vectors(rays.directions)
         range_m = float(self._renderer.scene.cast(origin, along))

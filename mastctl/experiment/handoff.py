@@ -11,7 +11,7 @@ import math
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
@@ -24,6 +24,7 @@ from calib.store import parse_rig
 from calib.warp import grey
 from drivers.interfaces import Image
 from mastctl.client import Client, ClientError, Snapshot
+from mastctl.experiment.pointing import Truth
 from mastctl.experiment.targets import Target
 from mastctl.experiment.views import VIEWS_PER_TARGET, Views
 
@@ -38,20 +39,6 @@ PAN_RANGE_RAD = {"pancam": 1.0, "navcam": 0.35}
 
 JOINT_SIGMA_RAD = 3e-5
 """What a joint reading is taken to be wrong by: half a step of a stepped pan/tilt unit."""
-
-
-class Truth(Protocol):
-    """What only a simulation knows."""
-
-    def residual_px(
-        self,
-        clicked_frame_id: str,
-        clicked_px: tuple[float, float],
-        landed_frame_id: str,
-        aim_px: tuple[float, float],
-    ) -> tuple[float, float] | None:
-        """Return where a clicked point is in a later frame, less ``aim_px``; None for a click on the sky."""
-        ...
 
 
 @dataclass(frozen=True, eq=False)

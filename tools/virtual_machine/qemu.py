@@ -36,9 +36,9 @@ for module in $(/bin/busybox cat /modules/order); do
     [ $module = vivid.ko ] && options=$(echo "$VIVID" | /bin/busybox tr ';' ' ')
     /bin/busybox insmod /modules/$module $options
 done
-/bin/busybox mount -t 9p -o ro,{MOUNT_9P},cache=loose root /root
-/bin/busybox mount -o move /dev /root/dev
-exec /bin/busybox switch_root /root "$FIRST"
+/bin/busybox mount -t 9p -o ro,{MOUNT_9P},cache=loose root /host
+/bin/busybox mount -o move /dev /host/dev
+exec /bin/busybox switch_root /host "$FIRST"
 """
 
 
@@ -78,7 +78,7 @@ def _unpack(package: str, version: str, scratch: Path, folder: Path) -> None:
     tree = scratch / "unpacked"
     _run(["depmod", "-b", str(tree), version])
     root = scratch / "initrd"
-    for part in ("bin", "dev", "modules", "root"):
+    for part in ("bin", "dev", "modules", "host"):
         (root / part).mkdir(parents=True)
     order: list[str] = []
     for module in MODULES:

@@ -12,6 +12,7 @@ import logging
 import os
 import select
 import threading
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from types import TracebackType
@@ -80,7 +81,7 @@ class ManyBauds(Protocol):
     host_baud: int | None
 
 
-class Line:
+class Line(ABC):
     """The thread, the schedule of bytes on the wire, and the faults of the replies; ends are subclasses."""
 
     def __init__(
@@ -137,28 +138,28 @@ class Line:
     ) -> None:
         self.close()
 
+    @abstractmethod
     def _connect(self) -> None:
         """Make the end that a host can open."""
-        raise NotImplementedError
 
+    @abstractmethod
     def _disconnect(self) -> None:
         """Break it; nothing if it is broken."""
-        raise NotImplementedError
 
-    def _dismantle(self) -> None:
+    def _dismantle(self) -> None:  # noqa: B027  # only a pseudo terminal has something
         """Let go of what outlives a hang-up."""
 
+    @abstractmethod
     def _readable(self) -> list[int]:
         """The descriptors that may have something for ``_take``."""
-        raise NotImplementedError
 
+    @abstractmethod
     def _take(self, ready: Sequence[int]) -> bytes:
         """What the host has sent, empty for nothing that the device would understand."""
-        raise NotImplementedError
 
+    @abstractmethod
     def _give(self, data: bytes) -> None:
         """Hand bytes to the host; what it does not make room for is lost, as on a real line."""
-        raise NotImplementedError
 
     def _want(self, up: bool) -> None:
         with self._changed:
