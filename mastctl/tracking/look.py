@@ -2,8 +2,8 @@
 
 Steps of a start at a pixel, as they stand in the record: ``rest``, ``frames``, ``target``, ``start``; of one
 at a position ``choose``, ``limits`` to ``settle``, ``look``, ``start``. A look has ``choose``, ``limits`` to
-``settle`` (``rest`` for a pair on the body), ``look``, ``find``; a target that one pair does not find is looked
-for by the next one that sees it.
+``settle`` (``rest`` for a pair on the body), ``look``, ``find``; what one pair does not find, the next one
+that sees the place looks for.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ class NotTrackable(MastctlError):
 
 @dataclass(frozen=True)
 class EyePixel:
-    """What one eye told: ``verdict`` is `calib.match`'s, or ``no_frame``; pixel and sigma where it is good."""
+    """What one eye told: the verdict is `calib.match`'s or ``no_frame``; pixel and sigma if it is good."""
 
     frame_id: str
     verdict: str
@@ -214,7 +214,7 @@ class Looker:
         return self._steps.go(choice.pan_rad, choice.tilt_rad, self._rig.stereo[choice.pair][0])
 
     def _pictures(self, eyes: tuple[str, str], settled: Reading) -> tuple[dict[str, View], dict[str, str]]:
-        """New pictures, left first, and why an eye has none. Raises PointingError; DriverError of the head."""
+        """New pictures, left first, and why an eye has none. Raises PointingError, the head's DriverError."""
         missing: dict[str, str] = {}
         while len(missing) < len(eyes):
             asked = [name for name in eyes if name not in missing]

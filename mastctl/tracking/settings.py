@@ -21,8 +21,11 @@ class TrackingSettings:
         pose that jumped.
     start_error
         How far from an asked position the target of a track may turn out to be, as a part of its range.
+    named_pairs
+        Pairs whose bounds were set; the mast file must have them.
     """
 
     handoff: HandoffRules = field(default_factory=HandoffRules)
     most_step: float = 0.3
     start_error: float = 0.1
+    named_pairs: tuple[str, ...] = ()

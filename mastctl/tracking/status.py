@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 from calib.rigid import FloatArray
-from mastctl.operations import as_json
+from mastctl.as_json import as_json
 from mastctl.tracking.look import Seen
 from mastctl.tracking.pose import RoverPose, motion_between
 
@@ -42,9 +42,11 @@ class TrackStatus:
     stands_at
         The pose that the track was carried to; None before the first pose.
     pose
-        The newest pose. It is another than ``stands_at`` after a pose that jumped.
+        The newest pose. It is another than ``stands_at`` after a pose that jumped, and while a look runs.
     seen
         The last look.
+    found_by
+        The pair that found the target last.
     looks, misses
         Looks so far, and how many in a row did not find it.
     handoffs, renewals
@@ -65,6 +67,7 @@ class TrackStatus:
     stands_at: RoverPose | None = None
     pose: RoverPose | None = None
     seen: Seen | None = None
+    found_by: str = ""
     looks: int = 0
     misses: int = 0
     handoffs: tuple[HandedOver, ...] = ()
