@@ -148,9 +148,7 @@ class PoseBody(_Strict):
     def _sound(self) -> PoseBody:
         length = math.sqrt(sum(part * part for part in self.quaternion))
         if abs(length - 1.0) > 1e-3:
-            raise ValueError(
-                f"quaternion has the length {length:g} where 1 is expected; its order is w, x, y, z"
-            )
+            raise ValueError(f"quaternion (w, x, y, z) has the length {length:g} where 1 is expected")
         if self.covariance is not None and self.sigma is not None:
             raise ValueError("covariance and sigma say the same; one of them is expected")
         if self.covariance is not None:

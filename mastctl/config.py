@@ -178,7 +178,7 @@ def _tracking(top: Section) -> TrackingSettings:
     if "tracking" not in top:
         return usual
     section = top.section("tracking", (), ("handoff", "most_step", "start_error"))
-    rules, named = usual.handoff, ()
+    rules, named = usual.handoff, tuple[str, ...]()
     if "handoff" in section:
         keys = ("pairs", "margin_px", "disparity_error_px", "range_error")
         handoff = section.section("handoff", (), keys)

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from importlib.metadata import version
-from typing import Any, TypeVar
+from typing import Any
 
 from calib.mast import Rig
 from calib.store import StoredRig
@@ -35,9 +35,6 @@ SNAPSHOT_TIMEOUT_S = 5.0
 RENDERING_S = 20.0  # six simulated cameras share one renderer, on a machine that may be busy
 HARDWARE_CLOSE_S = 3.0
 STOP_THREADS = 4
-
-
-Target = TypeVar("Target", PixelTarget, PositionTarget, AnglesTarget)
 
 
 class Refused(MastctlError):
@@ -206,7 +203,8 @@ class Service:
             If another operation runs.
         """
         with self._mast_lock:
-            request = replace(request, target=self._in_rover(request.target))
+            if isinstance(request.target, PositionTarget):
+                request = replace(request, target=self._in_rover(request.target))
             self._check(request, mast_digest)
             loop = self._loop
 
@@ -229,7 +227,8 @@ class Service:
             As for `point`.
         """
         with self._mast_lock:
-            target = self._in_rover(target)
+            if isinstance(target, PositionTarget):
+                target = self._in_rover(target)
             self._check(PointRequest(target), mast_digest)
             return self.tracker.start(target, told)
 
@@ -315,10 +314,10 @@ class Service:
         if request.aim is not None:
             self._check_aim(request.aim)
 
-    def _in_rover(self, target: Target) -> Target:
-        """A target with its position in the rover frame of now; anything else as it is."""
+    def _in_rover(self, target: PositionTarget) -> PositionTarget:
+        """A position in the rover frame of now; before the first pose that is the site frame."""
         pose = self.tracker.pose
-        if not isinstance(target, PositionTarget) or target.frame != "site" or pose is None:
+        if target.frame != "site" or pose is None:
             return target
         x, y, z = pose.site_from_rover.inverse.points(position_in_rover_m(target)).tolist()
         return PositionTarget((x, y, z), "rover")
