@@ -34,7 +34,7 @@ from mastctl.tracking.pose import (
     stands,
 )
 from mastctl.tracking.settings import TrackingSettings
-from mastctl.tracking.status import ACTIVE, HandedOver, TrackStatus
+from mastctl.tracking.status import ACTIVE, HandedOver, TrackState, TrackStatus
 
 log = logging.getLogger(__name__)
 
@@ -311,9 +311,8 @@ class Tracker:
             reason = "the rover moved while the track's first pictures were taken; start it again"
             if outcome is None:
                 reason = _why(operation)
-            return TrackStatus(
-                state="stopped" if operation.state == "stopped" else "idle", reason=reason, pose=status.pose
-            )
+            ended: TrackState = "stopped" if operation.state == "stopped" else "idle"
+            return TrackStatus(state=ended, reason=reason, id=status.id, pose=status.pose)
         track, seen = outcome
         self._carried = Carried(track, status.stands_at)
         log.info("track %s begins %.2f m away, by %s", status.id, seen.range_m, seen.pair)
