@@ -37,6 +37,8 @@ class Found:
         New pictures of the clicked camera and of its partner.
     pixel_px
         (2,) the thing in ``now``.
+    resting
+        The head while they were taken.
     """
 
     view: View
@@ -44,6 +46,7 @@ class Found:
     now: View
     other: View
     pixel_px: FloatArray
+    resting: Reading
 
 
 class Steps:
@@ -124,7 +127,7 @@ class Steps:
         with self.step("target") as detail:
             again = self.eyes.again(view, pixel, now)
             detail.update(facts(again))
-        return Found(view, pixel, now, other, again.pixel_px)
+        return Found(view, pixel, now, other, again.pixel_px, resting)
 
     def go(self, pan_rad: float, tilt_rad: float, camera: str | None = None) -> Reading:
         """Check the limits, move, wait until settled; return the reading there.
