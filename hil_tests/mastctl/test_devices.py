@@ -544,7 +544,6 @@ def test_close_stops_the_head_and_leaves_no_thread() -> None:
         devices.move(0.0, 0.0)
 
 
-@impatient
 def test_close_ends_although_every_driver_hangs(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
