@@ -158,7 +158,7 @@ def _add_tracking(app: FastAPI, service: Service) -> None:
 
     @app.post(f"{PREFIX}/track/look", status_code=202, summary="Look for the target once more")
     def look() -> dict[str, Any]:
-        return {"id": tracker.look().id}
+        return {"id": service.look_for_target().id}
 
     @app.post(f"{PREFIX}/track/stop", summary="End the track; the head stops if it moves for it")
     async def stop() -> dict[str, Any]:

@@ -240,7 +240,19 @@ class Service:
         PoseRefused
             As `mastctl.tracking.tracker.Tracker.take_pose`.
         """
-        return self.tracker.take_pose(pose, look)
+        with self._mast_lock:
+            return self.tracker.take_pose(pose, look)
+
+    def look_for_target(self) -> Operation:
+        """Look for the track's target once more and return the look's first record.
+
+        Raises
+        ------
+        NoTrack, Busy
+            As `mastctl.tracking.tracker.Tracker.look`.
+        """
+        with self._mast_lock:
+            return self.tracker.look()
 
     def stop_track(self) -> None:
         """End the track, and stop the mast if it moves for it. Raises DriverError."""
