@@ -200,6 +200,7 @@ def test_a_pose_that_jumps_loses_the_target_and_looks_nowhere(client: Client) ->
     assert "jumped" in refusal(client.look, "no_track")
     assert client.track()["position_in_site_m"] == pytest.approx(TARGET_M)
     assert client.track()["position_m"] == pytest.approx([2.0, 0.5, 0.0])
+    assert client.track()["covariance_m2"] is None
     # The next pose is near again: the track goes on from where it stood, both jumps' uncertainty with it.
     track = drive(client, 0.6, 4.0)
     assert track["state"] == "tracking"
@@ -482,6 +483,11 @@ def test_the_commands_follow_a_target(
     assert (code, json.loads(out)["looks"]) == (0, 2)
     code, out, _ = run(daemon, capsys, "status", "--json")
     assert (code, json.loads(out)["state"]) == (0, "tracking")
+    far = ("--position", "9", "0", "0", "--sigma", "0.01", "0.005", "--time", "3")
+    code, out, _ = run(daemon, capsys, "pose", *far)
+    assert (code, out.partition(", the pose")[0]) == (
+        0, "lost, by navcam, at (-4.000, 0.500, 0.000) m, predicted"
+    )  # fmt: skip
     code, out, log = run(daemon, capsys, "pose", "--position", "0.5", "0", "0", "--time", "1")
     assert (code, out) == (1, "")
     assert "not later than the pose before" in log

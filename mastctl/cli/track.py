@@ -160,11 +160,15 @@ def track_line(track: dict[str, Any]) -> str:
     """Return a track in one line."""
     words = [track["state"]]
     if track["pair"]:
-        words += [f"by {track['pair']}", f"{track['range_m']:.3f} m away"]
+        words.append(f"by {track['pair']}")
+        if not track["predicted"]:
+            words.append(f"{track['range_m']:.3f} m away")
     if track["position_m"]:
         x, y, z = track["position_m"]
-        variance = sum(track["covariance_m2"][axis][axis] for axis in range(3))
-        words.append(f"at ({x:.3f}, {y:.3f}, {z:.3f}) m ± {math.sqrt(variance):.3f} m")
+        words.append(f"at ({x:.3f}, {y:.3f}, {z:.3f}) m")
+        if track["covariance_m2"]:
+            variance = sum(track["covariance_m2"][axis][axis] for axis in range(3))
+            words[-1] += f" ± {math.sqrt(variance):.3f} m"
     if track["predicted"]:
         words.append("predicted")
     if track["operation"]:

@@ -38,7 +38,7 @@ class TrackStatus:
     predicted
         Whether the rover moved since the last look: the position is carried over, not seen.
     position_m, covariance_m2
-        (3,) and (3, 3) in the rover frame of ``stands_at``.
+        (3,) and (3, 3) in the rover frame of ``stands_at``; no covariance is known after a pose that jumped.
     stands_at
         The pose that the track was carried to; None before the first pose.
     pose
@@ -79,11 +79,12 @@ class TrackStatus:
         """Return it as ``GET /track`` tells it."""
         position, covariance = self.position_m, self.covariance_m2
         in_site = position
-        if position is not None and covariance is not None and self.pose and self.stands_at:
+        if position is not None and self.pose and self.stands_at:
             in_site = self.stands_at.site_from_rover.points(position)
             moved = motion_between(self.stands_at, self.pose)
             position = moved.points(position)
-            covariance = moved.rotation @ covariance @ moved.rotation.T
+            if covariance is not None:
+                covariance = moved.rotation @ covariance @ moved.rotation.T
         seen = self.seen
         told = {
             "sequence": self.sequence,

@@ -267,7 +267,7 @@ class Tracker:
         origin_m = self._rig.mast.translation_m
         self._carried, reason = self._carried.to(pose, origin_m, self._settings.most_step)
         if reason:
-            return replace(status, state="lost", reason=reason)
+            return replace(status, state="lost", reason=reason, covariance_m2=None)
         if after_jump:
             status = replace(status, reason="not looked for since a pose jumped")
         track = self._carried.track
