@@ -170,7 +170,7 @@ class Axis:
         return self.rests and self.seen is not None and seen.position == self.seen.position
 
     def confirms(self, first: Seen, middle: Seen, last: Seen) -> bool:
-        """Return whether the middle of three positions can be taken: see the module `head`."""
+        """Return whether the middle of three positions can be taken: see the module `position`."""
         low, high = sorted((first.position, last.position))
         furthest = self.fastest * (last.time_s - first.time_s) + 1
         return low <= middle.position <= high and high - low <= furthest
