@@ -203,7 +203,12 @@ class Axis:
         """Return whether it was at its target and still for so long when it was seen last."""
         return self.arrived and self._dwell_s >= dwell_s
 
-    def stalled(self) -> bool:
-        """Return whether it stands still away from its target for longer than any start takes."""
+    def stall_words(self) -> str:
+        """Say that it stands still away from its target for longer than any start takes; else empty."""
         patience_s = max(STALL_S, 5.0 / max(self.speed or 1, 1))
-        return self.seen is not None and not self.arrived and self._dwell_s > patience_s
+        if self.seen is None or self.target is None or self.arrived or self._dwell_s <= patience_s:
+            return ""
+        return (
+            f"{self.name} stands at {self.angle_rad:.4f} rad and does not reach its target "
+            f"{self.rad_from_position(self.target):.4f} rad"
+        )

@@ -292,13 +292,5 @@ class FlirPtu:
 
     def _faults(self) -> tuple[str, ...]:
         """What is wrong, in plain words."""
-        return (
-            *self._count.lost.values(),
-            *self._supply.words,
-            *(
-                f"{axis.name} stands at {axis.angle_rad:.4f} rad and does not reach its target "
-                f"{axis.rad_from_position(axis.target):.4f} rad"
-                for axis in self._axes.values()
-                if axis.stalled() and axis.target is not None
-            ),
-        )
+        stalls = (axis.stall_words() for axis in self._axes.values())
+        return (*self._count.lost.values(), *self._supply.words, *(words for words in stalls if words))
