@@ -7,7 +7,7 @@ Clicks and joint readings err once per hand-off, so the eyes of one hand-off sha
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -124,11 +124,12 @@ def body_sights(
             rows.append(row)
     k = len(cameras)
     shapes = ((3,), (3, 3), (3, 4), (k, 2), (k, 2, 2), (k,))
-    columns = [
-        np.array([row[i] for row in rows]) if rows else np.zeros((0, *shape))
-        for i, shape in enumerate(shapes)
-    ]
-    return BodySights(rig, tuple(cameras), origin, tuple(used), *columns[:5], columns[5].astype(bool))
+    position, covariance, rates, found, noise, seen = (
+        np.array([row[i] for row in rows]).reshape(len(rows), *shape) for i, shape in enumerate(shapes)
+    )
+    return BodySights(
+        rig, tuple(cameras), origin, tuple(used), position, covariance, rates, found, noise, seen.astype(bool)
+    )
 
 
 def _row(
@@ -138,7 +139,7 @@ def _row(
     at = (one.joints.pan_rad, one.joints.tilt_rad)
     left, right = (rig.camera_in_rover(name, *at) for name in one.pair)
     try:
-        seen = triangulate(left, right, *one.clicks_px, one.sigma_px)
+        seen = triangulate(left, right, one.clicks_px[0], one.clicks_px[1], one.sigma_px)
     except CalibError:
         return None
     turned = gimbal_rates(np.eye(3)[None], seen.position_m[None], gimbal(numbers_of(rig.mast), *at), _JOINTS)[
@@ -147,11 +148,11 @@ def _row(
     covariance = seen.covariance_m2 + one.joints.sigma_rad**2 * turned @ turned.T
     found, noise = np.zeros((len(cameras), 2)), np.zeros((len(cameras), 2, 2))
     there = np.zeros(len(cameras), dtype=bool)
-    landed: Mapping[str, object] = one.found
+    accepted = one.found
     for eye, name in enumerate(cameras):
-        if name not in landed or not rig.cameras[name].model.project(seen.position_m)[1]:
+        match = accepted.get(name)
+        if match is None or not rig.cameras[name].model.project(seen.position_m)[1]:
             continue
-        match = one.found[name]
         assert match.found_px is not None and match.found_covariance_px2 is not None
         found[eye], there[eye] = match.found_px, True
         noise[eye] = match.found_covariance_px2 + model_px**2 * np.eye(2)

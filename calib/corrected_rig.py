@@ -96,7 +96,7 @@ def _parameter_rates(rig: Rig, known: RigCovariance, correction: BodyPose) -> Fl
     for eye, name in enumerate(used.cameras):
         on = used.seen[:, eye]
         rates[on, eye] = pixel_rates(rig, known.names, name, 0.0, 0.0, used.positions_m[on])[1]
-    rates = rates.reshape(count, 2 * eyes, -1)
+    flat = rates.reshape(count, 2 * eyes, -1)
     for i, one in enumerate(used.handoffs):
         joints = (one.joints.pan_rad, one.joints.tilt_rad)
         clicked = [
@@ -104,5 +104,5 @@ def _parameter_rates(rig: Rig, known: RigCovariance, correction: BodyPose) -> Fl
         ]
         # A model that shifts its pixel of the point by something puts a click's point where a click
         # shifted the other way would.
-        rates[i] -= equations.point_rates[i] @ used.rates_m_per_px[i] @ np.concatenate(clicked)
-    return rates
+        flat[i] -= equations.point_rates[i] @ used.rates_m_per_px[i] @ np.concatenate(clicked)
+    return flat

@@ -26,7 +26,7 @@ PRIOR_SHIFT_M, PRIOR_TURN_RAD = 0.005, 0.005
 and what that and the 2 mm themselves do at a camera some 0.7 m from the prisms."""
 
 SEEN = 4.0
-"""A direction is seen if the hand-offs say four times as much of it as the prior: its sigma more than halves."""
+"""A direction is seen if the hand-offs say four times as much of it as the prior."""
 
 FEWEST = 8
 """Hand-offs: half of them may not decide by a hair, and blunders must stand out."""

@@ -1,4 +1,4 @@
-"""Hand-offs with known errors: plain CAHVOR arithmetic and SciPy's rotations, nothing of the code under test."""
+"""Hand-offs with known errors: plain CAHVOR arithmetic and SciPy's rotations, no code under test."""
 
 from __future__ import annotations
 
