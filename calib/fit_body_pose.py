@@ -187,7 +187,8 @@ class _Fit:
 
 _PRIOR_SIGMA = np.array([PRIOR_SHIFT_M] * 3 + [PRIOR_TURN_RAD] * 3)
 _PRIOR = np.diag(1.0 / _PRIOR_SIGMA**2)
-_STEPS = 6
+_STEPS, _ROBUST_STEPS = 4, 10
+"""Of Gauss and Newton: a turn by 5 mrad is all but linear; weights by residuals take longer to settle."""
 
 
 def _enough(sights: BodySights) -> None:
@@ -230,7 +231,7 @@ def _fit(sights: BodySights, robust: bool = False) -> _Fit:
     before = at = sights.equations(step)
     numbers = 2 * sights.seen.sum(axis=1)
     bend = chdtri(numbers, 0.05)
-    for _ in range(3 * _STEPS if robust else _STEPS):
+    for _ in range(_ROBUST_STEPS if robust else _STEPS):
         weights = np.ones(len(numbers))
         if robust:
             statistics = _normal(at, weights)[2] / scale

@@ -57,7 +57,7 @@ class HandoffBias:
         """The offset in words."""
         sigma = np.sqrt(np.diag(self.covariance_px2))
         x, y = (
-            f"{abs(off):.2f} +- {s:.2f} px {words[off < 0]}"
+            f"{abs(off):.2f} +- {s:.2f} px {words[int(off < 0)]}"
             for off, s, words in zip(
                 self.offset_px, sigma, (("right", "left"), ("lower", "higher")), strict=True
             )
