@@ -334,12 +334,12 @@ def _told(used: BodySights, fit: _Fit, outliers: tuple[LeftOut, ...]) -> BodyPos
 
 def _sentence(direction: FloatArray) -> str:
     """A direction that the hand-offs leave to the prior, in words."""
-    parts = [
-        f"{weight:+.2f} {word}" for weight, word in zip(direction, WORDS, strict=True) if abs(weight) > 0.3
-    ]
+    toward = direction * np.sign(direction[np.argmax(np.abs(direction))])
+    large = sorted(zip(-np.abs(toward), toward, WORDS, strict=True))
+    parts = [f"{weight:+.2f} {word}" for size, weight, word in large if size < -0.3]
     return (
-        f"not seen: {', '.join(parts)} (each in units of {1e3 * PRIOR_SHIFT_M:g} mm or "
-        f"{1e3 * PRIOR_TURN_RAD:g} mrad); there the prior stands"
+        f"not told by these hand-offs: {' with '.join(parts)}, in units of {1e3 * PRIOR_SHIFT_M:g} mm and "
+        f"{1e3 * PRIOR_TURN_RAD:g} mrad; only the prior holds it"
     )
 
 
