@@ -63,9 +63,7 @@ def run(args: argparse.Namespace) -> int:
     if args.click_px < 0:
         raise output.WrongUse(f"--click-px {args.click_px:g} where 0 or more is expected")
     if args.mast is not None and not args.simulated:
-        raise output.WrongUse(
-            "--mast belongs to --simulated; a running daemon has its own mast file"
-        )
+        raise output.WrongUse("--mast belongs to --simulated; a running daemon has its own mast file")
     if args.out is not None:
         check_writable(args.out)
     with ExitStack() as stack:

@@ -38,7 +38,7 @@ def write_report(experiment: HandoffExperiment, folder: Path) -> Path:
 
     Raises
     ------
-    OSError
+    OSError, BadFile
         If the folder or a file in it cannot be written.
     """
     folder.mkdir(parents=True, exist_ok=True)
