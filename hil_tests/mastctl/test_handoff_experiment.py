@@ -14,6 +14,7 @@ import pytest
 from calib.handoff import Joints, Predicted
 from calib.handoff_refined import RefinedPixel, Verdict
 from calib.matched_handoff import Landed, MatchedHandoff
+from mastctl.cli.main import main
 from mastctl.experiment.handoff import Handed, HandoffExperiment, HandoffRecord, summarise
 from mastctl.experiment.handoff_report import table_rows, write_report
 from mastctl.handoff_log import read_log
@@ -89,7 +90,7 @@ def test_the_record_of_hand_offs_and_a_constant_offset_are_told(tmp_path: Path) 
     records = []
     for index in range(10):
         there = np.array([100.0 + 20 * index, 200.0])
-        found = there + [0.5 + 0.02 * index, -2.0]
+        found = there + np.array([0.5 + 0.02 * index, -2.0])
         landed = {
             "hazcam_left": Landed(there, 0.01 * np.eye(2), "accepted", "", found, 0.01 * np.eye(2)),
             "hazcam_right": Landed(there, 0.01 * np.eye(2), "flat", "no texture"),
@@ -115,3 +116,8 @@ def test_the_record_of_hand_offs_and_a_constant_offset_are_told(tmp_path: Path) 
     (bias,) = experiment.as_json()["bias"]
     assert bias["camera"] == "hazcam_left" and told in bias["sentence"] and bias["sigmas"] > 10
     assert json.loads((tmp_path / "record.json").read_text())["bias"] == [bias]
+
+
+def test_another_mast_file_is_for_the_simulated_rover_only(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["experiment", "handoff", "--mast-file", "m.yaml", "--json"]) == 2
+    assert "--simulated" in json.loads(capsys.readouterr().out)["error"]["message"]

@@ -90,6 +90,10 @@ def _show(proposal: Proposal) -> None:
         _show_pose(group, pose)
     for group, why in proposal.refusals.items():
         notes.append(f"{group}: {why}")
+    if not proposal.poses:
+        for note in notes:
+            output.tell(note)
+        return
     rows = [
         [camera, *(f"{x:.2f}, {y:.2f}" for x, y in sizes)]
         for pose in proposal.poses.values()

@@ -33,7 +33,7 @@ def add_parser(kinds: Any) -> None:
         help="start the packaged simulated rover for it, and compare with the truth",
     )  # fmt: skip
     parser.add_argument(
-        "--mast", type=Path, metavar="MAST.yaml",
+        "--mast-file", type=Path, metavar="MAST.yaml",
         help="with --simulated: the mast file that its daemon uses (default: the packaged one)",
     )  # fmt: skip
     parser.add_argument(
@@ -62,8 +62,8 @@ def run(args: argparse.Namespace) -> int:
 
     if args.click_px < 0:
         raise output.WrongUse(f"--click-px {args.click_px:g} where 0 or more is expected")
-    if args.mast is not None and not args.simulated:
-        raise output.WrongUse("--mast belongs to --simulated; a running daemon has its own mast file")
+    if args.mast_file is not None and not args.simulated:
+        raise output.WrongUse("--mast-file belongs to --simulated; a running daemon has its own mast file")
     if args.out is not None:
         check_writable(args.out)
     with ExitStack() as stack:
@@ -83,8 +83,8 @@ def _simulated(args: argparse.Namespace, stack: ExitStack) -> tuple[Client, Trut
     from mastctl.experiment.demo import SimulationTruth, demo_config
 
     config = demo_config(load_config(None), head="ptu_d46_70", seed=args.seed)
-    if args.mast is not None:
-        config = replace(config, mast_file=args.mast)
+    if args.mast_file is not None:
+        config = replace(config, mast_file=args.mast_file)
     daemon = stack.enter_context(RunningDaemon(config))
     rover = daemon.hardware.simulation
     assert rover is not None  # the packaged configuration is a simulated rover
