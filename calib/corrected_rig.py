@@ -12,9 +12,9 @@ from dataclasses import replace
 
 import numpy as np
 
+from calib.body_pose import BodyPose
 from calib.cahvor import CameraModel
 from calib.camera_parameters import parameter_names, parameter_part, tangents
-from calib.fit_body_pose import BodyPose
 from calib.mast import Rig
 from calib.rig_covariance import RigCovariance
 from calib.rigid import FloatArray

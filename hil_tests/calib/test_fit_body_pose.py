@@ -20,12 +20,13 @@ from handed_over import (
 )
 from scipy.spatial.transform import Rotation
 
+from calib.body_pose import PRIOR_SHIFT_M, PRIOR_TURN_RAD, BodyPose
 from calib.body_sights import body_groups
 from calib.cahvor import CameraModel
 from calib.camera_parameters import parameter_names, parameter_part, tangents
 from calib.corrected_rig import corrected_covariance, corrected_rig
 from calib.errors import NoCorrection
-from calib.fit_body_pose import PRIOR_SHIFT_M, PRIOR_TURN_RAD, BodyPose, fit_body_pose
+from calib.fit_body_pose import fit_body_pose
 from calib.mast import Rig
 from calib.rig_covariance import RigCovariance, moved_rig
 from calib.store import load_rig

@@ -11,10 +11,11 @@ from typing import Any
 
 import numpy as np
 
+from calib.body_pose import PRIOR_SHIFT_M, PRIOR_TURN_RAD, BodyPose
 from calib.body_sights import body_groups
 from calib.corrected_rig import corrected_covariance, corrected_rig
 from calib.errors import NoCorrection
-from calib.fit_body_pose import PRIOR_SHIFT_M, PRIOR_TURN_RAD, BodyPose, fit_body_pose
+from calib.fit_body_pose import fit_body_pose
 from calib.handoff_bias import HandoffBias, handoff_bias
 from calib.mast import Rig
 from calib.matched_handoff import MatchedHandoff

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from mastctl.cli import output
 
 if TYPE_CHECKING:
-    from calib.fit_body_pose import BodyPose
+    from calib.body_pose import BodyPose
     from calib.store import StoredRig
     from mastctl.calibration.refined import Proposal
 
@@ -104,7 +104,7 @@ def _show(proposal: Proposal) -> None:
 
 
 def _show_pose(group: str, pose: BodyPose) -> None:
-    from calib.fit_body_pose import WORDS
+    from calib.body_pose import WORDS
 
     sigma = pose.covariance.diagonal() ** 0.5
     rows = [
