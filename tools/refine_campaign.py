@@ -1,8 +1,8 @@
 """How well `mastctl calibrate --refine` corrects Hazcams that are not where they are believed; no pictures.
 
 The believed rig is the true one with its Hazcams moved by two disagreeing prism set-ups (5 mm, 5 mrad an
-axis), or not at all. Navcam hands targets over; clicks and matches err. Errors are of geometric hand-offs with
-exact clicks to other targets, 1.5 to 4 m away:
+axis), or not at all. Navcam hands targets over; clicks and matches err. Errors are of geometric hand-offs of
+other targets, 1.5 to 4 m away, with exact clicks:
 
     .venv/bin/python tools/refine_campaign.py --rig configs/sim/rocky8.yaml --cases 100 --seed 1
 """
