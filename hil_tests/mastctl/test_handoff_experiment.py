@@ -5,15 +5,19 @@ from __future__ import annotations
 import csv
 import json
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from calib.handoff import Predicted
+from calib.handoff import Joints, Predicted
 from calib.handoff_refined import RefinedPixel, Verdict
+from calib.matched_handoff import Landed, MatchedHandoff
+from mastctl.cli.main import main
 from mastctl.experiment.handoff import Handed, HandoffExperiment, HandoffRecord, summarise
 from mastctl.experiment.handoff_report import table_rows, write_report
+from mastctl.handoff_log import read_log
 
 STEP = "navcam to hazcam"
 
@@ -80,3 +84,40 @@ def test_the_report_holds_every_target_and_escapes_what_it_is_told(tmp_path: Pat
     document = json.loads((tmp_path / "new/record.json").read_text())
     assert document["handoffs"][0]["paper_worst_px"] == 4.0
     assert table_rows(summaries)[1][0][-1] == "4"
+
+
+def test_the_record_of_hand_offs_and_a_constant_offset_are_told(tmp_path: Path) -> None:
+    records = []
+    for index in range(10):
+        there = np.array([100.0 + 20 * index, 200.0])
+        found = there + np.array([0.5 + 0.02 * index, -2.0])
+        landed = {
+            "hazcam_left": Landed(there, 0.01 * np.eye(2), "accepted", "", found, 0.01 * np.eye(2)),
+            "hazcam_right": Landed(there, 0.01 * np.eye(2), "flat", "no texture"),
+        }
+        at = Joints(0.0, -0.5)
+        matched = MatchedHandoff(
+            "2026-01-01T00:00:00Z",
+            "d",
+            ("navcam_left", "navcam_right"),
+            at,
+            there + np.eye(2),
+            0.2,
+            at,
+            landed,
+        )
+        records.append(replace(record(index), matched=matched))
+    experiment = HandoffExperiment({"hardware": "simulated"}, 1, 0.2, tuple(records), (), "now", 3.0)
+    page = write_report(experiment, tmp_path).read_text()
+    write_report(experiment, tmp_path)  # a second run replaces the first one's record
+    assert len(read_log(tmp_path / "handoffs.jsonl").handoffs) == 10
+    told = "2.00 +- 0.13 px higher of where navcam puts them"
+    assert told in page and "calibrate --refine" in page
+    (bias,) = experiment.as_json()["bias"]
+    assert bias["camera"] == "hazcam_left" and told in bias["sentence"] and bias["sigmas"] > 10
+    assert json.loads((tmp_path / "record.json").read_text())["bias"] == [bias]
+
+
+def test_another_mast_file_is_for_the_simulated_rover_only(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["experiment", "handoff", "--mast-file", "m.yaml", "--json"]) == 2
+    assert "--simulated" in json.loads(capsys.readouterr().out)["error"]["message"]

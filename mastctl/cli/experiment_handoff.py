@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -32,6 +33,10 @@ def add_parser(kinds: Any) -> None:
         help="start the packaged simulated rover for it, and compare with the truth",
     )  # fmt: skip
     parser.add_argument(
+        "--mast-file", type=Path, metavar="MAST.yaml",
+        help="with --simulated: the mast file that its daemon uses (default: the packaged one)",
+    )  # fmt: skip
+    parser.add_argument(
         "--targets", type=at_least_one, default=10, metavar="N", help="targets of each hand-off (default 10)"
     )
     parser.add_argument(
@@ -42,7 +47,10 @@ def add_parser(kinds: Any) -> None:
         "--seed", type=seed, default=1, metavar="S", help="chooses views and pixels (default 1)"
     )
     parser.add_argument(
-        "--out", type=Path, metavar="DIR", help="folder for report.html, targets.csv and record.json"
+        "--out",
+        type=Path,
+        metavar="DIR",
+        help="folder for report.html, targets.csv, handoffs.jsonl and record.json",
     )
     parser.set_defaults(run=run)
 
@@ -54,6 +62,8 @@ def run(args: argparse.Namespace) -> int:
 
     if args.click_px < 0:
         raise output.WrongUse(f"--click-px {args.click_px:g} where 0 or more is expected")
+    if args.mast_file is not None and not args.simulated:
+        raise output.WrongUse("--mast-file belongs to --simulated; a running daemon has its own mast file")
     if args.out is not None:
         check_writable(args.out)
     with ExitStack() as stack:
@@ -73,6 +83,8 @@ def _simulated(args: argparse.Namespace, stack: ExitStack) -> tuple[Client, Trut
     from mastctl.experiment.demo import SimulationTruth, demo_config
 
     config = demo_config(load_config(None), head="ptu_d46_70", seed=args.seed)
+    if args.mast_file is not None:
+        config = replace(config, mast_file=args.mast_file)
     daemon = stack.enter_context(RunningDaemon(config))
     rover = daemon.hardware.simulation
     assert rover is not None  # the packaged configuration is a simulated rover
@@ -106,7 +118,7 @@ def _run(args: argparse.Namespace, client: Client, truth: Truth | None) -> Hando
 
 def _tell(args: argparse.Namespace, experiment: HandoffExperiment) -> int:
     from mastctl.cli.experiment import turned
-    from mastctl.experiment.handoff_report import table_rows, write_report
+    from mastctl.experiment.handoff_report import bias_sentences, table_rows, write_report
 
     page = write_report(experiment, args.out) if args.out is not None else None
     if args.json:
@@ -117,6 +129,7 @@ def _tell(args: argparse.Namespace, experiment: HandoffExperiment) -> int:
     else:
         headings, rows = table_rows(experiment.summaries)
         notes = [f"clicks with {experiment.click_px:g} px of noise; lengths in px of the destination camera"]
+        notes += bias_sentences(experiment)
         notes += [f"report: {page}"] if page is not None else []
         output.print_table(
             f"Hand-off errors, px ({experiment.status.get('hardware')} hardware)",

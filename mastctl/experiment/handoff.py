@@ -17,8 +17,10 @@ import numpy as np
 
 from calib.errors import CalibError
 from calib.handoff import Joints, Predicted, hand_off
+from calib.handoff_bias import HandoffBias, handoff_bias
 from calib.handoff_refined import Eye, RefinedPixel, refine_handoff
 from calib.mast import Rig
+from calib.matched_handoff import MatchedHandoff, matched_handoff
 from calib.rig_covariance import RigCovariance, stored_covariance
 from calib.store import parse_rig
 from calib.warp import grey
@@ -85,6 +87,7 @@ class HandoffRecord:
     error: str = ""
     seconds: float = 0.0
     source_image: Image | None = None
+    matched: MatchedHandoff | None = None
 
 
 @dataclass(frozen=True)
@@ -116,6 +119,11 @@ class HandoffExperiment:
     started: str
     seconds: float
 
+    @property
+    def bias(self) -> tuple[HandoffBias, ...]:
+        """The mean offset of what was found from what was predicted, by camera."""
+        return handoff_bias([r.matched for r in self.records if r.matched is not None])
+
     def as_json(self) -> dict[str, Any]:
         """Return the whole record for programs."""
         return {
@@ -139,6 +147,16 @@ class HandoffExperiment:
                     "paper_worst_px": PAPER_WORST_PX.get(row.step),
                 }
                 for row in self.summaries
+            ],
+            "bias": [
+                {
+                    "camera": one.camera,
+                    "source": one.source,
+                    "offset_px": one.offset_px.tolist(),
+                    "sigmas": one.sigmas,
+                    "sentence": one.sentence,
+                }
+                for one in self.bias
             ],
             "failures": [
                 {"handoff": r.step, "target": r.index, "error": r.error} for r in self.records if r.error
@@ -296,6 +314,8 @@ class _Bench:
         clicks = exact + self._rng.normal(0.0, self._click_px, (2, 2))
         joints = Joints(target.shot.pan_rad, target.shot.tilt_rad, JOINT_SIGMA_RAD)
         there = next(iter(shots.values()))
+        to_joints = Joints(there.pan_rad, there.tilt_rad, JOINT_SIGMA_RAD)
+        sigma_px = max(self._click_px, 0.05)
         done = hand_off(
             self._rig,
             self._source,
@@ -303,8 +323,8 @@ class _Bench:
             joints,
             clicks[0],
             clicks[1],
-            to_joints=Joints(there.pan_rad, there.tilt_rad, JOINT_SIGMA_RAD),
-            sigma_px=max(self._click_px, 0.05),
+            to_joints=to_joints,
+            sigma_px=sigma_px,
             calibration=self._calibration,
         )
         refined = refine_handoff(
@@ -330,6 +350,9 @@ class _Bench:
             tuple(handed),
             seconds=time.monotonic() - begun_s,
             source_image=target.shot.image if with_pictures else None,
+            matched=matched_handoff(
+                target.shot.mast_digest, self._source, joints, clicks, sigma_px, to_joints, done, refined
+            ),
         )
 
     def _eye(self, shot: Snapshot) -> Eye:
