@@ -1,6 +1,6 @@
-"""Follow the same targets with this project's tracker, OpenCV's and opencv-contrib's, in one run on one thread.
+"""Follow the same targets with this project's tracker, OpenCV's and opencv-contrib's, in one run, one thread.
 
-    .venv/bin/python -m tools.compare_trackers --work SEQUENCES [--contrib ENVIRONMENT] [--targets 12] [--json]
+    .venv/bin/python -m tools.compare_trackers --work SEQUENCES [--contrib ENVIRONMENT] [--targets 12]
 
 Renders the sequences of tools/tracker_sequences.py into --work (half a minute each, once), runs every method
 of tools/tracker_methods.py on them, and a tracker of opencv-contrib (--kind, CSRT by default) in the
@@ -30,7 +30,6 @@ import json
 import subprocess
 import sys
 import venv
-from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -169,7 +168,7 @@ def compare(
 
 
 def verdicts(rows: list[Row]) -> list[dict[str, object]]:
-    """Hold ours against what is wanted, for every world and setting, beside the plain and beside all others."""
+    """Hold ours against what is wanted, for every world and setting."""
     answers: list[dict[str, object]] = []
     for mine in (one for one in rows if one.method == "ours"):
         same = [o for o in rows if (o.world, o.setting) == (mine.world, mine.setting) and o is not mine]
@@ -197,9 +196,8 @@ def print_table(rows: list[Row]) -> None:
     """Print rows, a block each world and setting."""
     for number, one in enumerate(rows):
         if number == 0 or (one.world, one.setting) != (rows[number - 1].world, rows[number - 1].setting):
-            print(
-                f"\n{one.world} {one.setting}, {one.runs} targets, {STEPS} steps of {SETTINGS[one.setting]:.1%}"
-            )
+            step = f"{STEPS} steps of {SETTINGS[one.setting]:.1%}"
+            print(f"\n{one.world} {one.setting}, {one.runs} targets, {step}")
             print(f"{'method':28} kept lost wrong missed  rms px   worst   drift      mm  to ours     ms")
         cells = [
             f"{value:7.3f}" if value is not None else "      -"

@@ -37,7 +37,7 @@ GRID_PX = np.stack(np.meshgrid(*[np.linspace(-HALF_PX, HALF_PX, 7)] * 2), axis=-
 LEAST_INLIERS = 10
 
 Tracked = tuple[FloatArray, FloatArray]
-"""Found pixels (20, 2, 2), not-a-number where it said lost, and milliseconds (20,) of a step with both eyes."""
+"""Found pixels (20, 2, 2), not-a-number where it said lost, and milliseconds (20,) of a step, both eyes."""
 
 
 def ours(sequence: Sequence) -> Tracked:
