@@ -10,11 +10,13 @@ empty. Each row says, over both eyes:
 - kept: runs in which the last picture's target was found and no found pixel was off by more than 5 px;
 - lost: runs that ended with the target said to be lost; wrong: runs with a pixel off by more than 5 px that
   was given as found; missed: steps said to be lost, of all;
-- rms and worst distance from the true pixel over the steps of kept runs; drift: rms at their last step, in
+- median: distance from the true pixel over all steps of all runs, those said lost counted as infinite;
+- rms: the same distance over the steps of kept runs; drift: rms at their last step, in
   pixels and as millimetres at the target, since a pixel of the last picture may be much less of the target
   than one of the first, where the target was chosen;
 - to ours: this row's rms over ours, in the runs that both kept;
-- ms: processor time of a step for both eyes, median.
+- ms: processor time of a step for both eyes, median and 95th percentile, and the median over that of plain
+  matchTemplate.
 """
 # ruff: noqa: E402  the number of threads is set before numpy is imported
 
@@ -58,12 +60,14 @@ class Row:
     lost: int
     wrong: int
     missed: float
+    median_px: float | None
     rms_px: float | None
-    worst_px: float | None
     drift_px: float | None
     drift_mm: float | None
     to_ours: float | None
     milliseconds: float | None
+    milliseconds_p95: float | None
+    to_match_template: float | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,19 +101,27 @@ def judged(runs: list[Tracked], truth_px: np.ndarray, pixel_m: np.ndarray) -> Ju
     return Judged(np.linalg.norm(found - truth_px, axis=-1), np.array([one[1] for one in runs]), pixel_m)
 
 
-def row(world: str, setting: str, method: str, mine: Judged, ours: Judged) -> Row:
+def row(world: str, setting: str, method: str, mine: Judged, ours: Judged, plain: Judged) -> Row:
     """Sum up a method's runs."""
     kept, both = mine.kept, mine.kept & ours.kept
     errors = mine.error_px[kept]
+    spent, reference = percentile(mine.milliseconds, 50), percentile(plain.milliseconds, 50)
+    median = float(np.median(np.where(np.isnan(mine.error_px), np.inf, mine.error_px)))
     last_m = rms(errors[:, -1] * mine.pixel_m[kept, None])
     return Row(
         world, setting, method, len(kept), int(kept.sum()), int(mine.lost.sum()), int(mine.wrong.sum()),
         float(np.isnan(mine.error_px).any(axis=2).mean()),
-        rms(errors), float(np.nanmax(errors)) if len(errors) else None, rms(errors[:, -1]),
+        median if np.isfinite(median) else None, rms(errors), rms(errors[:, -1]),
         None if last_m is None else 1e3 * last_m,
         rms(mine.error_px[both]) / (rms(ours.error_px[both]) or np.nan) if both.any() else None,
-        float(np.nanmedian(mine.milliseconds)) if np.isfinite(mine.milliseconds).any() else None,
+        spent, percentile(mine.milliseconds, 95),
+        spent / reference if spent and reference else None,
     )  # fmt: skip
+
+
+def percentile(values: np.ndarray, percent: float) -> float | None:
+    """Percentile of what is not not-a-number."""
+    return float(np.nanpercentile(values, percent)) if np.isfinite(values).any() else None
 
 
 def focal_px(camera: CameraModel) -> float:
@@ -164,7 +176,10 @@ def compare(
     if contrib is not None:
         found[f"{contrib[1]} (opencv-contrib)"] = contrib_tracked(*contrib, files)
     results = {name: judged(runs, np.array(truth), np.array(pixel_m)) for name, runs in found.items()}
-    return [row(world, setting, name, one, results["ours"]) for name, one in results.items()]
+    return [
+        row(world, setting, name, one, results["ours"], results["matchTemplate"])
+        for name, one in results.items()
+    ]
 
 
 def verdicts(rows: list[Row]) -> list[dict[str, object]]:
@@ -198,13 +213,15 @@ def print_table(rows: list[Row]) -> None:
         if number == 0 or (one.world, one.setting) != (rows[number - 1].world, rows[number - 1].setting):
             step = f"{STEPS} steps of {SETTINGS[one.setting]:.1%}"
             print(f"\n{one.world} {one.setting}, {one.runs} targets, {step}")
-            print(f"{'method':28} kept lost wrong missed  rms px   worst   drift      mm  to ours     ms")
+            heads = "kept lost wrong missed  median     rms   drift      mm  to ours     ms    p95 ratio"
+            print(f"{'method':28} {heads}")
         cells = [
             f"{value:7.3f}" if value is not None else "      -"
-            for value in (one.rms_px, one.worst_px, one.drift_px, one.drift_mm)
+            for value in (one.median_px, one.rms_px, one.drift_px, one.drift_mm)
         ]
         ratio = "      -" if one.to_ours is None else f"{one.to_ours:7.2f}"
-        spent = "     -" if one.milliseconds is None else f"{one.milliseconds:6.2f}"
+        times = (one.milliseconds, one.milliseconds_p95, one.to_match_template)
+        spent = " ".join(f"{value or np.nan:6.2f}" for value in times)
         counts = f"{one.kept:4d} {one.lost:4d} {one.wrong:5d} {one.missed:6.0%}"
         print(f"{one.method:28} {counts} {' '.join(cells)}  {ratio} {spent}")
 

@@ -78,20 +78,22 @@ def test_runs_are_counted_by_hand() -> None:
     ]
     truth, pixel_m = np.zeros((4, STEPS, 2, 2)), np.full(4, 0.002)
     mine, its = (judged(runs, truth, pixel_m) for runs in (ours, other))
-    first, second = row("plane", "B", "ours", mine, mine), row("plane", "B", "other", its, mine)
+    first, second = row("plane", "B", "ours", mine, mine, its), row("plane", "B", "other", its, mine, its)
     assert (first.kept, first.lost, first.wrong, first.missed) == (4, 0, 0, pytest.approx(1 / 80))
     assert (second.kept, second.lost, second.wrong) == (1, 2, 2)
     assert second.drift_px == pytest.approx(0.5)
     assert second.drift_mm == pytest.approx(1.0)
-    assert second.worst_px == pytest.approx(0.7)
+    assert second.median_px == pytest.approx(0.1)
     assert second.rms_px == pytest.approx(np.sqrt((39 * 0.01 + 0.49) / 40))
     assert second.to_ours == pytest.approx(np.sqrt((39 * 0.01 + 0.49) / 40) / 0.1)
-    assert second.milliseconds == 4.0
+    assert (second.milliseconds, second.milliseconds_p95, first.to_match_template) == (4.0, 4.0, 1.0)
 
 
 def test_ours_is_held_against_the_best_of_those_that_keep_targets() -> None:
     def one(method: str, kept: int, to_ours: float, milliseconds: float = 9.0) -> Row:
-        return Row("plane", "B", method, 12, kept, 0, 0, 0.0, 0.1, 0.2, 0.15, 0.3, to_ours, milliseconds)
+        return Row(
+            "plane", "B", method, 12, kept, 0, 0, 0.0, 0.1, 0.1, 0.15, 0.3, to_ours, milliseconds, 12.0, 8.0
+        )
 
     answers = verdicts(
         [one("ours", 12, 1.0, 11.0), one("few", 2, 1.1), one("most", 9, 1.8), one("most, assisted", 9, 3.0)]
