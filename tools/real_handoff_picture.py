@@ -59,7 +59,7 @@ def draw(first: View, second: View, ways: Mapping[str, Sequence[Carried]], path:
     figure.supxlabel(CREDIT, fontsize=8, color="#555555", x=0.99, ha="right")
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(
-        path, dpi=100, pil_kwargs={"quality": 82, "optimize": True} if path.suffix == ".jpg" else None
+        path, dpi=100, pil_kwargs={"quality": 74, "optimize": True} if path.suffix == ".jpg" else None
     )
 
 
