@@ -6,7 +6,8 @@ measured on, in two worlds:
 - ``plane``: level textured ground without rocks; the pair flies straight at the target, 25 degrees from the
   ground's normal in B and along it in C, and the range is that of the left camera;
 - ``ground``: the simulator's ground with relief, every second target on a rock where the scene has one in
-  reach that both eyes see all the way; the rover drives, and the range is the level distance of the mast, so in C the view steepens from 9 to some 50 degrees.
+  reach that both eyes see all the way; the rover drives, and the range is the level distance of the mast,
+  so in C the view steepens from 9 to some 50 degrees.
 
 At each stop the rover stands with up to 2 degrees of roll and pitch and heads by 0.08 rad (one sigma) wrong.
 The head is turned to the true target, up to 15 px away in x and y, so that it stays in both pictures however
