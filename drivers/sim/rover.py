@@ -28,6 +28,7 @@ from drivers.clock import Clock
 from drivers.errors import BadOptions, NoFreshFrame
 from drivers.faults import FaultPanel, nearest, read_script
 from drivers.interfaces import PanTilt
+from drivers.options import is_number, is_whole
 from drivers.sim.cameras import CameraSettings, SimulatedCamera
 from drivers.sim.pan_tilt import HeadSettings, SimulatedPanTilt, head_settings
 from drivers.sim.render import Renderer, compile_renderer
@@ -141,7 +142,7 @@ def simulation_settings(section: Mapping[str, Any], folder: Path) -> SimulationS
 
 def _whole(value: Any, key: str, low: int, high: int) -> int:
     """A whole number within bounds."""
-    if isinstance(value, bool) or not isinstance(value, int) or not low <= value <= high:
+    if not is_whole(value) or not low <= value <= high:
         raise BadOptions(f"{key} is {value!r}, expected a whole number from {low} to {high}")
     return value
 
@@ -157,8 +158,7 @@ def _filled(defaults: Any, values: Any, key: str) -> Any:
             raise BadOptions(f"{key} has no key {name!r}{nearest(str(name), known)}")
         kind = type(known[name])
         if kind in (int, float):
-            wrong = isinstance(value, bool) or not isinstance(value, int if kind is int else int | float)
-            if wrong or not math.isfinite(value):
+            if not (is_whole(value) if kind is int else is_number(value)):
                 what = "a whole number" if kind is int else "a number"
                 raise BadOptions(f"{key}.{name} is {value!r}, expected {what}")
             value = kind(value)
