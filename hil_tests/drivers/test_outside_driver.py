@@ -164,8 +164,9 @@ def test_it_keeps_the_promises_of_the_page(hardware: Hardware) -> None:
     head.move(0.5, 0.0)
     assert head.read().moving
     head.stop()
-    stopped = head.read()
-    assert not stopped.moving and stopped.pan_rad < 0.4
+    while (stopped := head.read()).moving:  # it brakes, the longer the later the stop came
+        assert time.monotonic() < asked_s + 30.0
+    assert stopped.pan_rad < 0.4
     head.close()
     with pytest.raises(NoReply):
         head.read()

@@ -383,7 +383,7 @@ def outliers(folder: Path, capsys: pytest.CaptureFixture[str], *words: str) -> l
     return [outlier["name"] for outlier in told["outliers"]]
 
 
-@pytest.mark.parametrize("shift_m", [0.012, 0.05, 1.0])
+@pytest.mark.parametrize("shift_m", [0.012, 1.0])
 def test_a_tape_measured_wrongly_is_named(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], shift_m: float
 ) -> None:
@@ -392,7 +392,7 @@ def test_a_tape_measured_wrongly_is_named(
     assert outliers(folder, capsys) == ["tape b of placement mast-2 (set-up level)"]
 
 
-@pytest.mark.parametrize("shift_m", [0.02, 0.05, 1.0])
+@pytest.mark.parametrize("shift_m", [0.02, 1.0])
 def test_the_papers_method_lists_the_images_of_a_board_with_a_wrong_tape(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], shift_m: float
 ) -> None:
@@ -407,7 +407,7 @@ def test_the_papers_method_lists_the_images_of_a_board_with_a_wrong_tape(
 
 
 @pytest.mark.parametrize("method", ["joint", "paper"])
-@pytest.mark.parametrize("shift_m", [0.012, 0.05, 1.0])
+@pytest.mark.parametrize("shift_m", [0.012, 1.0])
 def test_a_prism_measured_wrongly_is_named(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], shift_m: float, method: str
 ) -> None:
@@ -436,7 +436,7 @@ def test_a_wrong_dot_is_named(
     assert outliers(written(survey, tmp_path), capsys, "--method", method) == [name]
 
 
-@pytest.mark.parametrize("shift_px", [0.5, 3.0, 30.0])
+@pytest.mark.parametrize("shift_px", [0.5, 30.0])
 def test_a_shifted_image_is_named(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], shift_px: float
 ) -> None:
@@ -493,8 +493,9 @@ def test_an_image_with_the_placement_of_another_is_told_whose_it_is(
 ) -> None:
     rows(folder / IMAGES, lambda c, _: c | {"placement": other} if c["image"] == image else c)
     # Drawing a report takes longer than all the rest; an image without any pixels is the hard one to draw.
-    report = ["--report", str(folder.parent / "r")] if other in ("mast-5", "mast-8") else []
-    code, told = calibrate(capsys, folder, "--method", method, *(report if method == "joint" else []))
+    drawn = method == "joint" and (image, other) in ((IMAGE, "mast-5"), (CHECK, "mast-8"))
+    report = ["--report", str(folder.parent / "r")] if drawn else []
+    code, told = calibrate(capsys, folder, "--method", method, *report)
     assert code == 0, told
     reasons = " | ".join(reason["sentence"] for reason in told["verdict"]["reasons"])
     assert f"image {image} cannot show placement {other} but would show {own} (set-up level)" in reasons
