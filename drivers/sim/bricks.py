@@ -50,7 +50,7 @@ def make_brick(x_m: float, y_m: float, turn_rad: float, ground_z_m: Callable[[fl
     around = flat @ np.array([[cos, sin], [-sin, cos]]) + [x_m, y_m]
     bottom = max(float(ground_z_m(x, y)) for x, y in around) + SUNK_M
     top = np.column_stack([around, np.full(4, bottom - height)])
-    return Brick(np.concatenate([top, top + [0.0, 0.0, height]]))
+    return Brick(np.concatenate([top, top + np.array([0.0, 0.0, height])]))
 
 
 def scattered(

@@ -58,7 +58,13 @@ class SceneSettings:
     sun_elevation_rad: float = 0.70
 
     def __post_init__(self) -> None:
-        bounds = (("seed", 0, 2**63), ("relief_m", 0, 1), ("rocks", 0, 500), ("bricks", 0, 24), ("sun_elevation_rad", 0.2, 1.5))
+        bounds = (
+            ("seed", 0, 2**63),
+            ("relief_m", 0, 1),
+            ("rocks", 0, 500),
+            ("bricks", 0, 24),
+            ("sun_elevation_rad", 0.2, 1.5),
+        )
         for name, low, high in bounds:
             value = getattr(self, name)
             if not low <= value <= high:

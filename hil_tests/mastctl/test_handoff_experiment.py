@@ -12,7 +12,7 @@ import pytest
 
 from calib.handoff import Predicted
 from calib.handoff_refined import RefinedPixel, Verdict
-from mastctl.experiment.handoff import Handed, HandoffExperiment, HandoffRecord, summarise
+from mastctl.experiment.handoff_record import Handed, HandoffExperiment, HandoffRecord, summarise
 from mastctl.experiment.handoff_report import table_rows, write_report
 
 STEP = "navcam to hazcam"
@@ -50,7 +50,7 @@ RECORDS = (
 
 
 def test_errors_are_against_the_truth_and_only_accepted_ones_are_refined() -> None:
-    row = summarise(STEP, "hazcam_left", RECORDS)
+    row = summarise(STEP, "ground", "hazcam_left", RECORDS)
     assert (row.targets, row.failed, row.accepted) == (3, 1, 1)
     assert row.geometric_rms_px == pytest.approx((math.sqrt(5.0), math.sqrt(8.0)))
     assert row.geometric_bias_px == pytest.approx((1.0, -2.0))
@@ -64,12 +64,12 @@ def test_without_the_truth_the_refined_pixel_stands_in() -> None:
     assert one.geometric_error_px == (3.0, -4.0)
     assert one.refined_error_px is None
     assert handed((1.0, 1.0), (0.0, 0.0), None, "flat").geometric_error_px is None
-    empty = summarise(STEP, "hazcam_right", RECORDS)
+    empty = summarise(STEP, "ground", "hazcam_right", RECORDS)
     assert empty.geometric_rms_px is None and empty.refined_rms_px is None
 
 
 def test_the_report_holds_every_target_and_escapes_what_it_is_told(tmp_path: Path) -> None:
-    summaries = (summarise(STEP, "hazcam_left", RECORDS),)
+    summaries = (summarise(STEP, "ground", "hazcam_left", RECORDS),)
     experiment = HandoffExperiment({"hardware": "simulated"}, 1, 0.2, RECORDS, summaries, "now", 3.0)
     page = write_report(experiment, tmp_path / "new").read_text()
     assert "&lt;i&gt;none" in page and "hidden &lt;b&gt;" in page and "<i>none" not in page
