@@ -19,7 +19,6 @@ from calib.cahvor import CameraModel
 from calib.epipolar import find_partner
 from calib.handoff import Handoff, Predicted
 from calib.match import Match, MatchSettings, match
-from calib.one_point import Sighting, one_point
 from calib.rigid import FloatArray
 from calib.warp import Grey, Plane
 
@@ -132,7 +131,7 @@ def refine_handoff(
             refined[name] = surface
         else:
             refined[name] = _looked_up(source[0], clicks_px[0], surface, eye, predicted, settings, sizes)
-    return _agreeing(refined, handoff, destinations, settings)
+    return _agreeing(refined, handoff, settings)
 
 
 def _surface(
@@ -188,7 +187,6 @@ def _looked_up(
 def _agreeing(
     refined: dict[str, RefinedPixel],
     handoff: Handoff,
-    destinations: Mapping[str, Eye],
     settings: RefineSettings,
 ) -> dict[str, RefinedPixel]:
     """Take back what the other destination eyes, or the source's range, do not confirm."""
@@ -199,13 +197,7 @@ def _agreeing(
     if doubting:
         words = f"{doubting[0]} does not confirm it: {refined[doubting[0]].reason}"
         return {**refined, **{name: _taken_back(one, words) for name, one in accepted.items()}}
-    point = one_point(
-        handoff.seen.position_m,
-        handoff.covariance_m2,
-        [Sighting(destinations[n].camera, o.pixel_px, o.covariance_px2) for n, o in accepted.items()],
-        settings.model_px,
-    )
-    chi2 = math.inf if point is None else point.chi2
+    chi2 = _misfit(accepted, handoff, settings)
     if chi2 > settings.worst_chi2:
         words = (
             f"{' and '.join(accepted)} and the source pair do not mean one point: weighted misfit "
@@ -213,6 +205,22 @@ def _agreeing(
         )
         return {**refined, **{name: _taken_back(one, words) for name, one in accepted.items()}}
     return refined
+
+
+def _misfit(accepted: Mapping[str, RefinedPixel], handoff: Handoff, settings: RefineSettings) -> float:
+    """Weighted square of how far the found pixels lie from the hand-off's, all together.
+
+    What the eyes share (a range or a calibration that is off) may move them together as far as that is
+    uncertain; against each other they may be wrong only by what each alone can.
+    """
+    order = [name for name, predicted in handoff.pixels.items() if predicted is not None]
+    rows = np.concatenate([2 * order.index(name) + np.arange(2) for name in accepted])
+    allowed = handoff.joint_px2[np.ix_(rows, rows)] + settings.model_px**2 * np.eye(len(rows))
+    for index, one in enumerate(accepted.values()):
+        part = slice(2 * index, 2 * index + 2)
+        allowed[part, part] += one.covariance_px2
+    off = np.concatenate([one.off_px for one in accepted.values()])
+    return float(off @ np.linalg.solve(allowed, off))
 
 
 def _taken_back(one: RefinedPixel, words: str) -> RefinedPixel:

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from calib import pointing
 from calib.handoff_refined import Eye
 from calib.mast import Rig
+from calib.rig_covariance import RigCovariance, moved_rig
 from drivers.sim import texture
 from drivers.sim.bricks import Brick, make_brick
 from drivers.sim.compiled import kernels
@@ -27,12 +28,15 @@ from mastctl.experiment.targets import BORDER_PX, textured
 
 Float64 = NDArray[np.float64]
 
+OFF_PX = 3.0
+"""What the destination pair's calibration is off by in every second two looks, one sigma each axis."""
+
 KINDS = ("occluded", "flat", "repeated", "shadow", "range")
 STEPS = (("navcam", "hazcam", 2.0, 0.35), ("pancam", "navcam", 6.0, 0.9))
 """From, to, distance in metres, azimuth to either side."""
 
 CLICK_PX = 0.2
-PER_VIEW = 5
+PER_VIEW = 4
 APART_PX = 45.0
 RANGE_SLACK = 0.25
 TRIED = 3000
@@ -71,6 +75,8 @@ class Case:
         Commanded pan, tilt.
     source, destinations
         Pictures with the cameras as the mast file has them.
+    believed, calibration
+        The mast file: the packaged one, or one whose destination pair is off.
     clicks_px
         (2, 2) with their noise, and with what is wrong about the second.
     sigma_px
@@ -85,6 +91,8 @@ class Case:
     joints_rad: tuple[float, float]
     source: tuple[Eye, Eye]
     destinations: dict[str, Eye]
+    believed: Rig
+    calibration: RigCovariance
     clicks_px: Float64
     sigma_px: float
     true_px: dict[str, Float64]
@@ -93,18 +101,19 @@ class Case:
 class Stage:
     """The rover before scenes that provoke."""
 
-    def __init__(self, true: Rig, believed: Rig, seed: int) -> None:
+    def __init__(self, true: Rig, believed: Rig, calibration: RigCovariance, seed: int) -> None:
         self._rng = np.random.default_rng(seed)
         self._scene_seed = seed
         self._world: World | None = None
-        self._rigs = (true, believed)
+        self._true, self._believed, self._calibration = true, believed, calibration
         self._scenes: dict[tuple[Any, ...], Scene] = {}
 
     def cases(self, kind: str, count: int) -> Iterator[Case]:
         """Yield ``count`` cases of a kind, by turns of either step."""
         done, look = 0, 0
         while done < count:
-            for case in self._look(kind, *STEPS[look % len(STEPS)]):
+            off_px = OFF_PX * (look // len(STEPS) % 2)
+            for case in self._look(kind, off_px, *STEPS[look % len(STEPS)]):
                 yield case
                 done += 1
                 if done == count:
@@ -116,14 +125,18 @@ class Stage:
         if self._world is not None:
             self._world.close()
 
-    def _look(self, kind: str, source: str, to: str, distance_m: float, azimuth_rad: float) -> Iterator[Case]:
+    def _look(
+        self, kind: str, off_px: float, source: str, to: str, distance_m: float, azimuth_rad: float
+    ) -> Iterator[Case]:
         """One look from a new place: up to ``PER_VIEW`` targets."""
         rng = self._rng
         azimuth = rng.uniform(-azimuth_rad, azimuth_rad)
         view = self._view(kind, distance_m, azimuth)
         if self._world is None:
-            self._world = World(view.source, *self._rigs, WorldErrors(), rng)
+            self._world = World(view.source, self._true, self._believed, WorldErrors(), rng)
         world = self._world
+        believed, calibration = self._mast_file(world.true.stereo[to], off_px)
+        world.believed = believed
         world.relight(view.source)
         pair, next_pair = world.true.stereo[source], world.true.stereo[to]
         pan, tilt = self._angles(world, pair[0], distance_m, azimuth)
@@ -154,11 +167,30 @@ class Stage:
             clicks[1, 0] += view.second_click_px * rng.choice([-1.0, 1.0])
             source_eyes = (eyes[pair[0]], eyes[pair[1]])
             yield Case(
-                kind, view.note, (source, to), (pan, tilt), source_eyes, destinations, clicks,
-                view.sigma_px, true,
+                kind, f"{view.note}, mast file off by {off_px:g} px", (source, to), (pan, tilt), source_eyes,
+                destinations, believed, calibration, clicks, view.sigma_px, true,
             )  # fmt: skip
             if len(taken) == PER_VIEW:
                 return
+
+    def _mast_file(self, pair: tuple[str, str], off_px: float) -> tuple[Rig, RigCovariance]:
+        """The packaged mast file; or one whose pair is off in x and y together, and which knows how far."""
+        if not off_px:
+            return self._believed, self._calibration
+        known, moved = self._calibration, self._believed
+        parts = [f"cameras.{name}.{letter}.{axis}" for name in pair for letter in "HV" for axis in "xyz"]
+        names = known.names + tuple(name for name in parts if name not in known.names)
+        covariance = np.zeros((len(names), len(names)))
+        covariance[: len(known.names), : len(known.names)] = known.covariance
+        for letter in "HV":
+            # A camera whose H (V) is off by A sees everything a pixel to the right (lower).
+            step = np.zeros(len(names))
+            for name in pair:
+                for k, axis in enumerate("xyz"):
+                    step[names.index(f"cameras.{name}.{letter}.{axis}")] = moved.cameras[name].model.A[k]
+            covariance += off_px**2 * np.outer(step, step)
+            moved = moved_rig(moved, names, float(self._rng.normal(0.0, off_px)) * step)
+        return moved, RigCovariance(names, covariance)
 
     def _angles(self, world: World, camera: str, distance_m: float, azimuth: float) -> tuple[float, float]:
         """Joint angles that look at level ground at the distance."""
@@ -291,13 +323,13 @@ def _at_shadow_edge(scene: Scene, points_m: Float64) -> NDArray[np.bool_]:
     around = EDGE_M * np.array([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
     lit = []
     for x, y in around:
-        lit.append(np.isnan(scene.cast(points_m + [x, y, -0.012], sun_direction(scene.settings))))
+        lit.append(np.isnan(scene.cast(points_m + np.array([x, y, -0.012]), sun_direction(scene.settings))))
     on_ground = np.array([abs(p[2] - scene.ground_z_m(p[0], p[1])) < 1e-3 for p in points_m])
     return np.asarray(np.any(lit, axis=0) & ~np.all(lit, axis=0) & on_ground)
 
 
 def faded(scene: Scene, contrast: float, broad: bool = True) -> Scene:
-    """Return the scene with the contrast of its ground multiplied; ``broad`` also that of soil and shadows."""
+    """Return the scene with its ground's contrast multiplied; ``broad`` also that of soil and shadows."""
     world = scene.world
 
     def less(picture: Any) -> Any:

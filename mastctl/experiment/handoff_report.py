@@ -30,6 +30,10 @@ CSV_COLUMNS = (
 CROP_PX, SCALE = 30, 6
 VIEW_SIDE_PX = 480
 TRUTH_BGR = (80, 200, 80)
+LEGEND = (
+    "<p>Ellipse: where the geometric hand-off says to search (3 sigma). Red cross: geometric. Blue cross: "
+    "refined. Green circle: the truth, where it is known.</p>"
+)
 
 
 def write_report(experiment: HandoffExperiment, folder: Path) -> Path:
@@ -170,12 +174,10 @@ def _parts(experiment: HandoffExperiment) -> list[str]:
     parts += ["<h2>Each target</h2>", html.table(*target_rows(experiment.records))]
     pictured = [r for r in experiment.records if r.source_image is not None and r.handed]
     if known := [r for r in pictured if r.kind != "ground"]:
-        parts.append("<h2>Known points</h2><p>Ellipse: where the geometric hand-off says to search (3 sigma). "
-                     "Red cross: geometric. Blue cross: refined. Green circle: the truth.</p>")  # fmt: skip
+        parts.append(f"<h2>Known points</h2>{LEGEND}")
         parts += _views(known)
     if shown := [r for r in pictured if r.kind == "ground"]:
-        parts.append("<h2>Targets</h2><p>Ellipse: where the geometric hand-off says to search (3 sigma). "
-                     "Red cross: geometric. Blue cross: refined. Green circle: the truth, where known.</p>")  # fmt: skip
+        parts.append(f"<h2>Targets</h2>{LEGEND}")
         parts += [_pictures(record) for record in shown]
     return parts
 
