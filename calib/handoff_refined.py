@@ -166,8 +166,16 @@ def _looked_up(
     search = settings.sigmas * math.sqrt(float(np.linalg.eigvalsh(predicted.search_px2)[-1]))
     search = min(max(search, settings.least_px), settings.most_px)
     found: Match = match(source.image, source.camera, pixel_px, surface, eye.image, eye.camera, search, sizes)
+    scores = (found.correlation, found.second)
+    if not _whole_window(found, eye, search):
+        edge = f"part of the {search:.0f} px around the hand-off's pixel where it may be lies at the border"
+        words = found.reason if found.verdict == "border" else f"{edge} of the picture"
+        return _none("unseen", words, *scores)
+    if found.verdict == "border":
+        # All of the window could be searched: what it holds best is not the target.
+        return _none("occluded", found.reason, *scores)
     if found.verdict != "good":
-        return _none(_WORDS[found.verdict], found.reason, found.correlation, found.second)
+        return _none(_WORDS[found.verdict], found.reason, *scores)
     off = found.pixel_px - predicted.pixel_px
     allowed = predicted.search_px2 + found.covariance_px2 + settings.model_px**2 * np.eye(2)
     distance = math.sqrt(float(off @ np.linalg.solve(allowed, off)))
@@ -176,12 +184,16 @@ def _looked_up(
             "occluded",
             f"what fits best lies {np.linalg.norm(off):.1f} px from the geometric hand-off, {distance:.1f} "
             "of its standard deviations: something else, or a wrong calibration",
-            found.correlation,
-            found.second,
+            *scores,
         )
-    return RefinedPixel(
-        "accepted", "", found.pixel_px, found.covariance_px2, off, found.correlation, found.second
-    )
+    return RefinedPixel("accepted", "", found.pixel_px, found.covariance_px2, off, *scores)
+
+
+def _whole_window(found: Match, eye: Eye, search_px: float) -> bool:
+    """Tell whether the patch fits into the picture wherever in the window the target is."""
+    reach = search_px + found.half_px
+    size = np.array(eye.camera.size_px)
+    return bool((found.predicted_px >= reach).all() and (found.predicted_px <= size - 1 - reach).all())
 
 
 def _agreeing(

@@ -2,7 +2,7 @@
 
 What the verdicts have to judge is what correlation answers without them: the source's patch warped through
 its range, its best place in the window. A case is wrong if that is more than 4 px from the exact projection
-in either eye, and caught if no such eye is accepted.
+in either eye, and caught if no such eye is accepted; an accepted pixel is judged by itself.
 
     .venv/bin/python -m tools.handoff_campaign --cases 100 --seed 1
 """
@@ -60,9 +60,15 @@ class Outcome:
     verdict: str
     reason: str
     correlation: float
+    second: float
     geometric_px: float
     refined_px: float
     correlated_px: float
+
+    @property
+    def answer_px(self) -> float:
+        """What the answer is off by: the accepted pixel, else what correlation alone would have answered."""
+        return self.refined_px if self.verdict == "accepted" else self.correlated_px
 
 
 def run_case(case: Case, number: int) -> list[Outcome]:
@@ -82,18 +88,18 @@ def run_case(case: Case, number: int) -> list[Outcome]:
         )  # fmt: skip
     except (NoHandoff, NoStereoPoint) as error:
         nan = math.nan
-        return [outcome(name, "refused", str(error), nan, math.inf, nan, math.inf) for name in to]
+        return [outcome(name, "refused", str(error), nan, nan, math.inf, nan, math.inf) for name in to]
     refined = refine_handoff(done, case.source, case.clicks_px, case.destinations)
     plane = _surface(case, done)
     outcomes = []
     for name in to:
         predicted, one = done.pixels[name], refined[name]
         if predicted is None:
-            outcomes.append(outcome(name, one.verdict, one.reason, math.nan, math.inf, math.nan, math.inf))
+            outcomes.append(outcome(name, one.verdict, one.reason, *([math.inf] * 5)))
             continue
         best = correlated(case, case.destinations[name], plane, predicted)
         errors = (_off(place, case, name) for place in (predicted.pixel_px, one.pixel_px, best))
-        outcomes.append(outcome(name, one.verdict, one.reason, one.correlation, *errors))
+        outcomes.append(outcome(name, one.verdict, one.reason, one.correlation, one.second, *errors))
     return outcomes
 
 
@@ -145,7 +151,7 @@ class Row:
 def summarise(kind: str, cases: Sequence[Sequence[Outcome]]) -> Row:
     """Count cases: wrong if an eye's answer is, flagged if no such eye is accepted."""
     accepted = [[one for one in eyes if one.verdict == "accepted"] for eyes in cases]
-    wrong = [[one for one in eyes if one.correlated_px > WRONG_PX] for eyes in cases]
+    wrong = [[one for one in eyes if one.answer_px > WRONG_PX] for eyes in cases]
     errors = np.array([one.refined_px for eyes in accepted for one in eyes])
     right = [max(one.correlated_px for one in eyes) <= RIGHT_PX for eyes in cases]
     return Row(

@@ -29,7 +29,7 @@ from mastctl.experiment.targets import BORDER_PX, textured
 Float64 = NDArray[np.float64]
 
 OFF_PX = 3.0
-"""What the destination pair's calibration is off by in every second two looks, one sigma each axis."""
+"""What the destination pair's calibration is off by in two of three looks, one sigma each axis."""
 
 KINDS = ("occluded", "flat", "repeated", "shadow", "range")
 STEPS = (("navcam", "hazcam", 2.0, 0.35), ("pancam", "navcam", 6.0, 0.9))
@@ -41,10 +41,11 @@ APART_PX = 45.0
 RANGE_SLACK = 0.25
 TRIED = 3000
 BEFORE_M = 0.02
+EDGE_PX = 25.0
 EDGE_M = 0.04  # a shadow's edge is nearer to the target than this
 SUN_BY_RAD = (0.15, 0.7)
 CONTRASTS = (0.005, 0.2)  # of flat ground, beside the natural 1
-PERIODS_PER_SIDE = (64, 128, 256)  # of the 4.096 m texture: 64, 32 and 16 mm
+PERIODS_PER_SIDE = (64, 128)  # of the 4.096 m texture: 64 and 32 mm
 SECOND_CLICK_PX = (3.0, 30.0)
 SECOND_EYE_RAD = (0.002, 0.02)
 
@@ -102,17 +103,18 @@ class Stage:
     """The rover before scenes that provoke."""
 
     def __init__(self, true: Rig, believed: Rig, calibration: RigCovariance, seed: int) -> None:
-        self._rng = np.random.default_rng(seed)
         self._scene_seed = seed
+        self._rng = np.random.default_rng(seed)
         self._world: World | None = None
         self._true, self._believed, self._calibration = true, believed, calibration
         self._scenes: dict[tuple[Any, ...], Scene] = {}
 
     def cases(self, kind: str, count: int) -> Iterator[Case]:
         """Yield ``count`` cases of a kind, by turns of either step."""
+        self._rng = np.random.default_rng([self._scene_seed, *kind.encode()])
         done, look = 0, 0
         while done < count:
-            off_px = OFF_PX * (look // len(STEPS) % 2)
+            off_px = 0.0 if look % 3 == 2 else OFF_PX
             for case in self._look(kind, off_px, *STEPS[look % len(STEPS)]):
                 yield case
                 done += 1
@@ -153,13 +155,15 @@ class Stage:
             exact = np.array(
                 [world.true_pixel(pair[0], pan, tilt, point), world.true_pixel(pair[1], *right_tilt, point)]
             )
+            if not _inside(exact[1], eyes[pair[1]].image.shape, BORDER_PX):
+                continue
             if any(np.linalg.norm(exact[0] - other) < APART_PX for other in taken):
                 continue
             if not self._shows(world, view, (pair[1],), right_tilt, point)[0]:
                 continue
             shown = self._shows(world, replace(view, source=view.destination), next_pair, (pan, tilt), point)
             true = {name: world.true_pixel(name, pan, tilt, point) for name in next_pair}
-            inside = all(_inside(true[name], destinations[name].image.shape) for name in next_pair)
+            inside = all(_inside(true[name], destinations[name].image.shape, EDGE_PX) for name in next_pair)
             if not inside or all(shown) == (kind == "occluded"):
                 continue
             taken.append(exact[0])
@@ -308,9 +312,8 @@ class Stage:
         return tuple(row)
 
 
-def _inside(pixel_px: Float64, shape: tuple[int, ...]) -> bool:
+def _inside(pixel_px: Float64, shape: tuple[int, ...], edge: float) -> bool:
     """Whether a pixel is well inside a picture."""
-    edge = 12.0
     return bool(
         np.isfinite(pixel_px).all()
         and (pixel_px > edge).all()
