@@ -25,6 +25,7 @@ from mastctl.experiment.handoff_report import table_rows, target_rows, view_pict
 from mastctl.experiment.known_points import BrickPoints
 
 STEP = "navcam to hazcam"
+FRAME = "hazcam_left-000001-00000000-0000"
 
 
 def handed(
@@ -128,7 +129,7 @@ def test_bricks_points_are_seen_only_where_nothing_hides_them(repository: Path) 
     known = BrickPoints(cast(SimulatedRover, rover))
     points = known.points()
     assert [point.kind for point in points] == ["corner"] * 4 + ["face"] * 5
-    seen = {tuple(point.position_m): known.seen_px("hazcam_left-1", point.position_m) for point in points}
+    seen = {tuple(point.position_m): known.seen_px(FRAME, point.position_m) for point in points}
     for corner in brick.corners_m[:4]:
         pixel = seen[tuple(corner)]
         assert pixel is not None, "no upper corner is hidden from above"
@@ -137,5 +138,5 @@ def test_bricks_points_are_seen_only_where_nothing_hides_them(repository: Path) 
     for face in brick.faces_m:
         turned_to_camera = (face - middle) @ (camera.C - face) > 0
         assert (seen[tuple(face)] is not None) == turned_to_camera
-    assert known.seen_px("hazcam_left-1", np.array([2.1, 0.0, -0.001])) is None, "behind the brick"
-    assert known.seen_px("hazcam_left-1", np.array([-3.0, 0.0, 0.0])) is None, "behind the camera"
+    assert known.seen_px(FRAME, np.array([2.1, 0.0, -0.001])) is None, "behind the brick"
+    assert known.seen_px(FRAME, np.array([-3.0, 0.0, 0.0])) is None, "behind the camera"

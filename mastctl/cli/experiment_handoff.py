@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from mastctl.experiment.pointing import Truth
 
 PICTURES_PER_STEP = 4
+TARGETS = {"ground": "textured ground", "corner": "bricks' corners", "face": "middles of bricks' faces"}
 MOST_BRICKS = 24  # what a scene takes
 MOST_POINTS = 9  # of one brick: its upper corners and its faces but the bottom
 
@@ -133,12 +134,11 @@ def _tell(args: argparse.Namespace, experiment: HandoffExperiment) -> int:
             document["report"] = str(page)
         output.print_json(document)
     else:
-        headings, rows = table_rows(experiment.summaries)
         notes = [f"clicks with {experiment.click_px:g} px of noise; lengths in px of the destination camera"]
         notes += [f"report: {page}"] if page is not None else []
-        output.print_table(
-            f"Hand-off errors, px ({experiment.status.get('hardware')} hardware)",
-            *turned(headings, rows),
-            notes,
-        )
+        kinds = list(dict.fromkeys(row.kind for row in experiment.summaries))
+        for kind in kinds:
+            headings, rows = table_rows([row for row in experiment.summaries if row.kind == kind])
+            title = f"Hand-off errors of {TARGETS[kind]}, px ({experiment.status.get('hardware')} hardware)"
+            output.print_table(title, *turned(headings, rows), notes if kind == kinds[-1] else ())
     return 0 if any(record.handed for record in experiment.records) else 1
