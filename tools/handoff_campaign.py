@@ -193,7 +193,7 @@ def main() -> int:
     for kind, count in wanted.items():
         for case in stage.cases(kind, count):
             done[kind].append(run_case(case, len(done[kind])))
-        print(f"{kind}: {len(done[kind])} cases, {time.monotonic() - began:.0f} s", file=sys.stderr)
+        print(f"{time.monotonic() - began:.0f} s: {summarise(kind, done[kind])}", file=sys.stderr, flush=True)
     stage.close()
     rows = [summarise(kind, cases) for kind, cases in done.items()]
     bad = [cases for kind in KINDS for cases in done.get(kind, [])]

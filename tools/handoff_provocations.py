@@ -20,8 +20,9 @@ from calib.handoff_refined import Eye
 from calib.mast import Rig
 from calib.rig_covariance import RigCovariance, moved_rig
 from drivers.sim import texture
-from drivers.sim.bricks import Brick, make_brick
+from drivers.sim.bricks import Brick, make_brick, meshes
 from drivers.sim.compiled import kernels
+from drivers.sim.rocks import together
 from drivers.sim.scene import Scene, SceneSettings, build_scene, sun_direction
 from mastctl.experiment.approach_world import World, WorldErrors
 from mastctl.experiment.targets import BORDER_PX, textured
@@ -36,7 +37,7 @@ STEPS = (("navcam", "hazcam", 2.0, 0.35), ("pancam", "navcam", 6.0, 0.9))
 """From, to, distance in metres, azimuth to either side."""
 
 CLICK_PX = 0.2
-PER_VIEW = 4
+PER_VIEW = 5
 APART_PX = 45.0
 RANGE_SLACK = 0.25
 TRIED = 3000
@@ -107,10 +108,11 @@ class Stage:
         self._rng = np.random.default_rng(seed)
         self._world: World | None = None
         self._true, self._believed, self._calibration = true, believed, calibration
-        self._scenes: dict[tuple[Any, ...], Scene] = {}
+        self._scenes: dict[SceneSettings, Scene] = {}
 
     def cases(self, kind: str, count: int) -> Iterator[Case]:
         """Yield ``count`` cases of a kind, by turns of either step."""
+        self.close()
         self._rng = np.random.default_rng([self._scene_seed, *kind.encode()])
         done, look = 0, 0
         while done < count:
@@ -126,6 +128,7 @@ class Stage:
         """Let go of the renderer."""
         if self._world is not None:
             self._world.close()
+            self._world = None
 
     def _look(
         self, kind: str, off_px: float, source: str, to: str, distance_m: float, azimuth_rad: float
@@ -262,7 +265,7 @@ class Stage:
             return View(scene, scene, "as it is")
         if kind == "occluded":
             scene = self._scene(usual)
-            hidden = self._scene(usual, self._row(scene, distance_m, azimuth))
+            hidden = with_bricks(scene, self._row(scene, distance_m, azimuth))
             stood = bool(rng.random() < 0.5) and distance_m < 4.0
             return View(hidden if stood else scene, hidden, "stood there" if stood else "came between")
         if kind == "flat":
@@ -291,10 +294,8 @@ class Stage:
         turn = float(rng.uniform(*SECOND_EYE_RAD) * rng.choice([-1.0, 1.0]))
         return View(scene, scene, f"head turned by {turn * 1e3:.1f} mrad between", second_eye_rad=turn)
 
-    def _scene(self, settings: SceneSettings, more: tuple[Brick, ...] = ()) -> Scene:
+    def _scene(self, settings: SceneSettings) -> Scene:
         """Build a scene, or take it from those kept."""
-        if more:
-            return build_scene(settings, more)
         if settings not in self._scenes:
             self._scenes[settings] = build_scene(settings)
         return self._scenes[settings]
@@ -329,6 +330,12 @@ def _at_shadow_edge(scene: Scene, points_m: Float64) -> NDArray[np.bool_]:
         lit.append(np.isnan(scene.cast(points_m + np.array([x, y, -0.012]), sun_direction(scene.settings))))
     on_ground = np.array([abs(p[2] - scene.ground_z_m(p[0], p[1])) < 1e-3 for p in points_m])
     return np.asarray(np.any(lit, axis=0) & ~np.all(lit, axis=0) & on_ground)
+
+
+def with_bricks(scene: Scene, more: tuple[Brick, ...]) -> Scene:
+    """Return the scene with bricks that throw no shadow, as if something were held before the camera."""
+    stones = together(scene.world.rocks, meshes(more))
+    return Scene(scene.settings, scene.world._replace(rocks=stones), scene.bricks + more)
 
 
 def faded(scene: Scene, contrast: float, broad: bool = True) -> Scene:

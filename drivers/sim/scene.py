@@ -121,8 +121,8 @@ class Scene:
         return ground_z_m(self.world.inner, x_m, y_m)
 
 
-def build_scene(settings: SceneSettings | None = None, more: tuple[Brick, ...] = ()) -> Scene:
-    """Return the scene of ``settings``, with ``more`` bricks; takes some two seconds once compiled.
+def build_scene(settings: SceneSettings | None = None) -> Scene:
+    """Return the scene of ``settings``; takes some two seconds once the kernels are compiled.
 
     Raises
     ------
@@ -141,7 +141,6 @@ def build_scene(settings: SceneSettings | None = None, more: tuple[Brick, ...] =
     laid = bricks.scattered(
         settings.bricks, brick_rng, stones.spheres_m, lambda x, y: ground_z_m(inner, x, y)
     )
-    laid += more
     if laid:
         stones = rocks.together(stones, bricks.meshes(laid))
     tones = ground_tones(inner, sun, tone_rng) * shadows(inner, stones, sun)
