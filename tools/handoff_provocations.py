@@ -32,7 +32,7 @@ Float64 = NDArray[np.float64]
 OFF_PX = 3.0
 """What the destination pair's calibration is off by in two of three looks, one sigma each axis."""
 
-KINDS = ("occluded", "flat", "repeated", "shadow", "range")
+KINDS = ("shadow", "repeated", "range", "occluded", "flat")
 STEPS = (("navcam", "hazcam", 2.0, 0.35), ("pancam", "navcam", 6.0, 0.9))
 """From, to, distance in metres, azimuth to either side."""
 
@@ -323,13 +323,15 @@ def _inside(pixel_px: Float64, shape: tuple[int, ...], edge: float) -> bool:
 
 
 def _at_shadow_edge(scene: Scene, points_m: Float64) -> NDArray[np.bool_]:
-    """Whether ground points (n, 3) lie at the edge of a shadow: some neighbours see the sun, some do not."""
-    around = EDGE_M * np.array([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
-    lit = []
-    for x, y in around:
-        lit.append(np.isnan(scene.cast(points_m + np.array([x, y, -0.012]), sun_direction(scene.settings))))
-    on_ground = np.array([abs(p[2] - scene.ground_z_m(p[0], p[1])) < 1e-3 for p in points_m])
-    return np.asarray(np.any(lit, axis=0) & ~np.all(lit, axis=0) & on_ground)
+    """Whether points (n, 3) are open ground at a shadow's edge: some neighbours see the sun, some do not."""
+    around = EDGE_M * np.array([[1.0, 0.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, -1.0, 0.0]])
+    above = points_m[:, None] + around + [0.0, 0.0, -0.012]
+    lit = np.isnan(scene.cast(above, sun_direction(scene.settings)))
+    # Beside a stone a neighbour is in it, and meets its inside.
+    wide = points_m[:, None] + 2.0 * around + [0.0, 0.0, -0.012]
+    is_open = np.isnan(scene.cast(wide, [0.0, 0.0, -1.0])).all(axis=1)
+    on_ground = np.array([abs(p[2] - scene.ground_z_m(p[0], p[1])) < 1e-3 for p in points_m], dtype=bool)
+    return np.asarray(lit.any(axis=1) & ~lit.all(axis=1) & is_open & on_ground)
 
 
 def with_bricks(scene: Scene, more: tuple[Brick, ...]) -> Scene:

@@ -84,6 +84,7 @@ def test_the_report_holds_every_target_and_escapes_what_it_is_told(tmp_path: Pat
     page = write_report(experiment, tmp_path / "new").read_text()
     assert "&lt;i&gt;none" in page and "hidden &lt;b&gt;" in page and "<i>none" not in page
     assert page.count("<figure>") == 4
+    assert "errors of each target" in page
     rows = list(csv.DictReader((tmp_path / "new/targets.csv").open()))
     assert [row["verdict"] for row in rows] == ["accepted", "occluded", ""]
     assert rows[0]["search_sigma_major_px"] == "2.0" and rows[1]["refined_x_px"] == ""

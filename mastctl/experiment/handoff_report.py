@@ -171,7 +171,7 @@ def _parts(experiment: HandoffExperiment) -> list[str]:
         parts.append(f"<h2>Not accepted by image ({len(doubts)})</h2>")
         rows = [[r.step, str(r.index), h.camera, h.refined.verdict, h.refined.reason] for r, h in doubts]
         parts.append(html.table(["hand-off", "target", "camera", "verdict", "reason"], rows))
-    parts += ["<h2>Each target</h2>", html.table(*target_rows(experiment.records))]
+    parts += ["<h2>Each target</h2>", _plot(experiment), html.table(*target_rows(experiment.records))]
     pictured = [r for r in experiment.records if r.source_image is not None and r.handed]
     if known := [r for r in pictured if r.kind != "ground"]:
         parts.append(f"<h2>Known points</h2>{LEGEND}")
@@ -180,6 +180,48 @@ def _parts(experiment: HandoffExperiment) -> list[str]:
         parts.append(f"<h2>Targets</h2>{LEGEND}")
         parts += [_pictures(record) for record in shown]
     return parts
+
+
+def _plot(experiment: HandoffExperiment) -> str:
+    """Each target's errors in both eyes beside the paper's worst, as its figures 6 and 8."""
+    try:
+        figure = error_figure(experiment.records)
+    except ImportError:
+        return "<p>No plot: matplotlib is not installed (pip install 'mastctl[report]').</p>"
+    return (
+        "<p>Nothing was handed over.</p>"
+        if figure is None
+        else html.plot_tag(figure, "errors of each target")
+    )
+
+
+def error_figure(records: Sequence[HandoffRecord]) -> Any:
+    """Return a matplotlib figure of the errors' lengths by target; None if nothing was handed over."""
+    from matplotlib.figure import Figure
+
+    steps = list(dict.fromkeys(r.step for r in records if r.handed))
+    if not steps:
+        return None
+    figure = Figure(figsize=(5.6 * len(steps), 3.6), layout="constrained")
+    for axis, step in zip(figure.subplots(1, len(steps), squeeze=False)[0], steps, strict=True):
+        mine = [r for r in records if r.step == step and r.handed]
+        cameras = list(dict.fromkeys(one.camera for r in mine for one in r.handed))
+        for camera, marker in zip(cameras, "ox", strict=False):
+            for refined, colour in ((False, FIRST_COLOUR), (True, SECOND_COLOUR)):
+                seen = [(r.index, one) for r in mine for one in r.handed if one.camera == camera]
+                errors = [
+                    (index, float(np.hypot(*error)))
+                    for index, one in seen
+                    if (error := one.refined_error_px if refined else one.geometric_error_px) is not None
+                ]
+                label = f"{camera}, {'refined' if refined else 'geometric'}"
+                if errors:
+                    axis.plot(*zip(*errors, strict=True), marker, color=colour, ms=5, mfc="none", label=label)
+        if (paper := PAPER_WORST_PX.get(step)) is not None:
+            axis.axhline(paper, color="0.4", lw=1, ls="--", label="the paper's worst, geometric")
+        axis.set(title=step, xlabel="target", ylabel="error, px", ylim=(0, None))
+        axis.legend(fontsize=7)
+    return figure
 
 
 def _pictures(record: HandoffRecord) -> str:
