@@ -20,6 +20,7 @@ from calib.store import load_rig
 from drivers.sim import bricks
 from drivers.sim.rover import SimulatedRover
 from drivers.sim.scene import Scene, tiny_scene
+from mastctl.cli.main import main
 from mastctl.experiment.handoff_record import Handed, HandoffExperiment, HandoffRecord, summarise
 from mastctl.experiment.handoff_report import table_rows, target_rows, view_picture, write_report
 from mastctl.experiment.known_points import BrickPoints
@@ -141,3 +142,9 @@ def test_bricks_points_are_seen_only_where_nothing_hides_them(repository: Path) 
         assert (seen[tuple(face)] is not None) == turned_to_camera
     assert known.seen_px(FRAME, np.array([2.1, 0.0, -0.001])) is None, "behind the brick"
     assert known.seen_px(FRAME, np.array([-3.0, 0.0, 0.0])) is None, "behind the camera"
+
+
+@pytest.mark.parametrize("words", [["--bricks", "3"], ["--simulated", "--bricks", "25"]])
+def test_bricks_are_the_simulations_and_few(words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["experiment", "handoff", *words]) == 2
+    assert "1 to 24 are possible, with --simulated" in " ".join(capsys.readouterr().err.split())
