@@ -67,3 +67,14 @@ class NoHandoff(CalibError):
     def __init__(self, code: str, message: str) -> None:
         self.code = code
         super().__init__(message)
+
+
+class NoCorrection(CalibError):
+    """Hand-offs that give no correction of the body cameras; ``code`` names the cause for programs.
+
+    Codes: ``too_few``, ``one_sided``, ``inconsistent``, ``not_significant``.
+    """
+
+    def __init__(self, code: str, message: str) -> None:
+        self.code = code
+        super().__init__(message)

@@ -35,12 +35,15 @@ class Triangulation:
         explains, it says that the two pixels are not of one point, or that the models are off.
     ranges_m
         From the left and from the right ray's origin to the foot of the normal on that ray.
+    rates_m_per_px
+        (3, 4) d position / d (left x, left y, right x, right y).
     """
 
     position_m: FloatArray
     covariance_m2: FloatArray
     ray_gap_m: float
     ranges_m: tuple[float, float]
+    rates_m_per_px: FloatArray
 
 
 def triangulate(
@@ -131,4 +134,5 @@ def triangulate(
         covariance_m2=frozen_array(sigma_px * sigma_px * (jacobian @ jacobian.T), (3, 3)),
         ray_gap_m=math.sqrt(float(gap @ gap)),
         ranges_m=(float(s1), float(s2)),
+        rates_m_per_px=frozen_array(jacobian, (3, 4)),
     )

@@ -102,10 +102,19 @@ class Section:
             for i, item in enumerate(self._list(key, count, "integers"))
         )
 
-    def vector(self, key: str, limit: float = 1e9) -> FloatArray:
-        """Return a value that must be a list of three finite numbers, as (3,)."""
-        items = self._list(key, 3, "numbers")
+    def vector(self, key: str, limit: float = 1e9, count: int = 3) -> FloatArray:
+        """Return a value that must be a list of ``count`` finite numbers, as (count,)."""
+        items = self._list(key, count, "numbers")
         return np.array([self._number(f"{key}[{i}]", item, limit) for i, item in enumerate(items)])
+
+    def covariance(self, key: str, count: int, limit: float = 1e9) -> FloatArray:
+        """Return a value that must be ``count`` lists of as many numbers, and a covariance."""
+        rows = Section(self.path, self.place, {}, (), ())
+        rows.values = {f"{key}[{i}]": row for i, row in enumerate(self._list(key, count, "rows"))}
+        matrix = np.array([rows.vector(row, limit, count) for row in rows.values])
+        if not np.allclose(matrix, matrix.T) or np.linalg.eigvalsh(matrix)[0] < 0.0:
+            raise self.bad(key, "no covariance: it must be symmetric, with no variance below zero")
+        return matrix
 
     def section(self, key: str, required: Sequence[str] = (), optional: Sequence[str] = ()) -> Section:
         """Return a value that must be a mapping with known keys."""

@@ -71,7 +71,7 @@ def test_the_papers_sigmas_hold_its_scatter(navcams: Rig) -> None:
 def test_pixel_rates_are_those_of_differences(joint: Calibration) -> None:
     points = np.array([[4.0, 0.5, -0.5], [6.0, 1.0, 0.0]])
     for camera in ("navcam_left", "hazcam_right"):
-        _, rates = pixel_rates(joint, camera, 0.2, -0.3, points)
+        _, rates = pixel_rates(joint.rig, joint.parameter_names, camera, 0.2, -0.3, points)
         every = np.arange(len(joint.parameter_names))
         for column, name in enumerate(joint.parameter_names):
             step = np.zeros(len(every))

@@ -13,8 +13,9 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
-from calib.handoff import Predicted
+from calib.handoff import Joints, Predicted
 from calib.handoff_refined import RefinedPixel, Verdict
+from calib.matched_handoff import Landed, MatchedHandoff
 from calib.rigid import Rigid
 from calib.store import load_rig
 from drivers.sim import bricks
@@ -24,6 +25,7 @@ from mastctl.cli.main import main
 from mastctl.experiment.handoff_record import Handed, HandoffExperiment, HandoffRecord, summarise
 from mastctl.experiment.handoff_report import table_rows, target_rows, view_picture, write_report
 from mastctl.experiment.known_points import BrickPoints
+from mastctl.handoff_log import read_log
 
 STEP = "navcam to hazcam"
 FRAME = "hazcam_left-000001-00000000-0000"
@@ -148,3 +150,40 @@ def test_bricks_points_are_seen_only_where_nothing_hides_them(repository: Path) 
 def test_bricks_are_the_simulations_and_few(words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["experiment", "handoff", *words]) == 2
     assert "1 to 24 are possible, with --simulated" in " ".join(capsys.readouterr().err.split())
+
+
+def test_the_record_of_hand_offs_and_a_constant_offset_are_told(tmp_path: Path) -> None:
+    records = []
+    for index in range(10):
+        there = np.array([100.0 + 20 * index, 200.0])
+        found = there + np.array([0.5 + 0.02 * index, -2.0])
+        landed = {
+            "hazcam_left": Landed(there, 0.01 * np.eye(2), "accepted", "", found, 0.01 * np.eye(2)),
+            "hazcam_right": Landed(there, 0.01 * np.eye(2), "flat", "no texture"),
+        }
+        at = Joints(0.0, -0.5)
+        matched = MatchedHandoff(
+            "2026-01-01T00:00:00Z",
+            "d",
+            ("navcam_left", "navcam_right"),
+            at,
+            there + np.eye(2),
+            0.2,
+            at,
+            landed,
+        )
+        records.append(replace(record(index), matched=matched))
+    experiment = HandoffExperiment({"hardware": "simulated"}, 1, 0.2, tuple(records), (), "now", 3.0)
+    page = write_report(experiment, tmp_path).read_text()
+    write_report(experiment, tmp_path)  # a second run replaces the first one's record
+    assert len(read_log(tmp_path / "handoffs.jsonl").handoffs) == 10
+    told = "2.00 +- 0.13 px higher of where navcam puts them"
+    assert told in page and "calibrate --refine" in page
+    (bias,) = experiment.as_json()["bias"]
+    assert bias["camera"] == "hazcam_left" and told in bias["sentence"] and bias["sigmas"] > 10
+    assert json.loads((tmp_path / "record.json").read_text())["bias"] == [bias]
+
+
+def test_another_mast_file_is_for_the_simulated_rover_only(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["experiment", "handoff", "--mast-file", "m.yaml", "--json"]) == 2
+    assert "--simulated" in json.loads(capsys.readouterr().out)["error"]["message"]

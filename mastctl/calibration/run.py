@@ -96,12 +96,18 @@ def calibrate(
     """
     calibration = FITS[method](survey, mast_parameters)
     verdict = judge(survey, calibration, warnings, [name for name, _ in undetected])
-    saved, previous = _save(with_fit(calibration, survey, verdict.told()), out)
+    saved, previous = save_new(with_fit(calibration, survey, verdict.told()), out)
     return Calibrated(survey, calibration, verdict, warnings, undetected, saved, previous)
 
 
-def _save(rig: Rig, out: Path) -> tuple[StoredRig, Path | None]:
-    """Save the mast file; return it, and the name of the file's former version."""
+def save_new(rig: Rig, out: Path) -> tuple[StoredRig, Path | None]:
+    """Save a mast file and keep every former version; return it, and the name of the last one.
+
+    Raises
+    ------
+    BadFile
+        If ``out`` cannot be written; it holds what it held before.
+    """
     was_there = out.exists()
     kept = keep_previous(out) if was_there else None
     try:

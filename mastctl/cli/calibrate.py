@@ -1,4 +1,4 @@
-"""``mastctl calibrate``: from a survey folder to a mast file and a report."""
+"""``mastctl calibrate``: from a survey folder to a mast file and a report, or a mast file refined."""
 
 from __future__ import annotations
 
@@ -26,22 +26,31 @@ def add_commands(subparsers: Any) -> None:
         help="fit cameras and mast to a survey, and write the mast file",
         description="Reads a survey folder (docs/calibration.md), checks it, finds dots where there are "
         "none, fits cameras and mast, and writes the mast file with its uncertainty. Every former version "
-        "is kept: the last as NAME.previous.yaml, those before as NAME.previous-1.yaml and so on.",
+        "is kept: the last as NAME.previous.yaml, those before as NAME.previous-1.yaml and so on. With "
+        "--refine it corrects the body cameras of a mast file by hand-offs instead, as a new mast file, and "
+        "ends with 1 and writes nothing if they tell no significant correction.",
     )
-    parser.add_argument("survey", type=Path, metavar="SURVEY", help="the survey folder")
+    parser.add_argument(
+        "survey", type=Path, metavar="SURVEY", help="the survey folder; with --refine the mast file"
+    )
+    parser.add_argument(
+        "--refine",
+        type=Path,
+        action="append",
+        metavar="HANDOFFS.jsonl",
+        help="record of hand-offs to correct the body cameras by; may be given several times",
+    )
     parser.add_argument("--out", type=Path, required=True, metavar="MAST.yaml", help="the mast file to write")
     parser.add_argument("--report", type=Path, metavar="DIR", help="folder for calibration.html")
     parser.add_argument(
         "--method",
         choices=("paper", "joint"),
-        default="joint",
         help="paper: cameras first, then the mast; joint (default): everything together, weighted",
     )
     parser.add_argument(
         "--mast",
         type=int,
         choices=(4, 6, 8),
-        default=6,
         help="mast parameters: 4 upright, 6 the paper's (default), 8 two skew axes",
     )
     parser.add_argument(
@@ -55,6 +64,15 @@ def add_commands(subparsers: Any) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Read, check, find dots, fit, save, report; nothing is written before the fit is good."""
+    if args.refine:
+        from mastctl.cli import calibrate_refine
+
+        return calibrate_refine.run(args)
+    args.method, args.mast = args.method or "joint", args.mast or 6
+    return _from_survey(args)
+
+
+def _from_survey(args: argparse.Namespace) -> int:
     from calib.survey import read_survey
     from mastctl.calibration.run import SurveyRefused, calibrate, checked
 
@@ -84,21 +102,30 @@ def run(args: argparse.Namespace) -> int:
 
 def _check_out(out: Path, survey: Survey) -> None:
     """Refuse an impossible --out before the minutes of the search, not after them."""
+    check_file(out, "--out")
     try:
         target = out.resolve()
-        if not target.parent.is_dir():
-            raise _unusable(f"--out {out}", f"there is no folder {out.parent}; make it first")
-        if target.is_dir():
-            raise _unusable(f"--out {out}", "is a folder; a file is expected")
-        if target.exists() and not target.is_file():
-            raise _unusable(f"--out {out}", "is no regular file; a file is expected")
         pictures = (survey.folder / image.file for image in survey.images if image.file != Path())
         texts = (survey.folder / name for name in SURVEY_FILES)
         if target in {path.resolve() for path in (*texts, *pictures)}:
             raise _unusable(f"--out {out}", "is a file of the survey itself; name another one")
-        _try_to_write(target.parent, f"--out {out}")
     except (OSError, ValueError) as error:
         raise _unusable(f"--out {out}", str(error)) from None
+
+
+def check_file(path: Path, option: str) -> None:
+    """Refuse a file that cannot be written, by what is there now."""
+    try:
+        target = path.resolve()
+        if not target.parent.is_dir():
+            raise _unusable(f"{option} {path}", f"there is no folder {path.parent}; make it first")
+        if target.is_dir():
+            raise _unusable(f"{option} {path}", "is a folder; a file is expected")
+        if target.exists() and not target.is_file():
+            raise _unusable(f"{option} {path}", "is no regular file; a file is expected")
+        _try_to_write(target.parent, f"{option} {path}")
+    except (OSError, ValueError) as error:
+        raise _unusable(f"{option} {path}", str(error)) from None
 
 
 def _check_report(report: Path | None) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -36,6 +37,10 @@ def add_parser(kinds: Any) -> None:
         help="start the packaged simulated rover for it, and compare with the truth",
     )  # fmt: skip
     parser.add_argument(
+        "--mast-file", type=Path, metavar="MAST.yaml",
+        help="with --simulated: the mast file that its daemon uses (default: the packaged one)",
+    )  # fmt: skip
+    parser.add_argument(
         "--targets", type=at_least_one, metavar="N",
         help="targets of each hand-off (default 10, with --bricks all that show)",
     )  # fmt: skip
@@ -52,7 +57,10 @@ def add_parser(kinds: Any) -> None:
         "--seed", type=seed, default=1, metavar="S", help="chooses views and pixels (default 1)"
     )
     parser.add_argument(
-        "--out", type=Path, metavar="DIR", help="folder for report.html, targets.csv and record.json"
+        "--out",
+        type=Path,
+        metavar="DIR",
+        help="folder for report.html, targets.csv, handoffs.jsonl and record.json",
     )
     parser.set_defaults(run=run)
 
@@ -64,6 +72,8 @@ def run(args: argparse.Namespace) -> int:
 
     if args.click_px < 0:
         raise output.WrongUse(f"--click-px {args.click_px:g} where 0 or more is expected")
+    if args.mast_file is not None and not args.simulated:
+        raise output.WrongUse("--mast-file belongs to --simulated; a running daemon has its own mast file")
     if args.bricks is not None and not (args.simulated and args.bricks <= MOST_BRICKS):
         raise output.WrongUse(f"--bricks {args.bricks}: 1 to {MOST_BRICKS} are possible, with --simulated")
     if args.out is not None:
@@ -86,6 +96,8 @@ def _simulated(args: argparse.Namespace, stack: ExitStack) -> tuple[Client, Trut
     from mastctl.experiment.known_points import BrickPoints
 
     config = demo_config(load_config(None), head="ptu_d46_70", seed=args.seed, bricks=args.bricks or 0)
+    if args.mast_file is not None:
+        config = replace(config, mast_file=args.mast_file)
     daemon = stack.enter_context(RunningDaemon(config))
     rover = daemon.hardware.simulation
     assert rover is not None  # the packaged configuration is a simulated rover
@@ -125,7 +137,7 @@ def _run(
 
 def _tell(args: argparse.Namespace, experiment: HandoffExperiment) -> int:
     from mastctl.cli.experiment import turned
-    from mastctl.experiment.handoff_report import table_rows, write_report
+    from mastctl.experiment.handoff_report import bias_sentences, table_rows, write_report
 
     page = write_report(experiment, args.out) if args.out is not None else None
     if args.json:
@@ -135,6 +147,7 @@ def _tell(args: argparse.Namespace, experiment: HandoffExperiment) -> int:
         output.print_json(document)
     else:
         notes = [f"clicks with {experiment.click_px:g} px of noise; lengths in px of the destination camera"]
+        notes += bias_sentences(experiment)
         notes += [f"report: {page}"] if page is not None else []
         kinds = list(dict.fromkeys(row.kind for row in experiment.summaries))
         for kind in kinds:

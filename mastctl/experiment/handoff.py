@@ -19,6 +19,7 @@ from calib.errors import CalibError
 from calib.handoff import Joints, hand_off
 from calib.handoff_refined import Eye, refine_handoff
 from calib.mast import Rig
+from calib.matched_handoff import matched_handoff
 from calib.rig_covariance import RigCovariance, stored_covariance
 from calib.store import parse_rig
 from calib.warp import grey
@@ -237,6 +238,8 @@ class _Bench:
         clicks = exact + self._rng.normal(0.0, self._click_px, (2, 2))
         joints = Joints(target.shot.pan_rad, target.shot.tilt_rad, JOINT_SIGMA_RAD)
         there = next(iter(shots.values()))
+        to_joints = Joints(there.pan_rad, there.tilt_rad, JOINT_SIGMA_RAD)
+        sigma_px = max(self._click_px, 0.05)
         done = hand_off(
             self._rig,
             self._source,
@@ -244,8 +247,8 @@ class _Bench:
             joints,
             clicks[0],
             clicks[1],
-            to_joints=Joints(there.pan_rad, there.tilt_rad, JOINT_SIGMA_RAD),
-            sigma_px=max(self._click_px, 0.05),
+            to_joints=to_joints,
+            sigma_px=sigma_px,
             calibration=self._calibration,
         )
         refined = refine_handoff(
@@ -272,6 +275,9 @@ class _Bench:
             seconds=time.monotonic() - begun_s,
             source_image=target.shot.image if with_pictures else None,
             kind=target.kind,
+            matched=matched_handoff(
+                target.shot.mast_digest, self._source, joints, clicks, sigma_px, to_joints, done, refined
+            ),
         )
 
     def _eye(self, shot: Snapshot) -> Eye:

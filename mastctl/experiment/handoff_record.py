@@ -9,7 +9,9 @@ from typing import Any
 import numpy as np
 
 from calib.handoff import Predicted
+from calib.handoff_bias import HandoffBias, handoff_bias
 from calib.handoff_refined import RefinedPixel
+from calib.matched_handoff import MatchedHandoff
 from drivers.interfaces import Image
 
 PAPER_WORST_PX: Mapping[str, float] = {"pancam to navcam": 2.5, "navcam to hazcam": 4.0}
@@ -64,6 +66,7 @@ class HandoffRecord:
     seconds: float = 0.0
     source_image: Image | None = None
     kind: str = "ground"
+    matched: MatchedHandoff | None = None
 
 
 @dataclass(frozen=True)
@@ -96,6 +99,11 @@ class HandoffExperiment:
     started: str
     seconds: float
 
+    @property
+    def bias(self) -> tuple[HandoffBias, ...]:
+        """The mean offset of what was found from what was predicted, by camera."""
+        return handoff_bias([r.matched for r in self.records if r.matched is not None])
+
     def as_json(self) -> dict[str, Any]:
         """Return the whole record for programs."""
         return {
@@ -120,6 +128,16 @@ class HandoffExperiment:
                     "paper_worst_px": PAPER_WORST_PX.get(row.step),
                 }
                 for row in self.summaries
+            ],
+            "bias": [
+                {
+                    "camera": one.camera,
+                    "source": one.source,
+                    "offset_px": one.offset_px.tolist(),
+                    "sigmas": one.sigmas,
+                    "sentence": one.sentence,
+                }
+                for one in self.bias
             ],
             "failures": [
                 {"handoff": r.step, "target": r.index, "error": r.error} for r in self.records if r.error

@@ -1,4 +1,4 @@
-"""What a hand-off experiment leaves: targets.csv, record.json and one self-contained HTML page."""
+"""What a hand-off experiment leaves: targets.csv, handoffs.jsonl, record.json and one HTML page."""
 
 from __future__ import annotations
 
@@ -20,6 +20,7 @@ from mastctl.experiment.handoff_record import (
     HandoffSummary,
 )
 from mastctl.experiment.report import FIRST_COLOUR, SECOND_COLOUR, bgr, jpeg_tag
+from mastctl.handoff_log import HandoffLog
 
 CSV_COLUMNS = (
     "handoff", "target", "kind", "range_m", "frame_id", "clicked_x_px", "clicked_y_px", "camera",
@@ -37,11 +38,13 @@ LEGEND = (
 
 
 def write_report(experiment: HandoffExperiment, folder: Path) -> Path:
-    """Write report.html, targets.csv and record.json into ``folder`` (made if need be); return the page.
+    """Write report.html, the tables and the record into ``folder`` (made if need be); return the page.
+
+    ``handoffs.jsonl`` is what `mastctl calibrate --refine` reads (`mastctl.handoff_log`).
 
     Raises
     ------
-    OSError
+    OSError, BadFile
         If the folder or a file in it cannot be written.
     """
     folder.mkdir(parents=True, exist_ok=True)
@@ -50,11 +53,22 @@ def write_report(experiment: HandoffExperiment, folder: Path) -> Path:
         writer.writerow(CSV_COLUMNS)
         for record in experiment.records:
             writer.writerows(_csv_rows(record))
+    log = HandoffLog(folder / "handoffs.jsonl")
+    log.path.unlink(missing_ok=True)
+    for record in experiment.records:
+        if record.matched is not None:
+            log.append(record.matched)
     document = json.dumps(experiment.as_json() | {"status": dict(experiment.status)}, indent=1)
     (folder / "record.json").write_text(document + "\n", encoding="utf-8")
     page = folder / "report.html"
     page.write_text(html.page("Hand-off experiment", _parts(experiment)), encoding="utf-8")
     return page
+
+
+def bias_sentences(experiment: HandoffExperiment) -> list[str]:
+    """Return the constant offsets of three sigma and more in words, and what they are good for."""
+    told = [one.sentence for one in experiment.bias if one.significant]
+    return [*told, "mastctl calibrate --refine corrects body cameras by handoffs.jsonl"] if told else []
 
 
 def table_rows(summaries: Sequence[HandoffSummary]) -> tuple[list[str], list[list[str]]]:
@@ -160,6 +174,9 @@ def _parts(experiment: HandoffExperiment) -> list[str]:
         f"<p>Geometric: rays of the clicks, nearest point, projected, against {reference}. Refined: found by "
         "correlation in the destination's picture, rms of the length. Only accepted matches count.</p>",
     ]
+    if told := bias_sentences(experiment):
+        parts.append("<h2>Constant offsets</h2>")
+        parts += [f"<p>{html.escape(sentence)}.</p>" for sentence in told]
     failures = [r for r in experiment.records if r.error]
     if failures:
         parts.append(f"<h2>Failed targets ({len(failures)})</h2>")

@@ -1,0 +1,137 @@
+"""The record of hand-offs: one line each, whole or not at all, and read back strictly."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from calib.errors import BadFile
+from calib.handoff import Joints
+from calib.matched_handoff import Landed, MatchedHandoff
+from mastctl.handoff_log import HandoffLog, as_json, read_log
+
+
+def one(index: int = 0) -> MatchedHandoff:
+    there = np.array([300.25 + index, 200.0])
+    return MatchedHandoff(
+        "2026-01-02T03:04:05.678+00:00", "a" * 64, ("navcam_left", "navcam_right"), Joints(0.1, -0.5, 3e-5),
+        np.array([[500.1, 300.2], [400.3, 300.4]]), 0.2, Joints(0.1, -0.5, 3e-5),
+        {
+            "hazcam_left": Landed(there, 0.01 * np.eye(2), "accepted", "", there + 1, 0.02 * np.eye(2)),
+            "hazcam_right": Landed(there, 0.01 * np.eye(2), "occluded", "a rock is before it"),
+        },
+    )  # fmt: skip
+
+
+def test_what_is_appended_is_read_back_to_the_last_digit(tmp_path: Path) -> None:
+    path = tmp_path / "new" / "handoffs.jsonl"
+    log = HandoffLog(path)
+    for index in range(3):
+        log.append(one(index))
+    read = read_log(path)
+    assert [as_json(handoff) for handoff in read.handoffs] == [as_json(one(i)) for i in range(3)]
+    assert read.handoffs[1].name == "hand-off of 2026-01-02T03:04:05.678+00:00 (handoffs.jsonl line 2)"
+    assert list(read.handoffs[0].found) == ["hazcam_left"]
+    assert read.handoffs[0].landed["hazcam_right"].found_px is None
+
+
+def test_many_writers_do_not_mix_their_lines(tmp_path: Path) -> None:
+    path = tmp_path / "h.jsonl"
+    with ThreadPoolExecutor(8) as pool:
+        list(pool.map(lambda index: HandoffLog(path).append(one(index)), range(40)))
+    seen = sorted(float(h.landed["hazcam_left"].geometric_px[0]) for h in read_log(path).handoffs)
+    assert seen == [300.25 + index for index in range(40)]
+
+
+def test_a_line_that_a_crash_cut_short_is_passed_over_and_then_taken_away(tmp_path: Path) -> None:
+    path = tmp_path / "h.jsonl"
+    log = HandoffLog(path)
+    log.append(one(0))
+    whole = path.read_bytes()
+    path.write_bytes(whole + whole[:100])
+    assert len(read_log(path).handoffs) == 1
+    log.append(one(1))
+    assert len(read_log(path).handoffs) == 2
+    path.write_bytes(whole.rstrip(b"\n"))  # whole, but for its end: kept
+    log.append(one(1))
+    assert len(read_log(path).handoffs) == 2
+
+
+def test_a_file_of_something_else_is_not_appended_to(tmp_path: Path) -> None:
+    path = tmp_path / "mast.yaml"
+    path.write_text("schema: mastctl/mast/1\n")
+    with pytest.raises(BadFile, match="no record of hand-offs"):
+        HandoffLog(path).append(one())
+    assert path.read_text() == "schema: mastctl/mast/1\n"
+    with pytest.raises(BadFile, match="cannot be appended to"):
+        HandoffLog(tmp_path).append(one())
+    with pytest.raises(ValueError, match="JSON"):
+        HandoffLog(tmp_path / "new.jsonl").append(replace(one(), sigma_px=float("nan")))
+    assert not (tmp_path / "new.jsonl").exists()
+
+
+def changed(key: str, value: Any) -> Callable[[dict[str, Any]], None]:
+    def change(line: dict[str, Any]) -> None:
+        holder = line
+        *path, last = key.split("/")
+        for part in path:
+            holder = holder[part]
+        holder[last] = value
+
+    return change
+
+
+LEFT = "destinations/hazcam_left"
+
+
+@pytest.mark.parametrize(
+    ("change", "place", "words"),
+    [
+        (changed("schema", "mastctl/handoff/2"), "line 2.schema", "mastctl/handoff/1"),
+        (changed("extra", 1), "line 2.extra", "unknown key"),
+        (changed("time", "yesterday"), "line 2.time", "ISO 8601"),
+        (changed("source", ["navcam_left"]), "line 2.source", "right camera"),
+        (changed("sigma_px", 0), "line 2.sigma_px", "above zero"),
+        (changed("joint_sigma_rad", -1.0), "line 2.joint_sigma_rad", "zero or more"),
+        (changed("left_px", ["1", "2"]), "line 2.left_px[0]", "a number"),
+        (changed("destinations/front", {}), "line 2.destinations.front", "<pair>_left"),
+        (changed(f"{LEFT}/verdict", "good"), "line 2.destinations.hazcam_left.verdict", "accepted"),
+        (changed(f"{LEFT}/found_px", None), "line 2.destinations.hazcam_left.found_px", "2 numbers"),
+        (
+            changed(f"{LEFT}/found_covariance_px2", [[1, 2], [2, 1]]),
+            "line 2.destinations.hazcam_left.found_covariance_px2", "covariance",
+        ),
+        (
+            changed(f"{LEFT}/found_covariance_px2", [[1, 0], [0]]),
+            "line 2.destinations.hazcam_left.found_covariance_px2[1]", "2 numbers",
+        ),
+    ],
+)  # fmt: skip
+def test_a_bad_line_is_refused_by_its_number_and_key(
+    tmp_path: Path, change: Callable[[dict[str, Any]], None], place: str, words: str
+) -> None:
+    path = tmp_path / "h.jsonl"
+    line = as_json(one(1))
+    change(line)
+    path.write_text("".join(json.dumps(each) + "\n" for each in (as_json(one(0)), line, as_json(one(2)))))
+    with pytest.raises(BadFile) as caught:
+        read_log(path)
+    assert caught.value.place == place and words in caught.value.reason
+
+
+def test_a_broken_line_before_the_last_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "h.jsonl"
+    whole = json.dumps(as_json(one()))
+    path.write_text(f"{whole}\n{whole[:50]}\n{whole}\n")
+    with pytest.raises(BadFile, match=r"line 2: is no JSON"):
+        read_log(path)
+    path.write_text("[" * 5000 + "\n" + whole + "\n")
+    with pytest.raises(BadFile, match="line 1"):
+        read_log(path)

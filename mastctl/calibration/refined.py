@@ -1,0 +1,201 @@
+"""From records of hand-offs to a mast file with corrected body cameras: proposed, judged, and told."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from calib.body_pose import PRIOR_SHIFT_M, PRIOR_TURN_RAD, BodyPose
+from calib.body_sights import body_groups
+from calib.corrected_rig import corrected_covariance, corrected_rig
+from calib.errors import NoCorrection
+from calib.fit_body_pose import fit_body_pose
+from calib.handoff_bias import HandoffBias, handoff_bias
+from calib.mast import Rig
+from calib.matched_handoff import MatchedHandoff
+from calib.rig_covariance import stored_covariance
+from calib.store import StoredRig
+from calib.uncertainty import sigma_by_key
+from mastctl.calibration.mast_file import plain, rounded
+from mastctl.calibration.run import save_new
+from mastctl.handoff_log import ReadLog
+
+
+@dataclass(frozen=True, eq=False)
+class Proposal:
+    """What records of hand-offs say of a mast file.
+
+    Attributes
+    ----------
+    mast, logs
+        What was read.
+    handoffs
+        Those of this very mast file; each is looked at once, in however many records it stands.
+    other_mast
+        How many were made with another mast file and were passed over.
+    bias
+        Mean offset by camera.
+    poses
+        By body pair: the correction, significant or not.
+    refusals
+        By body pair without one: why.
+    """
+
+    mast: StoredRig
+    logs: tuple[ReadLog, ...]
+    handoffs: tuple[MatchedHandoff, ...]
+    other_mast: int
+    bias: tuple[HandoffBias, ...]
+    poses: Mapping[str, BodyPose]
+    refusals: Mapping[str, NoCorrection]
+
+    @property
+    def significant(self) -> dict[str, BodyPose]:
+        """The corrections that are worth a new mast file."""
+        return {group: pose for group, pose in self.poses.items() if pose.significant}
+
+    def refusal(self) -> NoCorrection:
+        """Return why there is no correction at all; the first body pair's code stands for all."""
+        codes, sentences = [], []
+        for group, why in self.refusals.items():
+            codes.append(why.code)
+            sentences.append(f"{group}: {why}")
+        for group, pose in self.poses.items():
+            codes.append("not_significant")
+            sentences.append(
+                f"{group}: {len(pose.used.handoffs)} hand-offs tell no correction: {pose.sigmas:.1f} sigma "
+                "where 3 are asked for"
+            )
+        if self.other_mast:
+            sentences.append(f"{self.other_mast} hand-offs were made with another mast file")
+        return NoCorrection(codes[0], "; ".join(sentences))
+
+
+def propose(mast: StoredRig, logs: Sequence[ReadLog]) -> Proposal:
+    """Return what records of hand-offs say of a mast file's body cameras.
+
+    Raises
+    ------
+    NoCorrection
+        ``too_few``: the mast file has no camera on the body.
+    """
+    groups = body_groups(mast.rig)
+    if not groups:
+        raise NoCorrection("too_few", f"{mast.path} has no camera on the rover's body to correct")
+    every: dict[tuple[Any, ...], MatchedHandoff] = {}
+    for log in logs:
+        for one in log.handoffs:
+            every[(one.time, one.mast_digest, one.pair, *one.clicks_px.ravel().tolist())] = one
+    handoffs = tuple(one for one in every.values() if one.mast_digest == mast.digest)
+    poses: dict[str, BodyPose] = {}
+    refusals: dict[str, NoCorrection] = {}
+    for group, cameras in groups.items():
+        try:
+            poses[group] = fit_body_pose(mast.rig, cameras, handoffs)
+        except NoCorrection as refusal:
+            refusals[group] = refusal
+    return Proposal(
+        mast, tuple(logs), handoffs, len(every) - len(handoffs), handoff_bias(handoffs), poses, refusals
+    )
+
+
+def save_refined(proposal: Proposal, out: Path) -> tuple[StoredRig, Path | None]:
+    """Save the mast file with every significant correction; return it, and where ``out``'s former one is.
+
+    Raises
+    ------
+    NoCorrection
+        If there is none; nothing is written.
+    BadFile
+        If ``out`` cannot be written; it holds what it held before.
+    """
+    if not proposal.significant:
+        raise proposal.refusal()
+    return save_new(refined_rig(proposal), out)
+
+
+def refined_rig(proposal: Proposal) -> Rig:
+    """Return the rig with every significant correction, its covariance and its provenance.
+
+    Mast and head cameras are untouched. ``fit.covariance`` and ``fit.sigma`` are those of the corrected rig;
+    what else the survey left under ``fit`` stays as the survey left it.
+    """
+    rig = proposal.mast.rig
+    known = stored_covariance(rig)
+    for pose in proposal.significant.values():
+        known = None if known is None else corrected_covariance(rig, known, pose)
+        rig = corrected_rig(rig, pose)
+    told = {group: pose_told(pose) for group, pose in proposal.significant.items()}
+    fit = {**rig.fit, "refined": told}
+    if known is not None:
+        fit["covariance"] = rounded(known.covariance).tolist()
+        fit["sigma"] = plain(sigma_by_key(rig, known.names, known.covariance))
+    before = rig.provenance.get("refined", [])
+    provenance = {
+        **rig.provenance,
+        "refined": [
+            *(before if isinstance(before, list) else [before]),
+            {
+                "former_file": proposal.mast.path.name,
+                "former_digest": proposal.mast.digest,
+                "cameras": [name for pose in proposal.significant.values() for name in pose.cameras],
+                "records": [{"file": log.path.name, "digest": log.digest} for log in proposal.logs],
+                "handoffs": {g: len(p.used.handoffs) for g, p in proposal.significant.items()},
+                "program": f"mastctl {version('mastctl')}",
+                "date": datetime.now(UTC).isoformat(timespec="seconds"),
+            },
+        ],
+    }
+    return replace(rig, fit=fit, provenance=provenance)
+
+
+def pose_told(pose: BodyPose) -> dict[str, Any]:
+    """Return a correction as JSON or YAML; the shift is of the origin, the turn about it, rover axes."""
+    told: dict[str, Any] = {
+        "cameras": list(pose.cameras),
+        "origin_m": pose.origin_m.tolist(),
+        "shift_m": pose.step[:3].tolist(),
+        "turn_rad": pose.step[3:].tolist(),
+        "covariance": rounded(pose.covariance).tolist(),
+        "prior_sigma": {"shift_m": PRIOR_SHIFT_M, "turn_rad": PRIOR_TURN_RAD},
+        "significance_sigmas": pose.sigmas,
+        "chance": pose.chance,
+        "handoffs": len(pose.used.handoffs),
+        "outliers": [one.sentence for one in pose.outliers],
+        "rms_px": {
+            name: {"before": list(before), "after": list(after)}
+            for name, (before, after) in pose.rms_px.items()
+        },
+        "chi2_before": pose.chi2_before,
+        "chi2_after": pose.chi2_after,
+        "degrees_of_freedom": pose.degrees_of_freedom,
+        "directions_seen": pose.seen,
+        "unseen": list(pose.unseen),
+    }
+    if pose.eyes_apart is not None:
+        told["eyes_apart"] = {
+            "right_less_left_px": pose.eyes_apart.offset_px.tolist(),
+            "covariance_px2": pose.eyes_apart.covariance_px2.tolist(),
+            "sigmas": pose.eyes_apart.sigmas,
+        }
+    return told
+
+
+def bias_told(bias: HandoffBias) -> dict[str, Any]:
+    """Return a camera's mean offset as JSON."""
+    return {
+        "source": bias.source,
+        "camera": bias.camera,
+        "handoffs": bias.handoffs,
+        "left_out": bias.left_out,
+        "offset_px": bias.offset_px.tolist(),
+        "sigma_px": np.sqrt(np.diag(bias.covariance_px2)).tolist(),
+        "sigmas": bias.sigmas,
+        "sentence": bias.sentence,
+    }
