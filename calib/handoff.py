@@ -67,6 +67,9 @@ class Handoff:
         (3, 3) of the position from everything that was said to be uncertain, rover frame.
     pixels
         By destination camera; None where it does not see the target.
+    joint_px2
+        (2n, 2n) as ``search_px2`` of all n pixels that are not None, in their order, together: what they
+        share (the target's place, the calibration) moves them together.
     reasons
         For each None, why, in words.
     pan_rad, tilt_rad
@@ -76,6 +79,7 @@ class Handoff:
     seen: Triangulation
     covariance_m2: FloatArray
     pixels: Mapping[str, Predicted | None]
+    joint_px2: FloatArray
     reasons: Mapping[str, str]
     pan_rad: float
     tilt_rad: float
@@ -137,13 +141,20 @@ def hand_off(
     total = _other_covariance(
         rig, pair, shown, joints, to_joints, np.array([left_px, right_px], dtype=np.float64), calibration
     )
+    places, rates = [], []
+    for name in shown:
+        pixel, rate, _ = cameras[name].project_jacobian(seen.position_m)
+        places.append(np.asarray(pixel))
+        rates.append(rate)
+    both = np.concatenate(rates)
+    clicks = both @ seen.covariance_m2 @ both.T
+    joint = clicks + total[3:, 3:]
     pixels: dict[str, Predicted | None] = dict.fromkeys(to)
     for row, name in enumerate(shown):
-        pixel, rate, _ = cameras[name].project_jacobian(seen.position_m)
-        clicks = rate @ seen.covariance_m2 @ rate.T
-        part = slice(3 + 2 * row, 5 + 2 * row)
-        pixels[name] = Predicted(np.asarray(pixel), clicks, clicks + total[part, part])
-    return Handoff(seen, seen.covariance_m2 + total[:3, :3], pixels, reasons, there.pan_rad, there.tilt_rad)
+        part = (slice(2 * row, 2 * row + 2),) * 2
+        pixels[name] = Predicted(places[row], clicks[part], joint[part])
+    position_m2 = seen.covariance_m2 + total[:3, :3]
+    return Handoff(seen, position_m2, pixels, joint, reasons, there.pan_rad, there.tilt_rad)
 
 
 def _refuse_range(seen: Triangulation, models: Sequence[CameraModel], pair: tuple[str, str]) -> None:

@@ -19,7 +19,6 @@ from calib.cahvor import CameraModel
 from calib.epipolar import find_partner
 from calib.handoff import Handoff, Predicted
 from calib.match import Match, MatchSettings, match
-from calib.one_point import Sighting, one_point
 from calib.rigid import FloatArray
 from calib.warp import Grey, Plane
 
@@ -132,7 +131,7 @@ def refine_handoff(
             refined[name] = surface
         else:
             refined[name] = _looked_up(source[0], clicks_px[0], surface, eye, predicted, settings, sizes)
-    return _agreeing(refined, handoff, destinations, settings)
+    return _agreeing(refined, handoff, settings)
 
 
 def _surface(
@@ -167,8 +166,16 @@ def _looked_up(
     search = settings.sigmas * math.sqrt(float(np.linalg.eigvalsh(predicted.search_px2)[-1]))
     search = min(max(search, settings.least_px), settings.most_px)
     found: Match = match(source.image, source.camera, pixel_px, surface, eye.image, eye.camera, search, sizes)
+    scores = (found.correlation, found.second)
+    if not _whole_window(found, eye, search):
+        edge = f"part of the {search:.0f} px around the hand-off's pixel where it may be lies at the border"
+        words = found.reason if found.verdict == "border" else f"{edge} of the picture"
+        return _none("unseen", words, *scores)
+    if found.verdict == "border":
+        # All of the window could be searched: what it holds best is not the target.
+        return _none("occluded", found.reason, *scores)
     if found.verdict != "good":
-        return _none(_WORDS[found.verdict], found.reason, found.correlation, found.second)
+        return _none(_WORDS[found.verdict], found.reason, *scores)
     off = found.pixel_px - predicted.pixel_px
     allowed = predicted.search_px2 + found.covariance_px2 + settings.model_px**2 * np.eye(2)
     distance = math.sqrt(float(off @ np.linalg.solve(allowed, off)))
@@ -177,18 +184,21 @@ def _looked_up(
             "occluded",
             f"what fits best lies {np.linalg.norm(off):.1f} px from the geometric hand-off, {distance:.1f} "
             "of its standard deviations: something else, or a wrong calibration",
-            found.correlation,
-            found.second,
+            *scores,
         )
-    return RefinedPixel(
-        "accepted", "", found.pixel_px, found.covariance_px2, off, found.correlation, found.second
-    )
+    return RefinedPixel("accepted", "", found.pixel_px, found.covariance_px2, off, *scores)
+
+
+def _whole_window(found: Match, eye: Eye, search_px: float) -> bool:
+    """Tell whether the patch fits into the picture wherever in the window the target is."""
+    reach = search_px + found.half_px
+    size = np.array(eye.camera.size_px)
+    return bool((found.predicted_px >= reach).all() and (found.predicted_px <= size - 1 - reach).all())
 
 
 def _agreeing(
     refined: dict[str, RefinedPixel],
     handoff: Handoff,
-    destinations: Mapping[str, Eye],
     settings: RefineSettings,
 ) -> dict[str, RefinedPixel]:
     """Take back what the other destination eyes, or the source's range, do not confirm."""
@@ -199,13 +209,7 @@ def _agreeing(
     if doubting:
         words = f"{doubting[0]} does not confirm it: {refined[doubting[0]].reason}"
         return {**refined, **{name: _taken_back(one, words) for name, one in accepted.items()}}
-    point = one_point(
-        handoff.seen.position_m,
-        handoff.covariance_m2,
-        [Sighting(destinations[n].camera, o.pixel_px, o.covariance_px2) for n, o in accepted.items()],
-        settings.model_px,
-    )
-    chi2 = math.inf if point is None else point.chi2
+    chi2 = _misfit(accepted, handoff, settings)
     if chi2 > settings.worst_chi2:
         words = (
             f"{' and '.join(accepted)} and the source pair do not mean one point: weighted misfit "
@@ -213,6 +217,22 @@ def _agreeing(
         )
         return {**refined, **{name: _taken_back(one, words) for name, one in accepted.items()}}
     return refined
+
+
+def _misfit(accepted: Mapping[str, RefinedPixel], handoff: Handoff, settings: RefineSettings) -> float:
+    """Weighted square of how far the found pixels lie from the hand-off's, all together.
+
+    What the eyes share (a range or a calibration that is off) may move them together as far as that is
+    uncertain; against each other they may be wrong only by what each alone can.
+    """
+    order = [name for name, predicted in handoff.pixels.items() if predicted is not None]
+    rows = np.concatenate([2 * order.index(name) + np.arange(2) for name in accepted])
+    allowed = handoff.joint_px2[np.ix_(rows, rows)] + settings.model_px**2 * np.eye(len(rows))
+    for index, one in enumerate(accepted.values()):
+        part = slice(2 * index, 2 * index + 2)
+        allowed[part, part] += one.covariance_px2
+    off = np.concatenate([one.off_px for one in accepted.values()])
+    return float(off @ np.linalg.solve(allowed, off))
 
 
 def _taken_back(one: RefinedPixel, words: str) -> RefinedPixel:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -28,9 +29,14 @@ def divided_icosahedron() -> Float64:
     corners = np.concatenate([edges, np.roll(edges, 1, axis=1), np.roll(edges, 2, axis=1)])
     faces = np.array(FACES.split(), dtype=np.int64).reshape(20, 3)
     triangles: Float64 = corners[faces] / np.linalg.norm(corners[0])
+    return divided(triangles, unit)
+
+
+def divided(triangles: Float64, placed: Callable[[Float64], Float64]) -> Float64:
+    """Return triangles (n, 3, 3) cut into four three times over; ``placed`` moves each new corner (k, 3)."""
     for _ in range(DIVISIONS):
         a, b, c = triangles[:, 0], triangles[:, 1], triangles[:, 2]
-        ab, bc, ca = (unit(p + q) for p, q in ((a, b), (b, c), (c, a)))
+        ab, bc, ca = (placed(0.5 * (p + q)) for p, q in ((a, b), (b, c), (c, a)))
         children = np.stack([[a, ab, ca], [ab, b, bc], [ca, bc, c], [ab, bc, ca]])  # (4, 3, n, 3)
         triangles = children.transpose(2, 0, 1, 3).reshape(-1, 3, 3)
     return triangles
@@ -112,10 +118,15 @@ def make_rocks(count: int, rng: np.random.Generator, ground_z_m: Any) -> Any:
     )
 
 
-def boxes(corners_m: Float64, together: int) -> Float64:
-    """Return (k, n / together, 6) boxes around runs of triangles of corners_m (k, n, 3, 3)."""
+def together(first: Any, second: Any) -> Any:
+    """Return the ``kernels.Rocks`` of both."""
+    return kernels().Rocks(*(np.concatenate(parts) for parts in zip(first, second, strict=True)))
+
+
+def boxes(corners_m: Float64, run: int) -> Float64:
+    """Return (k, n / run, 6) boxes around runs of triangles of corners_m (k, n, 3, 3)."""
     count, triangles = corners_m.shape[:2]
-    points = corners_m.reshape(count, triangles // together, together * 3, 3)
+    points = corners_m.reshape(count, triangles // run, run * 3, 3)
     return np.ascontiguousarray(np.concatenate([points.min(axis=2), points.max(axis=2)], axis=-1))
 
 

@@ -15,7 +15,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from drivers.errors import BadOptions
-from drivers.sim import rocks, texture
+from drivers.sim import bricks, rocks, texture
+from drivers.sim.bricks import Brick
 from drivers.sim.compiled import kernels
 
 Float64 = NDArray[np.float64]
@@ -43,6 +44,8 @@ class SceneSettings:
         How far the ground rises and falls about z = 0, metres, 0 to 1; 0 gives flat textured ground.
     rocks
         How many stones of 0.05-0.6 m lie 1.5-20 m away within 1.5 rad of north, 0 to 500.
+    bricks
+        How many bricks stand ahead, by turns 1.8 m and 6 m away, as far as there is room, 0 to 24.
     sun_azimuth_rad, sun_elevation_rad
         Where the sun stands: from north over east, and above the horizon (0.2 to 1.5 rad).
     """
@@ -50,11 +53,18 @@ class SceneSettings:
     seed: int = 1
     relief_m: float = 0.15
     rocks: int = 50
+    bricks: int = 0
     sun_azimuth_rad: float = -1.95
     sun_elevation_rad: float = 0.70
 
     def __post_init__(self) -> None:
-        bounds = (("seed", 0, 2**63), ("relief_m", 0, 1), ("rocks", 0, 500), ("sun_elevation_rad", 0.2, 1.5))
+        bounds = (
+            ("seed", 0, 2**63),
+            ("relief_m", 0, 1),
+            ("rocks", 0, 500),
+            ("bricks", 0, 24),
+            ("sun_elevation_rad", 0.2, 1.5),
+        )
         for name, low, high in bounds:
             value = getattr(self, name)
             if not low <= value <= high:
@@ -64,11 +74,12 @@ class SceneSettings:
 
 
 class Scene:
-    """Ground, rocks and light, ready for casting rays; made by ``build_scene``, never changed."""
+    """Ground, rocks, bricks and light, ready for casting rays; made by ``build_scene``, never changed."""
 
-    def __init__(self, settings: SceneSettings, world: Any) -> None:
+    def __init__(self, settings: SceneSettings, world: Any, bricks: tuple[Brick, ...] = ()) -> None:
         self.settings = settings
         self.world = world
+        self.bricks = bricks
 
     def cast(self, origins_m: ArrayLike, directions: ArrayLike) -> Float64:
         """Return how far rays go before they meet the ground or a rock.
@@ -120,18 +131,23 @@ def build_scene(settings: SceneSettings | None = None) -> Scene:
     """
     settings = settings or SceneSettings()
     # one stream of numbers for each part: a flat scene keeps the stones and gravel of the rough one
-    relief_rng, hill_rng, rock_rng, gravel_rng, tone_rng, stone_rng = (
-        np.random.default_rng(child) for child in np.random.SeedSequence(settings.seed).spawn(6)
+    relief_rng, hill_rng, rock_rng, gravel_rng, tone_rng, stone_rng, brick_rng = (
+        np.random.default_rng(child) for child in np.random.SeedSequence(settings.seed).spawn(7)
     )
     sun = sun_direction(settings)
     inner = make_grid(inner_relief_m(settings, relief_rng), INNER_CELL_M)
     outer = make_grid(outer_relief_m(settings, hill_rng), OUTER_CELL_M)
     stones = rocks.make_rocks(settings.rocks, rock_rng, lambda x, y: ground_z_m(inner, x, y))
+    laid = bricks.scattered(
+        settings.bricks, brick_rng, stones.spheres_m, lambda x, y: ground_z_m(inner, x, y)
+    )
+    if laid:
+        stones = rocks.together(stones, bricks.meshes(laid))
     tones = ground_tones(inner, sun, tone_rng) * shadows(inner, stones, sun)
     detail = texture.pyramid(texture.gravel(gravel_rng, sun, texture.DETAIL_TEXELS), texture.DETAIL_TEXEL_M)
     stone = texture.pyramid(texture.stone(stone_rng, texture.STONE_TEXELS), texture.STONE_TEXEL_M)
     broad = texture.pyramid(tones, INNER_CELL_M)
-    return Scene(settings, kernels().World(inner, outer, stones, detail, broad, stone, sun))
+    return Scene(settings, kernels().World(inner, outer, stones, detail, broad, stone, sun), laid)
 
 
 def tiny_scene() -> Scene:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from calib.handoff import Handoff, Joints, hand_off
 from calib.handoff_refined import Eye, RefinedPixel, refine_handoff
 from calib.mast import Mast, Rig, RigCamera
+from calib.rig_covariance import RigCovariance, moved_rig
 from hil_tests.calib.pictures import Pinhole, TexturedPlane, picture, random_texture
 
 TARGET = np.array([2.0, 0.05, 0.3])
@@ -144,3 +145,72 @@ def test_a_camera_that_the_hand_off_does_not_reach_says_why(good: Case) -> None:
     refined = replace(good, handoff=handoff).refined()
     assert refined["far_left"].verdict == "unseen"
     assert refined["far_left"].reason == "the target is behind"
+
+
+def test_a_wrong_range_that_the_source_pair_agrees_on_is_not_accepted(good: Case) -> None:
+    """The right source picture of another moment: both clicks and both pictures mean the same wrong range."""
+    images = {**good.images, "near_right": np.roll(good.images["near_right"], 12, axis=1)}
+    clicks = good.clicks_px + np.array([[0.0, 0.0], [12.0, 0.0]])
+    done = hand_off(RIG, SOURCE, NEXT, Joints(0.0, 0.0), *clicks, sigma_px=0.5)
+    refined = Case(images, done, clicks).refined()
+    for name in NEXT:
+        geometric = done.pixels[name]
+        assert geometric is not None
+        assert np.linalg.norm(geometric.pixel_px - CAMERAS[name].pixel(TARGET)) > 4.0
+        assert refined[name].verdict != "accepted"
+
+
+def shaded(plane: TexturedPlane, x_texels: int) -> TexturedPlane:
+    """The plane with faint texture, dark on one side of a slanting edge through its middle or beside it."""
+    side = plane.grey.shape[0]
+    x, y = np.meshgrid(np.arange(side), np.arange(side))
+    dark = (x - side // 2 - x_texels) + 0.4 * (y - side // 2) > 0
+    faint = 130.0 + 0.1 * (plane.grey - plane.grey.mean())
+    return replace(plane, grey=np.where(dark, 0.5 * faint, faint))
+
+
+def test_a_shadow_that_moved_between_the_pictures_is_not_accepted() -> None:
+    images = pictures(shaded(GROUND, 0)) | {
+        name: image for name, image in pictures(shaded(GROUND, 14)).items() if name in NEXT
+    }
+    refined = case(images, sigma_px=2.0).refined()
+    assert all(refined[name].verdict != "accepted" for name in NEXT)
+
+
+def test_a_window_that_the_picture_cuts_is_no_search(good: Case) -> None:
+    """Where the target may be in a part that cannot be searched, the best of the rest means nothing."""
+    eyes = {}
+    for name in NEXT:
+        model = CAMERAS[name].model
+        edge = int(CAMERAS[name].pixel(TARGET)[0]) - 26
+        size = (model.size_px[0] - edge, model.size_px[1])
+        eyes[name] = Eye(
+            np.ascontiguousarray(good.images[name][:, edge:]),
+            replace(model, H=model.H - edge * model.A, size_px=size),
+        )
+    rig = replace(RIG, cameras={**RIG.cameras, **{n: RigCamera("rover", eyes[n].camera) for n in NEXT}})
+    done = hand_off(rig, SOURCE, NEXT, Joints(0.0, 0.0), *good.clicks_px, sigma_px=3.0)
+    source = (Eye(good.images[n], CAMERAS[n].model) for n in SOURCE)
+    refined = refine_handoff(done, (next(source), next(source)), good.clicks_px, eyes)
+    assert {one.verdict for one in refined.values()} == {"unseen"}
+    assert all("border of the picture" in one.reason for one in refined.values())
+
+
+@pytest.mark.parametrize("together", [True, False])
+def test_what_both_eyes_share_may_be_off_but_not_one_against_the_other(good: Case, together: bool) -> None:
+    """A pair whose calibration is off by 5 px and said to be: the picture decides, if both eyes agree."""
+    names = tuple(f"cameras.{name}.H.{axis}" for name in NEXT for axis in "xyz")
+    shared = np.concatenate([CAMERAS[name].model.A for name in NEXT])
+    covariance = RigCovariance(names, 4.0**2 * np.outer(shared, shared))
+    wrong = 5.0 * np.concatenate([CAMERAS[n].model.A * (1 if together or n == NEXT[0] else -1) for n in NEXT])
+    rig = moved_rig(RIG, names, wrong)
+    done = hand_off(
+        rig, SOURCE, NEXT, Joints(0.0, 0.0), *good.clicks_px, sigma_px=0.2, calibration=covariance
+    )
+    source = tuple(Eye(good.images[name], CAMERAS[name].model) for name in SOURCE)
+    eyes = {name: Eye(good.images[name], rig.cameras[name].model) for name in NEXT}
+    refined = refine_handoff(done, (source[0], source[1]), good.clicks_px, eyes)
+    for name in NEXT:
+        assert (refined[name].verdict == "accepted") == together, refined[name].reason
+        if together:
+            assert np.abs(refined[name].pixel_px - CAMERAS[name].pixel(TARGET)).max() < 0.2

@@ -7,6 +7,8 @@ import json
 import math
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -14,12 +16,19 @@ import pytest
 from calib.handoff import Joints, Predicted
 from calib.handoff_refined import RefinedPixel, Verdict
 from calib.matched_handoff import Landed, MatchedHandoff
+from calib.rigid import Rigid
+from calib.store import load_rig
+from drivers.sim import bricks
+from drivers.sim.rover import SimulatedRover
+from drivers.sim.scene import Scene, tiny_scene
 from mastctl.cli.main import main
-from mastctl.experiment.handoff import Handed, HandoffExperiment, HandoffRecord, summarise
-from mastctl.experiment.handoff_report import table_rows, write_report
+from mastctl.experiment.handoff_record import Handed, HandoffExperiment, HandoffRecord, summarise
+from mastctl.experiment.handoff_report import table_rows, target_rows, view_picture, write_report
+from mastctl.experiment.known_points import BrickPoints
 from mastctl.handoff_log import read_log
 
 STEP = "navcam to hazcam"
+FRAME = "hazcam_left-000001-00000000-0000"
 
 
 def handed(
@@ -54,7 +63,7 @@ RECORDS = (
 
 
 def test_errors_are_against_the_truth_and_only_accepted_ones_are_refined() -> None:
-    row = summarise(STEP, "hazcam_left", RECORDS)
+    row = summarise(STEP, "ground", "hazcam_left", RECORDS)
     assert (row.targets, row.failed, row.accepted) == (3, 1, 1)
     assert row.geometric_rms_px == pytest.approx((math.sqrt(5.0), math.sqrt(8.0)))
     assert row.geometric_bias_px == pytest.approx((1.0, -2.0))
@@ -68,22 +77,79 @@ def test_without_the_truth_the_refined_pixel_stands_in() -> None:
     assert one.geometric_error_px == (3.0, -4.0)
     assert one.refined_error_px is None
     assert handed((1.0, 1.0), (0.0, 0.0), None, "flat").geometric_error_px is None
-    empty = summarise(STEP, "hazcam_right", RECORDS)
+    empty = summarise(STEP, "ground", "hazcam_right", RECORDS)
     assert empty.geometric_rms_px is None and empty.refined_rms_px is None
 
 
 def test_the_report_holds_every_target_and_escapes_what_it_is_told(tmp_path: Path) -> None:
-    summaries = (summarise(STEP, "hazcam_left", RECORDS),)
+    summaries = (summarise(STEP, "ground", "hazcam_left", RECORDS),)
     experiment = HandoffExperiment({"hardware": "simulated"}, 1, 0.2, RECORDS, summaries, "now", 3.0)
     page = write_report(experiment, tmp_path / "new").read_text()
     assert "&lt;i&gt;none" in page and "hidden &lt;b&gt;" in page and "<i>none" not in page
     assert page.count("<figure>") == 4
+    assert "errors of each target" in page
     rows = list(csv.DictReader((tmp_path / "new/targets.csv").open()))
     assert [row["verdict"] for row in rows] == ["accepted", "occluded", ""]
     assert rows[0]["search_sigma_major_px"] == "2.0" and rows[1]["refined_x_px"] == ""
     document = json.loads((tmp_path / "new/record.json").read_text())
     assert document["handoffs"][0]["paper_worst_px"] == 4.0
     assert table_rows(summaries)[1][0][-1] == "4"
+
+
+def test_kinds_of_targets_have_rows_of_their_own() -> None:
+    corner = replace(RECORDS[0], index=3, kind="corner")
+    records = (*RECORDS, corner)
+    assert summarise(STEP, "ground", "hazcam_left", records).targets == 3
+    assert summarise(STEP, "corner", "hazcam_left", records).targets == 1
+    headings, rows = target_rows(records)
+    assert all(len(row) == len(headings) for row in rows)
+    assert rows[3][:3] == [STEP, "3", "corner"] and rows[3][4:6] == ["3.00, -4.00", "0.50, 0.00"]
+    assert rows[1][5] == "occluded"
+
+
+def test_a_views_picture_marks_every_target_where_it_is() -> None:
+    one = handed((300.0, 200.0), (300.0, 200.0), (300.0, 200.0))
+    other = replace(one, geometric=replace(one.geometric, pixel_px=np.array([340.0, 230.0])), true_px=None)
+    picture = view_picture([(0, one), (1, other)])
+    middle = picture.shape[0] // 2
+    scale = middle // (20 + 30)
+    for x, y in ((-20, -15), (20, 15)):
+        piece = picture[middle + scale * y - 2 :, middle + scale * x - 2 :][:5, :5]
+        assert piece.any(), "a cross is drawn on black"
+
+
+def test_bricks_points_are_seen_only_where_nothing_hides_them(repository: Path) -> None:
+    """A brick ahead of the Hazcam shows the front of its top and hides the ground and its own far side."""
+    scene = tiny_scene()
+    brick = bricks.make_brick(1.7, 0.0, 0.3, lambda x, y: 0.0)
+    world = scene.world._replace(rocks=bricks.meshes([brick]))
+    camera = load_rig(repository / "configs/sim/rocky8.yaml").rig.cameras["hazcam_left"].model
+    truth = SimpleNamespace(camera_in_rover=camera, site_from_rover=Rigid.identity())
+    rover: Any = SimpleNamespace(
+        scene=Scene(scene.settings, world, (brick,)),
+        site_from_rover=Rigid.identity(),
+        frame_truth=lambda camera, sequence: truth,
+    )
+    known = BrickPoints(cast(SimulatedRover, rover))
+    points = known.points()
+    assert [point.kind for point in points] == ["corner"] * 4 + ["face"] * 5
+    seen = {tuple(point.position_m): known.seen_px(FRAME, point.position_m) for point in points}
+    for corner in brick.corners_m[:4]:
+        pixel = seen[tuple(corner)]
+        assert pixel is not None, "no upper corner is hidden from above"
+        np.testing.assert_allclose(pixel, camera.project(corner)[0])
+    middle = brick.corners_m.mean(axis=0)
+    for face in brick.faces_m:
+        turned_to_camera = (face - middle) @ (camera.C - face) > 0
+        assert (seen[tuple(face)] is not None) == turned_to_camera
+    assert known.seen_px(FRAME, np.array([2.1, 0.0, -0.001])) is None, "behind the brick"
+    assert known.seen_px(FRAME, np.array([-3.0, 0.0, 0.0])) is None, "behind the camera"
+
+
+@pytest.mark.parametrize("words", [["--bricks", "3"], ["--simulated", "--bricks", "25"]])
+def test_bricks_are_the_simulations_and_few(words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["experiment", "handoff", *words]) == 2
+    assert "1 to 24 are possible, with --simulated" in " ".join(capsys.readouterr().err.split())
 
 
 def test_the_record_of_hand_offs_and_a_constant_offset_are_told(tmp_path: Path) -> None:

@@ -12,10 +12,14 @@ from mastctl.cli import output
 
 if TYPE_CHECKING:
     from mastctl.client import Client
-    from mastctl.experiment.handoff import HandoffExperiment, HandoffRecord
+    from mastctl.experiment.handoff_record import HandoffExperiment, HandoffRecord
+    from mastctl.experiment.known_points import KnownPoints
     from mastctl.experiment.pointing import Truth
 
 PICTURES_PER_STEP = 4
+TARGETS = {"ground": "textured ground", "corner": "bricks' corners", "face": "middles of bricks' faces"}
+MOST_BRICKS = 24  # what a scene takes
+MOST_POINTS = 9  # of one brick: its upper corners and its faces but the bottom
 
 
 def add_parser(kinds: Any) -> None:
@@ -37,8 +41,14 @@ def add_parser(kinds: Any) -> None:
         help="with --simulated: the mast file that its daemon uses (default: the packaged one)",
     )  # fmt: skip
     parser.add_argument(
-        "--targets", type=at_least_one, default=10, metavar="N", help="targets of each hand-off (default 10)"
-    )
+        "--targets", type=at_least_one, metavar="N",
+        help="targets of each hand-off (default 10, with --bricks all that show)",
+    )  # fmt: skip
+    parser.add_argument(
+        "--bricks", type=at_least_one, metavar="N",
+        help="put N bricks (at most 24) into the simulation, by turns at 2 m and at 6 m; their corners and "
+        "the middles of their faces are the targets",
+    )  # fmt: skip
     parser.add_argument(
         "--click-px", type=output.finite_number, default=0.2, metavar="PX",
         help="sigma of the noise added to the clicks (default 0.2)",
@@ -64,40 +74,48 @@ def run(args: argparse.Namespace) -> int:
         raise output.WrongUse(f"--click-px {args.click_px:g} where 0 or more is expected")
     if args.mast_file is not None and not args.simulated:
         raise output.WrongUse("--mast-file belongs to --simulated; a running daemon has its own mast file")
+    if args.bricks is not None and not (args.simulated and args.bricks <= MOST_BRICKS):
+        raise output.WrongUse(f"--bricks {args.bricks}: 1 to {MOST_BRICKS} are possible, with --simulated")
     if args.out is not None:
         check_writable(args.out)
     with ExitStack() as stack:
         if args.simulated:
-            client, truth = _simulated(args, stack)
+            client, truth, points = _simulated(args, stack)
         else:
-            client, truth = stack.enter_context(client_of(args)), None
-        experiment = _run(args, client, truth)
+            client, truth, points = stack.enter_context(client_of(args)), None, None
+        experiment = _run(args, client, truth, points)
     return _tell(args, experiment)
 
 
-def _simulated(args: argparse.Namespace, stack: ExitStack) -> tuple[Client, Truth]:
-    """The packaged simulated rover behind a daemon on a free port."""
+def _simulated(args: argparse.Namespace, stack: ExitStack) -> tuple[Client, Truth, KnownPoints | None]:
+    """The packaged simulated rover behind a daemon on a free port, with its bricks if they are asked for."""
     from mastctl.client import Client
     from mastctl.config import load_config
     from mastctl.daemon import RunningDaemon
     from mastctl.experiment.demo import SimulationTruth, demo_config
+    from mastctl.experiment.known_points import BrickPoints
 
-    config = demo_config(load_config(None), head="ptu_d46_70", seed=args.seed)
+    config = demo_config(load_config(None), head="ptu_d46_70", seed=args.seed, bricks=args.bricks or 0)
     if args.mast_file is not None:
         config = replace(config, mast_file=args.mast_file)
     daemon = stack.enter_context(RunningDaemon(config))
     rover = daemon.hardware.simulation
     assert rover is not None  # the packaged configuration is a simulated rover
-    return stack.enter_context(Client(daemon.url)), SimulationTruth(rover)
+    points = BrickPoints(rover) if args.bricks else None
+    return stack.enter_context(Client(daemon.url)), SimulationTruth(rover), points
 
 
-def _run(args: argparse.Namespace, client: Client, truth: Truth | None) -> HandoffExperiment:
+def _run(
+    args: argparse.Namespace, client: Client, truth: Truth | None, points: KnownPoints | None
+) -> HandoffExperiment:
     """Run with a progress bar on stderr, one step a target."""
 
     from mastctl.experiment.handoff import STEPS, run_handoff_experiment
 
     with output.progress_bar(args.json) as progress:
-        task = progress.add_task("hand-off", total=args.targets * len(STEPS))
+        targets = args.targets or (MOST_POINTS * args.bricks if args.bricks else 10)
+        total = None if args.bricks else targets * len(STEPS)  # how many points show is not known before
+        task = progress.add_task("hand-off", total=total)
 
         def show(record: HandoffRecord) -> None:
             if record.error:
@@ -107,10 +125,11 @@ def _run(args: argparse.Namespace, client: Client, truth: Truth | None) -> Hando
 
         return run_handoff_experiment(
             client,
-            targets=args.targets,
+            targets=targets,
             seed=args.seed,
             click_px=args.click_px,
             truth=truth,
+            points=points,
             on_target=show,
             pictures=PICTURES_PER_STEP if args.out is not None else 0,
         )
@@ -127,13 +146,12 @@ def _tell(args: argparse.Namespace, experiment: HandoffExperiment) -> int:
             document["report"] = str(page)
         output.print_json(document)
     else:
-        headings, rows = table_rows(experiment.summaries)
         notes = [f"clicks with {experiment.click_px:g} px of noise; lengths in px of the destination camera"]
         notes += bias_sentences(experiment)
         notes += [f"report: {page}"] if page is not None else []
-        output.print_table(
-            f"Hand-off errors, px ({experiment.status.get('hardware')} hardware)",
-            *turned(headings, rows),
-            notes,
-        )
+        kinds = list(dict.fromkeys(row.kind for row in experiment.summaries))
+        for kind in kinds:
+            headings, rows = table_rows([row for row in experiment.summaries if row.kind == kind])
+            title = f"Hand-off errors of {TARGETS[kind]}, px ({experiment.status.get('hardware')} hardware)"
+            output.print_table(title, *turned(headings, rows), notes if kind == kinds[-1] else ())
     return 0 if any(record.handed for record in experiment.records) else 1

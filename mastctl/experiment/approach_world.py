@@ -117,16 +117,20 @@ class World:
         count = self.errors.count_rad
         return np.array([round(pan_rad / count), round(tilt_rad / count)]) * count
 
+    def true_camera(self, name: str, pan_rad: float, tilt_rad: float) -> CameraModel:
+        """A camera in the rover frame where it truly is with these goals."""
+        return self.true.camera_in_rover(name, *self._turned(pan_rad, tilt_rad).tolist())
+
     def true_pixel(
         self, name: str, pan_rad: float, tilt_rad: float, target_in_site_m: FloatArray
     ) -> FloatArray:
         """Where a point of the site truly is in a camera; not-a-number if it cannot be seen."""
-        model = self.true.camera_in_rover(name, *self._turned(pan_rad, tilt_rad).tolist())
+        model = self.true_camera(name, pan_rad, tilt_rad)
         return np.asarray(model.project(self.site_from_rover.inverse.points(target_in_site_m))[0])
 
     def point_at(self, name: str, pan_rad: float, tilt_rad: float, pixel_px: FloatArray) -> FloatArray | None:
         """The point of the site, (3,) metres, that a pixel truly shows; None for the sky."""
-        rays = self.true.camera_in_rover(name, *self._turned(pan_rad, tilt_rad).tolist()).ray(pixel_px)
+        rays = self.true_camera(name, pan_rad, tilt_rad).ray(pixel_px)
         origin = self.site_from_rover.points(rays.origins_m)
         along = self.site_from_rover.vectors(rays.directions)
         range_m = float(self._renderer.scene.cast(origin, along))

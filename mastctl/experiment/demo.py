@@ -11,14 +11,19 @@ from mastctl.config import Config, Listen
 from mastctl.frames import camera_and_sequence
 
 
-def demo_config(config: Config, *, head: str | None, seed: int, wire: str | None = None) -> Config:
+def demo_config(
+    config: Config, *, head: str | None, seed: int, wire: str | None = None, bricks: int = 0
+) -> Config:
     """Return the packaged configuration on any free port, with the head, wire and seed of the demo.
 
-    None leaves the head to the wire, and the wire away: see `drivers.sim.rover`.
+    None leaves the head to the wire, and the wire away: see `drivers.sim.rover`. ``bricks`` stand in
+    the scene.
     """
     chosen = {key: value for key, value in (("head", head), ("wire", wire)) if value is not None}
     packaged = {key: value for key, value in config.hardware.simulation.items() if key != "head"}
     simulation = {**packaged, **chosen, "seed": seed}
+    if bricks:
+        simulation["scene"] = {**packaged.get("scene", {}), "bricks": bricks}
     return replace(config, listen=Listen(port=0), hardware=replace(config.hardware, simulation=simulation))
 
 

@@ -1,37 +1,34 @@
 """The paper's hand-off experiment (section V) through the HTTP interface of a running daemon.
 
-For each target: look at ground at the distance with the source pair, choose a textured pixel, take the
-destination pair's pictures at the same joint angles, and hand the target over: geometrically, and by image.
-On a simulated rover the error is against the truth; on a real one the refined pixel stands in for it.
+For each target: look at it with the source pair, take the destination pair's pictures at the same joint
+angles, and hand the target over: geometrically, and by image. Targets are textured pixels of ground at the
+distance, or points that are known exactly. On a simulated rover the error is against the truth; on a real one
+the refined pixel stands in for it.
 """
 
 from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 import numpy as np
 
 from calib.errors import CalibError
-from calib.handoff import Joints, Predicted, hand_off
-from calib.handoff_bias import HandoffBias, handoff_bias
-from calib.handoff_refined import Eye, RefinedPixel, refine_handoff
+from calib.handoff import Joints, hand_off
+from calib.handoff_refined import Eye, refine_handoff
 from calib.mast import Rig
-from calib.matched_handoff import MatchedHandoff, matched_handoff
+from calib.matched_handoff import matched_handoff
 from calib.rig_covariance import RigCovariance, stored_covariance
 from calib.store import parse_rig
 from calib.warp import grey
-from drivers.interfaces import Image
 from mastctl.client import Client, ClientError, Snapshot
+from mastctl.experiment.handoff_record import Handed, HandoffExperiment, HandoffRecord, summarise
+from mastctl.experiment.known_points import KnownPoint, KnownPoints
 from mastctl.experiment.pointing import Truth
 from mastctl.experiment.targets import Target
 from mastctl.experiment.views import VIEWS_PER_TARGET, Views
-
-PAPER_WORST_PX: Mapping[str, float] = {"pancam to navcam": 2.5, "navcam to hazcam": 4.0}
-"""The paper's worst geometric hand-off, Pancam to Navcam at 6 m and Navcam to Hazcam at 2 m."""
 
 STEPS: tuple[tuple[str, str, float], ...] = (("pancam", "navcam", 6.0), ("navcam", "hazcam", 2.0))
 """The paper's hand-offs: from, to, distance in metres."""
@@ -42,126 +39,8 @@ PAN_RANGE_RAD = {"pancam": 1.0, "navcam": 0.35}
 JOINT_SIGMA_RAD = 3e-5
 """What a joint reading is taken to be wrong by: half a step of a stepped pan/tilt unit."""
 
-
-@dataclass(frozen=True, eq=False)
-class Handed:
-    """One target in one destination camera.
-
-    ``geometric`` and ``refined`` are what the hand-off says; ``true_px`` where the target really is, None
-    where nobody knows.
-    """
-
-    camera: str
-    geometric: Predicted
-    refined: RefinedPixel
-    true_px: tuple[float, float] | None
-    image: Image | None = None
-
-    @property
-    def geometric_error_px(self) -> tuple[float, float] | None:
-        """Geometric less true; less refined where the truth is not known; None where neither is."""
-        return self._error(self.geometric.pixel_px)
-
-    @property
-    def refined_error_px(self) -> tuple[float, float] | None:
-        """Refined less true; None where the refinement was not accepted or the truth is not known."""
-        return None if self.true_px is None else self._error(self.refined.pixel_px)
-
-    def _error(self, pixel_px: np.ndarray) -> tuple[float, float] | None:
-        reference = self.refined.pixel_px if self.true_px is None else np.array(self.true_px)
-        off = pixel_px - reference
-        return (float(off[0]), float(off[1])) if np.isfinite(off).all() else None
-
-
-@dataclass(frozen=True, eq=False)
-class HandoffRecord:
-    """One target of one step: what each destination camera saw, or why it failed."""
-
-    step: str
-    index: int
-    distance_m: float
-    range_m: float
-    frame_id: str
-    clicked_px: tuple[float, float]
-    handed: tuple[Handed, ...]
-    error: str = ""
-    seconds: float = 0.0
-    source_image: Image | None = None
-    matched: MatchedHandoff | None = None
-
-
-@dataclass(frozen=True)
-class HandoffSummary:
-    """One row of the table: one step, one camera. Numbers are None where there is nothing to average."""
-
-    step: str
-    camera: str
-    targets: int
-    failed: int
-    geometric_rms_px: tuple[float, float] | None
-    geometric_bias_px: tuple[float, float] | None
-    geometric_worst_px: float | None
-    accepted: int
-    refined_rms_px: float | None
-    refined_worst_px: float | None
-    verdicts: Mapping[str, int]
-
-
-@dataclass(frozen=True, eq=False)
-class HandoffExperiment:
-    """What was run and what came out."""
-
-    status: Mapping[str, Any]
-    seed: int
-    click_px: float
-    records: tuple[HandoffRecord, ...]
-    summaries: tuple[HandoffSummary, ...]
-    started: str
-    seconds: float
-
-    @property
-    def bias(self) -> tuple[HandoffBias, ...]:
-        """The mean offset of what was found from what was predicted, by camera."""
-        return handoff_bias([r.matched for r in self.records if r.matched is not None])
-
-    def as_json(self) -> dict[str, Any]:
-        """Return the whole record for programs."""
-        return {
-            "hardware": self.status.get("hardware"),
-            "seed": self.seed,
-            "click_px": self.click_px,
-            "seconds": round(self.seconds, 2),
-            "handoffs": [
-                {
-                    "handoff": row.step,
-                    "camera": row.camera,
-                    "targets": row.targets,
-                    "failed": row.failed,
-                    "geometric_rms_px": row.geometric_rms_px,
-                    "geometric_bias_px": row.geometric_bias_px,
-                    "geometric_worst_px": row.geometric_worst_px,
-                    "accepted": row.accepted,
-                    "refined_rms_px": row.refined_rms_px,
-                    "refined_worst_px": row.refined_worst_px,
-                    "verdicts": dict(row.verdicts),
-                    "paper_worst_px": PAPER_WORST_PX.get(row.step),
-                }
-                for row in self.summaries
-            ],
-            "bias": [
-                {
-                    "camera": one.camera,
-                    "source": one.source,
-                    "offset_px": one.offset_px.tolist(),
-                    "sigmas": one.sigmas,
-                    "sentence": one.sentence,
-                }
-                for one in self.bias
-            ],
-            "failures": [
-                {"handoff": r.step, "target": r.index, "error": r.error} for r in self.records if r.error
-            ],
-        }
+KNOWN_SLACK = 0.2
+"""Known points count as at a distance within this share of it."""
 
 
 def run_handoff_experiment(
@@ -171,6 +50,7 @@ def run_handoff_experiment(
     seed: int = 1,
     click_px: float = 0.2,
     truth: Truth | None = None,
+    points: KnownPoints | None = None,
     on_target: Callable[[HandoffRecord], None] | None = None,
     pictures: int = 0,
 ) -> HandoffExperiment:
@@ -181,17 +61,20 @@ def run_handoff_experiment(
     client
         A client of the daemon that moves the mast.
     targets
-        Targets of each step.
+        Targets of each step; with ``points``, no more of them than that.
     seed
         Chooses views, pixels and the noise of clicks.
     click_px
         Sigma of the noise that is added to both clicks, each axis, as a person would make it.
     truth
         Where a clicked point really is in another frame; only a simulation knows.
+    points
+        Take these for targets instead of textured ground.
     on_target
         Called after each target, failed or not.
     pictures
-        How many targets of each step keep their images for the report.
+        How many targets of each step keep their images for the report; with ``points``, all those of so many
+        views.
 
     Raises
     ------
@@ -212,50 +95,23 @@ def run_handoff_experiment(
     records: list[HandoffRecord] = []
     for source, to, distance_m in steps:
         bench = _Bench(
-            client, rig, (source, to), distance_m, status["limits"], rng, click_px, truth, calibration
+            client, rig, (source, to), distance_m, status["limits"], rng, click_px, truth, points, calibration
         )
-        for index in range(targets):
-            kept = sum(r.source_image is not None for r in records if r.step == bench.step)
-            record = bench.one_target(index, kept < pictures)
+        found = bench.known(points, targets, pictures) if points else bench.chosen(targets, pictures)
+        for record in found:
             records.append(record)
             if on_target is not None:
                 on_target(record)
+    kinds = list(dict.fromkeys(record.kind for record in records))
     summaries = [
-        summarise(f"{source} to {to}", camera, records)
+        summarise(f"{source} to {to}", kind, camera, records)
         for source, to, _ in steps
+        for kind in kinds
         for camera in rig.stereo[to]
     ]
     return HandoffExperiment(
         status, seed, click_px, tuple(records), tuple(summaries), started, time.monotonic() - begun_s
     )
-
-
-def summarise(step: str, camera: str, records: Sequence[HandoffRecord]) -> HandoffSummary:
-    """Return the table's row of one camera of one step."""
-    mine = [r for r in records if r.step == step]
-    seen = [h for r in mine for h in r.handed if h.camera == camera]
-    geometric = np.array([e for h in seen if (e := h.geometric_error_px) is not None]).reshape(-1, 2)
-    refined = np.array([e for h in seen if (e := h.refined_error_px) is not None]).reshape(-1, 2)
-    verdicts: dict[str, int] = {}
-    for one in seen:
-        verdicts[one.refined.verdict] = verdicts.get(one.refined.verdict, 0) + 1
-    return HandoffSummary(
-        step,
-        camera,
-        len(mine),
-        sum(bool(r.error) for r in mine),
-        _pair(np.sqrt(np.mean(geometric**2, axis=0))) if len(geometric) else None,
-        _pair(geometric.mean(axis=0)) if len(geometric) else None,
-        float(np.linalg.norm(geometric, axis=1).max()) if len(geometric) else None,
-        verdicts.get("accepted", 0),
-        float(np.sqrt(np.mean(np.sum(refined**2, axis=1)))) if len(refined) else None,
-        float(np.linalg.norm(refined, axis=1).max()) if len(refined) else None,
-        verdicts,
-    )
-
-
-def _pair(values: np.ndarray) -> tuple[float, float]:
-    return float(values[0]), float(values[1])
 
 
 def _served(rig: Rig, status: Mapping[str, Any], pair: str) -> bool:
@@ -275,6 +131,7 @@ class _Bench:
         rng: np.random.Generator,
         click_px: float,
         truth: Truth | None,
+        points: KnownPoints | None,
         calibration: RigCovariance | None,
     ) -> None:
         self.step = f"{pairs[0]} to {pairs[1]}"
@@ -285,10 +142,63 @@ class _Bench:
         self._rng = rng
         self._click_px = click_px
         self._truth = truth
+        self._points = points
         self._calibration = calibration
         self._views = Views(client, rig, self._source, limits, rng, PAN_RANGE_RAD[pairs[0]])
 
-    def one_target(self, index: int, with_pictures: bool) -> HandoffRecord:
+    def chosen(self, targets: int, pictures: int) -> Iterator[HandoffRecord]:
+        """Hand over textured ground at the distance; the first few records keep their pictures."""
+        for index in range(targets):
+            record = self._one_target(index, pictures > 0)
+            pictures -= record.source_image is not None
+            yield record
+
+    def known(self, points: KnownPoints, targets: int, pictures: int) -> Iterator[HandoffRecord]:
+        """Hand over known points near the distance, all that one view shows from the same pictures."""
+        left = self._rig.camera_in_rover(self._source[0], 0.0, 0.0)
+        groups: dict[int, list[KnownPoint]] = {}
+        for point in points.points():
+            away_m = float(np.linalg.norm(point.position_m - left.C))
+            if abs(away_m - self._distance_m) <= KNOWN_SLACK * self._distance_m:
+                groups.setdefault(point.group, []).append(point)
+        index = 0
+        for group in groups.values():
+            begun_s = time.monotonic()
+            pair = self._views.look_at(np.mean([point.position_m for point in group], axis=0))
+            if pair is None:
+                continue
+            shots = {name: self._client.snapshot(name) for name in self._to}
+            pictures -= 1
+            for point in group:
+                target = self._known_target(points, point, pair, shots)
+                if target is None or index == targets:
+                    continue
+                try:
+                    record = self._hand_over(target, shots, index, begun_s, pictures >= 0)
+                except CalibError as error:
+                    reason = f"{getattr(error, 'code', 'error')}: {error}"
+                    record = self._failed(index, point.kind, reason, begun_s)
+                index += 1
+                begun_s = time.monotonic()
+                yield record
+
+    def _known_target(
+        self,
+        points: KnownPoints,
+        point: KnownPoint,
+        pair: tuple[Snapshot, Snapshot],
+        shots: Mapping[str, Snapshot],
+    ) -> Target | None:
+        """The point as a target, if it shows in all four pictures."""
+        seen = [points.seen_px(shot.frame_id, point.position_m) for shot in (*pair, *shots.values())]
+        left, right = seen[:2]
+        if left is None or right is None or None in seen:
+            return None
+        model = self._rig.camera_in_rover(self._source[0], pair[0].pan_rad, pair[0].tilt_rad)
+        range_m = float(np.linalg.norm(point.position_m - model.C))
+        return Target(pair[0], *left, range_m, pair[1], right, point.kind, point.position_m)
+
+    def _one_target(self, index: int, with_pictures: bool) -> HandoffRecord:
         """Find one target, hand it over, and return the record of it."""
         begun_s = time.monotonic()
         reason = f"no textured target found at {self._distance_m:g} m in {VIEWS_PER_TARGET} views"
@@ -296,20 +206,34 @@ class _Bench:
             try:
                 target = self._views.find_target(self._distance_m)
                 if target is not None:
-                    return self._hand_over(target, index, begun_s, with_pictures)
+                    shots = {name: self._client.snapshot(name) for name in self._to}
+                    return self._hand_over(target, shots, index, begun_s, with_pictures)
             except (ClientError, CalibError) as error:
                 reason = f"{getattr(error, 'code', 'error')}: {error}"
                 if getattr(error, "code", "") != "not_seen":
                     break
-        nan = (math.nan, math.nan)
-        seconds = time.monotonic() - begun_s
+        return self._failed(index, "ground", reason, begun_s)
+
+    def _failed(self, index: int, kind: str, reason: str, begun_s: float) -> HandoffRecord:
+        """The record of a target that was not handed over."""
+        nan, seconds = (math.nan, math.nan), time.monotonic() - begun_s
         return HandoffRecord(
-            self.step, index, self._distance_m, math.nan, "", nan, (), error=reason, seconds=seconds
+            self.step,
+            index,
+            self._distance_m,
+            math.nan,
+            "",
+            nan,
+            (),
+            error=reason,
+            seconds=seconds,
+            kind=kind,
         )
 
-    def _hand_over(self, target: Target, index: int, begun_s: float, with_pictures: bool) -> HandoffRecord:
+    def _hand_over(
+        self, target: Target, shots: Mapping[str, Snapshot], index: int, begun_s: float, with_pictures: bool
+    ) -> HandoffRecord:
         """Hand a target over; raises NoHandoff where no destination camera sees it."""
-        shots = {name: self._client.snapshot(name) for name in self._to}
         exact = np.array([(target.x_px, target.y_px), target.right_px])
         clicks = exact + self._rng.normal(0.0, self._click_px, (2, 2))
         joints = Joints(target.shot.pan_rad, target.shot.tilt_rad, JOINT_SIGMA_RAD)
@@ -350,6 +274,7 @@ class _Bench:
             tuple(handed),
             seconds=time.monotonic() - begun_s,
             source_image=target.shot.image if with_pictures else None,
+            kind=target.kind,
             matched=matched_handoff(
                 target.shot.mast_digest, self._source, joints, clicks, sigma_px, to_joints, done, refined
             ),
@@ -361,6 +286,8 @@ class _Bench:
 
     def _true(self, target: Target, shot: Snapshot) -> tuple[float, float] | None:
         """Where the target is, that the clicks miss by their noise."""
+        if target.point_m is not None and self._points is not None:
+            return self._points.seen_px(shot.frame_id, target.point_m)
         if self._truth is None:
             return None
         exact = (target.x_px, target.y_px)

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from calib.cahvor import CameraModel
 from calib.epipolar import find_partner
 from calib.errors import NoStereoPoint
+from calib.rigid import FloatArray
 from calib.stereo import triangulate
 from calib.warp import grey
 from drivers.interfaces import Image
@@ -25,7 +26,11 @@ NOISE_DN = 2.0
 
 @dataclass(frozen=True, eq=False)
 class Target:
-    """A pixel of a snapshot, its partner in the other eye (``right_px`` of ``right``), and stereo's range."""
+    """A pixel of a snapshot, its partner in the other eye (``right_px`` of ``right``), and its range.
+
+    ``kind`` says what it is: ``ground`` for a pixel chosen by its texture. ``point_m`` (3,) is where it is in
+    the rover frame, if that is known from elsewhere.
+    """
 
     shot: Snapshot
     x_px: float
@@ -33,6 +38,8 @@ class Target:
     range_m: float
     right: Snapshot
     right_px: tuple[float, float]
+    kind: str = "ground"
+    point_m: FloatArray | None = None
 
 
 def choose_target(

@@ -11,7 +11,8 @@ import numpy as np
 from calib import pointing
 from calib.errors import Unreachable
 from calib.mast import Rig
-from mastctl.client import Client, ClientError
+from calib.rigid import FloatArray
+from mastctl.client import Client, ClientError, Snapshot
 from mastctl.experiment.targets import Target, choose_target
 
 # A view that offers no usable target is left for another; after this many in a row the distance is given up.
@@ -47,40 +48,46 @@ class Views:
         ClientError
             If the daemon does not turn the head or gives no pictures.
         """
-        angles = self._angles_towards(distance_m)
-        if angles is None:
+        pair = self.look_at(self._ground_ahead(distance_m))
+        if pair is None:
+            return None
+        models = tuple(self._rig.camera_in_rover(shot.camera, shot.pan_rad, shot.tilt_rad) for shot in pair)
+        return choose_target(*pair, models[0], models[1], distance_m, self._rng)
+
+    def look_at(self, point_m: FloatArray) -> tuple[Snapshot, Snapshot] | None:
+        """Turn to a point (3,) of the rover frame and take both pictures; None outside the head's limits.
+
+        Raises
+        ------
+        ClientError
+            If the daemon does not turn the head or gives no pictures.
+        """
+        try:
+            solutions = pointing.solve(self._rig.mast, self._rig.cameras[self._pair[0]].model, point_m)
+            angles = pointing.choose(solutions, self._pan_limits_rad, self._tilt_limits_rad)
+        except Unreachable:
             return None
         operation = self._client.wait(
-            self._client.point(pan_rad=angles[0], tilt_rad=angles[1]), timeout_s=OPERATION_TIMEOUT_S
+            self._client.point(pan_rad=angles.pan_rad, tilt_rad=angles.tilt_rad),
+            timeout_s=OPERATION_TIMEOUT_S,
         )
         if operation["state"] != "done":
             error = operation.get("error") or {}
             raise ClientError(
                 str(error.get("code", operation["state"])), str(error.get("message", "the move was stopped"))
             )
-        left, right = (self._client.snapshot(camera) for camera in self._pair)
-        models = tuple(
-            self._rig.camera_in_rover(shot.camera, shot.pan_rad, shot.tilt_rad) for shot in (left, right)
-        )
-        return choose_target(left, right, models[0], models[1], distance_m, self._rng)
+        return self._client.snapshot(self._pair[0]), self._client.snapshot(self._pair[1])
 
-    def _angles_towards(self, distance_m: float) -> tuple[float, float] | None:
-        """Joint angles that look at level ground at the range, anywhere ahead; None outside the limits."""
-        mast = self._rig.mast
-        head_in_rover_m = mast.rover_from_head(0.0, 0.0).translation_m
+    def _ground_ahead(self, distance_m: float) -> FloatArray:
+        """A point (3,) of level ground at the range from the head, anywhere ahead, rover frame."""
+        head_in_rover_m = self._rig.mast.rover_from_head(0.0, 0.0).translation_m
         height_m = -float(head_in_rover_m[2])
         along_m = math.sqrt(max(distance_m**2 - height_m**2, 0.0))
         azimuth_rad = self._rng.uniform(-self._pan_range_rad, self._pan_range_rad)
-        point_m = np.array(
+        return np.array(
             [
                 head_in_rover_m[0] + along_m * math.cos(azimuth_rad),
                 head_in_rover_m[1] + along_m * math.sin(azimuth_rad),
                 0.0,
             ]
         )
-        try:
-            solutions = pointing.solve(mast, self._rig.cameras[self._pair[0]].model, point_m)
-            chosen = pointing.choose(solutions, self._pan_limits_rad, self._tilt_limits_rad)
-        except Unreachable:
-            return None
-        return chosen.pan_rad, chosen.tilt_rad

@@ -1,0 +1,234 @@
+"""Provoke bad hand-offs and count which of the wrong ones the refinement's verdicts catch.
+
+What the verdicts have to judge is what correlation answers without them: the source's patch warped through
+its range, its best place in the window. A case is wrong if that is more than 4 px from the exact projection
+in either eye, and caught if no such eye is accepted; an accepted pixel is judged by itself.
+
+    .venv/bin/python -m tools.handoff_campaign --cases 100 --seed 1
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import json
+import math
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from calib.epipolar import find_partner
+from calib.errors import NoHandoff, NoStereoPoint
+from calib.handoff import Handoff, Joints, Predicted, hand_off
+from calib.handoff_refined import Eye, RefineSettings, refine_handoff
+from calib.match import MatchSettings
+from calib.rig_covariance import RigCovariance, stored_covariance
+from calib.store import load_rig
+from calib.warp import Plane, warp_patch
+from drivers.sim.render import compile_renderer
+from mastctl.packaged import config_folder
+from tools.handoff_provocations import KINDS, Case, Stage
+
+WRONG_PX = 4.0
+RIGHT_PX = 1.0
+WANTED = 0.9
+HALF_PX = 20
+PAD = 120
+JOINT_SIGMA_RAD = 3e-5
+
+ANYTHING = MatchSettings(
+    flat_sigma_px=math.inf, least_correlation=-9.0, least_lead=-9.0, worst_ratio=math.inf,
+    worst_sigma_px=math.inf,
+)  # fmt: skip
+"""No thresholds: for a surface where the stereo pair would be refused."""
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """One case in one destination camera; errors are lengths in px, not-a-number where there is no pixel."""
+
+    kind: str
+    note: str
+    case: int
+    step: str
+    camera: str
+    verdict: str
+    reason: str
+    correlation: float
+    second: float
+    geometric_px: float
+    refined_px: float
+    correlated_px: float
+
+    @property
+    def answer_px(self) -> float:
+        """What the answer is off by: the accepted pixel, else what correlation alone would have answered."""
+        return self.refined_px if self.verdict == "accepted" else self.correlated_px
+
+
+def run_case(case: Case, number: int) -> list[Outcome]:
+    """Hand one target over; nothing where the geometric hand-off refuses by itself."""
+    at = Joints(*case.joints_rad, JOINT_SIGMA_RAD)
+    believed = case.believed
+    pair, to = believed.stereo[case.step[0]], believed.stereo[case.step[1]]
+    step = " to ".join(case.step)
+
+    def outcome(camera: str, verdict: str, reason: str, *numbers: float) -> Outcome:
+        return Outcome(case.kind, case.note, number, step, camera, verdict, reason, *numbers)
+
+    try:
+        done = hand_off(
+            believed, pair, to, at, *case.clicks_px,
+            to_joints=at, sigma_px=case.sigma_px, calibration=case.calibration,
+        )  # fmt: skip
+    except (NoHandoff, NoStereoPoint) as error:
+        nan = math.nan
+        return [outcome(name, "refused", str(error), nan, nan, math.inf, nan, math.inf) for name in to]
+    refined = refine_handoff(done, case.source, case.clicks_px, case.destinations)
+    plane = _surface(case, done)
+    outcomes = []
+    for name in to:
+        predicted, one = done.pixels[name], refined[name]
+        if predicted is None:
+            outcomes.append(outcome(name, one.verdict, one.reason, *([math.inf] * 5)))
+            continue
+        best = correlated(case, case.destinations[name], plane, predicted)
+        errors = (_off(place, case, name) for place in (predicted.pixel_px, one.pixel_px, best))
+        outcomes.append(outcome(name, one.verdict, one.reason, one.correlation, one.second, *errors))
+    return outcomes
+
+
+def _surface(case: Case, done: Handoff) -> Plane:
+    """What the source pair sees, without thresholds; level ground at the clicks' point where it sees none."""
+    (left, right), clicks = case.source, case.clicks_px
+    found = find_partner(left.image, left.camera, clicks[0], right.image, right.camera, settings=ANYTHING)
+    return found.plane or Plane(done.seen.position_m, np.array([0.0, 0.0, -1.0]))
+
+
+def correlated(case: Case, eye: Eye, plane: Plane, predicted: Predicted) -> np.ndarray:
+    """Return where the warped patch correlates best in the window; the geometric pixel if there is none."""
+    settings = RefineSettings()
+    reach = settings.sigmas * math.sqrt(float(np.linalg.eigvalsh(predicted.search_px2)[-1]))
+    reach = math.ceil(min(max(reach, settings.least_px), settings.most_px))
+    template = warp_patch(
+        case.source[0].image, case.source[0].camera, case.clicks_px[0], plane, eye.camera, HALF_PX
+    )
+    if template is None:
+        return predicted.pixel_px
+    low = np.rint(predicted.pixel_px).astype(int) - reach - HALF_PX
+    padded = cv2.copyMakeBorder(eye.image, PAD, PAD, PAD, PAD, cv2.BORDER_REFLECT)
+    x, y = np.clip(low + PAD, 0, np.array(padded.shape[::-1]) - 2 * (reach + HALF_PX) - 1)
+    side = 2 * (reach + HALF_PX) + 1
+    scores = cv2.matchTemplate(padded[y : y + side, x : x + side], template.values, cv2.TM_CCOEFF_NORMED)
+    v, u = np.unravel_index(int(np.argmax(scores)), scores.shape)
+    return np.array([x + u, y + v]) - PAD + HALF_PX + template.target_px - template.centre_px
+
+
+def _off(pixel_px: np.ndarray, case: Case, name: str) -> float:
+    return float(np.linalg.norm(pixel_px - case.true_px[name]))
+
+
+@dataclass(frozen=True)
+class Row:
+    """One row of the table, in cases: both eyes together."""
+
+    kind: str
+    cases: int
+    accepted: int
+    accepted_rms_px: float
+    accepted_worst_px: float
+    wrong: int
+    flagged: int
+    accepted_wrong: int
+    refused_right: int
+
+
+def summarise(kind: str, cases: Sequence[Sequence[Outcome]]) -> Row:
+    """Count cases: wrong if an eye's answer is, flagged if no such eye is accepted."""
+    accepted = [[one for one in eyes if one.verdict == "accepted"] for eyes in cases]
+    wrong = [[one for one in eyes if one.answer_px > WRONG_PX] for eyes in cases]
+    errors = np.array([one.refined_px for eyes in accepted for one in eyes])
+    right = [max(one.correlated_px for one in eyes) <= RIGHT_PX for eyes in cases]
+    return Row(
+        kind,
+        len(cases),
+        sum(bool(eyes) for eyes in accepted),
+        float(np.sqrt(np.mean(errors**2))) if len(errors) else math.nan,
+        float(errors.max()) if len(errors) else math.nan,
+        sum(bool(eyes) for eyes in wrong),
+        sum(bool(eyes) and all(one.verdict != "accepted" for one in eyes) for eyes in wrong),
+        sum(any(one.refined_px > WRONG_PX for one in eyes) for eyes in accepted),
+        sum(ok and not eyes for ok, eyes in zip(right, accepted, strict=True)),
+    )
+
+
+def main() -> int:
+    """Run the campaign; exit 1 if less than nine tenths of the wrong answers are flagged."""
+    parser = argparse.ArgumentParser(description="Provoke bad hand-offs and count what the verdicts catch.")
+    parser.add_argument(
+        "--cases", type=int, default=100, help="bad cases, a fifth of each kind (default 100)"
+    )
+    parser.add_argument("--good", type=int, help="good cases beside them (default: half as many)")
+    parser.add_argument("--seed", type=int, default=1, help="of scene, views, targets and noise")
+    parser.add_argument("--kind", choices=(*KINDS, "good"), help="only this kind, --cases of it")
+    parser.add_argument("--json", action="store_true")
+    parser.add_argument("--out", type=Path, metavar="FILE.csv", help="a line for each case and camera")
+    options = parser.parse_args()
+    began = time.monotonic()
+    true = load_rig(config_folder() / "sim" / "rocky8.yaml").rig
+    believed = load_rig(config_folder() / "masts" / "rocky8_simulated.yaml").rig
+    calibration = stored_covariance(believed) or RigCovariance((), np.zeros((0, 0)))
+    compile_renderer()
+    wanted = {kind: math.ceil(options.cases / len(KINDS)) for kind in KINDS}
+    wanted["good"] = options.cases // 2 if options.good is None else options.good
+    if options.kind:
+        wanted = {options.kind: options.cases}
+    stage = Stage(true, believed, calibration, options.seed)
+    done: dict[str, list[list[Outcome]]] = {kind: [] for kind in wanted}
+    for kind, count in wanted.items():
+        for case in stage.cases(kind, count):
+            done[kind].append(run_case(case, len(done[kind])))
+        print(f"{time.monotonic() - began:.0f} s: {summarise(kind, done[kind])}", file=sys.stderr, flush=True)
+    stage.close()
+    rows = [summarise(kind, cases) for kind, cases in done.items()]
+    bad = [cases for kind in KINDS for cases in done.get(kind, [])]
+    total = summarise("all bad", bad)
+    if options.out:
+        _write(options.out, [one for cases in done.values() for eyes in cases for one in eyes])
+    if options.json:
+        document = {"seed": options.seed, "rows": [vars(row) for row in (*rows, total)]}
+        print(json.dumps(document, indent=1))
+    else:
+        _print([*rows, total])
+    return 0 if total.flagged >= WANTED * total.wrong else 1
+
+
+def _print(rows: Sequence[Row]) -> None:
+    print(
+        f"{'kind':10s} {'cases':>6s} {'wrong':>6s} {'flagged':>8s} {'accepted':>9s} {'rms px':>7s} "
+        f"{'worst px':>9s} {'accepted wrong':>15s} {'refused right':>14s}"
+    )
+    for row in rows:
+        flagged = f"{row.flagged} of {row.wrong}"
+        print(
+            f"{row.kind:10s} {row.cases:6d} {row.wrong:6d} {flagged:>8s} {row.accepted:9d} "
+            f"{row.accepted_rms_px:7.2f} {row.accepted_worst_px:9.2f} {row.accepted_wrong:15d} "
+            f"{row.refused_right:14d}"
+        )
+    print(f"  (wrong: plain correlation is more than {WRONG_PX:g} px off; right: at most {RIGHT_PX:g} px)")
+
+
+def _write(path: Path, outcomes: Sequence[Outcome]) -> None:
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(vars(outcomes[0]))
+        writer.writerows(list(vars(one).values()) for one in outcomes)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
