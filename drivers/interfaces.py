@@ -10,7 +10,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
-from typing import Literal, Protocol, runtime_checkable
+from typing import Literal, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -173,4 +173,34 @@ class HoldsExposure(Protocol):
 
     def exposure_held(self) -> AbstractContextManager[None]:
         """Return a context in which the exposure does not change: a measurement compares its pictures."""
+        ...
+
+
+class FrameTime(NamedTuple):
+    """When a frame was exposed: its count and mid-exposure, as `Frame` has them."""
+
+    sequence: int
+    mid_exposure_s: float
+
+
+@runtime_checkable
+class Paced(Protocol):
+    """A camera that takes frames at a steady rate, asked or not; not every camera does.
+
+    Attributes
+    ----------
+    period_s
+        From frame to frame, seconds.
+    trigger
+        The name of what exposes its frames; cameras of one trigger expose together. Empty: free-running.
+    """
+
+    @property
+    def period_s(self) -> float: ...
+    @property
+    def trigger(self) -> str: ...
+    def recent_times(self) -> Sequence[FrameTime]:
+        """Return the times of the frames that came last, all of one count, oldest first; empty where it does
+        not keep them.
+        """
         ...
