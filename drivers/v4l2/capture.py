@@ -23,6 +23,7 @@ from drivers.clock import Clock
 from drivers.errors import BadFrame, DriverError
 from drivers.interfaces import Image
 from drivers.v4l2 import abi, pixels
+from drivers.v4l2.bells import Bells
 from drivers.v4l2.errors import StreamFailed
 from drivers.v4l2.frames import Arrived, Counters
 from drivers.v4l2.node import Dequeued, Node, PictureFormat
@@ -46,7 +47,8 @@ RECENT_FRAMES = 30  # a second's: from their times the offset between two camera
 class _Shared:
     """What the thread and its callers share, under one lock."""
 
-    changed: threading.Condition = field(default_factory=lambda: threading.Condition(threading.Lock()))
+    lock: threading.Lock = field(default_factory=threading.Lock)
+    bells: Bells = field(default_factory=Bells)  # of the callers that wait for a change
     newest: Arrived | None = None
     node: Node | None = None  # in whose memory the newest lies
     picture: Image | None = None  # the newest converted, once somebody asked
@@ -119,7 +121,7 @@ class Capture:
     @property
     def counters(self) -> Counters:
         """What happened to the frames so far."""
-        with (shared := self._shared).changed:
+        with (shared := self._shared).lock:
             return Counters(
                 shared.good, shared.damaged, shared.dropped, shared.late, shared.reopened, shared.last_damage
             )
@@ -132,18 +134,18 @@ class Capture:
     @property
     def lost(self) -> str:
         """Why there are no frames now: the camera is gone or its stream failed; empty while it streams."""
-        with self._shared.changed:
+        with self._shared.lock:
             return self._shared.lost
 
     @property
     def newest(self) -> Arrived | None:
         """The newest good frame, however old; None if there is none."""
-        with self._shared.changed:
+        with self._shared.lock:
             return self._shared.newest
 
     def recent(self) -> list[Arrived]:
         """Return the last good frames of this stream, oldest first, without their pictures."""
-        with self._shared.changed:
+        with self._shared.lock:
             return list(self._shared.recent)
 
     def take(self, exposed_after_s: float, timeout_s: float) -> tuple[Arrived, Image] | None:
@@ -151,20 +153,26 @@ class Capture:
 
         None after ``timeout_s``, and at once when the camera is lost or closed.
         """
-        until_s = None
-        with (shared := self._shared).changed:
+        shared, bell, until_s = self._shared, None, None
+        try:
             while True:
-                newest = shared.newest
-                if newest is not None and newest.window().begin_s > exposed_after_s:
-                    if (picture := self._picture(newest)) is not None:
+                with shared.lock:
+                    newest = shared.newest
+                    fresh = newest is not None and newest.window().begin_s > exposed_after_s
+                    if newest is not None and fresh and (picture := self._picture(newest)) is not None:
                         return newest, picture
-                    continue
-                if shared.closed or shared.lost:
-                    return None
+                    if shared.closed or shared.lost:
+                        return None
+                    bell = bell or shared.bells.take()
                 now_s = time.monotonic()
                 until_s = now_s + timeout_s if until_s is None else until_s
-                if now_s > until_s or not shared.changed.wait(until_s - now_s):
+                if now_s >= until_s:
                     return None
+                bell.wait(until_s - now_s)
+        finally:
+            if bell is not None:
+                with shared.lock:
+                    shared.bells.give_back(bell)
 
     def _picture(self, newest: Arrived) -> Image | None:
         """Convert the newest frame unless it is; None if that finds it damaged.
@@ -186,13 +194,15 @@ class Capture:
 
     def close(self) -> None:
         """End the thread and let go of the camera."""
-        with self._shared.changed:
+        with self._shared.lock:
             if self._shared.closed:
                 return
             self._shared.closed = True
-            self._shared.changed.notify_all()
+        self._shared.bells.ring_all()
         os.eventfd_write(self._wake, 1)
         self._thread.join()
+        with self._shared.lock:
+            self._shared.bells.close()
         self._uevents.close()
         os.close(self._wake)
 
@@ -224,7 +234,7 @@ class Capture:
         poll = select.poll()
         poll.register(node.fileno(), select.POLLIN)
         poll.register(self._wake, select.POLLIN)
-        with self._shared.changed:
+        with self._shared.lock:
             self._shared.node = node
         timeout_ms = max(1.0, 1e3 * SILENT_PERIODS * stream.period_s)
         silent_since_s: float | None = None
@@ -263,39 +273,39 @@ class Capture:
             sequence = self._last_sequence + 1
         self._last_sequence = sequence
         if wrong:
-            with (shared := self._shared).changed:
+            with (shared := self._shared).lock:
                 shared.dropped += dropped
                 shared.damaged += 1
                 shared.last_damage = wrong
             stream.node.queue(buffer.number)
             return
         arrived = Arrived(buffer, stream.format, stream.rule, sequence, self._streams, received_s)
-        with (shared := self._shared).changed:
+        with (shared := self._shared).lock:
             shared.dropped += dropped
             shared.good += 1
             shared.late += received_s - buffer.stamp_s > stream.period_s + LATE_S
             shared.newest, shared.picture = arrived, None
             shared.recent.append(arrived)
-            shared.changed.notify_all()
-        if self._held is not None:
-            stream.node.queue(self._held)
-        self._held = buffer.number
+        held, self._held = self._held, buffer.number
+        if held is not None:
+            stream.node.queue(held)
+        shared.bells.ring_all()
         self._pause_s = FIRST_PAUSE_S
         if self._between is not None:
             self._between(stream, arrived, np.frombuffer(stream.node.bytes_of(buffer), np.uint8))
 
     def _lose(self, why: str) -> None:
         """Say that there are no frames for now."""
-        with self._shared.changed:
+        with self._shared.lock:
             if not self._shared.lost:
                 log.warning("%s; it is opened again when it is back", why)
             self._shared.lost = why
             self._forget()
-            self._shared.changed.notify_all()
+        self._shared.bells.ring_all()
 
     def _let_go(self) -> None:
         """Forget the frame that lies in the memory of a stream that ends."""
-        with self._shared.changed:
+        with self._shared.lock:
             self._forget()
         self._held = None
 
@@ -327,13 +337,13 @@ class Capture:
         except Exception as error:
             if not isinstance(error, DriverError):  # a defect: the thread goes on trying, and says so
                 log.exception("%s: opening again failed", self._name)
-            with self._shared.changed:
+            with self._shared.lock:
                 self._shared.lost = str(error) or type(error).__name__
             return None
-        with self._shared.changed:
+        with self._shared.lock:
             self._shared.lost = ""
             self._shared.reopened += 1
-            self._shared.changed.notify_all()
+        self._shared.bells.ring_all()
         log.warning("%s is back at %s", self._name, stream.node.path)
         return stream
 

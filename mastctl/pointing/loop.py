@@ -37,6 +37,7 @@ from mastctl.limits import Limits
 from mastctl.pointing.counts import counts_told
 from mastctl.pointing.looking import CamerasLike, Clicked, Eyes, View, facts
 from mastctl.pointing.motion import Head, HeadLike
+from mastctl.pointing.one_moment import check_one_moment
 from mastctl.pointing.record import Recorder
 from mastctl.pointing.requests import (
     Aim,
@@ -236,11 +237,17 @@ class _Run:
             again = self._eyes.again(view, pixel, now)
             detail.update(facts(again))
         with self._step("stereo") as detail:
+            detail.update(self._one_moment(now, again.pixel_px, [other], resting))
             partnered = self._eyes.stereo(now, again.pixel_px, other)
             detail.update(facts(partnered.match), across_px=round(partnered.across_px, 3))
         assert partnered.plane is not None
         self._triangulate(now, again.pixel_px, other, partnered.match.pixel_px)
         return Clicked(view, pixel, partnered.plane)
+
+    def _one_moment(
+        self, view: View, pixel_px: FloatArray, others: Sequence[View], resting: Reading
+    ) -> dict[str, Any]:
+        return check_one_moment(self._eyes, self._settings, view, pixel_px, others, resting)
 
     def _triangulate(self, one: View, one_px: FloatArray, other: View, other_px: FloatArray) -> None:
         with self._step("triangulate") as detail:
@@ -270,6 +277,8 @@ class _Run:
             confirmed: list[tuple[View, FloatArray]] = [(now, seen.pixel_px)]
             with self._step("eyes") as detail:
                 detail.update(confirmed_by=list(companions))
+                if views:
+                    detail.update(self._one_moment(now, seen.pixel_px, list(views.values()), settled))
                 for name, other in views.items():
                     same_pair = {aim.camera, name} == {source, self._eyes.partner(source)}
                     found, detail[name] = self._eyes.agree(clicked, now, seen, other, same_pair)
