@@ -37,7 +37,6 @@ from drivers.v4l2.camera import V4l2Camera, open_camera
 from drivers.v4l2.choice import options_for
 from drivers.v4l2.controls import set_by_name
 from drivers.v4l2.find import open_node
-from drivers.v4l2.frames import Arrived
 from drivers.v4l2.options import CameraOptions, parse_options
 from drivers.v4l2.stream import set_format
 
@@ -219,23 +218,24 @@ def opencv_gaps(options: dict[str, Any], seconds: float, say: Callable[..., None
 
 
 def watch(cameras: list[V4l2Camera], over: threading.Event, full: list[int]) -> None:
-    """Count the missing frames for which the driver had no buffer, because we held them all.
+    """Count the missing frames for which the driver had no buffer, because none had come back from us.
 
-    It had one if we had taken the frame before out by the time when the missing one was due: frames come out
-    in their order.
+    These are the missing ones that were due while all others, but for the one that we hold and one to spare,
+    lay filled and not taken. For any other missing frame the driver had a buffer and did not fill it.
     """
-    last: list[Arrived | None] = [None for _ in cameras]
+    last = [-1 for _ in cameras]
     ended = False
     while not ended:
         ended = over.wait(0.2)
         for index, camera in enumerate(cameras):
-            for frame in camera.capture.recent():
-                before = last[index]
-                if before is None or frame.sequence > before.sequence:
-                    missed = 0 if before is None else frame.sequence - before.sequence - 1
-                    if before is not None and before.received_s - before.buffer.stamp_s > camera.period_s:
-                        full[index] += missed
-                    last[index] = frame
+            frames = camera.capture.recent()
+            for before, frame in pairwise(frames):
+                missed = frame.sequence - before.sequence - 1
+                if frame.sequence > last[index] >= 0 and missed:
+                    due_s = before.buffer.stamp_s + camera.period_s
+                    lying = sum(f.sequence <= before.sequence and f.received_s > due_s for f in frames)
+                    full[index] += missed if lying >= CameraOptions.buffers - 2 else 0
+            last[index] = frames[-1].sequence if frames else last[index]
 
 
 @contextmanager
