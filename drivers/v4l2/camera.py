@@ -101,6 +101,8 @@ class V4l2Camera:
     def next_frame(self, exposed_after_s: float, timeout_s: float) -> V4l2Frame:
         """Return the newest frame whose exposure surely began after ``exposed_after_s``, waiting if need be.
 
+        Its stamp is at most a period and 5 ms old, or it came during the call.
+
         Raises
         ------
         NoFreshFrame
@@ -215,4 +217,7 @@ class V4l2Camera:
         if last is None:
             return message if damaged else f"{message}; none came at all"
         age_s = exposed_after_s - last.window().begin_s
+        if age_s < 0.0:  # late enough, but older than a frame that is still to come
+            age_s = self._clock.now_s() - last.buffer.stamp_s
+            return f"{message}; the last good one is frame {last.sequence}, {age_s:.3f} s old"
         return f"{message}; the last good one is frame {last.sequence}, exposed {age_s:.3f} s before"

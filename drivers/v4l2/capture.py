@@ -28,6 +28,7 @@ from drivers.v4l2.errors import StreamFailed
 from drivers.v4l2.frames import Arrived, Counters
 from drivers.v4l2.node import Dequeued, Node, PictureFormat
 from drivers.v4l2.options import CameraOptions
+from drivers.v4l2.polling import Poll
 from drivers.v4l2.stamps import StampCheck
 from drivers.v4l2.stream import Stream
 from drivers.v4l2.uevents import UeventSocket
@@ -151,15 +152,22 @@ class Capture:
     def take(self, exposed_after_s: float, timeout_s: float) -> tuple[Arrived, Image] | None:
         """Return the newest frame, once its exposure began after that moment, and its read-only picture.
 
-        None after ``timeout_s``, and at once when the camera is lost or closed.
+        A frame that was there before is given only while its stamp is at most a period and 5 ms old: when the
+        computer stood still for longer, a newer one is on its way. None after ``timeout_s``, and at once when
+        the camera is lost or closed.
         """
-        shared, bell, until_s = self._shared, None, None
+        shared, bell, until_s, first = self._shared, None, None, None
         try:
             while True:
                 with shared.lock:
                     newest = shared.newest
-                    fresh = newest is not None and newest.window().begin_s > exposed_after_s
-                    if newest is not None and fresh and (picture := self._picture(newest)) is not None:
+                    first = newest if bell is None else first
+                    if (
+                        newest is not None
+                        and newest.window().begin_s > exposed_after_s
+                        and (newest is not first or self._is_young(newest))
+                        and (picture := self._picture(newest)) is not None
+                    ):
                         return newest, picture
                     if shared.closed or shared.lost:
                         return None
@@ -173,6 +181,9 @@ class Capture:
             if bell is not None:
                 with shared.lock:
                     shared.bells.give_back(bell)
+
+    def _is_young(self, frame: Arrived) -> bool:
+        return self._clock.now_s() - frame.buffer.stamp_s <= self.period_s + LATE_S
 
     def _picture(self, newest: Arrived) -> Image | None:
         """Convert the newest frame unless it is; None if that finds it damaged.
@@ -231,23 +242,21 @@ class Capture:
     def _stream(self, stream: Stream) -> None:
         """Take frames until closed. Raises DriverError when the camera fails."""
         node = stream.node
-        poll = select.poll()
-        poll.register(node.fileno(), select.POLLIN)
-        poll.register(self._wake, select.POLLIN)
+        poll = Poll(node.fileno(), self._wake)
         with self._shared.lock:
             self._shared.node = node
-        timeout_ms = max(1.0, 1e3 * SILENT_PERIODS * stream.period_s)
         silent_since_s: float | None = None
-        just_a_frame = [(node.fileno(), select.POLLIN)]
         while True:
-            events = poll.poll(timeout_ms)
-            if events != just_a_frame and any(descriptor == self._wake for descriptor, _ in events):
-                return
+            events = 0
+            if poll.wait(SILENT_PERIODS * stream.period_s):
+                if poll.events(1):
+                    return
+                events = poll.events(0)
             # One frame a round: asking for another that is not there costs as much as the poll that tells it.
             if events and (buffer := node.dequeue()) is not None:
                 self._take(stream, buffer)
                 silent_since_s = None
-            elif any(event & ~select.POLLIN for _, event in events):
+            elif events & ~select.POLLIN:
                 raise StreamFailed("its driver reports an error and gives no frame", device=self._name)
             else:
                 node.check_there()

@@ -14,6 +14,8 @@ from collections.abc import Callable, Iterator
 from itertools import pairwise
 from pathlib import Path
 
+import cv2
+import numpy as np
 import pytest
 
 from drivers.errors import BadOptions, DriverError, NoFreshFrame
@@ -184,11 +186,46 @@ def test_an_old_frame_is_never_given(bench: Bench, camera: V4l2Camera) -> None:
 
 
 def test_the_newest_frame_is_given_not_the_first_that_fits(bench: Bench, camera: V4l2Camera) -> None:
-    bench.clock.time_s = 101.0
+    bench.clock.time_s = 100.4
     for n in range(10):
         bench.streams[0].frame(n, 100.0 + 0.04 * n)
     until(lambda: camera.counters.good == 10)
     assert camera.next_frame(99.0, 0.0).sequence == 9
+
+
+def test_a_frame_older_than_the_next_should_be_is_waited_past(bench: Bench, camera: V4l2Camera) -> None:
+    bench.clock.time_s = 100.04
+    bench.streams[0].frame(0, 100.0)
+    assert camera.next_frame(99.0, PATIENCE_S).sequence == 0  # a period and 5 ms are allowed
+    bench.clock.time_s = 100.046
+    with pytest.raises(NoFreshFrame, match=r"the last good one is frame 0, 0\.046 s old"):
+        camera.next_frame(99.0, 0.01)
+    threading.Timer(0.05, lambda: bench.streams[0].frame(1, 100.045)).start()
+    assert camera.next_frame(99.0, PATIENCE_S).sequence == 1
+
+
+def test_a_frame_that_comes_late_is_given_to_who_waits(bench: Bench, camera: V4l2Camera) -> None:
+    bench.clock.time_s = 100.5
+    threading.Timer(0.05, lambda: bench.streams[0].frame(1, 100.3)).start()
+    assert camera.next_frame(100.2, PATIENCE_S).sequence == 1
+
+
+def test_a_broken_jpeg_is_damage_that_shows_when_it_is_decoded(bench: Bench) -> None:
+    whole = cv2.imencode(".jpg", np.full((8, 16), 90, np.uint8))[1].tobytes()
+    broken = whole[:2] + b"\0" * 40 + b"\xff\xd9"
+    bench.clock.time_s = 100.03
+    camera = V4l2Camera(parse_options({"card": "Fake", "format": "MJPG"}, "eye"), "eye", bench.clock)
+    try:
+        stream = bench.streams[0]
+        stream.format = PictureFormat("MJPG", SIZE_PX, 0, 4096)
+        stream.node.put((Dequeued(0, len(broken), START, 0, 100.0), broken))
+        with pytest.raises(NoFreshFrame, match="1 came damaged"):
+            camera.next_frame(99.9, 0.5)
+        stream.node.put((Dequeued(1, len(whole), START, 1, 100.02), whole))
+        assert abs(int(camera.next_frame(99.9, PATIENCE_S).image.mean()) - 90) <= 2
+    finally:
+        camera.close()
+    assert (camera.counters.good, camera.counters.damaged) == (1, 1)
 
 
 def test_a_waiting_call_gets_the_frame_that_comes(bench: Bench, camera: V4l2Camera) -> None:
@@ -223,6 +260,7 @@ def test_a_damaged_frame_is_refused_counted_and_given_back(
     until(lambda: camera.counters.damaged == 1)
     assert camera.counters.last_damage == words
     until(lambda: bench.streams[0].node.queued == [1])  # and frame 0 is still held
+    bench.clock.time_s = 100.04
     assert camera.next_frame(0.0, 0.0).sequence == 0
 
 
@@ -273,9 +311,9 @@ def test_a_failed_stream_is_opened_again(bench: Bench, camera: V4l2Camera) -> No
 
 
 def test_the_count_grows_when_the_drivers_count_begins_again(bench: Bench, camera: V4l2Camera) -> None:
-    bench.clock.time_s = 101.0
     sequences = []
     for index, count in enumerate((2**32 - 1, 0, 1, 0)):
+        bench.clock.time_s = 100.01 + 0.04 * index
         bench.streams[0].frame(count, 100.0 + 0.04 * index)
         until(lambda wanted=index + 1: camera.counters.good == wanted)
         sequences.append(camera.next_frame(0.0, 0.0).sequence)
@@ -304,7 +342,7 @@ def test_a_camera_that_cannot_be_opened_leaves_nothing(bench: Bench) -> None:
 
 
 def test_only_the_newest_frames_buffer_is_held(bench: Bench, camera: V4l2Camera) -> None:
-    bench.clock.time_s = 200.0
+    bench.clock.time_s = 101.98
     for n in range(50):
         bench.streams[0].frame(n, 100.0 + 0.04 * n, level=n)
     until(lambda: len(bench.streams[0].node.queued) == 49)
