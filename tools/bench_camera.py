@@ -250,7 +250,14 @@ def other_reader(beside: list[dict[str, Any]], seconds: float) -> Iterator[list[
                 set_format(node, options["format"], tuple(options["size_px"]), "beside")
                 node.set_rate(options["rate_hz"])
             count = round(seconds * options["rate_hz"])
-            command = ["v4l2-ctl", "-d", path, "--verbose", "--stream-mmap=8", f"--stream-count={count}"]
+            command = [
+                "v4l2-ctl",
+                "-d",
+                path,
+                "--verbose",
+                f"--stream-mmap={CameraOptions.buffers}",
+                f"--stream-count={count}",
+            ]
             told = stack.enter_context(tempfile.TemporaryFile("w+"))  # a full pipe would hold it up
             reader = subprocess.Popen(command, stdout=told, stderr=told)
             running.append((stack.enter_context(reader), told))

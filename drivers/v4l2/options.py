@@ -64,7 +64,7 @@ class CameraOptions:
     auto_exposure: ExposureSettings | None = None
     margin_s: float = 0.002
     trigger: str = ""
-    buffers: int = 8
+    buffers: int = 16
 
 
 def parse_options(options: Mapping[str, Any], name: str) -> CameraOptions:

@@ -14,6 +14,7 @@ from drivers.errors import NoFreshFrame
 from drivers.interfaces import Reading
 from drivers.pairing import learned
 from drivers.v4l2.camera import V4l2Camera, open_camera
+from drivers.v4l2.options import CameraOptions
 from mastctl.devices import Devices
 from mastctl.limits import Limits
 
@@ -68,9 +69,9 @@ def test_what_came_instead_is_told(camera: V4l2Camera) -> None:
         camera.next_frame(time.monotonic() + 35.0, 0.1)
 
 
-FRAMES_OF_A_FULL_RING = 6
-"""A gap of the reader's making needs all eight buffers full, so at least so many frames come late with it.
-A gap without them is vivid's own: it skips frames while buffers are free when the machine below stalls."""
+FRAMES_OF_A_FULL_RING = CameraOptions.buffers - 2
+"""A gap of the reader's making needs all buffers full, so at least so many frames come late with it. A gap
+without them is vivid's own: it skips frames while buffers are free when the machine below stalls."""
 
 
 @pytest.mark.parametrize("size_px", [(640, 480), (1280, 720)])  # vivid's nearest to 1024x768
