@@ -7,9 +7,9 @@ lock; one that is woken through a condition first waits for that lock.
 from __future__ import annotations
 
 import contextlib
+import math
 import os
-
-from drivers.v4l2.polling import Poll
+import select
 
 
 class Bell:
@@ -17,11 +17,12 @@ class Bell:
 
     def __init__(self) -> None:
         self._fd = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
-        self._poll = Poll(self._fd)
+        self._poll = select.poll()
+        self._poll.register(self._fd, select.POLLIN)
 
     def wait(self, timeout_s: float) -> None:
         """Return when it rings, at the latest after ``timeout_s``."""
-        if self._poll.wait(timeout_s):
+        if self._poll.poll(max(0, math.ceil(1e3 * timeout_s))):
             with contextlib.suppress(BlockingIOError):
                 os.eventfd_read(self._fd)
 

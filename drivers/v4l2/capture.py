@@ -28,7 +28,6 @@ from drivers.v4l2.errors import StreamFailed
 from drivers.v4l2.frames import Arrived, Counters
 from drivers.v4l2.node import Dequeued, Node, PictureFormat
 from drivers.v4l2.options import CameraOptions
-from drivers.v4l2.polling import Poll
 from drivers.v4l2.stamps import StampCheck
 from drivers.v4l2.stream import Stream
 from drivers.v4l2.uevents import UeventSocket
@@ -242,16 +241,17 @@ class Capture:
     def _stream(self, stream: Stream) -> None:
         """Take frames until closed. Raises DriverError when the camera fails."""
         node = stream.node
-        poll = Poll(node.fileno(), self._wake)
+        poll = select.poll()
+        poll.register(node.fileno(), select.POLLIN)
+        poll.register(self._wake, select.POLLIN)
         with self._shared.lock:
             self._shared.node = node
         silent_since_s: float | None = None
         while True:
-            events = 0
-            if poll.wait(SILENT_PERIODS * stream.period_s):
-                if poll.events(1):
-                    return
-                events = poll.events(0)
+            found = dict(poll.poll(max(1.0, 1e3 * SILENT_PERIODS * stream.period_s)))
+            if self._wake in found:
+                return
+            events = found.get(node.fileno(), 0)
             # One frame a round: asking for another that is not there costs as much as the poll that tells it.
             if events and (buffer := node.dequeue()) is not None:
                 self._take(stream, buffer)
