@@ -254,7 +254,11 @@ class Devices:
         first = names[0]
         for name in names[1:]:
             before = self._learned.get((first, name))
-            self._learned[first, name] = learned(self._cameras[first], self._cameras[name], before)
+            try:
+                self._learned[first, name] = learned(self._cameras[first], self._cameras[name], before)
+            except Exception as error:
+                words = f"the drivers tell no times of {first} and {name}: {type(error).__name__}: {error}"
+                raise DriverError(words, device=name) from None
         return {name: self._learned[first, name] for name in names[1:]}
 
     def _taken(self, after_s: Mapping[str, float], deadline_s: float) -> dict[str, StampedFrame]:

@@ -359,6 +359,15 @@ def test_eyes_that_never_belong_together_are_told(ticking: tuple[Ticking, Tickin
         devices.frames(EYES, now(), 0.3)
 
 
+@pytest.mark.parametrize("times", [lambda: [(1, math.nan)] * 9, lambda: ["noon"] * 9, lambda: 1 / 0])
+def test_times_that_cannot_be_true_are_a_typed_error(
+    ticking: tuple[Ticking, Ticking], devices: Devices, times: Callable[[], Any]
+) -> None:
+    ticking[1].recent_times = times  # type: ignore[method-assign]
+    with pytest.raises(DriverError, match="the drivers tell no times of navcam_left and navcam_right"):
+        devices.frames(EYES, now(), 2.0)
+
+
 def test_a_move_between_two_exposures_moves_both(
     devices: Devices, hardware: FakeHardware, monkeypatch: pytest.MonkeyPatch
 ) -> None:
