@@ -62,6 +62,11 @@ class Frame:
     mid_exposure_s: float
     exposure_s: float
 
+    @property
+    def exposure_began_s(self) -> float:
+        """When the exposure began, seconds of CLOCK_MONOTONIC."""
+        return self.mid_exposure_s - self.exposure_s / 2
+
 
 Side = Literal["positive", "negative", "unknown"]
 
@@ -177,10 +182,10 @@ class HoldsExposure(Protocol):
 
 
 class FrameTime(NamedTuple):
-    """When a frame was exposed: its count and mid-exposure, as `Frame` has them."""
+    """A frame's count, as `Frame` has it, and when its exposure began, seconds of CLOCK_MONOTONIC."""
 
     sequence: int
-    mid_exposure_s: float
+    exposure_began_s: float
 
 
 @runtime_checkable

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 import statistics
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
@@ -31,7 +31,7 @@ class Stamped(Protocol):
     @property
     def sequence(self) -> int: ...
     @property
-    def mid_exposure_s(self) -> float: ...
+    def exposure_began_s(self) -> float: ...
 
 
 @dataclass(frozen=True)
@@ -44,6 +44,8 @@ class Offset:
         From frame to frame, of the slower one; infinite where it is not known.
     usual_s
         How much later the other one exposes, seconds; None before it is learned and where it is not constant.
+    began_s
+        When an exposure of the first one began: the others are whole periods away. None if not known.
     counts_apart
         By how much the other one's count is higher for the same trigger; None for free-running cameras.
     """
@@ -51,6 +53,7 @@ class Offset:
     period_s: float = math.inf
     usual_s: float | None = None
     counts_apart: int | None = None
+    began_s: float | None = None
 
 
 def learned(one: object, other: object, before: Offset | None = None) -> Offset:
@@ -77,8 +80,8 @@ def learned_from(
     before_s: float | None = None,
 ) -> Offset:
     """Return what the times of two cameras' last frames tell, oldest first; `LEAST_TO_LEARN` of each."""
-    times_s = np.array([frame.mid_exposure_s for frame in ones])
-    theirs_s = np.array([frame.mid_exposure_s for frame in others])
+    times_s = np.array([frame.exposure_began_s for frame in ones])
+    theirs_s = np.array([frame.exposure_began_s for frame in others])
     nearest = np.abs(theirs_s[:, None] - times_s[None, :]).argmin(axis=1)
     apart_s = theirs_s - times_s[nearest]
     # By whole periods nearer to the last one: a frame may have lost its partner, or wait for it.
@@ -95,14 +98,14 @@ def learned_from(
             frame.sequence - ones[index].sequence
             for frame, index in list(zip(others, nearest, strict=True))[-COUNTED_FROM:]
         )
-    return Offset(period_s, usual_s if spread_s <= period_s / 4 else None, counts_apart)
+    return Offset(period_s, usual_s if spread_s <= period_s / 4 else None, counts_apart, float(times_s[-1]))
 
 
 def _measured_period_s(nominal_s: float, times: Sequence[FrameTime]) -> float:
     """The period by the frames themselves: an automatic exposure may have made it longer."""
     first, last = times[0], times[-1]
     counted = last.sequence - first.sequence
-    span_s = last.mid_exposure_s - first.mid_exposure_s
+    span_s = last.exposure_began_s - first.exposure_began_s
     return span_s / counted if counted > 0 and span_s > 0 else nominal_s
 
 
@@ -121,6 +124,37 @@ class Pairing:
         self._first = first
         self._offsets = dict(offsets)
 
+    def moments(self, exposed_after_s: float) -> dict[str, float]:
+        """Return after which moment to ask each camera, so that the first frames to come belong together.
+
+        Each moment is no earlier than asked, and where the cameras' rhythm is known half a period before an
+        expected frame.
+        """
+        rhythm = self._rhythm()
+        if rhythm is None or rhythm.began_s is None:
+            return dict.fromkeys((self._first, *self._offsets), exposed_after_s)
+        earliest_s = exposed_after_s - min(0.0, *(offset.usual_s or 0.0 for offset in self._offsets.values()))
+        between_s = rhythm.began_s - rhythm.period_s / 2
+        first_s = between_s + rhythm.period_s * math.ceil((earliest_s - between_s) / rhythm.period_s)
+        return {self._first: first_s} | {n: first_s + (o.usual_s or 0.0) for n, o in self._offsets.items()}
+
+    def _rhythm(self) -> Offset | None:
+        """An offset that tells when frames are to be expected; None unless it is known of all cameras."""
+        known = [offset for offset in self._offsets.values() if offset.usual_s is not None]
+        return known[0] if known and len(known) == len(self._offsets) else None
+
+    def again(self, frames: Mapping[str, Stamped]) -> dict[str, float]:
+        """Return after which moment to ask which cameras again; none if all frames belong together.
+
+        Where the rhythm is known all are asked anew, since those whose frame is newer do not wait. But counts
+        that stamps contradict show only in frames that stand still.
+        """
+        behind = self.behind(frames)
+        counted = any(offset.counts_apart is not None for offset in self._offsets.values())
+        if behind and self._rhythm() is not None and not counted:
+            return self.moments(max(frame.exposure_began_s for frame in frames.values()))
+        return {name: frames[name].exposure_began_s + by_s for name, by_s in behind.items()}
+
     def behind(self, frames: Mapping[str, Stamped]) -> dict[str, float]:
         """Return the cameras whose frame is too old for the others'; empty if all belong together.
 
@@ -131,7 +165,7 @@ class Pairing:
         for name, offset in self._offsets.items():
             late_s = _late_s(one, frames[name], offset)
             if late_s is None:  # the stamps contradict the counts: one of the two missed a trigger
-                self._offsets[name] = offset = Offset(offset.period_s, offset.usual_s)
+                self._offsets[name] = offset = replace(offset, counts_apart=None)
                 late_s = _late_s(one, frames[name], offset) or 0.0
             if late_s:
                 behind = name if late_s < 0 else self._first
@@ -141,7 +175,7 @@ class Pairing:
 
 def _late_s(one: Stamped, other: Stamped, offset: Offset) -> float | None:
     """How much later the other frame is than the one's partner: 0 if it is the partner, None if who knows."""
-    dt_s = other.mid_exposure_s - one.mid_exposure_s
+    dt_s = other.exposure_began_s - one.exposure_began_s
     apart = abs(dt_s) > offset.period_s / 2 + SLOP_S
     if offset.counts_apart is not None:
         ahead = other.sequence - one.sequence - offset.counts_apart

@@ -236,18 +236,18 @@ class Devices:
         deadline_s = time.monotonic() + timeout_s
         names = tuple(dict.fromkeys(cameras))
         if len(names) < 2:
-            return self._taken(dict.fromkeys(names, exposed_after_s), deadline_s)
-        used_s = {name: self._paired_s.get(name, -math.inf) for name in names}
+            frames = self._fetched(dict.fromkeys(names, exposed_after_s), deadline_s)
+            return {name: self._stamped(name, frame) for name, frame in frames.items()}
+        used_s = max(self._paired_s.get(name, -math.inf) for name in names)
         pairing = Pairing(names[0], self._offsets(names))
-        frames = self._taken({name: max(exposed_after_s, used_s[name]) for name in names}, deadline_s)
-        while behind := pairing.behind(frames):
+        frames = self._fetched(pairing.moments(max(exposed_after_s, used_s)), deadline_s)
+        while after_s := pairing.again(frames):
             if time.monotonic() > deadline_s:
                 words = f"no frames of {', '.join(names)} that belong together came within {timeout_s:g} s"
-                raise NoFreshFrame(words, device=min(behind))
-            after_s = {name: frames[name].exposure_began_s + by_s for name, by_s in behind.items()}
-            frames |= self._taken(after_s, deadline_s)
+                raise NoFreshFrame(words, device=min(after_s))
+            frames |= self._fetched(after_s, deadline_s)
         self._paired_s |= {name: frame.exposure_began_s for name, frame in frames.items()}
-        return self._together(frames)
+        return self._together({name: self._stamped(name, frame) for name, frame in frames.items()})
 
     def _offsets(self, names: Sequence[str]) -> dict[str, Offset]:
         """What is known of each camera's times beside the first one's."""
@@ -261,18 +261,22 @@ class Devices:
                 raise DriverError(words, device=name) from None
         return {name: self._learned[first, name] for name in names[1:]}
 
-    def _taken(self, after_s: Mapping[str, float], deadline_s: float) -> dict[str, StampedFrame]:
+    def _fetched(
+        self, after_s: Mapping[str, float], deadline_s: float
+    ) -> dict[str, CheckedFrame | StampedFrame]:
         """One frame of each named camera, exposed after its moment."""
         asked: dict[str, Future[CheckedFrame | StampedFrame]] = {}
         for camera, exposed_after_s in after_s.items():
             take = self._taker(camera, exposed_after_s, deadline_s)
             left_s = max(0.0, deadline_s - time.monotonic())
             asked[camera] = self._camera_threads[camera].submit("next_frame", take, left_s + self._grace_s)
-        taken: dict[str, StampedFrame] = {}
-        for camera, future in asked.items():
-            frame = self._camera_threads[camera].wait("next_frame", future, deadline_s + self._grace_s)
-            taken[camera] = frame if isinstance(frame, StampedFrame) else self._stamp(camera, frame)
-        return taken
+        return {
+            camera: self._camera_threads[camera].wait("next_frame", future, deadline_s + self._grace_s)
+            for camera, future in asked.items()
+        }
+
+    def _stamped(self, camera: str, frame: CheckedFrame | StampedFrame) -> StampedFrame:
+        return frame if isinstance(frame, StampedFrame) else self._stamp(camera, frame)
 
     def _together(self, frames: dict[str, StampedFrame]) -> dict[str, StampedFrame]:
         """Frames that serve one measurement: if the head moved between two exposures, it moved in all."""

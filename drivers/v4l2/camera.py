@@ -147,7 +147,7 @@ class V4l2Camera:
 
     def recent_times(self) -> list[FrameTime]:
         """Return the times of the last good frames of this stream, oldest first."""
-        return [FrameTime(frame.sequence, frame.window().mid_s) for frame in self.capture.recent()]
+        return [FrameTime(frame.sequence, frame.window().begin_s) for frame in self.capture.recent()]
 
     def abilities(self) -> dict[str, Any]:
         """Return what the camera offers, as JSON: ``formats`` and ``controls`` with their values now."""

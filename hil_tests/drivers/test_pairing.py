@@ -18,7 +18,7 @@ class Shot:
     """A frame; ``trigger`` is the truth that pairing does not look at."""
 
     sequence: int
-    mid_exposure_s: float
+    exposure_began_s: float
     trigger: int
 
 
@@ -32,12 +32,12 @@ class Eye:
     now_s: float = 0.0
 
     def recent_times(self) -> list[FrameTime]:
-        seen = [shot for shot in self.shots if shot.mid_exposure_s <= self.now_s][-30:]
-        return [FrameTime(shot.sequence, shot.mid_exposure_s) for shot in seen]
+        seen = [shot for shot in self.shots if shot.exposure_began_s <= self.now_s][-30:]
+        return [FrameTime(shot.sequence, shot.exposure_began_s) for shot in seen]
 
     def take(self, after_s: float, now_s: float) -> Shot:
-        fresh = [shot for shot in self.shots if shot.mid_exposure_s > after_s]
-        ready = [shot for shot in fresh if shot.mid_exposure_s <= now_s]
+        fresh = [shot for shot in self.shots if shot.exposure_began_s > after_s]
+        ready = [shot for shot in fresh if shot.exposure_began_s <= now_s]
         return ready[-1] if ready else fresh[0]
 
 
@@ -61,21 +61,23 @@ class Story:
     right: Eye
     used_s: list[float] = field(default_factory=lambda: [0.0, 0.0])
     offset: Offset | None = None
+    late_s: float = 0.0
 
     def pair(self, asked_s: float) -> tuple[Shot, Shot]:
         self.left.now_s = self.right.now_s = asked_s
         self.offset = learned(self.left, self.right, self.offset)
         pairing = Pairing("left", {"right": self.offset})
-        after_s = {"left": max(asked_s, self.used_s[0]), "right": max(asked_s, self.used_s[1])}
+        after_s = pairing.moments(max(asked_s, *self.used_s))
         eyes = {"left": self.left, "right": self.right}
         frames = {name: eyes[name].take(after_s[name], asked_s) for name in eyes}
         for _ in range(10):
-            if not (behind := pairing.behind(frames)):
-                self.used_s = [frames["left"].mid_exposure_s, frames["right"].mid_exposure_s]
+            if not (after_s := pairing.again(frames)):
+                self.used_s = [frames["left"].exposure_began_s, frames["right"].exposure_began_s]
                 return frames["left"], frames["right"]
-            now_s = max(frame.mid_exposure_s for frame in frames.values())
-            for name, by_s in behind.items():
-                frames[name] = eyes[name].take(frames[name].mid_exposure_s + by_s, now_s)
+            now_s = max(frame.exposure_began_s for frame in frames.values())
+            now_s += self.late_s  # the threads get to it late, and the newest frame may be another by then
+            for name, moment_s in after_s.items():
+                frames[name] = eyes[name].take(moment_s, now_s)
         raise AssertionError("no pair after ten rounds")
 
     def pairs(self, moments_s: list[float]) -> list[tuple[Shot, Shot]]:
@@ -87,7 +89,7 @@ def moments(count: int, first_s: float = 11.5, seed: int = 7) -> list[float]:
 
 
 def dt_s(pair: tuple[Shot, Shot]) -> float:
-    return pair[1].mid_exposure_s - pair[0].mid_exposure_s
+    return pair[1].exposure_began_s - pair[0].exposure_began_s
 
 
 def test_the_fake_is_paced() -> None:
@@ -101,6 +103,14 @@ def test_free_running_cameras_are_paired_with_their_offset_learned(offset_s: flo
     assert all(abs(dt_s(pair) - offset_s) <= 0.002 for pair in pairs)
     usual_s = learned(story.left, story.right).usual_s
     assert usual_s == pytest.approx(offset_s, abs=0.0015)
+
+
+@pytest.mark.parametrize("late_s", [0.03, 0.05, 0.1])
+def test_who_is_slower_than_the_cameras_gets_pairs_all_the_same(late_s: float) -> None:
+    gone = set(range(45, 400, 3))
+    right = [shot for shot in series(400, 0.012) if shot.sequence not in gone]
+    pairs = Story(Eye(series(400, 0.0)), Eye(right), late_s=late_s).pairs(moments(20))
+    assert all(one.trigger == other.trigger for one, other in pairs)
 
 
 def test_near_half_a_period_the_same_partner_is_taken_each_time() -> None:
@@ -140,8 +150,8 @@ def test_cameras_that_drift_past_each_other_are_paired_all_the_way() -> None:
 
 
 def test_cameras_without_a_common_rhythm_have_no_constant_offset() -> None:
-    ones = [FrameTime(s.sequence, s.mid_exposure_s) for s in series(30, 0.0)]
-    others = [FrameTime(s.sequence, s.mid_exposure_s) for s in series(30, 0.0, 0.019, 5, 0.0431)]
+    ones = [FrameTime(s.sequence, s.exposure_began_s) for s in series(30, 0.0)]
+    others = [FrameTime(s.sequence, s.exposure_began_s) for s in series(30, 0.0, 0.019, 5, 0.0431)]
     assert learned_from(ones, others, PERIOD_S).usual_s is None
 
 
@@ -156,7 +166,7 @@ def test_triggered_cameras_are_paired_by_count() -> None:
 def missed(trigger: int) -> list[Shot]:
     """A camera that misses a trigger counts on without a gap."""
     kept = [shot for shot in series(400, 0.0005) if shot.sequence != trigger]
-    return [Shot(n, shot.mid_exposure_s, shot.trigger) for n, shot in enumerate(kept)]
+    return [Shot(n, shot.exposure_began_s, shot.trigger) for n, shot in enumerate(kept)]
 
 
 @pytest.mark.parametrize("which", [0, 1])

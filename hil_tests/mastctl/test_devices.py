@@ -308,8 +308,7 @@ class Ticking(FakeCamera):
 
     def recent_times(self) -> list[FrameTime]:
         newest = math.floor((now() - 0.002 - self.phase_s) / self.every_s)
-        times = [FrameTime(n, n * self.every_s + self.phase_s) for n in range(newest - 20, newest + 1)]
-        return [t for t in times if t.mid_exposure_s > 0]
+        return [FrameTime(n, n * self.every_s + self.phase_s - 0.001) for n in range(newest - 20, newest + 1)]
 
     def next_frame(self, exposed_after_s: float, timeout_s: float) -> Any:
         self.hook()

@@ -39,7 +39,7 @@ def check_one_moment(
     DriverError
         If the further picture does not come.
     """
-    apart_s = [other.frame.mid_exposure_s - view.frame.mid_exposure_s for other in others]
+    apart_s = [other.frame.exposure_began_s - view.frame.exposure_began_s for other in others]
     names = [other.frame.camera for other in others]
     detail: dict[str, Any] = {"dt_s": {n: round(dt_s, 6) for n, dt_s in zip(names, apart_s, strict=True)}}
     spread_s = max(0.0, *apart_s) - min(0.0, *apart_s)
@@ -47,7 +47,7 @@ def check_one_moment(
         return detail
     camera = view.frame.camera
     later = eyes.new((camera,), view.frame.exposure_began_s, resting)[camera]
-    between_s = later.frame.mid_exposure_s - view.frame.mid_exposure_s
+    between_s = later.frame.exposure_began_s - view.frame.exposure_began_s
     try:
         seen = eyes.again(view, pixel_px, later)
     except PointingError as error:
