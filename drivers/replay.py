@@ -24,6 +24,7 @@ from drivers.clock import Clock
 from drivers.errors import BadOptions, DriverError, NoFreshFrame
 from drivers.faults import PAN_TILT, nearest
 from drivers.interfaces import Camera, Frame, FrameTime, Image, PanTilt, Reading
+from drivers.options import is_number
 from drivers.recording import Pointing, read_folder, read_products
 
 TOLERANCE_RAD = 0.002
@@ -262,7 +263,7 @@ def _files(products: Any, folder: Path) -> list[Path]:
 def _number(options: Mapping[str, Any], key: str, default: float) -> float:
     """A positive number among the options."""
     value = options.get(key, default)
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or not 0 < value < math.inf:
+    if not is_number(value) or not value > 0:
         raise BadOptions(f"{key!r} is {value!r} where a number above 0 is expected", device="replay")
     return float(value)
 
@@ -273,7 +274,6 @@ def _grey_range(options: Mapping[str, Any]) -> tuple[float, float] | None:
     if value is None:
         return None
     numbers = value if isinstance(value, (list, tuple)) else ()
-    fine = len(numbers) == 2 and all(isinstance(n, (int, float)) and not isinstance(n, bool) for n in numbers)
-    if not fine or not -math.inf < numbers[0] < numbers[1] < math.inf:
+    if len(numbers) != 2 or not all(is_number(number) for number in numbers) or not numbers[0] < numbers[1]:
         raise BadOptions(f"'grey_range_dn' is {value!r} where [low, high] is expected", device="replay")
     return float(numbers[0]), float(numbers[1])

@@ -7,16 +7,17 @@ waits behind them. Every refusal is ``{"error": {"code", "message", "detail"}}``
 from __future__ import annotations
 
 import asyncio
+import json
 import math
-from collections.abc import Mapping
+from collections.abc import AsyncIterator, Mapping
 from importlib.metadata import version
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import cv2
 import numpy as np
 from fastapi import FastAPI, Query, Request
 from fastapi.exceptions import RequestValidationError
-from fastapi.responses import JSONResponse, Response
+from fastapi.responses import JSONResponse, Response, StreamingResponse
 from starlette.exceptions import HTTPException
 from starlette.types import ASGIApp
 
@@ -31,24 +32,38 @@ from mastctl.api_requests import (
     FaultsQuery,
     MastBody,
     PointBody,
+    PoseBody,
     SnapshotQuery,
+    StandBody,
+    TrackBody,
     sentence,
 )
+from mastctl.as_json import as_json
 from mastctl.errors import MastctlError
 from mastctl.frames import StampedFrame
 from mastctl.limits import OutsideLimits
 from mastctl.mast_in_use import MastInUse
-from mastctl.operations import as_json, error_body
+from mastctl.operations import error_body
 from mastctl.service import Service
+from mastctl.tracking.pose import RoverPose
+
+if TYPE_CHECKING:
+    from drivers.sim.rover import SimulatedRover
 
 PREFIX = "/api/v1"
 JPEG_QUALITY = 90
+STREAM_POLL_S = 0.05  # how late a change may be told
+STREAM_ALIVE_S = 5.0
 PNG_COMPRESSION = 1  # a noisy picture gains 10 % from more, and takes five times as long
 
 STATUS_OF_CODE: Mapping[str, int] = {
     "busy": 409,
     "moving": 409,
     "no_former_mast": 409,
+    "no_pose_before": 409,
+    "no_track": 409,
+    "pose_runs_backwards": 409,
+    "rover_moved": 409,
     "stopped": 409,
     "frame_moving": 409,
     "other_mast_file": 409,
@@ -61,13 +76,15 @@ STATUS_OF_CODE: Mapping[str, int] = {
     "bad_mast_file": 422,
     "outside_image": 422,
     "outside_limits": 422,
+    "pose_without_covariance": 422,
+    "pose_without_time": 422,
     "wrong_camera": 422,
     "failed": 503,
 }
 
 
 class NotSimulated(MastctlError):
-    """Faults are switched on simulated devices only."""
+    """Faults and the true pose are a simulated rover's only."""
 
     code = "not_simulated"
 
@@ -84,9 +101,10 @@ def create_app(service: Service) -> ASGIApp:
     )
     _add_errors(app)
     _add_pointing(app, service)
+    _add_tracking(app, service)
     _add_pictures(app, service)
     _add_simulation(app, service)
-    return Guard(app, ignores_body=frozenset({f"{PREFIX}/stop"}))
+    return Guard(app, ignores_body=frozenset({f"{PREFIX}/stop", f"{PREFIX}/track/stop"}))
 
 
 def _add_pointing(app: FastAPI, service: Service) -> None:
@@ -114,6 +132,62 @@ def _add_pointing(app: FastAPI, service: Service) -> None:
     async def stop() -> dict[str, Any]:
         stopped = await asyncio.get_running_loop().run_in_executor(service.stop_threads, service.stop)
         return {"stopped": True, "operation": stopped}
+
+
+def _add_tracking(app: FastAPI, service: Service) -> None:
+    """The rover's pose, and the track."""
+    tracker = service.tracker
+
+    def told() -> dict[str, Any]:
+        return tracker.status.told(service.clock.now_s())
+
+    @app.post(f"{PREFIX}/pose", summary="Say where the rover stands; a track is carried over and looked for")
+    def pose(body: PoseBody) -> dict[str, Any]:
+        operation = service.take_pose(body.pose(service.clock.now_s()), body.look)
+        return {"operation": operation, "track": told()}
+
+    @app.get(f"{PREFIX}/track", summary="The track at this moment")
+    async def track() -> dict[str, Any]:
+        return told()
+
+    @app.post(f"{PREFIX}/track", status_code=202, summary="Follow what a pixel shows, or is at a position")
+    def start(body: TrackBody) -> dict[str, Any]:
+        asked = body.model_dump(exclude_none=True)
+        digest = None if body.pixel is None else body.pixel.mast_digest
+        return {"id": service.start_track(body.target(), {"track": asked}, digest).id}
+
+    @app.post(f"{PREFIX}/track/look", status_code=202, summary="Look for the target once more")
+    def look() -> dict[str, Any]:
+        return {"id": service.look_for_target().id}
+
+    @app.post(f"{PREFIX}/track/stop", summary="End the track; the head stops if it moves for it")
+    async def stop() -> dict[str, Any]:
+        await asyncio.get_running_loop().run_in_executor(service.stop_threads, service.stop_track)
+        return told()
+
+    @app.get(
+        f"{PREFIX}/track/stream",
+        summary="The track as server-sent events: now, and at each change",
+        response_class=StreamingResponse,
+        responses={200: {"content": {"text/event-stream": {}}}},
+    )
+    async def stream() -> StreamingResponse:
+        return StreamingResponse(_track_events(service), media_type="text/event-stream")
+
+
+async def _track_events(service: Service) -> AsyncIterator[str]:
+    """Each change of the track as an event, and a comment now and then to show that somebody is there."""
+    told, quiet_s = -1, 0.0
+    while not service.operations.closed:
+        status = service.tracker.status
+        if status.sequence != told:
+            told, quiet_s = status.sequence, 0.0
+            yield f"data: {json.dumps(status.told(service.clock.now_s()), allow_nan=False)}\n\n"
+        elif quiet_s >= STREAM_ALIVE_S:
+            quiet_s = 0.0
+            yield ": alive\n\n"
+        await asyncio.sleep(STREAM_POLL_S)
+        quiet_s += STREAM_POLL_S
 
 
 def _add_pictures(app: FastAPI, service: Service) -> None:
@@ -159,14 +233,30 @@ def _add_pictures(app: FastAPI, service: Service) -> None:
 
 
 def _add_simulation(app: FastAPI, service: Service) -> None:
-    """The fault switches of a simulated rover."""
+    """The fault switches of a simulated rover, and where it truly stands."""
 
-    def panel() -> FaultPanel:
+    def simulated(what: str) -> SimulatedRover:
         if service.hardware.simulation is None:
             raise NotSimulated(
-                f"the hardware is {service.hardware.kind}: faults are for a simulated rover only"
+                f"the hardware is {service.hardware.kind}: {what} are for a simulated rover only"
             )
-        return service.hardware.simulation.faults
+        return service.hardware.simulation
+
+    def panel() -> FaultPanel:
+        return simulated("faults").faults
+
+    def stands() -> dict[str, Any]:
+        pose = RoverPose(simulated("true poses").site_from_rover).told(0.0)
+        return {"position_m": pose["position_m"], "quaternion": pose["quaternion"]}
+
+    @app.get(f"{PREFIX}/simulation/pose", summary="Where the simulated rover truly stands")
+    async def true_pose() -> dict[str, Any]:
+        return stands()
+
+    @app.post(f"{PREFIX}/simulation/pose", summary="Put the simulated rover somewhere on its ground")
+    async def stand(body: StandBody) -> dict[str, Any]:
+        simulated("true poses").stand(body.x_m, body.y_m, body.heading_rad, body.pitch_rad, body.roll_rad)
+        return stands()
 
     def told() -> dict[str, Any]:
         return {"faults": [_fault_told(fault) for fault in panel().active()]}
@@ -246,7 +336,8 @@ def _add_errors(app: FastAPI) -> None:
     @app.exception_handler(RequestValidationError)
     async def invalid(request: Request, error: RequestValidationError) -> JSONResponse:
         path = request.url.path.removeprefix(PREFIX)
-        route = next((word for word in ("point", "faults", "snapshot", "mast") if word in path), "")
+        words = ("point", "faults", "snapshot", "mast", "track", "simulation/pose", "pose")
+        route = next((word for word in words if word in path), "")
         sentences = [sentence(problem, route) for problem in error.errors()[:10]]
         return error_response(422, "bad_request", sentences[0], {"problems": sentences})
 

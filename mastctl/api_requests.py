@@ -7,10 +7,14 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Annotated, Any, Literal
 
+import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, model_validator
+from scipy.spatial.transform import Rotation
 
 from calib.formats.strict import nearest
+from calib.rigid import Rigid
 from mastctl.pointing.requests import Aim, AnglesTarget, PixelTarget, PointRequest, PositionTarget
+from mastctl.tracking.pose import RoverPose
 
 LARGEST_PX = 1e5
 LARGEST_M = 1e6
@@ -19,6 +23,9 @@ Name = Annotated[str, Field(min_length=1, max_length=200)]
 Pixel = Annotated[float, Field(ge=-LARGEST_PX, le=LARGEST_PX)]
 Metres = Annotated[float, Field(ge=-LARGEST_M, le=LARGEST_M)]
 Angle = Annotated[float, Field(ge=-2 * math.pi, le=2 * math.pi)]
+Slope = Annotated[float, Field(ge=-1.0, le=1.0)]
+Sigma = Annotated[float, Field(ge=0.0, le=LARGEST_M)]
+Part = Annotated[float, Field(ge=-1e9, le=1e9)]
 
 
 class _Strict(BaseModel):
@@ -91,6 +98,98 @@ class PointBody(_Strict):
         return PointRequest(target=target, aim=aim, pointings=self.pointings)
 
 
+class TrackBody(_Strict):
+    """``POST /track``: exactly one of pixel and position_m."""
+
+    pixel: PixelBody | None = None
+    position_m: Annotated[list[Metres], Field(min_length=3, max_length=3)] | None = None
+    frame: Literal["rover", "site"] | None = None
+
+    @model_validator(mode="after")
+    def _one_target(self) -> TrackBody:
+        if (self.pixel is None) == (self.position_m is None):
+            raise ValueError("exactly one of pixel and position_m is expected")
+        if self.frame is not None and self.position_m is None:
+            raise ValueError("frame goes with position_m only")
+        return self
+
+    def target(self) -> PixelTarget | PositionTarget:
+        """Return it as the tracker takes it."""
+        if self.pixel is not None:
+            pixel = self.pixel
+            return PixelTarget(pixel.camera, pixel.frame_id, pixel.x_px, pixel.y_px)
+        assert self.position_m is not None
+        x, y, z = self.position_m
+        return PositionTarget((x, y, z), self.frame or "rover")
+
+
+class SigmaBody(_Strict):
+    """One sigma of each axis of a motion: of its translation, metres, and of its rotation, radians."""
+
+    position_m: Sigma
+    rotation_rad: Annotated[float, Field(ge=0.0, le=math.pi)]
+
+
+class PoseBody(_Strict):
+    """``POST /pose``: site_from_rover, and how well the motion since the pose before is known.
+
+    ``covariance`` has its rows and columns in the order x, y, z, turn about x, about y, about z: metres and
+    radians along the rover's axes of this pose.
+    """
+
+    position_m: Annotated[list[Metres], Field(min_length=3, max_length=3)]
+    quaternion: Annotated[list[Part], Field(min_length=4, max_length=4)]
+    covariance: list[list[Part]] | None = None
+    sigma: SigmaBody | None = None
+    time_s: Annotated[float, Field(ge=-1e12, le=1e12)] | None = None
+    look: bool = True
+
+    @model_validator(mode="after")
+    def _sound(self) -> PoseBody:
+        length = math.sqrt(sum(part * part for part in self.quaternion))
+        if abs(length - 1.0) > 1e-3:
+            raise ValueError(f"quaternion (w, x, y, z) has the length {length:g} where 1 is expected")
+        if self.covariance is not None and self.sigma is not None:
+            raise ValueError("covariance and sigma say the same; one of them is expected")
+        if self.covariance is not None:
+            _check_covariance(self.covariance)
+        return self
+
+    def pose(self, received_s: float) -> RoverPose:
+        """Return it as the tracker takes it."""
+        w, x, y, z = self.quaternion
+        rotation = Rotation.from_quat([x, y, z, w]).as_matrix()
+        covariance = None
+        if self.covariance is not None:
+            order = [3, 4, 5, 0, 1, 2]  # rotation first, as calib.tracking has it
+            covariance = np.array(self.covariance)[np.ix_(order, order)]
+        elif self.sigma is not None:
+            covariance = np.diag([self.sigma.rotation_rad**2] * 3 + [self.sigma.position_m**2] * 3)
+        return RoverPose(Rigid(rotation, np.array(self.position_m)), covariance, self.time_s, received_s)
+
+
+def _check_covariance(rows: list[list[float]]) -> None:
+    """Pass a matrix that can be a covariance. Raises ValueError."""
+    if len(rows) != 6 or any(len(row) != 6 for row in rows):
+        raise ValueError("covariance: 6 rows of 6 numbers are expected")
+    matrix = np.array(rows)
+    scale = float(np.abs(matrix).max())
+    if np.abs(matrix - matrix.T).max() > 1e-6 * scale:
+        raise ValueError("covariance is not symmetric")
+    if scale > 0 and np.linalg.eigvalsh(matrix)[0] < -1e-9 * scale:
+        raise ValueError("covariance has a negative variance in some direction")
+
+
+class StandBody(_Strict):
+    """``POST /simulation/pose``: where the simulated rover truly stands on its ground."""
+
+    x_m: Metres
+    y_m: Metres
+    heading_rad: Angle
+    pitch_rad: Slope = 0.0
+    roll_rad: Slope = 0.0
+
+
 class MastBody(_Strict):
     """``POST /mast``: the name of a file beside the configured mast file, or ``previous``: true."""
 
@@ -154,10 +253,14 @@ class ErrorBody(BaseModel):
 _KEYS: Mapping[tuple[str, ...], Sequence[str]] = {
     ("body", "pixel"): tuple(PixelBody.model_fields),
     ("body", "aim"): tuple(AimBody.model_fields),
+    ("body", "sigma"): tuple(SigmaBody.model_fields),
 }
 _ROUTE_KEYS: Mapping[tuple[str, str], Sequence[str]] = {
     ("body", "point"): tuple(PointBody.model_fields),
     ("body", "mast"): tuple(MastBody.model_fields),
+    ("body", "track"): tuple(TrackBody.model_fields),
+    ("body", "simulation/pose"): tuple(StandBody.model_fields),
+    ("body", "pose"): tuple(PoseBody.model_fields),
     ("body", "faults"): tuple(FaultBody.model_fields),
     ("query", "snapshot"): tuple(SnapshotQuery.model_fields),
     ("query", "faults"): tuple(FaultsQuery.model_fields),
@@ -187,7 +290,8 @@ def sentence(problem: Mapping[str, Any], route: str) -> str:
         return f"{place}: unknown key; {nearest(where[-1], known)}" if known else f"{place}: unknown key"
     value = _short(problem.get("input"))
     if kind in ("too_short", "too_long"):
-        return f"{place}: {value} where a list of 3 numbers is expected"
+        size = 4 if where[-1] == "quaternion" else 3
+        return f"{place}: {value} where a list of {size} numbers is expected"
     if kind in ("model_attributes_type", "model_type", "dict_type"):
         return f"{place}: {value} where an object with keys is expected"
     for start in ("Input should be ", "String should have "):

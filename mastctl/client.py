@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import json
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from types import TracebackType
 from typing import Any, Literal
@@ -198,6 +199,111 @@ class Client:
         """Stop the mast and the running operation."""
         return self._json("POST", "/stop")
 
+    def pose(
+        self,
+        position_m: Sequence[float],
+        quaternion: Sequence[float],
+        *,
+        covariance: Sequence[Sequence[float]] | None = None,
+        sigma: tuple[float, float] | None = None,
+        time_s: float | None = None,
+        look: bool = True,
+    ) -> dict[str, Any]:
+        """Say where the rover stands; return the track as it is then, and the ``operation`` of a look.
+
+        Parameters
+        ----------
+        position_m, quaternion
+            site_from_rover: (x, y, z), metres, and (w, x, y, z).
+        covariance
+            6 rows of 6 of the motion since the pose before, along the rover's axes of this pose: x, y, z in
+            metres, then the turns about them in radians; or
+        sigma
+            (metres, radians): one sigma of each axis of its translation and of its rotation.
+        time_s
+            By the sender's clock.
+        look
+            Whether a track's target shall be looked for.
+        """
+        body: dict[str, Any] = {
+            "position_m": [float(value) for value in position_m],
+            "quaternion": [float(value) for value in quaternion],
+            "look": look,
+        }
+        if covariance is not None:
+            body["covariance"] = [[float(value) for value in row] for row in covariance]
+        if sigma is not None:
+            body["sigma"] = {"position_m": sigma[0], "rotation_rad": sigma[1]}
+        if time_s is not None:
+            body["time_s"] = time_s
+        return self._json("POST", "/pose", json=body)
+
+    def track(self) -> dict[str, Any]:
+        """Return the track as it is."""
+        return self._json("GET", "/track")
+
+    def start_track(
+        self,
+        *,
+        pixel: tuple[str, str, float, float] | None = None,
+        position_m: Sequence[float] | None = None,
+        frame: Literal["rover", "site"] | None = None,
+    ) -> str:
+        """Start to follow a target and return the operation's id; arguments as for `point`."""
+        body: dict[str, Any] = {}
+        if pixel is not None:
+            body["pixel"] = dict(zip(("camera", "frame_id", "x_px", "y_px"), pixel, strict=True))
+        if position_m is not None:
+            body["position_m"] = [float(value) for value in position_m]
+        if frame is not None:
+            body["frame"] = frame
+        return str(self._json("POST", "/track", json=body)["id"])
+
+    def look(self) -> str:
+        """Look for the track's target once more; return the operation's id."""
+        return str(self._json("POST", "/track/look")["id"])
+
+    def wait_track(
+        self,
+        operation_id: str | None,
+        timeout_s: float = 60.0,
+        on_step: Callable[[dict[str, Any]], None] | None = None,
+    ) -> dict[str, Any]:
+        """Wait until a start or a look of the track has ended; return the track after it.
+
+        ``None`` for the operation returns the track as it is. Raises ClientError as `wait`.
+        """
+        if operation_id is not None:
+            self.wait(operation_id, timeout_s, on_step)
+        until_s = time.monotonic() + timeout_s
+        while (track := self.track())["operation"] == operation_id is not None:
+            if time.monotonic() > until_s:
+                raise ClientError("timeout", f"the track did not take up operation {operation_id}")
+            time.sleep(POLL_S)
+        return track
+
+    def watch_track(self) -> Iterator[dict[str, Any]]:
+        """Yield the track as it is, and again at each change, until the daemon ends."""
+        try:
+            with self._http.stream("GET", PREFIX + "/track/stream") as answer:
+                if not answer.is_success:
+                    raise self._bad_answer(f"the stream says {answer.status_code}")
+                for line in answer.iter_lines():
+                    if line.startswith("data:"):
+                        yield json.loads(line.removeprefix("data:"))
+        except (httpx.ConnectError, httpx.ConnectTimeout):
+            raise self._no_daemon() from None
+        except httpx.TimeoutException:
+            raise ClientError("timeout", f"the daemon at {self.url} fell silent") from None
+        except httpx.HTTPError as error:
+            raise ClientError("no_daemon", f"the connection to {self.url} broke: {error}") from None
+        except ValueError:
+            raise self._bad_answer("an event of the stream is not JSON") from None
+
+    def stop_track(self) -> dict[str, Any]:
+        """End the track; return it as it is then."""
+        return self._json("POST", "/track/stop")
+
     def snapshot(
         self,
         camera: str,
@@ -250,6 +356,18 @@ class Client:
         """Return the mast file that the daemon uses, byte for byte."""
         return bytes(self._ask("GET", "/mast").content)
 
+    def true_pose(self) -> dict[str, Any]:
+        """Return where a simulated rover truly stands: ``position_m`` and ``quaternion``, site_from_rover."""
+        return self._json("GET", "/simulation/pose")
+
+    def stand(
+        self, x_m: float, y_m: float, heading_rad: float, pitch_rad: float = 0.0, roll_rad: float = 0.0
+    ) -> dict[str, Any]:
+        """Put a simulated rover somewhere on its ground, truly; return its true pose."""
+        body = {"x_m": x_m, "y_m": y_m, "heading_rad": heading_rad}
+        body |= {"pitch_rad": pitch_rad, "roll_rad": roll_rad}
+        return self._json("POST", "/simulation/pose", json=body)
+
     def faults(self) -> list[dict[str, Any]]:
         """Return the faults that are switched on in a simulated rover."""
         return list(self._json("GET", "/simulation/faults")["faults"])
@@ -294,9 +412,7 @@ class Client:
         try:
             answer = self._http.request(method, PREFIX + path, **options)
         except (httpx.ConnectError, httpx.ConnectTimeout):
-            raise ClientError(
-                "no_daemon", f"no daemon answers at {self.url}; 'mastctl run' starts one"
-            ) from None
+            raise self._no_daemon() from None
         except httpx.TimeoutException:
             raise ClientError(
                 "timeout", f"the daemon at {self.url} took the request but did not answer"
@@ -314,6 +430,9 @@ class Client:
             raise self._bad_answer(f"it says {answer.status_code}, not in the way of this program") from None
         exit_code = 2 if answer.status_code in _BAD_INPUT else 1
         raise ClientError(code, message, detail if isinstance(detail, dict) else None, exit_code)
+
+    def _no_daemon(self) -> ClientError:
+        return ClientError("no_daemon", f"no daemon answers at {self.url}; 'mastctl run' starts one")
 
     def _bad_answer(self, reason: str) -> ClientError:
         return ClientError("bad_answer", f"what answers at {self.url} is no mastctl daemon: {reason}")

@@ -7,7 +7,7 @@ is read (`check_cameras`). Options of drivers are handed through as they stand; 
 from __future__ import annotations
 
 import ipaddress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from urllib.parse import quote
 
@@ -19,6 +19,8 @@ from calib.mast import Rig
 from drivers.open_hardware import DeviceSettings, HardwareSettings
 from mastctl.limits import Limits
 from mastctl.packaged import default_config
+from mastctl.tracking.choice import HandoffRules, PairBounds
+from mastctl.tracking.settings import TrackingSettings
 
 CONFIG_SCHEMA = "mastctl/config/1"
 DEFAULT_HOST = "127.0.0.1"
@@ -56,6 +58,7 @@ class Config:
     listen: Listen
     hardware: HardwareSettings
     limits: Limits
+    tracking: TrackingSettings = field(default_factory=TrackingSettings)
 
 
 def load_config(path: str | Path | None = None) -> Config:
@@ -77,7 +80,11 @@ def parse_config(data: bytes, path: str | Path) -> Config:
         found = document.get("schema", "no such key")
         raise BadFile(path, "schema", f"'{str(found)[:60]}' where '{CONFIG_SCHEMA}' is expected")
     top = Section(
-        path, "", document, ("schema", "mast_file", "pan_tilt", "cameras", "limits"), ("listen", "simulation")
+        path,
+        "",
+        document,
+        ("schema", "mast_file", "pan_tilt", "cameras", "limits"),
+        ("listen", "simulation", "tracking"),
     )
     folder = Path(path).resolve().parent
     cameras = {name: _device(top, "cameras", name) for name in top.mapping("cameras")}
@@ -94,17 +101,22 @@ def parse_config(data: bytes, path: str | Path) -> Config:
             folder=folder,
         ),
         limits=_limits(top),
+        tracking=_tracking(top),
     )
 
 
 def check_cameras(config: Config, rig: Rig) -> None:
-    """Pass a configuration whose cameras the mast file knows.
+    """Pass a configuration whose cameras, and pairs to track with, the mast file knows.
 
     Raises
     ------
     BadFile
-        Naming the camera, and the nearest one that the mast file has.
+        Naming the camera or pair, and the nearest one that the mast file has.
     """
+    for pair in config.tracking.named_pairs:
+        if pair not in rig.stereo:
+            words = f"the mast file has no such pair; {nearest(pair, tuple(rig.stereo))}"
+            raise BadFile(config.path, f"tracking.handoff.pairs.{pair}", words)
     known = tuple(rig.cameras)
     for name in config.hardware.cameras:
         if name not in known:
@@ -158,6 +170,56 @@ def _limits(top: Section) -> Limits:
     if speed_rad_per_s <= 0.0:
         raise section.bad("speed_rad_per_s", f"{speed_rad_per_s:g} where a number above 0 is expected")
     return Limits(pan_rad, tilt_rad, speed_rad_per_s)
+
+
+def _tracking(top: Section) -> TrackingSettings:
+    """Read how targets are followed; what is left out stays as it is."""
+    usual = TrackingSettings()
+    if "tracking" not in top:
+        return usual
+    section = top.section("tracking", (), ("handoff", "most_step", "start_error"))
+    rules, named = usual.handoff, tuple[str, ...]()
+    if "handoff" in section:
+        keys = ("pairs", "margin_px", "disparity_error_px", "range_error")
+        handoff = section.section("handoff", (), keys)
+        named = tuple(handoff.mapping("pairs"))
+        pairs = {name: _pair_bounds(handoff, name) for name in named}
+        rules = HandoffRules(
+            pairs={**rules.pairs, **pairs},
+            margin_px=_number_between(handoff, "margin_px", rules.margin_px, 0.0, 1000.0),
+            disparity_error_px=_number_between(
+                handoff, "disparity_error_px", rules.disparity_error_px, 0.001, 100.0
+            ),
+            range_error=_number_between(handoff, "range_error", rules.range_error, 0.001, 10.0),
+        )
+    return TrackingSettings(
+        handoff=rules,
+        most_step=_number_between(section, "most_step", usual.most_step, 0.01, 1.0),
+        start_error=_number_between(section, "start_error", usual.start_error, 0.001, 1.0),
+        named_pairs=named,
+    )
+
+
+def _pair_bounds(handoff: Section, name: str) -> PairBounds:
+    """Read ``{nearest_m, steepest_rad}`` of a pair."""
+    usual = PairBounds()
+    place = handoff.at(f"pairs.{name}")
+    value = handoff.mapping("pairs")[name]
+    section = Section(handoff.path, place, value, (), ("nearest_m", "steepest_rad"))
+    return PairBounds(
+        nearest_m=_number_between(section, "nearest_m", usual.nearest_m, 0.0, 1000.0),
+        steepest_rad=_number_between(section, "steepest_rad", usual.steepest_rad, 0.0, usual.steepest_rad),
+    )
+
+
+def _number_between(section: Section, key: str, usual: float, low: float, high: float) -> float:
+    """Read a number within bounds, or return the usual one."""
+    if key not in section:
+        return usual
+    value = section.number(key)
+    if not low <= value <= high:
+        raise section.bad(key, f"{value:g} where a number from {low:g} to {high:g} is expected")
+    return value
 
 
 def _range(section: Section, key: str) -> tuple[float, float]:

@@ -6,10 +6,8 @@ stop is the last word: from the moment a stop is asked for until the operation h
 
 from __future__ import annotations
 
-import dataclasses
 import itertools
 import logging
-import math
 import secrets
 import threading
 from collections import OrderedDict
@@ -17,11 +15,10 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any, Literal, Protocol
 
-import numpy as np
-
 from calib.errors import CalibError
 from drivers.clock import Clock
 from drivers.errors import DriverError
+from mastctl.as_json import as_json
 from mastctl.errors import MastctlError, Stopped
 from mastctl.state import Motion, Residual
 
@@ -97,6 +94,7 @@ class Operation:
 
 
 Work = Callable[[Callable[[Any], None], threading.Event], Any]
+OnEnd = Callable[[Operation], None]
 
 
 class Operations:
@@ -127,8 +125,15 @@ class Operations:
         with self._lock:
             return self._motion
 
-    def start(self, request: Mapping[str, Any], work: Work) -> Operation:
+    @property
+    def closed(self) -> bool:
+        """Whether the service is closing or closed."""
+        return self._closed
+
+    def start(self, request: Mapping[str, Any], work: Work, on_end: OnEnd | None = None) -> Operation:
         """Start ``work(record_step, cancelled)`` in a thread and return its first record.
+
+        ``on_end`` gets the last record, in the same thread, when the next operation may be started already.
 
         Raises
         ------
@@ -146,7 +151,7 @@ class Operations:
             operation = Operation(name, "queued", dict(request), self._clock.now_s())
             cancelled = threading.Event()
             thread = threading.Thread(
-                target=self._work, args=(name, work, cancelled), name=f"operation {name}", daemon=True
+                target=self._work, args=(name, work, cancelled, on_end), name=f"operation {name}", daemon=True
             )
             self._records[name] = operation
             while len(self._records) > KEPT_OPERATIONS:
@@ -218,7 +223,17 @@ class Operations:
         self._mover.block_moves(reason)
         return name
 
-    def _work(self, name: str, work: Work, cancelled: threading.Event) -> None:
+    def _work(self, name: str, work: Work, cancelled: threading.Event, on_end: OnEnd | None) -> None:
+        """Run one operation, then tell who wants to know."""
+        self._run_to_end(name, work, cancelled)
+        if on_end is None:
+            return
+        try:
+            on_end(self.get(name))
+        except Exception:  # nothing is left that it could be told to
+            log.exception("what follows upon operation %s met a defect of the program", name)
+
+    def _run_to_end(self, name: str, work: Work, cancelled: threading.Event) -> None:
         """Run one operation to its end; whatever happens is in its record afterwards."""
 
         def record(step: Any) -> None:
@@ -286,25 +301,6 @@ def error_body(error: BaseException) -> dict[str, Any]:
         "message": f"the service met a defect of its own ({type(error).__name__}); its log says more",
         "detail": None,
     }
-
-
-def as_json(value: Any) -> Any:
-    """Return dataclasses, arrays and tuples as plain JSON values; numbers that are not finite become null."""
-    if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        return {field.name: as_json(getattr(value, field.name)) for field in dataclasses.fields(value)}
-    if isinstance(value, Mapping):
-        return {str(key): as_json(entry) for key, entry in value.items()}
-    if isinstance(value, np.ndarray):
-        return as_json(value.tolist())
-    if isinstance(value, (list, tuple, set, frozenset)):
-        return [as_json(entry) for entry in value]
-    if isinstance(value, np.generic):
-        return as_json(value.item())
-    if isinstance(value, float):
-        return value if math.isfinite(value) else None
-    if value is None or isinstance(value, (str, int, bool)):
-        return value
-    return str(value)
 
 
 def _last_residual(result: Any, name: str) -> Residual | None:

@@ -21,8 +21,11 @@ from mastctl.frames import StampedFrame
 from mastctl.mast_in_use import MastInUse, read_mast, read_next
 from mastctl.operations import Busy, Operation, Operations
 from mastctl.pointing.loop import PointingLoop
-from mastctl.pointing.requests import Aim, AnglesTarget, PixelTarget, PointRequest
+from mastctl.pointing.requests import Aim, AnglesTarget, PixelTarget, PointRequest, PositionTarget
+from mastctl.pointing.wanted import position_in_rover_m
 from mastctl.state import State
+from mastctl.tracking.pose import RoverPose
+from mastctl.tracking.tracker import Tracker
 
 log = logging.getLogger(__name__)
 
@@ -72,6 +75,8 @@ class Service:
     ----------
     mast, former
         The mast file in use, and the one before it; replaced as a whole, never edited.
+    tracker
+        The track, and the rover's pose.
     stop_threads
         Where the web side calls `stop`: threads that nothing else can keep busy.
     """
@@ -90,6 +95,9 @@ class Service:
         self.stop_threads = ThreadPoolExecutor(STOP_THREADS, thread_name_prefix="stop")
         self._rig = _configured(mast.stored.rig, config.hardware.cameras)
         self._loop = PointingLoop(self._rig, self.devices, config.limits, clock)
+        self.tracker = Tracker(
+            self.operations, self.devices, self._rig, config.limits, clock, config.tracking
+        )
         self._version = version("mastctl")
 
     @classmethod
@@ -138,6 +146,7 @@ class Service:
             reading=self.devices.last_reading,
             frames=self.devices.newest_frames(),
             motion=self.operations.motion,
+            track=self.tracker.status,
             faults=self.devices.faults(),
         )
 
@@ -194,6 +203,8 @@ class Service:
             If another operation runs.
         """
         with self._mast_lock:
+            if isinstance(request.target, PositionTarget):
+                request = replace(request, target=self._in_rover(request.target))
             self._check(request, mast_digest)
             loop = self._loop
 
@@ -202,6 +213,52 @@ class Service:
                     return loop.run(request, record, cancelled)
 
             return self.operations.start(told, run)
+
+    def start_track(
+        self, target: PixelTarget | PositionTarget, told: Mapping[str, Any], mast_digest: str | None = None
+    ) -> Operation:
+        """Begin to follow what a pixel shows, or what is seen at a position; return the start's record.
+
+        Raises
+        ------
+        TrackRuns, Busy
+            If a track or another operation runs.
+        FrameGone, Refused
+            As for `point`.
+        """
+        with self._mast_lock:
+            if isinstance(target, PositionTarget):
+                target = self._in_rover(target)
+            self._check(PointRequest(target), mast_digest)
+            return self.tracker.start(target, told)
+
+    def take_pose(self, pose: RoverPose, look: bool) -> str | None:
+        """Take where the rover stands; return the id of the look that follows, if one does.
+
+        Raises
+        ------
+        PoseRefused
+            As `mastctl.tracking.tracker.Tracker.take_pose`.
+        """
+        with self._mast_lock:
+            return self.tracker.take_pose(pose, look)
+
+    def look_for_target(self) -> Operation:
+        """Look for the track's target once more and return the look's first record.
+
+        Raises
+        ------
+        NoTrack, Busy
+            As `mastctl.tracking.tracker.Tracker.look`.
+        """
+        with self._mast_lock:
+            return self.tracker.look()
+
+    def stop_track(self) -> None:
+        """End the track, and stop the mast if it moves for it. Raises DriverError."""
+        running = self.tracker.stop("the track was stopped")
+        if running is not None and self.operations.motion.operation == running:
+            self.operations.stop()
 
     def load_mast(self, name: str) -> MastInUse:
         """Use another mast file of the configured one's folder from now on, and return it.
@@ -246,6 +303,7 @@ class Service:
             self.devices.use_rig(mast.stored.rig, mast.stored.digest)
             self._rig = _configured(mast.stored.rig, self.config.hardware.cameras)
             self._loop = PointingLoop(self._rig, self.devices, self.config.limits, self.clock)
+            self.tracker.use_rig(self._rig, mast.path.name)
             self.mast, self.former = mast, self.mast
         for note in mast.stored.notes:
             log.warning("%s", note)
@@ -268,8 +326,17 @@ class Service:
         if request.aim is not None:
             self._check_aim(request.aim)
 
+    def _in_rover(self, target: PositionTarget) -> PositionTarget:
+        """A position in the rover frame of now; before the first pose that is the site frame."""
+        pose = self.tracker.pose
+        if target.frame != "site" or pose is None:
+            return target
+        x, y, z = pose.site_from_rover.inverse.points(position_in_rover_m(target)).tolist()
+        return PositionTarget((x, y, z), "rover")
+
     def stop(self) -> str | None:
-        """Stop the mast and what runs; return the stopped operation's id. Raises DriverError."""
+        """Stop the mast, what runs, and the track; return the stopped operation's id. Raises DriverError."""
+        self.tracker.stop("a stop was asked for")
         return self.operations.stop()
 
     def close(self) -> None:
@@ -287,6 +354,10 @@ class Service:
         if frame.moving:
             words = f"the head moved while frame {target.frame_id} was exposed; take another"
             raise Refused("frame_moving", words)
+        moved_s = self.tracker.moved_s
+        if moved_s is not None and frame.exposure_began_s < moved_s:
+            words = f"the rover moved since frame {target.frame_id} was exposed; take another"
+            raise Refused("rover_moved", words)
         height, width = frame.image.shape[:2]
         _check_inside("pixel", target.x_px, target.y_px, (width, height))
 

@@ -13,6 +13,7 @@ from drivers.interfaces import Reading
 from mastctl.device_thread import Fault
 from mastctl.frames import StampedFrame
 from mastctl.limits import Limits
+from mastctl.tracking.status import TrackStatus
 
 StateWord = Literal["idle", "moving", "pointing", "stopped", "fault"]
 
@@ -64,6 +65,8 @@ class State:
         The last good reading of the head, None before the first.
     frames
         Each configured camera's newest frame.
+    track
+        The track, and the rover's pose.
     """
 
     now_s: float
@@ -76,6 +79,7 @@ class State:
     reading: Reading | None
     frames: Mapping[str, StampedFrame | None]
     motion: Motion
+    track: TrackStatus
     faults: tuple[Fault, ...]
 
     @property
@@ -123,6 +127,8 @@ class State:
                 "residual_sigma_px": list(motion.residual.residual_sigma_px),
                 "operation": motion.residual.operation,
             },
+            "pose": None if self.track.pose is None else self.track.pose.told(self.now_s),
+            "track": {"state": self.track.state, "reason": self.track.reason, "id": self.track.id},
             "control": None,
             "cameras": {name: self._camera_told(frame) for name, frame in self.frames.items()},
             "mast": dict(self.mast),

@@ -56,10 +56,6 @@ class Truth:
         self._settings = settings
         self._last: Sample | None = None
 
-    def forget(self) -> None:
-        """Begin anew, after the line or the servo was away."""
-        self._last = None
-
     def check(self, sample: Sample) -> None:
         """Take a sample as true.
 

@@ -7,11 +7,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
+from drivers.approach import APPROACHES, Approach, last_turn
 from drivers.dynamixel.models import Model, model_named
 from drivers.errors import BadOptions
-from drivers.faults import nearest
+from drivers.options import OptionReader
 
-Approach = Literal["none", "positive", "negative", "gravity"]
 Rest = Literal["hold", "torque_off"]
 OnHardwareError = Literal["report", "reboot"]
 
@@ -84,9 +84,7 @@ class AxisSettings:
 
     def approach_sign(self, goal_rad: float) -> int:
         """Return the direction of the last stretch in counts: 1, -1, or 0 for none."""
-        if self.approach == "gravity":
-            return self.sign if goal_rad < self.gravity_turnover_rad else -self.sign
-        return {"none": 0, "positive": self.sign, "negative": -self.sign}[self.approach]
+        return self.sign * last_turn(self.approach, goal_rad, self.gravity_turnover_rad)
 
 
 @dataclass(frozen=True)
@@ -146,11 +144,9 @@ def head_settings(options: Mapping[str, Any]) -> HeadSettings:
         "port", "baud", "pan", "tilt", "speed_rad_per_s", "acceleration_rad_per_s2", "watchdog_s", "poll_hz",
         "reply_timeout_s", "settle_s", "torque_off_at_start", "fast_read",
     }  # fmt: skip
-    read = _Options("", options, known, ("port", "pan", "tilt"))
-    port = options["port"]
-    if not isinstance(port, str) or not port:
-        raise BadOptions(f"options.port is {port!r}, expected a serial device such as /dev/ttyUSB0 or a URL")
-    pan, tilt = (_axis(f"{name}.", options[name]) for name in ("pan", "tilt"))
+    read = OptionReader(options, known, ("port", "pan", "tilt"))
+    port = read.text("port", "a serial device such as /dev/ttyUSB0 or a URL")
+    pan, tilt = (_axis(read, name) for name in ("pan", "tilt"))
     if pan.servo_id == tilt.servo_id:
         raise BadOptions(f"options.pan.id and options.tilt.id are both {pan.servo_id}, expected two ids")
     poll_hz = read.number("poll_hz", 50.0, 10.0, 500.0)
@@ -196,33 +192,33 @@ def head_settings(options: Mapping[str, Any]) -> HeadSettings:
     )
 
 
-def _axis(place: str, value: Any) -> AxisSettings:
+def _axis(options: OptionReader, name: str) -> AxisSettings:
     """One axis of the options."""
-    if not isinstance(value, Mapping):
-        raise BadOptions(
-            f"options.{place[:-1]} is {value!r}, expected a mapping with id, model, zero_counts ..."
-        )
     known = {
         "id", "model", "zero_counts", "sign", "limits_rad", "approach", "approach_rad",
         "gravity_turnover_rad", "at_stop", "at_close", "on_hardware_error", "current_limit_A", "settle_rad",
     }  # fmt: skip
-    read = _Options(place, value, known, ("id", "model", "limits_rad"))
+    expected = "a mapping with id, model, zero_counts ..."
+    read = options.section(name, expected, known, ("id", "model", "limits_rad"))
     try:
-        model = model_named(value["model"])
+        model = model_named(read.values["model"])
     except BadOptions as error:
-        raise BadOptions(f"options.{place}model: {error}") from None
+        raise BadOptions(f"options.{name}.model: {error}") from None
+    limits_rad = read.pair("limits_rad", "[low, high] in radians")
+    if not limits_rad[0] < limits_rad[1]:
+        raise read.bad("limits_rad", "[low, high] with low below high")
     axis = AxisSettings(
         servo_id=read.whole("id", 1, 0, 252),
         model=model,
         zero_counts=read.whole("zero_counts", model.centre_count, -(2**31), 2**31 - 1),
-        limits_rad=read.pair("limits_rad"),
-        sign=read.word("sign", 1, (1, -1)),
-        approach=read.word("approach", "none", ("none", "positive", "negative", "gravity")),
+        limits_rad=limits_rad,
+        sign=read.one_of("sign", 1, (1, -1)),
+        approach=read.one_of("approach", "none", APPROACHES),
         approach_rad=read.number("approach_rad", 0.0, 0.0, 0.5),
         gravity_turnover_rad=read.number("gravity_turnover_rad", math.pi / 2, -math.pi, math.pi),
-        at_stop=read.word("at_stop", "hold", ("hold", "torque_off")),
-        at_close=read.word("at_close", "hold", ("hold", "torque_off")),
-        on_hardware_error=read.word("on_hardware_error", "report", ("report", "reboot")),
+        at_stop=read.one_of("at_stop", "hold", ("hold", "torque_off")),
+        at_close=read.one_of("at_close", "hold", ("hold", "torque_off")),
+        on_hardware_error=read.one_of("on_hardware_error", "report", ("report", "reboot")),
         current_limit_A=read.number("current_limit_A", None, 0.001, 20.0),
         settle_rad=read.number("settle_rad", max(0.001, 3 * model.count_rad), model.count_rad, 0.1),
     )
@@ -230,81 +226,22 @@ def _axis(place: str, value: Any) -> AxisSettings:
     if low < model.low_count or high > model.high_count:
         reach = sorted((axis.angle_rad(model.low_count), axis.angle_rad(model.high_count)))
         raise BadOptions(
-            f"options.{place}limits_rad are the servo's counts {low} to {high}, but a {model.name} in "
+            f"options.{name}.limits_rad are the servo's counts {low} to {high}, but a {model.name} in "
             f"position mode holds {model.low_count} to {model.high_count}, which with zero_counts "
             f"{axis.zero_counts} is {reach[0]:.4f} to {reach[1]:.4f} rad; mount the horn so that the range "
             "does not cross the seam"
         )
     if (axis.approach == "none") != (axis.approach_rad == 0.0):
         raise BadOptions(
-            f"options.{place}approach is {axis.approach!r} with approach_rad {axis.approach_rad:g}; "
+            f"options.{name}.approach is {axis.approach!r} with approach_rad {axis.approach_rad:g}; "
             "expected a stretch above zero with a side, and neither or both"
         )
     least = model.backlash_rad or 0.0
     if axis.approach != "none" and axis.approach_rad <= least:
         raise BadOptions(
-            f"options.{place}approach_rad {axis.approach_rad:g} rad does not take up the backlash of a "
+            f"options.{name}.approach_rad {axis.approach_rad:g} rad does not take up the backlash of a "
             f"{model.name}, {least:.4f} rad; expected more"
         )
     if axis.current_limit_A is not None and model.current_unit_A is None:
-        raise BadOptions(f"options.{place}current_limit_A: a {model.name} has no current limit")
+        raise BadOptions(f"options.{name}.current_limit_A: a {model.name} has no current limit")
     return axis
-
-
-class _Options:
-    """One mapping of options, read key by key."""
-
-    def __init__(
-        self, place: str, given: Mapping[str, Any], known: set[str], needed: tuple[str, ...]
-    ) -> None:
-        self._place, self._given = place, given
-        for key in given:
-            if key not in known:
-                raise BadOptions(f"options.{place}{key}: there is no such option{nearest(str(key), known)}")
-        for key in needed:
-            if key not in given:
-                raise BadOptions(f"options.{place}{key} is missing")
-
-    def number(self, key: str, default: Any, low: float, high: float) -> Any:
-        value = self._given.get(key, default)
-        if value is default and key not in self._given:
-            return default
-        good = isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
-        if not good or not low <= value <= high:
-            raise BadOptions(
-                f"options.{self._place}{key} is {value!r}, expected a number from {low:g} to {high:g}"
-            )
-        return float(value)
-
-    def whole(self, key: str, default: int, low: int, high: int) -> int:
-        value = self._given.get(key, default)
-        if not isinstance(value, int) or isinstance(value, bool) or not low <= value <= high:
-            raise BadOptions(
-                f"options.{self._place}{key} is {value!r}, expected a whole number from {low} to {high}"
-            )
-        return value
-
-    def flag(self, key: str, default: bool) -> bool:
-        value = self._given.get(key, default)
-        if not isinstance(value, bool):
-            raise BadOptions(f"options.{self._place}{key} is {value!r}, expected true or false")
-        return value
-
-    def word(self, key: str, default: Any, words: tuple[Any, ...]) -> Any:
-        value = self._given.get(key, default)
-        if isinstance(value, bool) or value not in words:
-            listed = " or ".join(str(word) for word in words)
-            raise BadOptions(f"options.{self._place}{key} is {value!r}, expected {listed}")
-        return value
-
-    def pair(self, key: str) -> tuple[float, float]:
-        value = self._given[key]
-        numbers = isinstance(value, list | tuple) and len(value) == 2
-        if not numbers or not all(isinstance(v, int | float) and not isinstance(v, bool) for v in value):
-            raise BadOptions(f"options.{self._place}{key} is {value!r}, expected [low, high] in radians")
-        low, high = (float(v) for v in value)
-        if not (math.isfinite(low) and math.isfinite(high) and low < high):
-            raise BadOptions(
-                f"options.{self._place}{key} is {value!r}, expected [low, high] with low below high"
-            )
-        return low, high

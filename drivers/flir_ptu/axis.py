@@ -170,7 +170,7 @@ class Axis:
         return self.rests and self.seen is not None and seen.position == self.seen.position
 
     def confirms(self, first: Seen, middle: Seen, last: Seen) -> bool:
-        """Return whether the middle of three positions can be taken: see the module `head`."""
+        """Return whether the middle of three positions can be taken: see the module `position`."""
         low, high = sorted((first.position, last.position))
         furthest = self.fastest * (last.time_s - first.time_s) + 1
         return low <= middle.position <= high and high - low <= furthest
@@ -203,7 +203,12 @@ class Axis:
         """Return whether it was at its target and still for so long when it was seen last."""
         return self.arrived and self._dwell_s >= dwell_s
 
-    def stalled(self) -> bool:
-        """Return whether it stands still away from its target for longer than any start takes."""
+    def stall_words(self) -> str:
+        """Say that it stands still away from its target for longer than any start takes; else empty."""
         patience_s = max(STALL_S, 5.0 / max(self.speed or 1, 1))
-        return self.seen is not None and not self.arrived and self._dwell_s > patience_s
+        if self.seen is None or self.target is None or self.arrived or self._dwell_s <= patience_s:
+            return ""
+        return (
+            f"{self.name} stands at {self.angle_rad:.4f} rad and does not reach its target "
+            f"{self.rad_from_position(self.target):.4f} rad"
+        )

@@ -87,6 +87,7 @@ class Conversation:
         self._manners = _Manners()
         self._in_step = False
         self._tries = 1
+        self.byte_s = line.byte_s
         self.reply_s = REPLY_S + REPLY_BYTES * line.byte_s
 
     @property

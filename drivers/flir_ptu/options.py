@@ -5,16 +5,14 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any
 
-from drivers.errors import BadOptions
-from drivers.faults import nearest
+from drivers.approach import APPROACHES, Approach, last_turn
+from drivers.options import OptionReader
 
 DEVICE = "flir_ptu"
 BAUDS = (600, 1200, 2400, 4800, 9600, 19200, 38400, 57600, 115200)
 PORTS = "a serial device such as /dev/ttyUSB0, socket://HOST:4000 or rfc2217://HOST:PORT"
-
-Approach = Literal["none", "positive", "negative", "gravity"]
 
 
 @dataclass(frozen=True)
@@ -52,9 +50,7 @@ class AxisOptions:
 
     def approach_sign(self, goal_rad: float) -> int:
         """Return the direction of the last stretch in positions: 1, -1, or 0 for none."""
-        if self.approach == "gravity":
-            return self.sign if goal_rad < self.gravity_turnover_rad else -self.sign
-        return {"none": 0, "positive": self.sign, "negative": -self.sign}[self.approach]
+        return self.sign * last_turn(self.approach, goal_rad, self.gravity_turnover_rad)
 
 
 @dataclass(frozen=True)
@@ -94,41 +90,46 @@ def options_from(values: Mapping[str, Any]) -> Options:
     BadOptions
         For an unknown or missing key or a value that cannot be: which, what it is, what would be right.
     """
-    known = tuple(Options.__dataclass_fields__)
-    read = _Reader("", values, known, ("port", "pan", "tilt"))
-    port = values["port"]
-    foreign = isinstance(port, str) and "://" in port and not port.startswith(("socket://", "rfc2217://"))
-    if not isinstance(port, str) or not port.strip() or foreign:
+    read = OptionReader(values, Options.__dataclass_fields__, ("port", "pan", "tilt"))
+    port = read.text("port", PORTS)
+    if "://" in port and not port.startswith(("socket://", "rfc2217://")):
         raise read.bad("port", PORTS)
     return Options(
         port=port,
-        pan=_axis("pan", values["pan"]),
-        tilt=_axis("tilt", values["tilt"]),
-        baud=read.one_of("baud", 9600, BAUDS),
+        pan=_axis(read, "pan"),
+        tilt=_axis(read, "tilt"),
+        baud=read.one_of("baud", 9600, BAUDS, ", "),
         speed_rad_per_s=read.number("speed_rad_per_s", None, 1e-4, 20.0),
         acceleration_rad_per_s2=read.number("acceleration_rad_per_s2", None, 1e-4, 100.0),
         settle_s=read.number("settle_s", 0.1, 0.0, 10.0),
-        supply_V=read.pair("supply_V", "[low, high] in volts, low below high"),
+        supply_V=_supply(read),
         hottest_C=read.number("hottest_C", 60.0, 0.0, 150.0),
     )
 
 
-def _axis(name: str, values: Any) -> AxisOptions:
+def _supply(read: OptionReader) -> tuple[float, float] | None:
+    """Read the bounds of the supply."""
+    if read.values.get("supply_V") is None:
+        return None
+    expected = "[low, high] in volts, low below high"
+    low, high = read.pair("supply_V", expected)
+    if not low < high:
+        raise read.bad("supply_V", expected)
+    return low, high
+
+
+def _axis(options: OptionReader, name: str) -> AxisOptions:
     """Read one axis."""
-    if not isinstance(values, Mapping):
-        raise BadOptions(f"options.{name} is {values!r}, expected a mapping with limits_rad")
-    read = _Reader(f"{name}.", values, tuple(AxisOptions.__dataclass_fields__), ("limits_rad",))
-    ends = values["limits_rad"]
-    if not isinstance(ends, list | tuple) or len(ends) != 2 or not all(_is_number(end) for end in ends):
-        raise read.bad("limits_rad", "[low, high] in radians")
-    low, high = (float(end) for end in ends)
+    known = AxisOptions.__dataclass_fields__
+    read = options.section(name, "a mapping with limits_rad", known, ("limits_rad",))
+    low, high = read.pair("limits_rad", "[low, high] in radians")
     if not -math.tau <= low < high <= math.tau:
         raise read.bad("limits_rad", "[low, high] with low below high, at most a full turn either way")
     axis = AxisOptions(
         limits_rad=(low, high),
-        sign=read.one_of("sign", 1, (1, -1)),
+        sign=read.one_of("sign", 1, (1, -1), ", "),
         zero_rad=read.number("zero_rad", 0.0, -math.tau, math.tau),
-        approach=read.one_of("approach", "none", ("none", "positive", "negative", "gravity")),
+        approach=read.one_of("approach", "none", APPROACHES, ", "),
         approach_rad=read.number("approach_rad", 0.0, 0.0, 0.5),
         gravity_turnover_rad=read.number("gravity_turnover_rad", math.pi / 2, -math.pi, math.pi),
         resolution_arcsec=read.number("resolution_arcsec", None, 0.1, 3600.0),
@@ -136,55 +137,3 @@ def _axis(name: str, values: Any) -> AxisOptions:
     if (axis.approach == "none") != (axis.approach_rad == 0.0):
         raise read.bad("approach_rad", f"a stretch above zero beside a side, none beside {axis.approach!r}")
     return axis
-
-
-class _Reader:
-    """One mapping of options, read key by key."""
-
-    def __init__(
-        self, place: str, values: Mapping[str, Any], known: tuple[str, ...], needed: tuple[str, ...]
-    ) -> None:
-        self._place, self._values = place, values
-        for key in values:
-            if key not in known:
-                words = f"options.{place}{key}: there is no such option{nearest(str(key), known)}"
-                raise BadOptions(words)
-        for key in needed:
-            if key not in values:
-                raise BadOptions(f"options.{place}{key} is missing")
-
-    def bad(self, key: str, expected: str) -> BadOptions:
-        """The refusal of a key's value."""
-        words = f"options.{self._place}{key} is {self._values.get(key)!r}, expected {expected}"
-        return BadOptions(words)
-
-    def number(self, key: str, default: Any, low: float, high: float) -> Any:
-        """A number within bounds."""
-        if key not in self._values:
-            return default
-        value = self._values[key]
-        if not _is_number(value) or not low <= value <= high:
-            raise self.bad(key, f"a number from {low:g} to {high:g}")
-        return float(value)
-
-    def pair(self, key: str, expected: str) -> tuple[float, float] | None:
-        """Two rising numbers, or None where there are none."""
-        value = self._values.get(key)
-        if value is None:
-            return None
-        good = isinstance(value, list | tuple) and len(value) == 2 and all(_is_number(one) for one in value)
-        if not good or not value[0] < value[1]:
-            raise self.bad(key, expected)
-        return float(value[0]), float(value[1])
-
-    def one_of(self, key: str, default: Any, allowed: tuple[Any, ...]) -> Any:
-        """One of a few values."""
-        value = self._values.get(key, default)
-        if isinstance(value, bool) or not isinstance(value, str | int) or value not in allowed:
-            raise self.bad(key, ", ".join(str(one) for one in allowed))
-        return value
-
-
-def _is_number(value: Any) -> bool:
-    """Whether a value is a finite number and not a truth value."""
-    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)

@@ -6,10 +6,16 @@ They give no bounds for all models, so these are the configuration's, or what wa
 
 from __future__ import annotations
 
+import logging
 import re
+import time
 from dataclasses import dataclass
 
-from drivers.flir_ptu.options import Options
+from drivers.errors import Refused
+from drivers.flir_ptu.conversation import Conversation
+from drivers.flir_ptu.options import DEVICE, Options
+
+log = logging.getLogger(__name__)
 
 EVERY_S = 5.0
 """How often a resting unit is asked."""
@@ -46,3 +52,51 @@ def supply_words(now: Supply, at_start: Supply, options: Options) -> tuple[str, 
     if now.hottest_c > options.hottest_C:
         words.append(f"the unit is at {now.hottest_c:.0f} °C, expected {options.hottest_C:.0f} °C at most")
     return tuple(words)
+
+
+class SupplyWatch:
+    """The watch over a unit's supply and temperature.
+
+    Attributes
+    ----------
+    words
+        What is wrong, in plain words; empty if nothing is, or the unit does not tell.
+    """
+
+    def __init__(self, options: Options) -> None:
+        self.words: tuple[str, ...] = ()
+        self._options = options
+        self._at_start: Supply | None = None  # None: this unit does not tell
+        self._due_s = 0.0
+
+    def begin(self, talk: Conversation) -> None:
+        """Ask what there is, unless that is known; raises as `Conversation.tell`."""
+        if self._at_start is not None:
+            return
+        first, again = _ask(talk), _ask(talk)
+        if first is not None and again is not None:  # the middle, should a digit be damaged
+            third = _ask(talk) or again
+            self._at_start = sorted((first, again, third), key=lambda supply: supply.volts)[1]
+
+    def look(self, talk: Conversation) -> None:
+        """Ask and judge now and then; a fault is told only if it is measured twice. Raises as `begin`."""
+        if self._at_start is None or time.monotonic() < self._due_s:
+            return
+        words: tuple[str, ...] = ()
+        for _ in range(2):
+            supply = _ask(talk)
+            if supply is None:
+                return  # damaged: asked again by the next reading
+            words = supply_words(supply, self._at_start, self._options)
+            if not words:
+                break
+        self.words, self._due_s = words, time.monotonic() + EVERY_S
+
+
+def _ask(talk: Conversation) -> Supply | None:
+    """Supply and temperature; None where the unit does not tell, or in words nobody knows."""
+    try:
+        return supply_of(talk.tell("O"))
+    except Refused as error:
+        log.info("%s: it does not tell its supply (%s)", DEVICE, error)
+        return None

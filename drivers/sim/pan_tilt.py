@@ -12,6 +12,7 @@ from drivers.clock import Clock
 from drivers.errors import BadOptions, BadReply, DriverError, NoReply
 from drivers.faults import PAN_TILT, Fault, FaultPanel, nearest
 from drivers.interfaces import Reading
+from drivers.options import is_number
 from drivers.sim.axis import AxisSettings
 from drivers.sim.wire.axis import WireAxis
 
@@ -109,8 +110,7 @@ def head_settings(value: Any) -> HeadSettings:
         if name not in known:
             raise BadOptions(f"simulation.head has no key {name!r}{nearest(name, known)}")
         zero_allowed = name in ("backlash_rad", "approach_rad", "sag_rad")
-        good = isinstance(number, int | float) and not isinstance(number, bool) and math.isfinite(number)
-        if not good or number < 0 or (number == 0 and not zero_allowed):
+        if not is_number(number) or number < 0 or (number == 0 and not zero_allowed):
             raise BadOptions(f"simulation.head.{name} is {number!r}, expected a positive number")
         if name != "sag_rad":
             head = replace(head, pan=replace(head.pan, **{name: float(number)}))

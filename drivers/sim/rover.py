@@ -22,12 +22,13 @@ from numpy.typing import ArrayLike, NDArray
 from calib.cahvor import CameraModel
 from calib.errors import BadFile
 from calib.mast import Rig
-from calib.rigid import FloatArray, Rigid
+from calib.rigid import FloatArray, Rigid, rot_x, rot_y, rot_z
 from calib.store import load_rig
 from drivers.clock import Clock
 from drivers.errors import BadOptions, NoFreshFrame
 from drivers.faults import FaultPanel, nearest, read_script
 from drivers.interfaces import PanTilt
+from drivers.options import is_number, is_whole
 from drivers.sim.cameras import CameraSettings, SimulatedCamera
 from drivers.sim.pan_tilt import HeadSettings, SimulatedPanTilt, head_settings
 from drivers.sim.render import Renderer, compile_renderer
@@ -36,6 +37,9 @@ from drivers.sim.wire.head import DEFAULT_HEADS, WiredHead, check_head
 
 TRUTH_FRAMES = 512
 """How many frames of each camera ``frame_truth`` remembers."""
+
+REACH_M = 28.0
+"""How far from the middle of the ground the rover may stand, along x and y; only hills from 32 m on."""
 
 BLUR_STEP_PX = 1.5
 """An exposure during which the picture moves is averaged over renderings no further apart than this..."""
@@ -141,7 +145,7 @@ def simulation_settings(section: Mapping[str, Any], folder: Path) -> SimulationS
 
 def _whole(value: Any, key: str, low: int, high: int) -> int:
     """A whole number within bounds."""
-    if isinstance(value, bool) or not isinstance(value, int) or not low <= value <= high:
+    if not is_whole(value) or not low <= value <= high:
         raise BadOptions(f"{key} is {value!r}, expected a whole number from {low} to {high}")
     return value
 
@@ -157,8 +161,7 @@ def _filled(defaults: Any, values: Any, key: str) -> Any:
             raise BadOptions(f"{key} has no key {name!r}{nearest(str(name), known)}")
         kind = type(known[name])
         if kind in (int, float):
-            wrong = isinstance(value, bool) or not isinstance(value, int if kind is int else int | float)
-            if wrong or not math.isfinite(value):
+            if not (is_whole(value) if kind is int else is_number(value)):
                 what = "a whole number" if kind is int else "a number"
                 raise BadOptions(f"{key}.{name} is {value!r}, expected {what}")
             value = kind(value)
@@ -240,6 +243,32 @@ class SimulatedRover:
     def true_joints(self, time_s: float) -> tuple[float, float]:
         """Return the mechanical pan and tilt at a moment of the last minute, radians."""
         return self._head.true_joints(time_s)
+
+    def stand(
+        self, x_m: float, y_m: float, heading_rad: float, pitch_rad: float = 0.0, roll_rad: float = 0.0
+    ) -> Rigid:
+        """Put the rover somewhere on the ground, at once, and return site_from_rover.
+
+        Parameters
+        ----------
+        x_m, y_m
+            In the site frame; the rover's origin comes to lie on the ground there.
+        heading_rad, pitch_rad, roll_rad
+            Turned about the rover's x (roll), then y (pitch, nose up), then z (heading, to the right).
+
+        Raises
+        ------
+        BadOptions
+            Farther than ``REACH_M`` from the middle of the ground.
+        """
+        if not (abs(x_m) <= REACH_M and abs(y_m) <= REACH_M):
+            raise BadOptions(
+                f"({x_m:g}, {y_m:g}) m is off the simulated ground, which ends {REACH_M:g} m from its middle"
+            )
+        rotation = rot_z(heading_rad) @ rot_y(pitch_rad) @ rot_x(roll_rad)
+        place = np.array([x_m, y_m, self.scene.ground_z_m(x_m, y_m)])
+        self.site_from_rover = Rigid(rotation, place)
+        return self.site_from_rover
 
     def frame_truth(self, camera: str, sequence: int) -> FrameTruth:
         """Return where a camera was when a frame was taken.

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -10,6 +9,7 @@ from typing import Any, TypeVar
 
 from drivers.errors import BadOptions
 from drivers.faults import nearest
+from drivers.options import is_number, is_whole
 from drivers.v4l2.controls import Value
 from drivers.v4l2.exposure import ExposureSettings
 from drivers.v4l2.find import Address, check_address
@@ -177,9 +177,7 @@ class _Reader:
         value = self.options.get(key)
         if key not in self.options:
             return None
-        if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
-            raise self._bad(key, f"a number {least:g} to {most:g}")
-        if not least <= value <= most:
+        if not is_number(value) or not least <= value <= most:
             raise self._bad(key, f"a number {least:g} to {most:g}")
         return float(value)
 
@@ -187,7 +185,7 @@ class _Reader:
         if key not in self.options:
             return None
         value = self.options[key]
-        if isinstance(value, bool) or not isinstance(value, int) or not least <= value <= most:
+        if not is_whole(value) or not least <= value <= most:
             raise self._bad(key, f"a whole number {least} to {most}")
         return value
 
@@ -195,9 +193,7 @@ class _Reader:
         if key not in self.options:
             return None
         value = self.options[key]
-        whole = isinstance(value, (list, tuple)) and all(
-            isinstance(v, int) and not isinstance(v, bool) and 0 < v <= 16384 for v in value
-        )
+        whole = isinstance(value, (list, tuple)) and all(is_whole(v) and 0 < v <= 16384 for v in value)
         if not whole or len(value) != 2:
             raise self._bad(key, "[width, height] in pixels")
         return int(value[0]), int(value[1])

@@ -307,15 +307,16 @@ def test_close_leaves_the_servos_as_configured(at_close: str, torque: int) -> No
 def test_the_watchdog_is_fed_while_nobody_calls() -> None:
     with opened() as (it, head):
         head.read()
-        before = head._link.counts.transactions if head._link else 0
-        until(lambda: head._link and head._link.counts.transactions > before + 60, "a second of polls")
+        pair = head._session.pair
+        before = pair.link.counts.transactions
+        until(lambda: pair.link.counts.transactions > before + 60, "a second of polls")
         assert it.servos[0].table["bus_watchdog"] == 20
         assert head.read().faults == ()
 
 
 def test_fast_reads_are_used_only_after_they_proved_themselves() -> None:
     with opened(options={"fast_read": True}) as (_, head):
-        assert head._fast
+        assert head._session.pair.fast
         assert head.read().faults == ()
     with opened(options={"fast_read": True}, models=("mx_28", X)) as (_, head):
         assert head.read().faults == ()

@@ -7,11 +7,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from calib.rigid import Rigid, rot_z
 from calib.store import load_rig
 from drivers.clock import ManualClock
-from drivers.errors import NoFreshFrame
+from drivers.errors import BadOptions, NoFreshFrame
 from drivers.sim.render import Renderer
 from drivers.sim.rover import TRUTH_FRAMES, SimulatedRover, simulation_settings
 from drivers.sim.scene import Scene
@@ -86,6 +87,17 @@ def test_truth_follows_the_rover_when_it_stands_elsewhere(small_rig: Path, scene
     in_site = device.site_from_rover.points(point)
     assert abs(in_site[2] - scene.ground_z_m(in_site[0], in_site[1])) < 1e-3
     assert device.true_pixel("navcam_left", frame.sequence, point) == pytest.approx((128.0, 96.0), abs=1e-6)
+
+
+def test_a_rover_that_is_put_somewhere_stands_on_the_ground_there(small_rig: Path, scene: Scene) -> None:
+    device, _ = rover(small_rig)
+    pose = device.stand(2.0, -1.0, 0.5, 0.1, -0.05)
+    assert device.site_from_rover == pose
+    assert pose.translation_m == pytest.approx([2.0, -1.0, scene.ground_z_m(2.0, -1.0)])
+    assert pose.rotation == pytest.approx(Rotation.from_euler("ZYX", [0.5, 0.1, -0.05]).as_matrix())
+    assert pose.vectors([1.0, 0.0, 0.0])[2] < 0, "the nose is up, and down is positive"
+    with pytest.raises(BadOptions, match=r"\(28\.1, 0\) m is off the simulated ground"):
+        device.stand(28.1, 0.0, 0.0)
 
 
 def test_a_moving_head_blurs_its_cameras_but_not_those_on_the_body(small_rig: Path) -> None:

@@ -8,15 +8,10 @@ import math
 from pathlib import Path
 
 import numpy as np
-import pytest
 
-from calib.errors import CalibError
-from calib.store import load_rig
 from mastctl.experiment.approach import (
-    HANDOFFS_M,
     ApproachRun,
     Stop,
-    choose_pair,
     summary,
     table_rows,
     write_record,
@@ -25,23 +20,6 @@ from mastctl.experiment.approach import (
 
 def stop(range_m: float, error_m: tuple[float, float, float], state: str = "tracked") -> Stop:
     return Stop(range_m, "hazcam", state, "", np.array(error_m), np.full(3, 0.003), 0.3, False)
-
-
-@pytest.mark.parametrize(("range_m", "pair"), [(9.0, "pancam"), (4.0, "navcam"), (1.0, "hazcam")])
-def test_the_pair_follows_from_the_range(repository: Path, range_m: float, pair: str) -> None:
-    rig = load_rig(repository / "configs/sim/rocky8.yaml").rig
-    name, pan, tilt = choose_pair(rig, np.array([0.5 + range_m, 0.3, 0.0]), HANDOFFS_M)
-    assert name == pair
-    if pair != "hazcam":
-        pixel, _ = rig.camera_in_rover(f"{pair}_left", pan, tilt).project(np.array([0.5 + range_m, 0.3, 0.0]))
-        assert np.allclose(pixel, rig.cameras[f"{pair}_left"].model.image_center_px, atol=1e-6)
-
-
-def test_a_target_behind_the_rover_is_seen_by_the_head_only(repository: Path) -> None:
-    rig = load_rig(repository / "configs/sim/rocky8.yaml").rig
-    assert choose_pair(rig, np.array([-1.5, 0.2, 0.0]), HANDOFFS_M)[0] == "navcam"
-    with pytest.raises(CalibError, match="no stereo pair sees the target"):
-        choose_pair(rig, np.array([-1.5, 0.2, 0.0]), {"hazcam": 0.0})
 
 
 def test_runs_are_counted_and_averaged_by_hand() -> None:

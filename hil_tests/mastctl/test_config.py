@@ -14,6 +14,7 @@ from service_fakes import rig
 from calib.errors import BadFile
 from mastctl.config import Config, Listen, check_cameras, load_config, parse_config
 from mastctl.packaged import config_folder, default_config
+from mastctl.tracking.choice import PairBounds
 
 GOOD: dict[str, Any] = {
     "schema": "mastctl/config/1",
@@ -103,6 +104,24 @@ BAD: list[tuple[str, Any, str, str]] = [
     ("listen/socket", "/run/x.sock", "listen.host", "beside 'socket'"),
     ("listen", {"socket": "/" + "x" * 120}, "listen.socket", "longer than"),
     ("simulation", "yes", "simulation", "a mapping is expected"),
+    ("tracking", "yes", "tracking", "a mapping with handoff, most_step, start_error is expected"),
+    ("tracking", {"most_stap": 0.3}, "tracking.most_stap", "the nearest known is 'most_step'"),
+    ("tracking", {"most_step": 0.0}, "tracking.most_step", "from 0.01 to 1"),
+    ("tracking", {"start_error": "a"}, "tracking.start_error", "number"),
+    ("tracking", {"handoff": {"margin_px": -1}}, "tracking.handoff.margin_px", "from 0 to 1000"),
+    ("tracking", {"handoff": {"pairs": [1]}}, "tracking.handoff.pairs", "a mapping is expected"),
+    (
+        "tracking",
+        {"handoff": {"pairs": {"navcam": {"nearest": 1}}}},
+        "tracking.handoff.pairs.navcam.nearest",
+        "the nearest known is 'nearest_m'",
+    ),
+    (
+        "tracking",
+        {"handoff": {"pairs": {"navcam": {"steepest_rad": 2}}}},
+        "tracking.handoff.pairs.navcam.steepest_rad",
+        "from 0 to 1.5708",
+    ),
 ]
 
 
@@ -123,6 +142,22 @@ def test_a_camera_that_the_mast_file_lacks_is_named_with_the_nearest() -> None:
     with pytest.raises(BadFile, match=r"cameras\.navcam_lift: .*the nearest known is 'navcam_left'"):
         check_cameras(config, rig())
     check_cameras(parsed(yaml.safe_dump(GOOD).encode()), rig())
+
+
+def test_what_is_left_out_of_tracking_stays_as_it_is() -> None:
+    usual = parsed(yaml.safe_dump(GOOD).encode()).tracking
+    assert usual.handoff.pairs["pancam"].nearest_m == 6.0
+    pairs = {"navcam": {"nearest_m": 2.5, "steepest_rad": 0.7}}
+    tracking = parsed(changed("tracking", {"handoff": {"pairs": pairs, "range_error": 0.1}})).tracking
+    assert tracking.handoff.pairs["navcam"] == PairBounds(2.5, 0.7)
+    assert tracking.handoff.pairs["pancam"] == usual.handoff.pairs["pancam"]
+    assert (tracking.handoff.range_error, tracking.most_step) == (0.1, usual.most_step)
+
+
+def test_a_pair_that_the_mast_file_lacks_is_named() -> None:
+    config = parsed(changed("tracking", {"handoff": {"pairs": {"navcan": {"nearest_m": 2.0}}}}))
+    with pytest.raises(BadFile, match=r"tracking\.handoff\.pairs\.navcan: .*the nearest known is 'navcam'"):
+        check_cameras(config, rig())
 
 
 def test_a_file_that_is_not_there_is_named(tmp_path: Path) -> None:

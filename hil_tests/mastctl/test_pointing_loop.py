@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from pointing_world import LIMITS, SIZE_PX, World, click, rig, run
 
-from mastctl.operations import as_json
+from mastctl.as_json import as_json
 from mastctl.pointing.loop import (
     Aim,
     AnglesTarget,

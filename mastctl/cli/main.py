@@ -25,6 +25,7 @@ log = logging.getLogger(__name__)
 # Which module brings which command, in the order in which the help shows them.
 MODULES: dict[str, tuple[str, ...]] = {
     "mastctl.cli.service": ("run", "status", "point", "stop", "snapshot"),
+    "mastctl.cli.track": ("track",),
     "mastctl.cli.geometry": ("camera", "solve", "triangulate", "budget"),
     "mastctl.cli.handoff": ("handoff",),
     "mastctl.cli.calibrate": ("calibrate",),

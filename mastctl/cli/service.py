@@ -136,7 +136,7 @@ def _point(args: argparse.Namespace) -> int:
     with client_of(args) as client:
         if args.pixel is not None:
             camera, frame_id, x, y = args.pixel
-            request["pixel"] = (camera, frame_id, _number("--pixel", x), _number("--pixel", y))
+            request["pixel"] = (camera, frame_id, number_of("--pixel", x), number_of("--pixel", y))
         elif args.camera is not None:
             shot = client.snapshot(args.camera)
             request["pixel"] = (args.camera, shot.frame_id, *args.at)
@@ -146,9 +146,9 @@ def _point(args: argparse.Namespace) -> int:
             request["pan_rad"], request["tilt_rad"] = args.angles
         operation_id = client.point(**request)
         if args.no_wait:
-            _tell(args, {"id": operation_id}, f"operation {operation_id}")
+            tell_result(args, {"id": operation_id}, f"operation {operation_id}")
             return 0
-        record = _followed(client, operation_id, args)
+        record = followed(client, operation_id, args)
     if record["state"] != "done":
         error = record.get("error") or {}
         raise CommandError(
@@ -167,7 +167,7 @@ def _stop(args: argparse.Namespace) -> int:
     with client_of(args) as client:
         answer = client.stop()
     operation = answer.get("operation")
-    _tell(args, answer, f"stopped{f', operation {operation} too' if operation else ''}")
+    tell_result(args, answer, f"stopped{f', operation {operation} too' if operation else ''}")
     return 0
 
 
@@ -183,7 +183,7 @@ def _snapshot(args: argparse.Namespace) -> int:
     except OSError as error:
         raise CommandError("file_system", f"{out}: cannot be written: {error.strerror}", 2) from None
     line = f"{out}: frame {shot.frame_id}, pan {shot.pan_rad:.6f} rad, tilt {shot.tilt_rad:.6f} rad"
-    _tell(args, {"file": str(out), **shot.facts}, line + (", head moving" if shot.moving else ""))
+    tell_result(args, {"file": str(out), **shot.facts}, line + (", head moving" if shot.moving else ""))
     return 0
 
 
@@ -203,7 +203,7 @@ def client_of(args: argparse.Namespace) -> Iterator[Client]:
         yield client
 
 
-def _followed(client: Client, operation_id: str, args: argparse.Namespace) -> dict[str, Any]:
+def followed(client: Client, operation_id: str, args: argparse.Namespace) -> dict[str, Any]:
     """Wait for an operation, showing its steps to a person."""
     if args.json:
         return client.wait(operation_id, args.timeout)
@@ -270,6 +270,11 @@ def _status_rows(status: dict[str, Any]) -> Iterator[tuple[str, str]]:
     for name, camera in status["cameras"].items():
         age_s = camera["age_s"]
         yield name, "no frame yet" if age_s is None else f"newest frame {age_s:.1f} s old"
+    track = status["track"]
+    yield "track", track["state"] + (f": {track['reason']}" if track["reason"] else "")
+    if status["pose"] is not None:
+        x, y, z = status["pose"]["position_m"]
+        yield "rover", f"at ({x:.3f}, {y:.3f}, {z:.3f}) m of the site, {status['pose']['age_s']:.1f} s ago"
     mast = status["mast"]
     yield "mast file", f"{mast['file']} ({mast['digest'][:8]}...)"
     yield "up", f"{status['uptime_s']:.0f} s, version {status['version']}"
@@ -283,17 +288,17 @@ def _camera_pixel(words: list[str] | None) -> tuple[str, float, float] | None:
     """``CAMERA X Y`` of --aim."""
     if words is None:
         return None
-    return words[0], _number("--aim", words[1]), _number("--aim", words[2])
+    return words[0], number_of("--aim", words[1]), number_of("--aim", words[2])
 
 
-def _number(option: str, word: str) -> float:
+def number_of(option: str, word: str) -> float:
     try:
         return finite_number(word)
     except argparse.ArgumentTypeError as error:
         raise WrongUse(f"{option}: {error}") from None
 
 
-def _tell(args: argparse.Namespace, document: dict[str, Any], line: str) -> None:
+def tell_result(args: argparse.Namespace, document: dict[str, Any], line: str) -> None:
     """One JSON document for programs, or one line for people, on stdout."""
     if args.json:
         output.print_json(document)

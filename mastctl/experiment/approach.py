@@ -6,7 +6,7 @@ import csv
 import json
 import math
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -20,13 +20,11 @@ from calib.tracking import Track, moved, seen_by, start_track
 from drivers.sim.scene import SceneSettings, build_scene
 from mastctl.experiment.approach_world import World, WorldErrors
 from mastctl.experiment.targets import textured
+from mastctl.tracking.choice import choose_pairs
 
 START_M, END_M = 10.0, 1.0
 STEP = 0.1
 """Of the range, driven in one step."""
-
-HANDOFFS_M: Mapping[str, float] = {"pancam": 6.0, "navcam": 2.0, "hazcam": 0.0}
-"""Down to which range each pair is used, from the longest focal length to the shortest."""
 
 SUN_MOVES_RAD = math.radians(8.0)
 LOST_LOOKS = 3
@@ -174,51 +172,11 @@ def _front_m(world: World) -> float:
     return float(left + right) / 2
 
 
-def choose_pair(rig: Rig, position_m: FloatArray, ranges_m: Mapping[str, float]) -> tuple[str, float, float]:
-    """Return the pair that should look at a position, and the joint angles that bring it into its middle.
-
-    Pairs are tried from the longest focal length on: the first whose range reaches so near, and whose cameras
-    see it well inside their pictures.
-
-    Raises
-    ------
-    CalibError
-        If none sees it.
-    """
-    best: tuple[str, float, float] | None = None
-    for name, least_m in ranges_m.items():
-        pair = rig.stereo[name]
-        pan = tilt = 0.0
-        if rig.cameras[pair[0]].on == "head":
-            try:
-                angles = solve(rig.mast, rig.cameras[pair[0]].model, position_m)[0]
-            except CalibError:
-                continue
-            pan, tilt = angles.pan_rad, angles.tilt_rad
-        models = [rig.camera_in_rover(camera, pan, tilt) for camera in pair]
-        if not all(_inside(model.project(position_m), model.size_px) for model in models):
-            continue
-        best = (name, pan, tilt)
-        range_m = float(np.linalg.norm(position_m - (models[0].C + models[1].C) / 2))
-        if range_m >= least_m:
-            return best
-    if best is None:
-        raise CalibError(f"no stereo pair sees the target at {np.round(position_m, 2).tolist()} m")
-    return best
-
-
-def _inside(projected: tuple[FloatArray, np.ndarray], size_px: tuple[int, int]) -> bool:
-    pixel, valid = projected
-    margin = 30
-    return (
-        bool(valid) and margin <= pixel[0] < size_px[0] - margin and margin <= pixel[1] < size_px[1] - margin
-    )
-
-
 def _look(world: World, track: Track, target: FloatArray) -> tuple[Track, Stop]:
     """Look for the target with the pair of its range, again if it is lost; the track and the record."""
     rig = world.believed
-    name, pan, tilt = choose_pair(rig, track.position_m, HANDOFFS_M)
+    chosen = choose_pairs(rig, track.position_m)[0]
+    name, pan, tilt = chosen.pair, chosen.pan_rad or 0.0, chosen.tilt_rad or 0.0
     pair = rig.stereo[name]
     for _ in range(LOST_LOOKS):
         eyes = world.look(pair, pan, tilt)

@@ -18,8 +18,7 @@ import logging
 import math
 import threading
 from collections.abc import Callable, Sequence
-from contextlib import AbstractContextManager
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
@@ -34,11 +33,8 @@ from drivers.errors import DriverError
 from drivers.interfaces import Reading
 from mastctl.errors import MastctlError
 from mastctl.limits import Limits
-from mastctl.pointing.counts import counts_told
-from mastctl.pointing.looking import CamerasLike, Clicked, Eyes, View, facts
-from mastctl.pointing.motion import Head, HeadLike
+from mastctl.pointing.looking import Clicked, View, facts
 from mastctl.pointing.one_moment import check_one_moment
-from mastctl.pointing.record import Recorder
 from mastctl.pointing.requests import (
     Aim,
     AnglesTarget,
@@ -55,7 +51,8 @@ from mastctl.pointing.requests import (
     rounded,
     triple,
 )
-from mastctl.pointing.wanted import aim_of, check_pointings, clicked_px, position_in_rover_m
+from mastctl.pointing.steps import DevicesLike, Steps
+from mastctl.pointing.wanted import aim_of, check_pointings, position_in_rover_m
 
 __all__ = [
     "Aim",
@@ -76,10 +73,6 @@ log = logging.getLogger(__name__)
 
 NO_PICTURE_OF_A_POSITION = "no residual: a position has no picture that could be looked for"
 NO_TARGET = "no residual: joint angles name no target; no picture was taken"
-
-
-class DevicesLike(HeadLike, CamerasLike, Protocol):
-    """What the loop needs of `mastctl.devices.Devices`."""
 
 
 class PointingLoop:
@@ -154,11 +147,9 @@ class _Run:
         self._rig = rig
         self._devices = devices
         self._limits = limits
-        self._clock = clock
         self._settings = settings
-        self._head = Head(devices, limits, clock, settings, cancelled)
-        self._eyes = Eyes(devices, rig, settings)
-        self._recorder = Recorder(record, clock, self._head.check_not_stopped)
+        self._steps = Steps(rig, devices, limits, clock, settings, record, cancelled)
+        self._eyes = self._steps.eyes
         self._position_m: FloatArray | None = None
         self._range_m: float | None = None
         self._pointings: list[Pointing] = []
@@ -171,7 +162,7 @@ class _Run:
             self._stop()
             code = getattr(error, "code", "failed")
             raise PointingError(
-                code, " ".join(str(error).split()), self._recorder.last, self._so_far()
+                code, " ".join(str(error).split()), self._steps.last, self._so_far()
             ) from error
         except BaseException:
             self._stop()
@@ -184,65 +175,38 @@ class _Run:
         target, rig = request.target, self._rig
         check_pointings(request)
         if isinstance(target, AnglesTarget):
-            self._rest()
-            settled = self._go(target.pan_rad, target.tilt_rad)
-            self._pointings.append(_without_picture(target, settled))
+            self._steps.rest()
+            settled = self._steps.go(target.pan_rad, target.tilt_rad)
+            self._done(_without_picture(target, settled))
             return
         aim = aim_of(request, rig)
         aim_px = np.array([aim.x_px, aim.y_px])
         if isinstance(target, PositionTarget):
             self._position_m = position_in_rover_m(target)
-            commanded, settled = self._solve_and_go(aim, aim_px, self._rest())
-            now = self._look((aim.camera,), settled)[aim.camera]
-            self._pointings.append(self._pointing(commanded, now, aim_px, None))
+            commanded, settled = self._solve_and_go(aim, aim_px, self._steps.rest())
+            now = self._steps.look((aim.camera,), settled)[aim.camera]
+            self._done(self._pointing(commanded, now, aim_px, None))
             return
         self._point_at(self._see(target), aim, aim_px, request.pointings)
 
     # Steps
 
-    def _step(self, name: str) -> AbstractContextManager[dict[str, Any]]:
-        number = len(self._pointings) + 1
-        return self._recorder.step(name, **({"pointing": number} if number > 1 else {}))
-
-    def _rest(self) -> Reading:
-        with self._step("rest") as detail:
-            resting = self._head.resting()
-            detail.update(pan_rad=resting.pan_rad, tilt_rad=resting.tilt_rad)
-        return resting
+    def _done(self, pointing: Pointing) -> None:
+        """Keep a pointing; the steps that follow belong to the next."""
+        self._pointings.append(pointing)
+        self._steps.pointing += 1
 
     def _see(self, target: PixelTarget) -> Clicked:
         """From the clicked pixel to a position in the rover frame."""
-        pixel = clicked_px(target, self._rig)
-        partner = self._eyes.partner(target.camera)
-        if partner is None:
-            words = f"{target.camera} is in no stereo pair of the mast file: no range"
-            raise PointingError("no_stereo", words)
-        view = self._eyes.named(target.frame_id)
-        if view.frame.camera != target.camera:
-            words = f"frame {target.frame_id} is of camera {view.frame.camera}, not of {target.camera}"
-            raise PointingError("wrong_camera", words)
-        if view.frame.moving:
-            words = f"the head moved while frame {target.frame_id} was exposed; click in another"
-            raise PointingError("head_moving", words)
-        resting = self._rest()
-        with self._step("frames") as detail:
-            fresh = self._eyes.new((target.camera, partner), self._clock.now_s(), resting)
-            now, other = fresh[target.camera], fresh[partner]
-            detail.update(frame_ids=[now.frame.frame_id, other.frame.frame_id])
-            if view.frame.mast_digest != now.frame.mast_digest:
-                raise PointingError(
-                    "other_mast_file", f"frame {target.frame_id} was taken with another mast file"
-                )
-        with self._step("target") as detail:
-            again = self._eyes.again(view, pixel, now)
-            detail.update(facts(again))
-        with self._step("stereo") as detail:
-            detail.update(self._one_moment(now, again.pixel_px, [other], resting))
-            partnered = self._eyes.stereo(now, again.pixel_px, other)
+        found = self._steps.clicked(target)
+        now, other = found.now, found.other
+        with self._steps.step("stereo") as detail:
+            detail.update(self._one_moment(now, found.pixel_px, [other], found.resting))
+            partnered = self._eyes.stereo(now, found.pixel_px, other)
             detail.update(facts(partnered.match), across_px=round(partnered.across_px, 3))
         assert partnered.plane is not None
-        self._triangulate(now, again.pixel_px, other, partnered.match.pixel_px)
-        return Clicked(view, pixel, partnered.plane)
+        self._triangulate(now, found.pixel_px, other, partnered.match.pixel_px)
+        return Clicked(found.view, found.clicked_px, partnered.plane)
 
     def _one_moment(
         self, view: View, pixel_px: FloatArray, others: Sequence[View], resting: Reading
@@ -250,7 +214,7 @@ class _Run:
         return check_one_moment(self._eyes, self._settings, view, pixel_px, others, resting)
 
     def _triangulate(self, one: View, one_px: FloatArray, other: View, other_px: FloatArray) -> None:
-        with self._step("triangulate") as detail:
+        with self._steps.step("triangulate") as detail:
             sigma_px = self._settings.triangulation_sigma_px
             point = triangulate(one.camera, other.camera, one_px, other_px, sigma_px)
             self._position_m = point.position_m
@@ -265,17 +229,17 @@ class _Run:
         """Point once or twice at the clicked thing and measure each time."""
         source = clicked.view.frame.camera
         for number in range(1, pointings + 1):
-            commanded, settled = self._solve_and_go(aim, aim_px, self._rest() if number > 1 else None)
+            commanded, settled = self._solve_and_go(aim, aim_px, self._steps.rest() if number > 1 else None)
             assert self._position_m is not None
             companions = self._eyes.companions(aim.camera, source, self._position_m, settled)
-            views = self._look((aim.camera, *companions), settled)
+            views = self._steps.look((aim.camera, *companions), settled)
             now = views.pop(aim.camera)
-            with self._step("measure") as detail:
+            with self._steps.step("measure") as detail:
                 seen = self._eyes.look_for(clicked, now)
                 detail.update(facts(seen), predicted_px=rounded(seen.predicted_px))
                 detail.update(residual_px=rounded(seen.pixel_px - aim_px))
             confirmed: list[tuple[View, FloatArray]] = [(now, seen.pixel_px)]
-            with self._step("eyes") as detail:
+            with self._steps.step("eyes") as detail:
                 detail.update(confirmed_by=list(companions))
                 if views:
                     detail.update(self._one_moment(now, seen.pixel_px, list(views.values()), settled))
@@ -283,7 +247,7 @@ class _Run:
                     same_pair = {aim.camera, name} == {source, self._eyes.partner(source)}
                     found, detail[name] = self._eyes.agree(clicked, now, seen, other, same_pair)
                     confirmed.append((other, found.pixel_px))
-            self._pointings.append(self._pointing(commanded, now, aim_px, seen))
+            self._done(self._pointing(commanded, now, aim_px, seen))
             if number < pointings:
                 self._again(confirmed)
 
@@ -294,7 +258,7 @@ class _Run:
         eye's own, free of what the mast file has wrong between the two.
         """
         if len(confirmed) < 2:
-            with self._step("triangulate"):
+            with self._steps.step("triangulate"):
                 words = "a second pointing needs two eyes of a pair that see the target after the first one"
                 raise PointingError("no_stereo", words)
         (one, one_px), (other, other_px) = confirmed[-2:]
@@ -309,8 +273,8 @@ class _Run:
     def _solve_and_go(self, aim: Aim, aim_px: FloatArray, resting: Reading | None) -> tuple[Pair, Reading]:
         """Solve for the present position, move, settle; return the commanded angles and the arrival."""
         assert self._position_m is not None
-        here = resting or self._head.read()
-        with self._step("solve") as detail:
+        here = resting or self._steps.head.read()
+        with self._steps.step("solve") as detail:
             solutions = solve(
                 self._rig.mast,
                 self._rig.cameras[aim.camera].model,
@@ -323,34 +287,7 @@ class _Run:
             best = choose(solutions, self._limits.pan_rad, self._limits.tilt_rad, here.pan_rad, here.tilt_rad)
             detail.update(chosen=_told(best))
         self._range_m = best.range_m
-        return (best.pan_rad, best.tilt_rad), self._go(best.pan_rad, best.tilt_rad, aim.camera)
-
-    def _go(self, pan_rad: float, tilt_rad: float, camera: str | None = None) -> Reading:
-        """Check the limits, move, wait until settled; return the reading there.
-
-        Where the head knows its counts, the record says what these leave, in pixels of ``camera``.
-        """
-        with self._step("limits") as detail:
-            detail.update(pan_rad=pan_rad, tilt_rad=tilt_rad)
-            self._limits.check(pan_rad, tilt_rad)
-        with self._step("move") as detail:
-            allowed_s = self._head.time_allowed_s(pan_rad, tilt_rad)
-            detail.update(pan_rad=pan_rad, tilt_rad=tilt_rad, allowed_s=round(allowed_s, 3))
-            begun_s = self._clock.now_s()
-            self._head.send(pan_rad, tilt_rad)
-        with self._step("settle") as detail:
-            settled = self._head.arrived(pan_rad, tilt_rad, begun_s + allowed_s)
-            detail.update(pan_rad=settled.pan_rad, tilt_rad=settled.tilt_rad)
-            model = None if camera is None else self._rig.cameras[camera].model
-            detail.update(counts_told(self._devices, settled.tilt_rad, model))
-        return settled
-
-    def _look(self, cameras: Sequence[str], settled: Reading) -> dict[str, View]:
-        """Take new pictures, exposed after the head had settled."""
-        with self._step("look") as detail:
-            views = self._eyes.new(cameras, settled.time_s, settled)
-            detail.update(frame_ids=[view.frame.frame_id for view in views.values()])
-        return views
+        return (best.pan_rad, best.tilt_rad), self._steps.go(best.pan_rad, best.tilt_rad, aim.camera)
 
     def _pointing(self, commanded: Pair, now: View, aim_px: FloatArray, seen: Match | None) -> Pointing:
         """Put together what one pointing did."""

@@ -27,7 +27,7 @@ class PixelTarget:
 
 @dataclass(frozen=True)
 class PositionTarget:
-    """A point (3,), metres, in the ``rover`` or ``site`` frame; the two are one until rover poses exist."""
+    """A point (3,), metres, in the ``rover`` or ``site`` frame; the two are one before the first pose."""
 
     position_m: tuple[float, float, float]
     frame: str = "rover"

@@ -46,7 +46,10 @@ def clicked_px(target: PixelTarget, rig: Rig) -> FloatArray:
 
 
 def position_in_rover_m(target: PositionTarget) -> FloatArray:
-    """Return a position target (3,) in the rover frame, checked. Raises PointingError."""
+    """Return a position target (3,) as it stands, checked. Raises PointingError.
+
+    Who knows the rover's pose carries a ``site`` position to the rover frame first; without one they are one.
+    """
     if target.frame not in FRAMES_KNOWN:
         words = f"frame is {target.frame[:80]} where rover or site is expected"
         raise PointingError("bad_request", words)
@@ -54,7 +57,7 @@ def position_in_rover_m(target: PositionTarget) -> FloatArray:
     if position.shape != (3,) or not np.isfinite(position).all():
         words = f"position_m is {target.position_m} where 3 finite numbers are expected"
         raise PointingError("bad_request", words)
-    return position  # the site frame is the rover's as long as no rover pose is known
+    return position
 
 
 def check_pointings(request: PointRequest) -> None:

@@ -1,0 +1,27 @@
+"""From which side an axis of a real head approaches its goal, to take the backlash of its gear up."""
+
+from __future__ import annotations
+
+from typing import Literal, get_args
+
+Approach = Literal["none", "positive", "negative", "gravity"]
+APPROACHES: tuple[Approach, ...] = get_args(Approach)
+
+
+def last_turn(approach: Approach, goal_rad: float, gravity_turnover_rad: float) -> int:
+    """Return which way the axis turns on the last stretch: 1 for positive, -1 for negative, 0 for either.
+
+    Parameters
+    ----------
+    approach
+        ``positive``, ``negative``, ``none``, or ``gravity``: against the weight, so that gear and weight
+        press on the same flank.
+    goal_rad
+        Where the axis is to stand.
+    gravity_turnover_rad
+        The angle at which the weight changes sides: below it the weight pulls the axis down, so that the
+        last stretch turns positive, above it up.
+    """
+    if approach == "gravity":
+        return 1 if goal_rad < gravity_turnover_rad else -1
+    return {"none": 0, "positive": 1, "negative": -1}[approach]

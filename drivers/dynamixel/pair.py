@@ -1,0 +1,218 @@
+"""Both servos of a head on one open line: made ready without moving them, then read and written together.
+
+What is done about what they say is decided elsewhere (`drivers.dynamixel.session`).
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+
+from drivers.dynamixel.link import GroupAnswer, Link, Part
+from drivers.dynamixel.motion import AxisMotion, Sample, Truth, motion_block
+from drivers.dynamixel.servo import Servo
+from drivers.dynamixel.settings import AxisSettings, HeadSettings
+
+log = logging.getLogger(__name__)
+
+FAST_TRIALS = 10
+
+
+class Axis:
+    """One axis while its servo is at hand.
+
+    Parameters
+    ----------
+    link
+        The open line.
+    name
+        ``pan`` or ``tilt``.
+    settings, head
+        What the configuration says.
+
+    Attributes
+    ----------
+    servo, motion
+        Who turns it, and what it is doing.
+    hardware_error
+        What its servo has reported, in words; empty if nothing.
+    """
+
+    def __init__(self, link: Link, name: str, settings: AxisSettings, head: HeadSettings) -> None:
+        self.settings = settings
+        self.servo = Servo(link, name, settings, head)
+        self.motion = AxisMotion(self.servo.name, settings, head.settle_s)
+        self.hardware_error = ""
+        self._acceleration_rad_per_s2 = head.acceleration_rad_per_s2
+
+    def take_hold(self) -> None:
+        """Hold where the axis stands, with nothing commanded; raises as `Servo.take_hold`."""
+        self.motion.begin(self.servo.take_hold())
+
+    def let_go(self) -> None:
+        """Switch the torque off; raises as `Servo.set`."""
+        self.servo.set("torque_enable", 0)
+        self.motion.limp()
+
+    def brake(self) -> None:
+        """Brake and hold where that ends, if the axis holds at all; raises as `Servo.set`."""
+        if self.motion.holds and self.motion.sample is not None:
+            goal = self.motion.stopping_counts(self._acceleration_rad_per_s2)
+            self.servo.set("goal_position", goal)
+            self.motion.halt(goal)
+
+    def go_on(self) -> None:
+        """Send the next leg of a move if the present one has ended; raises as `Servo.set`."""
+        goal = self.motion.next_leg()
+        if goal is not None:
+            self.servo.set("goal_position", goal)
+            self.motion.begin_leg()
+
+
+class Pair:
+    """Pan and tilt on one open line.
+
+    Parameters
+    ----------
+    link
+        The open line; `close` closes it.
+    head
+        What the configuration says.
+
+    Attributes
+    ----------
+    axes
+        Pan and tilt.
+    fast
+        Whether both servos are read by the fast group read.
+    """
+
+    def __init__(self, link: Link, head: HeadSettings) -> None:
+        self.axes = (Axis(link, "pan", head.pan, head), Axis(link, "tilt", head.tilt, head))
+        self.link = link
+        self.fast = False
+        self._head = head
+        self._blocks = [motion_block(axis.settings) for axis in self.axes]
+        self._truths = [Truth(axis.servo.name, axis.settings) for axis in self.axes]
+        self._parts = tuple(
+            Part(axis.settings.servo_id, block.address, block.length)
+            for axis, block in zip(self.axes, self._blocks, strict=True)
+        )
+
+    def samples(self) -> list[Sample]:
+        """Return what both servos say about their motion now, pan first.
+
+        Raises
+        ------
+        NoReply, Refused, LineLost
+            As `Link.group_read`, of the servo that is to blame.
+        BadReply
+            If a sample cannot be the answer to the question just asked.
+        """
+        answer = self.link.group_read(self._parts, fast=self.fast)
+        if answer.missing:
+            answer = self._ask_singly(answer)
+        samples = []
+        for axis, block in zip(self.axes, self._blocks, strict=True):
+            status = answer.statuses[axis.settings.servo_id]
+            values = block.decode(status.data)
+            samples.append(Sample(values, status.alert, answer.sent_s, answer.received_s))
+        for truth, sample in zip(self._truths, samples, strict=True):
+            truth.check(sample)
+        return samples
+
+    def _ask_singly(self, answer: GroupAnswer) -> GroupAnswer:
+        """Ask the servos that a group read left out one by one, so that the right one is named."""
+        statuses, received_s = dict(answer.statuses), answer.received_s
+        for part in self._parts:
+            if part.servo_id in answer.missing:
+                single = self.link.group_read([part])
+                if single.missing:
+                    raise single.missing[part.servo_id]
+                statuses.update(single.statuses)
+                received_s = single.received_s
+        return GroupAnswer(statuses, {}, answer.sent_s, received_s)
+
+    def get(self, register: str) -> list[int | None]:
+        """Return one register of both servos, None where no answer came. Raises LineLost, BadReply."""
+        entries = [axis.settings.model.registers[register] for axis in self.axes]
+        ids = [axis.settings.servo_id for axis in self.axes]
+        answer = self.link.group_read(
+            [Part(i, entry.address, entry.size) for i, entry in zip(ids, entries, strict=True)]
+        )
+        return [
+            entry.decode(answer.statuses[i].data) if i in answer.statuses else None
+            for i, entry in zip(ids, entries, strict=True)
+        ]
+
+    def send(self, values: Sequence[Sequence[tuple[str, int]]]) -> None:
+        """Write neighbouring registers of each servo, all with one packet. Raises LineLost, BadReply."""
+        parts = []
+        for axis, pairs in zip(self.axes, values, strict=True):
+            entries = [axis.settings.model.registers[name] for name, _ in pairs]
+            data = b"".join(entry.encode(value) for entry, (_, value) in zip(entries, pairs, strict=True))
+            parts.append(Part(axis.settings.servo_id, entries[0].address, len(data), data))
+        self.link.group_write(parts)
+
+    def arm(self) -> None:
+        """Arm both watchdogs with one packet, and see that they are, unless they are off by configuration.
+
+        Raises
+        ------
+        NoReply, Refused, LineLost, WrongDevice
+            As `Servo.set`.
+        """
+        counts = self._head.watchdog_counts
+        if not counts:
+            return
+        self.send([[("bus_watchdog", counts)]] * 2)
+        for axis in self.axes:
+            if axis.servo.get("bus_watchdog") != counts:
+                axis.servo.set("bus_watchdog", counts)
+
+    def prove_fast_read(self) -> bool:
+        """Return whether the servos answer the fast group read, every time of some trials."""
+        for _ in range(FAST_TRIALS):
+            if self.link.group_read(self._parts, fast=True).missing:
+                log.info("%s: no fast group read; the plain one is used", self._head.port)
+                return False
+        return True
+
+    def release(self) -> None:
+        """Leave each servo as its ``at_close`` says; never raises."""
+        for axis in self.axes:
+            axis.servo.release()
+
+    def close(self) -> None:
+        """Close the line."""
+        self.link.close()
+
+
+def ready_pair(head: HeadSettings) -> Pair:
+    """Open the line and make both servos ready, without moving them: checked, set up, holding, armed.
+
+    Raises
+    ------
+    LineLost, NoReply, WrongDevice, HardwareFault, Refused
+        If the servos cannot be reached or do not fit; the line is closed again.
+    """
+    link = Link(head.port, head.baud, head.reply_timeout_s)
+    try:
+        pair = Pair(link, head)
+        servos = [axis.servo for axis in pair.axes]
+        for servo in servos:
+            servo.check_identity()
+        for servo in servos:
+            servo.check_health()
+            servo.check_place()
+        for servo in servos:
+            servo.set_up()
+            servo.check_set_up()
+        for axis in pair.axes:
+            axis.take_hold()
+        pair.arm()
+        pair.fast = head.fast_read and pair.prove_fast_read()
+    except BaseException:
+        link.close()
+        raise
+    return pair

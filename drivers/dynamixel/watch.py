@@ -1,0 +1,193 @@
+"""What servos do by themselves while a head is driven: shut down, stop by their watchdog, restart.
+
+Looked for in registers that a poll does not read, and in the alert bit that it does.
+"""
+
+from __future__ import annotations
+
+import logging
+import time
+
+from drivers.dynamixel.pair import Axis, Pair
+from drivers.dynamixel.servo import WATCHDOG_TRIPPED, hardware_fault_words
+from drivers.dynamixel.settings import HeadSettings
+from drivers.errors import BadReply, DriverError, HardwareFault, WatchdogTripped
+
+log = logging.getLogger(__name__)
+
+WATCH_S = 0.2  # how often torque and watchdog registers are looked at while all goes well
+MOST_REBOOTS, REBOOT_SPAN_S = 3, 600.0
+
+
+class GivenUp(Exception):
+    """The servos are not as this driver left them, or only silence can stop them: start anew.
+
+    Whoever owns the line closes it and raises ``error`` instead.
+    """
+
+    def __init__(self, error: DriverError) -> None:
+        super().__init__(str(error))
+        self.error = error
+
+
+class Reboots:
+    """When servos were rebooted, which may be done `MOST_REBOOTS` times in `REBOOT_SPAN_S`."""
+
+    def __init__(self) -> None:
+        self._times_s: list[float] = []
+
+    def allow(self, now_s: float) -> bool:
+        """Return whether one more may be done now, and count it."""
+        self._times_s = [then_s for then_s in self._times_s if now_s - then_s < REBOOT_SPAN_S]
+        if len(self._times_s) >= MOST_REBOOTS:
+            return False
+        self._times_s.append(now_s)
+        return True
+
+
+class Watch:
+    """The watch over two servos, from when they were made ready until the line is given up.
+
+    Parameters
+    ----------
+    pair
+        The servos, ready.
+    head
+        What the configuration says.
+    reboots
+        Counted over all lines of this head.
+
+    Attributes
+    ----------
+    tripped
+        Whether a watchdog has stopped a motion; latched until `arm_anew`.
+    """
+
+    def __init__(self, pair: Pair, head: HeadSettings, reboots: Reboots) -> None:
+        self.tripped = False
+        self._pair = pair
+        self._head = head
+        self._reboots = reboots
+        self._looked_s = 0.0
+
+    def look_soon(self) -> None:
+        """Have the next `look` look: the servos may have stopped by themselves."""
+        self._looked_s = 0.0
+
+    def look(self) -> None:
+        """Look now and then, and after every silence, whether a watchdog has tripped or torque is gone.
+
+        Raises
+        ------
+        GivenUp
+            If something set or restarted the servos that was not this driver.
+        NoReply, Refused, LineLost, BadReply
+            If a servo cannot be asked.
+        """
+        now_s = time.monotonic()
+        if now_s - self._looked_s < WATCH_S:
+            return
+        self._looked_s = now_s
+        for register in ("bus_watchdog", "torque_enable"):
+            values = self._pair.get(register)
+            if register == "bus_watchdog" and WATCHDOG_TRIPPED in values:
+                self._note_trip()
+            for axis, value in zip(self._pair.axes, values, strict=True):
+                self._judge(axis, register, value)
+        errors = any(axis.hardware_error for axis in self._pair.axes)
+        for axis in self._pair.axes:
+            if (words := axis.motion.other_goal_words()) and not self.tripped and not errors:
+                raise _distrust(words)
+
+    def _judge(self, axis: Axis, register: str, value: int | None) -> None:
+        """Give up if a register is not as it was left."""
+        if value is None or axis.hardware_error:
+            return  # asked again soon, or known
+        changed = register == "bus_watchdog" and value not in (self._head.watchdog_counts, WATCHDOG_TRIPPED)
+        if changed or (register == "torque_enable" and bool(value) != axis.motion.holds):
+            raise _distrust(f"{axis.servo.name} has {value} in {register}")
+
+    def _note_trip(self) -> None:
+        """The watchdog of a servo has tripped: latch it if a motion was stopped, else arm it anew."""
+        if self.tripped:
+            return
+        if not all(axis.motion.at_goal() for axis in self._pair.axes):
+            self.tripped = True
+            log.error("the bus watchdog has stopped the head: this process was silent for too long")
+            return
+        log.warning("the bus watchdog tripped while the head stood at its goal; it is armed anew")
+        for axis in self._pair.axes:
+            axis.servo.set("bus_watchdog", 0)
+        self.arm()
+
+    def arm(self) -> None:
+        """Arm both watchdogs; raises as `Pair.arm`."""
+        self._pair.arm()
+        if self._head.watchdog_counts:
+            self._looked_s = time.monotonic()
+
+    def arm_anew(self) -> None:
+        """After a trip: void the old goals, arm, and forget it; raises as `Servo.take_hold`."""
+        for axis in self._pair.axes:
+            if axis.motion.holds:
+                axis.take_hold()
+        self.arm()
+        self.tripped = False
+        log.warning("the head is armed anew after its watchdog had stopped it")
+
+    def note_alert(self, axis: Axis) -> None:
+        """A servo reports a hardware error: say which, stop the other axis, follow the reboot policy.
+
+        Raises
+        ------
+        GivenUp
+            To have the servo rebooted when it is made ready again.
+        NoReply, Refused, LineLost, WrongDevice
+            As `Servo.get` and `Servo.set`.
+        """
+        error = axis.servo.get("hardware_error")
+        if not error:
+            return
+        words = hardware_fault_words(axis.servo.name, error)
+        if not axis.servo.get("torque_enable"):
+            words += "; its torque is off"
+            axis.motion.limp()
+        axis.hardware_error = words
+        log.error("%s", words)
+        for other in self._pair.axes:
+            if not other.hardware_error:
+                other.brake()
+        if axis.settings.on_hardware_error == "reboot" and self._reboots.allow(time.monotonic()):
+            raise GivenUp(HardwareFault(words, detail={"hardware_error": error}))
+
+    def check_free(self) -> None:
+        """See that nothing forbids a move.
+
+        Raises
+        ------
+        HardwareFault, WatchdogTripped
+            If a servo reports a hardware error, or the watchdog has stopped the head.
+        """
+        for axis in self._pair.axes:
+            if axis.hardware_error:
+                raise HardwareFault(axis.hardware_error)
+        if self.tripped:
+            raise WatchdogTripped(
+                "the servos' bus watchdog has stopped the head; stop arms it anew, then move again"
+            )
+
+    def faults(self, now_s: float) -> tuple[str, ...]:
+        """Return what is wrong, in plain words."""
+        words = [axis.hardware_error for axis in self._pair.axes]
+        if self.tripped:
+            words.append(
+                "the servos' bus watchdog has stopped the head since this process was silent for too long; "
+                "stop arms it anew"
+            )
+        words += [axis.motion.stuck_words(now_s) for axis in self._pair.axes]
+        return tuple(word for word in words if word)
+
+
+def _distrust(words: str) -> GivenUp:
+    """Something changed the servos that was not this driver."""
+    return GivenUp(BadReply(f"{words}: it restarted, or somebody else set it"))

@@ -1,0 +1,165 @@
+"""Starts and looks of a track in a small world whose truth is the test's own geometry."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+from pointing_world import LIMITS, SIZE_PX, World, rig
+
+from calib.errors import CalibError
+from calib.tracking import Track
+from drivers.errors import DriverError, NoReply
+from mastctl.errors import MastctlError
+from mastctl.frames import StampedFrame
+from mastctl.pointing.requests import PixelTarget, PointingError, PointingSettings
+from mastctl.pointing.steps import Step, Steps
+from mastctl.tracking.look import Looker, NotTrackable
+from mastctl.tracking.settings import TrackingSettings
+
+PIXEL = (110.0, 130.0)
+Paint = Callable[[str, int, np.ndarray], np.ndarray]
+
+
+@dataclass
+class Eyes(World):
+    """The world, with cameras that do not answer."""
+
+    silent: tuple[str, ...] = ()
+
+    def frames(
+        self, cameras: Sequence[str], exposed_after_s: float, timeout_s: float
+    ) -> dict[str, StampedFrame]:
+        for camera in cameras:
+            if camera in self.silent:
+                raise NoReply("unplugged", device=camera)
+        return super().frames(cameras, exposed_after_s, timeout_s)
+
+
+def looker(world: World, steps: list[Step] | None = None) -> Looker:
+    told = [] if steps is None else steps
+    made = Steps(rig(), world, LIMITS, world.clock, PointingSettings(), told.append, threading.Event())
+    return Looker(made, rig(), LIMITS, TrackingSettings())
+
+
+def begun(world: World) -> tuple[Track, np.ndarray]:
+    """A track of what a pixel shows, and where that truly is."""
+    frame = world.shoot()
+    track, _ = looker(world).begin_at_pixel(PixelTarget("navcam_left", frame.frame_id, *PIXEL))
+    return track, world.true_point(frame, *PIXEL)
+
+
+def covered(*cameras: str) -> Paint:
+    """Something else in front of some cameras."""
+    other = np.random.default_rng(5).integers(60, 200, SIZE_PX[::-1], dtype=np.uint8)
+
+    def paint(camera: str, number: int, image: np.ndarray) -> np.ndarray:
+        return other if camera in cameras else image
+
+    return paint
+
+
+def test_a_start_and_a_look_put_the_target_where_it_is() -> None:
+    world = Eyes()
+    steps: list[Step] = []
+    track, point = begun(world)
+    assert np.linalg.norm(track.position_m - point) < 0.03
+    after, seen = looker(world, steps).look(track)
+    assert (seen.state, seen.pair, seen.reason) == ("tracked", "navcam", "")
+    assert np.linalg.norm(after.position_m - point) < 0.03
+    assert [step.name for step in steps] == ["choose", "limits", "move", "settle", "look", "find"]
+    pixels = [np.array([seen.pixels[eye].x_px, seen.pixels[eye].y_px]) for eye in rig().stereo["navcam"]]
+    middle = (np.array(SIZE_PX) - 1) / 2
+    assert np.mean(pixels, axis=0) == pytest.approx(middle, abs=2.0), "pointed before the picture was taken"
+    for eye, pixel in zip(rig().stereo["navcam"], pixels, strict=True):
+        assert pixel == pytest.approx(world.true_pixel(seen.pixels[eye].frame_id, point), abs=0.3)
+
+
+def plain(camera: str, number: int, image: np.ndarray) -> np.ndarray:
+    """Nothing to hold on to."""
+    return np.random.default_rng(number).normal(120, 2, image.shape).astype(np.uint8)
+
+
+def edge(camera: str, number: int, image: np.ndarray) -> np.ndarray:
+    """Two plain halves that meet under the click."""
+    halves = np.where(np.arange(image.shape[1]) < PIXEL[0], 90.0, 150.0) * np.ones((image.shape[0], 1))
+    return np.random.default_rng(number).normal(halves, 2).astype(np.uint8)
+
+
+@pytest.mark.parametrize(
+    ("paint", "words"),
+    [(plain, "texture"), (edge, "along one direction"), (covered("navcam_right"), "epipolar line")],
+)
+def test_what_cannot_be_followed_is_refused_with_the_reason(paint: Paint, words: str) -> None:
+    world = Eyes()
+    world.image = paint
+    with pytest.raises((PointingError, NotTrackable)) as refused:
+        begun(world)
+    assert words in str(refused.value)
+    assert "\n" not in str(refused.value)
+
+
+def test_a_position_starts_with_what_is_there_and_nothing_else() -> None:
+    world = Eyes()
+    point = world.true_point(world.shoot(), *PIXEL)
+    track, seen = looker(world).begin_at_position(point)
+    assert np.linalg.norm(track.position_m - point) < 0.03
+    assert seen.pair == "navcam"
+    with pytest.raises(NotTrackable, match=r"m from it; at most 0\.\d\d m is expected"):
+        looker(world).begin_at_position(point - np.array([0.0, 0.0, 0.5]))
+    with pytest.raises(CalibError, match="no stereo pair sees the target"):
+        looker(world).begin_at_position(np.array([-3.0, 0.0, 0.0]))
+
+
+def test_one_eye_serves_while_the_target_is_tracked_and_does_not_find_a_lost_one() -> None:
+    world = Eyes()
+    track, point = begun(world)
+    world.silent = ("navcam_right", "pancam_left", "pancam_right")
+    after, seen = looker(world).look(track)
+    assert seen.state == "tracked"
+    assert (seen.pixels["navcam_right"].verdict, seen.pixels["navcam_left"].verdict) == ("no_frame", "good")
+    assert seen.pixels["navcam_right"].reason == "navcam_right: unplugged"
+    assert np.linalg.norm(after.position_m - point) < 0.03
+    world.image = covered("navcam_left")
+    lost, seen = looker(world).look(after)
+    assert (lost.state, lost.misses) == ("lost", 1)
+    assert "navcam_right: unplugged" in seen.reason
+    world.image = lambda camera, number, image: image
+    assert looker(world).look(lost)[1].state == "lost", "one eye alone"
+    world.silent = ()
+    assert looker(world).look(lost)[1].state == "tracked"
+
+
+def test_no_eye_at_all_is_a_lost_target_with_both_reasons() -> None:
+    world = Eyes()
+    track, _ = begun(world)
+    world.silent = ("navcam_left", "navcam_right", "pancam_left", "pancam_right")
+    after, seen = looker(world).look(track)
+    assert (after.state, seen.reason) == ("lost", "navcam_left: unplugged; navcam_right: unplugged")
+    assert after.position_m == pytest.approx(track.position_m)
+
+
+def test_the_next_pair_looks_where_the_first_finds_nothing() -> None:
+    world = Eyes()
+    track, point = begun(world)
+    world.image = covered("navcam_left", "navcam_right")
+    after, seen = looker(world).look(track)
+    assert (seen.state, seen.pair) == ("tracked", "pancam")
+    assert np.linalg.norm(after.position_m - point) < 0.03
+    world.image = covered("navcam_left", "navcam_right", "pancam_left", "pancam_right")
+    assert looker(world).look(track)[1].pair == "navcam", "the first pair says why"
+
+
+def test_a_head_that_fails_ends_the_look() -> None:
+    world = Eyes()
+    track, _ = begun(world)
+
+    def fail() -> None:
+        raise NoReply("no answer", device="pan_tilt")
+
+    world.on_read = fail
+    with pytest.raises((DriverError, MastctlError), match="pan_tilt: no answer"):
+        looker(world).look(track)

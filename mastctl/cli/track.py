@@ -1,0 +1,185 @@
+"""Following a target with a running daemon: ``mastctl track start|status|watch|pose|look|stop``."""
+
+from __future__ import annotations
+
+import argparse
+import math
+import sys
+from typing import TYPE_CHECKING, Any
+
+from mastctl.cli.output import CommandError, WrongUse, finite_number, positive_number
+from mastctl.cli.service import add_daemon_options, client_of, followed, number_of, tell_result
+
+if TYPE_CHECKING:
+    from mastctl.client import Client
+
+
+def add_commands(subparsers: argparse._SubParsersAction[Any]) -> None:
+    """Add track with its commands."""
+    track = subparsers.add_parser("track", help="follow a target while the rover moves")
+    commands = track.add_subparsers(dest="track_command", metavar="WHAT", required=True)
+
+    start = commands.add_parser("start", help="start to follow a target")
+    what = start.add_mutually_exclusive_group(required=True)
+    what.add_argument(
+        "--pixel", nargs=4, metavar=("CAMERA", "FRAME_ID", "X", "Y"), help="a pixel of a named frame"
+    )
+    what.add_argument(
+        "--camera", metavar="NAME", help="a pixel (--at) of a snapshot taken now by this camera"
+    )
+    what.add_argument(
+        "--position",
+        nargs=3,
+        type=finite_number,
+        metavar=("X", "Y", "Z"),
+        help="what is seen at a point, metres",
+    )
+    start.add_argument(
+        "--at", nargs=2, type=finite_number, metavar=("X", "Y"), help="the pixel, with --camera"
+    )
+    start.add_argument("--frame", choices=("rover", "site"), help="frame of --position (default rover)")
+    start.set_defaults(run=_start)
+
+    status = commands.add_parser("status", help="show the track")
+    status.set_defaults(run=_status)
+
+    watch = commands.add_parser(
+        "watch", help="show the track now and at each change, a line each; --json: a document a line"
+    )
+    watch.add_argument("--count", type=_count, metavar="N", help="end after so many (default: never)")
+    watch.set_defaults(run=_watch)
+
+    pose = commands.add_parser("pose", help="say where the rover stands; the target is looked for from there")
+    pose.add_argument(
+        "--position", nargs=3, type=finite_number, required=True, metavar=("X", "Y", "Z"),
+        help="of the rover in the site frame, metres",
+    )  # fmt: skip
+    pose.add_argument(
+        "--quaternion", nargs=4, type=finite_number, default=[1.0, 0.0, 0.0, 0.0],
+        metavar=("QW", "QX", "QY", "QZ"), help="site from rover (default: not turned)",
+    )  # fmt: skip
+    pose.add_argument(
+        "--sigma", nargs=2, type=finite_number, metavar=("M", "RAD"),
+        help="of the motion since the pose before, each axis; needed while a track runs",
+    )  # fmt: skip
+    pose.add_argument("--time", type=finite_number, metavar="S", help="by your clock, seconds")
+    pose.add_argument("--no-look", action="store_true", help="carry the track over, do not look")
+    pose.set_defaults(run=_pose)
+
+    look = commands.add_parser("look", help="look for the target once more")
+    look.set_defaults(run=_look)
+
+    stop = commands.add_parser("stop", help="end the track")
+    stop.set_defaults(run=_stop)
+
+    for waiting in (start, pose, look):
+        waiting.add_argument(
+            "--timeout",
+            type=positive_number,
+            default=120.0,
+            metavar="S",
+            help="how long to wait (default 120 s)",
+        )
+    for command in (start, status, watch, pose, look, stop):
+        add_daemon_options(command)
+
+
+def _start(args: argparse.Namespace) -> int:
+    if (args.camera is None) != (args.at is None):
+        raise WrongUse("--camera and --at go together")
+    if args.frame is not None and args.position is None:
+        raise WrongUse("--frame goes with --position")
+    with client_of(args) as client:
+        if args.position is not None:
+            operation_id = client.start_track(position_m=args.position, frame=args.frame)
+        elif args.pixel is not None:
+            camera, frame_id, x, y = args.pixel
+            pixel = (camera, frame_id, number_of("--pixel", x), number_of("--pixel", y))
+            operation_id = client.start_track(pixel=pixel)
+        else:
+            shot = client.snapshot(args.camera)
+            operation_id = client.start_track(pixel=(args.camera, shot.frame_id, *args.at))
+        record = followed(client, operation_id, args)
+        if record["state"] != "done":
+            error = record.get("error") or {}
+            raise CommandError(
+                str(error.get("code", record["state"])),
+                str(error.get("message", f"operation {operation_id} ended as {record['state']}")),
+                detail={"operation": record},
+            )
+        return _show(args, client.wait_track(operation_id, args.timeout))
+
+
+def _status(args: argparse.Namespace) -> int:
+    with client_of(args) as client:
+        return _show(args, client.track())
+
+
+def _watch(args: argparse.Namespace) -> int:
+    with client_of(args) as client:
+        for number, track in enumerate(client.watch_track(), 1):
+            _show(args, track)
+            sys.stdout.flush()
+            if number == args.count:
+                break
+    return 0
+
+
+def _pose(args: argparse.Namespace) -> int:
+    with client_of(args) as client:
+        sigma = None if args.sigma is None else (args.sigma[0], args.sigma[1])
+        answer = client.pose(
+            args.position, args.quaternion, sigma=sigma, time_s=args.time, look=not args.no_look
+        )
+        return _after_look(args, client, answer["operation"])
+
+
+def _look(args: argparse.Namespace) -> int:
+    with client_of(args) as client:
+        return _after_look(args, client, client.look())
+
+
+def _stop(args: argparse.Namespace) -> int:
+    with client_of(args) as client:
+        return _show(args, client.stop_track())
+
+
+def _after_look(args: argparse.Namespace, client: Client, operation_id: str | None) -> int:
+    """Wait for a look, if there is one, and show the track."""
+    if operation_id is not None:
+        followed(client, operation_id, args)
+    return _show(args, client.wait_track(operation_id, args.timeout))
+
+
+def _show(args: argparse.Namespace, track: dict[str, Any]) -> int:
+    tell_result(args, track, track_line(track))
+    return 0
+
+
+def track_line(track: dict[str, Any]) -> str:
+    """Return a track in one line."""
+    words = [track["state"]]
+    if track["pair"]:
+        words.append(f"by {track['pair']}")
+        if not track["predicted"]:
+            words.append(f"{track['range_m']:.3f} m away")
+    if track["position_m"]:
+        x, y, z = track["position_m"]
+        words.append(f"at ({x:.3f}, {y:.3f}, {z:.3f}) m")
+        if track["covariance_m2"]:
+            variance = sum(track["covariance_m2"][axis][axis] for axis in range(3))
+            words[-1] += f" ± {math.sqrt(variance):.3f} m"
+    if track["predicted"]:
+        words.append("predicted")
+    if track["operation"]:
+        words.append("looking")
+    if track["reason"]:
+        words.append(track["reason"])
+    return ", ".join(words)
+
+
+def _count(text: str) -> int:
+    """Read how many (argparse ``type``)."""
+    if not text.isascii() or not text.isdigit() or int(text) < 1:
+        raise argparse.ArgumentTypeError(f"'{text}' where a whole number above zero is expected")
+    return int(text)

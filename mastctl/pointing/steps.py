@@ -1,0 +1,162 @@
+"""The steps that a pointing and a track's look have in common, each with its entry in the record."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+from calib.mast import Rig
+from calib.rigid import FloatArray
+from drivers.clock import Clock
+from drivers.interfaces import Reading
+from mastctl.limits import Limits
+from mastctl.pointing.counts import counts_told
+from mastctl.pointing.looking import CamerasLike, Eyes, View, facts
+from mastctl.pointing.motion import Head, HeadLike
+from mastctl.pointing.record import Recorder
+from mastctl.pointing.requests import PixelTarget, PointingError, PointingSettings, Step
+from mastctl.pointing.wanted import clicked_px
+
+
+class DevicesLike(HeadLike, CamerasLike, Protocol):
+    """What the steps need of `mastctl.devices.Devices`."""
+
+
+@dataclass(frozen=True, eq=False)
+class Found:
+    """A clicked thing, found again in a fresh pair.
+
+    Attributes
+    ----------
+    view, clicked_px
+        The named frame, and the pixel (2,) that was clicked in it.
+    now, other
+        New pictures of the clicked camera and of its partner.
+    pixel_px
+        (2,) the thing in ``now``.
+    resting
+        The head while they were taken.
+    """
+
+    view: View
+    clicked_px: FloatArray
+    now: View
+    other: View
+    pixel_px: FloatArray
+    resting: Reading
+
+
+class Steps:
+    """Head and eyes during one request.
+
+    Attributes
+    ----------
+    head, eyes
+        What the steps are made with.
+    pointing
+        Which pointing of the request the next steps belong to; the record names the second and later ones.
+    """
+
+    def __init__(
+        self,
+        rig: Rig,
+        devices: DevicesLike,
+        limits: Limits,
+        clock: Clock,
+        settings: PointingSettings,
+        record: Callable[[Step], None],
+        cancelled: threading.Event,
+    ) -> None:
+        self.head = Head(devices, limits, clock, settings, cancelled)
+        self.eyes = Eyes(devices, rig, settings)
+        self.pointing = 1
+        self._rig = rig
+        self._devices = devices
+        self._limits = limits
+        self._clock = clock
+        self._recorder = Recorder(record, clock, self.head.check_not_stopped)
+
+    @property
+    def last(self) -> str:
+        """The step that was begun last."""
+        return self._recorder.last
+
+    def step(self, name: str) -> AbstractContextManager[dict[str, Any]]:
+        """Record what happens inside as one step; the dict becomes its detail."""
+        return self._recorder.step(name, **({"pointing": self.pointing} if self.pointing > 1 else {}))
+
+    def rest(self) -> Reading:
+        """Return the reading of a head that rests. Raises PointingError, DriverError."""
+        with self.step("rest") as detail:
+            resting = self.head.resting()
+            detail.update(pan_rad=resting.pan_rad, tilt_rad=resting.tilt_rad)
+        return resting
+
+    def clicked(self, target: PixelTarget) -> Found:
+        """Take a fresh pair and find in it what was clicked.
+
+        Raises
+        ------
+        PointingError, FrameGone, DriverError
+            If camera, frame or pixel do not fit, or the thing is not found.
+        """
+        pixel = clicked_px(target, self._rig)
+        partner = self.eyes.partner(target.camera)
+        if partner is None:
+            words = f"{target.camera} is in no stereo pair of the mast file: no range"
+            raise PointingError("no_stereo", words)
+        view = self.eyes.named(target.frame_id)
+        if view.frame.camera != target.camera:
+            words = f"frame {target.frame_id} is of camera {view.frame.camera}, not of {target.camera}"
+            raise PointingError("wrong_camera", words)
+        if view.frame.moving:
+            words = f"the head moved while frame {target.frame_id} was exposed; click in another"
+            raise PointingError("head_moving", words)
+        resting = self.rest()
+        with self.step("frames") as detail:
+            fresh = self.eyes.new((target.camera, partner), self._clock.now_s(), resting)
+            now, other = fresh[target.camera], fresh[partner]
+            detail.update(frame_ids=[now.frame.frame_id, other.frame.frame_id])
+            if view.frame.mast_digest != now.frame.mast_digest:
+                raise PointingError(
+                    "other_mast_file", f"frame {target.frame_id} was taken with another mast file"
+                )
+        with self.step("target") as detail:
+            again = self.eyes.again(view, pixel, now)
+            detail.update(facts(again))
+        return Found(view, pixel, now, other, again.pixel_px, resting)
+
+    def go(self, pan_rad: float, tilt_rad: float, camera: str | None = None) -> Reading:
+        """Check the limits, move, wait until settled; return the reading there.
+
+        Where the head knows its counts, the record says what these leave, in pixels of ``camera``.
+
+        Raises
+        ------
+        OutsideLimits, PointingError, Stopped, DriverError
+            If the angles may not be commanded or are not reached.
+        """
+        with self.step("limits") as detail:
+            detail.update(pan_rad=pan_rad, tilt_rad=tilt_rad)
+            self._limits.check(pan_rad, tilt_rad)
+        with self.step("move") as detail:
+            allowed_s = self.head.time_allowed_s(pan_rad, tilt_rad)
+            detail.update(pan_rad=pan_rad, tilt_rad=tilt_rad, allowed_s=round(allowed_s, 3))
+            begun_s = self._clock.now_s()
+            self.head.send(pan_rad, tilt_rad)
+        with self.step("settle") as detail:
+            settled = self.head.arrived(pan_rad, tilt_rad, begun_s + allowed_s)
+            detail.update(pan_rad=settled.pan_rad, tilt_rad=settled.tilt_rad)
+            model = None if camera is None else self._rig.cameras[camera].model
+            detail.update(counts_told(self._devices, settled.tilt_rad, model))
+        return settled
+
+    def look(self, cameras: Sequence[str], settled: Reading) -> dict[str, View]:
+        """Take new pictures, exposed after the head had settled. Raises PointingError, DriverError."""
+        with self.step("look") as detail:
+            views = self.eyes.new(cameras, settled.time_s, settled)
+            detail.update(frame_ids=[view.frame.frame_id for view in views.values()])
+        return views

@@ -1,0 +1,1 @@
+"""Following a target in the daemon: rover poses, the pair that looks, the looks, the track's state."""

@@ -1,0 +1,276 @@
+"""The work of a track's operations: begin at a pixel or a position; point, take a pair, look for the target.
+
+Steps of a start at a pixel, as they stand in the record: ``rest``, ``frames``, ``target``, ``start``; of one
+at a position ``choose``, ``limits`` to ``settle``, ``look``, ``start``. A look has ``choose``, ``limits`` to
+``settle`` (``rest`` for a pair on the body), ``look``, ``find``; what one pair does not find, the next one
+that sees the place looks for.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+
+from calib.errors import CalibError
+from calib.handoff_refined import Eye
+from calib.mast import Rig
+from calib.match import Match
+from calib.rigid import FloatArray
+from calib.tracking import Look, Track, seen_by, start_track
+from drivers.errors import DriverError
+from drivers.interfaces import Reading
+from mastctl.errors import MastctlError
+from mastctl.limits import Limits
+from mastctl.pointing.looking import View
+from mastctl.pointing.requests import PixelTarget, rounded
+from mastctl.pointing.steps import Steps
+from mastctl.tracking.choice import Choice, choose_pairs
+from mastctl.tracking.settings import TrackingSettings
+
+PAIRS_TRIED = 2
+"""How many pairs look for a target at one stop."""
+
+
+class NotTrackable(MastctlError):
+    """A track that cannot begin: sky, plain surface, an edge, hidden from one eye, nothing at the place."""
+
+    code = "not_trackable"
+
+
+@dataclass(frozen=True)
+class EyePixel:
+    """What one eye told: the verdict is `calib.match`'s or ``no_frame``; pixel and sigma if it is good."""
+
+    frame_id: str
+    verdict: str
+    reason: str = ""
+    x_px: float = math.nan
+    y_px: float = math.nan
+    sigma_px: tuple[float, float] = (math.nan, math.nan)
+    correlation: float = math.nan
+
+
+@dataclass(frozen=True, eq=False)
+class Seen:
+    """What a start or a look told.
+
+    Attributes
+    ----------
+    state, reason
+        ``tracked``, or ``lost`` with the reason in one sentence.
+    pair
+        Which looked; empty if none could.
+    position_m, covariance_m2
+        (3,) and (3, 3) of the target afterwards, in the rover frame of the look.
+    range_m
+        From the middle between the pair's cameras.
+    pixels
+        By camera.
+    chi2, renewed
+        As `calib.tracking.Look`.
+    """
+
+    state: Literal["tracked", "lost"]
+    reason: str
+    pair: str
+    position_m: FloatArray
+    covariance_m2: FloatArray
+    range_m: float
+    pixels: Mapping[str, EyePixel] = field(default_factory=dict)
+    chi2: float = math.nan
+    renewed: bool = False
+
+
+class Looker:
+    """Looks for targets during one operation.
+
+    Parameters
+    ----------
+    steps
+        Head, eyes and record of the operation.
+    rig
+        The mast file in use.
+    limits
+        Of the head, for the choice among solutions.
+    settings
+        Which pair looks.
+    """
+
+    def __init__(self, steps: Steps, rig: Rig, limits: Limits, settings: TrackingSettings) -> None:
+        self._steps = steps
+        self._rig = rig
+        self._limits = limits
+        self._settings = settings
+
+    def begin_at_pixel(self, target: PixelTarget) -> tuple[Track, Seen]:
+        """Begin with a pixel of a named frame, found again in a fresh pair.
+
+        Raises
+        ------
+        NotTrackable, PointingError, FrameGone, DriverError
+            If it cannot be followed.
+        """
+        found = self._steps.clicked(target)
+        track = self._started(found.now, found.other, found.pixel_px)
+        pair = next(name for name, eyes in self._rig.stereo.items() if target.camera in eyes)
+        return track, self._first(pair, track, found.now, found.other, found.pixel_px)
+
+    def begin_at_position(self, position_m: FloatArray) -> tuple[Track, Seen]:
+        """Begin with what is seen at a position (3,) of the rover frame.
+
+        Raises
+        ------
+        NotTrackable, PointingError, Unreachable, OutsideLimits, DriverError
+            If nothing there can be followed, or what is there stands elsewhere.
+        """
+        choice = self._choices(position_m)[0]
+        settled = self._pointed(choice)
+        left, right = self._rig.stereo[choice.pair]
+        views = self._steps.look((left, right), settled)
+        pixel = np.asarray(views[left].camera.project(position_m)[0])
+        track = self._started(views[left], views[right], pixel)
+        off_m = float(np.linalg.norm(track.position_m - position_m))
+        allowed_m = self._settings.start_error * choice.range_m
+        if off_m > allowed_m:
+            place = ", ".join(f"{value:.2f}" for value in track.position_m)
+            raise NotTrackable(
+                f"what {left} sees in the direction of the position is at ({place}) m, {off_m:.2f} m from "
+                f"it; at most {allowed_m:.2f} m is expected"
+            )
+        return track, self._first(choice.pair, track, views[left], views[right], pixel)
+
+    def look(self, track: Track) -> tuple[Track, Seen]:
+        """Point, take a pair, look; with the next pair if the first does not find it.
+
+        Raises
+        ------
+        PointingError, OutsideLimits, DriverError
+            If the head fails, or goes where it was not sent. That no picture comes is a look without
+            success.
+        """
+        first: tuple[Track, Seen] | None = None
+        for choice in self._choices(track.position_m)[:PAIRS_TRIED]:
+            after, seen = self._look_with(choice, track)
+            if seen.state == "tracked":
+                return after, seen
+            first = first or (after, seen)
+        assert first is not None
+        return first
+
+    def _look_with(self, choice: Choice, track: Track) -> tuple[Track, Seen]:
+        settled = self._pointed(choice)
+        views, missing = self._pictures(self._rig.stereo[choice.pair], settled)
+        with self._steps.step("find") as detail:
+            eyes = {name: Eye(view.image, view.camera) for name, view in views.items()}
+            look = seen_by(track, eyes)
+            pixels = {name: EyePixel("", "no_frame", reason) for name, reason in missing.items()}
+            pixels |= {name: _eye_pixel(views[name], found) for name, found in look.found.items()}
+            seen = self._told(choice, look, pixels, settled)
+            detail.update(
+                pair=choice.pair, state=seen.state, reason=seen.reason, position_m=rounded(seen.position_m, 5)
+            )
+        return look.track, seen
+
+    def _told(self, choice: Choice, look: Look, pixels: Mapping[str, EyePixel], settled: Reading) -> Seen:
+        track, reason = look.track, look.reason
+        gone = [one.reason for one in pixels.values() if one.verdict == "no_frame"]
+        if track.state == "lost" and gone:
+            reason = "; ".join([*gone, reason] if look.found else gone)
+        range_m = self._range_m(choice.pair, track.position_m, settled)
+        return Seen(
+            track.state,
+            reason,
+            choice.pair,
+            track.position_m,
+            track.covariance_m2,
+            range_m,
+            pixels,
+            look.chi2,
+            look.renewed,
+        )
+
+    def _choices(self, position_m: FloatArray) -> list[Choice]:
+        with self._steps.step("choose") as detail:
+            here = self._steps.head.read()
+            found = choose_pairs(
+                self._rig,
+                position_m,
+                self._settings.handoff,
+                self._limits,
+                (here.pan_rad, here.tilt_rad),
+            )
+            detail.update(pairs=[one.pair for one in found], range_m=round(found[0].range_m, 3))
+            detail.update(range_error_m=round(found[0].range_error_m, 4), outside=found[0].outside)
+        return found
+
+    def _pointed(self, choice: Choice) -> Reading:
+        """Bring the target into the middle; a pair on the body only needs a head at rest."""
+        if choice.pan_rad is None or choice.tilt_rad is None:
+            return self._steps.rest()
+        return self._steps.go(choice.pan_rad, choice.tilt_rad, self._rig.stereo[choice.pair][0])
+
+    def _pictures(self, eyes: tuple[str, str], settled: Reading) -> tuple[dict[str, View], dict[str, str]]:
+        """New pictures, left first, and why an eye has none. Raises PointingError, the head's DriverError."""
+        missing: dict[str, str] = {}
+        while len(missing) < len(eyes):
+            asked = [name for name in eyes if name not in missing]
+            try:
+                views = self._steps.look(asked, settled)
+                return {name: views[name] for name in asked}, missing
+            except DriverError as error:
+                if error.device not in asked:
+                    raise
+                missing[error.device] = " ".join(str(error).split())
+        return {}, missing
+
+    def _started(self, one: View, other: View, pixel_px: FloatArray) -> Track:
+        with self._steps.step("start") as detail:
+            try:
+                track = start_track(Eye(one.image, one.camera), Eye(other.image, other.camera), pixel_px)
+            except CalibError as error:
+                raise NotTrackable(" ".join(str(error).split())) from None
+            sigma_m = np.sqrt(np.diag(track.covariance_m2))
+            detail.update(position_m=rounded(track.position_m, 5), sigma_m=rounded(sigma_m, 5))
+        return track
+
+    def _first(self, pair: str, track: Track, one: View, other: View, pixel_px: FloatArray) -> Seen:
+        """What a start told; the other eye's pixel is where the triangulated point lies in it."""
+        partner = np.asarray(other.camera.project(track.position_m)[0])
+        middle = (one.camera.C + other.camera.C) / 2
+        return Seen(
+            "tracked",
+            "",
+            pair,
+            track.position_m,
+            track.covariance_m2,
+            float(np.linalg.norm(track.position_m - middle)),
+            {
+                view.frame.camera: EyePixel(view.frame.frame_id, "good", "", float(at[0]), float(at[1]))
+                for view, at in ((one, pixel_px), (other, partner))
+            },
+        )
+
+    def _range_m(self, pair: str, position_m: FloatArray, settled: Reading) -> float:
+        left, right = (
+            self._rig.camera_in_rover(eye, settled.pan_rad, settled.tilt_rad)
+            for eye in self._rig.stereo[pair]
+        )
+        return float(np.linalg.norm(position_m - (left.C + right.C) / 2))
+
+
+def _eye_pixel(view: View, found: Match) -> EyePixel:
+    x, y = (float(value) for value in found.pixel_px)
+    sigma = found.sigma_px
+    return EyePixel(
+        view.frame.frame_id,
+        found.verdict,
+        found.reason,
+        x,
+        y,
+        (float(sigma[0]), float(sigma[1])),
+        float(found.correlation),
+    )

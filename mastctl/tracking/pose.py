@@ -1,0 +1,107 @@
+"""Where the rover stands in the site frame, as somebody outside says, and what may follow upon what.
+
+Poses are absolute; their covariance is that of the *motion since the pose before*, which is what a visual
+odometer knows. An error that all poses share moves the site frame and no target.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from calib.rigid import FloatArray, Rigid
+from mastctl.errors import MastctlError
+
+STANDS_M, STANDS_RAD = 0.005, 0.001
+"""Within these of each other two poses are one standing, told twice: an odometer's noise, no motion."""
+
+
+class PoseRefused(MastctlError):
+    """A pose that cannot be taken; ``code`` names why.
+
+    Codes: ``pose_runs_backwards``, ``pose_without_time``, ``pose_without_covariance``, ``no_pose_before``.
+    """
+
+    def __init__(self, code: str, message: str) -> None:
+        self.code = code
+        super().__init__(message)
+
+
+@dataclass(frozen=True, eq=False)
+class RoverPose:
+    """One pose of the rover.
+
+    Attributes
+    ----------
+    site_from_rover
+        The pose.
+    covariance
+        (6, 6) of the motion since the pose before: small rotation, rad², then translation, m², both along
+        the rover's axes of this pose; None if it was not said. `calib.tracking.moved` takes it so.
+    time_s
+        By the sender's clock, which need not be the daemon's; None if it was not said.
+    received_s
+        When it came, seconds of CLOCK_MONOTONIC.
+    """
+
+    site_from_rover: Rigid
+    covariance: FloatArray | None = None
+    time_s: float | None = None
+    received_s: float = 0.0
+
+    def told(self, now_s: float) -> dict[str, Any]:
+        """Return it as JSON, with its age."""
+        from scipy.spatial.transform import Rotation  # slow to load, and not every command needs it
+
+        x, y, z, w = Rotation.from_matrix(self.site_from_rover.rotation).as_quat(canonical=True).tolist()
+        return {
+            "position_m": self.site_from_rover.translation_m.tolist(),
+            "quaternion": [w, x, y, z],
+            "time_s": self.time_s,
+            "age_s": max(0.0, now_s - self.received_s),
+        }
+
+
+def check_follows(pose: RoverPose, before: RoverPose | None) -> None:
+    """Pass a pose that is later than the one before it. Raises PoseRefused."""
+    if before is None or before.time_s is None:
+        return
+    if pose.time_s is None:
+        raise PoseRefused(
+            "pose_without_time",
+            f"time_s is missing; the pose before had one ({before.time_s:g} s), and without it nobody knows "
+            "which of the two is later",
+        )
+    if pose.time_s <= before.time_s:
+        raise PoseRefused(
+            "pose_runs_backwards",
+            f"time_s is {pose.time_s:g} s, which is not later than the pose before it ({before.time_s:g} s)",
+        )
+
+
+def motion_between(before: RoverPose, now: RoverPose) -> Rigid:
+    """Return now_from_before: the rover frame of one pose in that of the other."""
+    return now.site_from_rover.inverse @ before.site_from_rover
+
+
+def stands(motion: Rigid) -> bool:
+    """Return whether a motion is none."""
+    turned_rad = math.acos(min(1.0, max(-1.0, (float(np.trace(motion.rotation)) - 1) / 2)))
+    return float(np.linalg.norm(motion.translation_m)) <= STANDS_M and turned_rad <= STANDS_RAD
+
+
+def carried_covariance(covariance: FloatArray, now_from_then: Rigid) -> FloatArray:
+    """Return a motion's covariance (6, 6), stated at one pose, along the axes and at the origin of the next.
+
+    A rotation error r and a translation error t of then move a point x of now by R r x (x - p) + R t.
+    """
+    turn, shift = now_from_then.rotation, now_from_then.translation_m
+    x, y, z = shift
+    across = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    carried = np.zeros((6, 6))
+    carried[:3, :3] = carried[3:, 3:] = turn
+    carried[3:, :3] = across @ turn
+    return np.asarray(carried @ covariance @ carried.T)

@@ -1,0 +1,362 @@
+"""The track of a daemon: started, carried over each motion of the rover, looked for, stopped.
+
+A look is an operation like a pointing: one at a time, through the same limits, ended by the same stop. A
+pose that comes while one runs waits for its end; if the rover moved meanwhile, the look's pictures belong to
+no one pose and are thrown away, and the next look follows at once.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections.abc import Callable, Mapping
+from contextlib import AbstractContextManager
+from dataclasses import replace
+from typing import Any, Protocol
+
+import numpy as np
+
+from calib.mast import Rig
+from calib.tracking import Track
+from drivers.clock import Clock
+from mastctl.errors import MastctlError
+from mastctl.limits import Limits
+from mastctl.operations import Operation, Operations
+from mastctl.pointing.requests import PixelTarget, PointingSettings, PositionTarget
+from mastctl.pointing.steps import DevicesLike, Steps
+from mastctl.tracking.carried import Carried
+from mastctl.tracking.look import Looker, Seen
+from mastctl.tracking.pose import (
+    PoseRefused,
+    RoverPose,
+    check_follows,
+    motion_between,
+    stands,
+)
+from mastctl.tracking.settings import TrackingSettings
+from mastctl.tracking.status import ACTIVE, HandedOver, TrackState, TrackStatus
+
+log = logging.getLogger(__name__)
+
+Told = Mapping[str, Any]
+Outcome = tuple[Track, Seen]
+
+
+class TrackRuns(MastctlError):
+    """A track runs already; there is one at a time."""
+
+    code = "busy"
+
+
+class NoTrack(MastctlError):
+    """Something was asked of a track, and none runs."""
+
+    code = "no_track"
+
+
+class HoldingDevices(DevicesLike, Protocol):
+    """What the tracker needs of `mastctl.devices.Devices`."""
+
+    def exposure_held(self) -> AbstractContextManager[None]: ...
+
+
+class Tracker:
+    """At most one track, and the rover's pose; safe to use from any thread, never blocks for a device.
+
+    Parameters
+    ----------
+    operations
+        Runs the looks.
+    devices
+        Head and cameras.
+    rig, limits, clock
+        The mast file in use, the head's limits, what stamps everything.
+    settings
+        Which pair looks, how far a pose may lie from the one before.
+    """
+
+    def __init__(
+        self,
+        operations: Operations,
+        devices: HoldingDevices,
+        rig: Rig,
+        limits: Limits,
+        clock: Clock,
+        settings: TrackingSettings | None = None,
+    ) -> None:
+        self._operations = operations
+        self._devices = devices
+        self._rig = rig
+        self._limits = limits
+        self._clock = clock
+        self._settings = settings or TrackingSettings()
+        self._lock = threading.Lock()
+        self._status = TrackStatus()
+        self._carried: Carried | None = None  # what is followed; None without a track
+        self._waiting: list[RoverPose] = []  # poses that came while a look runs
+        self._look_again = False
+        self._moved_s: float | None = None
+
+    @property
+    def status(self) -> TrackStatus:
+        """What is known now."""
+        return self._status
+
+    @property
+    def pose(self) -> RoverPose | None:
+        """The newest pose, None before the first: then site and rover are one."""
+        return self._status.pose
+
+    @property
+    def moved_s(self) -> float | None:
+        """When the newest pose that moved the rover came, seconds of CLOCK_MONOTONIC; None before."""
+        return self._moved_s
+
+    def start(self, target: PixelTarget | PositionTarget, told: Told) -> Operation:
+        """Begin a track with what a pixel shows, or with what is seen at a position of the rover frame.
+
+        Raises
+        ------
+        TrackRuns
+            If a track runs.
+        Busy
+            If an operation runs.
+        """
+        with self._lock:
+            if self._status.state in ACTIVE:
+                raise TrackRuns(f"track {self._status.id} runs; stop it before another is started")
+
+            def begin(looker: Looker) -> Outcome:
+                if isinstance(target, PixelTarget):
+                    return looker.begin_at_pixel(target)
+                return looker.begin_at_position(np.array(target.position_m))
+
+            operation = self._run(told, begin)
+            pose = self._status.pose
+            self._carried, self._waiting, self._look_again = None, [], False
+            self._publish(
+                TrackStatus(
+                    state="starting", id=operation.id, stands_at=pose, pose=pose, operation=operation.id
+                )
+            )
+            return operation
+
+    def take_pose(self, pose: RoverPose, look: bool) -> str | None:
+        """Take where the rover stands now; carry the track over and look for its target.
+
+        Returns
+        -------
+        operation
+            The id of the look; None if there is no track, none is wanted, or none could be started.
+
+        Raises
+        ------
+        PoseRefused
+            If it is not later than the one before, or, while a track runs, if it has no covariance or no
+            pose came before it.
+        """
+        with self._lock:
+            before = self._status.pose
+            check_follows(pose, before)
+            active = self._status.state in ACTIVE
+            if active and before is None:
+                raise PoseRefused(
+                    "no_pose_before",
+                    "no pose was known when the track began, so that the motion since is not known; stop the "
+                    "track, send the pose, and start it again",
+                )
+            if active and pose.covariance is None:
+                raise PoseRefused(
+                    "pose_without_covariance",
+                    "covariance (6 rows of 6) or sigma of the motion since the pose before is missing; while "
+                    "a track runs it says where to look",
+                )
+            if before is not None and not stands(motion_between(before, pose)):
+                self._moved_s = pose.received_s
+            status = replace(self._status, pose=pose)
+            operation = status.operation
+            if active:
+                stood = status.stands_at
+                if stood is not None and not stands(motion_between(stood, pose)):
+                    status = replace(status, predicted=True)
+                if operation is not None:
+                    self._waiting.append(pose)
+                    self._look_again = self._look_again or look
+                else:
+                    status = self._carry(status, pose)
+                    status = self._looked_for(status) if look else status
+                    operation = status.operation
+            self._publish(status)
+            return operation
+
+    def look(self) -> Operation:
+        """Look for the target from where the rover stands.
+
+        Raises
+        ------
+        NoTrack
+            If no track runs, or the newest pose jumped away from it.
+        Busy
+            If an operation runs.
+        """
+        with self._lock:
+            carried = self._carried
+            if carried is None:
+                raise NoTrack("no track runs that could be looked for")
+            if carried.jumped:
+                raise NoTrack(self._status.reason)
+            operation = self._begin_look(carried)
+            self._publish(replace(self._status, operation=operation.id))
+            return operation
+
+    def stop(self, reason: str) -> str | None:
+        """End the track, if one runs; return the operation of it that runs, which is left to the caller."""
+        with self._lock:
+            if self._status.state not in ACTIVE:
+                return None
+            running = self._status.operation
+            self._carried, self._waiting, self._look_again = None, [], False
+            self._publish(replace(self._status, state="stopped", reason=reason, operation=None))
+            log.info("track %s stopped: %s", self._status.id, reason)
+            return running
+
+    def use_rig(self, rig: Rig, name: str) -> None:
+        """Look by another mast file from now on; a track ends, since its key picture is of the former."""
+        self.stop(f"mast file {name} came into use; the track's pictures belong to the former one")
+        with self._lock:
+            self._rig = rig
+
+    # With the lock held
+
+    def _run(self, told: Told, work: Callable[[Looker], Outcome]) -> Operation:
+        """Start an operation that looks; its outcome comes to `_ended`."""
+        rig, outcomes = self._rig, list[Outcome]()
+
+        def run(record: Callable[[Any], None], cancelled: threading.Event) -> Seen:
+            steps = Steps(
+                rig, self._devices, self._limits, self._clock, PointingSettings(), record, cancelled
+            )
+            with self._devices.exposure_held():
+                outcome = work(Looker(steps, rig, self._limits, self._settings))
+            outcomes.append(outcome)
+            return outcome[1]
+
+        return self._operations.start(
+            told, run, lambda operation: self._ended(operation, outcomes[0] if outcomes else None)
+        )
+
+    def _begin_look(self, carried: Carried) -> Operation:
+        """Start a look. Raises Busy, MastctlError."""
+        operation = self._run({"track": self._status.id}, lambda looker: looker.look(carried.track))
+        self._look_again = False
+        return operation
+
+    def _looked_for(self, status: TrackStatus) -> TrackStatus:
+        """Begin a look unless that makes no sense now; the status says why not."""
+        if self._carried is None or self._carried.jumped:
+            return status
+        try:
+            return replace(status, operation=self._begin_look(self._carried).id)
+        except MastctlError as error:  # a pointing runs, or the service is closing
+            return replace(status, reason=f"not looked for yet: {error}")
+
+    def _carry(self, status: TrackStatus, pose: RoverPose) -> TrackStatus:
+        """Carry the track over to a pose, or say that the pose jumped."""
+        assert self._carried is not None
+        after_jump = self._carried.jumped
+        origin_m = self._rig.mast.translation_m
+        self._carried, reason = self._carried.to(pose, origin_m, self._settings.most_step)
+        if reason:
+            return replace(status, state="lost", reason=reason, covariance_m2=None)
+        if after_jump:
+            status = replace(status, reason="not looked for since a pose jumped")
+        track = self._carried.track
+        return replace(status, position_m=track.position_m, covariance_m2=track.covariance_m2, stands_at=pose)
+
+    def _publish(self, status: TrackStatus) -> None:
+        before = self._status
+        if status.state == "lost" and (before.state, before.reason) != (status.state, status.reason):
+            log.warning("track %s: %s", status.id, status.reason)
+        self._status = replace(status, sequence=before.sequence + 1, changed_s=self._clock.now_s())
+
+    # In the operation's thread
+
+    def _ended(self, operation: Operation, outcome: Outcome | None) -> None:
+        """Take what a start or a look told, then the poses that waited for it."""
+        with self._lock:
+            if self._status.operation != operation.id:
+                return  # stopped meanwhile
+            waiting, self._waiting = self._waiting, []
+            status = replace(self._status, operation=None)
+            stood = status.stands_at
+            left = any(stood is not None and not stands(motion_between(stood, one)) for one in waiting)
+            if status.state == "starting":
+                status = self._started(status, operation, outcome, left)
+            elif left:
+                words = "the rover moved while the pictures were taken, so that they belong to no one pose"
+                status = replace(status, reason=words)
+            else:
+                status = self._looked(status, operation, outcome)
+            if self._carried is not None:
+                for one in waiting:
+                    status = self._carry(status, one)
+                if self._look_again:
+                    status = self._looked_for(status)
+            self._publish(status)
+
+    def _started(
+        self, status: TrackStatus, operation: Operation, outcome: Outcome | None, left: bool
+    ) -> TrackStatus:
+        if outcome is None or left:
+            reason = "the rover moved while the track's first pictures were taken; start it again"
+            if outcome is None:
+                reason = _why(operation)
+            ended: TrackState = "stopped" if operation.state == "stopped" else "idle"
+            return TrackStatus(state=ended, reason=reason, id=status.id, pose=status.pose)
+        track, seen = outcome
+        self._carried = Carried(track, status.stands_at)
+        log.info("track %s begins %.2f m away, by %s", status.id, seen.range_m, seen.pair)
+        return replace(
+            status,
+            state="tracking",
+            position_m=seen.position_m,
+            covariance_m2=seen.covariance_m2,
+            seen=seen,
+            found_by=seen.pair,
+        )
+
+    def _looked(self, status: TrackStatus, operation: Operation, outcome: Outcome | None) -> TrackStatus:
+        carried = self._carried
+        assert carried is not None
+        status = replace(status, looks=status.looks + 1)
+        if outcome is None and operation.state == "stopped":
+            self._carried = None
+            return replace(status, state="stopped", reason=_why(operation))
+        if outcome is None:
+            # Nothing was seen: both eyes must find the target again, as after a look without success.
+            track = replace(carried.track, state="lost", misses=carried.track.misses + 1)
+            self._carried = replace(carried, track=track)
+            return replace(status, state="lost", reason=_why(operation), misses=track.misses)
+        track, seen = outcome
+        self._carried = replace(carried, track=track)
+        status = replace(
+            status,
+            reason=seen.reason,
+            position_m=seen.position_m,
+            covariance_m2=seen.covariance_m2,
+            seen=seen,
+            misses=track.misses,
+            renewals=status.renewals + seen.renewed,
+        )
+        if seen.state == "lost":
+            return replace(status, state="lost")
+        if seen.pair != status.found_by:
+            log.info("track %s: %s hands over to %s", status.id, status.found_by, seen.pair)
+            handed = HandedOver(status.found_by, seen.pair, seen.range_m)
+            status = replace(status, handoffs=(*status.handoffs, handed))
+        return replace(status, state="tracking", predicted=False, found_by=seen.pair)
+
+
+def _why(operation: Operation) -> str:
+    """Why an operation brought nothing, in its own words."""
+    return str((operation.error or {}).get("message", "the operation ended without a result"))
