@@ -39,10 +39,9 @@ def check_one_moment(
     DriverError
         If the further picture does not come.
     """
-    apart_s = [other.frame.exposure_began_s - view.frame.exposure_began_s for other in others]
-    names = [other.frame.camera for other in others]
-    detail: dict[str, Any] = {"dt_s": {n: round(dt_s, 6) for n, dt_s in zip(names, apart_s, strict=True)}}
-    spread_s = max(0.0, *apart_s) - min(0.0, *apart_s)
+    detail = apart(view, others)
+    moments_s = (0.0, *detail["dt_s"].values())
+    spread_s = max(moments_s) - min(moments_s)
     if spread_s <= settings.same_moment_s:
         return detail
     camera = view.frame.camera
@@ -66,3 +65,9 @@ def check_one_moment(
             f"{1e3 * spread_s:.1f} ms apart; less than {settings.between_eyes_px:g} px serves a measurement",
         )
     return detail
+
+
+def apart(view: View, others: Sequence[View]) -> dict[str, Any]:
+    """Return ``dt_s`` for the record: how much later than the first eye each other one began to expose."""
+    begun_s = view.frame.exposure_began_s
+    return {"dt_s": {o.frame.camera: round(o.frame.exposure_began_s - begun_s, 6) for o in others}}
