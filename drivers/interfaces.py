@@ -10,7 +10,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
-from typing import Literal, Protocol, runtime_checkable
+from typing import Literal, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -61,6 +61,11 @@ class Frame:
     sequence: int
     mid_exposure_s: float
     exposure_s: float
+
+    @property
+    def exposure_began_s(self) -> float:
+        """When the exposure began, seconds of CLOCK_MONOTONIC."""
+        return self.mid_exposure_s - self.exposure_s / 2
 
 
 Side = Literal["positive", "negative", "unknown"]
@@ -173,4 +178,34 @@ class HoldsExposure(Protocol):
 
     def exposure_held(self) -> AbstractContextManager[None]:
         """Return a context in which the exposure does not change: a measurement compares its pictures."""
+        ...
+
+
+class FrameTime(NamedTuple):
+    """A frame's count, as `Frame` has it, and when its exposure began, seconds of CLOCK_MONOTONIC."""
+
+    sequence: int
+    exposure_began_s: float
+
+
+@runtime_checkable
+class Paced(Protocol):
+    """A camera that takes frames at a steady rate, asked or not; not every camera does.
+
+    Attributes
+    ----------
+    period_s
+        From frame to frame, seconds.
+    trigger
+        The name of what exposes its frames; cameras of one trigger expose together. Empty: free-running.
+    """
+
+    @property
+    def period_s(self) -> float: ...
+    @property
+    def trigger(self) -> str: ...
+    def recent_times(self) -> Sequence[FrameTime]:
+        """Return the times of the frames that came last, all of one count, oldest first; empty where it does
+        not keep them.
+        """
         ...

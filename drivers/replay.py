@@ -23,7 +23,7 @@ from typing import Any
 from drivers.clock import Clock
 from drivers.errors import BadOptions, DriverError, NoFreshFrame
 from drivers.faults import PAN_TILT, nearest
-from drivers.interfaces import Camera, Frame, Image, PanTilt, Reading
+from drivers.interfaces import Camera, Frame, FrameTime, Image, PanTilt, Reading
 from drivers.options import is_number
 from drivers.recording import Pointing, read_folder, read_products
 
@@ -207,6 +207,20 @@ class ReplayedCamera:
             # A little longer, so that rounding does not leave the frame a hair unfinished.
             self._clock.sleep(min(ready_s - now_s + 1e-6, 0.5))
         raise NoFreshFrame("it is closed", device=self._name)
+
+    @property
+    def period_s(self) -> float:
+        """From frame to frame, seconds."""
+        return PERIOD_S
+
+    @property
+    def trigger(self) -> str:
+        """None: each camera's instants are its own."""
+        return ""
+
+    def recent_times(self) -> list[FrameTime]:
+        """Return none: frames that nobody asks for are never made."""
+        return []
 
     def close(self) -> None:
         """Let go; a waiting call ends with NoFreshFrame within half a second."""

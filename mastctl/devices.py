@@ -8,19 +8,22 @@ This module does not decide where to point and does not retry: an answer that ca
 from __future__ import annotations
 
 import logging
+import math
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future
 from contextlib import ExitStack, contextmanager
+from dataclasses import replace
 from typing import Protocol
 
 import numpy as np
 
 from calib.mast import Rig
 from drivers.clock import Clock
-from drivers.errors import BadFrame, BadReply, DriverError, NoReply
+from drivers.errors import BadFrame, BadReply, DriverError, NoFreshFrame, NoReply
 from drivers.interfaces import AxisReport, Camera, HoldsExposure, KnowsSize, PanTilt, Reading, Reporting
+from drivers.pairing import Offset, Pairing, learned
 from mastctl import frames as frame_checks
 from mastctl import joint_history
 from mastctl.device_thread import DeviceThread, Fault
@@ -97,6 +100,8 @@ class Devices:
         self._on_head: set[str] = set()
         if rig is not None:
             self._take_rig(rig)
+        self._paired_s: dict[str, float] = {}  # per camera when the last frame that served a set began
+        self._learned: dict[tuple[str, str], Offset] = {}
         self._still_since: dict[str, StampedFrame] = {}  # per camera the first frame of the same content
         self._stamping = {name: threading.Lock() for name in self._cameras}
         self._gate = threading.Lock()
@@ -202,6 +207,10 @@ class Devices:
     ) -> dict[str, StampedFrame]:
         """Return one frame of each camera, asked for in parallel, with its facts.
 
+        Frames of several cameras belong together (`drivers.pairing`): exposed at one trigger, or nearest in
+        time. Each serves one such set. All are ``moving`` if the head moved at any time from the first
+        exposure to the end of the last.
+
         Parameters
         ----------
         cameras
@@ -216,7 +225,7 @@ class Devices:
         UnknownCamera
             If a name is not configured.
         NoFreshFrame, BadFrame, NoReply, DriverError
-            If a camera did not deliver; the first in the order asked.
+            If a camera did not deliver, or none that belong together; the first in the order asked.
         BadReply
             If the head's readings do not reach around an exposure.
         """
@@ -225,15 +234,61 @@ class Devices:
                 known = ", ".join(sorted(self._cameras)) or "none"
                 raise UnknownCamera(f"camera {camera} is not configured; configured are {known}")
         deadline_s = time.monotonic() + timeout_s
+        names = tuple(dict.fromkeys(cameras))
+        if len(names) < 2:
+            frames = self._fetched(dict.fromkeys(names, exposed_after_s), deadline_s)
+            return {name: self._stamped(name, frame) for name, frame in frames.items()}
+        used_s = max(self._paired_s.get(name, -math.inf) for name in names)
+        pairing = Pairing(names[0], self._offsets(names))
+        frames = self._fetched(pairing.moments(max(exposed_after_s, used_s)), deadline_s)
+        while after_s := pairing.again(frames):
+            if time.monotonic() > deadline_s:
+                words = f"no frames of {', '.join(names)} that belong together came within {timeout_s:g} s"
+                raise NoFreshFrame(words, device=min(after_s))
+            frames |= self._fetched(after_s, deadline_s)
+        self._paired_s |= {name: frame.exposure_began_s for name, frame in frames.items()}
+        return self._together({name: self._stamped(name, frame) for name, frame in frames.items()})
+
+    def _offsets(self, names: Sequence[str]) -> dict[str, Offset]:
+        """What is known of each camera's times beside the first one's."""
+        first = names[0]
+        for name in names[1:]:
+            before = self._learned.get((first, name))
+            try:
+                self._learned[first, name] = learned(self._cameras[first], self._cameras[name], before)
+            except Exception as error:
+                words = f"the drivers tell no times of {first} and {name}: {type(error).__name__}: {error}"
+                raise DriverError(words, device=name) from None
+        return {name: self._learned[first, name] for name in names[1:]}
+
+    def _fetched(
+        self, after_s: Mapping[str, float], deadline_s: float
+    ) -> dict[str, CheckedFrame | StampedFrame]:
+        """One frame of each named camera, exposed after its moment."""
         asked: dict[str, Future[CheckedFrame | StampedFrame]] = {}
-        for camera in dict.fromkeys(cameras):
+        for camera, exposed_after_s in after_s.items():
             take = self._taker(camera, exposed_after_s, deadline_s)
-            asked[camera] = self._camera_threads[camera].submit("next_frame", take, timeout_s + self._grace_s)
-        taken: dict[str, StampedFrame] = {}
-        for camera, future in asked.items():
-            frame = self._camera_threads[camera].wait("next_frame", future, deadline_s + self._grace_s)
-            taken[camera] = frame if isinstance(frame, StampedFrame) else self._stamp(camera, frame)
-        return taken
+            left_s = max(0.0, deadline_s - time.monotonic())
+            asked[camera] = self._camera_threads[camera].submit("next_frame", take, left_s + self._grace_s)
+        return {
+            camera: self._camera_threads[camera].wait("next_frame", future, deadline_s + self._grace_s)
+            for camera, future in asked.items()
+        }
+
+    def _stamped(self, camera: str, frame: CheckedFrame | StampedFrame) -> StampedFrame:
+        return frame if isinstance(frame, StampedFrame) else self._stamp(camera, frame)
+
+    def _together(self, frames: dict[str, StampedFrame]) -> dict[str, StampedFrame]:
+        """Frames that serve one measurement: if the head moved between two exposures, it moved in all."""
+        if any(frame.moving for frame in frames.values()):
+            moving = True
+        else:
+            began_s = min(frame.exposure_began_s for frame in frames.values())
+            ended_s = max(frame.mid_exposure_s + frame.exposure_s / 2 for frame in frames.values())
+            moving = self._history.at_exposure(began_s, (began_s + ended_s) / 2, ended_s, HEAD).moving
+        if not moving:
+            return frames
+        return {name: replace(frame, moving=True) for name, frame in frames.items()}
 
     def frame_by_id(self, frame_id: str, max_age_s: float | None = None) -> StampedFrame:
         """Return a frame that is still kept.

@@ -71,6 +71,11 @@ class CheckedFrame:
     mid_exposure_s: float
     exposure_s: float
 
+    @property
+    def exposure_began_s(self) -> float:
+        """When the exposure began, seconds of CLOCK_MONOTONIC."""
+        return self.mid_exposure_s - self.exposure_s / 2
+
 
 def check_size(camera: str, size_px: tuple[int, int], wanted_px: tuple[int, int]) -> None:
     """Raise BadFrame if a camera's pictures, (width, height), are not of the mast file's size."""

@@ -1,9 +1,11 @@
 """Measure the V4L2 cameras: gaps, the age of frames, processor time beside OpenCV, memory, descriptors.
 
     tools/vm run --timeout 3000 .venv/bin/python tools/bench_camera.py
-    .venv/bin/python tools/bench_camera.py --device /dev/v4l/by-id/...   (once or twice)
+    tools/vm run --cameras three .venv/bin/python tools/bench_camera.py --only gaps --hdmi-rate 40
+    .venv/bin/python tools/bench_camera.py --device /dev/v4l/by-id/...   (once to three times)
 
-Without --device the first two cameras that are connected are taken; in the virtual machine these are vivid's.
+Without --device the cameras that are connected are taken, three at most; in the virtual machine these are
+vivid's. Two are ours; a third one is read by v4l2-ctl at the same time, for what the computer itself loses.
 """
 
 from __future__ import annotations
@@ -18,6 +20,7 @@ import signal
 import statistics
 import subprocess
 import sys
+import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -34,12 +37,13 @@ from drivers.v4l2.camera import V4l2Camera, open_camera
 from drivers.v4l2.choice import options_for
 from drivers.v4l2.controls import set_by_name
 from drivers.v4l2.find import open_node
-from drivers.v4l2.options import parse_options
+from drivers.v4l2.options import CameraOptions, parse_options
 from drivers.v4l2.stream import set_format
 
 PARTS = ("gaps", "age", "cpu", "memory", "unplugged", "opens")
 CONSUMERS = ("sleeps", "computes", "is stopped for 2 s")
 STOPPED_S = 2.0
+SLICE_FRAMES = 10
 WARM_S = 2.0  # so long the first touch of every buffer costs more than its frame
 VIVID = Path("/sys/bus/platform/drivers/vivid")
 VIVID_CONTROLS = {"timestamp_source": 1, "osd_text_mode": 2}
@@ -55,6 +59,9 @@ def main() -> None:
     )
     parser.add_argument("--size", nargs=2, type=int, default=[640, 480], metavar=("W", "H"))
     parser.add_argument("--rate", type=float, metavar="HZ", help="default: the highest the camera has")
+    parser.add_argument(
+        "--hdmi-rate", type=float, metavar="HZ", help="first set HDMI inputs to --size and this"
+    )
     parser.add_argument("--seconds", type=float, default=60.0, help="of each of the three runs for gaps")
     parser.add_argument("--pauses", type=int, default=30, help="for the age of frames")
     parser.add_argument("--repeats", type=int, default=3, help="of the processor time")
@@ -66,20 +73,22 @@ def main() -> None:
     )
     parser.add_argument("--json", action="store_true")
     args = parser.parse_args()
-    devices = args.device or [camera.bus for camera in find.list_cameras()[:2]]
+    devices = args.device or [camera.bus for camera in find.list_cameras()[:3]]
     if not devices:
         sys.exit("no camera is connected")
+    if args.hdmi_rate:
+        for device in devices:
+            set_timings(device, args.size, args.hdmi_rate)
     options = [chosen(device, tuple(args.size), args.rate) for device in devices]
+    options, beside = options[:2], options[2:]
     say = (lambda *words: None) if args.json else print
     say(
         f"{len(options)} cameras, {args.size} px, {options[0]['rate_hz']:g} Hz, load {os.getloadavg()[0]:.1f}"
     )
     told: dict[str, Any] = {"rate_hz": options[0]["rate_hz"], "size_px": args.size, "cameras": len(options)}
     if "gaps" in args.only:
-        told["gaps"] = [gaps(options, what, args.seconds, say) for what in CONSUMERS]
+        told["gaps"] = [gaps(options, beside, what, args.seconds, say) for what in CONSUMERS]
         told["opencv_gaps"] = opencv_gaps(options[0], args.seconds, say)
-        if len(options) == 2 and shutil.which("v4l2-ctl"):
-            told["gaps_beside"] = gaps_beside(options, args.seconds, say)
     if "age" in args.only:
         told["age"] = age_after_pause(options[0], args.pauses, say)
     if "cpu" in args.only:
@@ -107,6 +116,21 @@ def chosen(device: str, size_px: tuple[int, int], rate_hz: float | None) -> dict
     return options
 
 
+def set_timings(device: str, size_px: list[int], rate_hz: float) -> None:
+    """Make an HDMI input expect a signal of this size and rate (VESA CVT)."""
+    path = node_path(parse_options(options_for(device, None, tuple(size_px), None, {}), device))
+    signal_words = f"cvt,width={size_px[0]},height={size_px[1]},fps={rate_hz:g}"
+    subprocess.run(
+        ["v4l2-ctl", "-d", path, "--set-dv-bt-timings", signal_words], check=True, capture_output=True
+    )
+
+
+def node_path(options: CameraOptions) -> str:
+    """The node of a camera, for programs that want that."""
+    with open_node(options.address, "node") as node:
+        return str(node.path)
+
+
 @contextmanager
 def opened(options: list[dict[str, Any]]) -> Iterator[list[V4l2Camera]]:
     """All cameras, each with a first frame."""
@@ -120,18 +144,26 @@ def opened(options: list[dict[str, Any]]) -> Iterator[list[V4l2Camera]]:
 
 
 def gaps(
-    options: list[dict[str, Any]], what: str, seconds: float, say: Callable[..., None]
+    options: list[dict[str, Any]],
+    beside: list[dict[str, Any]],
+    what: str,
+    seconds: float,
+    say: Callable[..., None],
 ) -> dict[str, Any]:
-    """Drops while the consumer does something else than take frames."""
+    """Drops while the consumer does something else than take frames; and those of v4l2-ctl beside."""
     reads = "import sys\nwhile sys.stdin.buffer.read(65536): pass"
     with (
         subprocess.Popen([sys.executable, "-c", reads], stdin=subprocess.PIPE) as consumer,
         opened(options) as cameras,
+        other_reader(beside, seconds + 2) as other,
     ):
         over = threading.Event()
-        conductor = threading.Thread(target=stop_and_go, args=(consumer, over))
+        full = [0 for _ in cameras]
+        helpers = [threading.Thread(target=watch, args=(cameras, over, full))]
         if what.startswith("is stopped"):
-            conductor.start()
+            helpers.append(threading.Thread(target=stop_and_go, args=(consumer, over)))
+        for helper in helpers:
+            helper.start()
         before = [camera.counters for camera in cameras]
         began_s = time.monotonic()
         until_s = began_s + seconds
@@ -150,8 +182,8 @@ def gaps(
         span_s = time.monotonic() - began_s
         counted = [camera.counters for camera in cameras]
         over.set()
-        if conductor.is_alive():
-            conductor.join()
+        for helper in helpers:
+            helper.join()
     row = {
         "consumer": what,
         "seconds": span_s,
@@ -159,11 +191,15 @@ def gaps(
         "dropped": [now.dropped - then.dropped for now, then in zip(counted, before, strict=True)],
         "damaged": [now.damaged - then.damaged for now, then in zip(counted, before, strict=True)],
         "late": [now.late - then.late for now, then in zip(counted, before, strict=True)],
+        "buffers_full": full,
+        "v4l2-ctl": other,
     }
     rates = ", ".join(f"{frames / span_s:.2f}" for frames in row["frames"])
     say(
         f"consumer {what}: {rates} Hz over {span_s:.0f} s, "
-        f"dropped {row['dropped']}, damaged {row['damaged']}, late {row['late']}"
+        f"missed {row['dropped']}, of these for want of a buffer {full}, "
+        f"damaged {row['damaged']}, late {row['late']}"
+        + "".join(f"; v4l2-ctl beside missed {their['missed']} of {their['frames']}" for their in other)
     )
     return row
 
@@ -181,23 +217,58 @@ def opencv_gaps(options: dict[str, Any], seconds: float, say: Callable[..., None
     return {"frames": len(stamps_s), "missed": missed}
 
 
-def gaps_beside(options: list[dict[str, Any]], seconds: float, say: Callable[..., None]) -> dict[str, Any]:
-    """Drops of one camera that we read, and at the same time of the other, which v4l2-ctl reads."""
-    with open_node(parse_options(options[1], "beside").address, "beside") as node:
-        path = str(node.path)
-        set_format(node, options[1]["format"], tuple(options[1]["size_px"]), "beside")
-        node.set_rate(options[1]["rate_hz"])
-    count = round(seconds * options[1]["rate_hz"])
-    command = ["v4l2-ctl", "-d", path, "--stream-mmap=8", f"--stream-count={count}"]
-    with opened(options[:1]) as (camera,):
-        before = camera.counters
-        done = subprocess.run(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
-        now = camera.counters
-    theirs = sum(map(int, re.findall(r"dropped buffers: (\d+)", done.stdout)))
-    ours = now.dropped - before.dropped
-    say(f"at the same time: ours {now.good - before.good} frames, missed {ours}; v4l2-ctl {count}, {theirs}")
-    return {"ours": {"frames": now.good - before.good, "missed": ours},
-            "v4l2-ctl": {"frames": count, "missed": theirs}}  # fmt: skip
+def watch(cameras: list[V4l2Camera], over: threading.Event, full: list[int]) -> None:
+    """Count the missing frames for which the driver had no buffer, because none had come back from us.
+
+    These are the missing ones that were due while all others, but for the one that we hold and one to spare,
+    lay filled and not taken. For any other missing frame the driver had a buffer and did not fill it.
+    """
+    last = [-1 for _ in cameras]
+    ended = False
+    while not ended:
+        ended = over.wait(0.2)
+        for index, camera in enumerate(cameras):
+            frames = camera.capture.recent()
+            for before, frame in pairwise(frames):
+                missed = frame.sequence - before.sequence - 1
+                if frame.sequence > last[index] >= 0 and missed:
+                    due_s = before.buffer.stamp_s + camera.period_s
+                    lying = sum(f.sequence <= before.sequence and f.received_s > due_s for f in frames)
+                    full[index] += missed if lying >= CameraOptions.buffers - 2 else 0
+            last[index] = frames[-1].sequence if frames else last[index]
+
+
+@contextmanager
+def other_reader(beside: list[dict[str, Any]], seconds: float) -> Iterator[list[dict[str, Any]]]:
+    """v4l2-ctl, written in C, reads another camera meanwhile; afterwards the list says what it missed."""
+    found: list[dict[str, Any]] = []
+    with ExitStack() as stack:
+        running = []
+        for options in beside if shutil.which("v4l2-ctl") else []:
+            with open_node(parse_options(options, "beside").address, "beside") as node:
+                path = str(node.path)
+                set_format(node, options["format"], tuple(options["size_px"]), "beside")
+                node.set_rate(options["rate_hz"])
+            count = round(seconds * options["rate_hz"])
+            command = [
+                "v4l2-ctl",
+                "-d",
+                path,
+                "--verbose",
+                f"--stream-mmap={CameraOptions.buffers}",
+                f"--stream-count={count}",
+            ]
+            told = stack.enter_context(tempfile.TemporaryFile("w+"))  # a full pipe would hold it up
+            reader = subprocess.Popen(command, stdout=told, stderr=told)
+            running.append((stack.enter_context(reader), told))
+        if running:
+            time.sleep(1.0)  # so that it reads already when we begin to count
+        yield found
+        for reader, told in running:
+            reader.wait()
+            told.seek(0)
+            dropped = re.findall(r"cap dqbuf:.*?(?: dropped: (\d+))?(?: \(.*)?\n", told.read())
+            found.append({"frames": len(dropped), "missed": sum(int(number or 0) for number in dropped)})
 
 
 def stop_and_go(consumer: subprocess.Popen[bytes], over: threading.Event) -> None:
@@ -216,65 +287,88 @@ def hand_over(consumer: subprocess.Popen[bytes], cameras: list[V4l2Camera]) -> N
 
 
 def age_after_pause(options: dict[str, Any], pauses: int, say: Callable[..., None]) -> dict[str, Any]:
-    """How old a frame is when it is returned after a pause of a second: stamp to return."""
+    """How old a frame is when it is returned after a pause of a second: stamp to return.
+
+    A frame beyond the bound is old either because a newer one was there and had not been taken from the
+    kernel, or because the driver had made none: then nobody could have returned a newer one.
+    """
     ages: dict[str, list[float]] = {"next_frame": [], "next_frame, exposed after the call": [], "OpenCV": []}
+    bound_s = 1 / options["rate_hz"] + 0.005
+    kept_back = 0
     with opened([options]) as (camera,):
         for _ in range(pauses):
             time.sleep(1.0)
             frame = camera.next_frame(0.0, 10.0)
-            ages["next_frame"].append(time.monotonic() - frame.stamp_s)
-            frame = camera.next_frame(time.monotonic(), 10.0)
-            ages["next_frame, exposed after the call"].append(time.monotonic() - frame.stamp_s)
+            returned_s = time.monotonic()
+            ages["next_frame"].append(returned_s - frame.stamp_s)
+            frame_after = camera.next_frame(time.monotonic(), 10.0)
+            ages["next_frame, exposed after the call"].append(time.monotonic() - frame_after.stamp_s)
+            if ages["next_frame"][-1] > bound_s:
+                stamps_s = [arrived.buffer.stamp_s for arrived in camera.capture.recent()]
+                kept_back += any(frame.stamp_s < stamp_s < returned_s - 0.005 for stamp_s in stamps_s)
     with opencv(options) as reader:
         for _ in range(min(pauses, 10)):
             time.sleep(1.0)
             reader.read()
             ages["OpenCV"].append(time.monotonic() - reader.get(cv2.CAP_PROP_POS_MSEC) / 1e3)
-    table = {}
+    table: dict[str, Any] = {}
     for who, values in ages.items():
         table[who] = {"median_s": statistics.median(values), "most_s": max(values)}
         say(
             f"age after a pause, {who}: "
             f"median {1e3 * table[who]['median_s']:.1f} ms, most {1e3 * max(values):.1f} ms"
         )
-    table["bound_s"] = 1 / options["rate_hz"] + 0.005
-    say(f"  bound (a period and 5 ms): {1e3 * table['bound_s']:.1f} ms")
+    beyond = sum(age_s > bound_s for age_s in ages["next_frame"])
+    table |= {"bound_s": bound_s, "beyond": beyond, "beyond_and_kept_back": kept_back}
+    say(
+        f"  bound (a period and 5 ms): {1e3 * bound_s:.1f} ms; beyond it {beyond} of {pauses}, "
+        f"and in {kept_back} of these the driver had made a newer frame"
+    )
     return table
 
 
-def cpu_per_frame(options: dict[str, Any], say: Callable[..., None], frames: int = 150) -> dict[str, float]:
-    """Processor time of this process for each frame, each frame converted."""
+def cpu_per_frame(options: dict[str, Any], say: Callable[..., None], slices: int = 15) -> dict[str, float]:
+    """Processor time of this process for each frame; the median of slices: a busy machine disturbs some."""
     table = {}
     for who, colour in (("ours, grey", False), ("ours, BGR", True)):
         with opened([{**options, "colour": colour}]) as (camera,):
-            warm_until_s = time.monotonic() + WARM_S
-            while time.monotonic() < warm_until_s:
-                frame = camera.next_frame(time.monotonic(), 10.0)
-            began_s, first = time.process_time(), frame.sequence
-            while frame.sequence < first + frames:
-                frame = camera.next_frame(frame.mid_exposure_s, 10.0)
-            table[who] = (time.process_time() - began_s) / (frame.sequence - first)
+            newest_s = [0.0]
+
+            def take(camera: V4l2Camera = camera, newest_s: list[float] = newest_s) -> int:
+                frame = camera.next_frame(newest_s[0], 10.0)
+                newest_s[0] = frame.mid_exposure_s
+                return frame.sequence
+
+            table[who] = per_frame(take, slices)
     with opened([options]) as (camera,):
-        time.sleep(WARM_S)
-        began_s, first = time.process_time(), camera.counters.good
-        time.sleep(frames / options["rate_hz"])
-        table["ours, nobody asks"] = (time.process_time() - began_s) / (camera.counters.good - first)
+
+        def sleep(camera: V4l2Camera = camera) -> int:
+            time.sleep(SLICE_FRAMES / options["rate_hz"])
+            return camera.counters.good
+
+        table["ours, nobody asks"] = per_frame(sleep, slices, 1)
     with opencv(options) as reader:
-        warm_until_s = time.monotonic() + WARM_S
-        while time.monotonic() < warm_until_s:
-            reader.read()
-        began_s = time.process_time()
-        for _ in range(frames):
-            reader.read()
-        table["OpenCV, BGR"] = (time.process_time() - began_s) / frames
-        began_s = time.process_time()
-        for _ in range(frames):
-            reader.grab()
-        table["OpenCV, grab alone"] = (time.process_time() - began_s) / frames
+        table["OpenCV, BGR"] = per_frame(reader.read, slices)
+        table["OpenCV, grab alone"] = per_frame(reader.grab, slices)
     for who, cpu_s in table.items():
         ratio = cpu_s / table["OpenCV, BGR"]
         say(f"processor time a frame, {who}: {1e3 * cpu_s:.2f} ms ({ratio:.2f} of OpenCV)")
     return table
+
+
+def per_frame(take: Callable[[], Any], slices: int, steps: int = SLICE_FRAMES) -> float:
+    """Median over slices of the processor time for a frame; ``take`` takes one, or returns their count."""
+    warm_until_s = time.monotonic() + WARM_S
+    while time.monotonic() < warm_until_s:
+        count = take()
+    found = []
+    for _ in range(slices):
+        began_s, first = time.process_time(), count
+        for _ in range(steps):
+            count = take()
+        frames = count - first if isinstance(count, int) and not isinstance(count, bool) else steps
+        found.append((time.process_time() - began_s) / max(frames, 1))
+    return statistics.median(found)
 
 
 @contextmanager

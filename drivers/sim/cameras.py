@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from drivers.clock import Clock
 from drivers.errors import NoFreshFrame, NoReply
 from drivers.faults import Fault, FaultPanel
-from drivers.interfaces import Frame, Image
+from drivers.interfaces import Frame, FrameTime, Image
 
 RING_FRAMES = 4
 """Finished frames that can still be fetched, as in a capture ring of four buffers."""
@@ -155,6 +155,20 @@ class SimulatedCamera:
                 break
             self._clock.sleep(min(ready_s - now_s, 0.5))
         raise NoFreshFrame(self._instead(exposed_after_s, timeout_s), device=self.name)
+
+    @property
+    def period_s(self) -> float:
+        """From frame to frame, seconds, at the rate of now."""
+        return self._epoch(self._clock.now_s()).period_s
+
+    @property
+    def trigger(self) -> str:
+        """None that could be counted by: a fault may slow one camera's count."""
+        return ""
+
+    def recent_times(self) -> list[FrameTime]:
+        """Return none: frames that nobody asks for are never made."""
+        return []
 
     def close(self) -> None:
         """Let go; a waiting call ends with NoFreshFrame within half a second."""

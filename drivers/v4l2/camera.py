@@ -2,21 +2,20 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
 from drivers.clock import Clock, SystemClock
-from drivers.errors import BadFrame, NoFreshFrame
-from drivers.interfaces import Frame, Image
+from drivers.errors import NoFreshFrame
+from drivers.interfaces import Frame, FrameTime
 from drivers.v4l2 import find, pixels
-from drivers.v4l2.capture import Capture
+from drivers.v4l2.capture import Bytes, Capture
 from drivers.v4l2.controls import get_value, list_controls
 from drivers.v4l2.errors import NoCamera
 from drivers.v4l2.exposure import GROUPS, ExposureControl
-from drivers.v4l2.frames import Counters, RawFrame
+from drivers.v4l2.frames import Arrived, Counters
 from drivers.v4l2.options import CameraOptions, parse_options
 from drivers.v4l2.stream import Stream, sizes_text
 
@@ -41,8 +40,6 @@ class V4l2Frame(Frame):
         The kernel's stamp, and when the frame was dequeued, seconds of CLOCK_MONOTONIC.
     driver_sequence, stream
         The driver's count, which starts anew with each stream, and the stream's number.
-    raw
-        The camera's own bytes.
     """
 
     mid_uncertainty_s: float
@@ -51,11 +48,6 @@ class V4l2Frame(Frame):
     received_s: float
     driver_sequence: int
     stream: int
-    raw: RawFrame
-
-    def colour(self) -> Image:
-        """Return the same picture in colour, uint8 (h, w, 3) BGR, for people to look at."""
-        return self.image if self.image.ndim == 3 else pixels.colour(self.raw.format, self.raw.raw)
 
 
 def open_camera(options: Mapping[str, Any], clock: Clock | None = None, name: str = "v4l2") -> V4l2Camera:
@@ -87,13 +79,14 @@ class V4l2Camera:
                 options,
                 name,
                 clock,
+                pixels.colour if options.colour else pixels.grey,
                 None if self._exposure is None else self._judge,
                 None if self._exposure is None else lambda: self._auto().exposure_s,
             )
         except BaseException:
             self._leave_group()
             raise
-        self._converted: tuple[RawFrame, V4l2Frame] | None = None
+        self._last: V4l2Frame | None = None
 
     @property
     def counters(self) -> Counters:
@@ -108,6 +101,8 @@ class V4l2Camera:
     def next_frame(self, exposed_after_s: float, timeout_s: float) -> V4l2Frame:
         """Return the newest frame whose exposure surely began after ``exposed_after_s``, waiting if need be.
 
+        Its stamp is at most a period and 5 ms old, or it came during the call.
+
         Raises
         ------
         NoFreshFrame
@@ -115,44 +110,44 @@ class V4l2Camera:
         NoCamera
             At once, if the camera is gone.
         """
-        before = self.counters
-        began_s, left_s = time.monotonic(), timeout_s
-        while True:
-            raw = self.capture.wait(exposed_after_s, left_s)
-            if raw is None:
-                if lost := self.capture.lost:
-                    raise NoCamera(lost)
-                raise NoFreshFrame(self._instead(exposed_after_s, timeout_s, before), device=self.name)
-            try:
-                return self.converted(raw)
-            except BadFrame as error:
-                self.capture.refuse(raw, str(error))
-                left_s = began_s + timeout_s - time.monotonic()
-
-    def converted(self, raw: RawFrame) -> V4l2Frame:
-        """Return a raw frame as a picture: grey, or BGR by the options. Raises BadFrame for a broken JPEG."""
-        known = self._converted
-        if known is not None and known[0] is raw:
-            return known[1]
-        convert = pixels.colour if self._options.colour else pixels.grey
-        image = convert(raw.format, raw.raw)
-        image.setflags(write=False)
-        window = raw.window
-        frame = V4l2Frame(
+        damaged = self.capture.damaged
+        taken = self.capture.take(exposed_after_s, timeout_s)
+        if taken is None:
+            if lost := self.capture.lost:
+                raise NoCamera(lost)
+            raise NoFreshFrame(self._instead(exposed_after_s, timeout_s, damaged), device=self.name)
+        arrived, image = taken
+        last = self._last
+        if last is not None and last.image is image:
+            return last
+        buffer, window, exposure_s = arrived.buffer, arrived.window(), arrived.rule.exposure_s
+        self._last = V4l2Frame(
             image=image,
-            sequence=raw.sequence,
+            sequence=arrived.sequence,
             mid_exposure_s=window.mid_s,
             exposure_s=window.length_s,
-            mid_uncertainty_s=window.mid_uncertainty_s(raw.exposure_s),
-            set_exposure_s=raw.exposure_s,
-            stamp_s=raw.stamp_s,
-            received_s=raw.received_s,
-            driver_sequence=raw.driver_sequence,
-            stream=raw.stream,
-            raw=raw,
+            mid_uncertainty_s=window.mid_uncertainty_s(exposure_s),
+            set_exposure_s=exposure_s,
+            stamp_s=buffer.stamp_s,
+            received_s=arrived.received_s,
+            driver_sequence=buffer.sequence,
+            stream=arrived.stream,
         )
-        self._converted = (raw, frame)
-        return frame
+        return self._last
+
+    @property
+    def period_s(self) -> float:
+        """From frame to frame, seconds, by the driver's word."""
+        return self.capture.period_s
+
+    @property
+    def trigger(self) -> str:
+        """The name of the hardware trigger that exposes it; empty for a free-running camera."""
+        return self._options.trigger
+
+    def recent_times(self) -> list[FrameTime]:
+        """Return the times of the last good frames of this stream, oldest first."""
+        return [FrameTime(frame.sequence, frame.window().begin_s) for frame in self.capture.recent()]
 
     def abilities(self) -> dict[str, Any]:
         """Return what the camera offers, as JSON: ``formats`` and ``controls`` with their values now."""
@@ -198,28 +193,31 @@ class V4l2Camera:
             self._exposure = None
             GROUPS.leave(self.name, self._options.auto_exposure)
 
-    def _judge(self, stream: Stream, raw: RawFrame) -> None:
+    def _judge(self, stream: Stream, frame: Arrived, data: Bytes) -> None:
         """In the capture thread: look at a frame now and then, and set the exposure that its group wants."""
         control = self._exposure
         if control is None or stream.exposure_s is None:
             return
-        if control.exposure_s == stream.asked_exposure_s and raw.window.begin_s >= self._judge_after_s:
-            self._judge_after_s = raw.received_s + JUDGE_EVERY_S
+        if control.exposure_s == stream.asked_exposure_s and frame.window().begin_s >= self._judge_after_s:
+            self._judge_after_s = frame.received_s + JUDGE_EVERY_S
             if not control.held:
-                control.see(self.name, pixels.grey(raw.format, raw.raw), control.exposure_s)
+                control.see(self.name, pixels.grey(frame.format, data), control.exposure_s)
         if control.exposure_s != stream.asked_exposure_s:  # also when another camera of the group wanted it
             stream.set_exposure(control.exposure_s)
-            self._judge_after_s = raw.received_s + SETTLE_PERIODS * stream.period_s
+            self._judge_after_s = frame.received_s + SETTLE_PERIODS * stream.period_s
 
-    def _instead(self, exposed_after_s: float, timeout_s: float, before: Counters) -> str:
+    def _instead(self, exposed_after_s: float, timeout_s: float, damaged_before: int) -> str:
         """What to say when no fresh frame came."""
         counters = self.counters
         message = f"no frame exposed after {exposed_after_s:.3f} s came within {timeout_s:g} s"
-        damaged = counters.damaged - before.damaged
+        damaged = counters.damaged - damaged_before
         if damaged:
             message += f"; {damaged} came damaged ({counters.last_damage})"
         last = self.capture.newest
         if last is None:
             return message if damaged else f"{message}; none came at all"
-        age_s = exposed_after_s - last.window.begin_s
+        age_s = exposed_after_s - last.window().begin_s
+        if age_s < 0.0:  # late enough, but older than a frame that is still to come
+            age_s = self._clock.now_s() - last.buffer.stamp_s
+            return f"{message}; the last good one is frame {last.sequence}, {age_s:.3f} s old"
         return f"{message}; the last good one is frame {last.sequence}, exposed {age_s:.3f} s before"

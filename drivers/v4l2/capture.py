@@ -1,26 +1,32 @@
 """The thread of one camera: always dequeues, checks, keeps the newest good frame, reopens what went away.
 
-The newest frame stays in the kernel's buffer until the next one is there, and is copied only if somebody asks
-for it; nobody's slowness holds more than that one buffer up.
+The newest frame stays in the kernel's buffer until the next one is there. Who asks for it has it converted
+straight from there, once for all that ask; nobody's slowness holds more than that one buffer up. What runs
+for every frame is kept short: one that nobody asks for costs little more than its system calls.
 """
 
 from __future__ import annotations
 
 import logging
-import math
 import os
 import select
 import threading
 import time
+from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
+import numpy as np
+from numpy.typing import NDArray
+
 from drivers.clock import Clock
-from drivers.errors import DriverError
+from drivers.errors import BadFrame, DriverError
+from drivers.interfaces import Image
 from drivers.v4l2 import abi, pixels
+from drivers.v4l2.bells import Bells
 from drivers.v4l2.errors import StreamFailed
-from drivers.v4l2.frames import Arrived, Counters, RawFrame
-from drivers.v4l2.node import Dequeued
+from drivers.v4l2.frames import Arrived, Counters
+from drivers.v4l2.node import Dequeued, Node, PictureFormat
 from drivers.v4l2.options import CameraOptions
 from drivers.v4l2.stamps import StampCheck
 from drivers.v4l2.stream import Stream
@@ -28,19 +34,25 @@ from drivers.v4l2.uevents import UeventSocket
 
 log = logging.getLogger(__name__)
 
+Bytes = NDArray[np.uint8]
+
 SILENT_PERIODS = 3
 STALLED_S = 5.0  # a camera that is there but gives nothing for so long is opened again
 LATE_S = 0.005  # a frame is late if it comes more than a period and this after its stamp
 FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.05, 1.0
+RECENT_FRAMES = 30  # a second's: from their times the offset between two cameras is learned
 
 
 @dataclass(eq=False)
 class _Shared:
     """What the thread and its callers share, under one lock."""
 
-    changed: threading.Condition = field(default_factory=threading.Condition)
+    lock: threading.Lock = field(default_factory=threading.Lock)
+    bells: Bells = field(default_factory=Bells)  # of the callers that wait for a change
     newest: Arrived | None = None
-    copied: RawFrame | None = None  # the newest in memory of its own, once somebody asked
+    node: Node | None = None  # in whose memory the newest lies
+    picture: Image | None = None  # the newest converted, once somebody asked
+    recent: deque[Arrived] = field(default_factory=lambda: deque(maxlen=RECENT_FRAMES))  # of this stream
     good: int = 0
     damaged: int = 0
     dropped: int = 0
@@ -58,9 +70,14 @@ class Capture:
     ----------
     options, name, clock
         How the camera is opened, its name, and the clock that its stamps are judged by.
+    convert
+        Makes a picture in memory of its own from a format and bytes in the kernel's memory; BadFrame from it
+        means a damaged frame.
     between
-        Called in the capture thread after each good frame, with the stream: the automatic exposure. What
-        it takes delays the next frame. The frame's bytes are the kernel's: good until it returns.
+        Called in the capture thread after each good frame with the stream, the frame and its bytes, which are
+        the kernel's: the automatic exposure. What it takes delays the next frame.
+    exposure_s
+        Tells the exposure time to open with; without it that is the options'.
 
     Raises
     ------
@@ -73,10 +90,12 @@ class Capture:
         options: CameraOptions,
         name: str,
         clock: Clock,
-        between: Callable[[Stream, RawFrame], None] | None = None,
+        convert: Callable[[PictureFormat, Bytes], Image],
+        between: Callable[[Stream, Arrived, Bytes], None] | None = None,
         exposure_s: Callable[[], float] | None = None,
     ) -> None:
         self._options = options
+        self._convert = convert
         self._name = name
         self._clock = clock
         self._between = between
@@ -87,6 +106,7 @@ class Capture:
         self._offset: int | None = 0  # from the driver's count to ours; None until a new stream's first frame
         self._last_sequence = -1
         self._held: int | None = None  # the buffer of the newest good frame
+        self._lengths: tuple[int, ...] = ()
         self._check = StampCheck()
         stream = self._open()
         self.format = stream.format
@@ -101,58 +121,98 @@ class Capture:
     @property
     def counters(self) -> Counters:
         """What happened to the frames so far."""
-        with (shared := self._shared).changed:
+        with (shared := self._shared).lock:
             return Counters(
                 shared.good, shared.damaged, shared.dropped, shared.late, shared.reopened, shared.last_damage
             )
 
     @property
+    def damaged(self) -> int:
+        """How many frames were refused so far."""
+        return self._shared.damaged
+
+    @property
     def lost(self) -> str:
         """Why there are no frames now: the camera is gone or its stream failed; empty while it streams."""
-        with self._shared.changed:
+        with self._shared.lock:
             return self._shared.lost
 
     @property
-    def newest(self) -> RawFrame | None:
+    def newest(self) -> Arrived | None:
         """The newest good frame, however old; None if there is none."""
-        return self.wait(-math.inf, 0.0)
+        with self._shared.lock:
+            return self._shared.newest
 
-    def wait(self, exposed_after_s: float, timeout_s: float) -> RawFrame | None:
-        """Return the newest frame once it began after that; None after ``timeout_s``, when lost or closed."""
+    def recent(self) -> list[Arrived]:
+        """Return the last good frames of this stream, oldest first, without their pictures."""
+        with self._shared.lock:
+            return list(self._shared.recent)
+
+    def take(self, exposed_after_s: float, timeout_s: float) -> tuple[Arrived, Image] | None:
+        """Return the newest frame, once its exposure began after that moment, and its read-only picture.
+
+        A frame that was there before is given only while its stamp is at most a period and 5 ms old: when the
+        computer stood still for longer, a newer one is on its way. None after ``timeout_s``, and at once when
+        the camera is lost or closed.
+        """
+        shared, bell, until_s, first = self._shared, None, None, None
+        try:
+            while True:
+                with shared.lock:
+                    newest = shared.newest
+                    first = newest if bell is None else first
+                    if (
+                        newest is not None
+                        and newest.window().begin_s > exposed_after_s
+                        and (newest is not first or self._is_young(newest))
+                        and (picture := self._picture(newest)) is not None
+                    ):
+                        return newest, picture
+                    if shared.closed or shared.lost:
+                        return None
+                    bell = bell or shared.bells.take()
+                now_s = time.monotonic()
+                until_s = now_s + timeout_s if until_s is None else until_s
+                if now_s >= until_s:
+                    return None
+                bell.wait(until_s - now_s)
+        finally:
+            if bell is not None:
+                with shared.lock:
+                    shared.bells.give_back(bell)
+
+    def _is_young(self, frame: Arrived) -> bool:
+        return self._clock.now_s() - frame.buffer.stamp_s <= self.period_s + LATE_S
+
+    def _picture(self, newest: Arrived) -> Image | None:
+        """Convert the newest frame unless it is; None if that finds it damaged.
+
+        It is done under the lock: the frame's buffer does not go back meanwhile.
+        """
         shared = self._shared
-
-        def there() -> bool:
-            return shared.newest is not None and shared.newest.window().begin_s > exposed_after_s
-
-        with shared.changed:
-            if not there():
-                shared.changed.wait_for(
-                    lambda: there() or shared.closed or bool(shared.lost), max(0.0, timeout_s)
-                )
-            if shared.newest is None or not there():
-                return None
-            if shared.copied is None:  # copied under the lock: its buffer does not go back meanwhile
-                shared.copied = shared.newest.frame(copy=True)
-            return shared.copied
-
-    def refuse(self, frame: RawFrame, why: str) -> None:
-        """Take a frame back that turned out damaged when it was decoded."""
-        with (shared := self._shared).changed:
-            if frame is shared.copied:
-                shared.newest = shared.copied = None
+        if shared.picture is None and shared.node is not None:
+            data = np.frombuffer(shared.node.bytes_of(newest.buffer), np.uint8)
+            try:
+                shared.picture = self._convert(newest.format, data)
+                shared.picture.setflags(write=False)
+            except BadFrame as error:
+                shared.newest = None
                 shared.good -= 1
                 shared.damaged += 1
-                shared.last_damage = why
+                shared.last_damage = str(error)
+        return shared.picture
 
     def close(self) -> None:
         """End the thread and let go of the camera."""
-        with self._shared.changed:
+        with self._shared.lock:
             if self._shared.closed:
                 return
             self._shared.closed = True
-            self._shared.changed.notify_all()
+        self._shared.bells.ring_all()
         os.eventfd_write(self._wake, 1)
         self._thread.join()
+        with self._shared.lock:
+            self._shared.bells.close()
         self._uevents.close()
         os.close(self._wake)
 
@@ -180,23 +240,26 @@ class Capture:
 
     def _stream(self, stream: Stream) -> None:
         """Take frames until closed. Raises DriverError when the camera fails."""
+        node = stream.node
         poll = select.poll()
-        poll.register(stream.node.fileno(), select.POLLIN)
+        poll.register(node.fileno(), select.POLLIN)
         poll.register(self._wake, select.POLLIN)
-        timeout_ms = max(1.0, 1e3 * SILENT_PERIODS * stream.period_s)
+        with self._shared.lock:
+            self._shared.node = node
         silent_since_s: float | None = None
         while True:
-            events = dict(poll.poll(timeout_ms))
-            if self._wake in events:
+            found = dict(poll.poll(max(1.0, 1e3 * SILENT_PERIODS * stream.period_s)))
+            if self._wake in found:
                 return
+            events = found.get(node.fileno(), 0)
             # One frame a round: asking for another that is not there costs as much as the poll that tells it.
-            if events and (buffer := stream.node.dequeue()) is not None:
+            if events and (buffer := node.dequeue()) is not None:
                 self._take(stream, buffer)
                 silent_since_s = None
-            elif events.get(stream.node.fileno(), 0) & ~select.POLLIN:
+            elif events & ~select.POLLIN:
                 raise StreamFailed("its driver reports an error and gives no frame", device=self._name)
             else:
-                stream.node.check_there()
+                node.check_there()
                 now_s = time.monotonic()
                 silent_since_s = now_s if silent_since_s is None else silent_since_s
                 if now_s - silent_since_s > max(STALLED_S, 2 * SILENT_PERIODS * stream.period_s):
@@ -209,8 +272,8 @@ class Capture:
         wrong = self._check.wrong_stamp(buffer.flags, buffer.stamp_s, received_s)
         if buffer.flags & abi.BUF_FLAG_ERROR:
             wrong = "its driver marks it as damaged"
-        data = stream.node.bytes_of(buffer)
-        wrong = wrong or pixels.wrong_length(stream.format, data)
+        elif not wrong and buffer.used_bytes not in self._lengths:
+            wrong = pixels.wrong_length(stream.format, stream.node.bytes_of(buffer))
         if self._offset is None:
             self._offset = self._last_sequence + 1 - buffer.sequence
         sequence = self._offset + buffer.sequence
@@ -218,46 +281,47 @@ class Capture:
             self._offset += self._last_sequence + 1 - sequence
             sequence = self._last_sequence + 1
         self._last_sequence = sequence
-        arrived = None
-        if not wrong:
-            arrived = Arrived(data, buffer, stream.format, stream.rule, sequence, self._streams, received_s)
-        self._publish(stream, arrived, dropped, wrong)
-        if arrived is None:
-            stream.node.queue(buffer.number)
-            return
-        if self._held is not None:
-            stream.node.queue(self._held)
-        self._held = buffer.number
-        self._pause_s = FIRST_PAUSE_S
-        if self._between is not None:
-            self._between(stream, arrived.frame(copy=False))
-
-    def _publish(self, stream: Stream, arrived: Arrived | None, dropped: int, wrong: str) -> None:
-        with (shared := self._shared).changed:
-            shared.dropped += dropped
-            if arrived is None:
+        if wrong:
+            with (shared := self._shared).lock:
+                shared.dropped += dropped
                 shared.damaged += 1
                 shared.last_damage = wrong
-                return
+            stream.node.queue(buffer.number)
+            return
+        arrived = Arrived(buffer, stream.format, stream.rule, sequence, self._streams, received_s)
+        with (shared := self._shared).lock:
+            shared.dropped += dropped
             shared.good += 1
-            shared.late += arrived.received_s - arrived.buffer.stamp_s > stream.period_s + LATE_S
-            shared.newest, shared.copied = arrived, None
-            shared.changed.notify_all()
+            shared.late += received_s - buffer.stamp_s > stream.period_s + LATE_S
+            shared.newest, shared.picture = arrived, None
+            shared.recent.append(arrived)
+        held, self._held = self._held, buffer.number
+        if held is not None:
+            stream.node.queue(held)
+        shared.bells.ring_all()
+        self._pause_s = FIRST_PAUSE_S
+        if self._between is not None:
+            self._between(stream, arrived, np.frombuffer(stream.node.bytes_of(buffer), np.uint8))
 
     def _lose(self, why: str) -> None:
         """Say that there are no frames for now."""
-        with self._shared.changed:
+        with self._shared.lock:
             if not self._shared.lost:
                 log.warning("%s; it is opened again when it is back", why)
             self._shared.lost = why
-            self._shared.newest = self._shared.copied = None
-            self._shared.changed.notify_all()
+            self._forget()
+        self._shared.bells.ring_all()
 
     def _let_go(self) -> None:
         """Forget the frame that lies in the memory of a stream that ends."""
-        with self._shared.changed:
-            self._shared.newest = self._shared.copied = None
+        with self._shared.lock:
+            self._forget()
         self._held = None
+
+    def _forget(self) -> None:
+        shared = self._shared
+        shared.newest = shared.node = shared.picture = None
+        shared.recent.clear()
 
     def _closing_after(self, pause_s: float) -> bool:
         """Wait before the next try, shorter if the kernel says that a node came; True when closed."""
@@ -282,13 +346,13 @@ class Capture:
         except Exception as error:
             if not isinstance(error, DriverError):  # a defect: the thread goes on trying, and says so
                 log.exception("%s: opening again failed", self._name)
-            with self._shared.changed:
+            with self._shared.lock:
                 self._shared.lost = str(error) or type(error).__name__
             return None
-        with self._shared.changed:
+        with self._shared.lock:
             self._shared.lost = ""
             self._shared.reopened += 1
-            self._shared.changed.notify_all()
+        self._shared.bells.ring_all()
         log.warning("%s is back at %s", self._name, stream.node.path)
         return stream
 
@@ -296,6 +360,7 @@ class Capture:
         exposure_s = None if self._exposure_s is None else self._exposure_s()
         stream = Stream(self._options, self._name, exposure_s)
         self._check = StampCheck()
+        self._lengths = pixels.whole_lengths(stream.format)
         self._streams += 1
         if self._streams > 1:
             self._offset = None

@@ -19,6 +19,11 @@ from drivers.errors import DriverError
 from drivers.v4l2 import abi
 from drivers.v4l2.errors import CameraBusy, NoCamera, NoPermission, NotACamera, StreamFailed
 
+_quick_ioctl = ctypes.PyDLL(None, use_errno=True).ioctl
+"""Keeps Python's lock, for the two requests of every frame: they never wait, and a thread that lets go of the
+lock may get it back only after 5 ms."""
+_quick_ioctl.argtypes = (ctypes.c_int, ctypes.c_ulong, ctypes.c_void_p)
+
 _MOST_ENTRIES = 1024  # of any enumeration: a driver that never ends one must not hang us
 
 
@@ -89,6 +94,7 @@ class Node:
         self._maps: list[mmap.mmap] = []
         self._streaming = False
         self._exchanged = self._buffer(0)  # for the requests made for every frame; made once, as each costs
+        self._exchanged_at = ctypes.addressof(self._exchanged)
         self._fd = _open(self.path, self.name)
         try:
             self.identity = self._identify()
@@ -222,17 +228,16 @@ class Node:
     def queue(self, index: int) -> None:
         """Give a buffer back to the driver. Raises DriverError."""
         self._exchanged.index = index
-        self.call(abi.VIDIOC_QBUF, self._exchanged, f"take buffer {index} back")
+        if _quick_ioctl(self._fd, abi.VIDIOC_QBUF, self._exchanged_at) < 0:
+            raise self.failure(OSError(ctypes.get_errno(), ""), f"take buffer {index} back")
 
     def dequeue(self) -> Dequeued | None:
         """Return the next filled buffer, None if there is none yet. Raises DriverError."""
         buffer = self._exchanged
-        try:
-            fcntl.ioctl(self._fd, abi.VIDIOC_DQBUF, buffer)
-        except OSError as error:
-            if error.errno == errno.EAGAIN:
+        if _quick_ioctl(self._fd, abi.VIDIOC_DQBUF, self._exchanged_at) < 0:
+            if (number := ctypes.get_errno()) == errno.EAGAIN:
                 return None
-            raise self.failure(error, "give a frame") from None
+            raise self.failure(OSError(number, ""), "give a frame")
         stamp = buffer.timestamp
         stamp_s = stamp.tv_sec + stamp.tv_usec * 1e-6
         return Dequeued(buffer.index, buffer.bytesused, buffer.flags, buffer.sequence, stamp_s)

@@ -19,7 +19,7 @@ T = TypeVar("T")
 
 OPTIONS = (
     "device", "card", "bus", "format", "size_px", "rate_hz", "colour", "controls", "exposure_s", "gain",
-    "white_balance_k", "focus", "auto_exposure", "margin_s", "buffers",
+    "white_balance_k", "focus", "auto_exposure", "margin_s", "trigger", "buffers",
 )  # fmt: skip
 AUTO_EXPOSURE_OPTIONS = ("group", "percentile", "target", "tolerance", "shortest_s", "longest_s")
 
@@ -45,6 +45,8 @@ class CameraOptions:
         The program's own automatic exposure between measurements; None for a fixed one.
     margin_s
         How much earlier than its stamp says an exposure may have begun, seconds.
+    trigger
+        The name of the hardware trigger that exposes it, the same for all cameras on it; empty: none.
     buffers
         How many frames the kernel may hold while this process is held up.
     """
@@ -61,7 +63,8 @@ class CameraOptions:
     focus: int | None = None
     auto_exposure: ExposureSettings | None = None
     margin_s: float = 0.002
-    buffers: int = 8
+    trigger: str = ""
+    buffers: int = 16
 
 
 def parse_options(options: Mapping[str, Any], name: str) -> CameraOptions:
@@ -103,6 +106,7 @@ def parse_options(options: Mapping[str, Any], name: str) -> CameraOptions:
         focus=read.whole("focus", -(2**31), 2**31 - 1),
         auto_exposure=auto,
         margin_s=_or(read.number("margin_s", 0.0, 1.0), CameraOptions.margin_s),
+        trigger=read.text("trigger"),
         buffers=_or(read.whole("buffers", 3, 32), CameraOptions.buffers),
     )
 

@@ -74,13 +74,16 @@ def least_bytes(format: PictureFormat) -> int:
     return _stride(format, _row_bytes(layout, width)) * height
 
 
+def whole_lengths(format: PictureFormat) -> tuple[int, ...]:
+    """Return the lengths in bytes that a whole picture may have; none where only its content tells."""
+    least = least_bytes(format)
+    return (least, format.length_bytes) if least else ()
+
+
 def wrong_length(format: PictureFormat, data: memoryview) -> str:
     """Return what is wrong with the length, or a JPEG's ends, of a picture's bytes; empty if nothing."""
-    least = least_bytes(format)
-    if least:
-        if len(data) in (least, format.length_bytes):
-            return ""
-        return f"{len(data)} bytes where {least} are expected"
+    if lengths := whole_lengths(format):
+        return "" if len(data) in lengths else f"{len(data)} bytes where {lengths[0]} are expected"
     if bytes(data[:2]) != _JPEG_BEGIN:
         return "no JPEG: it does not begin like one"
     tail = bytes(data[-_JPEG_PADDING_BYTES:]).rstrip(b"\0")
@@ -108,7 +111,7 @@ def grey(format: PictureFormat, raw: NDArray[np.uint8]) -> Image:
     if layout.kind == "nv12":
         width, height = format.size_px
         stride = _stride(format, width)
-        return np.ascontiguousarray(raw[: stride * height].reshape(height, stride)[:, :width])
+        return raw[: stride * height].reshape(height, stride)[:, :width].copy()
     samples = _samples(format, layout, raw)
     if layout.kind == "bayer":
         return _image(cv2.cvtColor(samples, getattr(cv2, f"COLOR_Bayer{layout.order}2GRAY")))

@@ -8,6 +8,7 @@ late enough, so every uncertainty makes the window longer and never lets an old 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 from drivers.v4l2 import abi
 
@@ -40,8 +41,7 @@ class StampRule:
     driver: str = ""
 
 
-@dataclass(frozen=True)
-class Window:
+class Window(NamedTuple):
     """A stretch of time in which the whole exposure lay, seconds of CLOCK_MONOTONIC."""
 
     begin_s: float

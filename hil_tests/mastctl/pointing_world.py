@@ -86,7 +86,8 @@ class World:
     """Devices for the loop. A test changes what the head or a picture is by replacing the hooks.
 
     ``reading(reading)`` may change what the head says, ``image(camera, frame_number, image)`` what a
-    camera shows, ``slip_rad`` is by how much the head's encoders are wrong after the next move.
+    camera shows, ``slip_rad`` is by how much the head's encoders are wrong after the next move, ``late_s``
+    how much later than the others a camera exposes.
     """
 
     clock: ManualClock = field(default_factory=lambda: ManualClock(100.0))
@@ -95,6 +96,7 @@ class World:
     image: Callable[[str, int, np.ndarray], np.ndarray] = lambda camera, number, image: image
     on_read: Callable[[], None] = lambda: None
     slip_rad: tuple[float, float] = (0.0, 0.0)
+    late_s: dict[str, float] = field(default_factory=dict)
     moves: list[tuple[float, float]] = field(default_factory=list)
     stops: int = 0
     digest: str = "0" * 64
@@ -168,7 +170,7 @@ class World:
 
     def _take(self, name: str) -> StampedFrame:
         self._count += 1
-        now_s = self.clock.now_s()
+        now_s = self.clock.now_s() + self.late_s.get(name, 0.0)
         (pan, tilt), moving = self.joints(now_s)
         noise = np.random.default_rng(self._count).normal(scale=NOISE_DN, size=SIZE_PX[::-1])
         shown = np.clip(np.rint(clean(name, *self.true_joints(now_s)) + noise), 0, 255).astype(np.uint8)

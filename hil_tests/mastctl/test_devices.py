@@ -17,11 +17,11 @@ from service_fakes import FakeCamera, FakeHardware, Hang, eventually, rig
 
 from drivers.clock import SystemClock
 from drivers.errors import BadFrame, BadReply, DriverError, LineLost, NoFreshFrame, NoReply
-from drivers.interfaces import Reading
+from drivers.interfaces import Frame, FrameTime, Reading
 from mastctl import devices as devices_module
 from mastctl.devices import Devices, UnknownCamera
 from mastctl.errors import FrameGone, Stopped
-from mastctl.frames import KEPT_FRAMES
+from mastctl.frames import KEPT_FRAMES, StampedFrame
 from mastctl.joint_history import JointHistory
 from mastctl.limits import Limits, OutsideLimits
 
@@ -312,6 +312,88 @@ def test_cameras_are_asked_in_parallel(devices: Devices, hardware: FakeHardware)
     for name in ("navcam_left", "navcam_right"):
         hardware.fake_cameras[name].hook = lambda: together.wait(5.0)
     assert set(devices.frames(["navcam_left", "navcam_right"], now(), 3.0)) == {"navcam_left", "navcam_right"}
+
+
+class Ticking(FakeCamera):
+    """A free-running camera: exposes every 50 ms, ``phase_s`` after the full ones."""
+
+    period_s, trigger, phase_s = 0.05, "", 0.0
+    every_s = 0.05
+
+    def recent_times(self) -> list[FrameTime]:
+        newest = math.floor((now() - 0.002 - self.phase_s) / self.every_s)
+        return [FrameTime(n, n * self.every_s + self.phase_s - 0.001) for n in range(newest - 20, newest + 1)]
+
+    def next_frame(self, exposed_after_s: float, timeout_s: float) -> Any:
+        self.hook()
+        sequence = math.floor((exposed_after_s + 0.001 - self.phase_s) / self.every_s) + 1
+        mid_s = sequence * self.every_s + self.phase_s
+        time.sleep(max(0.0, mid_s + 0.001 - now()))
+        image = self._random.integers(0, 255, (48, 64), dtype=np.uint8)
+        return self.change(Frame(image, sequence, mid_s, 0.002))
+
+
+@pytest.fixture
+def ticking(hardware: FakeHardware) -> tuple[Ticking, Ticking]:
+    eyes = Ticking("navcam_left", 1), Ticking("navcam_right", 2)
+    eyes[1].phase_s = 0.024
+    hardware.fake_cameras |= {eye.name: eye for eye in eyes}
+    return eyes
+
+
+def apart_s(frames: dict[str, StampedFrame]) -> float:
+    return frames["navcam_right"].mid_exposure_s - frames["navcam_left"].mid_exposure_s
+
+
+EYES = ("navcam_left", "navcam_right")
+
+
+def test_frames_of_two_eyes_are_always_the_same_partners(
+    ticking: tuple[Ticking, Ticking], devices: Devices
+) -> None:
+    for wait_s in (0.0, 0.013, 0.031, 0.007, 0.022):
+        time.sleep(wait_s)  # so that now the one, now the other is first after the call
+        assert apart_s(devices.frames(EYES, now(), 2.0)) == pytest.approx(0.024, abs=1e-6)
+
+
+def test_each_frame_serves_one_pair(ticking: tuple[Ticking, Ticking], devices: Devices) -> None:
+    asked_s = now()
+    pairs = [devices.frames(EYES, asked_s, 2.0) for _ in range(3)]
+    for eye in EYES:
+        assert len({pair[eye].frame_id for pair in pairs}) == 3
+
+
+def test_eyes_that_never_belong_together_are_told(ticking: tuple[Ticking, Ticking], devices: Devices) -> None:
+    for eye in ticking:
+        eye.recent_times = list  # type: ignore[assignment]  # nothing learned
+        eye.period_s = 0.04  # wrong: it is 50 ms
+    ticking[1].phase_s = 0.025  # from either neighbour more than half of what is said to be the period
+    with pytest.raises(NoFreshFrame, match="no frames of navcam_left, navcam_right that belong together"):
+        devices.frames(EYES, now(), 0.3)
+
+
+@pytest.mark.parametrize("times", [lambda: [(1, math.nan)] * 9, lambda: ["noon"] * 9, lambda: 1 / 0])
+def test_times_that_cannot_be_true_are_a_typed_error(
+    ticking: tuple[Ticking, Ticking], devices: Devices, times: Callable[[], Any]
+) -> None:
+    ticking[1].recent_times = times  # type: ignore[method-assign]
+    with pytest.raises(DriverError, match="the drivers tell no times of navcam_left and navcam_right"):
+        devices.frames(EYES, now(), 2.0)
+
+
+def test_a_move_between_two_exposures_moves_both(
+    devices: Devices, hardware: FakeHardware, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Even if the readings around either exposure do not reach over the pause between them."""
+    still = JointHistory.at_exposure
+
+    def at_exposure(self: JointHistory, began_s: float, mid_s: float, ended_s: float, device: str) -> Any:
+        return replace(still(self, began_s, mid_s, ended_s, device), moving=ended_s - began_s > 0.01)
+
+    monkeypatch.setattr(JointHistory, "at_exposure", at_exposure)
+    assert not devices.frames(["navcam_left"], now(), 1.0)["navcam_left"].moving  # 2 ms of exposure
+    hardware.fake_cameras["navcam_right"].hook = lambda: time.sleep(0.03)
+    assert all(frame.moving for frame in devices.frames(EYES, now(), 2.0).values())
 
 
 def test_a_frame_that_serves_already_is_not_taken_again(devices: Devices, hardware: FakeHardware) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Generator
 from pathlib import Path
 
 import pytest
@@ -22,3 +23,14 @@ def vm_kernel(request: pytest.FixtureRequest) -> Path:
     if request.config.getoption("--require-vm"):
         pytest.fail(reason)
     pytest.skip(reason)
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_makereport(
+    item: pytest.Function, call: pytest.CallInfo[None]
+) -> Generator[None, pytest.TestReport, pytest.TestReport]:
+    """All that skips for want of the kernel is told in one line: one place, one reason."""
+    report = yield
+    if report.skipped and isinstance(report.longrepr, tuple) and "vm_kernel" in item.fixturenames:
+        report.longrepr = (__file__, 0, report.longrepr[2])
+    return report

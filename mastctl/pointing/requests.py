@@ -142,7 +142,8 @@ class PointingError(MastctlError):
         ``bad_request``, ``outside_image``, ``other_mast_file``, ``no_stereo``, ``head_fault``,
         ``head_moving``, ``bad_reading``, ``no_fresh_frame``, ``did_not_arrive``, ``did_not_settle``,
         ``not_in_view``, ``target_flat``, ``target_ambiguous``, ``target_border``, ``target_not_found``,
-        ``eyes_disagree``. A code of a driver, of the limits or of the geometry passes through.
+        ``target_moving``, ``eyes_disagree``. A code of a driver, of the limits or of the geometry passes
+        through.
     step
         The step that failed.
     result
@@ -189,6 +190,10 @@ class PointingSettings:
         For a new picture: some frames of a slow camera, on a busy machine.
     same_pose_rad
         Joint angles nearer than this are one pose: a tenth of a Pancam pixel.
+    same_moment_s
+        Exposures less apart than this are one: half a pixel would take 5000 px/s, which blurs any picture.
+    between_eyes_px
+        How far the target may move between the exposures of a pair that serves a measurement.
     nearest_m
         Nothing nearer is looked for.
     search_px, wide_search_px
@@ -216,6 +221,8 @@ class PointingSettings:
     rest_wait_s: float = 2.0
     frame_timeout_s: float = 8.0
     same_pose_rad: float = 3e-5
+    same_moment_s: float = 1e-4
+    between_eyes_px: float = 0.5
     nearest_m: float = 0.4
     search_px: float = 48.0
     wide_search_px: float = 200.0

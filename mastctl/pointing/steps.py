@@ -16,6 +16,7 @@ from mastctl.limits import Limits
 from mastctl.pointing.counts import counts_told
 from mastctl.pointing.looking import CamerasLike, Eyes, View, facts
 from mastctl.pointing.motion import Head, HeadLike
+from mastctl.pointing.one_moment import apart
 from mastctl.pointing.record import Recorder
 from mastctl.pointing.requests import PixelTarget, PointingError, PointingSettings, Step
 from mastctl.pointing.wanted import clicked_px
@@ -119,7 +120,7 @@ class Steps:
         with self.step("frames") as detail:
             fresh = self.eyes.new((target.camera, partner), self._clock.now_s(), resting)
             now, other = fresh[target.camera], fresh[partner]
-            detail.update(frame_ids=[now.frame.frame_id, other.frame.frame_id])
+            detail.update(frame_ids=[now.frame.frame_id, other.frame.frame_id], **apart(now, [other]))
             if view.frame.mast_digest != now.frame.mast_digest:
                 raise PointingError(
                     "other_mast_file", f"frame {target.frame_id} was taken with another mast file"
@@ -158,5 +159,6 @@ class Steps:
         """Take new pictures, exposed after the head had settled. Raises PointingError, DriverError."""
         with self.step("look") as detail:
             views = self.eyes.new(cameras, settled.time_s, settled)
-            detail.update(frame_ids=[view.frame.frame_id for view in views.values()])
+            first, *others = views.values()
+            detail.update(frame_ids=[view.frame.frame_id for view in views.values()], **apart(first, others))
         return views

@@ -21,9 +21,10 @@ CAMERAS = {
     "webcams": "n_devs=2 node_types=0x20001,0x1 num_inputs=1,1 input_types=0x0,0x0",
     "hdmi": "n_devs=2 node_types=0x101,0x101 num_inputs=1,1 input_types=0x3,0x3 "
     "num_outputs=1,1 output_types=0x1,0x1",
+    "three": "n_devs=3 node_types=0x1,0x1,0x1 num_inputs=1,1,1 input_types=0x3,0x3,0x3",
 }
-"""Layouts of the virtual cameras, as options of vivid: two webcams, the first with a metadata node; or two
-HDMI inputs, each with an output that can be looped into it."""
+"""Layouts of the virtual cameras, as options of vivid: two webcams, the first with a metadata node; two HDMI
+inputs, each with an output that can be looped into it; or three HDMI inputs."""
 
 
 class VmFailed(Exception):

@@ -15,6 +15,7 @@ import re
 import shutil
 import subprocess
 import tempfile
+from collections.abc import Mapping
 from pathlib import Path
 
 INPUTS = Path(__file__).resolve().parents[2] / "hil_tests" / "vm" / "kernel"
@@ -28,6 +29,10 @@ BUILD_PROGRAMS = {
     "xz": "xz-utils",
 }
 BUILD_PROGRAMS |= {"patch": "patch", "strip": "binutils", "dpkg-deb": "dpkg", "tar": "tar"}
+
+
+SECOND_READER = {"v4l2-ctl": "v4l-utils"}
+"""The camera tests compare our reader with this one."""
 
 
 class CannotBuild(Exception):
@@ -119,15 +124,28 @@ def _no_source() -> str:
 
 
 def _install_programs() -> None:
-    """See to the programs of the build; by apt-get where they are missing and we may."""
-    missing = sorted({debian for program, debian in BUILD_PROGRAMS.items() if not shutil.which(program)})
+    """See to the programs of the build. Raises CannotBuild."""
+    if reason := install(BUILD_PROGRAMS):
+        raise CannotBuild(f"the build needs {reason}")
+
+
+def install(programs: Mapping[str, str]) -> str:
+    """See to programs, Debian's package by name; by apt-get where they are missing and we may.
+
+    Returns the missing packages and how to get them, empty when all are there.
+    """
+    missing = sorted({debian for program, debian in programs.items() if not shutil.which(program)})
     if not missing:
-        return
+        return ""
     command = ["apt-get", "install", "-qq", "-y", "--no-install-recommends", *missing]
+    told = f"{', '.join(missing)}; as root on Debian: {' '.join(command)}"
     if os.geteuid() != 0 or not shutil.which("apt-get"):
-        raise CannotBuild(f"the build needs {', '.join(missing)}; as root on Debian: {' '.join(command)}")
+        return told
     _run(["apt-get", "update", "-qq"], check=False)
-    _run(command, env={**os.environ, "DEBIAN_FRONTEND": "noninteractive"})
+    done = _run(command, check=False, env={**os.environ, "DEBIAN_FRONTEND": "noninteractive"})
+    if done.returncode == 0:
+        return ""
+    return f"{told}, which failed just now: {' '.join(done.stderr.split())[-200:]}"
 
 
 def _fetch(folder: Path) -> Path:

@@ -62,7 +62,7 @@ def test_a_refused_queue_is_got_over(camera: V4l2Camera) -> None:
 @pytest.mark.parametrize(
     ("control", "words"),
     [
-        ("inject_vidioc_reqbufs_error", "does not give 8 buffers: Invalid argument"),
+        ("inject_vidioc_reqbufs_error", "does not give 16 buffers: Invalid argument"),
         ("inject_vidioc_streamon_error", "does not start the stream: Invalid argument"),
         ("inject_vidioc_qbuf_error", "does not take buffer 0 back: Invalid argument"),
     ],

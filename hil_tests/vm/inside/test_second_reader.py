@@ -11,8 +11,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from drivers.clock import SystemClock
 from drivers.v4l2 import find
-from drivers.v4l2.camera import open_camera
+from drivers.v4l2.capture import Capture
+from drivers.v4l2.options import parse_options
 from hil_tests.vm.inside.conftest import BUS, options
 
 pytestmark = pytest.mark.skipif(
@@ -33,17 +35,30 @@ def by_v4l2_ctl(file: Path, code: str, size_px: tuple[int, int]) -> NDArray[np.u
     return np.fromfile(file, np.uint8)
 
 
+def our_bytes(count: int, **more: object) -> list[NDArray[np.uint8]]:
+    """The bytes of some frames one after the other, as our capture thread holds them."""
+    capture = Capture(
+        parse_options(options(**more), "left"), "left", SystemClock(), lambda format, data: data.copy()
+    )
+    after_s, found = time.monotonic(), []
+    try:
+        for _ in range(count):
+            taken = capture.take(after_s, 10.0)
+            assert taken is not None
+            after_s = taken[0].window().begin_s
+            found.append(taken[1])
+    finally:
+        capture.close()
+    return found
+
+
 @pytest.mark.parametrize("pattern", ["75% Colorbar", "Gray Ramp"])
 @pytest.mark.parametrize(
     "code", ["YUYV", "GREY", "Y10", "Y12", "Y16", "NV12", "BA81", "RG10", "GB12", "BYR2"]
 )
 def test_frames_are_the_same_to_the_last_bit(tmp_path: Path, code: str, pattern: str) -> None:
     size_px = (640, 480)
-    camera = open_camera(
-        options(format=code, size_px=list(size_px), controls={"test_pattern": pattern}), name="left"
-    )
-    ours = camera.next_frame(time.monotonic(), 10.0).raw.raw
-    camera.close()
+    ours = our_bytes(1, format=code, size_px=list(size_px), controls={"test_pattern": pattern})[0]
     theirs = by_v4l2_ctl(tmp_path / "frame", code, size_px)
     assert len(np.unique(theirs)) > 1  # a picture, not an empty buffer
     assert np.array_equal(ours, theirs)
@@ -51,9 +66,6 @@ def test_frames_are_the_same_to_the_last_bit(tmp_path: Path, code: str, pattern:
 
 def test_moved_pictures_are_told_apart(tmp_path: Path) -> None:
     """The comparison can fail: of two pictures of a moving scene one at least is not theirs."""
-    camera = open_camera(options(controls={"horizontal_movement": "Move Left"}), name="left")
-    first = camera.next_frame(time.monotonic(), 10.0)
-    second = camera.next_frame(first.mid_exposure_s, 10.0)
-    camera.close()
+    first, second = our_bytes(2, controls={"horizontal_movement": "Move Left"})
     theirs = by_v4l2_ctl(tmp_path / "frame", "YUYV", (640, 480))
-    assert not (np.array_equal(first.raw.raw, theirs) and np.array_equal(second.raw.raw, theirs))
+    assert not (np.array_equal(first, theirs) and np.array_equal(second, theirs))

@@ -1,0 +1,186 @@
+"""Which frames of several eyes belong together: those of one trigger, or those nearest in time.
+
+Free-running cameras expose up to half a period apart, by an offset that stays nearly the same for a while. It
+is learned from the times of the frames that came last, so that the same partner is taken each time even where
+the offset is near half a period. Cameras with one hardware trigger are paired by their counts instead.
+"""
+
+from __future__ import annotations
+
+import math
+import statistics
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Protocol
+
+import numpy as np
+
+from drivers.interfaces import FrameTime, Paced
+
+SLOP_S = 0.002
+"""How much more than half a period two frames of a pair may be apart: jitter of the stamps."""
+
+LEAST_TO_LEARN = 5
+COUNTED_FROM = 5
+"""From so many of the last frames the difference of two triggered cameras' counts is learned."""
+
+
+class Stamped(Protocol):
+    """What pairing looks at: every frame has it."""
+
+    @property
+    def sequence(self) -> int: ...
+    @property
+    def exposure_began_s(self) -> float: ...
+
+
+@dataclass(frozen=True)
+class Offset:
+    """What is known of two cameras before frames of them are taken.
+
+    Attributes
+    ----------
+    period_s
+        From frame to frame, of the slower one; infinite where it is not known.
+    usual_s
+        How much later the other one exposes, seconds; None before it is learned and where it is not constant.
+    began_s
+        When an exposure of the first one began: the others are whole periods away. None if not known.
+    counts_apart
+        By how much the other one's count is higher for the same trigger; None for free-running cameras.
+    """
+
+    period_s: float = math.inf
+    usual_s: float | None = None
+    counts_apart: int | None = None
+    began_s: float | None = None
+
+
+def learned(one: object, other: object, before: Offset | None = None) -> Offset:
+    """Return what two cameras' last frames tell; of cameras that are not `Paced`, nothing.
+
+    ``before`` is what was learned the last time: near half a period, where two partners are equally good, the
+    choice stays the same.
+    """
+    if not isinstance(one, Paced) or not isinstance(other, Paced):
+        return Offset()
+    ones, others = one.recent_times(), other.recent_times()
+    if min(len(ones), len(others)) < LEAST_TO_LEARN:
+        return Offset(max(one.period_s, other.period_s))
+    period_s = max(_measured_period_s(one.period_s, ones), _measured_period_s(other.period_s, others))
+    triggered = one.trigger != "" and one.trigger == other.trigger
+    return learned_from(ones, others, period_s, triggered, None if before is None else before.usual_s)
+
+
+def learned_from(
+    ones: Sequence[FrameTime],
+    others: Sequence[FrameTime],
+    period_s: float,
+    triggered: bool = False,
+    before_s: float | None = None,
+) -> Offset:
+    """Return what the times of two cameras' last frames tell, oldest first; `LEAST_TO_LEARN` of each."""
+    times_s = np.array([frame.exposure_began_s for frame in ones])
+    theirs_s = np.array([frame.exposure_began_s for frame in others])
+    nearest = np.abs(theirs_s[:, None] - times_s[None, :]).argmin(axis=1)
+    apart_s = theirs_s - times_s[nearest]
+    # By whole periods nearer to the last one: a frame may have lost its partner, or wait for it.
+    apart_s -= period_s * np.round((apart_s - apart_s[-1]) / period_s)
+    usual_s = float(np.median(apart_s))
+    spread_s = float(np.median(np.abs(apart_s - usual_s)))
+    usual_s -= period_s * round(usual_s / period_s)
+    same_s = usual_s if before_s is None else usual_s - period_s * round((usual_s - before_s) / period_s)
+    if abs(same_s) <= period_s / 2 + SLOP_S:
+        usual_s = same_s
+    counts_apart = None
+    if triggered:
+        counts_apart = statistics.median_low(
+            frame.sequence - ones[index].sequence
+            for frame, index in list(zip(others, nearest, strict=True))[-COUNTED_FROM:]
+        )
+    return Offset(period_s, usual_s if spread_s <= period_s / 4 else None, counts_apart, float(times_s[-1]))
+
+
+def _measured_period_s(nominal_s: float, times: Sequence[FrameTime]) -> float:
+    """The period by the frames themselves: an automatic exposure may have made it longer."""
+    first, last = times[0], times[-1]
+    counted = last.sequence - first.sequence
+    span_s = last.exposure_began_s - first.exposure_began_s
+    return span_s / counted if counted > 0 and span_s > 0 else nominal_s
+
+
+class Pairing:
+    """Tells, while frames of several cameras are taken, which camera's next one is still needed.
+
+    Parameters
+    ----------
+    offsets
+        What is known of each camera beside the first one, by name.
+    first
+        The first camera's name; all others are paired with it.
+    """
+
+    def __init__(self, first: str, offsets: Mapping[str, Offset]) -> None:
+        self._first = first
+        self._offsets = dict(offsets)
+
+    def moments(self, exposed_after_s: float) -> dict[str, float]:
+        """Return after which moment to ask each camera, so that the first frames to come belong together.
+
+        Each moment is no earlier than asked, and where the cameras' rhythm is known half a period before an
+        expected frame.
+        """
+        rhythm = self._rhythm()
+        if rhythm is None or rhythm.began_s is None:
+            return dict.fromkeys((self._first, *self._offsets), exposed_after_s)
+        earliest_s = exposed_after_s - min(0.0, *(offset.usual_s or 0.0 for offset in self._offsets.values()))
+        between_s = rhythm.began_s - rhythm.period_s / 2
+        first_s = between_s + rhythm.period_s * math.ceil((earliest_s - between_s) / rhythm.period_s)
+        return {self._first: first_s} | {n: first_s + (o.usual_s or 0.0) for n, o in self._offsets.items()}
+
+    def _rhythm(self) -> Offset | None:
+        """An offset that tells when frames are to be expected; None unless it is known of all cameras."""
+        known = [offset for offset in self._offsets.values() if offset.usual_s is not None]
+        return known[0] if known and len(known) == len(self._offsets) else None
+
+    def again(self, frames: Mapping[str, Stamped]) -> dict[str, float]:
+        """Return after which moment to ask which cameras again; none if all frames belong together.
+
+        Where the rhythm is known all are asked anew, since those whose frame is newer do not wait. But counts
+        that stamps contradict show only in frames that stand still.
+        """
+        behind = self.behind(frames)
+        counted = any(offset.counts_apart is not None for offset in self._offsets.values())
+        if behind and self._rhythm() is not None and not counted:
+            return self.moments(max(frame.exposure_began_s for frame in frames.values()))
+        return {name: frames[name].exposure_began_s + by_s for name, by_s in behind.items()}
+
+    def behind(self, frames: Mapping[str, Stamped]) -> dict[str, float]:
+        """Return the cameras whose frame is too old for the others'; empty if all belong together.
+
+        With each camera comes how many seconds later, at least, its next frame must be.
+        """
+        one = frames[self._first]
+        found: dict[str, float] = {}
+        for name, offset in self._offsets.items():
+            late_s = _late_s(one, frames[name], offset)
+            if late_s is None:  # the stamps contradict the counts: one of the two missed a trigger
+                self._offsets[name] = offset = replace(offset, counts_apart=None)
+                late_s = _late_s(one, frames[name], offset) or 0.0
+            if late_s:
+                behind = name if late_s < 0 else self._first
+                found[behind] = max(found.get(behind, 0.0), abs(late_s) - offset.period_s / 2)
+        return found
+
+
+def _late_s(one: Stamped, other: Stamped, offset: Offset) -> float | None:
+    """How much later the other frame is than the one's partner: 0 if it is the partner, None if who knows."""
+    dt_s = other.exposure_began_s - one.exposure_began_s
+    apart = abs(dt_s) > offset.period_s / 2 + SLOP_S
+    if offset.counts_apart is not None:
+        ahead = other.sequence - one.sequence - offset.counts_apart
+        return None if ahead == 0 and apart else ahead * offset.period_s if ahead else 0.0
+    if offset.usual_s is not None:
+        late_s = dt_s - offset.usual_s
+        return late_s if abs(late_s) > offset.period_s / 2 else 0.0
+    return dt_s if apart else 0.0
