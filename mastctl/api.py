@@ -136,10 +136,7 @@ def _add_pointing(app: FastAPI, service: Service) -> None:
 
 def _add_tracking(app: FastAPI, service: Service) -> None:
     """The rover's pose, and the track."""
-    tracker = service.tracker
-
-    def told() -> dict[str, Any]:
-        return tracker.status.told(service.clock.now_s())
+    told = service.track_told
 
     @app.post(f"{PREFIX}/pose", summary="Say where the rover stands; a track is carried over and looked for")
     def pose(body: PoseBody) -> dict[str, Any]:
@@ -182,7 +179,7 @@ async def _track_events(service: Service) -> AsyncIterator[str]:
         status = service.tracker.status
         if status.sequence != told:
             told, quiet_s = status.sequence, 0.0
-            yield f"data: {json.dumps(status.told(service.clock.now_s()), allow_nan=False)}\n\n"
+            yield f"data: {json.dumps(service.track_told(status), allow_nan=False)}\n\n"
         elif quiet_s >= STREAM_ALIVE_S:
             quiet_s = 0.0
             yield ": alive\n\n"

@@ -101,7 +101,7 @@ def parse_config(data: bytes, path: str | Path) -> Config:
             folder=folder,
         ),
         limits=_limits(top),
-        tracking=_tracking(top),
+        tracking=_tracking(top, folder),
     )
 
 
@@ -172,12 +172,12 @@ def _limits(top: Section) -> Limits:
     return Limits(pan_rad, tilt_rad, speed_rad_per_s)
 
 
-def _tracking(top: Section) -> TrackingSettings:
+def _tracking(top: Section, folder: Path) -> TrackingSettings:
     """Read how targets are followed; what is left out stays as it is."""
     usual = TrackingSettings()
     if "tracking" not in top:
         return usual
-    section = top.section("tracking", (), ("handoff", "most_step", "start_error"))
+    section = top.section("tracking", (), ("handoff", "most_step", "start_error", "handoff_log"))
     rules, named = usual.handoff, tuple[str, ...]()
     if "handoff" in section:
         keys = ("pairs", "margin_px", "disparity_error_px", "range_error")
@@ -197,6 +197,7 @@ def _tracking(top: Section) -> TrackingSettings:
         most_step=_number_between(section, "most_step", usual.most_step, 0.01, 1.0),
         start_error=_number_between(section, "start_error", usual.start_error, 0.001, 1.0),
         named_pairs=named,
+        handoff_log=folder / section.text("handoff_log") if "handoff_log" in section else None,
     )
 
 

@@ -24,6 +24,7 @@ from calib.formats import digest_of, read_bytes
 from calib.formats.strict import Section
 from calib.formats.yaml_text import kind_of
 from calib.handoff import Joints
+from calib.handoff_bias import HandoffBias
 from calib.handoff_refined import Verdict
 from calib.matched_handoff import Landed, MatchedHandoff
 from calib.store import CAMERA_NAME
@@ -133,6 +134,20 @@ def as_json(handoff: MatchedHandoff) -> dict[str, Any]:
             }
             for name, one in handoff.landed.items()
         },
+    }
+
+
+def bias_told(bias: HandoffBias) -> dict[str, Any]:
+    """Return a camera's mean offset as JSON."""
+    return {
+        "source": bias.source,
+        "camera": bias.camera,
+        "handoffs": bias.handoffs,
+        "left_out": bias.left_out,
+        "offset_px": bias.offset_px.tolist(),
+        "sigma_px": np.sqrt(np.diag(bias.covariance_px2)).tolist(),
+        "sigmas": bias.sigmas,
+        "sentence": bias.sentence,
     }
 
 

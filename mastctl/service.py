@@ -10,7 +10,9 @@ from dataclasses import replace
 from importlib.metadata import version
 from typing import Any
 
+from calib.errors import CalibError
 from calib.mast import Rig
+from calib.rig_covariance import stored_covariance
 from calib.store import StoredRig
 from drivers.clock import Clock, SystemClock
 from drivers.open_hardware import Hardware, open_hardware
@@ -18,6 +20,7 @@ from mastctl.config import Config
 from mastctl.devices import HEAD, Devices, UnknownCamera
 from mastctl.errors import FrameGone, MastctlError
 from mastctl.frames import StampedFrame
+from mastctl.handoff_check import HandoffCheck
 from mastctl.mast_in_use import MastInUse, read_mast, read_next
 from mastctl.operations import Busy, Operation, Operations
 from mastctl.pointing.loop import PointingLoop
@@ -25,6 +28,7 @@ from mastctl.pointing.requests import Aim, AnglesTarget, PixelTarget, PointReque
 from mastctl.pointing.wanted import position_in_rover_m
 from mastctl.state import State
 from mastctl.tracking.pose import RoverPose
+from mastctl.tracking.status import TrackStatus
 from mastctl.tracking.tracker import Tracker
 
 log = logging.getLogger(__name__)
@@ -77,6 +81,8 @@ class Service:
         The mast file in use, and the one before it; replaced as a whole, never edited.
     tracker
         The track, and the rover's pose.
+    handoffs
+        What the track's hand-offs say of the mast file in use.
     stop_threads
         Where the web side calls `stop`: threads that nothing else can keep busy.
     """
@@ -95,8 +101,15 @@ class Service:
         self.stop_threads = ThreadPoolExecutor(STOP_THREADS, thread_name_prefix="stop")
         self._rig = _configured(mast.stored.rig, config.hardware.cameras)
         self._loop = PointingLoop(self._rig, self.devices, config.limits, clock)
+        self.handoffs = HandoffCheck(config.tracking.handoff_log, mast.stored.digest, clock)
         self.tracker = Tracker(
-            self.operations, self.devices, self._rig, config.limits, clock, config.tracking
+            self.operations,
+            self.devices,
+            self._rig,
+            config.limits,
+            clock,
+            config.tracking,
+            self.handoffs.add,
         )
         self._version = version("mastctl")
 
@@ -147,8 +160,13 @@ class Service:
             frames=self.devices.newest_frames(),
             motion=self.operations.motion,
             track=self.tracker.status,
-            faults=self.devices.faults(),
+            faults=(*self.devices.faults(), *self.handoffs.faults()),
         )
+
+    def track_told(self, status: TrackStatus | None = None) -> dict[str, Any]:
+        """Return the track, as it is or was, and the self-check of now as ``GET /track`` tells them."""
+        told = (status or self.tracker.status).told(self.clock.now_s())
+        return {**told, "self_check": self.handoffs.told()}
 
     def snapshot(self, camera: str, fresh: bool) -> StampedFrame:
         """Return a frame exposed after this call (``fresh``), or one that is at most a second old.
@@ -304,6 +322,7 @@ class Service:
             self._rig = _configured(mast.stored.rig, self.config.hardware.cameras)
             self._loop = PointingLoop(self._rig, self.devices, self.config.limits, self.clock)
             self.tracker.use_rig(self._rig, mast.path.name)
+            self.handoffs.use_mast(mast.stored.digest)
             self.mast, self.former = mast, self.mast
         for note in mast.stored.notes:
             log.warning("%s", note)
@@ -344,6 +363,7 @@ class Service:
         self.operations.close()
         self.devices.close()
         self.stop_threads.shutdown(wait=False)
+        self.handoffs.close()
         _bounded("closing the hardware", self.hardware.close, HARDWARE_CLOSE_S)
 
     def _check_pixel(self, target: PixelTarget) -> None:
@@ -373,8 +393,18 @@ class Service:
 def _configured(rig: Rig, cameras: Iterable[str]) -> Rig:
     """Return the part of a rig that this daemon can see with: nothing is aimed with a camera it lacks."""
     names = set(cameras)
+    fit = {key: value for key, value in rig.fit.items() if key not in ("parameters", "covariance")}
+    try:
+        known = stored_covariance(rig)
+    except CalibError as error:
+        log.warning("the calibration counts as exact: %s", error)
+        known = None
+    if known is not None:
+        part = known.of(tuple(names))
+        fit |= {"parameters": list(part.names), "covariance": part.covariance.tolist()}
     return replace(
         rig,
+        fit=fit,
         cameras={name: camera for name, camera in rig.cameras.items() if name in names},
         stereo={pair: eyes for pair, eyes in rig.stereo.items() if names.issuperset(eyes)},
     )

@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 from pointing_world import LIMITS, SIZE_PX, World, rig
 
 from calib.errors import CalibError
+from calib.mast import Rig
+from calib.rigid import Rigid
 from calib.tracking import Track
 from drivers.errors import DriverError, NoReply
 from mastctl.errors import MastctlError
@@ -39,16 +42,17 @@ class Eyes(World):
         return super().frames(cameras, exposed_after_s, timeout_s)
 
 
-def looker(world: World, steps: list[Step] | None = None) -> Looker:
+def looker(world: World, steps: list[Step] | None = None, believed: Rig | None = None) -> Looker:
     told = [] if steps is None else steps
-    made = Steps(rig(), world, LIMITS, world.clock, PointingSettings(), told.append, threading.Event())
-    return Looker(made, rig(), LIMITS, TrackingSettings())
+    believed = believed or rig()
+    made = Steps(believed, world, LIMITS, world.clock, PointingSettings(), told.append, threading.Event())
+    return Looker(made, believed, LIMITS, TrackingSettings())
 
 
-def begun(world: World) -> tuple[Track, np.ndarray]:
+def begun(world: World, camera: str = "navcam_left") -> tuple[Track, np.ndarray]:
     """A track of what a pixel shows, and where that truly is."""
-    frame = world.shoot()
-    track, _ = looker(world).begin_at_pixel(PixelTarget("navcam_left", frame.frame_id, *PIXEL))
+    frame = world.shoot(camera)
+    track, _ = looker(world).begin_at_pixel(PixelTarget(camera, frame.frame_id, *PIXEL))
     return track, world.true_point(frame, *PIXEL)
 
 
@@ -151,6 +155,79 @@ def test_the_next_pair_looks_where_the_first_finds_nothing() -> None:
     assert np.linalg.norm(after.position_m - point) < 0.03
     world.image = covered("navcam_left", "navcam_right", "pancam_left", "pancam_right")
     assert looker(world).look(track)[1].pair == "navcam", "the first pair says why"
+
+
+def navcams_turned(by_rad: float) -> Rig:
+    """A mast file that believes the Navcams turned to the right of where they look."""
+    turn = Rigid(Rotation.from_euler("z", by_rad).as_matrix(), np.zeros(3))
+    true = rig()
+    cameras = {
+        name: replace(camera, model=camera.model.moved(turn)) if name.startswith("navcam") else camera
+        for name, camera in true.cameras.items()
+    }
+    return replace(true, cameras=cameras)
+
+
+def test_a_change_of_the_pair_looks_with_both_and_keeps_what_they_saw() -> None:
+    world = Eyes()
+    steps: list[Step] = []
+    track, point = begun(world, "pancam_left")
+    after, seen = looker(world, steps).look(track, "pancam")
+    assert (seen.state, seen.pair, seen.reason) == ("tracked", "navcam", "")
+    assert np.linalg.norm(after.position_m - point) < 0.03
+    one = ["limits", "move", "settle", "look", "find"]
+    assert [step.name for step in steps] == ["choose", *one, *one, "hand_over"]
+    record = seen.matched
+    assert record is not None
+    assert (record.pair, list(record.found)) == (rig().stereo["pancam"], list(rig().stereo["navcam"]))
+    frames = {name[:-7]: name for step in steps if step.name == "look" for name in step.detail["frame_ids"]}
+    for eye, pixel in zip(record.pair, record.clicks_px, strict=True):
+        assert pixel == pytest.approx(world.true_pixel(frames[eye], point), abs=0.6)
+    for eye, landed in record.found.items():
+        true = world.true_pixel(frames[eye], point)
+        assert landed.geometric_px == pytest.approx(true, abs=0.3)
+        assert landed.found_px == pytest.approx(true, abs=0.3)
+    joints = [(at.pan_rad, at.tilt_rad) for at in (record.joints, record.to_joints)]
+    assert joints == [pytest.approx(world.joints_of(frames[eye])) for eye in ("pancam_left", "navcam_left")]
+    assert looker(world).look(after, "navcam")[1].matched is None, "the same pair looks on"
+
+
+def test_a_pair_that_is_turned_shows_in_the_record_and_takes_over_only_within_what_is_known() -> None:
+    world = Eyes()
+    track, _ = begun(world, "pancam_left")
+    believed = navcams_turned(0.003)  # 645 px of focal length: targets lie 1.9 px to the left of where believed
+    surely = replace(track, covariance_m2=1e-6 * np.eye(3))
+    _, seen = looker(world, None, believed).look(surely, "pancam")
+    assert (seen.state, seen.pair) == ("tracked", "pancam")
+    assert seen.reason.startswith("navcam does not take over: what was found does not fit the prediction")
+    roughly = replace(track, covariance_m2=2e-2**2 * np.eye(3))  # as after half a metre of driving
+    _, taken = looker(world, None, believed).look(roughly, "pancam")
+    assert (taken.state, taken.pair) == ("tracked", "navcam")
+    for matched in (seen.matched, taken.matched):
+        assert matched is not None
+        off = [one.found_px - one.geometric_px for one in matched.found.values()]
+        assert np.array(off) == pytest.approx(np.array([[1.93, 0.0]] * 2), abs=0.4)
+
+
+def test_without_the_former_pairs_pictures_the_next_looks_alone() -> None:
+    world = Eyes()
+    track, point = begun(world, "pancam_left")
+    world.silent = ("pancam_left", "pancam_right")
+    after, seen = looker(world).look(track, "pancam")
+    assert (seen.state, seen.pair, seen.matched) == ("tracked", "navcam", None)
+    assert np.linalg.norm(after.position_m - point) < 0.03
+    world.silent = ("pancam_left", "pancam_right", "navcam_left", "navcam_right")
+    assert looker(world).look(track, "pancam")[1].reason == "navcam_left: unplugged; navcam_right: unplugged"
+    world.silent = ("navcam_left", "navcam_right")
+    _, seen = looker(world).look(track, "pancam")
+    assert (seen.state, seen.pair, seen.matched) == ("tracked", "pancam", None)
+    assert seen.reason == "navcam does not take over: navcam_left: unplugged; navcam_right: unplugged"
+
+
+def test_eyes_that_expose_apart_start_no_track_with_what_moves() -> None:
+    world = Apart()
+    with pytest.raises(PointingError, match="the target moves at"):
+        begun(world)
 
 
 def test_a_head_that_fails_ends_the_look() -> None:

@@ -53,7 +53,7 @@ class ScriptedLooker:
         track = replace(track, position_m=position_m)
         return track, replace(told, position_m=position_m)
 
-    def look(self, track: Track) -> tuple[Track, Seen]:
+    def look(self, track: Track, found_by: str = "") -> tuple[Track, Seen]:
         with self._steps.step("find"):
             type(self).looks.append(track)
         return type(self).script(track)

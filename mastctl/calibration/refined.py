@@ -9,8 +9,6 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from calib.body_pose import PRIOR_SHIFT_M, PRIOR_TURN_RAD, BodyPose
 from calib.body_sights import body_groups
 from calib.corrected_rig import corrected_covariance, corrected_rig
@@ -185,17 +183,3 @@ def pose_told(pose: BodyPose) -> dict[str, Any]:
             "sigmas": pose.eyes_apart.sigmas,
         }
     return told
-
-
-def bias_told(bias: HandoffBias) -> dict[str, Any]:
-    """Return a camera's mean offset as JSON."""
-    return {
-        "source": bias.source,
-        "camera": bias.camera,
-        "handoffs": bias.handoffs,
-        "left_out": bias.left_out,
-        "offset_px": bias.offset_px.tolist(),
-        "sigma_px": np.sqrt(np.diag(bias.covariance_px2)).tolist(),
-        "sigmas": bias.sigmas,
-        "sentence": bias.sentence,
-    }

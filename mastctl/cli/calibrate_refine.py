@@ -57,7 +57,8 @@ def _check_out(out: Path, read: list[Path]) -> None:
 
 
 def _document(proposal: Proposal, saved: StoredRig | None, previous: Path | None) -> dict[str, Any]:
-    from mastctl.calibration.refined import bias_told, pose_told
+    from mastctl.calibration.refined import pose_told
+    from mastctl.handoff_log import bias_told
 
     return {
         "mast_file": None

@@ -40,7 +40,7 @@ def add_commands(subparsers: argparse._SubParsersAction[Any]) -> None:
     start.add_argument("--frame", choices=("rover", "site"), help="frame of --position (default rover)")
     start.set_defaults(run=_start)
 
-    status = commands.add_parser("status", help="show the track")
+    status = commands.add_parser("status", help="show the track, and offsets that hand-offs tell")
     status.set_defaults(run=_status)
 
     watch = commands.add_parser(
@@ -112,7 +112,10 @@ def _start(args: argparse.Namespace) -> int:
 
 def _status(args: argparse.Namespace) -> int:
     with client_of(args) as client:
-        return _show(args, client.track())
+        track = client.track()
+        offsets = [one["sentence"] for one in track["self_check"]["offsets"]]
+        tell_result(args, track, "\n".join([track_line(track), *offsets]))
+        return 0
 
 
 def _watch(args: argparse.Namespace) -> int:

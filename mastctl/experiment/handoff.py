@@ -29,15 +29,13 @@ from mastctl.experiment.known_points import KnownPoint, KnownPoints
 from mastctl.experiment.pointing import Truth
 from mastctl.experiment.targets import Target
 from mastctl.experiment.views import VIEWS_PER_TARGET, Views
+from mastctl.tracking.matched import JOINT_SIGMA_RAD
 
 STEPS: tuple[tuple[str, str, float], ...] = (("pancam", "navcam", 6.0), ("navcam", "hazcam", 2.0))
 """The paper's hand-offs: from, to, distance in metres."""
 
 PAN_RANGE_RAD = {"pancam": 1.0, "navcam": 0.35}
 """How far to either side targets lie: the body's cameras do not turn with the head."""
-
-JOINT_SIGMA_RAD = 3e-5
-"""What a joint reading is taken to be wrong by: half a step of a stepped pan/tilt unit."""
 
 KNOWN_SLACK = 0.2
 """Known points count as at a distance within this share of it."""

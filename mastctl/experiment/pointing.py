@@ -20,7 +20,7 @@ from calib.store import parse_rig
 from drivers.interfaces import Image
 from mastctl.client import Client, ClientError
 from mastctl.experiment.targets import Target
-from mastctl.experiment.views import OPERATION_TIMEOUT_S, VIEWS_PER_TARGET, Views
+from mastctl.experiment.views import VIEWS_PER_TARGET, Views, pointed
 
 # Rms pixel errors (x, y) of the paper's Table VI: first and second pointing at each distance in metres.
 PAPER_TABLE_VI: Mapping[float, tuple[tuple[float, float], tuple[float, float]]] = {
@@ -304,12 +304,8 @@ class _Bench:
         """Ask the daemon for two pointings and write down what it measured."""
         error, operation = "", {}
         try:
-            operation = self._client.wait(
-                self._client.point(
-                    pixel=(target.shot.camera, target.shot.frame_id, target.x_px, target.y_px), pointings=2
-                ),
-                timeout_s=OPERATION_TIMEOUT_S,
-            )
+            pixel = (target.shot.camera, target.shot.frame_id, target.x_px, target.y_px)
+            operation = pointed(self._client, pixel=pixel, pointings=2)
             if operation["state"] != "done":
                 told = operation.get("error") or {}
                 error = f"{told.get('code', operation['state'])}: {told.get('message', 'stopped')}"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
@@ -18,6 +19,7 @@ from mastctl.experiment.targets import Target, choose_target
 # A view that offers no usable target is left for another; after this many in a row the distance is given up.
 VIEWS_PER_TARGET = 12
 OPERATION_TIMEOUT_S = 60.0
+STOP_TIMEOUT_S = 30.0
 
 
 class Views:
@@ -91,3 +93,23 @@ class Views:
                 0.0,
             ]
         )
+
+
+def pointed(client: Client, **request: Any) -> dict[str, Any]:
+    """Have the daemon point as `Client.point` says; return the ended operation's record.
+
+    Raises
+    ------
+    ClientError
+        If it refuses; ``timeout``, if it has not ended in time. It is stopped then, so that the next one can
+        begin.
+    """
+    try:
+        return client.wait(client.point(**request), timeout_s=OPERATION_TIMEOUT_S)
+    except ClientError as error:
+        if error.code == "timeout":
+            with suppress(ClientError):  # what took too long is told, not what the stop met
+                stopped = client.stop()["operation"]
+                if stopped is not None:
+                    client.wait(stopped, timeout_s=STOP_TIMEOUT_S)
+        raise

@@ -18,7 +18,6 @@ import logging
 import math
 import threading
 from collections.abc import Callable, Sequence
-from typing import Any
 
 import numpy as np
 
@@ -34,7 +33,6 @@ from drivers.interfaces import Reading
 from mastctl.errors import MastctlError
 from mastctl.limits import Limits
 from mastctl.pointing.looking import Clicked, View, facts
-from mastctl.pointing.one_moment import check_one_moment
 from mastctl.pointing.requests import (
     Aim,
     AnglesTarget,
@@ -201,17 +199,12 @@ class _Run:
         found = self._steps.clicked(target)
         now, other = found.now, found.other
         with self._steps.step("stereo") as detail:
-            detail.update(self._one_moment(now, found.pixel_px, [other], found.resting))
+            detail.update(self._steps.one_moment(now, found.pixel_px, [other], found.resting))
             partnered = self._eyes.stereo(now, found.pixel_px, other)
             detail.update(facts(partnered.match), across_px=round(partnered.across_px, 3))
         assert partnered.plane is not None
         self._triangulate(now, found.pixel_px, other, partnered.match.pixel_px)
         return Clicked(found.view, found.clicked_px, partnered.plane)
-
-    def _one_moment(
-        self, view: View, pixel_px: FloatArray, others: Sequence[View], resting: Reading
-    ) -> dict[str, Any]:
-        return check_one_moment(self._eyes, self._settings, view, pixel_px, others, resting)
 
     def _triangulate(self, one: View, one_px: FloatArray, other: View, other_px: FloatArray) -> None:
         with self._steps.step("triangulate") as detail:
@@ -242,7 +235,7 @@ class _Run:
             with self._steps.step("eyes") as detail:
                 detail.update(confirmed_by=list(companions))
                 if views:
-                    detail.update(self._one_moment(now, seen.pixel_px, list(views.values()), settled))
+                    detail.update(self._steps.one_moment(now, seen.pixel_px, list(views.values()), settled))
                 for name, other in views.items():
                     same_pair = {aim.camera, name} == {source, self._eyes.partner(source)}
                     found, detail[name] = self._eyes.agree(clicked, now, seen, other, same_pair)

@@ -16,7 +16,7 @@ from mastctl.limits import Limits
 from mastctl.pointing.counts import counts_told
 from mastctl.pointing.looking import CamerasLike, Eyes, View, facts
 from mastctl.pointing.motion import Head, HeadLike
-from mastctl.pointing.one_moment import apart
+from mastctl.pointing.one_moment import apart, check_one_moment
 from mastctl.pointing.record import Recorder
 from mastctl.pointing.requests import PixelTarget, PointingError, PointingSettings, Step
 from mastctl.pointing.wanted import clicked_px
@@ -78,6 +78,7 @@ class Steps:
         self._devices = devices
         self._limits = limits
         self._clock = clock
+        self._settings = settings
         self._recorder = Recorder(record, clock, self.head.check_not_stopped)
 
     @property
@@ -162,3 +163,9 @@ class Steps:
             first, *others = views.values()
             detail.update(frame_ids=[view.frame.frame_id for view in views.values()], **apart(first, others))
         return views
+
+    def one_moment(
+        self, view: View, pixel_px: FloatArray, others: Sequence[View], resting: Reading
+    ) -> dict[str, Any]:
+        """Check that pictures of several eyes serve one measurement, as `check_one_moment` says."""
+        return check_one_moment(self.eyes, self._settings, view, pixel_px, others, resting)

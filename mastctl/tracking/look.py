@@ -3,14 +3,15 @@
 Steps of a start at a pixel, as they stand in the record: ``rest``, ``frames``, ``target``, ``start``; of one
 at a position ``choose``, ``limits`` to ``settle``, ``look``, ``start``. A look has ``choose``, ``limits`` to
 ``settle`` (``rest`` for a pair on the body), ``look``, ``find``; what one pair does not find, the next one
-that sees the place looks for.
+that sees the place looks for. Where the target shall go to another pair, the pair that found it last looks
+first, then the next one, each with these steps, and ``hand_over`` makes the record of both.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
@@ -19,6 +20,7 @@ from calib.errors import CalibError
 from calib.handoff_refined import Eye
 from calib.mast import Rig
 from calib.match import Match
+from calib.matched_handoff import MatchedHandoff
 from calib.rigid import FloatArray
 from calib.tracking import Look, Track, seen_by, start_track
 from drivers.errors import DriverError
@@ -29,6 +31,7 @@ from mastctl.pointing.looking import View
 from mastctl.pointing.requests import PixelTarget, rounded
 from mastctl.pointing.steps import Steps
 from mastctl.tracking.choice import Choice, choose_pairs
+from mastctl.tracking.matched import record_of
 from mastctl.tracking.settings import TrackingSettings
 
 PAIRS_TRIED = 2
@@ -72,6 +75,8 @@ class Seen:
         By camera.
     chi2, renewed
         As `calib.tracking.Look`.
+    matched
+        The target in the pictures of the pair before and of the next one, if both looked.
     """
 
     state: Literal["tracked", "lost"]
@@ -83,6 +88,27 @@ class Seen:
     pixels: Mapping[str, EyePixel] = field(default_factory=dict)
     chi2: float = math.nan
     renewed: bool = False
+    matched: MatchedHandoff | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class _Taken:
+    """The pictures of one pair: new ones by camera, left first, and why an eye has none."""
+
+    choice: Choice
+    settled: Reading
+    views: Mapping[str, View]
+    missing: Mapping[str, str]
+
+
+@dataclass(frozen=True, eq=False)
+class _Sight:
+    """What one pair's pictures told."""
+
+    track: Track
+    seen: Seen
+    taken: _Taken
+    found: Mapping[str, Match]
 
 
 class Looker:
@@ -115,7 +141,7 @@ class Looker:
             If it cannot be followed.
         """
         found = self._steps.clicked(target)
-        track = self._started(found.now, found.other, found.pixel_px)
+        track = self._started(found.now, found.other, found.pixel_px, found.resting)
         pair = next(name for name, eyes in self._rig.stereo.items() if target.camera in eyes)
         return track, self._first(pair, track, found.now, found.other, found.pixel_px)
 
@@ -132,7 +158,7 @@ class Looker:
         left, right = self._rig.stereo[choice.pair]
         views = self._steps.look((left, right), settled)
         pixel = np.asarray(views[left].camera.project(position_m)[0])
-        track = self._started(views[left], views[right], pixel)
+        track = self._started(views[left], views[right], pixel, settled)
         off_m = float(np.linalg.norm(track.position_m - position_m))
         allowed_m = self._settings.start_error * choice.range_m
         if off_m > allowed_m:
@@ -143,8 +169,14 @@ class Looker:
             )
         return track, self._first(choice.pair, track, views[left], views[right], pixel)
 
-    def look(self, track: Track) -> tuple[Track, Seen]:
+    def look(self, track: Track, found_by: str = "") -> tuple[Track, Seen]:
         """Point, take a pair, look; with the next pair if the first does not find it.
+
+        Parameters
+        ----------
+        found_by
+            The pair that found the target last. If another one should look now, it looks first, as long as
+            it sees the place, so that both pairs' pictures are of one pose of the rover.
 
         Raises
         ------
@@ -152,28 +184,66 @@ class Looker:
             If the head fails, or goes where it was not sent. That no picture comes is a look without
             success.
         """
-        first: tuple[Track, Seen] | None = None
-        for choice in self._choices(track.position_m)[:PAIRS_TRIED]:
-            after, seen = self._look_with(choice, track)
-            if seen.state == "tracked":
-                return after, seen
-            first = first or (after, seen)
+        choices = self._choices(track.position_m)
+        first: _Sight | None = None
+        former = next((one for one in choices[1:] if one.pair == found_by), None)
+        if former is not None:
+            first = self._handed_over(former, choices[0], track)
+            if first.seen.state == "tracked":
+                return first.track, first.seen
+        for choice in choices[:PAIRS_TRIED]:
+            if former is not None and choice in (former, choices[0]):
+                continue
+            sight = self._find(self._take(choice), track)
+            if sight.seen.state == "tracked":
+                return sight.track, sight.seen
+            first = first or sight
         assert first is not None
-        return first
+        return first.track, first.seen
 
-    def _look_with(self, choice: Choice, track: Track) -> tuple[Track, Seen]:
+    def _handed_over(self, former: Choice, choice: Choice, track: Track) -> _Sight:
+        """Look with the pair before, then with the next one, which goes on if it finds the same thing."""
+        before = self._find(self._take(former), track)
+        held = before.seen.state == "tracked"
+        after = self._find(self._take(choice), before.track if held else track)
+        matched = self._matched(before, after) if held else None
+        known = matched is not None and len(matched.found) == len(self._rig.stereo[choice.pair])
+        if known and after.seen.state == "lost":
+            # The same thing to look at, but elsewhere: the pairs' calibrations differ. The next pair goes on
+            # if what it sees fits what is known without the pair before.
+            after = self._find(after.taken, track)
+        if after.seen.state == "lost" and held:
+            reason = f"{choice.pair} does not take over: {after.seen.reason}"
+            return replace(before, seen=replace(before.seen, reason=reason, matched=matched))
+        renewed = after.seen.renewed or (held and before.seen.renewed)
+        return replace(after, seen=replace(after.seen, renewed=renewed, matched=matched))
+
+    def _matched(self, before: _Sight, after: _Sight) -> MatchedHandoff | None:
+        with self._steps.step("hand_over") as detail:
+            detail.update(from_pair=before.seen.pair, to_pair=after.seen.pair)
+            pair = self._rig.stereo[before.seen.pair]
+            made = record_of(self._rig, pair, before.taken.views, before.found, after.taken.views)
+            if isinstance(made, str):
+                detail.update(reason=made)
+                return None
+            detail.update(verdicts={name: one.verdict for name, one in made.landed.items()})
+        return made
+
+    def _take(self, choice: Choice) -> _Taken:
         settled = self._pointed(choice)
-        views, missing = self._pictures(self._rig.stereo[choice.pair], settled)
+        return _Taken(choice, settled, *self._pictures(self._rig.stereo[choice.pair], settled))
+
+    def _find(self, taken: _Taken, track: Track) -> _Sight:
         with self._steps.step("find") as detail:
-            eyes = {name: Eye(view.image, view.camera) for name, view in views.items()}
+            eyes = {name: Eye(view.image, view.camera) for name, view in taken.views.items()}
             look = seen_by(track, eyes)
-            pixels = {name: EyePixel("", "no_frame", reason) for name, reason in missing.items()}
-            pixels |= {name: _eye_pixel(views[name], found) for name, found in look.found.items()}
-            seen = self._told(choice, look, pixels, settled)
+            pixels = {name: EyePixel("", "no_frame", reason) for name, reason in taken.missing.items()}
+            pixels |= {name: _eye_pixel(taken.views[name], found) for name, found in look.found.items()}
+            seen = self._told(taken.choice, look, pixels, taken.settled)
             detail.update(
-                pair=choice.pair, state=seen.state, reason=seen.reason, position_m=rounded(seen.position_m, 5)
+                pair=seen.pair, state=seen.state, reason=seen.reason, position_m=rounded(seen.position_m, 5)
             )
-        return look.track, seen
+        return _Sight(look.track, seen, taken, look.found)
 
     def _told(self, choice: Choice, look: Look, pixels: Mapping[str, EyePixel], settled: Reading) -> Seen:
         track, reason = look.track, look.reason
@@ -227,8 +297,9 @@ class Looker:
                 missing[error.device] = " ".join(str(error).split())
         return {}, missing
 
-    def _started(self, one: View, other: View, pixel_px: FloatArray) -> Track:
+    def _started(self, one: View, other: View, pixel_px: FloatArray, resting: Reading) -> Track:
         with self._steps.step("start") as detail:
+            detail.update(self._steps.one_moment(one, pixel_px, [other], resting))
             try:
                 track = start_track(Eye(one.image, one.camera), Eye(other.image, other.camera), pixel_px)
             except CalibError as error:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from pathlib import Path
 
 from mastctl.tracking.choice import HandoffRules
 
@@ -23,9 +24,12 @@ class TrackingSettings:
         How far from an asked position the target of a track may turn out to be, as a part of its range.
     named_pairs
         Pairs whose bounds were set; the mast file must have them.
+    handoff_log
+        Where hand-offs are written down; None: they are forgotten at the daemon's end.
     """
 
     handoff: HandoffRules = field(default_factory=HandoffRules)
     most_step: float = 0.3
     start_error: float = 0.1
     named_pairs: tuple[str, ...] = ()
+    handoff_log: Path | None = None

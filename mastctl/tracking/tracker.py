@@ -17,6 +17,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from calib.mast import Rig
+from calib.matched_handoff import MatchedHandoff
 from calib.tracking import Track
 from drivers.clock import Clock
 from mastctl.errors import MastctlError
@@ -73,6 +74,8 @@ class Tracker:
         The mast file in use, the head's limits, what stamps everything.
     settings
         Which pair looks, how far a pose may lie from the one before.
+    on_matched
+        Gets each hand-off's record; must return at once.
     """
 
     def __init__(
@@ -83,6 +86,7 @@ class Tracker:
         limits: Limits,
         clock: Clock,
         settings: TrackingSettings | None = None,
+        on_matched: Callable[[MatchedHandoff], None] = lambda matched: None,
     ) -> None:
         self._operations = operations
         self._devices = devices
@@ -90,6 +94,7 @@ class Tracker:
         self._limits = limits
         self._clock = clock
         self._settings = settings or TrackingSettings()
+        self._on_matched = on_matched
         self._lock = threading.Lock()
         self._status = TrackStatus()
         self._carried: Carried | None = None  # what is followed; None without a track
@@ -247,7 +252,8 @@ class Tracker:
 
     def _begin_look(self, carried: Carried) -> Operation:
         """Start a look. Raises Busy, MastctlError."""
-        operation = self._run({"track": self._status.id}, lambda looker: looker.look(carried.track))
+        found_by = self._status.found_by
+        operation = self._run({"track": self._status.id}, lambda looker: looker.look(carried.track, found_by))
         self._look_again = False
         return operation
 
@@ -339,6 +345,8 @@ class Tracker:
             return replace(status, state="lost", reason=_why(operation), misses=track.misses)
         track, seen = outcome
         self._carried = replace(carried, track=track)
+        if seen.matched is not None:
+            self._on_matched(seen.matched)
         status = replace(
             status,
             reason=seen.reason,
