@@ -37,6 +37,7 @@ MOUNTS: dict[str, tuple[tuple[float, float, float], float]] = {
     "pancam_right": ((0.06, 0.15, -0.05), 1290.0),
 }
 NOISE_DN = 2.0
+LATE_S = 0.010
 LIMITS = Limits((-1.5, 1.5), (-1.2, 0.5), 1.0)
 
 
@@ -199,3 +200,16 @@ def click(frame: StampedFrame, x_px: float, y_px: float, **more: object) -> Poin
     """A request for a pixel of a frame."""
     request = PointRequest(PixelTarget(frame.camera, frame.frame_id, x_px, y_px))
     return replace(request, **more)  # type: ignore[arg-type]
+
+
+def moving_world(px_per_s: float, late_s: float = LATE_S) -> World:
+    """A world whose right Navcam exposes later, and in which everything slides to the right."""
+    world = World(late_s={"navcam_right": late_s})
+    begun_s = world.clock.now_s()
+
+    def slide(camera: str, number: int, image: np.ndarray) -> np.ndarray:
+        seen_s = world.clock.now_s() + world.late_s.get(camera, 0.0) - begun_s
+        return np.roll(image, round(px_per_s * seen_s), axis=1)
+
+    world.image = slide
+    return world

@@ -4,26 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from pointing_world import World, click, rig, run
+from pointing_world import LATE_S, World, click, moving_world, rig, run
 
 from mastctl.pointing.looking import Eyes
 from mastctl.pointing.one_moment import check_one_moment
 from mastctl.pointing.requests import PointingError, PointingSettings, Step
-
-LATE_S = 0.010
-
-
-def moving_world(px_per_s: float, late_s: float = LATE_S) -> World:
-    """A world whose right Navcam exposes later, and in which everything slides to the right."""
-    world = World(late_s={"navcam_right": late_s})
-    begun_s = world.clock.now_s()
-
-    def slide(camera: str, number: int, image: np.ndarray) -> np.ndarray:
-        seen_s = world.clock.now_s() + world.late_s.get(camera, 0.0) - begun_s
-        return np.roll(image, round(px_per_s * seen_s), axis=1)
-
-    world.image = slide
-    return world
 
 
 def detail(steps: list[Step], name: str) -> dict[str, object]:
