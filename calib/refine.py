@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from calib.rigid import FloatArray
-from calib.warp import Grey, Surface, square_grid
+from calib.warp import Grey, Surface, patch_grid
 
 MOST_STEPS = 12
 STEP_ENOUGH_PX = 1e-4
@@ -64,13 +64,14 @@ def refine(
     start_px: FloatArray,
     deforming: bool = True,
     correlated_px: int = 3,
+    near_px2: FloatArray | None = None,
 ) -> Refined | None:
     """Find where the image shows the template, from a start good to about a pixel.
 
     Parameters
     ----------
     template
-        (n, n) grey, its middle on the whole pixel ``centre_px`` (2,).
+        (h, w) grey, its middle on the whole pixel ``centre_px`` (2,).
     target_px
         (2,) the target's place in the template's own pixel grid.
     image
@@ -81,20 +82,27 @@ def refine(
         Whether D is free; else it stays zero.
     correlated_px
         Over how many pixels grey differences depend on each other.
+    near_px2
+        (2, 2) covariance of a Gaussian around the target by which pixels count; all alike if not given.
 
     Returns
     -------
     refined
         None if it did not settle, left the image, or found nothing to hold on to.
     """
-    half = template.shape[0] // 2
-    offsets = square_grid(half) + (centre_px - target_px)  # q: from the target to each patch pixel
+    height, width = template.shape
+    offsets = patch_grid((width // 2, height // 2)) + (centre_px - target_px)  # q: from target to patch pixels
     values = template.astype(np.float64)
     inner = (slice(2, -2), slice(2, -2))  # the border has no two-sided gradient
     q, t = offsets[inner], values[inner]
     jacobian = _columns(_gradient(values)[inner], q, t, deforming)
     weights = _columns(_gradient(ndimage.gaussian_filter(values, SMOOTH_PX))[inner], q, t, deforming)
-    shape, n = t.shape, t.size
+    shape, n = t.shape, float(t.size)
+    counts = np.ones(shape)
+    if near_px2 is not None:
+        counts = np.exp(-0.5 * np.einsum("...i,ij,...j", q, np.linalg.inv(near_px2), q))
+        weights *= counts.reshape(-1, 1)
+        n = float(counts.sum() ** 2 / (counts**2).sum())
     normal = weights.T @ jacobian
     if not np.isfinite(normal).all() or np.linalg.cond(normal) > WORST_CONDITION:
         return None
@@ -107,10 +115,10 @@ def refine(
         if not surface.inside(places):
             return None
         seen = surface.at(places)
-        gain, offset = _photometry(t, seen)
+        gain, offset = _photometry(t, seen, counts)
         if gain <= 0.05:
             return None
-        rest = (seen - gain * t - offset).reshape(n)
+        rest = (seen - gain * t - offset).reshape(-1)
         step = -inverse @ (weights.T @ rest)
         move = step[:2] / gain
         length = float(np.linalg.norm(move))
@@ -130,7 +138,7 @@ def refine(
     meat = _sum_of_neighbours(scores, correlated_px)
     parameters = inverse @ meat @ inverse.T * (n / (n - jacobian.shape[1])) / gain**2
     covariance = parameters[:2, :2] + FLOOR_PX**2 * np.eye(2)
-    correlation = float(np.corrcoef(t.reshape(n), seen.reshape(n))[0, 1])
+    correlation = float(np.corrcoef(t.reshape(-1), seen.reshape(-1))[0, 1])
     if not np.isfinite(covariance).all() or not np.isfinite(correlation):
         return None
     return Refined(position, (covariance + covariance.T) / 2, deformation, correlation)
@@ -152,11 +160,13 @@ def _columns(gradient: FloatArray, q: FloatArray, t: FloatArray, deforming: bool
     return np.stack([*columns, -t, -np.ones_like(t)], axis=-1).reshape(t.size, -1)
 
 
-def _photometry(template: FloatArray, seen: FloatArray) -> tuple[float, float]:
-    """Return gain and offset that bring the template nearest to what is seen."""
-    centred = template - template.mean()
-    gain = float((centred * seen).sum() / max(float((centred**2).sum()), 1e-9))
-    return gain, float(seen.mean() - gain * template.mean())
+def _photometry(template: FloatArray, seen: FloatArray, counts: FloatArray) -> tuple[float, float]:
+    """Return gain and offset that bring the template nearest to what is seen, pixels weighted by ``counts``."""
+    total = float(counts.sum())
+    template_mean, seen_mean = float((counts * template).sum()) / total, float((counts * seen).sum()) / total
+    weighted = counts * (template - template_mean)
+    gain = float((weighted * seen).sum() / max(float((weighted * template).sum()), 1e-9))
+    return gain, seen_mean - gain * template_mean
 
 
 def _sum_of_neighbours(scores: FloatArray, reach_px: int) -> FloatArray:

@@ -27,7 +27,7 @@ from calib.errors import CalibError, NoStereoPoint
 from calib.handoff_refined import Eye
 from calib.match import Match, MatchSettings, match
 from calib.one_point import Sighting, one_point
-from calib.rigid import FloatArray, Rigid
+from calib.rigid import FloatArray, Rigid, moved_rigid
 from calib.stereo import triangulate
 from calib.warp import Plane
 
@@ -90,6 +90,8 @@ class Track:
         The key picture.
     misses
         Looks since it was last found.
+    motion_covariance
+        (6, 6) of the rover's motion since then, as `moved` takes it; it is part of ``covariance_m2``.
     """
 
     state: State
@@ -97,6 +99,7 @@ class Track:
     covariance_m2: FloatArray
     key: Key
     misses: int = 0
+    motion_covariance: FloatArray = field(default_factory=lambda: np.zeros((6, 6)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -183,16 +186,28 @@ def moved(track: Track, now_from_then: Rigid, covariance: FloatArray) -> Track:
             "a motion's covariance is 6 rows of 6 finite numbers: rotation in rad², then translation in m²"
         )
     position = now_from_then.points(track.position_m)
-    x, y, z = position
-    rate = np.hstack([np.array([[0.0, z, -y], [-z, 0.0, x], [y, -x, 0.0]]), np.eye(3)])
-    turned = now_from_then.rotation
-    carried = turned @ track.covariance_m2 @ turned.T + rate @ spread @ rate.T
-    key = replace(
-        track.key,
-        eye=replace(track.key.eye, camera=track.key.eye.camera.moved(now_from_then)),
-        normal=now_from_then.vectors(track.key.normal),
+    rate, turned = _motion_rate(position), now_from_then.rotation
+    # What was wrong before about the old origin is, about the new one, turned and with a lever.
+    lever = -_motion_rate(now_from_then.translation_m)[:, :3]
+    then = np.block([[turned, np.zeros((3, 3))], [lever @ turned, turned]])
+    return replace(
+        track,
+        position_m=position,
+        covariance_m2=turned @ track.covariance_m2 @ turned.T + rate @ spread @ rate.T,
+        key=_carried(track.key, now_from_then),
+        motion_covariance=then @ track.motion_covariance @ then.T + spread,
     )
-    return replace(track, position_m=position, covariance_m2=carried, key=key)
+
+
+def _motion_rate(position_m: FloatArray) -> FloatArray:
+    """Return d position / d motion (3, 6): how a small rotation and a translation of the frame move a point."""
+    x, y, z = position_m
+    return np.hstack([np.array([[0.0, z, -y], [-z, 0.0, x], [y, -x, 0.0]]), np.eye(3)])
+
+
+def _carried(key: Key, motion: Rigid) -> Key:
+    """The key in another frame."""
+    return Key(replace(key.eye, camera=key.eye.camera.moved(motion)), key.pixel_px, motion.vectors(key.normal))
 
 
 def seen_by(
@@ -244,9 +259,21 @@ def seen_by(
             f"{allowed:g} is expected"
         )
         return replace(_lost(track, found, words), chi2=chi2)
-    after = Track("tracked", point.position_m, point.covariance_m2, replace(track.key, eye=key.eye))
+    after = Track("tracked", point.position_m, point.covariance_m2, _corrected(track, point.position_m))
     renewed = _renewed(after, eyes, good, settings)
     return Look(replace(after, key=renewed or after.key), found, "", chi2, renewed is not None)
+
+
+def _corrected(track: Track, position_m: FloatArray) -> Key:
+    """The key after the motion's error that a found position tells of, as far as it is the motion's.
+
+    A heading off by half a degree puts a target 10 m away 9 cm off. Were the key camera shifted by as much
+    instead of turned, it would look at flat ground under another angle, and steps would add up.
+    """
+    weight = track.motion_covariance @ _motion_rate(track.position_m).T
+    spread = track.covariance_m2 + 1e-12 * np.eye(3)
+    error = weight @ np.linalg.solve(spread, position_m - track.position_m)
+    return _carried(track.key, moved_rigid(Rigid.identity(), np.concatenate([error[3:], error[:3]])))
 
 
 def _anchored(track: Track) -> Key | None:
