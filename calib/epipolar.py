@@ -92,13 +92,13 @@ def find_partner(
     if found.verdict != "good":
         return StereoMatch(found)
     try:
-        plane = _surface(camera, pixel, partner, swept.plane, found)
+        plane = local_plane(camera, pixel, partner, swept.plane, found)
     except NoStereoPoint as error:
         return StereoMatch(no_match("weak", f"the two eyes see no point together: {error}", swept.pixel_px))
     again = match(image, camera, pixel, plane, partner_image, partner, LAST_SEARCH_PX, settings)
     if again.verdict == "good":
         found = again
-        plane = _surface(camera, pixel, partner, plane, found)
+        plane = local_plane(camera, pixel, partner, plane, found)
     across, sigma = _across(camera, pixel, partner, plane, found)
     back = _sweep(partner_image, partner, found.pixel_px, image, camera, nearest_m, settings)
     apart = math.inf if isinstance(back, Match) else float(np.linalg.norm(back.pixel_px - pixel))
@@ -290,10 +290,25 @@ def _between(inverse: FloatArray, places: FloatArray, index: int) -> FloatArray:
     return near
 
 
-def _surface(
+def local_plane(
     camera: CameraModel, pixel: FloatArray, partner: CameraModel, plane: Plane, found: Match
 ) -> Plane:
-    """Return the local plane: the target triangulated, the slope from four points around it."""
+    """Return the surface that a match between two eyes tells: the target triangulated, slope by its deformation.
+
+    Parameters
+    ----------
+    pixel
+        (2,) the target in ``camera``.
+    plane
+        The surface that was believed when ``partner`` was searched.
+    found
+        What was found there.
+
+    Raises
+    ------
+    NoStereoPoint
+        If the two eyes' rays have no point in common.
+    """
     target = triangulate(camera, partner, pixel, found.pixel_px).position_m
     deformation = np.zeros((2, 2)) if found.deformation is None else found.deformation
     corners = []

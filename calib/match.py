@@ -375,7 +375,7 @@ def _search(
     if x in (0, scores.shape[1] - 1) or y in (0, scores.shape[0] - 1):
         words = f"the best place is at the border of the window of {reach} px"
         return no_match("border", words, template.target_px, *facts)
-    shift = low + half + np.array([x, y]) - template.centre_px
+    shift = low + half + np.array([x, y]) + _summit(scores, x, y) - template.centre_px
     start = template.target_px + shift - cut_low
     refined = refine(
         template.values,
@@ -395,6 +395,13 @@ def _search(
         refined.pixel_px + cut_low, refined.covariance_px2, refined.deformation, refined.correlation
     )
     return Found(placed, second)
+
+
+def _summit(scores: NDArray[np.float32], x: int, y: int) -> FloatArray:
+    """Return how far (2,) the summit of a score surface lies from its highest pixel, by parabolas."""
+    around = np.array([scores[y, x - 1 : x + 2], scores[y - 1 : y + 2, x]], dtype=np.float64)
+    bend = 2.0 * around[:, 1] - around[:, 0] - around[:, 2]
+    return np.asarray(np.clip((around[:, 2] - around[:, 0]) / (2.0 * np.maximum(bend, 1e-9)), -0.5, 0.5))
 
 
 def correlated_px(magnification: float) -> int:

@@ -17,7 +17,7 @@ relief and a wrong plane over more. The usual σ²N⁻¹ would call such a posit
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,6 +31,7 @@ STEP_ENOUGH_PX = 1e-4
 WORST_DEFORMATION = 0.5  # beyond it the patch is not the same thing any more
 SMOOTH_PX = 0.8  # of the template before its derivative
 WORST_CONDITION = 1e15
+NARROW = 0.35  # of the Gaussian's sigma: slope and scale come from all of it, the place from its middle
 FLOOR_PX = 0.002  # what cubic interpolation itself leaves, measured without noise
 
 
@@ -95,21 +96,67 @@ def refine(
     values = template.astype(np.float64)
     inner = (slice(2, -2), slice(2, -2))  # the border has no two-sided gradient
     q, t = offsets[inner], values[inner]
-    jacobian = _columns(_gradient(values)[inner], q, t, deforming)
-    weights = _columns(_gradient(ndimage.gaussian_filter(values, SMOOTH_PX))[inner], q, t, deforming)
-    shape, n = t.shape, float(t.size)
-    counts = np.ones(shape)
-    if near_px2 is not None:
-        counts = np.exp(-0.5 * np.einsum("...i,ij,...j", q, np.linalg.inv(near_px2), q))
-        weights *= counts.reshape(-1, 1)
-        n = float(counts.sum() ** 2 / (counts**2).sum())
-    normal = weights.T @ jacobian
+    jacobian = _columns(_gradient(values)[inner], q, t)
+    weights = _columns(_gradient(ndimage.gaussian_filter(values, SMOOTH_PX))[inner], q, t)
+    start = np.asarray(start_px, dtype=np.float64)
+    surface = Surface.around(image, start + q.min(axis=(0, 1)), start + q.max(axis=(0, 1)), margin_px=3)
+    fit = _Fit(start, np.zeros((2, 2)))
+    if near_px2 is None:
+        stages = [(deforming, np.ones(t.shape), STEP_ENOUGH_PX)]
+    else:
+        wide, narrow = (
+            np.exp(-0.5 * np.einsum("...i,ij,...j", q, np.linalg.inv(size**2 * near_px2), q))
+            for size in (1.0, NARROW)
+        )
+        stages = [(False, wide, 0.05), (deforming, wide, 0.01), (False, narrow, STEP_ENOUGH_PX)]
+    for index, (deforms, counts, enough_px) in enumerate(stages):
+        free = slice(None) if deforms else [0, 1, 6, 7]
+        nearer = _settled(fit, surface, q, t, jacobian[:, free], weights[:, free], counts, enough_px)
+        if nearer is None and index < 2:
+            return None
+        fit = nearer or fit  # where the middle alone holds nothing, the whole patch tells the place
+    scores = (fit.weights * fit.rest[:, None]).reshape(*t.shape, -1)
+    meat = _sum_of_neighbours(scores, correlated_px)
+    n = float(fit.counts.sum() ** 2 / (fit.counts**2).sum())
+    parameters = fit.inverse @ meat @ fit.inverse.T * (n / max(n - len(meat), 1.0)) / fit.gain**2
+    covariance = parameters[:2, :2] + FLOOR_PX**2 * np.eye(2)
+    seen = fit.rest + fit.gain * t.reshape(-1)
+    correlation = float(np.corrcoef(t.reshape(-1), seen)[0, 1])
+    if not np.isfinite(covariance).all() or not np.isfinite(correlation):
+        return None
+    return Refined(fit.position, (covariance + covariance.T) / 2, fit.deformation, correlation)
+
+
+@dataclass(frozen=True, eq=False)
+class _Fit:
+    """A state of the iteration: place and deformation; once settled also what its covariance is made of."""
+
+    position: FloatArray
+    deformation: FloatArray
+    gain: float = 1.0
+    rest: FloatArray = field(default_factory=lambda: np.empty(0))
+    counts: FloatArray = field(default_factory=lambda: np.empty(0))
+    weights: FloatArray = field(default_factory=lambda: np.empty((0, 0)))
+    inverse: FloatArray = field(default_factory=lambda: np.empty((0, 0)))
+
+
+def _settled(
+    fit: _Fit,
+    surface: Surface,
+    q: FloatArray,
+    t: FloatArray,
+    jacobian: FloatArray,
+    weights: FloatArray,
+    counts: FloatArray,
+    enough_px: float,
+) -> _Fit | None:
+    """Iterate until a step is shorter than ``enough_px``, pixels weighted by ``counts``; None if it does not."""
+    weighted = weights * counts.reshape(-1, 1)
+    normal = weighted.T @ jacobian
     if not np.isfinite(normal).all() or np.linalg.cond(normal) > WORST_CONDITION:
         return None
     inverse = np.linalg.inv(normal)
-    position, deformation = np.array(start_px, dtype=np.float64), np.zeros((2, 2))
-    surface = Surface.around(image, position + q.min(axis=(0, 1)), position + q.max(axis=(0, 1)), margin_px=3)
-    gain, offset = 1.0, 0.0
+    position, deformation = fit.position, fit.deformation
     for _ in range(MOST_STEPS):
         places = position + q + q @ deformation.T
         if not surface.inside(places):
@@ -119,29 +166,20 @@ def refine(
         if gain <= 0.05:
             return None
         rest = (seen - gain * t - offset).reshape(-1)
-        step = -inverse @ (weights.T @ rest)
+        step = -inverse @ (weighted.T @ rest)
         move = step[:2] / gain
         length = float(np.linalg.norm(move))
         if length > 1.0:  # never further than the gradient is good for
             step *= 1.0 / length
             move = step[:2] / gain
         position = position + move
-        if deforming:
+        if len(step) > 4:
             deformation = deformation + (step[2:6] / gain).reshape(2, 2)
         if np.linalg.norm(deformation) > WORST_DEFORMATION:
             return None
-        if length < STEP_ENOUGH_PX:
-            break
-    else:
-        return None
-    scores = (weights * rest[:, None]).reshape(*shape, -1)
-    meat = _sum_of_neighbours(scores, correlated_px)
-    parameters = inverse @ meat @ inverse.T * (n / (n - jacobian.shape[1])) / gain**2
-    covariance = parameters[:2, :2] + FLOOR_PX**2 * np.eye(2)
-    correlation = float(np.corrcoef(t.reshape(-1), seen.reshape(-1))[0, 1])
-    if not np.isfinite(covariance).all() or not np.isfinite(correlation):
-        return None
-    return Refined(position, (covariance + covariance.T) / 2, deformation, correlation)
+        if length < enough_px:
+            return _Fit(position, deformation, gain, rest, counts, weighted, inverse)
+    return None
 
 
 def _gradient(values: FloatArray) -> FloatArray:
@@ -152,11 +190,10 @@ def _gradient(values: FloatArray) -> FloatArray:
     )
 
 
-def _columns(gradient: FloatArray, q: FloatArray, t: FloatArray, deforming: bool) -> FloatArray:
-    """Return the derivatives (n, p) of image minus model: position, deformation row by row, gain, offset."""
+def _columns(gradient: FloatArray, q: FloatArray, t: FloatArray) -> FloatArray:
+    """Return the derivatives (n, 8) of image minus model: position, deformation row by row, gain, offset."""
     columns = [gradient[..., 0], gradient[..., 1]]
-    if deforming:
-        columns += [gradient[..., a] * q[..., b] for a in (0, 1) for b in (0, 1)]
+    columns += [gradient[..., a] * q[..., b] for a in (0, 1) for b in (0, 1)]
     return np.stack([*columns, -t, -np.ones_like(t)], axis=-1).reshape(t.size, -1)
 
 

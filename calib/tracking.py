@@ -22,7 +22,7 @@ from typing import Literal
 import numpy as np
 
 from calib.cahvor import CameraModel
-from calib.epipolar import find_partner
+from calib.epipolar import find_partner, local_plane
 from calib.errors import CalibError, NoStereoPoint
 from calib.handoff_refined import Eye
 from calib.match import Match, MatchSettings, match
@@ -33,9 +33,13 @@ from calib.warp import Plane
 
 State = Literal["tracked", "lost"]
 
-SIZES = MatchSettings(half_px=12)
+SIZES = MatchSettings(half_px=12, near_px=6.0)
 """Smaller patches than a single match takes: seen flat from 10 m, 41 px of ground are 0.8 m long and no
 plane, and what lies off the plane pulls the place along as the view steepens."""
+
+
+SLOPE_PX = 2.0
+"""Search for the partner of a pixel that both eyes have just been found at."""
 
 
 @dataclass(frozen=True)
@@ -56,15 +60,18 @@ class TrackSettings:
     renew_grown, renew_shrunk
         The key picture is renewed when the target's surface is seen this much larger, slant included, or
         smaller. Seen flat, a step nearer shows much that the key picture did not.
+    renew_below
+        Or when the correlation falls below this: what is seen now is no longer what the key picture shows.
     """
 
     sigmas: float = 3.5
     least_px: float = 4.0
     most_px: float = 120.0
-    model_px: float = 0.3
+    model_px: float = 0.12
     worst_chi2: float = 18.5
     renew_grown: float = 1.2
     renew_shrunk: float = 0.3
+    renew_below: float = 0.9
 
 
 @dataclass(frozen=True, eq=False)
@@ -260,7 +267,7 @@ def seen_by(
         )
         return replace(_lost(track, found, words), chi2=chi2)
     after = Track("tracked", point.position_m, point.covariance_m2, _corrected(track, point.position_m))
-    renewed = _renewed(after, eyes, good, settings)
+    renewed = _renewed(after, eyes, good, settings, sizes)
     return Look(replace(after, key=renewed or after.key), found, "", chi2, renewed is not None)
 
 
@@ -308,6 +315,7 @@ def _renewed(
     eyes: Mapping[str, Eye],
     good: Mapping[str, Match],
     settings: TrackSettings,
+    sizes: MatchSettings,
 ) -> Key | None:
     """A new key from this look, where scale or view have changed enough and both eyes saw it."""
     if len(good) < 2:
@@ -315,22 +323,23 @@ def _renewed(
     first, second = list(eyes)[:2]
     camera = eyes[first].camera
     scale = _pixels_per_metre(camera, track) / _pixels_per_metre(track.key.eye.camera, track)
-    if settings.renew_shrunk < scale < settings.renew_grown:
+    alike = min(one.correlation for one in good.values()) >= settings.renew_below
+    if settings.renew_shrunk < scale < settings.renew_grown and alike:
         return None
     pixel = good[first].pixel_px
-    return Key(eyes[first], pixel, _slope(eyes[first], eyes[second], pixel, good[second], track.key.normal))
+    return Key(eyes[first], pixel, _slope(eyes[first], eyes[second], pixel, track, sizes))
 
 
-def _slope(left: Eye, right: Eye, left_px: FloatArray, right_match: Match, before: FloatArray) -> FloatArray:
-    """The surface's normal (3,) as the pair sees it now; as it was believed ``before`` where stereo fails."""
+def _slope(left: Eye, right: Eye, left_px: FloatArray, track: Track, sizes: MatchSettings) -> FloatArray:
+    """The surface's normal (3,) as the pair sees it now; as it was believed before where stereo fails."""
+    before = Plane(track.position_m, track.key.normal)
+    found = match(left.image, left.camera, left_px, before, right.image, right.camera, SLOPE_PX, sizes)
+    if found.verdict != "good":
+        return before.normal
     try:
-        found = find_partner(left.image, left.camera, left_px, right.image, right.camera)
+        return local_plane(left.camera, left_px, right.camera, before, found).normal
     except NoStereoPoint:
-        return before
-    if found.match.verdict != "good" or found.plane is None:
-        return before
-    apart = np.linalg.norm(found.match.pixel_px - right_match.pixel_px)
-    return found.plane.normal if apart <= 1.0 else before
+        return before.normal
 
 
 def _pixels_per_metre(camera: CameraModel, track: Track) -> float:
