@@ -322,7 +322,9 @@ def _template(
         near_px2 = _near(plane, destination, seen, settings.near_px * grown)
         reach = np.ceil(COUNTS_TO * np.sqrt(np.diag(near_px2))).astype(int) + 2
         half = np.minimum(reach, settings.most_half_px)
-    least = np.minimum(half, round(settings.smallest_half_px * min(grown, settings.most_half_px / settings.half_px)))
+    least = np.minimum(
+        half, round(settings.smallest_half_px * min(grown, settings.most_half_px / settings.half_px))
+    )
     edge = np.minimum(seen, np.array(destination.size_px) - 1 - seen).astype(int) - 4
     half = np.minimum(half, np.maximum(edge, least))
     while True:

@@ -92,7 +92,9 @@ def refine(
         None if it did not settle, left the image, or found nothing to hold on to.
     """
     height, width = template.shape
-    offsets = patch_grid((width // 2, height // 2)) + (centre_px - target_px)  # q: from target to patch pixels
+    offsets = patch_grid((width // 2, height // 2)) + (
+        centre_px - target_px
+    )  # q: from target to patch pixels
     values = template.astype(np.float64)
     inner = (slice(2, -2), slice(2, -2))  # the border has no two-sided gradient
     q, t = offsets[inner], values[inner]

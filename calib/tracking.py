@@ -214,7 +214,9 @@ def _motion_rate(position_m: FloatArray) -> FloatArray:
 
 def _carried(key: Key, motion: Rigid) -> Key:
     """The key in another frame."""
-    return Key(replace(key.eye, camera=key.eye.camera.moved(motion)), key.pixel_px, motion.vectors(key.normal))
+    return Key(
+        replace(key.eye, camera=key.eye.camera.moved(motion)), key.pixel_px, motion.vectors(key.normal)
+    )
 
 
 def seen_by(

@@ -157,7 +157,9 @@ def warp_patch(
     half = (half_px, half_px) if isinstance(half_px, int) else half_px
     centre = np.rint(target).astype(np.intp)
     reach = np.array(half) + 0.5  # to the outer pixels' far sides
-    knots, ok = carry(centre + reach * np.stack(np.meshgrid(KNOTS, KNOTS), axis=-1), destination, plane, source)
+    knots, ok = carry(
+        centre + reach * np.stack(np.meshgrid(KNOTS, KNOTS), axis=-1), destination, plane, source
+    )
     if not ok.all() or not _inside(knots, source_image.shape):
         return None
     across, down = (np.linalg.norm(np.diff(knots, axis=a), axis=-1).max() for a in (1, 0))
@@ -180,7 +182,8 @@ def _cubic(half: int, samples: int) -> FloatArray:
     places = (np.arange(-half, half + 1)[:, None] + parts).reshape(-1) / (half + 0.5)
     others = [np.delete(KNOTS, k) for k in range(len(KNOTS))]
     weights = [
-        np.prod((places[:, None] - rest) / (knot - rest), axis=1) for knot, rest in zip(KNOTS, others, strict=True)
+        np.prod((places[:, None] - rest) / (knot - rest), axis=1)
+        for knot, rest in zip(KNOTS, others, strict=True)
     ]
     return np.stack(weights, axis=1)
 

@@ -17,14 +17,22 @@ from mastctl.experiment.approach import (
     ApproachRun,
     Stop,
     choose_pair,
-    summary,
-    table_rows,
-    write_record,
 )
+from mastctl.experiment.approach_report import summary, table_rows, write_record
 
 
 def stop(range_m: float, error_m: tuple[float, float, float], state: str = "tracked") -> Stop:
-    return Stop(range_m, "hazcam", state, "", np.array(error_m), np.full(3, 0.003), 0.3, False)
+    return Stop(
+        range_m,
+        "hazcam",
+        state,
+        "",
+        np.array(error_m),
+        np.full(3, 0.003),
+        0.3,
+        False,
+        np.array([0.1, 0.0, 0.0]),
+    )
 
 
 @pytest.mark.parametrize(("range_m", "pair"), [(9.0, "pancam"), (4.0, "navcam"), (1.0, "hazcam")])
