@@ -152,7 +152,7 @@ def _settled(
     counts: FloatArray,
     enough_px: float,
 ) -> _Fit | None:
-    """Iterate until a step is shorter than ``enough_px``, pixels weighted by ``counts``; None if it does not."""
+    """Iterate, pixels weighted by ``counts``, until a step is shorter than ``enough_px``; None if none is."""
     weighted = weights * counts.reshape(-1, 1)
     normal = weighted.T @ jacobian
     if not np.isfinite(normal).all() or np.linalg.cond(normal) > WORST_CONDITION:
@@ -200,7 +200,7 @@ def _columns(gradient: FloatArray, q: FloatArray, t: FloatArray) -> FloatArray:
 
 
 def _photometry(template: FloatArray, seen: FloatArray, counts: FloatArray) -> tuple[float, float]:
-    """Return gain and offset that bring the template nearest to what is seen, pixels weighted by ``counts``."""
+    """Return gain and offset that bring the template nearest to what is seen, weighted by ``counts``."""
     total = float(counts.sum())
     template_mean, seen_mean = float((counts * template).sum()) / total, float((counts * seen).sum()) / total
     weighted = counts * (template - template_mean)

@@ -38,10 +38,6 @@ SIZES = MatchSettings(half_px=12, near_px=6.0)
 plane, and what lies off the plane pulls the place along as the view steepens."""
 
 
-SLOPE_PX = 2.0
-"""Search for the partner of a pixel that both eyes have just been found at."""
-
-
 @dataclass(frozen=True)
 class TrackSettings:
     """Thresholds of the tracking, with the reasons for their values.
@@ -207,7 +203,7 @@ def moved(track: Track, now_from_then: Rigid, covariance: FloatArray) -> Track:
 
 
 def _motion_rate(position_m: FloatArray) -> FloatArray:
-    """Return d position / d motion (3, 6): how a small rotation and a translation of the frame move a point."""
+    """Return d position / d motion (3, 6): how a small rotation, then a translation, move a point."""
     x, y, z = position_m
     return np.hstack([np.array([[0.0, z, -y], [-z, 0.0, x], [y, -x, 0.0]]), np.eye(3)])
 
@@ -269,7 +265,7 @@ def seen_by(
         )
         return replace(_lost(track, found, words), chi2=chi2)
     after = Track("tracked", point.position_m, point.covariance_m2, _corrected(track, point.position_m))
-    renewed = _renewed(after, eyes, good, settings, sizes)
+    renewed = _renewed(after, eyes, good, plane, settings)
     return Look(replace(after, key=renewed or after.key), found, "", chi2, renewed is not None)
 
 
@@ -316,8 +312,8 @@ def _renewed(
     track: Track,
     eyes: Mapping[str, Eye],
     good: Mapping[str, Match],
+    plane: Plane,
     settings: TrackSettings,
-    sizes: MatchSettings,
 ) -> Key | None:
     """A new key from this look, where scale or view have changed enough and both eyes saw it."""
     if len(good) < 2:
@@ -328,20 +324,12 @@ def _renewed(
     alike = min(one.correlation for one in good.values()) >= settings.renew_below
     if settings.renew_shrunk < scale < settings.renew_grown and alike:
         return None
-    pixel = good[first].pixel_px
-    return Key(eyes[first], pixel, _slope(eyes[first], eyes[second], pixel, track, sizes))
-
-
-def _slope(left: Eye, right: Eye, left_px: FloatArray, track: Track, sizes: MatchSettings) -> FloatArray:
-    """The surface's normal (3,) as the pair sees it now; as it was believed before where stereo fails."""
-    before = Plane(track.position_m, track.key.normal)
-    found = match(left.image, left.camera, left_px, before, right.image, right.camera, SLOPE_PX, sizes)
-    if found.verdict != "good":
-        return before.normal
+    left, right = good[first], good[second]
     try:
-        return local_plane(left.camera, left_px, right.camera, before, found).normal
+        slope = local_plane(camera, left.pixel_px, eyes[second].camera, plane, right, left)
     except NoStereoPoint:
-        return before.normal
+        return None
+    return Key(eyes[first], left.pixel_px, slope.normal)
 
 
 def _pixels_per_metre(camera: CameraModel, track: Track) -> float:

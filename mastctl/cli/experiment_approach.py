@@ -41,7 +41,7 @@ def run(args: argparse.Namespace) -> int:
     from calib.store import load_rig
     from mastctl.cli.experiment import check_writable
     from mastctl.experiment.approach import run_approach
-    from mastctl.experiment.approach_report import counted, summary, table_rows, write_record
+    from mastctl.experiment.approach_report import counted, summary, table_rows, write_record, write_strip
     from mastctl.packaged import config_folder
 
     if args.out is not None:
@@ -58,8 +58,9 @@ def run(args: argparse.Namespace) -> int:
         one = runs[-1]
         told = one.error or ("kept" if one.kept else f"lost: {one.stops[-1].reason}" if one.stops else "lost")
         console.print(f"seed {one.seed}: {told}", markup=False)
-    if args.out is not None:
-        write_record(runs, args.out)
+        if args.out is not None:  # after every run: what is interrupted leaves its record
+            write_record(runs, args.out)
+            write_strip(one, args.out)
     if args.json:
         output.print_json(summary(runs))
     else:

@@ -78,7 +78,7 @@ class Stop:
 
 @dataclass(frozen=True, eq=False)
 class ApproachRun:
-    """One approach: its stops, or why it did not begin; ``start_m`` is the first stereo's error, as a stop's."""
+    """One approach: its stops, or why it did not begin; ``start_m`` (3,) is the first stereo's error."""
 
     seed: int
     stops: tuple[Stop, ...]

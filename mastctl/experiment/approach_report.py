@@ -1,4 +1,4 @@
-"""What an approach experiment tells and leaves: the table beside the paper's Table I, records and pictures."""
+"""What an approach experiment tells and leaves: the table beside the paper's Table I, records, pictures."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import csv
 import json
 import math
 from collections.abc import Sequence
+from itertools import pairwise
 from pathlib import Path
 
 import cv2
@@ -30,7 +31,7 @@ AXES = ("along", "right", "below")
 
 
 def silently_wrong(stop: Stop) -> bool:
-    """Tell whether a stop says tracked and is off by more than 3 cm, 1 % of the range and five of its sigmas."""
+    """Tell whether a stop says tracked and is off by over 3 cm, 1 % of the range and five of its sigmas."""
     far = float(np.linalg.norm(stop.error_m)) > max(0.03, 0.01 * stop.range_m)
     return stop.state == "tracked" and far and bool((np.abs(stop.error_m) > 5 * stop.sigma_m).any())
 
@@ -38,13 +39,13 @@ def silently_wrong(stop: Stop) -> bool:
 def handoffs(run: ApproachRun) -> int:
     """How often another pair took over and found the target."""
     seen = [stop.pair for stop in run.stops if stop.state == "tracked"]
-    return sum(a != b for a, b in zip(seen, seen[1:], strict=False))
+    return sum(a != b for a, b in pairwise(seen))
 
 
 def losses(run: ApproachRun) -> tuple[int, int]:
     """How often the target was lost, and how often found again."""
     states = ["tracked", *(stop.state for stop in run.stops)]
-    pairs = list(zip(states, states[1:], strict=False))
+    pairs = list(pairwise(states))
     return pairs.count(("tracked", "lost")), pairs.count(("lost", "tracked"))
 
 
@@ -89,8 +90,12 @@ def table_rows(runs: Sequence[ApproachRun]) -> tuple[list[str], list[list[str]]]
     theory = next(row for row in target_approach_budget() if row.name == "pancam")
     rows = [
         ["stereo at the start", f"{theory.stereo_cm:.1f}", f"{PAPER_CM['stereo']}", *_cm(found, "start")],
-        ["at 1 m, not tracked", f"{theory.untracked_cm:.1f}", f"{PAPER_CM['untracked']}"]
-        + _cm(found, "untracked"),
+        [
+            "at 1 m, not tracked",
+            f"{theory.untracked_cm:.1f}",
+            f"{PAPER_CM['untracked']}",
+            *_cm(found, "untracked"),
+        ],
         ["at 1 m, tracked", f"{theory.tracked_cm:.2f}", f"{PAPER_CM['tracked']}", *_cm(found, "final")],
     ]
     for low, high in BINS_M:
@@ -116,7 +121,7 @@ def counted(runs: Sequence[ApproachRun]) -> str:
 
 
 def write_record(runs: Sequence[ApproachRun], folder: Path) -> None:
-    """Write stops.csv, record.json, a strip of pictures a run and error.png into ``folder`` (made if need be).
+    """Write stops.csv, record.json and error.png into ``folder`` (made if need be).
 
     Raises
     ------
@@ -142,11 +147,20 @@ def write_record(runs: Sequence[ApproachRun], folder: Path) -> None:
         ],
     }
     (folder / "record.json").write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
-    for one in runs:
-        if one.stops and one.stops[0].patches:
-            _, png = cv2.imencode(".png", strip(one))
-            (folder / f"strip_{one.seed}.png").write_bytes(png.tobytes())
     write_plot(runs, folder / "error.png")
+
+
+def write_strip(run: ApproachRun, folder: Path) -> None:
+    """Write a run's pictures as strip_SEED.png into ``folder``; nothing for a run that did not begin.
+
+    Raises
+    ------
+    OSError
+        If the file cannot be written.
+    """
+    if run.stops:
+        _, png = cv2.imencode(".png", strip(run))
+        (folder / f"strip_{run.seed}.png").write_bytes(png.tobytes())
 
 
 def strip(run: ApproachRun) -> Image:
@@ -154,7 +168,7 @@ def strip(run: ApproachRun) -> Image:
     columns = []
     for stop in run.stops:
         colour = (80, 200, 80) if stop.state == "tracked" else (60, 60, 230)
-        tiles = [np.zeros((16, 0, 3), np.uint8)]
+        tiles = []
         for row, patch in enumerate(stop.patches):
             side = patch.shape[0] * SCALE
             tile = cv2.resize(patch, (side, side), interpolation=cv2.INTER_NEAREST)
@@ -163,10 +177,10 @@ def strip(run: ApproachRun) -> Image:
             cv2.drawMarker(tile, (side // 2, side // 2), tone, cv2.MARKER_CROSS, 12, 1)
             cv2.rectangle(tile, (0, 0), (side - 1, side - 1), tone, 1)
             tiles.append(tile)
-        head = np.full((16, tiles[1].shape[1], 3), 255, np.uint8)
+        head = np.full((16, tiles[0].shape[1], 3), 255, np.uint8)
         words = f"{stop.pair} {stop.range_m:.2f} m"
         cv2.putText(head, words, (2, 12), cv2.FONT_HERSHEY_SIMPLEX, 0.4, (0, 0, 0), 1, cv2.LINE_AA)
-        columns.append(np.vstack([head, *tiles[1:]]))
+        columns.append(np.vstack([head, *tiles]))
     return np.asarray(np.hstack(columns), dtype=np.uint8)
 
 
