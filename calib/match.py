@@ -23,6 +23,7 @@ from calib.rigid import FloatArray
 from calib.warp import Grey, Plane, Template, blurred_to, carry, warp_patch
 
 MOST_ASPECT = 5.0  # of a weight that is round on a surface seen flat
+_CROSS = np.array([[-1.0, 0.0], [1.0, 0.0], [0.0, -1.0], [0.0, 1.0]])
 COUNTS_TO = 2.2  # sigmas of that weight, beyond which pixels are left out
 
 Verdict = Literal["good", "flat", "ambiguous", "weak", "border"]
@@ -313,10 +314,12 @@ def _template(
     settings: MatchSettings,
 ) -> tuple[Template, FloatArray | None] | None:
     """Warp the largest patch that both pictures hold, sized by the coarser of the two; with its weight."""
-    probe = warp_patch(image, source, target, plane, destination, 1)
-    if probe is None:
+    around, ok = carry(seen + _CROSS, destination, plane, source)
+    if not ok.all():
         return None
-    grown = max(1.0, probe.magnification)
+    # Destination pixels a source pixel, by area.
+    shrunk = abs(float(np.linalg.det(np.stack([around[1] - around[0], around[3] - around[2]]) / 2)))
+    grown = max(1.0, 1.0 / np.sqrt(max(shrunk, 1e-6)))
     near_px2, half = None, np.full(2, min(round(settings.half_px * grown), settings.most_half_px))
     if settings.near_px > 0:
         near_px2 = _near(plane, destination, seen, settings.near_px * grown)
@@ -341,9 +344,7 @@ def _near(plane: Plane, camera: CameraModel, pixel: FloatArray, near_px: float) 
     ray = camera.ray(pixel)
     range_m = float((plane.point_m - ray.origins_m) @ plane.normal) / float(ray.directions @ plane.normal)
     _, rate, _ = camera.project_jacobian(ray.origins_m + range_m * ray.directions)
-    first = np.cross(plane.normal, np.eye(3)[int(np.argmin(np.abs(plane.normal)))])
-    first /= np.linalg.norm(first)
-    seen = rate @ np.stack([first, np.cross(plane.normal, first)], axis=1)
+    seen = rate @ plane.axes
     values, vectors = np.linalg.eigh(seen @ seen.T)
     aspect = min(float(np.sqrt(values[1] / max(values[0], 1e-12 * values[1]))), MOST_ASPECT)
     return np.asarray((vectors * np.array([near_px**2 / aspect, near_px**2 * aspect])) @ vectors.T)

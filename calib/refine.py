@@ -110,7 +110,7 @@ def refine(
             np.exp(-0.5 * np.einsum("...i,ij,...j", q, np.linalg.inv(size**2 * near_px2), q))
             for size in (1.0, NARROW)
         )
-        stages = [(False, wide, 0.05), (deforming, wide, 0.01), (False, narrow, STEP_ENOUGH_PX)]
+        stages = [(False, wide, 0.05), (deforming, wide, 0.01), (False, narrow, 10 * STEP_ENOUGH_PX)]
     for index, (deforms, counts, enough_px) in enumerate(stages):
         free = slice(None) if deforms else [0, 1, 6, 7]
         nearer = _settled(fit, surface, q, t, jacobian[:, free], weights[:, free], counts, enough_px)

@@ -320,7 +320,7 @@ def _renewed(
         return None
     first, second = list(eyes)[:2]
     camera = eyes[first].camera
-    scale = _pixels_per_metre(camera, track) / _pixels_per_metre(track.key.eye.camera, track)
+    scale = _pixels_per_metre(camera, plane) / _pixels_per_metre(track.key.eye.camera, plane)
     alike = min(one.correlation for one in good.values()) >= settings.renew_below
     if settings.renew_shrunk < scale < settings.renew_grown and alike:
         return None
@@ -332,16 +332,10 @@ def _renewed(
     return Key(eyes[first], left.pixel_px, slope.normal)
 
 
-def _pixels_per_metre(camera: CameraModel, track: Track) -> float:
+def _pixels_per_metre(camera: CameraModel, plane: Plane) -> float:
     """How large a camera sees the target's surface: the root of pixels² a m² of it, slant included."""
-    _, rate, valid = camera.project_jacobian(track.position_m)
-    normal = track.key.normal
-    first = np.cross(normal, np.eye(3)[int(np.argmin(np.abs(normal)))])
-    first /= np.linalg.norm(first)
-    area = (
-        np.linalg.det(rate @ np.stack([first, np.cross(normal, first)], axis=1)) if bool(valid) else math.nan
-    )
-    return math.sqrt(abs(float(area)))
+    _, rate, valid = camera.project_jacobian(plane.point_m)
+    return math.sqrt(abs(float(np.linalg.det(rate @ plane.axes)))) if bool(valid) else math.nan
 
 
 def _lost(track: Track, found: Mapping[str, Match], reason: str) -> Look:

@@ -7,7 +7,7 @@ source camera's own model. All models and planes are in one common frame (usuall
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, cached_property
 
 import cv2
 import numpy as np
@@ -41,6 +41,14 @@ class Plane:
             raise CalibError(f"plane normal {normal.tolist()} has no direction")
         object.__setattr__(self, "point_m", frozen_array(self.point_m, (3,)))
         object.__setattr__(self, "normal", frozen_array(normal / length, (3,)))
+
+    @cached_property
+    def axes(self) -> FloatArray:
+        """Two perpendicular unit vectors in the plane, as columns (3, 2)."""
+        x, y, z = self.normal.tolist()
+        flat = np.array([-y, x, 0.0]) if abs(z) < 0.9 else np.array([0.0, -z, y])
+        first = flat / np.linalg.norm(flat)
+        return np.stack([first, np.cross(self.normal, first)], axis=1)
 
 
 def grey(image: ArrayLike) -> Grey:
