@@ -58,7 +58,7 @@ def test_installed_wheel_runs_the_demo_from_another_folder(wheel: Path, tmp_path
     }
     clean["PIP_DISABLE_PIP_VERSION_CHECK"] = "1"
     run(
-        environment / "bin" / "pip", "install", "-q", "--no-index", "--find-links", wheels,
+        environment / "bin" / "pip", "install", "-q", "--no-compile", "--no-index", "--find-links", wheels,
         f"{wheel}[sim,report]",
         timeout_s=INSTALL_TIMEOUT_S, env=clean,
     )  # fmt: skip

@@ -205,6 +205,9 @@ class _Surveyor:
                 inwards = np.zeros(2)
         self.put_up(setup, placement, pose)
         self.shoot(names, setup, placement, purpose, joints)
+        if ring.also:
+            turned = self.rig.stereo[ring.also]
+            self.shoot(turned, setup, placement, "mast", self.aim(turned, pose))
 
     def mast(self, head: Sequence[str], setups: Sequence[str]) -> None:
         """Put boards over the range of the mast, nearer the steeper; check boards in the same way."""

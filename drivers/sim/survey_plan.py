@@ -27,12 +27,17 @@ BOARD = Board(10, 10, 0.08, 0.04, {name: np.array(place) for name, place in TAPE
 
 @dataclass(frozen=True)
 class Ring:
-    """Boards at one distance from a pair of cameras, for its calibration."""
+    """Boards at one distance from a pair of cameras, for its calibration.
+
+    ``also`` names a pair on the head that turns to each of them and photographs it too, so that both pairs
+    hang on the same boards.
+    """
 
     pair: str
     range_m: float
     boards: int = 4
     head_tilt_rad: float = 0.0
+    also: str = ""
 
 
 PAPER_RINGS = (

@@ -19,8 +19,6 @@ import pytest
 
 from drivers.errors import DriverError, LineLost, NoReply
 from drivers.interfaces import PanTilt, Reading
-from drivers.sim import rover
-from drivers.sim.scene import SceneSettings, build_scene
 from mastctl.client import Client
 from mastctl.config import load_config
 from mastctl.daemon import RunningDaemon
@@ -401,11 +399,9 @@ def _stands(rig: Rig) -> bool:
         ("dynamixel", "ph42", 1.5),
     ],
 )
-def test_the_demos_pointing_loop_lands_with_every_head(
-    wire: str | None, head: str, worst_px: float, monkeypatch: pytest.MonkeyPatch
-) -> None:
+@pytest.mark.usefixtures("one_scene")
+def test_the_demos_pointing_loop_lands_with_every_head(wire: str | None, head: str, worst_px: float) -> None:
     # A count of the X is 2 px and its backlash 5.6 px of the navcam; the PTU's steps are 0.07 px.
-    monkeypatch.setattr(rover, "build_scene", lambda settings: build_scene(SceneSettings(seed=1, rocks=4)))
     config = demo_config(load_config(None), head=head, wire=wire, seed=1)
     simulation = {**config.hardware.simulation, "samples": 1}
     cameras = {n: c for n, c in config.hardware.cameras.items() if n.startswith("navcam")}

@@ -168,6 +168,24 @@ def test_a_plan_can_ask_for_less(rig: Rig) -> None:
     assert survey.cameras["navcam_left"].rough_C_m is None
 
 
+def test_a_pair_on_the_head_may_see_the_boards_of_one_on_the_body(rig: Rig) -> None:
+    ring = Ring("hazcam", 1.5, boards=4)
+    alone, together = (
+        simulate_survey(rig, 2, SurveyPlan(rings=(replace(ring, also=also),), mast_boards=0, check_boards=0))[
+            0
+        ]
+        for also in ("", "navcam")
+    )
+    assert {image.camera for image in alone.images} == {"hazcam_left", "hazcam_right"}
+    boards = {image.placement for image in alone.images}
+    turned = [image for image in together.images if image.camera.startswith("navcam")]
+    assert {image.placement for image in turned} <= boards
+    assert len(turned) >= 4, "most boards are seen whole"
+    for image in turned:
+        assert image.purpose == "mast"
+        assert image.tilt_rad is not None and image.tilt_rad < -0.5, "the head looks down to them"
+
+
 def test_truth_places_the_board_before_its_camera(simulated: tuple[Survey, SurveyTruth]) -> None:
     survey, truth = simulated
     for image in survey.images[::11]:

@@ -492,7 +492,9 @@ def test_an_image_with_the_placement_of_another_is_told_whose_it_is(
     folder: Path, capsys: pytest.CaptureFixture[str], image: str, own: str, other: str, method: str
 ) -> None:
     rows(folder / IMAGES, lambda c, _: c | {"placement": other} if c["image"] == image else c)
-    code, told = calibrate(capsys, folder, "--method", method, "--report", str(folder.parent / "r"))
+    # Drawing a report takes longer than all the rest; an image without any pixels is the hard one to draw.
+    report = ["--report", str(folder.parent / "r")] if other in ("mast-5", "mast-8") else []
+    code, told = calibrate(capsys, folder, "--method", method, *(report if method == "joint" else []))
     assert code == 0, told
     reasons = " | ".join(reason["sentence"] for reason in told["verdict"]["reasons"])
     assert f"image {image} cannot show placement {other} but would show {own} (set-up level)" in reasons

@@ -17,10 +17,13 @@ from typing import Any
 import pytest
 from survey_world import navcam_rig, navcam_survey, write_folder
 
+from calib.calibration import Calibration
+from calib.fit_paper import fit_paper
 from calib.store import load_rig, save_rig
 from calib.survey import read_survey
 from mastctl import html
 from mastctl.calibration import detection
+from mastctl.calibration.run import FITS
 from mastctl.cli.main import main
 
 KILLED_AT = """
@@ -43,6 +46,17 @@ FILE_LIMIT_BYTES = 20_000
 @pytest.fixture(scope="module")
 def survey(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_folder(navcam_survey(1)[0], tmp_path_factory.mktemp("survey") / "s")
+
+
+@pytest.fixture(scope="module")
+def fitted(survey: Path) -> Calibration:
+    return fit_paper(read_survey(survey))
+
+
+@pytest.fixture(autouse=True)
+def one_fit(fitted: Calibration, monkeypatch: pytest.MonkeyPatch) -> None:
+    """In this process the survey is fitted once: what comes after the fit is tried here."""
+    monkeypatch.setitem(FITS, "paper", lambda survey, mast_parameters: fitted)
 
 
 def words(survey: Path, out: Path, *more: str) -> list[str]:

@@ -113,15 +113,17 @@ def test_a_joint_that_stands_still_is_named_with_what_it_leaves_open(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], joint: str, survey: Any, axis: str, method: str
 ) -> None:
     write_folder(survey(), tmp_path / "s")
-    told = calibrate(capsys, tmp_path, "--method", method, "--report", str(tmp_path / "r"))
+    report = ["--report", str(tmp_path / "r")] if method == "joint" else []
+    told = calibrate(capsys, tmp_path, "--method", method, *report)
     assert told["verdict"]["grade"] == "bad"
     first = {direction["parameters"][0] for direction in told["degenerate"]}
     assert first == {f"mast.translation_m.{axis}", f"mast.rotation_rad.{axis}"}
-    page = html.unescape((tmp_path / "r" / "calibration.html").read_text())
     for direction in told["degenerate"]:
         assert f"{joint} hardly moved" in direction["sentence"]
         assert f"over the range of {joint} that will be used" in direction["sentence"]
-        assert direction["sentence"] in page
+    if report:
+        page = html.unescape((tmp_path / "r" / "calibration.html").read_text())
+        assert all(direction["sentence"] in page for direction in told["degenerate"])
     assert any(f"{joint} goes from" in warning for warning in told["warnings"])
 
 

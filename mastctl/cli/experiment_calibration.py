@@ -36,8 +36,8 @@ def add_parser(kinds: Any) -> None:
     )  # fmt: skip
     parser.add_argument(
         "--study", action="append", metavar="NAME",
-        choices=("placements", "boards", "station", "prisms", "mast"),
-        help="placements, boards, station, prisms or mast; may be given several times (default: all)",
+        choices=("placements", "boards", "station", "prisms", "hazcam", "mast"),
+        help="placements, boards, station, prisms, hazcam or mast; may be given several times (default: all)",
     )  # fmt: skip
     parser.add_argument("--seed", type=seed, default=1, metavar="S", help="of everything random (default 1)")
     parser.add_argument(

@@ -172,6 +172,10 @@ def variants() -> tuple[Variant, ...]:
             found.append(Variant(f"station, {method}", label, 1000 * station_m, method, 6, plan))
     for prisms in (3, 4):
         found.append(Variant("prisms", f"{prisms}", prisms, "joint", 6, replace(base, prisms=prisms)))
+    for also in ("", "navcam"):
+        rings = tuple(replace(r, also=also) if r.pair == "hazcam" else r for r in base.rings)
+        label = f"seen by {also} too" if also else "seen by hazcam"
+        found.append(Variant("hazcam boards", label, float(bool(also)), plan=replace(base, rings=rings)))
     paper = replace(base, sigma=Sigma(PAPER_STATION_M, 0.1))
     for parameters in (4, 6, 8):
         found.append(Variant("mast parameters", f"{parameters}", parameters, "paper", parameters, paper))
