@@ -10,7 +10,8 @@ The verdict is part of the measurement: only a ``good`` match is one. What the o
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import cv2
@@ -18,7 +19,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from calib.cahvor import CameraModel
-from calib.refine import Refined, refine
+from calib.refine import NARROW, Refined, refine
 from calib.rigid import FloatArray
 from calib.warp import Grey, Plane, Template, blurred_to, carry, warp_patch
 
@@ -183,7 +184,21 @@ def match(
     if isinstance(found, Match):
         return found
     surface = _surface_term(source, target, plane, destination, template, near_px2, settings.roughness)
+    middle = found.refined.middle
+    if middle is not None:
+        # The middle is noisier, but the target is nearer to its plane.
+        nearer = NARROW**2 * surface
+        if _worst(middle.covariance_px2 + nearer) < _worst(found.refined.covariance_px2 + surface):
+            found, surface = (
+                replace(found, refined=replace(middle, correlation=found.refined.correlation)),
+                nearer,
+            )
     return judged(template, found, surface, settings)
+
+
+def _worst(covariance_px2: FloatArray) -> float:
+    """The variance in the worst direction."""
+    return float(np.linalg.eigvalsh(covariance_px2)[-1])
 
 
 def texture_lacks(values: Grey, settings: MatchSettings) -> str:
@@ -254,7 +269,7 @@ def judged(template: Template, found: Found, surface_px2: FloatArray, settings: 
     if rivalled(refined.correlation, found.second, settings):
         words = f"a second place fits nearly as well: {found.second:.2f} beside {refined.correlation:.2f}"
         return no_match("ambiguous", words, template.target_px, *facts)
-    worst_px = float(np.sqrt(np.linalg.eigvalsh(refined.covariance_px2)[-1]))
+    worst_px = math.sqrt(_worst(refined.covariance_px2))
     if worst_px > settings.worst_sigma_px:
         words = f"the place is certain to {worst_px:.2f} px only, {settings.worst_sigma_px} px is expected"
         return no_match("weak", words, template.target_px, *facts)
@@ -394,10 +409,8 @@ def _search(
     ):
         words = f"the best place (correlation {best:.2f}) does not settle to a sub-pixel position"
         return no_match("weak", words, template.target_px, *facts)
-    placed = Refined(
-        refined.pixel_px + cut_low, refined.covariance_px2, refined.deformation, refined.correlation
-    )
-    return Found(placed, second)
+    middle = refined.middle and replace(refined.middle, pixel_px=refined.middle.pixel_px + cut_low)
+    return Found(replace(refined, pixel_px=refined.pixel_px + cut_low, middle=middle), second)
 
 
 def _summit(scores: NDArray[np.float32], x: int, y: int) -> FloatArray:

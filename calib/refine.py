@@ -17,7 +17,7 @@ relief and a wrong plane over more. The usual σ²N⁻¹ would call such a posit
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,6 +32,7 @@ WORST_DEFORMATION = 0.5  # beyond it the patch is not the same thing any more
 SMOOTH_PX = 0.8  # of the template before its derivative
 WORST_CONDITION = 1e15
 NARROW = 0.35  # of the Gaussian's sigma: slope and scale come from all of it, the place from its middle
+_RIGID = [0, 1, 6, 7]  # the columns of place, gain and offset
 FLOOR_PX = 0.002  # what cubic interpolation itself leaves, measured without noise
 
 
@@ -49,12 +50,15 @@ class Refined:
         (2, 2) D: what the warp did not foresee, as a linear map of offsets from the target.
     correlation
         Normalised correlation of template and image at the found place, -1..1.
+    middle
+        The place that the patch's middle alone tells, `NARROW` as wide, the deformation kept.
     """
 
     pixel_px: FloatArray
     covariance_px2: FloatArray
     deformation: FloatArray
     correlation: float
+    middle: Refined | None = None
 
 
 def refine(
@@ -92,9 +96,8 @@ def refine(
         None if it did not settle, left the image, or found nothing to hold on to.
     """
     height, width = template.shape
-    offsets = patch_grid((width // 2, height // 2)) + (
-        centre_px - target_px
-    )  # q: from target to patch pixels
+    # q: from the target to each patch pixel
+    offsets = patch_grid((width // 2, height // 2)) + (centre_px - target_px)
     values = template.astype(np.float64)
     inner = (slice(2, -2), slice(2, -2))  # the border has no two-sided gradient
     q, t = offsets[inner], values[inner]
@@ -102,21 +105,32 @@ def refine(
     weights = _columns(_gradient(ndimage.gaussian_filter(values, SMOOTH_PX))[inner], q, t)
     start = np.asarray(start_px, dtype=np.float64)
     surface = Surface.around(image, start + q.min(axis=(0, 1)), start + q.max(axis=(0, 1)), margin_px=3)
-    fit = _Fit(start, np.zeros((2, 2)))
+
+    def settled(fit: _Fit, counts: FloatArray, deforms: bool, enough_px: float) -> _Fit | None:
+        free = slice(None) if deforms else _RIGID
+        return _settled(fit, surface, q, t, jacobian[:, free], weights[:, free], counts, enough_px)
+
+    first = _Fit(start, np.zeros((2, 2)))
     if near_px2 is None:
-        stages = [(deforming, np.ones(t.shape), STEP_ENOUGH_PX)]
-    else:
-        wide, narrow = (
-            np.exp(-0.5 * np.einsum("...i,ij,...j", q, np.linalg.inv(size**2 * near_px2), q))
-            for size in (1.0, NARROW)
-        )
-        stages = [(False, wide, 0.05), (deforming, wide, 0.01), (False, narrow, 10 * STEP_ENOUGH_PX)]
-    for index, (deforms, counts, enough_px) in enumerate(stages):
-        free = slice(None) if deforms else [0, 1, 6, 7]
-        nearer = _settled(fit, surface, q, t, jacobian[:, free], weights[:, free], counts, enough_px)
-        if nearer is None and index < 2:
-            return None
-        fit = nearer or fit  # where the middle alone holds nothing, the whole patch tells the place
+        whole = settled(first, np.ones(t.shape), deforming, STEP_ENOUGH_PX)
+        return _refined(whole, t, correlated_px) if whole else None
+    wide = _gaussian(q, near_px2)
+    begun = settled(first, wide, False, 0.05)
+    whole = settled(begun, wide, deforming, 10 * STEP_ENOUGH_PX) if begun else None
+    if whole is None or (refined := _refined(whole, t, correlated_px)) is None:
+        return None
+    middle = settled(whole, _gaussian(q, NARROW**2 * near_px2), False, 10 * STEP_ENOUGH_PX)
+    return replace(refined, middle=_refined(middle, t, correlated_px) if middle else None)
+
+
+def _gaussian(q: FloatArray, covariance_px2: FloatArray) -> FloatArray:
+    """Weights of offsets (h, w, 2): 1 at the target."""
+    weights = np.exp(-0.5 * np.einsum("...i,ij,...j", q, np.linalg.inv(covariance_px2), q))
+    return np.asarray(weights, dtype=np.float64)
+
+
+def _refined(fit: _Fit, t: FloatArray, correlated_px: int) -> Refined | None:
+    """The place of a settled fit with its covariance; None if that is not finite."""
     scores = (fit.weights * fit.rest[:, None]).reshape(*t.shape, -1)
     meat = _sum_of_neighbours(scores, correlated_px)
     n = float(fit.counts.sum() ** 2 / (fit.counts**2).sum())

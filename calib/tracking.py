@@ -33,7 +33,7 @@ from calib.warp import Plane
 
 State = Literal["tracked", "lost"]
 
-SIZES = MatchSettings(half_px=12, near_px=6.0)
+SIZES = MatchSettings(half_px=12, near_px=6.0, roughness=0.03)
 """Smaller patches than a single match takes: seen flat from 10 m, 41 px of ground are 0.8 m long and no
 plane, and what lies off the plane pulls the place along as the view steepens."""
 
@@ -54,8 +54,9 @@ class TrackSettings:
         Of the innovation, four pixel coordinates against the prior: 1 in 1000 good looks with both eyes is
         above 18.5.
     renew_grown, renew_shrunk
-        The key picture is renewed when the target's surface is seen this much larger, slant included, or
-        smaller. Seen flat, a step nearer shows much that the key picture did not.
+        The key picture is renewed when the target's surface is seen this much larger or smaller...
+    renew_shape
+        ...or foreshortened this much otherwise: seen flat, a step nearer shows much that it did not.
     renew_below
         Or when the correlation falls below this: what is seen now is no longer what the key picture shows.
     """
@@ -65,8 +66,9 @@ class TrackSettings:
     most_px: float = 120.0
     model_px: float = 0.12
     worst_chi2: float = 18.5
-    renew_grown: float = 1.2
+    renew_grown: float = 1.6
     renew_shrunk: float = 0.3
+    renew_shape: float = 1.25
     renew_below: float = 0.9
 
 
@@ -320,9 +322,9 @@ def _renewed(
         return None
     first, second = list(eyes)[:2]
     camera = eyes[first].camera
-    scale = _pixels_per_metre(camera, plane) / _pixels_per_metre(track.key.eye.camera, plane)
+    scale, shape = _seen_larger(camera, track.key.eye.camera, plane)
     alike = min(one.correlation for one in good.values()) >= settings.renew_below
-    if settings.renew_shrunk < scale < settings.renew_grown and alike:
+    if settings.renew_shrunk < scale < settings.renew_grown and shape < settings.renew_shape and alike:
         return None
     left, right = good[first], good[second]
     try:
@@ -332,10 +334,14 @@ def _renewed(
     return Key(eyes[first], left.pixel_px, slope.normal)
 
 
-def _pixels_per_metre(camera: CameraModel, plane: Plane) -> float:
-    """How large a camera sees the target's surface: the root of pixels² a m² of it, slant included."""
-    _, rate, valid = camera.project_jacobian(plane.point_m)
-    return math.sqrt(abs(float(np.linalg.det(rate @ plane.axes)))) if bool(valid) else math.nan
+def _seen_larger(camera: CameraModel, key: CameraModel, plane: Plane) -> tuple[float, float]:
+    """How much larger a camera sees the target's surface than the key's did, and how much another shape."""
+    rates = [one.project_jacobian(plane.point_m) for one in (camera, key)]
+    if not all(bool(valid) for _, _, valid in rates):
+        return math.nan, math.nan
+    now, then = (rate @ plane.axes for _, rate, _ in rates)
+    larger, smaller = np.linalg.svd(now @ np.linalg.inv(then), compute_uv=False).tolist()
+    return math.sqrt(larger * smaller), larger / smaller
 
 
 def _lost(track: Track, found: Mapping[str, Match], reason: str) -> Look:
