@@ -125,8 +125,8 @@ def refine(
 
 def _gaussian(q: FloatArray, covariance_px2: FloatArray) -> FloatArray:
     """Weights of offsets (h, w, 2): 1 at the target."""
-    weights = np.exp(-0.5 * np.einsum("...i,ij,...j", q, np.linalg.inv(covariance_px2), q))
-    return np.asarray(weights, dtype=np.float64)
+    squares = np.einsum("...i,ij,...j", q, np.linalg.inv(covariance_px2), q)
+    return np.asarray(np.exp(-0.5 * squares), dtype=np.float64)
 
 
 def _refined(fit: _Fit, t: FloatArray, correlated_px: int) -> Refined | None:
