@@ -171,7 +171,7 @@ def _settled(
     normal = weighted.T @ jacobian
     if not np.isfinite(normal).all() or np.linalg.cond(normal) > WORST_CONDITION:
         return None
-    inverse = np.linalg.inv(normal)
+    inverse = np.asarray(np.linalg.inv(normal), dtype=np.float64)
     position, deformation = fit.position, fit.deformation
     for _ in range(MOST_STEPS):
         places = position + q + q @ deformation.T

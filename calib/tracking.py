@@ -74,11 +74,19 @@ class TrackSettings:
 
 @dataclass(frozen=True, eq=False)
 class Key:
-    """The picture that templates are cut from, its camera in the rover frame, the target's place in it."""
+    """The picture that templates are cut from, its camera in the rover frame, the target's place in it.
+
+    Attributes
+    ----------
+    drift_m2
+        (3, 3) covariance, along the surface, of the place followed from the place picked: what the keys
+        before handed on.
+    """
 
     eye: Eye
     pixel_px: FloatArray
     normal: FloatArray
+    drift_m2: FloatArray = field(default_factory=lambda: np.zeros((3, 3)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,7 +98,7 @@ class Track:
     state
         ``tracked``: the last look found it. ``lost``: it did not.
     position_m, covariance_m2
-        (3,) and (3, 3) in the rover frame of the last motion.
+        (3,) and (3, 3) of the place that is followed, in the rover frame of the last motion.
     key
         The key picture.
     misses
@@ -105,6 +113,14 @@ class Track:
     key: Key
     misses: int = 0
     motion_covariance: FloatArray = field(default_factory=lambda: np.zeros((6, 6)))
+
+    @property
+    def target_covariance_m2(self) -> FloatArray:
+        """(3, 3) of the target that was picked: of the followed place, and of its drift from the picked one.
+
+        What pixels and motions tell; an error that all cameras of the mast file share is not in it.
+        """
+        return self.covariance_m2 + self.key.drift_m2
 
 
 @dataclass(frozen=True, eq=False)
@@ -213,7 +229,10 @@ def _motion_rate(position_m: FloatArray) -> FloatArray:
 def _carried(key: Key, motion: Rigid) -> Key:
     """The key in another frame."""
     return Key(
-        replace(key.eye, camera=key.eye.camera.moved(motion)), key.pixel_px, motion.vectors(key.normal)
+        replace(key.eye, camera=key.eye.camera.moved(motion)),
+        key.pixel_px,
+        motion.vectors(key.normal),
+        motion.rotation @ key.drift_m2 @ motion.rotation.T,
     )
 
 
@@ -331,7 +350,10 @@ def _renewed(
         slope = local_plane(camera, left.pixel_px, eyes[second].camera, plane, right, left)
     except NoStereoPoint:
         return None
-    return Key(eyes[first], left.pixel_px, slope.normal)
+    _, rate, _ = camera.project_jacobian(plane.point_m)
+    to_surface = plane.axes @ np.linalg.inv(rate @ plane.axes)
+    drift = track.key.drift_m2 + to_surface @ left.covariance_px2 @ to_surface.T
+    return Key(eyes[first], left.pixel_px, slope.normal, drift)
 
 
 def _seen_larger(camera: CameraModel, key: CameraModel, plane: Plane) -> tuple[float, float]:

@@ -255,7 +255,7 @@ def _look(world: World, track: Track, target: FloatArray, carried_m: FloatArray)
         track.state,
         look.reason,
         axes @ (track.position_m - true),
-        np.sqrt(np.diag(axes @ track.covariance_m2 @ axes.T)),
+        np.sqrt(np.diag(axes @ track.target_covariance_m2 @ axes.T)),
         pixel_error,
         look.renewed,
         axes @ (carried_m - true),
