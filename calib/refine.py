@@ -49,7 +49,7 @@ class Refined:
     deformation
         (2, 2) D: what the warp did not foresee, as a linear map of offsets from the target.
     correlation
-        Normalised correlation of template and image at the found place, -1..1.
+        Normalised correlation of template and image at the found place, pixels weighted alike, -1..1.
     middle
         The place that the patch's middle alone tells, `NARROW` as wide, the deformation kept.
     """
@@ -116,7 +116,8 @@ def refine(
         return _refined(whole, t, correlated_px) if whole else None
     wide = _gaussian(q, near_px2)
     begun = settled(first, wide, False, 0.05)
-    whole = settled(begun, wide, deforming, 10 * STEP_ENOUGH_PX) if begun else None
+    # What bends and hides more than the deformation can follow still has a place.
+    whole = (settled(begun, wide, deforming, 10 * STEP_ENOUGH_PX) or begun) if begun else None
     if whole is None or (refined := _refined(whole, t, correlated_px)) is None:
         return None
     middle = settled(whole, _gaussian(q, NARROW**2 * near_px2), False, 10 * STEP_ENOUGH_PX)
@@ -136,8 +137,9 @@ def _refined(fit: _Fit, t: FloatArray, correlated_px: int) -> Refined | None:
     n = float(fit.counts.sum() ** 2 / (fit.counts**2).sum())
     parameters = fit.inverse @ meat @ fit.inverse.T * (n / max(n - len(meat), 1.0)) / fit.gain**2
     covariance = parameters[:2, :2] + FLOOR_PX**2 * np.eye(2)
-    seen = fit.rest + fit.gain * t.reshape(-1)
-    correlation = float(np.corrcoef(t.reshape(-1), seen)[0, 1])
+    pair = np.stack([t.reshape(-1), fit.rest + fit.gain * t.reshape(-1)])
+    spread = np.cov(pair, aweights=fit.counts.reshape(-1))
+    correlation = float(spread[0, 1] / np.sqrt(max(spread[0, 0] * spread[1, 1], 1e-12)))
     if not np.isfinite(covariance).all() or not np.isfinite(correlation):
         return None
     return Refined(fit.position, (covariance + covariance.T) / 2, fit.deformation, correlation)

@@ -259,6 +259,8 @@ def seen_by(
         )
     plane = Plane(track.position_m, track.key.normal)
     found = {name: _found(track, key, plane, eye, settings, sizes) for name, eye in eyes.items()}
+    if sum(one.verdict == "good" for one in found.values()) == 1 < len(found):
+        found = _asked_the_other(found, eyes, sizes)
     good = {name: one for name, one in found.items() if one.verdict == "good"}
     doubt = next((f"{n}: {m.reason}" for n, m in found.items() if m.verdict in ("weak", "ambiguous")), "")
     if not good:
@@ -327,6 +329,20 @@ def _found(
     reach = settings.sigmas * math.sqrt(max(float(np.linalg.eigvalsh(spread)[-1]), 0.0))
     search = min(max(reach + 2 * settings.model_px, settings.least_px), settings.most_px)
     return match(key.eye.image, key.eye.camera, key.pixel_px, plane, eye.image, eye.camera, search, sizes)
+
+
+def _asked_the_other(
+    found: Mapping[str, Match], eyes: Mapping[str, Eye], sizes: MatchSettings
+) -> dict[str, Match]:
+    """Look from the eye that found the target into the one that did not.
+
+    On a rock the two eyes see the surface more differently than one eye sees it before and after a step.
+    """
+    seen = next(name for name, one in found.items() if one.verdict == "good")
+    other = next(name for name in found if name != seen)
+    one, two = eyes[seen], eyes[other]
+    partner = find_partner(one.image, one.camera, found[seen].pixel_px, two.image, two.camera, settings=sizes)
+    return dict(found) | ({other: partner.match} if partner.match.verdict == "good" else {})
 
 
 def _renewed(
