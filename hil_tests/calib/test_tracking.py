@@ -10,8 +10,10 @@ from numpy.typing import NDArray
 
 from calib.errors import CalibError
 from calib.handoff_refined import Eye
+from calib.match import match
 from calib.rigid import Rigid, rot_y, rot_z
 from calib.tracking import Track, moved, seen_by, start_track
+from calib.warp import Plane
 from hil_tests.calib.pictures import Pinhole, TexturedPlane, picture, random_texture
 
 TARGET = np.array([3.0, 0.1, 0.0])
@@ -220,3 +222,26 @@ def test_a_found_target_tells_how_the_rover_was_turned(begun: Track) -> None:
 def test_a_motion_without_a_usable_covariance_is_refused(begun: Track, spread: NDArray[np.float64]) -> None:
     with pytest.raises(CalibError, match="6 rows of 6"):
         moved(begun, Rigid.identity(), spread)
+
+
+def test_an_eye_that_sees_the_surface_otherwise_is_asked_through_the_other(begun: Track) -> None:
+    """With a slope believed far off, the eye beside the key camera's still fits, the other does not."""
+    normal = np.array([0.0, 1.0, -0.3]) / np.hypot(1.0, 0.3)
+    doubtful = replace(begun, key=replace(begun.key, normal=normal))
+    both = eyes(0.0, seed=3)
+    right = both["right"]
+    key = begun.key
+    alone = match(
+        key.eye.image,
+        key.eye.camera,
+        key.pixel_px,
+        Plane(begun.position_m, normal),
+        right.image,
+        right.camera,
+        5.0,
+    )
+    assert alone.verdict == "weak"
+    look = seen_by(doubtful, both)
+    assert look.track.state == "tracked"
+    exact = pinholes(0.0)["right"].pixel(TARGET)
+    np.testing.assert_allclose(look.found["right"].pixel_px, exact, atol=0.2)
