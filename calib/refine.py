@@ -17,6 +17,7 @@ relief and a wrong plane over more. The usual σ²N⁻¹ would call such a posit
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -32,6 +33,7 @@ WORST_DEFORMATION = 0.5  # beyond it the patch is not the same thing any more
 SMOOTH_PX = 0.8  # of the template before its derivative
 WORST_CONDITION = 1e15
 NARROW = 0.35  # of the Gaussian's sigma: slope and scale come from all of it, the place from its middle
+LEAST_COUNT = 0.01  # of a Gaussian weight that is worth computing
 _RIGID = [0, 1, 6, 7]  # the columns of place, gain and offset
 FLOOR_PX = 0.002  # what cubic interpolation itself leaves, measured without noise
 
@@ -107,21 +109,30 @@ def refine(
     surface = Surface.around(image, start + q.min(axis=(0, 1)), start + q.max(axis=(0, 1)), margin_px=3)
 
     def settled(fit: _Fit, counts: FloatArray, deforms: bool, enough_px: float) -> _Fit | None:
+        part = _counting(counts)
         free = slice(None) if deforms else _RIGID
-        return _settled(fit, surface, q, t, jacobian[:, free], weights[:, free], counts, enough_px)
+        rates, steps = (one[part][..., free].reshape(-1, 8 if deforms else 4) for one in (jacobian, weights))
+        return _settled(fit, surface, q[part], t[part], rates, steps, counts[part], enough_px)
 
     first = _Fit(start, np.zeros((2, 2)))
     if near_px2 is None:
         whole = settled(first, np.ones(t.shape), deforming, STEP_ENOUGH_PX)
-        return _refined(whole, t, correlated_px) if whole else None
+        return _refined(whole, correlated_px) if whole else None
     wide = _gaussian(q, near_px2)
     begun = settled(first, wide, False, 0.05)
     # What bends and hides more than the deformation can follow still has a place.
     whole = (settled(begun, wide, deforming, 10 * STEP_ENOUGH_PX) or begun) if begun else None
-    if whole is None or (refined := _refined(whole, t, correlated_px)) is None:
+    if whole is None or (refined := _refined(whole, correlated_px)) is None:
         return None
     middle = settled(whole, _gaussian(q, NARROW**2 * near_px2), False, 10 * STEP_ENOUGH_PX)
-    return replace(refined, middle=_refined(middle, t, correlated_px) if middle else None)
+    return replace(refined, middle=_refined(middle, correlated_px) if middle else None)
+
+
+def _counting(counts: FloatArray) -> tuple[slice, slice]:
+    """The rows and columns of weights (h, w) that count."""
+    held = counts > LEAST_COUNT
+    rows, columns = np.flatnonzero(held.any(axis=1)), np.flatnonzero(held.any(axis=0))
+    return slice(int(rows[0]), int(rows[-1]) + 1), slice(int(columns[0]), int(columns[-1]) + 1)
 
 
 def _gaussian(q: FloatArray, covariance_px2: FloatArray) -> FloatArray:
@@ -130,16 +141,15 @@ def _gaussian(q: FloatArray, covariance_px2: FloatArray) -> FloatArray:
     return np.asarray(np.exp(-0.5 * squares), dtype=np.float64)
 
 
-def _refined(fit: _Fit, t: FloatArray, correlated_px: int) -> Refined | None:
+def _refined(fit: _Fit, correlated_px: int) -> Refined | None:
     """The place of a settled fit with its covariance; None if that is not finite."""
+    t = fit.template
     scores = (fit.weights * fit.rest[:, None]).reshape(*t.shape, -1)
     meat = _sum_of_neighbours(scores, correlated_px)
     n = float(fit.counts.sum() ** 2 / (fit.counts**2).sum())
     parameters = fit.inverse @ meat @ fit.inverse.T * (n / max(n - len(meat), 1.0)) / fit.gain**2
     covariance = parameters[:2, :2] + FLOOR_PX**2 * np.eye(2)
-    pair = np.stack([t.reshape(-1), fit.rest + fit.gain * t.reshape(-1)])
-    spread = np.cov(pair, aweights=fit.counts.reshape(-1))
-    correlation = float(spread[0, 1] / np.sqrt(max(spread[0, 0] * spread[1, 1], 1e-12)))
+    correlation = _correlation(t.reshape(-1), fit.rest + fit.gain * t.reshape(-1), fit.counts.reshape(-1))
     if not np.isfinite(covariance).all() or not np.isfinite(correlation):
         return None
     return Refined(fit.position, (covariance + covariance.T) / 2, fit.deformation, correlation)
@@ -152,6 +162,7 @@ class _Fit:
     position: FloatArray
     deformation: FloatArray
     gain: float = 1.0
+    template: FloatArray = field(default_factory=lambda: np.empty((0, 0)))
     rest: FloatArray = field(default_factory=lambda: np.empty(0))
     counts: FloatArray = field(default_factory=lambda: np.empty(0))
     weights: FloatArray = field(default_factory=lambda: np.empty((0, 0)))
@@ -171,9 +182,13 @@ def _settled(
     """Iterate, pixels weighted by ``counts``, until a step is shorter than ``enough_px``; None if none is."""
     weighted = weights * counts.reshape(-1, 1)
     normal = weighted.T @ jacobian
-    if not np.isfinite(normal).all() or np.linalg.cond(normal) > WORST_CONDITION:
+    try:
+        inverse = np.asarray(np.linalg.inv(normal), dtype=np.float64)
+    except np.linalg.LinAlgError:
         return None
-    inverse = np.asarray(np.linalg.inv(normal), dtype=np.float64)
+    # Largest entries for norms: within a factor of the matrix' size of the condition.
+    if not float(np.abs(normal).max() * np.abs(inverse).max()) < WORST_CONDITION:
+        return None
     position, deformation = fit.position, fit.deformation
     for _ in range(MOST_STEPS):
         places = position + q + q @ deformation.T
@@ -196,7 +211,7 @@ def _settled(
         if np.linalg.norm(deformation) > WORST_DEFORMATION:
             return None
         if length < enough_px:
-            return _Fit(position, deformation, gain, rest, counts, weighted, inverse)
+            return _Fit(position, deformation, gain, t, rest, counts, weighted, inverse)
     return None
 
 
@@ -209,10 +224,10 @@ def _gradient(values: FloatArray) -> FloatArray:
 
 
 def _columns(gradient: FloatArray, q: FloatArray, t: FloatArray) -> FloatArray:
-    """Return the derivatives (n, 8) of image minus model: position, deformation row by row, gain, offset."""
+    """Return the derivatives (h, w, 8) of image minus model: position, deformation by rows, gain, offset."""
     columns = [gradient[..., 0], gradient[..., 1]]
     columns += [gradient[..., a] * q[..., b] for a in (0, 1) for b in (0, 1)]
-    return np.stack([*columns, -t, -np.ones_like(t)], axis=-1).reshape(t.size, -1)
+    return np.stack([*columns, -t, -np.ones_like(t)], axis=-1)
 
 
 def _photometry(template: FloatArray, seen: FloatArray, counts: FloatArray) -> tuple[float, float]:
@@ -222,6 +237,14 @@ def _photometry(template: FloatArray, seen: FloatArray, counts: FloatArray) -> t
     weighted = counts * (template - template_mean)
     gain = float((weighted * seen).sum() / max(float((weighted * template).sum()), 1e-9))
     return gain, seen_mean - gain * template_mean
+
+
+def _correlation(a: FloatArray, b: FloatArray, counts: FloatArray) -> float:
+    """Normalised correlation of two grey vectors (n,), weighted."""
+    total = float(counts.sum())
+    a, b = a - float(counts @ a) / total, b - float(counts @ b) / total
+    weighted = counts * a
+    return float(weighted @ b) / math.sqrt(max(float(weighted @ a) * float((counts * b) @ b), 1e-12))
 
 
 def _sum_of_neighbours(scores: FloatArray, reach_px: int) -> FloatArray:
