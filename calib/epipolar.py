@@ -11,7 +11,6 @@ The common frame has z down (rover, site): level ground is one of the planes tri
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import cv2
@@ -23,7 +22,7 @@ from calib.errors import NoStereoPoint
 from calib.match import Match, MatchSettings, expected_correlation, match, no_match, rivalled, texture_lacks
 from calib.rigid import FloatArray
 from calib.stereo import triangulate
-from calib.warp import GRAZING, Grey, Plane, sample, square_grid
+from calib.warp import GRAZING, Grey, Plane, carry, sample, square_grid
 
 UP = np.array([0.0, 0.0, -1.0])
 FARTHEST_M = 1e4  # as good as infinity for any stereo base on a rover
@@ -31,6 +30,7 @@ COARSE = 2  # the first sweep uses every second pixel of half-size pictures
 DENSE = 400  # points of the ray that tell the curve's length
 FINE_STEPS = np.arange(-3.0, 3.5, 0.5)  # px around each of the best coarse places
 BEST_KEPT = 4
+SIDES = np.array([[-1.0, 0.0], [1.0, 0.0], [0.0, -1.0], [0.0, 1.0]])  # left, right, top, bottom
 LAST_SEARCH_PX = 4.0
 MATCHED_BACK_PX = 2.0  # the way back is not refined: half a pixel of the sweep, and slope
 
@@ -92,13 +92,13 @@ def find_partner(
     if found.verdict != "good":
         return StereoMatch(found)
     try:
-        plane = _surface(camera, pixel, partner, swept.plane, found)
+        plane = local_plane(camera, pixel, partner, swept.plane, found)
     except NoStereoPoint as error:
         return StereoMatch(no_match("weak", f"the two eyes see no point together: {error}", swept.pixel_px))
     again = match(image, camera, pixel, plane, partner_image, partner, LAST_SEARCH_PX, settings)
     if again.verdict == "good":
         found = again
-        plane = _surface(camera, pixel, partner, plane, found)
+        plane = local_plane(camera, pixel, partner, plane, found)
     across, sigma = _across(camera, pixel, partner, plane, found)
     back = _sweep(partner_image, partner, found.pixel_px, image, camera, nearest_m, settings)
     apart = math.inf if isinstance(back, Match) else float(np.linalg.norm(back.pixel_px - pixel))
@@ -290,39 +290,67 @@ def _between(inverse: FloatArray, places: FloatArray, index: int) -> FloatArray:
     return near
 
 
-def _surface(
-    camera: CameraModel, pixel: FloatArray, partner: CameraModel, plane: Plane, found: Match
+def local_plane(
+    camera: CameraModel,
+    pixel: FloatArray,
+    partner: CameraModel,
+    plane: Plane,
+    found: Match,
+    own: Match | None = None,
 ) -> Plane:
-    """Return the local plane: the target triangulated, the slope from four points around it."""
+    """Return the surface that two eyes tell: the target triangulated, its slope from the deformations found.
+
+    Parameters
+    ----------
+    pixel
+        (2,) the target in ``camera``.
+    plane
+        The surface over which the searched patches were warped.
+    found
+        What was found in ``partner``.
+    own
+        What was found in ``camera``, if the patches come from a third picture and not from this one.
+
+    Raises
+    ------
+    NoStereoPoint
+        If the two eyes' rays have no point in common.
+    """
     target = triangulate(camera, partner, pixel, found.pixel_px).position_m
-    deformation = np.zeros((2, 2)) if found.deformation is None else found.deformation
-    corners = []
-    for offset in _corners(found.half_px):
-        # Where the old plane carries this neighbour, and where the deformation says it really is.
-        rays = partner.ray(found.predicted_px + offset)
-        slope = rays.directions @ plane.normal
-        if not bool(rays.valid) or abs(slope) < GRAZING:
-            return Plane(target, plane.normal)
-        hit = rays.origins_m + ((plane.point_m - rays.origins_m) @ plane.normal / slope) * rays.directions
-        own, valid = camera.project(hit)
-        if not bool(valid):
-            return Plane(target, plane.normal)
-        corners.append(
-            triangulate(camera, partner, own, found.pixel_px + offset + deformation @ offset).position_m
-        )
-    left, right, top, bottom = corners
+    # Where the old plane carries neighbours of the target, and where the deformations say they really are.
+    offsets = 0.7 * found.half_px * SIDES
+    mine, valid = carry(found.predicted_px + offsets, partner, plane, camera)
+    if not valid.all():
+        return Plane(target, plane.normal)
+    if own is not None:
+        mine = own.pixel_px + _deformed(mine - own.predicted_px, own)
+    theirs = found.pixel_px + _deformed(offsets, found)
+    left, right, top, bottom = _meeting(camera.ray(mine), partner.ray(theirs))
     normal = np.cross(right - left, bottom - top)
     sight = target - camera.C
-    if abs(normal @ sight) < GRAZING * np.linalg.norm(normal) * np.linalg.norm(sight):
+    # Written so that a neighbour without a point in both eyes falls back too.
+    if not abs(normal @ sight) >= GRAZING * np.linalg.norm(normal) * np.linalg.norm(sight):
         return Plane(target, plane.normal)
     return Plane(target, normal)
 
 
-def _corners(half_px: int) -> Sequence[FloatArray]:
-    """Return the middles of a patch's sides as offsets: left, right, top, bottom."""
-    reach = 0.7 * half_px
-    sides = ((-1.0, 0.0), (1.0, 0.0), (0.0, -1.0), (0.0, 1.0))
-    return [reach * np.asarray(side, dtype=np.float64) for side in sides]
+def _deformed(offsets: FloatArray, found: Match) -> FloatArray:
+    """Offsets (n, 2) from the target as a match saw them deformed."""
+    return offsets if found.deformation is None else offsets + offsets @ found.deformation.T
+
+
+def _meeting(first: Rays, second: Rays) -> FloatArray:
+    """Return the middles (n, 3) of the common normals of rays; not-a-number where there are none."""
+    between = second.origins_m - first.origins_m
+    cosine = np.einsum("ij,ij->i", first.directions, second.directions)
+    ahead, back = (np.einsum("ij,ij->i", between, rays.directions) for rays in (first, second))
+    with np.errstate(invalid="ignore", divide="ignore"):
+        sine2 = 1.0 - cosine * cosine
+        ranges = (ahead - cosine * back) / sine2, (cosine * ahead - back) / sine2
+    feet = [
+        rays.origins_m + r[:, None] * rays.directions for rays, r in zip((first, second), ranges, strict=True)
+    ]
+    return np.asarray((feet[0] + feet[1]) / 2)
 
 
 def _across(

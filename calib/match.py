@@ -10,7 +10,8 @@ The verdict is part of the measurement: only a ``good`` match is one. What the o
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import cv2
@@ -18,9 +19,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from calib.cahvor import CameraModel
-from calib.refine import Refined, refine
+from calib.refine import NARROW, Refined, refine
 from calib.rigid import FloatArray
 from calib.warp import Grey, Plane, Template, blurred_to, carry, warp_patch
+
+MOST_ASPECT = 5.0  # of a weight that is round on a surface seen flat
+_CROSS = np.array([[-1.0, 0.0], [1.0, 0.0], [0.0, -1.0], [0.0, 1.0]])
+COUNTS_TO = 2.2  # sigmas of that weight, beyond which pixels are left out
 
 Verdict = Literal["good", "flat", "ambiguous", "weak", "border"]
 
@@ -55,6 +60,9 @@ class MatchSettings:
         How far the target may lie off the patch's plane, one sigma, as a part of the patch's half extent on
         it. It counts as far as the two cameras stand apart. 0 for what is known to be plane; the default
         is what makes sigmas true on the simulated rover's ground and rocks.
+    near_px
+        By how much nearer pixels count more in the refinement: one sigma of a Gaussian that is round on the
+        surface and as large as a circle of this radius in the destination. 0: all of the patch alike.
     """
 
     half_px: int = 20
@@ -68,6 +76,7 @@ class MatchSettings:
     apart_px: int = 5
     worst_sigma_px: float = 0.5
     roughness: float = 0.01
+    near_px: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -163,18 +172,33 @@ def match(
         -search_px <= seen[0] <= width - 1 + search_px and -search_px <= seen[1] <= height - 1 + search_px
     ):
         return no_match("border", f"the target is expected at {_at(seen)}, outside the picture", seen)
-    template = _template(source_image, source, target, plane, destination, seen, settings)
-    if template is None:
+    cut = _template(source_image, source, target, plane, destination, seen, settings)
+    if cut is None:
         return no_match("border", f"the patch around {_at(target)} is cut by the picture's border", seen)
-    half = template.values.shape[0] // 2
+    template, near_px2 = cut
+    half = min(template.values.shape) // 2
     lacking = texture_lacks(template.values, settings)
     if lacking:
         return no_match("flat", lacking, seen, half_px=half)
-    found = _search(template, destination_image, search_px, settings)
+    found = _search(template, destination_image, search_px, settings, near_px2)
     if isinstance(found, Match):
         return found
-    surface = _surface_term(source, target, plane, destination, template, settings.roughness)
+    surface = _surface_term(source, target, plane, destination, template, near_px2, settings.roughness)
+    middle = found.refined.middle
+    if middle is not None:
+        # The middle is noisier, but the target is nearer to its plane.
+        nearer = NARROW**2 * surface
+        if _worst(middle.covariance_px2 + nearer) < _worst(found.refined.covariance_px2 + surface):
+            found, surface = (
+                replace(found, refined=replace(middle, correlation=found.refined.correlation)),
+                nearer,
+            )
     return judged(template, found, surface, settings)
+
+
+def _worst(covariance_px2: FloatArray) -> float:
+    """The variance in the worst direction."""
+    return float(np.linalg.eigvalsh(covariance_px2)[-1])
 
 
 def texture_lacks(values: Grey, settings: MatchSettings) -> str:
@@ -236,7 +260,7 @@ class Found:
 
 def judged(template: Template, found: Found, surface_px2: FloatArray, settings: MatchSettings) -> Match:
     """Return the match with its verdict, from correlation, rival and certainty."""
-    refined, half = found.refined, template.values.shape[0] // 2
+    refined, half = found.refined, min(template.values.shape) // 2
     facts = (refined.correlation, found.second, half)
     least = settings.least_correlation * expected_correlation(template.values, settings)
     if refined.correlation < least:
@@ -245,7 +269,7 @@ def judged(template: Template, found: Found, surface_px2: FloatArray, settings: 
     if rivalled(refined.correlation, found.second, settings):
         words = f"a second place fits nearly as well: {found.second:.2f} beside {refined.correlation:.2f}"
         return no_match("ambiguous", words, template.target_px, *facts)
-    worst_px = float(np.sqrt(np.linalg.eigvalsh(refined.covariance_px2)[-1]))
+    worst_px = math.sqrt(_worst(refined.covariance_px2))
     if worst_px > settings.worst_sigma_px:
         words = f"the place is certain to {worst_px:.2f} px only, {settings.worst_sigma_px} px is expected"
         return no_match("weak", words, template.target_px, *facts)
@@ -268,6 +292,7 @@ def _surface_term(
     plane: Plane,
     destination: CameraModel,
     template: Template,
+    near_px2: FloatArray | None,
     roughness: float,
 ) -> FloatArray:
     """Return the covariance (2, 2) px² that a target off the patch's plane adds: e eᵀ along the parallax.
@@ -275,7 +300,9 @@ def _surface_term(
     The patch tells where its plane is; the target itself lies off it by ``roughness`` of the patch's half
     extent on the plane, hence 1 / sine of the viewing angle as much along the source's ray.
     """
-    ray, half = source.ray(target), template.values.shape[0] // 2
+    ray, half = source.ray(target), np.array(template.values.shape[::-1]) // 2
+    if near_px2 is not None:
+        half = np.sqrt(3.0 * np.diag(near_px2))  # a box of this half side spreads as much
     sides = template.target_px + half * np.array([[-1.0, 0.0], [1.0, 0.0], [0.0, -1.0], [0.0, 1.0]])
     rays = destination.ray(sides)
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -300,32 +327,54 @@ def _template(
     destination: CameraModel,
     seen: FloatArray,
     settings: MatchSettings,
-) -> Template | None:
-    """Warp the largest patch that both pictures hold, sized by the coarser of the two."""
-    probe = warp_patch(image, source, target, plane, destination, 1)
-    if probe is None:
+) -> tuple[Template, FloatArray | None] | None:
+    """Warp the largest patch that both pictures hold, sized by the coarser of the two; with its weight."""
+    around, ok = carry(seen + _CROSS, destination, plane, source)
+    if not ok.all():
         return None
-    grown = max(1.0, probe.magnification)
-    half = min(round(settings.half_px * grown), settings.most_half_px)
-    least = round(settings.smallest_half_px * min(grown, settings.most_half_px / settings.half_px))
-    edge = int(min(*seen, *(np.array(destination.size_px) - 1 - seen))) - 4
-    half = min(half, max(edge, least))
-    while half >= least:
-        template = warp_patch(image, source, target, plane, destination, half)
+    # Destination pixels a source pixel, by area.
+    shrunk = abs(float(np.linalg.det(np.stack([around[1] - around[0], around[3] - around[2]]) / 2)))
+    grown = max(1.0, 1.0 / np.sqrt(max(shrunk, 1e-6)))
+    near_px2, half = None, np.full(2, min(round(settings.half_px * grown), settings.most_half_px))
+    if settings.near_px > 0:
+        near_px2 = _near(plane, destination, seen, settings.near_px * grown)
+        reach = np.ceil(COUNTS_TO * np.sqrt(np.diag(near_px2))).astype(int) + 2
+        half = np.minimum(reach, settings.most_half_px)
+    least = np.minimum(
+        half, round(settings.smallest_half_px * min(grown, settings.most_half_px / settings.half_px))
+    )
+    edge = np.minimum(seen, np.array(destination.size_px) - 1 - seen).astype(int) - 4
+    half = np.minimum(half, np.maximum(edge, least))
+    while True:
+        template = warp_patch(image, source, target, plane, destination, (int(half[0]), int(half[1])))
         if template is not None:
-            return template
-        half = half - 3 if half - 3 >= least or half == least else least
-    return None
+            return template, near_px2
+        if (half == least).all():
+            return None
+        half = np.maximum(half - 3, least)
 
 
-def _search(template: Template, image: Grey, search_px: float, settings: MatchSettings) -> Found | Match:
+def _near(plane: Plane, camera: CameraModel, pixel: FloatArray, near_px: float) -> FloatArray:
+    """Return the covariance (2, 2) px² of a Gaussian that is round on the plane, of the area of a circle."""
+    ray = camera.ray(pixel)
+    range_m = float((plane.point_m - ray.origins_m) @ plane.normal) / float(ray.directions @ plane.normal)
+    _, rate, _ = camera.project_jacobian(ray.origins_m + range_m * ray.directions)
+    seen = rate @ plane.axes
+    values, vectors = np.linalg.eigh(seen @ seen.T)
+    aspect = min(float(np.sqrt(values[1] / max(values[0], 1e-12 * values[1]))), MOST_ASPECT)
+    return np.asarray((vectors * np.array([near_px**2 / aspect, near_px**2 * aspect])) @ vectors.T)
+
+
+def _search(
+    template: Template, image: Grey, search_px: float, settings: MatchSettings, near_px2: FloatArray | None
+) -> Found | Match:
     """Correlate over the window, then refine at the best place."""
-    half, reach = template.values.shape[0] // 2, int(np.ceil(search_px))
+    half, reach = np.array(template.values.shape[::-1]) // 2, int(np.ceil(search_px))
     low = np.maximum(template.centre_px - reach - half, 0)
     high = np.minimum(template.centre_px + reach + half, np.array(image.shape[::-1]) - 1)
     if (high - low < 2 * half + 4).any():
         words = f"the target is expected at {_at(template.target_px)}, too near the picture's border"
-        return no_match("border", words, template.target_px, half_px=half)
+        return no_match("border", words, template.target_px, half_px=int(half.min()))
     margin = int(np.ceil(4 * max(template.magnification, 1.0))) + 16
     cut_low = np.maximum(low - margin, 0)
     cut = image[cut_low[1] : high[1] + 1 + margin, cut_low[0] : high[0] + 1 + margin]
@@ -336,7 +385,7 @@ def _search(template: Template, image: Grey, search_px: float, settings: MatchSe
     (x, y), best, second, _ = peaks(
         scores, max(settings.apart_px, round(settings.apart_px * template.magnification))
     )
-    facts = (best, second, half)
+    facts = (best, second, int(half.min()))
     least = 0.8 * settings.least_correlation * expected_correlation(template.values, settings)
     if best < least:
         words = f"no place in the window of {reach} px correlates by more than {best:.2f}"
@@ -344,7 +393,7 @@ def _search(template: Template, image: Grey, search_px: float, settings: MatchSe
     if x in (0, scores.shape[1] - 1) or y in (0, scores.shape[0] - 1):
         words = f"the best place is at the border of the window of {reach} px"
         return no_match("border", words, template.target_px, *facts)
-    shift = low + half + np.array([x, y]) - template.centre_px
+    shift = low + half + np.array([x, y]) + _summit(scores, x, y) - template.centre_px
     start = template.target_px + shift - cut_low
     refined = refine(
         template.values,
@@ -353,16 +402,22 @@ def _search(template: Template, image: Grey, search_px: float, settings: MatchSe
         cut,
         start,
         correlated_px=correlated_px(template.magnification),
+        near_px2=near_px2,
     )
     if refined is None or float(np.abs(refined.pixel_px - start).max()) > 2.0 * max(
         1.0, template.magnification
     ):
         words = f"the best place (correlation {best:.2f}) does not settle to a sub-pixel position"
         return no_match("weak", words, template.target_px, *facts)
-    placed = Refined(
-        refined.pixel_px + cut_low, refined.covariance_px2, refined.deformation, refined.correlation
-    )
-    return Found(placed, second)
+    middle = refined.middle and replace(refined.middle, pixel_px=refined.middle.pixel_px + cut_low)
+    return Found(replace(refined, pixel_px=refined.pixel_px + cut_low, middle=middle), second)
+
+
+def _summit(scores: NDArray[np.float32], x: int, y: int) -> FloatArray:
+    """Return how far (2,) the summit of a score surface lies from its highest pixel, by parabolas."""
+    around = np.array([scores[y, x - 1 : x + 2], scores[y - 1 : y + 2, x]], dtype=np.float64)
+    bend = 2.0 * around[:, 1] - around[:, 0] - around[:, 2]
+    return np.asarray(np.clip((around[:, 2] - around[:, 0]) / (2.0 * np.maximum(bend, 1e-9)), -0.5, 0.5))
 
 
 def correlated_px(magnification: float) -> int:

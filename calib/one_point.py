@@ -11,7 +11,9 @@ from calib.cahvor import CameraModel
 from calib.rigid import FloatArray
 
 STEPS = 6
-"""Gauss-Newton steps; the second changes a position within a hundredth of its sigma by next to nothing."""
+"""Gauss-Newton steps at most..."""
+ENOUGH = 1e-4
+"""...and the step, in sigmas of the point, after which no more are made."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,5 +68,8 @@ def one_point(
             normal += rate.T @ weight @ rate
             right += rate.T @ weight @ rest
             chi2 += float(rest @ weight @ rest)
-        position = position + np.linalg.solve(normal, right)
+        step = np.linalg.solve(normal, right)
+        position = position + step
+        if step @ right < ENOUGH**2:
+            break
     return OnePoint(position, np.linalg.inv(normal), chi2)

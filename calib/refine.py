@@ -17,20 +17,24 @@ relief and a wrong plane over more. The usual σ²N⁻¹ would call such a posit
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
 from calib.rigid import FloatArray
-from calib.warp import Grey, Surface, square_grid
+from calib.warp import Grey, Surface, patch_grid
 
 MOST_STEPS = 12
 STEP_ENOUGH_PX = 1e-4
 WORST_DEFORMATION = 0.5  # beyond it the patch is not the same thing any more
 SMOOTH_PX = 0.8  # of the template before its derivative
 WORST_CONDITION = 1e15
+NARROW = 0.35  # of the Gaussian's sigma: slope and scale come from all of it, the place from its middle
+LEAST_COUNT = 0.01  # of a Gaussian weight that is worth computing
+_RIGID = [0, 1, 6, 7]  # the columns of place, gain and offset
 FLOOR_PX = 0.002  # what cubic interpolation itself leaves, measured without noise
 
 
@@ -47,13 +51,16 @@ class Refined:
     deformation
         (2, 2) D: what the warp did not foresee, as a linear map of offsets from the target.
     correlation
-        Normalised correlation of template and image at the found place, -1..1.
+        Normalised correlation of template and image at the found place, pixels weighted alike, -1..1.
+    middle
+        The place that the patch's middle alone tells, `NARROW` as wide, the deformation kept.
     """
 
     pixel_px: FloatArray
     covariance_px2: FloatArray
     deformation: FloatArray
     correlation: float
+    middle: Refined | None = None
 
 
 def refine(
@@ -64,13 +71,14 @@ def refine(
     start_px: FloatArray,
     deforming: bool = True,
     correlated_px: int = 3,
+    near_px2: FloatArray | None = None,
 ) -> Refined | None:
     """Find where the image shows the template, from a start good to about a pixel.
 
     Parameters
     ----------
     template
-        (n, n) grey, its middle on the whole pixel ``centre_px`` (2,).
+        (h, w) grey, its middle on the whole pixel ``centre_px`` (2,).
     target_px
         (2,) the target's place in the template's own pixel grid.
     image
@@ -81,59 +89,130 @@ def refine(
         Whether D is free; else it stays zero.
     correlated_px
         Over how many pixels grey differences depend on each other.
+    near_px2
+        (2, 2) covariance of a Gaussian around the target by which pixels count; all alike if not given.
 
     Returns
     -------
     refined
         None if it did not settle, left the image, or found nothing to hold on to.
     """
-    half = template.shape[0] // 2
-    offsets = square_grid(half) + (centre_px - target_px)  # q: from the target to each patch pixel
+    height, width = template.shape
+    # q: from the target to each patch pixel
+    offsets = patch_grid((width // 2, height // 2)) + (centre_px - target_px)
     values = template.astype(np.float64)
     inner = (slice(2, -2), slice(2, -2))  # the border has no two-sided gradient
     q, t = offsets[inner], values[inner]
-    jacobian = _columns(_gradient(values)[inner], q, t, deforming)
-    weights = _columns(_gradient(ndimage.gaussian_filter(values, SMOOTH_PX))[inner], q, t, deforming)
-    shape, n = t.shape, t.size
-    normal = weights.T @ jacobian
-    if not np.isfinite(normal).all() or np.linalg.cond(normal) > WORST_CONDITION:
+    jacobian = _columns(_gradient(values)[inner], q, t)
+    weights = _columns(_gradient(ndimage.gaussian_filter(values, SMOOTH_PX))[inner], q, t)
+    start = np.asarray(start_px, dtype=np.float64)
+    surface = Surface.around(image, start + q.min(axis=(0, 1)), start + q.max(axis=(0, 1)), margin_px=3)
+
+    def settled(fit: _Fit, counts: FloatArray, deforms: bool, enough_px: float) -> _Fit | None:
+        part = _counting(counts)
+        free = slice(None) if deforms else _RIGID
+        rates, steps = (one[part][..., free].reshape(-1, 8 if deforms else 4) for one in (jacobian, weights))
+        return _settled(fit, surface, q[part], t[part], rates, steps, counts[part], enough_px)
+
+    first = _Fit(start, np.zeros((2, 2)))
+    if near_px2 is None:
+        whole = settled(first, np.ones(t.shape), deforming, STEP_ENOUGH_PX)
+        return _refined(whole, correlated_px) if whole else None
+    wide = _gaussian(q, near_px2)
+    begun = settled(first, wide, False, 0.05)
+    # What bends and hides more than the deformation can follow still has a place.
+    whole = (settled(begun, wide, deforming, 10 * STEP_ENOUGH_PX) or begun) if begun else None
+    if whole is None or (refined := _refined(whole, correlated_px)) is None:
         return None
-    inverse = np.linalg.inv(normal)
-    position, deformation = np.array(start_px, dtype=np.float64), np.zeros((2, 2))
-    surface = Surface.around(image, position + q.min(axis=(0, 1)), position + q.max(axis=(0, 1)), margin_px=3)
-    gain, offset = 1.0, 0.0
+    middle = settled(whole, _gaussian(q, NARROW**2 * near_px2), False, 10 * STEP_ENOUGH_PX)
+    return replace(refined, middle=_refined(middle, correlated_px) if middle else None)
+
+
+def _counting(counts: FloatArray) -> tuple[slice, slice]:
+    """The rows and columns of weights (h, w) that count."""
+    held = counts > LEAST_COUNT
+    rows, columns = np.flatnonzero(held.any(axis=1)), np.flatnonzero(held.any(axis=0))
+    return slice(int(rows[0]), int(rows[-1]) + 1), slice(int(columns[0]), int(columns[-1]) + 1)
+
+
+def _gaussian(q: FloatArray, covariance_px2: FloatArray) -> FloatArray:
+    """Weights of offsets (h, w, 2): 1 at the target."""
+    squares = np.einsum("...i,ij,...j", q, np.linalg.inv(covariance_px2), q)
+    return np.asarray(np.exp(-0.5 * squares), dtype=np.float64)
+
+
+def _refined(fit: _Fit, correlated_px: int) -> Refined | None:
+    """The place of a settled fit with its covariance; None if that is not finite."""
+    t = fit.template
+    scores = (fit.weights * fit.rest[:, None]).reshape(*t.shape, -1)
+    meat = _sum_of_neighbours(scores, correlated_px)
+    n = float(fit.counts.sum() ** 2 / (fit.counts**2).sum())
+    parameters = fit.inverse @ meat @ fit.inverse.T * (n / max(n - len(meat), 1.0)) / fit.gain**2
+    covariance = parameters[:2, :2] + FLOOR_PX**2 * np.eye(2)
+    correlation = _correlation(t.reshape(-1), fit.rest + fit.gain * t.reshape(-1), fit.counts.reshape(-1))
+    if not np.isfinite(covariance).all() or not np.isfinite(correlation):
+        return None
+    return Refined(fit.position, (covariance + covariance.T) / 2, fit.deformation, correlation)
+
+
+@dataclass(frozen=True, eq=False)
+class _Fit:
+    """A state of the iteration: place and deformation; once settled also what its covariance is made of."""
+
+    position: FloatArray
+    deformation: FloatArray
+    gain: float = 1.0
+    template: FloatArray = field(default_factory=lambda: np.empty((0, 0)))
+    rest: FloatArray = field(default_factory=lambda: np.empty(0))
+    counts: FloatArray = field(default_factory=lambda: np.empty(0))
+    weights: FloatArray = field(default_factory=lambda: np.empty((0, 0)))
+    inverse: FloatArray = field(default_factory=lambda: np.empty((0, 0)))
+
+
+def _settled(
+    fit: _Fit,
+    surface: Surface,
+    q: FloatArray,
+    t: FloatArray,
+    jacobian: FloatArray,
+    weights: FloatArray,
+    counts: FloatArray,
+    enough_px: float,
+) -> _Fit | None:
+    """Iterate, pixels weighted by ``counts``, until a step is shorter than ``enough_px``; None if none is."""
+    weighted = weights * counts.reshape(-1, 1)
+    normal = weighted.T @ jacobian
+    try:
+        inverse = np.asarray(np.linalg.inv(normal), dtype=np.float64)
+    except np.linalg.LinAlgError:
+        return None
+    # Largest entries for norms: within a factor of the matrix' size of the condition.
+    if not float(np.abs(normal).max() * np.abs(inverse).max()) < WORST_CONDITION:
+        return None
+    position, deformation = fit.position, fit.deformation
     for _ in range(MOST_STEPS):
         places = position + q + q @ deformation.T
         if not surface.inside(places):
             return None
         seen = surface.at(places)
-        gain, offset = _photometry(t, seen)
+        gain, offset = _photometry(t, seen, counts)
         if gain <= 0.05:
             return None
-        rest = (seen - gain * t - offset).reshape(n)
-        step = -inverse @ (weights.T @ rest)
+        rest = (seen - gain * t - offset).reshape(-1)
+        step = -inverse @ (weighted.T @ rest)
         move = step[:2] / gain
         length = float(np.linalg.norm(move))
         if length > 1.0:  # never further than the gradient is good for
             step *= 1.0 / length
             move = step[:2] / gain
         position = position + move
-        if deforming:
+        if len(step) > 4:
             deformation = deformation + (step[2:6] / gain).reshape(2, 2)
         if np.linalg.norm(deformation) > WORST_DEFORMATION:
             return None
-        if length < STEP_ENOUGH_PX:
-            break
-    else:
-        return None
-    scores = (weights * rest[:, None]).reshape(*shape, -1)
-    meat = _sum_of_neighbours(scores, correlated_px)
-    parameters = inverse @ meat @ inverse.T * (n / (n - jacobian.shape[1])) / gain**2
-    covariance = parameters[:2, :2] + FLOOR_PX**2 * np.eye(2)
-    correlation = float(np.corrcoef(t.reshape(n), seen.reshape(n))[0, 1])
-    if not np.isfinite(covariance).all() or not np.isfinite(correlation):
-        return None
-    return Refined(position, (covariance + covariance.T) / 2, deformation, correlation)
+        if length < enough_px:
+            return _Fit(position, deformation, gain, t, rest, counts, weighted, inverse)
+    return None
 
 
 def _gradient(values: FloatArray) -> FloatArray:
@@ -144,19 +223,28 @@ def _gradient(values: FloatArray) -> FloatArray:
     )
 
 
-def _columns(gradient: FloatArray, q: FloatArray, t: FloatArray, deforming: bool) -> FloatArray:
-    """Return the derivatives (n, p) of image minus model: position, deformation row by row, gain, offset."""
+def _columns(gradient: FloatArray, q: FloatArray, t: FloatArray) -> FloatArray:
+    """Return the derivatives (h, w, 8) of image minus model: position, deformation by rows, gain, offset."""
     columns = [gradient[..., 0], gradient[..., 1]]
-    if deforming:
-        columns += [gradient[..., a] * q[..., b] for a in (0, 1) for b in (0, 1)]
-    return np.stack([*columns, -t, -np.ones_like(t)], axis=-1).reshape(t.size, -1)
+    columns += [gradient[..., a] * q[..., b] for a in (0, 1) for b in (0, 1)]
+    return np.stack([*columns, -t, -np.ones_like(t)], axis=-1)
 
 
-def _photometry(template: FloatArray, seen: FloatArray) -> tuple[float, float]:
-    """Return gain and offset that bring the template nearest to what is seen."""
-    centred = template - template.mean()
-    gain = float((centred * seen).sum() / max(float((centred**2).sum()), 1e-9))
-    return gain, float(seen.mean() - gain * template.mean())
+def _photometry(template: FloatArray, seen: FloatArray, counts: FloatArray) -> tuple[float, float]:
+    """Return gain and offset that bring the template nearest to what is seen, weighted by ``counts``."""
+    total = float(counts.sum())
+    template_mean, seen_mean = float((counts * template).sum()) / total, float((counts * seen).sum()) / total
+    weighted = counts * (template - template_mean)
+    gain = float((weighted * seen).sum() / max(float((weighted * template).sum()), 1e-9))
+    return gain, seen_mean - gain * template_mean
+
+
+def _correlation(a: FloatArray, b: FloatArray, counts: FloatArray) -> float:
+    """Normalised correlation of two grey vectors (n,), weighted."""
+    total = float(counts.sum())
+    a, b = a - float(counts @ a) / total, b - float(counts @ b) / total
+    weighted = counts * a
+    return float(weighted @ b) / math.sqrt(max(float(weighted @ a) * float((counts * b) @ b), 1e-12))
 
 
 def _sum_of_neighbours(scores: FloatArray, reach_px: int) -> FloatArray:

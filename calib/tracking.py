@@ -22,18 +22,18 @@ from typing import Literal
 import numpy as np
 
 from calib.cahvor import CameraModel
-from calib.epipolar import find_partner
+from calib.epipolar import find_partner, local_plane
 from calib.errors import CalibError, NoStereoPoint
 from calib.handoff_refined import Eye
 from calib.match import Match, MatchSettings, match
 from calib.one_point import Sighting, one_point
-from calib.rigid import FloatArray, Rigid
+from calib.rigid import FloatArray, Rigid, moved_rigid
 from calib.stereo import triangulate
 from calib.warp import Plane
 
 State = Literal["tracked", "lost"]
 
-SIZES = MatchSettings(half_px=12)
+SIZES = MatchSettings(half_px=12, near_px=6.0, roughness=0.03)
 """Smaller patches than a single match takes: seen flat from 10 m, 41 px of ground are 0.8 m long and no
 plane, and what lies off the plane pulls the place along as the view steepens."""
 
@@ -54,26 +54,39 @@ class TrackSettings:
         Of the innovation, four pixel coordinates against the prior: 1 in 1000 good looks with both eyes is
         above 18.5.
     renew_grown, renew_shrunk
-        The key picture is renewed when the target's surface is seen this much larger, slant included, or
-        smaller. Seen flat, a step nearer shows much that the key picture did not.
+        The key picture is renewed when the target's surface is seen this much larger or smaller...
+    renew_shape
+        ...or foreshortened this much otherwise: seen flat, a step nearer shows much that it did not.
+    renew_below
+        Or when the correlation falls below this: what is seen now is no longer what the key picture shows.
     """
 
     sigmas: float = 3.5
     least_px: float = 4.0
     most_px: float = 120.0
-    model_px: float = 0.3
+    model_px: float = 0.12
     worst_chi2: float = 18.5
-    renew_grown: float = 1.2
+    renew_grown: float = 1.6
     renew_shrunk: float = 0.3
+    renew_shape: float = 1.25
+    renew_below: float = 0.9
 
 
 @dataclass(frozen=True, eq=False)
 class Key:
-    """The picture that templates are cut from, its camera in the rover frame, the target's place in it."""
+    """The picture that templates are cut from, its camera in the rover frame, the target's place in it.
+
+    Attributes
+    ----------
+    drift_m2
+        (3, 3) covariance, along the surface, of the place followed from the place picked: what the keys
+        before handed on.
+    """
 
     eye: Eye
     pixel_px: FloatArray
     normal: FloatArray
+    drift_m2: FloatArray = field(default_factory=lambda: np.zeros((3, 3)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,11 +98,13 @@ class Track:
     state
         ``tracked``: the last look found it. ``lost``: it did not.
     position_m, covariance_m2
-        (3,) and (3, 3) in the rover frame of the last motion.
+        (3,) and (3, 3) of the place that is followed, in the rover frame of the last motion.
     key
         The key picture.
     misses
         Looks since it was last found.
+    motion_covariance
+        (6, 6) of the rover's motion since then, as `moved` takes it; it is part of ``covariance_m2``.
     """
 
     state: State
@@ -97,6 +112,15 @@ class Track:
     covariance_m2: FloatArray
     key: Key
     misses: int = 0
+    motion_covariance: FloatArray = field(default_factory=lambda: np.zeros((6, 6)))
+
+    @property
+    def target_covariance_m2(self) -> FloatArray:
+        """(3, 3) of the target that was picked: of the followed place, and of its drift from the picked one.
+
+        What pixels and motions tell; an error that all cameras of the mast file share is not in it.
+        """
+        return self.covariance_m2 + self.key.drift_m2
 
 
 @dataclass(frozen=True, eq=False)
@@ -183,16 +207,33 @@ def moved(track: Track, now_from_then: Rigid, covariance: FloatArray) -> Track:
             "a motion's covariance is 6 rows of 6 finite numbers: rotation in rad², then translation in m²"
         )
     position = now_from_then.points(track.position_m)
-    x, y, z = position
-    rate = np.hstack([np.array([[0.0, z, -y], [-z, 0.0, x], [y, -x, 0.0]]), np.eye(3)])
-    turned = now_from_then.rotation
-    carried = turned @ track.covariance_m2 @ turned.T + rate @ spread @ rate.T
-    key = replace(
-        track.key,
-        eye=replace(track.key.eye, camera=track.key.eye.camera.moved(now_from_then)),
-        normal=now_from_then.vectors(track.key.normal),
+    rate, turned = _motion_rate(position), now_from_then.rotation
+    # What was wrong before about the old origin is, about the new one, turned and with a lever.
+    lever = -_motion_rate(now_from_then.translation_m)[:, :3]
+    then = np.block([[turned, np.zeros((3, 3))], [lever @ turned, turned]])
+    return replace(
+        track,
+        position_m=position,
+        covariance_m2=turned @ track.covariance_m2 @ turned.T + rate @ spread @ rate.T,
+        key=_carried(track.key, now_from_then),
+        motion_covariance=then @ track.motion_covariance @ then.T + spread,
     )
-    return replace(track, position_m=position, covariance_m2=carried, key=key)
+
+
+def _motion_rate(position_m: FloatArray) -> FloatArray:
+    """Return d position / d motion (3, 6): how a small rotation, then a translation, move a point."""
+    x, y, z = position_m
+    return np.hstack([np.array([[0.0, z, -y], [-z, 0.0, x], [y, -x, 0.0]]), np.eye(3)])
+
+
+def _carried(key: Key, motion: Rigid) -> Key:
+    """The key in another frame."""
+    return Key(
+        replace(key.eye, camera=key.eye.camera.moved(motion)),
+        key.pixel_px,
+        motion.vectors(key.normal),
+        motion.rotation @ key.drift_m2 @ motion.rotation.T,
+    )
 
 
 def seen_by(
@@ -218,6 +259,8 @@ def seen_by(
         )
     plane = Plane(track.position_m, track.key.normal)
     found = {name: _found(track, key, plane, eye, settings, sizes) for name, eye in eyes.items()}
+    if sum(one.verdict == "good" for one in found.values()) == 1 < len(found):
+        found = _asked_the_other(found, eyes, sizes)
     good = {name: one for name, one in found.items() if one.verdict == "good"}
     doubt = next((f"{n}: {m.reason}" for n, m in found.items() if m.verdict in ("weak", "ambiguous")), "")
     if not good:
@@ -244,9 +287,21 @@ def seen_by(
             f"{allowed:g} is expected"
         )
         return replace(_lost(track, found, words), chi2=chi2)
-    after = Track("tracked", point.position_m, point.covariance_m2, replace(track.key, eye=key.eye))
-    renewed = _renewed(after, eyes, good, settings)
+    after = Track("tracked", point.position_m, point.covariance_m2, _corrected(track, point.position_m))
+    renewed = _renewed(after, eyes, good, plane, settings)
     return Look(replace(after, key=renewed or after.key), found, "", chi2, renewed is not None)
+
+
+def _corrected(track: Track, position_m: FloatArray) -> Key:
+    """The key after the motion's error that a found position tells of, as far as it is the motion's.
+
+    A heading off by half a degree puts a target 10 m away 9 cm off. Were the key camera shifted by as much
+    instead of turned, it would look at flat ground under another angle, and steps would add up.
+    """
+    weight = track.motion_covariance @ _motion_rate(track.position_m).T
+    spread = track.covariance_m2 + 1e-12 * np.eye(3)
+    error = weight @ np.linalg.solve(spread, position_m - track.position_m)
+    return _carried(track.key, moved_rigid(Rigid.identity(), np.concatenate([error[3:], error[:3]])))
 
 
 def _anchored(track: Track) -> Key | None:
@@ -276,10 +331,25 @@ def _found(
     return match(key.eye.image, key.eye.camera, key.pixel_px, plane, eye.image, eye.camera, search, sizes)
 
 
+def _asked_the_other(
+    found: Mapping[str, Match], eyes: Mapping[str, Eye], sizes: MatchSettings
+) -> dict[str, Match]:
+    """Look from the eye that found the target into the one that did not.
+
+    On a rock the two eyes see the surface more differently than one eye sees it before and after a step.
+    """
+    seen = next(name for name, one in found.items() if one.verdict == "good")
+    other = next(name for name in found if name != seen)
+    one, two = eyes[seen], eyes[other]
+    partner = find_partner(one.image, one.camera, found[seen].pixel_px, two.image, two.camera, settings=sizes)
+    return dict(found) | ({other: partner.match} if partner.match.verdict == "good" else {})
+
+
 def _renewed(
     track: Track,
     eyes: Mapping[str, Eye],
     good: Mapping[str, Match],
+    plane: Plane,
     settings: TrackSettings,
 ) -> Key | None:
     """A new key from this look, where scale or view have changed enough and both eyes saw it."""
@@ -287,35 +357,29 @@ def _renewed(
         return None
     first, second = list(eyes)[:2]
     camera = eyes[first].camera
-    scale = _pixels_per_metre(camera, track) / _pixels_per_metre(track.key.eye.camera, track)
-    if settings.renew_shrunk < scale < settings.renew_grown:
+    scale, shape = _seen_larger(camera, track.key.eye.camera, plane)
+    alike = min(one.correlation for one in good.values()) >= settings.renew_below
+    if settings.renew_shrunk < scale < settings.renew_grown and shape < settings.renew_shape and alike:
         return None
-    pixel = good[first].pixel_px
-    return Key(eyes[first], pixel, _slope(eyes[first], eyes[second], pixel, good[second], track.key.normal))
-
-
-def _slope(left: Eye, right: Eye, left_px: FloatArray, right_match: Match, before: FloatArray) -> FloatArray:
-    """The surface's normal (3,) as the pair sees it now; as it was believed ``before`` where stereo fails."""
+    left, right = good[first], good[second]
     try:
-        found = find_partner(left.image, left.camera, left_px, right.image, right.camera)
+        slope = local_plane(camera, left.pixel_px, eyes[second].camera, plane, right, left)
     except NoStereoPoint:
-        return before
-    if found.match.verdict != "good" or found.plane is None:
-        return before
-    apart = np.linalg.norm(found.match.pixel_px - right_match.pixel_px)
-    return found.plane.normal if apart <= 1.0 else before
+        return None
+    _, rate, _ = camera.project_jacobian(plane.point_m)
+    to_surface = plane.axes @ np.linalg.inv(rate @ plane.axes)
+    drift = track.key.drift_m2 + to_surface @ left.covariance_px2 @ to_surface.T
+    return Key(eyes[first], left.pixel_px, slope.normal, drift)
 
 
-def _pixels_per_metre(camera: CameraModel, track: Track) -> float:
-    """How large a camera sees the target's surface: the root of pixels² a m² of it, slant included."""
-    _, rate, valid = camera.project_jacobian(track.position_m)
-    normal = track.key.normal
-    first = np.cross(normal, np.eye(3)[int(np.argmin(np.abs(normal)))])
-    first /= np.linalg.norm(first)
-    area = (
-        np.linalg.det(rate @ np.stack([first, np.cross(normal, first)], axis=1)) if bool(valid) else math.nan
-    )
-    return math.sqrt(abs(float(area)))
+def _seen_larger(camera: CameraModel, key: CameraModel, plane: Plane) -> tuple[float, float]:
+    """How much larger a camera sees the target's surface than the key's did, and how much another shape."""
+    rates = [one.project_jacobian(plane.point_m) for one in (camera, key)]
+    if not all(bool(valid) for _, _, valid in rates):
+        return math.nan, math.nan
+    now, then = (rate @ plane.axes for _, rate, _ in rates)
+    larger, smaller = np.linalg.svd(now @ np.linalg.inv(then), compute_uv=False).tolist()
+    return math.sqrt(larger * smaller), larger / smaller
 
 
 def _lost(track: Track, found: Mapping[str, Match], reason: str) -> Look:

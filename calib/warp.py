@@ -7,6 +7,7 @@ source camera's own model. All models and planes are in one common frame (usuall
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache, cached_property
 
 import cv2
 import numpy as np
@@ -21,6 +22,7 @@ Grey = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 
 GRAZING = 0.03  # sine of the flattest view of a plane that is still believed (1.7 degrees)
+KNOTS = np.array([-1.0, -1 / 3, 1 / 3, 1.0])  # across a patch, in units of its half side
 MOST_SAMPLES = 8  # per axis and destination pixel; shrinking further than 8 times is not asked of this module
 SPLINE_MARGIN_PX = 12  # a cubic spline's memory of its border is below 1e-6 after 11 samples
 
@@ -39,6 +41,14 @@ class Plane:
             raise CalibError(f"plane normal {normal.tolist()} has no direction")
         object.__setattr__(self, "point_m", frozen_array(self.point_m, (3,)))
         object.__setattr__(self, "normal", frozen_array(normal / length, (3,)))
+
+    @cached_property
+    def axes(self) -> FloatArray:
+        """Two perpendicular unit vectors in the plane, as columns (3, 2)."""
+        x, y, z = self.normal.tolist()
+        flat = np.array([-y, x, 0.0]) if abs(z) < 0.9 else np.array([0.0, -z, y])
+        first = flat / np.linalg.norm(flat)
+        return np.stack([first, np.cross(self.normal, first)], axis=1)
 
 
 def grey(image: ArrayLike) -> Grey:
@@ -95,8 +105,13 @@ def carry(
 
 def square_grid(half_px: int) -> FloatArray:
     """Return the offsets (n, n, 2) of a square patch with n = 2 half_px + 1, (x, y), centre (0, 0)."""
-    steps = np.arange(-half_px, half_px + 1, dtype=np.float64)
-    return np.stack(np.meshgrid(steps, steps), axis=-1)
+    return patch_grid((half_px, half_px))
+
+
+def patch_grid(half_px: tuple[int, int]) -> FloatArray:
+    """Return the offsets (2 y + 1, 2 x + 1, 2) of a patch with half sides (x, y), centre (0, 0)."""
+    x, y = (np.arange(-half, half + 1, dtype=np.float64) for half in half_px)
+    return np.stack(np.meshgrid(x, y), axis=-1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,7 +121,7 @@ class Template:
     Attributes
     ----------
     values
-        float32 (n, n) grey values; rows and columns are the destination's.
+        float32 (h, w) grey values, h and w odd; rows and columns are the destination's.
     centre_px
         (2,) whole pixel of the destination on which the middle of the patch lies.
     target_px
@@ -127,11 +142,17 @@ def warp_patch(
     source_px: ArrayLike,
     plane: Plane,
     destination: CameraModel,
-    half_px: int,
+    half_px: int | tuple[int, int],
 ) -> Template | None:
     """Warp the source's patch around ``source_px`` (2,) over the plane into the destination's pixel grid.
 
     A destination pixel that covers several source pixels averages them (area sampling), as its sensor would.
+    Sixteen knots of the patch are carried exactly, the pixels between them by the cubic through them.
+
+    Parameters
+    ----------
+    half_px
+        Half of the patch's side, or of its sides in x and y, destination pixels.
 
     Returns
     -------
@@ -141,32 +162,38 @@ def warp_patch(
     target, seen = carry(source_px, source, plane, destination)
     if not bool(seen):
         return None
+    half = (half_px, half_px) if isinstance(half_px, int) else half_px
     centre = np.rint(target).astype(np.intp)
-    grid = centre + square_grid(half_px)
-    maps, ok = carry(grid, destination, plane, source)
-    if not ok.all() or not _inside(maps, source_image.shape):
+    reach = np.array(half) + 0.5  # to the outer pixels' far sides
+    knots, ok = carry(
+        centre + reach * np.stack(np.meshgrid(KNOTS, KNOTS), axis=-1), destination, plane, source
+    )
+    if not ok.all() or not _inside(knots, source_image.shape):
         return None
-    step_x = np.linalg.norm(np.diff(maps, axis=1), axis=-1).max()
-    step_y = np.linalg.norm(np.diff(maps, axis=0), axis=-1).max()
-    samples = int(np.clip(np.ceil(max(step_x, step_y) - 0.25), 1, MOST_SAMPLES))
-    if samples > 1:
-        parts = (np.arange(samples) + 0.5) / samples - 0.5
-        sub = np.stack(np.meshgrid(parts, parts), axis=-1).reshape(-1, 2)
-        maps, ok = carry(grid[None] + sub[:, None, None, :], destination, plane, source)
-        if not ok.all() or not _inside(maps, source_image.shape):
-            return None
-        values = sample(source_image, maps).mean(axis=0)
-    else:
-        values = sample(source_image, maps)
-    step = np.stack([_mean_step(maps, 1), _mean_step(maps, 0)], axis=-1)
-    shrink = float(np.sqrt(max(abs(np.linalg.det(step)), 1e-6)))
+    across, down = (np.linalg.norm(np.diff(knots, axis=a), axis=-1).max() for a in (1, 0))
+    steps = np.array([across, down]) / (reach * (KNOTS[1] - KNOTS[0]))  # source pixels a destination pixel
+    many, tall = (int(n) for n in np.clip(np.ceil(steps - 0.25), 1, MOST_SAMPLES))
+    columns, rows = _cubic(half[0], many), _cubic(half[1], tall)
+    maps = np.stack([rows @ knots[..., axis] @ columns.T for axis in (0, 1)], axis=-1)
+    values = sample(source_image, maps)
+    if many > 1 or tall > 1:
+        values = values.reshape(2 * half[1] + 1, tall, 2 * half[0] + 1, many).mean(axis=(1, 3))
+    span = np.stack([(knots[:, -1] - knots[:, 0]).mean(axis=0), (knots[-1] - knots[0]).mean(axis=0)], axis=-1)
+    shrink = float(np.sqrt(max(abs(np.linalg.det(span / (2.0 * reach))), 1e-6)))
     return Template(values.astype(np.float32), centre, target, 1.0 / shrink)
 
 
-def _mean_step(maps: FloatArray, axis: int) -> FloatArray:
-    """Return the mean step (2,) in source pixels per destination pixel along a patch axis (0: y, 1: x)."""
-    grid = maps.reshape(-1, *maps.shape[-3:]).mean(axis=0)
-    return np.asarray(np.diff(grid, axis=axis).mean(axis=(0, 1)), dtype=np.float64)
+@cache
+def _cubic(half: int, samples: int) -> FloatArray:
+    """Weights ((2 half + 1) samples, 4) of the knots at the samples of a patch's pixels along one axis."""
+    parts = (np.arange(samples) + 0.5) / samples - 0.5
+    places = (np.arange(-half, half + 1)[:, None] + parts).reshape(-1) / (half + 0.5)
+    others = [np.delete(KNOTS, k) for k in range(len(KNOTS))]
+    weights = [
+        np.prod((places[:, None] - rest) / (knot - rest), axis=1)
+        for knot, rest in zip(KNOTS, others, strict=True)
+    ]
+    return np.stack(weights, axis=1)
 
 
 def _inside(maps: FloatArray, shape: tuple[int, ...]) -> bool:

@@ -226,3 +226,22 @@ def test_a_rough_surface_makes_the_place_less_certain_along_the_parallax_only() 
     # Half a patch of 41 px at 4 m is 62 mm, a twentieth of it 3 mm; f b / z² of it is some 0.05 px.
     assert 0.03 < np.sqrt(sigmas[1][0] ** 2 - sigmas[0][0] ** 2) < 0.12
     assert np.sqrt(sigmas[1][1] ** 2 - sigmas[0][1] ** 2) < 0.01
+
+
+def test_what_lies_far_from_the_target_does_not_pull_it() -> None:
+    """A picture whose outer part is displaced by 1.5 px, as relief displaces it when the view changes."""
+    plane, pixel = wall(4), np.array([180.0, 140.0])
+    point = plane.hit(LEFT.position_m, LEFT.rays(pixel))
+    there = TURNED.pixel(point)
+    inner, outer = seen(TURNED, 4), np.roll(seen(TURNED, 4), 2, axis=1)
+    y, x = np.mgrid[0 : SIZE_PX[1], 0 : SIZE_PX[0]]
+    mixed = np.where(np.hypot(x - there[0], y - there[1]) < 7, inner, outer).astype(np.float32)
+    off = {}
+    for near_px in (0.0, 6.0):
+        settings = MatchSettings(half_px=12, near_px=near_px, roughness=0.05)
+        surface = Plane(point, plane.normal)
+        found = match(seen(LEFT, 4), LEFT.model, pixel, surface, mixed, TURNED.model, 8, settings)
+        assert found.verdict == "good", found.reason
+        off[near_px] = float(np.linalg.norm(found.pixel_px - there))
+    assert off[0.0] > 0.6
+    assert off[6.0] < 0.15

@@ -10,8 +10,10 @@ from numpy.typing import NDArray
 
 from calib.errors import CalibError
 from calib.handoff_refined import Eye
-from calib.rigid import Rigid, rot_z
+from calib.match import match
+from calib.rigid import Rigid, rot_y, rot_z
 from calib.tracking import Track, moved, seen_by, start_track
+from calib.warp import Plane
 from hil_tests.calib.pictures import Pinhole, TexturedPlane, picture, random_texture
 
 TARGET = np.array([3.0, 0.1, 0.0])
@@ -156,7 +158,90 @@ def test_a_plain_surface_cannot_be_followed() -> None:
         start_track(plain["left"], plain["right"], np.array([160.0, 120.0]))
 
 
+def test_an_edge_cannot_be_followed() -> None:
+    """A straight border between dark and bright ground: nothing holds along it."""
+    edge = eyes(0.0, plane=replace(GROUND, grey=np.tile(np.repeat([90.0, 160.0], 512), (1024, 1))))
+    steps = np.abs(np.diff(edge["left"].image[120, 60:260]))
+    assert steps.max() > 25.0
+    pixel = np.array([60.0 + int(np.argmax(steps)), 120.0])
+    with pytest.raises(CalibError, match="texture along one direction only"):
+        start_track(edge["left"], edge["right"], pixel)
+
+
+def test_the_sky_cannot_be_followed() -> None:
+    """Bright and featureless above a horizon, noise only."""
+    both = {}
+    rng = np.random.default_rng(4)
+    for name, eye in eyes(0.0).items():
+        image = eye.image.copy()
+        image[:110] = 210.0 + rng.normal(0.0, 1.5, image[:110].shape)
+        both[name] = replace(eye, image=image.astype(np.float32))
+    with pytest.raises(CalibError, match="too little texture"):
+        start_track(both["left"], both["right"], np.array([160.0, 60.0]))
+
+
+def test_a_pose_that_jumps_is_said_and_nothing_else_is_taken(begun: Track) -> None:
+    """The rover is said to stand where it was, to a few millimetres, and is 25 cm aside and 20 ahead."""
+    surely = np.diag([1e-6] * 3 + [9e-6] * 3)
+    track = moved(begun, Rigid.identity(), surely)
+    for index in range(2):
+        turned = rot_z(0.08)
+        site_from_rover = Rigid(turned, np.array([0.2, 0.25, 0.0]))
+        seen = {}
+        for name, y in zip(NAMES, (-0.1, 0.1), strict=True):
+            down = float(np.arctan2(1.2, TARGET[0] - 0.2))
+            position = turned @ np.array([0.0, y, -1.2]) + site_from_rover.translation_m
+            camera = Pinhole(position, 0.08, -down, 900.0, (321, 241))
+            image = picture(camera, GROUND, noise_dn=1.5, seed=40 + index)
+            seen[name] = Eye(image, camera.model.moved(site_from_rover.inverse))
+        look = seen_by(track, seen)
+        assert look.track.state == "lost" and look.track.misses == index + 1
+        assert look.reason
+        np.testing.assert_array_equal(look.track.position_m, track.position_m)
+        track = look.track
+
+
+def test_a_found_target_tells_how_the_rover_was_turned(begun: Track) -> None:
+    """Pitch reported wrong by 10 mrad: the key camera is put right by turning, as the rover's frame errs."""
+    now = pose(0.1)
+    wrong = Rigid(rot_y(0.010), np.zeros(3))
+    spread = np.diag([0.009**2] * 3 + [0.002**2] * 3)
+    track = moved(begun, wrong @ now.inverse @ pose(0.0), spread)
+    look = seen_by(track, eyes(0.1, seed=60))
+    assert look.track.state == "tracked" and not look.renewed
+    exact = pinholes(0.0)["left"].model.moved(now.inverse)
+
+    def turned_rad(one: Track) -> float:
+        return float(np.arccos(np.clip(one.key.eye.camera.A @ exact.A, -1.0, 1.0)))
+
+    assert turned_rad(track) == pytest.approx(0.010, rel=0.05)
+    assert turned_rad(look.track) < 0.003
+
+
 @pytest.mark.parametrize("spread", [np.eye(3), np.full((6, 6), np.nan), -np.eye(6)])
 def test_a_motion_without_a_usable_covariance_is_refused(begun: Track, spread: NDArray[np.float64]) -> None:
     with pytest.raises(CalibError, match="6 rows of 6"):
         moved(begun, Rigid.identity(), spread)
+
+
+def test_an_eye_that_sees_the_surface_otherwise_is_asked_through_the_other(begun: Track) -> None:
+    """With a slope believed far off, the eye beside the key camera's still fits, the other does not."""
+    normal = np.array([0.0, 1.0, -0.3]) / np.hypot(1.0, 0.3)
+    doubtful = replace(begun, key=replace(begun.key, normal=normal))
+    both = eyes(0.0, seed=3)
+    right = both["right"]
+    key = begun.key
+    alone = match(
+        key.eye.image,
+        key.eye.camera,
+        key.pixel_px,
+        Plane(begun.position_m, normal),
+        right.image,
+        right.camera,
+        5.0,
+    )
+    assert alone.verdict == "weak"
+    look = seen_by(doubtful, both)
+    assert look.track.state == "tracked"
+    exact = pinholes(0.0)["right"].pixel(TARGET)
+    np.testing.assert_allclose(look.found["right"].pixel_px, exact, atol=0.2)

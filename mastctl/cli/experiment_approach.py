@@ -26,7 +26,10 @@ def add_parser(kinds: Any) -> None:
         "--seed", type=seed, default=1, metavar="S", help="of the first run's scene and errors (default 1)"
     )
     parser.add_argument(
-        "--out", type=Path, metavar="DIR", help="folder for stops.csv, a line each stop, and record.json"
+        "--out",
+        type=Path,
+        metavar="DIR",
+        help="folder for stops.csv, record.json, a strip of pictures a run, and error.png",
     )
     parser.set_defaults(run=run)
 
@@ -37,7 +40,8 @@ def run(args: argparse.Namespace) -> int:
 
     from calib.store import load_rig
     from mastctl.cli.experiment import check_writable
-    from mastctl.experiment.approach import run_approach, summary, table_rows, write_record
+    from mastctl.experiment.approach import run_approach
+    from mastctl.experiment.approach_report import counted, summary, table_rows, write_record, write_strip
     from mastctl.packaged import config_folder
 
     if args.out is not None:
@@ -54,12 +58,14 @@ def run(args: argparse.Namespace) -> int:
         one = runs[-1]
         told = one.error or ("kept" if one.kept else f"lost: {one.stops[-1].reason}" if one.stops else "lost")
         console.print(f"seed {one.seed}: {told}", markup=False)
-    if args.out is not None:
-        write_record(runs, args.out)
+        if args.out is not None:  # after every run: what is interrupted leaves its record
+            write_record(runs, args.out)
+            write_strip(one, args.out)
     if args.json:
         output.print_json(summary(runs))
     else:
-        notes = ["errors in the rover frame at the last stop, rms over the runs that kept the target"]
+        notes = [counted(runs)]
+        notes += ["3 times the rms, along the line of sight, to its right and below it, in the rover frame"]
         notes += [f"record: {args.out}"] if args.out is not None else []
         output.print_table("Approach from 10 m to 1 m, simulated rover", *table_rows(runs), notes)
     return 0 if any(one.kept for one in runs) else 1

@@ -2,21 +2,20 @@
 
 from __future__ import annotations
 
-import csv
-import json
 import math
 import time
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from pathlib import Path
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from calib.errors import CalibError
+from calib.handoff_refined import Eye
 from calib.mast import Rig
+from calib.match import Match
 from calib.pointing import solve
 from calib.rigid import FloatArray
 from calib.tracking import Track, moved, seen_by, start_track
+from drivers.interfaces import Image
 from drivers.sim.scene import SceneSettings, build_scene
 from mastctl.experiment.approach_world import World, WorldErrors
 from mastctl.experiment.targets import textured
@@ -29,6 +28,9 @@ STEP = 0.1
 SUN_MOVES_RAD = math.radians(8.0)
 LOST_LOOKS = 3
 """How often a lost target is looked for at one stop, before the rover drives on."""
+
+PATCH_PX = 30
+"""Half the side of the pictures that are kept for the report."""
 
 GIVE_UP = 4
 """Stops without the target after which the run ends as lost."""
@@ -53,6 +55,10 @@ class Stop:
         What the track says of the same three.
     pixel_error_px
         Of the left eye's match, against the truth; not-a-number where there was none.
+    untracked_m
+        The error along, right and below had the start's position been carried by reported motions alone.
+    patches
+        The key picture around the target, and both eyes' pictures around where it was found or expected.
     """
 
     range_m: float
@@ -63,16 +69,19 @@ class Stop:
     sigma_m: FloatArray
     pixel_error_px: float
     renewed: bool
+    untracked_m: FloatArray
+    patches: tuple[Image, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
 class ApproachRun:
-    """One approach: its stops, or why it did not begin."""
+    """One approach: its stops, or why it did not begin; ``start_m`` (3,) is the first stereo's error."""
 
     seed: int
     stops: tuple[Stop, ...]
     error: str = ""
     seconds: float = 0.0
+    start_m: FloatArray = field(default_factory=lambda: np.full(3, np.nan))
 
     @property
     def kept(self) -> bool:
@@ -103,8 +112,12 @@ def run_approach(true: Rig, believed: Rig, seed: int, errors: WorldErrors | None
         begun = _begin(world, rng)
         if isinstance(begun, str):
             return ApproachRun(seed, (), begun, time.monotonic() - begun_s)
-        stops = _drive(world, *begun, light, rng)
-        return ApproachRun(seed, tuple(stops), "", time.monotonic() - begun_s)
+        track, target = begun
+        there = world.site_from_rover.inverse.points(target)
+        start_m = _axes(there - track.key.eye.camera.C) @ (track.position_m - there)
+        world.read_windows()
+        stops = _drive(world, track, target, light, rng)
+        return ApproachRun(seed, tuple(stops), "", time.monotonic() - begun_s, start_m)
     finally:
         world.close()
 
@@ -140,7 +153,7 @@ def _drive(
 ) -> list[Stop]:
     """Step by step up to the target."""
     stops: list[Stop] = []
-    missed, relit = 0, False
+    missed, relit, carried = 0, False, track.position_m
     for _ in range(60):
         here = world.site_from_rover
         away = target[:2] - here.translation_m[:2]
@@ -155,12 +168,12 @@ def _drive(
         x, y = here.translation_m[:2] + step * np.array([math.cos(bearing), math.sin(bearing)])
         facing = math.atan2(target[1] - y, target[0] - x) + rng.normal(0.0, 0.08)
         motion, covariance = world.drive(float(x), float(y), facing)
-        track = moved(track, motion, covariance)
+        track, carried = moved(track, motion, covariance), motion.points(carried)
         if not relit and left_m < 4.0:
             sun = light.sun_azimuth_rad + SUN_MOVES_RAD
             world.relight(build_scene(replace(light, sun_azimuth_rad=sun)))
             relit = True
-        track, stop = _look(world, track, target)
+        track, stop = _look(world, track, target, carried)
         stops.append(stop)
         missed = 0 if stop.state == "tracked" else missed + 1
     return stops
@@ -172,12 +185,13 @@ def _front_m(world: World) -> float:
     return float(left + right) / 2
 
 
-def _look(world: World, track: Track, target: FloatArray) -> tuple[Track, Stop]:
+def _look(world: World, track: Track, target: FloatArray, carried_m: FloatArray) -> tuple[Track, Stop]:
     """Look for the target with the pair of its range, again if it is lost; the track and the record."""
     rig = world.believed
     chosen = choose_pairs(rig, track.position_m)[0]
     name, pan, tilt = chosen.pair, chosen.pan_rad or 0.0, chosen.tilt_rad or 0.0
     pair = rig.stereo[name]
+    key = track.key
     for _ in range(LOST_LOOKS):
         eyes = world.look(pair, pan, tilt)
         look = seen_by(track, eyes)
@@ -198,9 +212,30 @@ def _look(world: World, track: Track, target: FloatArray) -> tuple[Track, Stop]:
         track.state,
         look.reason,
         axes @ (track.position_m - true),
-        np.sqrt(np.diag(axes @ track.covariance_m2 @ axes.T)),
+        np.sqrt(np.diag(axes @ track.target_covariance_m2 @ axes.T)),
         pixel_error,
         look.renewed,
+        axes @ (carried_m - true),
+        (_patch(key.eye, key.pixel_px), *(_patch(eyes[n], _place(look.found.get(n))) for n in pair)),
+    )
+
+
+def _place(found: Match | None) -> FloatArray:
+    """Where a match found the target, or expected it."""
+    if found is None:
+        return np.full(2, np.nan)
+    return found.pixel_px if found.verdict == "good" else found.predicted_px
+
+
+def _patch(eye: Eye, pixel_px: FloatArray) -> Image:
+    """The picture around a pixel, black beyond its border."""
+    side = 2 * PATCH_PX + 1
+    if not np.isfinite(pixel_px).all():
+        return np.zeros((side, side), np.uint8)
+    x, y = (int(v) for v in np.rint(pixel_px))
+    whole = np.pad(np.clip(eye.image, 0, 255).astype(np.uint8), side)
+    return np.ascontiguousarray(
+        whole[max(0, y + side - PATCH_PX) :, max(0, x + side - PATCH_PX) :][:side, :side]
     )
 
 
@@ -210,83 +245,3 @@ def _axes(sight: FloatArray) -> FloatArray:
     right = np.cross([0.0, 0.0, 1.0], along)
     right /= np.linalg.norm(right)
     return np.stack([along, right, np.cross(along, right)])
-
-
-def summary(runs: Sequence[ApproachRun]) -> dict[str, float]:
-    """Numbers over all runs: kept, lost, silently wrong, and the final error's components, metres rms."""
-    kept = [r for r in runs if r.kept]
-    finals = np.array([r.final_error_m for r in kept]).reshape(-1, 3)
-    # Silently wrong: it says tracked, and is farther off than five of its own sigmas and 3 cm.
-    wrong = [
-        r
-        for r in runs
-        for s in r.stops
-        if s.state == "tracked"
-        and np.linalg.norm(s.error_m) > max(0.03, 0.01 * s.range_m)
-        and (np.abs(s.error_m) > 5 * s.sigma_m).any()
-    ]
-    rms = np.sqrt(np.mean(finals**2, axis=0)) if len(finals) else np.full(3, math.nan)
-    return {
-        "runs": len(runs),
-        "kept": len(kept),
-        "silently_wrong": len({id(r) for r in wrong}),
-        "along_rms_m": float(rms[0]),
-        "right_rms_m": float(rms[1]),
-        "below_rms_m": float(rms[2]),
-        "position_rms_m": float(np.sqrt(np.sum(rms**2))),
-    }
-
-
-def table_rows(runs: Sequence[ApproachRun]) -> tuple[list[str], list[list[str]]]:
-    """Return headings and rows: what was measured beside the paper's Table I, theory, for a Pancam start."""
-    from calib.budget import target_approach_budget
-
-    found = summary(runs)
-    theory = next(row for row in target_approach_budget() if row.name == "pancam")
-    cm = {key: f"{300 * value:.2f}" for key, value in found.items() if key.endswith("_m")}
-    rows = [
-        ["runs, kept, silently wrong", f"{found['runs']}, {found['kept']}, {found['silently_wrong']}", ""],
-        [
-            "3 rms along the line of sight, cm",
-            cm["along_rms_m"],
-            f"{theory.tracked_cm:.2f}",
-        ],
-        ["3 rms to its right, cm", cm["right_rms_m"], ""],
-        ["3 rms below it, cm", cm["below_rms_m"], ""],
-        ["3 rms of the position, cm", cm["position_rms_m"], ""],
-    ]
-    return ["", "measured", "theory (Table I)"], rows
-
-
-STOPS_CSV = (
-    "seed", "stop", "range_m", "pair", "state", "along_m", "right_m", "below_m",
-    "sigma_along_m", "sigma_right_m", "sigma_below_m", "pixel_error_px", "renewed", "reason",
-)  # fmt: skip
-
-
-def write_record(runs: Sequence[ApproachRun], folder: Path) -> None:
-    """Write stops.csv and record.json into ``folder`` (made if need be).
-
-    Raises
-    ------
-    OSError
-        If the folder or a file in it cannot be written.
-    """
-    folder.mkdir(parents=True, exist_ok=True)
-    with (folder / "stops.csv").open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(STOPS_CSV)
-        for one in runs:
-            for index, stop in enumerate(one.stops):
-                numbers = [*stop.error_m.tolist(), *stop.sigma_m.tolist()]
-                pixel = "" if math.isnan(stop.pixel_error_px) else stop.pixel_error_px
-                start = [one.seed, index, stop.range_m, stop.pair, stop.state]
-                writer.writerow([*start, *numbers, pixel, int(stop.renewed), stop.reason])
-    document = {
-        "summary": {key: None if math.isnan(value) else value for key, value in summary(runs).items()},
-        "runs": [
-            {"seed": one.seed, "kept": one.kept, "error": one.error, "seconds": round(one.seconds, 1)}
-            for one in runs
-        ],
-    }
-    (folder / "record.json").write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
