@@ -102,6 +102,21 @@ class Rigid:
         )
 
 
+def carried_covariance(covariance: FloatArray, now_from_then: Rigid) -> FloatArray:
+    """Return a motion's covariance (6, 6), stated in one frame, along the axes and at the origin of another.
+
+    Small rotation, then translation. A rotation error r and a translation error t of then move a point x of
+    now by R r x (x - p) + R t.
+    """
+    turn, shift = now_from_then.rotation, now_from_then.translation_m
+    x, y, z = shift
+    across = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    carried = np.zeros((6, 6))
+    carried[:3, :3] = carried[3:, 3:] = turn
+    carried[3:, :3] = across @ turn
+    return np.asarray(carried @ covariance @ carried.T)
+
+
 def moved_rigid(pose: Rigid, step: FloatArray) -> Rigid:
     """Return a pose shifted by step[:3] and turned by the rotation vector step[3:] about its origin."""
     from scipy.spatial.transform import Rotation  # slow to load, and a command on files needs no fit

@@ -27,7 +27,7 @@ from calib.errors import CalibError, NoStereoPoint
 from calib.handoff_refined import Eye
 from calib.match import Match, MatchSettings, match
 from calib.one_point import Sighting, one_point
-from calib.rigid import FloatArray, Rigid, moved_rigid
+from calib.rigid import FloatArray, Rigid, carried_covariance, moved_rigid
 from calib.stereo import triangulate
 from calib.warp import Plane
 
@@ -208,15 +208,12 @@ def moved(track: Track, now_from_then: Rigid, covariance: FloatArray) -> Track:
         )
     position = now_from_then.points(track.position_m)
     rate, turned = _motion_rate(position), now_from_then.rotation
-    # What was wrong before about the old origin is, about the new one, turned and with a lever.
-    lever = -_motion_rate(now_from_then.translation_m)[:, :3]
-    then = np.block([[turned, np.zeros((3, 3))], [lever @ turned, turned]])
     return replace(
         track,
         position_m=position,
         covariance_m2=turned @ track.covariance_m2 @ turned.T + rate @ spread @ rate.T,
         key=_carried(track.key, now_from_then),
-        motion_covariance=then @ track.motion_covariance @ then.T + spread,
+        motion_covariance=carried_covariance(track.motion_covariance, now_from_then) + spread,
     )
 
 

@@ -12,14 +12,13 @@ from scipy.spatial.transform import Rotation
 
 from calib.errors import CalibError
 from calib.mast import Rig
-from calib.rigid import Rigid
+from calib.rigid import Rigid, carried_covariance
 from calib.store import load_rig
 from mastctl.limits import Limits
 from mastctl.tracking.choice import HandoffRules, PairBounds, choose_pairs
 from mastctl.tracking.pose import (
     PoseRefused,
     RoverPose,
-    carried_covariance,
     check_follows,
     motion_between,
     stands,

@@ -6,9 +6,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from calib.rigid import FloatArray
+from calib.rigid import FloatArray, carried_covariance
 from calib.tracking import Track, moved
-from mastctl.tracking.pose import RoverPose, carried_covariance, motion_between
+from mastctl.tracking.pose import RoverPose, motion_between
 
 
 @dataclass(frozen=True, eq=False)

@@ -91,17 +91,3 @@ def stands(motion: Rigid) -> bool:
     """Return whether a motion is none."""
     turned_rad = math.acos(min(1.0, max(-1.0, (float(np.trace(motion.rotation)) - 1) / 2)))
     return float(np.linalg.norm(motion.translation_m)) <= STANDS_M and turned_rad <= STANDS_RAD
-
-
-def carried_covariance(covariance: FloatArray, now_from_then: Rigid) -> FloatArray:
-    """Return a motion's covariance (6, 6), stated at one pose, along the axes and at the origin of the next.
-
-    A rotation error r and a translation error t of then move a point x of now by R r x (x - p) + R t.
-    """
-    turn, shift = now_from_then.rotation, now_from_then.translation_m
-    x, y, z = shift
-    across = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    carried = np.zeros((6, 6))
-    carried[:3, :3] = carried[3:, 3:] = turn
-    carried[3:, :3] = across @ turn
-    return np.asarray(carried @ covariance @ carried.T)
