@@ -125,7 +125,7 @@ class HandoffCheck:
     def _read(self, path: Path) -> None:
         self._asked(self._clock.now_s())
         try:
-            before = read_log(path).handoffs if path.exists() else ()
+            before = read_log(path).handoffs if path.is_file() else ()
         except (BadFile, OSError) as error:
             words = f"{' '.join(str(error).split())}; what was written down before does not count"
             with self._lock:

@@ -104,7 +104,12 @@ BAD: list[tuple[str, Any, str, str]] = [
     ("listen/socket", "/run/x.sock", "listen.host", "beside 'socket'"),
     ("listen", {"socket": "/" + "x" * 120}, "listen.socket", "longer than"),
     ("simulation", "yes", "simulation", "a mapping is expected"),
-    ("tracking", "yes", "tracking", "a mapping with handoff, most_step, start_error is expected"),
+    (
+        "tracking",
+        "yes",
+        "tracking",
+        "a mapping with handoff, most_step, start_error, handoff_log is expected",
+    ),
     ("tracking", {"most_stap": 0.3}, "tracking.most_stap", "the nearest known is 'most_step'"),
     ("tracking", {"most_step": 0.0}, "tracking.most_step", "from 0.01 to 1"),
     ("tracking", {"start_error": "a"}, "tracking.start_error", "number"),
@@ -152,6 +157,14 @@ def test_what_is_left_out_of_tracking_stays_as_it_is() -> None:
     assert tracking.handoff.pairs["navcam"] == PairBounds(2.5, 0.7)
     assert tracking.handoff.pairs["pancam"] == usual.handoff.pairs["pancam"]
     assert (tracking.handoff.range_error, tracking.most_step) == (0.1, usual.most_step)
+
+
+def test_the_record_of_hand_offs_lies_beside_the_configuration_and_is_none_by_default(tmp_path: Path) -> None:
+    data = changed("tracking", {"handoff_log": "handed/over.jsonl"})
+    assert parse_config(data, tmp_path / "d.yaml").tracking.handoff_log == tmp_path / "handed/over.jsonl"
+    assert parsed(yaml.safe_dump(GOOD).encode()).tracking.handoff_log is None
+    with pytest.raises(BadFile, match=r"tracking\.handoff_log"):
+        parsed(changed("tracking", {"handoff_log": 3}))
 
 
 def test_a_pair_that_the_mast_file_lacks_is_named() -> None:

@@ -6,6 +6,7 @@ import csv
 import json
 import math
 from pathlib import Path
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -14,11 +15,13 @@ from calib.store import load_rig
 from drivers.sim.rover import simulation_settings
 from mastctl.cli.experiment import turned
 from mastctl.cli.main import main
+from mastctl.client import Client, ClientError
 from mastctl.config import load_config
 from mastctl.experiment.demo import demo_config
 from mastctl.experiment.pointing import Landing, PointingExperiment, TargetRecord, rms, summarise
 from mastctl.experiment.report import CSV_COLUMNS, table_rows, write_report
 from mastctl.experiment.targets import on_level_ground, textured
+from mastctl.experiment.views import pointed
 
 NAN = math.nan
 
@@ -143,3 +146,44 @@ def test_the_demo_refuses_a_head_that_is_not_behind_its_wire(
     assert main(["demo", "--wire", "flir_ptu", "--head", "ph42", "--out", str(tmp_path / "demo")]) == 2
     told = capsys.readouterr().err
     assert "'ph42', which is not behind simulation.wire 'flir_ptu'; expected ptu_d46_70" in told
+
+
+class SlowDaemon:
+    """What of a client an experiment uses; the first operations end only when they are stopped."""
+
+    def __init__(self, slow: int) -> None:
+        self.slow, self.running, self.calls = slow, "", list[str]()
+
+    def point(self, **request: Any) -> str:
+        if self.running:
+            raise ClientError("busy", f"operation {self.running} is running; wait for it or stop it")
+        self.running = f"{len(self.calls):06d}"
+        self.calls.append("point")
+        return self.running
+
+    def wait(self, operation: str, timeout_s: float) -> dict[str, Any]:
+        if self.slow:
+            raise ClientError("timeout", f"operation {operation} has not ended after {timeout_s:g} s")
+        self.running = ""
+        return {"state": "done"}
+
+    def stop(self) -> dict[str, Any]:
+        self.calls.append("stop")
+        self.slow -= 1
+        return {"stopped": True, "operation": self.running}
+
+
+def test_an_operation_that_takes_too_long_is_stopped_and_the_next_one_begins() -> None:
+    daemon = SlowDaemon(1)
+    with pytest.raises(ClientError, match=r"has not ended after 60 s"):
+        pointed(cast(Client, daemon), pan_rad=0.1, tilt_rad=0.0)
+    assert pointed(cast(Client, daemon), pan_rad=0.2, tilt_rad=0.0) == {"state": "done"}
+    assert daemon.calls == ["point", "stop", "point"]
+
+
+def test_a_refusal_stops_nothing() -> None:
+    daemon = SlowDaemon(0)
+    daemon.running = "another"
+    with pytest.raises(ClientError, match="another is running"):
+        pointed(cast(Client, daemon), pan_rad=0.1, tilt_rad=0.0)
+    assert daemon.calls == []

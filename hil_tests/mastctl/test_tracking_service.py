@@ -12,10 +12,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-from service_fakes import FakeHardware, Hang, ScriptedLoop, eventually, fake_daemon, rig
+from service_fakes import CONFIG, FakeHardware, Hang, ScriptedLoop, eventually, fake_daemon, rig
 
+from calib.handoff import Joints
 from calib.handoff_refined import Eye
 from calib.mast import Mast
+from calib.matched_handoff import Landed, MatchedHandoff
 from calib.rigid import Rigid
 from calib.store import save_rig
 from calib.tracking import Key, Track
@@ -23,11 +25,13 @@ from drivers.errors import NoReply
 from mastctl.cli.main import main
 from mastctl.client import Client, ClientError
 from mastctl.daemon import RunningDaemon
+from mastctl.handoff_log import read_log
 from mastctl.tracking import tracker as tracker_module
 from mastctl.tracking.look import EyePixel, NotTrackable, Seen
 
 TARGET_M = (5.0, 0.5, 0.0)
 SIGMA = (0.01, 0.005)
+LOGGED = "tracking: {{handoff_log: handed/over.jsonl}}\n"
 
 
 class ScriptedLooker:
@@ -83,7 +87,7 @@ def pair(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[tuple[Runn
     monkeypatch.setattr(ScriptedLooker, "script", staticmethod(found), raising=False)
     monkeypatch.setattr(ScriptedLooker, "begin", staticmethod(lambda: None))
     monkeypatch.setattr(ScriptedLooker, "looks", [], raising=False)
-    with fake_daemon(monkeypatch, tmp_path) as made:
+    with fake_daemon(monkeypatch, tmp_path, config=CONFIG + LOGGED) as made:
         yield made
 
 
@@ -187,6 +191,74 @@ def test_a_change_of_the_pair_is_a_handoff(client: Client, monkeypatch: pytest.M
     drive(client, 0.5, 2.0)
     track = drive(client, 0.9, 3.0)
     assert track["handoffs"] == [{"from_pair": "navcam", "to_pair": "hazcam", "range_m": 5.0}]
+
+
+def handed(digest: str, index: int) -> MatchedHandoff:
+    """A hand-off to a camera that sees targets 2 px to the right of where they should be."""
+    at = np.array([30.0 + index, 20.0])
+    found = at + np.random.default_rng(index).normal((2.0, 0.0), 0.3)
+    landed = Landed(at, 0.01 * np.eye(2), "accepted", "", found, 0.01 * np.eye(2))
+    return MatchedHandoff(
+        "2026-01-01T00:00:00Z", digest, ("navcam_left", "navcam_right"), Joints(0.0, -0.5),
+        np.array([at, at - 5.0]), 0.1, Joints(0.0, -0.5), {"hazcam_left": landed},
+    )  # fmt: skip
+
+
+def test_hand_offs_that_tell_an_offset_say_so(
+    client: Client,
+    daemon: RunningDaemon,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    assert started(client)["self_check"] == {"handoffs": 0, "offsets": []}
+    digest = client.status()["mast"]["digest"]
+    numbers = iter(range(100))
+
+    def hand_over(track: Track) -> tuple[Track, Seen]:
+        return track, replace(seen(track, "hazcam"), matched=handed(digest, next(numbers)))
+
+    monkeypatch.setattr(ScriptedLooker, "script", staticmethod(hand_over))
+    for _ in range(12):
+        client.wait_track(client.look())
+    told = client.track()["self_check"]
+    assert told["handoffs"] == 12
+    (offset,) = told["offsets"]
+    assert (offset["source"], offset["camera"], offset["handoffs"]) == ("navcam", "hazcam_left", 12)
+    assert offset["offset_px"] == pytest.approx([2.0, 0.0], abs=0.4)
+    assert offset["sentence"].startswith("hazcam_left sees targets ")
+    code, out, _ = run(daemon, capsys, "status")
+    assert (code, out.splitlines()[1:]) == (0, [offset["sentence"]])
+    path = daemon.service.config.mast_file.parent / "handed/over.jsonl"
+    eventually(lambda: path.exists() and len(read_log(path).handoffs) == 12, "the record is written")
+    folder = daemon.service.config.mast_file.parent
+    save_rig(replace(rig(), name="better"), folder / "better.yaml")
+    client._json("POST", "/mast", json={"file": "better.yaml"})
+    assert client.track()["self_check"] == {"handoffs": 0, "offsets": []}
+    client._json("POST", "/mast/back")
+    assert len(client.track()["self_check"]["offsets"]) == 1
+
+
+def test_a_record_that_cannot_be_written_is_told_and_stops_no_track(
+    client: Client, daemon: RunningDaemon, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    started(client)
+    folder = daemon.service.config.mast_file.parent
+    (folder / "handed").write_text("a file where the record's folder should be")
+    digest = client.status()["mast"]["digest"]
+
+    def hand_over(track: Track) -> tuple[Track, Seen]:
+        return track, replace(seen(track, "hazcam"), matched=handed(digest, 0))
+
+    monkeypatch.setattr(ScriptedLooker, "script", staticmethod(hand_over))
+    track = drive(client, 0.5, 2.0)
+    assert (track["state"], track["self_check"]["handoffs"]) == ("tracking", 1)
+    eventually(lambda: client.status()["faults"], "the fault")
+    status = client.status()
+    (fault,) = status["faults"]
+    assert (fault["device"], fault["code"]) == ("handoff_log", "unwritable")
+    assert "over.jsonl: cannot be appended to: " in fault["message"]
+    assert status["state"] != "fault", "the mast is well"
+    assert drive(client, 0.9, 3.0)["state"] == "tracking"
 
 
 def test_a_pose_that_jumps_loses_the_target_and_looks_nowhere(client: Client) -> None:

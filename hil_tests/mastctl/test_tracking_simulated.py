@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from service_fakes import eventually
 
 from calib.mast import Rig, RigCamera
 from calib.rigid import FloatArray, Rigid
@@ -19,6 +20,7 @@ from mastctl.client import Client, ClientError
 from mastctl.config import load_config
 from mastctl.daemon import RunningDaemon
 from mastctl.experiment.targets import textured
+from mastctl.handoff_log import read_log
 
 CROPPED_PX = (400, 300)
 STEP_M = 0.45
@@ -32,7 +34,7 @@ cameras: {navcam_left: {driver: sim}, navcam_right: {driver: sim},
           hazcam_left: {driver: sim}, hazcam_right: {driver: sim}}
 limits: {pan_rad: [-2.6, 2.6], tilt_rad: [-1.2, 0.5], speed_rad_per_s: 2.0}
 simulation: {rover: rig.yaml, samples: 1, seed: 3, cameras: {rate_hz: 30}}
-tracking: {handoff: {pairs: {navcam: {nearest_m: 2.6}}}}
+tracking: {handoff: {pairs: {navcam: {nearest_m: 2.6}}}, handoff_log: handed.jsonl}
 """
 
 
@@ -147,6 +149,14 @@ def test_an_approach_over_http_hands_over_and_keeps_its_target(client: Client, d
     assert track["pair"] == "hazcam"
     assert [(one["from_pair"], one["to_pair"]) for one in track["handoffs"]] == [("navcam", "hazcam")]
     assert track["looks"] == 4
+    assert track["self_check"] == {"handoffs": 1, "offsets": []}
+    path = daemon.service.config.mast_file.parent / "handed.jsonl"
+    eventually(lambda: path.exists() and len(read_log(path).handoffs) == 1, "the record is written")
+    (record,) = read_log(path).handoffs
+    assert record.pair == ("navcam_left", "navcam_right")
+    assert list(record.found) == ["hazcam_left", "hazcam_right"]
+    for landed in record.found.values():
+        assert landed.found_px == pytest.approx(landed.geometric_px, abs=1.0), "the mast file is true"
 
 
 def test_the_told_pose_moves_the_site_and_not_the_truth(client: Client, daemon: RunningDaemon) -> None:

@@ -7,7 +7,7 @@ import math
 import sys
 from typing import TYPE_CHECKING, Any
 
-from mastctl.cli.output import CommandError, WrongUse, finite_number, positive_number
+from mastctl.cli.output import CommandError, WrongUse, finite_number, one_line, positive_number
 from mastctl.cli.service import add_daemon_options, client_of, followed, number_of, tell_result
 
 if TYPE_CHECKING:
@@ -113,8 +113,10 @@ def _start(args: argparse.Namespace) -> int:
 def _status(args: argparse.Namespace) -> int:
     with client_of(args) as client:
         track = client.track()
-        offsets = [one["sentence"] for one in track["self_check"]["offsets"]]
-        tell_result(args, track, "\n".join([track_line(track), *offsets]))
+        _show(args, track)
+        if not args.json:
+            for one in track["self_check"]["offsets"]:
+                sys.stdout.write(one_line(one["sentence"]) + "\n")
         return 0
 
 
