@@ -229,6 +229,15 @@ class CameraModel:
         """((w-1)/2, (h-1)/2): the middle of the image in pixel-centre coordinates."""
         return ((self.size_px[0] - 1) / 2, (self.size_px[1] - 1) / 2)
 
+    def holds(self, pixel_px: ArrayLike, margin_px: float = 0.0) -> bool:
+        """Tell whether a pixel (2,) lies in the image, at least ``margin_px`` inside its outer border.
+
+        The border runs half a pixel outside the outer pixels' centres. Not-a-number lies outside.
+        """
+        x, y = np.asarray(pixel_px, dtype=np.float64)
+        low, (width, height) = margin_px - 0.5, self.size_px
+        return bool(low <= x <= width - 1 - low and low <= y <= height - 1 - low)
+
     def moved(self, b_from_a: Rigid) -> CameraModel:
         """Return the same camera with its vectors in frame b instead of a: C moves, A H V O turn."""
         rows = self._rows @ b_from_a.rotation.T

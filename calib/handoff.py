@@ -184,9 +184,9 @@ def _unseen(model: CameraModel, position_m: FloatArray) -> str:
     pixel, valid = model.project(position_m)
     if not valid:
         return "the target is behind the camera or beyond what its lens images"
-    width, height = model.size_px
-    if -0.5 <= pixel[0] <= width - 0.5 and -0.5 <= pixel[1] <= height - 0.5:
+    if model.holds(pixel):
         return ""
+    width, height = model.size_px
     return (
         f"the target falls on pixel ({pixel[0]:.1f}, {pixel[1]:.1f}), outside the image of {width} x {height}"
     )

@@ -113,6 +113,24 @@ def test_points_outside_the_image_keep_their_numbers() -> None:
     assert plain("CAHVOR").ray([1e5, -1e5]).valid
 
 
+@pytest.mark.parametrize(
+    ("pixel", "margin_px", "held"),
+    [
+        ((-0.5, -0.5), 0.0, True),
+        ((SIZE[0] - 0.5, SIZE[1] - 0.5), 0.0, True),
+        ((-0.51, 10.0), 0.0, False),
+        ((10.0, SIZE[1] - 0.49), 0.0, False),
+        ((0.0, SIZE[1] - 1.0), 0.5, True),
+        ((0.0, 10.0), 0.6, False),
+        ((np.nan, 10.0), 0.0, False),
+    ],
+)
+def test_the_image_ends_half_a_pixel_outside_its_outer_pixels(
+    pixel: tuple[float, float], margin_px: float, held: bool
+) -> None:
+    assert plain("CAHV").holds(pixel, margin_px) is held
+
+
 def test_shapes_follow_the_input() -> None:
     model = plain("CAHVORE", E=[0.01, 0, 0])
     points = np.random.default_rng(1).uniform(0.5, 2.0, (2, 5, 3))

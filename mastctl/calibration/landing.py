@@ -124,7 +124,6 @@ def handoff_errors_px(
     errors = {}
     for name in to:
         pixel, valid = true.camera_in_rover(name, pan_rad, tilt_rad).project(target_m)
-        width, height = true.cameras[name].model.size_px
-        if valid and 0 <= pixel[0] <= width - 1 and 0 <= pixel[1] <= height - 1:
+        if valid and true.cameras[name].model.holds(pixel):
             errors[name] = seen(believed, name, pan_rad, tilt_rad, position) - pixel
     return errors

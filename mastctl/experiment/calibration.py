@@ -263,7 +263,7 @@ def _pointing(
             left_px = _pixel(true, pair[0], rng)
             noise = CLICK_PX * rng.standard_normal((2, 2))
             target, left, right = click(true, pair, pan, tilt, left_px, range_m)
-            if not _inside(true, pair[1], right):
+            if not true.cameras[pair[1]].model.holds(right):
                 continue
             rows.append(
                 [
@@ -341,7 +341,7 @@ def _shared_view(
             target, left, right = click(true, pair, pan, tilt, left_px, away_m)
         except CalibError:
             continue
-        if _inside(true, pair[1], right):
+        if true.cameras[pair[1]].model.holds(right):
             return pan, tilt, target, left, right
     return None
 
@@ -350,11 +350,6 @@ def _pixel(rig: Rig, camera: str, rng: np.random.Generator) -> FloatArray:
     """A pixel (2,) anywhere but at the edges."""
     size = np.array(rig.cameras[camera].model.size_px, dtype=np.float64)
     return np.asarray(size * rng.uniform(MARGIN, 1.0 - MARGIN, 2))
-
-
-def _inside(rig: Rig, camera: str, pixel: FloatArray) -> bool:
-    width, height = rig.cameras[camera].model.size_px
-    return bool(0 <= pixel[0] <= width - 1 and 0 <= pixel[1] <= height - 1)
 
 
 def _mast_rms(fit: Calibration) -> dict[str, tuple[float, float]]:

@@ -56,8 +56,7 @@ class BrickPoints:
         truth = self._rover.frame_truth(*camera_and_sequence(frame_id))
         camera = truth.camera_in_rover
         pixel, valid = camera.project(position_m)
-        width, height = camera.size_px
-        if not valid or not (-0.5 <= pixel[0] <= width - 0.5 and -0.5 <= pixel[1] <= height - 0.5):
+        if not valid or not camera.holds(pixel):
             return None
         ray = camera.ray(pixel)
         met_m = self._rover.scene.cast(

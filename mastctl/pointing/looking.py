@@ -255,8 +255,7 @@ class Eyes:
             return False
         camera = self._rig.camera_in_rover(name, resting.pan_rad, resting.tilt_rad)
         place, valid = camera.project(position_m)
-        margin, size = 2.0 * self._settings.match.half_px, np.array(camera.size_px)
-        return bool(valid) and bool(((place >= margin) & (place <= size - 1 - margin)).all())
+        return bool(valid) and camera.holds(place, 2.0 * self._settings.match.half_px)
 
     def _sizes(self) -> tuple[MatchSettings, MatchSettings]:
         """Return the matching with the usual patch, and with one that may fit beside an edge."""

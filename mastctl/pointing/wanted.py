@@ -74,7 +74,8 @@ def check_pointings(request: PointRequest) -> None:
 
 def _inside(rig: Rig, camera: str, x_px: float, y_px: float, what: str) -> None:
     """Pass a pixel of the camera's image."""
-    width, height = rig.cameras[camera].model.size_px
-    if not (-0.5 <= x_px <= width - 0.5 and -0.5 <= y_px <= height - 0.5):
+    model = rig.cameras[camera].model
+    if not model.holds((x_px, y_px)):
+        width, height = model.size_px
         words = f"{what}: pixel ({x_px:g}, {y_px:g}) is outside the {width}x{height} px of {camera}"
         raise PointingError("outside_image", words)

@@ -212,10 +212,8 @@ def _check_inside(eye: str, model: CameraModel, position_m: FloatArray, margin_p
     pixel, seen = model.project(position_m)
     if not bool(seen):
         raise CalibError(f"{eye} has it behind itself or beyond what its lens images")
-    width, height = model.size_px
-    if not (
-        margin_px <= pixel[0] <= width - 1 - margin_px and margin_px <= pixel[1] <= height - 1 - margin_px
-    ):
+    if not model.holds(pixel, margin_px):
+        width, height = model.size_px
         raise CalibError(
             f"{eye} has it at pixel ({pixel[0]:.0f}, {pixel[1]:.0f}), not {margin_px:g} px inside its "
             f"{width}x{height} px"
