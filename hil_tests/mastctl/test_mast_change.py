@@ -15,6 +15,7 @@ import pytest
 from service_fakes import FakeHardware, ScriptedLoop, eventually, fake_daemon, rig
 
 from calib.mast import Mast, RigCamera
+from calib.rig_covariance import stored_covariance
 from calib.store import load_rig, save_rig
 from drivers.errors import NoReply
 from mastctl import service as service_module
@@ -190,3 +191,16 @@ def test_a_file_that_cannot_be_read_is_refused(web: httpx.Client, folder: Path) 
 )
 def test_bodies_that_make_no_sense_are_refused(web: httpx.Client, body: dict[str, Any]) -> None:
     refusal(web.post("/mast", json=body), 422, "bad_request")
+
+
+def test_a_daemon_with_fewer_cameras_keeps_the_covariance_of_those_it_has() -> None:
+    names = ["mast.rotation_rad.x", "cameras.navcam_left.C.x", "cameras.hazcam_left.C.x"]
+    fit = {"parameters": names, "covariance": np.diag([1e-6, 4e-6, 9e-6]).tolist(), "rms_px": 0.1}
+    part = service_module._configured(replace(rig(), fit=fit), ["navcam_left", "navcam_right"])
+    known = stored_covariance(part)
+    assert known is not None
+    assert known.names == tuple(names[:2])
+    assert np.diag(known.covariance).tolist() == [1e-6, 4e-6]
+    assert part.fit["rms_px"] == 0.1
+    spoilt = service_module._configured(replace(rig(), fit={**fit, "covariance": [[1.0]]}), ["navcam_left"])
+    assert stored_covariance(spoilt) is None
