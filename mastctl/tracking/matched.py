@@ -24,8 +24,8 @@ JOINT_SIGMA_RAD = 3e-5
 """What a joint reading is taken to be wrong by: half a step of a stepped pan/tilt unit."""
 LEAST_SIGMA_PX = 0.05
 SETTINGS = RefineSettings(least_px=6.0, model_px=1.0)
-"""Two sets of cameras may mean rover frames that are 5 mrad apart (2 px of a Hazcam, the paper's bias): wide
-enough that four sigma of it are found also by a mast file that says nothing of its own errors."""
+"""Two sets of cameras may mean rover frames that are 5 mrad apart, the paper's bias of 2 px in a Hazcam: wide
+enough that this is found also by a mast file that says nothing of its own errors. Beyond 3 px nothing is."""
 
 
 def record_of(
