@@ -256,7 +256,7 @@ class Looker:
             reason,
             choice.pair,
             track.position_m,
-            track.covariance_m2,
+            track.target_covariance_m2,
             range_m,
             pixels,
             look.chi2,
@@ -317,7 +317,7 @@ class Looker:
             "",
             pair,
             track.position_m,
-            track.covariance_m2,
+            track.target_covariance_m2,
             float(np.linalg.norm(track.position_m - middle)),
             {
                 view.frame.camera: EyePixel(view.frame.frame_id, "good", "", float(at[0]), float(at[1]))

@@ -277,7 +277,9 @@ class Tracker:
         if after_jump:
             status = replace(status, reason="not looked for since a pose jumped")
         track = self._carried.track
-        return replace(status, position_m=track.position_m, covariance_m2=track.covariance_m2, stands_at=pose)
+        return replace(
+            status, position_m=track.position_m, covariance_m2=track.target_covariance_m2, stands_at=pose
+        )
 
     def _publish(self, status: TrackStatus) -> None:
         before = self._status
