@@ -26,6 +26,10 @@ def add_parser(kinds: Any) -> None:
         "--seed", type=seed, default=1, metavar="S", help="of the first run's scene and errors (default 1)"
     )
     parser.add_argument(
+        "--on", choices=("rocks", "ground"), default="rocks",
+        help="what targets lie on (default rocks; ground: wherever there is texture)",
+    )  # fmt: skip
+    parser.add_argument(
         "--out",
         type=Path,
         metavar="DIR",
@@ -54,7 +58,7 @@ def run(args: argparse.Namespace) -> int:
     console = Console(stderr=True, quiet=args.json)
     for index in range(args.runs):
         with console.status(f"approach {index + 1} of {args.runs}"):
-            runs.append(run_approach(true, believed, args.seed + index))
+            runs.append(run_approach(true, believed, args.seed + index, on=args.on))
         one = runs[-1]
         told = one.error or ("kept" if one.kept else f"lost: {one.stops[-1].reason}" if one.stops else "lost")
         console.print(f"seed {one.seed}: {told}", markup=False)
@@ -67,5 +71,7 @@ def run(args: argparse.Namespace) -> int:
         notes = [counted(runs)]
         notes += ["3 times the rms, along the line of sight, to its right and below it, in the rover frame"]
         notes += [f"record: {args.out}"] if args.out is not None else []
-        output.print_table("Approach from 10 m to 1 m, simulated rover", *table_rows(runs), notes)
+        output.print_table(
+            f"Approach from 10 m to 1 m, targets on {args.on}, simulated rover", *table_rows(runs), notes
+        )
     return 0 if any(one.kept for one in runs) else 1

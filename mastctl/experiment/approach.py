@@ -5,9 +5,12 @@ from __future__ import annotations
 import math
 import time
 from dataclasses import dataclass, field, replace
+from typing import Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
+from calib.cahvor import CameraModel
 from calib.errors import CalibError
 from calib.handoff_refined import Eye
 from calib.mast import Rig
@@ -24,6 +27,15 @@ from mastctl.tracking.choice import choose_pairs
 START_M, END_M = 10.0, 1.0
 STEP = 0.1
 """Of the range, driven in one step."""
+
+On = Literal["rocks", "ground"]
+"""What targets lie on: rocks, as the paper's, or wherever there is texture, which is mostly level ground."""
+
+ROCK_M = 0.05
+"""A target so far above the ground is on a rock."""
+
+NEAR_ROCK_PX = 40
+"""How far from the rock's chosen point its texture is looked for."""
 
 SUN_MOVES_RAD = math.radians(8.0)
 LOST_LOOKS = 3
@@ -94,7 +106,9 @@ class ApproachRun:
         return self.stops[-1].error_m if self.stops else np.full(3, np.nan)
 
 
-def run_approach(true: Rig, believed: Rig, seed: int, errors: WorldErrors | None = None) -> ApproachRun:
+def run_approach(
+    true: Rig, believed: Rig, seed: int, errors: WorldErrors | None = None, on: On = "rocks"
+) -> ApproachRun:
     """Drive one approach to a random target.
 
     Parameters
@@ -103,13 +117,15 @@ def run_approach(true: Rig, believed: Rig, seed: int, errors: WorldErrors | None
         The rig that takes the pictures, and the mast file's.
     seed
         Of scene, target, path and every error.
+    on
+        What the target lies on.
     """
     begun_s = time.monotonic()
     rng = np.random.default_rng([seed, 6])
     light = SceneSettings(seed=seed)
     world = World(build_scene(light), true, believed, errors or WorldErrors(), rng)
     try:
-        begun = _begin(world, rng)
+        begun = _begin(world, rng, on)
         if isinstance(begun, str):
             return ApproachRun(seed, (), begun, time.monotonic() - begun_s)
         track, target = begun
@@ -122,21 +138,25 @@ def run_approach(true: Rig, believed: Rig, seed: int, errors: WorldErrors | None
         world.close()
 
 
-def _begin(world: World, rng: np.random.Generator) -> tuple[Track, FloatArray] | str:
+def _begin(world: World, rng: np.random.Generator, on: On) -> tuple[Track, FloatArray] | str:
     """Pick a textured pixel of the left Pancam at the start range; the track, and the truth in the site."""
     pair = world.believed.stereo["pancam"]
     reason = "no view offered a target"
     for _ in range(12):
-        azimuth = rng.uniform(-0.5, 0.5)
-        ground = np.array([START_M * math.cos(azimuth), START_M * math.sin(azimuth), 0.0])
-        angles = solve(world.believed.mast, world.believed.cameras[pair[0]].model, ground)[0]
+        aim = _aim(world, rng, on)
+        if aim is None:
+            return "no rock stands at the start range"
+        angles = solve(world.believed.mast, world.believed.cameras[pair[0]].model, aim)[0]
         eyes = world.look(pair, angles.pan_rad, angles.tilt_rad)
         left, right = (eyes[name] for name in pair)
-        rows, columns = np.nonzero(textured(left.image.astype(np.uint8)))
+        fit = textured(left.image.astype(np.uint8))
+        if on == "rocks":
+            fit &= _near(left.camera, aim)
+        rows, columns = np.nonzero(fit)
         for pick in rng.integers(len(rows), size=4) if len(rows) else ():
             pixel = np.array([float(columns[pick]), float(rows[pick])])
             target = world.point_at(pair[0], angles.pan_rad, angles.tilt_rad, pixel)
-            if target is None:
+            if target is None or (on == "rocks" and world.height_m(target) < ROCK_M):
                 continue
             range_m = float(np.linalg.norm(world.site_from_rover.inverse.points(target) - left.camera.C))
             if abs(range_m - START_M) > 0.15 * START_M:
@@ -146,6 +166,22 @@ def _begin(world: World, rng: np.random.Generator) -> tuple[Track, FloatArray] |
             except CalibError as error:
                 reason = str(error)
     return reason
+
+
+def _aim(world: World, rng: np.random.Generator, on: On) -> FloatArray | None:
+    """Where to look for a target, (3,) in the rover frame; None without a rock."""
+    if on == "rocks":
+        rock = world.turn_to_rock(START_M, ROCK_M)
+        return None if rock is None else world.site_from_rover.inverse.points(rock)
+    azimuth = rng.uniform(-0.5, 0.5)
+    return np.array([START_M * math.cos(azimuth), START_M * math.sin(azimuth), 0.0])
+
+
+def _near(camera: CameraModel, aim_m: FloatArray) -> NDArray[np.bool_]:
+    """Which pixels (h, w) lie near the image of a point."""
+    (x, y), (width, height) = camera.project(aim_m)[0], camera.size_px
+    columns, rows = np.arange(width), np.arange(height)[:, None]
+    return np.asarray(np.maximum(np.abs(columns - x), np.abs(rows - y)) <= NEAR_ROCK_PX)
 
 
 def _drive(

@@ -54,6 +54,10 @@ WINDOW_PX = (704, 384)
 Wide enough for the other eye: at 6 m the Pancams see a target 170 px apart."""
 
 
+ROCKS_WITHIN_RAD, RAYS = 1.3, 6000
+"""To either side of the first heading rocks are sought, by so many rays: 10 m away one each 4 cm."""
+
+
 def windowed(rig: Rig, size_px: tuple[int, int]) -> Rig:
     """Return the rig with its mast cameras' pictures cut to their middle; what they see stays where it is."""
     cameras = dict(rig.cameras)
@@ -107,6 +111,37 @@ class World:
         pitch, roll = self._rng.normal(0.0, math.radians(1.5), 2)
         rotation = rot_z(heading_rad) @ rot_y(pitch) @ rot_x(roll)
         return Rigid(rotation, np.array([x_m, y_m, self._renderer.scene.ground_z_m(x_m, y_m)]))
+
+    def height_m(self, point_in_site_m: FloatArray) -> float:
+        """How far a point (3,) of the site lies above the ground under it, metres: more than 0 on a rock."""
+        x, y, z = point_in_site_m.tolist()
+        return float(self._renderer.scene.ground_z_m(x, y) - z)
+
+    def turn_to_rock(self, range_m: float, least_m: float) -> FloatArray | None:
+        """Turn the rover where it stands towards a rock some ``range_m`` away.
+
+        Returns
+        -------
+        point_m
+            (3,) of the site, on the side that the mast sees, at least ``least_m`` above the ground; larger
+            rocks are likelier. None, and no turn, if there is none.
+        """
+        scene, rng = self._renderer.scene, self._rng
+        origin = self.site_from_rover.points(self.true.mast.translation_m)
+        azimuth = rng.uniform(-ROCKS_WITHIN_RAD, ROCKS_WITHIN_RAD, RAYS)
+        away = rng.uniform(0.85, 1.15, RAYS) * range_m
+        aims = np.stack([away * np.cos(azimuth), away * np.sin(azimuth), np.full(RAYS, -origin[2])], axis=1)
+        reach = scene.cast(origin, aims)
+        points = origin + reach[:, None] * aims / np.linalg.norm(aims, axis=1, keepdims=True)
+        points = points[np.abs(reach - range_m) < 0.15 * range_m]
+        fit = [point for point in points if self.height_m(point) > least_m]
+        if not fit:
+            return None
+        chosen: FloatArray = fit[rng.integers(len(fit))]
+        here = self.site_from_rover.translation_m
+        heading = math.atan2(chosen[1] - here[1], chosen[0] - here[0]) + rng.uniform(-0.4, 0.4)
+        self.site_from_rover = self._standing(float(here[0]), float(here[1]), heading)
+        return chosen
 
     def drive(self, x_m: float, y_m: float, heading_rad: float) -> tuple[Rigid, FloatArray]:
         """Drive to a place of the site; return the motion as reported (now_from_then) and its covariance."""
