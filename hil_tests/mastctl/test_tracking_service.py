@@ -305,6 +305,10 @@ def test_a_first_pose_during_a_track_says_nothing_about_its_motion(client: Clien
     assert started(client, first_pose=False)["state"] == "tracking"
 
 
+COUPLED = np.zeros((6, 6))
+COUPLED[4, 5] = COUPLED[5, 4] = 1.0  # two turns, coupled more than their variances allow
+
+
 @pytest.mark.parametrize(
     ("change", "words"),
     [
@@ -313,6 +317,8 @@ def test_a_first_pose_during_a_track_says_nothing_about_its_motion(client: Clien
         ({"position_m": [0, 0]}, "a list of 3 numbers"),
         ({"covariance": [[1.0]]}, "6 rows of 6"),
         ({"covariance": np.diag([1.0, 1, 1, 1, 1, -1]).tolist()}, "negative variance"),
+        ({"covariance": np.diag([1e9, -0.5, 1, 1, 1, 1]).tolist()}, "negative variance"),
+        ({"covariance": (np.diag([1e6] * 3 + [1e-6] * 3) + 1e-5 * COUPLED).tolist()}, "negative variance"),
         ({"covariance": np.triu(np.ones((6, 6))).tolist()}, "not symmetric"),
         (
             {"covariance": np.eye(6).tolist(), "sigma": {"position_m": 0.1, "rotation_rad": 0.1}},
