@@ -594,6 +594,17 @@ def test_wrong_use_of_the_commands_ends_with_2(
     assert log.startswith("mastctl: ")
 
 
+def test_fewer_changes_than_asked_for_are_a_failure(
+    daemon: RunningDaemon, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole = Client.watch_track
+    monkeypatch.setattr(Client, "watch_track", lambda client: [next(whole(client))])  # then the daemon ends
+    assert run(daemon, capsys, "watch")[:2] == (0, "idle\n")
+    code, out, log = run(daemon, capsys, "watch", "--count", "2")
+    assert (code, out) == (1, "idle\n")
+    assert "the daemon ended before the track was shown 2 times" in log
+
+
 def test_a_carried_key_keeps_its_camera_where_it_stood(client: Client, daemon: RunningDaemon) -> None:
     started(client)
     drive(client, 0.5, 2.0)
