@@ -168,16 +168,24 @@ class PoseBody(_Strict):
         return RoverPose(Rigid(rotation, np.array(self.position_m)), covariance, self.time_s, received_s)
 
 
+_NEGATIVE = "covariance has a negative variance in some direction"
+
+
 def _check_covariance(rows: list[list[float]]) -> None:
     """Pass a matrix that can be a covariance. Raises ValueError."""
     if len(rows) != 6 or any(len(row) != 6 for row in rows):
         raise ValueError("covariance: 6 rows of 6 numbers are expected")
     matrix = np.array(rows)
-    scale = float(np.abs(matrix).max())
-    if np.abs(matrix - matrix.T).max() > 1e-6 * scale:
+    variances = np.diag(matrix)
+    if (variances < 0).any():
+        raise ValueError(_NEGATIVE)
+    # Each axis by its own sigma: a large one in metres hides nothing that is wrong with a small one.
+    sigma = np.where(variances > 0, np.sqrt(np.abs(variances)), 1.0)
+    correlation = matrix / sigma / sigma[:, None]
+    if np.abs(correlation - correlation.T).max() > 1e-6:
         raise ValueError("covariance is not symmetric")
-    if scale > 0 and np.linalg.eigvalsh(matrix)[0] < -1e-9 * scale:
-        raise ValueError("covariance has a negative variance in some direction")
+    if np.linalg.eigvalsh(correlation)[0] < -1e-6:
+        raise ValueError(_NEGATIVE)
 
 
 class StandBody(_Strict):

@@ -189,6 +189,8 @@ def _handoff(path: str | Path, number: int, value: Any) -> MatchedHandoff:
     source = value["source"]
     if not isinstance(source, list) or len(source) != 2 or not all(isinstance(n, str) for n in source):
         raise line.bad("source", f"{kind_of(source)} where [left camera, right camera] is expected")
+    if not all(CAMERA_NAME.fullmatch(name) for name in source):
+        raise line.bad("source", "a camera's name is <pair>_left or <pair>_right")
     sigma_px, sigma_rad = line.number("sigma_px"), line.number("joint_sigma_rad")
     if sigma_px <= 0.0:
         raise line.bad("sigma_px", f"{sigma_px:g} where a number above zero is expected")

@@ -305,6 +305,10 @@ def test_a_first_pose_during_a_track_says_nothing_about_its_motion(client: Clien
     assert started(client, first_pose=False)["state"] == "tracking"
 
 
+COUPLED = np.zeros((6, 6))
+COUPLED[4, 5] = COUPLED[5, 4] = 1.0  # two turns, coupled more than their variances allow
+
+
 @pytest.mark.parametrize(
     ("change", "words"),
     [
@@ -313,6 +317,8 @@ def test_a_first_pose_during_a_track_says_nothing_about_its_motion(client: Clien
         ({"position_m": [0, 0]}, "a list of 3 numbers"),
         ({"covariance": [[1.0]]}, "6 rows of 6"),
         ({"covariance": np.diag([1.0, 1, 1, 1, 1, -1]).tolist()}, "negative variance"),
+        ({"covariance": np.diag([1e9, -0.5, 1, 1, 1, 1]).tolist()}, "negative variance"),
+        ({"covariance": (np.diag([1e6] * 3 + [1e-6] * 3) + 1e-5 * COUPLED).tolist()}, "negative variance"),
         ({"covariance": np.triu(np.ones((6, 6))).tolist()}, "not symmetric"),
         (
             {"covariance": np.eye(6).tolist(), "sigma": {"position_m": 0.1, "rotation_rad": 0.1}},
@@ -586,6 +592,17 @@ def test_wrong_use_of_the_commands_ends_with_2(
     code, out, log = run(daemon, capsys, *words)
     assert (code, out) == (2, "")
     assert log.startswith("mastctl: ")
+
+
+def test_fewer_changes_than_asked_for_are_a_failure(
+    daemon: RunningDaemon, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole = Client.watch_track
+    monkeypatch.setattr(Client, "watch_track", lambda client: [next(whole(client))])  # then the daemon ends
+    assert run(daemon, capsys, "watch")[:2] == (0, "idle\n")
+    code, out, log = run(daemon, capsys, "watch", "--count", "2")
+    assert (code, out) == (1, "idle\n")
+    assert "the daemon ended before the track was shown 2 times" in log
 
 
 def test_a_carried_key_keeps_its_camera_where_it_stood(client: Client, daemon: RunningDaemon) -> None:

@@ -126,7 +126,9 @@ def _watch(args: argparse.Namespace) -> int:
             _show(args, track)
             sys.stdout.flush()
             if number == args.count:
-                break
+                return 0
+    if args.count is not None:
+        raise CommandError("ended", f"the daemon ended before the track was shown {args.count} times")
     return 0
 
 
