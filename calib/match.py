@@ -252,9 +252,10 @@ def rivalled(best: float, second: float, settings: MatchSettings) -> bool:
 
 @dataclass(frozen=True, eq=False)
 class Found:
-    """A refined place with its rival's score and the image it was found in."""
+    """A refined place, and what the unrefined correlation says there and at the second best place."""
 
     refined: Refined
+    best: float
     second: float
 
 
@@ -266,8 +267,9 @@ def judged(template: Template, found: Found, surface_px2: FloatArray, settings: 
     if refined.correlation < least:
         words = f"the best place correlates by {refined.correlation:.2f}, at least {least:.2f} is expected"
         return no_match("weak", words, template.target_px, *facts)
-    if rivalled(refined.correlation, found.second, settings):
-        words = f"a second place fits nearly as well: {found.second:.2f} beside {refined.correlation:.2f}"
+    # Both as correlated: only the best place has been deformed to fit.
+    if rivalled(found.best, found.second, settings):
+        words = f"a second place fits nearly as well: {found.second:.2f} beside {found.best:.2f}"
         return no_match("ambiguous", words, template.target_px, *facts)
     worst_px = math.sqrt(_worst(refined.covariance_px2))
     if worst_px > settings.worst_sigma_px:
@@ -410,7 +412,7 @@ def _search(
         words = f"the best place (correlation {best:.2f}) does not settle to a sub-pixel position"
         return no_match("weak", words, template.target_px, *facts)
     middle = refined.middle and replace(refined.middle, pixel_px=refined.middle.pixel_px + cut_low)
-    return Found(replace(refined, pixel_px=refined.pixel_px + cut_low, middle=middle), second)
+    return Found(replace(refined, pixel_px=refined.pixel_px + cut_low, middle=middle), best, second)
 
 
 def _summit(scores: NDArray[np.float32], x: int, y: int) -> FloatArray:
