@@ -63,6 +63,9 @@ class MatchSettings:
     near_px
         By how much nearer pixels count more in the refinement: one sigma of a Gaussian that is round on the
         surface and as large as a circle of this radius in the destination. 0: all of the patch alike.
+    relief
+        ``roughness`` grows by its own size for each such part of the correlation that neither noise nor the
+        warp explains: what is no plane correlates worse from elsewhere. 0: it does not grow.
     """
 
     half_px: int = 20
@@ -77,6 +80,7 @@ class MatchSettings:
     worst_sigma_px: float = 0.5
     roughness: float = 0.01
     near_px: float = 0.0
+    relief: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -183,7 +187,11 @@ def match(
     found = _search(template, destination_image, search_px, settings, near_px2)
     if isinstance(found, Match):
         return found
-    surface = _surface_term(source, target, plane, destination, template, near_px2, settings.roughness)
+    roughness = settings.roughness
+    if settings.relief > 0:
+        explained = found.refined.correlation / expected_correlation(template.values, settings)
+        roughness *= 1.0 + max(0.0, 1.0 - explained) / settings.relief
+    surface = _surface_term(source, target, plane, destination, template, near_px2, roughness)
     middle = found.refined.middle
     if middle is not None:
         # The middle is noisier, but the target is nearer to its plane.
