@@ -62,7 +62,7 @@ class TrackSettings:
     renew_below
         Or when the correlation falls below this: what is seen now is no longer what the key picture shows.
     worst_drift_m
-        One sigma of the drift from the picked place; beyond it the target counts as lost for good.
+        One sigma of the drift from the picked place; beyond it the target counts as lost.
     """
 
     sigmas: float = 3.5
