@@ -63,6 +63,9 @@ class MatchSettings:
     near_px
         By how much nearer pixels count more in the refinement: one sigma of a Gaussian that is round on the
         surface and as large as a circle of this radius in the destination. 0: all of the patch alike.
+    relief
+        ``roughness`` grows by its own size for each such part of the correlation that neither noise nor the
+        warp explains: what is no plane correlates worse from elsewhere. 0: it does not grow.
     """
 
     half_px: int = 20
@@ -77,6 +80,7 @@ class MatchSettings:
     worst_sigma_px: float = 0.5
     roughness: float = 0.01
     near_px: float = 0.0
+    relief: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -183,7 +187,11 @@ def match(
     found = _search(template, destination_image, search_px, settings, near_px2)
     if isinstance(found, Match):
         return found
-    surface = _surface_term(source, target, plane, destination, template, near_px2, settings.roughness)
+    roughness = settings.roughness
+    if settings.relief > 0:
+        explained = found.refined.correlation / expected_correlation(template.values, settings)
+        roughness *= 1.0 + max(0.0, 1.0 - explained) / settings.relief
+    surface = _surface_term(source, target, plane, destination, template, near_px2, roughness)
     middle = found.refined.middle
     if middle is not None:
         # The middle is noisier, but the target is nearer to its plane.
@@ -252,9 +260,10 @@ def rivalled(best: float, second: float, settings: MatchSettings) -> bool:
 
 @dataclass(frozen=True, eq=False)
 class Found:
-    """A refined place with its rival's score and the image it was found in."""
+    """A refined place, and what the unrefined correlation says there and at the second best place."""
 
     refined: Refined
+    best: float
     second: float
 
 
@@ -266,8 +275,9 @@ def judged(template: Template, found: Found, surface_px2: FloatArray, settings: 
     if refined.correlation < least:
         words = f"the best place correlates by {refined.correlation:.2f}, at least {least:.2f} is expected"
         return no_match("weak", words, template.target_px, *facts)
-    if rivalled(refined.correlation, found.second, settings):
-        words = f"a second place fits nearly as well: {found.second:.2f} beside {refined.correlation:.2f}"
+    # Both as correlated: only the best place has been deformed to fit.
+    if rivalled(found.best, found.second, settings):
+        words = f"a second place fits nearly as well: {found.second:.2f} beside {found.best:.2f}"
         return no_match("ambiguous", words, template.target_px, *facts)
     worst_px = math.sqrt(_worst(refined.covariance_px2))
     if worst_px > settings.worst_sigma_px:
@@ -410,7 +420,7 @@ def _search(
         words = f"the best place (correlation {best:.2f}) does not settle to a sub-pixel position"
         return no_match("weak", words, template.target_px, *facts)
     middle = refined.middle and replace(refined.middle, pixel_px=refined.middle.pixel_px + cut_low)
-    return Found(replace(refined, pixel_px=refined.pixel_px + cut_low, middle=middle), second)
+    return Found(replace(refined, pixel_px=refined.pixel_px + cut_low, middle=middle), best, second)
 
 
 def _summit(scores: NDArray[np.float32], x: int, y: int) -> FloatArray:

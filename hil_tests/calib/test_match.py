@@ -10,8 +10,9 @@ from pictures import Pinhole, TexturedPlane, picture, random_texture
 
 from calib.epipolar import find_partner
 from calib.errors import CalibError
-from calib.match import Match, MatchSettings, match
-from calib.warp import Plane, carry, facing_plane, grey
+from calib.match import Found, Match, MatchSettings, judged, match
+from calib.refine import Refined
+from calib.warp import Plane, Template, carry, facing_plane, grey
 
 FOCAL_PX = 1290.0  # the paper's Navcam
 SIZE_PX = (360, 280)
@@ -226,6 +227,36 @@ def test_a_rough_surface_makes_the_place_less_certain_along_the_parallax_only() 
     # Half a patch of 41 px at 4 m is 62 mm, a twentieth of it 3 mm; f b / z² of it is some 0.05 px.
     assert 0.03 < np.sqrt(sigmas[1][0] ** 2 - sigmas[0][0] ** 2) < 0.12
     assert np.sqrt(sigmas[1][1] ** 2 - sigmas[0][1] ** 2) < 0.01
+
+
+def test_what_is_left_unexplained_makes_the_surface_term_larger() -> None:
+    """With (1 - correlation / what noise allows) = u, roughness counts 1 + u / relief times."""
+    pixel = np.array([180.0, 140.0])
+    point = wall(5).hit(LEFT.position_m, LEFT.rays(pixel))
+    other = seen(RIGHT, 5) + 0.5 * (seen(RIGHT, 77) - seen(RIGHT, 77).mean())  # as strong as twice the noise
+    for image, least, most in ((seen(RIGHT, 5), 1.0, 1.1), (other, 1.5, 4.0)):
+        variances = []
+        for roughness, relief in ((0.0, 0.0), (0.05, 0.0), (0.05, 0.1)):
+            found = match(
+                seen(LEFT, 5), LEFT.model, pixel, Plane(point, wall(5).normal), image, RIGHT.model, 10,
+                MatchSettings(roughness=roughness, relief=relief),
+            )  # fmt: skip
+            assert found.verdict == "good", found.reason
+            variances.append(found.covariance_px2[0, 0])
+        larger = np.sqrt((variances[2] - variances[0]) / (variances[1] - variances[0]))
+        assert least <= larger < most
+        unexplained = 10.0 * (1.0 - found.correlation / (1.0 - NOISE_DN**2 / 25.0**2))
+        assert larger == pytest.approx(1.0 + max(0.0, unexplained), abs=0.15)
+
+
+def test_best_and_second_place_are_compared_before_the_best_is_deformed() -> None:
+    """Correlations 0.6 and 0.4 as found are rivals, though deforming the best brought it to 0.81."""
+    values = random_texture(6)[:25, :25].astype(np.float32)
+    template = Template(values, np.array([50, 50]), np.array([50.0, 50.0]), 1.0)
+    refined = Refined(np.array([50.0, 50.0]), 1e-4 * np.eye(2), np.zeros((2, 2)), 0.81)
+    none = np.zeros((2, 2))
+    assert judged(template, Found(refined, 0.6, 0.4), none, PLANE).verdict == "ambiguous"
+    assert judged(template, Found(refined, 0.8, 0.4), none, PLANE).verdict == "good"
 
 
 def test_what_lies_far_from_the_target_does_not_pull_it() -> None:

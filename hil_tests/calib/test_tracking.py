@@ -245,3 +245,13 @@ def test_an_eye_that_sees_the_surface_otherwise_is_asked_through_the_other(begun
     assert look.track.state == "tracked"
     exact = pinholes(0.0)["right"].pixel(TARGET)
     np.testing.assert_allclose(look.found["right"].pixel_px, exact, atol=0.2)
+
+
+def test_a_place_that_may_have_drifted_too_far_is_not_called_tracked(begun: Track) -> None:
+    """The same look counts with 2 cm of drift handed on by the keys before, and not with 4."""
+    near, far = (replace(begun, key=replace(begun.key, drift_m2=s * s * np.eye(3))) for s in (0.02, 0.04))
+    both = eyes(0.0, seed=3)
+    assert seen_by(near, both).track.state == "tracked"
+    look = seen_by(far, both)
+    assert look.track.state == "lost" and "drifted by 4 cm" in look.reason
+    np.testing.assert_array_equal(look.track.position_m, far.position_m)
