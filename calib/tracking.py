@@ -25,7 +25,7 @@ from calib.cahvor import CameraModel
 from calib.epipolar import find_partner, local_plane
 from calib.errors import CalibError, NoStereoPoint
 from calib.handoff_refined import Eye
-from calib.match import Match, MatchSettings, match
+from calib.match import Match, MatchSettings, match, no_match
 from calib.one_point import Sighting, one_point
 from calib.rigid import FloatArray, Rigid, carried_covariance, moved_rigid
 from calib.stereo import triangulate
@@ -33,11 +33,15 @@ from calib.warp import Plane
 
 State = Literal["tracked", "lost"]
 
-SIZES = MatchSettings(half_px=12, near_px=6.0, roughness=0.04, relief=0.1, worst_ratio=0.7)
+SIZES = MatchSettings(half_px=12, near_px=6.0, roughness=0.04, relief=0.1, worst_ratio=0.7, least_lead=0.03)
 """Smaller patches than a single match takes: seen flat from 10 m, 41 px of ground are 0.8 m long and no
 plane, and what lies off the plane pulls the place along as the view steepens. Roughness and relief make nine
 in ten and more of the range errors lie within two of the told sigmas. A second place may fit a little better
 than elsewhere: the other eye and the prediction must confirm the best."""
+
+WIDE_HALF_PX = 20
+"""Of the patch that is tried where the small one does not tell one place from another: seen near, a rock's
+texture is coarse."""
 
 
 @dataclass(frozen=True)
@@ -342,7 +346,12 @@ def _found(
     spread = rate @ track.covariance_m2 @ rate.T if bool(valid) else np.eye(2)
     reach = settings.sigmas * math.sqrt(max(float(np.linalg.eigvalsh(spread)[-1]), 0.0))
     search = min(max(reach + 2 * settings.model_px, settings.least_px), settings.most_px)
-    return match(key.eye.image, key.eye.camera, key.pixel_px, plane, eye.image, eye.camera, search, sizes)
+    found = no_match("weak", "not looked for")
+    for size in (sizes, replace(sizes, half_px=WIDE_HALF_PX)):
+        found = match(key.eye.image, key.eye.camera, key.pixel_px, plane, eye.image, eye.camera, search, size)
+        if found.verdict not in ("ambiguous", "weak"):
+            break
+    return found
 
 
 def _asked_the_other(

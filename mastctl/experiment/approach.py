@@ -34,6 +34,15 @@ On = Literal["rocks", "ground"]
 ROCK_M = 0.05
 """A target so far above the ground is on a rock."""
 
+ROCKS = 150
+"""In the scene, so that several stand at the start range."""
+
+PICKS = 12
+"""Pixels that are tried in one view: most of a rock's strongest texture is its edge, which is refused."""
+
+INSIDE_PX, APART_M = 15.0, 0.15
+"""On a rock, what is seen this far beside a target (4 cm across at 10 m) is not farther away from it."""
+
 NEAR_ROCK_PX = 40
 """How far from the rock's chosen point its texture is looked for."""
 
@@ -122,7 +131,7 @@ def run_approach(
     """
     begun_s = time.monotonic()
     rng = np.random.default_rng([seed, 6])
-    light = SceneSettings(seed=seed)
+    light = SceneSettings(seed=seed, rocks=ROCKS) if on == "rocks" else SceneSettings(seed=seed)
     world = World(build_scene(light), true, believed, errors or WorldErrors(), rng)
     try:
         begun = _begin(world, rng, on)
@@ -153,10 +162,12 @@ def _begin(world: World, rng: np.random.Generator, on: On) -> tuple[Track, Float
         if on == "rocks":
             fit &= _near(left.camera, aim)
         rows, columns = np.nonzero(fit)
-        for pick in rng.integers(len(rows), size=4) if len(rows) else ():
+        for pick in rng.integers(len(rows), size=PICKS) if len(rows) else ():
             pixel = np.array([float(columns[pick]), float(rows[pick])])
             target = world.point_at(pair[0], angles.pan_rad, angles.tilt_rad, pixel)
-            if target is None or (on == "rocks" and world.height_m(target) < ROCK_M):
+            if target is None or (
+                on == "rocks" and not _on_rock(world, pair[0], angles.pan_rad, angles.tilt_rad, pixel, target)
+            ):
                 continue
             range_m = float(np.linalg.norm(world.site_from_rover.inverse.points(target) - left.camera.C))
             if abs(range_m - START_M) > 0.15 * START_M:
@@ -182,6 +193,19 @@ def _near(camera: CameraModel, aim_m: FloatArray) -> NDArray[np.bool_]:
     (x, y), (width, height) = camera.project(aim_m)[0], camera.size_px
     columns, rows = np.arange(width), np.arange(height)[:, None]
     return np.asarray(np.maximum(np.abs(columns - x), np.abs(rows - y)) <= NEAR_ROCK_PX)
+
+
+def _on_rock(
+    world: World, camera: str, pan_rad: float, tilt_rad: float, pixel: FloatArray, target: FloatArray
+) -> bool:
+    """Whether a target lies on a rock and not at its boundary, where nobody would put one."""
+    if world.height_m(target) < ROCK_M:
+        return False
+    for off in INSIDE_PX * np.array([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]]):
+        beside = world.point_at(camera, pan_rad, tilt_rad, pixel + off)
+        if beside is None or float(np.linalg.norm(beside - target)) > APART_M:
+            return False
+    return True
 
 
 def _drive(
