@@ -74,10 +74,10 @@ class TrackSettings:
     most_px: float = 120.0
     model_px: float = 0.12
     worst_chi2: float = 18.5
-    renew_grown: float = 1.8
+    renew_grown: float = 1.4
     renew_shrunk: float = 0.3
-    renew_shape: float = 1.5
-    renew_below: float = 0.85
+    renew_shape: float = 1.25
+    renew_below: float = 0.92
     worst_drift_m: float = 0.03
 
 
