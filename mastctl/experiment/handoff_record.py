@@ -13,6 +13,7 @@ from calib.handoff_bias import HandoffBias, handoff_bias
 from calib.handoff_refined import RefinedPixel
 from calib.matched_handoff import MatchedHandoff
 from drivers.interfaces import Image
+from mastctl.handoff_log import bias_told
 
 PAPER_WORST_PX: Mapping[str, float] = {"pancam to navcam": 2.5, "navcam to hazcam": 4.0}
 """The paper's worst geometric hand-off, Pancam to Navcam at 6 m and Navcam to Hazcam at 2 m."""
@@ -129,16 +130,7 @@ class HandoffExperiment:
                 }
                 for row in self.summaries
             ],
-            "bias": [
-                {
-                    "camera": one.camera,
-                    "source": one.source,
-                    "offset_px": one.offset_px.tolist(),
-                    "sigmas": one.sigmas,
-                    "sentence": one.sentence,
-                }
-                for one in self.bias
-            ],
+            "bias": [bias_told(one) for one in self.bias],
             "failures": [
                 {"handoff": r.step, "target": r.index, "error": r.error} for r in self.records if r.error
             ],
