@@ -22,9 +22,11 @@ from drivers.sim import bricks
 from drivers.sim.rover import SimulatedRover
 from drivers.sim.scene import Scene, tiny_scene
 from mastctl.cli.main import main
+from mastctl.client import Client, ClientError
+from mastctl.experiment.handoff import run_handoff_experiment
 from mastctl.experiment.handoff_record import Handed, HandoffExperiment, HandoffRecord, summarise
 from mastctl.experiment.handoff_report import table_rows, target_rows, view_picture, write_report
-from mastctl.experiment.known_points import BrickPoints
+from mastctl.experiment.known_points import BrickPoints, KnownPoint
 from mastctl.handoff_log import read_log
 
 STEP = "navcam to hazcam"
@@ -150,6 +152,59 @@ def test_bricks_points_are_seen_only_where_nothing_hides_them(repository: Path) 
 def test_bricks_are_the_simulations_and_few(words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["experiment", "handoff", *words]) == 2
     assert "1 to 24 are possible, with --simulated" in " ".join(capsys.readouterr().err.split())
+
+
+class StuckDaemon:
+    """What of a client the experiment uses; the first view takes too long, the others are refused."""
+
+    def __init__(self, mast: bytes) -> None:
+        self.mast, self.calls = mast, list[str]()
+
+    def status(self) -> dict[str, Any]:
+        cameras = [f"{pair}_{eye}" for pair in ("pancam", "navcam") for eye in ("left", "right")]
+        limits = {"pan_rad": [-2.0, 2.0], "tilt_rad": [-1.0, 1.0]}
+        return {"hardware": "simulated", "cameras": dict.fromkeys(cameras), "limits": limits}
+
+    def mast_file(self) -> bytes:
+        return self.mast
+
+    def point(self, **request: Any) -> str:
+        self.calls.append("point")
+        if len(self.calls) > 1:
+            raise ClientError("busy", "operation 7 is running; wait for it or stop it")
+        return "000001"
+
+    def wait(self, operation: str, timeout_s: float) -> dict[str, Any]:
+        raise ClientError("timeout", f"operation {operation} has not ended after {timeout_s:g} s")
+
+    def stop(self) -> dict[str, Any]:
+        self.calls.append("stop")
+        return {"stopped": True, "operation": None}
+
+
+class Stakes:
+    """Three points some 6 m away, one a view."""
+
+    def points(self) -> list[KnownPoint]:
+        return [KnownPoint("corner", group, np.array([6.0, group - 1.0, 0.0])) for group in range(3)]
+
+    def seen_px(self, frame_id: str, position_m: np.ndarray) -> tuple[float, float] | None:
+        raise AssertionError("no view is taken")
+
+
+@pytest.mark.parametrize(("targets", "calls"), [(2, ["point", "stop", "point"]), (1, ["point", "stop"])])
+def test_a_view_that_fails_is_a_failed_target_and_no_more_are_turned_to_than_asked(
+    repository: Path, targets: int, calls: list[str]
+) -> None:
+    daemon = StuckDaemon((repository / "configs/sim/rocky8.yaml").read_bytes())
+    run = run_handoff_experiment(cast(Client, daemon), targets=targets, points=Stakes())
+    assert daemon.calls == calls
+    reasons = [
+        "timeout: operation 000001 has not ended after 60 s",
+        "busy: operation 7 is running; wait for it or stop it",
+    ]
+    assert [record.error for record in run.records] == reasons[:targets]
+    assert {(row.kind, row.targets, row.failed) for row in run.summaries} == {("corner", targets, targets)}
 
 
 def test_the_record_of_hand_offs_and_a_constant_offset_are_told(tmp_path: Path) -> None:

@@ -116,6 +116,11 @@ def _served(rig: Rig, status: Mapping[str, Any], pair: str) -> bool:
     return pair in rig.stereo and all(camera in status["cameras"] for camera in rig.stereo[pair])
 
 
+def _reason(error: ClientError | CalibError) -> str:
+    """Why a target failed, as its record says it."""
+    return f"{getattr(error, 'code', 'error')}: {error}"
+
+
 class _Bench:
     """One step of the running experiment."""
 
@@ -152,7 +157,10 @@ class _Bench:
             yield record
 
     def known(self, points: KnownPoints, targets: int, pictures: int) -> Iterator[HandoffRecord]:
-        """Hand over known points near the distance, all that one view shows from the same pictures."""
+        """Hand over known points near the distance, all that one view shows from the same pictures.
+
+        A view that fails is one failed target: which of its points it would have shown, nobody knows.
+        """
         left = self._rig.camera_in_rover(self._source[0], 0.0, 0.0)
         groups: dict[int, list[KnownPoint]] = {}
         for point in points.points():
@@ -161,21 +169,29 @@ class _Bench:
                 groups.setdefault(point.group, []).append(point)
         index = 0
         for group in groups.values():
+            if index == targets:
+                return
             begun_s = time.monotonic()
-            pair = self._views.look_at(np.mean([point.position_m for point in group], axis=0))
-            if pair is None:
+            try:
+                pair = self._views.look_at(np.mean([point.position_m for point in group], axis=0))
+                if pair is None:
+                    continue
+                shots = {name: self._client.snapshot(name) for name in self._to}
+            except ClientError as error:
+                yield self._failed(index, group[0].kind, _reason(error), begun_s)
+                index += 1
                 continue
-            shots = {name: self._client.snapshot(name) for name in self._to}
             pictures -= 1
             for point in group:
+                if index == targets:
+                    return
                 target = self._known_target(points, point, pair, shots)
-                if target is None or index == targets:
+                if target is None:
                     continue
                 try:
                     record = self._hand_over(target, shots, index, begun_s, pictures >= 0)
                 except CalibError as error:
-                    reason = f"{getattr(error, 'code', 'error')}: {error}"
-                    record = self._failed(index, point.kind, reason, begun_s)
+                    record = self._failed(index, point.kind, _reason(error), begun_s)
                 index += 1
                 begun_s = time.monotonic()
                 yield record
@@ -207,7 +223,7 @@ class _Bench:
                     shots = {name: self._client.snapshot(name) for name in self._to}
                     return self._hand_over(target, shots, index, begun_s, with_pictures)
             except (ClientError, CalibError) as error:
-                reason = f"{getattr(error, 'code', 'error')}: {error}"
+                reason = _reason(error)
                 if getattr(error, "code", "") != "not_seen":
                     break
         return self._failed(index, "ground", reason, begun_s)

@@ -69,10 +69,7 @@ class Views:
             angles = pointing.choose(solutions, self._pan_limits_rad, self._tilt_limits_rad)
         except Unreachable:
             return None
-        operation = self._client.wait(
-            self._client.point(pan_rad=angles.pan_rad, tilt_rad=angles.tilt_rad),
-            timeout_s=OPERATION_TIMEOUT_S,
-        )
+        operation = pointed(self._client, pan_rad=angles.pan_rad, tilt_rad=angles.tilt_rad)
         if operation["state"] != "done":
             error = operation.get("error") or {}
             raise ClientError(
