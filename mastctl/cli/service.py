@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from mastctl.cli import output
 from mastctl.cli.output import CommandError, WrongUse, finite_number, positive_number
+from mastctl.cli.target import add_target_options, check_done, check_target, number_of, target_of
 
 if TYPE_CHECKING:
     from mastctl.client import Client
@@ -32,23 +33,10 @@ def add_commands(subparsers: argparse._SubParsersAction[Any]) -> None:
     status.set_defaults(run=_status)
 
     point = subparsers.add_parser("point", help="point a camera at something and measure the residual")
-    what = point.add_mutually_exclusive_group(required=True)
-    what.add_argument(
-        "--pixel", nargs=4, metavar=("CAMERA", "FRAME_ID", "X", "Y"), help="a pixel of a named frame"
-    )
-    what.add_argument(
-        "--camera", metavar="NAME", help="a pixel (--at) of a snapshot taken now by this camera"
-    )
-    what.add_argument(
-        "--position", nargs=3, type=finite_number, metavar=("X", "Y", "Z"), help="a point, metres"
-    )
+    what = add_target_options(point, "a point, metres")
     what.add_argument(
         "--angles", nargs=2, type=finite_number, metavar=("PAN", "TILT"), help="joint angles, radians"
     )
-    point.add_argument(
-        "--at", nargs=2, type=finite_number, metavar=("X", "Y"), help="the pixel, with --camera"
-    )
-    point.add_argument("--frame", choices=("rover", "site"), help="frame of --position (default rover)")
     point.add_argument("--aim", nargs=3, metavar=("CAMERA", "X", "Y"), help="where the target shall come")
     point.add_argument("--pointings", type=int, choices=(1, 2), help="how often to point (default 1)")
     point.add_argument("--no-wait", action="store_true", help="print the operation's id and do not wait")
@@ -124,38 +112,17 @@ def _status(args: argparse.Namespace) -> int:
 
 
 def _point(args: argparse.Namespace) -> int:
-    if (args.camera is None) != (args.at is None):
-        raise WrongUse("--camera and --at go together")
-    if args.frame is not None and args.position is None:
-        raise WrongUse("--frame goes with --position")
-    request: dict[str, Any] = {
-        "pointings": args.pointings,
-        "frame": args.frame,
-        "aim": _camera_pixel(args.aim),
-    }
+    check_target(args)
+    request: dict[str, Any] = {"pointings": args.pointings, "aim": _camera_pixel(args.aim)}
+    if args.angles is not None:
+        request["pan_rad"], request["tilt_rad"] = args.angles
     with client_of(args) as client:
-        if args.pixel is not None:
-            camera, frame_id, x, y = args.pixel
-            request["pixel"] = (camera, frame_id, number_of("--pixel", x), number_of("--pixel", y))
-        elif args.camera is not None:
-            shot = client.snapshot(args.camera)
-            request["pixel"] = (args.camera, shot.frame_id, *args.at)
-        elif args.position is not None:
-            request["position_m"] = args.position
-        else:
-            request["pan_rad"], request["tilt_rad"] = args.angles
-        operation_id = client.point(**request)
+        operation_id = client.point(**request, **target_of(args, client))
         if args.no_wait:
             tell_result(args, {"id": operation_id}, f"operation {operation_id}")
             return 0
         record = followed(client, operation_id, args)
-    if record["state"] != "done":
-        error = record.get("error") or {}
-        raise CommandError(
-            str(error.get("code", record["state"])),
-            str(error.get("message", f"operation {operation_id} ended as {record['state']}")),
-            detail={"operation": record},
-        )
+    check_done(record)
     if args.json:
         output.print_json(record)
     else:
@@ -289,13 +256,6 @@ def _camera_pixel(words: list[str] | None) -> tuple[str, float, float] | None:
     if words is None:
         return None
     return words[0], number_of("--aim", words[1]), number_of("--aim", words[2])
-
-
-def number_of(option: str, word: str) -> float:
-    try:
-        return finite_number(word)
-    except argparse.ArgumentTypeError as error:
-        raise WrongUse(f"{option}: {error}") from None
 
 
 def tell_result(args: argparse.Namespace, document: dict[str, Any], line: str) -> None:

@@ -7,8 +7,9 @@ import math
 import sys
 from typing import TYPE_CHECKING, Any
 
-from mastctl.cli.output import CommandError, WrongUse, finite_number, one_line, positive_number
-from mastctl.cli.service import add_daemon_options, client_of, followed, number_of, tell_result
+from mastctl.cli.output import CommandError, finite_number, one_line, positive_number
+from mastctl.cli.service import add_daemon_options, client_of, followed, tell_result
+from mastctl.cli.target import add_target_options, check_done, check_target, target_of
 
 if TYPE_CHECKING:
     from mastctl.client import Client
@@ -20,24 +21,7 @@ def add_commands(subparsers: argparse._SubParsersAction[Any]) -> None:
     commands = track.add_subparsers(dest="track_command", metavar="WHAT", required=True)
 
     start = commands.add_parser("start", help="start to follow a target")
-    what = start.add_mutually_exclusive_group(required=True)
-    what.add_argument(
-        "--pixel", nargs=4, metavar=("CAMERA", "FRAME_ID", "X", "Y"), help="a pixel of a named frame"
-    )
-    what.add_argument(
-        "--camera", metavar="NAME", help="a pixel (--at) of a snapshot taken now by this camera"
-    )
-    what.add_argument(
-        "--position",
-        nargs=3,
-        type=finite_number,
-        metavar=("X", "Y", "Z"),
-        help="what is seen at a point, metres",
-    )
-    start.add_argument(
-        "--at", nargs=2, type=finite_number, metavar=("X", "Y"), help="the pixel, with --camera"
-    )
-    start.add_argument("--frame", choices=("rover", "site"), help="frame of --position (default rover)")
+    add_target_options(start, "what is seen at a point, metres")
     start.set_defaults(run=_start)
 
     status = commands.add_parser("status", help="show the track, and offsets that hand-offs tell")
@@ -85,28 +69,10 @@ def add_commands(subparsers: argparse._SubParsersAction[Any]) -> None:
 
 
 def _start(args: argparse.Namespace) -> int:
-    if (args.camera is None) != (args.at is None):
-        raise WrongUse("--camera and --at go together")
-    if args.frame is not None and args.position is None:
-        raise WrongUse("--frame goes with --position")
+    check_target(args)
     with client_of(args) as client:
-        if args.position is not None:
-            operation_id = client.start_track(position_m=args.position, frame=args.frame)
-        elif args.pixel is not None:
-            camera, frame_id, x, y = args.pixel
-            pixel = (camera, frame_id, number_of("--pixel", x), number_of("--pixel", y))
-            operation_id = client.start_track(pixel=pixel)
-        else:
-            shot = client.snapshot(args.camera)
-            operation_id = client.start_track(pixel=(args.camera, shot.frame_id, *args.at))
-        record = followed(client, operation_id, args)
-        if record["state"] != "done":
-            error = record.get("error") or {}
-            raise CommandError(
-                str(error.get("code", record["state"])),
-                str(error.get("message", f"operation {operation_id} ended as {record['state']}")),
-                detail={"operation": record},
-            )
+        operation_id = client.start_track(**target_of(args, client))
+        check_done(followed(client, operation_id, args))
         return _show(args, client.wait_track(operation_id, args.timeout))
 
 
