@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -164,21 +165,30 @@ def _report(args: argparse.Namespace, experiment: PointingExperiment) -> int:
     """Write the report if asked, print the table or the document; 1 if no target at all landed."""
     from mastctl.experiment.report import table_rows, write_report
 
-    page = write_report(experiment, args.out) if args.out is not None else None
-    if args.json:
-        document = experiment.as_json()
-        if page is not None:
-            document["report"] = str(page)
-        output.print_json(document)
-    else:
-        headings, rows = table_rows(experiment.summaries)
-        notes = [*experiment.notes, *([f"report: {page}"] if page is not None else [])]
+    def show(notes: list[str]) -> None:
+        hardware = experiment.status.get("hardware")
         output.print_table(
-            f"Pointing residuals, rms px ({experiment.camera}, {experiment.status.get('hardware')} hardware)",
-            *turned(headings, rows),
-            notes,
+            f"Pointing residuals, rms px ({experiment.camera}, {hardware} hardware)",
+            *turned(*table_rows(experiment.summaries)),
+            [*experiment.notes, *notes],
         )
+
+    page = write_report(experiment, args.out) if args.out is not None else None
+    tell_report(args, page, experiment.as_json, show)
     return 0 if any(record.landings for record in experiment.records) else 1
+
+
+def tell_report(
+    args: argparse.Namespace,
+    page: Path | None,
+    document: Callable[[], dict[str, Any]],
+    show: Callable[[list[str]], None],
+) -> None:
+    """Print the document for programs, or have the tables shown; either names the report's page, if any."""
+    if args.json:
+        output.print_json(document() | ({} if page is None else {"report": str(page)}))
+    else:
+        show([] if page is None else [f"report: {page}"])
 
 
 def turned(headings: list[str], rows: list[list[str]]) -> tuple[list[str], list[list[str]]]:

@@ -102,20 +102,16 @@ def _run(args: argparse.Namespace, rig: Any, chosen: list[Variant]) -> Calibrati
 
 
 def _tell(args: argparse.Namespace, experiment: CalibrationExperiment) -> int:
-    from mastctl.cli.experiment import turned
+    from mastctl.cli.experiment import tell_report, turned
     from mastctl.experiment.calibration_report import as_json, short_rows, table_iv, table_v, write_report
 
-    page = write_report(experiment, args.out) if args.out is not None else None
-    if args.json:
-        document = as_json(experiment)
-        if page is not None:
-            document["report"] = str(page)
-        output.print_json(document)
-    else:
+    def show(notes: list[str]) -> None:
         headings, rows = table_iv(experiment)
         if len(rows) > 1:
             output.print_table("Table IV, mast parameters", *turned(headings, rows))
             output.print_table("Table V, rms residuals of the mast's images, px", *table_v(experiment))
-        notes = [f"report: {page}"] if page is not None else []
         output.print_table("Errors, px: rms an axis, and worst", *short_rows(experiment.summaries), notes)
+
+    page = write_report(experiment, args.out) if args.out is not None else None
+    tell_report(args, page, lambda: as_json(experiment), show)
     return 0 if any(not outcome.failure for outcome in experiment.outcomes) else 1

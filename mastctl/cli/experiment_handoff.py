@@ -136,22 +136,18 @@ def _run(
 
 
 def _tell(args: argparse.Namespace, experiment: HandoffExperiment) -> int:
-    from mastctl.cli.experiment import turned
+    from mastctl.cli.experiment import tell_report, turned
     from mastctl.experiment.handoff_report import bias_sentences, table_rows, write_report
 
-    page = write_report(experiment, args.out) if args.out is not None else None
-    if args.json:
-        document = experiment.as_json()
-        if page is not None:
-            document["report"] = str(page)
-        output.print_json(document)
-    else:
-        notes = [f"clicks with {experiment.click_px:g} px of noise; lengths in px of the destination camera"]
-        notes += bias_sentences(experiment)
-        notes += [f"report: {page}"] if page is not None else []
+    def show(notes: list[str]) -> None:
+        noise = f"clicks with {experiment.click_px:g} px of noise; lengths in px of the destination camera"
         kinds = list(dict.fromkeys(row.kind for row in experiment.summaries))
         for kind in kinds:
             headings, rows = table_rows([row for row in experiment.summaries if row.kind == kind])
             title = f"Hand-off errors of {TARGETS[kind]}, px ({experiment.status.get('hardware')} hardware)"
-            output.print_table(title, *turned(headings, rows), notes if kind == kinds[-1] else ())
+            last = [noise, *bias_sentences(experiment), *notes] if kind == kinds[-1] else []
+            output.print_table(title, *turned(headings, rows), last)
+
+    page = write_report(experiment, args.out) if args.out is not None else None
+    tell_report(args, page, experiment.as_json, show)
     return 0 if any(record.handed for record in experiment.records) else 1
