@@ -22,7 +22,7 @@ from numpy.typing import ArrayLike, NDArray
 from calib.cahvor import CameraModel
 from calib.errors import BadFile
 from calib.mast import Rig
-from calib.rigid import FloatArray, Rigid, rot_x, rot_y, rot_z
+from calib.rigid import FloatArray, Rigid
 from calib.store import load_rig
 from drivers.clock import Clock
 from drivers.errors import BadOptions, NoFreshFrame
@@ -254,7 +254,7 @@ class SimulatedRover:
         x_m, y_m
             In the site frame; the rover's origin comes to lie on the ground there.
         heading_rad, pitch_rad, roll_rad
-            Turned about the rover's x (roll), then y (pitch, nose up), then z (heading, to the right).
+            As `Scene.standing` takes them.
 
         Raises
         ------
@@ -265,9 +265,7 @@ class SimulatedRover:
             raise BadOptions(
                 f"({x_m:g}, {y_m:g}) m is off the simulated ground, which ends {REACH_M:g} m from its middle"
             )
-        rotation = rot_z(heading_rad) @ rot_y(pitch_rad) @ rot_x(roll_rad)
-        place = np.array([x_m, y_m, self.scene.ground_z_m(x_m, y_m)])
-        self.site_from_rover = Rigid(rotation, place)
+        self.site_from_rover = self.scene.standing(x_m, y_m, heading_rad, pitch_rad, roll_rad)
         return self.site_from_rover
 
     def frame_truth(self, camera: str, sequence: int) -> FrameTruth:

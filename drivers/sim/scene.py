@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from calib.rigid import Rigid, rot_x, rot_y, rot_z
 from drivers.errors import BadOptions
 from drivers.sim import bricks, rocks, texture
 from drivers.sim.bricks import Brick
@@ -119,6 +120,16 @@ class Scene:
     def ground_z_m(self, x_m: float, y_m: float) -> float:
         """Return z of the ground (rocks apart) under (x, y), metres in the site frame."""
         return ground_z_m(self.world.inner, x_m, y_m)
+
+    def standing(
+        self, x_m: float, y_m: float, heading_rad: float, pitch_rad: float = 0.0, roll_rad: float = 0.0
+    ) -> Rigid:
+        """Return site_from_rover of a rover whose origin lies on the ground at (x, y), metres.
+
+        It is turned about its x (roll), then y (pitch, nose up), then z (heading, to the right).
+        """
+        rotation = rot_z(heading_rad) @ rot_y(pitch_rad) @ rot_x(roll_rad)
+        return Rigid(rotation, np.array([x_m, y_m, self.ground_z_m(x_m, y_m)]))
 
 
 def build_scene(settings: SceneSettings | None = None) -> Scene:

@@ -109,8 +109,7 @@ class World:
     def _standing(self, x_m: float, y_m: float, heading_rad: float) -> Rigid:
         """A pose on the ground, tilted as by stones under the wheels."""
         pitch, roll = self._rng.normal(0.0, math.radians(1.5), 2)
-        rotation = rot_z(heading_rad) @ rot_y(pitch) @ rot_x(roll)
-        return Rigid(rotation, np.array([x_m, y_m, self._renderer.scene.ground_z_m(x_m, y_m)]))
+        return self._renderer.scene.standing(x_m, y_m, heading_rad, pitch, roll)
 
     def height_m(self, point_in_site_m: FloatArray) -> float:
         """How far a point (3,) of the site lies above the ground under it, metres: more than 0 on a rock."""
