@@ -124,30 +124,22 @@ class PointingLoop:
             For everything that goes wrong on purpose: its code and one sentence, the step, and the
             pointings done before. The mast was told to stop.
         """
-        return _Run(
-            self._rig, self._devices, self._limits, self._clock, self._settings, record, cancelled
-        ).all(request)
+        steps = Steps(self._rig, self._devices, self._limits, self._clock, self._settings, record, cancelled)
+        return _Run(steps, self._rig, self._devices, self._limits, self._settings).all(request)
 
 
 class _Run:
     """One request."""
 
     def __init__(
-        self,
-        rig: Rig,
-        devices: DevicesLike,
-        limits: Limits,
-        clock: Clock,
-        settings: PointingSettings,
-        record: Callable[[Step], None],
-        cancelled: threading.Event,
+        self, steps: Steps, rig: Rig, devices: DevicesLike, limits: Limits, settings: PointingSettings
     ) -> None:
+        self._steps = steps
+        self._eyes = steps.eyes
         self._rig = rig
         self._devices = devices
         self._limits = limits
         self._settings = settings
-        self._steps = Steps(rig, devices, limits, clock, settings, record, cancelled)
-        self._eyes = self._steps.eyes
         self._position_m: FloatArray | None = None
         self._range_m: float | None = None
         self._pointings: list[Pointing] = []
