@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 import math
 import threading
 from collections.abc import Callable, Iterator
@@ -496,6 +497,31 @@ def test_a_device_that_fails_makes_the_target_lost_not_the_daemon(
     drive(client, 0.6, 3.0)
     assert ScriptedLooker.looks[-1].state == "lost", "both eyes must find it again"
     assert client.track()["state"] == "tracking"
+
+
+def test_whoever_reads_the_log_may_use_the_track(
+    client: Client, daemon: RunningDaemon, caplog: pytest.LogCaptureFixture
+) -> None:
+    waits: list[bool] = []
+
+    def stop(record: logging.LogRecord) -> bool:
+        stopping = threading.Thread(target=daemon.service.tracker.stop, args=("enough",), daemon=True)
+        stopping.start()
+        stopping.join(5.0)
+        waits.append(stopping.is_alive())
+        return True
+
+    log = logging.getLogger(tracker_module.__name__)
+    log.addFilter(stop)
+    try:
+        with caplog.at_level(logging.INFO, log.name):
+            started(client)
+            eventually(lambda: len(waits) == 2, "the words of the start, and of its stop")
+    finally:
+        log.removeFilter(stop)
+    assert waits == [False, False], "the log was written with the lock held"
+    assert client.track()["reason"] == "enough"
+    assert [record.levelno for record in caplog.records] == [logging.INFO] * 2
 
 
 def test_another_mast_file_ends_the_track(client: Client, daemon: RunningDaemon) -> None:

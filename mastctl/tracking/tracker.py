@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import logging
 import threading
-from collections.abc import Callable, Mapping
-from contextlib import AbstractContextManager
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import replace
 from typing import Any, Protocol
 
@@ -96,6 +96,7 @@ class Tracker:
         self._settings = settings or TrackingSettings()
         self._on_matched = on_matched
         self._lock = threading.Lock()
+        self._said: list[tuple[Any, ...]] = []  # of whoever holds the lock: level, words, what they are about
         self._status = TrackStatus()
         self._carried: Carried | None = None  # what is followed; None without a track
         self._waiting: list[RoverPose] = []  # poses that came while a look runs
@@ -127,7 +128,7 @@ class Tracker:
         Busy
             If an operation runs.
         """
-        with self._lock:
+        with self._held():
             if self._status.state in ACTIVE:
                 raise TrackRuns(f"track {self._status.id} runs; stop it before another is started")
 
@@ -160,7 +161,7 @@ class Tracker:
             If it is not later than the one before, or, while a track runs, if it has no covariance or no
             pose came before it.
         """
-        with self._lock:
+        with self._held():
             before = self._status.pose
             check_follows(pose, before)
             active = self._status.state in ACTIVE
@@ -204,7 +205,7 @@ class Tracker:
         Busy
             If an operation runs.
         """
-        with self._lock:
+        with self._held():
             carried = self._carried
             if carried is None:
                 raise NoTrack("no track runs that could be looked for")
@@ -216,22 +217,38 @@ class Tracker:
 
     def stop(self, reason: str) -> str | None:
         """End the track, if one runs; return the operation of it that runs, which is left to the caller."""
-        with self._lock:
+        with self._held():
             if self._status.state not in ACTIVE:
                 return None
             running = self._status.operation
             self._carried, self._waiting, self._look_again = None, [], False
             self._publish(replace(self._status, state="stopped", reason=reason, operation=None))
-            log.info("track %s stopped: %s", self._status.id, reason)
+            self._say(logging.INFO, "track %s stopped: %s", self._status.id, reason)
             return running
 
     def use_rig(self, rig: Rig, name: str) -> None:
         """Look by another mast file from now on; a track ends, since its key picture is of the former."""
         self.stop(f"mast file {name} came into use; the track's pictures belong to the former one")
-        with self._lock:
+        with self._held():
             self._rig = rig
 
+    @contextmanager
+    def _held(self) -> Iterator[None]:
+        """Hold the lock; what was said meanwhile is logged after it, since whoever writes a log may block."""
+        said: list[tuple[Any, ...]] = []
+        try:
+            with self._lock:
+                self._said = said
+                yield
+        finally:
+            for level, words, *about in said:
+                log.log(level, words, *about)
+
     # With the lock held
+
+    def _say(self, level: int, words: str, *about: Any) -> None:
+        """Have something logged when the lock is let go."""
+        self._said.append((level, words, *about))
 
     def _run(self, told: Told, work: Callable[[Looker], Outcome]) -> Operation:
         """Start an operation that looks; its outcome comes to `_ended`."""
@@ -284,14 +301,14 @@ class Tracker:
     def _publish(self, status: TrackStatus) -> None:
         before = self._status
         if status.state == "lost" and (before.state, before.reason) != (status.state, status.reason):
-            log.warning("track %s: %s", status.id, status.reason)
+            self._say(logging.WARNING, "track %s: %s", status.id, status.reason)
         self._status = replace(status, sequence=before.sequence + 1, changed_s=self._clock.now_s())
 
     # In the operation's thread
 
     def _ended(self, operation: Operation, outcome: Outcome | None) -> None:
         """Take what a start or a look told, then the poses that waited for it."""
-        with self._lock:
+        with self._held():
             if self._status.operation != operation.id:
                 return  # stopped meanwhile
             waiting, self._waiting = self._waiting, []
@@ -323,7 +340,7 @@ class Tracker:
             return TrackStatus(state=ended, reason=reason, id=status.id, pose=status.pose)
         track, seen = outcome
         self._carried = Carried(track, status.stands_at)
-        log.info("track %s begins %.2f m away, by %s", status.id, seen.range_m, seen.pair)
+        self._say(logging.INFO, "track %s begins %.2f m away, by %s", status.id, seen.range_m, seen.pair)
         return replace(
             status,
             state="tracking",
@@ -361,7 +378,7 @@ class Tracker:
         if seen.state == "lost":
             return replace(status, state="lost")
         if seen.pair != status.found_by:
-            log.info("track %s: %s hands over to %s", status.id, status.found_by, seen.pair)
+            self._say(logging.INFO, "track %s: %s hands over to %s", status.id, status.found_by, seen.pair)
             handed = HandedOver(status.found_by, seen.pair, seen.range_m)
             status = replace(status, handoffs=(*status.handoffs, handed))
         return replace(status, state="tracking", predicted=False, found_by=seen.pair)
