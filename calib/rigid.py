@@ -106,7 +106,7 @@ def carried_covariance(covariance: FloatArray, now_from_then: Rigid) -> FloatArr
     """Return a motion's covariance (6, 6), stated in one frame, along the axes and at the origin of another.
 
     Small rotation, then translation. A rotation error r and a translation error t of then move a point x of
-    now by R r x (x - p) + R t.
+    now by R r x (x - p) + R t. What comes back is exactly symmetric and has no negative variance.
     """
     turn, shift = now_from_then.rotation, now_from_then.translation_m
     x, y, z = shift
@@ -114,7 +114,11 @@ def carried_covariance(covariance: FloatArray, now_from_then: Rigid) -> FloatArr
     carried = np.zeros((6, 6))
     carried[:3, :3] = carried[3:, 3:] = turn
     carried[3:, :3] = across @ turn
-    return np.asarray(carried @ covariance @ carried.T)
+    moved = carried @ covariance @ carried.T
+    moved = (moved + moved.T) / 2
+    # A variance of nothing may come out of the product as -1e-20.
+    np.fill_diagonal(moved, np.maximum(np.diag(moved), 0.0))
+    return np.asarray(moved)
 
 
 def moved_rigid(pose: Rigid, step: FloatArray) -> Rigid:

@@ -11,10 +11,13 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from calib.errors import CalibError
+from calib.handoff_refined import Eye
 from calib.mast import Rig
 from calib.rigid import Rigid, carried_covariance
 from calib.store import load_rig
+from calib.tracking import Key, Track
 from mastctl.limits import Limits
+from mastctl.tracking.carried import Carried
 from mastctl.tracking.choice import HandoffRules, PairBounds, choose_pairs
 from mastctl.tracking.pose import (
     PoseRefused,
@@ -130,3 +133,18 @@ def test_a_covariance_carried_on_moves_points_as_the_motions_themselves_do() -> 
         x, y, z = onward.points(point)
         rate = np.hstack([np.array([[0, z, -y], [-z, 0, x], [y, -x, 0]]), np.eye(3)])
         assert rate @ carried @ rate.T == pytest.approx(moves.T @ moves, abs=2e-3 * np.abs(moves).max() ** 2)
+
+
+def test_what_jumped_poses_are_uncertain_by_has_no_variance_below_zero(rig: Rig) -> None:
+    """A slip along one direction, turned onto an axis: rounding alone makes -1e-20 of the others' nothing."""
+    key = Key(Eye(np.zeros((48, 64), np.float32), rig.cameras["navcam_left"].model), np.zeros(2), np.ones(3))
+    begun = Carried(Track("tracked", np.array([5.0, 0.5, 0.0]), 1e-4 * np.eye(3), key), pose(0.0))
+    for heading in np.arange(0.1, 3.1, 0.1):
+        along = np.array([0.0, 0.0, 0.0, math.cos(heading), math.sin(heading), 0.0])
+        far = replace(pose(1.0, 4.0), covariance=0.01**2 * np.outer(along, along))
+        back = replace(pose(2.0, 0.1, heading), covariance=np.zeros((6, 6)))
+        jumped, _ = begun.to(far, np.zeros(3), 0.3)
+        assert jumped.jumped
+        carried, reason = jumped.to(back, np.zeros(3), 0.3)
+        assert (reason, carried.jumped) == ("", False)
+        assert carried.track.motion_covariance[3, 3] == pytest.approx(0.01**2)
