@@ -176,7 +176,7 @@ class DynamixelHead(Reporting):
         session = Session(pair, head, self._clock, self._reboots)
         try:
             session.poll_once()
-        except BaseException as error:
+        except BaseException as error:  # whatever it was goes on to the caller; the line is not left open
             pair.close()
             raise (error.error if isinstance(error, GivenUp) else error) from None
         log.info("%s: %s", head.port, "; ".join(f"{axis.servo.name} is ready" for axis in pair.axes))
