@@ -21,7 +21,7 @@ from drivers.clock import ManualClock
 from drivers.faults import CAMERA_WORDS, HEAD_WORDS
 from drivers.interfaces import Reading
 from drivers.open_hardware import DeviceSettings, Hardware, HardwareSettings, open_hardware
-from mastctl.devices import Devices
+from mastctl.devices import RESTING_PERIOD_S, Devices
 from mastctl.limits import Limits
 from mastctl.packaged import config_folder
 from mastctl.pointing.loop import (
@@ -185,6 +185,25 @@ def test_a_frame_of_another_mast_file_is_refused() -> None:
 # The simulated rover
 
 
+class DevicesInStep(Devices):
+    """Reads the head between requests whenever the clock has gone on, not whenever the machine's time has.
+
+    A late reply turns the clock by half a second. Read as often as the service does by the machine's time,
+    the head would make the clock run ten times as fast; and where the cameras' threads are late on a busy
+    machine, each frame would be gone from its ring before its partner is asked for.
+    """
+
+    _due_s = 0.0
+
+    def _poll(self) -> float:
+        if self._clock.now_s() >= self._due_s:
+            try:
+                super()._poll()
+            finally:
+                self._due_s = self._clock.now_s() + RESTING_PERIOD_S
+        return 0.005
+
+
 class Rover:
     """The simulated rover with small cameras and flat ground, behind the service's own devices."""
 
@@ -208,7 +227,7 @@ class Rover:
             self.clock,
         )
         limits = Limits((-2.6, 2.6), (-1.2, 0.5), 1.0)
-        self.devices = Devices(self.hardware, limits, "0" * 64, self.clock, self.rig)
+        self.devices = DevicesInStep(self.hardware, limits, "0" * 64, self.clock, self.rig)
         self.loop = PointingLoop(self.rig, self.devices, limits, self.clock)
         assert self.hardware.simulation is not None
         self.truth = self.hardware.simulation
