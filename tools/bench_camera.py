@@ -39,6 +39,8 @@ from drivers.v4l2.controls import set_by_name
 from drivers.v4l2.find import open_node
 from drivers.v4l2.options import CameraOptions, parse_options
 from drivers.v4l2.stream import set_format
+from mastctl.cli.output import positive_number
+from tools.arguments import at_least, end
 
 PARTS = ("gaps", "age", "cpu", "memory", "unplugged", "opens")
 CONSUMERS = ("sleeps", "computes", "is stopped for 2 s")
@@ -57,17 +59,21 @@ def main() -> None:
     parser.add_argument(
         "--device", action="append", default=[], help="link, card or bus; give two for stereo"
     )
-    parser.add_argument("--size", nargs=2, type=int, default=[640, 480], metavar=("W", "H"))
-    parser.add_argument("--rate", type=float, metavar="HZ", help="default: the highest the camera has")
+    parser.add_argument("--size", nargs=2, type=at_least(1), default=[640, 480], metavar=("W", "H"))
     parser.add_argument(
-        "--hdmi-rate", type=float, metavar="HZ", help="first set HDMI inputs to --size and this"
+        "--rate", type=positive_number, metavar="HZ", help="default: the highest the camera has"
     )
-    parser.add_argument("--seconds", type=float, default=60.0, help="of each of the three runs for gaps")
-    parser.add_argument("--pauses", type=int, default=30, help="for the age of frames")
-    parser.add_argument("--repeats", type=int, default=3, help="of the processor time")
-    parser.add_argument("--frames", type=int, default=100_000, help="for the memory")
-    parser.add_argument("--opens", type=int, default=1000, help="for the descriptors")
-    parser.add_argument("--unplugs", type=int, default=10, help="vivid only, as root")
+    parser.add_argument(
+        "--hdmi-rate", type=positive_number, metavar="HZ", help="first set HDMI inputs to --size and this"
+    )
+    parser.add_argument(
+        "--seconds", type=positive_number, default=60.0, help="of each of the three runs for gaps"
+    )
+    parser.add_argument("--pauses", type=at_least(1), default=30, help="for the age of frames")
+    parser.add_argument("--repeats", type=at_least(1), default=3, help="of the processor time")
+    parser.add_argument("--frames", type=at_least(1), default=100_000, help="for the memory")
+    parser.add_argument("--opens", type=at_least(1), default=1000, help="for the descriptors")
+    parser.add_argument("--unplugs", type=at_least(1), default=10, help="vivid only, as root")
     parser.add_argument(
         "--only", choices=PARTS, nargs="+", default=list(PARTS), metavar="PART", help=", ".join(PARTS)
     )
@@ -488,4 +494,4 @@ def descriptors(options: dict[str, Any], opens: int, say: Callable[..., None]) -
 
 
 if __name__ == "__main__":
-    main()
+    end(main)

@@ -39,6 +39,7 @@ from calib.cahvor import CameraModel
 from calib.mast import Mast
 from calib.pointing import solve
 from calib.rigid import Rigid, rot_x, rot_y, rot_z
+from tools.arguments import at_least, end
 
 COUNTS = (1_000, 100_000, 1_000_000)
 SAME = {"forward": 1e-6, "gradient": 1e-3, "inverse": 1e-7}
@@ -377,11 +378,9 @@ def find_mrcal(folder: Path) -> Mrcal | None:
 def main() -> int:
     """Run both benchmarks and print the tables."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--rounds", type=int, default=7, help="how often each is timed (default 7)")
+    parser.add_argument("--rounds", type=at_least(1), default=7, help="how often each is timed (default 7)")
     parser.add_argument("--json", action="store_true", help="print one JSON document instead of tables")
     arguments = parser.parse_args()
-    if arguments.rounds < 1:
-        parser.error("--rounds must be 1 or more")
     with tempfile.TemporaryDirectory() as name:
         mrcal = find_mrcal(Path(name))
         if mrcal is None:
@@ -402,4 +401,4 @@ def main() -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    end(main)

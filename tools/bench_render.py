@@ -21,6 +21,7 @@ from calib.rigid import Rigid
 from drivers.sim.compiled import is_compiled
 from drivers.sim.render import Renderer, compile_renderer, ray_table
 from drivers.sim.scene import SceneSettings, build_scene
+from tools.arguments import at_least, end
 
 MAST = Mast(np.array([0.3443, -0.0043, -1.4572]), np.array([-0.0088, -0.0181, 0.0027]))
 WANTED = {("navcam 640x480", 1): 17.0, ("navcam", 1): 8.0, ("navcam", 2): 3.0, ("pancam", 2): 3.0}
@@ -47,7 +48,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--repeats", type=int, default=9)
+    parser.add_argument("--repeats", type=at_least(1), default=9)
     options = parser.parse_args()
     navcam = camera((1024, 768), 1290.0)
     hazcam = camera((640, 480), 309.0)
@@ -100,4 +101,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    end(main)

@@ -30,6 +30,8 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
+from tools.arguments import at_least, end, not_negative
+
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
 BAUD = 1_000_000
@@ -235,9 +237,9 @@ def measure(path: str, driver: Any, which: int, calls: int) -> tuple[list[float]
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--calls", type=int, default=300, help="in a batch")
-    parser.add_argument("--batches", type=int, default=10)
-    parser.add_argument("--delay-ms", type=float, nargs="+", default=[0.0, 1.0])
+    parser.add_argument("--calls", type=at_least(2), default=300, help="in a batch")
+    parser.add_argument("--batches", type=at_least(1), default=10)
+    parser.add_argument("--delay-ms", type=not_negative, nargs="+", default=[0.0, 1.0])
     parser.add_argument("--json", action="store_true")
     args = parser.parse_args()
     drivers: dict[str, Any] = {
@@ -291,4 +293,4 @@ def main() -> int:
 
 
 if __name__ == "__main__":
-    raise SystemExit(main())
+    end(main)

@@ -17,7 +17,6 @@ from __future__ import annotations
 
 import argparse
 import os
-import sys
 import time
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
@@ -36,6 +35,7 @@ from calib.survey import Sigma, Survey
 from calib.uncertainty import pixel_covariance
 from drivers.sim.survey import SurveyPlan, SurveyTruth, simulate_survey
 from mastctl.calibration.run import FITS
+from tools.arguments import at_least, end, not_negative
 
 DIRECTIONS_RAD = ((-0.8, -0.2), (0.0, -0.4), (0.7, -0.7))
 RANGES_M = (2.0, 6.0, 10.0)
@@ -125,13 +125,15 @@ def main() -> int:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--surveys", type=int, default=100)
-    parser.add_argument("--seed", type=int, default=1, help="of the first survey; the others follow")
+    parser.add_argument("--surveys", type=at_least(1), default=100)
+    parser.add_argument("--seed", type=at_least(0), default=1, help="of the first survey; the others follow")
     parser.add_argument("--method", choices=sorted(FITS), default="joint")
     parser.add_argument("--mast", type=int, choices=(6, 8), default=6)
-    parser.add_argument("--joint-sigma-rad", type=float, default=0.0, help="noise of joint readings")
-    parser.add_argument("--prism-cad-sigma-m", type=float, default=0.0, help="noise of the prisms' drawing")
-    parser.add_argument("--workers", type=int, default=os.cpu_count() or 1)
+    parser.add_argument("--joint-sigma-rad", type=not_negative, default=0.0, help="noise of joint readings")
+    parser.add_argument(
+        "--prism-cad-sigma-m", type=not_negative, default=0.0, help="noise of the prisms' drawing"
+    )
+    parser.add_argument("--workers", type=at_least(1), default=os.cpu_count() or 1)
     root = Path(__file__).resolve().parent.parent
     parser.add_argument("--rig", type=Path, default=root / "configs" / "sim" / "rocky8.yaml")
     options = parser.parse_args()
@@ -195,4 +197,4 @@ def _held(errors: np.ndarray) -> str:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    end(main)

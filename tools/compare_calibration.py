@@ -50,6 +50,7 @@ from calib.fit_camera import FixedPoints, fit_camera, pinhole
 from calib.least_squares import minimise
 from calib.rigid import Rigid
 from calib.terms import ImageTerm
+from tools.arguments import at_least, end
 from tools.compare_points import (
     COLUMNS,
     NOISE_PX,
@@ -352,12 +353,10 @@ def main() -> int:
         default=REPOSITORY.parent / "shared" / "data" / "opencv_stereo",
         help="folder of OpenCV's stereo sample pictures, left*.jpg and right*.jpg",
     )
-    parser.add_argument("--surveys", type=int, default=20, help="simulated surveys (default 20)")
-    parser.add_argument("--rounds", type=int, default=5, help="how often a fit is timed (default 5)")
+    parser.add_argument("--surveys", type=at_least(1), default=20, help="simulated surveys (default 20)")
+    parser.add_argument("--rounds", type=at_least(1), default=5, help="how often a fit is timed (default 5)")
     parser.add_argument("--json", action="store_true", help="print one JSON document instead of tables")
     arguments = parser.parse_args()
-    if arguments.rounds < 1 or arguments.surveys < 1:
-        parser.error("--rounds and --surveys must be 1 or more")
     cv2.setNumThreads(1)
     mrcal = find_mrcal()
     rows: list[Row] = []
@@ -386,4 +385,4 @@ def main() -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    end(main)

@@ -39,6 +39,7 @@ import cv2
 import numpy as np
 
 from calib.cahvor import CameraModel
+from tools.arguments import at_least, end
 from tools.tracker_methods import HALF_PX, METHODS, Tracked
 from tools.tracker_sequences import SETTINGS, STEPS, WORLDS, Sequence, loaded, rigs, sequences
 
@@ -140,7 +141,8 @@ def contrib_python(folder: Path) -> Path:
     if not python.exists():
         print(f"making {folder} with {CONTRIB}", file=sys.stderr)
         venv.create(folder, with_pip=True)
-        subprocess.run([python, "-m", "pip", "install", "-q", "numpy", CONTRIB], check=True)
+        if subprocess.run([python, "-m", "pip", "install", "-q", "numpy", CONTRIB]).returncode:
+            raise SystemExit(f"{CONTRIB} cannot be installed into {folder}; remove it and try again")
     return python
 
 
@@ -230,16 +232,17 @@ def main() -> int:
     """Compare and print; exit code 1 if something wanted is not met."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--work", type=Path, required=True, help="folder of the sequences, 33 MB each")
-    parser.add_argument("--targets", type=int, default=12, help="targets a world and setting (default 12)")
-    parser.add_argument("--seed", type=int, default=1, help="of the first (default 1)")
+    parser.add_argument(
+        "--targets", type=at_least(1), default=12, help="targets a world and setting (default 12)"
+    )
+    parser.add_argument("--seed", type=at_least(0), default=1, help="of the first (default 1)")
     parser.add_argument("--worlds", nargs="+", choices=WORLDS, default=list(WORLDS))
     parser.add_argument("--settings", nargs="+", choices=list(SETTINGS), default=list(SETTINGS))
     parser.add_argument("--contrib", type=Path, help="environment with opencv-contrib, made if not there")
     parser.add_argument("--kind", default="CSRT", help="its tracker (default CSRT)")
     parser.add_argument("--json", action="store_true", help="print one JSON document instead of tables")
     arguments = parser.parse_args()
-    if arguments.targets < 1 or arguments.seed < 0:
-        parser.error("--targets must be 1 or more and --seed 0 or more")
+    arguments.work.mkdir(parents=True, exist_ok=True)
     cv2.setNumThreads(1)
     contrib = (contrib_python(arguments.contrib), arguments.kind) if arguments.contrib else None
     configs = REPOSITORY / "configs"
@@ -264,4 +267,4 @@ def main() -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    end(main)

@@ -10,7 +10,6 @@ the focal length, as rough cameras of a survey may be. Stresses: more noise, lit
 from __future__ import annotations
 
 import argparse
-import sys
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -27,6 +26,7 @@ from calib.survey import Board
 from drivers.sim.board import BoardLook, draw_board, half_size_m, photograph
 from drivers.sim.render import Renderer
 from drivers.sim.scene import SceneSettings, build_scene
+from tools.arguments import at_least, end
 
 BOARD = Board(10, 10, 0.08, 0.04, {})
 SIZE_PX = (1024, 768)
@@ -201,8 +201,8 @@ def overlay(image: np.ndarray, found: DotsFound | DetectionFailure) -> np.ndarra
 def main() -> int:
     """Run the campaign and print its table."""
     parser = argparse.ArgumentParser(description="Dots found on rendered boards: error, failures, time.")
-    parser.add_argument("--poses", type=int, default=6, help="poses for each range and tilt")
-    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--poses", type=at_least(1), default=6, help="poses for each range and tilt")
+    parser.add_argument("--seed", type=at_least(0), default=1)
     parser.add_argument("--stress", choices=sorted(STRESSES), default="none")
     parser.add_argument("--pictures", type=Path, help="folder for pictures with what was found")
     arguments = parser.parse_args()
@@ -233,4 +233,4 @@ def main() -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    end(main)

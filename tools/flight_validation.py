@@ -25,6 +25,7 @@ from calib.model_difference import ModelDifference, model_difference
 from calib.store import save_rig
 from drivers.clock import ManualClock
 from drivers.errors import DriverError
+from tools.arguments import end
 
 REPOSITORY = Path(__file__).resolve().parent.parent
 DOCUMENT = REPOSITORY / "docs" / "validation.md"
@@ -40,11 +41,9 @@ def main() -> int:
     parser.add_argument("--write", action="store_true", help="renew docs/validation.md and its pictures")
     parser.add_argument("--mast-file", type=Path, help="write the mast file of the replayed rover here")
     arguments = parser.parse_args()
-    if not (arguments.data / "msl_navcam").is_dir():
-        print(
-            f"{arguments.data}: no folder msl_navcam; --data names the folder that holds it", file=sys.stderr
-        )
-        return 2
+    for name in ("msl_navcam", "mer_navcam"):
+        if not (arguments.data / name).is_dir():
+            parser.error(f"{arguments.data} has no folder {name}; --data names the folder that holds it")
     blocks = msl_blocks(arguments.data / "msl_navcam", arguments.write)
     blocks |= mer_blocks(arguments.data / "mer_navcam", arguments.write, arguments.mast_file)
     for name, text in blocks.items():
@@ -298,4 +297,4 @@ def _table(header: str, rows: list[str]) -> str:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    end(main)

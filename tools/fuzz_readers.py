@@ -14,7 +14,6 @@ import json
 import os
 import random
 import signal
-import sys
 import tempfile
 import time
 from collections import Counter
@@ -33,6 +32,7 @@ from calib.formats.pds3 import load_pds3_camera, read_product
 from calib.store import StoredRig, parse_camera, parse_rig
 from calib.tables import parse_table
 from mastctl.cli.main import main as mastctl
+from tools.arguments import at_least, end
 
 HANG_S = 20
 
@@ -284,8 +284,8 @@ def _alarm() -> Iterator[None]:
 def main() -> int:
     """Run the campaign, print counts and the slowest case, and return 1 if anything was let out."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--cases", type=int, default=20_000)
-    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--cases", type=at_least(1), default=20_000)
+    parser.add_argument("--seed", type=at_least(0), default=1)
     parser.add_argument(
         "--command-share", type=float, default=0.2, help="part of the cases that run a command"
     )
@@ -324,4 +324,4 @@ def main() -> int:
 
 if __name__ == "__main__":
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    sys.exit(main())
+    end(main)

@@ -34,6 +34,7 @@ from drivers.sim.wire.dynamixel_bus import DynamixelBus
 from drivers.sim.wire.dynamixel_packets import InstructionParser
 from drivers.sim.wire.dynamixel_servo import SimulatedServo
 from drivers.sim.wire.ptu import SimulatedPtu
+from tools.arguments import at_least, end
 
 SDK = PacketHandler(2.0)
 MARK = b"\xff\xff\xfd"
@@ -446,8 +447,8 @@ def campaign(cases: int, seed: int) -> tuple[dict[str, Counter[str]], dict[str, 
 def main() -> int:
     """Run the campaign, print the table, and return 1 if anything failed."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--cases", type=int, default=60_000)
-    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--cases", type=at_least(1), default=60_000)
+    parser.add_argument("--seed", type=at_least(0), default=1)
     args = parser.parse_args()
     counts, spent_s, failures = campaign(args.cases, args.seed)
     for failure in failures[:20]:
@@ -463,4 +464,4 @@ def main() -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    end(main)

@@ -32,6 +32,7 @@ from calib.store import load_rig
 from calib.warp import Plane, warp_patch
 from drivers.sim.render import compile_renderer
 from mastctl.packaged import config_folder
+from tools.arguments import at_least, end, new_file
 from tools.handoff_provocations import KINDS, Case, Stage
 
 WRONG_PX = 4.0
@@ -135,13 +136,13 @@ def _off(pixel_px: np.ndarray, case: Case, name: str) -> float:
 
 @dataclass(frozen=True)
 class Row:
-    """One row of the table, in cases: both eyes together."""
+    """One row of the table, in cases: both eyes together; None where none was accepted."""
 
     kind: str
     cases: int
     accepted: int
-    accepted_rms_px: float
-    accepted_worst_px: float
+    accepted_rms_px: float | None
+    accepted_worst_px: float | None
     wrong: int
     flagged: int
     accepted_wrong: int
@@ -158,8 +159,8 @@ def summarise(kind: str, cases: Sequence[Sequence[Outcome]]) -> Row:
         kind,
         len(cases),
         sum(bool(eyes) for eyes in accepted),
-        float(np.sqrt(np.mean(errors**2))) if len(errors) else math.nan,
-        float(errors.max()) if len(errors) else math.nan,
+        float(np.sqrt(np.mean(errors**2))) if len(errors) else None,
+        float(errors.max()) if len(errors) else None,
         sum(bool(eyes) for eyes in wrong),
         sum(bool(eyes) and all(one.verdict != "accepted" for one in eyes) for eyes in wrong),
         sum(any(one.refined_px > WRONG_PX for one in eyes) for eyes in accepted),
@@ -171,13 +172,13 @@ def main() -> int:
     """Run the campaign; exit 1 if less than nine tenths of the wrong answers are flagged."""
     parser = argparse.ArgumentParser(description="Provoke bad hand-offs and count what the verdicts catch.")
     parser.add_argument(
-        "--cases", type=int, default=100, help="bad cases, a fifth of each kind (default 100)"
+        "--cases", type=at_least(1), default=100, help="bad cases, a fifth of each kind (default 100)"
     )
-    parser.add_argument("--good", type=int, help="good cases beside them (default: half as many)")
-    parser.add_argument("--seed", type=int, default=1, help="of scene, views, targets and noise")
+    parser.add_argument("--good", type=at_least(0), help="good cases beside them (default: half as many)")
+    parser.add_argument("--seed", type=at_least(0), default=1, help="of scene, views, targets and noise")
     parser.add_argument("--kind", choices=(*KINDS, "good"), help="only this kind, --cases of it")
     parser.add_argument("--json", action="store_true")
-    parser.add_argument("--out", type=Path, metavar="FILE.csv", help="a line for each case and camera")
+    parser.add_argument("--out", type=new_file, metavar="FILE.csv", help="a line for each case and camera")
     options = parser.parse_args()
     began = time.monotonic()
     true = load_rig(config_folder() / "sim" / "rocky8.yaml").rig
@@ -215,9 +216,12 @@ def _print(rows: Sequence[Row]) -> None:
     )
     for row in rows:
         flagged = f"{row.flagged} of {row.wrong}"
+        rms, worst = (
+            "-" if value is None else f"{value:.2f}" for value in (row.accepted_rms_px, row.accepted_worst_px)
+        )
         print(
             f"{row.kind:10s} {row.cases:6d} {row.wrong:6d} {flagged:>8s} {row.accepted:9d} "
-            f"{row.accepted_rms_px:7.2f} {row.accepted_worst_px:9.2f} {row.accepted_wrong:15d} "
+            f"{rms:>7s} {worst:>9s} {row.accepted_wrong:15d} "
             f"{row.refused_right:14d}"
         )
     print(f"  (wrong: plain correlation is more than {WRONG_PX:g} px off; right: at most {RIGHT_PX:g} px)")
@@ -231,4 +235,4 @@ def _write(path: Path, outcomes: Sequence[Outcome]) -> None:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    end(main)

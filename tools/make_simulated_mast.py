@@ -29,13 +29,13 @@ from simulated_mast.check import (
     turned_rover_frame,
 )
 
-from calib.errors import BadFile
 from calib.mast import Rig
 from calib.store import load_rig, save_rig
 from calib.survey import Sigma, read_survey, write_survey
 from drivers.sim.pan_tilt import PRESETS
 from drivers.sim.survey import Ring, SurveyPlan, simulate_survey
 from mastctl.calibration.run import Calibrated, calibrate, checked
+from tools.arguments import at_least, end
 
 SIGMA = Sigma(station_m=0.001, dot_px=0.1, joint_rad=3e-5)
 """The joints' is half a step of the packaged rover's head."""
@@ -63,21 +63,19 @@ def main() -> int:
     )
     parser.add_argument("--rig", required=True, type=Path, help="the true rig")
     parser.add_argument("--out", required=True, type=Path, help="the mast file to write")
-    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--seed", type=at_least(0), default=1)
     parser.add_argument("--mast", type=int, choices=(6, 8), default=6, help="mast parameters to fit")
     parser.add_argument("--head", choices=sorted(PRESETS), default="ptu_d46_70")
-    parser.add_argument("--targets", type=int, default=200, help="targets a distance for the pointing error")
+    parser.add_argument(
+        "--targets", type=at_least(1), default=200, help="targets a distance for the pointing error"
+    )
     options = parser.parse_args()
-    try:
-        true_rig = load_rig(options.rig)
-        done = survey_and_calibrate(true_rig.rig, options.seed, options.mast)
-        provenance = _provenance(options, true_rig.digest, done)
-        name = options.out.stem
-        save_rig(replace(done.saved.rig, name=name, provenance=provenance), options.out)
-        stored = load_rig(options.out).rig
-    except BadFile as error:
-        print(error, file=sys.stderr)
-        return 2
+    true_rig = load_rig(options.rig)
+    done = survey_and_calibrate(true_rig.rig, options.seed, options.mast)
+    provenance = _provenance(options, true_rig.digest, done)
+    name = options.out.stem
+    save_rig(replace(done.saved.rig, name=name, provenance=provenance), options.out)
+    stored = load_rig(options.out).rig
     print(f"wrote {options.out}: {len(done.survey.images)} images, {done.verdict.words}")
     tell_projection(true_rig.rig, stored)
     tell_pointing(true_rig.rig, stored, options)
@@ -149,4 +147,4 @@ def _provenance(options: argparse.Namespace, digest: str, done: Calibrated) -> d
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    end(main)

@@ -9,7 +9,6 @@ exist; losing it is a failure. The kinematics here are SciPy's rotations, not th
 from __future__ import annotations
 
 import argparse
-import sys
 import time
 from collections import Counter
 from dataclasses import dataclass
@@ -21,6 +20,7 @@ from calib.cahvor import CameraModel
 from calib.errors import Unreachable
 from calib.mast import Mast
 from calib.pointing import Solution, solve
+from tools.arguments import at_least, end
 
 WORST_PX = 1e-7
 SAME_RAD = 1e-5
@@ -145,8 +145,10 @@ def run_case(case: Case) -> Outcome:
 def main() -> int:
     """Run the campaign; exit 1 if a solution was lost or one missed its pixel by more than 1e-7."""
     parser = argparse.ArgumentParser(description="Point random masts and print the worst re-projection.")
-    parser.add_argument("--cases", type=int, default=10_000, help="number of random masts (default 10000)")
-    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument(
+        "--cases", type=at_least(1), default=10_000, help="number of random masts (default 10000)"
+    )
+    parser.add_argument("--seed", type=at_least(0), default=1)
     options = parser.parse_args()
     rng = np.random.default_rng(options.seed)
     worst: dict[tuple[str, str], float] = {}
@@ -176,4 +178,4 @@ def main() -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    end(main)

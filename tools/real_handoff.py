@@ -24,7 +24,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import sys
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -43,6 +42,7 @@ from calib.tracking import Key, Look, Track, TrackSettings, seen_by
 from calib.warp import Plane, carry
 from drivers.clock import ManualClock
 from tools import flight_mer as mer
+from tools.arguments import end, new_file
 from tools.render_bias import BLUR_PX, GRID_PX, HALF_PX, MARGIN_PX, best_affine
 from tools.render_bias import match as ecc
 
@@ -241,7 +241,7 @@ def main() -> int:
     """Print a row a pair and assumption, and draw the picture."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("data", type=Path, help="folder of the frames 1N4910*.IMG")
-    parser.add_argument("--picture", type=Path, help="file for the picture")
+    parser.add_argument("--picture", type=new_file, help="file for the picture")
     parser.add_argument("--json", action="store_true", help="print one JSON document instead of the table")
     arguments = parser.parse_args()
     try:
@@ -291,4 +291,4 @@ def print_table(rows: Sequence[dict[str, Any]]) -> None:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    end(main)

@@ -27,6 +27,8 @@ from calib.matched_handoff import MatchedHandoff, matched_handoff
 from calib.rigid import FloatArray, Rigid, moved_rigid
 from calib.store import load_rig
 from mastctl.calibration.landing import handoff_errors_px
+from mastctl.cli.output import positive_number
+from tools.arguments import at_least, end, not_negative
 
 HEAD_HEIGHT_M, ASIDE_RAD = 1.45, 0.35
 HELD_OUT, HELD_OUT_M = 60, (1.5, 4.0)
@@ -114,13 +116,15 @@ def main() -> int:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--rig", required=True, type=Path, help="the true rig")
-    parser.add_argument("--cases", type=int, default=100)
-    parser.add_argument("--handoffs", type=int, default=20, help="of each case")
-    parser.add_argument("--click-px", type=float, default=0.2)
-    parser.add_argument("--match-px", type=float, default=0.4, help="what a match is wrong by")
-    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--cases", type=at_least(1), default=100)
+    parser.add_argument("--handoffs", type=at_least(1), default=20, help="of each case")
+    parser.add_argument("--click-px", type=positive_number, default=0.2)
+    parser.add_argument("--match-px", type=not_negative, default=0.4, help="what a match is wrong by")
+    parser.add_argument("--seed", type=at_least(0), default=1)
     options = parser.parse_args()
     true = load_rig(options.rig).rig
+    if lacking := [pair for pair in ("navcam", "hazcam") if pair not in true.stereo]:
+        parser.error(f"--rig {options.rig} has no stereo pair '{lacking[0]}'")
     prior = np.array([PRIOR_SHIFT_M] * 3 + [PRIOR_TURN_RAD] * 3)
     print("targets     moved  significant  told  chi2 of 6   before rms, worst px   after rms, worst px")
     for words, ranges_m in (("2 m", (2.0, 2.0)), ("1.5 to 4 m", (1.5, 4.0))):
@@ -153,4 +157,4 @@ def main() -> int:
 
 
 if __name__ == "__main__":
-    raise SystemExit(main())
+    end(main)

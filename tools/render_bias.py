@@ -23,6 +23,8 @@ from calib.mast import Mast
 from calib.rigid import FloatArray, Rigid, rot_y, rot_z
 from drivers.sim.render import Renderer
 from drivers.sim.scene import Scene, SceneSettings, build_scene
+from mastctl.cli.output import positive_number
+from tools.arguments import at_least, end
 
 MAST = Mast(np.array([0.3443, -0.0043, -1.4572]), np.array([-0.0088, -0.0181, 0.0027]))
 Poses = Callable[[CameraModel, float, np.random.Generator], tuple[Rigid, Rigid]]
@@ -236,11 +238,11 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--pairs", type=int, default=6, help="pairs of pictures a row")
-    parser.add_argument("--patches", type=int, default=40, help="patches a pair")
-    parser.add_argument("--samples", type=int, nargs="+", default=[1, 2, 3])
-    parser.add_argument("--ranges", type=float, nargs="+", default=[10.0, 6.0, 2.0])
-    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--pairs", type=at_least(1), default=6, help="pairs of pictures a row")
+    parser.add_argument("--patches", type=at_least(1), default=40, help="patches a pair")
+    parser.add_argument("--samples", type=at_least(1), nargs="+", default=[1, 2, 3])
+    parser.add_argument("--ranges", type=positive_number, nargs="+", default=[10.0, 6.0, 2.0])
+    parser.add_argument("--seed", type=at_least(0), default=1)
     options = parser.parse_args()
     rows: list[tuple[str, CameraModel, float, Poses]] = []
     for range_m in options.ranges:
@@ -270,4 +272,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    end(main)

@@ -21,7 +21,6 @@ import logging
 import math
 import secrets
 import statistics
-import sys
 import threading
 import time
 from collections.abc import Callable, Iterable, Sequence
@@ -35,6 +34,8 @@ import numpy as np
 from drivers.errors import DriverError, HardwareFault
 from drivers.faults import HEAD_WORDS
 from drivers.interfaces import Reading
+from mastctl.cli.output import positive_number
+from tools.arguments import at_least, end, new_file
 from tools.servo_rigs import LIMITS_RAD, Rig, dynamixel_pty, ptu_pty
 
 DRIVERS: dict[str, Callable[[], AbstractContextManager[Rig]]] = {
@@ -334,12 +335,12 @@ def run_all(
 def main() -> int:
     """Run the campaign; exit 1 if a position was wrong, a limit passed, or something did not come back."""
     parser = argparse.ArgumentParser(description="Drive servo drivers on faulty simulated hardware.")
-    parser.add_argument("--transactions", type=int, default=10_000, help="calls a driver and word")
-    parser.add_argument("--hours", type=float, help="go on with new seeds for so long")
-    parser.add_argument("--seed", type=int, help="chosen and printed when left out")
+    parser.add_argument("--transactions", type=at_least(1), default=10_000, help="calls a driver and word")
+    parser.add_argument("--hours", type=positive_number, help="go on with new seeds for so long")
+    parser.add_argument("--seed", type=at_least(0), help="chosen and printed when left out")
     parser.add_argument("--driver", choices=list(DRIVERS), action="append", help="one or more (default both)")
     parser.add_argument("--word", choices=WORDS, action="append", help="one or more (default all)")
-    parser.add_argument("--out", type=Path, help="file for the rows as JSON lines")
+    parser.add_argument("--out", type=new_file, help="file for the rows as JSON lines")
     options = parser.parse_args()
     logging.getLogger("drivers").setLevel(logging.CRITICAL)
     seed = secrets.randbelow(2**31) if options.seed is None else options.seed
@@ -361,4 +362,4 @@ def main() -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    end(main)

@@ -23,6 +23,7 @@ from drivers.sim.board import draw_board, photograph
 from drivers.sim.render import Renderer
 from drivers.sim.scene import build_scene
 from drivers.sim.survey import SurveyPlan, SurveyTruth, simulate_survey
+from tools.arguments import at_least, end, not_negative
 
 BLUR_PX, NOISE_DN = 0.7, 2.0
 
@@ -33,18 +34,18 @@ def main() -> int:
     )
     parser.add_argument("--rig", required=True, type=Path, help="the true rig, a mast file")
     parser.add_argument("--out", required=True, type=Path, help="the folder to write; new or empty")
-    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--seed", type=at_least(0), default=1)
     parser.add_argument("--render", action="store_true", help="pictures instead of dots.csv")
     parser.add_argument(
         "--plain", action="store_true", help="with --render: boards before grey, no landscape"
     )
-    parser.add_argument("--mast-boards", type=int, default=SurveyPlan.mast_boards)
-    parser.add_argument("--check-boards", type=int, default=SurveyPlan.check_boards)
+    parser.add_argument("--mast-boards", type=at_least(1), default=SurveyPlan.mast_boards)
+    parser.add_argument("--check-boards", type=at_least(0), default=SurveyPlan.check_boards)
     parser.add_argument("--prisms", type=int, choices=(3, 4), default=SurveyPlan.prisms)
-    parser.add_argument("--station-sigma-m", type=float, default=0.001)
-    parser.add_argument("--dot-sigma-px", type=float, default=0.1)
-    parser.add_argument("--joint-sigma-rad", type=float, default=0.0)
-    parser.add_argument("--prism-cad-sigma-m", type=float, default=0.0)
+    parser.add_argument("--station-sigma-m", type=not_negative, default=0.001)
+    parser.add_argument("--dot-sigma-px", type=not_negative, default=0.1)
+    parser.add_argument("--joint-sigma-rad", type=not_negative, default=0.0)
+    parser.add_argument("--prism-cad-sigma-m", type=not_negative, default=0.0)
     options = parser.parse_args()
     try:
         rig = load_rig(options.rig).rig
@@ -97,4 +98,4 @@ def pictures(survey: Survey, truth: SurveyTruth, seed: int, plain: bool) -> Iter
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    end(main)

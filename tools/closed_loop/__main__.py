@@ -20,6 +20,8 @@ from typing import Any
 
 import numpy as np
 
+from mastctl.cli.output import positive_number
+from tools.arguments import at_least, end
 from tools.closed_loop.run import RECORD
 from tools.virtual_machine import boot, kernel
 
@@ -30,10 +32,10 @@ def main() -> int:
     parser = argparse.ArgumentParser(
         prog="tools.closed_loop", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--targets", type=int, default=10, help="at each distance (default 10)")
-    parser.add_argument("--distances", type=float, nargs="+", default=[10.0, 6.0, 2.0], metavar="M")
-    parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--timeout", type=float, default=3600.0, metavar="S", help="of the machine")
+    parser.add_argument("--targets", type=at_least(1), default=10, help="at each distance (default 10)")
+    parser.add_argument("--distances", type=positive_number, nargs="+", default=[10.0, 6.0, 2.0], metavar="M")
+    parser.add_argument("--seed", type=at_least(0), default=1)
+    parser.add_argument("--timeout", type=positive_number, default=3600.0, metavar="S", help="of the machine")
     parser.add_argument("--out", type=Path, metavar="DIR", help="where the records are kept")
     args = parser.parse_args()
     if (found := kernel.find()) is None:
@@ -136,4 +138,4 @@ def _pair(value: Any) -> str:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    end(main)

@@ -18,11 +18,13 @@ from pathlib import Path
 from typing import Any
 
 import drivers.sim
+from mastctl.cli.output import positive_number
 from mastctl.client import Client
 from mastctl.config import load_config
 from mastctl.daemon import RunningDaemon
 from mastctl.experiment.demo import SimulationTruth
 from mastctl.experiment.pointing import PointingExperiment, TargetRecord, run_pointing_experiment
+from tools.arguments import at_least, end
 from tools.closed_loop import files
 
 RECORD = "record.json"
@@ -31,11 +33,12 @@ RECORD = "record.json"
 def main() -> int:
     parser = argparse.ArgumentParser(prog="tools.closed_loop.run", description=__doc__.splitlines()[0])
     parser.add_argument("kind", choices=("memory", "devices"))
-    parser.add_argument("--targets", type=int, default=10, help="at each distance")
-    parser.add_argument("--distances", type=float, nargs="+", default=[10.0, 6.0, 2.0], metavar="M")
-    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--targets", type=at_least(1), default=10, help="at each distance")
+    parser.add_argument("--distances", type=positive_number, nargs="+", default=[10.0, 6.0, 2.0], metavar="M")
+    parser.add_argument("--seed", type=at_least(0), default=1)
     parser.add_argument("--out", type=Path, required=True, metavar="DIR")
     args = parser.parse_args()
+    args.out.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix="closed-loop-") as name:
         run = in_memory if args.kind == "memory" else through_devices
         document = run(Path(name), args)
@@ -125,4 +128,4 @@ def _records(experiment: PointingExperiment) -> list[dict[str, Any]]:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    end(main)

@@ -1,0 +1,29 @@
+"""The tools' arguments: what makes no sense, or is not there, is one sentence and exit code 2."""
+
+from __future__ import annotations
+
+import runpy
+import sys
+
+import pytest
+
+CASES = {
+    "refine_campaign --rig /nosuch": "/nosuch: cannot be read: No such file or directory",
+    "refine_campaign --rig /nosuch --click-px 0": "--click-px: '0' where a number above zero is expected",
+    "compare_trackers --work /dev/null/x": "/dev/null/x: Not a directory",
+    "handoff_campaign --cases 0": "--cases: '0' where a whole number of at least 1 is expected",
+    "handoff_campaign --out /dev/null/x.csv": "--out: /dev/null/x.csv: Not a directory",
+    "calibration_coverage --joint-sigma-rad -1": "--joint-sigma-rad: '-1' where zero or more is expected",
+}
+
+
+@pytest.mark.parametrize("words", CASES)
+def test_what_a_tool_cannot_use_is_one_sentence(
+    words: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    name, *arguments = words.split()
+    monkeypatch.setattr(sys, "argv", [name, *arguments])
+    with pytest.raises(SystemExit) as ended:
+        runpy.run_module(f"tools.{name}", run_name="__main__")
+    assert ended.value.code == 2
+    assert capsys.readouterr().err.rstrip("\n").endswith(CASES[words])

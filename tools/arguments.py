@@ -1,0 +1,59 @@
+"""What the tools share: arguments that make sense, and one sentence instead of a traceback."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+from calib.errors import CalibError
+from drivers.errors import DriverError
+from mastctl.cli.output import as_command_error, finite_number, one_line
+
+
+def at_least(least: int) -> Callable[[str], int]:
+    """Return what reads a whole number of at least ``least`` (argparse ``type``)."""
+
+    def read(text: str) -> int:
+        if not text.isascii() or not text.isdigit() or int(text) < least:
+            raise argparse.ArgumentTypeError(f"'{text}' where a whole number of at least {least} is expected")
+        return int(text)
+
+    return read
+
+
+def not_negative(text: str) -> float:
+    """Read a finite number of zero or more (argparse ``type``)."""
+    value = finite_number(text)
+    if value < 0:
+        raise argparse.ArgumentTypeError(f"'{text}' where zero or more is expected")
+    return value
+
+
+def new_file(text: str) -> Path:
+    """Read the name of a file that can be written, before minutes are spent on it (argparse ``type``)."""
+    path = Path(text)
+    try:
+        path.touch()
+    except OSError as error:
+        raise argparse.ArgumentTypeError(f"{path}: {error.strerror}") from None
+    return path
+
+
+def end(main: Callable[[], int | None]) -> None:
+    """Run a tool and exit with its code.
+
+    A refusal of the project's own is one sentence and the exit code that `mastctl` has for it; a file that
+    cannot be read or written is one sentence and 2.
+    """
+    try:
+        sys.exit(main())
+    except (CalibError, DriverError) as error:
+        words, code = str(error), as_command_error(error).exit_code
+    except OSError as error:
+        if error.filename is None:
+            raise
+        words, code = f"{error.filename}: {error.strerror}", 2
+    sys.stderr.write(f"{one_line(words)}\n")
+    sys.exit(code)
