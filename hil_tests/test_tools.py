@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import runpy
 import sys
+from pathlib import Path
 
 import pytest
 
@@ -19,11 +20,11 @@ CASES = {
 
 @pytest.mark.parametrize("words", CASES)
 def test_what_a_tool_cannot_use_is_one_sentence(
-    words: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    words: str, repository: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     name, *arguments = words.split()
     monkeypatch.setattr(sys, "argv", [name, *arguments])
     with pytest.raises(SystemExit) as ended:
-        runpy.run_module(f"tools.{name}", run_name="__main__")
+        runpy.run_path(str(repository / "tools" / f"{name}.py"), run_name="__main__")
     assert ended.value.code == 2
     assert capsys.readouterr().err.rstrip("\n").endswith(CASES[words])
