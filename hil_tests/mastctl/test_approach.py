@@ -5,16 +5,22 @@ from __future__ import annotations
 import csv
 import json
 import math
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import pytest
 
+from calib.mast import Rig
+from calib.pointing import solve
 from calib.store import load_rig
-from mastctl.experiment.approach import (
-    ApproachRun,
-    Stop,
-)
+from drivers.sim import bricks, rocks
+from drivers.sim.scene import Scene, SceneSettings, make_grid, tiny_scene
+from mastctl.cli.main import main
+from mastctl.experiment import approach
+from mastctl.experiment.approach import ROCK_M, ROCKS, START_M, ApproachRun, Stop
 from mastctl.experiment.approach_report import (
     handoffs,
     losses,
@@ -24,7 +30,7 @@ from mastctl.experiment.approach_report import (
     write_record,
     write_strip,
 )
-from mastctl.experiment.approach_world import WINDOW_PX, windowed
+from mastctl.experiment.approach_world import WINDOW_PX, World, WorldErrors, windowed
 
 
 def stop(range_m: float, error_m: tuple[float, float, float], state: str = "tracked") -> Stop:
@@ -101,3 +107,131 @@ def test_the_record_holds_every_stop(tmp_path: Path) -> None:
     assert [row["range_m"] for row in rows] == ["1.05"]
     document = json.loads((tmp_path / "new/record.json").read_text())
     assert document["runs"][1]["error"] == "no view"
+
+
+# Targets on rocks: on level ground, z = 0, where the height of a point is plain
+
+
+@pytest.fixture(scope="module")
+def rig(repository: Path) -> Rig:
+    pytest.importorskip("numba", reason="the simulated rover needs numba (extra sim)")
+    return load_rig(repository / "configs/sim/rocky8.yaml").rig
+
+
+@pytest.fixture
+def standing(rig: Rig) -> Iterator[Callable[..., World]]:
+    """Make worlds of level ground with these parts exchanged; the rover stands at its middle."""
+    made: list[World] = []
+
+    def world(seed: int = 1, **parts: Any) -> World:
+        scene = tiny_scene()
+        scene = Scene(scene.settings, scene.world._replace(**parts))
+        made.append(World(scene, rig, rig, WorldErrors(), np.random.default_rng(seed)))
+        return made[-1]
+
+    yield world
+    for one in made:
+        one.close()
+
+
+@pytest.mark.parametrize("range_m", [6.0, 10.0])
+def test_the_rover_turns_to_a_rock_at_the_range_that_stands_out_of_the_ground(
+    standing: Callable[..., World], range_m: float
+) -> None:
+    stones = rocks.make_rocks(60, np.random.default_rng(5), lambda x, y: 0.0)
+    world = standing(rocks=stones)
+    mast = world.true.mast.translation_m
+    chosen = set()
+    for _ in range(10):
+        before = world.site_from_rover
+        point = world.turn_to_rock(range_m, ROCK_M)
+        assert point is not None
+        assert -0.6 < point[2] <= -ROCK_M, "above the ground, and no higher than a stone"
+        away_m = float(np.linalg.norm(point - before.points(mast)))
+        assert abs(away_m - range_m) <= 0.15 * range_m
+        (stone,) = np.nonzero(
+            np.linalg.norm(stones.spheres_m[:, :3] - point, axis=1) <= stones.spheres_m[:, 3]
+        )
+        chosen.update(stone.tolist())
+        there = world.site_from_rover
+        assert there.translation_m == pytest.approx([0.0, 0.0, 0.0])
+        ahead = there.inverse.points(point)
+        assert abs(math.atan2(ahead[1], ahead[0])) < 0.45, "ahead, but not always straight ahead"
+    assert len(chosen) > 1, "not always the same stone"
+
+
+def test_without_a_rock_at_the_range_nothing_turns_and_the_run_says_so(
+    standing: Callable[..., World], rig: Rig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A brick 8.2 m away, which some rays meet that would reach the ground 8.5 m away."""
+    brick = bricks.make_brick(rig.mast.translation_m[0] + 8.1, 0.0, math.pi / 2, lambda x, y: 0.0)
+    world = standing(rocks=bricks.meshes([brick]))
+    before = world.site_from_rover
+    assert world.turn_to_rock(START_M, ROCK_M) is None
+    assert world.turn_to_rock(8.0, 0.18) is None, "it stands 17 cm out of the ground"
+    assert world.site_from_rover == before
+    assert world.turn_to_rock(8.0, ROCK_M) is not None
+    asked: list[SceneSettings] = []
+
+    def build(settings: SceneSettings) -> Scene:
+        asked.append(settings)
+        return Scene(settings, tiny_scene().world._replace(rocks=bricks.meshes([brick])))
+
+    monkeypatch.setattr(approach, "build_scene", build)
+    assert approach.run_approach(rig, rig, 3).error == "no rock stands at the start range"
+    assert asked == [SceneSettings(seed=3, rocks=ROCKS)]
+
+
+def test_on_ground_the_rover_looks_at_level_ground_ahead(standing: Callable[..., World]) -> None:
+    world = standing()
+    before = world.site_from_rover
+    for _ in range(5):
+        aim = approach._aim(world, np.random.default_rng(2), "ground")
+        assert aim is not None
+        assert float(np.hypot(aim[0], aim[1])) == pytest.approx(START_M)
+        assert aim[2] == 0.0 and aim[0] > 0.8 * START_M
+    assert world.site_from_rover == before
+
+
+def test_height_is_above_the_ground_under_a_point(standing: Callable[..., World]) -> None:
+    raised = make_grid(np.full((9, 9), 0.25, dtype=np.float32), 8.0)
+    assert standing().height_m(np.array([3.0, 1.0, -0.1])) == pytest.approx(0.1)
+    assert standing(inner=raised).height_m(np.array([3.0, 1.0, -0.1])) == pytest.approx(-0.15)
+
+
+def test_a_target_is_on_a_rock_and_not_at_its_boundary(standing: Callable[..., World]) -> None:
+    """The front of a brick 10 m ahead, 39 cm across and 17 cm out of the ground."""
+    brick = bricks.make_brick(START_M, 0.0, math.pi / 2, lambda x, y: 0.0)
+    world = standing(rocks=bricks.meshes([brick]))
+    front = START_M - bricks.SIZE_M[1] / 2
+    camera = "pancam_left"
+    angles = solve(
+        world.true.mast,
+        world.true.cameras[camera].model,
+        world.site_from_rover.inverse.points([front, 0.0, -0.08]),
+    )[0]
+
+    def on_rock(y_m: float, z_m: float, x_m: float = front) -> bool:
+        target = np.array([x_m, y_m, z_m])
+        pixel = world.true_pixel(camera, angles.pan_rad, angles.tilt_rad, target)
+        return approach._on_rock(world, camera, angles.pan_rad, angles.tilt_rad, pixel, target)
+
+    assert on_rock(0.0, -0.08) and on_rock(0.13, -0.10)
+    assert not on_rock(0.18, -0.08), "2 cm from the side"
+    assert not on_rock(0.0, -0.17, START_M + 0.08), "at the far edge of the top"
+    assert not on_rock(0.0, -0.04), "so low that it may be the ground"
+    assert not on_rock(0.0, 0.0, START_M - 1.0), "on the ground before it"
+
+
+@pytest.mark.parametrize(("words", "on"), [([], "rocks"), (["--on", "ground"], "ground")])
+def test_the_command_says_what_targets_lie_on(
+    words: list[str], on: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def run(true: Rig, believed: Rig, seed: int, **more: Any) -> ApproachRun:
+        assert more == {"on": on}
+        return ApproachRun(seed, (stop(1.05, (0.001, 0.0, 0.0)),))
+
+    monkeypatch.setattr(approach, "run_approach", run)
+    assert main(["experiment", "approach", "--runs", "1", *words]) == 0
+    assert f"targets on {on}" in capsys.readouterr().out
+    assert main(["experiment", "approach", "--on", "sand"]) == 2
