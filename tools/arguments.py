@@ -9,26 +9,7 @@ from pathlib import Path
 
 from calib.errors import CalibError
 from drivers.errors import DriverError
-from mastctl.cli.output import as_command_error, finite_number, one_line
-
-
-def at_least(least: int) -> Callable[[str], int]:
-    """Return what reads a whole number of at least ``least`` (argparse ``type``)."""
-
-    def read(text: str) -> int:
-        if not text.isascii() or not text.isdigit() or int(text) < least:
-            raise argparse.ArgumentTypeError(f"'{text}' where a whole number of at least {least} is expected")
-        return int(text)
-
-    return read
-
-
-def not_negative(text: str) -> float:
-    """Read a finite number of zero or more (argparse ``type``)."""
-    value = finite_number(text)
-    if value < 0:
-        raise argparse.ArgumentTypeError(f"'{text}' where zero or more is expected")
-    return value
+from mastctl.cli.output import as_command_error, one_line
 
 
 def new_file(text: str) -> Path:

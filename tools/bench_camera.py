@@ -39,8 +39,8 @@ from drivers.v4l2.controls import set_by_name
 from drivers.v4l2.find import open_node
 from drivers.v4l2.options import CameraOptions, parse_options
 from drivers.v4l2.stream import set_format
-from mastctl.cli.output import positive_number
-from tools.arguments import at_least, end
+from mastctl.cli.output import at_least, positive_number
+from tools.arguments import end
 
 PARTS = ("gaps", "age", "cpu", "memory", "unplugged", "opens")
 CONSUMERS = ("sleeps", "computes", "is stopped for 2 s")

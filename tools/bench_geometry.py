@@ -39,7 +39,8 @@ from calib.cahvor import CameraModel
 from calib.mast import Mast
 from calib.pointing import solve
 from calib.rigid import Rigid, rot_x, rot_y, rot_z
-from tools.arguments import at_least, end
+from mastctl.cli.output import at_least
+from tools.arguments import end
 
 COUNTS = (1_000, 100_000, 1_000_000)
 SAME = {"forward": 1e-6, "gradient": 1e-3, "inverse": 1e-7}

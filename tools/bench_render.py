@@ -21,7 +21,8 @@ from calib.rigid import Rigid
 from drivers.sim.compiled import is_compiled
 from drivers.sim.render import Renderer, compile_renderer, ray_table
 from drivers.sim.scene import SceneSettings, build_scene
-from tools.arguments import at_least, end
+from mastctl.cli.output import at_least
+from tools.arguments import end
 
 MAST = Mast(np.array([0.3443, -0.0043, -1.4572]), np.array([-0.0088, -0.0181, 0.0027]))
 WANTED = {("navcam 640x480", 1): 17.0, ("navcam", 1): 8.0, ("navcam", 2): 3.0, ("pancam", 2): 3.0}

@@ -30,7 +30,8 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
-from tools.arguments import at_least, end, not_negative
+from mastctl.cli.output import at_least, not_negative
+from tools.arguments import end
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 

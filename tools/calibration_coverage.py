@@ -35,7 +35,8 @@ from calib.survey import Sigma, Survey
 from calib.uncertainty import pixel_covariance
 from drivers.sim.survey import SurveyPlan, SurveyTruth, simulate_survey
 from mastctl.calibration.run import FITS
-from tools.arguments import at_least, end, not_negative
+from mastctl.cli.output import at_least, not_negative
+from tools.arguments import end
 
 DIRECTIONS_RAD = ((-0.8, -0.2), (0.0, -0.4), (0.7, -0.7))
 RANGES_M = (2.0, 6.0, 10.0)

@@ -50,7 +50,8 @@ from calib.fit_camera import FixedPoints, fit_camera, pinhole
 from calib.least_squares import minimise
 from calib.rigid import Rigid
 from calib.terms import ImageTerm
-from tools.arguments import at_least, end
+from mastctl.cli.output import at_least
+from tools.arguments import end
 from tools.compare_points import (
     COLUMNS,
     NOISE_PX,

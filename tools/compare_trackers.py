@@ -39,7 +39,8 @@ import cv2
 import numpy as np
 
 from calib.cahvor import CameraModel
-from tools.arguments import at_least, end
+from mastctl.cli.output import at_least
+from tools.arguments import end
 from tools.tracker_methods import HALF_PX, METHODS, Tracked
 from tools.tracker_sequences import SETTINGS, STEPS, WORLDS, Sequence, loaded, rigs, sequences
 

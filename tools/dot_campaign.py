@@ -26,7 +26,8 @@ from calib.survey import Board
 from drivers.sim.board import BoardLook, draw_board, half_size_m, photograph
 from drivers.sim.render import Renderer
 from drivers.sim.scene import SceneSettings, build_scene
-from tools.arguments import at_least, end
+from mastctl.cli.output import at_least
+from tools.arguments import end
 
 BOARD = Board(10, 10, 0.08, 0.04, {})
 SIZE_PX = (1024, 768)

@@ -32,7 +32,8 @@ from calib.formats.pds3 import load_pds3_camera, read_product
 from calib.store import StoredRig, parse_camera, parse_rig
 from calib.tables import parse_table
 from mastctl.cli.main import main as mastctl
-from tools.arguments import at_least, end
+from mastctl.cli.output import at_least
+from tools.arguments import end
 
 HANG_S = 20
 

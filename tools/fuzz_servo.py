@@ -34,7 +34,8 @@ from drivers.sim.wire.dynamixel_bus import DynamixelBus
 from drivers.sim.wire.dynamixel_packets import InstructionParser
 from drivers.sim.wire.dynamixel_servo import SimulatedServo
 from drivers.sim.wire.ptu import SimulatedPtu
-from tools.arguments import at_least, end
+from mastctl.cli.output import at_least
+from tools.arguments import end
 
 SDK = PacketHandler(2.0)
 MARK = b"\xff\xff\xfd"

@@ -31,8 +31,9 @@ from calib.rig_covariance import RigCovariance, stored_covariance
 from calib.store import load_rig
 from calib.warp import Plane, warp_patch
 from drivers.sim.render import compile_renderer
+from mastctl.cli.output import at_least
 from mastctl.packaged import config_folder
-from tools.arguments import at_least, end, new_file
+from tools.arguments import end, new_file
 from tools.handoff_provocations import KINDS, Case, Stage
 
 WRONG_PX = 4.0

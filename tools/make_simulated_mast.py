@@ -35,7 +35,8 @@ from calib.survey import Sigma, read_survey, write_survey
 from drivers.sim.pan_tilt import PRESETS
 from drivers.sim.survey import Ring, SurveyPlan, simulate_survey
 from mastctl.calibration.run import Calibrated, calibrate, checked
-from tools.arguments import at_least, end
+from mastctl.cli.output import at_least
+from tools.arguments import end
 
 SIGMA = Sigma(station_m=0.001, dot_px=0.1, joint_rad=3e-5)
 """The joints' is half a step of the packaged rover's head."""

@@ -20,7 +20,8 @@ from calib.cahvor import CameraModel
 from calib.errors import Unreachable
 from calib.mast import Mast
 from calib.pointing import Solution, solve
-from tools.arguments import at_least, end
+from mastctl.cli.output import at_least
+from tools.arguments import end
 
 WORST_PX = 1e-7
 SAME_RAD = 1e-5

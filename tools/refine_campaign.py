@@ -27,8 +27,8 @@ from calib.matched_handoff import MatchedHandoff, matched_handoff
 from calib.rigid import FloatArray, Rigid, moved_rigid
 from calib.store import load_rig
 from mastctl.calibration.landing import handoff_errors_px
-from mastctl.cli.output import positive_number
-from tools.arguments import at_least, end, not_negative
+from mastctl.cli.output import at_least, not_negative, positive_number
+from tools.arguments import end
 
 HEAD_HEIGHT_M, ASIDE_RAD = 1.45, 0.35
 HELD_OUT, HELD_OUT_M = 60, (1.5, 4.0)

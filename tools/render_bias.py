@@ -23,8 +23,8 @@ from calib.mast import Mast
 from calib.rigid import FloatArray, Rigid, rot_y, rot_z
 from drivers.sim.render import Renderer
 from drivers.sim.scene import Scene, SceneSettings, build_scene
-from mastctl.cli.output import positive_number
-from tools.arguments import at_least, end
+from mastctl.cli.output import at_least, positive_number
+from tools.arguments import end
 
 MAST = Mast(np.array([0.3443, -0.0043, -1.4572]), np.array([-0.0088, -0.0181, 0.0027]))
 Poses = Callable[[CameraModel, float, np.random.Generator], tuple[Rigid, Rigid]]

@@ -34,8 +34,8 @@ import numpy as np
 from drivers.errors import DriverError, HardwareFault
 from drivers.faults import HEAD_WORDS
 from drivers.interfaces import Reading
-from mastctl.cli.output import positive_number
-from tools.arguments import at_least, end, new_file
+from mastctl.cli.output import at_least, positive_number
+from tools.arguments import end, new_file
 from tools.servo_rigs import LIMITS_RAD, Rig, dynamixel_pty, ptu_pty
 
 DRIVERS: dict[str, Callable[[], AbstractContextManager[Rig]]] = {

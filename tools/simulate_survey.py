@@ -23,7 +23,8 @@ from drivers.sim.board import draw_board, photograph
 from drivers.sim.render import Renderer
 from drivers.sim.scene import build_scene
 from drivers.sim.survey import SurveyPlan, SurveyTruth, simulate_survey
-from tools.arguments import at_least, end, not_negative
+from mastctl.cli.output import at_least, not_negative
+from tools.arguments import end
 
 BLUR_PX, NOISE_DN = 0.7, 2.0
 

@@ -16,6 +16,9 @@ if TYPE_CHECKING:
 DEFAULT_TARGETS = 10
 DEFAULT_DISTANCES_M = (10.0, 6.0, 2.0)
 
+at_least_one = output.at_least(1)
+seed = output.at_least(0)
+
 
 def add_commands(subparsers: Any) -> None:
     """Add ``experiment`` and ``demo``."""
@@ -65,23 +68,6 @@ def _add_common(parser: argparse.ArgumentParser, out_help: str) -> None:
         "--seed", type=seed, default=1, metavar="S", help="chooses views and pixels (default 1)"
     )
     parser.add_argument("--out", type=Path, metavar="DIR", help=out_help)
-
-
-def at_least_one(text: str) -> int:
-    """Read a count above zero."""
-    return _whole(text, 1)
-
-
-def seed(text: str) -> int:
-    """Read a seed: zero or above."""
-    return _whole(text, 0)
-
-
-def _whole(text: str, least: int) -> int:
-    """Read a whole number of at least ``least``."""
-    if not text.isascii() or not text.isdigit() or int(text) < least:
-        raise argparse.ArgumentTypeError(f"'{text}' where a whole number of at least {least} is expected")
-    return int(text)
 
 
 def run_pointing(args: argparse.Namespace) -> int:

@@ -50,7 +50,7 @@ def add_parser(kinds: Any) -> None:
         "the middles of their faces are the targets",
     )  # fmt: skip
     parser.add_argument(
-        "--click-px", type=output.finite_number, default=0.2, metavar="PX",
+        "--click-px", type=output.not_negative, default=0.2, metavar="PX",
         help="sigma of the noise added to the clicks (default 0.2)",
     )  # fmt: skip
     parser.add_argument(
@@ -70,8 +70,6 @@ def run(args: argparse.Namespace) -> int:
     from mastctl.cli.experiment import check_writable
     from mastctl.cli.service import client_of
 
-    if args.click_px < 0:
-        raise output.WrongUse(f"--click-px {args.click_px:g} where 0 or more is expected")
     if args.mast_file is not None and not args.simulated:
         raise output.WrongUse("--mast-file belongs to --simulated; a running daemon has its own mast file")
     if args.bricks is not None and not (args.simulated and args.bricks <= MOST_BRICKS):

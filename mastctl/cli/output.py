@@ -7,7 +7,7 @@ import json
 import math
 import re
 import sys
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -164,3 +164,22 @@ def positive_number(text: str) -> float:
     if value <= 0:
         raise argparse.ArgumentTypeError(f"'{text}' where a number above zero is expected")
     return value
+
+
+def not_negative(text: str) -> float:
+    """Read an option's value as a finite number of zero or more (argparse ``type``)."""
+    value = finite_number(text)
+    if value < 0:
+        raise argparse.ArgumentTypeError(f"'{text}' where zero or more is expected")
+    return value
+
+
+def at_least(least: int) -> Callable[[str], int]:
+    """Return what reads an option's value as a whole number of at least ``least`` (argparse ``type``)."""
+
+    def read(text: str) -> int:
+        if not text.isascii() or not text.isdigit() or int(text) < least:
+            raise argparse.ArgumentTypeError(f"'{text}' where a whole number of at least {least} is expected")
+        return int(text)
+
+    return read

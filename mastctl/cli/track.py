@@ -7,7 +7,7 @@ import math
 import sys
 from typing import TYPE_CHECKING, Any
 
-from mastctl.cli.output import CommandError, finite_number, one_line, positive_number
+from mastctl.cli.output import CommandError, at_least, finite_number, one_line, positive_number
 from mastctl.cli.service import add_daemon_options, client_of, followed, tell_result
 from mastctl.cli.target import add_target_options, check_done, check_target, target_of
 
@@ -30,7 +30,7 @@ def add_commands(subparsers: argparse._SubParsersAction[Any]) -> None:
     watch = commands.add_parser(
         "watch", help="show the track now and at each change, a line each; --json: a document a line"
     )
-    watch.add_argument("--count", type=_count, metavar="N", help="end after so many (default: never)")
+    watch.add_argument("--count", type=at_least(1), metavar="N", help="end after so many (default: never)")
     watch.set_defaults(run=_watch)
 
     pose = commands.add_parser("pose", help="say where the rover stands; the target is looked for from there")
@@ -149,10 +149,3 @@ def track_line(track: dict[str, Any]) -> str:
     if track["reason"]:
         words.append(track["reason"])
     return ", ".join(words)
-
-
-def _count(text: str) -> int:
-    """Read how many (argparse ``type``)."""
-    if not text.isascii() or not text.isdigit() or int(text) < 1:
-        raise argparse.ArgumentTypeError(f"'{text}' where a whole number above zero is expected")
-    return int(text)

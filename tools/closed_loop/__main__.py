@@ -20,8 +20,8 @@ from typing import Any
 
 import numpy as np
 
-from mastctl.cli.output import positive_number
-from tools.arguments import at_least, end
+from mastctl.cli.output import at_least, positive_number
+from tools.arguments import end
 from tools.closed_loop.run import RECORD
 from tools.virtual_machine import boot, kernel
 

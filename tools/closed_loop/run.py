@@ -18,13 +18,13 @@ from pathlib import Path
 from typing import Any
 
 import drivers.sim
-from mastctl.cli.output import positive_number
+from mastctl.cli.output import at_least, positive_number
 from mastctl.client import Client
 from mastctl.config import load_config
 from mastctl.daemon import RunningDaemon
 from mastctl.experiment.demo import SimulationTruth
 from mastctl.experiment.pointing import PointingExperiment, TargetRecord, run_pointing_experiment
-from tools.arguments import at_least, end
+from tools.arguments import end
 from tools.closed_loop import files
 
 RECORD = "record.json"
