@@ -10,7 +10,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
-import flight_mer as mer
 import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
@@ -18,6 +17,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
 from calib.rigid import FloatArray
+from tools import flight_mer as mer
 
 matplotlib.use("Agg")
 

@@ -15,8 +15,6 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-import flight_mer as mer
-import flight_msl as msl
 import numpy as np
 
 from calib.fit_poses import PoseFit
@@ -25,6 +23,8 @@ from calib.model_difference import ModelDifference, model_difference
 from calib.store import save_rig
 from drivers.clock import ManualClock
 from drivers.errors import DriverError
+from tools import flight_mer as mer
+from tools import flight_msl as msl
 from tools.arguments import end
 
 REPOSITORY = Path(__file__).resolve().parent.parent
@@ -189,7 +189,7 @@ def mer_blocks(folder: Path, pictures: bool, mast_file: Path | None) -> dict[str
         for name, pair in found.items()
     }
     if pictures:
-        import flight_pictures
+        from tools import flight_pictures
 
         flight_pictures.pointing(first, second, done, PICTURES / "opportunity_pointing.jpg")
         pairs = [
