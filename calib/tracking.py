@@ -22,10 +22,11 @@ from typing import Literal
 import numpy as np
 
 from calib.cahvor import CameraModel
+from calib.distinct import indistinct
 from calib.epipolar import find_partner, local_plane
 from calib.errors import CalibError, NoStereoPoint
 from calib.handoff_refined import Eye
-from calib.match import Match, MatchSettings, match, no_match
+from calib.match import Match, MatchSettings, match
 from calib.one_point import Sighting, one_point
 from calib.rigid import FloatArray, Rigid, carried_covariance, moved_rigid
 from calib.stereo import triangulate
@@ -38,10 +39,8 @@ SIZES = MatchSettings(half_px=12, near_px=6.0, roughness=0.04, relief=0.1, worst
 plane, and what lies off the plane pulls the place along as the view steepens. Roughness and relief make nine
 in ten and more of the range errors lie within two of the told sigmas. A second place may fit a little better
 than elsewhere: the other eye and the prediction must confirm the best."""
-
-WIDE_HALF_PX = 20
-"""Of the patch that is tried where the small one does not tell one place from another: seen near, a rock's
-texture is coarse."""
+MIDDLE_SEARCH_PX = 4.0
+"""How far the range of a patch's middle may put it from where the whole patch puts it, at the start."""
 
 
 @dataclass(frozen=True)
@@ -188,8 +187,15 @@ def start_track(
     found = find_partner(left.image, left.camera, pixel, right.image, right.camera, settings=settings)
     if found.match.verdict != "good" or found.plane is None:
         raise CalibError(f"the target cannot be followed: {found.match.reason}")
-    noise = max(sigma_px, float(found.match.sigma_px.max()))
-    seen = triangulate(left.camera, right.camera, pixel, found.match.pixel_px, noise)
+    # The patch that tells the surface reaches beyond it on a rock: the range is that of its middle.
+    middle = match(
+        left.image, left.camera, pixel, found.plane, right.image, right.camera, MIDDLE_SEARCH_PX, SIZES
+    )
+    reason = middle.reason or indistinct(left.image, left.camera, pixel, found.plane, SIZES)
+    if reason:
+        raise CalibError(f"the target cannot be followed: {reason}")
+    noise = max(sigma_px, float(middle.sigma_px.max()))
+    seen = triangulate(left.camera, right.camera, pixel, middle.pixel_px, noise)
     key = Key(left, pixel, found.plane.normal)
     return Track("tracked", seen.position_m, seen.covariance_m2, key)
 
@@ -346,12 +352,7 @@ def _found(
     spread = rate @ track.covariance_m2 @ rate.T if bool(valid) else np.eye(2)
     reach = settings.sigmas * math.sqrt(max(float(np.linalg.eigvalsh(spread)[-1]), 0.0))
     search = min(max(reach + 2 * settings.model_px, settings.least_px), settings.most_px)
-    found = no_match("weak", "not looked for")
-    for size in (sizes, replace(sizes, half_px=WIDE_HALF_PX)):
-        found = match(key.eye.image, key.eye.camera, key.pixel_px, plane, eye.image, eye.camera, search, size)
-        if found.verdict not in ("ambiguous", "weak"):
-            break
-    return found
+    return match(key.eye.image, key.eye.camera, key.pixel_px, plane, eye.image, eye.camera, search, sizes)
 
 
 def _asked_the_other(
