@@ -7,6 +7,7 @@ shows is shading, and the edges of shadows, which move with the sun.
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import cv2
@@ -59,17 +60,11 @@ def indistinct(
     x, y = low - first
     beside = settings.apart_px
     scores[max(0, y - beside) : y + beside + 1, max(0, x - beside) : x + beside + 1] = -1.0
-    alike, where = _highest(scores)
+    _, alike, _, where = cv2.minMaxLoc(np.nan_to_num(scores, nan=-1.0, posinf=-1.0, neginf=-1.0))
     if alike > MOST_ALIKE:
-        away = float(np.hypot(*(where - [x, y])))
+        away = math.dist(where, (x, y))
         return (
             f"an edge or a repeated pattern: what is {away:.0f} px beside it correlates by {alike:.2f}, "
             f"at most {MOST_ALIKE:g} is allowed"
         )
     return ""
-
-
-def _highest(scores: Grey) -> tuple[float, FloatArray]:
-    """Return the largest finite score and its place (x, y)."""
-    _, best, _, place = cv2.minMaxLoc(np.nan_to_num(scores, nan=-1.0, posinf=-1.0, neginf=-1.0))
-    return float(best), np.array(place, dtype=np.float64)

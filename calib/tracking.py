@@ -73,10 +73,10 @@ class TrackSettings:
     most_px: float = 120.0
     model_px: float = 0.12
     worst_chi2: float = 18.5
-    renew_grown: float = 1.4
+    renew_grown: float = 1.8
     renew_shrunk: float = 0.3
-    renew_shape: float = 1.25
-    renew_below: float = 0.92
+    renew_shape: float = 1.5
+    renew_below: float = 0.8
     worst_drift_m: float = 0.03
 
 
@@ -109,6 +109,9 @@ class Track:
         (3,) and (3, 3) of the place that is followed, in the rover frame of the last motion.
     key
         The key picture.
+    standby
+        The key that the last look with both eyes would have given: what is looked for where the key is not
+        found any more, since the light has changed or another side shows.
     misses
         Looks since it was last found.
     motion_covariance
@@ -119,6 +122,7 @@ class Track:
     position_m: FloatArray
     covariance_m2: FloatArray
     key: Key
+    standby: Key | None = None
     misses: int = 0
     motion_covariance: FloatArray = field(default_factory=lambda: np.zeros((6, 6)))
 
@@ -228,6 +232,7 @@ def moved(track: Track, now_from_then: Rigid, covariance: FloatArray) -> Track:
         position_m=position,
         covariance_m2=turned @ track.covariance_m2 @ turned.T + rate @ spread @ rate.T,
         key=_carried(track.key, now_from_then),
+        standby=track.standby and _carried(track.standby, now_from_then),
         motion_covariance=carried_covariance(track.motion_covariance, now_from_then) + spread,
     )
 
@@ -264,6 +269,15 @@ def seen_by(
     """
     settings = settings or TrackSettings()
     sizes = match_settings or SIZES
+    look = _seen(track, eyes, settings, sizes)
+    if look.track.state == "tracked" or track.standby is None:
+        return look
+    again = _seen(replace(track, key=track.standby), eyes, settings, sizes)
+    return replace(again, renewed=True) if again.track.state == "tracked" else look
+
+
+def _seen(track: Track, eyes: Mapping[str, Eye], settings: TrackSettings, sizes: MatchSettings) -> Look:
+    """Look with the track's key."""
     key = _anchored(track)
     if key is None:
         return _lost(
@@ -299,16 +313,21 @@ def seen_by(
             f"{allowed:g} is expected"
         )
         return replace(_lost(track, found, words), chi2=chi2)
-    after = Track("tracked", point.position_m, point.covariance_m2, _corrected(track, point.position_m))
-    renewed = _renewed(after, eyes, good, plane, settings)
-    drift_m = _drifted(renewed or after.key)
+    turned = _turned(track, point.position_m)
+    corrected = _carried(track.key, turned)
+    fresh = _fresh_key(track.key, eyes, good, plane)
+    renewed = fresh is not None and _outgrown(track.key, eyes, good, plane, settings)
+    chosen = fresh if fresh is not None and renewed else corrected
+    drift_m = _drifted(chosen)
     if drift_m > settings.worst_drift_m:
         words = (
             f"the place that is followed may have drifted by {100 * drift_m:.0f} cm from the one picked, at "
             f"most {100 * settings.worst_drift_m:g} cm are allowed: the surface around it is no plane"
         )
         return replace(_lost(track, found, words), chi2=chi2)
-    return Look(replace(after, key=renewed or after.key), found, "", chi2, renewed is not None)
+    standby = fresh or (track.standby and _carried(track.standby, turned))
+    after = Track("tracked", point.position_m, point.covariance_m2, chosen, standby)
+    return Look(after, found, "", chi2, renewed)
 
 
 def _drifted(key: Key) -> float:
@@ -316,8 +335,8 @@ def _drifted(key: Key) -> float:
     return math.sqrt(max(float(np.linalg.eigvalsh(key.drift_m2)[-1]), 0.0))
 
 
-def _corrected(track: Track, position_m: FloatArray) -> Key:
-    """The key after the motion's error that a found position tells of, as far as it is the motion's.
+def _turned(track: Track, position_m: FloatArray) -> Rigid:
+    """The motion's error that a found position tells of, as far as it is the motion's.
 
     A heading off by half a degree puts a target 10 m away 9 cm off. Were the key camera shifted by as much
     instead of turned, it would look at flat ground under another angle, and steps would add up.
@@ -325,7 +344,7 @@ def _corrected(track: Track, position_m: FloatArray) -> Key:
     weight = track.motion_covariance @ _motion_rate(track.position_m).T
     spread = track.covariance_m2 + 1e-12 * np.eye(3)
     error = weight @ np.linalg.solve(spread, position_m - track.position_m)
-    return _carried(track.key, moved_rigid(Rigid.identity(), np.concatenate([error[3:], error[:3]])))
+    return moved_rigid(Rigid.identity(), np.concatenate([error[3:], error[:3]]))
 
 
 def _anchored(track: Track) -> Key | None:
@@ -369,22 +388,12 @@ def _asked_the_other(
     return dict(found) | ({other: partner.match} if partner.match.verdict == "good" else {})
 
 
-def _renewed(
-    track: Track,
-    eyes: Mapping[str, Eye],
-    good: Mapping[str, Match],
-    plane: Plane,
-    settings: TrackSettings,
-) -> Key | None:
-    """A new key from this look, where scale or view have changed enough and both eyes saw it."""
+def _fresh_key(key: Key, eyes: Mapping[str, Eye], good: Mapping[str, Match], plane: Plane) -> Key | None:
+    """A key from the pictures of this look; None if one eye alone saw the target."""
     if len(good) < 2:
         return None
     first, second = list(eyes)[:2]
     camera = eyes[first].camera
-    scale, shape = _seen_larger(camera, track.key.eye.camera, plane)
-    alike = min(one.correlation for one in good.values()) >= settings.renew_below
-    if settings.renew_shrunk < scale < settings.renew_grown and shape < settings.renew_shape and alike:
-        return None
     left, right = good[first], good[second]
     try:
         slope = local_plane(camera, left.pixel_px, eyes[second].camera, plane, right, left)
@@ -392,8 +401,19 @@ def _renewed(
         return None
     _, rate, _ = camera.project_jacobian(plane.point_m)
     to_surface = plane.axes @ np.linalg.inv(rate @ plane.axes)
-    drift = track.key.drift_m2 + to_surface @ left.covariance_px2 @ to_surface.T
+    drift = key.drift_m2 + to_surface @ left.covariance_px2 @ to_surface.T
     return Key(eyes[first], left.pixel_px, slope.normal, drift)
+
+
+def _outgrown(
+    key: Key, eyes: Mapping[str, Eye], good: Mapping[str, Match], plane: Plane, settings: TrackSettings
+) -> bool:
+    """Whether scale, view or light have changed so much that the key should be exchanged."""
+    scale, shape = _seen_larger(next(iter(eyes.values())).camera, key.eye.camera, plane)
+    alike = min(one.correlation for one in good.values()) >= settings.renew_below
+    return not (
+        settings.renew_shrunk < scale < settings.renew_grown and shape < settings.renew_shape and alike
+    )
 
 
 def _seen_larger(camera: CameraModel, key: CameraModel, plane: Plane) -> tuple[float, float]:
