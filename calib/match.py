@@ -209,19 +209,21 @@ def _worst(covariance_px2: FloatArray) -> float:
     return float(np.linalg.eigvalsh(covariance_px2)[-1])
 
 
-def texture_lacks(values: Grey, settings: MatchSettings) -> str:
-    """Return why a patch (n, n) cannot hold a position, empty if it can.
+def texture_lacks(values: Grey, settings: MatchSettings, counts: FloatArray | None = None) -> str:
+    """Return why a patch (h, w) cannot hold a position, empty if it can.
 
     The worst sigma that noise allows is √2 noise / √λ with λ the smaller eigenvalue of Σ ∇T ∇Tᵀ, less what
-    noise itself adds to it.
+    noise itself adds to it; pixels count by ``counts`` (h, w), all alike if not given.
     """
     smooth = cv2.GaussianBlur(values, (0, 0), 1.0)
     inner = smooth.astype(np.float64)
     gx = (inner[1:-1, 2:] - inner[1:-1, :-2]) / 2
     gy = (inner[2:, 1:-1] - inner[:-2, 1:-1]) / 2
-    structure = np.array([[(gx * gx).sum(), (gx * gy).sum()], [(gx * gy).sum(), (gy * gy).sum()]])
+    weight = np.ones(gx.shape) if counts is None else counts[1:-1, 1:-1]
+    mixed = (weight * gx * gy).sum()
+    structure = np.array([[(weight * gx * gx).sum(), mixed], [mixed, (weight * gy * gy).sum()]])
     # White noise after a Gaussian of 1 px and a two-sided difference keeps 0.0313 of its variance.
-    smaller, larger = np.linalg.eigvalsh(structure) - 0.0313 * settings.noise_dn**2 * gx.size
+    smaller, larger = np.linalg.eigvalsh(structure) - 0.0313 * settings.noise_dn**2 * weight.sum()
     worst_px = float(np.sqrt(2.0) * settings.noise_dn / np.sqrt(max(smaller, 1e-9)))
     if worst_px <= settings.flat_sigma_px:
         return ""
@@ -347,9 +349,8 @@ def _template(
     grown = max(1.0, 1.0 / np.sqrt(max(shrunk, 1e-6)))
     near_px2, half = None, np.full(2, min(round(settings.half_px * grown), settings.most_half_px))
     if settings.near_px > 0:
-        near_px2 = _near(plane, destination, seen, settings.near_px * grown)
-        reach = np.ceil(COUNTS_TO * np.sqrt(np.diag(near_px2))).astype(int) + 2
-        half = np.minimum(reach, settings.most_half_px)
+        near_px2 = near_covariance(plane, destination, seen, settings.near_px * grown)
+        half = np.minimum(near_half_px(near_px2), settings.most_half_px)
     least = np.minimum(
         half, round(settings.smallest_half_px * min(grown, settings.most_half_px / settings.half_px))
     )
@@ -364,7 +365,7 @@ def _template(
         half = np.maximum(half - 3, least)
 
 
-def _near(plane: Plane, camera: CameraModel, pixel: FloatArray, near_px: float) -> FloatArray:
+def near_covariance(plane: Plane, camera: CameraModel, pixel: FloatArray, near_px: float) -> FloatArray:
     """Return the covariance (2, 2) px² of a Gaussian that is round on the plane, of the area of a circle."""
     ray = camera.ray(pixel)
     range_m = float((plane.point_m - ray.origins_m) @ plane.normal) / float(ray.directions @ plane.normal)
@@ -373,6 +374,11 @@ def _near(plane: Plane, camera: CameraModel, pixel: FloatArray, near_px: float) 
     values, vectors = np.linalg.eigh(seen @ seen.T)
     aspect = min(float(np.sqrt(values[1] / max(values[0], 1e-12 * values[1]))), MOST_ASPECT)
     return np.asarray((vectors * np.array([near_px**2 / aspect, near_px**2 * aspect])) @ vectors.T)
+
+
+def near_half_px(near_px2: FloatArray) -> NDArray[np.intp]:
+    """Return the half sides (x, y) of the patch that such a Gaussian weighs."""
+    return np.asarray(np.ceil(COUNTS_TO * np.sqrt(np.diag(near_px2))).astype(np.intp) + 2)
 
 
 def _search(

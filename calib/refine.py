@@ -118,13 +118,13 @@ def refine(
     if near_px2 is None:
         whole = settled(first, np.ones(t.shape), deforming, STEP_ENOUGH_PX)
         return _refined(whole, correlated_px) if whole else None
-    wide = _gaussian(q, near_px2)
+    wide = gaussian(q, near_px2)
     begun = settled(first, wide, False, 0.05)
     # What bends and hides more than the deformation can follow still has a place.
     whole = (settled(begun, wide, deforming, 10 * STEP_ENOUGH_PX) or begun) if begun else None
     if whole is None or (refined := _refined(whole, correlated_px)) is None:
         return None
-    middle = settled(whole, _gaussian(q, NARROW**2 * near_px2), False, 10 * STEP_ENOUGH_PX)
+    middle = settled(whole, gaussian(q, NARROW**2 * near_px2), False, 10 * STEP_ENOUGH_PX)
     return replace(refined, middle=_refined(middle, correlated_px) if middle else None)
 
 
@@ -135,8 +135,8 @@ def _counting(counts: FloatArray) -> tuple[slice, slice]:
     return slice(int(rows[0]), int(rows[-1]) + 1), slice(int(columns[0]), int(columns[-1]) + 1)
 
 
-def _gaussian(q: FloatArray, covariance_px2: FloatArray) -> FloatArray:
-    """Weights of offsets (h, w, 2): 1 at the target."""
+def gaussian(q: FloatArray, covariance_px2: FloatArray) -> FloatArray:
+    """Return the weights (h, w) of offsets (h, w, 2), px, by a Gaussian of this (2, 2) covariance: 1 at 0."""
     squares = np.einsum("...i,ij,...j", q, np.linalg.inv(covariance_px2), q)
     return np.asarray(np.exp(-0.5 * squares), dtype=np.float64)
 

@@ -22,10 +22,11 @@ from typing import Literal
 import numpy as np
 
 from calib.cahvor import CameraModel
+from calib.distinct import indistinct
 from calib.epipolar import find_partner, local_plane
 from calib.errors import CalibError, NoStereoPoint
 from calib.handoff_refined import Eye
-from calib.match import Match, MatchSettings, match, no_match
+from calib.match import Match, MatchSettings, match
 from calib.one_point import Sighting, one_point
 from calib.rigid import FloatArray, Rigid, carried_covariance, moved_rigid
 from calib.stereo import triangulate
@@ -38,10 +39,8 @@ SIZES = MatchSettings(half_px=12, near_px=6.0, roughness=0.04, relief=0.1, worst
 plane, and what lies off the plane pulls the place along as the view steepens. Roughness and relief make nine
 in ten and more of the range errors lie within two of the told sigmas. A second place may fit a little better
 than elsewhere: the other eye and the prediction must confirm the best."""
-
-WIDE_HALF_PX = 20
-"""Of the patch that is tried where the small one does not tell one place from another: seen near, a rock's
-texture is coarse."""
+MIDDLE_SEARCH_PX = 4.0
+"""How far the range of a patch's middle may put it from where the whole patch puts it, at the start."""
 
 
 @dataclass(frozen=True)
@@ -74,10 +73,10 @@ class TrackSettings:
     most_px: float = 120.0
     model_px: float = 0.12
     worst_chi2: float = 18.5
-    renew_grown: float = 1.4
+    renew_grown: float = 1.8
     renew_shrunk: float = 0.3
-    renew_shape: float = 1.25
-    renew_below: float = 0.92
+    renew_shape: float = 1.5
+    renew_below: float = 0.8
     worst_drift_m: float = 0.03
 
 
@@ -110,6 +109,9 @@ class Track:
         (3,) and (3, 3) of the place that is followed, in the rover frame of the last motion.
     key
         The key picture.
+    standby
+        The key that the last look with both eyes would have given: what is looked for where the key is not
+        found any more, since the light has changed or another side shows.
     misses
         Looks since it was last found.
     motion_covariance
@@ -120,6 +122,7 @@ class Track:
     position_m: FloatArray
     covariance_m2: FloatArray
     key: Key
+    standby: Key | None = None
     misses: int = 0
     motion_covariance: FloatArray = field(default_factory=lambda: np.zeros((6, 6)))
 
@@ -188,8 +191,15 @@ def start_track(
     found = find_partner(left.image, left.camera, pixel, right.image, right.camera, settings=settings)
     if found.match.verdict != "good" or found.plane is None:
         raise CalibError(f"the target cannot be followed: {found.match.reason}")
-    noise = max(sigma_px, float(found.match.sigma_px.max()))
-    seen = triangulate(left.camera, right.camera, pixel, found.match.pixel_px, noise)
+    # The patch that tells the surface reaches beyond it on a rock: the range is that of its middle.
+    middle = match(
+        left.image, left.camera, pixel, found.plane, right.image, right.camera, MIDDLE_SEARCH_PX, SIZES
+    )
+    reason = middle.reason or indistinct(left.image, left.camera, pixel, found.plane, SIZES)
+    if reason:
+        raise CalibError(f"the target cannot be followed: {reason}")
+    noise = max(sigma_px, float(middle.sigma_px.max()))
+    seen = triangulate(left.camera, right.camera, pixel, middle.pixel_px, noise)
     key = Key(left, pixel, found.plane.normal)
     return Track("tracked", seen.position_m, seen.covariance_m2, key)
 
@@ -222,6 +232,7 @@ def moved(track: Track, now_from_then: Rigid, covariance: FloatArray) -> Track:
         position_m=position,
         covariance_m2=turned @ track.covariance_m2 @ turned.T + rate @ spread @ rate.T,
         key=_carried(track.key, now_from_then),
+        standby=track.standby and _carried(track.standby, now_from_then),
         motion_covariance=carried_covariance(track.motion_covariance, now_from_then) + spread,
     )
 
@@ -258,6 +269,15 @@ def seen_by(
     """
     settings = settings or TrackSettings()
     sizes = match_settings or SIZES
+    look = _seen(track, eyes, settings, sizes)
+    if look.track.state == "tracked" or track.standby is None:
+        return look
+    again = _seen(replace(track, key=track.standby), eyes, settings, sizes)
+    return replace(again, renewed=True) if again.track.state == "tracked" else look
+
+
+def _seen(track: Track, eyes: Mapping[str, Eye], settings: TrackSettings, sizes: MatchSettings) -> Look:
+    """Look with the track's key."""
     key = _anchored(track)
     if key is None:
         return _lost(
@@ -293,16 +313,21 @@ def seen_by(
             f"{allowed:g} is expected"
         )
         return replace(_lost(track, found, words), chi2=chi2)
-    after = Track("tracked", point.position_m, point.covariance_m2, _corrected(track, point.position_m))
-    renewed = _renewed(after, eyes, good, plane, settings)
-    drift_m = _drifted(renewed or after.key)
+    turned = _turned(track, point.position_m)
+    corrected = _carried(track.key, turned)
+    fresh = _fresh_key(track.key, eyes, good, plane)
+    renewed = fresh is not None and _outgrown(track.key, eyes, good, plane, settings)
+    chosen = fresh if fresh is not None and renewed else corrected
+    drift_m = _drifted(chosen)
     if drift_m > settings.worst_drift_m:
         words = (
             f"the place that is followed may have drifted by {100 * drift_m:.0f} cm from the one picked, at "
             f"most {100 * settings.worst_drift_m:g} cm are allowed: the surface around it is no plane"
         )
         return replace(_lost(track, found, words), chi2=chi2)
-    return Look(replace(after, key=renewed or after.key), found, "", chi2, renewed is not None)
+    standby = fresh or (track.standby and _carried(track.standby, turned))
+    after = Track("tracked", point.position_m, point.covariance_m2, chosen, standby)
+    return Look(after, found, "", chi2, renewed)
 
 
 def _drifted(key: Key) -> float:
@@ -310,8 +335,8 @@ def _drifted(key: Key) -> float:
     return math.sqrt(max(float(np.linalg.eigvalsh(key.drift_m2)[-1]), 0.0))
 
 
-def _corrected(track: Track, position_m: FloatArray) -> Key:
-    """The key after the motion's error that a found position tells of, as far as it is the motion's.
+def _turned(track: Track, position_m: FloatArray) -> Rigid:
+    """The motion's error that a found position tells of, as far as it is the motion's.
 
     A heading off by half a degree puts a target 10 m away 9 cm off. Were the key camera shifted by as much
     instead of turned, it would look at flat ground under another angle, and steps would add up.
@@ -319,7 +344,7 @@ def _corrected(track: Track, position_m: FloatArray) -> Key:
     weight = track.motion_covariance @ _motion_rate(track.position_m).T
     spread = track.covariance_m2 + 1e-12 * np.eye(3)
     error = weight @ np.linalg.solve(spread, position_m - track.position_m)
-    return _carried(track.key, moved_rigid(Rigid.identity(), np.concatenate([error[3:], error[:3]])))
+    return moved_rigid(Rigid.identity(), np.concatenate([error[3:], error[:3]]))
 
 
 def _anchored(track: Track) -> Key | None:
@@ -346,12 +371,7 @@ def _found(
     spread = rate @ track.covariance_m2 @ rate.T if bool(valid) else np.eye(2)
     reach = settings.sigmas * math.sqrt(max(float(np.linalg.eigvalsh(spread)[-1]), 0.0))
     search = min(max(reach + 2 * settings.model_px, settings.least_px), settings.most_px)
-    found = no_match("weak", "not looked for")
-    for size in (sizes, replace(sizes, half_px=WIDE_HALF_PX)):
-        found = match(key.eye.image, key.eye.camera, key.pixel_px, plane, eye.image, eye.camera, search, size)
-        if found.verdict not in ("ambiguous", "weak"):
-            break
-    return found
+    return match(key.eye.image, key.eye.camera, key.pixel_px, plane, eye.image, eye.camera, search, sizes)
 
 
 def _asked_the_other(
@@ -368,22 +388,12 @@ def _asked_the_other(
     return dict(found) | ({other: partner.match} if partner.match.verdict == "good" else {})
 
 
-def _renewed(
-    track: Track,
-    eyes: Mapping[str, Eye],
-    good: Mapping[str, Match],
-    plane: Plane,
-    settings: TrackSettings,
-) -> Key | None:
-    """A new key from this look, where scale or view have changed enough and both eyes saw it."""
+def _fresh_key(key: Key, eyes: Mapping[str, Eye], good: Mapping[str, Match], plane: Plane) -> Key | None:
+    """A key from the pictures of this look; None if one eye alone saw the target."""
     if len(good) < 2:
         return None
     first, second = list(eyes)[:2]
     camera = eyes[first].camera
-    scale, shape = _seen_larger(camera, track.key.eye.camera, plane)
-    alike = min(one.correlation for one in good.values()) >= settings.renew_below
-    if settings.renew_shrunk < scale < settings.renew_grown and shape < settings.renew_shape and alike:
-        return None
     left, right = good[first], good[second]
     try:
         slope = local_plane(camera, left.pixel_px, eyes[second].camera, plane, right, left)
@@ -391,8 +401,19 @@ def _renewed(
         return None
     _, rate, _ = camera.project_jacobian(plane.point_m)
     to_surface = plane.axes @ np.linalg.inv(rate @ plane.axes)
-    drift = track.key.drift_m2 + to_surface @ left.covariance_px2 @ to_surface.T
+    drift = key.drift_m2 + to_surface @ left.covariance_px2 @ to_surface.T
     return Key(eyes[first], left.pixel_px, slope.normal, drift)
+
+
+def _outgrown(
+    key: Key, eyes: Mapping[str, Eye], good: Mapping[str, Match], plane: Plane, settings: TrackSettings
+) -> bool:
+    """Whether scale, view or light have changed so much that the key should be exchanged."""
+    scale, shape = _seen_larger(next(iter(eyes.values())).camera, key.eye.camera, plane)
+    alike = min(one.correlation for one in good.values()) >= settings.renew_below
+    return not (
+        settings.renew_shrunk < scale < settings.renew_grown and shape < settings.renew_shape and alike
+    )
 
 
 def _seen_larger(camera: CameraModel, key: CameraModel, plane: Plane) -> tuple[float, float]:

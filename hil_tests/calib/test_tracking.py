@@ -168,6 +168,33 @@ def test_an_edge_cannot_be_followed() -> None:
         start_track(edge["left"], edge["right"], pixel)
 
 
+def test_the_edge_of_a_shadow_cannot_be_followed() -> None:
+    """Faint texture would hold along it, but with other faint texture the same edge looks the same."""
+    shadow = np.tile(np.repeat([70.0, 150.0], 512), (1024, 1)) + 0.3 * (random_texture(5) - 120.0)
+    edge = eyes(0.0, plane=replace(GROUND, grey=shadow))
+    steps = np.abs(np.diff(edge["left"].image[120, 60:260]))
+    pixel = np.array([60.0 + int(np.argmax(steps)), 120.0])
+    with pytest.raises(CalibError, match=r"an edge or a repeated pattern: what is \d+ px beside it"):
+        start_track(edge["left"], edge["right"], pixel)
+
+
+def test_the_range_at_the_start_is_that_of_the_middle_of_the_patch() -> None:
+    """A disc of 4 cm, 3 cm above the ground: the patch that tells the slope is three times as wide."""
+    up_m, wide_m = 0.03, 0.04
+    top = replace(GROUND, point_m=TARGET - [0.0, 0.0, up_m], grey=random_texture(6))
+    both = {}
+    for name, camera in pinholes(0.0).items():
+        grid = np.stack(np.meshgrid(*map(np.arange, camera.size_px)), axis=-1).astype(float)
+        hit = top.hit(camera.position_m, camera.rays(grid))
+        on_disc = np.linalg.norm(hit - top.point_m, axis=-1) < wide_m
+        image = np.where(on_disc, picture(camera, top, noise_dn=1.5), picture(camera, GROUND, noise_dn=1.5))
+        both[name] = Eye(image.astype(np.float32), camera.model)
+    track = start_track(both["left"], both["right"], pinholes(0.0)["left"].pixel(top.point_m))
+    sight = top.point_m - both["left"].camera.C
+    off_m = (track.position_m - top.point_m) @ sight / np.linalg.norm(sight)
+    assert abs(off_m) < 0.02, "the ground would be 8 cm farther"
+
+
 def test_the_sky_cannot_be_followed() -> None:
     """Bright and featureless above a horizon, noise only."""
     both = {}
