@@ -282,3 +282,19 @@ def test_a_place_that_may_have_drifted_too_far_is_not_called_tracked(begun: Trac
     look = seen_by(far, both)
     assert look.track.state == "lost" and "drifted by 4 cm" in look.reason
     np.testing.assert_array_equal(look.track.position_m, far.position_m)
+
+
+def test_what_the_key_does_not_show_any_more_is_found_by_the_standby(begun: Track) -> None:
+    """As when the light has changed: the key picture shows another texture, the last look's the right one."""
+    near, nearer = pose(0.2), pose(0.4)
+    track = seen_by(step(begun, pose(0.0), near), eyes(0.2, seed=40)).track
+    assert track.standby is not None
+    image = picture(pinholes(0.0)["left"], replace(GROUND, grey=random_texture(77)))
+    changed = replace(track, key=replace(track.key, eye=replace(track.key.eye, image=image)))
+    spread = np.diag(np.array([0.004] * 3 + [0.005] * 3) ** 2)
+    now = eyes(0.4, seed=50)
+    look = seen_by(step(changed, near, nearer, spread), now)
+    assert look.track.state == "tracked" and look.renewed, look.reason
+    assert np.linalg.norm(look.track.position_m - nearer.inverse.points(TARGET)) < 0.03
+    assert np.linalg.eigvalsh(look.track.key.drift_m2)[-1] > 0.0, "the exchange hands on its error"
+    assert seen_by(step(replace(changed, standby=None), near, nearer, spread), now).track.state == "lost"
