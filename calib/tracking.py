@@ -325,7 +325,7 @@ def _seen(track: Track, eyes: Mapping[str, Eye], settings: TrackSettings, sizes:
             f"most {100 * settings.worst_drift_m:g} cm are allowed: the surface around it is no plane"
         )
         return replace(_lost(track, found, words), chi2=chi2)
-    standby = fresh or (track.standby and _carried(track.standby, turned))
+    standby = None if renewed else fresh or (track.standby and _carried(track.standby, turned))
     after = Track("tracked", point.position_m, point.covariance_m2, chosen, standby)
     return Look(after, found, "", chi2, renewed)
 
