@@ -190,11 +190,13 @@ def best_affine(offsets_px: FloatArray, there_px: FloatArray) -> FloatArray:
 def match(
     first: np.ndarray, second: np.ndarray, pixel: np.ndarray, best: FloatArray, rng: np.random.Generator
 ) -> FloatArray | None:
-    """Where ECC finds the patch about ``pixel`` in the second picture; None if it gives up."""
+    """Where ECC finds the patch about ``pixel`` in the second picture; None at the border or if it fails."""
     x, y = pixel
     template = first[y - HALF_PX : y + HALF_PX + 1, x - HALF_PX : x + HALF_PX + 1]
     corner = np.rint(best[:, 2]).astype(int) - HALF_PX - MARGIN_PX
     size = 2 * (HALF_PX + MARGIN_PX) + 1
+    if (corner < 0).any() or (corner + size > second.shape[::-1]).any():
+        return None
     window = second[corner[1] : corner[1] + size, corner[0] : corner[0] + size]
     # start from the true stretch but up to half a pixel away, so that standing still is no success
     warp = best.copy()
