@@ -2,7 +2,8 @@
 
 Every call blocks for a bounded time and may come from any thread. The head is read all the time (50 times a
 second while it moves, 20 while it rests), so that each frame gets the joint angles at its mid-exposure.
-This module does not decide where to point and does not retry: an answer that cannot be true is an error.
+This module does not decide where to point, and an answer that cannot be true is an error. Only a reading,
+which moves nothing, is asked for once more: no operation ends because one answer was lost on the line.
 """
 
 from __future__ import annotations
@@ -121,14 +122,20 @@ class Devices:
         return self._history.newest
 
     def read(self) -> Reading:
-        """Return the joint state measured now.
+        """Return the joint state measured now; what was not answered properly is asked for once more.
 
         Raises
         ------
         NoReply, BadReply, DriverError
-            If the head does not answer in 1 s, or answers what cannot be true.
+            If the head twice does not answer in 1 s, or answers what cannot be true; the first error.
         """
-        return self._head.call("read", self._read_once, READ_TIMEOUT_S)
+        try:
+            return self._head.call("read", self._read_once, READ_TIMEOUT_S)
+        except (NoReply, BadReply) as error:
+            try:
+                return self._head.call("read", self._read_once, READ_TIMEOUT_S)
+            except DriverError:
+                raise error from None
 
     def report(self) -> Mapping[str, AxisReport]:
         """Return where each axis was sent and stands in counts; empty for a head that does not know."""

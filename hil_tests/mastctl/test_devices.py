@@ -201,6 +201,32 @@ def test_a_lost_line_is_forgotten_when_any_call_finds_it_back(
     assert devices.faults() == ()
 
 
+@pytest.mark.parametrize("error", [NoReply("lost on the line"), BadReply("damaged on the line")])
+def test_a_reading_lost_on_the_line_is_asked_for_once_more(
+    devices: Devices, hardware: FakeHardware, error: DriverError
+) -> None:
+    devices._head.call("no polls", lambda: setattr(devices._head, "_between", None), 1.0)
+    failures = iter([error])
+    reads: list[str] = []
+
+    def fails(name: str) -> None:
+        reads.append(name)
+        for failure in failures:
+            raise failure
+
+    hardware.head.hook = fails
+    assert devices.read().pan_rad == 0.0 and reads == ["read", "read"]
+    assert devices.faults() == ()
+    failures = iter([error, LineLost("and then it is gone")])
+    with pytest.raises(type(error), match="on the line"):
+        devices.read()
+    failures = iter([LineLost("gone")])
+    reads.clear()
+    with pytest.raises(LineLost):
+        devices.read()
+    assert reads == ["read"], "a line that is gone is not asked again"
+
+
 @impatient
 def test_a_late_answer_is_dropped(devices: Devices, hardware: FakeHardware) -> None:
     hang = Hang()
