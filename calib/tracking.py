@@ -160,9 +160,7 @@ class Look:
     renewed: bool = False
 
 
-def start_track(
-    left: Eye, right: Eye, left_px: FloatArray, settings: MatchSettings | None = None, sigma_px: float = 0.2
-) -> Track:
+def start_track(left: Eye, right: Eye, left_px: FloatArray, sigma_px: float = 0.2) -> Track:
     """Begin a track from a click in the left picture of a pair.
 
     Parameters
@@ -188,7 +186,7 @@ def start_track(
         raise CalibError(
             f"the target pixel ({pixel[0]:.1f}, {pixel[1]:.1f}) is outside the picture of {width} x {height}"
         )
-    found = find_partner(left.image, left.camera, pixel, right.image, right.camera, settings=settings)
+    found = find_partner(left.image, left.camera, pixel, right.image, right.camera)
     if found.match.verdict != "good" or found.plane is None:
         raise CalibError(f"the target cannot be followed: {found.match.reason}")
     # The patch that tells the surface reaches beyond it on a rock: the range is that of its middle.
@@ -270,7 +268,7 @@ def seen_by(
     settings = settings or TrackSettings()
     sizes = match_settings or SIZES
     look = _seen(track, eyes, settings, sizes)
-    if look.track.state == "tracked" or track.standby is None:
+    if look.track.state == "tracked" or track.standby is None or not eyes:
         return look
     again = _seen(replace(track, key=track.standby), eyes, settings, sizes)
     return replace(again, renewed=True) if again.track.state == "tracked" else look
@@ -285,8 +283,12 @@ def _seen(track: Track, eyes: Mapping[str, Eye], settings: TrackSettings, sizes:
         )
     plane = Plane(track.position_m, track.key.normal)
     found = {name: _found(track, key, plane, eye, settings, sizes) for name, eye in eyes.items()}
+    slope: Plane | None = None
+    first = next(iter(eyes), "")
+    asked_first = False  # whether the first eye was found through the second
     if sum(one.verdict == "good" for one in found.values()) == 1 < len(found):
-        found = _asked_the_other(found, eyes, sizes)
+        asked_first = found[first].verdict != "good"
+        found, slope = _asked_the_other(found, eyes, sizes)
     good = {name: one for name, one in found.items() if one.verdict == "good"}
     doubt = next((f"{n}: {m.reason}" for n, m in found.items() if m.verdict in ("weak", "ambiguous")), "")
     if not good:
@@ -315,7 +317,7 @@ def _seen(track: Track, eyes: Mapping[str, Eye], settings: TrackSettings, sizes:
         return replace(_lost(track, found, words), chi2=chi2)
     turned = _turned(track, point.position_m)
     corrected = _carried(track.key, turned)
-    fresh = _fresh_key(track.key, eyes, good, plane)
+    fresh = _fresh_key(track.key, eyes, good, plane, slope, asked_first)
     renewed = fresh is not None and _outgrown(track.key, eyes, good, plane, settings)
     chosen = fresh if fresh is not None and renewed else corrected
     drift_m = _drifted(chosen)
@@ -376,8 +378,8 @@ def _found(
 
 def _asked_the_other(
     found: Mapping[str, Match], eyes: Mapping[str, Eye], sizes: MatchSettings
-) -> dict[str, Match]:
-    """Look from the eye that found the target into the one that did not.
+) -> tuple[dict[str, Match], Plane | None]:
+    """Look from the eye that found the target into the one that did not; return also the surface this told.
 
     On a rock the two eyes see the surface more differently than one eye sees it before and after a step.
     """
@@ -385,24 +387,46 @@ def _asked_the_other(
     other = next(name for name in found if name != seen)
     one, two = eyes[seen], eyes[other]
     partner = find_partner(one.image, one.camera, found[seen].pixel_px, two.image, two.camera, settings=sizes)
-    return dict(found) | ({other: partner.match} if partner.match.verdict == "good" else {})
+    if partner.match.verdict != "good":
+        return dict(found), None
+    return dict(found) | {other: partner.match}, partner.plane
 
 
-def _fresh_key(key: Key, eyes: Mapping[str, Eye], good: Mapping[str, Match], plane: Plane) -> Key | None:
-    """A key from the pictures of this look; None if one eye alone saw the target."""
+def _fresh_key(
+    key: Key,
+    eyes: Mapping[str, Eye],
+    good: Mapping[str, Match],
+    plane: Plane,
+    slope: Plane | None,
+    asked_first: bool,
+) -> Key | None:
+    """A key from the pictures of this look; None if one eye alone saw the target.
+
+    ``slope`` is the surface that one eye asked through the other told. Without it both were asked through the
+    key, over ``plane``, and tell the surface together.
+    """
     if len(good) < 2:
         return None
     first, second = list(eyes)[:2]
-    camera = eyes[first].camera
     left, right = good[first], good[second]
+    if slope is not None:
+        drift = key.drift_m2 + _on_surface(left.covariance_px2, eyes[first].camera, slope)
+        if asked_first:  # how far off the second eye was is handed on too
+            drift = drift + _on_surface(right.covariance_px2, eyes[second].camera, slope)
+        return Key(eyes[first], left.pixel_px, slope.normal, drift)
     try:
-        slope = local_plane(camera, left.pixel_px, eyes[second].camera, plane, right, left)
+        slope = local_plane(eyes[first].camera, left.pixel_px, eyes[second].camera, plane, right, left)
     except NoStereoPoint:
         return None
+    drift = key.drift_m2 + _on_surface(left.covariance_px2, eyes[first].camera, plane)
+    return Key(eyes[first], left.pixel_px, slope.normal, drift)
+
+
+def _on_surface(covariance_px2: FloatArray, camera: CameraModel, plane: Plane) -> FloatArray:
+    """A pixel's covariance (2, 2) as that of its place on the surface (3, 3), square metres."""
     _, rate, _ = camera.project_jacobian(plane.point_m)
     to_surface = plane.axes @ np.linalg.inv(rate @ plane.axes)
-    drift = key.drift_m2 + to_surface @ left.covariance_px2 @ to_surface.T
-    return Key(eyes[first], left.pixel_px, slope.normal, drift)
+    return np.asarray(to_surface @ covariance_px2 @ to_surface.T)
 
 
 def _outgrown(

@@ -272,6 +272,40 @@ def test_an_eye_that_sees_the_surface_otherwise_is_asked_through_the_other(begun
     assert look.track.state == "tracked"
     exact = pinholes(0.0)["right"].pixel(TARGET)
     np.testing.assert_allclose(look.found["right"].pixel_px, exact, atol=0.2)
+    fresh = look.track.standby
+    assert fresh is not None
+    true = GROUND.normal / np.linalg.norm(GROUND.normal)
+    off = np.degrees(np.arccos(abs(fresh.normal @ true) / np.linalg.norm(fresh.normal)))
+    assert off < 6.0, "the slope is that of the two eyes, not the believed one"
+
+
+def test_a_first_eye_found_through_the_second_hands_on_the_errors_of_both(begun: Track) -> None:
+    """The key is as if taken by the second eye, and its slope believed far off; the second eye is noisy."""
+    normal = np.array([0.0, 1.0, -0.3]) / np.hypot(1.0, 0.3)
+    second = eyes(0.0)["right"]
+    key = replace(begun.key, eye=second, pixel_px=pinholes(0.0)["right"].pixel(TARGET), normal=normal)
+    both = eyes(0.0, seed=3)
+    noisy = picture(pinholes(0.0)["right"], GROUND, noise_dn=15.0, seed=9)
+    both["right"] = replace(both["right"], image=noisy)
+    believed = Plane(begun.position_m, normal)
+    left = both["left"]
+    alone = match(second.image, second.camera, key.pixel_px, believed, left.image, left.camera, 5.0)
+    assert alone.verdict == "weak"
+    look = seen_by(replace(begun, key=key), both)
+    assert look.track.state == "tracked" and look.renewed, look.reason
+    drifts = []
+    for name in NAMES:
+        camera, found = pinholes(0.0)[name], look.found[name]
+        landings = []
+        for axis in 0.1 * np.eye(2):  # where the ray of the place beside lands on the surface found
+            ray = camera.model.ray(camera.pixel(TARGET) + axis)
+            surface = look.track.key.normal
+            along = (TARGET - ray.origins_m) @ surface / (ray.directions @ surface)
+            landings.append(ray.origins_m + along * ray.directions - TARGET)
+        rate = 10.0 * np.array(landings).T
+        drifts.append(float(np.trace(rate @ found.covariance_px2 @ rate.T)))
+    np.testing.assert_allclose(np.trace(look.track.key.drift_m2), sum(drifts), rtol=0.02)
+    assert drifts[1] > 0.06 * sum(drifts)
 
 
 def test_a_place_that_may_have_drifted_too_far_is_not_called_tracked(begun: Track) -> None:
