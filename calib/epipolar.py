@@ -291,25 +291,18 @@ def _between(inverse: FloatArray, places: FloatArray, index: int) -> FloatArray:
 
 
 def local_plane(
-    camera: CameraModel,
-    pixel: FloatArray,
-    partner: CameraModel,
-    plane: Plane,
-    found: Match,
-    own: Match | None = None,
+    camera: CameraModel, pixel: FloatArray, partner: CameraModel, plane: Plane, found: Match
 ) -> Plane:
-    """Return the surface that two eyes tell: the target triangulated, its slope from the deformations found.
+    """Return the surface that two eyes tell: the target triangulated, its slope from the deformation found.
 
     Parameters
     ----------
     pixel
         (2,) the target in ``camera``.
     plane
-        The surface over which the searched patches were warped.
+        The surface over which the searched patch was warped.
     found
         What was found in ``partner``.
-    own
-        What was found in ``camera``, if the patches come from a third picture and not from this one.
 
     Raises
     ------
@@ -317,21 +310,46 @@ def local_plane(
         If the two eyes' rays have no point in common.
     """
     target = triangulate(camera, partner, pixel, found.pixel_px).position_m
+    return Plane(target, normal_seen(target, camera, partner, plane, found))
+
+
+def normal_seen(
+    target_m: FloatArray,
+    camera: CameraModel,
+    partner: CameraModel,
+    plane: Plane,
+    found: Match,
+    own: Match | None = None,
+) -> FloatArray:
+    """Return the surface's unit normal (3,) that the deformations found by two eyes tell.
+
+    Parameters
+    ----------
+    target_m
+        (3,) the target.
+    plane
+        The surface over which the searched patches were warped; its normal is returned where the two eyes
+        see too little of a slope.
+    found
+        What was found in ``partner``.
+    own
+        What was found in ``camera``, if the patches come from a third picture and not from this one.
+    """
     # Where the old plane carries neighbours of the target, and where the deformations say they really are.
     offsets = 0.7 * found.half_px * SIDES
     mine, valid = carry(found.predicted_px + offsets, partner, plane, camera)
     if not valid.all():
-        return Plane(target, plane.normal)
+        return plane.normal
     if own is not None:
         mine = own.pixel_px + _deformed(mine - own.predicted_px, own)
     theirs = found.pixel_px + _deformed(offsets, found)
     left, right, top, bottom = _meeting(camera.ray(mine), partner.ray(theirs))
     normal = np.cross(right - left, bottom - top)
-    sight = target - camera.C
+    sight, length = target_m - camera.C, float(np.linalg.norm(normal))
     # Written so that a neighbour without a point in both eyes falls back too.
-    if not abs(normal @ sight) >= GRAZING * np.linalg.norm(normal) * np.linalg.norm(sight):
-        return Plane(target, plane.normal)
-    return Plane(target, normal)
+    if not abs(normal @ sight) > GRAZING * length * np.linalg.norm(sight):
+        return plane.normal
+    return np.asarray(normal / length)
 
 
 def _deformed(offsets: FloatArray, found: Match) -> FloatArray:

@@ -137,7 +137,8 @@ def _counting(counts: FloatArray) -> tuple[slice, slice]:
 
 def gaussian(q: FloatArray, covariance_px2: FloatArray) -> FloatArray:
     """Return the weights (h, w) of offsets (h, w, 2), px, by a Gaussian of this (2, 2) covariance: 1 at 0."""
-    squares = np.einsum("...i,ij,...j", q, np.linalg.inv(covariance_px2), q)
+    weights, (x, y) = np.linalg.inv(covariance_px2), (q[..., 0], q[..., 1])
+    squares = weights[0, 0] * x * x + (weights[0, 1] + weights[1, 0]) * x * y + weights[1, 1] * y * y
     return np.asarray(np.exp(-0.5 * squares), dtype=np.float64)
 
 
@@ -190,12 +191,13 @@ def _settled(
     if not float(np.abs(normal).max() * np.abs(inverse).max()) < WORST_CONDITION:
         return None
     position, deformation = fit.position, fit.deformation
+    photometry = _Photometry(t, counts)
     for _ in range(MOST_STEPS):
         places = position + q + q @ deformation.T
-        if not surface.inside(places):
+        if not surface.inside(places[:: len(places) - 1, :: places.shape[1] - 1]):  # the four corners
             return None
         seen = surface.at(places)
-        gain, offset = _photometry(t, seen, counts)
+        gain, offset = photometry.of(seen)
         if gain <= 0.05:
             return None
         rest = (seen - gain * t - offset).reshape(-1)
@@ -230,13 +232,19 @@ def _columns(gradient: FloatArray, q: FloatArray, t: FloatArray) -> FloatArray:
     return np.stack([*columns, -t, -np.ones_like(t)], axis=-1)
 
 
-def _photometry(template: FloatArray, seen: FloatArray, counts: FloatArray) -> tuple[float, float]:
-    """Return gain and offset that bring the template nearest to what is seen, weighted by ``counts``."""
-    total = float(counts.sum())
-    template_mean, seen_mean = float((counts * template).sum()) / total, float((counts * seen).sum()) / total
-    weighted = counts * (template - template_mean)
-    gain = float((weighted * seen).sum() / max(float((weighted * template).sum()), 1e-9))
-    return gain, seen_mean - gain * template_mean
+class _Photometry:
+    """Gain and offset that bring a template (h, w), weighted by ``counts``, nearest to what is seen."""
+
+    def __init__(self, template: FloatArray, counts: FloatArray) -> None:
+        self._shares = counts.reshape(-1) / float(counts.sum())
+        self._mean = float(self._shares @ template.reshape(-1))
+        self._weights = self._shares * (template.reshape(-1) - self._mean)
+        self._variance = max(float(self._weights @ template.reshape(-1)), 1e-12)
+
+    def of(self, seen: FloatArray) -> tuple[float, float]:
+        """Return gain and offset of a seen patch (h, w)."""
+        gain = float(self._weights @ seen.reshape(-1)) / self._variance
+        return gain, float(self._shares @ seen.reshape(-1)) - gain * self._mean
 
 
 def _correlation(a: FloatArray, b: FloatArray, counts: FloatArray) -> float:

@@ -23,8 +23,8 @@ import numpy as np
 
 from calib.cahvor import CameraModel
 from calib.distinct import indistinct
-from calib.epipolar import find_partner, local_plane
-from calib.errors import CalibError, NoStereoPoint
+from calib.epipolar import find_partner, normal_seen
+from calib.errors import CalibError
 from calib.handoff_refined import Eye
 from calib.match import Match, MatchSettings, match
 from calib.one_point import Sighting, one_point
@@ -414,12 +414,9 @@ def _fresh_key(
         if asked_first:  # how far off the second eye was is handed on too
             drift = drift + _on_surface(right.covariance_px2, eyes[second].camera, slope)
         return Key(eyes[first], left.pixel_px, slope.normal, drift)
-    try:
-        slope = local_plane(eyes[first].camera, left.pixel_px, eyes[second].camera, plane, right, left)
-    except NoStereoPoint:
-        return None
+    normal = normal_seen(plane.point_m, eyes[first].camera, eyes[second].camera, plane, right, left)
     drift = key.drift_m2 + _on_surface(left.covariance_px2, eyes[first].camera, plane)
-    return Key(eyes[first], left.pixel_px, slope.normal, drift)
+    return Key(eyes[first], left.pixel_px, normal, drift)
 
 
 def _on_surface(covariance_px2: FloatArray, camera: CameraModel, plane: Plane) -> FloatArray:
