@@ -22,7 +22,8 @@ from calib.warp import Grey, Plane, patch_grid
 AROUND_PX = 80
 """How far around is compared: as far as a heading that is wrong by 1.2 degrees puts a target in a Pancam."""
 MOST_ALIKE = 0.9
-"""Correlation with another place: texture of rocks and ground stays below 0.86, a shadow's edge has 0.97."""
+"""Correlation with another place: the simulated rover's rocks and ground were seen to stay below 0.86,
+edges of its shadows to have 0.97."""
 WORST_SIGMA_PX = 0.2
 """In the worst direction, of what grey noise alone would leave."""
 
@@ -39,7 +40,7 @@ def indistinct(
     pixel_px
         (2,) the target.
     plane
-        The surface there.
+        The surface there, at an angle to the pixel's ray.
     settings
         Of the matching that will look for it; ``near_px`` sizes and weighs the patch.
     """

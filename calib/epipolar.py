@@ -164,6 +164,8 @@ def _sweep(
         table = _scores(fine, ray, near, normals, partner, partner_image, 1)
         row, column = np.unravel_index(int(np.argmax(table)), table.shape)
         tries.append((float(table[row, column]), float(near[row]), int(column)))
+    if not tries:
+        return no_match("weak", "no place along the epipolar line can be compared", half_px=half)
     tries.sort(reverse=True)
     score, best, which = tries[0]
     seen, _ = partner.project(ray.origins_m + ray.directions / np.array([[one[1]] for one in tries]))

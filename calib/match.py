@@ -38,7 +38,8 @@ class MatchSettings:
     ----------
     half_px
         Half of the patch's side in the coarser of the two pictures. 20 (41 px) holds 0.02 px with usual
-        texture and is still nearly plane on a rock (facts: 41 and 61 px differ by a quarter only).
+        texture and is still nearly plane on a rock (facts: 41 and 61 px differ by a quarter only). With
+        ``near_px`` the patch is as large as its Gaussian; this only says how far an enlarged one may shrink.
     smallest_half_px
         How far the patch may shrink at the border of a picture.
     most_half_px

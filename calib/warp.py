@@ -57,13 +57,15 @@ def grey(image: ArrayLike) -> Grey:
     Raises
     ------
     CalibError
-        If the array is no image.
+        If the array is no image, or holds what is not finite.
     """
     array = np.asarray(image)
     if array.ndim == 3 and array.shape[2] == 3:
         array = array.astype(np.float32) @ np.array([0.114, 0.587, 0.299], np.float32)
     if array.ndim != 2 or array.size == 0:
         raise CalibError(f"an image of shape {array.shape} where (h, w) or (h, w, 3) is expected")
+    if array.dtype.kind == "f" and not np.isfinite(array).all():
+        raise CalibError("an image with values that are not finite")
     return np.ascontiguousarray(array, dtype=np.float32)
 
 

@@ -210,8 +210,16 @@ def test_plane_carries_pixels_as_the_pinhole_does() -> None:
 def test_arrays_that_are_no_picture_are_refused_in_a_sentence() -> None:
     with pytest.raises(CalibError, match="shape"):
         grey(np.zeros((4, 4, 2)))
+    with pytest.raises(CalibError, match="not finite"):
+        grey(np.array([[1.0, np.nan]]))
     with pytest.raises(CalibError, match="direction"):
         Plane(np.zeros(3), np.zeros(3))
+
+
+def test_a_picture_that_is_nothing_but_not_a_number_matches_nowhere() -> None:
+    nothing = np.full_like(seen(RIGHT, 5), np.nan)
+    found = find_partner(seen(LEFT, 5), LEFT.model, (200.0, 140.0), nothing, RIGHT.model)
+    assert found.match.verdict == "weak" and "line" in found.match.reason
 
 
 def test_a_rough_surface_makes_the_place_less_certain_along_the_parallax_only() -> None:

@@ -21,6 +21,7 @@ from calib.store import load_rig
 from drivers.sim import bricks
 from drivers.sim.rover import SimulatedRover
 from drivers.sim.scene import Scene, tiny_scene
+from mastctl.cli import experiment_handoff
 from mastctl.cli.main import main
 from mastctl.client import Client, ClientError
 from mastctl.experiment.handoff import run_handoff_experiment
@@ -237,6 +238,17 @@ def test_the_record_of_hand_offs_and_a_constant_offset_are_told(tmp_path: Path) 
     (bias,) = experiment.as_json()["bias"]
     assert bias["camera"] == "hazcam_left" and told in bias["sentence"] and bias["sigmas"] > 10
     assert json.loads((tmp_path / "record.json").read_text())["bias"] == [bias]
+
+
+def test_an_experiment_without_any_target_says_so(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    nothing = HandoffExperiment({"hardware": "simulated"}, 1, 0.2, (), (), "now", 3.0)
+    monkeypatch.setattr(experiment_handoff, "_run", lambda args, client, truth, points: nothing)
+    out = tmp_path / "report"
+    assert main(["experiment", "handoff", "--out", str(out)]) == 1
+    told = capsys.readouterr().out.splitlines()
+    assert told == ["no target was found to hand over", f"report: {out / 'report.html'}"]
 
 
 def test_another_mast_file_is_for_the_simulated_rover_only(capsys: pytest.CaptureFixture[str]) -> None:

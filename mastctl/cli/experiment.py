@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -159,18 +160,18 @@ def _report(args: argparse.Namespace, experiment: PointingExperiment) -> int:
             [*experiment.notes, *notes],
         )
 
-    page = write_report(experiment, args.out) if args.out is not None else None
-    tell_report(args, page, experiment.as_json, show)
+    tell_report(args, partial(write_report, experiment), experiment.as_json, show)
     return 0 if any(record.landings for record in experiment.records) else 1
 
 
 def tell_report(
     args: argparse.Namespace,
-    page: Path | None,
+    write: Callable[[Path], Path],
     document: Callable[[], dict[str, Any]],
     show: Callable[[list[str]], None],
 ) -> None:
-    """Print the document for programs, or have the tables shown; either names the report's page, if any."""
+    """Write the report if asked; print the document for programs, or have the tables shown, with its page."""
+    page = None if args.out is None else write(args.out)
     if args.json:
         output.print_json(document() | ({} if page is None else {"report": str(page)}))
     else:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -112,6 +113,5 @@ def _tell(args: argparse.Namespace, experiment: CalibrationExperiment) -> int:
             output.print_table("Table V, rms residuals of the mast's images, px", *table_v(experiment))
         output.print_table("Errors, px: rms an axis, and worst", *short_rows(experiment.summaries), notes)
 
-    page = write_report(experiment, args.out) if args.out is not None else None
-    tell_report(args, page, lambda: as_json(experiment), show)
+    tell_report(args, partial(write_report, experiment), lambda: as_json(experiment), show)
     return 0 if any(not outcome.failure for outcome in experiment.outcomes) else 1

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import argparse
+import sys
 from contextlib import ExitStack
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -140,12 +142,13 @@ def _tell(args: argparse.Namespace, experiment: HandoffExperiment) -> int:
     def show(notes: list[str]) -> None:
         noise = f"clicks with {experiment.click_px:g} px of noise; lengths in px of the destination camera"
         kinds = list(dict.fromkeys(row.kind for row in experiment.summaries))
+        if not kinds:
+            sys.stdout.write("\n".join(["no target was found to hand over", *notes]) + "\n")
         for kind in kinds:
             headings, rows = table_rows([row for row in experiment.summaries if row.kind == kind])
             title = f"Hand-off errors of {TARGETS[kind]}, px ({experiment.status.get('hardware')} hardware)"
             last = [noise, *bias_sentences(experiment), *notes] if kind == kinds[-1] else []
             output.print_table(title, *turned(headings, rows), last)
 
-    page = write_report(experiment, args.out) if args.out is not None else None
-    tell_report(args, page, experiment.as_json, show)
+    tell_report(args, partial(write_report, experiment), experiment.as_json, show)
     return 0 if any(record.handed for record in experiment.records) else 1
