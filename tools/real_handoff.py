@@ -276,7 +276,8 @@ def print_table(rows: Sequence[dict[str, Any]]) -> None:
     """Print the rows."""
     for one in rows:
         verdicts = ", ".join(f"{name} {count}" for name, count in sorted(one["verdicts"].items()))
-        print(f"{one['from']} to {one['to']}, {one['range']}: {one['targets']} targets: {verdicts}")
+        frames = f"{one['from']} to {one['to']}" if one["to"] else one["from"]
+        print(f"{frames}, {one['range']}: {one['targets']} targets: {verdicts}")
         if one["found"]:
             x, y = one["rms_px"]
             print(
