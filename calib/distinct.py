@@ -65,7 +65,7 @@ def indistinct(
     if alike > MOST_ALIKE:
         away = math.dist(where, (x, y))
         return (
-            f"an edge or a repeated pattern: what is {away:.0f} px beside it correlates by {alike:.2f}, "
-            f"at most {MOST_ALIKE:g} is allowed"
+            f"an edge, a smooth place or a repeated pattern: what is {away:.0f} px beside it correlates by "
+            f"{alike:.2f}, at most {MOST_ALIKE:g} is allowed"
         )
     return ""

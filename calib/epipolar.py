@@ -22,7 +22,7 @@ from calib.errors import NoStereoPoint
 from calib.match import Match, MatchSettings, expected_correlation, match, no_match, rivalled, texture_lacks
 from calib.rigid import FloatArray
 from calib.stereo import triangulate
-from calib.warp import GRAZING, Grey, Plane, carry, sample, square_grid
+from calib.warp import GRAZING, SIDES, Grey, Plane, carry, sample, square_grid
 
 UP = np.array([0.0, 0.0, -1.0])
 FARTHEST_M = 1e4  # as good as infinity for any stereo base on a rover
@@ -30,7 +30,6 @@ COARSE = 2  # the first sweep uses every second pixel of half-size pictures
 DENSE = 400  # points of the ray that tell the curve's length
 FINE_STEPS = np.arange(-3.0, 3.5, 0.5)  # px around each of the best coarse places
 BEST_KEPT = 4
-SIDES = np.array([[-1.0, 0.0], [1.0, 0.0], [0.0, -1.0], [0.0, 1.0]])  # left, right, top, bottom
 LAST_SEARCH_PX = 4.0
 MATCHED_BACK_PX = 2.0  # the way back is not refined: half a pixel of the sweep, and slope
 

@@ -21,10 +21,9 @@ from numpy.typing import ArrayLike, NDArray
 from calib.cahvor import CameraModel
 from calib.refine import NARROW, Refined, refine
 from calib.rigid import FloatArray
-from calib.warp import Grey, Plane, Template, blurred_to, carry, warp_patch
+from calib.warp import SIDES, Grey, Plane, Template, blurred_to, carry, warp_patch
 
 MOST_ASPECT = 5.0  # of a weight that is round on a surface seen flat
-_CROSS = np.array([[-1.0, 0.0], [1.0, 0.0], [0.0, -1.0], [0.0, 1.0]])
 COUNTS_TO = 2.2  # sigmas of that weight, beyond which pixels are left out
 
 Verdict = Literal["good", "flat", "ambiguous", "weak", "border"]
@@ -39,7 +38,7 @@ class MatchSettings:
     half_px
         Half of the patch's side in the coarser of the two pictures. 20 (41 px) holds 0.02 px with usual
         texture and is still nearly plane on a rock (facts: 41 and 61 px differ by a quarter only). With
-        ``near_px`` the patch is as large as its Gaussian; this only says how far an enlarged one may shrink.
+        ``near_px`` a match's patch is as large as its Gaussian; this says how far an enlarged one may shrink.
     smallest_half_px
         How far the patch may shrink at the border of a picture.
     most_half_px
@@ -316,7 +315,7 @@ def _surface_term(
     ray, half = source.ray(target), np.array(template.values.shape[::-1]) // 2
     if near_px2 is not None:
         half = np.sqrt(3.0 * np.diag(near_px2))  # a box of this half side spreads as much
-    sides = template.target_px + half * np.array([[-1.0, 0.0], [1.0, 0.0], [0.0, -1.0], [0.0, 1.0]])
+    sides = template.target_px + half * SIDES
     rays = destination.ray(sides)
     with np.errstate(invalid="ignore", divide="ignore"):
         ranges = ((plane.point_m - rays.origins_m) @ plane.normal) / (rays.directions @ plane.normal)
@@ -342,7 +341,7 @@ def _template(
     settings: MatchSettings,
 ) -> tuple[Template, FloatArray | None] | None:
     """Warp the largest patch that both pictures hold, sized by the coarser of the two; with its weight."""
-    around, ok = carry(seen + _CROSS, destination, plane, source)
+    around, ok = carry(seen + SIDES, destination, plane, source)
     if not ok.all():
         return None
     # Destination pixels a source pixel, by area.
@@ -387,8 +386,8 @@ def _search(
 ) -> Found | Match:
     """Correlate over the window, then refine at the best place."""
     half, reach = np.array(template.values.shape[::-1]) // 2, int(np.ceil(search_px))
-    low = np.maximum(template.centre_px - reach - half, 0)
-    high = np.minimum(template.centre_px + reach + half, np.array(image.shape[::-1]) - 1)
+    window = template.centre_px - reach - half, template.centre_px + reach + half
+    low, high = np.maximum(window[0], 0), np.minimum(window[1], np.array(image.shape[::-1]) - 1)
     if (high - low < 2 * half + 4).any():
         words = f"the target is expected at {_at(template.target_px)}, too near the picture's border"
         return no_match("border", words, template.target_px, half_px=int(half.min()))
@@ -397,8 +396,8 @@ def _search(
     cut = image[cut_low[1] : high[1] + 1 + margin, cut_low[0] : high[0] + 1 + margin]
     cut = np.ascontiguousarray(blurred_to(cut, template.magnification))
     inner = low - cut_low
-    window = cut[inner[1] : inner[1] + high[1] - low[1] + 1, inner[0] : inner[0] + high[0] - low[0] + 1]
-    scores = cv2.matchTemplate(window, template.values, cv2.TM_CCOEFF_NORMED).astype(np.float32)
+    searched = cut[inner[1] : inner[1] + high[1] - low[1] + 1, inner[0] : inner[0] + high[0] - low[0] + 1]
+    scores = cv2.matchTemplate(searched, template.values, cv2.TM_CCOEFF_NORMED).astype(np.float32)
     (x, y), best, second, _ = peaks(
         scores, max(settings.apart_px, round(settings.apart_px * template.magnification))
     )
@@ -407,9 +406,13 @@ def _search(
     if best < least:
         words = f"no place in the window of {reach} px correlates by more than {best:.2f}"
         return no_match("weak", words, template.target_px, *facts)
-    if x in (0, scores.shape[1] - 1) or y in (0, scores.shape[0] - 1):
+    best_at = np.array([x, y])
+    begins, ends = best_at == 0, best_at == np.array(scores.shape[::-1]) - 1
+    if begins.any() or ends.any():
         words = f"the best place is at the border of the window of {reach} px"
-        return no_match("border", words, template.target_px, *facts)
+        # Where the picture cut the window, the target may be outside; else the window shows something else.
+        outside = (begins & (low > window[0])).any() or (ends & (high < window[1])).any()
+        return no_match("border" if outside else "weak", words, template.target_px, *facts)
     shift = low + half + np.array([x, y]) + _summit(scores, x, y) - template.centre_px
     start = template.target_px + shift - cut_low
     refined = refine(

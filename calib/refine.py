@@ -51,7 +51,7 @@ class Refined:
     deformation
         (2, 2) D: what the warp did not foresee, as a linear map of offsets from the target.
     correlation
-        Normalised correlation of template and image at the found place, pixels weighted alike, -1..1.
+        Normalised correlation of template and image at the found place, pixels weighted as in the fit, -1..1.
     middle
         The place that the patch's middle alone tells, `NARROW` as wide, the deformation kept.
     """
@@ -194,7 +194,7 @@ def _settled(
     photometry = _Photometry(t, counts)
     for _ in range(MOST_STEPS):
         places = position + q + q @ deformation.T
-        if not surface.inside(places[:: len(places) - 1, :: places.shape[1] - 1]):  # the four corners
+        if not surface.inside(places[[0, 0, -1, -1], [0, -1, 0, -1]]):  # the corners
             return None
         seen = surface.at(places)
         gain, offset = photometry.of(seen)

@@ -130,7 +130,8 @@ class Track:
     def target_covariance_m2(self) -> FloatArray:
         """(3, 3) of the target that was picked: of the followed place, and of its drift from the picked one.
 
-        What pixels and motions tell; an error that all cameras of the mast file share is not in it.
+        What pixels and motions tell; an error that all cameras of the mast file share is not in it, and one
+        that two eyes do not share is averaged by looks from one place as if it were noise.
         """
         return self.covariance_m2 + self.key.drift_m2
 
@@ -270,7 +271,7 @@ def seen_by(
     look = _seen(track, eyes, settings, sizes)
     if look.track.state == "tracked" or track.standby is None or not eyes:
         return look
-    again = _seen(replace(track, key=track.standby), eyes, settings, sizes)
+    again = _seen(replace(track, key=track.standby, standby=None), eyes, settings, sizes)
     return replace(again, renewed=True) if again.track.state == "tracked" else look
 
 
@@ -284,10 +285,8 @@ def _seen(track: Track, eyes: Mapping[str, Eye], settings: TrackSettings, sizes:
     plane = Plane(track.position_m, track.key.normal)
     found = {name: _found(track, key, plane, eye, settings, sizes) for name, eye in eyes.items()}
     slope: Plane | None = None
-    first = next(iter(eyes), "")
-    asked_first = False  # whether the first eye was found through the second
-    if sum(one.verdict == "good" for one in found.values()) == 1 < len(found):
-        asked_first = found[first].verdict != "good"
+    # Of a lost target both eyes must find the key picture: stereo confirms whatever one of them has found.
+    if track.state == "tracked" and sum(one.verdict == "good" for one in found.values()) == 1 < len(found):
         found, slope = _asked_the_other(found, eyes, sizes)
     good = {name: one for name, one in found.items() if one.verdict == "good"}
     doubt = next((f"{n}: {m.reason}" for n, m in found.items() if m.verdict in ("weak", "ambiguous")), "")
@@ -317,7 +316,7 @@ def _seen(track: Track, eyes: Mapping[str, Eye], settings: TrackSettings, sizes:
         return replace(_lost(track, found, words), chi2=chi2)
     turned = _turned(track, point.position_m)
     corrected = _carried(track.key, turned)
-    fresh = _fresh_key(track.key, eyes, good, plane, slope, asked_first)
+    fresh = _fresh_key(track.key, eyes, good, plane, slope)
     renewed = fresh is not None and _outgrown(track.key, eyes, good, plane, settings)
     chosen = fresh if fresh is not None and renewed else corrected
     drift_m = _drifted(chosen)
@@ -381,15 +380,19 @@ def _asked_the_other(
 ) -> tuple[dict[str, Match], Plane | None]:
     """Look from the eye that found the target into the one that did not; return also the surface this told.
 
+    The place in the other eye is as uncertain as that in the first, seen over the surface, and its own match.
     On a rock the two eyes see the surface more differently than one eye sees it before and after a step.
     """
     seen = next(name for name, one in found.items() if one.verdict == "good")
     other = next(name for name in found if name != seen)
     one, two = eyes[seen], eyes[other]
     partner = find_partner(one.image, one.camera, found[seen].pixel_px, two.image, two.camera, settings=sizes)
-    if partner.match.verdict != "good":
+    if partner.match.verdict != "good" or partner.plane is None:
         return dict(found), None
-    return dict(found) | {other: partner.match}, partner.plane
+    carried = _on_surface(found[seen].covariance_px2, one.camera, partner.plane)
+    _, rate, _ = two.camera.project_jacobian(partner.plane.point_m)
+    covariance = partner.match.covariance_px2 + rate @ carried @ rate.T
+    return dict(found) | {other: replace(partner.match, covariance_px2=covariance)}, partner.plane
 
 
 def _fresh_key(
@@ -398,7 +401,6 @@ def _fresh_key(
     good: Mapping[str, Match],
     plane: Plane,
     slope: Plane | None,
-    asked_first: bool,
 ) -> Key | None:
     """A key from the pictures of this look; None if one eye alone saw the target.
 
@@ -409,13 +411,11 @@ def _fresh_key(
         return None
     first, second = list(eyes)[:2]
     left, right = good[first], good[second]
-    if slope is not None:
-        drift = key.drift_m2 + _on_surface(left.covariance_px2, eyes[first].camera, slope)
-        if asked_first:  # how far off the second eye was is handed on too
-            drift = drift + _on_surface(right.covariance_px2, eyes[second].camera, slope)
-        return Key(eyes[first], left.pixel_px, slope.normal, drift)
-    normal = normal_seen(plane.point_m, eyes[first].camera, eyes[second].camera, plane, right, left)
-    drift = key.drift_m2 + _on_surface(left.covariance_px2, eyes[first].camera, plane)
+    surface = slope or plane
+    normal = surface.normal
+    if slope is None:
+        normal = normal_seen(plane.point_m, eyes[first].camera, eyes[second].camera, plane, right, left)
+    drift = key.drift_m2 + _on_surface(left.covariance_px2, eyes[first].camera, surface)
     return Key(eyes[first], left.pixel_px, normal, drift)
 
 

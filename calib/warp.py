@@ -21,6 +21,7 @@ from calib.rigid import FloatArray, frozen_array
 Grey = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 
+SIDES = np.array([[-1.0, 0.0], [1.0, 0.0], [0.0, -1.0], [0.0, 1.0]])  # left, right, top, bottom
 GRAZING = 0.03  # sine of the flattest view of a plane that is still believed (1.7 degrees)
 KNOTS = np.array([-1.0, -1 / 3, 1 / 3, 1.0])  # across a patch, in units of its half side
 MOST_SAMPLES = 8  # per axis and destination pixel; shrinking further than 8 times is not asked of this module

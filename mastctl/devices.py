@@ -127,13 +127,18 @@ class Devices:
         Raises
         ------
         NoReply, BadReply, DriverError
-            If the head twice does not answer in 1 s, or answers what cannot be true; the first error.
+            If the head does not answer in 1 s, both questions together, or answers what cannot be true. The
+            error is that of the first question.
         """
+        until_s = time.monotonic() + READ_TIMEOUT_S
         try:
             return self._head.call("read", self._read_once, READ_TIMEOUT_S)
         except (NoReply, BadReply) as error:
+            left_s = until_s - time.monotonic()
+            if left_s <= 0:
+                raise
             try:
-                return self._head.call("read", self._read_once, READ_TIMEOUT_S)
+                return self._head.call("read", self._read_once, left_s)
             except DriverError:
                 raise error from None
 

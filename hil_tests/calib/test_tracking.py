@@ -8,11 +8,12 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from calib.epipolar import find_partner
 from calib.errors import CalibError
 from calib.handoff_refined import Eye
 from calib.match import match
 from calib.rigid import Rigid, rot_y, rot_z
-from calib.tracking import Track, moved, seen_by, start_track
+from calib.tracking import SIZES, Track, moved, seen_by, start_track
 from calib.warp import Plane
 from hil_tests.calib.pictures import Pinhole, TexturedPlane, picture, random_texture
 
@@ -124,6 +125,27 @@ def test_one_hidden_eye_is_enough_to_doubt(begun: Track) -> None:
     assert "does not confirm" in look.reason
 
 
+@pytest.mark.parametrize("down_px", [2, 4, 8])
+def test_an_eye_that_sees_the_target_elsewhere_contradicts_however_far_off(
+    begun: Track, down_px: int
+) -> None:
+    """Also where the place lies at the edge of the searched window: 4 px there."""
+    both = eyes(0.0, seed=3)
+    both["right"] = replace(both["right"], image=np.roll(both["right"].image, down_px, axis=0))
+    look = seen_by(begun, both)
+    assert look.track.state == "lost", look.found["right"]
+
+
+def test_a_lost_target_is_not_found_again_by_one_eye_and_stereo(begun: Track) -> None:
+    """With the believed slope the right eye does not find the key picture; it did by way of the left one."""
+    normal = np.array([0.0, 1.0, -0.3]) / np.hypot(1.0, 0.3)
+    doubtful = replace(begun, key=replace(begun.key, normal=normal))
+    both = eyes(0.0, seed=3)
+    assert seen_by(doubtful, both).track.state == "tracked"
+    look = seen_by(replace(doubtful, state="lost"), both)
+    assert look.track.state == "lost" and look.found["left"].verdict == "good"
+
+
 def test_a_missing_frame_of_one_eye_is_borne_while_tracked(begun: Track) -> None:
     look = seen_by(begun, {"left": eyes(0.0, seed=3)["left"]})
     assert look.track.state == "tracked"
@@ -174,7 +196,9 @@ def test_the_edge_of_a_shadow_cannot_be_followed() -> None:
     edge = eyes(0.0, plane=replace(GROUND, grey=shadow))
     steps = np.abs(np.diff(edge["left"].image[120, 60:260]))
     pixel = np.array([60.0 + int(np.argmax(steps)), 120.0])
-    with pytest.raises(CalibError, match=r"an edge or a repeated pattern: what is \d+ px beside it"):
+    with pytest.raises(
+        CalibError, match=r"an edge, a smooth place or a repeated pattern: what is \d+ px beside it"
+    ):
         start_track(edge["left"], edge["right"], pixel)
 
 
@@ -293,19 +317,23 @@ def test_a_first_eye_found_through_the_second_hands_on_the_errors_of_both(begun:
     assert alone.verdict == "weak"
     look = seen_by(replace(begun, key=key), both)
     assert look.track.state == "tracked" and look.renewed, look.reason
-    drifts = []
+    rates = []  # how far a pixel reaches over the surface found, m
     for name in NAMES:
-        camera, found = pinholes(0.0)[name], look.found[name]
-        landings = []
-        for axis in 0.1 * np.eye(2):  # where the ray of the place beside lands on the surface found
+        camera, surface, landings = pinholes(0.0)[name], look.track.key.normal, []
+        for axis in 0.1 * np.eye(2):
             ray = camera.model.ray(camera.pixel(TARGET) + axis)
-            surface = look.track.key.normal
             along = (TARGET - ray.origins_m) @ surface / (ray.directions @ surface)
             landings.append(ray.origins_m + along * ray.directions - TARGET)
-        rate = 10.0 * np.array(landings).T
-        drifts.append(float(np.trace(rate @ found.covariance_px2 @ rate.T)))
-    np.testing.assert_allclose(np.trace(look.track.key.drift_m2), sum(drifts), rtol=0.02)
-    assert drifts[1] > 0.06 * sum(drifts)
+        rates.append(10.0 * np.array(landings).T)
+    left_px2, right_px2 = (look.found[name].covariance_px2 for name in NAMES)
+    drift = rates[0] @ left_px2 @ rates[0].T
+    np.testing.assert_allclose(look.track.key.drift_m2, drift, atol=0.02 * np.trace(drift))
+    images = both["right"].image, both["right"].camera, look.found["right"].pixel_px
+    stereo = find_partner(*images, both["left"].image, both["left"].camera, settings=SIZES).match
+    handed = rates[0] @ (left_px2 - stereo.covariance_px2) @ rates[0].T
+    seen = rates[1] @ right_px2 @ rates[1].T
+    np.testing.assert_allclose(handed, seen, atol=0.02 * np.trace(seen))
+    assert np.trace(seen) > 0.05 * np.trace(drift)
 
 
 def test_a_place_that_may_have_drifted_too_far_is_not_called_tracked(begun: Track) -> None:
@@ -330,5 +358,7 @@ def test_what_the_key_does_not_show_any_more_is_found_by_the_standby(begun: Trac
     look = seen_by(step(changed, near, nearer, spread), now)
     assert look.track.state == "tracked" and look.renewed, look.reason
     assert np.linalg.norm(look.track.position_m - nearer.inverse.points(TARGET)) < 0.03
+    alone = seen_by(step(changed, near, nearer, spread), {"left": now["left"]}).track
+    assert alone.state == "tracked" and alone.standby is None, "the standby is the key then"
     assert np.linalg.eigvalsh(look.track.key.drift_m2)[-1] > 0.0, "the exchange hands on its error"
     assert seen_by(step(replace(changed, standby=None), near, nearer, spread), now).track.state == "lost"

@@ -228,6 +228,29 @@ def test_a_reading_lost_on_the_line_is_asked_for_once_more(
 
 
 @impatient
+def test_a_reading_that_hangs_when_asked_once_more_ends_with_the_first_error(
+    devices: Devices, hardware: FakeHardware
+) -> None:
+    devices._head.call("no polls", lambda: setattr(devices._head, "_between", None), 1.0)
+    hang = Hang()
+    failures = iter([NoReply("lost on the line")])
+
+    def fails(name: str) -> None:
+        for failure in failures:
+            raise failure
+        if name == "read":
+            hang()
+
+    hardware.head.hook = fails
+    with pytest.raises(NoReply, match="lost on the line"):
+        devices.read()
+    assert hang.entered.is_set()
+    devices.stop()
+    assert hardware.head.calls == [("stop",)], "a stop goes out beside it"
+    hang.let_go()
+
+
+@impatient
 def test_a_late_answer_is_dropped(devices: Devices, hardware: FakeHardware) -> None:
     hang = Hang()
     hardware.head.hook = lambda name: hang() if name == "move" else None
