@@ -64,6 +64,7 @@ class TrackSettings:
         ...or foreshortened this much otherwise: seen flat, a step nearer shows much that it did not.
     renew_below
         Or when the correlation falls below this: what is seen now is no longer what the key picture shows.
+        One eye that sees so little of it does not find a lost target again.
     worst_drift_m
         One sigma of the drift from the picked place; beyond it the target counts as lost.
     """
@@ -285,8 +286,11 @@ def _seen(track: Track, eyes: Mapping[str, Eye], settings: TrackSettings, sizes:
     plane = Plane(track.position_m, track.key.normal)
     found = {name: _found(track, key, plane, eye, settings, sizes) for name, eye in eyes.items()}
     slope: Plane | None = None
-    # Of a lost target both eyes must find the key picture: stereo confirms whatever one of them has found.
-    if track.state == "tracked" and sum(one.verdict == "good" for one in found.values()) == 1 < len(found):
+    alone = [one for one in found.values() if one.verdict == "good"]
+    # Stereo confirms whatever one eye has found: of a lost target that eye must know the key picture well.
+    if len(alone) == 1 < len(found) and (
+        track.state == "tracked" or alone[0].correlation >= settings.renew_below
+    ):
         found, slope = _asked_the_other(found, eyes, sizes)
     good = {name: one for name, one in found.items() if one.verdict == "good"}
     doubt = next((f"{n}: {m.reason}" for n, m in found.items() if m.verdict in ("weak", "ambiguous")), "")

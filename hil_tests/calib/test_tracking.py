@@ -136,14 +136,28 @@ def test_an_eye_that_sees_the_target_elsewhere_contradicts_however_far_off(
     assert look.track.state == "lost", look.found["right"]
 
 
-def test_a_lost_target_is_not_found_again_by_one_eye_and_stereo(begun: Track) -> None:
-    """With the believed slope the right eye does not find the key picture; it did by way of the left one."""
+def test_a_lost_target_is_found_again_by_one_eye_and_stereo_if_that_eye_is_sure(begun: Track) -> None:
+    """With the believed slope the right eye does not find the key picture; the left one does."""
     normal = np.array([0.0, 1.0, -0.3]) / np.hypot(1.0, 0.3)
-    doubtful = replace(begun, key=replace(begun.key, normal=normal))
-    both = eyes(0.0, seed=3)
-    assert seen_by(doubtful, both).track.state == "tracked"
-    look = seen_by(replace(doubtful, state="lost"), both)
-    assert look.track.state == "lost" and look.found["left"].verdict == "good"
+    doubtful = replace(begun, key=replace(begun.key, normal=normal), state="lost")
+    look = seen_by(doubtful, eyes(0.0, seed=3))
+    assert look.track.state == "tracked" and look.found["left"].correlation > 0.9
+    assert np.linalg.norm(look.track.position_m - TARGET) < 0.03
+
+
+def test_a_place_that_is_partly_alike_is_not_taken_for_a_lost_target(begun: Track) -> None:
+    """The target shows another texture, a place 7 cm beside it one partly alike, which stereo confirms."""
+    alike, other = np.roll(random_texture(5), (30, 20), (0, 1)) - 120.0, random_texture(77) - 120.0
+    world = replace(GROUND, grey=120.0 + 0.72 * alike + np.sqrt(1.0 - 0.72**2) * other)
+    both = {
+        name: Eye(picture(camera, world, noise_dn=noise_dn, seed=seed), camera.model)
+        for (name, camera), noise_dn, seed in zip(pinholes(0.0).items(), (1.5, 12.0), (50, 51), strict=True)
+    }
+    spread = np.diag(np.array([0.01] * 3 + [0.02] * 3) ** 2)
+    lost = replace(step(begun, pose(0.0), pose(0.0), spread), state="lost", misses=1)
+    look = seen_by(lost, both)
+    assert look.found["left"].verdict == "good" and look.found["right"].verdict == "weak"
+    assert look.track.state == "lost"
 
 
 def test_a_missing_frame_of_one_eye_is_borne_while_tracked(begun: Track) -> None:
