@@ -111,8 +111,8 @@ class Track:
     key
         The key picture.
     standby
-        The key that the last look with both eyes would have given: what is looked for where the key is not
-        found any more, since the light has changed or another side shows.
+        The key that the last look with both eyes would have given: what is looked for where a look by the
+        key loses the target, since the light has changed or another side shows. None after a renewal.
     misses
         Looks since it was last found.
     motion_covariance
@@ -253,12 +253,7 @@ def _carried(key: Key, motion: Rigid) -> Key:
     )
 
 
-def seen_by(
-    track: Track,
-    eyes: Mapping[str, Eye],
-    settings: TrackSettings | None = None,
-    match_settings: MatchSettings | None = None,
-) -> Look:
+def seen_by(track: Track, eyes: Mapping[str, Eye], settings: TrackSettings | None = None) -> Look:
     """Look for the target in one or two new pictures, and update the track.
 
     Parameters
@@ -268,15 +263,14 @@ def seen_by(
         rover frame. A frame that is missing is left out; one eye alone serves while the target is tracked.
     """
     settings = settings or TrackSettings()
-    sizes = match_settings or SIZES
-    look = _seen(track, eyes, settings, sizes)
+    look = _seen(track, eyes, settings)
     if look.track.state == "tracked" or track.standby is None or not eyes:
         return look
-    again = _seen(replace(track, key=track.standby, standby=None), eyes, settings, sizes)
+    again = _seen(replace(track, key=track.standby, standby=None), eyes, settings)
     return replace(again, renewed=True) if again.track.state == "tracked" else look
 
 
-def _seen(track: Track, eyes: Mapping[str, Eye], settings: TrackSettings, sizes: MatchSettings) -> Look:
+def _seen(track: Track, eyes: Mapping[str, Eye], settings: TrackSettings) -> Look:
     """Look with the track's key."""
     key = _anchored(track)
     if key is None:
@@ -284,14 +278,14 @@ def _seen(track: Track, eyes: Mapping[str, Eye], settings: TrackSettings, sizes:
             track, {}, "the surface of the target is not visible from where its key picture was taken"
         )
     plane = Plane(track.position_m, track.key.normal)
-    found = {name: _found(track, key, plane, eye, settings, sizes) for name, eye in eyes.items()}
+    found = {name: _found(track, key, plane, eye, settings) for name, eye in eyes.items()}
     slope: Plane | None = None
     alone = [one for one in found.values() if one.verdict == "good"]
     # Stereo confirms whatever one eye has found: of a lost target that eye must know the key picture well.
     if len(alone) == 1 < len(found) and (
         track.state == "tracked" or alone[0].correlation >= settings.renew_below
     ):
-        found, slope = _asked_the_other(found, eyes, sizes)
+        found, slope = _asked_the_other(found, eyes)
     good = {name: one for name, one in found.items() if one.verdict == "good"}
     doubt = next((f"{n}: {m.reason}" for n, m in found.items() if m.verdict in ("weak", "ambiguous")), "")
     if not good:
@@ -368,19 +362,17 @@ def _anchored(track: Track) -> Key | None:
     return replace(track.key, eye=replace(track.key.eye, camera=camera.moved(shift)))
 
 
-def _found(
-    track: Track, key: Key, plane: Plane, eye: Eye, settings: TrackSettings, sizes: MatchSettings
-) -> Match:
+def _found(track: Track, key: Key, plane: Plane, eye: Eye, settings: TrackSettings) -> Match:
     """Look in one picture, in the window that the prediction's covariance asks for."""
     _, rate, valid = eye.camera.project_jacobian(track.position_m)
     spread = rate @ track.covariance_m2 @ rate.T if bool(valid) else np.eye(2)
     reach = settings.sigmas * math.sqrt(max(float(np.linalg.eigvalsh(spread)[-1]), 0.0))
     search = min(max(reach + 2 * settings.model_px, settings.least_px), settings.most_px)
-    return match(key.eye.image, key.eye.camera, key.pixel_px, plane, eye.image, eye.camera, search, sizes)
+    return match(key.eye.image, key.eye.camera, key.pixel_px, plane, eye.image, eye.camera, search, SIZES)
 
 
 def _asked_the_other(
-    found: Mapping[str, Match], eyes: Mapping[str, Eye], sizes: MatchSettings
+    found: Mapping[str, Match], eyes: Mapping[str, Eye]
 ) -> tuple[dict[str, Match], Plane | None]:
     """Look from the eye that found the target into the one that did not; return also the surface this told.
 
@@ -390,7 +382,7 @@ def _asked_the_other(
     seen = next(name for name, one in found.items() if one.verdict == "good")
     other = next(name for name in found if name != seen)
     one, two = eyes[seen], eyes[other]
-    partner = find_partner(one.image, one.camera, found[seen].pixel_px, two.image, two.camera, settings=sizes)
+    partner = find_partner(one.image, one.camera, found[seen].pixel_px, two.image, two.camera, settings=SIZES)
     if partner.match.verdict != "good" or partner.plane is None:
         return dict(found), None
     carried = _on_surface(found[seen].covariance_px2, one.camera, partner.plane)

@@ -360,6 +360,15 @@ def test_a_place_that_may_have_drifted_too_far_is_not_called_tracked(begun: Trac
     np.testing.assert_array_equal(look.track.position_m, far.position_m)
 
 
+@pytest.mark.parametrize("near_px", [0.5, 1.5])
+def test_weights_so_narrow_that_one_row_counts_end_in_a_verdict(near_px: float) -> None:
+    both, narrow = eyes(0.0), replace(SIZES, near_px=near_px, flat_sigma_px=5.0, worst_sigma_px=50.0)
+    left, right, plane = both["left"], both["right"], Plane(TARGET, GROUND.normal)
+    pixel = pinholes(0.0)["left"].pixel(TARGET)
+    found = match(left.image, left.camera, pixel, plane, right.image, right.camera, 6.0, narrow)
+    assert found.verdict in ("good", "weak")
+
+
 def test_what_the_key_does_not_show_any_more_is_found_by_the_standby(begun: Track) -> None:
     """As when the light has changed: the key picture shows another texture, the last look's the right one."""
     near, nearer = pose(0.2), pose(0.4)

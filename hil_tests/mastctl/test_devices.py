@@ -201,11 +201,16 @@ def test_a_lost_line_is_forgotten_when_any_call_finds_it_back(
     assert devices.faults() == ()
 
 
+def stop_polling(devices: Devices) -> None:
+    """From now on the head is only read when somebody asks."""
+    devices._head.call("no polls", lambda: setattr(devices._head, "_between", None), 1.0)
+
+
 @pytest.mark.parametrize("error", [NoReply("lost on the line"), BadReply("damaged on the line")])
 def test_a_reading_lost_on_the_line_is_asked_for_once_more(
     devices: Devices, hardware: FakeHardware, error: DriverError
 ) -> None:
-    devices._head.call("no polls", lambda: setattr(devices._head, "_between", None), 1.0)
+    stop_polling(devices)
     failures = iter([error])
     reads: list[str] = []
 
@@ -231,7 +236,7 @@ def test_a_reading_lost_on_the_line_is_asked_for_once_more(
 def test_a_reading_that_hangs_when_asked_once_more_ends_with_the_first_error(
     devices: Devices, hardware: FakeHardware
 ) -> None:
-    devices._head.call("no polls", lambda: setattr(devices._head, "_between", None), 1.0)
+    stop_polling(devices)
     hang = Hang()
     failures = iter([NoReply("lost on the line")])
 
