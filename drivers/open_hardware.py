@@ -9,13 +9,16 @@ from __future__ import annotations
 import importlib
 import logging
 from collections.abc import Callable, Mapping
+from concurrent.futures import wait
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from types import MappingProxyType, TracebackType
 from typing import TYPE_CHECKING, Any, Literal
 
+from drivers.absent_camera import AbsentCamera, Opening, begin_opening, let_go
 from drivers.clock import Clock, SystemClock
-from drivers.errors import BadOptions, DriverError
+from drivers.errors import BadOptions, DriverError, NoReply
 from drivers.faults import PAN_TILT, nearest
 from drivers.interfaces import Camera, PanTilt
 
@@ -29,7 +32,16 @@ Kind = Literal["real", "simulated", "replayed", "mixed"]
 HEADS = {"dynamixel": "drivers.dynamixel.head", "flir_ptu": "drivers.flir_ptu.head"}
 """Pan/tilt drivers of this repository: the module whose ``open_head(options, clock)`` opens them."""
 
-BUILT_IN = (*HEADS, "v4l2", "sim", "replay")
+OURS = ("sim", "replay")
+"""No device behind them: they neither fail for a moment nor block."""
+
+BUILT_IN = (*HEADS, "v4l2", *OURS)
+
+OPENING_PATIENCE_S = 5.0
+"""A device that takes longer to open is named; if it is a camera, the others go on without it."""
+
+HEAD_OPENING_S = 60.0
+"""A head that takes longer to open is refused: without its readings nothing can be done."""
 
 
 @dataclass(frozen=True)
@@ -105,7 +117,10 @@ class Hardware:
 
 
 def open_hardware(settings: HardwareSettings, clock: Clock | None = None) -> Hardware:
-    """Open the head and every camera that the settings name.
+    """Open the head and every camera that the settings name, one after the other.
+
+    A camera that cannot be reached is absent (`AbsentCamera`), as is one whose opening takes longer than
+    `OPENING_PATIENCE_S`; it joins when it can be opened. A head is waited for `HEAD_OPENING_S`.
 
     Parameters
     ----------
@@ -119,14 +134,15 @@ def open_hardware(settings: HardwareSettings, clock: Clock | None = None) -> Har
     BadOptions
         For a driver that does not exist or cannot be loaded, and options that it refuses.
     DriverError
-        From a driver that cannot reach its device. Devices opened before are closed again.
+        From a driver that cannot reach its head; NoReply if it does not return in time. Devices opened
+        before are closed again, and those that come later too.
     """
     opener = _Opener(settings, clock or SystemClock())
     devices: dict[str, Any] = {}
     try:
-        devices[PAN_TILT] = opener.open(PAN_TILT, settings.pan_tilt, PanTilt)
+        devices[PAN_TILT] = opener.head(settings.pan_tilt)
         for name, device in settings.cameras.items():
-            devices[name] = opener.open(name, device, Camera)
+            devices[name] = opener.camera(name, device)
     except BaseException:
         _close(devices if opener.rover is None else {**devices, "simulated rover": opener.rover})
         raise
@@ -148,7 +164,49 @@ class _Opener:
         """What the opened devices are, together."""
         return next(iter(self._kinds)) if len(self._kinds) == 1 else "mixed"
 
-    def open(self, name: str, device: DeviceSettings, protocol: type) -> Any:
+    def head(self, device: DeviceSettings) -> Any:
+        """Open the head, and wait for it."""
+        make = partial(self._open, PAN_TILT, device, PanTilt)
+        if device.driver in OURS:
+            return make()
+        opening = begin_opening(PAN_TILT, make)
+        try:
+            if not _ended(opening, OPENING_PATIENCE_S):
+                log.warning(
+                    "%s: driver %r is still opening it after %g s; %g s are allowed",
+                    PAN_TILT, device.driver, OPENING_PATIENCE_S, HEAD_OPENING_S,
+                )  # fmt: skip
+                if not _ended(opening, HEAD_OPENING_S - OPENING_PATIENCE_S):
+                    words = f"driver {device.driver!r} did not open it within {HEAD_OPENING_S:g} s"
+                    raise NoReply(f"{words}: its factory has not returned", device=PAN_TILT)
+            return opening.result()
+        except BaseException:
+            let_go(opening)
+            raise
+
+    def camera(self, name: str, device: DeviceSettings) -> Any:
+        """Open a camera, or leave it absent."""
+        make = partial(self._open, name, device, Camera)
+        if device.driver in OURS:
+            return make()
+        opening = begin_opening(name, make)
+        try:
+            if not _ended(opening, OPENING_PATIENCE_S):
+                log.warning(
+                    "%s: driver %r is still opening it after %g s; going on without it",
+                    name, device.driver, OPENING_PATIENCE_S,
+                )  # fmt: skip
+                return AbsentCamera(name, device.driver, make, opening=opening)
+            return opening.result()
+        except BadOptions:
+            raise
+        except DriverError as error:
+            return AbsentCamera(name, device.driver, make, error=error)
+        except BaseException:
+            let_go(opening)
+            raise
+
+    def _open(self, name: str, device: DeviceSettings, protocol: type) -> Any:
         """Open one device and check that it does what the protocol asks."""
         if ":" in device.driver:
             self._kinds.add("real")
@@ -223,6 +281,11 @@ class _Opener:
         from drivers.v4l2.camera import open_camera
 
         return open_camera(device.options, self._clock, name)
+
+
+def _ended(opening: Opening, within_s: float) -> bool:
+    """Wait for an opening; return whether it has ended."""
+    return bool(wait([opening], within_s).done)
 
 
 def _factory(name: str, driver: str) -> Callable[..., Any]:

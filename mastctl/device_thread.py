@@ -53,14 +53,14 @@ class DeviceThread:
         Its name in errors and faults.
     between
         Called in the thread whenever nothing is asked, as the call ``between_name`` with the deadline
-        ``between_timeout_s``; returns the seconds until it wants to run again.
+        ``between_timeout_s``; returns the seconds until it wants to run again, None for never.
     """
 
     def __init__(
         self,
         device: str,
         *,
-        between: Callable[[], float] | None = None,
+        between: Callable[[], float | None] | None = None,
         between_name: str = "read",
         between_timeout_s: float = 1.0,
         between_after_error_s: float = 0.2,
@@ -183,6 +183,9 @@ class DeviceThread:
                         job.future.set_exception(error)
             elif self._between is not None:
                 pause_s, error = self._run(self._between_name, self._between, self._between_timeout_s)
+                if error is None and pause_s is None:
+                    self._between = None
+                    continue
                 next_between_s = time.monotonic() + (
                     float(pause_s) if error is None else self._between_after_error_s
                 )

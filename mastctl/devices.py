@@ -21,6 +21,7 @@ from typing import Protocol
 import numpy as np
 
 from calib.mast import Rig
+from drivers.absent_camera import AbsentCamera
 from drivers.clock import Clock
 from drivers.errors import BadFrame, BadReply, DriverError, NoFreshFrame, NoReply
 from drivers.interfaces import AxisReport, Camera, HoldsExposure, KnowsSize, PanTilt, Reading, Reporting
@@ -101,6 +102,8 @@ class Devices:
         self._on_head: set[str] = set()
         if rig is not None:
             self._take_rig(rig)
+            for name in self._cameras:
+                self._check_size(name)
         self._paired_s: dict[str, float] = {}  # per camera when the last frame that served a set began
         self._learned: dict[tuple[str, str], Offset] = {}
         self._still_since: dict[str, StampedFrame] = {}  # per camera the first frame of the same content
@@ -111,7 +114,7 @@ class Devices:
         self._blocked = ""
         self._closed = False
         self._last_faults: tuple[str, ...] = ()
-        self._camera_threads = {name: DeviceThread(name) for name in self._cameras}
+        self._camera_threads = {name: self._thread_of(name) for name in self._cameras}
         self._head = DeviceThread(HEAD, between=self._poll, between_timeout_s=READ_TIMEOUT_S)
 
     # The head
@@ -339,9 +342,6 @@ class Devices:
         self._store.change_mast(mast_digest)
 
     def _take_rig(self, rig: Rig) -> None:
-        for name, camera in self._cameras.items():
-            if isinstance(camera, KnowsSize) and name in rig.cameras:
-                frame_checks.check_size(name, camera.size_px, rig.cameras[name].model.size_px)
         self._sizes_px = {name: camera.model.size_px for name, camera in rig.cameras.items()}
         self._on_head = {name for name, camera in rig.cameras.items() if camera.on == "head"}
 
@@ -386,6 +386,26 @@ class Devices:
             log.warning("%s reports: %s", HEAD, "; ".join(reading.faults) or "healthy again")
         self._settle_stop()
         return reading
+
+    def _thread_of(self, camera: str) -> DeviceThread:
+        """The thread of a camera; that of an absent one looks after it, and tells its absence as a fault."""
+        if not isinstance(self._cameras[camera], AbsentCamera):
+            return DeviceThread(camera)
+        return DeviceThread(camera, between=lambda: self._join(camera), between_name="next_frame")
+
+    def _join(self, name: str) -> None:
+        """Put a camera that was absent at the start in its place, if it is there. Raises DriverError."""
+        place = self._cameras[name]
+        if isinstance(place, AbsentCamera):
+            self._cameras[name] = place.appeared()
+            log.warning("%s is here", name)
+        self._check_size(name)
+
+    def _check_size(self, name: str) -> None:
+        """Pass a camera that does not know its size, or has the mast file's. Raises BadFrame."""
+        camera = self._cameras[name]
+        if isinstance(camera, KnowsSize) and name in self._sizes_px:
+            frame_checks.check_size(name, camera.size_px, self._sizes_px[name])
 
     def _poll(self) -> float:
         return MOVING_PERIOD_S if self._read_once().moving else RESTING_PERIOD_S

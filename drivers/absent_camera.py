@@ -1,0 +1,143 @@
+"""A camera that could not be opened at the start: a place that it joins as soon as it can.
+
+A factory may fail, which is tried again with a growing wait, or block for as long as it likes, which nobody
+can end from outside. So each opening has a thread of its own, and whoever asks is told at once how it stands.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+from concurrent.futures import Future
+from typing import Any
+
+from drivers.absence import LONGEST_WAIT_S, Absence
+from drivers.errors import DriverError
+from drivers.interfaces import Camera, Frame
+
+Opening = Future[Any]
+
+
+def begin_opening(name: str, make: Callable[[], Any]) -> Opening:
+    """Open a device in a thread of its own, which is left behind if it never returns."""
+    opening: Opening = Future()
+
+    def work() -> None:
+        try:
+            opening.set_result(make())
+        except BaseException as error:  # it belongs to whoever asks for the result
+            opening.set_exception(error)
+
+    threading.Thread(target=work, name=f"opening {name}", daemon=True).start()
+    return opening
+
+
+def let_go(opening: Opening) -> None:
+    """Close what an opening brings, now or whenever it ends."""
+
+    def close(ended: Opening) -> None:
+        if ended.exception() is None:
+            ended.result().close()
+
+    opening.add_done_callback(close)
+
+
+class AbsentCamera:
+    """What stands for a camera until it can be opened.
+
+    Parameters
+    ----------
+    name, driver
+        Its name, and its driver's.
+    make
+        Opens it. Raises DriverError.
+    opening
+        An opening that is under way already; or
+    error
+        why the first one failed.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        driver: str,
+        make: Callable[[], Camera],
+        opening: Opening | None = None,
+        error: DriverError | None = None,
+    ) -> None:
+        self._name = name
+        self._driver = driver
+        self._make = make
+        self._lock = threading.Lock()
+        self._opening = opening
+        self._since_s = time.monotonic()
+        self._absence = Absence()
+        if error is not None:
+            self._absence.note(error, self._since_s)
+        self._closed = False
+        self.camera: Camera | None = None
+        """The camera, once it is open."""
+
+    def appeared(self) -> Camera:
+        """Return the camera if it is open by now, and see to it that it is tried; never waits.
+
+        Raises
+        ------
+        DriverError
+            Why it is not, and that it joins by itself; with the code of the driver's own error.
+        """
+        with self._lock:
+            if self.camera is None and not self._closed:
+                self._try(time.monotonic())
+            if self.camera is None:
+                raise self._why(time.monotonic())
+            return self.camera
+
+    def next_frame(self, exposed_after_s: float, timeout_s: float) -> Frame:
+        """Return a frame if the camera is there by now. Raises DriverError as `appeared`."""
+        return self.appeared().next_frame(exposed_after_s, timeout_s)
+
+    def close(self) -> None:
+        """Close the camera, also one that is opened later yet."""
+        with self._lock:
+            self._closed = True
+            opening, self._opening = self._opening, None
+            camera = self.camera
+        if opening is not None:
+            let_go(opening)
+        if camera is not None:
+            camera.close()
+
+    def _try(self, now_s: float) -> None:
+        """Take what an opening brought, or begin the next one when it is due."""
+        if self._opening is None:
+            if now_s < self._absence.again_s:
+                return
+            self._opening, self._since_s = begin_opening(self._name, self._make), now_s
+        if not self._opening.done():
+            return
+        opening, self._opening = self._opening, None
+        error = opening.exception()
+        if error is None:
+            self.camera = opening.result()
+        else:
+            fault = (
+                error if isinstance(error, DriverError) else DriverError(f"{type(error).__name__}: {error}")
+            )
+            self._absence.note(fault, now_s)
+
+    def _why(self, now_s: float) -> DriverError:
+        """Why it is not there, in words."""
+        error = self._absence.error
+        if error is None:
+            words = (
+                f"driver {self._driver!r} has been opening it for {now_s - self._since_s:.0f} s; "
+                "it joins by itself when the driver returns"
+            )
+            return DriverError(words, device=self._name)
+        named = str(error).removeprefix(f"{self._name}: ")
+        words = f"absent since the start: {named}; tried again every {LONGEST_WAIT_S:g} s, it joins by itself"
+        why = DriverError(words, device=self._name, detail=error.detail)
+        why.code = error.code
+        return why
