@@ -69,8 +69,6 @@ def parse_rig(data: bytes, path: str | Path) -> StoredRig:
         model, camera_notes = _model(section)
         cameras[name] = RigCamera(on, model)
         notes += camera_notes
-    if not cameras:
-        raise top.bad("cameras", "holds no camera; at least one is expected")
     rig = Rig(
         name=top.text("name"),
         mast=Mast(
@@ -227,7 +225,9 @@ def read_stereo(top: Section, cameras: Mapping[str, object]) -> dict[str, tuple[
             raise top.bad(key, f"{kind_of(names)} where [left camera, right camera] is expected")
         for name, side in zip(names, ("_left", "_right"), strict=True):
             if name not in cameras:
-                raise top.bad(key, f"'{name}' is no camera of this file; there are {', '.join(cameras)}")
+                raise top.bad(
+                    key, f"'{name}' is no camera of this file; there are {', '.join(cameras) or 'none'}"
+                )
             if not name.endswith(side):
                 raise top.bad(key, f"'{name}' where a camera named ...{side} is expected")
         pairs[pair] = (names[0], names[1])

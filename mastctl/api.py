@@ -74,6 +74,7 @@ STATUS_OF_CODE: Mapping[str, int] = {
     "not_simulated": 404,
     "bad_aim": 422,
     "bad_mast_file": 422,
+    "no_stereo": 422,
     "outside_image": 422,
     "outside_limits": 422,
     "pose_without_covariance": 422,

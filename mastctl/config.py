@@ -83,13 +83,11 @@ def parse_config(data: bytes, path: str | Path) -> Config:
         path,
         "",
         document,
-        ("schema", "mast_file", "pan_tilt", "cameras", "limits"),
-        ("listen", "simulation", "tracking"),
+        ("schema", "mast_file", "pan_tilt", "limits"),
+        ("cameras", "listen", "simulation", "tracking"),
     )
     folder = Path(path).resolve().parent
     cameras = {name: _device(top, "cameras", name) for name in top.mapping("cameras")}
-    if not cameras:
-        raise top.bad("cameras", "holds no camera; at least one is expected")
     return Config(
         path=Path(path),
         mast_file=folder / top.text("mast_file"),
@@ -115,12 +113,12 @@ def check_cameras(config: Config, rig: Rig) -> None:
     """
     for pair in config.tracking.named_pairs:
         if pair not in rig.stereo:
-            words = f"the mast file has no such pair; {nearest(pair, tuple(rig.stereo))}"
+            words = f"the mast file has no such pair; {_known(pair, tuple(rig.stereo))}"
             raise BadFile(config.path, f"tracking.handoff.pairs.{pair}", words)
     known = tuple(rig.cameras)
     for name in config.hardware.cameras:
         if name not in known:
-            words = f"the mast file {config.mast_file} has no such camera; {nearest(name, known)}"
+            words = f"the mast file {config.mast_file} has no such camera; {_known(name, known)}"
             raise BadFile(config.path, f"cameras.{name}", words)
 
 
@@ -132,6 +130,11 @@ def is_loopback(host: str) -> bool:
         return ipaddress.ip_address(host).is_loopback
     except ValueError:
         return False
+
+
+def _known(word: str, known: tuple[str, ...]) -> str:
+    """The nearest of what a mast file has, or that it has nothing of the kind."""
+    return nearest(word, known) if known else "it has none"
 
 
 def _device(top: Section, place: str, name: str) -> DeviceSettings:

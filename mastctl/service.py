@@ -367,6 +367,10 @@ class Service:
         _bounded("closing the hardware", self.hardware.close, HARDWARE_CLOSE_S)
 
     def _check_pixel(self, target: PixelTarget) -> None:
+        if target.camera not in self._rig.cameras:
+            known = ", ".join(self._rig.cameras) or "none"
+            raise UnknownCamera(f"camera {target.camera[:80]} is not configured; configured are {known}")
+        self._check_pair(target.camera)
         frame = self.devices.frame_by_id(target.frame_id, CLICK_AGE_S)
         if frame.camera != target.camera:
             words = f"frame {target.frame_id} is of camera {frame.camera}, not of {target.camera}"
@@ -381,11 +385,23 @@ class Service:
         height, width = frame.image.shape[:2]
         _check_inside("pixel", target.x_px, target.y_px, (width, height))
 
+    def _check_pair(self, camera: str) -> None:
+        """Pass a camera whose other eye is configured too: without it there is no range. Raises Refused."""
+        if any(camera in eyes for eyes in self._rig.stereo.values()):
+            return
+        words = f"{camera} is in no stereo pair of the mast file"
+        for pair, eyes in self.stored.rig.stereo.items():
+            if camera in eyes:
+                other = eyes[1] if camera == eyes[0] else eyes[0]
+                words = f"the other eye of the stereo pair {pair}, {other}, is not in the configuration"
+        raise Refused("no_stereo", f"{words}, so a pixel of {camera} has no range")
+
     def _check_aim(self, aim: Aim) -> None:
         known = self._rig.cameras.get(aim.camera)
         if known is None or known.on != "head":
-            on_head = ", ".join(name for name, entry in self._rig.cameras.items() if entry.on == "head")
-            words = f"'{aim.camera[:80]}' where a configured camera on the head is expected: {on_head}"
+            on_head = [name for name, entry in self._rig.cameras.items() if entry.on == "head"]
+            known_words = ", ".join(on_head) or "there is none"
+            words = f"'{aim.camera[:80]}' where a configured camera on the head is expected: {known_words}"
             raise Refused("bad_aim", f"aim.camera is {words}")
         _check_inside("aim", aim.x_px, aim.y_px, known.model.size_px)
 

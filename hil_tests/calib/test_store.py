@@ -150,7 +150,6 @@ BAD_MASTS: list[tuple[Callable[[dict[str, Any]], None], str, str]] = [
     (_edit("mast", value=[1]), "mast", "mapping"),
     (_edit("name", value=7), "name", "text"),
     (_edit("name", value=""), "name", "text"),
-    (_edit("cameras", value={}), "cameras", "at least one"),
     (_edit("cameras", value=[]), "cameras", "mapping"),
     (_edit("cameras", "navcam", value={}), "cameras.navcam", "_left"),
     (_edit(*NAVCAM, "on", value="mast"), "cameras.navcam_left.on", "head, rover"),
@@ -322,12 +321,24 @@ def test_a_rig_that_the_file_cannot_hold_changes_nothing(tmp_path: Path) -> None
     path = tmp_path / "rig.yaml"
     path.write_text(MAST_TEXT)
     rig = store.load_rig(path).rig
-    for wrong in ({"fit": {"a": object()}}, {"fit": {"a": float("inf")}}, {"name": ""}, {"cameras": {}}):
+    for wrong in ({"fit": {"a": object()}}, {"fit": {"a": float("inf")}}, {"name": ""}):
         fields = {"name": rig.name, "mast": rig.mast, "cameras": rig.cameras, "fit": {}} | wrong
         with pytest.raises(BadFile):
             store.save_rig(type(rig)(**fields), path)
     assert path.read_text() == MAST_TEXT
     assert _names(tmp_path) == ["rig.yaml"]
+
+
+def test_a_mast_without_cameras_is_kept_like_any_other(tmp_path: Path) -> None:
+    path, again = tmp_path / "bare.yaml", tmp_path / "again.yaml"
+    path.write_text(
+        "schema: mastctl/mast/1\nname: bare\nmast: {translation_m: [0, 0, -1.4], rotation_rad: [0, 0, 0]}\n"
+        "cameras: {}\n"
+    )
+    rig = store.load_rig(path).rig
+    assert dict(rig.cameras) == {} and dict(rig.stereo) == {}
+    store.save_rig(rig, again)
+    assert store.load_rig(again).rig.mast.translation_m.tolist() == [0.0, 0.0, -1.4]
 
 
 def test_a_save_keeps_the_version_before_it_its_permissions_and_a_link(tmp_path: Path) -> None:

@@ -77,7 +77,6 @@ BAD: list[tuple[str, Any, str, str]] = [
     ("pan_tilt/driver", ..., "pan_tilt.driver", "missing"),
     ("pan_tilt/options", [1], "pan_tilt.options", "a mapping is expected"),
     ("pan_tilt/options", {"x": float("nan")}, "pan_tilt.options.x", "finite"),
-    ("cameras", {}, "cameras", "at least one"),
     ("cameras", ["navcam_left"], "cameras", "a mapping is expected"),
     ("cameras/navcam_left", "v4l2", "cameras.navcam_left", "a mapping with driver"),
     ("cameras/navcam_left/option", {}, "cameras.navcam_left.option", "the nearest known is 'options'"),

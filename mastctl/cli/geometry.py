@@ -268,6 +268,8 @@ def _camera_name(stored: StoredRig, name: str | None) -> str:
     cameras = stored.rig.cameras
     if name is None and len(cameras) == 1:
         return next(iter(cameras))
+    if not cameras:
+        raise output.WrongUse(f"{stored.path} holds no camera")
     if name is None:
         raise output.WrongUse(
             f"{stored.path} holds several cameras; --camera with one of {', '.join(cameras)}"

@@ -108,7 +108,7 @@ class Steps:
         pixel = clicked_px(target, self._rig)
         partner = self.eyes.partner(target.camera)
         if partner is None:
-            words = f"{target.camera} is in no stereo pair of the mast file: no range"
+            words = f"{target.camera} is in no stereo pair with both eyes configured: no range"
             raise PointingError("no_stereo", words)
         view = self.eyes.named(target.frame_id)
         if view.frame.camera != target.camera:

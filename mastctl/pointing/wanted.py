@@ -27,10 +27,11 @@ def aim_of(request: PointRequest, rig: Rig) -> Aim:
             if name in rig.cameras and rig.cameras[name].on == "head":
                 x, y = rig.cameras[name].model.image_center_px
                 return Aim(name, x, y)
-        raise PointingError("bad_aim", "the mast file has no camera on the head to aim with")
+        words = "no camera on the head is configured to aim with; only joint angles can be pointed at"
+        raise PointingError("bad_aim", words)
     camera = rig.cameras.get(aim.camera)
     if camera is None:
-        raise PointingError("unknown_camera", f"aim.camera: the mast file has no camera {aim.camera[:80]}")
+        raise PointingError("unknown_camera", f"aim.camera {aim.camera[:80]} is not configured")
     if camera.on != "head":
         raise PointingError("bad_aim", f"aim.camera: {aim.camera} is on the rover's body and cannot be aimed")
     _inside(rig, aim.camera, aim.x_px, aim.y_px, "aim")
@@ -40,7 +41,7 @@ def aim_of(request: PointRequest, rig: Rig) -> Aim:
 def clicked_px(target: PixelTarget, rig: Rig) -> FloatArray:
     """Return the clicked pixel (2,), checked. Raises PointingError."""
     if target.camera not in rig.cameras:
-        raise PointingError("unknown_camera", f"the mast file has no camera {target.camera[:80]}")
+        raise PointingError("unknown_camera", f"camera {target.camera[:80]} is not configured")
     _inside(rig, target.camera, target.x_px, target.y_px, "pixel")
     return np.array([target.x_px, target.y_px])
 

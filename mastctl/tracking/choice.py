@@ -138,9 +138,8 @@ def choose_pairs(
     found = [choice for _, choice in (*kept, *broken)]
     if not found:
         place = ", ".join(f"{value:.2f}" for value in position_m)
-        raise CalibError(
-            f"no stereo pair sees the target at ({place}) m: {'; '.join(reasons) or 'there is none'}"
-        )
+        words = "; ".join(reasons) or "none is configured with both eyes"
+        raise CalibError(f"no stereo pair sees the target at ({place}) m: {words}")
     return found
 
 
