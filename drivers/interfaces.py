@@ -163,6 +163,16 @@ class Camera(Protocol):
 
 
 @runtime_checkable
+class SaysSimulated(Protocol):
+    """A head or camera that says whether it only plays one; a driver that does not say is taken as real."""
+
+    @property
+    def simulated(self) -> bool:
+        """True of a simulator, False of a real device."""
+        ...
+
+
+@runtime_checkable
 class KnowsSize(Protocol):
     """A camera that knows the size of its pictures before the first one; not every camera has this."""
 

@@ -82,7 +82,8 @@ class Hardware:
     pan_tilt, cameras
         The devices.
     kind
-        ``real`` (drivers from outside count as real), ``simulated``, ``replayed``, or ``mixed``.
+        ``real``, ``simulated``, ``replayed``, or ``mixed``. Drivers from outside count as real, if they do
+        not say otherwise (`drivers.interfaces.SaysSimulated`).
     simulation
         The simulated rover behind ``sim`` devices, or None; only for experiments, tests and faults.
     """
@@ -91,13 +92,20 @@ class Hardware:
         self,
         pan_tilt: PanTilt,
         cameras: Mapping[str, Camera],
-        kind: Kind,
+        kinds: Mapping[str, Kind | None],
         simulation: SimulatedRover | None = None,
     ) -> None:
         self.pan_tilt = pan_tilt
         self.cameras = MappingProxyType(dict(cameras))
-        self.kind = kind
+        self._kinds = dict(kinds)
         self.simulation = simulation
+
+    @property
+    def kind(self) -> Kind:
+        """What the devices are, together."""
+        devices = {PAN_TILT: self.pan_tilt, **self.cameras}
+        found = {self._kinds.get(name) or _own_word(device) for name, device in devices.items()}
+        return found.pop() if len(found) == 1 else "mixed"
 
     def close(self) -> None:
         """Close every device; one that fails to is logged and does not keep the others open."""
@@ -147,7 +155,7 @@ def open_hardware(settings: HardwareSettings, clock: Clock | None = None) -> Har
         _close(devices if opener.rover is None else {**devices, "simulated rover": opener.rover})
         raise
     pan_tilt = devices.pop(PAN_TILT)
-    return Hardware(pan_tilt, devices, opener.kind(), opener.rover)
+    return Hardware(pan_tilt, devices, opener.kinds, opener.rover)
 
 
 class _Opener:
@@ -156,13 +164,10 @@ class _Opener:
     def __init__(self, settings: HardwareSettings, clock: Clock) -> None:
         self._settings = settings
         self._clock = clock
-        self._kinds: set[Kind] = set()
+        self.kinds: dict[str, Kind | None] = {}
+        """By device; None for one that says so itself, or not at all."""
         self._replays: dict[str, Any] = {}
         self.rover: SimulatedRover | None = None
-
-    def kind(self) -> Kind:
-        """What the opened devices are, together."""
-        return next(iter(self._kinds)) if len(self._kinds) == 1 else "mixed"
 
     def head(self, device: DeviceSettings) -> Any:
         """Open the head, and wait for it."""
@@ -209,21 +214,21 @@ class _Opener:
     def _open(self, name: str, device: DeviceSettings, protocol: type) -> Any:
         """Open one device and check that it does what the protocol asks."""
         if ":" in device.driver:
-            self._kinds.add("real")
+            self.kinds[name] = None
             return _from_outside(name, device, protocol)
         if device.driver == "sim":
-            self._kinds.add("simulated")
+            self.kinds[name] = "simulated"
             return self._simulated(name, device)
         if device.driver == "replay":
-            self._kinds.add("replayed")
+            self.kinds[name] = "replayed"
             return self._replayed(name, device)
         if device.driver == "v4l2":
-            self._kinds.add("real")
+            self.kinds[name] = "real"
             return self._v4l2(name, device)
         if device.driver in HEADS:
             if protocol is not PanTilt:
                 raise BadOptions(f"driver {device.driver!r} is for a pan/tilt head", device=name)
-            self._kinds.add("real")
+            self.kinds[name] = "real"
             return self._head(name, device)
         raise BadOptions(
             f"there is no driver {device.driver!r}{nearest(device.driver, BUILT_IN)}; "
@@ -326,6 +331,16 @@ def _from_outside(name: str, device: DeviceSettings, protocol: type) -> Any:
             f"driver {device.driver!r} made a {type(made).__name__} without {', '.join(missing)}", device=name
         )
     return made
+
+
+def _own_word(device: object) -> Kind:
+    """What a device from outside says that it is."""
+    if isinstance(device, AbsentCamera):
+        device = device.camera
+    try:
+        return "simulated" if getattr(device, "simulated", False) is True else "real"
+    except Exception:  # a property of somebody else's: what cannot be told is taken as real
+        return "real"
 
 
 def _one_line(error: BaseException) -> str:

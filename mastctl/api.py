@@ -235,8 +235,9 @@ def _add_simulation(app: FastAPI, service: Service) -> None:
 
     def simulated(what: str) -> SimulatedRover:
         if service.hardware.simulation is None:
+            kind = service.hardware.kind
             raise NotSimulated(
-                f"the hardware is {service.hardware.kind}: {what} are for a simulated rover only"
+                f"{what} are for this program's own simulated rover only; the hardware is {kind}"
             )
         return service.hardware.simulation
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+import time
 import types
 from collections.abc import Iterator
 from dataclasses import replace
@@ -12,7 +13,7 @@ import numpy as np
 import pytest
 
 from drivers.clock import ManualClock
-from drivers.errors import BadOptions, LineLost, NoReply
+from drivers.errors import BadOptions, DriverError, LineLost, NoReply
 from drivers.interfaces import Frame, Reading
 from drivers.open_hardware import DeviceSettings, HardwareSettings, open_hardware
 
@@ -243,3 +244,91 @@ def test_sim_devices_take_no_options_and_know_their_cameras(small_rig: Path) -> 
         open_hardware(replace(settings, pan_tilt=DeviceSettings("sim", {"speed": 1})), ManualClock())
     with pytest.raises(BadOptions, match=r"navcam_lef: .* no such camera; did you mean 'navcam_left'"):
         open_hardware(replace(settings, cameras={"navcam_lef": SIM}), ManualClock())
+
+
+class SaidHead(Head):
+    simulated: object = True
+
+
+class SaidEye(Eye):
+    simulated = True
+
+
+class Vague:
+    """Neither true nor false: it counts as real."""
+
+    def __bool__(self) -> bool:
+        raise RuntimeError("do not ask")
+
+
+@pytest.mark.parametrize(
+    ("head", "eye", "kind"),
+    [
+        ("SaidHead", "SaidEye", "simulated"),
+        ("SaidHead", "Eye", "mixed"),
+        ("Head", "SaidEye", "mixed"),
+        ("VagueHead", "Eye", "real"),
+        ("BrokenHead", "Eye", "real"),
+    ],
+)
+def test_a_driver_from_outside_may_say_that_it_is_simulated(
+    outside: None, monkeypatch: pytest.MonkeyPatch, head: str, eye: str, kind: str
+) -> None:
+    module = sys.modules["outside_drivers"]
+    broken = property(lambda self: 1 / 0)
+    for name, made in (
+        ("SaidHead", SaidHead),
+        ("SaidEye", SaidEye),
+        ("VagueHead", type("VagueHead", (Head,), {"simulated": Vague()})),
+        ("BrokenHead", type("BrokenHead", (Head,), {"simulated": broken})),
+    ):
+        monkeypatch.setattr(module, name, made, raising=False)
+    settings = HardwareSettings(
+        DeviceSettings(f"outside_drivers:{head}"), {"cam_left": DeviceSettings(f"outside_drivers:{eye}")}
+    )
+    with open_hardware(settings) as hardware:
+        assert hardware.kind == kind and hardware.simulation is None
+
+
+def test_an_absent_camera_counts_as_real_until_it_is_there(
+    outside: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    there: list[SaidEye] = []
+
+    def late() -> SaidEye:
+        if not there:
+            raise NoReply("not yet")
+        return there[0]
+
+    monkeypatch.setattr(sys.modules["outside_drivers"], "SaidHead", SaidHead, raising=False)
+    monkeypatch.setattr(sys.modules["outside_drivers"], "late", late, raising=False)
+    settings = HardwareSettings(
+        DeviceSettings("outside_drivers:SaidHead"), {"cam_left": DeviceSettings("outside_drivers:late")}
+    )
+    with open_hardware(settings) as hardware:
+        assert hardware.kind == "mixed"
+        place = hardware.cameras["cam_left"]
+        with pytest.raises(DriverError, match="cam_left: absent since the start: not yet"):
+            place.next_frame(0.0, 0.1)
+        there.append(SaidEye())
+        deadline_s = time.monotonic() + 20.0
+        while True:
+            try:
+                place.next_frame(0.0, 0.1)
+                break
+            except DriverError:
+                assert time.monotonic() < deadline_s
+                time.sleep(0.01)
+        assert hardware.kind == "simulated"
+
+
+def test_a_v4l2_camera_that_is_not_plugged_in_is_absent(outside: None, tmp_path: Path) -> None:
+    settings = HardwareSettings(
+        DeviceSettings("outside_drivers:Head"),
+        {"cam_left": DeviceSettings("v4l2", {"device": str(tmp_path / "video0")})},
+    )
+    with open_hardware(settings) as hardware:
+        assert hardware.kind == "real"
+        with pytest.raises(DriverError, match=r"cam_left: absent since the start: .*video0") as caught:
+            hardware.cameras["cam_left"].next_frame(0.0, 0.1)
+        assert caught.value.code == "no_camera"
