@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 from calib.body_sights import BodySights
@@ -21,16 +22,26 @@ WORDS = ("shift forward", "shift right", "shift down", "roll", "pitch", "yaw")
 
 @dataclass(frozen=True, eq=False)
 class LeftOut:
-    """A hand-off that contradicts the rest: which, by how much (px, the worst eye), and the failed test."""
+    """A hand-off that was not used: which, by how much (px), and the failed test.
+
+    It contradicts the rest, by ``off_px`` in the worst eye; or, if it is not ``one_point``, its clicks
+    contradict each other, by ``off_px`` across the epipolar line.
+    """
 
     name: str
     off_px: float
     statistic: float
     limit: float
+    one_point: bool = True
 
     @property
     def sentence(self) -> str:
         """The outlier in words."""
+        if not self.one_point:
+            return (
+                f"{self.name} was not used: its two clicks do not mean one point, they are "
+                f"{self.off_px:.1f} px apart across the epipolar line, {math.sqrt(self.statistic):.1f} sigma"
+            )
         return f"{self.name} is off by {self.off_px:.1f} px after the correction and was not used"
 
 

@@ -7,18 +7,22 @@ Clicks and joint readings err once per hand-off, so the eyes of one hand-off sha
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 
-from calib.errors import CalibError
+from calib.errors import NoStereoPoint
 from calib.gimbal import gimbal, gimbal_rates, numbers_of
 from calib.mast import Rig
 from calib.matched_handoff import MODEL_PX, MatchedHandoff
+from calib.ray_gap import MOST_SIGMAS, RIG_PX, RayGap, ray_gap
+from calib.rig_covariance import RigCovariance, stored_covariance
+from calib.rig_rates import click_covariance
 from calib.rigid import FloatArray, Rigid, moved_rigid, rigid_rates
-from calib.stereo import triangulate
+from calib.stereo import Triangulation, triangulate
 
 _JOINTS = np.array([8, 9])
 """Pan and tilt among a gimbal's ten numbers."""
@@ -53,6 +57,8 @@ class BodySights:
         (n, 3), (n, 3, 3) and (n, 3, 4): the targets by the source pairs, from clicks and joint readings.
     found_px, noise_px2, seen
         (n, k, 2), (n, k, 2, 2) and (n, k): found pixels and their noise; which there are.
+    apart
+        Hand-offs that are not among them since their clicks do not mean one point, and their gaps.
     """
 
     rig: Rig
@@ -65,6 +71,7 @@ class BodySights:
     found_px: FloatArray
     noise_px2: FloatArray
     seen: np.ndarray
+    apart: tuple[tuple[MatchedHandoff, RayGap], ...] = ()
 
     def pose(self, step: FloatArray) -> Rigid:
         """Return the rigid motion that a step is, in the rover frame."""
@@ -111,37 +118,65 @@ def body_sights(
     """Return what the named body cameras found of the targets that pairs on the head handed over.
 
     Hand-offs from other pairs, without an accepted match, or whose clicks mean no point by this rig are
-    left out.
+    left out. Clicks may be matches, so ``model_px`` counts for them too.
+
+    Raises
+    ------
+    CalibError
+        If the rig's stored covariance is none of it.
     """
+    known = stored_covariance(rig)
     origin = np.mean([rig.cameras[name].model.C for name in cameras], axis=0)
-    used, rows = [], []
+    used, rows, apart = [], [], []
     for one in handoffs:
         if not all(name in rig.cameras and rig.cameras[name].on == "head" for name in one.pair):
             continue
-        row = _row(rig, cameras, one, model_px)
-        if row is not None:
+        seen = _seen(rig, one)
+        row = None if seen is None else _row(rig, cameras, one, seen, model_px)
+        if seen is None or row is None:
+            continue
+        gap = ray_gap(seen, _allowed_px2(rig, one, seen, known, model_px))
+        if gap.sigmas > MOST_SIGMAS:
+            apart.append((one, gap))
+        else:
             used.append(one)
             rows.append(row)
     k = len(cameras)
     shapes = ((3,), (3, 3), (3, 4), (k, 2), (k, 2, 2), (k,))
-    position, covariance, rates, found, noise, seen = (
+    position, covariance, rates, found, noise, there = (
         np.array([row[i] for row in rows]).reshape(len(rows), *shape) for i, shape in enumerate(shapes)
     )
     return BodySights(
-        rig, tuple(cameras), origin, tuple(used), position, covariance, rates, found, noise, seen.astype(bool)
-    )
+        rig, tuple(cameras), origin, tuple(used), position, covariance, rates, found, noise,
+        there.astype(bool), tuple(apart),
+    )  # fmt: skip
+
+
+def _seen(rig: Rig, one: MatchedHandoff) -> Triangulation | None:
+    """The point of a hand-off's clicks by this rig; None if there is none."""
+    left, right = (rig.camera_in_rover(n, one.joints.pan_rad, one.joints.tilt_rad) for n in one.pair)
+    try:
+        return triangulate(left, right, one.clicks_px[0], one.clicks_px[1], one.sigma_px)
+    except NoStereoPoint:
+        return None
+
+
+def _allowed_px2(
+    rig: Rig, one: MatchedHandoff, seen: Triangulation, known: RigCovariance | None, model_px: float
+) -> FloatArray:
+    """Covariance (4, 4) of a hand-off's clicks that a gap of its rays is judged by."""
+    return click_covariance(
+        rig, one.pair, one.joints.pan_rad, one.joints.tilt_rad, seen.position_m,
+        sigma_px=math.hypot(one.sigma_px, model_px if known else RIG_PX),
+        sigma_rad=one.joints.sigma_rad, calibration=known,
+    )  # fmt: skip
 
 
 def _row(
-    rig: Rig, cameras: Sequence[str], one: MatchedHandoff, model_px: float
+    rig: Rig, cameras: Sequence[str], one: MatchedHandoff, seen: Triangulation, model_px: float
 ) -> tuple[FloatArray, ...] | None:
     """One hand-off's position, covariance, rates, found pixels, their noise, and which are there."""
     at = (one.joints.pan_rad, one.joints.tilt_rad)
-    left, right = (rig.camera_in_rover(name, *at) for name in one.pair)
-    try:
-        seen = triangulate(left, right, one.clicks_px[0], one.clicks_px[1], one.sigma_px)
-    except CalibError:
-        return None
     turned = gimbal_rates(np.eye(3)[None], seen.position_m[None], gimbal(numbers_of(rig.mast), *at), _JOINTS)[
         0
     ]

@@ -17,8 +17,8 @@ from calib.cahvor import CameraModel
 from calib.camera_parameters import parameter_names, parameter_part, tangents
 from calib.mast import Rig
 from calib.rig_covariance import RigCovariance
+from calib.rig_rates import click_rates, pixel_rates
 from calib.rigid import FloatArray
-from calib.uncertainty import pixel_rates
 
 
 def corrected_rig(rig: Rig, correction: BodyPose) -> Rig:
@@ -99,10 +99,6 @@ def _parameter_rates(rig: Rig, known: RigCovariance, correction: BodyPose) -> Fl
     flat = rates.reshape(count, 2 * eyes, -1)
     for i, one in enumerate(used.handoffs):
         joints = (one.joints.pan_rad, one.joints.tilt_rad)
-        clicked = [
-            pixel_rates(rig, known.names, n, *joints, used.positions_m[i : i + 1])[1][0] for n in one.pair
-        ]
-        # A model that shifts its pixel of the point by something puts a click's point where a click
-        # shifted the other way would.
-        flat[i] -= equations.point_rates[i] @ used.rates_m_per_px[i] @ np.concatenate(clicked)
+        clicked = click_rates(rig, known.names, one.pair, *joints, used.positions_m[i])
+        flat[i] += equations.point_rates[i] @ used.rates_m_per_px[i] @ clicked
     return flat

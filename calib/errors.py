@@ -50,7 +50,7 @@ class Unreachable(CalibError):
 class NoStereoPoint(CalibError):
     """Two rays that do not meet in front of both cameras; ``code`` names the cause for programs.
 
-    Codes: ``parallel_rays``, ``behind_camera``, ``bad_pixel``.
+    Codes: ``parallel_rays``, ``behind_camera``, ``bad_pixel``, ``not_one_point``.
     """
 
     def __init__(self, code: str, message: str) -> None:

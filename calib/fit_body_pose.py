@@ -19,6 +19,7 @@ from calib.body_sights import BodySights, Equations, body_sights
 from calib.errors import NoCorrection
 from calib.mast import Rig
 from calib.matched_handoff import MatchedHandoff
+from calib.ray_gap import MOST_SIGMAS
 from calib.rigid import FloatArray
 from calib.significance import chance, sigmas
 
@@ -67,7 +68,10 @@ def fit_body_pose(rig: Rig, cameras: Sequence[str], handoffs: Sequence[MatchedHa
     used = _part(every, keep)
     _enough(used)
     fit = _fit(used)
-    left_out = []
+    left_out = [
+        LeftOut(one.name, gap.across_px, gap.sigmas**2, MOST_SIGMAS**2, one_point=False)
+        for one, gap in every.apart
+    ]
     at = every.equations(fit.step)
     for i in np.flatnonzero(~keep):
         off = float(np.linalg.norm(at.residual_px[i].reshape(-1, 2), axis=1).max())

@@ -1,29 +1,28 @@
 """Camera hand-off: where a target that one stereo pair sees falls in other cameras (the paper's section V).
 
 Three steps: a ray through each picked pixel of the pair; the point nearest to both rays; that point projected
-into each next camera, on the body or on the head, the head turned or not. The covariance goes the same way:
-of the clicks to first order in closed form, of joint angles and calibration by differences of the whole
-chain, so that errors which both sides share cancel as they do in the rig.
+into each next camera, on the body or on the head, the head turned or not. The covariance goes the same way,
+to first order in closed form: what clicks, joint angles and calibration are wrong by is carried through the
+whole chain, so that errors which both sides share cancel as they do in the rig.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from calib.cahvor import CameraModel
-from calib.errors import CalibError, NoHandoff
+from calib.errors import NoHandoff
 from calib.mast import Rig
-from calib.rig_covariance import RigCovariance, moved_rig
+from calib.ray_gap import RayGap, clicked_point
+from calib.rig_covariance import RigCovariance
+from calib.rig_rates import JOINT_NAMES, click_rates, pixel_rates
 from calib.rigid import FloatArray
-from calib.stereo import Triangulation, triangulate
-
-STEP = 0.1
-"""Of a sigma, for numerical derivatives."""
+from calib.stereo import Triangulation
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,6 +62,8 @@ class Handoff:
     ----------
     seen
         What the source pair gives: position in the rover frame and its covariance from the clicks.
+    gap
+        How far its two rays pass each other, and what explains that.
     covariance_m2
         (3, 3) of the position from everything that was said to be uncertain, rover frame.
     pixels
@@ -77,6 +78,7 @@ class Handoff:
     """
 
     seen: Triangulation
+    gap: RayGap
     covariance_m2: FloatArray
     pixels: Mapping[str, Predicted | None]
     joint_px2: FloatArray
@@ -117,18 +119,23 @@ def hand_off(
     sigma_px
         Sigma of each pixel coordinate of a click.
     calibration
-        Covariance of the rig; exact when left out.
+        Covariance of the rig. When left out, the covariances told count it as exact, and the rays' gap is
+        judged by `calib.ray_gap.RIG_PX`.
 
     Raises
     ------
     NoStereoPoint
-        As `calib.stereo.triangulate`.
+        As `calib.stereo.triangulate`. ``not_one_point``: the two rays pass each other farther than clicks,
+        joint readings and calibration explain (`calib.ray_gap`).
     NoHandoff
         ``too_near``: nearer than the pair's baseline. ``too_far``: infinity is within three sigma of the
         range. ``not_seen``: no destination camera sees the target.
     """
+    seen, gap = clicked_point(
+        rig, pair, joints.pan_rad, joints.tilt_rad, left_px, right_px,
+        sigma_px=sigma_px, sigma_rad=joints.sigma_rad, calibration=calibration,
+    )  # fmt: skip
     models = [rig.camera_in_rover(name, joints.pan_rad, joints.tilt_rad) for name in pair]
-    seen = triangulate(models[0], models[1], left_px, right_px, sigma_px)
     _refuse_range(seen, models, pair)
     there = to_joints or joints
     cameras = {name: rig.camera_in_rover(name, there.pan_rad, there.tilt_rad) for name in to}
@@ -138,9 +145,7 @@ def hand_off(
         words = "; ".join(f"{name}: {why}" for name, why in reasons.items())
         raise NoHandoff("not_seen", f"no destination camera sees the target: {words}")
 
-    total = _other_covariance(
-        rig, pair, shown, joints, to_joints, np.array([left_px, right_px], dtype=np.float64), calibration
-    )
+    total = _other_covariance(rig, pair, shown, joints, to_joints, seen, calibration)
     places, rates = [], []
     for name in shown:
         pixel, rate, _ = cameras[name].project_jacobian(seen.position_m)
@@ -154,7 +159,7 @@ def hand_off(
         part = (slice(2 * row, 2 * row + 2),) * 2
         pixels[name] = Predicted(places[row], clicks[part], joint[part])
     position_m2 = seen.covariance_m2 + total[:3, :3]
-    return Handoff(seen, position_m2, pixels, joint, reasons, there.pan_rad, there.tilt_rad)
+    return Handoff(seen, gap, position_m2, pixels, joint, reasons, there.pan_rad, there.tilt_rad)
 
 
 def _refuse_range(seen: Triangulation, models: Sequence[CameraModel], pair: tuple[str, str]) -> None:
@@ -198,46 +203,24 @@ def _other_covariance(
     to: Sequence[str],
     joints: Joints,
     to_joints: Joints | None,
-    clicks_px: FloatArray,
+    seen: Triangulation,
     calibration: RigCovariance | None,
 ) -> FloatArray:
     """Covariance (3 + 2n, 3 + 2n) of position and pixels from joint readings and calibration."""
     known = calibration.of((*pair, *to)) if calibration else RigCovariance((), np.zeros((0, 0)))
     readings = [joints] if to_joints is None else [joints, to_joints]
-    size, calibrated = 3 + 2 * len(to), len(known.names)
-
-    def chain(step: FloatArray) -> FloatArray:
-        believed = moved_rig(rig, known.names, step[:calibrated]) if calibrated else rig
-        turned = [
-            (at.pan_rad + off[0], at.tilt_rad + off[1])
-            for at, off in zip(readings, step[calibrated:].reshape(-1, 2), strict=True)
-        ]
-        left, right = (believed.camera_in_rover(name, *turned[0]) for name in pair)
-        position = triangulate(left, right, *clicks_px).position_m
-        out = np.empty(size)
-        out[:3] = position
-        for row, name in enumerate(to):
-            pixel, valid = believed.camera_in_rover(name, *turned[-1]).project(position)
-            if not valid:
-                raise CalibError(f"{name} loses the target within a tenth of a sigma of the calibration")
-            out[3 + 2 * row : 5 + 2 * row] = pixel
-        return out
-
-    # The columns of a square root of the covariance are steps of one sigma, each on its own.
-    values, vectors = np.linalg.eigh(known.covariance)
-    steps = np.zeros((calibrated + 2 * len(readings),) * 2)
-    steps[:calibrated, :calibrated] = (vectors * np.sqrt(np.maximum(values, 0.0))).T
-    for index, reading in enumerate(readings):
-        for axis in range(2):
-            place = calibrated + 2 * index + axis
-            steps[place, place] = reading.sigma_rad
-    moved = [_slope(chain, step) for step in steps if step.any()]
-    if not moved:
-        return np.zeros((size, size))
-    rates = np.array(moved)
-    return np.asarray(rates.T @ rates)
-
-
-def _slope(chain: Callable[[FloatArray], FloatArray], step: FloatArray) -> FloatArray:
-    """Derivative of a chain along a step, by central differences."""
-    return (chain(STEP * step) - chain(-STEP * step)) / (2 * STEP)
+    names, calibrated = (*known.names, *JOINT_NAMES), len(known.names)
+    width = calibrated + 2 * len(readings)
+    then = [*range(calibrated), width - 2, width - 1]  # the destination's reading is the last
+    rates = np.zeros((3 + 2 * len(to), width))
+    clicked = click_rates(rig, names, pair, joints.pan_rad, joints.tilt_rad, seen.position_m)
+    rates[:3, : calibrated + 2] = seen.rates_m_per_px @ clicked
+    at, point = readings[-1], seen.position_m[None]
+    for row, name in enumerate(to):
+        part = slice(3 + 2 * row, 5 + 2 * row)
+        model = rig.camera_in_rover(name, at.pan_rad, at.tilt_rad)
+        rates[part] = model.project_jacobian(seen.position_m)[1] @ rates[:3]
+        rates[part, then] += pixel_rates(rig, names, name, at.pan_rad, at.tilt_rad, point)[1][0]
+    turned = np.repeat([reading.sigma_rad for reading in readings], 2) * rates[:, calibrated:]
+    by_rig = rates[:, :calibrated]
+    return np.asarray(by_rig @ known.covariance @ by_rig.T + turned @ turned.T)

@@ -17,6 +17,9 @@ from calib.gimbal import MAST_NAMES, mast_of, numbers_of
 from calib.mast import Rig
 from calib.rigid import FloatArray
 
+ROUNDING = 1e-6
+"""Of one: what a stored correlation may be off by."""
+
 _MAST = tuple(f"mast.{name}" for name in MAST_NAMES)
 
 
@@ -63,7 +66,21 @@ def stored_covariance(rig: Rig) -> RigCovariance | None:
             f"fit.covariance of the mast file is not {len(names)} rows of {len(names)} numbers with a "
             "positive diagonal, as its fit.parameters ask"
         )
+    if _impossible(covariance):
+        raise CalibError(
+            "fit.covariance of the mast file is none: it is not symmetric, or some direction has a negative "
+            "variance"
+        )
     return RigCovariance(tuple(names), covariance)
+
+
+def _impossible(covariance: FloatArray) -> bool:
+    """Whether a matrix with a positive diagonal is no covariance, beyond what rounding does."""
+    scale = np.sqrt(np.diag(covariance))
+    scaled = covariance / np.outer(*2 * [np.where(scale > 0.0, scale, 1.0)])
+    if np.abs(scaled - scaled.T).max(initial=0.0) > ROUNDING:
+        return True
+    return bool(np.linalg.eigvalsh(scaled).min(initial=0.0) < -ROUNDING)
 
 
 def moved_rig(rig: Rig, names: Sequence[str], step: FloatArray) -> Rig:

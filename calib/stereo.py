@@ -32,11 +32,16 @@ class Triangulation:
         (3, 3) from the pixel noise alone, to first order; camera and mast errors are not in it.
     ray_gap_m
         Length of the common normal: how far the rays pass each other. Large beside what the pixel noise
-        explains, it says that the two pixels are not of one point, or that the models are off.
+        explains, it says that the two pixels are not of one point, or that the models are off; whether it is,
+        `calib.ray_gap` says.
     ranges_m
         From the left and from the right ray's origin to the foot of the normal on that ray.
     rates_m_per_px
         (3, 4) d position / d (left x, left y, right x, right y).
+    gap_m_per_px
+        (4,) d gap / d (the same) where the rays meet. The gap is the triple product of both directions and
+        what lies between the origins, over the sine of their angle; the rates are those of the product. It
+        is linear in each direction, so that they hold for pixels far off each other's lines too.
     """
 
     position_m: FloatArray
@@ -44,6 +49,7 @@ class Triangulation:
     ray_gap_m: float
     ranges_m: tuple[float, float]
     rates_m_per_px: FloatArray
+    gap_m_per_px: FloatArray
 
 
 def triangulate(
@@ -100,7 +106,8 @@ def triangulate(
     # The common normal's feet o1 + s1 d1 and o2 + s2 d2: the gap between them is perpendicular to d1 and d2.
     (d1, d2), between = directions, origins[0] - origins[1]
     cosine = float(d1 @ d2)
-    sine = float(np.linalg.norm(np.cross(d1, d2)))
+    normal = np.cross(d1, d2)
+    sine = float(np.linalg.norm(normal))
     if sine < PARALLEL_RAD:
         raise NoStereoPoint(
             "parallel_rays", f"the two rays are parallel to {sine:.2g} rad: no point where they meet"
@@ -128,6 +135,12 @@ def triangulate(
             d2 @ d_gap + np.hstack([[0.0, 0.0], gap @ d_directions[1]]),
         ]
     )
+    d_product = np.concatenate(
+        [
+            normal @ d_origins[0] + np.cross(d2, between) @ d_directions[0],
+            -normal @ d_origins[1] + np.cross(between, d1) @ d_directions[1],
+        ]
+    )
     jacobian = 0.5 * (d_foot1 + np.outer(d1, d_s1) + d_foot2 + np.outer(d2, d_s2))
     return Triangulation(
         position_m=frozen_array(0.5 * (foot1 + foot2), (3,)),
@@ -135,4 +148,5 @@ def triangulate(
         ray_gap_m=math.sqrt(float(gap @ gap)),
         ranges_m=(float(s1), float(s2)),
         rates_m_per_px=frozen_array(jacobian, (3, 4)),
+        gap_m_per_px=frozen_array(d_product / sine, (4,)),
     )

@@ -28,6 +28,7 @@ from calib.errors import CalibError
 from calib.handoff_refined import Eye
 from calib.match import Match, MatchSettings, match
 from calib.one_point import Sighting, one_point
+from calib.ray_gap import ray_gap, refuse_two_points
 from calib.rigid import FloatArray, Rigid, carried_covariance, moved_rigid
 from calib.stereo import triangulate
 from calib.warp import Plane
@@ -41,6 +42,10 @@ in ten and more of the range errors lie within two of the told sigmas. A second 
 than elsewhere: the other eye and the prediction must confirm the best."""
 MIDDLE_SEARCH_PX = 4.0
 """How far the range of a patch's middle may put it from where the whole patch puts it, at the start."""
+
+EYES_PX = 0.4
+"""One sigma, each pixel coordinate, of what two eyes' models may be wrong by where a track is begun: what is
+found 2 px off the epipolar line is another thing, or the mast file is off."""
 
 
 @dataclass(frozen=True)
@@ -200,6 +205,12 @@ def start_track(left: Eye, right: Eye, left_px: FloatArray, sigma_px: float = 0.
         raise CalibError(f"the target cannot be followed: {reason}")
     noise = max(sigma_px, float(middle.sigma_px.max()))
     seen = triangulate(left.camera, right.camera, pixel, middle.pixel_px, noise)
+    gap = ray_gap(seen, (noise**2 + EYES_PX**2) * np.eye(4))
+    by = f"a match good to {noise:.2g} px and cameras good to {EYES_PX:g} px"
+    try:
+        refuse_two_points(gap, ("the left eye", "the right eye"), by)
+    except CalibError as error:
+        raise CalibError(f"the target cannot be followed: {error}") from None
     key = Key(left, pixel, found.plane.normal)
     return Track("tracked", seen.position_m, seen.covariance_m2, key)
 

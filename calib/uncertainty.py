@@ -11,11 +11,11 @@ from scipy.optimize import approx_fprime
 from calib import rig_covariance
 from calib.adjustment import Adjustment
 from calib.calibration import Calibration, Degenerate
-from calib.camera_parameters import parameter_names, parameter_part, predict, tangents
+from calib.camera_parameters import parameter_part, tangents
 from calib.errors import CalibError
-from calib.gimbal import MAST_NAMES, gimbal, gimbal_rates, numbers_of
 from calib.mast import Rig
 from calib.pointing import solve
+from calib.rig_rates import pixel_rates
 from calib.rigid import FloatArray
 from calib.stereo import triangulate
 
@@ -58,30 +58,6 @@ def sigma_by_key(rig: Rig, names: Sequence[str], covariance: FloatArray) -> dict
             spread = np.sqrt(np.maximum(np.diag(block), 0.0)).tolist()
             cameras[name][letter] = [0.0, *spread] if letter == "R" else spread
     return {"mast": mast, "cameras": cameras}
-
-
-def pixel_rates(
-    rig: Rig, names: Sequence[str], camera: str, pan_rad: float, tilt_rad: float, points_m: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Return pixels (n, 2) of rover-frame points (n, 3) and their derivatives (n, 2, p) to named parameters.
-
-    ``names`` (p,) are ``mast.KEY.x`` and ``cameras.NAME.C.x``; what is not among them is held.
-    """
-    held = rig.cameras[camera]
-    at = {name: i for i, name in enumerate(names)}
-    out = np.zeros((len(points_m), 2, len(names)))
-    if held.on == "rover":
-        seen = predict(held.model, points_m)
-    else:
-        head = gimbal(numbers_of(rig.mast), pan_rad, tilt_rad)
-        seen = predict(held.model, (points_m - head.translation_m) @ head.rotation)
-        free = np.array([i for i, n in enumerate(MAST_NAMES) if f"mast.{n}" in at], dtype=int)
-        rates = gimbal_rates(seen.d_points @ head.rotation.T, points_m, head, free)
-        out[..., [at[f"mast.{MAST_NAMES[i]}"] for i in free]] = -rates
-    mine = [f"cameras.{camera}.{part}" for part in parameter_names(held.model.kind)]
-    known = [i for i, name in enumerate(mine) if name in at]
-    out[..., [at[mine[i]] for i in known]] = seen.d_step[..., known]
-    return seen.pixels_px, out
 
 
 def pixel_covariance(

@@ -133,6 +133,19 @@ def test_blunders_are_named_and_do_not_move_the_result(rig: Rig) -> None:
     assert worst.name == "hand-off 21" and abs(worst.off_px - np.hypot(30, 9)) < 2.0
 
 
+def test_clicks_of_two_things_are_named_and_not_used(rig: Rig) -> None:
+    """8 px off across the lines in one hand-off: its point is off by as much in both Hazcams alike."""
+    rng = np.random.default_rng(12)
+    true = {name: vectors(rig, name) for name in HAZCAMS}
+    made = hand_offs(true, rig, targets(rng, 24), rng)
+    spoiled = made[7].clicks_px + np.array([[0.0, 0.0], [0.0, 8.0]])
+    made[7] = replace(made[7], clicks_px=spoiled, name="line 8")
+    fit = fit_body_pose(rig, HAZCAMS, made)
+    assert [one.name for one in fit.outliers] == ["line 8"]
+    assert "its two clicks do not mean one point, they are " in fit.outliers[0].sentence
+    assert len(fit.used.handoffs) == 23
+
+
 def test_what_turns_mast_and_body_alike_is_no_correction(rig: Rig) -> None:
     """The rover frame is the mast's: another frame for the whole rig changes no pixel."""
     turn, shift = Rotation.from_rotvec([0.01, -0.02, 0.03]), np.array([0.02, 0.01, -0.03])

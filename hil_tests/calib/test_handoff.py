@@ -2,17 +2,25 @@
 
 from __future__ import annotations
 
+import math
+import re
+import time
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.stats import norm
 
 from calib.camera_parameters import parameter_names
-from calib.errors import CalibError, NoHandoff
+from calib.errors import CalibError, NoHandoff, NoStereoPoint
 from calib.handoff import Joints, hand_off
 from calib.mast import Rig
+from calib.ray_gap import FALSE_ALARMS, MOST_SIGMAS, ray_gap
 from calib.rig_covariance import RigCovariance, moved_rig, stored_covariance
+from calib.rig_rates import click_covariance
+from calib.stereo import triangulate
 from calib.store import load_rig
 
 AT = Joints(0.1, -0.55)
@@ -153,6 +161,141 @@ def test_a_covariance_that_does_not_fit_its_rig_is_refused(rig: Rig) -> None:
         (["mast.translation_m.x"], [["a"]], "1 rows"),
         (["mast.translation_m.x"], [[float("nan")]], "1 rows"),
         ("mast", [[1.0]], "list of names"),
+        (["mast.translation_m.x", "mast.translation_m.y"], [[1.0, 2.0], [2.0, 1.0]], "negative variance"),
+        (["mast.translation_m.x", "mast.translation_m.y"], [[1.0, 0.5], [0.4, 1.0]], "not symmetric"),
     ):
         with pytest.raises(CalibError, match=words):
             stored(parameters=parameters, covariance=covariance)
+
+
+def by_differences(
+    rig: Rig, clicks_px: np.ndarray, at: Joints, there: Joints | None, known: RigCovariance
+) -> tuple[np.ndarray, np.ndarray]:
+    """Covariances of position (3, 3) and Hazcam pixels (4, 4) without the clicks', by central differences."""
+    readings = [at] if there is None else [at, there]
+    size = len(known.names)
+    spread = np.zeros((size + 2 * len(readings),) * 2)
+    spread[:size, :size] = known.covariance
+    for i, reading in enumerate(readings):
+        spread[size + 2 * i :, size + 2 * i :][:2, :2] = np.eye(2) * reading.sigma_rad**2
+
+    def chain(step: np.ndarray) -> np.ndarray:
+        believed = moved_rig(rig, known.names, step[:size]) if size else rig
+        off = step[size:].reshape(-1, 2)
+        joints = [(r.pan_rad + o[0], r.tilt_rad + o[1]) for r, o in zip(readings, off, strict=True)]
+        eyes = (believed.camera_in_rover(name, *joints[0]) for name in PAIR)
+        position = triangulate(*eyes, *clicks_px).position_m
+        pixels = [believed.camera_in_rover(n, *joints[-1]).project(position)[0] for n in HAZCAMS]
+        return np.concatenate([position, *pixels])
+
+    root = np.linalg.cholesky(spread + 1e-24 * np.eye(len(spread))).T
+    rates = np.array([(chain(0.1 * step) - chain(-0.1 * step)) / 0.2 for step in root])
+    total = rates.T @ rates
+    return total[:3, :3], total[3:, 3:]
+
+
+SAME_AS_DIFFERENCES = 2e-4
+"""Of the largest entry. The differences themselves, over a tenth of a sigma, are this good."""
+
+
+@pytest.mark.parametrize("moves", [False, True])
+def test_covariances_are_those_of_the_whole_chain_by_differences(
+    rig: Rig, uncertain: RigCovariance, moves: bool
+) -> None:
+    at = replace(AT, sigma_rad=2e-4)
+    there = Joints(0.14, -0.5, 3e-4) if moves else None
+    exact = clicks(rig, PAIR, TARGET, at)
+    done = hand_off(
+        rig, PAIR, HAZCAMS, at, exact[0], exact[1], to_joints=there, sigma_px=0.3, calibration=uncertain
+    )
+    position, pixels = by_differences(rig, exact, at, there, uncertain)
+    told = done.covariance_m2 - done.seen.covariance_m2
+    assert np.abs(told - position).max() < SAME_AS_DIFFERENCES * np.abs(position).max()
+    rates = np.concatenate(
+        [rig.camera_in_rover(n, 0, 0).project_jacobian(done.seen.position_m)[1] for n in HAZCAMS]
+    )
+    told = done.joint_px2 - rates @ done.seen.covariance_m2 @ rates.T
+    assert np.abs(told - pixels).max() < SAME_AS_DIFFERENCES * np.abs(pixels).max()
+
+
+def test_a_hand_off_with_a_stored_covariance_takes_a_small_part_of_what_differences_take(
+    repository: Path,
+) -> None:
+    believed = load_rig(repository / "configs/masts/rocky8_simulated.yaml").rig
+    known = stored_covariance(believed)
+    assert known is not None
+    exact = clicks(believed, PAIR, TARGET, AT)
+    at = replace(AT, sigma_rad=1e-4)
+
+    def seconds(work: Callable[[], object], times: int) -> float:
+        began = time.process_time()
+        for _ in range(times):
+            work()
+        return (time.process_time() - began) / times
+
+    def geometric() -> object:
+        return hand_off(believed, PAIR, HAZCAMS, at, exact[0], exact[1], calibration=known)
+
+    mine = known.of((*PAIR, *HAZCAMS))
+    whole = seconds(lambda: by_differences(believed, exact, at, None, mine), 1)
+    short = min(seconds(geometric, 5) for _ in range(3))
+    print(f"{1e3 * short:.1f} ms a hand-off, {whole / short:.0f} times less than by differences")
+    assert short < whole / 10
+
+
+@pytest.mark.parametrize("calibrated", [False, True])
+def test_clicks_whose_rays_pass_each_other_are_refused_with_gap_and_pixels(
+    rig: Rig, uncertain: RigCovariance, calibrated: bool
+) -> None:
+    left, right = clicks(rig, PAIR, TARGET, AT)
+    with pytest.raises(NoStereoPoint) as refused:
+        hand_off(
+            rig, PAIR, HAZCAMS, AT, left, right + np.array([0.0, 30.0]),
+            calibration=uncertain if calibrated else None,
+        )  # fmt: skip
+    assert refused.value.code == "not_one_point"
+    words = re.search(r"([\d.]+) sigma; the pixel of navcam_right is ([\d.]+) px off", str(refused.value))
+    assert words is not None and float(words[1]) > 5.0
+    # The eyes look nearly along the same line: 30 px down are 30 px across to a few per cent.
+    assert float(words[2]) == pytest.approx(30.0, abs=0.6)
+    # The other way along the epipolar line nothing is wrong: it is a point at another range.
+    hand_off(rig, PAIR, HAZCAMS, AT, left, right + np.array([3.0, 0.0]))
+
+
+def test_a_rig_that_says_how_wrong_it_is_may_be(rig: Rig) -> None:
+    """A principal point 4 px too low is explained by a calibration as unsure, and by no better one."""
+    name = f"cameras.{PAIR[1]}.V.x"
+    left, right = clicks(rig, PAIR, TARGET, AT)
+    wrong = moved_rig(rig, [name], np.array([4.0]))
+    shift = clicks(wrong, PAIR, TARGET, AT)[1] - right
+    assert abs(shift[1]) == pytest.approx(4.0, abs=0.3)
+    hand_off(wrong, PAIR, HAZCAMS, AT, left, right, calibration=RigCovariance((name,), np.array([[16.0]])))
+    with pytest.raises(NoStereoPoint, match="do not mean one point"):
+        hand_off(wrong, PAIR, HAZCAMS, AT, left, right, calibration=RigCovariance((name,), np.eye(1)))
+
+
+@pytest.mark.parametrize(("calibrated", "draws"), [(False, 10_000), (True, 3_000)])
+def test_one_good_pair_of_clicks_in_a_thousand_is_refused(
+    rig: Rig, uncertain: RigCovariance, calibrated: bool, draws: int
+) -> None:
+    """Drawn from clicks and rigs that err as they are said to."""
+    rng = np.random.default_rng(5)
+    exact = clicks(rig, PAIR, TARGET, AT)
+    known = uncertain.of(PAIR)
+    root = np.linalg.cholesky(known.covariance)
+    at = (AT.pan_rad, AT.tilt_rad)
+    allowed = click_covariance(
+        rig, PAIR, *at, TARGET, sigma_px=0.2, calibration=known if calibrated else None
+    )
+    sigmas = []
+    for _ in range(draws):
+        step = root @ rng.standard_normal(len(root)) * calibrated
+        believed = moved_rig(rig, known.names, step)
+        eyes = [believed.camera_in_rover(name, *at) for name in PAIR]
+        clicked = exact + rng.normal(0.0, 0.2, (2, 2))
+        sigmas.append(ray_gap(triangulate(*eyes, *clicked), allowed).sigmas)
+    assert FALSE_ALARMS == 0.001 and pytest.approx(norm.isf(0.0005), abs=1e-4) == MOST_SIGMAS
+    # Of 10 (3) expected, 1 in 10^4 repetitions is outside; the mean square is 1 to 1.4 % (2.6 %).
+    refused = int(np.sum(np.array(sigmas) > MOST_SIGMAS))
+    assert (1 <= refused <= 24) if draws == 10_000 else refused <= 11
+    assert np.mean(np.square(sigmas)) == pytest.approx(1.0, abs=6 * math.sqrt(2 / draws))

@@ -67,6 +67,15 @@ def test_a_start_knows_the_position(begun: Track) -> None:
     assert np.linalg.norm(off) < 0.03
 
 
+def test_eyes_that_do_not_mean_one_point_start_no_track() -> None:
+    """The right eye sees 3 px lower than its model says; broad texture is found that far off the line."""
+    first = eyes(0.0, plane=replace(GROUND, texel_m=0.006))
+    camera = first["right"].camera
+    knocked = replace(first["right"], camera=replace(camera, V=camera.V + 3.0 * camera.A))
+    with pytest.raises(CalibError, match="px off the epipolar line"):
+        start_track(first["left"], knocked, pinholes(0.0)["left"].pixel(TARGET))
+
+
 def test_motion_carries_position_and_covariance(begun: Track) -> None:
     """Against draws of the motion's error by matrix exponentials."""
     from scipy.spatial.transform import Rotation

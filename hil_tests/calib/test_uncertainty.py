@@ -11,8 +11,9 @@ from calib.fit_joint import fit_joint
 from calib.fit_paper import fit_paper
 from calib.mast import Rig
 from calib.pointing import solve
+from calib.rig_rates import pixel_rates
 from calib.stereo import triangulate
-from calib.uncertainty import moved_rig, pixel_covariance, pixel_rates, pointing_covariance
+from calib.uncertainty import moved_rig, pixel_covariance, pointing_covariance
 
 SURVEYS = 16
 SMALL = Plan(ring=2, mast_boards=5, checks=0, hazcam=False)

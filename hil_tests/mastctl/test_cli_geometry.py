@@ -180,6 +180,20 @@ def test_rays_that_do_not_meet_are_a_failure(folder: Path, capsys: pytest.Captur
     assert (run.code, run.json["error"]["code"]) == (1, "behind_camera")
 
 
+def test_pixels_of_two_things_are_a_failure_that_says_by_how_much(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    # The rows are the epipolar lines: 30 rows apart at a disparity of 20 columns. The file says nothing of
+    # its errors, so that 1 px is taken: with clicks of 0.2 px a row is good to the root of 2 (1 + 0.04).
+    words = "triangulate mast.yaml --pair eye --pan 0 --tilt 0 --left 330 240 --right 310 270 --json"
+    run = Run(words, capsys)
+    assert (run.code, run.json["error"]["code"]) == (1, "not_one_point")
+    assert "30.0 px off the epipolar line" in run.json["error"]["message"]
+    assert f"{30 / math.sqrt(2 * 1.04):.1f} sigma" in run.json["error"]["message"]
+    assert Run(words.replace("310 270", "310 243"), capsys).code == 0
+    assert Run(f"{words} --sigma-px 10", capsys).code == 0
+
+
 def test_budget_is_the_papers_table_1(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     run = Run("budget --json", capsys)
     assert run.code == 0

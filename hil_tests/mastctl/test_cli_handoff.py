@@ -49,6 +49,16 @@ def test_the_contracts_keys(run: Any, clicked: list[str]) -> None:
         assert covariance.shape == (2, 2) and np.all(np.linalg.eigvalsh(covariance) > 0)
 
 
+@pytest.mark.parametrize("point", [(), ("--point",)])
+def test_clicks_on_two_things_are_refused_before_anything_is_made_of_them(
+    run: Any, clicked: list[str], point: tuple[str, ...]
+) -> None:
+    clicked[-1] = repr(float(clicked[-1]) + 30)
+    code, told = run("--from", "navcam", "--to", "pancam", *point, *HEAD, *clicked)
+    assert (code, told["error"]["code"]) == (1, "not_one_point")
+    assert "px off the epipolar line" in told["error"]["message"]
+
+
 def test_sigma_px_goes_into_the_covariance_squared(run: Any, clicked: list[str]) -> None:
     words = ("--from", "navcam", "--to", "hazcam_left", *HEAD, *clicked)
     small = run(*words)[1]["pixels"]["hazcam_left"]["covariance_px2"]

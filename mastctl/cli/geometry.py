@@ -188,7 +188,8 @@ def solve_pointing(args: argparse.Namespace) -> int:
 
 def triangulate_pair(args: argparse.Namespace) -> int:
     """Triangulate the point seen at a pixel of each camera of a pair, in the rover frame."""
-    from calib.stereo import triangulate
+    from calib.ray_gap import clicked_point
+    from calib.rig_covariance import stored_covariance
     from calib.store import load_rig
 
     stored = load_rig(args.mast)
@@ -198,14 +199,19 @@ def triangulate_pair(args: argparse.Namespace) -> int:
         raise output.WrongUse(
             f"no stereo pair '{args.pair}' in {args.mast}; {_nearest(args.pair, rig.stereo)}"
         )
-    left, right = (_at_joints(rig, name, args) for name in rig.stereo[args.pair])
-    seen = triangulate(left, right, args.left, args.right, args.sigma_px)
+    pair = rig.stereo[args.pair]
+    for name in pair:
+        _need_joints(rig, name, args)
+    seen, gap = clicked_point(
+        rig, pair, args.pan or 0.0, args.tilt or 0.0, args.left, args.right,
+        sigma_px=args.sigma_px, calibration=stored_covariance(rig),
+    )  # fmt: skip
     if args.json:
         output.print_json(
             {
                 "position_m": seen.position_m.tolist(),
                 "covariance_m2": seen.covariance_m2.tolist(),
-                "ray_gap_m": float(seen.ray_gap_m),
+                "ray_gap_m": seen.ray_gap_m,
             }
         )
         return 0
@@ -217,7 +223,10 @@ def triangulate_pair(args: argparse.Namespace) -> int:
             (axis, f"{value:.6f}", f"{sigma:.3f}")
             for axis, value, sigma in zip("xyz", seen.position_m, sigmas_mm, strict=True)
         ],
-        [f"ray gap {1e3 * seen.ray_gap_m:.3f} mm; sigma from {args.sigma_px:g} px in each pixel coordinate"],
+        [
+            f"ray gap {1e3 * seen.ray_gap_m:.3f} mm, {gap.sigmas:.1f} sigma; "
+            f"sigma from {args.sigma_px:g} px in each pixel coordinate"
+        ],
     )
     return 0
 
@@ -258,9 +267,14 @@ def _chosen_model(args: argparse.Namespace) -> CameraModel:
 
 def _at_joints(rig: Rig, name: str, args: argparse.Namespace) -> CameraModel:
     """Return a camera of the rig in the rover frame; a camera on the head needs --pan and --tilt."""
+    _need_joints(rig, name, args)
+    return rig.camera_in_rover(name, args.pan or 0.0, args.tilt or 0.0)
+
+
+def _need_joints(rig: Rig, name: str, args: argparse.Namespace) -> None:
+    """Refuse a camera on the head without --pan and --tilt."""
     if rig.cameras[name].on == "head" and (args.pan is None or args.tilt is None):
         raise output.WrongUse(f"camera '{name}' is on the head; --pan RAD and --tilt RAD are expected")
-    return rig.camera_in_rover(name, args.pan or 0.0, args.tilt or 0.0)
 
 
 def _camera_name(stored: StoredRig, name: str | None) -> str:

@@ -13,6 +13,7 @@ from mastctl.cli.output import finite_number, positive_number
 if TYPE_CHECKING:
     from calib.handoff import Handoff, Joints
     from calib.mast import Rig
+    from calib.rig_covariance import RigCovariance
 
 
 def add_commands(subparsers: Any) -> None:
@@ -65,6 +66,7 @@ def hand_over(args: argparse.Namespace) -> int:
         raise output.WrongUse("a camera is on the head; --pan RAD and --tilt RAD are expected")
     sigma = args.sigma_joint or 0.0
     joints = Joints(args.pan or 0.0, args.tilt or 0.0, sigma)
+    calibration = stored_covariance(rig)
     done = hand_off(
         rig,
         pair,
@@ -72,9 +74,9 @@ def hand_over(args: argparse.Namespace) -> int:
         joints,
         args.left,
         args.right,
-        to_joints=_destination(args, rig, pair, to[0], joints),
+        to_joints=_destination(args, rig, pair, to[0], joints, calibration),
         sigma_px=args.sigma_px,
-        calibration=stored_covariance(rig),
+        calibration=calibration,
     )
     if args.json:
         output.print_json(_as_json(done))
@@ -84,20 +86,27 @@ def hand_over(args: argparse.Namespace) -> int:
 
 
 def _destination(
-    args: argparse.Namespace, rig: Rig, pair: tuple[str, str], aim: str, joints: Joints
+    args: argparse.Namespace,
+    rig: Rig,
+    pair: tuple[str, str],
+    aim: str,
+    joints: Joints,
+    calibration: RigCovariance | None,
 ) -> Joints | None:
     """The joint angles of the destination images; None where the head does not turn."""
     from calib.handoff import Joints
     from calib.pointing import solve
-    from calib.stereo import triangulate
+    from calib.ray_gap import clicked_point
 
     if args.point:
         if args.to_pan is not None or args.to_tilt is not None:
             raise output.WrongUse("--point chooses the angles; leave --to-pan and --to-tilt out")
         if rig.cameras[aim].on != "head":
             raise output.WrongUse(f"--point: camera '{aim}' is on the rover's body and cannot be pointed")
-        left, right = (rig.camera_in_rover(name, joints.pan_rad, joints.tilt_rad) for name in pair)
-        seen = triangulate(left, right, args.left, args.right, args.sigma_px)
+        seen, _ = clicked_point(
+            rig, pair, joints.pan_rad, joints.tilt_rad, args.left, args.right,
+            sigma_px=args.sigma_px, sigma_rad=joints.sigma_rad, calibration=calibration,
+        )  # fmt: skip
         best = solve(
             rig.mast,
             rig.cameras[aim].model,
@@ -130,6 +139,8 @@ def _as_json(done: Handoff) -> dict[str, Any]:
         "position_m": done.seen.position_m.tolist(),
         "covariance_m2": done.covariance_m2.tolist(),
         "ray_gap_m": done.seen.ray_gap_m,
+        "ray_gap_sigmas": done.gap.sigmas,
+        "across_px": done.gap.across_px,
         "pan_rad": done.pan_rad,
         "tilt_rad": done.tilt_rad,
     }
@@ -158,8 +169,8 @@ def _print(args: argparse.Namespace, rig: Rig, done: Handoff) -> None:
     x, y, z = done.seen.position_m
     notes = [f"{name}: {why}" for name, why in done.reasons.items()]
     notes.append(f"head at pan {done.pan_rad:.6f}, tilt {done.tilt_rad:.6f} rad")
-    gap_mm = 1e3 * done.seen.ray_gap_m
-    notes.append(f"target at ({x:.4f}, {y:.4f}, {z:.4f}) m, rover frame; rays pass at {gap_mm:.2f} mm")
+    gap = f"{1e3 * done.seen.ray_gap_m:.2f} mm, {done.gap.sigmas:.1f} sigma"
+    notes.append(f"target at ({x:.4f}, {y:.4f}, {z:.4f}) m, rover frame; rays pass at {gap}")
     what = ["clicks"] + ["joints"] * bool(args.sigma_joint) + ["calibration"] * ("covariance" in rig.fit)
     notes.append(f"3-sigma half axes of where to search, from {', '.join(what)}; angle from x towards y")
     output.print_table(
