@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -13,14 +14,15 @@ from drivers.interfaces import Frame, FrameTime
 from drivers.v4l2 import find, pixels
 from drivers.v4l2.capture import Bytes, Capture
 from drivers.v4l2.controls import get_value, list_controls
-from drivers.v4l2.errors import NoCamera
+from drivers.v4l2.errors import NoCamera, StreamFailed
 from drivers.v4l2.exposure import GROUPS, ExposureControl
 from drivers.v4l2.frames import Arrived, Counters
 from drivers.v4l2.options import CameraOptions, parse_options
 from drivers.v4l2.stream import Stream, sizes_text
 
 JUDGE_EVERY_S = 0.25  # how often the automatic exposure looks at a frame
-SETTLE_PERIODS = 3  # a new exposure time shows this many frames later at most
+HOLD_PERIODS = 8  # so long a hold waits for a change under way to show: it takes three frames once it is made
+HOLD_MOST_S = 1.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,7 +37,7 @@ class V4l2Frame(Frame):
     mid_uncertainty_s
         The most that the true mid-exposure may be away from ``mid_exposure_s``.
     set_exposure_s
-        The camera's own exposure time, None if not known.
+        The camera's own exposure time, None if not known: also for the first frames after it was changed.
     stamp_s, received_s
         The kernel's stamp, and when the frame was dequeued, seconds of CLOCK_MONOTONIC.
     driver_sequence, stream
@@ -72,6 +74,11 @@ class V4l2Camera:
         self._clock = clock
         self._exposure: ExposureControl | None = None
         self._judge_after_s = 0.0
+        self._exposed = threading.Condition()  # guards what follows
+        self._holds = 0
+        self._asked_s: float | None = None  # the exposure time that was set last, as it was asked for
+        self._shows = False  # whether the last frame had it
+        self._changing = False
         if options.auto_exposure is not None and options.exposure_s is not None:
             self._exposure = GROUPS.join(name, options.auto_exposure, options.exposure_s)
         try:
@@ -81,7 +88,7 @@ class V4l2Camera:
                 clock,
                 pixels.colour if options.colour else pixels.grey,
                 None if self._exposure is None else self._judge,
-                None if self._exposure is None else lambda: self._auto().exposure_s,
+                None if self._exposure is None else self._to_open_with_s,
             )
         except BaseException:
             self._leave_group()
@@ -120,7 +127,7 @@ class V4l2Camera:
         last = self._last
         if last is not None and last.image is image:
             return last
-        buffer, window, exposure_s = arrived.buffer, arrived.window(), arrived.rule.exposure_s
+        buffer, window, exposure_s = arrived.buffer, arrived.window, arrived.timing.exposure_s
         self._last = V4l2Frame(
             image=image,
             sequence=arrived.sequence,
@@ -147,7 +154,7 @@ class V4l2Camera:
 
     def recent_times(self) -> list[FrameTime]:
         """Return the times of the last good frames of this stream, oldest first."""
-        return [FrameTime(frame.sequence, frame.window().begin_s) for frame in self.capture.recent()]
+        return [FrameTime(frame.sequence, frame.window.begin_s) for frame in self.capture.recent()]
 
     def abilities(self) -> dict[str, Any]:
         """Return what the camera offers, as JSON: ``formats`` and ``controls`` with their values now."""
@@ -169,24 +176,58 @@ class V4l2Camera:
 
     @contextmanager
     def exposure_held(self) -> Iterator[None]:
-        """Keep the exposure as it is inside the block: for a measurement that compares pictures."""
-        if self._exposure is None:
+        """Keep the exposure as it is inside the block: for a measurement that compares pictures.
+
+        A change that this camera's group decided on before is first made, and waited for until it shows, for
+        eight periods (1 s) at most. What was not made by then is made after the block.
+
+        Raises
+        ------
+        StreamFailed
+            If the camera is still at such a change after that time: nobody could say when it takes effect.
+        """
+        control = self._exposure
+        if control is None:
             yield
             return
-        self._exposure.hold()
+        control.hold()
         try:
-            yield
+            self._await_change(control)
+            try:
+                yield
+            finally:
+                with self._exposed:
+                    self._holds -= 1
         finally:
-            self._exposure.release()
+            control.release()
+
+    def _await_change(self, control: ExposureControl) -> None:
+        """Count a hold in, once the exposure is the group's and shows, or no frame comes to say so."""
+
+        def rests() -> bool:
+            return bool(self.capture.lost) or (self._shows and self._asked_s == control.exposure_s)
+
+        with self._exposed:
+            if not self._holds:
+                self._exposed.wait_for(rests, min(HOLD_MOST_S, HOLD_PERIODS * self.capture.period_s))
+            if self._changing:
+                raise StreamFailed(
+                    "it is still at a change of its exposure time and cannot hold it", device=self.name
+                )
+            self._holds += 1
 
     def close(self) -> None:
         """Let go of the camera; a waiting call ends with NoFreshFrame."""
         self.capture.close()
         self._leave_group()
 
-    def _auto(self) -> ExposureControl:
-        assert self._exposure is not None
-        return self._exposure
+    def _to_open_with_s(self) -> float:
+        """The exposure time to open with; while it is held, that of before."""
+        control = self._exposure
+        assert control is not None
+        with self._exposed:
+            held_s = self._asked_s if self._holds else None
+        return control.exposure_s if held_s is None else held_s
 
     def _leave_group(self) -> None:
         if self._exposure is not None and self._options.auto_exposure is not None:
@@ -196,15 +237,34 @@ class V4l2Camera:
     def _judge(self, stream: Stream, frame: Arrived, data: Bytes) -> None:
         """In the capture thread: look at a frame now and then, and set the exposure that its group wants."""
         control = self._exposure
-        if control is None or stream.exposure_s is None:
+        if control is None:
             return
-        if control.exposure_s == stream.asked_exposure_s and frame.window().begin_s >= self._judge_after_s:
+        with self._exposed:
+            self._asked_s = stream.asked_exposure_s
+            self._shows = frame.timing.exposure_s == stream.exposure_s
+            shows = self._shows
+            self._exposed.notify_all()
+        if stream.exposure_s is None:
+            return
+        wanted_s = control.exposure_s
+        if wanted_s == stream.asked_exposure_s and shows and frame.received_s >= self._judge_after_s:
             self._judge_after_s = frame.received_s + JUDGE_EVERY_S
             if not control.held:
-                control.see(self.name, pixels.grey(frame.format, data), control.exposure_s)
-        if control.exposure_s != stream.asked_exposure_s:  # also when another camera of the group wanted it
-            stream.set_exposure(control.exposure_s)
-            self._judge_after_s = frame.received_s + SETTLE_PERIODS * stream.period_s
+                wanted_s = control.see(self.name, pixels.grey(frame.format, data), wanted_s)
+        if wanted_s != stream.asked_exposure_s:  # also when another camera of the group wanted it
+            self._change(stream, wanted_s)
+
+    def _change(self, stream: Stream, exposure_s: float) -> None:
+        """Set the exposure, unless it is held; not under the lock, since a camera may take long over it."""
+        with self._exposed:
+            if self._holds:
+                return
+            self._changing, self._shows = True, False
+        try:
+            stream.set_exposure(exposure_s)
+        finally:
+            with self._exposed:
+                self._changing, self._asked_s = False, stream.asked_exposure_s
 
     def _instead(self, exposed_after_s: float, timeout_s: float, damaged_before: int) -> str:
         """What to say when no fresh frame came."""
@@ -216,7 +276,7 @@ class V4l2Camera:
         last = self.capture.newest
         if last is None:
             return message if damaged else f"{message}; none came at all"
-        age_s = exposed_after_s - last.window().begin_s
+        age_s = exposed_after_s - last.window.begin_s
         if age_s < 0.0:  # late enough, but older than a frame that is still to come
             age_s = self._clock.now_s() - last.buffer.stamp_s
             return f"{message}; the last good one is frame {last.sequence}, {age_s:.3f} s old"

@@ -14,6 +14,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable
+from contextlib import ExitStack
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -28,7 +29,7 @@ from drivers.v4l2.errors import StreamFailed
 from drivers.v4l2.frames import Arrived, Counters
 from drivers.v4l2.node import Dequeued, Node, PictureFormat
 from drivers.v4l2.options import CameraOptions
-from drivers.v4l2.stamps import StampCheck
+from drivers.v4l2.stamps import Spacing, StampCheck, Timing, exposure_window
 from drivers.v4l2.stream import Stream
 from drivers.v4l2.uevents import UeventSocket
 
@@ -40,6 +41,7 @@ SILENT_PERIODS = 3
 STALLED_S = 5.0  # a camera that is there but gives nothing for so long is opened again
 LATE_S = 0.005  # a frame is late if it comes more than a period and this after its stamp
 FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.05, 1.0
+CLOSE_PATIENCE_S = 2.0  # for the thread to end: a device that died may hold it in the kernel
 RECENT_FRAMES = 30  # a second's: from their times the offset between two cameras is learned
 
 
@@ -61,6 +63,8 @@ class _Shared:
     last_damage: str = ""
     lost: str = ""
     closed: bool = False
+    ended: bool = False  # the thread is through and touches nothing any more
+    left_behind: bool = False  # nobody waits for it
 
 
 class Capture:
@@ -107,16 +111,23 @@ class Capture:
         self._last_sequence = -1
         self._held: int | None = None  # the buffer of the newest good frame
         self._lengths: tuple[int, ...] = ()
-        self._check = StampCheck()
-        stream = self._open()
-        self.format = stream.format
-        self.period_s = stream.period_s
-        self.problems = tuple(stream.problems)
-        self.identity = stream.node.identity
-        self._wake = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
-        self._uevents = UeventSocket()
-        self._thread = threading.Thread(target=self._run, args=(stream,), name=f"capture {name}", daemon=True)
-        self._thread.start()
+        self._check, self._spacing = StampCheck(), Spacing(None, 0.0)  # of the stream that is open
+        with ExitStack() as opened:  # what is open when a later step fails is closed again
+            stream = self._open()
+            opened.callback(stream.close)
+            self.format = stream.format
+            self.period_s = stream.period_s
+            self.problems = tuple(stream.problems)
+            self.identity = stream.node.identity
+            self._wake = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
+            opened.callback(os.close, self._wake)
+            self._uevents = UeventSocket()
+            opened.callback(self._uevents.close)
+            self._thread = threading.Thread(
+                target=self._run, args=(stream,), name=f"capture {name}", daemon=True
+            )
+            self._thread.start()
+            opened.pop_all()
 
     @property
     def counters(self) -> Counters:
@@ -163,7 +174,7 @@ class Capture:
                     first = newest if bell is None else first
                     if (
                         newest is not None
-                        and newest.window().begin_s > exposed_after_s
+                        and newest.window.begin_s > exposed_after_s
                         and (newest is not first or self._is_young(newest))
                         and (picture := self._picture(newest)) is not None
                     ):
@@ -203,14 +214,27 @@ class Capture:
         return shared.picture
 
     def close(self) -> None:
-        """End the thread and let go of the camera."""
+        """End the thread and let go of the camera.
+
+        A driver that hangs in the kernel is left behind after 2 s; its thread lets go when it comes back.
+        """
         with self._shared.lock:
             if self._shared.closed:
                 return
             self._shared.closed = True
         self._shared.bells.ring_all()
         os.eventfd_write(self._wake, 1)
-        self._thread.join()
+        self._thread.join(CLOSE_PATIENCE_S)
+        with self._shared.lock:
+            self._shared.left_behind = self._thread.is_alive() and not self._shared.ended
+            left_behind = self._shared.left_behind
+        if left_behind:
+            log.warning("%s: its driver hangs; it is closed when the driver comes back", self._name)
+        else:
+            self._close_own()
+
+    def _close_own(self) -> None:
+        """Give back what the thread used, once it is through."""
         with self._shared.lock:
             self._shared.bells.close()
         self._uevents.close()
@@ -219,6 +243,17 @@ class Capture:
     # In the capture thread
 
     def _run(self, stream: Stream | None) -> None:
+        """Stream until closed; then, if `close` did not wait for it, give everything back."""
+        try:
+            self._serve(stream)
+        finally:
+            with self._shared.lock:
+                self._shared.ended = True
+                left_behind = self._shared.left_behind
+            if left_behind:
+                self._close_own()
+
+    def _serve(self, stream: Stream | None) -> None:
         """Stream, and open again after every failure, until closed."""
         while True:
             if stream is not None:
@@ -288,7 +323,16 @@ class Capture:
                 shared.last_damage = wrong
             stream.node.queue(buffer.number)
             return
-        arrived = Arrived(buffer, stream.format, stream.rule, sequence, self._streams, received_s)
+        timing = Timing(
+            *stream.exposures.of(sequence, buffer.stamp_s), *self._spacing.see(sequence, buffer.stamp_s)
+        )
+        window = exposure_window(stream.rule, timing, buffer.flags, buffer.stamp_s, received_s)
+        if window is None:
+            with self._shared.lock:
+                self._shared.dropped += dropped
+            stream.node.queue(buffer.number)
+            return
+        arrived = Arrived(buffer, stream.format, timing, window, sequence, self._streams, received_s)
         with (shared := self._shared).lock:
             shared.dropped += dropped
             shared.good += 1
@@ -358,8 +402,9 @@ class Capture:
 
     def _open(self) -> Stream:
         exposure_s = None if self._exposure_s is None else self._exposure_s()
-        stream = Stream(self._options, self._name, exposure_s)
+        stream = Stream(self._options, self._name, self._clock, exposure_s)
         self._check = StampCheck()
+        self._spacing = Spacing(stream.period_s if stream.rate_told else None, stream.rule.margin_s)
         self._lengths = pixels.whole_lengths(stream.format)
         self._streams += 1
         if self._streams > 1:

@@ -8,10 +8,11 @@ have the same exposure; it looks at the brightest of them.
 from __future__ import annotations
 
 import threading
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 
+from drivers.errors import BadOptions
 from drivers.interfaces import Image
 
 SATURATED = 250
@@ -132,31 +133,67 @@ class ExposureControl:
         self._looks.clear()
 
 
+@dataclass
+class _Group:
+    """The control that cameras share, and what it was made with by the first of them."""
+
+    control: ExposureControl
+    settings: ExposureSettings
+    exposure_s: float
+    maker: str
+    users: int = 0
+
+
 class _Groups:
     """The exposure controls that cameras share, by group name, as long as a camera uses them."""
 
     def __init__(self) -> None:
-        self._known: dict[str, tuple[ExposureControl, int]] = {}
+        self._known: dict[str, _Group] = {}
         self._lock = threading.Lock()
 
     def join(self, camera: str, settings: ExposureSettings, exposure_s: float) -> ExposureControl:
-        """Return the control of a group, made by its first camera; a camera without group has its own."""
+        """Return the control of a group, made by its first camera; a camera without group has its own.
+
+        Raises
+        ------
+        BadOptions
+            If the camera has other settings, or begins with another exposure time, than the group's first:
+            cameras of one group have one exposure.
+        """
         if not settings.group:
             return ExposureControl(settings, exposure_s)
         with self._lock:
-            control, users = self._known.get(settings.group, (ExposureControl(settings, exposure_s), 0))
-            self._known[settings.group] = (control, users + 1)
-            control.join(camera)
-            return control
+            group = self._known.get(settings.group)
+            if group is None:
+                group = _Group(ExposureControl(settings, exposure_s), settings, exposure_s, camera)
+            _check_same(camera, group, settings, exposure_s)
+            self._known[settings.group] = group
+            group.users += 1
+            group.control.join(camera)
+            return group.control
 
     def leave(self, camera: str, settings: ExposureSettings) -> None:
         """Let go of a group; the last one out forgets it."""
         with self._lock:
-            if settings.group in self._known:
-                control, users = self._known.pop(settings.group)
-                control.leave(camera)
-                if users > 1:
-                    self._known[settings.group] = (control, users - 1)
+            if (group := self._known.get(settings.group)) is not None:
+                group.control.leave(camera)
+                group.users -= 1
+                if not group.users:
+                    del self._known[settings.group]
+
+
+def _check_same(camera: str, group: _Group, settings: ExposureSettings, exposure_s: float) -> None:
+    """Refuse settings that differ from a group's. Raises BadOptions."""
+    options = [(f"auto_exposure.{f.name}", f.name) for f in fields(ExposureSettings) if f.name != "group"]
+    here = {option: getattr(settings, name) for option, name in options} | {"exposure_s": exposure_s}
+    there = {option: getattr(group.settings, name) for option, name in options}
+    for option, value in (there | {"exposure_s": group.exposure_s}).items():
+        if here[option] != value:
+            raise BadOptions(
+                f"{option!r} is {here[option]:g}, but {value:g} for {group.maker} of the same group "
+                f"{settings.group!r}; cameras of a group share one exposure, so the same is expected",
+                device=camera,
+            )
 
 
 GROUPS = _Groups()

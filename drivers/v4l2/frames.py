@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 from drivers.v4l2.node import Dequeued, PictureFormat
-from drivers.v4l2.stamps import StampRule, Window, exposure_window
+from drivers.v4l2.stamps import Timing, Window
 
 
 @dataclass(frozen=True)
@@ -16,7 +16,8 @@ class Counters:
     Attributes
     ----------
     good, damaged
-        Frames that were published, and frames that were refused (error flag, length, stamp).
+        Frames that were published, and frames that were refused (error flag, length, stamp). The first one or
+        two of a stream are neither, where nothing tells yet when their exposure began.
     dropped
         Frames that never came, by gaps in the driver's count.
     late
@@ -36,12 +37,14 @@ class Counters:
 
 
 class Arrived(NamedTuple):
-    """A good frame, without its picture; what can be worked out of it waits until somebody asks.
+    """A good frame, without its picture.
 
     Attributes
     ----------
-    buffer, format, rule
-        The kernel's buffer with the driver's own count and stamp, what its bytes mean, how its stamp is read.
+    buffer, format
+        The kernel's buffer with the driver's own count and stamp, and what its bytes mean.
+    timing, window
+        What is known of its exposure time, and in which the whole exposure lay.
     sequence, stream
         Our own count, which grows over every reopening, and the number of the stream.
     received_s
@@ -50,11 +53,8 @@ class Arrived(NamedTuple):
 
     buffer: Dequeued
     format: PictureFormat
-    rule: StampRule
+    timing: Timing
+    window: Window
     sequence: int
     stream: int
     received_s: float
-
-    def window(self) -> Window:
-        """Return in which the whole exposure lay."""
-        return exposure_window(self.rule, self.buffer.flags, self.buffer.stamp_s, self.received_s)

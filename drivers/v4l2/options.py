@@ -89,15 +89,17 @@ def parse_options(options: Mapping[str, Any], name: str) -> CameraOptions:
         raise BadOptions(
             f"'format' is {code!r}, which this driver does not read{nearest(code, FORMATS)}", device=name
         )
-    auto = _auto_exposure(read, name)
+    rate_hz = None if options.get("rate_hz", 0) is None else _rate(read)
+    auto = _auto_exposure(read, name, rate_hz)
     exposure_s = read.number("exposure_s", 1e-5, 10.0)
+    _check_in_frame("exposure_s", exposure_s, rate_hz, name)
     if auto is not None and exposure_s is None:
         raise BadOptions("'auto_exposure' needs 'exposure_s': the exposure time to begin with", device=name)
     return CameraOptions(
         address=address,
         format=code,
         size_px=read.size("size_px") or CameraOptions.size_px,
-        rate_hz=None if options.get("rate_hz", 0) is None else _rate(read),
+        rate_hz=rate_hz,
         colour=read.flag("colour"),
         controls=read.controls("controls"),
         exposure_s=exposure_s,
@@ -119,13 +121,23 @@ def _or(value: T | None, default: T) -> T:
     return default if value is None else value
 
 
-def _auto_exposure(read: _Reader, name: str) -> ExposureSettings | None:
+def _check_in_frame(option: str, exposure_s: float | None, rate_hz: float | None, name: str) -> None:
+    """Refuse an exposure time for which a camera would have to stretch its frames. Raises BadOptions."""
+    if exposure_s is not None and rate_hz is not None and exposure_s > 1 / rate_hz:
+        raise BadOptions(
+            f"{option!r} is {exposure_s:g} s, longer than a frame at 'rate_hz' {rate_hz:g} "
+            f"({1 / rate_hz:.4g} s); a shorter one, or a lower rate, is expected",
+            device=name,
+        )
+
+
+def _auto_exposure(read: _Reader, name: str, rate_hz: float | None) -> ExposureSettings | None:
     """The section ``auto_exposure``: true, or its settings."""
     value = read.options.get("auto_exposure", False)
     if value is False:
         return None
     if value is True:
-        return ExposureSettings()
+        value = {}
     if not isinstance(value, Mapping):
         raise BadOptions(
             f"'auto_exposure' is {value!r} where true, false or its settings are expected", device=name
@@ -136,14 +148,16 @@ def _auto_exposure(read: _Reader, name: str) -> ExposureSettings | None:
             raise BadOptions(f"'auto_exposure' has no setting {key!r}{near}", device=name)
     inner = _Reader(value, name, "auto_exposure.")
     default = ExposureSettings()
+    longest_s = default.longest_s if rate_hz is None else min(default.longest_s, 1 / rate_hz)
     settings = ExposureSettings(
         group=inner.text("group"),
         percentile=_or(inner.number("percentile", 1.0, 99.9), default.percentile),
         target=_or(inner.number("target", 10.0, 245.0), default.target),
         tolerance=_or(inner.number("tolerance", 1.0, 100.0), default.tolerance),
         shortest_s=_or(inner.number("shortest_s", 1e-5, 10.0), default.shortest_s),
-        longest_s=_or(inner.number("longest_s", 1e-5, 10.0), default.longest_s),
+        longest_s=_or(inner.number("longest_s", 1e-5, 10.0), longest_s),
     )
+    _check_in_frame("auto_exposure.longest_s", settings.longest_s, rate_hz, name)
     if settings.shortest_s >= settings.longest_s:
         raise BadOptions(
             f"'auto_exposure.shortest_s' is {settings.shortest_s:g} s, which is not below "

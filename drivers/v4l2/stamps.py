@@ -25,20 +25,35 @@ class StampRule:
 
     Attributes
     ----------
-    period_s
-        From one frame to the next: an unknown exposure lasts that long at most, and so does the readout.
-    exposure_s
-        The set exposure time, None if not known (an automatic exposure).
     margin_s
         The camera's configured margin: how much earlier than its stamp says an exposure may have begun.
     driver
         The kernel driver's name; those of `READOUT_STAMPERS` need a rule of their own.
     """
 
-    period_s: float
-    exposure_s: float | None
     margin_s: float
     driver: str = ""
+
+
+class Timing(NamedTuple):
+    """What is known of one frame's time beside its stamp.
+
+    Attributes
+    ----------
+    exposure_s
+        Its exposure time; None if it is not known (an automatic exposure, or a change under way).
+    longest_s
+        The longest exposure time that it may have; None if nothing but the frame before bounds it.
+    apart_s
+        It came at most so long after the frame before; None for the first of a stream.
+    before_apart_s
+        The same of the frame before, or of this one if that is more; None for the first two.
+    """
+
+    exposure_s: float | None
+    longest_s: float | None
+    apart_s: float | None
+    before_apart_s: float | None
 
 
 class Window(NamedTuple):
@@ -61,16 +76,21 @@ class Window(NamedTuple):
         return max(0.0, self.length_s - (exposure_s or 0.0)) / 2
 
 
-def exposure_window(rule: StampRule, flags: int, stamp_s: float, received_s: float) -> Window:
-    """Return the window of a frame's exposure.
+def exposure_window(
+    rule: StampRule, timing: Timing, flags: int, stamp_s: float, received_s: float
+) -> Window | None:
+    """Return the window of a frame's exposure, None if nothing says when that began at the earliest.
 
-    With T the period, e the exposure time (T when unknown), m the margin:
+    No row is exposed before its last picture was read out, and one readout follows the other. So readout and
+    exposure each take at most the time from frame to frame, T: this frame's own, never a promised or a usual
+    one, since an automatic exposure stretches frames one by one. With e the longest exposure time that may
+    have been set (where it is not known T, or U, the longer of T and that of the frame before), m the margin:
 
-    - start-of-exposure stamps: [t - m, t + e + T], the last row up to a readout (at most T) later;
+    - start-of-exposure stamps: [t - m, t + e + T], the last row up to a readout later;
     - start-of-exposure stamps of uvcvideo, which really mark the start of the readout: [t - e - m, t + T];
-    - end-of-frame stamps: [t - T - e - m, t], the readout having taken T at most.
+    - end-of-frame stamps: [t - T - e - m, t], with e = U where it is not known.
 
-    No window ends after the frame was received.
+    No window ends after the frame was received, nor does a stamp count that is later than that.
 
     Parameters
     ----------
@@ -79,15 +99,66 @@ def exposure_window(rule: StampRule, flags: int, stamp_s: float, received_s: flo
     stamp_s, received_s
         The buffer's stamp, and when it was dequeued, seconds of CLOCK_MONOTONIC.
     """
-    exposure_s = rule.period_s if rule.exposure_s is None else min(rule.exposure_s, rule.period_s)
+    stamp_s = min(stamp_s, received_s)
+    apart_s, longest_s = timing.apart_s, timing.longest_s
+    ends_s = received_s
     if flags & abi.BUF_FLAG_TSTAMP_SRC_MASK != abi.BUF_FLAG_TSTAMP_SRC_SOE:
-        begin_s, end_s = stamp_s - rule.period_s - exposure_s, stamp_s
+        longest_s = timing.before_apart_s if longest_s is None else longest_s
+        if apart_s is None or longest_s is None:
+            return None
+        begin_s, ends_s = stamp_s - apart_s - longest_s, stamp_s
     elif rule.driver in READOUT_STAMPERS:
-        begin_s, end_s = stamp_s - exposure_s, stamp_s + rule.period_s
+        longest_s = apart_s if longest_s is None else longest_s
+        if longest_s is None:
+            return None
+        begin_s = stamp_s - longest_s
+        if apart_s is not None:
+            ends_s = stamp_s + apart_s
     else:
-        begin_s, end_s = stamp_s, stamp_s + exposure_s + rule.period_s
+        begin_s = stamp_s
+        if apart_s is not None and longest_s is not None:
+            ends_s = stamp_s + longest_s + apart_s
     begin_s -= rule.margin_s
-    return Window(begin_s, max(begin_s, min(end_s, received_s)))
+    return Window(begin_s, max(begin_s, min(ends_s, received_s)))
+
+
+class Spacing:
+    """How long after the frame before a frame came at most, by what the frames themselves show.
+
+    Parameters
+    ----------
+    promised_s
+        From frame to frame by the camera's own word, seconds; None where it gives none.
+    margin_s
+        How late a stamp may be.
+    """
+
+    def __init__(self, promised_s: float | None, margin_s: float) -> None:
+        self._least_s = promised_s  # the shortest promised or seen: a frame that was lost took no less
+        self._margin_s = margin_s
+        self._sequence: int | None = None
+        self._stamp_s = 0.0
+        self._apart_s: float | None = None
+
+    def see(self, sequence: int, stamp_s: float) -> tuple[float | None, float | None]:
+        """Take in the next good frame and return `Timing.apart_s` and `Timing.before_apart_s` of it.
+
+        What lies between two frames that came is this frame's alone, but for what lost ones took at least.
+        If there is no room for those, the count is not to be believed.
+        """
+        before, between_s = self._sequence, stamp_s - self._stamp_s
+        self._sequence, self._stamp_s = sequence, stamp_s
+        if before is None or between_s <= 0.0:  # stamps that began again tell nothing of what was before
+            self._apart_s = None
+            return None, None
+        apart_s, lost = between_s, sequence - before - 1
+        if lost == 0:
+            seen_s = max(0.0, between_s - self._margin_s)
+            self._least_s = seen_s if self._least_s is None else min(self._least_s, seen_s)
+        elif self._least_s is not None and between_s >= (lost + 1) * self._least_s:
+            apart_s = between_s - lost * self._least_s
+        before_s, self._apart_s = self._apart_s, apart_s
+        return apart_s, None if before_s is None else max(before_s, apart_s)
 
 
 class StampCheck:

@@ -5,9 +5,11 @@ from __future__ import annotations
 import logging
 from collections.abc import Sequence
 
+from drivers.clock import Clock
 from drivers.v4l2 import abi, find
 from drivers.v4l2.controls import Control, Problem, first_of, get_value, list_controls, set_by_name, set_value
 from drivers.v4l2.errors import UnsupportedFormat
+from drivers.v4l2.exposures_set import ExposuresSet
 from drivers.v4l2.node import Node, PictureFormat
 from drivers.v4l2.options import CameraOptions
 from drivers.v4l2.pixels import FORMATS
@@ -29,10 +31,14 @@ class Stream:
         The open node, and the format that frames have.
     rate_hz, period_s
         The rate that the camera answered, or the asked one where it does not tell; from frame to frame.
+    rate_told
+        Whether the camera itself told that rate.
     rule
-        How the time stamps are to be read, at the exposure time of now.
+        How the time stamps are to be read.
+    exposures
+        With which exposure times a frame may have been taken.
     exposure_s
-        The exposure time by the camera's own word, None if unknown.
+        The exposure time by the camera's own word, None if unknown: also where its automatic stayed on.
     asked_exposure_s
         The exposure time that was set last, before the camera rounded it.
     problems
@@ -41,25 +47,36 @@ class Stream:
     Raises
     ------
     UnsupportedFormat
-        If format, size or rate are not to be had; the message says what is.
+        If format, size or rate are not to be had, the message says what is; and for an exposure longer than a
+        frame, for which a camera stretches its frames.
     DriverError
         If the camera cannot be opened or does not start.
     """
 
-    def __init__(self, options: CameraOptions, name: str, exposure_s: float | None = None) -> None:
+    def __init__(
+        self, options: CameraOptions, name: str, clock: Clock, exposure_s: float | None = None
+    ) -> None:
         self._options = options
         self._name = name
+        self._clock = clock
         self.exposure_s: float | None = None
         self.asked_exposure_s: float | None = None
         self.problems: list[Problem] = []
+        self.exposures = ExposuresSet(None)
         self._exposure: Control | None = None
+        self._automatic_stays = False
         self.node = find.open_node(options.address, name)
         try:
             self.format = set_format(self.node, options.format, options.size_px, name)
-            self.rate_hz = _set_rate(self.node, options, name)
+            self.rate_hz, self.rate_told = _set_rate(self.node, options, name)
             self.period_s = 1 / self.rate_hz
-            self.rule = self._rule()
-            self._set_controls(options, options.exposure_s if exposure_s is None else exposure_s)
+            self.rule = StampRule(options.margin_s, self.node.identity.driver)
+            exposure_s = options.exposure_s if exposure_s is None else exposure_s
+            self._check_exposure(exposure_s, "'exposure_s' is")
+            if options.auto_exposure is not None:
+                self._check_exposure(options.auto_exposure.longest_s, "'auto_exposure.longest_s' is")
+            self._set_controls(options, exposure_s)
+            self._check_exposure(self.exposure_s, "the camera has an exposure of")
             self.node.start(options.buffers)
         except BaseException:
             self.node.close()
@@ -72,14 +89,22 @@ class Stream:
             return
         steps = max(1, round(exposure_s / EXPOSURE_UNIT_S))
         bounded = min(max(steps, self._exposure.minimum), self._exposure.maximum)
+        began_s = self._clock.now_s()
         if problem := set_value(self.node, self._exposure, bounded):
             log.warning("%s: %s", self._name, problem.message)
         became = get_value(self.node, self._exposure)
-        self.exposure_s = None if became is None else became * EXPOSURE_UNIT_S
-        self.rule = self._rule()
+        known = became is not None and not self._automatic_stays
+        self.exposure_s = became * EXPOSURE_UNIT_S if became is not None and known else None
+        self.exposures.change(self.exposure_s, began_s, self._clock.now_s())
 
-    def _rule(self) -> StampRule:
-        return StampRule(self.period_s, self.exposure_s, self._options.margin_s, self.node.identity.driver)
+    def _check_exposure(self, exposure_s: float | None, words: str) -> None:
+        """Refuse an exposure time that is longer than a frame. Raises UnsupportedFormat."""
+        if self.rate_told and exposure_s is not None and exposure_s > self.period_s * (1 + RATE_TOLERANCE):
+            raise UnsupportedFormat(
+                f"{words} {exposure_s:g} s, longer than a frame at the camera's {self.rate_hz:g} Hz "
+                f"({self.period_s:.4g} s); a shorter one, or a lower rate, is expected",
+                device=self._name,
+            )
 
     def close(self) -> None:
         """Stop and let go; never raises for a camera that is gone."""
@@ -90,7 +115,7 @@ class Stream:
         self.problems += set_by_name(self.node, options.controls)
         controls = list_controls(self.node)
         if exposure_s is not None:
-            self._turn_off(controls, abi.CID_EXPOSURE_AUTO, abi.EXPOSURE_MANUAL)
+            self._automatic_stays = not self._turn_off(controls, abi.CID_EXPOSURE_AUTO, abi.EXPOSURE_MANUAL)
             self._turn_off(controls, abi.CID_EXPOSURE_AUTO_PRIORITY, 0)
             self._exposure = first_of(controls, (abi.CID_EXPOSURE_ABSOLUTE,))
             if self._exposure is None:
@@ -116,10 +141,12 @@ class Stream:
         for problem in self.problems:
             log.warning("%s: %s", self._name, problem.message)
 
-    def _turn_off(self, controls: Sequence[Control], which: int, value: int) -> None:
-        """Turn an automatic off, where the camera has one."""
+    def _turn_off(self, controls: Sequence[Control], which: int, value: int) -> bool:
+        """Turn an automatic off, where the camera has one; return whether none stays on."""
         if (control := first_of(controls, (which,))) and (problem := set_value(self.node, control, value)):
             self.problems.append(problem)
+            return False
+        return True
 
     def _missing(self, word: str, option: str) -> None:
         self.problems.append(Problem(option, f"the camera has no control for {word}; it stays as it is"))
@@ -165,14 +192,15 @@ def sizes_text(node: Node, code: str) -> str:
     return ", ".join(f"{w}x{h}" for w, h in sizes) or "only what is set"
 
 
-def _set_rate(node: Node, options: CameraOptions, name: str) -> float:
-    """Set the rate, and check the answer if one was asked for."""
+def _set_rate(node: Node, options: CameraOptions, name: str) -> tuple[float, bool]:
+    """Set the rate, and check the answer if one was asked for; return whether there was one, too."""
     if options.rate_hz is None:
-        return node.current_rate() or UNKNOWN_RATE_HZ
+        rate_hz = node.current_rate()
+        return rate_hz or UNKNOWN_RATE_HZ, bool(rate_hz)
     answer = node.set_rate(options.rate_hz)
     if answer is None:  # no say in it: an industrial camera with a fixed rate, or a trigger
         log.warning("%s: the camera does not take a frame rate", name)
-        return options.rate_hz
+        return options.rate_hz, False
     if abs(answer - options.rate_hz) > RATE_TOLERANCE * options.rate_hz:
         offered = ", ".join(f"{rate:g}" for rate in node.rates_hz(options.format, options.size_px))
         width, height = options.size_px
@@ -181,4 +209,4 @@ def _set_rate(node: Node, options: CameraOptions, name: str) -> float:
             f"it has {offered or f'{answer:g}'} Hz",
             device=name,
         )
-    return answer
+    return answer, True

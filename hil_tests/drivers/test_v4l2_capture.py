@@ -6,6 +6,7 @@ What only a real driver shows (mapping, faults, unplugging) is tested in hil_tes
 from __future__ import annotations
 
 import contextlib
+import errno
 import os
 import threading
 import time
@@ -24,6 +25,7 @@ from drivers.v4l2 import abi, capture, pixels
 from drivers.v4l2.camera import V4l2Camera, open_camera
 from drivers.v4l2.capture import Capture
 from drivers.v4l2.errors import NoCamera, StreamFailed
+from drivers.v4l2.exposures_set import ExposuresSet
 from drivers.v4l2.node import Dequeued, Identity, PictureFormat
 from drivers.v4l2.options import parse_options
 from drivers.v4l2.stamps import StampRule
@@ -101,7 +103,9 @@ class FakeStream:
         self.period_s = 0.04
         self.exposure_s: float | None = 0.01
         self.problems: list[object] = []
-        self.rule = StampRule(0.04, 0.01, 0.0)
+        self.rate_told = True
+        self.rule = StampRule(0.0)
+        self.exposures = ExposuresSet(0.01)
         self.closed = False
 
     def close(self) -> None:
@@ -338,6 +342,55 @@ def test_a_camera_that_cannot_be_opened_leaves_nothing(bench: Bench) -> None:
         bench.refusals.append(NoCamera("gone"))
         with pytest.raises(NoCamera):
             Capture(options, "c", bench.clock, pixels.grey)
+    assert held() == before
+
+
+def no_more_descriptors(*ignored: object) -> int:
+    raise OSError(errno.EMFILE, "Too many open files")
+
+
+@pytest.mark.parametrize(
+    ("where", "name"),
+    [(capture.os, "eventfd"), (capture, "UeventSocket"), (capture.threading.Thread, "start")],
+)
+def test_what_fails_after_the_camera_was_opened_leaves_no_stream_behind(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch, where: object, name: str
+) -> None:
+    options = parse_options({"card": "Fake"}, "c")
+    for number in range(3):
+        stream = FakeStream()
+        before = held()
+        with monkeypatch.context() as broken:
+            broken.setattr(capture, "Stream", lambda *ignored, made=stream: made)
+            broken.setattr(where, name, no_more_descriptors)
+            with pytest.raises(OSError, match="Too many open files"):
+                Capture(options, "c", bench.clock, pixels.grey)
+        assert stream.closed and held() == before, f"try {number}"
+        os.close(stream.node.ready)
+
+
+def test_closing_does_not_wait_for_ever_for_a_driver_that_hangs(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(capture, "CLOSE_PATIENCE_S", 0.05)
+    before = held()
+    camera = V4l2Camera(parse_options({"card": "Fake", "format": "GREY"}, "eye"), "eye", bench.clock)
+    hangs, back = threading.Event(), threading.Event()
+
+    def hang(index: int) -> None:
+        hangs.set()
+        assert back.wait(PATIENCE_S)
+
+    monkeypatch.setattr(bench.streams[0].node, "queue", hang)
+    bench.streams[0].frame(0, 100.0)
+    bench.streams[0].frame(1, 100.04)  # the first one's buffer goes back, and the driver does not return
+    assert hangs.wait(PATIENCE_S)
+    camera.close()
+    assert "eye: its driver hangs" in caplog.text and not bench.streams[0].closed
+    back.set()
+    until(lambda: held()[1] == before[1])
+    assert bench.streams[0].closed, "when the driver came back, the camera was let go"
+    os.close(bench.streams[0].node.ready)
     assert held() == before
 
 

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 import pytest
 
+from drivers.errors import BadOptions
 from drivers.v4l2.exposure import GROUPS, ExposureControl, ExposureSettings
 
 SETTINGS = ExposureSettings(percentile=95, target=180, tolerance=25, shortest_s=1e-4, longest_s=0.03)
@@ -56,7 +59,7 @@ def test_nothing_changes_during_a_measurement() -> None:
 
 def test_cameras_of_a_group_have_one_exposure_by_the_brightest() -> None:
     settings = ExposureSettings(group="navcam")
-    left, right = GROUPS.join("left", settings, 0.005), GROUPS.join("right", settings, 0.02)
+    left, right = GROUPS.join("left", settings, 0.005), GROUPS.join("right", settings, 0.005)
     try:
         assert left is right
         for _ in range(12):
@@ -70,6 +73,40 @@ def test_cameras_of_a_group_have_one_exposure_by_the_brightest() -> None:
     again = GROUPS.join("left", settings, 0.011)
     GROUPS.leave("left", settings)
     assert again is not left and again.exposure_s == 0.011
+
+
+@pytest.mark.parametrize(
+    ("settings", "exposure_s", "message"),
+    [
+        (
+            ExposureSettings(group="navcam", target=120),
+            0.005,
+            "right: 'auto_exposure.target' is 120, but 180 for left of the same group 'navcam'; "
+            "cameras of a group share one exposure, so the same is expected",
+        ),
+        (
+            ExposureSettings(group="navcam", longest_s=0.02),
+            0.005,
+            "'auto_exposure.longest_s' is 0.02, but 0.03",
+        ),
+        (ExposureSettings(group="navcam"), 0.02, "'exposure_s' is 0.02, but 0.005 for left"),
+    ],
+)
+def test_a_camera_of_a_group_with_settings_of_its_own_is_refused(
+    settings: ExposureSettings, exposure_s: float, message: str
+) -> None:
+    first = ExposureSettings(group="navcam")
+    control = GROUPS.join("left", first, 0.005)
+    try:
+        with pytest.raises(BadOptions, match=re.escape(message)):
+            GROUPS.join("right", settings, exposure_s)
+        assert GROUPS.join("right", first, 0.005) is control, "the refused one was not counted in"
+        GROUPS.leave("right", first)
+    finally:
+        GROUPS.leave("left", first)
+    with_others = GROUPS.join("right", settings, exposure_s)  # alone it may
+    GROUPS.leave("right", settings)
+    assert with_others.exposure_s == exposure_s
 
 
 def test_a_picture_taken_with_another_exposure_is_not_judged() -> None:

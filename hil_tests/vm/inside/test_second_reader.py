@@ -45,7 +45,7 @@ def our_bytes(count: int, **more: object) -> list[NDArray[np.uint8]]:
         for _ in range(count):
             taken = capture.take(after_s, 10.0)
             assert taken is not None
-            after_s = taken[0].window().begin_s
+            after_s = taken[0].window.begin_s
             found.append(taken[1])
     finally:
         capture.close()
