@@ -17,6 +17,7 @@ from types import MappingProxyType, TracebackType
 from typing import TYPE_CHECKING, Any, Literal
 
 from drivers.absent_camera import AbsentCamera, Opening, begin_opening, let_go
+from drivers.camera_offset import corrected
 from drivers.clock import Clock, SystemClock
 from drivers.errors import BadOptions, DriverError, NoReply
 from drivers.faults import PAN_TILT, nearest
@@ -46,10 +47,14 @@ HEAD_OPENING_S = 60.0
 
 @dataclass(frozen=True)
 class DeviceSettings:
-    """A device as a configuration names it: the driver, and its options."""
+    """A device as a configuration names it: the driver, and its options.
+
+    ``offset_s`` is for cameras: how much later than its stamps say mid-exposure is, as it was measured.
+    """
 
     driver: str
     options: Mapping[str, Any] = field(default_factory=dict)
+    offset_s: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -191,7 +196,10 @@ class _Opener:
 
     def camera(self, name: str, device: DeviceSettings) -> Any:
         """Open a camera, or leave it absent."""
-        make = partial(self._open, name, device, Camera)
+
+        def make() -> Any:
+            return corrected(self._open(name, device, Camera), device.offset_s)
+
         if device.driver in OURS:
             return make()
         opening = begin_opening(name, make)

@@ -16,6 +16,7 @@ from calib.formats import read_bytes
 from calib.formats.strict import Section, nearest
 from calib.formats.yaml_text import parse_mapping
 from calib.mast import Rig
+from drivers.camera_offset import MOST_OFFSET_S
 from drivers.open_hardware import DeviceSettings, HardwareSettings
 from mastctl.limits import Limits
 from mastctl.packaged import default_config
@@ -87,13 +88,13 @@ def parse_config(data: bytes, path: str | Path) -> Config:
         ("cameras", "listen", "simulation", "tracking"),
     )
     folder = Path(path).resolve().parent
-    cameras = {name: _device(top, "cameras", name) for name in top.mapping("cameras")}
+    cameras = {name: _camera(top, name) for name in top.mapping("cameras")}
     return Config(
         path=Path(path),
         mast_file=folder / top.text("mast_file"),
         listen=_listen(top, folder),
         hardware=HardwareSettings(
-            pan_tilt=_device(top, "", "pan_tilt"),
+            pan_tilt=_head(top),
             cameras=cameras,
             simulation=top.free("simulation"),
             folder=folder,
@@ -137,11 +138,18 @@ def _known(word: str, known: tuple[str, ...]) -> str:
     return nearest(word, known) if known else "it has none"
 
 
-def _device(top: Section, place: str, name: str) -> DeviceSettings:
+def _head(top: Section) -> DeviceSettings:
     """Read ``{driver: NAME, options: {...}}``."""
-    holder = top.mapping(place)[name] if place else top.values[name]
-    section = Section(top.path, f"{place}.{name}" if place else name, holder, ("driver",), ("options",))
+    section = Section(top.path, "pan_tilt", top.values["pan_tilt"], ("driver",), ("options",))
     return DeviceSettings(section.text("driver"), section.free("options"))
+
+
+def _camera(top: Section, name: str) -> DeviceSettings:
+    """Read ``{driver: NAME, options: {...}, offset_s: SECONDS}``."""
+    holder = top.mapping("cameras")[name]
+    section = Section(top.path, f"cameras.{name}", holder, ("driver",), ("options", "offset_s"))
+    offset_s = _number_between(section, "offset_s", 0.0, -MOST_OFFSET_S, MOST_OFFSET_S)
+    return DeviceSettings(section.text("driver"), section.free("options"), offset_s)
 
 
 def _listen(top: Section, folder: Path) -> Listen:

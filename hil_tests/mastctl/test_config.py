@@ -54,6 +54,23 @@ def test_a_good_configuration_is_read_whole() -> None:
     assert config.hardware.folder == Path("rover").resolve()
 
 
+def test_a_cameras_offset_is_read_for_any_driver() -> None:
+    config = parsed(changed("cameras/navcam_left/offset_s", -0.0125))
+    assert config.hardware.cameras["navcam_left"].offset_s == -0.0125
+    assert parsed(yaml.safe_dump(GOOD).encode()).hardware.cameras["navcam_left"].offset_s == 0.0
+
+
+@pytest.mark.parametrize("offset", [2, -1.5, "12 ms", None, float("nan"), True])
+def test_an_offset_that_cannot_be_is_refused(offset: object) -> None:
+    with pytest.raises(BadFile, match=r"daemon.yaml: cameras.navcam_left.offset_s: .* expected"):
+        parsed(changed("cameras/navcam_left/offset_s", offset))
+
+
+def test_the_head_has_no_offset() -> None:
+    with pytest.raises(BadFile, match=r"pan_tilt\.offset_s: unknown key"):
+        parsed(changed("pan_tilt/offset_s", 0.1))
+
+
 def test_an_absolute_mast_file_stays_where_it_is() -> None:
     assert parsed(changed("mast_file", "/somewhere/mast.yaml")).mast_file == Path("/somewhere/mast.yaml")
 
