@@ -40,7 +40,7 @@ class CorrectedCamera:
         exposure. That mid-exposure is known by measurement takes as much off either end: the exposure lay
         in the driver's own span, and nothing becomes later than the frame's arrival.
         """
-        frame = self._camera.next_frame(exposed_after_s - self._offset_s, timeout_s)
+        frame: Frame = self._camera.next_frame(exposed_after_s - self._offset_s, timeout_s)
         try:
             uncertainty_s = float(getattr(frame, "mid_uncertainty_s", 0.0))
             self._narrower_s = min(abs(self._offset_s), max(0.0, uncertainty_s))
@@ -51,8 +51,7 @@ class CorrectedCamera:
             if isinstance(frame, Frame):
                 if uncertainty_s > 0.0:
                     changes["mid_uncertainty_s"] = uncertainty_s - self._narrower_s
-                moved: Frame = dataclasses.replace(frame, **changes)
-                return moved
+                return dataclasses.replace(frame, **changes)
             return Frame(frame.image, frame.sequence, **changes)
         except (AttributeError, TypeError, ValueError):
             return frame  # no frame at all: whoever asked refuses it in its own words
