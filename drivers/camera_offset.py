@@ -44,7 +44,7 @@ class CorrectedCamera:
         try:
             uncertainty_s = float(getattr(frame, "mid_uncertainty_s", 0.0))
             self._narrower_s = min(abs(self._offset_s), max(0.0, uncertainty_s))
-            changes = {
+            changes: dict[str, Any] = {
                 "mid_exposure_s": frame.mid_exposure_s + self._offset_s,
                 "exposure_s": frame.exposure_s - 2 * self._narrower_s,
             }
