@@ -1,6 +1,7 @@
 """A real head made to look like the rigs of the contract suite.
 
-The suite moves its heads within LIMITS_RAD; a real head moves within the limits of its configuration.
+The suite moves its heads within LIMITS_RAD; a real head, of this repository's drivers or of one from
+outside (``package.module:factory``), moves within the limits of its configuration.
 `Scaled` stands between: it maps the one range onto the other, axis by axis, so that the same tests run
 unchanged and a head with narrow limits makes small moves.
 """
@@ -19,6 +20,7 @@ from drivers.faults import FaultPanel
 from drivers.interfaces import PanTilt, Reading
 from drivers.open_hardware import DeviceSettings, HardwareSettings, open_hardware
 from mastctl.config import Config, load_config
+from mastctl.pointing.requests import PointingSettings
 from tools.servo_rigs import LIMITS_RAD, Rig
 
 CHOSEN: str | None = None
@@ -26,6 +28,9 @@ CHOSEN: str | None = None
 
 COUNTS = {"dynamixel": 3, "flir_ptu": 1}
 """How many counts from its goal a head of a driver may stand when it calls itself settled."""
+
+OUTSIDE_COUNT_RAD = 1e-3
+"""Taken for the count of a head from outside, which nobody here knows; a 12-bit servo has 1.5e-3."""
 
 
 class Scaled:
@@ -87,17 +92,23 @@ def hardware_rig(file: Path) -> Iterator[Rig]:
     """The head of a configuration, standing in the middle of its limits."""
     config = load_config(file)
     settings = config.hardware.pan_tilt
-    own_count_rad = _count_rad(settings)
+    outside = ":" in settings.driver
+    own_count_rad = OUTSIDE_COUNT_RAD if outside else _count_rad(settings)
     with open_hardware(HardwareSettings(settings, {})) as hardware:
         head = Scaled(hardware.pan_tilt, config)
         count_rad = own_count_rad / min(head.scales)
+        settle_rad = (
+            PointingSettings().arrival_tolerance_rad / min(head.scales)  # what the service takes
+            if outside
+            else COUNTS[settings.driver] * count_rad
+        )
         yield Rig(
             name=f"{settings.driver}, real",
             head=head,
             panel=FaultPanel(lambda: 0.0, ()),
             true_rad=head.seen_rad,
             count_rad=count_rad,
-            settle_rad=COUNTS[settings.driver] * count_rad,
+            settle_rad=settle_rad,
             fastest_rad_per_s=None,
         )
 

@@ -1,7 +1,11 @@
-"""A small rig, and one scene for all tests of the simulated rover."""
+"""A small rig, one scene for all tests of the simulated rover, and the package of docs/drivers.md."""
 
 from __future__ import annotations
 
+import re
+import subprocess
+import sys
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -42,3 +46,34 @@ def small_rig(repository: Path, tmp_path_factory: pytest.TempPathFactory) -> Pat
     path = tmp_path_factory.mktemp("rig") / "small.yaml"
     save_rig(Rig("small", rig.mast, cameras, rig.stereo), path)
     return path
+
+
+@pytest.fixture(scope="session")
+def sources(repository: Path) -> dict[str, str]:
+    """File name to text, from the code blocks of the page that follow a file's name."""
+    page = (repository / "docs" / "drivers.md").read_text()
+    return dict(re.findall(r"`([\w/]+\.(?:py|toml))`[^\n]*:\n\n```\w+\n(.*?)```", page, re.DOTALL))
+
+
+@pytest.fixture(scope="session")
+def installed(sources: dict[str, str], tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """The package, installed by pip into a folder of its own that is on the path."""
+    project, target = tmp_path_factory.mktemp("project"), tmp_path_factory.mktemp("installed")
+    for name, text in sources.items():
+        path = project / name
+        path.parent.mkdir(exist_ok=True)
+        path.write_text(text)
+    (project / "bench_rig" / "__init__.py").touch()
+    options = "--quiet --no-deps --no-index --no-build-isolation --disable-pip-version-check"
+    done = subprocess.run(
+        [sys.executable, "-m", "pip", "install", *options.split(), "--target", str(target), str(project)],
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
+    assert done.returncode == 0, done.stderr
+    sys.path.insert(0, str(target))
+    yield target
+    sys.path.remove(str(target))
+    for name in [name for name in sys.modules if name.split(".")[0] == "bench_rig"]:
+        del sys.modules[name]

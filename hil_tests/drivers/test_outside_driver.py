@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import re
-import subprocess
 import sys
 import threading
 import time
@@ -26,37 +24,6 @@ from mastctl.pointing.loop import AnglesTarget, PixelTarget, PointingLoop, Point
 
 LANDED_WITHIN_PX = 0.6
 """Peak of a plain correlation to the whole pixel, and a floor seen from another side."""
-
-
-@pytest.fixture(scope="module")
-def sources(repository: Path) -> dict[str, str]:
-    """File name to text, from the code blocks of the page that follow a file's name."""
-    page = (repository / "docs" / "drivers.md").read_text()
-    return dict(re.findall(r"`([\w/]+\.(?:py|toml))`[^\n]*:\n\n```\w+\n(.*?)```", page, re.DOTALL))
-
-
-@pytest.fixture(scope="module")
-def installed(sources: dict[str, str], tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
-    """The package, installed by pip into a folder of its own that is on the path."""
-    project, target = tmp_path_factory.mktemp("project"), tmp_path_factory.mktemp("installed")
-    for name, text in sources.items():
-        path = project / name
-        path.parent.mkdir(exist_ok=True)
-        path.write_text(text)
-    (project / "bench_rig" / "__init__.py").touch()
-    options = "--quiet --no-deps --no-index --no-build-isolation --disable-pip-version-check"
-    done = subprocess.run(
-        [sys.executable, "-m", "pip", "install", *options.split(), "--target", str(target), str(project)],
-        capture_output=True,
-        text=True,
-        timeout=120,
-    )
-    assert done.returncode == 0, done.stderr
-    sys.path.insert(0, str(target))
-    yield target
-    sys.path.remove(str(target))
-    for name in [name for name in sys.modules if name.split(".")[0] == "bench_rig"]:
-        del sys.modules[name]
 
 
 @pytest.fixture(scope="module")
@@ -176,3 +143,15 @@ def test_options_it_refuses_are_told_in_its_own_words(installed: Path) -> None:
     head = DeviceSettings("bench_rig.head:open_head", {"speed_rad_per_s": -1})
     with pytest.raises(BadOptions, match="bench head: speed_rad_per_s is -1, expected a positive number"):
         open_hardware(HardwareSettings(head, {}))
+
+
+def test_the_head_of_the_page_comes_to_rest_at_every_goal(installed: Path) -> None:
+    """Also where sum and difference of the angles do not round back to the goal."""
+    from bench_rig.head import BenchHead  # type: ignore[import-not-found]
+
+    head, random = BenchHead(1e9), np.random.default_rng(4)
+    for pan_rad, tilt_rad in random.uniform(-1.0, 1.0, (200, 2)):
+        head.move(pan_rad, tilt_rad)
+        time.sleep(1e-6)
+        reading = head.read()
+        assert (reading.pan_rad, reading.tilt_rad, reading.moving) == (pan_rad, tilt_rad, False)
