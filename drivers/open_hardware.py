@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import importlib
 import logging
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import wait
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -163,6 +164,27 @@ def open_hardware(settings: HardwareSettings, clock: Clock | None = None) -> Har
     return Hardware(pan_tilt, devices, opener.kinds, opener.rover)
 
 
+@contextmanager
+def open_one_camera(settings: HardwareSettings, name: str, clock: Clock | None = None) -> Iterator[Camera]:
+    """Open one camera of the settings by itself, without the head, and close it at the end.
+
+    Raises
+    ------
+    BadOptions, DriverError
+        As `open_hardware`; but a camera that cannot be reached is an error here.
+    """
+    opener = _Opener(settings, clock or SystemClock())
+    try:
+        camera: Camera = opener.one(name, settings.cameras[name])
+        try:
+            yield camera
+        finally:
+            _close({name: camera})
+    finally:
+        if opener.rover is not None:
+            _close({"simulated rover": opener.rover})
+
+
 class _Opener:
     """Opens the devices of one configuration; those of a shared rover or replay share it."""
 
@@ -197,9 +219,7 @@ class _Opener:
     def camera(self, name: str, device: DeviceSettings) -> Any:
         """Open a camera, or leave it absent."""
 
-        def make() -> Any:
-            return corrected(self._open(name, device, Camera), device.offset_s)
-
+        make = partial(self.one, name, device)
         if device.driver in OURS:
             return make()
         opening = begin_opening(name, make)
@@ -218,6 +238,10 @@ class _Opener:
         except BaseException:
             let_go(opening)
             raise
+
+    def one(self, name: str, device: DeviceSettings) -> Any:
+        """A camera with its stamps corrected. Raises DriverError."""
+        return corrected(self._open(name, device, Camera), device.offset_s)
 
     def _open(self, name: str, device: DeviceSettings, protocol: type) -> Any:
         """Open one device and check that it does what the protocol asks."""

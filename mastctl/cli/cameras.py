@@ -16,6 +16,7 @@ from mastctl.cli.output import finite_number, positive_number
 if TYPE_CHECKING:
     from drivers.interfaces import Image
     from drivers.v4l2.camera import V4l2Camera
+    from mastctl.config import Config
     from mastctl.frames import StampedFrame
 
 FRAME_TIMEOUT_S = 5.0
@@ -31,6 +32,10 @@ def add_actions(actions: Any) -> None:
     check.add_argument(
         "--seconds", type=positive_number, default=5.0, metavar="S", help="how long (default 5)"
     )
+    check.add_argument(
+        "--with-head", action="store_true",
+        help="with --config: open the head first, for cameras of a simulator that look from it",
+    )  # fmt: skip
     check.set_defaults(run=camera_check)
 
     grab = actions.add_parser(
@@ -95,6 +100,13 @@ def camera_check(args: argparse.Namespace) -> int:
     """Measure what a camera delivers, and show what it can do."""
     from mastctl.picture_quality import quality_of
 
+    if (
+        args.config is not None
+        and (config := _config_of(args)).hardware.cameras[args.camera].driver != "v4l2"
+    ):
+        return _check_any(args, config)
+    if args.with_head:
+        raise output.WrongUse("--with-head goes with --config and a camera of another driver than v4l2")
     with _opened(args) as camera:
         measured = _measured(camera, args.seconds)
         frame = camera.next_frame(time.monotonic(), FRAME_TIMEOUT_S)
@@ -230,17 +242,54 @@ def _settings(words: list[str]) -> dict[str, int | str]:
 
 def _configured_options(args: argparse.Namespace) -> dict[str, Any]:
     """A v4l2 camera's options in a configuration."""
-    from mastctl.config import load_config
-
-    config = load_config(args.config)
-    device = config.hardware.cameras.get(args.camera)
-    if device is None:
-        known = ", ".join(config.hardware.cameras)
-        raise output.WrongUse(f"{config.path} has no camera {args.camera}; it has {known}")
+    config = _config_of(args)
+    device = config.hardware.cameras[args.camera]
     if device.driver != "v4l2":
         raise output.WrongUse(f"{args.camera} in {config.path} is of driver {device.driver!r}, not 'v4l2'")
     _refuse_settings(args)
     return dict(device.options)
+
+
+def _config_of(args: argparse.Namespace) -> Config:
+    """The configuration, which has the camera."""
+    from mastctl.config import load_config
+
+    config = load_config(args.config)
+    if args.camera not in config.hardware.cameras:
+        known = ", ".join(config.hardware.cameras)
+        raise output.WrongUse(f"{config.path} has no camera {args.camera}; it has {known}")
+    return config
+
+
+def _check_any(args: argparse.Namespace, config: Config) -> int:
+    """Hold a configured camera of any driver against what a driver promises."""
+    from dataclasses import replace
+
+    from drivers.clock import SystemClock
+    from drivers.open_hardware import open_hardware, open_one_camera
+    from mastctl.camera_check import CameraCheck
+    from mastctl.mast_in_use import read_mast
+
+    _refuse_settings(args)
+    rig = read_mast(config.mast_file, config).stored.rig
+    settings = replace(config.hardware, cameras={args.camera: config.hardware.cameras[args.camera]})
+    clock = SystemClock()
+    size_px = rig.cameras[args.camera].model.size_px
+    if args.with_head:
+        with open_hardware(settings, clock) as hardware:
+            found = CameraCheck(args.camera, hardware.cameras[args.camera], clock, size_px).run(args.seconds)
+    else:
+        with open_one_camera(settings, args.camera, clock) as camera:
+            found = CameraCheck(args.camera, camera, clock, size_px).run(args.seconds)
+    found |= {
+        "driver": settings.cameras[args.camera].driver,
+        "offset_s": settings.cameras[args.camera].offset_s,
+    }
+    if args.json:
+        output.print_json(found)
+    else:
+        _print_any_check(found)
+    return 0 if found["frames"] else 1
 
 
 def _configured_frame(args: argparse.Namespace) -> StampedFrame:
@@ -249,15 +298,11 @@ def _configured_frame(args: argparse.Namespace) -> StampedFrame:
 
     from drivers.clock import SystemClock
     from drivers.open_hardware import open_hardware
-    from mastctl.config import load_config
     from mastctl.devices import Devices
     from mastctl.mast_in_use import read_mast
 
     _refuse_settings(args)
-    config = load_config(args.config)
-    if args.camera not in config.hardware.cameras:
-        known = ", ".join(config.hardware.cameras)
-        raise output.WrongUse(f"{config.path} has no camera {args.camera}; it has {known}")
+    config = _config_of(args)
     mast = read_mast(config.mast_file, config)
     settings = replace(config.hardware, cameras={args.camera: config.hardware.cameras[args.camera]})
     clock = SystemClock()
@@ -317,12 +362,7 @@ def _print_check(told: dict[str, Any]) -> None:
         ("sharpness", f"{quality['sharpness']:.1f}"),
     ]
     output.print_table("check", ("what", "found"), rows, [f"problem: {p}" for p in told["problems"]])
-    most = max(quality["histogram"]) or 1.0
-    bars = [
-        (f"{16 * i:3d}-{16 * i + 15:3d}", f"{share:6.1%}", "#" * round(40 * share / most))
-        for i, share in enumerate(quality["histogram"])
-    ]
-    output.print_table("grey levels", ("level", "share", ""), bars)
+    _print_levels(quality)
     output.print_table(
         "formats", ("code", "sizes"), [(f["code"], f["sizes"]) for f in told["formats"] if f["readable"]]
     )
@@ -330,6 +370,45 @@ def _print_check(told: dict[str, Any]) -> None:
         (c["name"], c["kind"], str(c["value"]), f"{c['minimum']} to {c['maximum']}") for c in told["controls"]
     ]
     output.print_table("controls", ("name", "kind", "value", "range"), controls)
+
+
+def _print_levels(quality: dict[str, Any]) -> None:
+    """The histogram as bars."""
+    most = max(quality["histogram"]) or 1.0
+    bars = [
+        (f"{16 * i:3d}-{16 * i + 15:3d}", f"{share:6.1%}", "#" * round(40 * share / most))
+        for i, share in enumerate(quality["histogram"])
+    ]
+    output.print_table("grey levels", ("level", "share", ""), bars)
+
+
+def _print_any_check(told: dict[str, Any]) -> None:
+    """The check of any driver's camera as tables for people."""
+    problems = [f"problem: {p}" for p in told["problems"]] or ["no problem was found"]
+    rows = [("driver", told["driver"]), ("frames", f"{told['frames']} in {told['seconds']:g} s")]
+    if told["frames"]:
+        width, height = told["size_px"]
+        low, median, high = (1e3 * delay_s for delay_s in told["delay_s"])
+        shortest, longest = (1e3 * exposure_s for exposure_s in told["exposure_s"])
+        uncertainty_s = told["mid_exposure_uncertainty_s"]
+        rows += [
+            ("pictures", f"{width}x{height}, {'colour' if told['colour'] else 'grey'}"),
+            ("rate", "-" if told["rate_hz"] is None else f"{told['rate_hz']:.2f} Hz by counts and stamps"),
+            ("passed over, refused", f"{told['missed']}, {told['refused']}"),
+            ("exposure's end to here", f"{low:.1f} to {high:.1f} ms, median {median:.1f} ms"),
+            ("exposure", f"{shortest:.1f} to {longest:.1f} ms"),
+            (
+                "mid-exposure known to",
+                "not told; mastctl camera sync measures it"
+                if uncertainty_s is None
+                else f"+-{1e3 * uncertainty_s:.1f} ms",
+            ),
+            ("offset_s in use", f"{told['offset_s']:g}"),
+            ("tells of itself", ", ".join(told["abilities"]) or "nothing"),
+        ]
+    output.print_table(f"check of {told['camera']}", ("what", "found"), rows, problems)
+    if told["frames"]:
+        _print_levels(told["quality"])
 
 
 def _with_cross(image: Image, x_px: float, y_px: float) -> Image:
