@@ -25,9 +25,9 @@ class Absence:
         self.again_s = 0.0
         self._wait_s = FIRST_WAIT_S
 
-    def note(self, error: DriverError, now_s: float) -> None:
-        """Note that it is away, or still away after another try."""
-        self.again_s = now_s + self._wait_s
+    def note(self, error: DriverError, now_s: float, silent_s: float = 0.0) -> None:
+        """Note that it is away, or still away after a try; it is left alone for ``silent_s`` at least."""
+        self.again_s = now_s + max(self._wait_s, silent_s)
         self._wait_s = min(2 * self._wait_s, LONGEST_WAIT_S)
         self.error = error
 

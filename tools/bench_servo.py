@@ -184,6 +184,7 @@ def bus(path: str) -> Iterator[tuple[CALL, CALL]]:
 
     with link(path) as (read, write_read):
         owner = Bus("bench", lambda: time.monotonic() + 60.0)
+        owner.start()
         yield (
             lambda: owner.call("read", read, 5.0),
             lambda: owner.call("write and read", write_read, 5.0),

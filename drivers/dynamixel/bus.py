@@ -2,6 +2,9 @@
 
 Between calls the thread runs its own round (`Bus` asks it when to come back): reading the servos, feeding
 their watchdogs, coming back after a lost line. Nobody else ever touches the line.
+
+A stop does not queue: it breaks off what is under way (`Bus.urgent` is asked by the line), and no move that
+was called before it begins after it.
 """
 
 from __future__ import annotations
@@ -14,6 +17,7 @@ from collections.abc import Callable
 from queue import Empty, SimpleQueue
 from typing import Any, TypeVar, cast
 
+from drivers.dynamixel.port import Overtaken
 from drivers.errors import DriverError, NoReply
 
 log = logging.getLogger(__name__)
@@ -23,8 +27,10 @@ T = TypeVar("T")
 class _Job:
     """A call on its way; plain locks, since a call waits for little more than the thread's turn."""
 
-    def __init__(self, function: Callable[[], Any]) -> None:
+    def __init__(self, function: Callable[[], Any], *, first: bool = False, void: object = None) -> None:
         self.function = function
+        self.first = first
+        self.void = void  # what has to be the last stop still when its turn comes; None: whatever
         self.result: Any = None
         self.error: BaseException | None = None
         self.claimed = threading.Lock()  # by the owner thread to run it, or by its caller to give it up
@@ -57,13 +63,31 @@ class Bus:
     def __init__(self, name: str, between: Callable[[], float]) -> None:
         self._name = name
         self._between = between
+        self._urgent_jobs: deque[_Job] = deque()
         self._jobs: deque[_Job] = deque()
+        self._serving_urgent = False
+        self._last_stop = object()  # replaced by each
         self._wake: SimpleQueue[None] = SimpleQueue()
         self._closing: _Job | None = None
         self._thread = threading.Thread(target=self._serve, name=f"bus {name}", daemon=True)
+
+    def start(self) -> None:
+        """Begin to serve; until then calls wait."""
         self._thread.start()
 
-    def call(self, what: str, function: Callable[[], T], timeout_s: float, *, first: bool = False) -> T:
+    def urgent(self) -> bool:
+        """Whether a call with ``first`` waits for the line while something else has it."""
+        return bool(self._urgent_jobs) and not self._serving_urgent
+
+    def call(
+        self,
+        what: str,
+        function: Callable[[], T],
+        timeout_s: float,
+        *,
+        first: bool = False,
+        moves: bool = False,
+    ) -> T:
         """Run ``function`` in the owner thread and return its result.
 
         Parameters
@@ -75,24 +99,30 @@ class Bus:
         timeout_s
             How long to wait in all, seconds.
         first
-            Go before everything that waits.
+            Go before everything that waits, and have what is under way break off (see `urgent`): a stop.
+        moves
+            Do not begin if a call with ``first`` came after this one.
 
         Raises
         ------
         NoReply
-            If it did not end in time; if it had not begun, it never will.
+            If it did not end in time, and if it had not begun then, it never will; or a stop broke it off.
         DriverError
             What ``function`` raises.
         """
         if self._closing is not None:
             raise NoReply(f"{self._name} is closed; {what} was not sent")
-        job = _Job(function)
-        (self._jobs.appendleft if first else self._jobs.append)(job)
+        job = _Job(function, first=first, void=self._last_stop if moves else None)
+        if first:
+            self._last_stop = object()
+        (self._urgent_jobs if first else self._jobs).append(job)
         self._wake.put(None)
         if not job.done.acquire(timeout=timeout_s):
             begun = not job.claimed.acquire(blocking=False)
             words = "it is still under way" if begun else "its turn did not come"
             raise NoReply(f"{what} on {self._name} did not end within {timeout_s:g} s: {words}")
+        if isinstance(job.error, Overtaken):
+            raise NoReply(f"{what} on {self._name} was {job.error}, since a stop came")
         if job.error is not None:
             raise job.error
         return cast(T, job.result)
@@ -100,8 +130,9 @@ class Bus:
     def close(self, last: Callable[[], None], timeout_s: float) -> None:
         """Run ``last`` in the thread as the last call of all and end the thread; never raises."""
         if self._closing is None:
-            self._closing = job = _Job(last)
-            self._jobs.append(job)
+            self._closing = job = _Job(last, first=True)
+            self._last_stop = object()
+            self._urgent_jobs.append(job)
             self._wake.put(None)
             self._thread.join(timeout_s)
             if self._thread.is_alive():
@@ -112,7 +143,7 @@ class Bus:
     def _serve(self) -> None:
         again_s = time.monotonic()
         while True:
-            if not self._jobs:
+            if not (self._urgent_jobs or self._jobs):
                 wait_s = again_s - time.monotonic()
                 if wait_s <= 0:
                     again_s = self._round()
@@ -121,20 +152,39 @@ class Bus:
                     self._wake.get(timeout=wait_s)
                 except Empty:
                     continue
-            try:
-                job = self._jobs.popleft()
-            except IndexError:
+            job = self._next()
+            if job is None:
                 continue  # a wake-up for a call that was served already
+            self._serving_urgent = job.first
             job.run()
+            self._serving_urgent = False
             if job is self._closing:
                 return
             del job
 
+    def _next(self) -> _Job | None:
+        """The call whose turn it is; the moves that a stop has overtaken end here."""
+        if self._urgent_jobs:
+            return self._urgent_jobs.popleft()
+        if not self._jobs:
+            return None
+        job = self._jobs.popleft()
+        if job.void is not None and job.void is not self._last_stop:
+            job.function = _overtaken
+        return job
+
     def _round(self) -> float:
         try:
             return self._between()
+        except Overtaken:
+            return time.monotonic()
         except DriverError as error:  # its owner keeps and tells it
             log.debug("%s: %s", self._name, error)
         except Exception:  # a defect must not end the thread that feeds the watchdogs
             log.exception("%s: the bus thread's own round failed", self._name)
         return time.monotonic() + 0.1
+
+
+def _overtaken() -> None:
+    """Stands in for a move that was still waiting when a stop came."""
+    raise Overtaken("not begun; nothing was sent")

@@ -16,16 +16,18 @@ import logging
 import threading
 import time
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from typing import Any, TypeVar
 
 from drivers.absence import Absence
 from drivers.clock import Clock, SystemClock
 from drivers.dynamixel.bus import Bus
 from drivers.dynamixel.pair import ready_pair
+from drivers.dynamixel.servo import Reboots
 from drivers.dynamixel.session import Session
 from drivers.dynamixel.settings import HeadSettings, head_settings
-from drivers.dynamixel.watch import GivenUp, Reboots
-from drivers.errors import DriverError, NoReply, OutOfRange
+from drivers.dynamixel.watch import GivenUp
+from drivers.errors import DriverError, LineLost, NoReply, OutOfRange
 from drivers.interfaces import AxisReport, Reading, Reporting
 
 log = logging.getLogger(__name__)
@@ -72,9 +74,10 @@ class DynamixelHead(Reporting):
         self._absence = Absence()
         self._closed = False
         self._state = threading.Lock()
+        self._bus = Bus(settings.port, self._round)
         self._session: Session | None = self._connect()
         self._motions = [axis.motion for axis in self._session.pair.axes]
-        self._bus = Bus(settings.port, self._round)
+        self._bus.start()
 
     # What the service calls
 
@@ -112,17 +115,21 @@ class DynamixelHead(Reporting):
                     f"{name} {angle:.4f} rad is outside the head's limits {low:.4f} to {high:.4f} rad"
                 )
         capped = min(speed, self.settings.speed_rad_per_s)
-        self._call("move", lambda session: session.move((pan_rad, tilt_rad), capped))
+        self._call("move", lambda session: session.move((pan_rad, tilt_rad), capped), moves=True)
 
     def stop(self) -> None:
         """Brake both axes; each then holds or lets go as its ``at_stop`` says.
 
-        After the watchdog has stopped the head this is the deliberate act that arms it anew.
+        Each is told to brake by itself before anything is asked, and what else was under way on the line is
+        broken off for it; a move that waits for its turn is not begun. After the watchdog has stopped the
+        head this is the deliberate act that arms it anew.
 
         Raises
         ------
         LineLost, NoReply, BadReply
-            If a servo did not confirm; the driver then keeps silent until the watchdog has stopped it.
+            If a servo did not confirm. The driver then keeps silent until its watchdog has stopped it, a
+            further stop included: both were told to brake when the line was given up, and every packet more
+            would feed the watchdog of one that did not hear it.
         """
         self._call("stop", Session.stop, first=True)
 
@@ -141,12 +148,14 @@ class DynamixelHead(Reporting):
 
     # In the thread that owns the bus
 
-    def _call(self, what: str, function: Callable[[Session], T], first: bool = False) -> T:
+    def _call(
+        self, what: str, function: Callable[[Session], T], *, first: bool = False, moves: bool = False
+    ) -> T:
         with self._state:
             if self._closed:
                 raise NoReply(f"the head on {self.settings.port} is closed; {what} was not sent")
         self._absence.check()
-        return self._bus.call(what, lambda: self._within(function), CALL_TIMEOUT_S, first=first)
+        return self._bus.call(what, lambda: self._within(function), CALL_TIMEOUT_S, first=first, moves=moves)
 
     def _within(self, function: Callable[[Session], T]) -> T:
         """Do something with the servos, which may end in giving the line up."""
@@ -172,7 +181,7 @@ class DynamixelHead(Reporting):
     def _connect(self) -> Session:
         """Open the line, make both servos ready without moving them, and read them once."""
         head = self.settings
-        pair = ready_pair(head)
+        pair = ready_pair(head, self._reboots, self._bus.urgent)
         session = Session(pair, head, self._clock, self._reboots)
         try:
             session.poll_once()
@@ -196,21 +205,16 @@ class DynamixelHead(Reporting):
         self._absence.end()
 
     def _give_up(self, session: Session, error: DriverError) -> None:
-        """Close the line and try again later; without us the watchdogs stop the servos."""
-        now_s = time.monotonic()
+        """Have both axes brake, close the line, and try again when the watchdogs must have stopped them."""
+        with suppress(LineLost):
+            session.pair.brake()
         session.pair.close()
+        now_s = time.monotonic()
         self._session = None
-        self._absence.note(error, now_s)
+        self._absence.note(error, now_s, self.settings.silence_s)
         log.warning("%s; trying again in %.1f s", error, self._absence.again_s - now_s)
 
     def _close_now(self) -> None:
-        session = self._session
-        if session is None:
-            return
-        try:
-            self._within(Session.stop)
-        except DriverError as error:
-            log.warning("the head did not confirm the last stop: %s", error)
         if self._session is not None:
-            session.end()
+            self._session.end()
             self._session = None

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 from dynamixel_sdk import (
@@ -91,6 +91,8 @@ class Link:
         Bits per second.
     reply_timeout_s
         How long a reply may take beyond its time on the wire.
+    urgent
+        As of `Port`, whose ``Overtaken`` every method may raise but `shout`.
 
     Raises
     ------
@@ -98,10 +100,16 @@ class Link:
         As `Port`.
     """
 
-    def __init__(self, port: str, baud: int, reply_timeout_s: float = REPLY_TIMEOUT_S) -> None:
+    def __init__(
+        self,
+        port: str,
+        baud: int,
+        reply_timeout_s: float = REPLY_TIMEOUT_S,
+        urgent: Callable[[], bool] = lambda: False,
+    ) -> None:
         self.name = port
         self.counts = LineCounts()
-        self._port = Port(port, baud, reply_timeout_s)
+        self._port = Port(port, baud, reply_timeout_s, urgent)
         self._packets = PacketHandler()
         self._group_packets: dict[tuple[int, tuple[Part, ...]], bytes] = {}
 
@@ -254,6 +262,34 @@ class Link:
         self.counts.transactions += 1
         try:
             self._packets.send(self._port, BROADCAST_ID, instruction, body)
+        except LineLost as error:
+            raise self._placed(error, [part.servo_id for part in parts], "group write", "") from error
+
+    def shout(self, parts: Sequence[Part], copies: int = 1) -> None:
+        """Write to each of several servos by a packet of its own, at once and whatever is under way.
+
+        Nobody answers, nothing is listened to before, and one servo's packet does not hang on another's:
+        what is sent may collide with a reply, so send more than one copy where it matters.
+
+        Raises
+        ------
+        LineLost
+            If the line is gone.
+        """
+        packets = b"".join(
+            instruction_packet(
+                BROADCAST_ID,
+                INST_SYNC_WRITE,
+                part.address.to_bytes(2, "little")
+                + part.length.to_bytes(2, "little")
+                + bytes((part.servo_id,))
+                + part.data,
+            )
+            for part in parts
+        )
+        self.counts.transactions += copies * len(parts)
+        try:
+            self._port.write_now(copies * packets)
         except LineLost as error:
             raise self._placed(error, [part.servo_id for part in parts], "group write", "") from error
 

@@ -109,6 +109,7 @@ class AxisMotion:
         self._rest: tuple[int, float] | None = None  # counts and since when
         self._sample: Sample | None = None
         self._sampled = False  # since the goal was sent
+        self._speed_rad_per_s = 0.0  # of the profile
         self.goal = 0
         self.holds = True
 
@@ -116,6 +117,11 @@ class AxisMotion:
     def sample(self) -> Sample | None:
         """The last true sample."""
         return self._sample
+
+    @property
+    def heard_s(self) -> float:
+        """When the last true sample came, seconds of CLOCK_MONOTONIC; minus infinity before the first."""
+        return -math.inf if self._sample is None else self._sample.received_s
 
     def begin(self, goal: int) -> None:
         """Stand at a goal, nothing commanded: after start-up."""
@@ -139,7 +145,7 @@ class AxisMotion:
             short = min(side * (final - sample.counts), side * (final - stop))
             if short < stretch:
                 legs = [min(max(final - side * stretch, low), high), final]
-        self._commanded_rad = angle_rad
+        self._commanded_rad, self._speed_rad_per_s = angle_rad, speed_rad_per_s
         self._set(legs)
         return self.goal
 
@@ -178,6 +184,38 @@ class AxisMotion:
         way_rad = velocity * abs(velocity) / (2 * acceleration_rad_per_s2)
         low, high = self.settings.limit_counts
         return min(max(sample.counts + round(way_rad / model.count_rad), low), high)
+
+    def braking_counts(self, now_s: float, acceleration_rad_per_s2: float) -> int:
+        """Return the goal that makes the axis brake now and stay; needs no new sample.
+
+        Where the last sample is not of now, the axis is taken to have gone on as its profile says: with
+        ``acceleration_rad_per_s2`` to the speed of its move. It is never sent beyond the goal that it has, so
+        that a stop given again and again to an axis that does not answer moves it no further. An axis at its
+        goal keeps that goal: what it droops below it is not made the next one.
+        """
+        sample, model = self._sample, self.settings.model
+        assert sample is not None
+        if self.at_goal():
+            return self.goal
+        left = self.goal - sample.counts
+        toward = 1 if left > 0 else -1
+        velocity = toward * sample.values["present_velocity"] * model.velocity_unit_rad_per_s
+        if velocity < 0:
+            return self.stopping_counts(acceleration_rad_per_s2)
+        age_s = max(0.0, now_s - sample.received_s)
+        top = max(velocity, self._speed_rad_per_s)
+        rising_s = min(age_s, (top - velocity) / acceleration_rad_per_s2)
+        way_rad = velocity * rising_s + acceleration_rad_per_s2 * rising_s**2 / 2 + top * (age_s - rising_s)
+        velocity += acceleration_rad_per_s2 * rising_s
+        way_rad += velocity**2 / (2 * acceleration_rad_per_s2)
+        way = min(abs(left), round(way_rad / model.count_rad))
+        low, high = self.settings.limit_counts
+        return min(max(sample.counts + toward * way, low), high)
+
+    def braking_well(self, goal: int, acceleration_rad_per_s2: float) -> bool:
+        """Whether a goal that a stop sent is, by the last sample, near enough to where the axis can stand."""
+        off = abs(goal - self.braking_counts(-math.inf, acceleration_rad_per_s2))
+        return off * self.settings.model.count_rad <= self.settings.settle_rad
 
     def take(self, sample: Sample) -> None:
         """Take a true sample."""

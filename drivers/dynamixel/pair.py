@@ -6,16 +6,18 @@ What is done about what they say is decided elsewhere (`drivers.dynamixel.sessio
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+import time
+from collections.abc import Callable, Sequence
 
 from drivers.dynamixel.link import GroupAnswer, Link, Part
 from drivers.dynamixel.motion import AxisMotion, Sample, Truth, motion_block
-from drivers.dynamixel.servo import Servo
+from drivers.dynamixel.servo import Reboots, Servo
 from drivers.dynamixel.settings import AxisSettings, HeadSettings
 
 log = logging.getLogger(__name__)
 
 FAST_TRIALS = 10
+BRAKE_COPIES = 3  # more than a reply of 54 bytes can collide with
 
 
 class Axis:
@@ -54,12 +56,19 @@ class Axis:
         self.servo.set("torque_enable", 0)
         self.motion.limp()
 
+    def halt(self) -> int | None:
+        """Take where the axis stands if it brakes now as its goal; returns that, None if it holds nothing."""
+        if not self.motion.holds or self.motion.sample is None:
+            return None
+        goal = self.motion.braking_counts(time.monotonic(), self._acceleration_rad_per_s2)
+        self.motion.halt(goal)
+        return goal
+
     def brake(self) -> None:
         """Brake and hold where that ends, if the axis holds at all; raises as `Servo.set`."""
-        if self.motion.holds and self.motion.sample is not None:
-            goal = self.motion.stopping_counts(self._acceleration_rad_per_s2)
+        goal = self.halt()
+        if goal is not None:
             self.servo.set("goal_position", goal)
-            self.motion.halt(goal)
 
     def go_on(self) -> None:
         """Send the next leg of a move if the present one has ended; raises as `Servo.set`."""
@@ -121,6 +130,32 @@ class Pair:
             truth.check(sample)
         return samples
 
+    def sample(self, axis: Axis) -> Sample:
+        """Return what one servo says about its motion now, asking it alone; raises as `samples`."""
+        number = self.axes.index(axis)
+        part, block = self._parts[number], self._blocks[number]
+        answer = self.link.group_read([part])
+        if answer.missing:
+            raise answer.missing[part.servo_id]
+        status = answer.statuses[part.servo_id]
+        sample = Sample(block.decode(status.data), status.alert, answer.sent_s, answer.received_s)
+        self._truths[number].check(sample)
+        return sample
+
+    def brake(self) -> None:
+        """Tell each axis that holds to brake, whatever the line or the other axis does.
+
+        Nothing is asked and nobody answers: see that it was taken by `sample`. Raises LineLost.
+        """
+        parts = []
+        for axis in self.axes:
+            goal = axis.halt()
+            if goal is not None:
+                entry = axis.settings.model.registers["goal_position"]
+                parts.append(Part(axis.settings.servo_id, entry.address, entry.size, entry.encode(goal)))
+        if parts:
+            self.link.shout(parts, BRAKE_COPIES)
+
     def _ask_singly(self, answer: GroupAnswer) -> GroupAnswer:
         """Ask the servos that a group read left out one by one, so that the right one is named."""
         statuses, received_s = dict(answer.statuses), answer.received_s
@@ -178,32 +213,31 @@ class Pair:
                 return False
         return True
 
-    def release(self) -> None:
-        """Leave each servo as its ``at_close`` says; never raises."""
-        for axis in self.axes:
-            axis.servo.release()
-
     def close(self) -> None:
         """Close the line."""
         self.link.close()
 
 
-def ready_pair(head: HeadSettings) -> Pair:
+def ready_pair(head: HeadSettings, reboots: Reboots, urgent: Callable[[], bool]) -> Pair:
     """Open the line and make both servos ready, without moving them: checked, set up, holding, armed.
+
+    ``reboots`` are those done to this head; ``urgent`` is that of `Link`.
 
     Raises
     ------
+    Overtaken
+        If a stop came meanwhile; the line is closed again.
     LineLost, NoReply, WrongDevice, HardwareFault, Refused
         If the servos cannot be reached or do not fit; the line is closed again.
     """
-    link = Link(head.port, head.baud, head.reply_timeout_s)
+    link = Link(head.port, head.baud, head.reply_timeout_s, urgent)
     try:
         pair = Pair(link, head)
         servos = [axis.servo for axis in pair.axes]
         for servo in servos:
             servo.check_identity()
         for servo in servos:
-            servo.check_health()
+            servo.check_health(reboots)
             servo.check_place()
         for servo in servos:
             servo.set_up()

@@ -1,10 +1,10 @@
 """The SDK's port, hardened: blocking waits with a monotonic deadline, an exclusive line, typed errors.
 
-What it changes of ``dynamixel_sdk.PortHandler``: a wait sleeps in the kernel instead of spinning; the
-deadline runs on CLOCK_MONOTONIC; the line is opened for this process alone; pyserial's URLs
-(``socket://host:port``, ``rfc2217://...``) and every baud rate that the adapter can do are taken; a USB
-adapter's latency timer is set to its least; the busy flag can never stay set; whatever pyserial raises
-becomes `LineLost` with the port's name.
+What it changes of ``dynamixel_sdk.PortHandler``: a wait sleeps in the kernel instead of spinning, and
+gives way to a stop; the deadline runs on CLOCK_MONOTONIC; the line is opened for this process alone;
+pyserial's URLs (``socket://host:port``, ``rfc2217://...``) and every baud rate that the adapter can do are
+taken; a USB adapter's latency timer is set to its least; the busy flag can never stay set; whatever pyserial
+raises becomes `LineLost` with the port's name.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import os
 import select
 import termios
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import serial
@@ -27,6 +27,19 @@ CHUNK_BYTES = 4096
 WRITE_TIMEOUT_S = 0.5
 QUIET_S = 0.02  # a USB adapter may hold bytes back for 16 ms
 LONGEST_DRAIN_S = 0.3
+SLICE_S = 0.005  # how soon a wait sees that it has to give way
+REPLY_UNDER_WAY_S = 0.01  # how long it then lets a reply come in that would collide with what is sent next
+
+
+class Overtaken(Exception):
+    """What was under way on the line was broken off, since something more urgent wants it.
+
+    No `DriverError`: nobody on the way up may take it for a fault of the line and try again. Its words say
+    how far it had come.
+    """
+
+    def __init__(self, words: str = "broken off") -> None:
+        super().__init__(words)
 
 
 class Port(PortHandler):  # type: ignore[misc]
@@ -40,9 +53,13 @@ class Port(PortHandler):  # type: ignore[misc]
         Bits per second.
     reply_timeout_s
         How long a reply may take beyond its time on the wire.
+    urgent
+        Says that something urgent waits for the line: then nothing more is sent and no wait goes on.
 
     Raises
     ------
+    Overtaken
+        From every method that sends or waits, while something urgent waits; not from `write_now`.
     LineLost
         If it cannot be opened: no such device, no permission, or held by another program.
     BadOptions
@@ -53,8 +70,11 @@ class Port(PortHandler):  # type: ignore[misc]
     port_name: str
     ser: Any
 
-    def __init__(self, name: str, baud: int, reply_timeout_s: float) -> None:
+    def __init__(
+        self, name: str, baud: int, reply_timeout_s: float, urgent: Callable[[], bool] = lambda: False
+    ) -> None:
         super().__init__(name)
+        self._urgent = urgent
         self.baudrate = baud
         self.reply_timeout_s = reply_timeout_s
         self.suspect = False  # a reply may still be under way: listen until it is quiet before sending
@@ -138,7 +158,12 @@ class Port(PortHandler):  # type: ignore[misc]
 
     def writePort(self, packet: bytes | list[int]) -> int:
         """Send bytes; returns how many."""
-        data = bytes(packet)
+        if self._urgent():
+            raise Overtaken
+        return self.write_now(bytes(packet))
+
+    def write_now(self, data: bytes) -> int:
+        """Send bytes whatever else wants the line or is under way on it; returns how many."""
         if self._descriptor is None or "://" in self.port_name:
             with self.low_level("writing"):
                 return int(self.ser.write(data) or len(data))
@@ -223,6 +248,22 @@ class Port(PortHandler):  # type: ignore[misc]
         """Move bytes that come within ``wait_s`` to the buffer; returns whether any did."""
         if not self.is_open:
             raise LineLost(f"{self.port_name} is closed", detail={"port": self.port_name})
+        until_s = time.monotonic() + wait_s
+        give_way_s = None
+        while True:
+            now_s = time.monotonic()
+            if self._urgent():
+                give_way_s = give_way_s or now_s + REPLY_UNDER_WAY_S
+            if self._fetch_once(max(0.0, min(until_s - now_s, SLICE_S))):
+                return True
+            if time.monotonic() >= until_s:
+                return False
+            if give_way_s is not None and now_s >= give_way_s:
+                self.suspect = True
+                raise Overtaken
+
+    def _fetch_once(self, wait_s: float) -> bool:
+        """The same for a short wait."""
         if self._poll is None or self._descriptor is None:
             return self._fetch_from_object(wait_s)
         try:

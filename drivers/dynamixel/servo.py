@@ -36,6 +36,26 @@ REBOOT_S = 2.0  # how long a servo may be deaf after a reboot
 ATTEMPTS = 3
 LATE_S = 0.1  # a reply that did not come is waited out this long before the next question
 COME_TO_REST_S = 0.5
+MOST_REBOOTS, REBOOT_SPAN_S = 3, 600.0
+
+
+class Reboots:
+    """When the servos of a head were rebooted: `MOST_REBOOTS` times in `REBOOT_SPAN_S` at most.
+
+    Counted over all lines of the head, where a servo is rebooted and nowhere else.
+    """
+
+    def __init__(self) -> None:
+        self._times_s: list[float] = []
+
+    def left(self, now_s: float) -> int:
+        """Return how many may be done now."""
+        self._times_s = [then_s for then_s in self._times_s if now_s - then_s < REBOOT_SPAN_S]
+        return MOST_REBOOTS - len(self._times_s)
+
+    def note(self, now_s: float) -> None:
+        """Count one."""
+        self._times_s.append(now_s)
 
 
 class Servo:
@@ -112,8 +132,10 @@ class Servo:
         if not answering:
             self._link.write_unanswered(self._settings.servo_id, level, FULL_STATUS_RETURN)
 
-    def check_health(self) -> None:
+    def check_health(self, reboots: Reboots) -> None:
         """See that the servo reports no hardware error; restart it if the configuration says so.
+
+        A restart drops the torque, so it is not done again and again while what is wrong goes on.
 
         Raises
         ------
@@ -121,8 +143,10 @@ class Servo:
             In plain words.
         """
         error = self.get("hardware_error")
-        if error and self._settings.on_hardware_error == "reboot":
+        now_s = time.monotonic()
+        if error and self._settings.on_hardware_error == "reboot" and reboots.left(now_s):
             log.warning("%s: %s; rebooting it", self.name, ", ".join(hardware_error_words(error)))
+            reboots.note(now_s)
             self.reboot()
             error = self.get("hardware_error")
         if error:

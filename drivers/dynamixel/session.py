@@ -6,19 +6,23 @@ begins a new one.
 
 from __future__ import annotations
 
+import logging
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 from drivers.clock import Clock
-from drivers.dynamixel.pair import Pair
-from drivers.dynamixel.servo import velocity_counts
+from drivers.dynamixel.pair import Axis, Pair
+from drivers.dynamixel.servo import WATCHDOG_TRIPPED, Reboots, velocity_counts
 from drivers.dynamixel.settings import HeadSettings
-from drivers.dynamixel.watch import GivenUp, Reboots, Watch
+from drivers.dynamixel.watch import GivenUp, Watch
 from drivers.errors import DriverError, LineLost, NoReply, WatchdogTripped
 from drivers.interfaces import Reading
 
+log = logging.getLogger(__name__)
+
 ATTEMPTS, PATIENCE_S = 3, 0.15  # of a poll, before it counts as failed
 FAILED_POLLS = 2  # in a row, before the servos are set up anew
+STOP_PATIENCE_S = 0.2  # how long a stop asks for a confirmation that does not come
 
 
 class Session:
@@ -33,7 +37,7 @@ class Session:
     clock
         Stamps the readings.
     reboots
-        See `Watch`.
+        Done to this head, over all its lines.
 
     Attributes
     ----------
@@ -178,21 +182,75 @@ class Session:
         GivenUp
             If a servo did not confirm: silence lets the watchdogs stop what this could not.
         """
-        try:
-            self._poll()
-            if self._watch.tripped:
-                self._watch.arm_anew()
-                self._poll()
-            healthy = [axis for axis in self.pair.axes if not axis.hardware_error]
-            for axis in healthy:
-                axis.brake()
-            for axis in healthy:
-                if axis.settings.at_stop == "torque_off" and axis.motion.holds:
+        failed = self._stop_each()
+        for axis in self.pair.axes:
+            if axis not in failed and axis.settings.at_stop == "torque_off" and axis.motion.holds:
+                try:
                     axis.let_go()
-        except DriverError as error:
-            raise GivenUp(error) from None
+                except DriverError as error:
+                    failed[axis] = error
+        if failed:
+            raise GivenUp(_stop_error(self.pair, failed))
+        if self._watch.tripped:
+            self._watch.end_trip()
+
+    def _stop_each(self) -> dict[Axis, DriverError]:
+        """Brake each axis by itself; returns those that did not confirm, and why."""
+        failed: dict[Axis, DriverError] = {}
+        try:
+            self.pair.brake()
+        except LineLost as error:
+            return dict.fromkeys(self.pair.axes, error)
+        until_s = time.monotonic() + STOP_PATIENCE_S
+        # the one that was heard of last first: it is the one that will answer
+        waiting = sorted(self.pair.axes, key=lambda axis: -axis.motion.heard_s)
+        while waiting and (not failed or time.monotonic() < until_s):
+            for axis in tuple(waiting):
+                try:
+                    self._confirm(axis)
+                except DriverError as error:
+                    failed[axis] = error
+                else:
+                    waiting.remove(axis)
+                    failed.pop(axis, None)
+        return failed
+
+    def _confirm(self, axis: Axis) -> None:
+        """See that an axis brakes as it was told, or tell it again; raises as `Pair.samples`, `Servo.set`."""
+        motion = axis.motion
+        told = motion.goal
+        sample = self.pair.sample(axis)
+        motion.take(sample)
+        if sample.alert and motion.holds and not axis.servo.get("torque_enable"):
+            motion.limp()
+        if not motion.holds:
+            return
+        held = sample.values["goal_position"]
+        strange = held != told or self._watch.tripped
+        if strange and axis.servo.get("bus_watchdog") == WATCHDOG_TRIPPED:
+            axis.take_hold()
+            self._watch.arm_axis(axis)
+        elif held != told or not motion.braking_well(told, self._head.acceleration_rad_per_s2):
+            axis.brake()
 
     def end(self) -> None:
-        """Leave each servo as its ``at_close`` says, and close the line; never raises."""
-        self.pair.release()
+        """Stop, leave each servo as its ``at_close`` says, and close the line; never raises.
+
+        A servo that does not confirm the stop keeps its watchdog.
+        """
+        failed = self._stop_each()
+        for axis in self.pair.axes:
+            if axis in failed:
+                log.warning("%s did not confirm the last stop: %s", axis.servo.name, failed[axis])
+            else:
+                axis.servo.release()
         self.pair.close()
+
+
+def _stop_error(pair: Pair, failed: Mapping[Axis, DriverError]) -> DriverError:
+    """What to tell of a stop that not every axis has confirmed."""
+    error = next(iter(failed.values()))
+    names = " and ".join(axis.servo.name for axis in failed)
+    done = "".join(f"; {axis.servo.name} brakes" for axis in pair.axes if axis not in failed)
+    words = f"{names} did not confirm the stop and may still move: {error}{done}"
+    return type(error)(words, detail=error.detail)

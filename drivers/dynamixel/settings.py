@@ -18,6 +18,7 @@ OnHardwareError = Literal["report", "reboot"]
 STANDS_WITHIN_S = 0.5  # after this process has died: the last poll's age, the watchdog, and braking
 USUAL_WATCHDOG_S, SHORTEST_WATCHDOG_S = 0.3, 0.1
 WATCHDOG_STEP_S = 0.02
+SILENCE_SPARE_S = 0.05  # the servo's oscillator against ours
 POLL_BYTES = 20 + 2 * (11 + 43)  # the longer of the two instructions, and two replies of 43 bytes of data
 
 
@@ -131,6 +132,14 @@ class HeadSettings:
         """The watchdog register's value, rounded down; 0 for off."""
         return math.floor(self.watchdog_s / WATCHDOG_STEP_S + 1e-6)
 
+    @property
+    def silence_s(self) -> float:
+        """How long nothing may be sent so that the watchdogs have stopped both axes; 0 without them."""
+        if not self.watchdog_counts:
+            return 0.0
+        brakes_s = self.speed_rad_per_s / self.acceleration_rad_per_s2
+        return self.watchdog_counts * WATCHDOG_STEP_S + brakes_s + SILENCE_SPARE_S
+
 
 def head_settings(options: Mapping[str, Any]) -> HeadSettings:
     """Return the head that the options of ``driver: dynamixel`` describe.
@@ -160,7 +169,7 @@ def head_settings(options: Mapping[str, Any]) -> HeadSettings:
         )
     speed = read.number("speed_rad_per_s", 1.0, 0.03, 10.0)
     acceleration = read.number("acceleration_rad_per_s2", 4.0, 0.4, 1000.0)
-    longest_s = STANDS_WITHIN_S - 1 / poll_hz - speed / acceleration
+    longest_s = round(STANDS_WITHIN_S - 1 / poll_hz - speed / acceleration, 9)
     if longest_s < SHORTEST_WATCHDOG_S and options.get("watchdog_s") != 0:
         brakes_s = STANDS_WITHIN_S - 1 / poll_hz - SHORTEST_WATCHDOG_S
         raise BadOptions(

@@ -9,14 +9,13 @@ import logging
 import time
 
 from drivers.dynamixel.pair import Axis, Pair
-from drivers.dynamixel.servo import WATCHDOG_TRIPPED, hardware_fault_words
+from drivers.dynamixel.servo import WATCHDOG_TRIPPED, Reboots, hardware_fault_words
 from drivers.dynamixel.settings import HeadSettings
-from drivers.errors import BadReply, DriverError, HardwareFault, WatchdogTripped
+from drivers.errors import BadReply, DriverError, HardwareFault, Refused, WatchdogTripped
 
 log = logging.getLogger(__name__)
 
 WATCH_S = 0.2  # how often torque and watchdog registers are looked at while all goes well
-MOST_REBOOTS, REBOOT_SPAN_S = 3, 600.0
 
 
 class GivenUp(Exception):
@@ -28,21 +27,6 @@ class GivenUp(Exception):
     def __init__(self, error: DriverError) -> None:
         super().__init__(str(error))
         self.error = error
-
-
-class Reboots:
-    """When servos were rebooted, which may be done `MOST_REBOOTS` times in `REBOOT_SPAN_S`."""
-
-    def __init__(self) -> None:
-        self._times_s: list[float] = []
-
-    def allow(self, now_s: float) -> bool:
-        """Return whether one more may be done now, and count it."""
-        self._times_s = [then_s for then_s in self._times_s if now_s - then_s < REBOOT_SPAN_S]
-        if len(self._times_s) >= MOST_REBOOTS:
-            return False
-        self._times_s.append(now_s)
-        return True
 
 
 class Watch:
@@ -60,7 +44,7 @@ class Watch:
     Attributes
     ----------
     tripped
-        Whether a watchdog has stopped a motion; latched until `arm_anew`.
+        Whether a watchdog has stopped a motion; latched until `end_trip`.
     """
 
     def __init__(self, pair: Pair, head: HeadSettings, reboots: Reboots) -> None:
@@ -126,17 +110,21 @@ class Watch:
         if self._head.watchdog_counts:
             self._looked_s = time.monotonic()
 
-    def arm_anew(self) -> None:
-        """After a trip: void the old goals, arm, and forget it; raises as `Servo.take_hold`."""
-        for axis in self._pair.axes:
-            if axis.motion.holds:
-                axis.take_hold()
-        self.arm()
+    def arm_axis(self, axis: Axis) -> None:
+        """Arm one watchdog; raises as `Servo.set`."""
+        if self._head.watchdog_counts:
+            axis.servo.set("bus_watchdog", self._head.watchdog_counts)
+
+    def end_trip(self) -> None:
+        """Forget a trip: both axes stand where they were stopped, with their old goals void."""
         self.tripped = False
+        self.look_soon()
         log.warning("the head is armed anew after its watchdog had stopped it")
 
     def note_alert(self, axis: Axis) -> None:
-        """A servo reports a hardware error: say which, stop the other axis, follow the reboot policy.
+        """A servo reports a hardware error: brake both axes, say which error it is, follow the reboot policy.
+
+        Not every hardware error switches the torque off, so the axis itself is braked too.
 
         Raises
         ------
@@ -145,19 +133,24 @@ class Watch:
         NoReply, Refused, LineLost, WrongDevice
             As `Servo.get` and `Servo.set`.
         """
+        self._pair.brake()
         error = axis.servo.get("hardware_error")
         if not error:
+            log.warning("%s told of a hardware error but has none; the head has braked", axis.servo.name)
             return
         words = hardware_fault_words(axis.servo.name, error)
         if not axis.servo.get("torque_enable"):
             words += "; its torque is off"
             axis.motion.limp()
         axis.hardware_error = words
+        for one in self._pair.axes:
+            try:
+                one.brake()
+            except Refused:
+                if not one.hardware_error:
+                    raise
         log.error("%s", words)
-        for other in self._pair.axes:
-            if not other.hardware_error:
-                other.brake()
-        if axis.settings.on_hardware_error == "reboot" and self._reboots.allow(time.monotonic()):
+        if axis.settings.on_hardware_error == "reboot" and self._reboots.left(time.monotonic()):
             raise GivenUp(HardwareFault(words, detail={"hardware_error": error}))
 
     def check_free(self) -> None:

@@ -344,6 +344,7 @@ def test_calls_of_many_threads_queue_instead_of_failing() -> None:  # defect 11
     with scripted(lambda i, n: [says(i.packet_id, number(i.packet_id))]) as (line, _):
         link = Link(line.path, BAUD_RATE, PATIENT_S)
         bus = Bus(line.path, lambda: time.monotonic() + 60.0)
+        bus.start()
         got: list[tuple[int, int]] = []
 
         def ask(servo_id: int) -> None:
@@ -362,6 +363,7 @@ def test_calls_of_many_threads_queue_instead_of_failing() -> None:  # defect 11
 
 def test_a_call_whose_turn_does_not_come_is_never_made() -> None:
     bus = Bus("test", lambda: time.monotonic() + 60.0)
+    bus.start()
     begun, free = threading.Event(), threading.Event()
     made: list[int] = []
 
@@ -393,6 +395,7 @@ def test_what_goes_wrong_in_the_owner_threads_round_does_not_end_it() -> None:
         return time.monotonic() + 60.0
 
     bus = Bus("test", between)
+    bus.start()
     assert bus.call("ask", lambda: 7, PATIENT_S) == 7
     bus.close(lambda: None, PATIENT_S)
     assert rounds

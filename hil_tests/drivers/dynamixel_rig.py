@@ -1,0 +1,134 @@
+"""A Dynamixel head on simulated servos behind a pseudo terminal, and what only the tester knows about it.
+
+The simulator's registers and packets are its own (``drivers/sim/wire``), not the driver's.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+from drivers.clock import SystemClock
+from drivers.dynamixel.head import DynamixelHead, open_head
+from drivers.errors import DriverError
+from drivers.faults import FaultPanel
+from drivers.interfaces import PanTilt, Reading
+from drivers.sim.pan_tilt import AxisSettings
+from drivers.sim.wire.axis import WireAxis
+from drivers.sim.wire.dynamixel_bus import DynamixelBus
+from drivers.sim.wire.dynamixel_packets import Instruction, InstructionParser
+from drivers.sim.wire.dynamixel_servo import SimulatedServo
+from drivers.sim.wire.line import PtyLine
+
+COUNT_RAD = 2 * 3.141592653589793 / 4096
+LONG_S = 20.0
+SLOW_TO_BRAKE, QUICK_TO_BRAKE = (AxisSettings(COUNT_RAD, 0.0, -3.0, 3.0, 1.0, a) for a in (4.0, 20.0))
+X = "xm430_w350"
+
+
+class Ear:
+    """Hears every instruction of the host, and when it was through (a line's ``observer``)."""
+
+    def __init__(self) -> None:
+        self.heard: list[tuple[float, Instruction]] = []
+        self._parser = InstructionParser()
+
+    def __call__(self, who: Literal["host", "device"], data: bytes, time_s: float) -> None:
+        if who == "host":
+            self.heard += [(time_s, one) for one in self._parser.feed(data)]
+
+
+@dataclass
+class Rig:
+    """Servos, what turns on them, their line, its faults, and the options of a head that drives them."""
+
+    axes: tuple[WireAxis, WireAxis]
+    servos: list[SimulatedServo]
+    line: PtyLine
+    options: dict[str, Any]
+    panel: FaultPanel
+    ear: Ear = field(default_factory=Ear)
+
+    def open(self, **changes: Any) -> DynamixelHead:
+        return open_head({**self.options, **changes})
+
+
+@contextmanager
+def rig(
+    models: tuple[str, str] = (X, X),
+    starts_rad: tuple[float, float] = (0.0, 0.0),
+    pan: dict[str, int] | None = None,
+    mechanism: AxisSettings = QUICK_TO_BRAKE,
+) -> Iterator[Rig]:
+    """Two servos of a 12-bit or other kind; ``pan`` are initial registers of the pan servo."""
+    clock = SystemClock()
+    now_s = clock.now_s()
+    axes = (
+        WireAxis(mechanism, number=0, start_rad=starts_rad[0], time_s=now_s),
+        WireAxis(mechanism, number=1, start_rad=starts_rad[1], time_s=now_s),
+    )
+    extra: list[dict[str, int]] = [pan or {}, {}]
+    servos = [
+        SimulatedServo(model, i + 1, axis, settings={"baud_rate": 3, **extra[i]}, time_s=now_s)
+        for i, (model, axis) in enumerate(zip(models, axes, strict=True))
+    ]
+    panel, ear = FaultPanel(clock.now_s, ()), Ear()
+    with PtyLine(DynamixelBus(servos), clock, panel, wire_time=False, observer=ear) as line:
+        options = {
+            "port": line.path,
+            "pan": {"id": 1, "model": models[0], "limits_rad": [-2.5, 2.5]},
+            "tilt": {"id": 2, "model": models[1], "limits_rad": [-1.2, 1.0]},
+            "reply_timeout_s": 0.1,
+            "acceleration_rad_per_s2": 15.0,
+            "watchdog_s": 0.4,  # the machine may be busy
+        }
+        yield Rig(axes, servos, line, options, panel, ear)
+
+
+@contextmanager
+def opened(**how: Any) -> Iterator[tuple[Rig, DynamixelHead]]:
+    """A rig and its open head; ``options`` change the head's, everything else is the rig's."""
+    options = how.pop("options", {})
+    with rig(**how) as it:
+        head = it.open(**options)
+        try:
+            yield it, head
+        finally:
+            head.close()
+
+
+def until(true: Callable[[], Any], what: str) -> Any:
+    """Wait for something that must come."""
+    end_s = time.monotonic() + LONG_S
+    while time.monotonic() < end_s:
+        if found := true():
+            return found
+        time.sleep(0.005)
+    raise AssertionError(f"{what} did not come in {LONG_S:g} s")
+
+
+def settled(head: PanTilt) -> Reading:
+    def look() -> Reading | None:
+        reading = head.read()
+        return None if reading.moving else reading
+
+    found: Reading = until(look, "rest")
+    return found
+
+
+def read_or_none(head: PanTilt) -> Reading | None:
+    try:
+        return head.read()
+    except DriverError:
+        return None
+
+
+def failed(head: PanTilt) -> DriverError | None:
+    try:
+        head.read()
+    except DriverError as error:
+        return error
+    return None
