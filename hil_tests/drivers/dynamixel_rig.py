@@ -66,16 +66,16 @@ def rig(
     """Two servos of a 12-bit or other kind; ``pan`` are initial registers of the pan servo."""
     clock = SystemClock()
     now_s = clock.now_s()
+    panel, ear = FaultPanel(clock.now_s, ()), Ear()
     axes = (
-        WireAxis(mechanism, number=0, start_rad=starts_rad[0], time_s=now_s),
-        WireAxis(mechanism, number=1, start_rad=starts_rad[1], time_s=now_s),
+        WireAxis(mechanism, panel, number=0, start_rad=starts_rad[0], time_s=now_s),
+        WireAxis(mechanism, panel, number=1, start_rad=starts_rad[1], time_s=now_s),
     )
     extra: list[dict[str, int]] = [pan or {}, {}]
     servos = [
         SimulatedServo(model, i + 1, axis, settings={"baud_rate": 3, **extra[i]}, time_s=now_s)
         for i, (model, axis) in enumerate(zip(models, axes, strict=True))
     ]
-    panel, ear = FaultPanel(clock.now_s, ()), Ear()
     with PtyLine(DynamixelBus(servos), clock, panel, wire_time=False, observer=ear) as line:
         options = {
             "port": line.path,

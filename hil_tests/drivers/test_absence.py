@@ -7,7 +7,7 @@ import math
 import pytest
 
 from drivers.absence import Absence
-from drivers.dynamixel.watch import Reboots
+from drivers.dynamixel.servo import Reboots
 from drivers.errors import BadOptions, LineLost
 from drivers.options import OptionReader
 
@@ -30,8 +30,14 @@ def test_each_failed_try_waits_longer_until_the_device_is_back() -> None:
 
 def test_servos_are_rebooted_three_times_in_ten_minutes_and_no_more() -> None:
     reboots = Reboots()
-    assert [reboots.allow(now_s) for now_s in (0.0, 1.0, 2.0, 3.0, 599.0)] == [True, True, True, False, False]
-    assert reboots.allow(600.5) and not reboots.allow(600.6)
+
+    def reboot(now_s: float) -> bool:
+        if left := reboots.left(now_s):
+            reboots.note(now_s)
+        return bool(left)
+
+    assert [reboot(now_s) for now_s in (0.0, 1.0, 2.0, 3.0, 599.0)] == [True, True, True, False, False]
+    assert reboot(600.5) and not reboot(600.6)
 
 
 @pytest.mark.parametrize("value", [math.nan, math.inf, 10**400, -(10**400), True, "1", None, [1.0]])

@@ -390,6 +390,29 @@ def test_a_hardware_error_is_rebooted_away_where_the_configuration_says_so() -> 
         head.close()
 
 
+def test_a_supply_that_stays_low_reboots_a_servo_three_times_and_no_more(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("drivers.absence.LONGEST_WAIT_S", 0.1)
+    monkeypatch.setattr("drivers.sim.wire.dynamixel_servo.BOOT_S", 0.02)
+    with rig() as it:
+        for axis in ("pan", "tilt"):
+            it.options[axis]["on_hardware_error"] = "reboot"
+        head = it.open(reply_timeout_s=0.05)
+        it.panel.set("pan_tilt", "voltage_dip")
+
+        def codes() -> list[int]:
+            return [instruction.code for _, instruction in it.ear.heard]
+
+        ping, reboot = 1, 8
+        until(lambda: codes().count(reboot) >= 3, "three reboots")
+        third = [n for n, code in enumerate(codes()) if code == reboot][2]
+        until(lambda: codes()[third:].count(ping) > 10, "more tries")
+        assert codes().count(reboot) == 3
+        assert isinstance(failed(head), HardwareFault)
+        head.close()
+
+
 def test_a_setting_changed_behind_the_drivers_back_is_noticed_and_put_right() -> None:
     with opened() as (it, head):
         it.servos[0].table["torque_enable"] = 0
