@@ -85,6 +85,10 @@ HEAD_WORDS: Mapping[str, Word] = MappingProxyType(
         ),
         "duplicate": Word("so many replies are sent twice (in memory: nothing)", _N),
         "swapped": Word("so many replies change places with the next one (in memory: BadReply)", _N),
+        "misnamed": Word(
+            "so many replies bear the id of another servo, with a checksum that fits (Dynamixel line only)",
+            {"as_id": 2, **_N, "sender": 1},
+        ),
         "noise": Word("so many replies have garbage in front of them (in memory: nothing)", _N),
         "half": Word("so many replies break off in the middle (in memory: NoReply)", _N),
         "hang_up": Word("the line is unplugged; it comes back when the fault ends", {}),
@@ -129,6 +133,7 @@ _BOUNDS = {
     "rate_c_per_s": (0.0, 100.0),
     "replies": (1.0, math.inf),
     "sender": (0.0, 252.0),
+    "as_id": (0.0, 252.0),
     "offset_rad": (-math.pi, math.pi),
     "dx_px": (-4096.0, 4096.0),
     "dy_px": (-4096.0, 4096.0),

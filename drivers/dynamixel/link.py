@@ -2,6 +2,14 @@
 
 A `Link` belongs to one thread at a time. Every failure names port, servo id, register and instruction, in
 its sentence and in ``detail``. No value is ever made up: what a servo did not say is an error.
+
+A reply says who speaks, and not what was asked. What proves that it is of its question:
+
+- Where it holds the servo's millisecond counter, that shows the moment of the question (`counter`).
+- Where it does not, `Link.proven` asks twice around a silence and wants one answer; what is read for one
+  register differs in length from what is read for another (`models.Register.window`).
+- Of a group read the replies come in the order asked, one of each servo, or none counts.
+- A reply without data (to a write, a restart) proves nothing: who must be certain reads afterwards.
 """
 
 from __future__ import annotations
@@ -25,16 +33,22 @@ from dynamixel_sdk import (
     INST_WRITE,
 )
 
-from drivers.dynamixel.models import Register
+from drivers.dynamixel.counter import Counter
+from drivers.dynamixel.models import REGISTERS, Register
 from drivers.dynamixel.packets import ERROR_WORDS, PacketHandler, Status, crc16, instruction_packet
-from drivers.dynamixel.port import Port
-from drivers.errors import DriverError, LineLost, NoReply, Refused
+from drivers.dynamixel.port import QUIET_S, Port
+from drivers.errors import BadReply, DriverError, LineLost, NoReply, Refused
 
 log = logging.getLogger(__name__)
 
 REPLY_TIMEOUT_S = 0.05  # USB adapters hold bytes back for up to 16 ms, the servo for up to 0.5 ms
 
 PING_REPLY_BYTES = 14
+AGREEING_TRIES = 5  # of two answers in a row that are to be the same
+
+TICKS = tuple(REGISTERS[key]["realtime_tick"].address for key in ("X", "P"))
+MEETING_SHAPES = ((12, 0), (8, 2), (4, 4), (0, 2), (8, 4), (4, 2), (12, 2), (0, 4))
+"""Bytes read before and after the counter to get to know it; no two of the same length in all."""
 
 
 @dataclass(frozen=True)
@@ -68,6 +82,19 @@ class GroupAnswer:
     missing: Mapping[int, DriverError]
     sent_s: float
     received_s: float
+
+
+@dataclass(frozen=True)
+class _GroupQuestion:
+    """A group read as it is sent and what it is to be answered; kept, since most are asked again and again.
+
+    ``ticks`` are the places of the servos' counters in the blocks of those that have them there, by id.
+    """
+
+    packet: bytes
+    reply_bytes: int
+    parts: Mapping[int, Part]
+    ticks: Mapping[int, int]
 
 
 @dataclass
@@ -111,7 +138,8 @@ class Link:
         self.counts = LineCounts()
         self._port = Port(port, baud, reply_timeout_s, urgent)
         self._packets = PacketHandler()
-        self._group_packets: dict[tuple[int, tuple[Part, ...]], bytes] = {}
+        self._group_questions: dict[tuple[bool, tuple[Part, ...]], _GroupQuestion] = {}
+        self._counters: dict[int, Counter] = {}
 
     @property
     def baud(self) -> int:
@@ -159,8 +187,58 @@ class Link:
         noise = max(0, self._port.received_bytes - before - understood)
         return [found[servo_id] for servo_id in sorted(found)], noise
 
+    def proven(self, servo_id: int, *registers: Register) -> list[int]:
+        """Return registers' values, each of an answer that is certainly of its question.
+
+        Takes a silence of some 20 ms if any of the registers is not read with the servo's counter.
+
+        Raises
+        ------
+        BadReply
+            If answers contradict one another again and again, or are of another moment.
+        NoReply, Refused, LineLost
+            With port, id, register and instruction.
+        """
+        found: dict[tuple[int, int], bytes] = {}
+        asked = {register.window: register for register in registers if _tick_at(*register.window) is None}
+        before = {window: self._outcome(servo_id, register) for window, register in asked.items()}
+        tries_left = AGREEING_TRIES
+        while asked:
+            if not tries_left:
+                names = " and ".join(register.name for register in asked.values())
+                raise BadReply(
+                    f"servo {servo_id} on {self.name} contradicts itself about {names}",
+                    detail=self._where(servo_id, "read", names),
+                )
+            tries_left -= 1
+            self.quiet(QUIET_S)
+            for window, register in tuple(asked.items()):
+                now = self._outcome(servo_id, register)
+                if _same(now, before[window]):
+                    del asked[window]
+                    if isinstance(now, Refused):
+                        raise now
+                    found[window] = now
+                before[window] = now
+        for register in registers:
+            if register.window not in found:
+                answer = self.group_read([Part(servo_id, *register.window)])
+                if answer.missing:
+                    raise answer.missing[servo_id]
+                found[register.window] = answer.statuses[servo_id].data
+        return [register.decode_window(found[register.window]) for register in registers]
+
+    def _outcome(self, servo_id: int, register: Register) -> bytes | Refused:
+        """One answer to a question for a register's window, or its refusal; raises NoReply, LineLost."""
+        address, length = register.window
+        asked = address.to_bytes(2, "little") + length.to_bytes(2, "little")
+        try:
+            return self._ask(servo_id, INST_READ, asked, length, "read", register.name).data
+        except Refused as refused:
+            return refused
+
     def read(self, servo_id: int, register: Register) -> int:
-        """Return a register's value, signed where the register is.
+        """Return what seems to be a register's value, signed where it is: see `proven`.
 
         Raises
         ------
@@ -188,13 +266,16 @@ class Link:
 
     def reboot(self, servo_id: int) -> None:
         """Restart a servo: torque drops. Raises NoReply, BadReply, Refused, LineLost."""
+        self._counters.pop(servo_id, None)  # it begins anew
         self._ask(servo_id, INST_REBOOT, b"", 0, "reboot", "")
 
     def group_read(self, parts: Sequence[Part], *, fast: bool = False) -> GroupAnswer:
         """Read one block of each of several servos in one transaction.
 
         Servos whose blocks have one address and length are asked by Sync Read, others by Bulk Read. Each
-        servo waits for the one before it, so one that is missing may silence those behind it.
+        servo waits for the one before it, so one that is missing may silence those behind it. Blocks that
+        hold the servo's counter are taken only if it shows this moment; a servo whose counter is not known
+        yet is asked for it first.
 
         Parameters
         ----------
@@ -208,33 +289,30 @@ class Link:
         LineLost, BadReply
             If the line is gone or never quiet; everything else stands in the answer's ``missing``.
         """
-        parts = tuple(parts)
-        alike = len({(part.address, part.length) for part in parts}) == 1
-        if fast:
-            instruction = INST_FAST_SYNC_READ if alike else INST_FAST_BULK_READ
-        else:
-            instruction = INST_SYNC_READ if alike else INST_BULK_READ
-        packet = self._group_packets.get((instruction, parts))
-        if packet is None:
-            packet = self._group_packets[instruction, parts] = _group_read_packet(instruction, parts, alike)
+        key = (fast, tuple(parts))
+        question = self._group_questions.get(key)
+        if question is None:
+            question = self._group_questions[key] = _group_question(fast, parts)
+        for servo_id in question.ticks:
+            if servo_id not in self._counters and (error := self._unmet(question, servo_id)) is not None:
+                now_s = time.monotonic()
+                return GroupAnswer({}, dict.fromkeys(question.parts, error), now_s, now_s)
         self.counts.transactions += 1
         try:
             self._port.clearPort()
             sent_s = time.monotonic()
-            self._port.writePort(packet)
-            self._port.setPacketTimeout(len(packet) + sum(11 + part.length for part in parts))
-            statuses, wrong = self._fast_replies(parts) if fast else self._replies(parts)
+            self._port.writePort(question.packet)
+            self._port.setPacketTimeout(len(question.packet) + question.reply_bytes)
+            statuses, wrong = (self._fast_replies if fast else self._replies)(question, sent_s)
         except LineLost as error:
-            raise self._placed(error, [part.servo_id for part in parts], "group read", "") from error
+            raise self._placed(error, list(question.parts), "group read", "") from error
         received_s = time.monotonic()
         missing = {}
-        for part in parts:
-            if part.servo_id not in statuses:
-                missing[part.servo_id] = wrong.get(part.servo_id) or self._none(
-                    part.servo_id,
-                    "group read",
-                    f"addresses {part.address} to {part.address + part.length - 1}",
-                )
+        if len(statuses) < len(question.parts):
+            for servo_id, part in question.parts.items():
+                if servo_id not in statuses:
+                    addresses = f"addresses {part.address} to {part.address + part.length - 1}"
+                    missing[servo_id] = wrong.get(servo_id) or self._none(servo_id, "group read", addresses)
         return GroupAnswer(statuses, missing, sent_s, received_s)
 
     def group_write(self, parts: Sequence[Part]) -> None:
@@ -315,37 +393,107 @@ class Link:
             raise self._placed(error, [servo_id], word, register) from error
         raise self._none(servo_id, word, register)
 
-    def _replies(self, parts: Sequence[Part]) -> tuple[dict[int, Status], dict[int, DriverError]]:
-        """The replies to a group read until all have come or the deadline passes."""
-        waited = {part.servo_id: part.length for part in parts}
-        statuses: dict[int, Status] = {}
+    def _replies(
+        self, question: _GroupQuestion, sent_s: float
+    ) -> tuple[dict[int, Status], dict[int, DriverError]]:
+        """The replies to a group read until all have come or the deadline passes.
+
+        They come in the order of the list; where they do not, or a servo says two things, none is certain.
+        """
+        parts = question.parts
+        waited = list(parts)
+        taken: dict[int, Status] = {}
         wrong: dict[int, DriverError] = {}
         while waited:
             status = self._packets.receive(self._port)
             if status is None:
                 break
-            length = waited.get(status.servo_id)
-            if length is None:
+            servo_id = status.servo_id
+            if servo_id not in parts or len(status.data) != (0 if status.refused else parts[servo_id].length):
                 self._stray(status)
             elif status.refused:
-                wrong[status.servo_id] = self._refusal(status, "group read", "")
-                del waited[status.servo_id]
-            elif len(status.data) == length:
-                statuses[status.servo_id] = status
-                del waited[status.servo_id]
+                wrong[servo_id] = self._refusal(status, "group read", "")
+                waited = _behind(waited, servo_id)
+            elif servo_id in question.ticks and (doubts := self._doubts(question, status, sent_s)):
+                wrong[servo_id] = doubts
+            elif servo_id in waited:
+                taken[servo_id] = status
+                waited = _behind(waited, servo_id)
             else:
                 self._stray(status)
-        return statuses, wrong
+                if status != taken.get(servo_id):
+                    return {}, wrong
+        return taken, wrong
 
-    def _fast_replies(self, parts: Sequence[Part]) -> tuple[dict[int, Status], dict[int, DriverError]]:
+    def _unmet(self, question: _GroupQuestion, servo_id: int) -> DriverError | None:
+        """Get to know the counter of a servo of a group; returns why that failed. Raises LineLost."""
+        try:
+            self._meet(servo_id, question.parts[servo_id].address + question.ticks[servo_id])
+        except LineLost:
+            raise
+        except DriverError as error:
+            return error
+        return None
+
+    def _meet(self, servo_id: int, tick_address: int) -> None:
+        """Get to know a servo's counter: by two answers, each after a silence, that agree about it.
+
+        No question is asked twice, so that no reply that is some questions late can be taken for another.
+        """
+        shapes = iter(MEETING_SHAPES)
+        for shape in shapes:
+            counter = Counter(*self._tick(servo_id, tick_address, shape))
+            doubts = counter.doubts(*self._tick(servo_id, tick_address, next(shapes)))
+            if not doubts:
+                self._counters[servo_id] = counter
+                return
+        raise BadReply(
+            f"servo {servo_id} on {self.name}: no two replies are of the moments that they were asked for: "
+            f"{doubts}",
+            detail=self._where(servo_id, "read", "realtime_tick"),
+        )
+
+    def _tick(self, servo_id: int, address: int, shape: tuple[int, int]) -> tuple[int, float, float]:
+        """The counter in a reply of so many bytes around it, and when that was asked and came."""
+        before, after = shape
+        self.quiet(QUIET_S)
+        sent_s = time.monotonic()
+        length = before + 2 + after
+        asked = (address - before).to_bytes(2, "little") + length.to_bytes(2, "little")
+        status = self._ask(servo_id, INST_READ, asked, length, "read", "realtime_tick")
+        tick = int.from_bytes(status.data[before : before + 2], "little")
+        return tick, sent_s, time.monotonic()
+
+    def _doubts(self, question: _GroupQuestion, status: Status, sent_s: float) -> BadReply | None:
+        """Why a reply that just came and holds its servo's counter is not to this question; None if it is."""
+        servo_id = status.servo_id
+        at = question.ticks[servo_id]
+        tick = int.from_bytes(status.data[at : at + 2], "little")
+        doubts = self._counters[servo_id].doubts(tick, sent_s, time.monotonic())
+        if not doubts:
+            return None
+        self._stray(status)
+        return BadReply(
+            f"servo {servo_id} on {self.name}: {doubts}",
+            detail=self._where(servo_id, "group read", "realtime_tick"),
+        )
+
+    def _fast_replies(
+        self, question: _GroupQuestion, sent_s: float
+    ) -> tuple[dict[int, Status], dict[int, DriverError]]:
         """The blocks of the common reply to a fast group read; every block has a checksum of its own.
 
         Blocks are error, id, data and the checksum of all bytes so far; the last checksum is the packet's.
         """
-        status = self._packets.receive(self._port, fast=True)
-        if status is None:
+        parts = list(question.parts.values())
+        length = sum(4 + part.length for part in parts) - 2  # without the last checksum
+        while (status := self._packets.receive(self._port, fast=True)) is not None:
+            body = bytes((status.error,)) + status.data
+            if len(body) == length:
+                break
+            self._stray(status)
+        else:
             return {}, {}
-        body = bytes((status.error,)) + status.data
         total = len(body) + 10 - 7
         header = b"\xff\xff\xfd\x00" + bytes((status.servo_id,)) + total.to_bytes(2, "little") + b"\x55"
         crc, at = crc16(header), 0
@@ -366,6 +514,8 @@ class Link:
             answer = Status(part.servo_id, block[0], block[2:])
             if answer.refused:
                 wrong[part.servo_id] = self._refusal(answer, "fast group read", "")
+            elif part.servo_id in question.ticks and (doubts := self._doubts(question, answer, sent_s)):
+                wrong[part.servo_id] = doubts
             else:
                 statuses[part.servo_id] = answer
         return statuses, wrong
@@ -413,14 +563,39 @@ class Link:
         }
 
 
-def _group_read_packet(instruction: int, parts: Sequence[Part], alike: bool) -> bytes:
-    """The bytes of a group read."""
-    if alike:
+def _tick_at(address: int, length: int) -> int | None:
+    """Where in a block the servo's counter stands, None if it is not in it."""
+    return next((tick - address for tick in TICKS if address <= tick and tick + 2 <= address + length), None)
+
+
+def _same(one: bytes | Refused, other: bytes | Refused) -> bool:
+    """Whether two outcomes of one question are the same."""
+    if isinstance(one, Refused) or isinstance(other, Refused):
+        return type(one) is type(other) and str(one) == str(other)
+    return one == other
+
+
+def _behind(waited: list[int], servo_id: int) -> list[int]:
+    """Who is still waited for after a servo has spoken: those behind it in the list."""
+    return waited[waited.index(servo_id) + 1 :] if servo_id in waited else waited
+
+
+def _group_question(fast: bool, parts: Sequence[Part]) -> _GroupQuestion:
+    """A group read: Sync Read where all blocks are alike, else Bulk Read."""
+    if len({(part.address, part.length) for part in parts}) == 1:
+        instruction = INST_FAST_SYNC_READ if fast else INST_SYNC_READ
         body = parts[0].address.to_bytes(2, "little") + parts[0].length.to_bytes(2, "little")
         body += bytes(part.servo_id for part in parts)
     else:
+        instruction = INST_FAST_BULK_READ if fast else INST_BULK_READ
         body = b"".join(
             bytes((part.servo_id,)) + part.address.to_bytes(2, "little") + part.length.to_bytes(2, "little")
             for part in parts
         )
-    return instruction_packet(BROADCAST_ID, instruction, body)
+    places = {part.servo_id: _tick_at(part.address, part.length) for part in parts}
+    return _GroupQuestion(
+        instruction_packet(BROADCAST_ID, instruction, body),
+        sum(11 + part.length for part in parts),
+        {part.servo_id: part for part in parts},
+        {servo_id: at for servo_id, at in places.items() if at is not None},
+    )

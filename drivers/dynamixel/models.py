@@ -28,6 +28,7 @@ class Register:
     """One entry of a control table: its address, its size in bytes, whether it is signed or permanent.
 
     ``permanent`` registers (EEPROM) can be written only while torque is off and wear with each write.
+    ``window`` is the address and the length of what is read to know the register: see `_WINDOWS`.
     """
 
     name: str
@@ -35,10 +36,16 @@ class Register:
     size: int
     signed: bool = False
     permanent: bool = False
+    window: tuple[int, int] = (0, 0)
 
     def decode(self, data: bytes) -> int:
         """Return the value of the register's little-endian bytes."""
         return int.from_bytes(data, "little", signed=self.signed)
+
+    def decode_window(self, data: bytes) -> int:
+        """Return the register's value out of the bytes of its window."""
+        at = self.address - self.window[0]
+        return self.decode(data[at : at + self.size])
 
     def encode(self, value: int) -> bytes:
         """Return a value as the register's little-endian bytes; OverflowError if it does not fit."""
@@ -90,15 +97,44 @@ _REGISTERS = """
 """
 FIRST_RAM_ADDRESS = 64
 
+# A reply does not say which register it is of, but its length does if no two of these have the same one. Each
+# window holds registers only that every servo of the table has, without gaps, which servos may refuse. The
+# registers around the counter (realtime_tick) are read together with it.
+#   X/MX address, bytes   what stands there
+_WINDOWS = (
+    (0, 13),  # model number to secondary id
+    (20, 8),  # homing offset, moving threshold
+    (31, 7),  # temperature and voltage limits, PWM limit
+    (36, 4),  # PWM limit, current limit
+    (44, 12),  # velocity limit, position limits
+    (63, 1),  # shutdown
+    (64, 2),  # torque, LED
+    (68, 3),  # status return level, registered instruction, hardware error
+    (98, 1),  # bus watchdog
+    (100, 2),  # goal PWM
+)
+
+
+def _window(x: int, size: int, tick: int) -> tuple[int, int]:
+    """Address and length, on the X map, of what is read to know a register."""
+    for address, length in _WINDOWS:
+        if address <= x and x + size <= address + length:
+            return address, length
+    first, end = min(x, tick), max(x + size, tick + 2)
+    return first, end - first
+
 
 def _maps() -> dict[Map, Mapping[str, Register]]:
     maps: dict[Map, dict[str, Register]] = {"X": {}, "P": {}}
-    for line in _REGISTERS.strip().splitlines():
-        name, x, p, size, *signed = line.split()
+    rows = [line.split() for line in _REGISTERS.strip().splitlines()]
+    tick = next(int(row[1]) for row in rows if row[0] == "realtime_tick")
+    for name, x, p, size, *signed in rows:
+        first, length = _window(int(x), int(size), tick)
         for key, address in (("X", int(x)), ("P", int(p))):
             permanent = int(x) < FIRST_RAM_ADDRESS
+            window = (first + address - int(x), length)
             maps["X" if key == "X" else "P"][name] = Register(
-                name, address, int(size), bool(signed), permanent
+                name, address, int(size), bool(signed), permanent, window
             )
     return {key: MappingProxyType(registers) for key, registers in maps.items()}
 

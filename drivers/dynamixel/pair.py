@@ -5,14 +5,17 @@ What is done about what they say is decided elsewhere (`drivers.dynamixel.sessio
 
 from __future__ import annotations
 
+import itertools
 import logging
 import time
 from collections.abc import Callable, Sequence
 
 from drivers.dynamixel.link import GroupAnswer, Link, Part
-from drivers.dynamixel.motion import AxisMotion, Sample, Truth, motion_block
+from drivers.dynamixel.models import Block
+from drivers.dynamixel.motion import AxisMotion, Sample, motion_blocks
 from drivers.dynamixel.servo import Reboots, Servo
 from drivers.dynamixel.settings import AxisSettings, HeadSettings
+from drivers.errors import DriverError
 
 log = logging.getLogger(__name__)
 
@@ -101,46 +104,39 @@ class Pair:
         self.link = link
         self.fast = False
         self._head = head
-        self._blocks = [motion_block(axis.settings) for axis in self.axes]
-        self._truths = [Truth(axis.servo.name, axis.settings) for axis in self.axes]
-        self._parts = tuple(
-            Part(axis.settings.servo_id, block.address, block.length)
-            for axis, block in zip(self.axes, self._blocks, strict=True)
-        )
+        self._ids = [axis.settings.servo_id for axis in self.axes]
+        turns = zip(*(motion_blocks(axis.settings) for axis in self.axes), strict=True)
+        self._turns = itertools.cycle([(blocks, self._parts(blocks)) for blocks in turns])
+
+    def _parts(self, blocks: Sequence[Block]) -> tuple[Part, ...]:
+        """A block of each servo."""
+        return tuple(Part(i, b.address, b.length) for i, b in zip(self._ids, blocks, strict=True))
 
     def samples(self) -> list[Sample]:
-        """Return what both servos say about their motion now, pan first.
+        """Return what both servos say about their motion now, pan first, in one transaction.
 
         Raises
         ------
         NoReply, Refused, LineLost
             As `Link.group_read`, of the servo that is to blame.
         BadReply
-            If a sample cannot be the answer to the question just asked.
+            If a sample is not the answer to the question just asked.
         """
-        answer = self.link.group_read(self._parts, fast=self.fast)
+        answer, blocks = self._ask_both(self.fast)
         if answer.missing:
-            answer = self._ask_singly(answer)
+            raise self._to_blame(answer)
         samples = []
-        for axis, block in zip(self.axes, self._blocks, strict=True):
+        for axis, block in zip(self.axes, blocks, strict=True):
             status = answer.statuses[axis.settings.servo_id]
             values = block.decode(status.data)
             samples.append(Sample(values, status.alert, answer.sent_s, answer.received_s))
-        for truth, sample in zip(self._truths, samples, strict=True):
-            truth.check(sample)
+        for axis, sample in zip(self.axes, samples, strict=True):
+            axis.servo.truth.check(sample)
         return samples
 
     def sample(self, axis: Axis) -> Sample:
         """Return what one servo says about its motion now, asking it alone; raises as `samples`."""
-        number = self.axes.index(axis)
-        part, block = self._parts[number], self._blocks[number]
-        answer = self.link.group_read([part])
-        if answer.missing:
-            raise answer.missing[part.servo_id]
-        status = answer.statuses[part.servo_id]
-        sample = Sample(block.decode(status.data), status.alert, answer.sent_s, answer.received_s)
-        self._truths[number].check(sample)
-        return sample
+        return axis.servo.look_once()
 
     def brake(self) -> None:
         """Tell each axis that holds to brake, whatever the line or the other axis does.
@@ -156,28 +152,35 @@ class Pair:
         if parts:
             self.link.shout(parts, BRAKE_COPIES)
 
-    def _ask_singly(self, answer: GroupAnswer) -> GroupAnswer:
-        """Ask the servos that a group read left out one by one, so that the right one is named."""
-        statuses, received_s = dict(answer.statuses), answer.received_s
-        for part in self._parts:
+    def _ask_both(self, fast: bool) -> tuple[GroupAnswer, tuple[Block, ...]]:
+        """Ask both servos for the next of the blocks that hold their motion."""
+        blocks, parts = next(self._turns)
+        return self.link.group_read(parts, fast=fast), blocks
+
+    def _to_blame(self, answer: GroupAnswer) -> DriverError:
+        """Why a group read is not whole, told of the servo that does not answer alone either.
+
+        What they say alone is of other moments, and is not taken.
+        """
+        for part in next(self._turns)[1]:
             if part.servo_id in answer.missing:
                 single = self.link.group_read([part])
                 if single.missing:
-                    raise single.missing[part.servo_id]
-                statuses.update(single.statuses)
-                received_s = single.received_s
-        return GroupAnswer(statuses, {}, answer.sent_s, received_s)
+                    return single.missing[part.servo_id]
+        return next(iter(answer.missing.values()))
 
-    def get(self, register: str) -> list[int | None]:
-        """Return one register of both servos, None where no answer came. Raises LineLost, BadReply."""
+    def glance(self, register: str) -> list[int | None]:
+        """Return what a register of both servos seems to be, None where no answer came.
+
+        Where it decides anything ask for it by `Servo.get`. Raises LineLost, BadReply.
+        """
         entries = [axis.settings.model.registers[register] for axis in self.axes]
-        ids = [axis.settings.servo_id for axis in self.axes]
         answer = self.link.group_read(
-            [Part(i, entry.address, entry.size) for i, entry in zip(ids, entries, strict=True)]
+            [Part(i, *entry.window) for i, entry in zip(self._ids, entries, strict=True)]
         )
         return [
-            entry.decode(answer.statuses[i].data) if i in answer.statuses else None
-            for i, entry in zip(ids, entries, strict=True)
+            entry.decode_window(answer.statuses[i].data) if i in answer.statuses else None
+            for i, entry in zip(self._ids, entries, strict=True)
         ]
 
     def send(self, values: Sequence[Sequence[tuple[str, int]]]) -> None:
@@ -208,7 +211,7 @@ class Pair:
     def prove_fast_read(self) -> bool:
         """Return whether the servos answer the fast group read, every time of some trials."""
         for _ in range(FAST_TRIALS):
-            if self.link.group_read(self._parts, fast=True).missing:
+            if self._ask_both(fast=True)[0].missing:
                 log.info("%s: no fast group read; the plain one is used", self._head.port)
                 return False
         return True
@@ -241,7 +244,6 @@ def ready_pair(head: HeadSettings, reboots: Reboots, urgent: Callable[[], bool])
             servo.check_place()
         for servo in servos:
             servo.set_up()
-            servo.check_set_up()
         for axis in pair.axes:
             axis.take_hold()
         pair.arm()

@@ -1,27 +1,25 @@
 """One servo made ready: who it is, what is in its way, its settings checked and set, without moving it.
 
 Permanent settings are written only where they differ (they wear) and only while torque is off (the servo
-locks them). Everything written is read back.
+locks them). Everything written is read back, and nothing is decided by an answer that could be another
+question's (`Link.proven`).
 """
 
 from __future__ import annotations
 
+import itertools
 import logging
 import math
 import time
 from collections.abc import Callable
 from typing import TypeVar
 
-from drivers.dynamixel.link import Link, Part
-from drivers.dynamixel.models import (
-    HARDWARE_ERRORS,
-    MODELS_BY_NUMBER,
-    Block,
-    hardware_error_words,
-)
-from drivers.dynamixel.motion import Sample, Truth, motion_block
+from drivers.dynamixel.link import Link, Part, Pinged
+from drivers.dynamixel.models import HARDWARE_ERRORS, MODELS_BY_NUMBER, hardware_error_words
+from drivers.dynamixel.motion import Sample, Truth, motion_blocks
+from drivers.dynamixel.port import QUIET_S
 from drivers.dynamixel.settings import AxisSettings, HeadSettings
-from drivers.errors import DriverError, HardwareFault, NoReply, Refused, WrongDevice
+from drivers.errors import BadReply, DriverError, HardwareFault, NoReply, Refused, WrongDevice
 
 log = logging.getLogger(__name__)
 T = TypeVar("T")
@@ -69,6 +67,11 @@ class Servo:
         ``pan`` or ``tilt``, for messages.
     settings, head
         What the configuration says.
+
+    Attributes
+    ----------
+    truth
+        What its samples are compared with.
     """
 
     def __init__(self, link: Link, axis: str, settings: AxisSettings, head: HeadSettings) -> None:
@@ -78,29 +81,43 @@ class Servo:
         self._head = head
         self._registers = settings.model.registers
         self.name = f"{axis} (servo {settings.servo_id})"
+        self.truth = Truth(self.name, settings)
+        self._blocks = itertools.cycle(motion_blocks(settings))
 
     def get(self, register: str) -> int:
-        """Return a register's value; a lost reply is asked for again. Raises as `Link.read`."""
-        return self._repeated(lambda: self._link.read(self._settings.servo_id, self._registers[register]))
+        """Return a register's value; a lost reply is asked for again. Raises as `Link.proven`."""
+        return self.get_all(register)[register]
+
+    def get_all(self, *registers: str) -> dict[str, int]:
+        """Return several registers' values by name, as `get` does one, at the cost of one."""
+        entries = [self._registers[register] for register in registers]
+        values = self._repeated(lambda: self._link.proven(self._settings.servo_id, *entries))
+        return dict(zip(registers, values, strict=True))
 
     def set(self, register: str, value: int) -> None:
         """Set a register and see that it holds the value.
 
         Raises
         ------
-        Refused, NoReply, LineLost
-            As `Link.write`.
+        Refused, NoReply, BadReply, LineLost
+            As `Link.write` and `Link.proven`.
         WrongDevice
             If the servo says that it did but holds another value.
         """
         entry = self._registers[register]
+        refused: Refused | None = None
         for _ in range(ATTEMPTS):
             # a write may have been done and only its reply lost: writing again is the same
-            self._repeated(lambda: self._link.write(self._settings.servo_id, entry, value))
+            try:
+                self._repeated(lambda: self._link.write(self._settings.servo_id, entry, value))
+            except Refused as error:
+                if refused is not None:
+                    raise
+                refused = error  # it may be that of another write
             held = self.get(register)
             if held == value:
                 return
-            self._link.quiet(LATE_S)
+            self._link.quiet(LATE_S if refused is None else QUIET_S)
         raise WrongDevice(f"{self.name} holds {held} in {register} after {value} was written to it")
 
     def check_identity(self) -> None:
@@ -114,7 +131,7 @@ class Servo:
             If it does not answer.
         """
         model = self._settings.model
-        pinged = self._repeated(lambda: self._link.ping(self._settings.servo_id))
+        pinged = self._pinged()
         if pinged.model_number != model.number:
             other = MODELS_BY_NUMBER.get(pinged.model_number)
             found = f"a {other.name}" if other else f"of the unknown model number {pinged.model_number}"
@@ -126,11 +143,22 @@ class Servo:
             )
         level = self._registers["status_return_level"]
         try:
-            answering = self._link.read(self._settings.servo_id, level) == FULL_STATUS_RETURN
+            answering = self._link.proven(self._settings.servo_id, level) == [FULL_STATUS_RETURN]
         except NoReply:
             answering = False
         if not answering:
             self._link.write_unanswered(self._settings.servo_id, level, FULL_STATUS_RETURN)
+
+    def _pinged(self) -> Pinged:
+        """Who answers a ping, twice in a row and around a silence: a servo may answer nothing else yet."""
+        before = self._repeated(lambda: self._link.ping(self._settings.servo_id))
+        for _ in range(ATTEMPTS):
+            self._link.quiet(QUIET_S)
+            now = self._repeated(lambda: self._link.ping(self._settings.servo_id))
+            if now == before:
+                return now
+            before = now
+        raise BadReply(f"{self.name} says another thing about itself each time it is asked")
 
     def check_health(self, reboots: Reboots) -> None:
         """See that the servo reports no hardware error; restart it if the configuration says so.
@@ -155,36 +183,36 @@ class Servo:
     def reboot(self) -> None:
         """Restart the servo and wait until it answers; torque drops. Raises NoReply, LineLost."""
         self._link.reboot(self._settings.servo_id)
+        self.truth.forget()
         until_s = time.monotonic() + REBOOT_S
         while True:
             try:
-                self._link.ping(self._settings.servo_id)
+                self._pinged()
                 return
-            except NoReply:
+            except (NoReply, BadReply):
                 if time.monotonic() > until_s:
                     raise
 
     def look(self) -> Sample:
-        """Return what the servo says about its motion now, proven by its counter not to be an old reply.
+        """Return what the servo says about its motion now; what was lost is asked for again.
 
         Raises
         ------
         NoReply, BadReply, Refused, LineLost
             As `Link.group_read`.
         """
-        block, truth = motion_block(self._settings), Truth(self.name, self._settings)
+        return self._repeated(self.look_once)
+
+    def look_once(self) -> Sample:
+        """Return what the servo says about its motion now, asked one time; raises as `look`."""
+        block = next(self._blocks)
         part = Part(self._settings.servo_id, block.address, block.length)
-
-        def read() -> Sample:
-            answer = self._link.group_read([part])
-            if answer.missing:
-                raise answer.missing[part.servo_id]
-            status = answer.statuses[part.servo_id]
-            return Sample(block.decode(status.data), status.alert, answer.sent_s, answer.received_s)
-
-        truth.check(self._repeated(read))
-        sample = self._repeated(read)
-        truth.check(sample)
+        answer = self._link.group_read([part])
+        if answer.missing:
+            raise answer.missing[part.servo_id]
+        status = answer.statuses[part.servo_id]
+        sample = Sample(block.decode(status.data), status.alert, answer.sent_s, answer.received_s)
+        self.truth.check(sample)
         return sample
 
     def check_place(self) -> int:
@@ -217,7 +245,8 @@ class Servo:
             If the servo refuses a value.
         """
         wanted = self._wanted()
-        different = {name: value for name, value in wanted.items() if self.get(name) != value}
+        held = self.get_all(*wanted)
+        different = {name: value for name, value in wanted.items() if held[name] != value}
         if not different:
             return
         told = ", ".join(f"{name} {value}" for name, value in different.items())
@@ -233,42 +262,19 @@ class Servo:
         for name in sorted(different, key=lambda n: n != "operating_mode"):  # a new mode resets others
             self.set(name, different[name])
 
-    def check_set_up(self) -> None:
-        """See once more, in reads of another shape, that the settings that keep the head safe are right.
-
-        Raises
-        ------
-        WrongDevice
-            If one is not; only possible if an earlier answer was not the servo's answer to its question.
-        """
-        low, high = self._settings.limit_counts
-        modes = Block(self._registers, "return_delay", "operating_mode")
-        limits = Block(self._registers, "max_position_limit", "min_position_limit")
-        for block in (modes, limits):
-            part = Part(self._settings.servo_id, block.address, block.length)
-            answer = self._link.group_read([part])
-            if answer.missing:
-                raise answer.missing[part.servo_id]
-            held = block.decode(answer.statuses[part.servo_id].data)
-            wanted = {"operating_mode": POSITION_MODE, "max_position_limit": high, "min_position_limit": low}
-            for name in held.keys() & wanted.keys():
-                if held[name] != wanted[name]:
-                    raise WrongDevice(f"{self.name} holds {held[name]} in {name} instead of {wanted[name]}")
-
     def _wanted(self) -> dict[str, int]:
         """The permanent settings, by register."""
         settings, model = self._settings, self._settings.model
-        drive = self.get("drive_mode")
+        held = self.get_all("drive_mode", "secondary_id", "homing_offset")
+        drive, secondary, homing = held["drive_mode"], held["secondary_id"], held["homing_offset"]
         if drive & SLAVE_BIT:
             raise WrongDevice(
                 f"{self.name} is the slave of a pair (drive mode {drive}); a head needs single servos"
             )
-        secondary = self.get("secondary_id")
         if secondary < NO_SECONDARY_ID:
             raise WrongDevice(
                 f"{self.name} also obeys writes to id {secondary} (its secondary id); set that to 255 first"
             )
-        homing = self.get("homing_offset")
         if model.low_count == 0 and abs(homing) > HOMING_LIMIT:
             raise WrongDevice(
                 f"{self.name} has a homing offset of {homing} counts; position mode honours {HOMING_LIMIT} "
@@ -293,8 +299,8 @@ class Servo:
         tripped is cleared here, which makes this the deliberate act of arming anew.
         """
         settings, model, head = self._settings, self._settings.model, self._head
-        torque = bool(self.get("torque_enable"))
-        tripped = self.get("bus_watchdog") != 0
+        held = self.get_all("torque_enable", "bus_watchdog")
+        torque, tripped = bool(held["torque_enable"]), held["bus_watchdog"] != 0
         counts = self.check_place()
         if tripped:
             self.set("bus_watchdog", 0)  # the servo may now go on to its old goal: void it at once
@@ -337,11 +343,11 @@ class Servo:
         return goal
 
     def _repeated(self, ask: Callable[[], T]) -> T:
-        """Ask again after a lost reply, when one that is merely late can be no answer any more."""
+        """Ask again after a lost or wrong reply, when one that is merely late has come."""
         for _ in range(ATTEMPTS - 1):
             try:
                 return ask()
-            except NoReply:
+            except (NoReply, BadReply):
                 self._link.quiet(LATE_S)
         return ask()
 

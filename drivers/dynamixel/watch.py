@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import logging
 import time
+from collections.abc import Sequence
 
 from drivers.dynamixel.pair import Axis, Pair
 from drivers.dynamixel.servo import WATCHDOG_TRIPPED, Reboots, hardware_fault_words
@@ -73,7 +74,7 @@ class Watch:
             return
         self._looked_s = now_s
         for register in ("bus_watchdog", "torque_enable"):
-            values = self._pair.get(register)
+            values = self._sure(register, self._pair.glance(register))
             if register == "bus_watchdog" and WATCHDOG_TRIPPED in values:
                 self._note_trip()
             for axis, value in zip(self._pair.axes, values, strict=True):
@@ -83,12 +84,25 @@ class Watch:
             if (words := axis.motion.other_goal_words()) and not self.tripped and not errors:
                 raise _distrust(words)
 
+    def _sure(self, register: str, glanced: Sequence[int | None]) -> list[int | None]:
+        """The values of a register of both servos; one that is not as it was left is asked for again."""
+        return [
+            value if value is None or self._as_left(axis, register, value) else axis.servo.get(register)
+            for axis, value in zip(self._pair.axes, glanced, strict=True)
+        ]
+
+    def _as_left(self, axis: Axis, register: str, value: int) -> bool:
+        """Whether a register is as this driver left it."""
+        if register == "bus_watchdog":
+            return value == self._head.watchdog_counts
+        return bool(value) == axis.motion.holds
+
     def _judge(self, axis: Axis, register: str, value: int | None) -> None:
         """Give up if a register is not as it was left."""
         if value is None or axis.hardware_error:
             return  # asked again soon, or known
-        changed = register == "bus_watchdog" and value not in (self._head.watchdog_counts, WATCHDOG_TRIPPED)
-        if changed or (register == "torque_enable" and bool(value) != axis.motion.holds):
+        tripped = register == "bus_watchdog" and value == WATCHDOG_TRIPPED
+        if not tripped and not self._as_left(axis, register, value):
             raise _distrust(f"{axis.servo.name} has {value} in {register}")
 
     def _note_trip(self) -> None:

@@ -21,7 +21,8 @@ from drivers.dynamixel.models import (
     Model,
     hardware_error_words,
 )
-from drivers.errors import BadOptions, HardwareFault, NoReply, OutOfRange, Refused, WrongDevice
+from drivers.dynamixel.port import QUIET_S
+from drivers.errors import BadOptions, BadReply, HardwareFault, NoReply, OutOfRange, Refused, WrongDevice
 
 T = TypeVar("T")
 
@@ -84,7 +85,7 @@ def _found(link: Link, ping: Pinged) -> Found:
     words: list[str] = []
     if ping.alert and model is not None:
         words = hardware_error_words(
-            _patient(lambda: link.read(ping.servo_id, model.registers["hardware_error"]))
+            _patient(lambda: link.proven(ping.servo_id, model.registers["hardware_error"]))[0]
         )
     name = model.name if model else "unknown"
     return Found(link.baud, ping.servo_id, ping.model_number, name, ping.firmware, tuple(words))
@@ -115,7 +116,7 @@ def facts(link: Link, servo_id: int) -> Facts:
     values: dict[str, int] = {}
     for name, register in model.registers.items():
         try:
-            values[name] = _patient(lambda r=register: link.read(servo_id, r))  # type: ignore[misc]
+            values[name] = _patient(lambda r=register: link.proven(servo_id, r))[0]  # type: ignore[misc]
         except Refused:
             continue  # this model has none
     words = {name: _words(model, name, value) for name, value in values.items()}
@@ -124,6 +125,12 @@ def facts(link: Link, servo_id: int) -> Facts:
 
 def _identify(link: Link, servo_id: int) -> tuple[Model, int]:
     ping = _patient(lambda: link.ping(servo_id))
+    link.quiet(QUIET_S)
+    if (again := _patient(lambda: link.ping(servo_id))) != ping:
+        raise BadReply(
+            f"servo {servo_id} says another thing about itself each time it is asked: model "
+            f"{ping.model_number} and {again.model_number}"
+        )
     model = MODELS_BY_NUMBER.get(ping.model_number)
     if model is None:
         raise WrongDevice(
@@ -224,7 +231,7 @@ def set_id(link: Link, old: int, new: int, new_baud: int | None = None, *, torqu
             other = MODELS_BY_NUMBER.get(taken.model_number)
             raise WrongDevice(f"id {new} is taken by a {other.name if other else 'servo'}; choose another")
     torque = model.registers["torque_enable"]
-    if _patient(lambda: link.read(old, torque)):
+    if _patient(lambda: link.proven(old, torque)) != [0]:
         if not torque_off:
             raise WrongDevice(
                 f"the torque of servo {old} is on, which locks its id: support what hangs on it and give "
@@ -341,7 +348,7 @@ def try_out(link: Link, servo_id: int, amplitude_rad: float, torque_percent: flo
                     _step(link, servo_id, model, block, goal, (start - 2 * reach, start + 2 * reach))
                 )
         except BaseException:
-            write("goal_position", link.read(servo_id, registers["present_position"]))
+            write("goal_position", link.proven(servo_id, registers["present_position"])[0])
             raise
     return Trial(servo_id, model.name, model.count_rad, start, tuple(steps))
 

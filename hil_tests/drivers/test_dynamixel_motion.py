@@ -163,34 +163,6 @@ def test_a_brake_ends_where_the_speed_carries_it() -> None:
     assert bench.motion.stopping_counts(4.0) == 2300 + round(way_rad / COUNT_RAD)
 
 
-def test_a_true_sample_follows_the_servos_own_clock() -> None:
-    bench = Bench()
-    for _ in range(2000):  # 40 s: the counter wraps at 32.768 s
-        bench.now_s += PERIOD_S
-        bench.truth.check(bench.sample(2048))
-
-
-@pytest.mark.parametrize("late_ms", [20, 40, 500, 16000])
-def test_a_reply_from_another_moment_is_refused(late_ms: int) -> None:
-    bench = Bench()
-    bench.truth.check(bench.sample(2048))
-    bench.now_s += PERIOD_S
-    tick = (int(1000 * bench.now_s) - late_ms) % 32768
-    with pytest.raises(BadReply, match="another moment"):
-        bench.truth.check(bench.sample(2048, tick=tick))
-    bench.truth.check(bench.sample(2048))
-
-
-def test_a_repeated_reply_is_refused_even_right_away() -> None:
-    bench = Bench()
-    sample = bench.sample(2048)
-    bench.truth.check(sample)
-    bench.now_s += PERIOD_S
-    again = Sample(sample.values, False, bench.now_s, bench.now_s + 0.001)
-    with pytest.raises(BadReply, match="another moment"):
-        bench.truth.check(again)
-
-
 def test_a_position_that_leaps_is_refused() -> None:
     bench = Bench()
     bench.truth.check(bench.sample(20))

@@ -48,6 +48,29 @@ def test_its_registers(name: str) -> None:
             assert register.signed, register.name
 
 
+@pytest.mark.parametrize("name", ours.MODELS)
+def test_what_is_read_for_a_register_has_no_gaps_that_a_servo_refuses(name: str) -> None:
+    driver, simulator = ours.MODELS[name], theirs.model_named(name)
+    for register in driver.registers.values():
+        if register.name in CURRENT and driver.current_unit_A is None:
+            continue
+        first, length = register.window
+        assert first <= register.address, register.name
+        assert register.address + register.size <= first + length, register.name
+        assert all(at in simulator.by_byte for at in range(first, first + length)), register.name
+
+
+@pytest.mark.parametrize("map_name", ["X", "P"])
+def test_what_a_head_is_made_ready_by_can_be_told_apart_by_its_length(map_name: ours.Map) -> None:
+    deciding = (
+        "secondary_id", "operating_mode", "drive_mode", "return_delay", "homing_offset", "current_limit",
+        "min_position_limit", "max_position_limit", "torque_enable", "bus_watchdog", "hardware_error",
+        "status_return_level", "temperature_limit",
+    )  # fmt: skip
+    windows = {ours.REGISTERS[map_name][name].window for name in deciding}
+    assert len({length for _, length in windows}) == len(windows)
+
+
 def test_every_simulated_model_is_one_of_the_drivers() -> None:
     assert {m.number for m in theirs.MODELS.values()} == set(ours.MODELS_BY_NUMBER)
 

@@ -64,6 +64,14 @@ def status_packet(servo_id: int, error: int, parameters: bytes = b"") -> bytes:
     return packet(servo_id, bytes((STATUS, error)) + parameters)
 
 
+def renamed(data: bytes, servo_id: int) -> bytes:
+    """Return a whole packet as another servo would send it; bytes that are none as they are."""
+    if not data.startswith(HEADER) or len(data) < _FRONT + 4:
+        return data
+    front = HEADER + bytes((servo_id,)) + data[5:-2]
+    return front + crc16(front).to_bytes(2, "little")
+
+
 def fast_status_packets(blocks: list[tuple[int, int, bytes]], total: int) -> list[bytes]:
     """Return the pieces of the one answer to a fast sync or bulk read, one piece a servo.
 

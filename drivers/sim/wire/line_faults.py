@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 from drivers.faults import PAN_TILT, Fault, FaultPanel
+from drivers.sim.wire.dynamixel_packets import renamed
 
 if TYPE_CHECKING:
     from drivers.sim.wire.carrier import Reply
@@ -69,8 +70,10 @@ class LineFaults:
         return sent
 
     def _damaged(self, panel: FaultPanel, reply: Reply, time_s: float) -> Sent:
-        """A reply with a wrong byte, cut short, with garbage in front, or late."""
+        """A reply of another sender, with a wrong byte, cut short, with garbage in front, or late."""
         data, late_s = reply.data, 0.0
+        if fault := panel.takes(PAN_TILT, "misnamed", time_s, reply.sender):
+            data = renamed(data, int(fault.number("as_id")))
         if data and (fault := panel.takes(PAN_TILT, "corrupt", time_s, reply.sender)):
             place = _below(panel, fault, len(data))
             changed = data[place] ^ (1 + _below(panel, fault, 255))
