@@ -1,9 +1,9 @@
 """One device, one thread: calls go in one at a time, and nobody waits longer than a deadline.
 
 A driver may block, hang or raise anything. Here that becomes a typed error for the caller and a fault that
-the status shows, while the other devices go on. A call that came back too late is dropped. A thread that
-hangs inside a driver cannot be ended from outside: it is left alone (it is a daemon thread), calls to it
-fail at once, and it serves again when the driver returns.
+the status shows, while the other devices go on. A result that came too late is dropped, and that it came is
+told. A thread that hangs inside a driver cannot be ended from outside: it is left alone (it is a daemon
+thread), calls to it fail at once, and it serves again when the driver returns.
 
 Deadlines and pacing run on the machine's own clock, whatever clock stamps the data.
 """
@@ -14,10 +14,10 @@ import logging
 import threading
 import time
 from collections import deque
-from collections.abc import Callable
-from concurrent.futures import Future
+from collections.abc import Callable, Mapping
+from concurrent.futures import CancelledError, Future
 from dataclasses import dataclass
-from typing import Any, TypeVar
+from typing import Any, Generic, TypeVar
 
 from drivers.errors import DriverError, LineLost, NoReply
 from mastctl.errors import MastctlError
@@ -28,20 +28,70 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class Fault:
-    """Something wrong with a device, in plain words; ``since_s`` is a time of CLOCK_MONOTONIC."""
+    """Something wrong with a device, in plain words.
+
+    Attributes
+    ----------
+    since_s
+        When it began, seconds of CLOCK_MONOTONIC.
+    until
+        What takes it back, in plain words that follow "until".
+    """
 
     device: str
     code: str
     message: str
     since_s: float
+    until: str
 
 
-@dataclass
-class _Job:
+@dataclass(frozen=True)
+class Words:
+    """What belongs to the faults of one kind of call.
+
+    Attributes
+    ----------
+    until
+        What takes such a fault back, in plain words that follow "until".
+    late_is_fault
+        Whether an answer that came too late is a fault itself, because the call moves something; any other
+        answer, however late, shows that the device works again.
+    """
+
+    until: str
+    late_is_fault: bool = False
+
+
+@dataclass(eq=False)
+class Asked(Generic[T]):
+    """A call on its way: what `DeviceThread.submit` gives and `DeviceThread.wait` takes.
+
+    Attributes
+    ----------
+    first, told
+        As in `DeviceThread.submit`.
+    given_up
+        Whether its caller has stopped waiting.
+    """
+
     what: str
-    function: Callable[[], Any]
+    function: Callable[[], T]
     timeout_s: float
-    future: Future[Any]
+    first: bool
+    told: bool
+    asked_s: float
+    future: Future[T]
+    given_up: bool = False
+
+
+@dataclass(frozen=True)
+class _Now:
+    """The call under way."""
+
+    what: str
+    first: bool
+    began_s: float
+    until_s: float
 
 
 class DeviceThread:
@@ -54,6 +104,8 @@ class DeviceThread:
     between
         Called in the thread whenever nothing is asked, as the call ``between_name`` with the deadline
         ``between_timeout_s``; returns the seconds until it wants to run again, None for never.
+    words
+        What belongs to the faults of its calls, by their names.
     """
 
     def __init__(
@@ -64,58 +116,88 @@ class DeviceThread:
         between_name: str = "read",
         between_timeout_s: float = 1.0,
         between_after_error_s: float = 0.2,
+        words: Mapping[str, Words] | None = None,
     ) -> None:
         self._device = device
         self._between = between
         self._between_name = between_name
         self._between_timeout_s = between_timeout_s
         self._between_after_error_s = between_after_error_s
+        self._words = dict(words or {})
         self._wake = threading.Condition()
-        self._jobs: deque[_Job] = deque()
+        self._jobs: deque[Asked[Any]] = deque()
         self._closing = False
-        self._now: tuple[str, float, float] | None = None  # what, began, must end by
+        self._now: _Now | None = None
         self._faults: dict[str, Fault] = {}
         self._thread = threading.Thread(target=self._serve, name=f"device {device}", daemon=True)
         self._thread.start()
 
     def submit(
-        self, what: str, function: Callable[[], T], timeout_s: float, *, first: bool = False
-    ) -> Future[T]:
-        """Queue a call and return at once; ``first`` puts it before everything that waits.
+        self,
+        what: str,
+        function: Callable[[], T],
+        timeout_s: float,
+        *,
+        first: bool = False,
+        anyway: bool = False,
+        told: bool = True,
+    ) -> Asked[T]:
+        """Queue a call and return at once.
+
+        Parameters
+        ----------
+        what, function, timeout_s
+            Its name, what is run in the thread, and how long that may take, seconds.
+        first
+            Before everything that waits, whatever the device does meanwhile; closing lets it go out too. That
+            it hangs is its caller's to tell.
+        anyway
+            Also behind a call that is overdue.
+        told
+            Whether its errors become faults; otherwise they are its caller's to tell.
 
         Raises
         ------
         NoReply
             At once, if the device is already overdue with an earlier call, or closed.
         """
-        job = _Job(what, function, timeout_s, Future())
+        asked = Asked(what, function, timeout_s, first, told, time.monotonic(), Future[T]())
         with self._wake:
             if self._closing:
                 raise NoReply(f"{what} was asked after the device was closed", device=self._device)
             overdue = self._overdue()
-            if overdue and not first:
+            if overdue and not first and not anyway:
                 raise NoReply(overdue, device=self._device)
-            (self._jobs.appendleft if first else self._jobs.append)(job)
+            (self._jobs.appendleft if first else self._jobs.append)(asked)
             self._wake.notify()
-        return job.future
+        return asked
 
-    def wait(self, what: str, future: Future[T], deadline_s: float) -> T:
+    def wait(self, asked: Asked[T], deadline_s: float) -> T:
         """Return a call's result, waiting until ``deadline_s`` (of `time.monotonic`) at most.
 
         Raises
         ------
         NoReply
-            If it did not end in time; its late result will be dropped.
+            If it did not end in time: it will not begin any more, or its late result will be dropped.
+        DriverError, MastctlError
+            Whatever of these it raised.
         """
         try:
-            return future.result(max(0.0, deadline_s - time.monotonic()))
+            return asked.future.result(max(0.0, deadline_s - time.monotonic()))
+        except CancelledError:
+            raise NoReply(f"{asked.what} did not begin before the end", device=self._device) from None
         except TimeoutError:
-            future.cancel()
-            error = NoReply(f"{what} did not end within its deadline", device=self._device)
-            self._note(what, error)
+            asked.given_up = True
+            if asked.future.cancel():
+                with self._wake:
+                    if asked in self._jobs:
+                        self._jobs.remove(asked)
+            error = NoReply(f"{asked.what} did not end within its deadline", device=self._device)
+            if asked.told:
+                self._note(asked.what, error)
             raise error from None
 
-    def call(self, what: str, function: Callable[[], T], timeout_s: float) -> T:
+    def call(self, what: str, function: Callable[[], T], timeout_s: float, *, told: bool = True) -> T:
         """Run ``function`` in the thread and return its result within ``timeout_s`` seconds.
 
         Raises
@@ -126,7 +208,7 @@ class DeviceThread:
             Whatever of these ``function`` raises; any other exception comes as a DriverError.
         """
         deadline_s = time.monotonic() + timeout_s
-        return self.wait(what, self.submit(what, function, timeout_s), deadline_s)
+        return self.wait(self.submit(what, function, timeout_s, told=told), deadline_s)
 
     def faults(self) -> tuple[Fault, ...]:
         """Return what is wrong at this moment; a call that succeeds takes back its own earlier fault.
@@ -136,53 +218,79 @@ class DeviceThread:
         with self._wake:
             overdue = self._overdue()
             faults = dict(self._faults)
-            if overdue and self._now:
-                faults[self._now[0]] = Fault(self._device, NoReply.code, overdue, self._now[1])
+            now = self._now
+        if overdue and now is not None and not now.first:
+            faults[now.what] = self._fault(now.what, NoReply.code, overdue, now.began_s)
         return tuple(faults.values())
 
     def close(self, timeout_s: float) -> bool:
-        """End the thread; return whether it ended within ``timeout_s`` seconds. Waiting calls are refused."""
+        """End the thread; return whether it ended within ``timeout_s`` seconds.
+
+        Waiting calls are refused, except those that go ``first``: they still go out before the end.
+        """
         with self._wake:
             self._closing = True
-            for job in self._jobs:
-                job.future.cancel()
-            self._jobs.clear()
+            for asked in self._jobs:
+                if not asked.first:
+                    asked.future.cancel()
+            self._jobs = deque(asked for asked in self._jobs if asked.first)
             self._wake.notify()
         self._thread.join(timeout_s)
         if self._thread.is_alive():
             log.warning("%s: the driver hangs; its thread is left behind", self._device)
         return not self._thread.is_alive()
 
+    def typed(self, what: str, error: BaseException) -> Exception:
+        """Return what a driver raised as an error of the service's own kind, with the device's name."""
+        if isinstance(error, MastctlError):
+            return error
+        if isinstance(error, DriverError):
+            return error if error.device == self._device else _named(error, self._device)
+        log.debug("%s: %s raised", self._device, what, exc_info=error)
+        words = " ".join(str(error).split())[:200]
+        return DriverError(
+            f"the driver failed in {what}: {type(error).__name__}{': ' + words if words else ''}",
+            device=self._device,
+        )
+
     def _overdue(self) -> str:
-        """Say in plain words how late the call under way is; empty when it is not."""
-        if self._now is None or time.monotonic() <= self._now[2]:
+        """Say in plain words how late the call under way is; empty when it is not. The lock is held."""
+        now_s = time.monotonic()
+        if self._now is None or now_s <= self._now.until_s:
             return ""
-        what, began_s, _ = self._now
-        return f"does not answer: {what} has been under way for {time.monotonic() - began_s:.1f} s"
+        return f"does not answer: {self._now.what} has been under way for {now_s - self._now.began_s:.1f} s"
+
+    def _fault(self, what: str, code: str, message: str, since_s: float) -> Fault:
+        words = self._words.get(what)
+        until = f"{what} goes well again" if words is None else words.until
+        return Fault(
+            self._device, code, message, since_s, "the line is back" if code == LineLost.code else until
+        )
 
     def _serve(self) -> None:
         next_between_s = time.monotonic()
         while True:
-            job: _Job | None = None
+            asked: Asked[Any] | None = None
             with self._wake:
                 while not self._jobs and not self._closing:
                     wait_s = None if self._between is None else next_between_s - time.monotonic()
                     if wait_s is not None and wait_s <= 0.0:
                         break
                     self._wake.wait(wait_s)
-                if self._closing:
-                    return
                 if self._jobs:
-                    job = self._jobs.popleft()
-            if job is not None:
-                if job.future.set_running_or_notify_cancel():
-                    result, error = self._run(job.what, job.function, job.timeout_s)
-                    if error is None:
-                        job.future.set_result(result)
-                    else:
-                        job.future.set_exception(error)
+                    asked = self._jobs.popleft()
+                elif self._closing:
+                    return
+            if asked is not None:
+                if asked.future.set_running_or_notify_cancel():
+                    self._answer(asked)
             elif self._between is not None:
-                pause_s, error = self._run(self._between_name, self._between, self._between_timeout_s)
+                pause_s, error = self._run(
+                    Asked(
+                        self._between_name, self._between, self._between_timeout_s, False, True,
+                        time.monotonic(), Future(),
+                    )
+                )  # fmt: skip
                 if error is None and pause_s is None:
                     self._between = None
                     continue
@@ -190,36 +298,46 @@ class DeviceThread:
                     float(pause_s) if error is None else self._between_after_error_s
                 )
 
-    def _run(self, what: str, function: Callable[[], Any], timeout_s: float) -> tuple[Any, Exception | None]:
+    def _answer(self, asked: Asked[Any]) -> None:
+        """Make a call that somebody asked for."""
+        result, error = self._run(asked)
+        if error is None:
+            asked.future.set_result(result)
+        else:
+            asked.future.set_exception(error)
+
+    def _run(self, asked: Asked[Any]) -> tuple[Any, Exception | None]:
         """Make one call; whatever happens comes back as a result or a typed error."""
         began_s = time.monotonic()
         with self._wake:
-            self._now = (what, began_s, began_s + timeout_s)
+            self._now = _Now(asked.what, asked.first, began_s, began_s + asked.timeout_s)
         result: Any = None
         error: Exception | None = None
         try:
-            result = function()
-        except MastctlError as ours:  # a refusal of the service's own: nothing is wrong with the device
-            error = ours
-        except DriverError as fault:
-            error = fault if fault.device == self._device else _named(fault, self._device)
-        except (
-            BaseException
-        ) as anything:  # a driver from outside may raise what it likes, SystemExit included
-            log.debug("%s: %s raised", self._device, what, exc_info=True)
-            words = " ".join(str(anything).split())[:200]
-            error = DriverError(
-                f"the driver failed in {what}: {type(anything).__name__}{': ' + words if words else ''}",
-                device=self._device,
-            )
+            result = asked.function()
+        except BaseException as anything:  # a driver from outside may raise SystemExit or worse
+            error = self.typed(asked.what, anything)
         finally:
             with self._wake:
                 self._now = None
-        self._note(what, error)
+        ended_s = time.monotonic()
+        if asked.told:
+            late = asked.given_up or ended_s > began_s + asked.timeout_s
+            self._note(asked.what, error, ended_s - asked.asked_s if late else None)
         return result, error
 
-    def _note(self, what: str, error: Exception | None) -> None:
-        """Remember a fault, or take it back after the same call succeeded; say each change once."""
+    def _note(self, what: str, error: Exception | None, late_s: float | None = None) -> None:
+        """Remember a fault, or take it back after the same call succeeded; say each change once.
+
+        ``late_s`` is how long ago a call was asked for that ended when nobody waited for it any more.
+        """
+        if late_s is not None:
+            ended = "ended only now" if error is None else f"failed only now: {error}"
+            late = NoReply(f"a {what} asked for {late_s:.1f} s ago {ended}", device=self._device)
+            log.warning("%s", late)
+            words = self._words.get(what)
+            if error is None and words is not None and words.late_is_fault:
+                error = late
         if isinstance(error, MastctlError):
             return
         with self._wake:
@@ -232,17 +350,17 @@ class DeviceThread:
             else:
                 since_s = known.since_s if known else time.monotonic()
                 code = getattr(error, "code", DriverError.code)
-                self._faults[what] = Fault(self._device, code, str(error), since_s)
+                self._faults[what] = self._fault(what, code, str(error), since_s)
         if error is None and known:
             log.info("%s: %s works again", self._device, what)
-        elif error is not None and not known:
+        elif error is not None and not known and late_s is None:
             log.warning("%s", error)
 
 
 def _named(fault: DriverError, device: str) -> DriverError:
     """Return the same error with the device's name in front, if its class can be made so."""
     try:
-        named = type(fault)(str(fault), device=device)
+        named = type(fault)(str(fault), device=device, detail=fault.detail)
     except TypeError:
         return fault
     return named

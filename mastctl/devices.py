@@ -13,9 +13,9 @@ import math
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import Future
-from contextlib import ExitStack, contextmanager
-from dataclasses import replace
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from functools import partial
 from typing import Protocol
 
 import numpy as np
@@ -24,15 +24,26 @@ from calib.mast import Rig
 from drivers.absent_camera import AbsentCamera
 from drivers.clock import Clock
 from drivers.errors import BadFrame, BadReply, DriverError, NoFreshFrame, NoReply
-from drivers.interfaces import AxisReport, Camera, HoldsExposure, KnowsSize, PanTilt, Reading, Reporting
+from drivers.interfaces import (
+    AxisReport,
+    Camera,
+    FrameTime,
+    KnowsSize,
+    Paced,
+    PanTilt,
+    Reading,
+    Reporting,
+)
 from drivers.pairing import Offset, Pairing, learned
 from mastctl import frames as frame_checks
 from mastctl import joint_history
-from mastctl.device_thread import DeviceThread, Fault
+from mastctl.device_thread import Asked, DeviceThread, Fault, Words
 from mastctl.errors import FrameGone, MastctlError, Stopped
+from mastctl.exposure_hold import ExposureHold
 from mastctl.frames import CheckedFrame, FrameStore, StampedFrame
 from mastctl.joint_history import JointHistory
 from mastctl.limits import Limits
+from mastctl.stops import Stops
 
 log = logging.getLogger(__name__)
 
@@ -40,10 +51,19 @@ HEAD = "pan_tilt"
 READ_TIMEOUT_S = 1.0
 MOVE_TIMEOUT_S = 1.0
 STOP_TIMEOUT_S = 1.0
-STOP_PATIENCE_S = 0.05  # how long a stop waits for the head's own thread before it goes out beside it
+SIZE_TIMEOUT_S = 1.0
 CAMERA_GRACE_S = 3.0  # beyond the time given to next_frame: copying and decoding on a busy machine
 MOVING_PERIOD_S = 0.02
 RESTING_PERIOD_S = 0.05
+REST_S = 0.3  # after a move was taken, before a reading that says rest is one of its end
+WORDS = {
+    "read": Words("the head is read again"),
+    "move": Words("a later move is taken in time", late_is_fault=True),
+    "next_frame": Words("a picture comes"),
+    "recent_times": Words("a pair of pictures comes"),
+    "hold_exposure": Words("an operation can hold the exposure again"),
+    "release_exposure": Words("an operation has held and released the exposure again"),
+}
 MOVED_RAD = 1e-5  # a head camera's picture that stays the same to the last bit beyond this is frozen
 
 
@@ -102,20 +122,20 @@ class Devices:
         self._on_head: set[str] = set()
         if rig is not None:
             self._take_rig(rig)
-            for name in self._cameras:
-                self._check_size(name)
         self._paired_s: dict[str, float] = {}  # per camera when the last frame that served a set began
         self._learned: dict[tuple[str, str], Offset] = {}
         self._still_since: dict[str, StampedFrame] = {}  # per camera the first frame of the same content
         self._stamping = {name: threading.Lock() for name in self._cameras}
         self._gate = threading.Lock()
-        self._stops = 0
-        self._stop_owed = False
         self._blocked = ""
         self._closed = False
         self._last_faults: tuple[str, ...] = ()
+        self._moved_s = math.inf  # when the last move was taken, until the head was read at rest after it
         self._camera_threads = {name: self._thread_of(name) for name in self._cameras}
-        self._head = DeviceThread(HEAD, between=self._poll, between_timeout_s=READ_TIMEOUT_S)
+        if rig is not None:
+            self._check_sizes()
+        self._head = DeviceThread(HEAD, between=self._poll, between_timeout_s=READ_TIMEOUT_S, words=WORDS)
+        self._stops = Stops(self._head, HEAD, lambda: self._pan_tilt.stop())
 
     # The head
 
@@ -146,8 +166,14 @@ class Devices:
                 raise error from None
 
     def report(self) -> Mapping[str, AxisReport]:
-        """Return where each axis was sent and stands in counts; empty for a head that does not know."""
-        return self._pan_tilt.report() if isinstance(self._pan_tilt, Reporting) else {}
+        """Return where each axis was sent and stands in counts; empty for a head that does not know.
+
+        Raises
+        ------
+        NoReply, BadReply, DriverError
+            If the head does not tell within 1 s, or tells something else.
+        """
+        return self._head.call("report", self._reported, READ_TIMEOUT_S, told=False)
 
     def move(self, pan_rad: float, tilt_rad: float, speed_rad_per_s: float | None = None) -> None:
         """Start the head towards the angles, radians, and return; at most at the speed cap.
@@ -157,52 +183,35 @@ class Devices:
         OutsideLimits
             If an angle or the speed may not be commanded; nothing was sent.
         Stopped
-            If a stop came first or moves are blocked; nothing was sent.
+            If a stop came first, moves are blocked, or a stop has not come back from the driver yet;
+            nothing was sent.
         NoReply, DriverError
             If the head does not take the command in 1 s.
         """
-        with self._gate:
-            ticket = self._stops
+        ticket = self._stops.ticket()
 
         def send() -> None:
             with self._gate:
-                if self._blocked or ticket != self._stops:
-                    raise Stopped(self._blocked or "a stop came before the move was sent")
+                if self._blocked:
+                    raise Stopped(self._blocked)
+            self._stops.check(ticket)
             self._limits.check(pan_rad, tilt_rad)
             speed = self._limits.speed(speed_rad_per_s)
             self._history.move_sent(self._clock.now_s())
             self._pan_tilt.move(float(pan_rad), float(tilt_rad), speed)
-            self._settle_stop()
+            self._moved_s = time.monotonic()
 
         self._head.call("move", send, MOVE_TIMEOUT_S)
 
     def stop(self) -> None:
-        """Halt the head at once; moves still waiting are never sent.
-
-        The stop goes before everything that waits. If the head's thread hangs in an earlier call, the stop
-        is sent beside it from a thread of its own: a driver that is not made for two threads may then
-        answer badly, but a stop that arrives is worth more than an answer. When the hanging call comes
-        back, the stop is sent once more, since that call may have been a move.
+        """Halt the head at once, whatever hangs (`mastctl.stops`); moves still waiting are never sent.
 
         Raises
         ------
         NoReply, DriverError
             If the head did not confirm within 1 s; it may still move.
         """
-        deadline_s = time.monotonic() + STOP_TIMEOUT_S
-        with self._gate:
-            self._stops += 1
-        waiting = self._head.submit("stop", self._pan_tilt.stop, STOP_TIMEOUT_S, first=True)
-        try:
-            waiting.result(min(STOP_PATIENCE_S, STOP_TIMEOUT_S))
-            return
-        except TimeoutError:
-            if not waiting.cancel():  # under way already
-                self._head.wait("stop", waiting, deadline_s)
-                return
-        with self._gate:
-            self._stop_owed = True
-        self._stop_beside(deadline_s)
+        self._stops.send(STOP_TIMEOUT_S)
 
     def block_moves(self, reason: str) -> None:
         """Refuse every further move, with this reason, until `allow_moves`."""
@@ -254,7 +263,7 @@ class Devices:
             frames = self._fetched(dict.fromkeys(names, exposed_after_s), deadline_s)
             return {name: self._stamped(name, frame) for name, frame in frames.items()}
         used_s = max(self._paired_s.get(name, -math.inf) for name in names)
-        pairing = Pairing(names[0], self._offsets(names))
+        pairing = Pairing(names[0], self._offsets(names, deadline_s))
         frames = self._fetched(pairing.moments(max(exposed_after_s, used_s)), deadline_s)
         while after_s := pairing.again(frames):
             if time.monotonic() > deadline_s:
@@ -264,13 +273,22 @@ class Devices:
         self._paired_s |= {name: frame.exposure_began_s for name, frame in frames.items()}
         return self._together({name: self._stamped(name, frame) for name, frame in frames.items()})
 
-    def _offsets(self, names: Sequence[str]) -> dict[str, Offset]:
+    def _offsets(self, names: Sequence[str], deadline_s: float) -> dict[str, Offset]:
         """What is known of each camera's times beside the first one's."""
         first = names[0]
+        asked: dict[str, Asked[_Times | None]] = {}
+        for name in names:
+            tell = partial(self._times_of, name)
+            left_s = max(0.0, deadline_s - time.monotonic())
+            asked[name] = self._camera_threads[name].submit("recent_times", tell, left_s + self._grace_s)
+        times = {
+            name: self._camera_threads[name].wait(told, deadline_s + self._grace_s)
+            for name, told in asked.items()
+        }
         for name in names[1:]:
             before = self._learned.get((first, name))
             try:
-                self._learned[first, name] = learned(self._cameras[first], self._cameras[name], before)
+                self._learned[first, name] = learned(times[first], times[name], before)
             except Exception as error:
                 words = f"the drivers tell no times of {first} and {name}: {type(error).__name__}: {error}"
                 raise DriverError(words, device=name) from None
@@ -280,14 +298,14 @@ class Devices:
         self, after_s: Mapping[str, float], deadline_s: float
     ) -> dict[str, CheckedFrame | StampedFrame]:
         """One frame of each named camera, exposed after its moment."""
-        asked: dict[str, Future[CheckedFrame | StampedFrame]] = {}
+        asked: dict[str, Asked[CheckedFrame | StampedFrame]] = {}
         for camera, exposed_after_s in after_s.items():
             take = self._taker(camera, exposed_after_s, deadline_s)
             left_s = max(0.0, deadline_s - time.monotonic())
             asked[camera] = self._camera_threads[camera].submit("next_frame", take, left_s + self._grace_s)
         return {
-            camera: self._camera_threads[camera].wait("next_frame", future, deadline_s + self._grace_s)
-            for camera, future in asked.items()
+            camera: self._camera_threads[camera].wait(told, deadline_s + self._grace_s)
+            for camera, told in asked.items()
         }
 
     def _stamped(self, camera: str, frame: CheckedFrame | StampedFrame) -> StampedFrame:
@@ -327,12 +345,20 @@ class Devices:
 
     @contextmanager
     def exposure_held(self) -> Iterator[None]:
-        """Keep every camera's exposure as it is inside the block: a measurement compares its pictures."""
-        with ExitStack() as stack:
-            for camera in self._cameras.values():
-                if isinstance(camera, HoldsExposure):
-                    stack.enter_context(camera.exposure_held())
+        """Keep every camera's exposure as it is inside the block: a measurement compares its pictures.
+
+        Nothing is waited for; see `mastctl.exposure_hold`.
+        """
+        holds = [
+            ExposureHold(thread, partial(self._cameras.__getitem__, name))
+            for name, thread in self._camera_threads.items()
+        ]
+        begun = [hold for hold in holds if hold.begin()]
+        try:
             yield
+        finally:
+            for hold in begun:
+                hold.end()
 
     # All
 
@@ -347,11 +373,14 @@ class Devices:
 
     def faults(self) -> tuple[Fault, ...]:
         """Return what is wrong with any device now, what the head reports about itself included."""
-        found = list(self._head.faults())
+        found = [*self._head.faults(), *self._stops.faults()]
         reading = self._history.newest
         if reading is not None:
             found += [
-                Fault(HEAD, "device_fault", f"{HEAD}: {word}", reading.time_s) for word in reading.faults
+                Fault(
+                    HEAD, "device_fault", f"{HEAD}: {word}", reading.time_s, "the head no longer reports it"
+                )
+                for word in reading.faults
             ]
         for thread in self._camera_threads.values():
             found += thread.faults()
@@ -384,14 +413,18 @@ class Devices:
         if reading.faults != self._last_faults:
             self._last_faults = tuple(reading.faults)
             log.warning("%s reports: %s", HEAD, "; ".join(reading.faults) or "healthy again")
-        self._settle_stop()
+        if not reading.moving and time.monotonic() - self._moved_s > REST_S:
+            self._moved_s = math.inf
+            self._stops.proved()
         return reading
 
     def _thread_of(self, camera: str) -> DeviceThread:
         """The thread of a camera; that of an absent one looks after it, and tells its absence as a fault."""
         if not isinstance(self._cameras[camera], AbsentCamera):
-            return DeviceThread(camera)
-        return DeviceThread(camera, between=lambda: self._join(camera), between_name="next_frame")
+            return DeviceThread(camera, words=WORDS)
+        return DeviceThread(
+            camera, between=lambda: self._join(camera), between_name="next_frame", words=WORDS
+        )
 
     def _join(self, name: str) -> None:
         """Put a camera that was absent at the start in its place, if it is there. Raises DriverError."""
@@ -401,21 +434,49 @@ class Devices:
             log.warning("%s is here", name)
         self._check_size(name)
 
+    def _check_sizes(self) -> None:
+        """Pass cameras that do not tell their size now, or have the mast file's. Raises BadFrame."""
+        until_s = time.monotonic() + SIZE_TIMEOUT_S
+        asked = {
+            name: thread.submit("size_px", partial(self._check_size, name), SIZE_TIMEOUT_S, told=False)
+            for name, thread in self._camera_threads.items()
+        }
+        for name, told in asked.items():
+            try:
+                self._camera_threads[name].wait(told, until_s)
+            except BadFrame:
+                for thread in self._camera_threads.values():
+                    thread.close(0.1)
+                raise
+            except DriverError as error:
+                log.warning("%s; the size is seen in its pictures", error)
+
     def _check_size(self, name: str) -> None:
         """Pass a camera that does not know its size, or has the mast file's. Raises BadFrame."""
         camera = self._cameras[name]
         if isinstance(camera, KnowsSize) and name in self._sizes_px:
-            frame_checks.check_size(name, camera.size_px, self._sizes_px[name])
+            width, height = camera.size_px
+            frame_checks.check_size(name, (int(width), int(height)), self._sizes_px[name])
 
     def _poll(self) -> float:
         return MOVING_PERIOD_S if self._read_once().moving else RESTING_PERIOD_S
 
-    def _settle_stop(self) -> None:
-        """Send the stop that went out beside this thread once more, now in order."""
-        with self._gate:
-            owed, self._stop_owed = self._stop_owed, False
-        if owed:
-            self._pan_tilt.stop()
+    def _reported(self) -> Mapping[str, AxisReport]:
+        head = self._pan_tilt
+        told = dict(head.report()) if isinstance(head, Reporting) else {}
+        for axis in told.values():
+            if not isinstance(axis, AxisReport):
+                words = f"report returned {type(axis).__name__} where an AxisReport is expected"
+                raise BadReply(words, device=HEAD)
+        return told
+
+    def _times_of(self, name: str) -> _Times | None:
+        """What a camera tells of its frames' times; None if it is not `Paced`."""
+        camera = self._cameras[name]
+        if not isinstance(camera, Paced):
+            return None
+        recent = [FrameTime(one.sequence, one.exposure_began_s) for one in camera.recent_times()]
+        return _Times(float(camera.period_s), str(camera.trigger), recent)
 
     def _taker(
         self, camera: str, exposed_after_s: float, deadline_s: float
@@ -481,30 +542,17 @@ class Devices:
                 device=frame.camera,
             )
 
-    def _stop_beside(self, deadline_s: float) -> None:
-        """Send a stop from a thread of its own, because the head's thread hangs."""
-        outcome: Future[None] = Future()
 
-        def send() -> None:
-            try:
-                self._pan_tilt.stop()
-                outcome.set_result(None)
-            except BaseException as error:  # whatever a driver raises must reach the caller as a typed error
-                outcome.set_exception(error)
+@dataclass(frozen=True)
+class _Times:
+    """A camera's times as it told them: what `drivers.pairing.learned` asks for."""
 
-        threading.Thread(target=send, name="stop beside", daemon=True).start()
-        try:
-            outcome.result(max(0.0, deadline_s - time.monotonic()))
-        except TimeoutError:
-            raise NoReply(
-                "stop did not end within its deadline; the head may still move", device=HEAD
-            ) from None
-        except DriverError:
-            raise
-        except BaseException as error:
-            raise DriverError(
-                f"the driver failed in stop: {type(error).__name__}: {error}", device=HEAD
-            ) from None
+    period_s: float
+    trigger: str
+    recent: Sequence[FrameTime]
+
+    def recent_times(self) -> Sequence[FrameTime]:
+        return self.recent
 
 
 def _check_order(frame: CheckedFrame, newest: StampedFrame) -> None:

@@ -84,7 +84,13 @@ class HandoffCheck:
             asked_s = self._asked_s
         if asked_s is not None and self._clock.now_s() - asked_s > SLOW_S:
             faults.append(
-                Fault(NAME, "slow", f"{self._path} does not answer; hand-offs wait for it", asked_s)
+                Fault(
+                    NAME,
+                    "slow",
+                    f"{self._path} does not answer; hand-offs wait for it",
+                    asked_s,
+                    "the file answers",
+                )
             )
         return tuple(faults)
 
@@ -129,7 +135,9 @@ class HandoffCheck:
         except (BadFile, OSError) as error:
             words = f"{' '.join(str(error).split())}; what was written down before does not count"
             with self._lock:
-                self._unread = Fault(NAME, "unreadable", words, self._clock.now_s())
+                self._unread = Fault(
+                    NAME, "unreadable", words, self._clock.now_s(), "the file is right at the next start"
+                )
             log.error("%s", words)
             before = ()
         with self._lock:
@@ -154,7 +162,9 @@ class HandoffCheck:
         with self._lock:
             before = self._unwritten
             since_s = self._clock.now_s() if before is None else before.since_s
-            self._unwritten = Fault(NAME, "unwritable", words, since_s) if words else None
+            self._unwritten = (
+                Fault(NAME, "unwritable", words, since_s, "a hand-off is written down") if words else None
+            )
         if words and before is None:
             log.error("%s", words)
 

@@ -138,6 +138,7 @@ class State:
                     "device": fault.device,
                     "code": fault.code,
                     "message": fault.message,
+                    "until": fault.until,
                     "for_s": max(0.0, self.now_s - fault.since_s),
                 }
                 for fault in self.faults

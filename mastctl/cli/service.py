@@ -248,7 +248,10 @@ def _status_rows(status: dict[str, Any]) -> Iterator[tuple[str, str]]:
 
 
 def _fault_lines(status: dict[str, Any]) -> list[str]:
-    return [f"fault: {fault['message']} (for {fault['for_s']:.0f} s)" for fault in status["faults"]]
+    return [
+        f"fault: {fault['message']} (for {fault['for_s']:.0f} s, until {fault['until']})"
+        for fault in status["faults"]
+    ]
 
 
 def _camera_pixel(words: list[str] | None) -> tuple[str, float, float] | None:

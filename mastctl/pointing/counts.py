@@ -8,11 +8,14 @@ from typing import Any
 import numpy as np
 
 from calib.cahvor import CameraModel
+from drivers.errors import DriverError
 from drivers.interfaces import AxisReport
 
 
 def counts_told(head: object, tilt_rad: float, model: CameraModel | None) -> dict[str, Any]:
     """Return goal, measured count and what is left between command and measurement, for each axis.
+
+    A head that fails to tell has ``counts_missing`` instead, which says why: nothing fails by it.
 
     Parameters
     ----------
@@ -24,7 +27,10 @@ def counts_told(head: object, tilt_rad: float, model: CameraModel | None) -> dic
         The aiming camera, for the pixels; None for joint angles alone.
     """
     report = getattr(head, "report", None)
-    axes: dict[str, AxisReport] = dict(report()) if report is not None else {}
+    try:
+        axes: dict[str, AxisReport] = dict(report()) if report is not None else {}
+    except DriverError as error:
+        return {"counts_missing": str(error)}
     told: dict[str, Any] = {}
     for name, axis in axes.items():
         told[name] = {
