@@ -88,10 +88,17 @@ def align(
     Raises
     ------
     NotAligned
-        If there are fewer than three points, or they stand on one line.
+        If there are fewer than three points, they stand on one line, or a number is not finite.
+    ValueError
+        If the lists are not equally long, or a sigma is not above 0.
     """
     a, b = (np.asarray(points, dtype=np.float64).reshape(-1, 3) for points in (points_in_a_m, points_in_b_m))
-    sigma = np.broadcast_to(np.asarray(sigma_m, dtype=np.float64), len(a))
+    if not len(a) == len(b) == len(names):
+        raise ValueError(f"{len(a)} points, {len(b)} points and {len(names)} names do not go together")
+    for name, one, other in zip(names, a, b, strict=True):
+        if not (np.isfinite(one).all() and np.isfinite(other).all()):
+            raise NotAligned(f"point {name} is at {one.tolist()} and {other.tolist()}, which is no place")
+    sigma = _sigma(sigma_m, len(a))
     used = np.ones(len(a), dtype=bool)
     rejected: list[str] = []
     while True:
@@ -124,7 +131,7 @@ def mirrored(points_in_a_m: ArrayLike, points_in_b_m: ArrayLike, sigma_m: float)
     a, b = (np.asarray(points, dtype=np.float64).reshape(-1, 3) for points in (points_in_a_m, points_in_b_m))
     if len(a) < 4:
         return False
-    sigma = np.full(len(a), sigma_m)
+    sigma = _sigma(sigma_m, len(a))
     image = a * np.array([1.0, 1.0, -1.0])
     try:
         fits = [_chi2(_pose(c, b, sigma, []), c, b, sigma) for c in (a, image)]
@@ -188,6 +195,14 @@ def station_from_board(
         except NotAligned as error:
             raise NotAligned(f"tapes of placement {placement} in set-up {setup}: {error}") from None
     return poses
+
+
+def _sigma(sigma_m: ArrayLike, count: int) -> FloatArray:
+    """One sigma for each point; ValueError if it is none."""
+    sigma = np.broadcast_to(np.asarray(sigma_m, dtype=np.float64), count)
+    if not ((sigma > 0.0) & np.isfinite(sigma)).all():
+        raise ValueError(f"sigma_m is {sigma.tolist()} where finite numbers above 0 are expected")
+    return sigma
 
 
 def _pose(a: FloatArray, b: FloatArray, sigma: FloatArray, names: Sequence[str]) -> Rigid:

@@ -21,7 +21,7 @@ from numpy.typing import ArrayLike
 from calib.lens import Lens
 from calib.projection import Place, Projection
 from calib.published import project_as_published
-from calib.rigid import FloatArray, Rigid, frozen_array
+from calib.rigid import FloatArray, ReadOnlyArrays, Rigid, frozen_array
 
 Kind = Literal["CAHV", "CAHVOR", "CAHVORE"]
 
@@ -47,7 +47,7 @@ class Rays(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class CameraModel:
+class CameraModel(ReadOnlyArrays):
     """One camera of the CAHV family; A and O are unit vectors (see ``normalised``).
 
     Attributes
@@ -154,6 +154,8 @@ class CameraModel:
         r0, r1, r2 = self.R.tolist()
         e0, e1, e2 = self.E.tolist()
         slope_from_pixel = np.asarray(np.linalg.inv(pixel_from_slope), dtype=np.float64)
+        for matrix in (pixel_from_slope, slope_from_pixel):
+            matrix.setflags(write=False)
         lens = Lens(
             (r0, r1, r2),
             (e0, e1, e2),

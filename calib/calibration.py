@@ -31,7 +31,9 @@ class Outlier:
         Which one: ``image navcam_left-012``, ``image navcam_left-012 dot (row 3, column 4)``,
         ``tape b of placement far-2 (set-up level)``, ``prism p3 of set-up level``.
     statistic, limit
-        Sum of squares of its standardised residuals, and what it may be at the stated rate of false alarms.
+        Sum of squares of its standardised residuals, and what it was allowed to be: at the stated rate of
+        false alarms, wider where the typical measurement is farther off than its sigma says. Not-a-number
+        for an image that was left out with its board's tapes.
     size
         How far off it is: pixels (rms over an image) or metres. Not-a-number for an image whose board,
         as it is named, the camera cannot see.

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from calib.dot_board import MOST_MISSING, BoardGrid, DetectionFailure, best_grid
-from calib.dot_candidates import Candidates, Image, dot_candidates
+from calib.dot_candidates import Candidates, Image, Levels, dot_candidates
 from calib.dot_grid import IntArray
 from calib.dot_map import fit_plane_map
 from calib.dot_order import Ordered, expected_steps_px, order_by_gravity, order_by_steps
@@ -53,14 +53,15 @@ class DotsFound(NamedTuple):
 
 
 def find_dots(
-    image: Image, board: Board, expected: Predicted | Upright | None = None
+    image: Levels, board: Board, expected: Predicted | Upright | None = None
 ) -> DotsFound | DetectionFailure:
     """Return the dots of the board in an image, or why there are none.
 
     Parameters
     ----------
     image
-        (h, w) grey levels; the centre of the top-left pixel is (0, 0).
+        (h, w) grey levels of 8 or 16 bits; the centre of the top-left pixel is (0, 0). Of 16 bits all count
+        where dots are measured; they are looked for in what 8 bits hold of the levels that occur.
     board
         Rows, columns, spacing and diameter.
     expected
@@ -72,10 +73,11 @@ def find_dots(
     Raises
     ------
     ValueError
-        If the image is not a (h, w) array of uint8.
+        If the image is not a (h, w) array of uint8 or uint16.
     """
-    if image.ndim != 2 or image.dtype != np.uint8:
-        raise ValueError(f"an image of {image.shape} {image.dtype} where (h, w) uint8 is expected")
+    if image.ndim != 2 or image.dtype not in (np.uint8, np.uint16):
+        raise ValueError(f"an image of {image.shape} {image.dtype} where (h, w) uint8 or uint16 is expected")
+    levels, image = image, _in_8_bits(image)
     steps_px = None
     if isinstance(expected, Predicted):
         no_hope = hopeless(expected)
@@ -94,7 +96,7 @@ def find_dots(
             result = (
                 DetectionFailure(_unsure(steps_px))
                 if ordered is None
-                else _measured(image, board, grid, ordered)
+                else _measured(levels, board, grid, ordered)
             )
             if isinstance(result, DotsFound):
                 return result
@@ -105,6 +107,15 @@ def find_dots(
         if reached > furthest:
             furthest, failure = reached, result
     return failure
+
+
+def _in_8_bits(image: Levels) -> Image:
+    """The image in 8 bits: all levels but the darkest and the brightest thousandth, spread over them."""
+    if image.dtype == np.uint8:
+        return image.astype(np.uint8, copy=False)
+    dark, bright = np.percentile(image, (0.1, 99.9))
+    spread = (image - dark) * (255.0 / max(bright - dark, 1.0))
+    return np.asarray(np.clip(np.rint(spread), 0, 255), dtype=np.uint8)
 
 
 def _unsure(steps_px: FloatArray | None) -> str:
@@ -128,7 +139,7 @@ def _ordered(
     return order_by_steps(grid.places, grid.counts, steps, board, np.eye(2) if steps_px is None else steps_px)
 
 
-def _measured(image: Image, board: Board, grid: BoardGrid, ordered: Ordered) -> DotsFound | DetectionFailure:
+def _measured(image: Levels, board: Board, grid: BoardGrid, ordered: Ordered) -> DotsFound | DetectionFailure:
     """Fit every dot of the grid and correct for the shape of circles."""
     points = board.dots_in_board_m(ordered.rows, ordered.columns)[:, :2]
     radius = board.dot_diameter_m / 2

@@ -101,7 +101,9 @@ def find_in_file(
     if spoiled is not None:
         return DetectionFailure(f"{path.name} is not a picture that can be read: {spoiled}")
     content = np.frombuffer(data, dtype=np.uint8)
-    image = cv2.imdecode(content, cv2.IMREAD_GRAYSCALE) if len(content) else None
+    # The pixels as the file has them: all bits, and not turned as a camera's tag may ask.
+    how = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
+    image = cv2.imdecode(content, how) if len(content) else None
     if image is None:
         return DetectionFailure(f"{path.name} is not a picture that can be read")
     height, width = image.shape[:2]
@@ -109,7 +111,9 @@ def find_in_file(
         return DetectionFailure(
             f"{path.name} is {width} x {height} px where {size_px[0]} x {size_px[1]} are expected"
         )
-    return find_dots(np.asarray(image, dtype=np.uint8), board, expected)
+    if image.dtype not in (np.uint8, np.uint16):
+        return DetectionFailure(f"{path.name} holds {image.dtype} where 8 or 16 bits a pixel are expected")
+    return find_dots(image, board, expected)  # type: ignore[arg-type]  # of OpenCV's many types one of those
 
 
 def expectations(survey: Survey) -> dict[str, Predicted | Upright | None]:

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from calib.rigid import FloatArray
 
 Image = NDArray[np.uint8]
+Levels = NDArray[np.uint8] | NDArray[np.uint16]
 
 WIDEST_RATIO = (
     3.5  # major to minor axis: beyond this a board is seen too flatly for its dots to be told apart

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr
 
-from calib.dot_candidates import Image
+from calib.dot_candidates import Image, Levels
 from calib.rigid import FloatArray
 
 REACH = 2.0
@@ -54,7 +54,7 @@ class Refined(NamedTuple):
     noise_dn: FloatArray
 
 
-def refine_dots(image: Image, middles_px: FloatArray, shapes_px: FloatArray) -> Refined:
+def refine_dots(image: Levels, middles_px: FloatArray, shapes_px: FloatArray) -> Refined:
     """Fit dots whose places are known to a pixel.
 
     Parameters
@@ -100,7 +100,7 @@ def refine_dots(image: Image, middles_px: FloatArray, shapes_px: FloatArray) -> 
     noise = np.sqrt(square / np.maximum(freedom, 1.0))
     covariance = np.linalg.inv(normal + 1e-6 * _diagonals(normal) + 1e-12 * np.eye(PARAMETERS))
     sigma = noise * np.sqrt((covariance[:, 0, 0] + covariance[:, 1, 1]) / 2)
-    good = (freedom > 0) & (np.linalg.norm(state[:, :2], axis=1) < farthest)
+    good = (freedom > 0) & ~open_ & (np.linalg.norm(state[:, :2], axis=1) < farthest)
     good &= (state[:, 7] > 0.0) & (state[:, 2] > 0.5) & (state[:, 2] < 2.0)
     out = [middles_px + state[:, :2], sigma]
     out += [state[:, 2], state[:, 4] * state[:, 7], noise]
@@ -128,7 +128,7 @@ def centred(image: Image, middles_px: FloatArray, shapes_px: FloatArray) -> Floa
 
 
 def _patches(
-    image: Image, middles_px: FloatArray, shapes_px: FloatArray
+    image: Levels, middles_px: FloatArray, shapes_px: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return u (n, p, 2), pixels from the middle; grey levels (n, p); weights (n, p), 0 or 1."""
     lengths = np.linalg.svd(shapes_px, compute_uv=False)

@@ -39,7 +39,8 @@ def _one_line(text: str, limit: int) -> str:
 class Unreachable(CalibError):
     """No joint angles bring the target onto the pixel; ``code`` names the cause for programs.
 
-    Codes: ``blind_cone``, ``too_near``, ``outside_limits``, ``bad_pixel``, ``bad_target``, ``parallel_axes``.
+    Codes: ``blind_cone``, ``too_near``, ``outside_limits``, ``bad_pixel``, ``bad_target``, ``parallel_axes``,
+    ``bad_joints``.
     """
 
     def __init__(self, code: str, message: str) -> None:
@@ -72,7 +73,7 @@ class NoHandoff(CalibError):
 class NoCorrection(CalibError):
     """Hand-offs that give no correction of the body cameras; ``code`` names the cause for programs.
 
-    Codes: ``too_few``, ``one_sided``, ``inconsistent``, ``not_significant``.
+    Codes: ``too_few``, ``one_sided``, ``inconsistent``, ``not_significant``, ``not_settled``.
     """
 
     def __init__(self, code: str, message: str) -> None:

@@ -55,6 +55,7 @@ def fit_body_pose(rig: Rig, cameras: Sequence[str], handoffs: Sequence[MatchedHa
     NoCorrection
         ``too_few``: fewer than eight hand-offs. ``one_sided``: the found pixels span less than a fifth of
         the picture. ``inconsistent``: more than a third of the hand-offs contradict the rest.
+        ``not_settled``: the fit did not.
     """
     every = body_sights(rig, cameras, handoffs)
     _enough(every)
@@ -68,6 +69,11 @@ def fit_body_pose(rig: Rig, cameras: Sequence[str], handoffs: Sequence[MatchedHa
     used = _part(every, keep)
     _enough(used)
     fit = _fit(used)
+    if not fit.settled:
+        raise NoCorrection(
+            "not_settled",
+            f"the fit of {_named(cameras)} did not settle in {_STEPS} steps; the hand-offs hardly fix it",
+        )
     left_out = [
         LeftOut(one.name, gap.across_px, gap.sigmas**2, MOST_SIGMAS**2, one_point=False)
         for one, gap in every.apart
@@ -89,6 +95,7 @@ class _Fit:
     scale: float
     freedom: float
     chi2: float
+    settled: bool
 
     @property
     def covariance(self) -> FloatArray:
@@ -97,8 +104,10 @@ class _Fit:
 
 _PRIOR_SIGMA = np.array([PRIOR_SHIFT_M] * 3 + [PRIOR_TURN_RAD] * 3)
 _PRIOR = np.diag(1.0 / _PRIOR_SIGMA**2)
-_STEPS, _ROBUST_STEPS = 4, 10
-"""Of Gauss and Newton: a turn by 5 mrad is all but linear; weights by residuals take longer to settle."""
+_STEPS, _ROBUST_STEPS = 20, 10
+"""Of Gauss and Newton at most. Weights by residuals need not settle: they only find what to leave out."""
+_ENOUGH = 1e-3
+"""A step shorter than this, in sigmas, is none."""
 
 
 def _enough(sights: BodySights) -> None:
@@ -137,7 +146,7 @@ def _normal(at: Equations, weights: FloatArray) -> tuple[FloatArray, FloatArray,
 
 def _fit(sights: BodySights, robust: bool = False) -> _Fit:
     """Gauss-Newton; ``robust`` weighs hand-offs down by Huber's rule beyond the 95 % point."""
-    step, scale = np.zeros(6), 1.0
+    step, scale, settled = np.zeros(6), 1.0, False
     before = at = sights.equations(step)
     numbers = 2 * sights.seen.sum(axis=1)
     bend = chdtri(numbers, 0.05)
@@ -147,15 +156,20 @@ def _fit(sights: BodySights, robust: bool = False) -> _Fit:
             statistics = _normal(at, weights)[2] / scale
             weights = np.minimum(1.0, np.sqrt(bend / np.maximum(statistics, 1e-300)))
         information, gradient, _ = _normal(at, weights)
-        step = step + np.linalg.solve(information / scale + _PRIOR, gradient / scale - _PRIOR @ step)
+        normal = information / scale + _PRIOR
+        change = np.linalg.solve(normal, gradient / scale - _PRIOR @ step)
+        step = step + change
+        settled = bool(change @ normal @ change < _ENOUGH**2)
         at = sights.equations(step)
         statistics = _normal(at, weights)[2]
         fitted = np.trace(np.linalg.solve(information / scale + _PRIOR, information / scale))
         freedom = max(float(numbers.sum() - fitted), 1.0)
         typical = _typical(statistics, numbers) if robust else float(statistics.sum()) / freedom
         scale = max(1.0, typical)
+        if settled:
+            break
     information, _, statistics = _normal(at, np.ones(len(numbers)))
-    return _Fit(step, before, at, information, scale, freedom, float(statistics.sum()))
+    return _Fit(step, before, at, information, scale, freedom, float(statistics.sum()), settled)
 
 
 def _typical(statistics: FloatArray, numbers: np.ndarray) -> float:

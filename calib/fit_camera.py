@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from itertools import combinations
+from math import comb
 
 import cv2
 import numpy as np
@@ -36,6 +36,9 @@ POINTS_OF_IMAGE = 9
 
 WIDEST_RAD = np.radians(80.0)
 """A fish-eye's points beyond this angle from its axis do not take part in a start."""
+
+LAST_STEPS = 500
+"""Steps at most of the last fit, which must settle: a narrow field hardly tells the lens, and took 170."""
 
 GROSS = 6.0
 """An image is another board's if its rms is this many times the typical image's (and above its noise)."""
@@ -62,6 +65,8 @@ class CameraFit:
         (n,) which points took part.
     rms_px
         (2,) of those, along x and y.
+    limit_px
+        An image whose dots are farther off than this, rms of their distances, did not take part.
     """
 
     model: CameraModel
@@ -69,6 +74,7 @@ class CameraFit:
     residuals_px: FloatArray
     used: np.ndarray
     rms_px: FloatArray
+    limit_px: float
 
 
 def fit_camera(
@@ -123,7 +129,7 @@ def fit_camera(
             break
     if best is None or _typical(best, images) > GROSS * expected:
         how = (
-            "no start led to a camera"
+            "no start led to a camera at which the fit settled"
             if best is None
             else f"the best one leaves {_typical(best, images):.1f} px"
         )
@@ -159,9 +165,10 @@ def _starts(
     count = int(images.max()) + 1
     some = [np.flatnonzero(images == i) for i in range(count)]
     some = [rows[np.linspace(0, len(rows) - 1, min(POINTS_OF_IMAGE, len(rows))).astype(int)] for rows in some]
-    every = list(combinations(range(count), min(IMAGES_IN_SAMPLE, count)))
-    if len(every) > SAMPLES:
-        every = [every[i] for i in rng.choice(len(every), SAMPLES, replace=False)]
+    size = min(IMAGES_IN_SAMPLE, count)
+    choices = comb(count, size)
+    drawn = range(choices) if choices <= SAMPLES else rng.choice(choices, SAMPLES, replace=False)
+    every = [_combination(count, size, int(number)) for number in drawn]
     probe = np.concatenate(some)
     for number in (2, 1) if kind == "CAHVORE" else (0,):
         for factor in FOCAL_FACTORS:
@@ -178,6 +185,20 @@ def _starts(
                     best, best_score = model, score
             if best is not None:
                 yield best
+
+
+def _combination(count: int, size: int, number: int) -> tuple[int, ...]:
+    """The combination of so many of ``range(count)`` that comes at ``number`` in rising order, from 0."""
+    chosen: list[int] = []
+    for at in range(count):
+        if len(chosen) == size:
+            break
+        with_this = comb(count - at - 1, size - len(chosen) - 1)
+        if number < with_this:
+            chosen.append(at)
+        else:
+            number -= with_this
+    return tuple(chosen)
 
 
 def pinhole(
@@ -266,7 +287,7 @@ def _fit_from(
     sigma_px: float,
     expected_px: float,
 ) -> CameraFit | None:
-    """Least squares from a start, or None if it leads nowhere."""
+    """Least squares from a start, or None if it leads nowhere or does not settle."""
     weak = np.ones(len(parameter_names(start.kind)))
     for letter in "HV":
         weak[parameter_part(start.kind, letter)] = 1 / float(start.H @ start.H)
@@ -283,13 +304,19 @@ def _fit_from(
         model = minimise(problem, model, weak=weak, steps=rounds, gain=1e-6).state
     seen, valid = model.project(points_m)
     rms = _image_rms(seen - pixels_px, images)
-    good = rms < GROSS * max(float(np.median(rms)), expected_px)
+    limit_px = GROSS * max(float(np.median(rms)), expected_px)
+    good = rms < limit_px
     used = valid & good[images]
     if used.sum() < 8 or len(np.unique(images[used])) < 2:
         return None
     found = minimise(
-        FixedPoints(points_m[used], pixels_px[used], np.full(int(used.sum()), sigma_px)), model, weak=weak
+        FixedPoints(points_m[used], pixels_px[used], np.full(int(used.sum()), sigma_px)),
+        model,
+        weak=weak,
+        steps=LAST_STEPS,
     )
+    if not found.settled:
+        return None
     model = found.state
     seen, _ = model.project(points_m)
     residuals = seen - pixels_px
@@ -297,4 +324,4 @@ def _fit_from(
     unit_weight = float(np.sum((residuals[used] / sigma_px) ** 2)) / freedom
     covariance = max(unit_weight, 1.0) * covariance_of(found.normal.matrix, weak)
     rms_px: FloatArray = np.sqrt((residuals[used] ** 2).mean(axis=0)).astype(np.float64)
-    return CameraFit(model, covariance, residuals, used, rms_px)
+    return CameraFit(model, covariance, residuals, used, rms_px, limit_px)

@@ -49,7 +49,8 @@ def fit_joint(survey: Survey, mast_parameters: int = 6) -> Calibration:
     Raises
     ------
     SurveyNotFitted
-        If the survey determines no start, or the fit ends far from the noise: it is never reported as done.
+        If the survey determines no start, the fit does not settle, or it ends far from the noise: it is never
+        reported as done.
     """
     began = time.perf_counter()
     from_here = start(survey, mast_parameters)
@@ -57,6 +58,7 @@ def fit_joint(survey: Survey, mast_parameters: int = 6) -> Calibration:
     problem, fit = without_blunders(problem, from_here)
     covariance = covariance_of(fit.normal.matrix, problem.weak)
     _refuse_wrong_minimum(problem, fit.state)
+    _refuse_unsettled(fit)
     return _calibration(survey, mast_parameters, from_here, problem, fit, covariance, began)
 
 
@@ -109,6 +111,14 @@ def _refuse_lost(fit: Minimum[Estimate]) -> None:
     if not np.isfinite(fit.normal.cost):
         raise SurveyNotFitted(
             "the fit starts where a camera does not see a dot that it saw: no start was found"
+        )
+
+
+def _refuse_unsettled(fit: Minimum[Estimate]) -> None:
+    if not fit.settled:
+        raise SurveyNotFitted(
+            f"the fit did not settle: after {fit.steps} steps it was still finding better values, so that "
+            "neither they nor their sigmas are good; take more images, at more joint angles and distances"
         )
 
 

@@ -24,6 +24,9 @@ LEAN_STARTS_RAD = ((0.0, 0.0), (0.3, 0.0), (-0.3, 0.0), (0.0, 0.3), (0.0, -0.3))
 HEIGHT_STARTS_M = (0.0, 0.2, -0.2)
 """Where the head's origin may be below the mean of its cameras, metres."""
 
+LAST_STEPS = 100
+"""Steps at most of the last fit, which must settle."""
+
 GROSS = 6.0
 """An image is left out if its rms is this many times the typical image's and the expected one."""
 
@@ -57,11 +60,14 @@ class MastFit:
         Names of images that another board or other angles must belong to.
     rms_px
         (2,) of the images that took part.
+    limit_px
+        An image with a larger rms, per coordinate, was left out.
     """
 
     mast: FloatArray
     left_out: tuple[str, ...]
     rms_px: FloatArray
+    limit_px: float
 
 
 def fit_mast(
@@ -90,7 +96,7 @@ def fit_mast(
     Raises
     ------
     MastNotFitted
-        If no start leads to a mast that explains most images.
+        If no start leads to a mast at which the fit settles and that explains most images.
     """
     if not views:
         raise MastNotFitted("no image was taken away from the angles at which its camera is calibrated")
@@ -103,11 +109,16 @@ def fit_mast(
             best = found
         if best[0] < 3 * expected_px:
             break
-    if best is None or (best[0] > GROSS * expected_px and not keep_all):
-        left = np.inf if best is None else best[0]
+    if best is None or not np.isfinite(best[0]):
         raise MastNotFitted(
-            f"no mast explains the images: the best one leaves {left:.1f} px where some {expected_px:.2g} px "
-            "are expected; check pan and tilt (radians, right and up positive) and each image's placement; "
+            f"no start led to a mast at which the fit settled in {LAST_STEPS} steps; check pan and tilt "
+            "(radians, right and up positive), and take images at more joint angles"
+        )
+    if best[0] > GROSS * expected_px and not keep_all:
+        raise MastNotFitted(
+            f"no mast explains the images: the best one leaves {best[0]:.1f} px where some "
+            f"{expected_px:.2g} px are expected; check pan and tilt (radians, right and up positive) and "
+            "each image's placement; "
             "axes that do not meet at a right angle need eight parameters"
         )
     return best[1]
@@ -177,7 +188,7 @@ def _carried(view: MastView, mast: FloatArray, free: np.ndarray) -> tuple[FloatA
 def _fit_from(
     start: FloatArray, views: Sequence[MastView], mast_parameters: int, expected_px: float, keep_all: bool
 ) -> tuple[float, MastFit]:
-    """Typical residual of an image and the fit, from a start."""
+    """Typical residual of an image, infinite if the fit does not settle, and the fit, from a start."""
     mast = start
     few = [_thinned(view) for view in views]
     for steps, count in ((15, min(mast_parameters, 6)), (10, mast_parameters), (8, mast_parameters)):
@@ -189,16 +200,18 @@ def _fit_from(
         ).state
     rms = np.array([_rms(mast_residual(view, mast)) for view in views])
     typical = float(np.median(rms))
-    good = (rms <= GROSS * max(typical, expected_px)) | keep_all
+    limit_px = GROSS * max(typical, expected_px)
+    good = (rms <= limit_px) | keep_all
     kept = [view for view, keep in zip(views, good, strict=True) if keep]
     if np.isfinite(typical) and kept:
         sigmas = [np.ones(len(view.points_m)) for view in kept]
-        mast = minimise(_Images(kept, free, sigmas), mast, weak=weak, steps=30).state
+        last = minimise(_Images(kept, free, sigmas), mast, weak=weak, steps=LAST_STEPS)
+        mast, typical = last.state, typical if last.settled else np.inf
     else:
         kept = list(views)
     residuals = np.concatenate([mast_residual(view, mast) for view in kept])
     left_out = tuple(view.name for view, keep in zip(views, good, strict=True) if not keep)
-    return typical, MastFit(mast, left_out, np.sqrt((residuals**2).mean(axis=0)))
+    return typical, MastFit(mast, left_out, np.sqrt((residuals**2).mean(axis=0)), limit_px)
 
 
 def _seen(views: Sequence[MastView], mast: FloatArray) -> Sequence[MastView]:

@@ -10,14 +10,14 @@ left out beforehand (``calib.stray_dots``).
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from calib.adjustment import MAST, Adjustment
 from calib.cahvor import CameraModel
-from calib.calibration import Calibration, Outlier
+from calib.calibration import Calibration, ImageResiduals, Outlier
 from calib.fit_joint import estimate_values, mast_first, rig_of
 from calib.fit_mast import MastNotFitted, fit_mast
 from calib.fit_start import Start, SurveyNotFitted, at_setting, camera_from_points, mast_views, start
@@ -72,13 +72,14 @@ def _fit(survey: Survey, mast_parameters: int, began: float) -> Calibration:
         for t in from_here.images
         if purposes[t.name] == "mast" and t.camera in from_here.reference_rad and t.name not in left_out
     ]
-    doubtful = {n for n in from_here.doubtful if purposes[n] == "camera"}
+    of_camera = {t.name: t.camera for t in from_here.images}
+    doubtful = {n: from_here.limits_px[of_camera[n]] for n in from_here.doubtful if purposes[n] == "camera"}
     if mast_images:
         mast, doubtful = _mast_of(from_here, cameras, mast_images, mast_parameters, doubtful)
         if _carry(from_here, camera_images, mast) is not None:
-            cameras |= _cameras_again(survey, from_here, camera_images, mast, doubtful)
+            cameras |= _cameras_again(survey, from_here, camera_images, mast, set(doubtful))
             mast, doubtful = _mast_of(from_here, cameras, mast_images, mast_parameters, doubtful)
-    fitted = {t.name for t in (*camera_images, *mast_images)} - doubtful
+    fitted = {t.name for t in (*camera_images, *mast_images)} - set(doubtful)
     skipped = {t.name for t in from_here.images if t.name not in fitted}
     state = replace(from_here.estimate, cameras=_to_head(cameras, from_here, mast), mast=mast)
     wrong = {o.name for o in from_here.blunders}
@@ -115,7 +116,7 @@ def _fit(survey: Survey, mast_parameters: int, began: float) -> Calibration:
         sigma=sigma,
         rms_px=rms_by_camera(images),
         check_rms_px=check_rms(survey, state, images),
-        outliers=(*from_here.blunders, *_left_out(images, from_here, doubtful | left_out)),
+        outliers=(*from_here.blunders, *_left_out(images, {**dict.fromkeys(left_out, np.nan), **doubtful})),
         false_alarms=0.0,
         degenerate=open_directions(problem, names, mast_alone),
         notes=tuple(notes),
@@ -149,9 +150,9 @@ def _mast_of(
     cameras: Mapping[str, CameraModel],
     mast_images: list[ImageTerm],
     mast_parameters: int,
-    doubtful: set[str],
-) -> tuple[FloatArray, set[str]]:
-    """The mast, and the doubtful images with those that do not fit it."""
+    doubtful: Mapping[str, float],
+) -> tuple[FloatArray, dict[str, float]]:
+    """The mast, and the doubtful images with those that do not fit it; by name the limit they failed, px."""
     views = mast_views(mast_images, cameras, from_here.reference_rad, from_here.estimate.rover_from_board)
     rough = from_here.estimate.mast.copy()
     if mast_parameters == 4:
@@ -163,7 +164,7 @@ def _mast_of(
         )
     except MastNotFitted as error:
         raise SurveyNotFitted(f"mast: {error}") from None
-    return fit.mast, doubtful | set(fit.left_out)
+    return fit.mast, {**doubtful, **dict.fromkeys(fit.left_out, float(np.sqrt(2) * fit.limit_px))}
 
 
 def _carry(
@@ -219,14 +220,17 @@ def _bent_notes(from_here: Start) -> list[str]:
     ]
 
 
-def _left_out(images: tuple, from_here: Start, doubtful: set[str]) -> list[Outlier]:  # type: ignore[type-arg]
-    """The images left out, with how far they are off."""
+def _left_out(images: Sequence[ImageResiduals], doubtful: Mapping[str, float]) -> list[Outlier]:
+    """The images left out, with how far they are off and the limit that they failed, nan if by no test.
+
+    ``doubtful`` holds the rms distance of an image's dots, px, that would have been allowed.
+    """
     found = []
     for image in images:
         if image.name not in doubtful:
             continue
         in_sigmas = image.residuals_px / image.sigma_px[:, None]
         size = float(np.sqrt(np.mean(np.sum(image.residuals_px**2, axis=1))))
-        limit = len(in_sigmas) * 2 * (6 * from_here.expected_px[image.camera] / image.sigma_px.mean()) ** 2
-        found.append(Outlier("image", f"image {image.name}", float(np.sum(in_sigmas**2)), float(limit), size))
+        limit = float(np.sum((doubtful[image.name] / image.sigma_px) ** 2))
+        found.append(Outlier("image", f"image {image.name}", float(np.sum(in_sigmas**2)), limit, size))
     return found

@@ -113,8 +113,8 @@ def fit_poses(
     Raises
     ------
     PosesTooFew
-        If the poses do not fix the parameters: fewer than three, a joint that hardly moves, or no mast
-        near which the camera sees what the models see.
+        If the poses do not fix the parameters: fewer than three, a joint that hardly moves, no mast near
+        which the camera sees what the models see, or a fit that does not settle.
     ValueError
         If the numbers of models and angles differ, or an angle is not finite.
     """
@@ -141,6 +141,11 @@ def fit_poses(
     names = (*(f"mast.{MAST_NAMES[i]}" for i in problem.free), *CAMERA_NAMES)
     weak = np.full(len(names), WEAK)
     _check_determined(names, covariance_of(fit.normal.matrix, weak), weak, pan, tilt)
+    if not fit.settled:
+        raise PosesTooFew(
+            f"the fit did not settle in {fit.steps} steps: the poses hardly fix the mast; add poses that "
+            "move both joints"
+        )
     state = fit.state
     differences = (
         model_difference(model, state.camera.moved(mast_of(state.mast).rover_from_head(p, t)))

@@ -42,8 +42,9 @@ class Start:
     """A start: terms of the fit, the state to begin with, and images that did not agree with it.
 
     ``reference_rad`` holds, for each head camera, the joint setting at which it was calibrated, and
-    ``in_rover`` the cameras there, in the rover frame. ``bent`` are placements whose tapes do not fit the
-    board, ``blunders`` prisms and tapes that the poses were found without.
+    ``in_rover`` the cameras there, in the rover frame. ``limits_px`` holds, for each camera, how far off (rms
+    of the distances) the dots of an image may be that takes part. ``bent`` are placements whose tapes do not
+    fit the board, ``blunders`` prisms and tapes that the poses were found without.
     """
 
     images: tuple[ImageTerm, ...]
@@ -54,6 +55,7 @@ class Start:
     reference_rad: Mapping[str, tuple[float, float]]
     in_rover: Mapping[str, CameraModel]
     expected_px: Mapping[str, float]
+    limits_px: Mapping[str, float]
     bent: frozenset[tuple[str, str]]
     blunders: tuple[Outlier, ...]
     notes: tuple[str, ...]
@@ -76,7 +78,7 @@ def start(survey: Survey, mast_parameters: int, *, only_camera_images: bool = Fa
     notes, rover_from_board, bent = list(station.notes), station.rover_from_board, station.bent
     images, checks, joints = image_terms(survey, rover_from_board, notes)
     doubtful: set[str] = set()
-    in_rover, reference, expected = {}, {}, {}
+    in_rover, reference, expected, limits = {}, {}, {}, {}
     for name in survey.cameras:
         mine = [t for t in images if t.camera == name and t.board not in bent]
         if only_camera_images:
@@ -87,7 +89,8 @@ def start(survey: Survey, mast_parameters: int, *, only_camera_images: bool = Fa
             continue
         at, group = _largest_setting(mine, survey.sigma.joint_rad)
         expected[name] = _expected_px(survey, name, group, rover_from_board)
-        in_rover[name] = _camera(survey, name, group, rover_from_board, expected[name], doubtful)
+        fit = _camera(survey, name, group, rover_from_board, expected[name], doubtful)
+        in_rover[name], limits[name] = fit.model, fit.limit_px
         if survey.cameras[name].on == "head":
             reference[name] = at
     mast = np.zeros(len(MAST_NAMES))
@@ -118,6 +121,7 @@ def start(survey: Survey, mast_parameters: int, *, only_camera_images: bool = Fa
         reference,
         in_rover,
         expected,
+        limits,
         bent,
         station.blunders,
         tuple(notes),
@@ -164,7 +168,7 @@ def _camera(
     boards: Mapping[tuple[str, str], Rigid],
     expected_px: float,
     doubtful: set[str],
-) -> CameraModel:
+) -> CameraFit:
     """A camera in the rover frame at its reference setting."""
     camera = survey.cameras[name]
     placements = {t.board for t in group}
@@ -181,7 +185,7 @@ def _camera(
         if not fit.used[first : first + len(term.rows)].any():
             doubtful.add(term.name)
         first += len(term.rows)
-    return fit.model
+    return fit
 
 
 def camera_from_points(

@@ -21,17 +21,23 @@ from calib.mast import Rig
 from calib.ray_gap import RayGap, clicked_point
 from calib.rig_covariance import RigCovariance
 from calib.rig_rates import JOINT_NAMES, click_rates, pixel_rates
-from calib.rigid import FloatArray
+from calib.rigid import FloatArray, finite_float
 from calib.stereo import Triangulation
 
 
 @dataclass(frozen=True, eq=False)
 class Joints:
-    """Measured joint angles, and the sigma of each reading; radians."""
+    """Measured joint angles, and the sigma of each reading; radians. ValueError if they are none."""
 
     pan_rad: float
     tilt_rad: float
     sigma_rad: float = 0.0
+
+    def __post_init__(self) -> None:
+        for name in ("pan_rad", "tilt_rad", "sigma_rad"):
+            object.__setattr__(self, name, finite_float(name, getattr(self, name)))
+        if self.sigma_rad < 0.0:
+            raise ValueError(f"sigma_rad is {self.sigma_rad} where 0 or more is expected")
 
 
 @dataclass(frozen=True, eq=False)

@@ -61,7 +61,7 @@ def minimise(
     start: State,
     *,
     weak: FloatArray | None = None,
-    steps: int = 60,
+    steps: int = 200,
     gain: float = 1e-10,
 ) -> Minimum[State]:
     """Minimise a problem's cost from a start.

@@ -16,11 +16,11 @@ from typing import Any, Literal
 import numpy as np
 
 from calib.cahvor import CameraModel
-from calib.rigid import FloatArray, Rigid, frozen_array, rot_x, rot_y, rot_z
+from calib.rigid import FloatArray, ReadOnlyArrays, Rigid, finite_float, frozen_array, rot_x, rot_y, rot_z
 
 
 @dataclass(frozen=True, eq=False)
-class Mast:
+class Mast(ReadOnlyArrays):
     """Mast parameters: six of the paper, and axis offset a and twist k (0 in the paper's mast).
 
     Attributes
@@ -31,6 +31,11 @@ class Mast:
         (3,) θx, θy, θz of the mast frame in the rover frame, radians.
     axis_offset_m, axis_twist_rad
         Length and twist of the common perpendicular from the pan axis to the tilt axis.
+
+    Raises
+    ------
+    ValueError
+        If a number is not finite.
     """
 
     translation_m: FloatArray
@@ -41,6 +46,8 @@ class Mast:
     def __post_init__(self) -> None:
         object.__setattr__(self, "translation_m", frozen_array(self.translation_m, (3,)))
         object.__setattr__(self, "rotation_rad", frozen_array(self.rotation_rad, (3,)))
+        for name in ("axis_offset_m", "axis_twist_rad"):
+            object.__setattr__(self, name, finite_float(name, getattr(self, name)))
 
     @cached_property
     def rover_from_mast(self) -> Rigid:

@@ -38,7 +38,8 @@ class ModelDifference:
     rotation_rad
         (3,) rotation vector that turns the reference's rays onto the other's, same frame.
     shift_px
-        (n, 2) how far the other projects points far away from where the reference does, pixels of the other.
+        (n, 2) how far the other projects points far away from where the reference does, pixels of the other;
+        infinite where it does not see what the reference sees.
     """
 
     position_m: FloatArray
@@ -52,13 +53,23 @@ def model_difference(reference: CameraModel, other: CameraModel) -> ModelDiffere
 
     The rotation is the one that turns a grid of the reference's rays onto the other's best (Kabsch).
     Sizes may differ where one image is the other one binned.
+
+    Raises
+    ------
+    ValueError
+        If the two have fewer than two rays of the grid in common.
     """
     wanted_px = pixel_grid(other.size_px)
     rays, other_rays = reference.ray(pixel_grid(reference.size_px)), other.ray(wanted_px)
     px, valid = other.project(rays.origins_m + RANGES_M[1] * rays.directions)
-    both = rays.valid & other_rays.valid & valid
+    both = rays.valid & other_rays.valid
+    if both.sum() < 2:
+        raise ValueError(
+            f"the two models have {int(both.sum())} of {len(both)} rays in common, at least 2 are expected"
+        )
     rotation, _ = Rotation.align_vectors(other_rays.directions[both], rays.directions[both])
-    return ModelDifference(other.C - reference.C, rotation.as_rotvec(), (px - wanted_px)[both])
+    shift_px = np.where(valid[:, None], px - wanted_px, np.inf)[both]
+    return ModelDifference(other.C - reference.C, rotation.as_rotvec(), shift_px)
 
 
 def with_one_lens(models: Sequence[CameraModel], lens: CameraModel) -> tuple[CameraModel, ...]:

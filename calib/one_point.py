@@ -10,8 +10,8 @@ import numpy as np
 from calib.cahvor import CameraModel
 from calib.rigid import FloatArray
 
-STEPS = 6
-"""Gauss-Newton steps at most..."""
+STEPS = 20
+"""Gauss-Newton steps at most: near a camera the first ones are long..."""
 ENOUGH = 1e-4
 """...and the step, in sigmas of the point, after which no more are made."""
 
@@ -51,7 +51,7 @@ def one_point(
     Returns
     -------
     point
-        None if a camera cannot see where the point comes to lie.
+        None if a camera cannot see where the point comes to lie, or the steps do not settle.
     """
     seen = list(sightings)
     weights = [np.linalg.inv(one.covariance_px2 + model_px**2 * np.eye(2)) for one in seen]
@@ -71,5 +71,5 @@ def one_point(
         step = np.linalg.solve(normal, right)
         position = position + step
         if step @ right < ENOUGH**2:
-            break
-    return OnePoint(position, np.linalg.inv(normal), chi2)
+            return OnePoint(position, np.linalg.inv(normal), chi2)
+    return None

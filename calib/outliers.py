@@ -68,48 +68,29 @@ def judge(
     all_images
         The images with every dot that was measured, in the order of the problem's.
     """
-    dots = [
-        _dots(problem, state, covariance, whole, term)
-        for whole, term in zip(all_images, problem.images, strict=True)
-    ]
-    points = [_point(problem, state, covariance, term) for term in problem.station]
-    dot_scale = _scale([d[t.keep] for d, t in zip(dots, problem.images, strict=True) if t.keep.any()], 2)
-    point_scale = _scale(
-        [
-            np.array([p.statistic])
-            for p, t in zip(points, problem.station, strict=True)
-            if t.keep and p.freedom == 3
-        ],
-        3,
-    )
-    count = sum(len(d) for d in dots)
-    dot_limit = float(chi2.isf(FALSE_ALARMS / max(count, 1), 2)) * dot_scale
-    share = FALSE_ALARMS / max(len(dots), 1)
+    dots, points, limits = _tested(problem, state, covariance, all_images)
     images, worst, worst_ratio = [], None, 1.0
     bad_dots: list[tuple[int, np.ndarray]] = []
     for index, (term, statistic) in enumerate(zip(problem.images, dots, strict=True)):
-        good = statistic <= dot_limit
-        whole_limit = float(chi2.isf(share, 2 * max(int(good.sum()), 1))) * dot_scale
-        bad = good.mean() < 1 - BAD_IMAGE or float(statistic[good].sum()) > whole_limit
+        good = statistic <= limits.dot
+        bad = good.mean() < 1 - BAD_IMAGE or float(statistic[good].sum()) > limits.image(int(good.sum()))
         images.append(term)
         if not term.keep.any():
             if not bad:
                 images[index] = replace(term, keep=good)
             continue
         if bad:
-            limit = float(chi2.isf(share, 2 * len(statistic))) * dot_scale
-            ratio = float(np.minimum(statistic, 1e12).sum()) / limit
+            ratio = float(np.minimum(statistic, 1e12).sum()) / limits.image(len(statistic))
             if ratio > worst_ratio:
                 worst, worst_ratio = ("image", index), ratio
         elif (good != term.keep).any():
             bad_dots.append((index, good))
     readmitted = []
     image_failed = worst is not None
-    share = FALSE_ALARMS / max(len(points), 1)
     for index, (point, judged) in enumerate(zip(problem.station, points, strict=True)):
         if not judged.freedom:
             continue
-        ratio = float(judged.statistic[()]) / (float(chi2.isf(share, judged.freedom)) * point_scale)
+        ratio = float(judged.statistic[()]) / limits.point(judged.freedom)
         # A tape or prism cannot pull hundreds of dots along: where an image fails, it goes first.
         if point.keep and not image_failed and ratio > worst_ratio and _may_go(problem, point):
             worst, worst_ratio = ("station", index), ratio
@@ -131,33 +112,73 @@ def judge(
 def named(
     problem: Adjustment, state: Estimate, covariance: FloatArray, all_images: Sequence[ImageTerm]
 ) -> tuple[Outlier, ...]:
-    """Return everything that the problem leaves out, with the statistic it was left out for."""
+    """Return everything that the problem leaves out, with the statistic it was left out for and its limit."""
     found: list[Outlier] = []
-    count = sum(len(t.keep) for t in all_images)
-    dot_limit = float(chi2.isf(FALSE_ALARMS / max(count, 1), 2))
-    for whole, term in zip(all_images, problem.images, strict=True):
+    dots, points, limits = _tested(problem, state, covariance, all_images)
+    for whole, term, statistic in zip(all_images, problem.images, dots, strict=True):
         if term.keep.all():
             continue
-        statistic = _dots(problem, state, covariance, whole, term)
         residual = problem.image_residual(state, whole).reshape(-1, 2) * whole.sigma_px[:, None]
         if not term.keep.any():
-            limit = float(chi2.isf(FALSE_ALARMS / len(all_images), 2 * len(statistic)))
+            limit = limits.image(len(statistic))
             size = float(np.sqrt(np.mean(np.sum(residual**2, axis=1))))
             found.append(Outlier("image", f"image {term.name}", float(statistic.sum()), limit, size))
             continue
         for row in np.flatnonzero(~term.keep):
             name = f"image {term.name} dot (row {term.rows[row]}, column {term.columns[row]})"
             size = float(np.linalg.norm(residual[row]))
-            found.append(Outlier("dot", name, float(statistic[row]), dot_limit, size))
-    for point in problem.station:
+            found.append(Outlier("dot", name, float(statistic[row]), limits.dot, size))
+    for point, judged in zip(problem.station, points, strict=True):
         if point.keep:
             continue
-        judged = _point(problem, state, covariance, point)
-        limit = float(chi2.isf(FALSE_ALARMS / len(problem.station), 3))
+        limit = limits.point(judged.freedom or 3)
         size = float(np.linalg.norm(problem.station_residual(state, point)) * point.sigma_m)
         kind: Literal["prism", "tape"] = "prism" if point.board is None else "tape"
         found.append(Outlier(kind, point.name, float(judged.statistic[()]), limit, size))
     return tuple(found)
+
+
+@dataclass(frozen=True)
+class _Limits:
+    """Beyond what a statistic fails: a dot's, an image's by its dots, a station point's by its freedom.
+
+    Where the typical measurement is farther off than its sigma says, they are wider by as much.
+    """
+
+    dots: int
+    images: int
+    points: int
+    dot_scale: float
+    point_scale: float
+
+    @property
+    def dot(self) -> float:
+        return float(chi2.isf(FALSE_ALARMS / max(self.dots, 1), 2)) * self.dot_scale
+
+    def image(self, dots: int) -> float:
+        return float(chi2.isf(FALSE_ALARMS / max(self.images, 1), 2 * max(dots, 1))) * self.dot_scale
+
+    def point(self, freedom: int) -> float:
+        return float(chi2.isf(FALSE_ALARMS / max(self.points, 1), freedom)) * self.point_scale
+
+
+def _tested(
+    problem: Adjustment, state: Estimate, covariance: FloatArray, all_images: Sequence[ImageTerm]
+) -> tuple[list[FloatArray], list[Judged], _Limits]:
+    """The statistics of every image's dots and of every station point, and their limits."""
+    dots = [
+        _dots(problem, state, covariance, whole, term)
+        for whole, term in zip(all_images, problem.images, strict=True)
+    ]
+    points = [_point(problem, state, covariance, term) for term in problem.station]
+    kept = [d[t.keep] for d, t in zip(dots, problem.images, strict=True) if t.keep.any()]
+    whole = [
+        np.array([p.statistic])
+        for p, t in zip(points, problem.station, strict=True)
+        if t.keep and p.freedom == 3
+    ]
+    count = sum(len(d) for d in dots)
+    return dots, points, _Limits(count, len(dots), len(points), _scale(kept, 2), _scale(whole, 3))
 
 
 def _dots(

@@ -166,7 +166,7 @@ def solve(
         ``blind_cone``: too near the pan axis, with the distance from the axis that could be reached.
         ``too_near``: nearer than the ray can be brought, with both distances. ``bad_pixel``, ``bad_target``:
         the pixel has no ray, or the target is not three finite numbers below 1e9 m. ``parallel_axes``:
-        |cos k| < 0.001.
+        |cos k| < 0.001. ``bad_joints``: where the head is now is not finite.
 
     Notes
     -----
@@ -185,6 +185,7 @@ def solve(
     >>> round(best.pan_rad, 6), abs(round(best.tilt_rad, 6)), round(best.range_m, 6)
     (1.570796, 0.0, 3.0)
     """
+    _check_here(from_pan_rad, from_tilt_rad)
     x_px, y_px = camera_in_head.image_center_px if pixel_px is None else _two_numbers(pixel_px)
     ray = _camera_ray(camera_in_head, x_px, y_px)
     return _solve(_axes(mast), ray, target_in_rover_m, from_pan_rad, from_tilt_rad)
@@ -217,6 +218,7 @@ def solve_ray(
     Unreachable
         As ``solve``; ``bad_pixel`` for a ray that is not finite or has no direction.
     """
+    _check_here(from_pan_rad, from_tilt_rad)
     origin = np.asarray(origin_in_head_m, dtype=np.float64)
     direction = np.asarray(direction_in_head, dtype=np.float64)
     length = float(np.linalg.norm(direction))
@@ -283,7 +285,23 @@ def choose(
     ------
     Unreachable
         ``outside_limits``: with the angle, the limit and by how much, for the solution that misses least.
+        ``bad_joints``: a limit or an angle is not a number, a limit's lowest is above its highest, or there
+        is no solution to choose from.
     """
+    _check_here(from_pan_rad, from_tilt_rad)
+    for joint, (low, high) in (("pan", pan_limits_rad), ("tilt", tilt_limits_rad)):
+        if not low <= high:  # not a number either
+            raise Unreachable(
+                "bad_joints",
+                f"the {joint} limits are [{low}, {high}] rad where two rising numbers are expected",
+            )
+    if not solutions:
+        raise Unreachable("bad_joints", "there is no solution to choose from")
+    for one in solutions:
+        if not (math.isfinite(one.pan_rad) and math.isfinite(one.tilt_rad)):
+            raise Unreachable(
+                "bad_joints", f"a solution has pan {one.pan_rad} and tilt {one.tilt_rad} rad: no angles"
+            )
     turned = [
         Solution(one.pan_rad + pan_turn, one.tilt_rad + tilt_turn, one.range_m)
         for one in solutions
@@ -310,6 +328,14 @@ def choose(
             if _beyond(angle, limits) > 0.0
         ),
     )
+
+
+def _check_here(from_pan_rad: float, from_tilt_rad: float) -> None:
+    """Refuse joint angles that are not finite."""
+    if not (math.isfinite(from_pan_rad) and math.isfinite(from_tilt_rad)):
+        raise Unreachable(
+            "bad_joints", f"the head stands at pan {from_pan_rad}, tilt {from_tilt_rad} rad: no angles"
+        )
 
 
 def _two_numbers(pixel_px: ArrayLike) -> tuple[float, float]:

@@ -19,7 +19,10 @@ from calib.rigid import FloatArray, Rigid
 from calib.survey import Survey
 
 STEPS = 50
-"""Gauss-Newton steps at most; three or four do from the aligned start."""
+"""Gauss-Newton steps at most; three or four do from the aligned start, more where a prism is off."""
+
+ENOUGH = 1e-7
+"""A step of less, metres and radians, is none."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,6 +64,7 @@ class _Fit:
     poses: dict[str, Rigid]
     chi2: float
     freedom: int
+    settled: bool
 
 
 Seen = dict[str, dict[int, FloatArray]]
@@ -80,7 +84,7 @@ def refine_prisms(survey: Survey, *, false_alarm: float = FALSE_ALARM) -> Refine
     Raises
     ------
     NotAligned
-        If a set-up has fewer than three prisms.
+        If a set-up has fewer than three prisms, or the places do not settle.
     ValueError
         If the drawing is stated to be exact.
     """
@@ -106,6 +110,11 @@ def refine_prisms(survey: Survey, *, false_alarm: float = FALSE_ALARM) -> Refine
         rejected.append((found[0], names[found[1]]))
         drawn, seen = _without(drawn, seen, *found)
         fit = _fit(drawing, drawn, seen, *sigmas)
+    if not fit.settled:
+        raise NotAligned(
+            f"the prisms' places did not settle in {STEPS} steps: the set-ups stand too differently from the "
+            "drawing; check the prisms' names and places"
+        )
     doubt = ""
     if fit.chi2 > _limit(fit.freedom, false_alarm):
         rms = np.sqrt(fit.chi2 / fit.freedom)
@@ -167,6 +176,7 @@ def _fit(drawing: FloatArray, drawn: np.ndarray, seen: Seen, station_m: float, c
         for setup, points in seen.items()
     }
     size = places.size + 6 * len(poses)
+    settled = False
     for _ in range(STEPS):
         normal, gradient, total, count = np.zeros((size, size)), np.zeros(size), 0.0, 0
         for index in map(int, np.flatnonzero(drawn)):
@@ -193,7 +203,8 @@ def _fit(drawing: FloatArray, drawn: np.ndarray, seen: Seen, station_m: float, c
             turn, shift = step[places.size + 6 * number :][:3], step[places.size + 6 * number :][3:6]
             turned = Rotation.from_rotvec(turn).as_matrix() @ poses[setup].rotation
             poses[setup] = Rigid(turned, poses[setup].translation_m + shift)
-        if float(np.abs(step).max()) < 1e-12:
+        settled = float(np.abs(step).max()) < ENOUGH
+        if settled:
             break
     covariance = np.asarray(np.linalg.inv(normal), dtype=np.float64)[: places.size, : places.size]
-    return _Fit(places, covariance, poses, total, count - size)
+    return _Fit(places, covariance, poses, total, count - size, settled)

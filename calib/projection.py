@@ -17,7 +17,7 @@ import numpy as np
 from calib.lens import Lens
 from calib.lens_arrays import bend, unbend
 from calib.lens_point import bend_point, unbend_point
-from calib.rigid import FloatArray
+from calib.rigid import FloatArray, ReadOnlyArrays
 
 _CHUNK = 4096
 """Points at a time: some thirty rows of them stay in a core's own cache."""
@@ -28,7 +28,7 @@ Place = tuple[list[float], list[float], list[float], list[float]]
 
 
 @dataclass(frozen=True, eq=False)
-class Projection:
+class Projection(ReadOnlyArrays):
     """A lens with the plane behind it.
 
     Attributes

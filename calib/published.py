@@ -41,7 +41,9 @@ def project_as_published(
                 e = E[0] + E[1] * theta**2 + E[2] * theta**4
                 e_rate = 2.0 * E[1] * theta + 4.0 * E[2] * theta**3
                 rate = zeta * cosine + lam * sine - (1.0 - cosine) * e - lag * e_rate
-                theta = theta - (zeta * sine - lam * cosine - lag * e) / rate
+                step = (zeta * sine - lam * cosine - lag * e) / rate
+                theta = theta - step
+            theta[~(np.abs(step) < 1e-9)] = np.nan  # no ray was found, or none that is sure
             angle = linearity * theta
             chi = theta if linearity == 0.0 else (np.tan if linearity > 0.0 else np.sin)(angle) / linearity
         mu = R[0] + R[1] * chi**2 + R[2] * chi**4

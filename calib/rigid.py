@@ -6,6 +6,7 @@ names touch in a product: ``c_from_a = c_from_b @ b_from_a``. Quaternions are (w
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -32,6 +33,30 @@ def frozen_array(values: ArrayLike, shape: tuple[int, ...]) -> FloatArray:
     return array
 
 
+def finite_float(name: str, value: float) -> float:
+    """Return a number as a float; ValueError with its name if it is none, or not finite."""
+    try:
+        number = float(value)
+    except (TypeError, ValueError):
+        raise ValueError(f"{name} is {value!r} where a number is expected") from None
+    if not math.isfinite(number):
+        raise ValueError(f"{name} is {number} where a finite number is expected")
+    return number
+
+
+class ReadOnlyArrays:
+    """For frozen dataclasses: arrays that were read-only stay so when it is unpickled or deeply copied.
+
+    What is made of them once and kept would else go on saying what they were.
+    """
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        for value in state.values():
+            if isinstance(value, np.ndarray):
+                value.setflags(write=False)
+        self.__dict__.update(state)
+
+
 def rot_x(angle_rad: float) -> FloatArray:
     """Return the (3, 3) right-handed rotation about x."""
     c, s = np.cos(angle_rad), np.sin(angle_rad)
@@ -50,8 +75,12 @@ def rot_z(angle_rad: float) -> FloatArray:
     return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 
 
+NO_ROTATION = 1e-6
+"""How far R Rᵀ may be from the identity: a label's six digits make a part of it."""
+
+
 @dataclass(frozen=True, eq=False)
-class Rigid:
+class Rigid(ReadOnlyArrays):
     """A rigid transform ``b_from_a``: x_in_b = rotation @ x_in_a + translation_m.
 
     Attributes
@@ -60,6 +89,11 @@ class Rigid:
         (3, 3), orthonormal with determinant +1.
     translation_m
         (3,), the origin of a in b, metres.
+
+    Raises
+    ------
+    ValueError
+        If the rotation is none (to 1e-6), or a number is not finite.
     """
 
     rotation: FloatArray
@@ -67,6 +101,11 @@ class Rigid:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "rotation", frozen_array(self.rotation, (3, 3)))
+        off = _off_rotation(self.rotation)
+        if not off <= NO_ROTATION:
+            raise ValueError(
+                f"{self.rotation.tolist()} is no rotation: it stretches or shears by {off:.2g}, or mirrors"
+            )
         object.__setattr__(self, "translation_m", frozen_array(self.translation_m, (3,)))
 
     @staticmethod
@@ -100,6 +139,20 @@ class Rigid:
             and np.array_equal(self.rotation, other.rotation)
             and np.array_equal(self.translation_m, other.translation_m)
         )
+
+
+def _off_rotation(matrix: FloatArray) -> float:
+    """How far a matrix (3, 3) is from turning: rows of length 1, at right angles, the third their product."""
+    (a, b, c), (d, e, f), (g, h, i) = matrix.tolist()
+    off: float = max(
+        abs(a * a + b * b + c * c - 1.0),
+        abs(d * d + e * e + f * f - 1.0),
+        abs(a * d + b * e + c * f),
+        abs(b * f - c * e - g),
+        abs(c * d - a * f - h),
+        abs(a * e - b * d - i),
+    )
+    return off
 
 
 def carried_covariance(covariance: FloatArray, now_from_then: Rigid) -> FloatArray:

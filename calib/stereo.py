@@ -14,14 +14,14 @@ from numpy.typing import ArrayLike
 
 from calib.cahvor import CameraModel
 from calib.errors import NoStereoPoint
-from calib.rigid import FloatArray, frozen_array
+from calib.rigid import FloatArray, ReadOnlyArrays, finite_float, frozen_array
 
 PARALLEL_RAD = 1e-9
 """Rays that meet under a smaller angle are parallel: rounding alone would place the point."""
 
 
 @dataclass(frozen=True, eq=False)
-class Triangulation:
+class Triangulation(ReadOnlyArrays):
     """A point seen by two cameras, in the frame of their models.
 
     Attributes
@@ -75,6 +75,8 @@ def triangulate(
     NoStereoPoint
         ``bad_pixel``: a pixel is not two finite numbers or has no ray. ``parallel_rays``: the rays meet
         under less than 1e-9 rad. ``behind_camera``: they meet behind a camera, that is they diverge ahead.
+    ValueError
+        If the sigma is negative or not finite.
 
     Examples
     --------
@@ -88,6 +90,8 @@ def triangulate(
     >>> round(float(seen.position_m[0]), 6), round(float(seen.covariance_m2[0, 0]) ** 0.5, 6)
     (5.0, 0.353553)
     """
+    if finite_float("sigma_px", sigma_px) < 0.0:
+        raise ValueError(f"sigma_px is {sigma_px} where 0 or more is expected")
     origins = np.empty((2, 3))
     directions = np.empty((2, 3))
     d_origins = np.empty((2, 3, 2))

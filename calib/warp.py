@@ -16,7 +16,7 @@ from scipy import ndimage
 
 from calib.cahvor import CameraModel
 from calib.errors import CalibError
-from calib.rigid import FloatArray, frozen_array
+from calib.rigid import FloatArray, ReadOnlyArrays, frozen_array
 
 Grey = NDArray[np.float32]
 Mask = NDArray[np.bool_]
@@ -29,7 +29,7 @@ SPLINE_MARGIN_PX = 12  # a cubic spline's memory of its border is below 1e-6 aft
 
 
 @dataclass(frozen=True, eq=False)
-class Plane:
+class Plane(ReadOnlyArrays):
     """A plane through ``point_m`` (3,) with the unit ``normal`` (3,), of either sign."""
 
     point_m: FloatArray

@@ -34,6 +34,7 @@ SAMPLE_EVERY = 5
 
 CSV_COLUMNS = ("camera", "pan_rad", "tilt_rad", "file")
 MAX_CSV_BYTES = 1 << 24
+HOW = cv2.IMREAD_ANYDEPTH | cv2.IMREAD_ANYCOLOR | cv2.IMREAD_IGNORE_ORIENTATION
 MAX_IMAGE_BYTES = 1 << 30
 
 
@@ -207,7 +208,7 @@ def _decoded(data: bytes) -> NDArray[np.generic] | None:
     if not data:
         return None
     try:
-        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_ANYDEPTH | cv2.IMREAD_ANYCOLOR)
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), HOW)
     except cv2.error:
         return None
     return None if image is None else np.asarray(image)

@@ -213,7 +213,7 @@ def test_where_the_grid_does_not_grow_the_clustering_finder_helps(monkeypatch: p
 
 def test_images_of_another_kind_are_refused() -> None:
     for image in (np.zeros((480, 640)), np.zeros((480, 640, 3), dtype=np.uint8)):
-        with pytest.raises(ValueError, match="uint8 is expected"):
+        with pytest.raises(ValueError, match="uint8 or uint16 is expected"):
             find_dots(image, BOARD)
 
 

@@ -1,0 +1,231 @@
+"""What is no number, rotation or length is refused by name; what is frozen stays so; all bits count."""
+
+from __future__ import annotations
+
+import copy
+import math
+import pickle
+import struct
+import tracemalloc
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from boards import BOARD, COLUMNS, ROWS, SIZE_PX, camera, gravel, pose
+from made_survey import Blunders, make_survey
+from scipy.spatial.transform import Rotation
+
+from calib.align import NotAligned, align, mirrored
+from calib.cahvor import CameraModel
+from calib.detect import DotsFound, Predicted
+from calib.detect_survey import find_in_file
+from calib.errors import Unreachable
+from calib.fit_camera import SAMPLES, fit_camera
+from calib.fit_joint import fit_joint
+from calib.handoff import Joints
+from calib.mast import Mast, Rig
+from calib.model_difference import model_difference
+from calib.pointing import Solution, choose, solve
+from calib.rigid import Rigid
+from calib.stereo import triangulate
+from calib.warp import Plane
+from drivers.sim.board import draw_board, photograph
+
+NO_NUMBERS = (math.nan, math.inf, -math.inf)
+HEAD = CameraModel("CAHV", (101, 101), np.zeros(3), [1, 0, 0], [50, 100, 0], [50, 0, 100])
+MAST = Mast(np.array([0.0, 0.0, -1.5]), np.zeros(3))
+
+
+@pytest.mark.parametrize("bad", NO_NUMBERS)
+@pytest.mark.parametrize("name", ["axis_offset_m", "axis_twist_rad"])
+def test_a_mast_whose_axes_are_no_numbers_is_refused_by_name(name: str, bad: float) -> None:
+    with pytest.raises(ValueError, match=f"{name} is .* where a finite number is expected"):
+        Mast(np.zeros(3), np.zeros(3), **{name: bad})
+
+
+@pytest.mark.parametrize("bad", NO_NUMBERS)
+def test_a_head_that_stands_nowhere_has_no_next_angles(bad: float) -> None:
+    for here in ({"from_pan_rad": bad}, {"from_tilt_rad": bad}):
+        with pytest.raises(Unreachable, match="the head stands at") as refused:
+            solve(MAST, HEAD, [3.0, 0.0, -1.0], **here)
+        assert refused.value.code == "bad_joints"
+        with pytest.raises(Unreachable, match="the head stands at"):
+            choose([Solution(0.1, 0.0, 3.0)], (-1.0, 1.0), (-1.0, 1.0), **here)
+
+
+@pytest.mark.parametrize(
+    ("pan", "tilt", "solution", "words"),
+    [
+        ((math.nan, 1.0), (-1.0, 1.0), Solution(0.1, 0.0, 3.0), "pan limits"),
+        ((-1.0, 1.0), (-1.0, math.nan), Solution(0.1, 0.0, 3.0), "tilt limits"),
+        ((1.0, -1.0), (-1.0, 1.0), Solution(0.1, 0.0, 3.0), "rising"),
+        ((-1.0, 1.0), (-1.0, 1.0), Solution(math.nan, 0.0, 3.0), "no angles"),
+        ((-1.0, 1.0), (-1.0, 1.0), Solution(0.0, math.inf, 3.0), "no angles"),
+        ((-1.0, 1.0), (-1.0, 1.0), None, "no solution"),
+    ],
+)
+def test_nothing_is_chosen_by_limits_or_among_angles_that_are_none(
+    pan: tuple[float, float], tilt: tuple[float, float], solution: Solution | None, words: str
+) -> None:
+    with pytest.raises(Unreachable, match=words) as refused:
+        choose([] if solution is None else [solution], pan, tilt)
+    assert refused.value.code == "bad_joints"
+
+
+@pytest.mark.parametrize(
+    "matrix",
+    [
+        2.0 * np.eye(3),
+        np.diag([1.0, 1.0, -1.0]),
+        np.zeros((3, 3)),
+        np.array([[1.0, 0.1, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]),
+        np.eye(3) + 1e-4,
+    ],
+)
+def test_what_stretches_shears_or_mirrors_is_no_rigid_motion(matrix: np.ndarray) -> None:
+    with pytest.raises(ValueError, match="is no rotation"):
+        Rigid(matrix, np.zeros(3))
+
+
+def test_every_rotation_is_one() -> None:
+    for turn in Rotation.random(200, random_state=1):
+        motion = Rigid(turn.as_matrix(), np.ones(3))
+        step = motion
+        for _ in range(50):
+            motion = motion @ step @ step.inverse @ step
+    # Six printed digits are a rotation still.
+    Rigid(np.round(Rotation.from_rotvec([0.3, 0.2, 0.1]).as_matrix(), 7), np.zeros(3))
+
+
+def test_models_that_look_past_each_other_are_not_alike() -> None:
+    turned = HEAD.moved(Rigid(Rotation.from_rotvec([0.0, 0.0, np.radians(150)]).as_matrix(), np.zeros(3)))
+    found = model_difference(HEAD, turned)
+    assert math.degrees(np.linalg.norm(found.rotation_rad)) == pytest.approx(150.0)
+    assert np.isinf(found.shift_px).all() and len(found.shift_px)
+    # Rays in common need not be in the other's picture: at 30 degrees some are and some are not.
+    partly = model_difference(
+        HEAD, HEAD.moved(Rigid(Rotation.from_rotvec([0.0, 0.0, 1.2]).as_matrix(), np.zeros(3)))
+    )
+    assert pytest.approx(np.linalg.norm(partly.rotation_rad)) == 1.2
+    assert 0 < np.isinf(partly.shift_px[:, 0]).sum() < len(partly.shift_px)
+
+
+@pytest.mark.parametrize("sigma", [0.0, -1e-3, math.nan, math.inf])
+def test_points_without_a_sigma_are_not_aligned(sigma: float) -> None:
+    points = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
+    with pytest.raises(ValueError, match=r"sigma_m is .* above 0"):
+        align(points, points, sigma, list("abcd"))
+    with pytest.raises(ValueError, match=r"sigma_m is .* above 0"):
+        mirrored(points, points, sigma)
+
+
+@pytest.mark.parametrize("bad", NO_NUMBERS)
+def test_a_point_that_is_nowhere_is_named(bad: float) -> None:
+    points = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
+    off = points.copy()
+    off[2, 1] = bad
+    for pair in ((points, off), (off, points)):
+        with pytest.raises(NotAligned, match="point c is at"):
+            align(*pair, 1e-3, list("abcd"))
+    with pytest.raises(ValueError, match="do not go together"):
+        align(points, points[:3], 1e-3, list("abcd"))
+
+
+@pytest.mark.parametrize("bad", [*NO_NUMBERS, -0.1])
+def test_a_sigma_that_is_none_gives_no_covariance(bad: float) -> None:
+    right = replace(HEAD, C=np.array([0.0, 0.2, 0.0]))
+    with pytest.raises(ValueError, match="sigma_px is"):
+        triangulate(HEAD, right, [52, 50], [48, 50], bad)
+    with pytest.raises(ValueError, match="sigma_rad is"):
+        Joints(0.0, 0.0, bad)
+
+
+def again(one: object) -> list[object]:
+    """The same thing out of a pickle and out of deep and shallow copies."""
+    return [pickle.loads(pickle.dumps(one)), copy.deepcopy(one), copy.copy(one)]
+
+
+def test_frozen_geometry_stays_frozen_through_pickles_and_copies(true_rig: Rig) -> None:
+    model = true_rig.camera_in_rover("hazcam_left", 0.0, 0.0)
+    head = true_rig.camera_in_rover("navcam_left", 0.3, -0.2)
+    right = replace(HEAD, C=np.array([0.0, 0.2, 0.0]))
+    things: list[tuple[object, tuple[str, ...]]] = [
+        (model, (*"CAHVORE", "_rows")),
+        (head, (*"CAHVORE", "_rows")),
+        (head._projection, ("pixel_from_slope", "slope_from_pixel")),
+        (true_rig.mast, ("translation_m", "rotation_rad")),
+        (true_rig.mast.rover_from_head(0.1, 0.2), ("rotation", "translation_m")),
+        (Plane(np.zeros(3), np.array([0.0, 0.0, 2.0])), ("point_m", "normal")),
+        (triangulate(HEAD, right, [52, 50], [48, 50]), ("position_m", "covariance_m2", "rates_m_per_px")),
+    ]
+    for one, names in things:
+        for same in again(one):
+            for name in names:
+                with pytest.raises(ValueError, match="read-only"):
+                    getattr(same, name)[0] = 7.0
+                np.testing.assert_array_equal(getattr(same, name), getattr(one, name))
+    point = np.array([2.0, 0.3, 0.1])
+    for same in again(model):
+        assert isinstance(same, CameraModel)
+        np.testing.assert_array_equal(same.project(point)[0], model.project(point)[0])
+
+
+def test_thirty_samples_of_many_images_cost_no_list_of_all_triples() -> None:
+    """Of 300 images there are 4.5 million triples: listed they took 329 MB."""
+    count = 300
+    rng = np.random.default_rng(0)
+    model = CameraModel("CAHV", (641, 481), np.zeros(3), [0, 0, 1], [500, 0, 320], [0, 500, 240])
+    pixels = rng.uniform(20, 460, (count * 3, 2))
+    rays = model.ray(pixels)
+    points = rays.origins_m + rng.uniform(2, 5, count * 3)[:, None] * rays.directions
+    images = np.repeat(np.arange(count), 3)
+    tracemalloc.start()
+    fit = fit_camera(points, pixels, images, kind="CAHV", size_px=(641, 481), focal_px=510.0)
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert peak < 60e6, f"{peak / 1e6:.0f} MB"
+    assert np.abs(fit.residuals_px).max() < 1e-3 and SAMPLES == 30
+
+
+def test_the_limit_told_of_an_outlier_is_the_one_it_failed(navcams: Rig) -> None:
+    """Sigmas stated 3 times too small widen every limit; what is told is what was applied."""
+    survey = make_survey(navcams, 4, blunders=Blunders(dots=(("navcam_left-010", 40, (6.0, 0.0)),)))
+    survey = replace(survey, sigma=replace(survey.sigma, dot_px=survey.sigma.dot_px / 2.5))
+    fit = fit_joint(survey)
+    dots = [one for one in fit.outliers if one.kind == "dot"]
+    assert dots and all(one.statistic > one.limit for one in dots)
+    usual = 2 * math.log(sum(len(i.rows) for i in fit.images) / 0.01)
+    assert all(one.limit > 4 * usual for one in dots)
+
+
+@pytest.mark.parametrize("bits", [8, 12, 16])
+def test_a_picture_of_more_bits_is_measured_with_all_of_them(tmp_path: Path, bits: int) -> None:
+    rng = np.random.default_rng(3)
+    model, at = camera(1290.0), pose(2.0, (25, 40), 5)
+    exact = photograph(draw_board(gravel(rng), model, at, BOARD), 0.7, 0.0, np.random.default_rng(1))
+    levels = np.asarray(exact, dtype=np.float64) * (2**bits - 1) / 255
+    path = tmp_path / "board.png"
+    cv2.imwrite(str(path), levels.astype(np.uint8 if bits == 8 else np.uint16))
+    found = find_in_file(path, SIZE_PX, BOARD, Predicted(model, at))
+    assert isinstance(found, DotsFound), found
+    assert len(found.rows) == 100
+    points = at.points(BOARD.dots_in_board_m(ROWS, COLUMNS))
+    wanted = model.project(points)[0].reshape(10, 10, 2)[found.rows, found.columns]
+    assert np.sqrt(np.mean((found.pixels_px - wanted) ** 2)) < 0.02
+
+
+def test_a_turned_tag_turns_no_picture(tmp_path: Path) -> None:
+    """Pixels are where the sensor has them, whatever a tag says of how to hang the picture."""
+    image = np.zeros((30, 40), dtype=np.uint8)
+    done, data = cv2.imencode(".jpg", image)
+    assert done
+    # One entry: orientation (0x0112), a short, once, 6: to be turned by 90 degrees.
+    entry = struct.pack("<HHHIHHI", 1, 0x0112, 3, 1, 6, 0, 0)
+    tag = b"Exif\x00\x00II*\x00\x08\x00\x00\x00" + entry
+    turned = data.tobytes()[:2] + b"\xff\xe1" + (len(tag) + 2).to_bytes(2, "big") + tag + data.tobytes()[2:]
+    path = tmp_path / "turned.jpg"
+    path.write_bytes(turned)
+    failure = find_in_file(path, (40, 30), BOARD, None)
+    assert "px where" not in getattr(failure, "reason", str(failure))

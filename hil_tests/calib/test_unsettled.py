@@ -1,0 +1,138 @@
+"""A fit that was stopped before it settled is told as none, by every fitter."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+
+import numpy as np
+import pytest
+from handed_over import HAZCAMS, hand_offs, moved_hazcams, plain_rig, targets
+from made_survey import make_survey
+from scipy.spatial.transform import Rotation
+from test_fit_camera import boards
+
+from calib import (
+    fit_body_pose,
+    fit_camera,
+    fit_joint,
+    fit_mast,
+    fit_paper,
+    fit_poses,
+    least_squares,
+    one_point,
+)
+from calib.errors import CalibError
+from calib.mast import Rig
+from calib.rigid import FloatArray
+
+
+@pytest.fixture
+def stopped(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
+    """Stops the last fit of modules after one step (those that only lead to a start go on)."""
+
+    def stop(*modules: object) -> None:
+        def minimise(*arguments: object, steps: int = 200, **options: object) -> object:
+            last = steps >= 100
+            return least_squares.minimise(*arguments, steps=1 if last else steps, **options)  # type: ignore
+
+        for module in modules:
+            monkeypatch.setattr(module, "minimise", minimise)
+
+    return stop
+
+
+def test_a_camera(true_rig: Rig, stopped: Callable[..., None]) -> None:
+    stopped(fit_camera)
+    model = true_rig.cameras["navcam_left"].model
+    points, pixels, images = boards(model, (3.0, 6.0), 1)
+    pixels = pixels + np.random.default_rng(4).normal(0.0, 0.1, pixels.shape)
+    focal_px = float(np.linalg.norm(np.cross(model.A, model.H)))
+    with pytest.raises(fit_camera.CameraNotFitted, match="settled"):
+        fit_camera.fit_camera(
+            points, pixels, images, kind=model.kind, size_px=model.size_px, focal_px=focal_px
+        )
+
+
+@pytest.mark.parametrize("parameters", [4, 6])
+def test_a_mast(navcams: Rig, stopped: Callable[..., None], parameters: int) -> None:
+    views = mast_views(navcams)
+    fit_mast.fit_mast(views, parameters, keep_all=parameters == 4)
+    stopped(fit_mast)
+    with pytest.raises(fit_mast.MastNotFitted, match="settled"):
+        fit_mast.fit_mast(views, parameters, keep_all=parameters == 4)
+
+
+def mast_views(rig: Rig) -> list[fit_mast.MastView]:
+    """Images of random points at many joint angles."""
+    rng, views = np.random.default_rng(3), []
+    for index in range(8):
+        joints = (float(rng.uniform(-0.6, 0.6)), float(rng.uniform(-0.5, 0.0)))
+        camera = rig.camera_in_rover("navcam_left", *joints)
+        rays = camera.ray(rng.uniform(100, 700, (12, 2)))
+        points = rays.origins_m + rng.uniform(2.0, 5.0, 12)[:, None] * rays.directions
+        pixels = camera.project(points)[0] + rng.normal(0.0, 0.2, (12, 2))
+        reference = rig.camera_in_rover("navcam_left", 0.0, -0.2)
+        views.append(fit_mast.MastView(f"i{index}", reference, (0.0, -0.2), joints, points, pixels))
+    return views
+
+
+def test_a_survey_in_one_piece(navcams: Rig, stopped: Callable[..., None]) -> None:
+    stopped(fit_joint)
+    with pytest.raises(fit_joint.SurveyNotFitted, match="did not settle"):
+        fit_joint.fit_joint(make_survey(navcams, 2))
+
+
+def test_a_survey_as_the_paper_does_it(navcams: Rig, stopped: Callable[..., None]) -> None:
+    stopped(fit_mast)
+    with pytest.raises(fit_joint.SurveyNotFitted, match="settled"):
+        fit_paper.fit_paper(make_survey(navcams, 2))
+
+
+def test_a_mast_from_camera_models(navcams: Rig, stopped: Callable[..., None]) -> None:
+    rng = np.random.default_rng(1)
+    pan, tilt = rng.uniform(-1.0, 1.0, 8), rng.uniform(-0.6, 0.3, 8)
+    models = []
+    for p, t in zip(pan, tilt, strict=True):
+        model = navcams.camera_in_rover("navcam_left", float(p), float(t))
+        models.append(shaken(model, rng))
+    fit_poses.fit_poses(models, pan, tilt, parameters=8)
+    stopped(fit_poses)
+    with pytest.raises(fit_poses.PosesTooFew, match="did not settle"):
+        fit_poses.fit_poses(models, pan, tilt, parameters=8)
+
+
+def shaken(model: object, rng: np.random.Generator) -> object:
+    """The model turned by some 5 mrad and moved by some 5 mm."""
+    from calib.rigid import Rigid
+
+    turn = Rotation.from_rotvec(rng.normal(0.0, 5e-3, 3)).as_matrix()
+    return model.moved(Rigid(turn, rng.normal(0.0, 5e-3, 3)))  # type: ignore[attr-defined]
+
+
+def test_a_body_pose(true_rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
+    rig, rng = plain_rig(true_rig), np.random.default_rng(1)
+    true = moved_hazcams(rig, Rotation.from_rotvec([3e-3, -4e-3, 2e-3]), np.array([0.002, 0.001, -0.003]))
+    made = hand_offs(true, rig, targets(rng, 24), rng)
+    monkeypatch.setattr(fit_body_pose, "_STEPS", 1)
+    with pytest.raises(CalibError, match="did not settle") as refused:
+        fit_body_pose.fit_body_pose(rig, HAZCAMS, made)
+    assert getattr(refused.value, "code", "") == "not_settled"
+
+
+def test_one_point_of_many_pixels(navcams: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
+    target = np.array([3.0, 0.2, -0.3])
+    cameras = [navcams.camera_in_rover(name, 0.0, -0.3) for name in navcams.cameras]
+    seen = [one_point.Sighting(c, c.project(target)[0], 0.01 * np.eye(2)) for c in cameras]
+    find: Callable[[], one_point.OnePoint | None] = partial(
+        one_point.one_point, far(target), 25.0 * np.eye(3), seen, 0.1
+    )
+    found = find()
+    assert found is not None and np.linalg.norm(found.position_m - target) < 0.05
+    monkeypatch.setattr(one_point, "STEPS", 1)
+    assert find() is None
+
+
+def far(target_m: FloatArray) -> FloatArray:
+    """A believed place 1 m behind the target."""
+    return target_m + np.array([1.0, 0.0, 0.0])
