@@ -18,7 +18,7 @@ from drivers.clock import SystemClock
 from drivers.errors import DriverError
 from drivers.interfaces import Frame, Reading
 from mastctl import devices as devices_module
-from mastctl import frames, joint_history
+from mastctl import frames, joint_history, stops
 from mastctl import service as service_module
 from mastctl.devices import Devices
 from mastctl.limits import Limits
@@ -47,7 +47,7 @@ def test_deadlines_and_periods_are_the_programs_own(page: str) -> None:
         f"| `read()` | {m.READ_TIMEOUT_S:g} s |",
         f"| {m.MOVE_TIMEOUT_S:g} s | returns at once",
         f"| `stop()` | {m.STOP_TIMEOUT_S:g} s |",
-        f"has been busy for {m.STOP_PATIENCE_S:g} s",
+        f"has been busy for {stops.PATIENCE_S:g} s",
         f"`timeout_s` and {m.CAMERA_GRACE_S:g} s |",
         f"up to {s.frame_timeout_s:g} s for a pointing and "
         f"{service_module.SNAPSHOT_TIMEOUT_S:g} s for a snapshot",
