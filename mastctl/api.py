@@ -1,7 +1,8 @@
 """The HTTP interface (contract section 4): JSON under /api/v1, described by /openapi.json.
 
-Handlers that wait for a device run in worker threads; ``POST /stop`` has threads of its own, so that it never
-waits behind them. Every refusal is ``{"error": {"code", "message", "detail"}}``.
+The event loop only reads snapshots. Whatever takes a lock, a file or a device runs in worker threads
+(`mastctl.api_waiting`); ``POST /stop`` has threads of its own, so that it never waits behind them.
+Every refusal is ``{"error": {"code", "message", "detail"}}``.
 """
 
 from __future__ import annotations
@@ -9,9 +10,10 @@ from __future__ import annotations
 import asyncio
 import json
 import math
-from collections.abc import AsyncIterator, Mapping
+from collections.abc import AsyncIterator, Callable, Mapping
+from functools import partial
 from importlib.metadata import version
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
 import cv2
 import numpy as np
@@ -38,6 +40,7 @@ from mastctl.api_requests import (
     TrackBody,
     sentence,
 )
+from mastctl.api_waiting import Waiting
 from mastctl.as_json import as_json
 from mastctl.errors import MastctlError
 from mastctl.frames import StampedFrame
@@ -50,7 +53,10 @@ from mastctl.tracking.pose import RoverPose
 if TYPE_CHECKING:
     from drivers.sim.rover import SimulatedRover
 
+T = TypeVar("T")
+
 PREFIX = "/api/v1"
+STOP_ANSWER_S = 3.0  # the devices give a stop 1 s; beyond this it is told that nothing is known
 JPEG_QUALITY = 90
 STREAM_POLL_S = 0.05  # how late a change may be told
 STREAM_ALIVE_S = 5.0
@@ -65,6 +71,7 @@ STATUS_OF_CODE: Mapping[str, int] = {
     "pose_runs_backwards": 409,
     "rover_moved": 409,
     "stopped": 409,
+    "stopping": 409,
     "frame_moving": 409,
     "other_mast_file": 409,
     "frame_too_old": 410,
@@ -81,6 +88,10 @@ STATUS_OF_CODE: Mapping[str, int] = {
     "pose_without_time": 422,
     "wrong_camera": 422,
     "failed": 503,
+    "closing": 503,
+    "no_thread": 503,
+    "stop_pending": 503,
+    "too_many": 503,
 }
 
 
@@ -90,8 +101,15 @@ class NotSimulated(MastctlError):
     code = "not_simulated"
 
 
-def create_app(service: Service) -> ASGIApp:
-    """Return the ASGI application that serves one service."""
+class StopUnconfirmed(MastctlError):
+    """A stop was sent, and nothing came back."""
+
+    code = "stop_pending"
+
+
+def create_app(service: Service, waiting: Waiting | None = None) -> ASGIApp:
+    """Return the ASGI application that serves one service; ``waiting`` tells its requests when it ends."""
+    waiting = waiting or Waiting()
     app = FastAPI(
         title="mastctl",
         version=version("mastctl"),
@@ -101,14 +119,24 @@ def create_app(service: Service) -> ASGIApp:
         redoc_url=None,
     )
     _add_errors(app)
-    _add_pointing(app, service)
-    _add_tracking(app, service)
-    _add_pictures(app, service)
-    _add_simulation(app, service)
+    _add_pointing(app, service, waiting)
+    _add_tracking(app, service, waiting)
+    _add_pictures(app, service, waiting)
+    _add_simulation(app, service, waiting)
     return Guard(app, ignores_body=frozenset({f"{PREFIX}/stop", f"{PREFIX}/track/stop"}))
 
 
-def _add_pointing(app: FastAPI, service: Service) -> None:
+async def _stopped(service: Service, stop: Callable[[], T]) -> T:
+    """Run a stop in the threads that are there for it. Raises StopsHang, StopUnconfirmed, DriverError."""
+    try:
+        return await asyncio.wait_for(asyncio.wrap_future(service.stop_threads.submit(stop)), STOP_ANSWER_S)
+    except TimeoutError:
+        raise StopUnconfirmed(
+            f"the stop did not come back within {STOP_ANSWER_S:g} s; the head may still move"
+        ) from None
+
+
+def _add_pointing(app: FastAPI, service: Service, waiting: Waiting) -> None:
     """State, operations and the stop."""
 
     @app.get(f"{PREFIX}/status", summary="What is known at this moment")
@@ -119,7 +147,7 @@ def _add_pointing(app: FastAPI, service: Service) -> None:
     async def point(body: PointBody) -> dict[str, Any]:
         told = body.model_dump(exclude_none=True)
         digest = None if body.pixel is None else body.pixel.mast_digest
-        return {"id": service.point(body.request(), told, digest).id}
+        return {"id": (await waiting.run(lambda: service.point(body.request(), told, digest))).id}
 
     @app.get(f"{PREFIX}/operations", summary="The newest operations, without their steps")
     async def operations() -> dict[str, Any]:
@@ -131,17 +159,17 @@ def _add_pointing(app: FastAPI, service: Service) -> None:
 
     @app.post(f"{PREFIX}/stop", summary="Stop the mast and the running operation, at once")
     async def stop() -> dict[str, Any]:
-        stopped = await asyncio.get_running_loop().run_in_executor(service.stop_threads, service.stop)
-        return {"stopped": True, "operation": stopped}
+        return {"stopped": True, "operation": await _stopped(service, service.stop)}
 
 
-def _add_tracking(app: FastAPI, service: Service) -> None:
+def _add_tracking(app: FastAPI, service: Service, waiting: Waiting) -> None:
     """The rover's pose, and the track."""
     told = service.track_told
 
     @app.post(f"{PREFIX}/pose", summary="Say where the rover stands; a track is carried over and looked for")
-    def pose(body: PoseBody) -> dict[str, Any]:
-        operation = service.take_pose(body.pose(service.clock.now_s()), body.look)
+    async def pose(body: PoseBody) -> dict[str, Any]:
+        came = body.pose(service.clock.now_s())
+        operation = await waiting.run(lambda: service.take_pose(came, body.look))
         return {"operation": operation, "track": told()}
 
     @app.get(f"{PREFIX}/track", summary="The track at this moment")
@@ -149,18 +177,19 @@ def _add_tracking(app: FastAPI, service: Service) -> None:
         return told()
 
     @app.post(f"{PREFIX}/track", status_code=202, summary="Follow what a pixel shows, or is at a position")
-    def start(body: TrackBody) -> dict[str, Any]:
+    async def start(body: TrackBody) -> dict[str, Any]:
         asked = body.model_dump(exclude_none=True)
         digest = None if body.pixel is None else body.pixel.mast_digest
-        return {"id": service.start_track(body.target(), {"track": asked}, digest).id}
+        work = partial(service.start_track, body.target(), {"track": asked}, digest)
+        return {"id": (await waiting.run(work)).id}
 
     @app.post(f"{PREFIX}/track/look", status_code=202, summary="Look for the target once more")
-    def look() -> dict[str, Any]:
-        return {"id": service.look_for_target().id}
+    async def look() -> dict[str, Any]:
+        return {"id": (await waiting.run(service.look_for_target)).id}
 
     @app.post(f"{PREFIX}/track/stop", summary="End the track; the head stops if it moves for it")
     async def stop() -> dict[str, Any]:
-        await asyncio.get_running_loop().run_in_executor(service.stop_threads, service.stop_track)
+        await _stopped(service, service.stop_track)
         return told()
 
     @app.get(
@@ -188,7 +217,7 @@ async def _track_events(service: Service) -> AsyncIterator[str]:
         quiet_s += STREAM_POLL_S
 
 
-def _add_pictures(app: FastAPI, service: Service) -> None:
+def _add_pictures(app: FastAPI, service: Service, waiting: Waiting) -> None:
     """Frames with their facts, and the mast file they are to be read by."""
 
     @app.get(
@@ -197,16 +226,17 @@ def _add_pictures(app: FastAPI, service: Service) -> None:
         response_class=Response,
         responses={200: {"content": {"image/png": {}, "image/jpeg": {}}}},
     )
-    def snapshot(camera: str, query: Annotated[SnapshotQuery, Query()]) -> Response:
-        if query.frame_id is not None:
-            frame = service.kept_frame(camera, query.frame_id)
-        else:
-            frame = service.snapshot(camera, query.fresh)
-        return Response(
-            encoded(frame.image, query.format),
-            media_type=f"image/{query.format}",
-            headers=frame_headers(frame),
+    async def snapshot(camera: str, query: Annotated[SnapshotQuery, Query()]) -> Response:
+        service.check_camera(camera)
+        frame_id = query.frame_id
+        if frame_id is not None:
+            return await waiting.run(lambda: picture(service.kept_frame(camera, frame_id), query.format))
+        return await waiting.picture(
+            camera, lambda: picture(service.snapshot(camera, query.fresh), query.format)
         )
+
+    def picture(frame: StampedFrame, kind: str) -> Response:
+        return Response(encoded(frame.image, kind), media_type=f"image/{kind}", headers=frame_headers(frame))
 
     @app.get(f"{PREFIX}/mast", summary="The mast file in use, byte for byte", response_class=Response)
     async def mast() -> Response:
@@ -218,19 +248,21 @@ def _add_pictures(app: FastAPI, service: Service) -> None:
         )
 
     @app.post(f"{PREFIX}/mast", summary="Use another mast file, or the former one, from now on")
-    def load_mast(body: MastBody) -> dict[str, Any]:
-        return told(service.former_mast() if body.file is None else service.load_mast(body.file))
+    async def load_mast(body: MastBody) -> dict[str, Any]:
+        name = body.file
+        work = service.former_mast if name is None else partial(service.load_mast, name)
+        return told(await waiting.run(work))
 
     @app.post(f"{PREFIX}/mast/back", summary="Go back to the former mast file")
-    def back() -> dict[str, Any]:
-        return told(service.former_mast())
+    async def back() -> dict[str, Any]:
+        return told(await waiting.run(service.former_mast))
 
     def told(mast: MastInUse) -> dict[str, Any]:
         former = service.former
         return {"mast": mast.told(), "former_mast": None if former is None else former.told()}
 
 
-def _add_simulation(app: FastAPI, service: Service) -> None:
+def _add_simulation(app: FastAPI, service: Service, waiting: Waiting) -> None:
     """The fault switches of a simulated rover, and where it truly stands."""
 
     def simulated(what: str) -> SimulatedRover:
@@ -250,29 +282,33 @@ def _add_simulation(app: FastAPI, service: Service) -> None:
 
     @app.get(f"{PREFIX}/simulation/pose", summary="Where the simulated rover truly stands")
     async def true_pose() -> dict[str, Any]:
-        return stands()
+        return await waiting.run(stands)
 
     @app.post(f"{PREFIX}/simulation/pose", summary="Put the simulated rover somewhere on its ground")
     async def stand(body: StandBody) -> dict[str, Any]:
-        simulated("true poses").stand(body.x_m, body.y_m, body.heading_rad, body.pitch_rad, body.roll_rad)
-        return stands()
+        def put() -> dict[str, Any]:
+            rover = simulated("true poses")
+            rover.stand(body.x_m, body.y_m, body.heading_rad, body.pitch_rad, body.roll_rad)
+            return stands()
+
+        return await waiting.run(put)
 
     def told() -> dict[str, Any]:
         return {"faults": [_fault_told(fault) for fault in panel().active()]}
 
     @app.get(f"{PREFIX}/simulation/faults", summary="The faults that are switched on")
     async def faults() -> dict[str, Any]:
-        return told()
+        return await waiting.run(told)
 
     @app.post(f"{PREFIX}/simulation/faults", summary="Switch a fault on")
     async def set_fault(body: FaultBody) -> dict[str, Any]:
-        panel().set(body.device, body.word, **body.parameters)
-        return told()
+        await waiting.run(lambda: panel().set(body.device, body.word, **body.parameters))
+        return await waiting.run(told)
 
     @app.delete(f"{PREFIX}/simulation/faults", summary="Switch the faults of one device, or all, off")
     async def clear_faults(query: Annotated[FaultsQuery, Query()]) -> dict[str, Any]:
-        panel().clear(query.device)
-        return told()
+        await waiting.run(lambda: panel().clear(query.device))
+        return await waiting.run(told)
 
 
 def encoded(image: np.ndarray, kind: str) -> bytes:
@@ -327,7 +363,9 @@ def _add_errors(app: FastAPI) -> None:
 
     async def ours(request: Request, error: Exception) -> JSONResponse:
         body = error_body(error)
-        return error_response(status_of(error), body["code"], body["message"], body["detail"])
+        again_s = getattr(error, "retry_after_s", None)
+        headers = None if again_s is None else {"Retry-After": str(math.ceil(again_s))}
+        return error_response(status_of(error), body["code"], body["message"], body["detail"], headers)
 
     for kind in (MastctlError, DriverError, CalibError):
         app.add_exception_handler(kind, ours)

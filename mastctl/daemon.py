@@ -1,7 +1,8 @@
 """The daemon: a socket, a service, a web server, and an orderly end.
 
 Its life is: take the address, open the service, serve, and on the way out stop the mast before anything else.
-Whatever hangs on the way out is left behind after some seconds, and said.
+Whatever hangs on the way out is left behind after some seconds, and said. Every signal that would end the
+process ends it this way.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ import signal
 import socket
 import threading
 from collections.abc import Callable, Iterator
+from concurrent.futures import Future
 from pathlib import Path
 from types import TracebackType
 
@@ -22,14 +24,17 @@ import uvicorn
 
 from drivers.clock import Clock
 from drivers.open_hardware import Hardware
+from mastctl import signals
 from mastctl.api import create_app
+from mastctl.api_waiting import Waiting
 from mastctl.config import Config, Listen
+from mastctl.connections import ACCEPTED_AT_ONCE, WAITING_IN_KERNEL, Connection, most_connections, sweep
 from mastctl.errors import MastctlError
 from mastctl.service import Service
 
 log = logging.getLogger(__name__)
 
-GRACE_S = 2  # for requests under way, when the daemon ends
+GRACE_S = 2  # for answers under way, when the daemon ends; what waits for a device is refused at once
 START_TIMEOUT_S = 600.0  # the first start compiles the simulator's kernels
 END_TIMEOUT_S = 20.0
 
@@ -41,7 +46,10 @@ class AddressInUse(MastctlError):
 
 
 def run(config: Config, on_ready: Callable[[str], None], clock: Clock | None = None) -> None:
-    """Run a daemon in the main thread until SIGTERM or SIGINT; returns after the mast was stopped.
+    """Run a daemon in the main thread until a signal ends it; returns after the mast was stopped.
+
+    The signals are those of `mastctl.signals.wanted`. A second one has nobody waited for; SIGTSTP (Ctrl-Z)
+    stops the mast and then suspends the process.
 
     Parameters
     ----------
@@ -62,7 +70,7 @@ def run(config: Config, on_ready: Callable[[str], None], clock: Clock | None = N
     with _listening(config.listen) as (listener, url):
         service = Service.open(config, clock)
         try:
-            asyncio.run(_serve(service, listener, lambda _: on_ready(url), signals=True))
+            asyncio.run(_serve(service, listener, lambda _: on_ready(url), in_process=True))
         finally:
             service.close()
 
@@ -130,7 +138,7 @@ class RunningDaemon:
             self._ready.set()
 
         try:
-            asyncio.run(_serve(self.service, listener, ready, signals=False))
+            asyncio.run(_serve(self.service, listener, ready, in_process=False))
         except Exception:
             log.exception("the daemon ended")
         finally:
@@ -152,14 +160,19 @@ async def _serve(
     listener: socket.socket,
     on_ready: Callable[[Callable[[], None]], None],
     *,
-    signals: bool,
+    in_process: bool,
 ) -> None:
-    """Serve until told to stop; ``on_ready`` gets a function that tells it so, from any thread."""
+    """Serve until told to stop; ``on_ready`` gets a function that tells it so, from any thread.
+
+    With a process of its own the signals are the daemon's, and the service is closed under their rule too.
+    """
     loop = asyncio.get_running_loop()
+    waiting = Waiting()
     server = _Server(
         uvicorn.Config(
-            create_app(service),
-            http="h11",
+            create_app(service, waiting),
+            http=type("Connection", (Connection,), {"most": most_connections()}),
+            backlog=ACCEPTED_AT_ONCE,
             ws="none",
             lifespan="off",
             proxy_headers=False,
@@ -180,20 +193,38 @@ async def _serve(
         with contextlib.suppress(RuntimeError):  # the loop has ended already
             loop.call_soon_threadsafe(end)
 
-    if signals:
-        for number in (signal.SIGTERM, signal.SIGINT):
+    if in_process:
+        for number in signals.wanted():
             loop.add_signal_handler(number, end)
+        if signal.getsignal(signal.SIGTSTP) is not signal.SIG_IGN:
+            loop.add_signal_handler(signal.SIGTSTP, _suspend, service)
     serving = asyncio.create_task(server.serve(sockets=[listener]))
     while not server.started and not serving.done():
         await asyncio.sleep(0.005)
+    listener.listen(WAITING_IN_KERNEL)  # asyncio has one number for this and for how many it takes at once
+    sweeping = asyncio.create_task(sweep(server.server_state.connections))
     on_ready(end_from_anywhere)
     asked = asyncio.create_task(ending.wait())
     await asyncio.wait({serving, asked}, return_when=asyncio.FIRST_COMPLETED)
     asked.cancel()
+    stopped = asyncio.wrap_future(service.stop_threads.submit(service.operations.close))
+    waiting.end()
     log.info("ending: the mast is stopped first")
-    await asyncio.to_thread(service.operations.close)
+    await stopped
     server.should_exit = True
     await serving
+    sweeping.cancel()
+    if in_process:
+        await loop.run_in_executor(None, service.close)
+
+
+def _suspend(service: Service) -> None:
+    """Stop the mast, then let the process be suspended: nobody would watch a head under way."""
+
+    def then(stopped: Future[str | None]) -> None:
+        os.kill(os.getpid(), signal.SIGSTOP)
+
+    service.stop_threads.submit(service.stop).add_done_callback(then)
 
 
 @contextlib.contextmanager

@@ -128,7 +128,7 @@ class DeviceThread:
         self._jobs: deque[Asked[Any]] = deque()
         self._closing = False
         self._now: _Now | None = None
-        self._faults: dict[str, Fault] = {}
+        self._faults: Mapping[str, Fault] = {}  # replaced, never edited: read without a lock
         self._thread = threading.Thread(target=self._serve, name=f"device {device}", daemon=True)
         self._thread.start()
 
@@ -165,7 +165,7 @@ class DeviceThread:
         with self._wake:
             if self._closing:
                 raise NoReply(f"{what} was asked after the device was closed", device=self._device)
-            overdue = self._overdue()
+            overdue = self._overdue(self._now)
             if overdue and not first and not anyway:
                 raise NoReply(overdue, device=self._device)
             (self._jobs.appendleft if first else self._jobs.append)(asked)
@@ -215,10 +215,9 @@ class DeviceThread:
 
         It also takes back every call's lost line.
         """
-        with self._wake:
-            overdue = self._overdue()
-            faults = dict(self._faults)
-            now = self._now
+        faults = dict(self._faults)
+        now = self._now
+        overdue = self._overdue(now)
         if overdue and now is not None and not now.first:
             faults[now.what] = self._fault(now.what, NoReply.code, overdue, now.began_s)
         return tuple(faults.values())
@@ -253,12 +252,13 @@ class DeviceThread:
             device=self._device,
         )
 
-    def _overdue(self) -> str:
-        """Say in plain words how late the call under way is; empty when it is not. The lock is held."""
+    @staticmethod
+    def _overdue(now: _Now | None) -> str:
+        """Say in plain words how late the call under way is; empty when it is not."""
         now_s = time.monotonic()
-        if self._now is None or now_s <= self._now.until_s:
+        if now is None or now_s <= now.until_s:
             return ""
-        return f"does not answer: {self._now.what} has been under way for {now_s - self._now.began_s:.1f} s"
+        return f"does not answer: {now.what} has been under way for {now_s - now.began_s:.1f} s"
 
     def _fault(self, what: str, code: str, message: str, since_s: float) -> Fault:
         words = self._words.get(what)
@@ -343,14 +343,16 @@ class DeviceThread:
         with self._wake:
             known = self._faults.get(what)
             if error is None:
-                self._faults.pop(what, None)
-                for other, fault in list(self._faults.items()):
-                    if fault.code == LineLost.code:  # the line is back, whichever call found it gone
-                        del self._faults[other]
+                self._faults = {
+                    other: fault
+                    for other, fault in self._faults.items()
+                    if other != what and fault.code != LineLost.code  # whoever found the line gone
+                }
             else:
                 since_s = known.since_s if known else time.monotonic()
                 code = getattr(error, "code", DriverError.code)
-                self._faults[what] = self._fault(what, code, str(error), since_s)
+                fault = self._fault(what, code, str(error), since_s)
+                self._faults = {**self._faults, what: fault}
         if error is None and known:
             log.info("%s: %s works again", self._device, what)
         elif error is not None and not known and late_s is None:

@@ -127,7 +127,7 @@ class Devices:
         self._still_since: dict[str, StampedFrame] = {}  # per camera the first frame of the same content
         self._stamping = {name: threading.Lock() for name in self._cameras}
         self._gate = threading.Lock()
-        self._blocked = ""
+        self._blocks: dict[object, str] = {}  # who lets no move out, and why
         self._closed = False
         self._last_faults: tuple[str, ...] = ()
         self._moved_s = math.inf  # when the last move was taken, until the head was read at rest after it
@@ -192,8 +192,8 @@ class Devices:
 
         def send() -> None:
             with self._gate:
-                if self._blocked:
-                    raise Stopped(self._blocked)
+                if self._blocks:
+                    raise Stopped(next(iter(self._blocks.values())))
             self._stops.check(ticket)
             self._limits.check(pan_rad, tilt_rad)
             speed = self._limits.speed(speed_rad_per_s)
@@ -213,16 +213,15 @@ class Devices:
         """
         self._stops.send(STOP_TIMEOUT_S)
 
-    def block_moves(self, reason: str) -> None:
-        """Refuse every further move, with this reason, until `allow_moves`."""
+    def block_moves(self, holder: object, reason: str) -> None:
+        """Refuse every further move, with this reason, until the holder (any key) allows them again."""
         with self._gate:
-            self._blocked = reason
+            self._blocks[holder] = reason
 
-    def allow_moves(self) -> None:
-        """Take moves again, unless the devices are closed."""
+    def allow_moves(self, holder: object) -> None:
+        """Take back what this holder blocked; moves are taken when nobody blocks them."""
         with self._gate:
-            if not self._closed:
-                self._blocked = ""
+            self._blocks.pop(holder, None)
 
     # The cameras
 
@@ -388,7 +387,7 @@ class Devices:
 
     def close(self) -> None:
         """Stop the head and end the threads; takes some 4 s at most and never raises."""
-        self.block_moves("the service is closing")
+        self.block_moves(self, "the service is closing")
         with self._gate:
             if self._closed:
                 return

@@ -11,6 +11,7 @@ import re
 import secrets
 import threading
 from collections import deque
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -151,6 +152,7 @@ class FrameStore:
         self._runs: dict[str, str] = {}
         self._kept = kept
         self._frames: dict[str, deque[StampedFrame]] = {}
+        self._newest: Mapping[str, StampedFrame] = {}  # replaced, never edited
         self._lock = threading.Lock()
 
     def name(self, camera: str, sequence: int) -> tuple[str, str]:
@@ -168,12 +170,14 @@ class FrameStore:
         with self._lock:
             self._digest = mast_digest
             self._frames.clear()
+            self._newest = {}
             self._runs.clear()
 
     def begin_again(self, camera: str) -> None:
         """Forget a camera's frames, because its count went back: one number must not name two pictures."""
         with self._lock:
             self._frames.pop(camera, None)
+            self._newest = {name: frame for name, frame in self._newest.items() if name != camera}
             self._runs[camera] = secrets.token_hex(2)
 
     def add(self, frame: StampedFrame) -> StampedFrame:
@@ -186,13 +190,12 @@ class FrameStore:
                 if known.frame_id == frame.frame_id:
                     return known
             frames.append(frame)
+            self._newest = {**self._newest, frame.camera: frame}
             return frame
 
     def newest(self, camera: str) -> StampedFrame | None:
-        """Return a camera's newest frame, None before the first."""
-        with self._lock:
-            frames = self._frames.get(camera)
-            return frames[-1] if frames else None
+        """Return a camera's newest frame, None before the first; takes no lock."""
+        return self._newest.get(camera)
 
     def by_id(self, frame_id: str) -> StampedFrame:
         """Return a frame by its id.

@@ -47,8 +47,7 @@ class HandoffCheck:
         self._lock = threading.Lock()
         self._handoffs: deque[MatchedHandoff] = deque(maxlen=KEPT)
         self._digest = digest
-        self._counted = 0
-        self._offsets: tuple[HandoffBias, ...] = ()
+        self._judged: tuple[int, tuple[HandoffBias, ...]] = (0, ())  # how many count, what stands out
         self._unread: Fault | None = None
         self._unwritten: Fault | None = None
         self._asked_s: float | None = None  # since when the file has not answered
@@ -61,7 +60,8 @@ class HandoffCheck:
         """Count a hand-off, and have it written down."""
         with self._lock:
             self._handoffs.append(handoff)
-            self._judge()
+            news = self._judge()
+        _tell(news)
         if self._path is not None:
             self._queue.put(handoff)
 
@@ -69,19 +69,18 @@ class HandoffCheck:
         """Count only the hand-offs of this mast file from now on."""
         with self._lock:
             self._digest = digest
-            self._judge()
+            news = self._judge()
+        _tell(news)
 
     def told(self) -> dict[str, Any]:
         """Return how many hand-offs of the mast file count, and the offsets that stand out, as JSON."""
-        with self._lock:
-            counted, offsets = self._counted, self._offsets
+        counted, offsets = self._judged
         return {"handoffs": counted, "offsets": [bias_told(one) for one in offsets]}
 
     def faults(self) -> tuple[Fault, ...]:
         """Return what is wrong with the record's file."""
-        with self._lock:
-            faults = [one for one in (self._unread, self._unwritten) if one is not None]
-            asked_s = self._asked_s
+        faults = [one for one in (self._unread, self._unwritten) if one is not None]
+        asked_s = self._asked_s
         if asked_s is not None and self._clock.now_s() - asked_s > SLOW_S:
             faults.append(
                 Fault(
@@ -103,15 +102,13 @@ class HandoffCheck:
         if self._thread.is_alive():
             log.error("%s does not answer; the newest hand-offs are not written down", self._path)
 
-    def _judge(self) -> None:
-        """Sum up anew; the lock is held."""
+    def _judge(self) -> list[HandoffBias]:
+        """Sum up anew and return what stands out newly; the lock is held, so nothing is logged here."""
         those = [one for one in self._handoffs if one.mast_digest == self._digest]
-        known = {(one.source, one.camera) for one in self._offsets}
-        self._counted = sum(bool(one.found) for one in those)
-        self._offsets = tuple(one for one in handoff_bias(those) if one.significant)
-        for one in self._offsets:
-            if (one.source, one.camera) not in known:
-                log.warning("hand-offs tell an offset: %s", one.sentence)
+        known = {(one.source, one.camera) for one in self._judged[1]}
+        offsets = tuple(one for one in handoff_bias(those) if one.significant)
+        self._judged = sum(bool(one.found) for one in those), offsets
+        return [one for one in offsets if (one.source, one.camera) not in known]
 
     # In the file's thread
 
@@ -142,7 +139,8 @@ class HandoffCheck:
             before = ()
         with self._lock:
             self._handoffs = deque((*before, *self._handoffs), maxlen=KEPT)
-            self._judge()
+            news = self._judge()
+        _tell(news)
         self._asked(None)
 
     def _write(self, writer: HandoffLog, waiting: deque[MatchedHandoff]) -> None:
@@ -171,3 +169,8 @@ class HandoffCheck:
     def _asked(self, since_s: float | None) -> None:
         with self._lock:
             self._asked_s = since_s
+
+
+def _tell(news: list[HandoffBias]) -> None:
+    for one in news:
+        log.warning("hand-offs tell an offset: %s", one.sentence)

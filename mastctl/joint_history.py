@@ -87,13 +87,13 @@ class JointHistory:
     def __init__(self) -> None:
         self._readings: deque[Reading] = deque(maxlen=KEPT_READINGS)
         self._moves_s: deque[float] = deque(maxlen=200)
+        self._newest: Reading | None = None
         self._lock = threading.Lock()
 
     @property
     def newest(self) -> Reading | None:
-        """The last good reading."""
-        with self._lock:
-            return self._readings[-1] if self._readings else None
+        """The last good reading; read without a lock."""
+        return self._newest
 
     def add(self, reading: Reading) -> None:
         """Keep a checked reading; one of the same time replaces the last."""
@@ -101,6 +101,7 @@ class JointHistory:
             if self._readings and reading.time_s <= self._readings[-1].time_s:
                 self._readings.pop()
             self._readings.append(reading)
+            self._newest = reading
 
     def move_sent(self, time_s: float) -> None:
         """Remember that a move went out, so that no exposure around it counts as still."""

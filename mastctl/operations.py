@@ -2,6 +2,10 @@
 
 This module does not know how to point. It runs what it is given, keeps the record, and makes sure that a
 stop is the last word: from the moment a stop is asked for until the operation has ended, no move goes out.
+
+What is read from here (`Operations.motion`, `Operations.get`, `Operations.all`) is read without a lock: the
+records are a mapping that is replaced, never edited. The lock is for those that write, and is not held while
+anything else is waited for.
 """
 
 from __future__ import annotations
@@ -10,8 +14,8 @@ import itertools
 import logging
 import secrets
 import threading
-from collections import OrderedDict
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import Any, Literal, Protocol
 
@@ -27,6 +31,9 @@ log = logging.getLogger(__name__)
 KEPT_OPERATIONS = 200
 END_TIMEOUT_S = 5.0  # for a cancelled operation to notice, when the service closes
 
+STOP_ASKED = "a stop was asked for"
+CLOSING = "the service is closing"
+
 OperationState = Literal["queued", "running", "done", "failed", "stopped"]
 
 
@@ -35,9 +42,26 @@ class Busy(MastctlError):
 
     code = "busy"
 
-    def __init__(self, operation: str) -> None:
+    def __init__(self, operation: str, *, stopping: bool = False) -> None:
         self.operation = operation
-        super().__init__(f"operation {operation} is running; wait for it or stop it")
+        what = (
+            "is being stopped; ask again when it has ended"
+            if stopping
+            else "is running; wait for it or stop it"
+        )
+        super().__init__(f"operation {operation} {what}")
+
+
+class Stopping(MastctlError):
+    """The mast is being stopped, and nothing is started until that is over."""
+
+    code = "stopping"
+
+
+class NotStarted(MastctlError):
+    """The machine had no thread for an operation."""
+
+    code = "no_thread"
 
 
 class UnknownOperation(MastctlError):
@@ -50,8 +74,8 @@ class Mover(Protocol):
     """What of `mastctl.devices.Devices` is needed to stop and to keep stopped."""
 
     def stop(self) -> None: ...
-    def block_moves(self, reason: str) -> None: ...
-    def allow_moves(self) -> None: ...
+    def block_moves(self, holder: object, reason: str) -> None: ...
+    def allow_moves(self, holder: object) -> None: ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,18 +136,21 @@ class Operations:
         self._mover = mover
         self._clock = clock
         self._lock = threading.Lock()
-        self._records: OrderedDict[str, Operation] = OrderedDict()
+        self._records: Mapping[str, Operation] = {}  # oldest first
         self._numbers = itertools.count(1)
         self._run = secrets.token_hex(2)  # so that an id from before a restart names nothing
         self._current: tuple[str, threading.Event, threading.Thread] | None = None
         self._motion = Motion()
+        self._stops: set[object] = set()  # under way
         self._closed = False
+        self._cancelled_because = ""
 
     @property
     def motion(self) -> Motion:
         """What to show about operations: the running one, its target, the last residual."""
-        with self._lock:
-            return self._motion
+        motion, current = self._motion, self._current
+        ending = current is not None and current[0] == motion.operation and current[1].is_set()
+        return replace(motion, stopping=bool(self._stops) or ending)
 
     @property
     def closed(self) -> bool:
@@ -139,41 +166,68 @@ class Operations:
         ------
         Busy
             If another operation runs.
+        Stopping
+            If the mast is being stopped.
+        NotStarted
+            If the machine has no thread for it; the record says so too.
         MastctlError
             If the service is closing.
         """
         with self._lock:
             if self._closed:
-                raise MastctlError("the service is closing")
+                raise MastctlError(CLOSING)
+            if self._stops:
+                raise Stopping("the mast is being stopped; ask again when that is over")
             if self._current is not None:
-                raise Busy(self._current[0])
+                raise Busy(self._current[0], stopping=self._current[1].is_set())
             name = f"{next(self._numbers):06d}-{self._run}"
             operation = Operation(name, "queued", dict(request), self._clock.now_s())
             cancelled = threading.Event()
             thread = threading.Thread(
                 target=self._work, args=(name, work, cancelled, on_end), name=f"operation {name}", daemon=True
             )
-            self._records[name] = operation
-            while len(self._records) > KEPT_OPERATIONS:
-                self._records.popitem(last=False)
+            self._keep(operation)
             self._current = (name, cancelled, thread)
             self._motion = replace(self._motion, operation=name, target=dict(request), stopped=False)
-        thread.start()
+        try:
+            thread.start()
+        except RuntimeError as error:  # no thread to be had: nothing has moved, and the next may have one
+            refusal = NotStarted(f"operation {name} was not started: {error}")
+            self._end(name, "failed", None, error_body(refusal))
+            raise refusal from None
         return operation
 
+    @contextmanager
+    def held(self) -> Iterator[None]:
+        """Let no operation start and no move go out inside the block; waits for nobody."""
+        hold = object()
+        self._stops.add(hold)
+        self._mover.block_moves(hold, STOP_ASKED)
+        try:
+            yield
+        finally:
+            self._stops.discard(hold)
+            self._mover.allow_moves(hold)
+
     def stop(self) -> str | None:
-        """Stop the mast and the running operation, if any; return its id.
+        """Stop the mast, then the running operation, if any; return its id.
+
+        The head comes first: nothing is asked, written or locked before it was told.
 
         Raises
         ------
         DriverError
             If the head did not confirm the stop; the operation is stopped all the same.
         """
-        with self._lock:
-            name = self._cancel("a stop was asked for")
-            self._motion = replace(self._motion, stopped=True)
+        name: str | None = None
+        with self.held():
+            try:
+                self._mover.stop()
+            finally:
+                with self._lock:
+                    name = self._cancel(STOP_ASKED)
+                    self._motion = replace(self._motion, stopped=True)
         log.info("stop%s", f": operation {name}" if name else "")
-        self._mover.stop()
         return name
 
     def get(self, name: str) -> Operation:
@@ -184,8 +238,7 @@ class Operations:
         UnknownOperation
             If this run of the service does not know it, or no longer.
         """
-        with self._lock:
-            operation = self._records.get(name)
+        operation = self._records.get(name)
         if operation is None:
             raise UnknownOperation(
                 f"operation {name[:80]} is not known; the newest {KEPT_OPERATIONS} of this run are kept"
@@ -194,33 +247,45 @@ class Operations:
 
     def all(self) -> list[Operation]:
         """Return the kept records, newest first."""
-        with self._lock:
-            return list(reversed(self._records.values()))
+        return list(self._records.values())[::-1]
 
     def close(self) -> None:
         """Take no more, stop the mast and what runs, and wait some seconds for it to end; never raises."""
+        self._closed = True
+        self._mover.block_moves(self, CLOSING)
+        self._stop_unasked("as the service closes")
         with self._lock:
-            self._closed = True
             current = self._current
-            self._cancel("the service is closing")
-        try:
-            self._mover.stop()
-        except (DriverError, MastctlError) as error:
-            log.error("the head did not confirm the stop: %s", error)
+            self._cancel(CLOSING)
         if current is None:
             return
         current[2].join(END_TIMEOUT_S)
         if current[2].is_alive():
             log.error("operation %s did not end within %.0f s; it is given up", current[0], END_TIMEOUT_S)
-            self._end(current[0], "stopped", None, error_body(Stopped("the service is closing")))
+            self._end(current[0], "stopped", None, error_body(Stopped(CLOSING)))
+
+    def _stop_unasked(self, when: str) -> None:
+        """Stop the mast where nobody waits for the answer; whatever its driver raises must not go further."""
+        try:
+            self._mover.stop()
+        except BaseException as error:
+            log.error("the head did not confirm the stop %s: %s", when, error_body(error)["message"])
+
+    def _keep(self, operation: Operation) -> None:
+        """Keep a record, and forget the oldest; the lock is held."""
+        records = {**self._records, operation.id: operation}
+        while len(records) > KEPT_OPERATIONS:
+            del records[next(iter(records))]
+        self._records = records
 
     def _cancel(self, reason: str) -> str | None:
         """Tell the running operation to end and let no further move of it out; the lock is held."""
         if self._current is None:
             return None
         name, cancelled, _ = self._current
+        self._cancelled_because = reason
         cancelled.set()
-        self._mover.block_moves(reason)
+        self._mover.block_moves(name, reason)
         return name
 
     def _work(self, name: str, work: Work, cancelled: threading.Event, on_end: OnEnd | None) -> None:
@@ -240,10 +305,10 @@ class Operations:
             with self._lock:
                 known = self._records.get(name)
                 if known is not None:
-                    self._records[name] = replace(known, steps=(*known.steps, step))
+                    self._keep(replace(known, steps=(*known.steps, step)))
 
         with self._lock:
-            self._records[name] = replace(self._records[name], state="running", started_s=self._clock.now_s())
+            self._keep(replace(self._records[name], state="running", started_s=self._clock.now_s()))
         result: Any = None
         error: BaseException | None = None
         try:
@@ -257,45 +322,48 @@ class Operations:
             self._end(name, "done", result, None)
             log.info("operation %s done", name)
             return
-        try:
-            self._mover.stop()
-        except (DriverError, MastctlError) as unconfirmed:
-            log.error("the head did not confirm the stop after operation %s: %s", name, unconfirmed)
+        self._stop_unasked(f"after operation {name}")
         partial = getattr(error, "result", None)
         if cancelled.is_set():
-            self._end(name, "stopped", partial, error_body(Stopped("the operation was stopped")))
+            self._end(name, "stopped", partial, error_body(Stopped(self._cancelled_because)))
             log.info("operation %s stopped", name)
         else:
-            self._end(name, "failed", partial, error_body(error))
-            log.warning("operation %s failed: %s", name, error)
+            body = error_body(error)
+            self._end(name, "failed", partial, body)
+            log.warning("operation %s failed: %s", name, body["message"])
 
     def _end(self, name: str, state: OperationState, result: Any, error: dict[str, Any] | None) -> None:
         """Close a record and make room for the next operation."""
-        residual = _last_residual(result, name)
+        try:
+            residual = _last_residual(result, name)
+        except Exception:  # a result that is none must not keep the next operation out
+            log.exception("the result of operation %s tells no residual", name)
+            residual, result = None, None
         with self._lock:
             if self._current is None or self._current[0] != name:
                 return  # given up before
             known = self._records.get(name)
             if known is not None:
-                self._records[name] = replace(
-                    known, state=state, result=result, error=error, ended_s=self._clock.now_s()
-                )
+                ended_s = self._clock.now_s()
+                self._keep(replace(known, state=state, result=result, error=error, ended_s=ended_s))
             self._current = None
             self._motion = replace(self._motion, operation=None, residual=residual or self._motion.residual)
-            if not self._closed:
-                self._mover.allow_moves()
+            self._mover.allow_moves(name)
 
 
 def error_body(error: BaseException) -> dict[str, Any]:
-    """Return an error as programs read it: code, one plain sentence, more detail or null."""
-    if isinstance(error, (MastctlError, DriverError, CalibError)):
-        code = getattr(error, "code", None)
-        detail = getattr(error, "detail", None)
-        return {
-            "code": code if isinstance(code, str) else "failed",
-            "message": " ".join(str(error).split()),
-            "detail": as_json(detail) if isinstance(detail, Mapping) else None,
-        }
+    """Return an error as programs read it: code, one plain sentence, more detail or null; never raises."""
+    try:
+        if isinstance(error, (MastctlError, DriverError, CalibError)):
+            code = getattr(error, "code", None)
+            detail = getattr(error, "detail", None)
+            return {
+                "code": code if isinstance(code, str) else "failed",
+                "message": " ".join(str(error).split()),
+                "detail": as_json(detail) if isinstance(detail, Mapping) else None,
+            }
+    except Exception:  # a driver from outside raised what cannot even be put into words
+        log.debug("an error without words", exc_info=True)
     return {
         "code": "internal",
         "message": f"the service met a defect of its own ({type(error).__name__}); its log says more",

@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 import threading
 from collections.abc import Callable, Iterable, Mapping
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from importlib.metadata import version
 from typing import Any
@@ -22,11 +21,12 @@ from mastctl.errors import FrameGone, MastctlError
 from mastctl.frames import StampedFrame
 from mastctl.handoff_check import HandoffCheck
 from mastctl.mast_in_use import MastInUse, read_mast, read_next
-from mastctl.operations import Busy, Operation, Operations
+from mastctl.operations import STOP_ASKED, Busy, Operation, Operations
 from mastctl.pointing.loop import PointingLoop
 from mastctl.pointing.requests import Aim, AnglesTarget, PixelTarget, PointRequest, PositionTarget
 from mastctl.pointing.wanted import position_in_rover_m
 from mastctl.state import State
+from mastctl.stop_threads import StopThreads
 from mastctl.tracking.pose import RoverPose
 from mastctl.tracking.status import TrackStatus
 from mastctl.tracking.tracker import Tracker
@@ -38,7 +38,6 @@ SNAPSHOT_AGE_S = 1.0  # a snapshot that need not be fresh may be this old
 SNAPSHOT_TIMEOUT_S = 5.0
 RENDERING_S = 20.0  # six simulated cameras share one renderer, on a machine that may be busy
 HARDWARE_CLOSE_S = 3.0
-STOP_THREADS = 4
 
 
 class Refused(MastctlError):
@@ -98,7 +97,7 @@ class Service:
         grace_s = None if hardware.simulation is None else RENDERING_S
         self.devices = Devices(hardware, config.limits, mast.stored.digest, clock, mast.stored.rig, grace_s)
         self.operations = Operations(self.devices, clock)
-        self.stop_threads = ThreadPoolExecutor(STOP_THREADS, thread_name_prefix="stop")
+        self.stop_threads = StopThreads()
         self._rig = _configured(mast.stored.rig, config.hardware.cameras)
         self._loop = PointingLoop(self._rig, self.devices, config.limits, clock)
         self.handoffs = HandoffCheck(config.tracking.handoff_log, mast.stored.digest, clock)
@@ -112,6 +111,8 @@ class Service:
             self.handoffs.add,
         )
         self._version = version("mastctl")
+        self._closing = threading.Lock()
+        self._closed = False
 
     @classmethod
     def open(cls, config: Config, clock: Clock | None = None) -> Service:
@@ -180,6 +181,13 @@ class Service:
         after_s = now_s if fresh else now_s - SNAPSHOT_AGE_S
         return self.devices.frames([camera], after_s, SNAPSHOT_TIMEOUT_S)[camera]
 
+    def check_camera(self, camera: str) -> None:
+        """Pass a configured camera's name. Raises UnknownCamera."""
+        known = self.devices.newest_frames()
+        if camera not in known:
+            words = ", ".join(sorted(known)) or "none"
+            raise UnknownCamera(f"camera {camera[:80]} is not configured; configured are {words}")
+
     def kept_frame(self, camera: str, frame_id: str) -> StampedFrame:
         """Return a frame that is still kept, by its id.
 
@@ -188,8 +196,7 @@ class Service:
         FrameGone, Refused, UnknownCamera
             If it is not kept, is of another camera, or there is no such camera.
         """
-        if camera not in self.devices.newest_frames():
-            raise UnknownCamera(f"camera {camera[:80]} is not configured")
+        self.check_camera(camera)
         frame = self.devices.frame_by_id(frame_id)
         if frame.camera != camera:
             raise Refused("wrong_camera", f"frame {frame_id} is of camera {frame.camera}, not of {camera}")
@@ -274,6 +281,9 @@ class Service:
 
     def stop_track(self) -> None:
         """End the track, and stop the mast if it moves for it. Raises DriverError."""
+        running = self.tracker.status.operation
+        if running is not None and self.operations.motion.operation == running:
+            self.operations.stop()  # the head first
         running = self.tracker.stop("the track was stopped")
         if running is not None and self.operations.motion.operation == running:
             self.operations.stop()
@@ -354,15 +364,25 @@ class Service:
         return PositionTarget((x, y, z), "rover")
 
     def stop(self) -> str | None:
-        """Stop the mast, what runs, and the track; return the stopped operation's id. Raises DriverError."""
-        self.tracker.stop("a stop was asked for")
-        return self.operations.stop()
+        """Stop the mast, then what runs and the track; return the stopped operation's id. Raises DriverError.
+
+        Nothing comes before the head: no log, no file, and no lock that is held for longer than a read.
+        """
+        with self.operations.held():  # until the track has ended too, which would look again
+            try:
+                return self.operations.stop()
+            finally:
+                self.tracker.stop(STOP_ASKED)
 
     def close(self) -> None:
         """Stop the mast and let go of everything; bounded, never raises."""
         self.operations.close()
+        with self._closing:
+            if self._closed:
+                return
+            self._closed = True
         self.devices.close()
-        self.stop_threads.shutdown(wait=False)
+        self.stop_threads.close()
         self.handoffs.close()
         _bounded("closing the hardware", self.hardware.close, HARDWARE_CLOSE_S)
 

@@ -15,7 +15,7 @@ from mastctl.frames import StampedFrame
 from mastctl.limits import Limits
 from mastctl.tracking.status import TrackStatus
 
-StateWord = Literal["idle", "moving", "pointing", "stopped", "fault"]
+StateWord = Literal["idle", "moving", "pointing", "stopping", "stopped", "fault"]
 
 
 @dataclass(frozen=True)
@@ -41,12 +41,15 @@ class Motion:
         The last one measured.
     stopped
         Whether the last thing that happened was a stop.
+    stopping
+        Whether a stop is under way: the head has not confirmed it, or the operation has not ended yet.
     """
 
     operation: str | None = None
     target: Mapping[str, Any] | None = None
     residual: Residual | None = None
     stopped: bool = False
+    stopping: bool = False
 
 
 @dataclass(frozen=True)
@@ -91,6 +94,8 @@ class State:
         """Return the state in one word; ``head`` is the name under which the head's faults stand."""
         if self.reading is None or any(fault.device == head for fault in self.faults):
             return "fault"
+        if self.motion.stopping:
+            return "stopping"
         if self.motion.operation is not None:
             return "pointing"
         if self.moving:

@@ -106,15 +106,15 @@ class Stops:
             self._fault = None
 
     def faults(self) -> tuple[Fault, ...]:
-        """Return what is wrong with the stops at this moment."""
+        """Return what is wrong with the stops at this moment; takes no lock."""
         now_s = time.monotonic()
-        with self._changed:
-            overdue = self._overdue(now_s)
-            if overdue:
-                since_s = min([one.asked_s for one in self._inside] + [self._queued_s or now_s])
-                words = f"{self._device}: {overdue}; {MAY_MOVE}"
-                return (Fault(self._device, NoReply.code, words, since_s, f"it is back, and then {UNTIL}"),)
-            return () if self._fault is None else (self._fault,)
+        fault, queued_s = self._fault, self._queued_s
+        overdue = self._overdue(now_s)
+        if overdue:
+            since_s = min([one.asked_s for one in tuple(self._inside)] + [queued_s or now_s])
+            words = f"{self._device}: {overdue}; {MAY_MOVE}"
+            return (Fault(self._device, NoReply.code, words, since_s, f"it is back, and then {UNTIL}"),)
+        return () if fault is None else (fault,)
 
     def _send(self, asked_s: float, timeout_s: float) -> None:
         deadline_s = asked_s + timeout_s
@@ -201,8 +201,8 @@ class Stops:
             raise error
 
     def _overdue(self, now_s: float) -> str:
-        """Say which stop has not come back in time; empty if none. The lock is held."""
-        waiting_s = [one.asked_s for one in self._inside if now_s >= one.asked_s + self._overdue_s]
+        """Say which stop has not come back in time; empty if none."""
+        waiting_s = [one.asked_s for one in tuple(self._inside) if now_s >= one.asked_s + self._overdue_s]
         return self._told(min(waiting_s), now_s) if waiting_s else ""
 
     @staticmethod

@@ -336,10 +336,10 @@ def test_a_stop_reaches_a_head_that_only_fails_to_read(devices: Devices, hardwar
 
 
 def test_blocked_moves_are_refused_until_they_are_allowed(devices: Devices, hardware: FakeHardware) -> None:
-    devices.block_moves("a stop was asked for")
+    devices.block_moves("stop", "a stop was asked for")
     with pytest.raises(Stopped, match="a stop was asked for"):
         devices.move(0.1, 0.1)
-    devices.allow_moves()
+    devices.allow_moves("stop")
     devices.move(0.1, 0.1)
     assert len(hardware.head.calls) == 1
 

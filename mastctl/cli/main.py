@@ -1,6 +1,7 @@
 """The door of the command line: choose the command, run it, tell a refusal in one line with its exit code.
 
-Exit codes: 0 success, 2 wrong use or bad input, 1 failure, 130 interrupted, 141 nobody reads the output.
+Exit codes: 0 success, 2 wrong use or bad input, 1 failure, 130 interrupted (128 and the number of the signal
+that ended it), 141 nobody reads the output.
 A command module offers ``add_commands(subparsers)`` and sets ``run=function(args) -> int`` on each of its
 commands. Only the module of the command that was asked for is imported; a module imports what is
 slow (numpy, cv2, numba, fastapi) inside its functions.
@@ -13,12 +14,15 @@ import importlib
 import logging
 import os
 import re
+import signal
 import sys
 from collections.abc import Sequence
 from difflib import get_close_matches
 from typing import Any, NoReturn
 
+from mastctl import signals
 from mastctl.cli import output
+from mastctl.queued_output import QueuedHandler, writer_to
 
 log = logging.getLogger(__name__)
 
@@ -99,11 +103,11 @@ def main(argv: Sequence[str] | None = None) -> int:
             setattr(sys, name, open(os.devnull, "w"))  # noqa: SIM115, PTH123  for as long as the process
     words = list(sys.argv[1:] if argv is None else argv)
     as_json = "--json" in words
-    logging.basicConfig(
-        format="%(levelname)s %(name)s: %(message)s", level=logging.WARNING, stream=sys.stderr
-    )
+    if not logging.getLogger().handlers:
+        _log_to(sys.stderr.fileno())
     try:
-        code = _tell(words, as_json)
+        with signals.raised():
+            code = _tell(words, as_json)
         sys.stdout.flush()
     except OSError as error:
         # Nobody reads stdout any more (head, less), or its disk is full.
@@ -112,17 +116,33 @@ def main(argv: Sequence[str] | None = None) -> int:
     return code
 
 
+def _log_to(descriptor: int) -> None:
+    """Log through a queue: what a driver or a daemon in this process has to say never waits for a reader."""
+    handler = QueuedHandler(writer_to(descriptor))
+    logging.basicConfig(
+        format="%(levelname)s %(name)s: %(message)s", level=logging.WARNING, handlers=[handler]
+    )
+
+
+def _refused(error: BaseException, as_json: bool) -> int:
+    """Tell a refusal, after what was logged about it."""
+    for handler in logging.getLogger().handlers:
+        handler.flush()
+    return output.refuse(error, as_json)
+
+
 def _tell(words: Sequence[str], as_json: bool) -> int:
     """Run and turn what is raised into one line and an exit code; only a broken stdout gets out."""
     try:
         return _run(words)
     except BrokenPipeError:
         raise
-    except KeyboardInterrupt:
-        return output.refuse(output.CommandError("interrupted", "interrupted", exit_code=130), as_json)
+    except KeyboardInterrupt as interrupt:
+        number = getattr(interrupt, "number", signal.SIGINT)
+        return _refused(output.CommandError("interrupted", "interrupted", exit_code=128 + number), as_json)
     except Exception as error:  # the last door before the user: one line, never a traceback
         log.debug("refused", exc_info=True)
-        return output.refuse(error, as_json)
+        return _refused(error, as_json)
 
 
 def _give_up_stdout() -> None:

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import argparse
+import atexit
 import logging
 import signal
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -64,17 +65,29 @@ def add_daemon_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--config", metavar="FILE", help="the configuration that the daemon runs with")
 
 
-class _Ended(BaseException):
-    """SIGTERM came before the daemon was up; no SystemExit, which a driver from outside may raise too."""
-
-
 def _run(args: argparse.Namespace) -> int:
-    try:
-        signal.signal(signal.SIGTERM, _leave)  # before the imports, which take a second
+    from mastctl import signals
+
+    _queue_output()
+    # Told to end before it is up, it ends: nothing has moved yet. Before the imports, which take a second.
+    with suppress(KeyboardInterrupt), signals.raised(signal.SIGINT):
         _serve(args)
-    except _Ended:
-        pass
     return 0
+
+
+def _queue_output() -> None:
+    """Let nothing that the daemon says wait for who reads it, on stderr as on stdout."""
+    from mastctl.queued_output import QueuedText, writer_to
+
+    for name in ("stdout", "stderr"):
+        try:
+            descriptor = getattr(sys, name).fileno()
+        except OSError:  # a stream of a test, which does not wait
+            continue
+        writer = writer_to(descriptor)
+        setattr(sys, name, QueuedText(writer))
+        atexit.register(writer.flush)
+    signal.signal(signal.SIGTTOU, signal.SIG_IGN)  # a background job may write to its terminal
 
 
 def _serve(args: argparse.Namespace) -> None:
@@ -93,11 +106,6 @@ def _serve(args: argparse.Namespace) -> None:
         sys.stdout.flush()
 
     run(load_config(args.config), ready)
-
-
-def _leave(number: int, frame: object) -> None:
-    """End cleanly when told so before the daemon is up: nothing has moved yet."""
-    raise _Ended
 
 
 def _status(args: argparse.Namespace) -> int:

@@ -192,7 +192,7 @@ class _Run:
         now, other = found.now, found.other
         with self._steps.step("stereo") as detail:
             detail.update(self._steps.one_moment(now, found.pixel_px, [other], found.resting))
-            partnered = self._eyes.stereo(now, found.pixel_px, other)
+            partnered = self._steps.unless_stopped(self._eyes.stereo, now, found.pixel_px, other)
             detail.update(facts(partnered.match), across_px=round(partnered.across_px, 3))
         assert partnered.plane is not None
         self._triangulate(now, found.pixel_px, other, partnered.match.pixel_px)
@@ -220,7 +220,7 @@ class _Run:
             views = self._steps.look((aim.camera, *companions), settled)
             now = views.pop(aim.camera)
             with self._steps.step("measure") as detail:
-                seen = self._eyes.look_for(clicked, now)
+                seen = self._steps.unless_stopped(self._eyes.look_for, clicked, now)
                 detail.update(facts(seen), predicted_px=rounded(seen.predicted_px))
                 detail.update(residual_px=rounded(seen.pixel_px - aim_px))
             confirmed: list[tuple[View, FloatArray]] = [(now, seen.pixel_px)]
@@ -230,7 +230,9 @@ class _Run:
                     detail.update(self._steps.one_moment(now, seen.pixel_px, list(views.values()), settled))
                 for name, other in views.items():
                     same_pair = {aim.camera, name} == {source, self._eyes.partner(source)}
-                    found, detail[name] = self._eyes.agree(clicked, now, seen, other, same_pair)
+                    found, detail[name] = self._steps.unless_stopped(
+                        self._eyes.agree, clicked, now, seen, other, same_pair
+                    )
                     confirmed.append((other, found.pixel_px))
             self._done(self._pointing(commanded, now, aim_px, seen))
             if number < pointings:
@@ -304,8 +306,8 @@ class _Run:
         """Stop the mast whatever happened; what stops it must not hide why."""
         try:
             self._devices.stop()
-        except (MastctlError, DriverError) as error:
-            log.error("the head did not confirm the stop: %s", error)
+        except Exception as error:
+            log.error("the head did not confirm the stop: %s: %s", type(error).__name__, error)
 
 
 def _told(solution: Solution) -> dict[str, float]:

@@ -6,13 +6,15 @@ import threading
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
-from typing import Any, Protocol
+from functools import partial
+from typing import Any, ParamSpec, Protocol, TypeVar
 
 from calib.mast import Rig
 from calib.rigid import FloatArray
 from drivers.clock import Clock
 from drivers.interfaces import Reading
 from mastctl.limits import Limits
+from mastctl.pointing.abandoned import result_unless
 from mastctl.pointing.counts import counts_told
 from mastctl.pointing.looking import CamerasLike, Eyes, View, facts
 from mastctl.pointing.motion import Head, HeadLike
@@ -20,6 +22,9 @@ from mastctl.pointing.one_moment import apart, check_one_moment
 from mastctl.pointing.record import Recorder
 from mastctl.pointing.requests import PixelTarget, PointingError, PointingSettings, Step
 from mastctl.pointing.wanted import clicked_px
+
+P = ParamSpec("P")
+T = TypeVar("T")
 
 
 class DevicesLike(HeadLike, CamerasLike, Protocol):
@@ -90,6 +95,16 @@ class Steps:
         """Record what happens inside as one step; the dict becomes its detail."""
         return self._recorder.step(name, **({"pointing": self.pointing} if self.pointing > 1 else {}))
 
+    def unless_stopped(self, work: Callable[P, T], *args: P.args, **options: P.kwargs) -> T:
+        """Return what ``work(*args, **options)`` returns, which only waits or computes and moves nothing.
+
+        Raises
+        ------
+        PointingError
+            ``stopped``, within some 20 ms of a stop, however long the work still takes.
+        """
+        return result_unless(self.head.check_not_stopped, partial(work, *args, **options))
+
     def rest(self) -> Reading:
         """Return the reading of a head that rests. Raises PointingError, DriverError."""
         with self.step("rest") as detail:
@@ -119,7 +134,8 @@ class Steps:
             raise PointingError("head_moving", words)
         resting = self.rest()
         with self.step("frames") as detail:
-            fresh = self.eyes.new((target.camera, partner), self._clock.now_s(), resting)
+            began_s = self._clock.now_s()
+            fresh = self.unless_stopped(self.eyes.new, (target.camera, partner), began_s, resting)
             now, other = fresh[target.camera], fresh[partner]
             detail.update(frame_ids=[now.frame.frame_id, other.frame.frame_id], **apart(now, [other]))
             if view.frame.mast_digest != now.frame.mast_digest:
@@ -127,7 +143,7 @@ class Steps:
                     "other_mast_file", f"frame {target.frame_id} was taken with another mast file"
                 )
         with self.step("target") as detail:
-            again = self.eyes.again(view, pixel, now)
+            again = self.unless_stopped(self.eyes.again, view, pixel, now)
             detail.update(facts(again))
         return Found(view, pixel, now, other, again.pixel_px, resting)
 
@@ -159,7 +175,7 @@ class Steps:
     def look(self, cameras: Sequence[str], settled: Reading) -> dict[str, View]:
         """Take new pictures, exposed after the head had settled. Raises PointingError, DriverError."""
         with self.step("look") as detail:
-            views = self.eyes.new(cameras, settled.time_s, settled)
+            views = self.unless_stopped(self.eyes.new, cameras, settled.time_s, settled)
             first, *others = views.values()
             detail.update(frame_ids=[view.frame.frame_id for view in views.values()], **apart(first, others))
         return views
@@ -168,4 +184,6 @@ class Steps:
         self, view: View, pixel_px: FloatArray, others: Sequence[View], resting: Reading
     ) -> dict[str, Any]:
         """Check that pictures of several eyes serve one measurement, as `check_one_moment` says."""
-        return check_one_moment(self.eyes, self._settings, view, pixel_px, others, resting)
+        return self.unless_stopped(
+            check_one_moment, self.eyes, self._settings, view, pixel_px, others, resting
+        )

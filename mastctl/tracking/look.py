@@ -222,7 +222,9 @@ class Looker:
         with self._steps.step("hand_over") as detail:
             detail.update(from_pair=before.seen.pair, to_pair=after.seen.pair)
             pair = self._rig.stereo[before.seen.pair]
-            made = record_of(self._rig, pair, before.taken.views, before.found, after.taken.views)
+            made = self._steps.unless_stopped(
+                record_of, self._rig, pair, before.taken.views, before.found, after.taken.views
+            )
             if isinstance(made, str):
                 detail.update(reason=made)
                 return None
@@ -236,7 +238,7 @@ class Looker:
     def _find(self, taken: _Taken, track: Track) -> _Sight:
         with self._steps.step("find") as detail:
             eyes = {name: Eye(view.image, view.camera) for name, view in taken.views.items()}
-            look = seen_by(track, eyes)
+            look = self._steps.unless_stopped(seen_by, track, eyes)
             pixels = {name: EyePixel("", "no_frame", reason) for name, reason in taken.missing.items()}
             pixels |= {name: _eye_pixel(taken.views[name], found) for name, found in look.found.items()}
             seen = self._told(taken.choice, look, pixels, taken.settled)
@@ -301,7 +303,9 @@ class Looker:
         with self._steps.step("start") as detail:
             detail.update(self._steps.one_moment(one, pixel_px, [other], resting))
             try:
-                track = start_track(Eye(one.image, one.camera), Eye(other.image, other.camera), pixel_px)
+                track = self._steps.unless_stopped(
+                    start_track, Eye(one.image, one.camera), Eye(other.image, other.camera), pixel_px
+                )
             except CalibError as error:
                 raise NotTrackable(" ".join(str(error).split())) from None
             sigma_m = np.sqrt(np.diag(track.covariance_m2))

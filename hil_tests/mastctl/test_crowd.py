@@ -1,0 +1,108 @@
+"""Many at once: dead cameras, waiting requests, silent connections keep nobody else out."""
+
+from __future__ import annotations
+
+import contextlib
+import resource
+import signal
+import socket
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from outside_daemon import BOUND_S, daemon_process, line, stands_short_of_its_goal, under_way, write_config
+from service_fakes import Hang, eventually, fake_daemon
+
+from mastctl.client import Client, ClientError
+
+
+def in_threads(count: int, ask: Callable[[], Any]) -> list[threading.Thread]:
+    made = [threading.Thread(target=ask) for _ in range(count)]
+    for one in made:
+        one.start()
+    return made
+
+
+def test_snapshots_of_a_dead_camera_keep_nobody_else_waiting(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    hang, codes = Hang(), list[str]()
+    with fake_daemon(monkeypatch, tmp_path) as (daemon, hardware):
+        hardware.fake_cameras["navcam_left"].hook = hang
+
+        def ask() -> None:
+            with Client(daemon.url) as client:
+                try:
+                    client.snapshot("navcam_left", fresh=True)
+                except ClientError as error:
+                    codes.append(error.code)
+
+        asking = in_threads(45, ask)
+        assert hang.entered.wait(BOUND_S)
+        eventually(lambda: codes, "a refusal", BOUND_S)
+        assert set(codes) == {"too_many"}, "the first refusals are of those that wait behind four"
+        with Client(daemon.url, timeout_s=3.0) as client:
+            assert client.pose([0, 0, 0], [1, 0, 0, 0])["operation"] is None
+            assert client.snapshot("hazcam_left").camera == "hazcam_left"
+        eventually(lambda: len(codes) >= 41, "the refusal of all but four", BOUND_S)
+        hang.let_go()
+        for one in asking:
+            one.join()
+
+
+def test_what_waits_when_the_daemon_ends_is_refused_and_the_end_is_bounded(tmp_path: Path) -> None:
+    codes: list[str] = []
+    with daemon_process(tmp_path, write_config(tmp_path)) as daemon:
+        url = line(daemon)
+
+        def ask() -> None:
+            with Client(url) as client:
+                try:
+                    client.snapshot("navcam_left", fresh=True)
+                except ClientError as error:
+                    codes.append(error.code)
+
+        asking = in_threads(3, ask)
+        time.sleep(0.5)
+        daemon.send_signal(signal.SIGTERM)
+        for one in asking:
+            one.join()
+        _, log = daemon.communicate(timeout=BOUND_S)
+    assert codes == ["closing"] * 3
+    assert "Traceback" not in log, log
+    assert daemon.returncode == 0
+
+
+SILENT = 70
+DESCRIPTORS = 64
+
+
+def few_descriptors() -> None:
+    resource.setrlimit(resource.RLIMIT_NOFILE, (DESCRIPTORS, DESCRIPTORS))
+
+
+@pytest.mark.parametrize("begun", [b"", b"POST /api/v1/stop HT"], ids=["silent", "slow"])
+def test_more_silent_connections_than_descriptors_do_not_keep_a_stop_out(
+    tmp_path: Path, begun: bytes
+) -> None:
+    with daemon_process(tmp_path, write_config(tmp_path), preexec_fn=few_descriptors) as daemon:
+        url = line(daemon)
+        host, port = url.removeprefix("http://").split(":")
+        with contextlib.ExitStack() as open_ones:
+            with Client(url) as client:
+                under_way(client)
+            for _ in range(SILENT):
+                one = open_ones.enter_context(socket.create_connection((host, int(port)), timeout=BOUND_S))
+                with contextlib.suppress(OSError):
+                    one.sendall(begun)
+            began_s = time.monotonic()
+            with Client(url, timeout_s=BOUND_S) as client:
+                client.stop()
+                assert time.monotonic() - began_s < 2.0, "a stop gets in at once"
+                stands_short_of_its_goal(client)
+        daemon.send_signal(signal.SIGTERM)
+        _, log = daemon.communicate(timeout=BOUND_S)
+        assert "Traceback" not in log, log

@@ -1,0 +1,90 @@
+"""Every signal that ends a process stops the mast first, and one that suspends it too."""
+
+from __future__ import annotations
+
+import signal
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from outside_daemon import (
+    BOUND_S,
+    SHORT_OF_GOAL_RAD,
+    daemon_process,
+    line,
+    stands_short_of_its_goal,
+    under_way,
+    write_config,
+)
+from service_fakes import eventually
+
+from mastctl import signals
+from mastctl.client import Client
+
+
+def test_every_signal_that_ends_a_process_is_known() -> None:
+    for name in ("HUP", "INT", "QUIT", "USR1", "USR2", "ALRM", "TERM", "VTALRM", "PROF", "IO", "PWR", "XCPU"):
+        assert int(signal.Signals[f"SIG{name}"]) in signals.ENDING
+    assert signal.SIGRTMIN in signals.ENDING
+    assert not signals.ENDING & {
+        signal.SIGCHLD,
+        signal.SIGWINCH,
+        signal.SIGPIPE,
+        signal.SIGKILL,
+        signal.SIGSTOP,
+    }
+
+
+@pytest.mark.parametrize("name", ["SIGHUP", "SIGQUIT", "SIGUSR1", "SIGALRM"])
+def test_a_signal_that_ends_stops_the_mast_first(tmp_path: Path, name: str) -> None:
+    with daemon_process(tmp_path, write_config(tmp_path)) as daemon:
+        with Client(line(daemon)) as client:
+            under_way(client)
+        daemon.send_signal(signal.Signals[name])
+        _, log = daemon.communicate(timeout=BOUND_S)
+    assert (daemon.returncode, "Traceback" in log) == (0, False), log
+    words = (tmp_path / "head.log").read_text().splitlines()
+    assert words[0] == "move"
+    assert words[1].startswith("stop")
+    assert float(words[1].split()[1]) < SHORT_OF_GOAL_RAD
+    assert words[-1] == "close"
+
+
+def test_a_closed_terminal_is_survived_where_nohup_asked_for_it(tmp_path: Path) -> None:
+    ignore: Callable[[], Any] = lambda: signal.signal(signal.SIGHUP, signal.SIG_IGN)  # noqa: E731
+    with daemon_process(tmp_path, write_config(tmp_path), preexec_fn=ignore) as daemon:
+        url = line(daemon)
+        daemon.send_signal(signal.SIGHUP)
+        with Client(url) as client:
+            assert client.status()["state"] == "idle"
+        daemon.send_signal(signal.SIGTERM)
+        assert daemon.wait(BOUND_S) == 0
+
+
+def test_a_second_signal_does_not_cut_the_closing_short(tmp_path: Path) -> None:
+    config = write_config(tmp_path)
+    text = (tmp_path / "outside_devices.py").read_text()
+    slow = text.replace('self.note("close")', 'self.note("closing"); time.sleep(0.5); self.note("close")')
+    (tmp_path / "outside_devices.py").write_text(slow)
+    with daemon_process(tmp_path, config) as daemon:
+        line(daemon)
+        daemon.send_signal(signal.SIGTERM)
+        log = tmp_path / "head.log"
+        eventually(lambda: log.exists() and "closing" in log.read_text(), "the closing", BOUND_S)
+        daemon.send_signal(signal.SIGTERM)
+        daemon.send_signal(signal.SIGHUP)
+        daemon.wait(BOUND_S)
+    assert log.read_text().splitlines()[-1] == "close"
+
+
+def test_a_daemon_that_is_suspended_stops_the_mast_first(tmp_path: Path) -> None:
+    with daemon_process(tmp_path, write_config(tmp_path)) as daemon, Client(line(daemon)) as client:
+        under_way(client)
+        daemon.send_signal(signal.SIGTSTP)
+        state = Path(f"/proc/{daemon.pid}/stat")
+        eventually(lambda: state.read_text().rpartition(")")[2].split()[0] == "T", "the suspension", BOUND_S)
+        words = (tmp_path / "head.log").read_text().splitlines()
+        assert [word.split()[0] for word in words[:2]] == ["move", "stop"]
+        daemon.send_signal(signal.SIGCONT)
+        stands_short_of_its_goal(client)

@@ -1,0 +1,80 @@
+"""Words for stderr and stdout: nobody waits for whoever reads them."""
+
+from __future__ import annotations
+
+import logging
+import signal
+from pathlib import Path
+
+import pytest
+from outside_daemon import (
+    BOUND_S,
+    Pipe,
+    answers,
+    daemon_process,
+    free_port,
+    stands_short_of_its_goal,
+    under_way,
+    write_config,
+)
+from service_fakes import Hang, eventually
+
+from mastctl.client import Client
+from mastctl.queued_output import QueuedHandler, QueuedText, QueuedWriter
+
+
+@pytest.mark.parametrize("full", ["stderr", "stdout", "both"])
+def test_a_full_pipe_for_its_words_does_not_hold_a_stop(tmp_path: Path, full: str) -> None:
+    url = f"http://127.0.0.1:{(port := free_port())}"
+    config = write_config(tmp_path, f"{{port: {port}}}")
+    out, log = Pipe(), Pipe()
+    for name, pipe in (("stdout", out), ("stderr", log)):
+        if full in (name, "both"):
+            pipe.fill()
+    with daemon_process(tmp_path, config, stdout=out.write, stderr=log.write) as daemon:
+        eventually(lambda: answers(url), "the daemon's first answer", BOUND_S)
+        with Client(url, timeout_s=5.0) as client:
+            under_way(client)
+            assert client.stop()["stopped"] is True
+            stands_short_of_its_goal(client)
+        daemon.send_signal(signal.SIGTERM)
+        assert daemon.wait(BOUND_S) == 0
+    assert (tmp_path / "head.log").read_text().splitlines()[-1] == "close"
+
+
+def test_what_does_not_fit_is_dropped_and_counted_and_said_when_it_flows_again() -> None:
+    pipe = Pipe()
+    pipe.fill()
+    writer = QueuedWriter(pipe.write, kept=10)
+    handler = QueuedHandler(writer)
+    for number in range(100):
+        handler.handle(logging.makeLogRecord({"msg": "word %d", "args": (number,)}))
+    told = pipe.drain(b"dropped").decode()
+    kept = told.count("word")
+    assert 10 <= kept <= 12, "those in the queue, and one or two in the writing thread's hands"
+    assert f"{100 - kept} messages were dropped" in told
+    QueuedText(writer).write("again\n")
+    assert writer.flush(BOUND_S)
+    assert b"again" in pipe.drain(b"again")
+
+
+def test_words_that_take_for_ever_to_be_made_hold_only_the_thread_that_writes() -> None:
+    pipe, hang = Pipe(), Hang()
+
+    class Slow:
+        def __str__(self) -> str:
+            hang()
+            return "at last"
+
+    handler = QueuedHandler(QueuedWriter(pipe.write))
+    handler.handle(logging.makeLogRecord({"msg": "%s", "args": (Slow(),)}))
+    handler.handle(logging.makeLogRecord({"msg": "%d", "args": ("no number",)}))
+    handler.handle(logging.makeLogRecord({"msg": "next"}))
+    assert hang.entered.wait(BOUND_S)
+    hang.let_go()
+    told = pipe.drain(b"next").decode()
+    assert told.splitlines() == [
+        "at last",
+        "mastctl: a message could not be put into words: TypeError",
+        "next",
+    ]

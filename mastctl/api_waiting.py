@@ -1,0 +1,103 @@
+"""Requests that wait: for a thread, for a device, for a picture; and none that waits for a daemon that ends.
+
+The event loop itself never waits for a lock, a file or a device. What may, runs here in worker threads; a
+request that waits when the daemon ends is refused at once, and what its thread still brings is dropped.
+Pictures have a limit of their own for each camera, so that a dead camera, however often it is asked, takes
+no thread from anything else.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import math
+from collections.abc import Awaitable, Callable
+from typing import TypeVar
+
+import anyio
+from anyio import to_thread
+
+from mastctl.errors import MastctlError
+
+T = TypeVar("T")
+
+PICTURES_AT_ONCE = 4  # of one camera
+PICTURE_QUEUE_S = 2.0  # how long a request waits for those before it
+
+
+class TooMany(MastctlError):
+    """More is asked at once than can be done; it may be asked again after ``retry_after_s`` seconds."""
+
+    code = "too_many"
+
+    def __init__(self, message: str, retry_after_s: float) -> None:
+        self.retry_after_s = retry_after_s
+        super().__init__(message)
+
+
+class Ending(MastctlError):
+    """The daemon ends, and what was waited for will not come."""
+
+    code = "closing"
+
+
+class Waiting:
+    """The waiting requests of one daemon; used on its event loop only."""
+
+    def __init__(self) -> None:
+        self._ending = asyncio.Event()
+        self._asked: dict[str, asyncio.Semaphore] = {}
+        self._pictures: anyio.CapacityLimiter | None = None
+
+    def end(self) -> None:
+        """Refuse what waits now and what will come."""
+        self._ending.set()
+
+    async def run(self, function: Callable[[], T]) -> T:
+        """Return what ``function()`` returns, run in a worker thread.
+
+        Raises
+        ------
+        Ending
+            If the daemon ends before it returns.
+        """
+        return await self._unless_ending(to_thread.run_sync(function, abandon_on_cancel=True))
+
+    async def picture(self, camera: str, function: Callable[[], T]) -> T:
+        """Return what ``function()`` returns, which takes a picture with a (known) camera.
+
+        Raises
+        ------
+        TooMany
+            If so many others wait for this camera that it does not come to this one's turn in 2 s.
+        Ending
+            As `run`.
+        """
+        return await self._unless_ending(self._in_turn(camera, function))
+
+    async def _in_turn(self, camera: str, function: Callable[[], T]) -> T:
+        turn = self._asked.setdefault(camera, asyncio.Semaphore(PICTURES_AT_ONCE))
+        self._pictures = self._pictures or anyio.CapacityLimiter(math.inf)
+        try:
+            await asyncio.wait_for(turn.acquire(), PICTURE_QUEUE_S)
+        except TimeoutError:
+            raise TooMany(
+                f"{PICTURES_AT_ONCE} pictures of {camera} are waited for, and none came in "
+                f"{PICTURE_QUEUE_S:g} s; ask again later",
+                PICTURE_QUEUE_S,
+            ) from None
+        try:
+            return await to_thread.run_sync(function, abandon_on_cancel=True, limiter=self._pictures)
+        finally:
+            turn.release()
+
+    async def _unless_ending(self, work: Awaitable[T]) -> T:
+        call = asyncio.ensure_future(work)
+        ending = asyncio.ensure_future(self._ending.wait())
+        try:
+            await asyncio.wait({call, ending}, return_when=asyncio.FIRST_COMPLETED)
+            if call.done():
+                return call.result()
+            raise Ending("the daemon ends; what was asked for will not come")
+        finally:
+            for one in (call, ending):
+                one.cancel()

@@ -1,0 +1,145 @@
+"""Words for stderr and stdout that never hold whoever says them: a bounded queue, and a thread that writes.
+
+A pipe that nobody reads, a terminal that was stopped, or a disk that hangs holds a process in its next write,
+and with it everybody who waits for a lock of the writer. Here only the writing thread is held. What does
+not fit into the queue meanwhile is dropped and counted, and the count is told when the output flows again.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import logging
+import os
+import select
+import threading
+from collections.abc import Callable
+from functools import cache
+from queue import SimpleQueue
+
+KEPT = 1000  # messages that wait for an output that does not flow
+FLUSH_S = 1.0
+
+Message = str | Callable[[], str]
+
+
+class QueuedWriter:
+    """Writes text to a file descriptor, in the order given, from a thread of its own.
+
+    Parameters
+    ----------
+    descriptor
+        Where to; not closed.
+    kept
+        How many messages may wait.
+    """
+
+    def __init__(self, descriptor: int, kept: int = KEPT) -> None:
+        self.descriptor = descriptor
+        self._kept = kept
+        self._queue: SimpleQueue[Message | threading.Event] = SimpleQueue()
+        self._dropped = 0
+        # Reentrant, because a signal's handler or a finaliser may say something in the middle of it.
+        self._counting = threading.RLock()
+        threading.Thread(target=self._work, name="output", daemon=True).start()
+
+    def put(self, message: Message) -> None:
+        """Have a text written, or what a function returns, which is called in the writing thread; at once."""
+        if self._queue.qsize() >= self._kept:
+            with self._counting:
+                self._dropped += 1
+            return
+        if self._dropped:
+            self._queue.put(self._told_dropped)
+        self._queue.put(message)
+
+    def flush(self, timeout_s: float = FLUSH_S) -> bool:
+        """Wait until what was put before is written, ``timeout_s`` seconds at most; return whether it is."""
+        written = threading.Event()
+        self._queue.put(written)
+        return written.wait(timeout_s)
+
+    def _told_dropped(self) -> str:
+        with self._counting:
+            dropped, self._dropped = self._dropped, 0
+        if not dropped:
+            return ""
+        return f"mastctl: {dropped} messages were dropped here while nobody read this output\n"
+
+    # In the writing thread
+
+    def _work(self) -> None:
+        while True:
+            entry = self._queue.get()
+            if not isinstance(entry, threading.Event):
+                self._write(entry)
+            if self._dropped and self._queue.empty():
+                self._write(self._told_dropped)
+            if isinstance(entry, threading.Event):
+                entry.set()
+
+    def _write(self, message: Message) -> None:
+        """Write one message whole; what cannot be written at all (closed, disk full) is lost."""
+        try:
+            text = message if isinstance(message, str) else message()
+        except Exception as error:  # a message that cannot be put into words must not end the thread
+            text = f"mastctl: a message could not be put into words: {type(error).__name__}\n"
+        left = text.encode("utf-8", "backslashreplace")
+        while left:
+            try:
+                left = left[os.write(self.descriptor, left) :]
+            except BlockingIOError:  # whoever started us shares the pipe and does not wait on it
+                with contextlib.suppress(OSError):
+                    select.select([], [self.descriptor], [])
+            except OSError:
+                return
+
+
+@cache
+def writer_to(descriptor: int) -> QueuedWriter:
+    """Return the one writer to a descriptor, so that what several say stays in order."""
+    return QueuedWriter(descriptor)
+
+
+class QueuedText(io.TextIOBase):
+    """A text stream on a `QueuedWriter`, in the place of ``sys.stderr`` or ``sys.stdout``; never waits."""
+
+    encoding = "utf-8"
+
+    def __init__(self, writer: QueuedWriter) -> None:
+        self._writer = writer
+
+    def writable(self) -> bool:
+        return True
+
+    def write(self, text: str) -> int:
+        if text:
+            self._writer.put(text)
+        return len(text)
+
+    def flush(self) -> None:
+        """Return at once: the thread writes as soon as it can."""
+
+    def fileno(self) -> int:
+        return self._writer.descriptor
+
+    def isatty(self) -> bool:
+        return os.isatty(self._writer.descriptor)
+
+
+class QueuedHandler(logging.Handler):
+    """Log records through a `QueuedWriter`: no lock, and formatted in the writing thread."""
+
+    def __init__(self, writer: QueuedWriter) -> None:
+        super().__init__()
+        self._writer = writer
+
+    def createLock(self) -> None:
+        self.lock = None
+
+    def emit(self, record: logging.LogRecord) -> None:
+        self._writer.put(lambda: self.format(record) + "\n")
+
+    def flush(self) -> None:
+        """Wait for what was logged, a second at most."""
+        self._writer.flush()

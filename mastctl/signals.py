@@ -1,0 +1,69 @@
+"""Signals that end a process: which they are, and an end in order instead of a death on the spot."""
+
+from __future__ import annotations
+
+import signal
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import NoReturn
+
+# The program's own defects; after these nothing can be trusted to run.
+_DEFECTS = {
+    signal.SIGSEGV, signal.SIGBUS, signal.SIGFPE, signal.SIGILL, signal.SIGABRT, signal.SIGTRAP,
+    signal.SIGSYS,
+}  # fmt: skip
+# Those that end nobody, or nobody can catch; Python ignores SIGPIPE and SIGXFSZ: there the write fails.
+_OTHERS = {
+    signal.SIGCHLD, signal.SIGURG, signal.SIGWINCH, signal.SIGCONT, signal.SIGPIPE, signal.SIGXFSZ,
+    signal.SIGTSTP, signal.SIGTTIN, signal.SIGTTOU, signal.SIGKILL, signal.SIGSTOP,
+}  # fmt: skip
+
+ENDING: frozenset[int] = frozenset(map(int, signal.valid_signals() - _DEFECTS - _OTHERS))
+"""Every signal that ends a process by default and can be caught."""
+
+
+class Ended(KeyboardInterrupt):
+    """A signal asked for the end; ``number`` says which. Everything that heeds Ctrl-C heeds it too."""
+
+    def __init__(self, number: int) -> None:
+        self.number = number
+        super().__init__(f"ended by signal {number}")
+
+
+def wanted() -> tuple[int, ...]:
+    """Return the ending signals but those that whoever started us wants ignored, as nohup does SIGHUP."""
+    kept = {int(signal.SIGTERM), int(signal.SIGINT)}
+    return tuple(n for n in sorted(ENDING) if n in kept or signal.getsignal(n) is not signal.SIG_IGN)
+
+
+@contextmanager
+def raised(*also: int) -> Iterator[None]:
+    """Raise Ended in the main thread at the first ending signal inside the block; later ones do nothing.
+
+    SIGINT stays a KeyboardInterrupt each time, unless it is named in ``also``. Signals that somebody handles
+    or ignores already stay as they are.
+    """
+    asked = False
+
+    def end(number: int, frame: object) -> None:
+        nonlocal asked
+        if not asked:
+            asked = True
+            _end(number)
+
+    before = {n: signal.getsignal(n) for n in ENDING}
+    ours = [n for n, handler in before.items() if handler is signal.SIG_DFL or n in also]
+    try:
+        for number in ours:
+            signal.signal(number, end)
+    except ValueError:  # not the main thread: signals are somebody else's
+        ours = []
+    try:
+        yield
+    finally:
+        for number in ours:
+            signal.signal(number, before[number])
+
+
+def _end(number: int) -> NoReturn:
+    raise Ended(number)
