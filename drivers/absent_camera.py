@@ -79,6 +79,12 @@ class AbsentCamera:
         self.camera: Camera | None = None
         """The camera, once it is open."""
 
+    @property
+    def error(self) -> DriverError | None:
+        """Why the last opening failed; None while one is under way, or when it is there."""
+        error = self._absence.error
+        return None if error is None else self._told(error, "")
+
     def appeared(self) -> Camera:
         """Return the camera if it is open by now, and see to it that it is tried; never waits.
 
@@ -121,6 +127,7 @@ class AbsentCamera:
         error = opening.exception()
         if error is None:
             self.camera = opening.result()
+            self._absence.end()
         else:
             fault = (
                 error if isinstance(error, DriverError) else DriverError(f"{type(error).__name__}: {error}")
@@ -136,8 +143,12 @@ class AbsentCamera:
                 "it joins by itself when the driver returns"
             )
             return DriverError(words, device=self._name)
-        named = str(error).removeprefix(f"{self._name}: ")
-        words = f"absent since the start: {named}; tried again every {LONGEST_WAIT_S:g} s, it joins by itself"
-        why = DriverError(words, device=self._name, detail=error.detail)
-        why.code = error.code
-        return why
+        again = f"; tried again every {LONGEST_WAIT_S:g} s, it joins by itself"
+        return self._told(error, "absent since the start: ", again)
+
+    def _told(self, error: DriverError, before: str, after: str = "") -> DriverError:
+        """The same error with the camera's name in front, and words around its own."""
+        own = str(error).removeprefix(f"{self._name}: ")
+        told = DriverError(f"{before}{own}{after}", device=self._name, detail=error.detail)
+        told.code = error.code
+        return told

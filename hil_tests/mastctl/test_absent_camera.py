@@ -23,6 +23,7 @@ from calib.store import save_rig
 from drivers import open_hardware as door
 from drivers.errors import BadFrame, BadOptions, DriverError, LineLost, NoReply
 from drivers.interfaces import Frame
+from mastctl.cli.main import main
 from mastctl.config import load_config
 from mastctl.pointing.loop import AnglesTarget, PixelTarget, PointRequest
 from mastctl.service import Service
@@ -272,7 +273,8 @@ def test_a_head_whose_factory_blocks_refuses_the_start_in_a_sentence(
     eventually(lambda: bench.heads and bench.heads[0].calls == [("close",)], "what came late is closed")
 
 
-def test_ctrl_c_ends_a_start_that_hangs_in_a_factory(tmp_path: Path) -> None:
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_every_ending_signal_ends_a_start_that_hangs_in_a_factory(tmp_path: Path, number: int) -> None:
     (tmp_path / "hanging.py").write_text(
         "import sys, time\n\n\ndef head():\n    print('in the factory', file=sys.stderr, flush=True)\n"
         "    time.sleep(60)\n"
@@ -290,10 +292,48 @@ def test_ctrl_c_ends_a_start_that_hangs_in_a_factory(tmp_path: Path) -> None:
         assert run.stderr is not None
         while "in the factory" not in (line := run.stderr.readline()):
             assert line, "it ended before"
-        run.send_signal(signal.SIGINT)
+        run.send_signal(number)
         rest = run.communicate(timeout=20)[1]
     finally:
         run.kill()
         run.wait()
-    assert run.returncode == 130, rest
+    assert run.returncode == 0, rest
     assert "Traceback" not in rest
+
+
+def test_a_command_that_wants_one_picture_does_not_promise_to_wait(
+    bench: Bench, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    bench.before_eye["navcam_left"] = Away(LineLost("nothing at /dev/video7"))
+    config, out = str(configuration(tmp_path)), str(tmp_path / "picture.png")
+    assert main(["camera", "grab", "navcam_left", "--config", config, "--out", out]) == 1
+    told = capsys.readouterr().err.strip().splitlines()[-1]
+    assert told == "mastctl: navcam_left: nothing at /dev/video7"
+
+
+def test_another_mast_file_is_taken_while_a_camera_is_absent_or_has_another_size(
+    bench: Bench, tmp_path: Path
+) -> None:
+    away = bench.before_eye["navcam_left"] = Away(NoReply("no answer"))
+    with serving(tmp_path) as service:
+        save_rig(rig(), tmp_path / "other.yaml")
+        service.load_mast("other.yaml")
+        bench.kind = SmallEyeThatSaysSo
+        away.come()
+        eventually(lambda: "16x12 px" in "".join(told(service, "navcam_left")), "the fault")
+        service.load_mast("little.yaml")
+        assert "16x12 px" in "".join(told(service, "navcam_left"))
+        assert service.snapshot("navcam_right", fresh=True).camera == "navcam_right"
+
+
+def test_a_stop_is_not_kept_by_a_camera_that_is_absent_or_blocks(
+    bench: Bench, tmp_path: Path, hasty: None
+) -> None:
+    bench.before_eye["navcam_left"] = Away(NoReply("no answer"))
+    hang = bench.before_eye["navcam_right"] = Hang()
+    with serving(tmp_path) as service:
+        calls = bench.heads[0].calls
+        before = calls.count(("stop",))
+        service.stop()
+        assert calls.count(("stop",)) > before
+        hang.let_go()

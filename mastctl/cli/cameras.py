@@ -296,6 +296,7 @@ def _configured_frame(args: argparse.Namespace) -> StampedFrame:
     """One fresh frame of a configured camera (of any driver) with the joint angles of its moment."""
     from dataclasses import replace
 
+    from drivers.absent_camera import AbsentCamera
     from drivers.clock import SystemClock
     from drivers.open_hardware import open_hardware
     from mastctl.devices import Devices
@@ -307,6 +308,9 @@ def _configured_frame(args: argparse.Namespace) -> StampedFrame:
     settings = replace(config.hardware, cameras={args.camera: config.hardware.cameras[args.camera]})
     clock = SystemClock()
     with open_hardware(settings, clock) as hardware:
+        place = hardware.cameras[args.camera]
+        if isinstance(place, AbsentCamera) and place.error is not None:
+            raise place.error  # nobody waits here until it joins
         devices = Devices(hardware, config.limits, mast.stored.digest, clock, mast.stored.rig)
         try:
             return devices.frames([args.camera], clock.now_s(), FRAME_TIMEOUT_S)[args.camera]
