@@ -27,8 +27,9 @@ from calib.epipolar import find_partner, normal_seen
 from calib.errors import CalibError
 from calib.handoff_refined import Eye
 from calib.match import Match, MatchSettings, match
-from calib.one_point import Sighting, one_point
-from calib.ray_gap import ray_gap, refuse_two_points
+from calib.one_point import OnePoint, Sighting, one_point
+from calib.pose_doubt import PoseDoubt, pose_doubt
+from calib.ray_gap import MOST_SIGMAS, ray_gap, refuse_two_points
 from calib.rigid import FloatArray, Rigid, carried_covariance, moved_rigid
 from calib.stereo import triangulate
 from calib.warp import Plane
@@ -42,6 +43,9 @@ in ten and more of the range errors lie within two of the told sigmas. A second 
 than elsewhere: the other eye and the prediction must confirm the best."""
 MIDDLE_SEARCH_PX = 4.0
 """How far the range of a patch's middle may put it from where the whole patch puts it, at the start."""
+
+UNKNOWN_M = 100.0
+"""One sigma of where a target is of which only the pictures tell."""
 
 EYES_PX = 0.4
 """One sigma, each pixel coordinate, of what two eyes' models may be wrong by where a track is begun: what is
@@ -158,6 +162,9 @@ class Look:
         The weighted misfit of pixels and prediction; not-a-number if nothing was found.
     renewed
         Whether the key picture is now from this look.
+    doubt
+        What both eyes say against the motion since the last look, if they do; the target may be tracked all
+        the same.
     """
 
     track: Track
@@ -165,6 +172,7 @@ class Look:
     reason: str = ""
     chi2: float = math.nan
     renewed: bool = False
+    doubt: PoseDoubt | None = None
 
 
 def start_track(left: Eye, right: Eye, left_px: FloatArray, sigma_px: float = 0.2) -> Track:
@@ -275,10 +283,39 @@ def seen_by(track: Track, eyes: Mapping[str, Eye], settings: TrackSettings | Non
     """
     settings = settings or TrackSettings()
     look = _seen(track, eyes, settings)
-    if look.track.state == "tracked" or track.standby is None or not eyes:
-        return look
-    again = _seen(replace(track, key=track.standby, standby=None), eyes, settings)
-    return replace(again, renewed=True) if again.track.state == "tracked" else look
+    if look.track.state == "lost" and track.standby is not None and eyes:
+        again = _seen(replace(track, key=track.standby, standby=None), eyes, settings)
+        look = replace(again, renewed=True) if again.track.state == "tracked" else look
+    if look.track.state == "lost" and look.doubt is None and track.state == "tracked":
+        look = replace(look, doubt=_seen_elsewhere(track, eyes, settings))
+    return look
+
+
+def _seen_elsewhere(track: Track, eyes: Mapping[str, Eye], settings: TrackSettings) -> PoseDoubt | None:
+    """What a wider window shows of a target that is not where the motion since the last look put it.
+
+    Both eyes must know the key picture well and mean one point. The target stays lost all the same: so far
+    off, the next rock may look like it.
+    """
+    key = _anchored(track)
+    if key is None or len(eyes) < 2 or not track.motion_covariance.any():
+        return None
+    plane, wide = Plane(track.position_m, track.key.normal), replace(settings, least_px=settings.most_px)
+    found = {name: _found(track, key, plane, eye, wide) for name, eye in eyes.items()}
+    if any(m.verdict != "good" or m.correlation < settings.renew_below for m in found.values()):
+        return None
+    seen = _by_pictures(track.position_m, found, eyes, settings)
+    if seen is None or seen.chi2 > MOST_SIGMAS**2:
+        return None
+    return pose_doubt(track.position_m, track.covariance_m2, seen, sure=False)
+
+
+def _by_pictures(
+    start_m: FloatArray, good: Mapping[str, Match], eyes: Mapping[str, Eye], settings: TrackSettings
+) -> OnePoint | None:
+    """The point that pixels mean without the prediction; ``chi2`` says how badly they meet."""
+    sightings = [Sighting(eyes[n].camera, m.pixel_px, m.covariance_px2) for n, m in good.items()]
+    return one_point(start_m, UNKNOWN_M**2 * np.eye(3), sightings, settings.model_px)
 
 
 def _seen(track: Track, eyes: Mapping[str, Eye], settings: TrackSettings) -> Look:
@@ -315,6 +352,10 @@ def _seen(track: Track, eyes: Mapping[str, Eye], settings: TrackSettings) -> Loo
     if point is None:
         return _lost(track, found, "the found pixels and the prediction have no point in common")
     chi2 = point.chi2
+    against = None
+    if len(good) > 1 and track.motion_covariance.any():
+        seen = _by_pictures(point.position_m, good, eyes, settings)
+        against = None if seen is None else pose_doubt(track.position_m, track.covariance_m2, seen)
     # Each eye beyond the first adds a constraint; one eye alone has two.
     allowed = settings.worst_chi2 if len(good) > 1 else 13.8
     if chi2 > allowed:
@@ -322,7 +363,8 @@ def _seen(track: Track, eyes: Mapping[str, Eye], settings: TrackSettings) -> Loo
             f"what was found does not fit the prediction: weighted misfit {chi2:.0f}, at most "
             f"{allowed:g} is expected"
         )
-        return replace(_lost(track, found, words), chi2=chi2)
+        unsure = against and replace(against, sure=False)
+        return replace(_lost(track, found, words), chi2=chi2, doubt=unsure)
     turned = _turned(track, point.position_m)
     corrected = _carried(track.key, turned)
     fresh = _fresh_key(track.key, eyes, good, plane, slope)
@@ -334,10 +376,10 @@ def _seen(track: Track, eyes: Mapping[str, Eye], settings: TrackSettings) -> Loo
             f"the place that is followed may have drifted by {100 * drift_m:.0f} cm from the one picked, at "
             f"most {100 * settings.worst_drift_m:g} cm are allowed: the surface around it is no plane"
         )
-        return replace(_lost(track, found, words), chi2=chi2)
+        return replace(_lost(track, found, words), chi2=chi2, doubt=against)
     standby = None if renewed else fresh or (track.standby and _carried(track.standby, turned))
     after = Track("tracked", point.position_m, point.covariance_m2, chosen, standby)
-    return Look(after, found, "", chi2, renewed)
+    return Look(after, found, "", chi2, renewed, against)
 
 
 def _drifted(key: Key) -> float:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -12,8 +13,10 @@ from calib.epipolar import find_partner
 from calib.errors import CalibError
 from calib.handoff_refined import Eye
 from calib.match import match
+from calib.one_point import OnePoint
+from calib.pose_doubt import pose_doubt
 from calib.rigid import Rigid, rot_y, rot_z
-from calib.tracking import SIZES, Track, moved, seen_by, start_track
+from calib.tracking import SIZES, Look, Track, moved, seen_by, start_track
 from calib.warp import Plane
 from hil_tests.calib.pictures import Pinhole, TexturedPlane, picture, random_texture
 
@@ -93,6 +96,57 @@ def test_motion_carries_position_and_covariance(begun: Track) -> None:
     np.testing.assert_allclose(after.position_m, motion.points(begun.position_m), atol=1e-12)
     ratio = np.linalg.solve(after.covariance_m2, np.cov(np.array(drawn).T))
     assert np.abs(np.linalg.eigvals(ratio) - 1.0).max() < 0.12
+
+
+TOLD = np.diag([2e-3**2] * 3 + [0.015**2] * 3)
+
+
+def after_a_wrong_pose(begun: Track, wrong_m: list[float], covariance: NDArray[np.float64]) -> Look:
+    """A look 0.4 m nearer, after a pose that is ``wrong_m`` off."""
+    said = Rigid(np.eye(3), np.array([0.4, 0.0, 0.0]) + wrong_m)
+    return seen_by(moved(begun, said.inverse, covariance), eyes(0.4))
+
+
+@pytest.mark.parametrize("wrong_m", [[0.1, 0, 0], [0, 0.1, 0], [0, 0, -0.1], [-0.15, 0.1, 0]])
+def test_a_pose_10_cm_wrong_and_told_as_good_to_15_mm_is_said_to_be(
+    begun: Track, wrong_m: list[float]
+) -> None:
+    look = after_a_wrong_pose(begun, wrong_m, TOLD)
+    assert look.doubt is not None
+    # The pictures put the target as much nearer as the pose was too near, and the other way round.
+    assert np.abs(look.doubt.off_m - wrong_m).max() < 0.012
+    size = re.search(r"([\d.]+) cm \(([\d.]+) sigma\)", look.doubt.sentence)
+    assert size is not None and float(size[2]) > 3.3
+    assert float(size[1]) == pytest.approx(100 * np.linalg.norm(wrong_m), abs=1.2)
+
+
+def test_a_target_that_is_kept_after_a_wrong_pose_is_kept_with_the_doubt(begun: Track) -> None:
+    """9 cm along the range: just within what a look takes, and more than once in a thousand by chance."""
+    look = after_a_wrong_pose(begun, [0.09, 0.0, 0.0], TOLD)
+    assert (look.track.state, look.reason) == ("tracked", "")
+    assert look.doubt is not None and look.doubt.sure
+    assert "the pose is wrong by more than its covariance says" in look.doubt.sentence
+
+
+def test_a_pose_that_says_how_wrong_it_is_is_not_doubted(begun: Track) -> None:
+    honest = np.diag([2e-3**2] * 3 + [0.06**2] * 3)
+    for wrong_m in ([0.1, 0.0, 0.0], [0.0, 0.1, 0.0], [0.0, 0.0, -0.1]):
+        look = after_a_wrong_pose(begun, wrong_m, honest)
+        assert look.track.state == "tracked" and look.doubt is None
+    assert after_a_wrong_pose(begun, [0.0, 0.0, 0.0], TOLD).doubt is None
+
+
+def test_an_honest_motion_is_doubted_once_in_a_thousand_looks() -> None:
+    rng = np.random.default_rng(2)
+    prior, noise = (m @ m.T for m in rng.normal(0.0, 0.02, (2, 3, 3)))
+    roots = [np.linalg.cholesky(m) for m in (prior, noise)]
+    draws = 20_000
+    doubted = 0
+    for one, other in rng.standard_normal((draws, 2, 3)):
+        seen = OnePoint(TARGET + roots[1] @ other, noise, 0.0)
+        doubted += pose_doubt(TARGET + roots[0] @ one, prior, seen) is not None
+    # 20 expected; outside 6 to 40 once in some 10^4 repetitions.
+    assert 6 <= doubted <= 40
 
 
 def test_a_target_is_kept_while_the_rover_nears_it_with_wrong_odometry(begun: Track) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import threading
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -14,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from calib.errors import CalibError
 from calib.mast import Rig
 from calib.rigid import Rigid
-from calib.tracking import Track
+from calib.tracking import Track, moved
 from drivers.errors import DriverError, NoReply
 from mastctl.errors import MastctlError
 from mastctl.frames import StampedFrame
@@ -211,6 +212,30 @@ def test_a_pair_that_is_turned_shows_in_the_record_and_takes_over_only_within_wh
         assert matched is not None
         off = [one.found_px - one.geometric_px for one in matched.found.values()]
         assert np.array(off) == pytest.approx(np.array([[1.93, 0.0]] * 2), abs=0.4)
+
+
+@pytest.mark.parametrize("found_by", ["navcam", "pancam"])
+def test_a_pose_that_the_pictures_contradict_is_told_by_the_look(found_by: str) -> None:
+    """The rover stands; a pose says that it went 12 cm to the right, good to 1.5 cm."""
+    world = Eyes()
+    steps: list[Step] = []
+    track, _ = begun(world)
+    told = np.diag([1e-3**2] * 3 + [0.015**2] * 3)
+    said = moved(track, Rigid(np.eye(3), np.array([0.0, -0.12, 0.0])), told)
+    _, seen = looker(world, steps).look(said, found_by)
+    off = re.search(r"([\d.]+) cm \(([\d.]+) sigma\) from where the pose", seen.pose_doubt)
+    assert off is not None and float(off[1]) == pytest.approx(12.0, abs=1.5) and float(off[2]) > 4.0
+    assert any(step.detail.get("pose_doubt") == seen.pose_doubt for step in steps)
+    honest = moved(track, Rigid(np.eye(3), np.zeros(3)), told)
+    assert looker(world).look(honest, found_by)[1].pose_doubt == ""
+
+
+def test_a_pair_that_is_turned_is_no_reason_to_doubt_a_pose() -> None:
+    world = Eyes()
+    track, _ = begun(world)
+    roughly = replace(track, covariance_m2=2e-2**2 * np.eye(3), motion_covariance=1e-6 * np.eye(6))
+    _, seen = looker(world, None, navcams_turned(0.003)).look(roughly, "pancam")
+    assert (seen.pair, seen.pose_doubt) == ("navcam", "")
 
 
 def test_without_the_former_pairs_pictures_the_next_looks_alone() -> None:

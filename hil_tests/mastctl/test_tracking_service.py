@@ -186,6 +186,26 @@ def test_a_lost_target_stays_lost_with_its_reason_until_a_look_finds_it(
     assert (track["state"], track["reason"], track["misses"]) == ("tracking", "", 0)
 
 
+def test_a_pose_that_pictures_contradict_is_told_while_the_target_is_tracked(
+    client: Client, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    started(client)
+    words = "the pictures put the target 9.0 cm (3.4 sigma) from where the pose does"
+
+    def doubting(track: Track) -> tuple[Track, Seen]:
+        after, told = found(track)
+        return after, replace(told, pose_doubt=words)
+
+    monkeypatch.setattr(ScriptedLooker, "script", staticmethod(doubting))
+    with caplog.at_level("WARNING", logger="mastctl.tracking.tracker"):
+        track = drive(client, 0.5, 2.0)
+    assert (track["state"], track["reason"], track["pose_doubt"]) == ("tracking", words, words)
+    assert [words in one.getMessage() for one in caplog.records].count(True) == 1
+    monkeypatch.setattr(ScriptedLooker, "script", staticmethod(found))
+    track = drive(client, 0.9, 3.0)
+    assert (track["state"], track["reason"], track["pose_doubt"]) == ("tracking", "", "")
+
+
 def test_a_change_of_the_pair_is_a_handoff(client: Client, monkeypatch: pytest.MonkeyPatch) -> None:
     started(client)
     monkeypatch.setattr(ScriptedLooker, "script", staticmethod(lambda track: (track, seen(track, "hazcam"))))

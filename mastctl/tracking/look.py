@@ -75,6 +75,8 @@ class Seen:
         By camera.
     chi2, renewed
         As `calib.tracking.Look`.
+    pose_doubt
+        What the pictures say against the pose, one sentence; empty if they do not.
     matched
         The target in the pictures of the pair before and of the next one, if both looked.
     """
@@ -88,6 +90,7 @@ class Seen:
     pixels: Mapping[str, EyePixel] = field(default_factory=dict)
     chi2: float = math.nan
     renewed: bool = False
+    pose_doubt: str = ""
     matched: MatchedHandoff | None = None
 
 
@@ -216,7 +219,9 @@ class Looker:
             reason = f"{choice.pair} does not take over: {after.seen.reason}"
             return replace(before, seen=replace(before.seen, reason=reason, matched=matched))
         renewed = after.seen.renewed or (held and before.seen.renewed)
-        return replace(after, seen=replace(after.seen, renewed=renewed, matched=matched))
+        # Between two pairs their calibrations differ too: of a pose only the former pair tells.
+        doubt = before.seen.pose_doubt if held else after.seen.pose_doubt
+        return replace(after, seen=replace(after.seen, renewed=renewed, matched=matched, pose_doubt=doubt))
 
     def _matched(self, before: _Sight, after: _Sight) -> MatchedHandoff | None:
         with self._steps.step("hand_over") as detail:
@@ -245,6 +250,8 @@ class Looker:
             detail.update(
                 pair=seen.pair, state=seen.state, reason=seen.reason, position_m=rounded(seen.position_m, 5)
             )
+            if seen.pose_doubt:
+                detail.update(pose_doubt=seen.pose_doubt)
         return _Sight(look.track, seen, taken, look.found)
 
     def _told(self, choice: Choice, look: Look, pixels: Mapping[str, EyePixel], settled: Reading) -> Seen:
@@ -263,6 +270,7 @@ class Looker:
             pixels,
             look.chi2,
             look.renewed,
+            "" if look.doubt is None else look.doubt.sentence,
         )
 
     def _choices(self, position_m: FloatArray) -> list[Choice]:

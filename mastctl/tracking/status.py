@@ -100,6 +100,7 @@ class TrackStatus:
             "pixels": {} if seen is None else seen.pixels,
             "chi2": None if seen is None else seen.chi2,
             "renewed": False if seen is None else seen.renewed,
+            "pose_doubt": "" if seen is None else seen.pose_doubt,
             "looks": self.looks,
             "misses": self.misses,
             "handoffs": self.handoffs,

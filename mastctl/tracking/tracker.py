@@ -366,9 +366,11 @@ class Tracker:
         self._carried = replace(carried, track=track)
         if seen.matched is not None:
             self._on_matched(seen.matched)
+        if seen.pose_doubt and seen.state == "tracked":  # what is lost is logged with its whole reason
+            self._say(logging.WARNING, "track %s: %s", status.id, seen.pose_doubt)
         status = replace(
             status,
-            reason=seen.reason,
+            reason="; ".join(filter(None, (seen.reason, seen.pose_doubt))),
             position_m=seen.position_m,
             covariance_m2=seen.covariance_m2,
             seen=seen,
