@@ -97,7 +97,9 @@ class DynamixelHead(Reporting):
         Raises
         ------
         OutOfRange
-            For an angle outside the limits or a speed that is no positive number; nothing moves.
+            For an angle outside the limits, or a speed that is no positive number or slower than a servo can
+            be told (0.024 rad/s of an X or MX, 0.001 of a P; its 0 means as fast as it can);
+            nothing moves. Speeds between are rounded down.
         HardwareFault, WatchdogTripped
             While a servo reports a hardware error, or the watchdog has stopped the head.
         LineLost, NoReply, BadReply
@@ -106,6 +108,11 @@ class DynamixelHead(Reporting):
         speed = self.settings.speed_rad_per_s if speed_rad_per_s is None else speed_rad_per_s
         if not speed > 0:
             raise OutOfRange(f"speed {speed_rad_per_s} rad/s is not a positive number")
+        slowest = max(a.model.velocity_unit_rad_per_s for a in (self.settings.pan, self.settings.tilt))
+        if speed < slowest:
+            raise OutOfRange(
+                f"speed {speed:g} rad/s is less than the {slowest:.4f} rad/s that the servos know"
+            )
         for name, axis, angle in zip(
             AXES, (self.settings.pan, self.settings.tilt), (pan_rad, tilt_rad), strict=True
         ):

@@ -197,8 +197,9 @@ class Model:
         Where its own angle is zero.
     velocity_unit_rad_per_s, acceleration_unit_rad_per_s2
         Of one count of velocity and profile acceleration.
-    current_unit_A
-        Of one count of current; None for a servo that measures its load only.
+    current_unit_A, most_current_counts
+        One count of current, and the most that its current limit may be; None and 0 for a servo that measures
+        its load only.
     backlash_rad
         As the maker states it; None where nothing is stated.
     watchdog_firmware
@@ -215,6 +216,7 @@ class Model:
     velocity_unit_rad_per_s: float
     acceleration_unit_rad_per_s2: float
     current_unit_A: float | None
+    most_current_counts: int
     backlash_rad: float | None
     watchdog_firmware: int
 
@@ -227,13 +229,17 @@ class Model:
 _X = (REGISTERS["X"], 4096, 0, 4095, 2048, 0.229 * RPM_RAD_PER_S, 214.577 * REV_PER_MIN2_RAD_PER_S2)
 
 
-def _x(name: str, number: int, current_unit_A: float | None, backlash_deg: float | None) -> Model:
+def _x(
+    name: str, number: int, current_unit_A: float | None, most_current_counts: int, backlash_deg: float | None
+) -> Model:
     """A servo of the X or MX series: 12-bit encoder on the output shaft."""
     backlash = None if backlash_deg is None else math.radians(backlash_deg)
-    return Model(name, number, *_X, current_unit_A, backlash, watchdog_firmware=38)
+    return Model(name, number, *_X, current_unit_A, most_current_counts, backlash, watchdog_firmware=38)
 
 
-def _p(name: str, number: int, counts_per_turn: int, half_turn_counts: int) -> Model:
+def _p(
+    name: str, number: int, counts_per_turn: int, half_turn_counts: int, most_current_counts: int
+) -> Model:
     """A servo of the P series: counts on the motor's side of the gear."""
     units = 0.01 * RPM_RAD_PER_S, 1.0 * REV_PER_MIN2_RAD_PER_S2
     return Model(
@@ -246,34 +252,35 @@ def _p(name: str, number: int, counts_per_turn: int, half_turn_counts: int) -> M
         0,
         *units,
         0.001,
+        most_current_counts,
         math.radians(0.1),
         watchdog_firmware=0,
     )
 
 
-# Current units and backlash: e-manual, and the makers' data sheets where they state backlash
+# Current units and limits, backlash: e-manual, and the makers' data sheets where they state backlash
 # (15' for XM430, XM540, XH540; 20' for MX; under 6' for PH; nothing for XL330 and XC330).
 _MODELS = (
-    #  name             number  A/count  backlash, degrees
-    _x("XL330-M077-T", 1190, 0.001, None),
-    _x("XL330-M288-T", 1200, 0.001, None),
-    _x("XC330-T181-T", 1210, 0.001, None),
-    _x("XC330-T288-T", 1220, 0.001, None),
-    _x("XC330-M181-T", 1230, 0.001, None),
-    _x("XC330-M288-T", 1240, 0.001, None),
-    _x("XM430-W350", 1020, 0.00269, 0.25),
-    _x("XM430-W210", 1030, 0.00269, 0.25),
-    _x("XM540-W270", 1120, 0.00269, 0.25),
-    _x("XM540-W150", 1130, 0.00269, 0.25),
-    _x("XH540-W270", 1100, 0.00269, 0.25),
-    _x("XH540-W150", 1110, 0.00269, 0.25),
-    _x("MX-28", 30, None, 0.33),
-    _x("MX-64", 311, 0.00336, 0.33),
-    _x("MX-106", 321, 0.00336, 0.33),
-    #  name             number  counts a turn  half a turn
-    _p("PH42-020-S300", 2000, 607_500, 303_750),
-    _p("PH54-100-S500", 2010, 1_003_846, 501_923),
-    _p("PH54-200-S500", 2020, 1_003_846, 501_923),
+    #  name             number  A/count  most counts  backlash, degrees
+    _x("XL330-M077-T", 1190, 0.001, 1750, None),
+    _x("XL330-M288-T", 1200, 0.001, 1750, None),
+    _x("XC330-T181-T", 1210, 0.001, 910, None),
+    _x("XC330-T288-T", 1220, 0.001, 910, None),
+    _x("XC330-M181-T", 1230, 0.001, 2352, None),
+    _x("XC330-M288-T", 1240, 0.001, 2352, None),
+    _x("XM430-W350", 1020, 0.00269, 1193, 0.25),
+    _x("XM430-W210", 1030, 0.00269, 1193, 0.25),
+    _x("XM540-W270", 1120, 0.00269, 2047, 0.25),
+    _x("XM540-W150", 1130, 0.00269, 2047, 0.25),
+    _x("XH540-W270", 1100, 0.00269, 2047, 0.25),
+    _x("XH540-W150", 1110, 0.00269, 2047, 0.25),
+    _x("MX-28", 30, None, 0, 0.33),
+    _x("MX-64", 311, 0.00336, 1941, 0.33),
+    _x("MX-106", 321, 0.00336, 2047, 0.33),
+    #  name             number  counts a turn  half a turn  most counts of current
+    _p("PH42-020-S300", 2000, 607_500, 303_750, 4500),
+    _p("PH54-100-S500", 2010, 1_003_846, 501_923, 15900),
+    _p("PH54-200-S500", 2020, 1_003_846, 501_923, 22740),
 )
 MODELS: Mapping[str, Model] = MappingProxyType({model.name: model for model in _MODELS})
 MODELS_BY_NUMBER: Mapping[int, Model] = MappingProxyType({model.number: model for model in _MODELS})

@@ -105,6 +105,7 @@ class AxisMotion:
         self._sampled = False  # since the goal was sent
         self._speed_rad_per_s = 0.0  # of the profile
         self.goal = 0
+        self.profile: tuple[int, int] | None = None  # acceleration and velocity that were sent, counts
         self.holds = True
 
     @property
@@ -160,9 +161,14 @@ class AxisMotion:
         self._rest, self._sampled = None, False
 
     def next_leg(self) -> int | None:
-        """Return the next goal to send when the present leg has ended; `begin_leg` when it was sent."""
+        """Return the next goal to send when the present leg has ended; `begin_leg` when it was sent.
+
+        None for a servo that does not hold what was sent: it would turn by somebody else's profile.
+        """
         sample = self._sample
         if not self._legs or sample is None or not self._arrived(sample) or self._speed(sample) > 1:
+            return None
+        if self.other_goal_words():
             return None
         return self._legs[0]
 
@@ -245,11 +251,21 @@ class AxisMotion:
         return f"{self.name} stands still {abs(left_rad):.4f} rad from its goal: something holds it"
 
     def other_goal_words(self) -> str:
-        """Say that the servo holds another goal than was sent; empty if it does not."""
-        held = self._sample.values["goal_position"] if self._sample else self.goal
-        if held == self.goal or not self.holds or not self._sampled:
+        """Say that the servo holds another goal or profile than was sent; empty if it does not."""
+        if self._sample is None or not self.holds or not self._sampled:
             return ""
-        return f"{self.name} holds the goal {held} where {self.goal} was sent"
+        values = self._sample.values
+        if values["goal_position"] != self.goal:
+            return f"{self.name} holds the goal {values['goal_position']} where {self.goal} was sent"
+        if self.profile is None:
+            return ""
+        held = values["profile_acceleration"], values["profile_velocity"]
+        if held == self.profile:
+            return ""
+        return (
+            f"{self.name} holds the profile acceleration {held[0]} and velocity {held[1]} where "
+            f"{self.profile[0]} and {self.profile[1]} were sent (0 is as fast as it can)"
+        )
 
     def report(self) -> AxisReport | None:
         """Return where it was sent and where it stands; None before the first sample."""

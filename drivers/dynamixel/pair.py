@@ -41,6 +41,8 @@ class Axis:
         Who turns it, and what it is doing.
     hardware_error
         What its servo has reported, in words; empty if nothing.
+    acceleration_rad_per_s2
+        Of its profile, as the servo rounds it.
     """
 
     def __init__(self, link: Link, name: str, settings: AxisSettings, head: HeadSettings) -> None:
@@ -48,11 +50,13 @@ class Axis:
         self.servo = Servo(link, name, settings, head)
         self.motion = AxisMotion(self.servo.name, settings, head.settle_s)
         self.hardware_error = ""
-        self._acceleration_rad_per_s2 = head.acceleration_rad_per_s2
+        counts = settings.acceleration_counts(head.acceleration_rad_per_s2)
+        self.acceleration_rad_per_s2 = counts * settings.model.acceleration_unit_rad_per_s2
 
     def take_hold(self) -> None:
         """Hold where the axis stands, with nothing commanded; raises as `Servo.take_hold`."""
         self.motion.begin(self.servo.take_hold())
+        self.motion.profile = self.servo.profile
 
     def let_go(self) -> None:
         """Switch the torque off; raises as `Servo.set`."""
@@ -63,7 +67,7 @@ class Axis:
         """Take where the axis stands if it brakes now as its goal; returns that, None if it holds nothing."""
         if not self.motion.holds or self.motion.sample is None:
             return None
-        goal = self.motion.braking_counts(time.monotonic(), self._acceleration_rad_per_s2)
+        goal = self.motion.braking_counts(time.monotonic(), self.acceleration_rad_per_s2)
         self.motion.halt(goal)
         return goal
 
@@ -243,6 +247,7 @@ def ready_pair(head: HeadSettings, reboots: Reboots, urgent: Callable[[], bool])
             servo.check_health(reboots)
             servo.check_place()
         for servo in servos:
+            servo.set_profile()  # refused, if at all, before the torque is touched
             servo.set_up()
         for axis in pair.axes:
             axis.take_hold()

@@ -12,6 +12,7 @@ import logging
 import math
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from typing import TypeVar
 
 from drivers.dynamixel.link import Link, Part, Pinged
@@ -216,7 +217,10 @@ class Servo:
         return sample
 
     def check_place(self) -> int:
-        """See that the axis stands within its limits; returns its position, counts.
+        """See that the axis stands within its limits; returns the nearest count that may be its goal.
+
+        A few counts beyond a limit are passed (`AxisSettings.slack_counts`): an axis that holds at its limit
+        droops, and would be locked out for good.
 
         Raises
         ------
@@ -226,13 +230,14 @@ class Servo:
         counts = self.look().counts
         settings = self._settings
         low, high = settings.limit_counts
-        if not low <= counts <= high:
+        slack = settings.slack_counts
+        if not low - slack <= counts <= high + slack:
             raise WrongDevice(
                 f"{self.name} stands at {counts} counts ({settings.angle_rad(counts):.4f} rad), outside its "
                 f"limits {low} to {high} ({settings.limits_rad[0]:.4f} to {settings.limits_rad[1]:.4f} rad): "
                 "with torque off turn it inside by hand, or correct zero_counts or limits_rad"
             )
-        return counts
+        return min(max(counts, low), high)
 
     def set_up(self) -> None:
         """Bring the servo's permanent settings to what the configuration says.
@@ -250,7 +255,8 @@ class Servo:
         if not different:
             return
         told = ", ".join(f"{name} {value}" for name, value in different.items())
-        if self.get("torque_enable"):
+        torque = self.get("torque_enable")
+        if torque:
             if not self._head.torque_off_at_start:
                 raise WrongDevice(
                     f"{self.name} must be set to {told}, which it takes only with torque off, but torque is "
@@ -259,8 +265,15 @@ class Servo:
                 )
             self.set("torque_enable", 0)
         log.info("%s: setting %s", self.name, told)
-        for name in sorted(different, key=lambda n: n != "operating_mode"):  # a new mode resets others
-            self.set(name, different[name])
+        try:
+            for name in sorted(different, key=lambda n: n != "operating_mode"):  # a new mode resets others
+                self.set(name, different[name])
+        except DriverError:
+            if torque:  # what hangs on the axis is not left to fall
+                with suppress(DriverError):
+                    self.set("goal_position", self.look().counts)
+                    self.set("torque_enable", 1)
+            raise
 
     def _wanted(self) -> dict[str, int]:
         """The permanent settings, by register."""
@@ -298,27 +311,15 @@ class Servo:
         An old goal is void: the present position is the goal before anything can move. A watchdog that has
         tripped is cleared here, which makes this the deliberate act of arming anew.
         """
-        settings, model, head = self._settings, self._settings.model, self._head
         held = self.get_all("torque_enable", "bus_watchdog")
         torque, tripped = bool(held["torque_enable"]), held["bus_watchdog"] != 0
         counts = self.check_place()
-        if tripped:
-            self.set("bus_watchdog", 0)  # the servo may now go on to its old goal: void it at once
+        if tripped:  # once cleared, the servo may go on to its old goal: that is void in the same moment
+            self._link.shout([self._part("bus_watchdog", 0), self._part("goal_position", counts)])
+            self.set("bus_watchdog", 0)
         self.set("goal_position", counts)
-        profile = {
-            "profile_acceleration": max(
-                1, round(head.acceleration_rad_per_s2 / model.acceleration_unit_rad_per_s2)
-            ),
-            "profile_velocity": velocity_counts(settings, head.speed_rad_per_s),
-        }
-        for name, value in profile.items():
-            try:
-                self.set(name, value)
-            except Refused as error:
-                raise WrongDevice(
-                    f"{self.name} does not take {value} as its {name}: acceleration_rad_per_s2 or "
-                    f"speed_rad_per_s is more than its own limits allow ({error})"
-                ) from error
+        self._full_strength()
+        self.set_profile()
         if not torque:
             counts = self.check_place()
             self.set("goal_position", counts)
@@ -329,6 +330,40 @@ class Servo:
                     f"{self.name} does not switch its torque on; it may be shut down by a hardware error"
                 ) from None
         return self._come_to_rest()
+
+    @property
+    def profile(self) -> tuple[int, int]:
+        """Profile acceleration and velocity, as `set_profile` sets them."""
+        settings, head = self._settings, self._head
+        acceleration = settings.acceleration_counts(head.acceleration_rad_per_s2)
+        return acceleration, velocity_counts(settings, head.speed_rad_per_s)
+
+    def set_profile(self) -> None:
+        """Set how fast the servo turns and brakes; raises as `set`, and WrongDevice where it cannot."""
+        for name, value in zip(("profile_acceleration", "profile_velocity"), self.profile, strict=True):
+            try:
+                self.set(name, value)
+            except Refused as error:
+                raise WrongDevice(
+                    f"{self.name} does not take {value} as its {name}: acceleration_rad_per_s2 or "
+                    f"speed_rad_per_s is more than its own limits allow ({error})"
+                ) from error
+
+    def _full_strength(self) -> None:
+        """Lift the bound of the motor's drive that a trial that was killed has left; raises as `set`."""
+        found, limit = self.get_all("goal_pwm", "pwm_limit").values()
+        if found != limit:
+            log.warning(
+                "%s was bound to %.0f %% of its drive (by a servo test that was killed?); that is lifted",
+                self.name,
+                100 * found / max(limit, 1),
+            )
+            self.set("goal_pwm", limit)
+
+    def _part(self, register: str, value: int) -> Part:
+        """A register and its new value, for a packet."""
+        entry = self._registers[register]
+        return Part(self._settings.servo_id, entry.address, entry.size, entry.encode(value))
 
     def _come_to_rest(self) -> int:
         """Wait until the axis stands (it may have been falling) and hold it there; returns the goal."""

@@ -147,18 +147,25 @@ class Session:
         self.poll_once()
         speeds = [velocity_counts(axis.settings, speed_rad_per_s) for axis in self.pair.axes]
         goals = [
-            axis.motion.plan(angle_rad, speed_rad_per_s, self._head.acceleration_rad_per_s2)
+            axis.motion.plan(angle_rad, speed_rad_per_s, axis.acceleration_rad_per_s2)
             for axis, angle_rad in zip(self.pair.axes, angles_rad, strict=True)
         ]
         self._send_goals(goals, speeds)
 
     def _send_goals(self, goals: Sequence[int], speeds: Sequence[int]) -> None:
-        """Write speed and goal of both axes with one packet and see that they are held."""
+        """Write profile and goal of both axes with one packet and see that they are held."""
         motions = [axis.motion for axis in self.pair.axes]
-        values = [
-            [("profile_velocity", speed), ("goal_position", goal)]
-            for goal, speed in zip(goals, speeds, strict=True)
-        ]
+        values = []
+        for axis, goal, speed in zip(self.pair.axes, goals, speeds, strict=True):
+            acceleration = axis.servo.profile[0]
+            axis.motion.profile = acceleration, speed
+            values.append(
+                [
+                    ("profile_acceleration", acceleration),
+                    ("profile_velocity", speed),
+                    ("goal_position", goal),
+                ]
+            )
         for _ in range(ATTEMPTS):
             self.pair.send(values)
             self._poll()
@@ -230,7 +237,7 @@ class Session:
         if strange and axis.servo.get("bus_watchdog") == WATCHDOG_TRIPPED:
             axis.take_hold()
             self._watch.arm_axis(axis)
-        elif held != told or not motion.braking_well(told, self._head.acceleration_rad_per_s2):
+        elif held != told or not motion.braking_well(told, axis.acceleration_rad_per_s2):
             axis.brake()
 
     def end(self) -> None:

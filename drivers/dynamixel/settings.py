@@ -9,6 +9,7 @@ from typing import Any, Literal
 
 from drivers.approach import APPROACHES, Approach, last_turn
 from drivers.dynamixel.models import Model, model_named
+from drivers.dynamixel.port import QUIET_S
 from drivers.errors import BadOptions
 from drivers.options import OptionReader
 
@@ -18,6 +19,8 @@ OnHardwareError = Literal["report", "reboot"]
 STANDS_WITHIN_S = 0.5  # after this process has died: the last poll's age, the watchdog, and braking
 USUAL_WATCHDOG_S, SHORTEST_WATCHDOG_S = 0.3, 0.1
 WATCHDOG_STEP_S = 0.02
+LEAST_SLACK_COUNTS = 3
+LONGEST_REPLY_S = 0.3  # a few of them must fit into a call
 SILENCE_SPARE_S = 0.05  # the servo's oscillator against ours
 POLL_BYTES = 20 + 2 * (11 + 43)  # the longer of the two instructions, and two replies of 43 bytes of data
 
@@ -83,6 +86,15 @@ class AxisSettings:
         ends = sorted(self.zero_counts + self.sign * a / self.model.count_rad for a in self.limits_rad)
         return math.ceil(ends[0] - 1e-6), math.floor(ends[1] + 1e-6)
 
+    @property
+    def slack_counts(self) -> int:
+        """How far beyond a limit an axis that was sent to it may stand: it droops, or dithers."""
+        return max(LEAST_SLACK_COUNTS, math.ceil(self.settle_rad / self.model.count_rad))
+
+    def acceleration_counts(self, acceleration_rad_per_s2: float) -> int:
+        """Return a profile acceleration, not below the one given: braking takes no longer than promised."""
+        return max(1, math.ceil(acceleration_rad_per_s2 / self.model.acceleration_unit_rad_per_s2 - 1e-6))
+
     def approach_sign(self, goal_rad: float) -> int:
         """Return the direction of the last stretch in counts: 1, -1, or 0 for none."""
         return self.sign * last_turn(self.approach, goal_rad, self.gravity_turnover_rad)
@@ -104,7 +116,7 @@ class HeadSettings:
     poll_hz
         How often the servos are read when nobody asks.
     reply_timeout_s
-        What a reply may take beyond its time on the wire.
+        What a reply may take beyond its time on the wire; a lost one must not trip the watchdog.
     settle_s
         How long both axes must stand in position to count as settled.
     torque_off_at_start
@@ -185,6 +197,12 @@ def head_settings(options: Mapping[str, Any]) -> HeadSettings:
             f"{acceleration:g} rad/s2 in {speed / acceleration:.3g} s; expected {SHORTEST_WATCHDOG_S:g} "
             f"s or more, and {STANDS_WITHIN_S:g} s in all, the last poll's age included; or 0 to do without"
         )
+    reply_timeout_s = read.number("reply_timeout_s", 0.05, 0.002, LONGEST_REPLY_S)
+    if watchdog_s and reply_timeout_s > watchdog_s - 1 / poll_hz - QUIET_S:
+        raise BadOptions(
+            f"options.reply_timeout_s is {reply_timeout_s:g} s with watchdog_s {watchdog_s:.3g}: one lost "
+            f"reply would stop the head; expected {watchdog_s - 1 / poll_hz - QUIET_S:.3g} s or less"
+        )
     return HeadSettings(
         port=port,
         pan=pan,
@@ -194,7 +212,7 @@ def head_settings(options: Mapping[str, Any]) -> HeadSettings:
         acceleration_rad_per_s2=acceleration,
         watchdog_s=watchdog_s,
         poll_hz=poll_hz,
-        reply_timeout_s=read.number("reply_timeout_s", 0.05, 0.002, 1.0),
+        reply_timeout_s=reply_timeout_s,
         settle_s=read.number("settle_s", 0.1, 0.0, 5.0),
         torque_off_at_start=read.flag("torque_off_at_start", False),
         fast_read=read.flag("fast_read", False),
@@ -228,10 +246,15 @@ def _axis(options: OptionReader, name: str) -> AxisSettings:
         at_stop=read.one_of("at_stop", "hold", ("hold", "torque_off")),
         at_close=read.one_of("at_close", "hold", ("hold", "torque_off")),
         on_hardware_error=read.one_of("on_hardware_error", "report", ("report", "reboot")),
-        current_limit_A=read.number("current_limit_A", None, 0.001, 20.0),
+        current_limit_A=read.number("current_limit_A", None, 0.0001, 30.0),
         settle_rad=read.number("settle_rad", max(0.001, 3 * model.count_rad), model.count_rad, 0.1),
     )
     low, high = axis.limit_counts
+    if low >= high:
+        raise BadOptions(
+            f"options.{name}.limits_rad [{limits_rad[0]:g}, {limits_rad[1]:g}] hold no two counts of a "
+            f"{model.name}, whose count is {model.count_rad:.2g} rad; expected limits further apart"
+        )
     if low < model.low_count or high > model.high_count:
         reach = sorted((axis.angle_rad(model.low_count), axis.angle_rad(model.high_count)))
         raise BadOptions(
@@ -251,6 +274,14 @@ def _axis(options: OptionReader, name: str) -> AxisSettings:
             f"options.{name}.approach_rad {axis.approach_rad:g} rad does not take up the backlash of a "
             f"{model.name}, {least:.4f} rad; expected more"
         )
-    if axis.current_limit_A is not None and model.current_unit_A is None:
-        raise BadOptions(f"options.{name}.current_limit_A: a {model.name} has no current limit")
+    if axis.current_limit_A is not None:
+        if model.current_unit_A is None:
+            raise BadOptions(f"options.{name}.current_limit_A: a {model.name} has no current limit")
+        counts = round(axis.current_limit_A / model.current_unit_A)
+        if not 1 <= counts <= model.most_current_counts:
+            most_A = model.most_current_counts * model.current_unit_A
+            raise BadOptions(
+                f"options.{name}.current_limit_A is {axis.current_limit_A:g} A, expected "
+                f"{model.current_unit_A:g} to {most_A:.4g} A for a {model.name}"
+            )
     return axis

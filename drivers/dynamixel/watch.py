@@ -70,7 +70,11 @@ class Watch:
             If a servo cannot be asked.
         """
         now_s = time.monotonic()
-        if now_s - self._looked_s < WATCH_S:
+        errors = any(axis.hardware_error for axis in self._pair.axes)
+        expected = (
+            self.tripped or errors or not any(axis.motion.other_goal_words() for axis in self._pair.axes)
+        )
+        if expected and now_s - self._looked_s < WATCH_S:
             return
         self._looked_s = now_s
         for register in ("bus_watchdog", "torque_enable"):
@@ -79,7 +83,6 @@ class Watch:
                 self._note_trip()
             for axis, value in zip(self._pair.axes, values, strict=True):
                 self._judge(axis, register, value)
-        errors = any(axis.hardware_error for axis in self._pair.axes)
         for axis in self._pair.axes:
             if (words := axis.motion.other_goal_words()) and not self.tripped and not errors:
                 raise _distrust(words)

@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from typing import TypeVar
 
@@ -19,10 +19,20 @@ from drivers.dynamixel.models import (
     OPERATING_MODES,
     Block,
     Model,
+    Register,
     hardware_error_words,
 )
 from drivers.dynamixel.port import QUIET_S
-from drivers.errors import BadOptions, BadReply, HardwareFault, NoReply, OutOfRange, Refused, WrongDevice
+from drivers.errors import (
+    BadOptions,
+    BadReply,
+    DriverError,
+    HardwareFault,
+    NoReply,
+    OutOfRange,
+    Refused,
+    WrongDevice,
+)
 
 T = TypeVar("T")
 
@@ -33,6 +43,7 @@ NO_SECONDARY_ID = 253
 TRIAL_SPEED_RAD_PER_S = 0.2
 TRIAL_ACCELERATION_RAD_PER_S2 = 1.0
 TRIAL_WATCHDOG = 15  # times 20 ms
+WATCHDOG_TRIPPED = 255
 TRIAL_POLL_S = 0.02
 WARM_MARGIN_C = 10  # below the servo's own limit
 
@@ -296,8 +307,9 @@ class Trial:
 def try_out(link: Link, servo_id: int, amplitude_rad: float, torque_percent: float) -> Trial:
     """Turn a servo a little to one side, to the other and back: slowly, weakly, watched all the time.
 
-    Its bus watchdog is armed meanwhile. Whatever goes wrong, the servo is stopped where it stands; torque,
-    profile, strength and watchdog are left as they were found.
+    Its bus watchdog is armed meanwhile; one that has tripped is cleared first. Whatever goes wrong, the
+    servo is stopped where it stands; torque, profile, strength and watchdog are left as they were found, each
+    of them even if another cannot be.
 
     Parameters
     ----------
@@ -330,7 +342,11 @@ def try_out(link: Link, servo_id: int, amplitude_rad: float, torque_percent: flo
         _patient(lambda: link.write(servo_id, registers[name], value))
 
     steps: list[TrialStep] = []
-    with _restored(write, values):
+    with _restored(link, servo_id, model, values):
+        if values["bus_watchdog"]:  # it refuses goals; once cleared, the old goal is void in the same moment
+            parts = [("bus_watchdog", 0), ("goal_position", start)]
+            link.shout([_part(servo_id, registers[name], value) for name, value in parts])
+            write("bus_watchdog", 0)
         write("goal_position", start)
         write(
             "profile_acceleration",
@@ -348,7 +364,8 @@ def try_out(link: Link, servo_id: int, amplitude_rad: float, torque_percent: flo
                     _step(link, servo_id, model, block, goal, (start - 2 * reach, start + 2 * reach))
                 )
         except BaseException:
-            write("goal_position", link.proven(servo_id, registers["present_position"])[0])
+            with suppress(DriverError):  # what went wrong first is told
+                write("goal_position", link.proven(servo_id, registers["present_position"])[0])
             raise
     return Trial(servo_id, model.name, model.count_rad, start, tuple(steps))
 
@@ -383,18 +400,47 @@ def _check_fit(servo_id: int, model: Model, values: dict[str, int], reach: int) 
 
 
 @contextmanager
-def _restored(write: Callable[[str, int], None], values: dict[str, int]) -> Iterator[None]:
-    """Leave the servo as it was found; the watchdog first, since it would stop the rest."""
+def _restored(link: Link, servo_id: int, model: Model, values: dict[str, int]) -> Iterator[None]:
+    """Leave the servo as it was found: torque first, then all the rest, whatever of it fails."""
+    wrong: BaseException | None = None
     try:
         yield
-    finally:
-        write("bus_watchdog", 0)
-        if not values["torque_enable"]:
-            write("torque_enable", 0)
-        for name in ("profile_acceleration", "profile_velocity", "goal_pwm"):
-            write(name, values[name])
-        if values["bus_watchdog"] not in (0, 255):
-            write("bus_watchdog", values["bus_watchdog"])
+    except BaseException as error:  # goes on to the caller when the servo is as it was
+        wrong = error
+    wanted = [] if values["torque_enable"] else [("torque_enable", 0)]
+    wanted += [("bus_watchdog", 0)]  # one that trips would refuse goal_pwm
+    wanted += [(name, values[name]) for name in ("profile_acceleration", "profile_velocity", "goal_pwm")]
+    if values["bus_watchdog"] != WATCHDOG_TRIPPED:
+        wanted += [("bus_watchdog", values["bus_watchdog"])]
+    left: dict[str, DriverError] = {}
+    for name, value in wanted:
+        try:
+            _restore(link, servo_id, model.registers[name], value)
+        except DriverError as error:
+            left[name] = error
+        except KeyboardInterrupt as error:  # Ctrl-C again: the rest is tried all the same
+            wrong = wrong or error
+    if left:
+        names = " and ".join(left)
+        limp = "its torque may be on; " if "torque_enable" in left else ""
+        words = f"servo {servo_id} is not left as it was found in {names}: {limp}{next(iter(left.values()))}"
+        raise WrongDevice(words if wrong is None else f"{wrong or 'interrupted'}; and {words}") from wrong
+    if wrong is not None:
+        raise wrong
+
+
+def _restore(link: Link, servo_id: int, register: Register, value: int) -> None:
+    """Write a register and see that it holds the value."""
+    for _ in range(ATTEMPTS):
+        _patient(lambda: link.write(servo_id, register, value))
+        if _patient(lambda: link.proven(servo_id, register)) == [value]:
+            return
+    raise WrongDevice(f"{register.name} does not take {value}")
+
+
+def _part(servo_id: int, register: Register, value: int) -> Part:
+    """A register and its new value, for a packet."""
+    return Part(servo_id, register.address, register.size, register.encode(value))
 
 
 def _step(

@@ -29,12 +29,14 @@ from dynamixel_rig import (
 )
 
 from drivers.dynamixel.head import open_head
+from drivers.dynamixel.servo import Servo
 from drivers.errors import (
     DriverError,
     HardwareFault,
     LineLost,
     NoReply,
     OutOfRange,
+    Refused,
     WatchdogTripped,
     WrongDevice,
 )
@@ -130,7 +132,96 @@ def test_a_hardware_error_at_the_start_is_refused_or_rebooted_as_configured() ->
         head.close()
 
 
+def test_an_axis_that_droops_below_its_limit_is_not_locked_out() -> None:
+    with opened(starts_rad=(2.5 + 2 * COUNT_RAD, -1.2 - 3 * COUNT_RAD)) as (it, head):
+        assert [servo.table["goal_position"] for servo in it.servos] == [3677, 1266]  # the limits, inwards
+        assert settled(head).faults == ()
+        head.move(2.3, -1.0)
+        assert settled(head).tilt_rad == pytest.approx(-1.0, abs=COUNT_RAD)
+
+
+def test_an_axis_farther_outside_than_it_droops_is_refused() -> None:
+    with (
+        rig(starts_rad=(2.5 + 8 * COUNT_RAD, 0.0)) as it,
+        pytest.raises(WrongDevice, match="outside its lim"),
+    ):
+        it.open()
+
+
+def test_what_a_killed_servo_test_has_left_is_put_right_and_told(caplog: pytest.LogCaptureFixture) -> None:
+    with rig() as it:
+        it.open().close()
+        table = it.servos[0].table
+        it.servos[0].table.values.update({"goal_pwm": 88, "bus_watchdog": 255, "profile_velocity": 8})
+        head = it.open()
+        assert (table["goal_pwm"], table["bus_watchdog"]) == (885, 20)
+        assert table["profile_velocity"] == 41
+        assert "pan (servo 1) was bound to 10 % of its drive" in caplog.text
+        assert head.read().faults == ()
+        head.close()
+
+
+def test_a_cleared_watchdog_and_a_void_goal_go_out_together() -> None:
+    with rig() as it:
+        it.open().close()
+        it.servos[0].table.values.update({"bus_watchdog": 255, "goal_position": 3000})
+        it.ear.heard.clear()
+        it.open().close()
+        shouts = [n for n, (_, one) in enumerate(it.ear.heard) if one.code == 0x83]
+        clear, void = it.ear.heard[shouts[0]][1], it.ear.heard[shouts[0] + 1][1]
+        assert clear.parameters == bytes((98, 0, 1, 0, 1, 0))
+        assert void.parameters == bytes((116, 0, 4, 0, 1)) + (2048).to_bytes(4, "little")
+        written = [one.parameters[0] for _, one in it.ear.heard[: shouts[0]] if one.code == 3]
+        assert not {98, 116} & set(written), "one of them went out before"
+
+
+def test_a_setting_that_is_refused_with_the_torque_off_leaves_the_axis_held(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    true_wanted = Servo._wanted
+    monkeypatch.setattr(Servo, "_wanted", lambda servo: {**true_wanted(servo), "temperature_limit": 200})
+    with rig(pan={"torque_enable": 1}) as it:
+        with pytest.raises(Refused, match="temperature_limit"):
+            it.open(torque_off_at_start=True)
+        assert it.servos[0].table["torque_enable"] == 1
+
+
+def test_more_than_the_servo_can_is_refused_before_the_torque_is_touched() -> None:
+    with rig(models=("ph42_020_s300", X), pan={"torque_enable": 1}) as it:
+        with pytest.raises(WrongDevice, match="acceleration_rad_per_s2 or speed_rad_per_s is more than"):
+            it.open(acceleration_rad_per_s2=30.0, torque_off_at_start=True)
+        assert it.servos[0].table["torque_enable"] == 1
+        sent = [one for _, one in it.ear.heard if one.code == 3 and one.parameters[:2] == b"\x00\x02"]
+        assert sent == [], "torque was written"
+
+
 # Moving
+
+
+def test_a_speed_that_no_servo_can_be_told_is_refused_and_nothing_moves() -> None:
+    with opened() as (it, head):
+        with pytest.raises(OutOfRange, match=r"speed 0.005 rad/s is less than the 0.0240 rad/s"):
+            head.move(0.5, 0.0, 0.005)
+        assert it.servos[0].table["goal_position"] == 2048
+        head.move(0.5, 0.0, 0.03)
+        assert it.servos[0].table["profile_velocity"] == 1
+
+
+@pytest.mark.parametrize("register", ["profile_velocity", "profile_acceleration"])
+def test_a_profile_that_is_zeroed_under_way_is_noticed_and_put_right(register: str) -> None:
+    with rig() as it:
+        it.options["pan"].update(approach="positive", approach_rad=0.3)
+        head = it.open()
+        head.move(-0.3, 0.0)
+        until(lambda: head.read().pan_rad < -0.2, "motion")
+        it.servos[0].table[register] = 0  # as fast as it can
+        error = until(lambda: failed(head), "the fault")
+        assert "profile" in str(error)
+        last_stretch = (2048 - round(0.3 / COUNT_RAD)).to_bytes(4, "little")
+        assert not any(last_stretch in one.parameters for _, one in it.ear.heard), "the last stretch went out"
+        until(lambda: read_or_none(head), "the head")
+        assert it.servos[0].table[register] > 0
+        head.close()
 
 
 def test_both_axes_go_to_the_nearest_count_and_the_report_says_what_is_left() -> None:

@@ -186,6 +186,9 @@ def test_a_position_that_leaps_is_refused() -> None:
         ({"sign": 0}, "expected 1 or -1"),
         ({"sign": True}, "expected 1 or -1"),
         ({"model": "MX-28", "current_limit_A": 1.0}, "has no current limit"),
+        ({"current_limit_A": 3.3}, "expected 0.00269 to 3.209 A for a XM430-W350"),
+        ({"current_limit_A": 0.001}, "expected 0.00269 to 3.209 A for a XM430-W350"),
+        ({"limits_rad": [0.1, 0.1012]}, "hold no two counts of a XM430-W350, whose count is 0.0015 rad"),
         ({"id": 253}, "from 0 to 252"),
     ],
 )
@@ -206,6 +209,8 @@ def test_options_that_cannot_be_are_refused_in_words(change: dict[str, Any], wor
         ({"speed_rad_per_s": 2.0}, "acceleration_rad_per_s2 is 4: braking from 2 rad/s takes 0.5 s"),
         ({"speed_rad_per_s": 2.0}, "0.5 s in all"),
         ({"poll_hz": 1}, "from 10 to 500"),
+        ({"reply_timeout_s": 0.2}, "one lost reply would stop the head; expected 0.19 s or less"),
+        ({"reply_timeout_s": 1.0, "watchdog_s": 0}, "from 0.002 to 0.3"),
         ({"speed_rad_s": 1}, "did you mean 'speed_rad_per_s'"),
         ({"tilt": 3}, "expected a mapping"),
     ],
@@ -214,6 +219,17 @@ def test_options_of_the_head_that_cannot_be_are_refused_in_words(change: dict[st
     with pytest.raises(BadOptions) as caught:
         head_settings({**options(), **change})
     assert words in str(caught.value)
+
+
+def test_a_watchdog_and_braking_that_fill_half_a_second_exactly_are_taken() -> None:
+    settings = head_settings({**options(), "watchdog_s": 0.28, "acceleration_rad_per_s2": 5.0})
+    assert settings.watchdog_counts == 14
+
+
+def test_the_acceleration_that_braking_relies_on_is_not_rounded_down() -> None:
+    settings = head_settings(options()).pan
+    unit = settings.model.acceleration_unit_rad_per_s2
+    assert [settings.acceleration_counts(a * unit) for a in (0.5, 1.0, 1.1, 10.7)] == [1, 1, 2, 11]
 
 
 def test_limits_are_rounded_inwards() -> None:

@@ -33,6 +33,7 @@ def test_a_model(name: str) -> None:
         assert "present_current" not in simulator.by_name
     else:
         assert driver.current_unit_A == simulator.current_unit_a
+        assert driver.most_current_counts == simulator.by_name["current_limit"].high
 
 
 @pytest.mark.parametrize("name", ours.MODELS)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import re
+import signal
 import time
 from collections.abc import Iterator
 from typing import Any
@@ -172,6 +173,100 @@ def test_test_refuses_an_unfit_servo_and_moves_nothing(
     assert error in err
     assert bench.axes[0].angle_rad(time.monotonic()) == 0.0
     assert bench.servos[0].table["torque_enable"] == 0
+
+
+def quiet_link(bench: Bench, times_out_s: float = 0.02) -> Link:
+    return Link(bench.line.path, int(BAUD), times_out_s)
+
+
+def deaf_to(bench: Bench, monkeypatch: pytest.MonkeyPatch, *registers: str) -> None:
+    """The first servo neither does nor answers writes to some registers any more."""
+    servo = bench.servos[0]
+    deaf = {servo.model.by_name[name].address for name in registers}
+    true_write = servo.write
+
+    def write(address: int, data: bytes, time_s: float, **how: Any) -> None:
+        if address in deaf:
+            raise TimeoutError
+        true_write(address, data, time_s, **how)
+
+    true_receive = bench.line.device.receive
+
+    def receive(data: bytes, time_s: float) -> Any:
+        try:
+            return true_receive(data, time_s)
+        except TimeoutError:
+            return ()
+
+    monkeypatch.setattr(servo, "write", write)
+    monkeypatch.setattr(bench.line.device, "receive", receive)
+
+
+def test_test_restores_the_torque_first_and_all_the_rest_whatever_fails(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    servo = bench.servos[0]
+    before = dict(servo.table.values)
+    link = quiet_link(bench)
+    true_step = workshop._step
+
+    def step(*how: Any) -> Any:
+        deaf_to(bench, monkeypatch, "bus_watchdog", "profile_acceleration")
+        return true_step(*how)
+
+    monkeypatch.setattr(workshop, "_step", step)
+    with pytest.raises(workshop.WrongDevice, match="left as it was found in bus_watchdog and profile_acc"):
+        workshop.try_out(link, 1, math.radians(1), 30.0)
+    link.close()
+    for name in ("torque_enable", "profile_velocity", "goal_pwm"):
+        assert servo.table[name] == before[name], name
+
+
+def test_test_says_that_the_torque_may_be_on_and_what_went_wrong_before(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    link = quiet_link(bench)
+
+    def step(*how: Any) -> Any:
+        deaf_to(bench, monkeypatch, "torque_enable")
+        raise workshop.HardwareFault("it is blocked")
+
+    monkeypatch.setattr(workshop, "_step", step)
+    words = "^it is blocked; and servo 1 is not left as it was found in torque_enable: its torque may be on"
+    with pytest.raises(workshop.WrongDevice, match=words):
+        workshop.try_out(link, 1, math.radians(1), 30.0)
+    link.close()
+    assert bench.servos[0].table["goal_pwm"] == 885
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP, signal.SIGINT])
+def test_a_test_that_is_ended_leaves_the_servo_as_it_was(
+    bench: Bench, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, number: signal.Signals
+) -> None:
+    before = dict(bench.servos[0].table.values)
+    true_step = workshop._step
+
+    def step(*how: Any) -> Any:
+        signal.raise_signal(number)
+        return true_step(*how)
+
+    monkeypatch.setattr(workshop, "_step", step)
+    handlers = [signal.getsignal(one) for one in (signal.SIGTERM, signal.SIGHUP)]
+    code, _, err = run(capsys, "test", bench.line.path, "1", "--baud", BAUD, "--degrees", "3")
+    assert code == 130, err
+    for name in ("torque_enable", "profile_velocity", "profile_acceleration", "goal_pwm", "bus_watchdog"):
+        assert bench.servos[0].table[name] == before[name], name
+    assert [signal.getsignal(one) for one in (signal.SIGTERM, signal.SIGHUP)] == handlers
+
+
+def test_a_test_after_one_that_was_killed_works_at_once(
+    bench: Bench, capsys: pytest.CaptureFixture[str]
+) -> None:
+    table = bench.servos[0].table
+    table.values.update({"torque_enable": 1, "goal_pwm": 88, "bus_watchdog": 255, "goal_position": 2300})
+    code, _, err = run(capsys, "test", bench.line.path, "1", "--baud", BAUD, "--degrees", "3", "--json")
+    assert code == 0, err
+    assert (table["torque_enable"], table["bus_watchdog"], table["goal_position"]) == (1, 0, 2048)
 
 
 def test_test_stops_at_its_fence(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
