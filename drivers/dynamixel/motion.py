@@ -259,7 +259,8 @@ class AxisMotion:
             return f"{self.name} holds the goal {values['goal_position']} where {self.goal} was sent"
         if self.profile is None:
             return ""
-        held = values["profile_acceleration"], values["profile_velocity"]
+        acceleration = values.get("profile_acceleration", self.profile[0])  # not in every block
+        held = acceleration, values["profile_velocity"]
         if held == self.profile:
             return ""
         return (

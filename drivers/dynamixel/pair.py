@@ -81,7 +81,7 @@ class Axis:
         """Send the next leg of a move if the present one has ended; raises as `Servo.set`."""
         goal = self.motion.next_leg()
         if goal is not None:
-            self.servo.set("goal_position", goal)
+            self.servo.send_leg(self.motion.profile or self.servo.profile, goal)
             self.motion.begin_leg()
 
 

@@ -349,6 +349,18 @@ class Servo:
                     f"speed_rad_per_s is more than its own limits allow ({error})"
                 ) from error
 
+    def send_leg(self, profile: tuple[int, int], goal: int) -> None:
+        """Set a goal, with the profile that leads there in the same packet; raises as `set`."""
+        parts = [
+            self._part(name, value)
+            for name, value in zip(
+                ("profile_acceleration", "profile_velocity", "goal_position"), (*profile, goal), strict=True
+            )
+        ]
+        data = b"".join(part.data for part in parts)
+        self._link.group_write([Part(parts[0].servo_id, parts[0].address, len(data), data)])
+        self.set("goal_position", goal)
+
     def _full_strength(self) -> None:
         """Lift the bound of the motor's drive that a trial that was killed has left; raises as `set`."""
         found, limit = self.get_all("goal_pwm", "pwm_limit").values()
