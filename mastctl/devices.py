@@ -421,8 +421,9 @@ class Devices:
         """The thread of a camera; that of an absent one looks after it, and tells its absence as a fault."""
         if not isinstance(self._cameras[camera], AbsentCamera):
             return DeviceThread(camera, words=WORDS)
+        words = {**WORDS, "next_frame": Words("it is there, or a picture comes")}
         return DeviceThread(
-            camera, between=lambda: self._join(camera), between_name="next_frame", words=WORDS
+            camera, between=lambda: self._join(camera), between_name="next_frame", words=words
         )
 
     def _join(self, name: str) -> None:
