@@ -87,14 +87,17 @@ class World:
     """Devices for the loop. A test changes what the head or a picture is by replacing the hooks.
 
     ``reading(reading)`` may change what the head says, ``image(camera, frame_number, image)`` what a
-    camera shows, ``slip_rad`` is by how much the head's encoders are wrong after the next move, ``late_s``
-    how much later than the others a camera exposes.
+    camera shows, ``view(camera, time_s, joints)`` from where it shows it, ``slip_rad`` is by how much the
+    head's encoders are wrong after the next move, ``late_s`` how much later than the others a camera exposes.
     """
 
     clock: ManualClock = field(default_factory=lambda: ManualClock(100.0))
     speed_rad_per_s: float = 1.0
     reading: Callable[[Reading], Reading] = lambda reading: reading
     image: Callable[[str, int, np.ndarray], np.ndarray] = lambda camera, number, image: image
+    view: Callable[[str, float, tuple[float, float]], tuple[float, float]] = lambda camera, time_s, joints: (
+        joints
+    )
     on_read: Callable[[], None] = lambda: None
     slip_rad: tuple[float, float] = (0.0, 0.0)
     late_s: dict[str, float] = field(default_factory=dict)
@@ -116,7 +119,11 @@ class World:
     def joints(self, time_s: float) -> tuple[tuple[float, float], bool]:
         """What the encoders say, and whether the head moves."""
         way = max(abs(self._to[0] - self._from[0]), abs(self._to[1] - self._from[1]))
-        part = 1.0 if way == 0 else min(1.0, (time_s - self._begun_s) * self.speed_rad_per_s / way)
+        part = (
+            1.0
+            if way == 0
+            else float(np.clip((time_s - self._begun_s) * self.speed_rad_per_s / way, 0.0, 1.0))
+        )
         at = tuple(a + part * (b - a) for a, b in zip(self._from, self._to, strict=True))
         return (at[0], at[1]), part < 1.0
 
@@ -174,7 +181,8 @@ class World:
         now_s = self.clock.now_s() + self.late_s.get(name, 0.0)
         (pan, tilt), moving = self.joints(now_s)
         noise = np.random.default_rng(self._count).normal(scale=NOISE_DN, size=SIZE_PX[::-1])
-        shown = np.clip(np.rint(clean(name, *self.true_joints(now_s)) + noise), 0, 255).astype(np.uint8)
+        seen_from = self.view(name, now_s, self.true_joints(now_s))
+        shown = np.clip(np.rint(clean(name, *seen_from) + noise), 0, 255).astype(np.uint8)
         shown = self.image(name, self._count, shown)
         frame_id = f"{name}-{self._count:06d}"
         self._truth[frame_id] = self.true_joints(now_s)

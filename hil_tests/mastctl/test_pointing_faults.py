@@ -106,15 +106,15 @@ def test_a_trembling_head_does_not_count_as_settled() -> None:
     assert refused(world).code == "did_not_settle"
 
 
-def test_an_encoder_that_slips_in_the_move_shows_as_the_large_residual_it_is() -> None:
+def test_an_encoder_that_slips_by_less_than_a_servo_may_play_shows_as_the_residual_it_is() -> None:
     world = World()
     frame = world.shoot()
     point = world.true_point(frame, 90.0, 70.0)
-    world.slip_rad = (0.0349, -0.01)
+    world.slip_rad = (0.006, -0.004)
     result, _ = run(world, click(frame, 90.0, 70.0))
     (pointing,) = result.pointings
     truth = world.true_pixel(pointing.frame_id, point) - np.array(MIDDLE_PX)
-    assert np.abs(truth).max() > 15.0
+    assert np.abs(truth).max() > 3.0
     assert pointing.residual_px is not None
     assert np.abs(np.array(pointing.residual_px) - truth).max() < RIGHT_ANYWAY_PX
 
@@ -132,9 +132,9 @@ def noise(image: np.ndarray, seed: int) -> np.ndarray:
     ("what", "codes"),
     [
         ("across", ("eyes_disagree",)),
-        ("along", ("eyes_disagree",)),
-        ("garbage", ("target_not_found", "target_ambiguous", "eyes_disagree")),
-        ("dark", ("target_not_found", "target_ambiguous", "eyes_disagree")),
+        ("along", ("bad_frame",)),
+        ("garbage", ("bad_frame",)),
+        ("dark", ("bad_frame", "target_not_found", "target_ambiguous", "eyes_disagree")),
     ],
 )
 def test_a_picture_that_is_wrong_after_the_move_is_never_measured_in(
@@ -156,7 +156,7 @@ def test_a_picture_that_is_wrong_after_the_move_is_never_measured_in(
     world.image = change
     error = refused(world)
     assert error.code in codes, str(error)
-    assert error.step in ("measure", "eyes")
+    assert error.step in ("look", "measure", "eyes")
 
 
 @pytest.mark.parametrize("eye", ["navcam_left", "navcam_right"])
@@ -287,6 +287,7 @@ HARMLESS = [
     *[("pan_tilt", word) for word in ("slow", "delayed", "intermittent")],
     # Lines that lose or repeat a reply now and then; and what has not yet grown enough to harm.
     *[("pan_tilt", word) for word in ("mute", "half", "corrupt", "late", "duplicate", "swapped", "noise")],
+    ("pan_tilt", "misnamed"),  # of a Dynamixel line only
     *[("pan_tilt", word) for word in ("drifting", "overload", "temperature_ramp")],
     *[("navcam_left", word) for word in ("slow", "delayed", "intermittent", "dropped")],
     ("navcam_left", "frozen", "settle"),

@@ -112,7 +112,7 @@ def test_a_position_is_pointed_at_and_its_missing_residual_is_explained(frame: s
     assert "no picture" in pointing.note
     assert np.allclose(world.true_pixel(pointing.frame_id, np.array([4.0, 0.7, 0.0])), MIDDLE_PX, atol=1e-6)
     assert np.allclose(pointing.predicted_px, MIDDLE_PX, atol=1e-6)
-    assert [step.name for step in steps] == ["rest", "solve", "limits", "move", "settle", "look"]
+    assert [step.name for step in steps] == ["rest", "solve", "before", "limits", "move", "settle", "look"]
 
 
 def test_joint_angles_are_taken_up_without_a_picture() -> None:

@@ -2,8 +2,9 @@
 
 Steps of a pixel request, as they stand in the record: ``rest``, ``frames``, ``target``, ``stereo``,
 ``triangulate``; then for each pointing ``solve``, ``limits``, ``move``, ``settle``, ``look``, ``measure``,
-``eyes`` (and ``triangulate``, ``rest`` before the second). A position needs ``rest``, ``solve`` to ``settle``
-and ``look``; joint angles ``rest`` and ``limits`` to ``settle``, no picture.
+``eyes`` (and ``triangulate``, ``rest`` before the second; ``before`` ahead of the first move if the aiming
+eye has no picture yet that the new one could be compared with). A position needs ``rest``, ``solve`` to
+``settle`` and ``look``; joint angles ``rest`` and ``limits`` to ``settle``, no picture.
 
 A named frame's other eye may not be kept, and what was clicked may have been seen from another pose; so a
 fresh pair is always taken, the clicked patch is found in it, and range comes from that pair. The clicked
@@ -274,6 +275,8 @@ class _Run:
             best = choose(solutions, self._limits.pan_rad, self._limits.tilt_rad, here.pan_rad, here.tilt_rad)
             detail.update(chosen=_told(best))
         self._range_m = best.range_m
+        eyes = [name for name in (aim.camera, self._eyes.partner(aim.camera)) if name is not None]
+        self._steps.before(eyes, here, (best.pan_rad, best.tilt_rad))
         return (best.pan_rad, best.tilt_rad), self._steps.go(best.pan_rad, best.tilt_rad, aim.camera)
 
     def _pointing(self, commanded: Pair, now: View, aim_px: FloatArray, seen: Match | None) -> Pointing:
@@ -293,6 +296,7 @@ class _Run:
             residual_px=None if seen is None else pair(seen.pixel_px - aim_px),
             residual_sigma_px=None if seen is None else pair(seen.sigma_px),
             note=NO_PICTURE_OF_A_POSITION if seen is None else "",
+            motion_evidence=self._steps.motion_evidence,
         )
 
     def _so_far(self) -> PointingResult | None:

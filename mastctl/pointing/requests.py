@@ -10,6 +10,7 @@ import numpy as np
 
 from calib.match import MatchSettings
 from calib.rigid import FloatArray
+from calib.shown_view import ViewLimits
 from mastctl.errors import MastctlError
 
 Pair = tuple[float, float]
@@ -104,6 +105,8 @@ class Pointing:
         target_px - aim_px, and one sigma of the match; None as above.
     note
         One sentence that says why there is no residual; empty otherwise.
+    motion_evidence
+        By camera of the new pictures: whether they moved as the joints did, as a ``verdict`` with numbers.
     """
 
     commanded_pan_rad: float
@@ -118,6 +121,7 @@ class Pointing:
     residual_px: Pair | None
     residual_sigma_px: Pair | None
     note: str = ""
+    motion_evidence: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, eq=False)
@@ -205,6 +209,8 @@ class PointingSettings:
         put down to calibration: the paper's mast fit leaves 1.1 px rms.
     triangulation_sigma_px
         Of a pixel for the position's covariance: matching and calibration together.
+    view
+        What may lie between the view that joints tell and the one that a picture shows.
     match, small_half_px
         Of the matching itself; and the half patch that is tried where the usual one fits nowhere, because
         part of it lies on something nearer or farther.
@@ -230,6 +236,7 @@ class PointingSettings:
     range_px: float = 4.0
     triangulation_sigma_px: float = 0.2
     small_half_px: int = 12
+    view: ViewLimits = field(default_factory=ViewLimits)
     match: MatchSettings = field(default_factory=MatchSettings)
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from functools import partial
@@ -18,6 +18,7 @@ from mastctl.pointing.abandoned import result_unless
 from mastctl.pointing.counts import counts_told
 from mastctl.pointing.looking import CamerasLike, Eyes, View, facts
 from mastctl.pointing.motion import Head, HeadLike
+from mastctl.pointing.motion_seen import MotionSeen
 from mastctl.pointing.one_moment import apart, check_one_moment
 from mastctl.pointing.record import Recorder
 from mastctl.pointing.requests import PixelTarget, PointingError, PointingSettings, Step
@@ -64,6 +65,8 @@ class Steps:
         What the steps are made with.
     pointing
         Which pointing of the request the next steps belong to; the record names the second and later ones.
+    motion_evidence
+        What the last look's pictures say about the move before it, by camera (`MotionSeen`).
     """
 
     def __init__(
@@ -79,6 +82,8 @@ class Steps:
         self.head = Head(devices, limits, clock, settings, cancelled)
         self.eyes = Eyes(devices, rig, settings)
         self.pointing = 1
+        self.motion_evidence: Mapping[str, Mapping[str, Any]] = {}
+        self._motion_seen = MotionSeen(rig, settings.view)
         self._rig = rig
         self._devices = devices
         self._limits = limits
@@ -138,6 +143,7 @@ class Steps:
             fresh = self.unless_stopped(self.eyes.new, (target.camera, partner), began_s, resting)
             now, other = fresh[target.camera], fresh[partner]
             detail.update(frame_ids=[now.frame.frame_id, other.frame.frame_id], **apart(now, [other]))
+            self._motion_seen.remember(fresh)
             if view.frame.mast_digest != now.frame.mast_digest:
                 raise PointingError(
                     "other_mast_file", f"frame {target.frame_id} was taken with another mast file"
@@ -172,12 +178,40 @@ class Steps:
             detail.update(counts_told(self._devices, settled.tilt_rad, model))
         return settled
 
+    def before(self, cameras: Sequence[str], resting: Reading, goal_rad: tuple[float, float]) -> None:
+        """Take pictures to compare with after a move, where there are none yet and they will tell something.
+
+        Raises
+        ------
+        PointingError, DriverError
+            If none comes; nothing has moved.
+        """
+        configured = self._devices.newest_frames()
+        here_rad = resting.pan_rad, resting.tilt_rad
+        lacking = self._motion_seen.lacking(
+            [name for name in cameras if name in configured], here_rad, goal_rad
+        )
+        if not lacking:
+            return
+        with self.step("before") as detail:
+            views = self.eyes.new(lacking, self._clock.now_s(), resting)
+            detail.update(frame_ids=[view.frame.frame_id for view in views.values()])
+            self._motion_seen.remember(views)
+
     def look(self, cameras: Sequence[str], settled: Reading) -> dict[str, View]:
-        """Take new pictures, exposed after the head had settled. Raises PointingError, DriverError."""
+        """Take new pictures, exposed after the head had settled, that moved as the head did.
+
+        Raises
+        ------
+        PointingError, DriverError
+            If none come; `BadFrame` if one shows another view than the joints say.
+        """
         with self.step("look") as detail:
             views = self.unless_stopped(self.eyes.new, cameras, settled.time_s, settled)
             first, *others = views.values()
             detail.update(frame_ids=[view.frame.frame_id for view in views.values()], **apart(first, others))
+            self._motion_seen.check(views, detail)
+            self.motion_evidence = detail["motion_evidence"]
         return views
 
     def one_moment(

@@ -1,0 +1,169 @@
+"""Provoke the check of which view a picture shows: false alarms, missed lies, error and time.
+
+    .venv/bin/python -m tools.motion_campaign [--moves 30] [--seed 1] [--json]
+
+The simulated rover's head goes from view to view; its pictures come from the true rig, the check believes the
+packaged mast file. Each move is judged by both eyes of Navcam and Pancam: with the honest pictures; with
+those of before the move; with those of the next view, which the joints will tell only later. Moves are
+log-uniform from 1 mrad to 0.4 rad. A lie is missed if the picture's view is farther from the told one than
+allowed and no contradiction is told. Times are of the processor on one thread, both eyes together, reduction
+of the pictures included.
+"""
+# ruff: noqa: E402  the number of threads is set before numpy is imported
+
+from __future__ import annotations
+
+import os
+
+for _name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
+    os.environ[_name] = "1"
+
+import argparse
+import json
+import statistics
+import time
+from collections import Counter
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from calib.mast import Rig
+from calib.shown_view import Posed, shown_view
+from calib.store import load_rig
+from drivers.clock import ManualClock
+from drivers.open_hardware import DeviceSettings, HardwareSettings, open_hardware
+from mastctl.cli.output import at_least
+from mastctl.packaged import config_folder
+from tools.arguments import end
+
+PAIRS = {"navcam": ("navcam_left", "navcam_right"), "pancam": ("pancam_left", "pancam_right")}
+Views = list[dict[str, Posed]]
+
+
+@dataclass
+class Tally:
+    """What one pair said of one kind of pictures."""
+
+    verdicts: Counter[str] = field(default_factory=Counter)
+    off_rad: list[float] = field(default_factory=list)
+    share_of_allowed: list[float] = field(default_factory=list)
+    look_ms: list[float] = field(default_factory=list)
+    missed: int = 0
+
+
+def taken(moves: int, seed: int, head: str) -> Views:
+    """Return the pictures of ``moves`` + 2 views with the joint angles that the head reads."""
+    rng = np.random.default_rng(seed)
+    names = [name for pair in PAIRS.values() for name in pair]
+    folder, clock = config_folder(), ManualClock(50.0)
+    rover = {"rover": str(folder / "sim" / "rocky8.yaml"), "head": head, "seed": seed, "samples": 2}
+    settings = HardwareSettings(
+        DeviceSettings("sim"), dict.fromkeys(names, DeviceSettings("sim")), rover, folder
+    )
+    views: Views = []
+    with open_hardware(settings, clock) as hardware:
+        at = np.array([0.0, -0.4])
+        while len(views) < moves + 2:
+            hardware.pan_tilt.move(*(float(angle) for angle in at))
+            while hardware.pan_tilt.read().moving:
+                clock.advance(0.1)
+            clock.advance(0.3)
+            reading, begun_s = hardware.pan_tilt.read(), clock.now_s()
+            clock.advance(1.0)
+            views.append(
+                {
+                    name: Posed(
+                        hardware.cameras[name].next_frame(begun_s, 20.0).image.astype(np.float32),
+                        reading.pan_rad,
+                        reading.tilt_rad,
+                    )
+                    for name in names
+                }
+            )
+            way = np.exp(rng.uniform(np.log(1e-3), np.log(0.4))) * rng.choice([-1.0, 1.0], 2)
+            at = np.clip(at + way * rng.uniform([0.5, 0.1], [1.0, 0.5]), [-1.2, -0.75], [1.2, -0.15])
+    return views
+
+
+def fresh(view: Posed, told: Posed | None = None) -> Posed:
+    """The picture with nothing computed of it yet, with another one's angles if given."""
+    return Posed(view.image, *(told or view).angles_rad)
+
+
+def judged(rig: Rig, views: Views) -> dict[str, dict[str, Tally]]:
+    """Judge every move by every pair: honest pictures, those of before, those of the next view."""
+    tallies = {pair: {kind: Tally() for kind in ("honest", "before", "next")} for pair in PAIRS}
+    for before, after, later in zip(views, views[1:], views[2:], strict=False):
+        for pair, names in PAIRS.items():
+            for kind, shown in (("honest", after), ("before", before), ("next", later)):
+                tally = tallies[pair][kind]
+                former = {name: fresh(before[name]) for name in names}
+                new = {name: fresh(shown[name], after[name]) for name in names}
+                begun_s = time.thread_time()
+                results = [
+                    shown_view(rig, name, former[name], new[name], (other, former[other]))
+                    for name, other in (names, names[::-1])
+                ]
+                tally.look_ms.append(1e3 * (time.thread_time() - begun_s))
+                true = np.array(shown[names[0]].angles_rad)
+                for result in results:
+                    tally.verdicts[result.verdict] += 1
+                    if np.isfinite(result.pan_rad):
+                        off = np.array([result.pan_rad, result.tilt_rad]) - true
+                        tally.off_rad.append(float(np.abs(off).max()))
+                        share = np.abs(off) / np.array(result.allowed_rad)
+                        tally.share_of_allowed.append(float(share.max()))
+                        lie = np.abs(true - after[names[0]].angles_rad) > np.array(result.allowed_rad)
+                        tally.missed += bool(lie.any()) and result.verdict != "contradicted"
+    return tallies
+
+
+def told(tallies: dict[str, dict[str, Tally]]) -> list[dict[str, object]]:
+    """The table's rows."""
+    return [
+        {
+            "pair": pair,
+            "pictures": kind,
+            "verdicts": dict(tally.verdicts.most_common()),
+            "rms_mrad": None
+            if not tally.off_rad
+            else 1e3 * float(np.sqrt(np.mean(np.square(tally.off_rad)))),
+            "worst_mrad": None if not tally.off_rad else 1e3 * max(tally.off_rad),
+            "worst_of_allowed": None if not tally.off_rad else max(tally.share_of_allowed),
+            "missed": tally.missed,
+            "median_ms": statistics.median(tally.look_ms),
+        }
+        for pair, kinds in tallies.items()
+        for kind, tally in kinds.items()
+    ]
+
+
+def main(argv: list[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--moves", type=at_least(1), default=30, help="moves of the head (default 30)")
+    parser.add_argument("--seed", type=at_least(0), default=1, help="of moves and scene (default 1)")
+    parser.add_argument("--head", choices=("ptu_d46_70", "dynamixel_x", "ph42"), default="ptu_d46_70")
+    parser.add_argument("--json", action="store_true", help="print one JSON document on stdout")
+    args = parser.parse_args(argv)
+    rig = load_rig(config_folder() / "masts" / "rocky8_simulated.yaml").rig
+    views = taken(args.moves, args.seed, args.head)
+    rows = told(judged(rig, views))
+    if args.json:
+        print(json.dumps({"moves": args.moves, "seed": args.seed, "head": args.head, "rows": rows}))
+        return 0
+    for row in rows:
+        numbers = [row["rms_mrad"], row["worst_mrad"], row["worst_of_allowed"]]
+        rms, worst, share = ("-" if one is None else f"{one:.2f}" for one in numbers)
+        verdicts = ", ".join(f"{count} {word}" for word, count in dict(row["verdicts"]).items())  # type: ignore[call-overload]
+        print(
+            f"{row['pair']} {row['pictures']:7s} rms {rms} worst {worst} mrad ({share} of allowed), "
+            f"missed {row['missed']}, "
+            f"{row['median_ms']:.1f} ms a look: {verdicts}"
+        )
+    return 0
+
+
+if __name__ == "__main__":
+    end(main)
