@@ -9,17 +9,16 @@ no thread from anything else.
 from __future__ import annotations
 
 import asyncio
-import math
+import contextlib
+import threading
 from collections.abc import Awaitable, Callable
 from typing import TypeVar
-
-import anyio
-from anyio import to_thread
 
 from mastctl.errors import MastctlError
 
 T = TypeVar("T")
 
+AT_ONCE = 40  # worker threads for everything but pictures
 PICTURES_AT_ONCE = 4  # of one camera
 PICTURE_QUEUE_S = 2.0  # how long a request waits for those before it
 
@@ -34,6 +33,12 @@ class TooMany(MastctlError):
         super().__init__(message)
 
 
+class NoThread(MastctlError):
+    """The machine had no thread for a request."""
+
+    code = "no_thread"
+
+
 class Ending(MastctlError):
     """The daemon ends, and what was waited for will not come."""
 
@@ -46,7 +51,7 @@ class Waiting:
     def __init__(self) -> None:
         self._ending = asyncio.Event()
         self._asked: dict[str, asyncio.Semaphore] = {}
-        self._pictures: anyio.CapacityLimiter | None = None
+        self._others = asyncio.Semaphore(AT_ONCE)
 
     def end(self) -> None:
         """Refuse what waits now and what will come."""
@@ -60,7 +65,7 @@ class Waiting:
         Ending
             If the daemon ends before it returns.
         """
-        return await self._unless_ending(to_thread.run_sync(function, abandon_on_cancel=True))
+        return await self._unless_ending(self._worked(function))
 
     async def picture(self, camera: str, function: Callable[[], T]) -> T:
         """Return what ``function()`` returns, which takes a picture with a (known) camera.
@@ -74,9 +79,12 @@ class Waiting:
         """
         return await self._unless_ending(self._in_turn(camera, function))
 
+    async def _worked(self, function: Callable[[], T]) -> T:
+        async with self._others:
+            return await _in_thread(function)
+
     async def _in_turn(self, camera: str, function: Callable[[], T]) -> T:
         turn = self._asked.setdefault(camera, asyncio.Semaphore(PICTURES_AT_ONCE))
-        self._pictures = self._pictures or anyio.CapacityLimiter(math.inf)
         try:
             await asyncio.wait_for(turn.acquire(), PICTURE_QUEUE_S)
         except TimeoutError:
@@ -86,7 +94,7 @@ class Waiting:
                 PICTURE_QUEUE_S,
             ) from None
         try:
-            return await to_thread.run_sync(function, abandon_on_cancel=True, limiter=self._pictures)
+            return await _in_thread(function)
         finally:
             turn.release()
 
@@ -101,3 +109,32 @@ class Waiting:
         finally:
             for one in (call, ending):
                 one.cancel()
+
+
+async def _in_thread(function: Callable[[], T]) -> T:
+    """Return what a function returns, run in a daemon thread, which does not hold the process's end."""
+    loop = asyncio.get_running_loop()
+    answer: asyncio.Future[T] = loop.create_future()
+
+    def tell(result: T | None, error: Exception | None) -> None:
+        if answer.done():  # nobody waits any more
+            return
+        if error is not None:
+            answer.set_exception(error)
+        else:
+            answer.set_result(result)  # type: ignore[arg-type]
+
+    def run() -> None:
+        result, error = None, None
+        try:
+            result = function()
+        except Exception as raised:  # it belongs to who waits
+            error = raised
+        with contextlib.suppress(RuntimeError):  # the loop has ended already
+            loop.call_soon_threadsafe(tell, result, error)
+
+    try:
+        threading.Thread(target=run, name="request", daemon=True).start()
+    except RuntimeError as error:
+        raise NoThread(f"the request was not begun: {error}") from None
+    return await answer

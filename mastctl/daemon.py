@@ -15,10 +15,11 @@ import os
 import signal
 import socket
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future
 from pathlib import Path
 from types import TracebackType
+from typing import Any
 
 import uvicorn
 
@@ -31,6 +32,7 @@ from mastctl.config import Config, Listen
 from mastctl.connections import ACCEPTED_AT_ONCE, WAITING_IN_KERNEL, Connection, most_connections, sweep
 from mastctl.errors import MastctlError
 from mastctl.service import Service
+from mastctl.stop_threads import StopsHang
 
 log = logging.getLogger(__name__)
 
@@ -207,15 +209,25 @@ async def _serve(
     asked = asyncio.create_task(ending.wait())
     await asyncio.wait({serving, asked}, return_when=asyncio.FIRST_COMPLETED)
     asked.cancel()
-    stopped = asyncio.wrap_future(service.stop_threads.submit(service.operations.close))
+    try:
+        stopped = asyncio.wrap_future(service.stop_threads.submit(service.operations.close))
+    except StopsHang:
+        stopped = loop.run_in_executor(None, service.operations.close)
     waiting.end()
     log.info("ending: the mast is stopped first")
     await stopped
     server.should_exit = True
+    loop.call_later(GRACE_S - 0.5, _leave, server.server_state.connections)  # before uvicorn's own impatience
     await serving
     sweeping.cancel()
     if in_process:
         await loop.run_in_executor(None, service.close)
+
+
+def _leave(connections: Iterable[Any]) -> None:
+    """Leave those who have not read their answers."""
+    for one in list(connections):
+        one.leave()
 
 
 def _suspend(service: Service) -> None:

@@ -230,6 +230,12 @@ class Operations:
         log.info("stop%s", f": operation {name}" if name else "")
         return name
 
+    def wait_ended(self, name: str, timeout_s: float) -> None:
+        """Wait until an operation has ended, ``timeout_s`` seconds at most."""
+        current = self._current
+        if current is not None and current[0] == name and current[2].is_alive():
+            current[2].join(timeout_s)
+
     def get(self, name: str) -> Operation:
         """Return one record.
 

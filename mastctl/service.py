@@ -38,6 +38,7 @@ SNAPSHOT_AGE_S = 1.0  # a snapshot that need not be fresh may be this old
 SNAPSHOT_TIMEOUT_S = 5.0
 RENDERING_S = 20.0  # six simulated cameras share one renderer, on a machine that may be busy
 HARDWARE_CLOSE_S = 3.0
+ENDS_SOON_S = 0.25  # a stopped operation ends within 20 ms or so; then the next one may follow at once
 
 
 class Refused(MastctlError):
@@ -370,17 +371,20 @@ class Service:
         """
         with self.operations.held():  # until the track has ended too, which would look again
             try:
-                return self.operations.stop()
+                stopped = self.operations.stop()
             finally:
                 self.tracker.stop(STOP_ASKED)
+        if stopped is not None:
+            self.operations.wait_ended(stopped, ENDS_SOON_S)
+        return stopped
 
     def close(self) -> None:
         """Stop the mast and let go of everything; bounded, never raises."""
-        self.operations.close()
         with self._closing:
             if self._closed:
                 return
             self._closed = True
+        self.operations.close()
         self.devices.close()
         self.stop_threads.close()
         self.handoffs.close()

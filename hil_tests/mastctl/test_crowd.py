@@ -72,8 +72,22 @@ def test_what_waits_when_the_daemon_ends_is_refused_and_the_end_is_bounded(tmp_p
             one.join()
         _, log = daemon.communicate(timeout=BOUND_S)
     assert codes == ["closing"] * 3
-    assert "Traceback" not in log, log
+    assert daemon.returncode == 0, log
+    assert not {"Traceback", "ERROR"} & set(log.replace(":", " ").split()), log
+    assert "next_frame did not end" not in log, "nobody waited for the picture's own deadline"
+
+
+def test_an_answer_that_nobody_reads_does_not_hold_the_end(tmp_path: Path) -> None:
+    with daemon_process(tmp_path, write_config(tmp_path)) as daemon:
+        host, port = line(daemon).removeprefix("http://").split(":")
+        with socket.create_connection((host, int(port)), timeout=1.0) as client:
+            with contextlib.suppress(TimeoutError):
+                while True:  # until nothing more goes in: the daemon's answers are stuck
+                    client.sendall(b"GET /openapi.json HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n" * 100)
+            daemon.send_signal(signal.SIGTERM)
+            _, log = daemon.communicate(timeout=BOUND_S)
     assert daemon.returncode == 0
+    assert "Traceback" not in log, log
 
 
 SILENT = 70

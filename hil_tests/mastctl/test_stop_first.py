@@ -278,3 +278,18 @@ def test_a_stop_that_an_operation_has_not_heeded_yet_is_told_as_stopping(
         assert refused.value.code == "busy"
         leave.set()
         eventually(lambda: client.status()["state"] == "stopped", "the end")
+
+
+def test_a_defect_at_the_end_of_a_look_ends_the_track_instead_of_keeping_it_busy(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    def fail(*_: Any) -> None:
+        raise ValueError("a defect")
+
+    with fake_daemon(monkeypatch, tmp_path) as (daemon, _), Client(daemon.url) as client:
+        monkeypatch.setattr(daemon.service.tracker, "_started", fail)
+        frame_id = client.snapshot("navcam_left").frame_id
+        client.start_track(pixel=("navcam_left", frame_id, 30.0, 20.0))
+        eventually(lambda: client.track()["state"] == "stopped", "the end of the track")
+        assert "defect" in client.track()["reason"]
+        assert client.track()["operation"] is None

@@ -307,7 +307,15 @@ class Tracker:
     # In the operation's thread
 
     def _ended(self, operation: Operation, outcome: Outcome | None) -> None:
-        """Take what a start or a look told, then the poses that waited for it."""
+        """Take what a start or a look told, then the poses that waited for it; a defect ends the track."""
+        try:
+            self._taken(operation, outcome)
+        except Exception as defect:
+            words = f"the track met a defect of the program ({type(defect).__name__}); the log says more"
+            self.stop(words)
+            raise
+
+    def _taken(self, operation: Operation, outcome: Outcome | None) -> None:
         with self._held():
             if self._status.operation != operation.id:
                 return  # stopped meanwhile
