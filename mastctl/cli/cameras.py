@@ -1,4 +1,4 @@
-"""Commands on connected cameras: camera list, check, grab, focus."""
+"""Commands on connected cameras: camera list, check, grab, focus; sync is in a module of its own."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from mastctl.cli import output
+from mastctl.cli import camera_sync, output
 from mastctl.cli.output import finite_number, positive_number
 
 if TYPE_CHECKING:
@@ -23,9 +23,11 @@ FRAME_TIMEOUT_S = 5.0
 
 
 def add_actions(actions: Any) -> None:
-    """Add list, check, grab and focus to the actions of ``camera``."""
+    """Add list, check, grab, focus and sync to the actions of ``camera``."""
     listing = actions.add_parser("list", help="which cameras are connected, and their stable names")
     listing.set_defaults(run=camera_list)
+
+    camera_sync.add_action(actions)
 
     check = actions.add_parser("check", help="what a camera can do, and what it really delivers")
     _add_camera(check)

@@ -1,0 +1,201 @@
+"""``mastctl camera sync`` on the outside package of docs/drivers.md, with stamps shifted on purpose."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import signal
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+import yaml
+
+from mastctl.cli.main import main
+
+SHIFTED = '''
+"""The same cameras with stamps that are off by a known time; a picture never comes before its stamp."""
+
+import dataclasses
+import time
+
+from bench_rig import head
+from bench_rig.camera import FloorCamera
+
+
+class Shifted(FloorCamera):
+    def __init__(self, mast_file, name, early_s=0.0, uncertainty_s=None, plain=False):
+        super().__init__(mast_file, name)
+        self.early_s, self.plain = early_s, plain
+        if uncertainty_s is not None:
+            self.uncertainty_s = uncertainty_s
+
+    def next_frame(self, exposed_after_s, timeout_s):
+        frame = super().next_frame(exposed_after_s + self.early_s, timeout_s)
+        if self.plain:
+            frame.image[:] = 90
+        told = dataclasses.replace(frame, mid_exposure_s=frame.mid_exposure_s - self.early_s)
+        time.sleep(max(0.0, told.mid_exposure_s + told.exposure_s - time.monotonic()))
+        if hasattr(self, "uncertainty_s"):
+            object.__setattr__(told, "mid_uncertainty_s", self.uncertainty_s)
+        return told
+
+
+def head_that_tells():
+    told = head.open_head(speed_rad_per_s=1.0)
+    HEADS.append(told)
+    return told
+
+
+HEADS = []
+'''
+
+
+@pytest.fixture
+def package(repository: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """The package of the page and the shifting driver, importable."""
+    page = (repository / "docs" / "drivers.md").read_text()
+    sources = dict(re.findall(r"`(bench_rig/\w+\.py)`[^\n]*:\n\n```\w+\n(.*?)```", page, re.DOTALL))
+    (tmp_path / "bench_rig").mkdir()
+    (tmp_path / "bench_rig" / "__init__.py").touch()
+    for name, text in sources.items():
+        (tmp_path / name).write_text(text)
+    (tmp_path / "shifted_rig.py").write_text(SHIFTED)
+    monkeypatch.syspath_prepend(tmp_path)
+    yield tmp_path
+    for name in [name for name in sys.modules if name.split(".")[0] in ("bench_rig", "shifted_rig")]:
+        del sys.modules[name]
+
+
+def config(folder: Path, repository: Path, cameras: dict[str, dict[str, object]], pan: float = 2.6) -> str:
+    """A configuration whose pictures are small, so that the machine keeps up."""
+    mast = yaml.safe_load((repository / "configs" / "masts" / "rocky8_simulated.yaml").read_text())
+    for camera in mast["cameras"].values():  # every third pixel: the vectors H and V in its units
+        width, height = camera["size_px"]
+        camera["size_px"] = [width // 3, height // 3]
+        for key, middle, new in (
+            ("H", (width - 1) / 2, (width // 3 - 1) / 2),
+            ("V", (height - 1) / 2, (height // 3 - 1) / 2),
+        ):
+            camera[key] = [
+                (h - middle * a) / 3 + new * a for h, a in zip(camera[key], camera["A"], strict=True)
+            ]
+    mast.pop("fit", None)
+    (folder / "mast.yaml").write_text(yaml.safe_dump(mast))
+    text = {
+        "schema": "mastctl/config/1",
+        "mast_file": "mast.yaml",
+        "pan_tilt": {"driver": "shifted_rig:head_that_tells"},
+        "cameras": {
+            name: {
+                "driver": "shifted_rig:Shifted",
+                "options": {"mast_file": str(folder / "mast.yaml"), "name": name}
+                | {key: value for key, value in more.items() if key != "offset_s"},
+            }
+            | ({"offset_s": more["offset_s"]} if "offset_s" in more else {})
+            for name, more in cameras.items()
+        },
+        "limits": {"pan_rad": [-pan, pan], "tilt_rad": [-1.2, 0.5], "speed_rad_per_s": 1.0},
+    }
+    (folder / "config.yaml").write_text(yaml.safe_dump(text))
+    return str(folder / "config.yaml")
+
+
+def sync(capsys: pytest.CaptureFixture[str], *words: str) -> tuple[int, dict[str, dict[str, object]]]:
+    code = main(["camera", "sync", "--json", *words])
+    return code, json.loads(capsys.readouterr().out)
+
+
+def test_both_eyes_offsets_are_measured_within_three_sigma_and_told_where_they_contradict(
+    package: Path, repository: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """One camera is right; the other's pictures are 31 ms later than stamped, of which 10 ms are known."""
+    file = config(
+        package, repository, {"navcam_left": {}, "navcam_right": {"early_s": 0.031, "offset_s": 0.010}}
+    )
+    code, told = sync(capsys, "--config", file, "--seconds", "15")
+    assert code == 0, told
+    left, right = told["cameras"]["navcam_left"], told["cameras"]["navcam_right"]
+    for camera, true_s in ((left, 0.0), (right, 0.031)):
+        assert abs(camera["offset_s"] - true_s) < 3 * camera["sigma_s"] + 1e-4, told
+        assert camera["sigma_s"] < 5e-4
+    assert left["warning"] is None
+    assert re.search(
+        r"navcam_right: its pictures were taken 2[01]\.\d ms later than its stamps", right["warning"]
+    )
+    head = sys.modules["shifted_rig"].HEADS[-1]
+    assert head.at(time.monotonic()) == (0.0, 0.0), "the head is where it was"
+
+
+def test_pictures_older_than_their_stamps_are_told_unless_the_driver_says_how_uncertain_it_is(
+    package: Path, repository: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """As a buffered capture does: one is silent about it, one states 0.2 s, one shows a plain wall."""
+    file = config(
+        package,
+        repository,
+        {
+            "navcam_left": {"early_s": -0.120},
+            "navcam_right": {"early_s": -0.120, "uncertainty_s": 0.2},
+            "pancam_left": {"plain": True},
+        },
+    )
+    code, told = sync(capsys, "--config", file, "--seconds", "12", "--amplitude", "0.06", "--speed", "0.3")
+    assert code == 0, told
+    for name in ("navcam_left", "navcam_right"):
+        camera = told["cameras"][name]
+        assert abs(camera["offset_s"] + 0.120) < 3 * camera["sigma_s"] + 1e-4, told
+    assert "120.0 ms earlier" in told["cameras"]["navcam_left"]["warning"] or "earlier" in str(told["notes"])
+    assert told["cameras"]["navcam_right"]["warning"] is None
+    assert told["cameras"]["pancam_left"]["offset_s"] is None
+    assert "too plain" in told["cameras"]["pancam_left"]["failure"]
+
+
+def test_a_signal_stops_the_head_where_it_is(
+    package: Path, repository: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = config(package, repository, {"navcam_left": {}})
+
+    def interrupt() -> None:
+        until_s = time.monotonic() + 60.0
+        while time.monotonic() < until_s:
+            module = sys.modules.get("shifted_rig")
+            if module and module.HEADS and abs(module.HEADS[-1].at(time.monotonic())[0]) > 0.02:
+                break
+            time.sleep(0.005)
+        os.kill(os.getpid(), signal.SIGTERM)
+
+    thread = threading.Thread(target=interrupt)
+    thread.start()
+    before = signal.getsignal(signal.SIGTERM)
+    code, told = sync(capsys, "--config", file, "--seconds", "120")
+    thread.join()
+    assert code == 1 and told["error"]["code"] == "stopped" and "stopped" in told["error"]["message"]
+    pan_rad = sys.modules["shifted_rig"].HEADS[-1].at(time.monotonic())[0]
+    time.sleep(0.05)
+    assert sys.modules["shifted_rig"].HEADS[-1].at(time.monotonic())[0] == pan_rad != 0.0
+    assert signal.getsignal(signal.SIGTERM) is before
+
+
+def test_a_sweep_that_would_pass_a_limit_moves_nothing(
+    package: Path, repository: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = config(package, repository, {"navcam_left": {}}, pan=0.05)
+    code, told = sync(capsys, "--config", file, "--amplitude", "0.06")
+    assert code == 1 and "0.06" in told["error"]["message"] and "limit" in told["error"]["message"]
+    head = sys.modules["shifted_rig"].HEADS[-1]
+    assert head.at(time.monotonic())[0] == 0.0
+
+
+def test_a_camera_that_is_not_on_the_head_or_not_configured_is_refused(
+    package: Path, repository: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = config(package, repository, {"navcam_left": {}, "hazcam_left": {}})
+    for name, words in (("hazcam_left", "is not on the head"), ("navcam_rihgt", "is not configured")):
+        code, told = sync(capsys, name, "--config", file)
+        assert code == 2 and words in told["error"]["message"] and "navcam_left" in told["error"]["message"]
+    assert "shifted_rig" not in sys.modules, "nothing was opened"

@@ -1,0 +1,357 @@
+"""The time offset between pictures and joint readings, from how patches moved while the head went to and fro.
+
+A patch's place u along its way is a smooth function g of the joint angle that the picture was really taken
+at, whatever the camera's model, the range or a scale error of the joint: a cubic of its own for every patch.
+With the frame stamped t, the joint read at P(t), and s the sign of the motion, that angle is
+
+    q = P(t + o + c y) - h s
+
+o is the offset that is wanted, the same for all patches; c the time that a rolling shutter takes from the top
+of the picture to its bottom (y the patch's row in picture heights from the middle); h half the play of the
+gears, of which the readings see nothing. Going to and fro tells o and h from g, since they shift it
+oppositely on either way; going at several speeds tells o from h, since only o grows with the speed.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import CubicHermiteSpline
+
+from calib.rigid import FloatArray
+from mastctl.errors import MastctlError
+
+REACH_S = 0.6
+"""How far off a camera's stamps are looked for, seconds either way."""
+
+SEARCH_STEP_S = 0.01
+LEAST_REVERSAL_RAD = 5e-4
+LEAST_WAY_RAD = 0.010  # after a turn back: until then the gears of a plain servo are not all on one side
+LARGEST_GAP_S = 0.1  # between the readings around a frame; beyond it the angle is a guess
+LEAST_FRAMES = 30
+LEAST_LEGS = 8
+LEAST_SPEED_RAD_PER_S = 0.06
+SMOOTHING_S = 0.065  # readings so far to either side even each other out; short beside a ramp of the speed
+ROBUST_SIGMAS = 2.5
+WILD_SIGMAS = 6.0
+MOST_STEPS = 40
+WEIGHTED_STEPS = 8
+SETTLED_S = 1e-6
+UNEXPLAINED = 0.15  # of the patches' own motion, rms: then pictures did not move with the joint
+
+
+class CannotTell(MastctlError):
+    """The pictures do not tell the offset; the message says why."""
+
+    code = "cannot_tell"
+
+
+@dataclass(frozen=True)
+class OffsetFit:
+    """What came out.
+
+    Attributes
+    ----------
+    offset_s, sigma_s
+        Add it to the frames' stamps; one sigma.
+    rolling_s, rolling_sigma_s
+        From the top of the picture to its bottom, by a rolling shutter; None if all patches lie in few rows.
+    play_rad, play_sigma_rad
+        Of the gears, both sides together, as the pictures show it.
+    frames, patches, legs
+        How many of each told something.
+    rms_px
+        What the model leaves, one axis.
+    """
+
+    offset_s: float
+    sigma_s: float
+    rolling_s: float | None
+    rolling_sigma_s: float | None
+    play_rad: float
+    play_sigma_rad: float
+    frames: int
+    patches: int
+    legs: int
+    rms_px: float
+
+
+class Motion:
+    """The joint angle over time by its readings, cut into legs between turns back.
+
+    Parameters
+    ----------
+    times_s, angles_rad
+        (m,) readings in the order of their times.
+    """
+
+    def __init__(self, times_s: FloatArray, angles_rad: FloatArray) -> None:
+        self.times_s, first = np.unique(times_s, return_index=True)
+        self.angles_rad = angles_rad[first]
+        if len(self.times_s) < LEAST_FRAMES:
+            raise CannotTell(f"the head was read {len(self.times_s)} times, {LEAST_FRAMES} are needed")
+        self._turns, self._signs = _legs(self.angles_rad)
+        self._curve = _smoothed(self.times_s, self.angles_rad)
+        self._speed = self._curve.derivative()
+
+    def at(self, times_s: FloatArray) -> FloatArray:
+        """Return the angle, radians, on a curve through the readings that evens their counts out."""
+        return np.asarray(self._curve(np.clip(times_s, self.times_s[0], self.times_s[-1])))
+
+    def slope(self, times_s: FloatArray) -> FloatArray:
+        """Return the speed, rad/s."""
+        return np.asarray(self._speed(np.clip(times_s, self.times_s[0], self.times_s[-1])))
+
+    def leg(self, times_s: FloatArray) -> tuple[NDArray[np.int64], FloatArray]:
+        """Return which leg a moment is of (-1: it tells nothing) and the sign of that leg's motion."""
+        turns_s = self.times_s[self._turns]
+        leg = np.searchsorted(turns_s, times_s, side="right") - 1
+        after = np.clip(np.searchsorted(self.times_s, times_s), 1, len(self.times_s) - 1)
+        sure = (leg >= 0) & (times_s < self.times_s[-1])
+        sure &= self.times_s[after] - self.times_s[after - 1] <= LARGEST_GAP_S
+        known = np.clip(leg, 0, len(self._turns) - 1)
+        sure &= np.abs(self.slope(times_s)) >= LEAST_SPEED_RAD_PER_S  # one at rest tells nothing of time
+        sure &= np.abs(self.at(times_s) - self.angles_rad[self._turns[known]]) >= LEAST_WAY_RAD
+        return np.where(sure, leg, -1), self._signs[known]
+
+
+def _smoothed(times_s: FloatArray, angles_rad: FloatArray) -> CubicHermiteSpline:
+    """A curve with, at each reading, the place and speed of the parabola that fits its neighbours best."""
+    place, speed = np.empty(len(times_s)), np.empty(len(times_s))
+    first = np.searchsorted(times_s, times_s - SMOOTHING_S)
+    last = np.searchsorted(times_s, times_s + SMOOTHING_S, side="right")
+    for number, (begin, end) in enumerate(zip(first, last, strict=True)):
+        if end - begin < 4:
+            begin, end = max(0, number - 2), min(len(times_s), number + 3)
+        since_s = times_s[begin:end] - times_s[number]
+        parabola = np.linalg.lstsq(np.vander(since_s, 3), angles_rad[begin:end], rcond=None)[0]
+        place[number], speed[number] = parabola[2], parabola[1]
+    return CubicHermiteSpline(times_s, place, speed)
+
+
+def _legs(angles_rad: FloatArray) -> tuple[NDArray[np.int64], FloatArray]:
+    """Where the motion turns back (indices), and its sign from there on; dither of a count is no turn."""
+    steps = np.abs(np.diff(np.unique(angles_rad)))
+    count_rad = float(steps.min()) if len(steps) else 0.0
+    threshold_rad = max(LEAST_REVERSAL_RAD, 2.5 * count_rad if count_rad < LEAST_WAY_RAD / 3 else 0.0)
+    turns, signs = [0], [0.0]
+    extreme = 0
+    for index, angle_rad in enumerate(angles_rad):
+        way_rad = angle_rad - angles_rad[extreme]
+        if signs[-1] == 0.0:
+            if abs(way_rad) > threshold_rad:
+                signs[-1] = np.sign(way_rad)
+                extreme = index
+        elif way_rad * signs[-1] >= 0:
+            extreme = index
+        elif abs(way_rad) > threshold_rad:
+            turns.append(extreme)
+            signs.append(-signs[-1])
+            extreme = index
+    return np.array(turns), np.array(signs)
+
+
+def fit_offset(motion: Motion, stamps_s: FloatArray, places_px: FloatArray, rows: FloatArray) -> OffsetFit:
+    """Fit the offset.
+
+    Parameters
+    ----------
+    motion
+        The joint.
+    stamps_s
+        (n,) mid-exposure by the camera's stamps, seconds.
+    places_px
+        (n, p) place of each patch along its way; not-a-number where it was not found.
+    rows
+        (p,) row of each patch, picture heights from the middle.
+
+    Raises
+    ------
+    CannotTell
+        If too little was seen, if the pictures did not move with the joint, or more than `REACH_S` off.
+    """
+    patches = np.isfinite(places_px).sum(axis=0) >= LEAST_FRAMES
+    if not patches.any():
+        raise CannotTell(
+            f"no patch was found in {LEAST_FRAMES} of {len(stamps_s)} frames: "
+            "the scene is too plain, too dark or too near, or it moves"
+        )
+    places_px, rows = places_px[:, patches], rows[patches]
+    state = np.array([_search(motion, stamps_s, places_px), 0.0, 0.0])
+    free = np.array([True, float(np.ptp(rows)) > 0.2, True])
+    weights = np.isfinite(places_px).astype(np.float64)
+    for step in range(MOST_STEPS):
+        equations = _Equations(motion, stamps_s, places_px, rows, state, free, weights)
+        change = equations.step()
+        state = state + change
+        state[0] = np.clip(state[0], -1.5 * REACH_S, 1.5 * REACH_S)
+        if step < WEIGHTED_STEPS:  # afterwards they stay, so that it comes to rest
+            weights = equations.robust_weights()
+        elif abs(change[0]) < SETTLED_S:
+            break
+    else:
+        raise CannotTell("the fit of the time offset does not settle; a longer or wider sweep is needed")
+    sigmas = _sigmas(motion, stamps_s, places_px, rows, state, free, weights)
+    return _told(equations, state, free, sigmas)
+
+
+def _search(motion: Motion, stamps_s: FloatArray, places_px: FloatArray) -> float:
+    """The offset at which the best patches' places are most nearly a function of the angle."""
+    best = np.argsort(-np.isfinite(places_px).sum(axis=0), kind="stable")[:3]
+    offsets_s = np.arange(-REACH_S, REACH_S + SEARCH_STEP_S / 2, SEARCH_STEP_S)
+    left = np.full(len(offsets_s), np.inf)
+    for number, offset_s in enumerate(offsets_s):
+        leg, _ = motion.leg(stamps_s + offset_s)
+        angles_rad = motion.at(stamps_s + offset_s)
+        found = []
+        for patch in best:
+            seen = np.isfinite(places_px[:, patch]) & (leg >= 0)
+            if seen.sum() >= LEAST_FRAMES // 2:
+                found.append(_unexplained(angles_rad[seen], places_px[seen, patch]))
+        if found:
+            left[number] = np.median(found)
+    if not np.isfinite(left).any():
+        raise CannotTell("too few frames were taken while the head moved")
+    least = int(np.argmin(left))
+    if left[least] > UNEXPLAINED:
+        raise CannotTell(
+            f"the pictures did not move with the joint: {left[least]:.0%} of their motion is left "
+            "at the best offset"
+        )
+    if least in (0, len(offsets_s) - 1):
+        raise CannotTell(f"the stamps are further than {REACH_S:g} s off the joint readings")
+    return float(offsets_s[least])
+
+
+def _unexplained(angles_rad: FloatArray, places_px: FloatArray) -> float:
+    """Which part of a patch's motion is left by the best cubic of the angle, but for wild places."""
+    span = max(float(np.ptp(angles_rad)), 1e-9)
+    base = np.vander((angles_rad - angles_rad.mean()) * (2 / span), 4)
+    kept = np.full(len(places_px), True)
+    for share in (80, 70, 70):
+        cubic = np.linalg.lstsq(base[kept], places_px[kept], rcond=None)[0]
+        sizes = np.abs(places_px - base @ cubic)
+        kept = sizes <= np.percentile(sizes, share)
+    low, high = np.percentile(places_px, [15, 85])
+    return float(np.median(sizes) / max((high - low) / 2, 1e-9))
+
+
+class _Equations:
+    """The problem linearised at a state (o, c, h), each patch's cubic taken out of it."""
+
+    def __init__(
+        self,
+        motion: Motion,
+        stamps_s: FloatArray,
+        places_px: FloatArray,
+        rows: FloatArray,
+        state: FloatArray,
+        free: NDArray[np.bool_],
+        weights: FloatArray,
+    ) -> None:
+        self.free = free
+        self.residuals_px = np.full(places_px.shape, np.nan)
+        self.weights = np.zeros(places_px.shape)
+        self.normal = np.zeros((3, 3))
+        self.right = np.zeros(3)
+        self.legs: set[int] = set()
+        self.frames: set[int] = set()
+        for patch, row in enumerate(rows):
+            times_s = stamps_s + state[0] + state[1] * row
+            leg, sign = motion.leg(times_s)
+            seen = np.isfinite(places_px[:, patch]) & (leg >= 0) & (weights[:, patch] > 0)
+            if seen.sum() < LEAST_FRAMES // 2:
+                continue
+            root = np.sqrt(weights[seen, patch])
+            angles_rad = motion.at(times_s[seen]) - state[2] * sign[seen]
+            span = max(float(np.ptp(angles_rad)), 1e-9)
+            scaled = (angles_rad - angles_rad.mean()) * (2 / span)
+            base = np.vander(scaled, 4)
+            held, triangle = np.linalg.qr(base * root[:, None])
+            cubic = np.linalg.solve(triangle, held.T @ (places_px[seen, patch] * root))
+            slope = np.vander(scaled, 3) @ (cubic[:3] * [3, 2, 1]) * (2 / span)
+            speed = motion.slope(times_s[seen])
+            ways = slope[:, None] * np.stack([speed, speed * row, -sign[seen]], axis=1) * root[:, None]
+            ways -= held @ (held.T @ ways)
+            residual = places_px[seen, patch] - base @ cubic
+            self.residuals_px[seen, patch] = residual
+            self.weights[seen, patch] = weights[seen, patch]
+            self.normal += ways.T @ ways
+            self.right += ways.T @ (residual * root)
+            self.frames |= set(np.flatnonzero(seen).tolist())
+            self.legs |= set(leg[seen].tolist())
+        if len(self.frames) < LEAST_FRAMES or len(self.legs) < LEAST_LEGS:
+            raise CannotTell(
+                f"{len(self.frames)} frames on {len(self.legs)} ways of the head tell something, "
+                f"{LEAST_FRAMES} on {LEAST_LEGS} are needed"
+            )
+
+    def _inverse(self) -> FloatArray:
+        """The inverse of the normal matrix of what is free, zero elsewhere."""
+        found = np.zeros((3, 3))
+        part = self.normal[np.ix_(self.free, self.free)]
+        scale = np.sqrt(np.diag(part))
+        if not (scale > 0).all() or np.linalg.cond(part / np.outer(scale, scale)) > 1e8:
+            raise CannotTell("the head's motion does not tell a time offset from the play of its gears")
+        found[np.ix_(self.free, self.free)] = np.linalg.inv(part)
+        return found
+
+    def step(self) -> FloatArray:
+        """The change of the state that is best in the linearised problem."""
+        return self._inverse() @ self.right
+
+    def robust_weights(self) -> FloatArray:
+        """Weights by Huber, each patch by its own scale."""
+        sizes = np.abs(self.residuals_px)
+        with np.errstate(all="ignore"):
+            scale = 1.4826 * np.nanmedian(np.where(np.isfinite(sizes), sizes, np.nan), axis=0)
+            weights = np.minimum(1.0, ROBUST_SIGMAS * np.maximum(scale, 1e-6) / np.maximum(sizes, 1e-12))
+            typical = np.nanmedian(scale)
+            weights[sizes > WILD_SIGMAS * np.maximum(scale, 1e-6)] = 0.0
+            weights *= (typical / np.maximum(scale, 0.1 * typical)) ** 2
+        # What a change of the offset left out for now is not lost for good.
+        return np.where(np.isfinite(sizes), np.maximum(weights, 1e-6), 1e-3)
+
+
+def _sigmas(
+    motion: Motion,
+    stamps_s: FloatArray,
+    places_px: FloatArray,
+    rows: FloatArray,
+    state: FloatArray,
+    free: NDArray[np.bool_],
+    weights: FloatArray,
+) -> FloatArray:
+    """One sigma of the state, (3,), by leaving out each way of the head in turn (the jackknife).
+
+    Errors within one way go together: a reading's stamp, the phase of its counts, the play's side.
+    """
+    leg, _ = motion.leg(stamps_s + state[0])
+    changes = []
+    for number in np.unique(leg[leg >= 0]):
+        rest = np.where((leg == number)[:, None], 0.0, weights)
+        changes.append(_Equations(motion, stamps_s, places_px, rows, state, free, rest).step())
+    spread = np.array(changes) - np.mean(changes, axis=0)
+    sigmas: FloatArray = np.sqrt((len(changes) - 1) / len(changes) * np.sum(spread**2, axis=0))
+    return sigmas
+
+
+def _told(equations: _Equations, state: FloatArray, free: NDArray[np.bool_], sigmas: FloatArray) -> OffsetFit:
+    if abs(state[0]) > REACH_S:
+        raise CannotTell(f"the stamps are further than {REACH_S:g} s off the joint readings")
+    seen = equations.weights > 0
+    weights, residuals_px = equations.weights[seen], equations.residuals_px[seen]
+    return OffsetFit(
+        offset_s=float(state[0]),
+        sigma_s=float(sigmas[0]),
+        rolling_s=float(state[1]) if free[1] else None,
+        rolling_sigma_s=float(sigmas[1]) if free[1] else None,
+        play_rad=float(2 * state[2]),
+        play_sigma_rad=float(2 * sigmas[2]),
+        frames=len(equations.frames),
+        patches=int(np.isfinite(equations.residuals_px).any(axis=0).sum()),
+        legs=len(equations.legs),
+        rms_px=float(np.sqrt(np.average(residuals_px**2, weights=weights))),
+    )

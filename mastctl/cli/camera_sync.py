@@ -1,0 +1,195 @@
+"""``mastctl camera sync``: how late each camera's stamps are, measured by turning the head to and fro."""
+
+from __future__ import annotations
+
+import argparse
+import signal
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from types import SimpleNamespace
+from typing import TYPE_CHECKING, Any
+
+from mastctl.cli import output
+from mastctl.cli.output import positive_number
+
+if TYPE_CHECKING:
+    from calib.mast import Rig
+    from mastctl.camera_sync.sweep import Sweep
+    from mastctl.config import Config
+
+SIGNIFICANT_SIGMAS = 3.0
+LEAST_TOLD_S = 0.0005  # what nobody needs to correct
+
+
+def add_action(actions: Any) -> None:
+    """Add sync to the actions of ``camera``."""
+    sync = actions.add_parser(
+        "sync", help="measure how late the stamps are against the joints; turns the head to and fro"
+    )
+    sync.add_argument(
+        "cameras", nargs="*", metavar="NAME", help="cameras on the head (default: all of the configuration)"
+    )
+    sync.add_argument("--config", metavar="FILE", help="default: the packaged simulated rover")
+    sync.add_argument(
+        "--seconds", type=positive_number, default=30.0, metavar="S", help="how long it turns (default 30)"
+    )
+    sync.add_argument(
+        "--amplitude", type=positive_number, metavar="RAD",
+        help="how far pan goes to either side (default 0.07, or 0.15 of the narrowest view)",
+    )  # fmt: skip
+    sync.add_argument(
+        "--speed", type=positive_number, metavar="RAD_PER_S",
+        help="of the fastest ways (default five amplitudes a second, or the limit)",
+    )  # fmt: skip
+    sync.set_defaults(run=camera_sync)
+
+
+def camera_sync(args: argparse.Namespace) -> int:
+    """Measure, and tell each camera's offset_s; 1 if no camera's could be told."""
+    from dataclasses import replace
+
+    from drivers.clock import SystemClock
+    from drivers.open_hardware import open_hardware
+    from mastctl.camera_sync.sweep import Sweep, plan_sweep
+    from mastctl.config import load_config
+    from mastctl.devices import Devices
+    from mastctl.mast_in_use import read_mast
+
+    config = load_config(args.config)
+    mast = read_mast(config.mast_file, config)
+    rig = mast.stored.rig
+    names = _chosen(args, config, rig)
+    plan = plan_sweep(rig, names, config.limits, args.amplitude, args.speed, args.seconds)
+    settings = replace(config.hardware, cameras={name: config.hardware.cameras[name] for name in names})
+    clock = SystemClock()
+    with _ending_signals() as stop, open_hardware(settings, clock) as hardware:
+        head = SimpleNamespace(pan_tilt=hardware.pan_tilt, cameras={})
+        devices = Devices(head, config.limits, mast.stored.digest, clock, rig)
+        try:
+            sweep = Sweep(devices, hardware.cameras, rig, config.limits, stop)
+            if not args.json:
+                output.tell(
+                    f"turning pan {plan.amplitude_rad:.3f} rad to either side for {plan.seconds:g} s, "
+                    f"at {plan.speed_rad_per_s:.3f} rad/s at most; Ctrl-C stops the head"
+                )
+            sweep.run(plan)
+        finally:
+            devices.close()
+    found = {name: _found(sweep, name, settings.cameras[name].offset_s) for name in names}
+    document = {"cameras": found, "sweep": vars(plan), "notes": _notes(found)}
+    if args.json:
+        output.print_json(document)
+    else:
+        _show(document)
+    return 0 if any(camera["offset_s"] is not None for camera in found.values()) else 1
+
+
+def _chosen(args: argparse.Namespace, config: Config, rig: Rig) -> list[str]:
+    """The cameras that are meant: on the head, since others see no motion."""
+    on_head = [name for name in config.hardware.cameras if rig.cameras[name].on == "head"]
+    known = ", ".join(on_head) or "none"
+    for name in args.cameras:
+        if name not in on_head:
+            words = "is not on the head" if name in config.hardware.cameras else "is not configured"
+            raise output.WrongUse(f"camera {name} {words} in {config.path}; on the head are {known}")
+    if not on_head:
+        raise output.WrongUse(f"{config.path} has no camera on the head")
+    return list(dict.fromkeys(args.cameras)) or on_head
+
+
+@contextmanager
+def _ending_signals() -> Iterator[threading.Event]:
+    """An event that every ending signal sets, so that the head is stopped before the program ends."""
+    stop = threading.Event()
+    if threading.current_thread() is not threading.main_thread():
+        yield stop
+        return
+    signals = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+    before = {number: signal.signal(number, lambda *ignored: stop.set()) for number in signals}
+    try:
+        yield stop
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def _found(sweep: Sweep, name: str, in_use_s: float) -> dict[str, Any]:
+    """One camera's result, as JSON."""
+    from mastctl.camera_sync.fit import CannotTell
+
+    seen = sweep.seen[name]
+    told: dict[str, Any] = {
+        "offset_s": None,
+        "sigma_s": None,
+        "in_use_s": in_use_s,
+        "stated_uncertainty_s": seen.uncertainty_s,
+        "frames": len(seen.stamps_s),
+        "warning": None,
+        "failure": None,
+    }
+    try:
+        fit = sweep.fit(name)
+    except CannotTell as error:
+        return told | {"failure": str(error)}
+    span_s = seen.stamps_s[-1] - seen.stamps_s[0]
+    beyond_s = SIGNIFICANT_SIGMAS * fit.sigma_s + seen.uncertainty_s
+    if abs(fit.offset_s) > max(beyond_s, LEAST_TOLD_S):
+        side = "later" if fit.offset_s > 0 else "earlier"
+        told["warning"] = (
+            f"{name}: its pictures were taken {1e3 * abs(fit.offset_s):.1f} ms {side} than its stamps say, "
+            f"which contradicts them: {1e3 * beyond_s:.1f} ms are explained (three sigma, and "
+            f"{1e3 * seen.uncertainty_s:.1f} ms that the driver states)"
+        )
+    return told | {
+        "offset_s": in_use_s + fit.offset_s,
+        "sigma_s": fit.sigma_s,
+        "left_s": fit.offset_s,
+        "rolling_s": fit.rolling_s,
+        "rolling_sigma_s": fit.rolling_sigma_s,
+        "play_rad": fit.play_rad,
+        "play_sigma_rad": fit.play_sigma_rad,
+        "used_frames": fit.frames,
+        "patches": fit.patches,
+        "ways": fit.legs,
+        "rms_px": fit.rms_px,
+        "rate_hz": (len(seen.stamps_s) - 1) / span_s if span_s > 0 else None,
+    }
+
+
+def _notes(found: dict[str, Any]) -> list[str]:
+    """What all results together say."""
+    notes = [camera["warning"] for camera in found.values() if camera["warning"]]
+    notes += [f"{name}: {camera['failure']}" for name, camera in found.items() if camera["failure"]]
+    warned = [camera for camera in found.values() if camera["warning"]]
+    if len(found) > 1 and len(warned) == len(found):
+        low, high = min(c["left_s"] for c in warned), max(c["left_s"] for c in warned)
+        if high - low < LEAST_TOLD_S + SIGNIFICANT_SIGMAS * max(c["sigma_s"] for c in warned):
+            notes.append("all cameras are off by the same: the head's readings may as well be stamped wrong")
+    return notes
+
+
+def _show(document: dict[str, Any]) -> None:
+    rows, lines = [], []
+    for name, camera in document["cameras"].items():
+        if camera["offset_s"] is None:
+            rows.append((name, "-", "-", str(camera["frames"]), "-", "-"))
+            continue
+        rolling = "-" if camera["rolling_s"] is None else f"{1e3 * camera['rolling_s']:.1f}"
+        rows.append(
+            (
+                name, f"{1e3 * camera['left_s']:+.2f} ± {1e3 * camera['sigma_s']:.2f}",
+                f"{1e3 * camera['in_use_s']:+.2f}", f"{camera['used_frames']} of {camera['frames']}",
+                rolling, f"{1e3 * camera['play_rad']:.2f}",
+            )
+        )  # fmt: skip
+        lines.append(f"for the configuration: cameras.{name}.offset_s: {camera['offset_s']:.5f}")
+    columns = (
+        "camera",
+        "pictures later than stamps, ms",
+        "offset_s in use, ms",
+        "frames",
+        "rolling, ms",
+        "play, mrad",
+    )
+    output.print_table("camera sync", columns, rows, [*lines, *document["notes"]])
