@@ -152,9 +152,10 @@ class FlirPtu:
                 axis.next_target = ways[name][1]
 
     def stop(self) -> None:
-        """Halt both axes; they hold where they come to rest.
+        """Halt both axes; they hold where they come to rest, and no second leg of a move follows.
 
-        If another call is under way the halt goes out beside it at once, and again in order.
+        If another call is under way, or anything has to be asked first, the halt goes out at once, and again
+        in order. A line that is away is tried at once: a unit has no watchdog that silence would trip.
 
         Raises
         ------
@@ -164,13 +165,15 @@ class FlirPtu:
         self._stop_asked.set()
         free = self._lock.acquire(timeout=STOP_PATIENCE_S)
         try:
+            self._forget_legs()
             talk = self._talk
-            if talk is not None and not (free and talk.is_in_step):
+            if talk is not None and not (free and talk.is_in_step and not self._count.doubted):
                 with suppress(LineLost):  # told below
                     talk.shout("H")
             with self._talking() as talk:
                 self._halt(talk)
         finally:
+            self._forget_legs()  # those of a move that was under way beside it, whatever the unit has said
             self._stop_asked.clear()
             if free:
                 self._lock.release()
@@ -213,12 +216,13 @@ class FlirPtu:
 
     def _connect(self) -> Conversation:
         """Open the line, check the unit, and leave it standing still; not too often."""
-        if time.monotonic() < self._absence.again_s:
+        if time.monotonic() < self._absence.again_s and not self._stop_asked.is_set():
             self._absence.check()
         self._deaf = True  # a unit that homes itself at power-up reports its limit switches
         try:
             line = Line(self._options.port, self._options.baud, DEVICE)
             talk = self._talk = Conversation(line, DEVICE, self._hit)
+            talk.shout("H")  # before any question: it may still be under way
             resolutions = talk.in_step()
             self._deaf = False
             self._check(talk, resolutions)
@@ -283,6 +287,11 @@ class FlirPtu:
         self._count.halt_owed = False
         for axis in self._axes.values():
             axis.stopped(self._clock.now_s())
+
+    def _forget_legs(self) -> None:
+        """Let no axis go on from where an approach begins."""
+        for axis in self._axes.values():
+            axis.next_target = None
 
     def _go_on(self, talk: Conversation, axis: Axis) -> None:
         """Send an axis that is where its approach begins to its goal."""

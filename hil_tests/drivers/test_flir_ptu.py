@@ -611,6 +611,40 @@ def test_a_stop_does_not_wait_for_a_call_under_way(opened: Opener) -> None:
     assert unit.heard[-1] == "H", "and once more in order"
 
 
+def test_a_stop_goes_out_before_a_unit_that_is_in_doubt_is_checked(opened: Opener) -> None:
+    head, unit = opened()
+    rested(head)
+    unit.unasked = b"!P"
+    while not head._count.doubted:
+        with suppress(DriverError):
+            head.move(0.1, 0.1)
+    unit.heard.clear()
+    head.stop()
+    assert unit.heard[0] == "H"
+
+
+def test_no_second_leg_follows_a_stop_that_was_not_confirmed(opened: Opener) -> None:
+    axis = {"limits_rad": [-2.5, 2.5], "approach": "positive", "approach_rad": 20 * PAN_STEP_RAD}
+    head, unit = opened(pan=axis)
+    head.move(-0.5, 0.0)
+    began = unit.positions["P"]
+    unit.answers["H"] = lambda command: None
+    with pytest.raises(DriverError):
+        head.stop()
+    for _ in range(5):
+        head.read()
+    assert unit.positions["P"] == began
+
+
+def test_a_stop_tries_a_line_that_is_away_at_once_and_halts_before_it_asks(opened: Opener) -> None:
+    head, unit = opened()
+    head._give_up(LineLost("the line is gone", device="ptu"))
+    head._absence.again_s = time.monotonic() + 60.0
+    unit.heard.clear()
+    head.stop()
+    assert unit.heard[0] == "H"
+
+
 def serve_rfc2217(listener: socket.socket, unit: ScriptedPtu) -> None:
     """A serial server with a unit behind it, by pyserial's own server side, for one client."""
     connection, _ = listener.accept()
