@@ -50,13 +50,14 @@ def stop(range_m: float, error_m: tuple[float, float, float], state: str = "trac
 def test_runs_are_counted_and_averaged_by_hand() -> None:
     runs = [
         ApproachRun(1, (stop(5.0, (0.02, 0.0, 0.0)), stop(1.05, (0.003, 0.0, 0.001)))),
-        ApproachRun(2, (stop(1.05, (-0.004, 0.002, 0.0)),)),
+        ApproachRun(2, (replace(stop(1.05, (-0.004, 0.002, 0.0)), pose_doubt="9 cm"),)),
         ApproachRun(3, (stop(4.0, (0.0, 0.0, 0.0), "lost"),)),
         ApproachRun(4, (), "no view offered a target"),
         ApproachRun(5, (stop(1.05, (0.5, 0.0, 0.0)),)),
     ]
     found = summary(runs)
     assert (found["runs"], found["kept"], found["silently_wrong"]) == (5, 3, 1)
+    assert (found["poses_doubted"], found["stops"]) == (1, 5)
     assert math.isclose(found["final_right_rms_m"], math.sqrt(0.002**2 / 3))
     assert math.isclose(found["untracked_along_rms_m"], 0.1)
     assert (found["losses"], found["recoveries"], found["handoffs"]) == (1, 0, 0)

@@ -78,6 +78,8 @@ class Stop:
         Of the left eye's match, against the truth; not-a-number where there was none.
     untracked_m
         The error along, right and below had the start's position been carried by reported motions alone.
+    pose_doubt
+        What the pictures say against the reported motion, which is honest here; empty for nothing.
     patches
         The key picture around the target, and both eyes' pictures around where it was found or expected.
     """
@@ -91,6 +93,7 @@ class Stop:
     pixel_error_px: float
     renewed: bool
     untracked_m: FloatArray
+    pose_doubt: str = ""
     patches: tuple[Image, ...] = ()
 
 
@@ -251,10 +254,11 @@ def _look(world: World, track: Track, target: FloatArray, carried_m: FloatArray)
     chosen = choose_pairs(rig, track.position_m)[0]
     name, pan, tilt = chosen.pair, chosen.pan_rad or 0.0, chosen.tilt_rad or 0.0
     pair = rig.stereo[name]
-    key = track.key
+    key, doubt = track.key, ""
     for _ in range(LOST_LOOKS):
         eyes = world.look(pair, pan, tilt)
         look = seen_by(track, eyes)
+        doubt = doubt or (look.doubt.sentence if look.doubt else "")
         if look.track.state == "tracked":
             break
     track = look.track
@@ -276,6 +280,7 @@ def _look(world: World, track: Track, target: FloatArray, carried_m: FloatArray)
         pixel_error,
         look.renewed,
         axes @ (carried_m - true),
+        doubt,
         (_patch(key.eye, key.pixel_px), *(_patch(eyes[n], _place(look.found.get(n))) for n in pair)),
     )
 

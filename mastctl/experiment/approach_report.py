@@ -50,7 +50,7 @@ def losses(run: ApproachRun) -> tuple[int, int]:
 
 
 def summary(runs: Sequence[ApproachRun]) -> dict[str, float]:
-    """Numbers over all runs: kept, lost, silently wrong, hand-offs, and errors, metres rms.
+    """Numbers over all runs: kept, lost, silently wrong, poses doubted, hand-offs, and errors, metres rms.
 
     ``final`` is of the last stop of the runs that kept the target, ``untracked`` of the same stops without
     looking, ``start`` of the first stereo, ``from_6_m`` and so on of the tracked stops of a range.
@@ -62,6 +62,8 @@ def summary(runs: Sequence[ApproachRun]) -> dict[str, float]:
         "runs": len(runs),
         "kept": len(kept),
         "silently_wrong": sum(any(map(silently_wrong, run.stops)) for run in runs),
+        "stops": sum(len(run.stops) for run in began),
+        "poses_doubted": sum(bool(stop.pose_doubt) for run in began for stop in run.stops),
         "handoffs": sum(map(handoffs, began)),
         "losses": sum(one for one, _ in lost),
         "recoveries": sum(again for _, again in lost),
@@ -116,7 +118,8 @@ def counted(runs: Sequence[ApproachRun]) -> str:
     found = summary(runs)
     return (
         f"kept {found['kept']} of {found['runs']}, silently wrong {found['silently_wrong']}, "
-        f"hand-offs {found['handoffs']}, losses {found['losses']}, found again {found['recoveries']}"
+        f"hand-offs {found['handoffs']}, losses {found['losses']}, found again {found['recoveries']}, "
+        f"honest poses doubted {found['poses_doubted']} of {found['stops']} (1 in 1000 is chance)"
     )
 
 
