@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 from calib.cahvor import CameraModel, Rays
 from calib.errors import NoStereoPoint
 from calib.match import Match, MatchSettings, expected_correlation, match, no_match, rivalled, texture_lacks
-from calib.rigid import FloatArray
+from calib.rigid import FloatArray, finite_float
 from calib.stereo import triangulate
 from calib.warp import GRAZING, SIDES, Grey, Plane, carry, sample, square_grid
 
@@ -75,7 +75,14 @@ def find_partner(
         (2,) the target in ``image``, sub-pixel.
     nearest_m
         Where the sweep starts, metres.
+
+    Raises
+    ------
+    ValueError
+        If it starts at no finite distance ahead.
     """
+    if not finite_float("nearest_m", nearest_m) > 0.0:
+        raise ValueError(f"nearest_m is {nearest_m} where a distance above 0 is expected")
     settings = settings or MatchSettings()
     pixel = np.asarray(pixel_px, dtype=np.float64)
     swept = _sweep(image, camera, pixel, partner_image, partner, nearest_m, settings)

@@ -165,7 +165,14 @@ def match(
         The scene around the target, in the common frame.
     search_px
         Half side of the window around the predicted place, destination pixels.
+
+    Raises
+    ------
+    ValueError
+        If the window has no finite size.
     """
+    if not 0.0 <= search_px < math.inf:
+        raise ValueError(f"search_px is {search_px} where a finite number, 0 or more, is expected")
     settings = settings or MatchSettings()
     target = np.asarray(source_px, dtype=np.float64)
     seen, valid = carry(target, source, plane, destination)

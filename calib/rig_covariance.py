@@ -15,7 +15,7 @@ from calib.camera_parameters import parameter_names, stepped
 from calib.errors import CalibError
 from calib.gimbal import MAST_NAMES, mast_of, numbers_of
 from calib.mast import Rig
-from calib.rigid import FloatArray
+from calib.rigid import FloatArray, ReadOnlyArrays, frozen_array
 
 ROUNDING = 1e-6
 """Of one: what a stored correlation may be off by."""
@@ -24,11 +24,23 @@ _MAST = tuple(f"mast.{name}" for name in MAST_NAMES)
 
 
 @dataclass(frozen=True, eq=False)
-class RigCovariance:
-    """How sure a rig's parameters are: ``names`` (p,) and ``covariance`` (p, p), in the names' units."""
+class RigCovariance(ReadOnlyArrays):
+    """How sure a rig's parameters are: ``names`` (p,) and ``covariance`` (p, p), in the names' units.
+
+    Raises
+    ------
+    ValueError
+        If the covariance is not (p, p), finite, and without negative variances.
+    """
 
     names: tuple[str, ...]
     covariance: FloatArray
+
+    def __post_init__(self) -> None:
+        size = len(self.names)
+        object.__setattr__(self, "covariance", frozen_array(self.covariance, (size, size)))
+        if (np.diag(self.covariance) < 0.0).any():
+            raise ValueError("a covariance with a negative variance is none")
 
     def of(self, cameras: Sequence[str]) -> RigCovariance:
         """Return the part of the mast and of some cameras."""

@@ -6,6 +6,7 @@ source camera's own model. All models and planes are in one common frame (usuall
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import cache, cached_property
 
@@ -76,10 +77,10 @@ def facing_plane(camera: CameraModel, pixel_px: ArrayLike, range_m: float) -> Pl
     Raises
     ------
     CalibError
-        If the pixel has no ray or the range is not above zero.
+        If the pixel has no ray or the range is not a finite number above zero.
     """
     rays = camera.ray(np.asarray(pixel_px, dtype=np.float64))
-    if not bool(rays.valid) or not range_m > 0.0:
+    if not bool(rays.valid) or not 0.0 < range_m < math.inf:
         raise CalibError(f"no plane at range {range_m} m along pixel {np.asarray(pixel_px).tolist()}")
     return Plane(rays.origins_m + range_m * rays.directions, -rays.directions)
 

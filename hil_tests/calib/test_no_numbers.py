@@ -21,16 +21,19 @@ from calib.align import NotAligned, align, mirrored
 from calib.cahvor import CameraModel
 from calib.detect import DotsFound, Predicted
 from calib.detect_survey import find_in_file
-from calib.errors import Unreachable
+from calib.epipolar import find_partner
+from calib.errors import CalibError, Unreachable
 from calib.fit_camera import SAMPLES, fit_camera
 from calib.fit_joint import fit_joint
 from calib.handoff import Joints
 from calib.mast import Mast, Rig
+from calib.match import match
 from calib.model_difference import model_difference
 from calib.pointing import Solution, choose, solve
+from calib.rig_covariance import RigCovariance
 from calib.rigid import Rigid
 from calib.stereo import triangulate
-from calib.warp import Plane
+from calib.warp import Plane, facing_plane
 from drivers.sim.board import draw_board, photograph
 
 NO_NUMBERS = (math.nan, math.inf, -math.inf)
@@ -142,6 +145,26 @@ def test_a_sigma_that_is_none_gives_no_covariance(bad: float) -> None:
         Joints(0.0, 0.0, bad)
 
 
+@pytest.mark.parametrize("bad", [*NO_NUMBERS, 0.0, -1.0])
+def test_ranges_and_windows_that_are_none_are_refused(bad: float) -> None:
+    grey = np.zeros((101, 101), np.float32)
+    with pytest.raises(CalibError, match="no plane at range"):
+        facing_plane(HEAD, [50, 50], bad)
+    with pytest.raises(ValueError, match="nearest_m is"):
+        find_partner(grey, HEAD, [50, 50], grey, HEAD, bad)
+    if bad != 0.0:
+        with pytest.raises(ValueError, match="search_px is"):
+            match(grey, HEAD, [50, 50], facing_plane(HEAD, [50, 50], 3.0), grey, HEAD, bad)
+
+
+@pytest.mark.parametrize("bad", [*NO_NUMBERS, -1.0])
+def test_a_covariance_that_is_none_is_refused(bad: float) -> None:
+    with pytest.raises(ValueError, match=r"not finite|negative variance"):
+        RigCovariance(("mast.translation_m.x",), np.array([[bad]]))
+    with pytest.raises(ValueError, match="shape"):
+        RigCovariance(("mast.translation_m.x",), np.eye(2))
+
+
 def again(one: object) -> list[object]:
     """The same thing out of a pickle and out of deep and shallow copies."""
     return [pickle.loads(pickle.dumps(one)), copy.deepcopy(one), copy.copy(one)]
@@ -157,6 +180,7 @@ def test_frozen_geometry_stays_frozen_through_pickles_and_copies(true_rig: Rig) 
         (head._projection, ("pixel_from_slope", "slope_from_pixel")),
         (true_rig.mast, ("translation_m", "rotation_rad")),
         (true_rig.mast.rover_from_head(0.1, 0.2), ("rotation", "translation_m")),
+        (RigCovariance(("mast.translation_m.x",), np.eye(1)), ("covariance",)),
         (Plane(np.zeros(3), np.array([0.0, 0.0, 2.0])), ("point_m", "normal")),
         (triangulate(HEAD, right, [52, 50], [48, 50]), ("position_m", "covariance_m2", "rates_m_per_px")),
     ]
