@@ -14,6 +14,7 @@ CASES = {
     "compare_trackers --work /dev/null/x": "/dev/null/x: Not a directory",
     "handoff_campaign --cases 0": "--cases: '0' where a whole number of at least 1 is expected",
     "handoff_campaign --out /dev/null/x.csv": "--out: /dev/null/x.csv: Not a directory",
+    "motion_campaign --moves 0": "--moves: '0' where a whole number of at least 1 is expected",
     "calibration_coverage --joint-sigma-rad -1": "--joint-sigma-rad: '-1' where zero or more is expected",
 }
 

@@ -75,7 +75,7 @@ def test_a_start_and_a_look_put_the_target_where_it_is() -> None:
     after, seen = looker(world, steps).look(track)
     assert (seen.state, seen.pair, seen.reason) == ("tracked", "navcam", "")
     assert np.linalg.norm(after.position_m - point) < 0.03
-    assert [step.name for step in steps] == ["choose", "limits", "move", "settle", "look", "find"]
+    assert [step.name for step in steps] == ["choose", "before", "limits", "move", "settle", "look", "find"]
     pixels = [np.array([seen.pixels[eye].x_px, seen.pixels[eye].y_px]) for eye in rig().stereo["navcam"]]
     middle = (np.array(SIZE_PX) - 1) / 2
     assert np.mean(pixels, axis=0) == pytest.approx(middle, abs=2.0), "pointed before the picture was taken"
@@ -169,6 +169,22 @@ def navcams_turned(by_rad: float) -> Rig:
     return replace(true, cameras=cameras)
 
 
+@pytest.mark.parametrize("share", [0.0, 0.5])
+def test_pictures_that_did_not_move_with_the_head_are_not_looked_at(share: float) -> None:
+    world = Eyes()
+    track, _ = begun(world)
+    start = world.true_joints(world.clock.now_s())
+    world.view = lambda camera, time_s, joints: (
+        (start[0] + share * (joints[0] - start[0]), start[1] + share * (joints[1] - start[1]))
+    )
+    after, seen = looker(world).look(track)
+    assert (after.state, seen.state) == ("lost", "lost")
+    assert after.position_m == pytest.approx(track.position_m)
+    for eye in rig().stereo["navcam"]:
+        assert seen.pixels[eye].verdict == "no_frame"
+        assert "joints and pictures contradict each other" in seen.pixels[eye].reason
+
+
 def test_a_change_of_the_pair_looks_with_both_and_keeps_what_they_saw() -> None:
     world = Eyes()
     steps: list[Step] = []
@@ -177,7 +193,8 @@ def test_a_change_of_the_pair_looks_with_both_and_keeps_what_they_saw() -> None:
     assert (seen.state, seen.pair, seen.reason) == ("tracked", "navcam", "")
     assert np.linalg.norm(after.position_m - point) < 0.03
     one = ["limits", "move", "settle", "look", "find"]
-    assert [step.name for step in steps] == ["choose", *one, *one, "hand_over"]
+    names = [step.name for step in steps if step.name != "before"]
+    assert names == ["choose", *one, *one, "hand_over"]
     record = seen.matched
     assert record is not None
     assert (record.pair, list(record.found)) == (rig().stereo["pancam"], list(rig().stereo["navcam"]))

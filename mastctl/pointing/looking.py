@@ -86,8 +86,12 @@ class Eyes:
         """Return a kept frame by its id. Raises FrameGone."""
         return self._view(self._cameras.frame_by_id(frame_id))
 
-    def new(self, names: Sequence[str], after_s: float, resting: Reading) -> dict[str, View]:
+    def new(
+        self, names: Sequence[str], after_s: float, resting: Reading, timeout_s: float | None = None
+    ) -> dict[str, View]:
         """Return frames exposed after a moment, by a head that rests where it was read.
+
+        Waited for is as long as the settings say, or ``timeout_s``.
 
         Raises
         ------
@@ -97,7 +101,8 @@ class Eyes:
             If a frame does not come, or cannot be used.
         """
         views = {}
-        for name, frame in self._cameras.frames(names, after_s, self._settings.frame_timeout_s).items():
+        timeout_s = self._settings.frame_timeout_s if timeout_s is None else timeout_s
+        for name, frame in self._cameras.frames(names, after_s, timeout_s).items():
             if frame.exposure_began_s < after_s:
                 words = (
                     f"frame {frame.frame_id} was exposed {after_s - frame.exposure_began_s:.3f} s too early"

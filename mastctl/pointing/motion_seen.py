@@ -39,7 +39,13 @@ class MotionSeen:
     def lacking(
         self, cameras: Sequence[str], here_rad: tuple[float, float], goal_rad: tuple[float, float]
     ) -> list[str]:
-        """Return the head cameras without a picture, of which one before a move will tell something."""
+        """Return the head cameras without a picture, of which one before a move will tell something.
+
+        None of a move that is smaller than what need not show, or that leaves too little in common.
+        """
+        way_rad = max(abs(goal - here) for goal, here in zip(goal_rad, here_rad, strict=True))
+        if way_rad <= self._limits.floor_rad:
+            return []
         wanted = [name for name in cameras if self._on_head(name) and name not in self._before]
         return [name for name in wanted if overlap(self._rig, name, here_rad, goal_rad) >= LEAST_OVERLAP]
 

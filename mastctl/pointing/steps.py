@@ -178,7 +178,9 @@ class Steps:
             detail.update(counts_told(self._devices, settled.tilt_rad, model))
         return settled
 
-    def before(self, cameras: Sequence[str], resting: Reading, goal_rad: tuple[float, float]) -> None:
+    def before(
+        self, cameras: Sequence[str], goal_rad: tuple[float, float], timeout_s: float | None = None
+    ) -> None:
         """Take pictures to compare with after a move, where there are none yet and they will tell something.
 
         Raises
@@ -187,14 +189,14 @@ class Steps:
             If none comes; nothing has moved.
         """
         configured = self._devices.newest_frames()
-        here_rad = resting.pan_rad, resting.tilt_rad
+        here = self.head.read()
         lacking = self._motion_seen.lacking(
-            [name for name in cameras if name in configured], here_rad, goal_rad
+            [name for name in cameras if name in configured], (here.pan_rad, here.tilt_rad), goal_rad
         )
         if not lacking:
             return
         with self.step("before") as detail:
-            views = self.eyes.new(lacking, self._clock.now_s(), resting)
+            views = self.eyes.new(lacking, self._clock.now_s(), self.head.resting(), timeout_s)
             detail.update(frame_ids=[view.frame.frame_id for view in views.values()])
             self._motion_seen.remember(views)
 

@@ -2,9 +2,10 @@
 
 Steps of a start at a pixel, as they stand in the record: ``rest``, ``frames``, ``target``, ``start``; of one
 at a position ``choose``, ``limits`` to ``settle``, ``look``, ``start``. A look has ``choose``, ``limits`` to
-``settle`` (``rest`` for a pair on the body), ``look``, ``find``; what one pair does not find, the next one
-that sees the place looks for. Where the target shall go to another pair, the pair that found it last looks
-first, then the next one, each with these steps, and ``hand_over`` makes the record of both.
+``settle`` (``rest`` for a pair on the body), ``look``, ``find``; ``before`` takes pictures ahead of a move
+that the new ones must have moved against. What one pair does not find, the next one that sees the place looks
+for. Where the target shall go to another pair, the pair that found it last looks first, then the next one,
+each with these steps, and ``hand_over`` makes the record of both.
 """
 
 from __future__ import annotations
@@ -36,6 +37,8 @@ from mastctl.tracking.settings import TrackingSettings
 
 PAIRS_TRIED = 2
 """How many pairs look for a target at one stop."""
+BEFORE_TIMEOUT_S = 2.0
+"""A picture to compare with is worth waiting for some frames, not for a camera that is gone."""
 
 
 class NotTrackable(MastctlError):
@@ -291,6 +294,12 @@ class Looker:
         """Bring the target into the middle; a pair on the body only needs a head at rest."""
         if choice.pan_rad is None or choice.tilt_rad is None:
             return self._steps.rest()
+        eyes = self._rig.stereo[choice.pair]
+        try:
+            self._steps.before(eyes, (choice.pan_rad, choice.tilt_rad), BEFORE_TIMEOUT_S)
+        except DriverError as error:  # whether it comes after the move is what counts
+            if error.device not in eyes:
+                raise
         return self._steps.go(choice.pan_rad, choice.tilt_rad, self._rig.stereo[choice.pair][0])
 
     def _pictures(self, eyes: tuple[str, str], settled: Reading) -> tuple[dict[str, View], dict[str, str]]:
