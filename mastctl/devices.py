@@ -408,7 +408,7 @@ class Devices:
         reading = joint_history.checked(
             answer, HEAD, self._clock.now_s(), None if newest is None else newest.time_s
         )
-        self._history.add(reading)
+        reading = self._history.add(reading)
         if reading.faults != self._last_faults:
             self._last_faults = tuple(reading.faults)
             log.warning("%s reports: %s", HEAD, "; ".join(reading.faults) or "healthy again")

@@ -6,18 +6,19 @@ import bisect
 import math
 import threading
 from collections import deque
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from drivers.errors import BadReply
 from drivers.interfaces import Reading
+from mastctl.rest import DITHER_S, dithers
 
 KEPT_READINGS = 3000  # one minute at 50 Hz
 OLDEST_READING_S = 1.0  # a reading stamped further back is not a present measurement
 CLOCK_TOLERANCE_S = 0.005  # what a stamp may lie in the future by rounding
 LARGEST_GAP_S = 1.0  # between the readings around an exposure; beyond it the angles are a guess
-STILL_RAD = 3e-3  # two counts of a 12-bit servo: flicker below this is not motion
+STILL_RAD = 3e-3  # between neighbours; two counts of a 12-bit servo
 
 
 @dataclass(frozen=True)
@@ -82,12 +83,16 @@ def checked(answer: object, device: str, now_s: float, newest_s: float | None) -
 
 
 class JointHistory:
-    """Readings of the last minute, and when moves were sent. Safe to use from any thread."""
+    """Readings of the last minute, and when moves were sent. Safe to use from any thread.
+
+    A head that says now and then that it moves, although its readings are those of a head at rest
+    (`mastctl.rest.dithers`) and no move was sent for a second, is taken to rest.
+    """
 
     def __init__(self) -> None:
-        self._readings: deque[Reading] = deque(maxlen=KEPT_READINGS)
+        self._readings: deque[Reading] = deque(maxlen=KEPT_READINGS)  # as the driver gave them
+        self._newest: Reading | None = None  # with what is true of its motion
         self._moves_s: deque[float] = deque(maxlen=200)
-        self._newest: Reading | None = None
         self._lock = threading.Lock()
 
     @property
@@ -95,13 +100,18 @@ class JointHistory:
         """The last good reading; read without a lock."""
         return self._newest
 
-    def add(self, reading: Reading) -> None:
-        """Keep a checked reading; one of the same time replaces the last."""
+    def add(self, reading: Reading) -> Reading:
+        """Keep a checked reading and return it with ``moving`` as the class says.
+
+        One of the same time replaces the last.
+        """
         with self._lock:
             if self._readings and reading.time_s <= self._readings[-1].time_s:
                 self._readings.pop()
             self._readings.append(reading)
-            self._newest = reading
+            rests = reading.moving and self._dithers(reading.time_s)
+            self._newest = replace(reading, moving=False) if rests else reading
+            return self._newest
 
     def move_sent(self, time_s: float) -> None:
         """Remember that a move went out, so that no exposure around it counts as still."""
@@ -111,8 +121,9 @@ class JointHistory:
     def at_exposure(self, began_s: float, mid_s: float, ended_s: float, device: str) -> JointsAtExposure:
         """Return the joint angles at mid-exposure, linear between the readings around it.
 
-        The head counts as moving if any reading from the last one before the exposure to the first one
-        after it says so, if these differ by more than 3 mrad, or if a move was sent between them.
+        The head counts as moving if a move was sent between the last reading before the exposure and the
+        first one after it, if any of them says so, or if these differ by more than 3 mrad; the last two not
+        of a head that dithers at rest.
 
         Raises
         ------
@@ -125,6 +136,7 @@ class JointHistory:
             last = bisect.bisect_left(times_s, ended_s)
             around = [self._readings[i] for i in range(max(first, 0), min(last + 1, len(times_s)))]
             moves_s = list(self._moves_s)
+            rests = bool(around) and self._dithers(around[-1].time_s)
         if first < 0 or last >= len(times_s):
             side = "before" if first < 0 else "after"
             raise BadReply(f"there is no joint reading {side} the frame's exposure", device=device)
@@ -135,12 +147,28 @@ class JointHistory:
             raise BadReply(f"{words}, at most {LARGEST_GAP_S} s is taken", device=device)
         pans = [reading.pan_rad for reading in around]
         tilts = [reading.tilt_rad for reading in around]
-        moving = (
+        seems = (
             any(reading.moving for reading in around)
             or max(pans) - min(pans) > STILL_RAD
             or max(tilts) - min(tilts) > STILL_RAD
-            or any(stamps_s[0] <= sent_s <= stamps_s[-1] for sent_s in moves_s)
         )
+        moving = (seems and not rests) or any(stamps_s[0] <= sent_s <= stamps_s[-1] for sent_s in moves_s)
         return JointsAtExposure(
             float(np.interp(mid_s, stamps_s, pans)), float(np.interp(mid_s, stamps_s, tilts)), moving
         )
+
+    def _dithers(self, until_s: float) -> bool:
+        """Whether the readings up to a moment are those of a head that dithers at rest; the lock is held."""
+        return any(self._dithers_for(for_s, until_s) for for_s in (DITHER_S, 2 * DITHER_S))
+
+    def _dithers_for(self, for_s: float, until_s: float) -> bool:
+        since_s = until_s - for_s
+        if any(since_s <= sent_s <= until_s for sent_s in self._moves_s):
+            return False
+        window: list[Reading] = []
+        for reading in reversed(self._readings):
+            if reading.time_s < since_s:
+                break
+            if reading.time_s <= until_s:
+                window.append(reading)
+        return bool(window) and dithers(window[::-1], for_s=for_s)

@@ -18,7 +18,7 @@ from drivers.clock import SystemClock
 from drivers.errors import DriverError
 from drivers.interfaces import Frame, Reading
 from mastctl import devices as devices_module
-from mastctl import frames, joint_history, stops
+from mastctl import frames, joint_history, rest, stops
 from mastctl import service as service_module
 from mastctl.devices import Devices
 from mastctl.limits import Limits
@@ -54,8 +54,9 @@ def test_deadlines_and_periods_are_the_programs_own(page: str) -> None:
         f"a camera has {s.frame_timeout_s + m.CAMERA_GRACE_S:g} s in all",
         f"| `close()` | {service_module.HARDWARE_CLOSE_S:g} s for all devices",
         f"{1 / m.MOVING_PERIOD_S:g} times a second while the head moves, {1 / m.RESTING_PERIOD_S:g} times",
-        f"within {s.arrival_tolerance_rad:g} rad of the angles sent for {s.dwell_s:g} s",
-        f"within {s.rest_tolerance_rad:g} rad of each other",
+        f"rests within {s.arrival_tolerance_rad:g} rad of the angles sent",
+        f"({rest.SAME_RAD:g} rad) for {s.dwell_s:g} s",
+        f"for {rest.DITHER_S:g} s its readings lie within {s.rest_tolerance_rad:g} rad of each other",
         f"the way over the speed, and {allowed_s:g} s",
         f"more than {joint_history.CLOCK_TOLERANCE_S:g} s in the future, "
         f"more than {joint_history.OLDEST_READING_S:g} s back",

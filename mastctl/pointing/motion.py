@@ -10,6 +10,7 @@ from drivers.clock import Clock
 from drivers.interfaces import Reading
 from mastctl.limits import Limits
 from mastctl.pointing.requests import PointingError, PointingSettings
+from mastctl.rest import RestWatch
 
 
 class HeadLike(Protocol):
@@ -25,8 +26,8 @@ class Head:
 
     A reading must be finite, of now, not before the last one, and free of faults; it must be reachable from
     the last one at twice the speed cap, or lie on the way to the commanded angles (a replayed head is there
-    at once). The head has settled when for a dwell it says that it does not move and its angles
-    rest; it has arrived when it rests where it was sent.
+    at once). The head has settled when it rests (`mastctl.rest`); it has arrived when it rests where it was
+    sent.
     """
 
     def __init__(
@@ -60,11 +61,11 @@ class Head:
         DriverError
             If the head does not answer.
         """
-        settled, last = self._rests(self._clock.now_s() + self._settings.rest_wait_s, dwell_s=0.0)
+        watch = RestWatch(0.0, self._settings.rest_tolerance_rad)
+        settled, last = self._rests(watch, self._clock.now_s() + self._settings.rest_wait_s)
         if not settled:
-            raise PointingError(
-                "head_moving", f"the head still moves after {self._settings.rest_wait_s:g} s of waiting"
-            )
+            words = f"the head still moves after {self._settings.rest_wait_s:g} s of waiting"
+            raise PointingError("head_moving", f"{words}: {watch.seen()}")
         return last
 
     def time_allowed_s(self, pan_rad: float, tilt_rad: float) -> float:
@@ -97,18 +98,21 @@ class Head:
             If the head does not answer.
         """
         tolerance = self._settings.arrival_tolerance_rad
+        watch = RestWatch(self._settings.dwell_s, self._settings.rest_tolerance_rad)
         while True:
-            settled, last = self._rests(deadline_s, self._settings.dwell_s)
+            settled, last = self._rests(watch, deadline_s)
             off = last.pan_rad - pan_rad, last.tilt_rad - tilt_rad
             if settled and max(map(abs, off)) <= tolerance:
                 return last
             if self._clock.now_s() < deadline_s:
+                self._clock.sleep(self._settings.poll_s)
                 continue  # a head that rests elsewhere may not have started yet
             where = f"pan {off[0]:+.4f} rad and tilt {off[1]:+.4f} rad from the commanded angles"
             if max(map(abs, off)) > tolerance:
                 words = f"at its deadline the head is {where}, at most {tolerance:g} rad is expected"
                 raise PointingError("did_not_arrive", words)
-            raise PointingError("did_not_settle", f"at its deadline the head still moves, {where}")
+            words = f"at its deadline the head still moves, {where}: {watch.seen()}"
+            raise PointingError("did_not_settle", words)
 
     def read(self) -> Reading:
         """Return a reading that can be true.
@@ -148,26 +152,16 @@ class Head:
         self._last = reading
         return reading
 
-    def _rests(self, deadline_s: float, dwell_s: float) -> tuple[bool, Reading]:
-        """Read until the angles rest for a dwell (True) or the deadline passes; return the last reading."""
-        since: Reading | None = None
+    def _rests(self, watch: RestWatch, deadline_s: float) -> tuple[bool, Reading]:
+        """Read until the head rests (True) or the deadline passes; return the last reading."""
         while True:
             self.check_not_stopped()
             reading = self.read()
-            if reading.moving or (since is not None and not self._same(reading, since)):
-                since = None
-            elif since is None:
-                since = reading
-            if since is not None and reading.time_s - since.time_s >= dwell_s:
+            if watch.rests(reading):
                 return True, reading
             if self._clock.now_s() >= deadline_s:
                 return False, reading
             self._clock.sleep(self._settings.poll_s)
-
-    def _same(self, one: Reading, other: Reading) -> bool:
-        """Tell whether two readings differ by no more than a resting head flickers."""
-        apart = max(abs(one.pan_rad - other.pan_rad), abs(one.tilt_rad - other.tilt_rad))
-        return apart <= self._settings.rest_tolerance_rad
 
 
 def _outside(value: float, one: float, other: float) -> float:

@@ -12,6 +12,7 @@ from calib.match import MatchSettings
 from calib.rigid import FloatArray
 from calib.shown_view import ViewLimits
 from mastctl.errors import MastctlError
+from mastctl.rest import DITHER_RAD
 
 Pair = tuple[float, float]
 
@@ -175,10 +176,10 @@ class PointingSettings:
     poll_s
         Between readings while the head moves.
     dwell_s
-        How long the reading must rest: three exposures, and longer than a mast's ringing after the axis
-        reports its position reached.
+        How long the reading must stay the same: three exposures, and longer than a mast's ringing after the
+        axis reports its position reached. A reading that dithers is watched for a second (`mastctl.rest`).
     rest_tolerance_rad
-        What a reading at rest may flicker: one count of a 12-bit servo is 1.5 mrad.
+        How far the readings of a head at rest may lie from each other: three counts of a 12-bit servo.
     arrival_tolerance_rad
         How far from the commanded angle a head may rest: three counts and half the backlash of a 12-bit
         servo, 6 mrad. What remains is measured in the picture.
@@ -218,7 +219,7 @@ class PointingSettings:
 
     poll_s: float = 0.02
     dwell_s: float = 0.15
-    rest_tolerance_rad: float = 2e-3
+    rest_tolerance_rad: float = DITHER_RAD
     arrival_tolerance_rad: float = 6e-3
     acceleration_s: float = 1.5
     margin_s: float = 2.5
