@@ -1,13 +1,16 @@
 """One question at a time with a unit: each answer is matched to its question, or is not taken at all.
 
 The answer to a question is the next line that fits it, within a deadline of the monotonic clock. A line that
-does not fit is an error, never skipped in silence. After any error the two sides may be out of step: an
-answer may still be under way. Then nothing is asked before `in_step` has let the line fall quiet and has
-asked the resolutions of both axes, whose words no other answer has: since a unit answers in order, whatever
-was under way has come by then and was thrown away. The resolutions also tell a reset or another step mode.
+does not fit is an error, never skipped in silence, unless it is the last answer once more. After any error
+the two sides may be out of step: an answer may still be under way. Then nothing is asked before `in_step` has
+let the line fall quiet and has asked the resolutions of both axes, whose words no other answer has: since a
+unit answers in order, whatever was under way has come by then and was thrown away. The resolutions also tell
+a reset or another step mode.
 
 At the start the unit is asked for words and echo (``FV``, ``EE``), because both say which question an answer
-belongs to. One that stays terse or without echo is understood too.
+belongs to. A unit does not tell capitals from small letters, but echoes them: so each command is written
+otherwise than the last one (``PP``, ``Pp``, ``pP``), and the echo tells which of several alike is answered.
+One that stays terse or without such an echo is understood too; it is listened to for longer after an error.
 """
 
 from __future__ import annotations
@@ -17,10 +20,13 @@ from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from typing import TypeVar
 
 from drivers.errors import BadReply, NoReply, Refused
 from drivers.flir_ptu.line import Line
 from drivers.flir_ptu.replies import Answer, LineSplitter, answer_of, hits_of, number_of, without_hits
+
+T = TypeVar("T")
 
 REPLY_S = 0.3
 """How long a unit may think before its answer is complete, beyond the time the bytes take on the wire."""
@@ -28,7 +34,8 @@ REPLY_BYTES = 70  # a command, its echo and the longest answer in words
 QUIET_S = 0.06
 LONGEST_DRAIN_S = 0.4
 PATIENT_TRIES = 3
-STEP_TRIES = 2
+STEP_TRIES = 3
+AGREEING_TRIES = 5
 
 
 @dataclass(frozen=True)
@@ -59,10 +66,11 @@ ACCELERATION = _axis_query("A", "AXIS", "acceleration")
 
 @dataclass(frozen=True)
 class _Manners:
-    """How a unit answers: in words, and with an echo of the command."""
+    """How a unit answers: in words, with an echo of the command, and with one letter by letter."""
 
     verbose: bool | None = None
     echo: bool | None = None
+    exact: bool | None = None
 
 
 class Conversation:
@@ -87,6 +95,9 @@ class Conversation:
         self._manners = _Manners()
         self._in_step = False
         self._tries = 1
+        self._turn = 0
+        self._last_written = ""
+        self._answered = b""  # the last line that was taken for an answer
         self.byte_s = line.byte_s
         self.reply_s = REPLY_S + REPLY_BYTES * line.byte_s
 
@@ -138,6 +149,28 @@ class Conversation:
             self._in_step = False
             raise BadReply(f"answered {query.letters} with '{text[:80]}'", device=self._device)
         return number
+
+    def sure(self, query: Query, first: float | None = None) -> float:
+        """Return the number that answers a query twice in a row; ``first`` is one that was told before.
+
+        For what is asked once and then used all the time: the protocol has no checksum. Raises as `ask`, and
+        BadReply if no two answers are the same.
+        """
+        return self._twice(query.letters, lambda: self.ask(query), first)
+
+    def sure_text(self, command: str) -> str:
+        """Return the text that answers a command twice in a row; raises as `sure`."""
+        return self._twice(command, lambda: self.tell(command), None)
+
+    def _twice(self, command: str, ask: Callable[[], T], before: T | None) -> T:
+        """The first of the answers that is the same as the one before it."""
+        told: list[T] = [] if before is None else [before]
+        while len(told) < AGREEING_TRIES:
+            told.append(ask())
+            if len(told) > 1 and told[-1] == told[-2]:
+                return told[-1]
+        words = ", ".join(f"'{str(one)[:40]}'" for one in told)
+        raise BadReply(f"answers {command} otherwise each time: {words}", device=self._device)
 
     def tell(self, command: str, patience_s: float = 0.0) -> str:
         """Send a command and return the text of its answer, mostly empty.
@@ -197,20 +230,46 @@ class Conversation:
             raise BadReply("is out of step with this program", device=self._device)
         self._in_step = False
         for line in self._splitter.feed(self._line.pending()):
-            self._note_hits(line)  # whatever else it says, nobody waits for it
+            self._note_hits(line)
+            if self._speaks_twice(line):
+                raise BadReply(f"said {_shown(line)}, which nobody asked for", device=self._device)
         begun = self._splitter.clear()
         self._note_hits(begun)
         if without_hits(begun):
             raise BadReply(f"was in the middle of saying {_shown(begun)}", device=self._device)
         self._lines.clear()
-        self._line.send(f"{command} ".encode())
-        answer = self._next_answer(command, time.monotonic() + patience_s, skip=False)
+        written = self._written(command)
+        self._line.send(f"{written} ".encode())
+        answer = self._next_answer(written, time.monotonic() + patience_s, skip=False)
         if self._manners.echo and not answer.echo:
             raise BadReply(f"answered {command} without its echo", device=self._device)
+        if self._manners.exact and not answer.exact:
+            raise BadReply(f"answered another {command} than this one", device=self._device)
         self._in_step = True
         if not answer.good:
             raise Refused(f"refuses {command}: {answer.text or 'without words'}", device=self._device)
         return answer.text
+
+    def _speaks_twice(self, line: bytes) -> bool:
+        """Whether a line that nobody asked for puts the last answer in doubt: it may be the true one."""
+        rest = without_hits(line)
+        if rest in (b"", self._answered) or (rest == b"*" and hits_of(line)):  # once more; the end of a reset
+            return False
+        last = answer_of(line, self._last_written)
+        return not self._manners.exact or (last is not None and (last.exact or not last.echo))
+
+    def _written(self, command: str) -> str:
+        """A command as it is written this time, which is not as the last time.
+
+        Two small letters in front would hide a limit hit before the echo: see `replies`.
+        """
+        self._turn += 1
+        ways = 3 if command[1:2].isalpha() else 2
+        small = {1: 0, 2: 1}.get(self._turn % ways)
+        if small is not None:
+            command = command[:small] + command[small].lower() + command[small + 1 :]
+        self._last_written = command
+        return command
 
     def _resolutions(self) -> tuple[dict[str, float], _Manners]:
         """The resolution of each axis, whatever else comes in between, and how the unit answered."""
@@ -228,12 +287,14 @@ class Conversation:
 
     def _resolution(self, axis: str, query: Query) -> tuple[float, _Manners]:
         """One of them, and how the unit answered."""
-        self._line.send(f"{query.letters} ".encode())
+        while (written := self._written(query.letters)).isupper():
+            pass  # that would not tell whether the echo keeps small letters
+        self._line.send(f"{written} ".encode())
         until_s = time.monotonic() + self.reply_s
         refusal = ""
         while True:
             try:
-                answer = self._next_answer(query.letters, until_s, skip=True)
+                answer = self._next_answer(written, until_s, skip=True)
             except NoReply:
                 if refusal:
                     words = f"does not tell its {axis} resolution: {refusal}"
@@ -243,23 +304,30 @@ class Conversation:
             number = number_of(answer.text, query.words, " " in answer.text) if answer.good else None
             if other in answer.text.lower().split():
                 number = None
+            if self._manners.exact and answer.echo and not answer.exact:
+                continue  # the answer to an earlier one
             if number is not None:
-                return number, _Manners(" " in answer.text, answer.echo)
+                return number, _Manners(" " in answer.text, answer.echo, answer.exact)
             if not answer.good:
                 refusal = answer.text
 
     def _next_answer(self, command: str, until_s: float, skip: bool) -> Answer:
         """The next answer; a line that is none is an error unless such lines are to be skipped."""
-        echo = False
+        echo = exact = False
+        last, self._answered = self._answered, b""
         while True:
             line = self._next_line(command, until_s)
+            if self._manners.exact and without_hits(line) == last:
+                continue  # the last answer once more: this one is written otherwise
             answer = answer_of(line, command)
             if answer is not None:
-                return replace(answer, echo=answer.echo or echo)
-            if without_hits(line).upper() == command.encode("ascii"):
+                self._answered = without_hits(line) if answer.exact else b""
+                return replace(answer, echo=answer.echo or echo, exact=answer.exact or exact)
+            if without_hits(line).upper() == command.upper().encode("ascii"):
                 echo = True  # on a line of its own, as the E series has it
+                exact = without_hits(line) == command.encode("ascii")
             elif not skip and without_hits(line):
-                raise BadReply(f"answered {command} with {_shown(line)}", device=self._device)
+                raise BadReply(f"answered {command.upper()} with {_shown(line)}", device=self._device)
 
     def _next_line(self, command: str, until_s: float) -> bytes:
         """The next complete line."""
@@ -269,15 +337,18 @@ class Conversation:
                 self._note_hits(line)
                 self._lines.append(line)
             if not self._lines and time.monotonic() >= until_s:
-                raise NoReply(f"did not answer {command} within its deadline", device=self._device)
+                raise NoReply(f"did not answer {command.upper()} within its deadline", device=self._device)
         return self._lines.popleft()
 
     def _quiet(self) -> None:
         """Throw away what comes until nothing has come for a while; limit hits are noted."""
         self._in_step = False
-        until_s = time.monotonic() + LONGEST_DRAIN_S
+        self._answered = b""
+        unknown = self._manners.exact is None
+        quiet_s = QUIET_S if unknown or self._manners.exact else max(QUIET_S, self.reply_s)
+        until_s = time.monotonic() + quiet_s + LONGEST_DRAIN_S
         while time.monotonic() < until_s:
-            data = self._line.receive(time.monotonic() + QUIET_S)
+            data = self._line.receive(time.monotonic() + quiet_s)
             if not data:
                 break
             for line in self._splitter.feed(data):

@@ -101,15 +101,16 @@ class FlirPtu:
         """
         with self._talking() as talk:
             pan, tilt = self._axes["pan"], self._axes["tilt"]
-            times_s = [measure(talk, axis, self._clock).time_s for axis in (pan, tilt)]
+            time_s = measure(talk, pan, tilt, self._clock)
             if self._count.halt_owed:
                 self._halt(talk)
             for axis in (pan, tilt):
                 self._go_on(talk, axis)
             settled = all(axis.settled(self._options.settle_s) for axis in (pan, tilt))
             if settled:  # a moving head is asked for nothing but its place
-                self._supply.look(talk)
-            return Reading(pan.angle_rad, tilt.angle_rad, not settled, sum(times_s) / 2, self._faults())
+                with suppress(NoReply, BadReply):  # the place is known; the supply is asked for again
+                    self._supply.look(talk)
+            return Reading(pan.angle_rad, tilt.angle_rad, not settled, time_s, self._faults())
 
     def move(self, pan_rad: float, tilt_rad: float, speed_rad_per_s: float | None = None) -> None:
         """Start both axes together towards the nearest positions; readings carry an approach on.

@@ -33,7 +33,7 @@ def checked_version(talk: Conversation, options: Options, known: str) -> str:
     NoReply, BadReply, Refused, LineLost
         As `Conversation.tell`.
     """
-    version = talk.tell("V")
+    version = talk.sure_text("V")
     if known and version != known:
         words = f"another unit answers: '{version[:80]}' where '{known[:80]}' was"
         raise WrongDevice(words, device=DEVICE)
@@ -74,23 +74,26 @@ def ready_axes(
     for command in ("PO0", "TO0", "I"):  # whatever was given in slaved mode and never started is void
         talk.tell(command)
     settings = {"pan": options.pan, "tilt": options.tilt}
-    axes = {name: Axis(name, settings[name], resolutions[name]) for name in settings}
+    axes = {
+        name: Axis(name, settings[name], talk.sure(ask.RESOLUTION[name], resolutions[name]))
+        for name in settings
+    }
     _try(talk, "LE")
     for axis in axes.values():
-        axis.lowest, axis.highest = (int(talk.ask(q[axis.name])) for q in (ask.LOWEST, ask.HIGHEST))
+        axis.lowest, axis.highest = (int(talk.sure(q[axis.name])) for q in (ask.LOWEST, ask.HIGHEST))
         axis.check_limits()
     _limit(talk, axes)
     for name, axis in axes.items():
-        axis.fastest, axis.slowest = talk.ask(ask.FASTEST[name]), talk.ask(ask.SLOWEST[name])
+        axis.fastest, axis.slowest = talk.sure(ask.FASTEST[name]), talk.sure(ask.SLOWEST[name])
         if options.speed_rad_per_s is not None:
             axis.usual_speed = axis.speed_from_rad(options.speed_rad_per_s)
         elif name in known:
             axis.usual_speed = known[name].usual_speed
         else:
-            axis.usual_speed = int(talk.ask(ask.SPEED[name]))
+            axis.usual_speed = int(talk.sure(ask.SPEED[name]))
         if options.acceleration_rad_per_s2 is not None:
             _accelerate(talk, axis, options.acceleration_rad_per_s2)
-        measure(talk, axis, clock)
+    measure(talk, axes["pan"], axes["tilt"], clock)
     return axes
 
 
@@ -109,7 +112,7 @@ def _limit(talk: Conversation, axes: Mapping[str, Axis]) -> None:
 def _accelerate(talk: Conversation, axis: Axis, acceleration_rad_per_s2: float) -> None:
     """Set the acceleration, if the unit has another."""
     positions = max(1, round(acceleration_rad_per_s2 / axis.position_rad))
-    if int(talk.ask(ask.ACCELERATION[axis.name])) != positions:
+    if int(talk.sure(ask.ACCELERATION[axis.name])) != positions:
         talk.tell(f"{axis.name[0].upper()}A{positions}", RECOMPUTE_S)
 
 

@@ -14,8 +14,8 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass
 
-# No space follows the "!", as it does in an error; a capital may, the first letter of an echo.
-_HIT = re.compile(rb"\s*!([PTpt])(?![a-z])")
+# No space follows the "!", as it does in an error; an echo may, which never begins with two small letters.
+_HIT = re.compile(rb"\s*!([PTpt])(?![a-z]{2})")
 _NUMBER = re.compile(r"-?\d+(?:\.\d+)?\Z")
 _LONGEST_LINE = 400
 
@@ -32,11 +32,14 @@ class Answer:
         The words behind it.
     echo
         Whether the command stood in front.
+    exact
+        Whether it did letter by letter, capitals and small ones.
     """
 
     good: bool
     text: str
     echo: bool
+    exact: bool = False
 
 
 class LineSplitter:
@@ -59,7 +62,7 @@ class LineSplitter:
 
 def hits_of(line: bytes) -> tuple[str, ...]:
     """Return the axes, ``pan`` or ``tilt``, whose limit hits stand anywhere in a line."""
-    found = re.findall(rb"!([PTpt])(?![a-z])", line)
+    found = re.findall(rb"!([PTpt])(?![a-z]{2})", line)
     return tuple("pan" if letter in b"Pp" else "tilt" for letter in found)
 
 
@@ -73,16 +76,17 @@ def answer_of(line: bytes, command: str) -> Answer | None:
     command
         What was sent, without its delimiter.
     """
-    rest, echo = without_hits(line), False
+    rest, echo, exact = without_hits(line), False, False
     if not all(32 <= byte < 127 for byte in rest):
         return None
     sent = command.encode("ascii")
     if rest[: len(sent)].upper() == sent.upper() and not rest.startswith((b"*", b"!")):
+        exact = rest.startswith(sent)
         rest, echo = without_hits(rest[len(sent) :]), True
     if rest.strip() == b"*":
-        return Answer(True, "", echo)
+        return Answer(True, "", echo, exact)
     if rest.startswith((b"* ", b"! ")):
-        return Answer(rest.startswith(b"*"), rest[2:].decode("ascii").strip(), echo)
+        return Answer(rest.startswith(b"*"), rest[2:].decode("ascii").strip(), echo, exact)
     return None
 
 

@@ -34,10 +34,12 @@ class ScriptedPtu:
         start: bytes = b"",
         end: bytes = b"\r",
         e_series: bool = False,
+        capitals: bool = False,
     ) -> None:
         self.verbose, self.echo = verbose, echo
         self.obeys = obeys  # FV, FT, EE, ED
         self.start, self.end = start, end
+        self.capitals = capitals  # whatever was written, the echo is
         self.e_series = e_series  # the echo on a line of its own, resolutions without the axis's name
         self.positions = {"P": 0, "T": 0}
         self.slaved: dict[str, int] | None = None
@@ -52,21 +54,22 @@ class ScriptedPtu:
 
     def receive(self, data: bytes, time_s: float) -> Sequence[Reply]:
         *commands, self._rest = re.split(rb"[ \r\n]", self._rest + data)
-        replies = [self._reply(command.decode().upper()) for command in commands if command]
+        replies = [self._reply(command.decode()) for command in commands if command]
         return [Reply(reply) for reply in replies if reply is not None]
 
     def poll(self, time_s: float) -> Sequence[Reply]:
         unasked, self.unasked = self.unasked, b""
         return [Reply(unasked)] if unasked else []
 
-    def _reply(self, command: str) -> bytes | None:
+    def _reply(self, written: str) -> bytes | None:
+        command = written.upper()
         self.heard.append(command)
         echo = self.echo
         answer = self.answers.get(command, self._usual)
         text = answer(command) if callable(answer) else answer
         if text is None:
             return None
-        echoed = f"{command} ".encode() if echo else b""
+        echoed = f"{command if self.capitals else written} ".encode() if echo else b""
         return (echoed + self.start if self.e_series else self.start + echoed) + text + self.end
 
     def _usual(self, command: str) -> bytes | None:

@@ -366,7 +366,7 @@ def test_positions_that_contradict_each_other_are_refused(opened: Opener) -> Non
     settled(head)
     time.sleep(0.25)
     settled(head)
-    lies = iter(range(1000, 3000, 300))
+    lies = itertools.count(1000, 300)
     unit.answers["PP"] = lambda command: f"* Current Pan position is {next(lies)}".encode()
     with pytest.raises(BadReply, match="gives pan positions that contradict each other: 1000, 1300"):
         head.read()

@@ -1,0 +1,146 @@
+"""Every answer of a PTU is of its question: damaged facts, late answers, two axes asked by turns."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections import deque
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, suppress
+from typing import Any
+
+import pytest
+from scripted_ptu import ScriptedPtu
+
+from drivers.clock import ManualClock, SystemClock
+from drivers.errors import DriverError
+from drivers.flir_ptu.head import FlirPtu, open_head
+from drivers.sim.wire.line import PtyLine
+
+PAN_STEP_RAD, TILT_STEP_RAD = (math.radians(arcsec / 3600) for arcsec in (185.142857, 46.285714))
+OPTIONS: dict[str, Any] = {
+    "pan": {"limits_rad": [-2.5, 2.5]}, "tilt": {"limits_rad": [-0.7, 0.5]}, "settle_s": 0.0,
+}  # fmt: skip
+
+Opener = Callable[..., tuple[FlirPtu, PtyLine]]
+
+
+@pytest.fixture
+def opened() -> Iterator[Opener]:
+    with ExitStack() as stack:
+
+        def open_on(unit: ScriptedPtu, clock: Any = None) -> tuple[FlirPtu, PtyLine]:
+            line = stack.enter_context(PtyLine(unit, SystemClock(), wire_time=False))
+            head = open_head({**OPTIONS, "port": line.path}, clock)
+            stack.callback(head.close)
+            return head, line
+
+        yield open_on
+
+
+class Damaged(ScriptedPtu):
+    """A unit of whose answers to some commands the first is damaged on the line."""
+
+    def __init__(self, **damaged: bytes) -> None:
+        super().__init__()
+        self.damaged = damaged
+
+    def _usual(self, command: str) -> bytes | None:
+        return self.damaged.pop(command, None) or super()._usual(command)
+
+
+def test_a_version_that_was_damaged_when_the_head_was_opened_does_not_lock_the_unit_out(
+    opened: Opener,
+) -> None:
+    garbled = b"* Pan-Tilt Controller v2.13.0(D46/E), (C)2004-2006 Dir%cted Perception, Inc."
+    head, line = opened(Damaged(V=garbled))
+    assert "Directed Perception" in head.version
+    line.hang_up()
+    with pytest.raises(DriverError):
+        head.read()
+    line.come_back()
+    for _ in range(200):
+        with suppress(DriverError):
+            assert head.read().faults == ()
+            return
+        time.sleep(0.02)
+    raise AssertionError("the unit did not come back")
+
+
+def test_digits_that_were_damaged_when_the_head_was_opened_are_not_kept(opened: Opener) -> None:
+    unit = Damaged(
+        PN=b"* Minimum Pan position is -9090", TU=b"* Maximum Tilt speed is 9902 positions/sec",
+        PS=b"* Target Pan speed is 7000 positions/sec",
+    )  # fmt: skip
+    head, _ = opened(unit)
+    pan, tilt = head._axes["pan"], head._axes["tilt"]
+    assert (pan.lowest, tilt.fastest, pan.usual_speed) == (-3090, 2902.0, 1000)
+
+
+@pytest.mark.parametrize("which", [0, 1, 2, 3])
+def test_a_resolution_with_a_damaged_digit_does_not_scale_the_angles(opened: Opener, which: int) -> None:
+    unit = ScriptedPtu()
+    told = iter(
+        [b"* 185.142857 seconds arc per Pan position"] * which
+        + [b"* 135.142857 seconds arc per Pan position"]
+    )
+    usual = unit._usual
+    unit.answers["PR"] = lambda command: next(told, None) or usual(command)
+    unit.positions["P"] = 100
+    head, _ = opened(unit)
+    assert head.read().pan_rad == pytest.approx(100 * PAN_STEP_RAD)
+
+
+class Behind(ScriptedPtu):
+    """A unit whose answers about an axis's position come some such questions late."""
+
+    lag = 0
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._held: dict[str, deque[bytes | None]] = {"PP": deque(), "TP": deque()}
+
+    def _reply(self, written: str) -> bytes | None:
+        reply = super()._reply(written)
+        if written.upper() not in ("PP", "TP") or not self.lag:
+            return reply
+        self.positions = {axis: position + 1 for axis, position in self.positions.items()}
+        held = self._held[written.upper()]
+        held.append(reply)
+        return held.popleft() if len(held) > self.lag else None
+
+
+@pytest.mark.parametrize("lag", [1, 2, 3, 4])
+def test_positions_of_some_questions_ago_are_no_reading(opened: Opener, lag: int) -> None:
+    unit = Behind()
+    head, _ = opened(unit)
+    unit.lag = lag
+    for _ in range(8):
+        with pytest.raises(DriverError):
+            head.read()
+
+
+@pytest.mark.parametrize("answer_s", [0.03, 0.1, 0.25])
+@pytest.mark.parametrize("moves", [("pan", "tilt"), ("pan",), ("tilt",)])
+def test_both_angles_are_of_the_moment_told_however_slowly_the_unit_answers(
+    opened: Opener, moves: tuple[str, ...], answer_s: float
+) -> None:
+    clock, unit = ManualClock(), ScriptedPtu()
+    rates = {"P": 300.0 * ("pan" in moves), "T": -700.0 * ("tilt" in moves)}  # positions a second
+
+    def told(command: str) -> bytes:
+        axis = command[0]
+        position = round(rates[axis] * clock.now_s())
+        clock.advance(answer_s)
+        return f"* Current {'Pan' if axis == 'P' else 'Tilt'} position is {position}".encode()
+
+    head, _ = opened(unit, clock)
+    clock.advance(1.0)
+    unit.answers = {"PP": told, "TP": told}
+    for _ in range(2):  # the second one knows the axis that rests
+        reading = head.read()
+        pan_rad = rates["P"] * reading.time_s * PAN_STEP_RAD
+        tilt_rad = rates["T"] * reading.time_s * TILT_STEP_RAD
+        # The driver does not know when within the question's time on the wire the unit has looked: 4 ms.
+        assert reading.pan_rad == pytest.approx(pan_rad, abs=(300 * 0.005 + 1) * PAN_STEP_RAD)
+        assert reading.tilt_rad == pytest.approx(tilt_rad, abs=(700 * 0.005 + 1) * TILT_STEP_RAD)
