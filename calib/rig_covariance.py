@@ -17,8 +17,8 @@ from calib.gimbal import MAST_NAMES, mast_of, numbers_of
 from calib.mast import Rig
 from calib.rigid import FloatArray, ReadOnlyArrays, frozen_array
 
-ROUNDING = 1e-6
-"""Of one: what a stored correlation may be off by."""
+ROUNDING = 1e-4
+"""Of one: what a stored correlation may be off by, as where a file was written with few digits."""
 
 _MAST = tuple(f"mast.{name}" for name in MAST_NAMES)
 

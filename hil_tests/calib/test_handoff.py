@@ -148,6 +148,13 @@ def test_too_far_too_near_and_unseen_are_refused_by_name(rig: Rig) -> None:
     assert refused(left.origins_m + 2.0 * left.directions, ("pancam_right",)) == "not_seen"
 
 
+def test_a_covariance_written_with_few_digits_is_one_still(repository: Path) -> None:
+    believed = load_rig(repository / "configs/masts/rocky8_simulated.yaml").rig
+    rounded = [[float(f"{value:.6g}") for value in row] for row in believed.fit["covariance"]]
+    known = stored_covariance(replace(believed, fit={**believed.fit, "covariance": rounded}))
+    assert known is not None and len(known.names) == len(rounded)
+
+
 def test_a_covariance_that_does_not_fit_its_rig_is_refused(rig: Rig) -> None:
     def stored(**fit: object) -> RigCovariance | None:
         return stored_covariance(replace(rig, fit=fit))
