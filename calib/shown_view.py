@@ -22,6 +22,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from calib.agreed_view import AgreedView, agreed_view
 from calib.cahvor import CameraModel
 from calib.errors import CalibError
 from calib.mast import Rig
@@ -34,14 +35,7 @@ Verdict = Literal["seen", "small_move", "contradicted", "unlike", "too_plain", "
 
 MOST_PATCHES = 20
 LEAST_PATCHES = 6
-AGREEING = {"told": (5, 0.25), "any": (6, 0.4)}
-"""How many patches, and which share of those that a view should show, must agree on it: the told view needs
-fewer, since a large thing may have moved in the picture, than one that is looked for everywhere."""
 LEAST_CORRELATION = 0.7
-AGREE = 1.2
-"""Patches agree whose places differ by no more, reduced pixels: relief, shape, and the search itself."""
-SEARCH_SIGMA = 0.15
-"""Of one patch's place, reduced pixels; a smaller scatter of few patches is luck."""
 CLUSTER_RAD = 0.03
 RANGES = 48
 """Inverse ranges tried along a patch's line in the other eye."""
@@ -160,24 +154,6 @@ class _Patches:
         return _Patches(*(getattr(self, name)[which] for name in self.__dataclass_fields__))
 
 
-@dataclass(frozen=True, eq=False)
-class _Fit:
-    """A view by the patches that agree on it."""
-
-    angles_rad: FloatArray
-    sigma_rad: FloatArray
-    parallax_rad: FloatArray
-    rate_px_per_rad: FloatArray
-    agreeing: int
-    expected: int
-    correlation: float
-
-    def holds(self, view: Literal["told", "any"]) -> bool:
-        """Tell whether enough patches agree."""
-        least, share = AGREEING[view]
-        return self.agreeing >= max(least, share * self.expected)
-
-
 class _Comparison:
     """One camera's two pictures."""
 
@@ -254,7 +230,7 @@ class _Comparison:
             patches.places, patches.origins_m, patches.directions, inverse, unsure, patches.side_directions
         )
 
-    def at(self, patches: _Patches, view: FloatArray, reach_rad: float) -> _Fit | None:
+    def at(self, patches: _Patches, view: FloatArray, reach_rad: float) -> AgreedView | None:
         """Look for the patches where a view puts them; None if nothing agrees."""
         pan, tilt = float(view[0]), float(view[1])
         camera = self.camera(pan, tilt)
@@ -297,9 +273,9 @@ class _Comparison:
             seen, scores[k] = found(patch, self.later, centres[k], (int(reach[0]), int(reach[1])))
             off[k] = (seen - centres[k]) * self.step
         good = (scores >= LEAST_CORRELATION) & np.isfinite(off).all(axis=1)
-        return _agreed(view, off[good], rates[good], open_px[good], scores[good], self.step, len(places))
+        return agreed_view(view, off[good], rates[good], open_px[good], scores[good], self.step, len(places))
 
-    def anywhere(self, patches: _Patches) -> _Fit | None:
+    def anywhere(self, patches: _Patches) -> AgreedView | None:
         """The view that the later picture shows, wherever; None if it shows nothing of the earlier one."""
         before, told = np.array(self.before.angles_rad), np.array(self.after.angles_rad)
         starts = [before, *self._voted(patches, before, told)]
@@ -307,7 +283,7 @@ class _Comparison:
         held = [fit for fit in fits if fit is not None and fit.holds("any")]
         return max(held, key=lambda fit: (fit.agreeing, fit.correlation), default=None)
 
-    def _settled(self, patches: _Patches, start: FloatArray) -> _Fit | None:
+    def _settled(self, patches: _Patches, start: FloatArray) -> AgreedView | None:
         """The fit at a view found from a rough one."""
         fit = self.at(patches, start, CLUSTER_RAD)
         if fit is None or fit.agreeing < LEAST_PATCHES - 1:
@@ -439,49 +415,7 @@ def _spread(which: NDArray[np.intp]) -> NDArray[np.intp]:
     return np.asarray(which[np.linspace(0, len(which) - 1, MOST_PATCHES).round().astype(int)])
 
 
-def _agreed(
-    view: FloatArray,
-    off_px: FloatArray,
-    rates: FloatArray,
-    open_px: FloatArray,
-    scores: FloatArray,
-    step: int,
-    expected: int,
-) -> _Fit | None:
-    """The view on which most patches (n) agree; they lie ``off_px`` (n, 2) from where a view has them."""
-    if len(off_px) < 2:
-        return None
-    votes = np.linalg.solve(rates, off_px[..., None])[..., 0]
-    rest = off_px[None] - np.einsum("nij,mj->mni", rates, votes)
-    length2 = np.maximum((open_px**2).sum(axis=1), 1e-12)
-    along = np.clip(np.einsum("mni,ni->mn", rest, open_px) / length2, -1.0, 1.0)
-    apart = np.linalg.norm(rest - along[..., None] * open_px, axis=2)
-    agree = apart <= AGREE * step
-    best = int(np.argmax(agree.sum(axis=1) - 1e-3 * np.where(agree, apart / step, 0.0).sum(axis=1)))
-    which = agree[best]
-    # What has a range says more than what has none.
-    weights = 1.0 / (1.0 + length2[which] / (SEARCH_SIGMA * step) ** 2)
-    weights /= weights.max()
-    weighted = rates[which] * weights[:, None, None]
-    inverse = np.linalg.pinv(np.einsum("nij,nik->jk", weighted, rates[which]))
-    change = inverse @ np.einsum("nij,ni->j", weighted, off_px[which])
-    left = off_px[which] - rates[which] @ change
-    freedom = max(2.0 * float(weights.sum()) - 2.0, 1.0)
-    variance_px2 = float(weights @ (left**2).sum(axis=1)) / freedom
-    covariance = inverse * max(variance_px2, (SEARCH_SIGMA * step) ** 2)
-    parallax = np.abs(np.einsum("jk,nik,ni->nj", inverse, weighted, open_px[which])).sum(axis=0)
-    return _Fit(
-        view + change,
-        np.sqrt(np.diag(covariance)),
-        parallax,
-        rates[which],
-        int(which.sum()),
-        expected,
-        float(scores[which].mean()),
-    )
-
-
-def _told(fit: _Fit, told: FloatArray, way: FloatArray, limits: ViewLimits) -> ShownView:
+def _told(fit: AgreedView, told: FloatArray, way: FloatArray, limits: ViewLimits) -> ShownView:
     """What a fit says about the told view."""
     off = fit.angles_rad - told
     allowed = (
