@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import importlib
 import logging
+import threading
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import wait
 from contextlib import contextmanager
@@ -41,6 +42,9 @@ BUILT_IN = (*HEADS, "v4l2", *OURS)
 
 OPENING_PATIENCE_S = 5.0
 """A device that takes longer to open is named; if it is a camera, the others go on without it."""
+
+CLOSING_PATIENCE_S = 0.5
+"""After that the next device is closed beside one that is not closed yet."""
 
 HEAD_OPENING_S = 60.0
 """A head that takes longer to open is refused: without its readings nothing can be done."""
@@ -381,9 +385,19 @@ def _one_line(error: BaseException) -> str:
 
 
 def _close(devices: Mapping[str, Any]) -> None:
-    """Close devices, whatever some of them do."""
-    for name, device in devices.items():
+    """Close devices in this order, whatever some of them do; one that takes long keeps no other open."""
+
+    def close(name: str, device: Any) -> None:
         try:
             device.close()
-        except Exception:  # closing goes on for the others
+        except BaseException:  # whatever a foreign driver raises, SystemExit too: there is only the log
             log.exception("%s did not close", name)
+
+    closing = []
+    for name, device in devices.items():
+        thread = threading.Thread(target=close, args=(name, device), name=f"closing {name}", daemon=True)
+        closing.append(thread)
+        thread.start()
+        thread.join(CLOSING_PATIENCE_S)
+    for thread in closing:
+        thread.join()

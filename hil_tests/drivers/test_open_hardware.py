@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+import threading
 import time
 import types
 from collections.abc import Iterator
@@ -15,7 +16,7 @@ import pytest
 from drivers.clock import ManualClock
 from drivers.errors import BadOptions, DriverError, LineLost, NoReply
 from drivers.interfaces import Frame, Reading
-from drivers.open_hardware import DeviceSettings, HardwareSettings, open_hardware
+from drivers.open_hardware import DeviceSettings, Hardware, HardwareSettings, open_hardware
 
 SIM = DeviceSettings("sim")
 
@@ -332,3 +333,25 @@ def test_a_v4l2_camera_that_is_not_plugged_in_is_absent(outside: None, tmp_path:
         with pytest.raises(DriverError, match=r"cam_left: absent since the start: .*video0") as caught:
             hardware.cameras["cam_left"].next_frame(0.0, 0.1)
         assert caught.value.code == "no_camera"
+
+
+def test_a_head_that_hangs_while_it_is_closed_keeps_no_camera_open() -> None:
+    go, closed = threading.Event(), threading.Event()
+
+    class Slow(Head):
+        def close(self) -> None:
+            go.wait(30.0)
+
+    class Closes(Eye):
+        def close(self) -> None:
+            closed.set()
+            raise SystemExit(1)
+
+    hardware = Hardware(Slow(), {"navcam_left": Closes()}, {})
+    closing = threading.Thread(target=hardware.close)
+    closing.start()
+    assert closed.wait(10.0)
+    assert closing.is_alive(), "whoever closes waits for all of them"
+    go.set()
+    closing.join(10.0)
+    assert not closing.is_alive()
