@@ -16,6 +16,8 @@ import pytest
 from outside_daemon import BOUND_S, daemon_process, line, stands_short_of_its_goal, under_way, write_config
 from service_fakes import Hang, eventually, fake_daemon
 
+from mastctl import connections as connections_module
+from mastctl import daemon as daemon_module
 from mastctl.client import Client, ClientError
 
 
@@ -120,3 +122,60 @@ def test_more_silent_connections_than_descriptors_do_not_keep_a_stop_out(
         daemon.send_signal(signal.SIGTERM)
         _, log = daemon.communicate(timeout=BOUND_S)
         assert "Traceback" not in log, log
+
+
+def get(connection: socket.socket, path: str, method: str = "GET") -> bytes:
+    """Ask on a connection of one's own and return the beginning of the answer."""
+    connection.sendall(f"{method} /api/v1{path} HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n".encode())
+    return connection.recv(65536)
+
+
+def test_when_every_connection_is_at_work_stop_and_status_are_still_served(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr(daemon_module, "most_connections", lambda: 8)
+    with fake_daemon(monkeypatch, tmp_path) as (daemon, hardware), contextlib.ExitStack() as open_ones:
+        host, port = daemon.url.removeprefix("http://").split(":")
+
+        def connection() -> socket.socket:
+            return open_ones.enter_context(socket.create_connection((host, int(port)), timeout=BOUND_S))
+
+        streams = [connection() for _ in range(8)]
+        for one in streams:
+            assert b"200 OK" in get(one, "/track/stream")
+        refused = get(connection(), "/operations")
+        assert b"503" in refused
+        assert b"retry-after" in refused
+        assert b"200 OK" in get(connection(), "/status")
+        assert b"200 OK" in get(connection(), "/stop", "POST")
+        assert ("stop",) in hardware.head.calls
+
+
+@pytest.mark.parametrize(
+    "begun", [b"", b"GET /api/v1/st", b"POST /api/v1/stop HTTP/1.1\r\nContent-Length: 9\r\n\r\n{"]
+)
+def test_a_request_that_does_not_come_whole_is_left(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, begun: bytes
+) -> None:
+    monkeypatch.setattr(connections_module, "REQUEST_S", 0.3)
+    monkeypatch.setattr(connections_module, "SWEEP_S", 0.05)
+    with fake_daemon(monkeypatch, tmp_path) as (daemon, _):
+        host, port = daemon.url.removeprefix("http://").split(":")
+        with socket.create_connection((host, int(port)), timeout=BOUND_S) as client:
+            client.sendall(begun)
+            with contextlib.suppress(ConnectionResetError):
+                while client.recv(65536):  # an answer may come; then the end
+                    pass
+
+
+def test_a_client_that_does_not_read_is_left(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(connections_module, "STALLED_S", 0.3)
+    monkeypatch.setattr(connections_module, "SWEEP_S", 0.05)
+    with fake_daemon(monkeypatch, tmp_path) as (daemon, _):
+        host, port = daemon.url.removeprefix("http://").split(":")
+        with (
+            socket.create_connection((host, int(port)), timeout=BOUND_S) as client,
+            pytest.raises((ConnectionResetError, BrokenPipeError)),
+        ):
+            while True:
+                client.sendall(b"GET /openapi.json HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n" * 100)

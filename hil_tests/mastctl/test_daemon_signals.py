@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import signal
 from collections.abc import Callable
 from pathlib import Path
@@ -20,6 +21,7 @@ from outside_daemon import (
 from service_fakes import eventually
 
 from mastctl import signals
+from mastctl.cli.main import main
 from mastctl.client import Client
 
 
@@ -88,3 +90,23 @@ def test_a_daemon_that_is_suspended_stops_the_mast_first(tmp_path: Path) -> None
         assert [word.split()[0] for word in words[:2]] == ["move", "stop"]
         daemon.send_signal(signal.SIGCONT)
         stands_short_of_its_goal(client)
+
+
+def test_a_command_that_is_ended_unwinds_once_and_tells_the_signal(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    def ended(args: object) -> int:
+        try:
+            os.kill(os.getpid(), signal.SIGUSR1)
+        finally:
+            os.kill(os.getpid(), signal.SIGHUP)  # in the middle of making safe: it is not cut short
+            words.append("made safe")
+        return 0
+
+    words: list[str] = []
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("mastctl.cli.service._status", ended)
+        assert main(["status"]) == 128 + signal.SIGUSR1
+    assert words == ["made safe"]
+    assert capsys.readouterr().err == "mastctl: interrupted\n"
+    assert signal.getsignal(signal.SIGHUP) is signal.SIG_DFL

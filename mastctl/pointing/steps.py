@@ -106,7 +106,7 @@ class Steps:
         Raises
         ------
         PointingError
-            ``stopped``, within some 20 ms of a stop, however long the work still takes.
+            ``stopped``, soon after a stop (`abandoned.LOOKED_S`), however long the work still takes.
         """
         return result_unless(self.head.check_not_stopped, partial(work, *args, **options))
 
@@ -196,7 +196,8 @@ class Steps:
         if not lacking:
             return
         with self.step("before") as detail:
-            views = self.eyes.new(lacking, self._clock.now_s(), self.head.resting(), timeout_s)
+            began_s = self._clock.now_s()
+            views = self.unless_stopped(self.eyes.new, lacking, began_s, self.head.resting(), timeout_s)
             detail.update(frame_ids=[view.frame.frame_id for view in views.values()])
             self._motion_seen.remember(views)
 
