@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from drivers.clock import SystemClock
+from drivers.dynamixel.head import DynamixelHead
 from drivers.dynamixel.head import open_head as open_dynamixel
 from drivers.faults import FaultPanel
 from drivers.flir_ptu.head import open_head as open_flir_ptu
@@ -109,6 +110,52 @@ def dynamixel_pty(watchdog_s: float = 0.0, reply_timeout_s: float = 0.2) -> Iter
         head = open_dynamixel(options, clock)
         stack.callback(head.close)
         yield Rig("Dynamixel, pty", head, panel, _truth(axes), X_COUNT_RAD, line, sent)
+
+
+class CountedServo(SimulatedServo):
+    """A simulated servo that counts how often it was told to restart."""
+
+    restarts = 0
+
+    def reboot(self, time_s: float) -> None:
+        """As a servo does."""
+        self.restarts += 1
+        super().reboot(time_s)
+
+
+@contextmanager
+def fresh_servos() -> Iterator[tuple[PtyLine, FaultPanel, list[CountedServo]]]:
+    """Two XM430 servos as from the factory but for the baud rate, on a line of their own."""
+    clock, panel, axes = _axes()
+    servos = [
+        CountedServo("xm430_w350", number, axis, settings={"baud_rate": 3}, time_s=clock.now_s())
+        for number, axis in enumerate(axes, start=1)
+    ]
+    with PtyLine(DynamixelBus(servos), clock, panel, wire_time=False) as line:
+        yield line, panel, servos
+
+
+@contextmanager
+def opened_on(line: PtyLine) -> Iterator[DynamixelHead]:
+    """A head on such servos that reboots one with a hardware error; raises what opening it raises."""
+    ends = [
+        {"id": n, "model": "XM430-W350", "limits_rad": list(LIMITS_RAD[n - 1]), "on_hardware_error": "reboot"}
+        for n in (1, 2)
+    ]
+    head = open_dynamixel({"port": line.path, "pan": ends[0], "tilt": ends[1], "watchdog_s": 0})
+    try:
+        yield head
+    finally:
+        head.close()
+
+
+def as_opened(servo: SimulatedServo, head: DynamixelHead) -> bool:
+    """Whether a servo is set as an open head has to have left it (registers: e-manual)."""
+    axis = (head.settings.pan, head.settings.tilt)[servo.servo_id - 1]
+    table = servo.table
+    names = ("return_delay_time", "operating_mode", "drive_mode", "torque_enable", "bus_watchdog")
+    limits = (table["min_position_limit"], table["max_position_limit"])
+    return [table[name] for name in names] == [0, 3, 0, 1, 0] and limits == axis.limit_counts
 
 
 @contextmanager
