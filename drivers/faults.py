@@ -19,8 +19,8 @@ from typing import Any
 import numpy as np
 
 from calib.errors import BadFile
-from calib.formats import read_bytes
-from calib.formats.yaml_text import parse_mapping
+from calib.files import read_bytes
+from calib.files.yaml_text import parse_mapping
 from drivers.errors import BadOptions
 
 _MAX_SCRIPT_BYTES = 1_000_000

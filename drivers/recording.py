@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.errors import CalibError
-from calib.formats import pds3, read_bytes
+from calib.files import pds3, read_bytes
 from drivers.errors import BadFrame, BadOptions
 from drivers.interfaces import Image
 

@@ -46,7 +46,7 @@ class ClientError(Exception):
 
 @dataclass(frozen=True, eq=False)
 class Snapshot:
-    """A picture and its facts, as `mastctl.frames.StampedFrame`; ``data`` is the file as it came."""
+    """A picture and its facts, as `mastctl.devices.frames.StampedFrame`; ``data`` is the file as it came."""
 
     image: Image
     data: bytes

@@ -12,13 +12,13 @@ from pathlib import Path
 from urllib.parse import quote
 
 from calib.errors import BadFile
-from calib.formats import read_bytes
-from calib.formats.strict import Section, nearest
-from calib.formats.yaml_text import parse_mapping
-from calib.mast import Rig
+from calib.files import read_bytes
+from calib.files.strict import Section, nearest
+from calib.files.yaml_text import parse_mapping
+from calib.mast.rig import Rig
 from drivers.camera_offset import MOST_OFFSET_S
 from drivers.open_hardware import DeviceSettings, HardwareSettings
-from mastctl.limits import Limits
+from mastctl.devices.limits import Limits
 from mastctl.packaged import default_config
 from mastctl.tracking.choice import HandoffRules, PairBounds
 from mastctl.tracking.settings import TrackingSettings

@@ -26,13 +26,13 @@ import uvicorn
 from drivers.clock import Clock
 from drivers.open_hardware import Hardware
 from mastctl import signals
-from mastctl.api import create_app
-from mastctl.api_waiting import Waiting
 from mastctl.config import Config, Listen
-from mastctl.connections import ACCEPTED_AT_ONCE, WAITING_IN_KERNEL, Connection, most_connections, sweep
 from mastctl.errors import MastctlError
-from mastctl.service import Service
-from mastctl.stop_threads import StopsHang
+from mastctl.service.service import Service
+from mastctl.service.stop_threads import StopsHang
+from mastctl.web.app import create_app
+from mastctl.web.connections import ACCEPTED_AT_ONCE, WAITING_IN_KERNEL, Connection, most_connections, sweep
+from mastctl.web.waiting import Waiting
 
 log = logging.getLogger(__name__)
 

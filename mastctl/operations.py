@@ -24,7 +24,7 @@ from drivers.clock import Clock
 from drivers.errors import DriverError
 from mastctl.as_json import as_json
 from mastctl.errors import MastctlError, Stopped
-from mastctl.state import Motion, Residual
+from mastctl.service.state import Motion, Residual
 
 log = logging.getLogger(__name__)
 
@@ -71,7 +71,7 @@ class UnknownOperation(MastctlError):
 
 
 class Mover(Protocol):
-    """What of `mastctl.devices.Devices` is needed to stop and to keep stopped."""
+    """What of `mastctl.devices.devices.Devices` is needed to stop and to keep stopped."""
 
     def stop(self) -> None: ...
     def block_moves(self, holder: object, reason: str) -> None: ...

@@ -15,8 +15,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from calib.cahvor import CameraModel
-from calib.mast import Mast
+from calib.camera.cahvor import CameraModel
+from calib.mast.rig import Mast
 from calib.rigid import Rigid
 from drivers.sim.compiled import is_compiled
 from drivers.sim.render import Renderer, compile_renderer, ray_table

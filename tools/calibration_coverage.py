@@ -27,12 +27,12 @@ from typing import NamedTuple
 import numpy as np
 from scipy.stats import chi2, kstest
 
-from calib.adjustment import MAST_NAMES
-from calib.calibration import Calibration
-from calib.mast import Rig
-from calib.store import load_rig
+from calib.files.mast_file import load_rig
+from calib.fit.adjustment import MAST_NAMES
+from calib.fit.calibration import Calibration
+from calib.fit.uncertainty import pixel_covariance
+from calib.mast.rig import Rig
 from calib.survey import Sigma, Survey
-from calib.uncertainty import pixel_covariance
 from drivers.sim.survey import SurveyPlan, SurveyTruth, simulate_survey
 from mastctl.calibration.run import FITS
 from mastctl.cli.output import at_least, not_negative

@@ -43,13 +43,13 @@ import numpy as np
 from scipy.optimize import OptimizeResult, least_squares
 from scipy.spatial.transform import Rotation
 
-from calib.adjustment import Adjustment, Estimate
-from calib.cahvor import CameraModel
-from calib.camera_parameters import parameter_names, parameter_part, stepped
-from calib.fit_camera import FixedPoints, fit_camera, pinhole
-from calib.least_squares import minimise
+from calib.camera.cahvor import CameraModel
+from calib.camera.parameters import parameter_names, parameter_part, stepped
+from calib.fit.adjustment import Adjustment, Estimate
+from calib.fit.camera import FixedPoints, fit_camera, pinhole
+from calib.fit.least_squares import minimise
+from calib.fit.terms import ImageTerm
 from calib.rigid import Rigid
-from calib.terms import ImageTerm
 from mastctl.cli.output import at_least
 from tools.arguments import end
 from tools.compare_points import (

@@ -38,7 +38,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from calib.cahvor import CameraModel
+from calib.camera.cahvor import CameraModel
 from mastctl.cli.output import at_least
 from tools.arguments import end
 from tools.tracker_methods import HALF_PX, METHODS, Tracked

@@ -19,8 +19,8 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from calib.cahvor import CameraModel
-from calib.detect import DetectionFailure, DotsFound, Predicted, find_dots
+from calib.camera.cahvor import CameraModel
+from calib.dots.find import DetectionFailure, DotsFound, PredictedBoard, find_dots
 from calib.rigid import Rigid
 from calib.survey import Board
 from drivers.sim.board import BoardLook, draw_board, half_size_m, photograph
@@ -67,7 +67,7 @@ class Trial:
     image: np.ndarray
     camera: CameraModel
     camera_from_board: Rigid
-    predicted: Predicted
+    predicted: PredictedBoard
 
 
 @dataclass(frozen=True)
@@ -146,7 +146,7 @@ def make_trial(
     shift = rng.uniform(0, WRONG_BY_M) * aside / np.linalg.norm(aside)
     predicted = Rigid(wrong.as_matrix() @ pose.rotation, wrong.apply(pose.translation_m + shift))
     rough = camera_of(focal_px, rng.choice([-1, 1]) * rng.uniform(0.001, WRONG_FOCAL))
-    return Trial(image, camera, pose, Predicted(rough, predicted))
+    return Trial(image, camera, pose, PredictedBoard(rough, predicted))
 
 
 def judge(trial: Trial) -> tuple[Outcome, DotsFound | DetectionFailure]:

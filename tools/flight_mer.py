@@ -6,9 +6,9 @@ and camera.
 The rule by which features count: at most 400 Shi-Tomasi corners of the first picture (quality 0.02 of
 the best, 25 px apart, 15 px blocks); the corner must lie in the second picture, 25 px from its border,
 for some range from 2 m on; of windows of +-12 px, every 8 px along the epipolar line, with the patch
-laid on level ground or across the ray, the best match counts if `calib.match` calls it good (texture,
-correlation, one peak, certainty; its default thresholds) and no other good match more than 5 px away
-comes near it. The windows are free in both directions, so nothing pulls a match to the line and nothing
+laid on level ground or across the ray, the best match counts if `calib.pictures.patch_match` calls it good
+(texture, correlation, one peak, certainty; its default thresholds) and no other good match more than 5 px
+away comes near it. The windows are free in both directions, so nothing pulls a match to the line and nothing
 sorts out large residuals.
 """
 
@@ -23,16 +23,16 @@ import numpy as np
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from calib.cahvor import CameraModel
-from calib.epipolar import find_partner
-from calib.fit_poses import PoseFit, fit_poses
-from calib.formats.pds3 import PdsProduct, read_product
-from calib.mast import Rig, RigCamera
-from calib.match import MatchSettings, match, rivalled
-from calib.pointing import Solution, solve
+from calib.camera.cahvor import CameraModel
+from calib.camera.stereo import triangulate
+from calib.files.pds3 import PdsProduct, read_product
+from calib.fit.poses import PoseFit, fit_poses
+from calib.mast.pointing import Solution, solve
+from calib.mast.rig import Rig, RigCamera
+from calib.pictures.epipolar import find_partner
+from calib.pictures.patch_match import MatchSettings, match_patch, rivalled
+from calib.pictures.warp import Grey, Plane, grey
 from calib.rigid import FloatArray, Rigid
-from calib.stereo import triangulate
-from calib.warp import Grey, Plane, grey
 from drivers.clock import ManualClock
 from drivers.replay import Replay, open_replay
 
@@ -193,7 +193,7 @@ def carry(first: View, pixel_px: FloatArray, second: View) -> Carried | None:
     for inverse_range in steps:
         point = ray.origins_m + ray.directions / inverse_range
         for normal in (UP, -ray.directions):
-            found = match(
+            found = match_patch(
                 first.image,
                 first.camera,
                 pixel_px,

@@ -17,10 +17,10 @@ from pathlib import Path
 
 import numpy as np
 
-from calib.fit_poses import PoseFit
-from calib.formats.pds3 import PdsProduct
-from calib.model_difference import ModelDifference, model_difference
-from calib.store import save_rig
+from calib.camera.difference import ModelDifference, model_difference
+from calib.files.mast_file import save_rig
+from calib.files.pds3 import PdsProduct
+from calib.fit.poses import PoseFit
 from drivers.clock import ManualClock
 from drivers.errors import DriverError
 from tools import flight_mer as mer

@@ -25,12 +25,12 @@ from typing import Any
 import numpy as np
 
 from calib.errors import BadFile
-from calib.formats import CameraFile
-from calib.formats.cahvor_text import format_cahvor, parse_cahvor
-from calib.formats.odl import parse_label
-from calib.formats.pds3 import load_pds3_camera, read_product
-from calib.store import StoredRig, parse_camera, parse_rig
-from calib.tables import parse_table
+from calib.files import CameraFile
+from calib.files.cahvor_text import format_cahvor, parse_cahvor
+from calib.files.mast_file import StoredRig, parse_camera, parse_rig
+from calib.files.odl import parse_label
+from calib.files.pds3 import load_pds3_camera, read_product
+from calib.files.tables import parse_table
 from mastctl.cli.main import main as mastctl
 from mastctl.cli.output import at_least
 from tools.arguments import end

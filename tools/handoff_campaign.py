@@ -22,14 +22,14 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from calib.epipolar import find_partner
 from calib.errors import NoHandoff, NoStereoPoint
-from calib.handoff import Handoff, Joints, Predicted, hand_off
-from calib.handoff_refined import Eye, RefineSettings, refine_handoff
-from calib.match import MatchSettings
-from calib.rig_covariance import RigCovariance, stored_covariance
-from calib.store import load_rig
-from calib.warp import Plane, warp_patch
+from calib.files.mast_file import load_rig
+from calib.handoff.by_image import Eye, RefineSettings, refine_handoff
+from calib.handoff.geometric import Handoff, Joints, PredictedPixel, hand_off
+from calib.mast.covariance import RigCovariance, stored_covariance
+from calib.pictures.epipolar import find_partner
+from calib.pictures.patch_match import MatchSettings
+from calib.pictures.warp import Plane, warp_patch
 from drivers.sim.render import compile_renderer
 from mastctl.cli.output import at_least
 from mastctl.packaged import config_folder
@@ -112,7 +112,7 @@ def _surface(case: Case, done: Handoff) -> Plane:
     return found.plane or Plane(done.seen.position_m, np.array([0.0, 0.0, -1.0]))
 
 
-def correlated(case: Case, eye: Eye, plane: Plane, predicted: Predicted) -> np.ndarray:
+def correlated(case: Case, eye: Eye, plane: Plane, predicted: PredictedPixel) -> np.ndarray:
     """Return where the warped patch correlates best in the window; the geometric pixel if there is none."""
     settings = RefineSettings()
     reach = settings.sigmas * math.sqrt(float(np.linalg.eigvalsh(predicted.search_px2)[-1]))

@@ -15,10 +15,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from calib import pointing
-from calib.handoff_refined import Eye
-from calib.mast import Rig
-from calib.rig_covariance import RigCovariance, moved_rig
+from calib.handoff.by_image import Eye
+from calib.mast import pointing
+from calib.mast.covariance import RigCovariance, moved_rig
+from calib.mast.rig import Rig
 from drivers.sim import texture
 from drivers.sim.bricks import Brick, make_brick, meshes
 from drivers.sim.compiled import kernels

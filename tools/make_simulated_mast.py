@@ -29,8 +29,8 @@ from simulated_mast.check import (
     turned_rover_frame,
 )
 
-from calib.mast import Rig
-from calib.store import load_rig, save_rig
+from calib.files.mast_file import load_rig, save_rig
+from calib.mast.rig import Rig
 from calib.survey import Sigma, read_survey, write_survey
 from drivers.sim.pan_tilt import PRESETS
 from drivers.sim.survey import Ring, SurveyPlan, simulate_survey

@@ -27,9 +27,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from calib.mast import Rig
-from calib.shown_view import Posed, shown_view
-from calib.store import load_rig
+from calib.files.mast_file import load_rig
+from calib.mast.rig import Rig
+from calib.pictures.shown_view import Posed, shown_view
 from drivers.clock import ManualClock
 from drivers.open_hardware import DeviceSettings, HardwareSettings, open_hardware
 from mastctl.cli.output import at_least

@@ -16,10 +16,10 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from calib.cahvor import CameraModel
+from calib.camera.cahvor import CameraModel
 from calib.errors import Unreachable
-from calib.mast import Mast
-from calib.pointing import Solution, solve
+from calib.mast.pointing import Solution, solve
+from calib.mast.rig import Mast
 from mastctl.cli.output import at_least
 from tools.arguments import end
 

@@ -12,9 +12,9 @@ range, so it is assumed, in two ways:
 - neighbours: the plane through the eight nearest other targets found in the first way, each at the range that
   its own two pixels tell, uncertain by 3 %. A target's own match never tells its range.
 
-The target then goes through `calib.tracking.seen_by` with one eye: window by the covariance of the position,
-patch warped over the plane, correlation, sub-pixel place, verdict, misfit. Residual: found less predicted, in
-x and y, and across the epipolar line, where an unknown range does not reach.
+The target then goes through `calib.tracking.track.seen_by` with one eye: window by the covariance of the
+position, patch warped over the plane, correlation, sub-pixel place, verdict, misfit. Residual: found less
+predicted, in x and y, and across the epipolar line, where an unknown range does not reach.
 
 The check that the residual is of the pictures and not of our matcher: OpenCV's ECC with a free affine map
 between the raw patches, started up to half a pixel off the prediction. It shares no code with the matcher.
@@ -33,13 +33,13 @@ from typing import Any
 import cv2
 import numpy as np
 
-from calib.cahvor import CameraModel
+from calib.camera.cahvor import CameraModel
+from calib.camera.stereo import triangulate
 from calib.errors import CalibError
-from calib.handoff_refined import Eye
+from calib.handoff.by_image import Eye
+from calib.pictures.warp import Plane, carry
 from calib.rigid import FloatArray
-from calib.stereo import triangulate
-from calib.tracking import Key, Look, Track, TrackSettings, seen_by
-from calib.warp import Plane, carry
+from calib.tracking.track import Key, Look, Track, TrackSettings, seen_by
 from drivers.clock import ManualClock
 from tools import flight_mer as mer
 from tools.arguments import end, new_file

@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
 
 from calib.rigid import FloatArray
-from calib.tracking import TrackSettings
+from calib.tracking.track import TrackSettings
 from tools.flight_mer import View
 from tools.real_handoff import Carried
 

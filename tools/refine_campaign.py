@@ -17,15 +17,15 @@ from pathlib import Path
 
 import numpy as np
 
-from calib.body_pose import PRIOR_SHIFT_M, PRIOR_TURN_RAD
-from calib.corrected_rig import corrected_rig
-from calib.fit_body_pose import fit_body_pose
-from calib.handoff import Joints, hand_off
-from calib.handoff_refined import RefinedPixel
-from calib.mast import Rig
-from calib.matched_handoff import MatchedHandoff, matched_handoff
+from calib.files.mast_file import load_rig
+from calib.handoff.body_pose import PRIOR_SHIFT_M, PRIOR_TURN_RAD
+from calib.handoff.by_image import RefinedPixel
+from calib.handoff.corrected_rig import corrected_rig
+from calib.handoff.fit_body_pose import fit_body_pose
+from calib.handoff.geometric import Joints, hand_off
+from calib.handoff.matched import MatchedHandoff, matched_handoff
+from calib.mast.rig import Rig
 from calib.rigid import FloatArray, Rigid, moved_rigid
-from calib.store import load_rig
 from mastctl.calibration.landing import handoff_errors_px
 from mastctl.cli.output import at_least, not_negative, positive_number
 from tools.arguments import end

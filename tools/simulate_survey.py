@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 
 from calib.errors import BadFile
-from calib.store import load_rig
+from calib.files.mast_file import load_rig
 from calib.survey import Sigma, Survey, write_survey
 from drivers.sim.board import draw_board, photograph
 from drivers.sim.render import Renderer

@@ -19,10 +19,10 @@ import cv2
 import numpy as np
 
 from calib.errors import CalibError
-from calib.handoff_refined import Eye
+from calib.handoff.by_image import Eye
+from calib.pictures.warp import grey
 from calib.rigid import FloatArray
-from calib.tracking import moved, seen_by, start_track
-from calib.warp import grey
+from calib.tracking.track import moved_track, seen_by, start_track
 from tools.tracker_sequences import STEPS, Sequence
 
 HALF_PX = 20
@@ -41,7 +41,7 @@ Tracked = tuple[FloatArray, FloatArray]
 
 
 def ours(sequence: Sequence) -> Tracked:
-    """`calib.tracking`, as the approach uses it: from uint8 pictures and odometry to both pixels."""
+    """`calib.tracking.track`, as the approach uses it: from uint8 pictures and odometry to both pixels."""
     found, times = np.full((STEPS, 2, 2), np.nan), np.full(STEPS, np.nan)
     try:
         track = start_track(*_eyes(sequence, 0).values(), sequence.truth_px[0, 0])
@@ -49,7 +49,7 @@ def ours(sequence: Sequence) -> Tracked:
         return found, times
     for step in range(STEPS):
         start = time.thread_time()
-        track = moved(track, sequence.motions[step], sequence.covariances[step])
+        track = moved_track(track, sequence.motions[step], sequence.covariances[step])
         look = seen_by(track, _eyes(sequence, step + 1))
         track = look.track
         times[step] = 1e3 * (time.thread_time() - start)

@@ -26,15 +26,15 @@ from pathlib import Path
 
 import numpy as np
 
-from calib.cahvor import CameraModel
+from calib.camera.cahvor import CameraModel
 from calib.errors import CalibError
-from calib.handoff_refined import Eye
-from calib.mast import Rig
-from calib.pointing import solve
+from calib.files.mast_file import load_rig
+from calib.handoff.by_image import Eye
+from calib.mast.pointing import solve
+from calib.mast.rig import Rig
+from calib.pictures.warp import grey
 from calib.rigid import FloatArray, Rigid, rot_x, rot_y, rot_z
-from calib.store import load_rig
-from calib.tracking import start_track
-from calib.warp import grey
+from calib.tracking.track import start_track
 from drivers.sim.render import Renderer
 from drivers.sim.scene import Scene, SceneSettings, build_scene
 from mastctl.experiment.approach_world import WorldErrors

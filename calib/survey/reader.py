@@ -9,13 +9,13 @@ from typing import Any, Literal, cast
 
 import numpy as np
 
-from calib.cahvor import Kind
+from calib.camera.cahvor import Kind
 from calib.errors import BadFile
-from calib.formats import LARGEST_IMAGE_PX, digest_of, read_bytes
-from calib.formats.strict import Section, nearest
-from calib.formats.yaml_text import MAX_BYTES, kind_of, parse_mapping
+from calib.files import LARGEST_IMAGE_PX, digest_of, read_bytes
+from calib.files.mast_file import CAMERA_NAME, read_stereo
+from calib.files.strict import Section, nearest
+from calib.files.yaml_text import MAX_BYTES, kind_of, parse_mapping
 from calib.rigid import FloatArray
-from calib.store import CAMERA_NAME, read_stereo
 from calib.survey.picture_file import picture_size_px
 from calib.survey.records import (
     Board,
@@ -50,7 +50,7 @@ def read_survey(folder: str | Path) -> Survey:
     """Read a survey folder.
 
     Pictures are not opened but for the size in their first bytes; whether there are enough of them, and
-    whether the measurements fit together, is for `calib.survey_check.check_survey`.
+    whether the measurements fit together, is for `calib.survey.check.check_survey`.
 
     Parameters
     ----------

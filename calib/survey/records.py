@@ -10,7 +10,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from calib.cahvor import Kind
+from calib.camera.cahvor import Kind
 from calib.rigid import FloatArray
 
 IntArray = NDArray[np.int64]

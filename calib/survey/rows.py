@@ -9,8 +9,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 from calib.errors import BadFile
-from calib.formats.strict import nearest
-from calib.tables import NUMBER, check_header
+from calib.files.strict import nearest
+from calib.files.tables import NUMBER, check_header
 
 MAX_ROWS = 2_000_000
 

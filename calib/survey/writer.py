@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from calib.errors import BadFile
-from calib.formats.yaml_text import dump_mapping
+from calib.files.yaml_text import dump_mapping
 from calib.survey.reader import (
     CLICK_COLUMNS,
     DOT_COLUMNS,

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import ndimage
 
-from calib.cahvor import CameraModel
+from calib.camera.cahvor import CameraModel
 from calib.rigid import Rigid
 from calib.survey import Board
 

@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.cahvor import CameraModel
+from calib.camera.cahvor import CameraModel
 from calib.rigid import Rigid
 from drivers.errors import BadOptions
 from drivers.sim.compiled import is_compiled, kernels

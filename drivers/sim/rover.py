@@ -19,11 +19,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from calib.cahvor import CameraModel
+from calib.camera.cahvor import CameraModel
 from calib.errors import BadFile
-from calib.mast import Rig
+from calib.files.mast_file import load_rig
+from calib.mast.rig import Rig
 from calib.rigid import FloatArray, Rigid
-from calib.store import load_rig
 from drivers.clock import Clock
 from drivers.errors import BadOptions, NoFreshFrame
 from drivers.faults import FaultPanel, nearest, read_script

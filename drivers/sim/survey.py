@@ -13,8 +13,8 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from calib.cahvor import CameraModel
-from calib.mast import Rig
+from calib.camera.cahvor import CameraModel
+from calib.mast.rig import Rig
 from calib.rigid import FloatArray, Rigid
 from calib.survey import Dots, StationPoint, Survey, SurveyCamera, SurveyImage
 from calib.survey.records import Purpose, StationKind

@@ -8,8 +8,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from calib.cahvor import CameraModel
-from calib.mast import Mast, Rig
+from calib.camera.cahvor import CameraModel
+from calib.mast.rig import Mast, Rig
 from calib.rigid import FloatArray, Rigid
 from calib.survey import Board, Sigma, Survey
 

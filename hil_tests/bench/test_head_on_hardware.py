@@ -34,7 +34,7 @@ from hil_tests.drivers.test_head_contract import (
     test_goals_halfway_between_counts_go_to_either_never_further as goals_halfway_between_counts,
 )
 from mastctl.config import load_config
-from mastctl.devices import MOVE_TIMEOUT_S, READ_TIMEOUT_S, STOP_TIMEOUT_S
+from mastctl.devices.devices import MOVE_TIMEOUT_S, READ_TIMEOUT_S, STOP_TIMEOUT_S
 from tools.servo_rigs import LIMITS_RAD, Rig
 
 if CHOSEN is None:

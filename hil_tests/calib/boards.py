@@ -8,8 +8,8 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from calib.cahvor import CameraModel
-from calib.detect import Predicted
+from calib.camera.cahvor import CameraModel
+from calib.dots.find import PredictedBoard
 from calib.rigid import Rigid
 from calib.survey import Board
 from drivers.sim.board import BoardLook, draw_board, photograph
@@ -71,7 +71,7 @@ class Shot:
         dots = self.camera_from_board.points(self.board.dots_in_board_m(rows, columns))
         return self.camera.project(dots)[0]
 
-    def roughly(self, rng: np.random.Generator) -> Predicted:
+    def roughly(self, rng: np.random.Generator) -> PredictedBoard:
         """A prediction that is wrong by 20 cm, 10 degrees and 5 % of the focal length."""
         axis, aside = (v / np.linalg.norm(v) for v in rng.normal(size=(2, 3)))
         wrong = Rotation.from_rotvec(np.radians(10) * axis)
@@ -79,7 +79,7 @@ class Shot:
         rough = replace(
             self.camera, kind="CAHV", O=None, R=None, H=_longer(self.camera.H), V=_longer(self.camera.V)
         )
-        return Predicted(
+        return PredictedBoard(
             rough, Rigid(wrong.as_matrix() @ c.rotation, wrong.apply(c.translation_m + 0.2 * aside))
         )
 

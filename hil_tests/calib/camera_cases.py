@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from calib.cahvor import CameraModel
+from calib.camera.cahvor import CameraModel
 
 SIZE = (640, 480)
 H = [500.0, 0.0, 319.5]

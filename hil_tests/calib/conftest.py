@@ -8,11 +8,11 @@ from pathlib import Path
 import pytest
 from made_survey import make_survey
 
-from calib.calibration import Calibration
-from calib.fit_joint import fit_joint
-from calib.fit_paper import fit_paper
-from calib.mast import Rig
-from calib.store import load_rig
+from calib.files.mast_file import load_rig
+from calib.fit.calibration import Calibration
+from calib.fit.joint import fit_joint
+from calib.fit.paper import fit_paper
+from calib.mast.rig import Rig
 
 
 @pytest.fixture(scope="session")

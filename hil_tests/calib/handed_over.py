@@ -8,10 +8,10 @@ from dataclasses import replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from calib.cahvor import CameraModel
-from calib.handoff import Joints
-from calib.mast import Rig, RigCamera
-from calib.matched_handoff import Landed, MatchedHandoff
+from calib.camera.cahvor import CameraModel
+from calib.handoff.geometric import Joints
+from calib.handoff.matched import Landed, MatchedHandoff
+from calib.mast.rig import Rig, RigCamera
 
 Vectors = Mapping[str, np.ndarray]
 HAZCAMS = ("hazcam_left", "hazcam_right")

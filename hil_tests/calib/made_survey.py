@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from calib.mast import Mast, Rig
+from calib.mast.rig import Mast, Rig
 from calib.rigid import Rigid
 from calib.survey import Board, Dots, Sigma, StationPoint, Survey, SurveyCamera, SurveyImage
 

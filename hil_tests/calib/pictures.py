@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import ndimage
 
-from calib.cahvor import CameraModel
+from calib.camera.cahvor import CameraModel
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 from made_survey import BOARD, COLUMNS, ROWS, Plan, make_survey, rover_from_head
 
-from calib.adjustment import MAST, Adjustment
-from calib.camera_parameters import parameter_names, stepped
-from calib.fit_joint import fit_joint, joint_problem
-from calib.fit_start import SurveyNotFitted, start
-from calib.least_squares import Normal, minimise
-from calib.mast import Rig
+from calib.camera.parameters import parameter_names, stepped
+from calib.fit.adjustment import MAST, Adjustment
+from calib.fit.joint import fit_joint, joint_problem
+from calib.fit.least_squares import Normal, minimise
+from calib.fit.start_values import SurveyNotFitted, start_values
+from calib.fit.usual_lens import lens_knowledge
+from calib.mast.rig import Rig
 from calib.survey import Sigma, Survey
-from calib.usual_lens import lens_knowledge
 
 RELATIVE = 1e-5
 """Of central differences with steps of a few sigmas' thousandths."""
@@ -41,11 +41,11 @@ def survey(true_rig: Rig) -> Survey:
 
 @pytest.fixture(scope="module")
 def problem(survey: Survey) -> Adjustment:
-    return joint_problem(survey, start(survey, 8), 8)
+    return joint_problem(survey, start_values(survey, 8), 8)
 
 
 def test_every_derivative_is_that_of_differences(problem: Adjustment, survey: Survey) -> None:
-    state = start(survey, 8).estimate
+    state = start_values(survey, 8).estimate
     normal = problem.normal(state)
     here = [block for _, block in problem.blocks(state)]
     width = 1e-3 / np.sqrt(np.diag(normal.matrix) + problem.weak)

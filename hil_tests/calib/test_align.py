@@ -11,11 +11,11 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 from survey_case import write_files
 
-from calib.align import NotAligned, align, mirrored, rover_from_station, station_from_board
-from calib.prisms import refine_prisms
+from calib.fit.station_poses import station_poses
 from calib.rigid import Rigid
-from calib.station_poses import station_poses
 from calib.survey import Sigma, StationPoint, Survey, read_survey
+from calib.survey.alignment import NotAligned, align, mirrored, rover_from_station, station_from_board
+from calib.survey.prisms import adjust_prisms
 
 PRISMS = np.array([(0.10, -0.25, -0.75), (0.10, 0.25, -0.80), (-0.30, -0.25, -0.90), (-0.30, 0.25, -0.70)])
 NAMES = ("p1", "p2", "p3", "p4")
@@ -199,7 +199,7 @@ def test_refined_prisms_are_as_good_as_their_covariance(base: Survey) -> None:
     distances, sums, spacing, drawn = [], [], [], []
     for _ in range(150):
         survey, true = several_set_ups(base, rng)
-        refined = refine_prisms(survey)
+        refined = adjust_prisms(survey)
         error = (refined.places_in_rover_m - true).ravel()
         distances.append(error @ np.linalg.solve(refined.covariance, error))
         sums.append(refined.chi2)
@@ -220,7 +220,7 @@ def _spacing(places: np.ndarray) -> float:
 def test_a_prism_wrong_in_one_set_up_is_named(base: Survey) -> None:
     survey, true = several_set_ups(base, np.random.default_rng(11))
     survey.station[6].position_m[:] += (0.05, 0.03, 0.0)
-    refined = refine_prisms(survey)
+    refined = adjust_prisms(survey)
     assert refined.rejected == (("s1", "p3"),)
     assert refined.doubt == ""
     assert _spacing(refined.places_in_rover_m) == pytest.approx(_spacing(true), abs=0.002)
@@ -229,7 +229,7 @@ def test_a_prism_wrong_in_one_set_up_is_named(base: Survey) -> None:
 def test_a_prism_wrong_in_the_drawing_is_named(base: Survey) -> None:
     survey, true = several_set_ups(base, np.random.default_rng(12))
     drawing = dict(survey.prisms_in_rover_m) | {"p2": PRISMS[1] + (0.2, 0.0, 0.1)}
-    refined = refine_prisms(Survey(**(vars(survey) | {"prisms_in_rover_m": drawing})))
+    refined = adjust_prisms(Survey(**(vars(survey) | {"prisms_in_rover_m": drawing})))
     assert refined.rejected == ((None, "p2"),)
     assert np.linalg.norm(refined.places_in_rover_m[1] - true[1]) < 0.05
 
@@ -253,4 +253,4 @@ def test_a_set_up_without_prisms_is_named(base: Survey) -> None:
 
 def test_an_exact_drawing_is_not_refined(base: Survey) -> None:
     with pytest.raises(ValueError, match="prism_cad_m is 0"):
-        refine_prisms(base)
+        adjust_prisms(base)

@@ -13,8 +13,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from calib.errors import BadFile
-from calib.formats.any_camera import load_any
-from calib.formats.yaml_text import dump_mapping, parse_mapping
+from calib.files.any_camera import load_any
+from calib.files.yaml_text import dump_mapping, parse_mapping
 from tools import fuzz_readers
 from tools.fuzz_readers import COMMANDS, READERS, VALID, broken, check_command, check_reader
 
@@ -148,7 +148,7 @@ def test_the_campaign_notices_what_is_let_out(monkeypatch: pytest.MonkeyPatch, t
     monkeypatch.setitem(fuzz_readers.READERS, "mast", ("mast.yaml", two_lines))
     with pytest.raises(AssertionError, match="not one line"):
         check_reader("mast", b"")
-    monkeypatch.setattr("calib.store.load_rig", let_out)
+    monkeypatch.setattr("calib.files.mast_file.load_rig", let_out)
     with pytest.raises(AssertionError, match="defect"):
         check_command("solve mast.yaml --camera eye_left --target 1 2 3", "mast.yaml", b"", tmp_path)
 
@@ -156,7 +156,7 @@ def test_the_campaign_notices_what_is_let_out(monkeypatch: pytest.MonkeyPatch, t
         Path("mast.yaml").write_text("changed")
         raise BadFile("f", "", "refused")
 
-    monkeypatch.setattr("calib.store.load_rig", changes_a_file)
+    monkeypatch.setattr("calib.files.mast_file.load_rig", changes_a_file)
     with pytest.raises(AssertionError, match="changed files"):
         check_command("solve mast.yaml --camera eye_left --target 1 2 3", "mast.yaml", b"", tmp_path)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from calib.budget import PAPER_PAIRS, stereo_range_error_m, target_approach_budget
+from calib.mast.budget import PAPER_PAIRS, stereo_range_error_m, target_approach_budget
 
 HALF_A_PRINTED_DIGIT_CM = 0.0501
 PRINTED_CM = {

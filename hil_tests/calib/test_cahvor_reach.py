@@ -11,7 +11,7 @@ import pytest
 from camera_cases import CENTER_PX, KINDS, SIZE, at_angle, plain, random_model
 from scipy.optimize import brentq
 
-from calib.cahvor import CameraModel
+from calib.camera.cahvor import CameraModel
 
 PIXEL_PX = 1e-8
 

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import pytest
 
-from calib.cahvor import CameraModel
+from calib.camera.cahvor import CameraModel
 
 PIXEL_PX = 1e-9
 DIRECTION = 1e-11

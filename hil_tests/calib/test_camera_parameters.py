@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from calib.cahvor import CameraModel
-from calib.camera_parameters import parameter_names, parameter_part, predict, stepped
+from calib.camera.cahvor import CameraModel
+from calib.camera.parameters import parameter_names, parameter_part, predict, stepped
 from calib.rigid import Rigid
 
 RELATIVE = 2e-7

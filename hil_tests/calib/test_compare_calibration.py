@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from calib.least_squares import minimise
+from calib.fit.least_squares import minimise
 from tools.compare_calibration import WORST_RATIO, boards_problem, boards_residuals, rms
 from tools.compare_points import Views, opencv_views, read_views
 

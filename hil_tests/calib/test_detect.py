@@ -8,9 +8,9 @@ import pytest
 from boards import BOARD, COLUMNS, NAVCAM_PX, PANCAM_PX, ROWS, Shot, camera, gravel, pose, shoot
 from scipy.spatial.transform import Rotation
 
-import calib.dot_board
-from calib.cahvor import CameraModel
-from calib.detect import DetectionFailure, DotsFound, Predicted, Upright, find_dots
+import calib.dots.board_grid
+from calib.camera.cahvor import CameraModel
+from calib.dots.find import DetectionFailure, DotsFound, PredictedBoard, Upright, find_dots
 from calib.rigid import Rigid
 from calib.survey import Board
 from drivers.sim.board import BoardLook
@@ -126,7 +126,7 @@ def test_a_mirrored_camera_sees_a_mirrored_order() -> None:
     # through a mirror: x of the image runs to the left
     flipped = CameraModel("CAHV", SIDE.size_px, SIDE.C, SIDE.A, [-NAVCAM_PX, 0, 319.5], SIDE.V)
     shot = shoot(rng, flipped, pose(4.0, (20, 10), 30))
-    predicted = Predicted(flipped, shot.camera_from_board)
+    predicted = PredictedBoard(flipped, shot.camera_from_board)
     check(shot, find_dots(shot.image, BOARD, predicted), WANTED_PX)
 
 
@@ -146,7 +146,10 @@ def test_a_wide_lens_bends_the_grid() -> None:
     shot = shoot(rng, wide, pose(0.9, (20, 30), 5, (0.35, 0.1)))
     ideal = CameraModel("CAHVORE", wide.size_px, wide.C, wide.A, wide.H, wide.V, cahvore_type=2)
     check(
-        shot, find_dots(shot.image, BOARD, Predicted(ideal, shot.camera_from_board)), WANTED_PX, cautious=0.5
+        shot,
+        find_dots(shot.image, BOARD, PredictedBoard(ideal, shot.camera_from_board)),
+        WANTED_PX,
+        cautious=0.5,
     )
 
 
@@ -168,7 +171,7 @@ def test_hidden_dots_are_left_out() -> None:
 def test_a_board_cut_by_the_image_says_by_which_edge() -> None:
     rng = np.random.default_rng(21)
     shot = shoot(rng, SIDE, pose(4.0, aside_m=(0.9, 0.0)))
-    told = reason(find_dots(shot.image, BOARD, Predicted(shot.camera, shot.camera_from_board)))
+    told = reason(find_dots(shot.image, BOARD, PredictedBoard(shot.camera, shot.camera_from_board)))
     assert "right edge" in told and "10 x 10 are expected" in told
 
 
@@ -186,7 +189,7 @@ def test_a_covered_outer_row_is_not_guessed() -> None:
 def test_gravel_without_a_board_is_a_failure() -> None:
     rng = np.random.default_rng(23)
     ground = gravel(rng).astype(np.uint8)
-    for expected in (None, Predicted(camera(NAVCAM_PX), pose(6.0))):
+    for expected in (None, PredictedBoard(camera(NAVCAM_PX), pose(6.0))):
         assert "stand in a grid" in reason(find_dots(ground, BOARD, expected))
     assert reason(find_dots(np.full((480, 640), 90, dtype=np.uint8), BOARD))
 
@@ -200,14 +203,14 @@ def test_two_boards_are_not_chosen_between() -> None:
 
 def test_a_board_seen_from_behind_by_the_survey_is_said() -> None:
     turned = Rigid(Rotation.from_rotvec([0, np.radians(170), 0]).as_matrix(), np.array([0, 0, 4.0]))
-    told = reason(find_dots(np.zeros((480, 640), dtype=np.uint8), BOARD, Predicted(SIDE, turned)))
+    told = reason(find_dots(np.zeros((480, 640), dtype=np.uint8), BOARD, PredictedBoard(SIDE, turned)))
     assert "back of the board" in told
 
 
 def test_where_the_grid_does_not_grow_the_clustering_finder_helps(monkeypatch: pytest.MonkeyPatch) -> None:
     rng = np.random.default_rng(25)
     shot = shoot(rng, SIDE, pose(4.0, (20, 10), 5))
-    monkeypatch.setattr(calib.dot_board, "grow_lattices", lambda found, spacing: [])
+    monkeypatch.setattr(calib.dots.board_grid, "grow_lattices", lambda found, spacing: [])
     check(shot, find_dots(shot.image, BOARD, shot.roughly(rng)), WANTED_PX)
 
 

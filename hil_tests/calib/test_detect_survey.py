@@ -12,9 +12,9 @@ import pytest
 from boards import gravel
 from scipy.spatial.transform import Rotation
 
-from calib.detect import Predicted, Upright
-from calib.detect_survey import detect_survey, expectations
-from calib.store import load_rig
+from calib.dots.find import PredictedBoard, Upright
+from calib.dots.find_in_survey import detect_survey, expectations
+from calib.files.mast_file import load_rig
 from calib.survey import Survey
 from drivers.sim.board import draw_board, photograph
 from drivers.sim.survey import Ring, SurveyPlan, simulate_survey
@@ -77,7 +77,7 @@ def test_predictions_are_as_good_as_rough_cameras_are(drawn) -> None:
     survey, _, (rig, truth) = drawn
     for name, expected in expectations(survey).items():
         image = next(image for image in survey.images if image.name == name)
-        assert isinstance(expected, Predicted)
+        assert isinstance(expected, PredictedBoard)
         turn = (
             expected.frame_from_board.rotation.T
             @ truth.rover_from_board[image.setup, image.placement].rotation

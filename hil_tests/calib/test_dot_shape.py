@@ -7,7 +7,7 @@ import pytest
 from boards import BOARD, COLUMNS, NAVCAM_PX, ROWS, camera, pose
 from scipy.spatial.transform import Rotation
 
-from calib.dot_shape import area_centroids, centre_bias, conic_centres
+from calib.dots.shape import area_centroids, centre_bias, conic_centres
 from calib.rigid import Rigid
 
 RADIUS_M = BOARD.dot_diameter_m / 2

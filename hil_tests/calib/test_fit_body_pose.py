@@ -20,16 +20,16 @@ from handed_over import (
 )
 from scipy.spatial.transform import Rotation
 
-from calib.body_pose import PRIOR_SHIFT_M, PRIOR_TURN_RAD, BodyPose
-from calib.body_sights import body_groups
-from calib.cahvor import CameraModel
-from calib.camera_parameters import parameter_names, parameter_part, tangents
-from calib.corrected_rig import corrected_covariance, corrected_rig
+from calib.camera.cahvor import CameraModel
+from calib.camera.parameters import parameter_names, parameter_part, tangents
 from calib.errors import NoCorrection
-from calib.fit_body_pose import fit_body_pose
-from calib.mast import Rig
-from calib.rig_covariance import RigCovariance, moved_rig
-from calib.store import load_rig
+from calib.files.mast_file import load_rig
+from calib.handoff.body_pose import PRIOR_SHIFT_M, PRIOR_TURN_RAD, BodyPose
+from calib.handoff.body_sights import body_groups
+from calib.handoff.corrected_rig import corrected_covariance, corrected_rig
+from calib.handoff.fit_body_pose import fit_body_pose
+from calib.mast.covariance import RigCovariance, moved_rig
+from calib.mast.rig import Rig
 
 TURN_RAD = np.array([0.001, 0.005, -0.002])
 SHIFT_M = np.array([0.003, -0.002, 0.001])

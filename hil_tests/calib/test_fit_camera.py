@@ -7,10 +7,10 @@ import pytest
 from made_survey import BOARD, COLUMNS, ROWS
 from scipy.spatial.transform import Rotation
 
-from calib.cahvor import CameraModel
-from calib.fit_camera import CameraFit, CameraNotFitted, fit_camera
-from calib.fit_mast import MastNotFitted, fit_mast
-from calib.mast import Rig
+from calib.camera.cahvor import CameraModel
+from calib.fit.camera import CameraFit, CameraNotFitted, fit_camera
+from calib.fit.mast import MastNotFitted, fit_mast
+from calib.mast.rig import Rig
 
 PIXEL = 2e-3
 """Recovery on data without noise: what lenses are usually like pulls a little on what a board sees badly."""

@@ -1,4 +1,7 @@
-"""The pose fit on masts made of two lines in space: no formula here is shared with calib.mast or the fit."""
+"""The pose fit on masts made of two lines in space: no formula here is shared with calib.mast.rig or the
+
+fit.
+"""
 
 from __future__ import annotations
 
@@ -8,10 +11,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from calib.cahvor import CameraModel
-from calib.fit_poses import PosesTooFew, fit_poses
-from calib.gimbal import numbers_of
-from calib.model_difference import model_difference, with_one_lens
+from calib.camera.cahvor import CameraModel
+from calib.camera.difference import model_difference, with_one_lens
+from calib.fit.poses import PosesTooFew, fit_poses
+from calib.mast.gimbal import numbers_of
 from calib.rigid import Rigid
 
 POSITION_M = 1e-9

@@ -11,12 +11,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from calib import store
-from calib.cahvor import CameraModel
+from calib.camera.cahvor import CameraModel
 from calib.errors import BadFile
-from calib.formats import CameraFile
-from calib.formats.any_camera import load_any, save_any
-from calib.formats.cahvor_text import (
+from calib.files import CameraFile
+from calib.files import mast_file as store
+from calib.files.any_camera import load_any, save_any
+from calib.files.cahvor_text import (
     format_cahvor,
     internal_parameters,
     load_cahvor,
@@ -24,8 +24,8 @@ from calib.formats.cahvor_text import (
     parse_cahvor,
     save_cahvor,
 )
-from calib.formats.pds3 import load_pds3_camera
-from calib.tables import parse_table, read_table, write_table
+from calib.files.pds3 import load_pds3_camera
+from calib.files.tables import parse_table, read_table, write_table
 from hil_tests.calib.test_pds3 import label_bytes
 from hil_tests.calib.test_store import CAMERA_TEXT, MAST_TEXT
 

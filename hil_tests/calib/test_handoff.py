@@ -13,15 +13,15 @@ import numpy as np
 import pytest
 from scipy.stats import norm
 
-from calib.camera_parameters import parameter_names
+from calib.camera.parameters import parameter_names
+from calib.camera.stereo import triangulate
 from calib.errors import CalibError, NoHandoff, NoStereoPoint
-from calib.handoff import Joints, hand_off
-from calib.mast import Rig
-from calib.ray_gap import FALSE_ALARMS, MOST_SIGMAS, ray_gap
-from calib.rig_covariance import RigCovariance, moved_rig, stored_covariance
-from calib.rig_rates import click_covariance
-from calib.stereo import triangulate
-from calib.store import load_rig
+from calib.files.mast_file import load_rig
+from calib.handoff.geometric import Joints, hand_off
+from calib.mast.covariance import RigCovariance, moved_rig, stored_covariance
+from calib.mast.ray_gap import FALSE_ALARMS, MOST_SIGMAS, ray_gap
+from calib.mast.rig import Rig
+from calib.mast.rig_rates import click_covariance
 
 AT = Joints(0.1, -0.55)
 TARGET = np.array([2.3, 0.2, -0.1])

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from calib.handoff import Joints
-from calib.handoff_bias import handoff_bias
-from calib.matched_handoff import Landed, MatchedHandoff
-from calib.significance import chance, sigmas
+from calib.fit.significance import chance, sigmas
+from calib.handoff.bias import handoff_bias
+from calib.handoff.geometric import Joints
+from calib.handoff.matched import Landed, MatchedHandoff
 
 
 def record(off_px: np.ndarray) -> list[MatchedHandoff]:

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from calib.handoff import Handoff, Joints, hand_off
-from calib.handoff_refined import Eye, RefinedPixel, refine_handoff
-from calib.mast import Mast, Rig, RigCamera
-from calib.rig_covariance import RigCovariance, moved_rig
+from calib.handoff.by_image import Eye, RefinedPixel, refine_handoff
+from calib.handoff.geometric import Handoff, Joints, hand_off
+from calib.mast.covariance import RigCovariance, moved_rig
+from calib.mast.rig import Mast, Rig, RigCamera
 from hil_tests.calib.pictures import Pinhole, TexturedPlane, picture, random_texture
 
 TARGET = np.array([2.0, 0.05, 0.3])

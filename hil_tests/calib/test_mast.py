@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from calib.cahvor import CameraModel
-from calib.mast import Mast, Rig, RigCamera
+from calib.camera.cahvor import CameraModel
+from calib.mast.rig import Mast, Rig, RigCamera
 from calib.rigid import Rigid
 
 ROUNDING_M = 1e-13

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from pictures import Pinhole, TexturedPlane, picture, random_texture
 
-from calib.epipolar import find_partner
 from calib.errors import CalibError
-from calib.match import Found, Match, MatchSettings, judged, match
-from calib.refine import Refined
-from calib.warp import Plane, Template, carry, facing_plane, grey
+from calib.pictures.epipolar import find_partner
+from calib.pictures.least_squares_matching import LeastSquaresMatch
+from calib.pictures.patch_match import MatchSettings, PatchFound, PatchMatch, judged, match_patch
+from calib.pictures.warp import Plane, Template, carry, facing_plane, grey
 
 FOCAL_PX = 1290.0  # the paper's Navcam
 SIZE_PX = (360, 280)
@@ -41,7 +41,7 @@ def seen(camera: Pinhole, seed: int, noise_dn: float = NOISE_DN, contrast_dn: fl
     return picture(camera, plane, noise_dn=noise_dn, seed=hash((camera.azimuth_rad, seed)) % 2**31)
 
 
-def errors_of(matches: list[tuple[Match, np.ndarray]]) -> tuple[np.ndarray, np.ndarray]:
+def errors_of(matches: list[tuple[PatchMatch, np.ndarray]]) -> tuple[np.ndarray, np.ndarray]:
     """Errors (n, 2) in pixels and the same over their own sigmas."""
     errors = np.array([found.pixel_px - truth for found, truth in matches])
     normalised = [
@@ -60,7 +60,7 @@ def test_patch_warped_over_a_guessed_plane_is_found_where_geometry_says() -> Non
             pixel = np.array([rng.uniform(90, 270), rng.uniform(70, 210)])
             point = plane.hit(LEFT.position_m, LEFT.rays(pixel))
             guess = facing_plane(LEFT.model, pixel, 1.01 * float(np.linalg.norm(point)))
-            found = match(
+            found = match_patch(
                 seen(LEFT, seed), LEFT.model, pixel, guess, seen(TURNED, seed), TURNED.model, 15, PLANE
             )
             assert found.verdict == "good", f"seed 3, scene {seed}, pixel {pixel}: {found.reason}"
@@ -77,7 +77,7 @@ def test_sigma_grows_with_noise_and_stays_honest() -> None:
     for _ in range(40):
         pixel = np.array([rng.uniform(90, 270), rng.uniform(70, 210)])
         point = plane.hit(LEFT.position_m, LEFT.rays(pixel))
-        found = match(
+        found = match_patch(
             seen(LEFT, 2, 8.0), LEFT.model, pixel, Plane(point, plane.normal), seen(TURNED, 2, 8.0),
             TURNED.model, 15, PLANE,
         )  # fmt: skip
@@ -103,7 +103,7 @@ def test_cameras_of_different_focal_length_match(zoom: float) -> None:
         pixel = np.array([180.0, 140.0]) + rng.uniform(-reach, reach, 2)
         point = plane.hit(source.position_m, source.rays(pixel))
         guess = facing_plane(source.model, pixel, float(np.linalg.norm(point)))
-        found = match(first, source.model, pixel, guess, second, other.model, search_px=12)
+        found = match_patch(first, source.model, pixel, guess, second, other.model, search_px=12)
         assert found.verdict == "good", f"seed 4, pixel {pixel}: {found.reason}"
         matches.append((found, other.pixel(point)))
     errors, _ = errors_of(matches)
@@ -148,7 +148,7 @@ def test_straight_edge_is_flat_along_itself() -> None:
     edge = np.full(SIZE_PX[::-1], 60.0, np.float32)
     edge[:, 180:] = 180.0
     edge += np.random.default_rng(0).normal(scale=NOISE_DN, size=edge.shape).astype(np.float32)
-    found = match(
+    found = match_patch(
         edge, LEFT.model, (180.0, 140.0), facing_plane(LEFT.model, (180, 140), 4), edge, LEFT.model, 10
     )
     assert found.verdict == "flat"
@@ -161,14 +161,16 @@ def test_repeated_texture_is_ambiguous() -> None:
     first = picture(LEFT, repeated, noise_dn=NOISE_DN, seed=1)
     second = picture(TURNED, repeated, noise_dn=NOISE_DN, seed=2)
     guess = facing_plane(LEFT.model, (180.0, 140.0), 4.0)
-    found = match(first, LEFT.model, (180.0, 140.0), guess, second, TURNED.model, search_px=40)
+    found = match_patch(first, LEFT.model, (180.0, 140.0), guess, second, TURNED.model, search_px=40)
     assert found.verdict == "ambiguous", found
 
 
 def test_something_else_in_the_picture_is_weak() -> None:
     guess = facing_plane(LEFT.model, (180.0, 140.0), 4.0)
     for seed in (0, 1, 2):
-        found = match(seen(LEFT, seed), LEFT.model, (180.0, 140.0), guess, seen(TURNED, 9), TURNED.model, 40)
+        found = match_patch(
+            seen(LEFT, seed), LEFT.model, (180.0, 140.0), guess, seen(TURNED, 9), TURNED.model, 40
+        )
         assert found.verdict == "weak", f"scene {seed}: {found}"
 
 
@@ -185,7 +187,7 @@ def test_target_hidden_from_one_eye_is_refused() -> None:
 def test_target_outside_the_other_picture_is_at_the_border() -> None:
     away = Pinhole(np.zeros(3), 1.2, 0.0, FOCAL_PX, SIZE_PX)
     guess = facing_plane(LEFT.model, (180.0, 140.0), 4.0)
-    found = match(seen(LEFT, 0), LEFT.model, (180.0, 140.0), guess, seen(TURNED, 0), away.model, 20)
+    found = match_patch(seen(LEFT, 0), LEFT.model, (180.0, 140.0), guess, seen(TURNED, 0), away.model, 20)
     assert found.verdict == "border"
 
 
@@ -194,7 +196,7 @@ def test_small_shift_of_the_window_does_not_hide_a_target_at_its_edge() -> None:
     point = wall(0).hit(LEFT.position_m, LEFT.rays(np.array([180.0, 140.0])))
     guess = facing_plane(LEFT.model, (180.0, 140.0), float(np.linalg.norm(point)))
     moved = np.roll(seen(TURNED, 0), 12, axis=1)
-    found = match(seen(LEFT, 0), LEFT.model, (180.0, 140.0), guess, moved, TURNED.model, search_px=11)
+    found = match_patch(seen(LEFT, 0), LEFT.model, (180.0, 140.0), guess, moved, TURNED.model, search_px=11)
     assert found.verdict in ("border", "weak")
 
 
@@ -227,7 +229,7 @@ def test_a_rough_surface_makes_the_place_less_certain_along_the_parallax_only() 
     point = wall(5).hit(LEFT.position_m, LEFT.rays(pixel))
     sigmas = []
     for roughness in (0.0, 0.05):
-        found = match(
+        found = match_patch(
             seen(LEFT, 5), LEFT.model, pixel, Plane(point, wall(5).normal), seen(RIGHT, 5), RIGHT.model, 10,
             MatchSettings(roughness=roughness),
         )  # fmt: skip
@@ -245,7 +247,7 @@ def test_what_is_left_unexplained_makes_the_surface_term_larger() -> None:
     for image, least, most in ((seen(RIGHT, 5), 1.0, 1.1), (other, 1.5, 4.0)):
         variances = []
         for roughness, relief in ((0.0, 0.0), (0.05, 0.0), (0.05, 0.1)):
-            found = match(
+            found = match_patch(
                 seen(LEFT, 5), LEFT.model, pixel, Plane(point, wall(5).normal), image, RIGHT.model, 10,
                 MatchSettings(roughness=roughness, relief=relief),
             )  # fmt: skip
@@ -261,10 +263,10 @@ def test_best_and_second_place_are_compared_before_the_best_is_deformed() -> Non
     """Correlations 0.6 and 0.4 as found are rivals, though deforming the best brought it to 0.81."""
     values = random_texture(6)[:25, :25].astype(np.float32)
     template = Template(values, np.array([50, 50]), np.array([50.0, 50.0]), 1.0)
-    refined = Refined(np.array([50.0, 50.0]), 1e-4 * np.eye(2), np.zeros((2, 2)), 0.81)
+    refined = LeastSquaresMatch(np.array([50.0, 50.0]), 1e-4 * np.eye(2), np.zeros((2, 2)), 0.81)
     none = np.zeros((2, 2))
-    assert judged(template, Found(refined, 0.6, 0.4), none, PLANE).verdict == "ambiguous"
-    assert judged(template, Found(refined, 0.8, 0.4), none, PLANE).verdict == "good"
+    assert judged(template, PatchFound(refined, 0.6, 0.4), none, PLANE).verdict == "ambiguous"
+    assert judged(template, PatchFound(refined, 0.8, 0.4), none, PLANE).verdict == "good"
 
 
 def test_what_lies_far_from_the_target_does_not_pull_it() -> None:
@@ -279,7 +281,7 @@ def test_what_lies_far_from_the_target_does_not_pull_it() -> None:
     for near_px in (0.0, 6.0):
         settings = MatchSettings(half_px=12, near_px=near_px, roughness=0.05)
         surface = Plane(point, plane.normal)
-        found = match(seen(LEFT, 4), LEFT.model, pixel, surface, mixed, TURNED.model, 8, settings)
+        found = match_patch(seen(LEFT, 4), LEFT.model, pixel, surface, mixed, TURNED.model, 8, settings)
         assert found.verdict == "good", found.reason
         off[near_px] = float(np.linalg.norm(found.pixel_px - there))
     assert off[0.0] > 0.6

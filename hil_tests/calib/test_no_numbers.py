@@ -17,23 +17,23 @@ from boards import BOARD, COLUMNS, ROWS, SIZE_PX, camera, gravel, pose
 from made_survey import Blunders, make_survey
 from scipy.spatial.transform import Rotation
 
-from calib.align import NotAligned, align, mirrored
-from calib.cahvor import CameraModel
-from calib.detect import DotsFound, Predicted
-from calib.detect_survey import find_in_file
-from calib.epipolar import find_partner
+from calib.camera.cahvor import CameraModel
+from calib.camera.difference import model_difference
+from calib.camera.stereo import triangulate
+from calib.dots.find import DotsFound, PredictedBoard
+from calib.dots.find_in_survey import find_in_file
 from calib.errors import CalibError, Unreachable
-from calib.fit_camera import SAMPLES, fit_camera
-from calib.fit_joint import fit_joint
-from calib.handoff import Joints
-from calib.mast import Mast, Rig
-from calib.match import match
-from calib.model_difference import model_difference
-from calib.pointing import Solution, choose, solve
-from calib.rig_covariance import RigCovariance
+from calib.fit.camera import SAMPLES, fit_camera
+from calib.fit.joint import fit_joint
+from calib.handoff.geometric import Joints
+from calib.mast.covariance import RigCovariance
+from calib.mast.pointing import Solution, choose, solve
+from calib.mast.rig import Mast, Rig
+from calib.pictures.epipolar import find_partner
+from calib.pictures.patch_match import match_patch
+from calib.pictures.warp import Plane, facing_plane
 from calib.rigid import Rigid
-from calib.stereo import triangulate
-from calib.warp import Plane, facing_plane
+from calib.survey.alignment import NotAligned, align, mirrored
 from drivers.sim.board import draw_board, photograph
 
 NO_NUMBERS = (math.nan, math.inf, -math.inf)
@@ -154,7 +154,7 @@ def test_ranges_and_windows_that_are_none_are_refused(bad: float) -> None:
         find_partner(grey, HEAD, [50, 50], grey, HEAD, bad)
     if bad != 0.0:
         with pytest.raises(ValueError, match="search_px is"):
-            match(grey, HEAD, [50, 50], facing_plane(HEAD, [50, 50], 3.0), grey, HEAD, bad)
+            match_patch(grey, HEAD, [50, 50], facing_plane(HEAD, [50, 50], 3.0), grey, HEAD, bad)
 
 
 @pytest.mark.parametrize("bad", [*NO_NUMBERS, -1.0])
@@ -232,7 +232,7 @@ def test_a_picture_of_more_bits_is_measured_with_all_of_them(tmp_path: Path, bit
     levels = np.asarray(exact, dtype=np.float64) * (2**bits - 1) / 255
     path = tmp_path / "board.png"
     cv2.imwrite(str(path), levels.astype(np.uint8 if bits == 8 else np.uint16))
-    found = find_in_file(path, SIZE_PX, BOARD, Predicted(model, at))
+    found = find_in_file(path, SIZE_PX, BOARD, PredictedBoard(model, at))
     assert isinstance(found, DotsFound), found
     assert len(found.rows) == 100
     points = at.points(BOARD.dots_in_board_m(ROWS, COLUMNS))

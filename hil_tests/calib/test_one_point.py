@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.optimize import least_squares
 
-from calib.one_point import Sighting, one_point
+from calib.camera.one_point import Sighting, one_point
 from hil_tests.calib.pictures import Pinhole
 
 CAMERAS = [

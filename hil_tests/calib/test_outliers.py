@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from made_survey import Blunders, make_survey
 
-from calib.calibration import Calibration
-from calib.fit_joint import fit_joint
-from calib.fit_paper import fit_paper
-from calib.fit_start import SurveyNotFitted
-from calib.mast import Rig
+from calib.fit.calibration import Calibration
+from calib.fit.joint import fit_joint
+from calib.fit.paper import fit_paper
+from calib.fit.start_values import SurveyNotFitted
+from calib.mast.rig import Rig
 from calib.survey import SurveyImage
 
 SEED = 6

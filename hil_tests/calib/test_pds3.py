@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from calib.errors import BadFile
-from calib.formats.odl import Quantity, parse_label
-from calib.formats.pds3 import load_pds3_camera, looks_like_pds3, read_label, read_product
+from calib.files.odl import Quantity, parse_label
+from calib.files.pds3 import load_pds3_camera, looks_like_pds3, read_label, read_product
 
 LABEL = """\
 PDS_VERSION_ID                    = PDS3

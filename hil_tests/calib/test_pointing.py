@@ -19,10 +19,10 @@ from hypothesis import strategies as st
 from scipy.optimize import least_squares, minimize_scalar
 from scipy.spatial.transform import Rotation
 
-from calib.cahvor import CameraModel
+from calib.camera.cahvor import CameraModel
 from calib.errors import Unreachable
-from calib.mast import Mast, Rig, RigCamera
-from calib.pointing import Solution, choose, solve, solve_ray
+from calib.mast.pointing import Solution, choose, solve, solve_ray
+from calib.mast.rig import Mast, Rig, RigCamera
 
 WORST_PX = 1e-7
 PANCAM_PX = 3441.0

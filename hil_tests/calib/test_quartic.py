@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from calib.quartic import roots_between
+from calib.mast.quartic import roots_between
 
 NEAR = 1e-6
 

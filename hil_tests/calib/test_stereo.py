@@ -9,9 +9,9 @@ import pytest
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from calib.cahvor import CameraModel
+from calib.camera.cahvor import CameraModel
+from calib.camera.stereo import triangulate
 from calib.errors import NoStereoPoint
-from calib.stereo import triangulate
 
 FORWARD, RIGHT, DOWN = np.eye(3)
 FOCAL_PX = 1000.0

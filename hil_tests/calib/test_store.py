@@ -14,11 +14,11 @@ import numpy as np
 import pytest
 import yaml
 
-from calib import store
 from calib.errors import BadFile
-from calib.formats import CameraFile
-from calib.formats.atomic import previous_path, save_bytes
-from calib.formats.yaml_text import parse_mapping
+from calib.files import CameraFile
+from calib.files import mast_file as store
+from calib.files.atomic import previous_path, save_bytes
+from calib.files.yaml_text import parse_mapping
 
 # The contract's example, written as a person writes it.
 MAST_TEXT = """\

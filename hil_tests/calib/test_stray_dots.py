@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from calib.fit_paper import fit_paper
-from calib.mast import Rig
-from calib.store import load_rig
-from calib.stray_dots import without_stray_dots
+from calib.files.mast_file import load_rig
+from calib.fit.paper import fit_paper
+from calib.fit.stray_dots import without_stray_dots
+from calib.mast.rig import Rig
 from calib.survey import Dots, Survey
 from drivers.sim.survey import simulate_survey
 from drivers.sim.survey_blunders import with_outlier_dots

@@ -10,10 +10,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from calib.mast import Rig
-from calib.store import load_rig
+from calib.files.mast_file import load_rig
+from calib.mast.rig import Rig
 from calib.survey import Board, Finding, StationPoint, Survey, SurveyImage
-from calib.survey_check import check_survey
+from calib.survey.check import check_survey
 from drivers.sim.survey import SurveyPlan, simulate_survey
 from drivers.sim.survey_blunders import with_moved_tape, with_swapped_boards, with_wrong_prism
 

@@ -9,15 +9,15 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from calib.epipolar import find_partner
+from calib.camera.one_point import OnePoint
 from calib.errors import CalibError
-from calib.handoff_refined import Eye
-from calib.match import match
-from calib.one_point import OnePoint
-from calib.pose_doubt import pose_doubt
+from calib.handoff.by_image import Eye
+from calib.pictures.epipolar import find_partner
+from calib.pictures.patch_match import match_patch
+from calib.pictures.warp import Plane
 from calib.rigid import Rigid, rot_y, rot_z
-from calib.tracking import SIZES, Look, Track, moved, seen_by, start_track
-from calib.warp import Plane
+from calib.tracking.pose_doubt import pose_doubt
+from calib.tracking.track import SIZES, Look, Track, moved_track, seen_by, start_track
 from hil_tests.calib.pictures import Pinhole, TexturedPlane, picture, random_texture
 
 TARGET = np.array([3.0, 0.1, 0.0])
@@ -61,7 +61,7 @@ def begun() -> Track:
 
 
 def step(track: Track, before: Rigid, now: Rigid, covariance: NDArray[np.float64] = EXACT) -> Track:
-    return moved(track, now.inverse @ before, covariance)
+    return moved_track(track, now.inverse @ before, covariance)
 
 
 def test_a_start_knows_the_position(begun: Track) -> None:
@@ -85,7 +85,7 @@ def test_motion_carries_position_and_covariance(begun: Track) -> None:
 
     motion = Rigid(rot_z(0.2), np.array([-0.5, 0.1, 0.02]))
     sigma = np.array([0.004, 0.006, 0.008, 0.01, 0.02, 0.005])
-    after = moved(begun, motion, np.diag(sigma**2))
+    after = moved_track(begun, motion, np.diag(sigma**2))
     rng = np.random.default_rng(2)
     root = np.linalg.cholesky(begun.covariance_m2)
     drawn = []
@@ -104,7 +104,7 @@ TOLD = np.diag([2e-3**2] * 3 + [0.015**2] * 3)
 def after_a_wrong_pose(begun: Track, wrong_m: list[float], covariance: NDArray[np.float64]) -> Look:
     """A look 0.4 m nearer, after a pose that is ``wrong_m`` off."""
     said = Rigid(np.eye(3), np.array([0.4, 0.0, 0.0]) + wrong_m)
-    return seen_by(moved(begun, said.inverse, covariance), eyes(0.4))
+    return seen_by(moved_track(begun, said.inverse, covariance), eyes(0.4))
 
 
 @pytest.mark.parametrize("wrong_m", [[0.1, 0, 0], [0, 0.1, 0], [0, 0, -0.1], [-0.15, 0.1, 0]])
@@ -156,7 +156,7 @@ def test_a_target_is_kept_while_the_rover_nears_it_with_wrong_odometry(begun: Tr
     for index, (x, heading) in enumerate([(0.3, 0.03), (0.6, -0.02), (0.85, 0.04), (1.1, 0.0), (1.3, 0.02)]):
         now = pose(x, heading)
         wrong = Rigid(rot_z(rng.normal(0.0, 0.009)), rng.normal(0.0, 0.01, 3))
-        track = moved(track, wrong @ now.inverse @ before, spread)
+        track = moved_track(track, wrong @ now.inverse @ before, spread)
         predicted = np.linalg.norm(track.position_m - now.inverse.points(TARGET))
         look = seen_by(track, eyes(x, heading, seed=10 * index + 10))
         assert look.track.state == "tracked", look.reason
@@ -311,7 +311,7 @@ def test_the_sky_cannot_be_followed() -> None:
 def test_a_pose_that_jumps_is_said_and_nothing_else_is_taken(begun: Track) -> None:
     """The rover is said to stand where it was, to a few millimetres, and is 25 cm aside and 20 ahead."""
     surely = np.diag([1e-6] * 3 + [9e-6] * 3)
-    track = moved(begun, Rigid.identity(), surely)
+    track = moved_track(begun, Rigid.identity(), surely)
     for index in range(2):
         turned = rot_z(0.08)
         site_from_rover = Rigid(turned, np.array([0.2, 0.25, 0.0]))
@@ -334,7 +334,7 @@ def test_a_found_target_tells_how_the_rover_was_turned(begun: Track) -> None:
     now = pose(0.1)
     wrong = Rigid(rot_y(0.010), np.zeros(3))
     spread = np.diag([0.009**2] * 3 + [0.002**2] * 3)
-    track = moved(begun, wrong @ now.inverse @ pose(0.0), spread)
+    track = moved_track(begun, wrong @ now.inverse @ pose(0.0), spread)
     look = seen_by(track, eyes(0.1, seed=60))
     assert look.track.state == "tracked" and not look.renewed
     exact = pinholes(0.0)["left"].model.moved(now.inverse)
@@ -349,7 +349,7 @@ def test_a_found_target_tells_how_the_rover_was_turned(begun: Track) -> None:
 @pytest.mark.parametrize("spread", [np.eye(3), np.full((6, 6), np.nan), -np.eye(6)])
 def test_a_motion_without_a_usable_covariance_is_refused(begun: Track, spread: NDArray[np.float64]) -> None:
     with pytest.raises(CalibError, match="6 rows of 6"):
-        moved(begun, Rigid.identity(), spread)
+        moved_track(begun, Rigid.identity(), spread)
 
 
 def test_an_eye_that_sees_the_surface_otherwise_is_asked_through_the_other(begun: Track) -> None:
@@ -359,7 +359,7 @@ def test_an_eye_that_sees_the_surface_otherwise_is_asked_through_the_other(begun
     both = eyes(0.0, seed=3)
     right = both["right"]
     key = begun.key
-    alone = match(
+    alone = match_patch(
         key.eye.image,
         key.eye.camera,
         key.pixel_px,
@@ -390,7 +390,7 @@ def test_a_first_eye_found_through_the_second_hands_on_the_errors_of_both(begun:
     both["right"] = replace(both["right"], image=noisy)
     believed = Plane(begun.position_m, normal)
     left = both["left"]
-    alone = match(second.image, second.camera, key.pixel_px, believed, left.image, left.camera, 5.0)
+    alone = match_patch(second.image, second.camera, key.pixel_px, believed, left.image, left.camera, 5.0)
     assert alone.verdict == "weak"
     look = seen_by(replace(begun, key=key), both)
     assert look.track.state == "tracked" and look.renewed, look.reason
@@ -428,7 +428,7 @@ def test_weights_so_narrow_that_one_row_counts_end_in_a_verdict(near_px: float) 
     both, narrow = eyes(0.0), replace(SIZES, near_px=near_px, flat_sigma_px=5.0, worst_sigma_px=50.0)
     left, right, plane = both["left"], both["right"], Plane(TARGET, GROUND.normal)
     pixel = pinholes(0.0)["left"].pixel(TARGET)
-    found = match(left.image, left.camera, pixel, plane, right.image, right.camera, 6.0, narrow)
+    found = match_patch(left.image, left.camera, pixel, plane, right.image, right.camera, 6.0, narrow)
     assert found.verdict in ("good", "weak")
 
 

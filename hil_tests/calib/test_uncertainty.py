@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 from made_survey import Plan, make_survey
 
-from calib.calibration import Calibration
-from calib.fit_joint import fit_joint
-from calib.fit_paper import fit_paper
-from calib.mast import Rig
-from calib.pointing import solve
-from calib.rig_rates import pixel_rates
-from calib.stereo import triangulate
-from calib.uncertainty import moved_rig, pixel_covariance, pointing_covariance
+from calib.camera.stereo import triangulate
+from calib.fit.calibration import Calibration
+from calib.fit.joint import fit_joint
+from calib.fit.paper import fit_paper
+from calib.fit.uncertainty import pixel_covariance, pointing_covariance, rig_moved_along
+from calib.mast.pointing import solve
+from calib.mast.rig import Rig
+from calib.mast.rig_rates import pixel_rates
 
 SURVEYS = 16
 SMALL = Plan(ring=2, mast_boards=5, checks=0, hazcam=False)
@@ -78,7 +78,7 @@ def test_pixel_rates_are_those_of_differences(joint: Calibration) -> None:
             step = np.zeros(len(every))
             step[column] = 1e-3 if name.split(".")[2][0] in "HV" else 1e-6
             ends = [
-                moved_rig(joint, every, s * step).camera_in_rover(camera, 0.2, -0.3).project(points)[0]
+                rig_moved_along(joint, every, s * step).camera_in_rover(camera, 0.2, -0.3).project(points)[0]
                 for s in (1, -1)
             ]
             difference = (ends[0] - ends[1]) / (2 * step[column])

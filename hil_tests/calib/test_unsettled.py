@@ -12,18 +12,16 @@ from made_survey import make_survey
 from scipy.spatial.transform import Rotation
 from test_fit_camera import boards
 
-from calib import (
-    fit_body_pose,
-    fit_camera,
-    fit_joint,
-    fit_mast,
-    fit_paper,
-    fit_poses,
-    least_squares,
-    one_point,
-)
+from calib.camera import one_point
 from calib.errors import CalibError
-from calib.mast import Rig
+from calib.fit import camera as fit_camera
+from calib.fit import joint as fit_joint
+from calib.fit import least_squares
+from calib.fit import mast as fit_mast
+from calib.fit import paper as fit_paper
+from calib.fit import poses as fit_poses
+from calib.handoff import fit_body_pose
+from calib.mast.rig import Rig
 from calib.rigid import FloatArray
 
 

@@ -11,8 +11,8 @@ from pathlib import Path
 
 import pytest
 
-from calib.mast import Rig, RigCamera
-from calib.store import load_rig, save_rig
+from calib.files.mast_file import load_rig, save_rig
+from calib.mast.rig import Rig, RigCamera
 from drivers.sim import rover
 from drivers.sim.scene import Scene, SceneSettings, build_scene
 

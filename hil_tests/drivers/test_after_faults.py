@@ -13,11 +13,11 @@ import numpy as np
 import pytest
 from dynamixel_rig import LONG_S, failed, opened, read_or_none, until
 
-from calib.mast import Mast, Rig
+from calib.mast.rig import Mast, Rig
 from drivers.clock import SystemClock
 from drivers.interfaces import PanTilt
-from mastctl.devices import Devices
-from mastctl.limits import Limits
+from mastctl.devices.devices import Devices
+from mastctl.devices.limits import Limits
 from mastctl.pointing.loop import AnglesTarget, PointingError, PointingLoop, PointRequest
 from tools.servo_rigs import dynamixel_pty, ptu_pty
 

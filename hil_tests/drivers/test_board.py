@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from calib.cahvor import CameraModel
+from calib.camera.cahvor import CameraModel
 from calib.rigid import Rigid
 from calib.survey import Board
 from drivers.sim.board import BoardLook, draw_board, photograph

@@ -14,14 +14,14 @@ import cv2
 import numpy as np
 import pytest
 
-from calib.pointing import solve
-from calib.store import load_rig
+from calib.files.mast_file import load_rig
+from calib.mast.pointing import solve
 from drivers.clock import SystemClock
 from drivers.errors import BadOptions, NoFreshFrame, NoReply
 from drivers.interfaces import Camera, Frame, PanTilt
 from drivers.open_hardware import DeviceSettings, Hardware, HardwareSettings, open_hardware
-from mastctl.devices import Devices
-from mastctl.limits import Limits
+from mastctl.devices.devices import Devices
+from mastctl.devices.limits import Limits
 from mastctl.pointing.loop import (
     AnglesTarget,
     PixelTarget,

@@ -12,7 +12,7 @@ from types import ModuleType
 import numpy as np
 import pytest
 
-from calib.cahvor import CameraModel
+from calib.camera.cahvor import CameraModel
 from calib.rigid import Rigid
 from drivers.errors import BadOptions
 from drivers.sim import render, texture

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from calib.files.mast_file import load_rig
 from calib.rigid import Rigid, rot_z
-from calib.store import load_rig
 from drivers.clock import ManualClock
 from drivers.errors import BadOptions, NoFreshFrame
 from drivers.sim.render import Renderer

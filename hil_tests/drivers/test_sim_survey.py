@@ -11,9 +11,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from calib.mast import Rig
+from calib.files.mast_file import load_rig
+from calib.mast.rig import Rig
 from calib.rigid import Rigid
-from calib.store import load_rig
 from calib.survey import Sigma, Survey, read_survey, write_survey
 from drivers.sim.survey import Ring, SurveyPlan, SurveyTruth, simulate_survey
 from drivers.sim.survey_blunders import (

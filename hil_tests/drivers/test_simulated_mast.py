@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from calib.rig_covariance import stored_covariance
-from calib.store import load_rig
+from calib.files.mast_file import load_rig
+from calib.mast.covariance import stored_covariance
 from tools.simulated_mast.check import projection_error_px, turned_rover_frame
 
 SAME_PX = 1e-3

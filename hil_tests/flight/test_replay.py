@@ -8,10 +8,10 @@ from types import ModuleType
 import numpy as np
 import pytest
 
-from calib.match import match
-from calib.pointing import solve
-from calib.stereo import triangulate
-from calib.warp import Plane, grey
+from calib.camera.stereo import triangulate
+from calib.mast.pointing import solve
+from calib.pictures.patch_match import match_patch
+from calib.pictures.warp import Plane, grey
 from drivers.clock import ManualClock
 from drivers.open_hardware import DeviceSettings, HardwareSettings, open_hardware
 from drivers.replay import NoRecording
@@ -56,7 +56,7 @@ def test_pointing_at_a_feature_goes_to_the_recorded_angles_and_finds_it(
         moved_s = clock.now_s()
         frame = camera.next_frame(moved_s, 1.0)
         assert frame.mid_exposure_s - frame.exposure_s / 2 > moved_s
-        found = match(
+        found = match_patch(
             clicked,
             clicked_camera,
             clicked_px,

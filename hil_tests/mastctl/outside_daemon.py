@@ -16,7 +16,7 @@ from typing import Any
 
 from service_fakes import CONFIG, eventually, rig
 
-from calib.store import save_rig
+from calib.files.mast_file import save_rig
 from mastctl.client import Client, ClientError
 
 BOUND_S = 60.0  # only ends a failing test

@@ -1,7 +1,8 @@
 """A small world for the pointing loop: a head that is a function of time, cameras that see textured ground.
 
 Geometry, pictures and motion are the test's own (`pictures.py`, azimuth and elevation of a pinhole); the loop
-gets devices with the signatures of `mastctl.devices.Devices` and a rig with the same numbers, or wrong ones.
+gets devices with the signatures of `mastctl.devices.devices.Devices` and a rig with the same numbers, or
+wrong ones.
 """
 
 from __future__ import annotations
@@ -16,12 +17,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.mast import Mast, Rig, RigCamera
+from calib.mast.rig import Mast, Rig, RigCamera
 from drivers.clock import ManualClock
 from drivers.interfaces import Reading
+from mastctl.devices.frames import StampedFrame
+from mastctl.devices.limits import Limits
 from mastctl.errors import FrameGone
-from mastctl.frames import StampedFrame
-from mastctl.limits import Limits
 from mastctl.pointing.loop import PixelTarget, PointingLoop, PointingResult, PointRequest, Step
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "calib"))

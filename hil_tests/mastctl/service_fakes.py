@@ -14,13 +14,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from calib.cahvor import CameraModel
-from calib.mast import Mast, Rig, RigCamera
-from calib.store import save_rig
+from calib.camera.cahvor import CameraModel
+from calib.files.mast_file import save_rig
+from calib.mast.rig import Mast, Rig, RigCamera
 from drivers.interfaces import Camera, Frame, PanTilt, Reading
-from mastctl import service as service_module
 from mastctl.config import load_config
 from mastctl.daemon import RunningDaemon
+from mastctl.service import service as service_module
 
 SIZE_PX = (64, 48)
 

@@ -9,8 +9,8 @@ from typing import Any
 
 import yaml
 
-from calib.mast import Rig
-from calib.store import load_rig
+from calib.files.mast_file import load_rig
+from calib.mast.rig import Rig
 from calib.survey import Survey, write_survey
 from drivers.sim.survey import Ring, SurveyPlan, SurveyTruth, simulate_survey
 

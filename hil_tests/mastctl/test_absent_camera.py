@@ -19,14 +19,14 @@ import numpy as np
 import pytest
 from service_fakes import FakeCamera, FakeHead, Hang, eventually, rig
 
-from calib.store import save_rig
+from calib.files.mast_file import save_rig
 from drivers import open_hardware as door
 from drivers.errors import BadFrame, BadOptions, DriverError, LineLost, NoReply
 from drivers.interfaces import Frame
 from mastctl.cli.main import main
 from mastctl.config import load_config
 from mastctl.pointing.loop import AnglesTarget, PixelTarget, PointRequest
-from mastctl.service import Service
+from mastctl.service.service import Service
 
 CAMERAS = ("navcam_left", "navcam_right", "hazcam_left")
 PATIENCE_S = 0.3

@@ -22,10 +22,10 @@ from service_fakes import CONFIG, FakeHardware, Hang, ScriptedLoop, eventually, 
 
 from drivers.errors import NoReply
 from drivers.faults import FaultPanel
-from mastctl import devices as devices_module
-from mastctl import service as service_module
-from mastctl.api_guard import LARGEST_BODY_BYTES
 from mastctl.daemon import RunningDaemon
+from mastctl.devices import devices as devices_module
+from mastctl.service import service as service_module
+from mastctl.web.guard import LARGEST_BODY_BYTES
 
 ANGLES = {"pan_rad": 0.1, "tilt_rad": -0.1}
 

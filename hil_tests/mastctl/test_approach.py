@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from calib.mast import Rig
-from calib.pointing import solve
-from calib.store import load_rig
+from calib.files.mast_file import load_rig
+from calib.mast.pointing import solve
+from calib.mast.rig import Rig
 from drivers.sim import bricks, rocks
 from drivers.sim.scene import Scene, SceneSettings, make_grid, tiny_scene
 from mastctl.cli.main import main

@@ -17,7 +17,7 @@ import pytest
 from survey_world import edit_yaml, navcam_survey, write_folder
 
 from calib.survey import Dots, Survey, SurveyImage, read_survey
-from calib.survey_check import check_survey
+from calib.survey.check import check_survey
 from drivers.sim.survey import Ring
 from drivers.sim.survey_blunders import (
     with_moved_tape,

@@ -17,14 +17,14 @@ from typing import Any
 import pytest
 from survey_world import navcam_rig, navcam_survey, write_folder
 
-from calib.calibration import Calibration
-from calib.fit_paper import fit_paper
-from calib.store import load_rig, save_rig
+from calib.files.mast_file import load_rig, save_rig
+from calib.fit.calibration import Calibration
+from calib.fit.paper import fit_paper
 from calib.survey import read_survey
-from mastctl import html
 from mastctl.calibration import detection
 from mastctl.calibration.run import FITS
 from mastctl.cli.main import main
+from mastctl.report import html
 
 KILLED_AT = """
 import os, signal, sys

@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 from survey_world import edit_yaml, navcam_survey, write_folder
 
-from calib.cahvor import CameraModel
-from calib.mast import Rig
-from calib.store import load_rig
+from calib.camera.cahvor import CameraModel
+from calib.files.mast_file import load_rig
+from calib.mast.rig import Rig
 from calib.survey import Dots, Sigma, Survey, SurveyImage
 from drivers.sim.survey import Ring, SurveyPlan, simulate_survey
 from drivers.sim.survey_plan import rover_from_head

@@ -12,14 +12,14 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from calib.camera_parameters import parameter_names
-from calib.formats import digest_of
-from calib.mast import Rig
-from calib.matched_handoff import MatchedHandoff
-from calib.rig_covariance import stored_covariance
-from calib.store import load_rig, save_rig
+from calib.camera.parameters import parameter_names
+from calib.files import digest_of
+from calib.files.mast_file import load_rig, save_rig
+from calib.handoff.matched import MatchedHandoff
+from calib.mast.covariance import stored_covariance
+from calib.mast.rig import Rig
 from mastctl.cli.main import main
-from mastctl.handoff_log import HandoffLog
+from mastctl.handoff.log import HandoffLog
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "calib"))
 from handed_over import HAZCAMS, hand_offs, moved_hazcams, plain_rig, targets, vectors

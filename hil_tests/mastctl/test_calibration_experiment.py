@@ -17,9 +17,9 @@ import numpy as np
 import pytest
 from survey_world import RIG_FILE
 
-from calib.calibration import Calibration
-from calib.fit_start import SurveyNotFitted
-from calib.store import load_rig
+from calib.files.mast_file import load_rig
+from calib.fit.calibration import Calibration
+from calib.fit.start_values import SurveyNotFitted
 from calib.survey import Sigma, Survey
 from drivers.sim.survey import SurveyPlan
 from mastctl.calibration.run import FITS

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from survey_world import navcam_rig, navcam_survey
 
-from calib.calibration import Calibration, Degenerate, Outlier
-from calib.fit_joint import fit_joint
+from calib.fit.calibration import Calibration, Degenerate, Outlier
+from calib.fit.joint import fit_joint
+from calib.fit.uncertainty import rig_moved_along
 from calib.survey import Survey
-from calib.uncertainty import moved_rig
 from mastctl.calibration.expected import check_sizes
 from mastctl.calibration.landing import click, handoff_errors_px, pointing_error_px
 from mastctl.calibration.maps import CORNER, change_map, uncertainty_map
@@ -51,7 +51,9 @@ def test_the_map_of_uncertainty_is_the_spread_of_drawn_rigs(fitted: tuple[Survey
     )
     columns = np.arange(len(calibration.parameter_names))
     errors = [
-        pointing_error_px(moved_rig(calibration, columns, step), rig, pair, pan, tilt, target, left, right)
+        pointing_error_px(
+            rig_moved_along(calibration, columns, step), rig, pair, pan, tilt, target, left, right
+        )
         for step in steps
     ]
     spread = float(np.sqrt(np.mean(np.square(errors))))

@@ -12,7 +12,7 @@ import pytest
 
 from drivers.errors import NoFreshFrame
 from drivers.interfaces import Frame
-from mastctl.camera_check import CameraCheck
+from mastctl.cameras.check import CameraCheck
 from mastctl.cli.main import main
 
 IMAGE = np.random.default_rng(1).integers(0, 256, (48, 64), dtype=np.uint8)

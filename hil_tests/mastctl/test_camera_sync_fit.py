@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from mastctl.camera_sync.fit import CannotTell, Motion, OffsetFit, fit_offset
+from mastctl.cameras.sync_fit import CannotTell, Motion, OffsetFit, fit_offset
 
 
 @dataclass(frozen=True)

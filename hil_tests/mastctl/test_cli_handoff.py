@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from calib.pointing import solve
-from calib.store import load_rig
+from calib.files.mast_file import load_rig
+from calib.mast.pointing import solve
 from mastctl.cli.main import main
 
 HEAD = ["--pan", "0.1", "--tilt", "-0.55"]

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from service_fakes import FakeHardware, ScriptedLoop, fake_daemon
 
-from calib.store import parse_rig
+from calib.files.mast_file import parse_rig
 from mastctl.client import Client, ClientError
 from mastctl.daemon import RunningDaemon
 

@@ -12,9 +12,9 @@ from typing import Any
 import pytest
 import yaml
 
-from calib import store
 from calib.errors import BadFile
-from calib.formats.strict import Section
+from calib.files import mast_file as store
+from calib.files.strict import Section
 from drivers import options as driver_options
 from drivers.dynamixel import settings as dynamixel
 from drivers.errors import BadOptions

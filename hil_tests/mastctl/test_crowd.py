@@ -16,9 +16,9 @@ import pytest
 from outside_daemon import BOUND_S, daemon_process, line, stands_short_of_its_goal, under_way, write_config
 from service_fakes import Hang, eventually, fake_daemon
 
-from mastctl import connections as connections_module
 from mastctl import daemon as daemon_module
 from mastctl.client import Client, ClientError
+from mastctl.web import connections as connections_module
 
 
 def in_threads(count: int, ask: Callable[[], Any]) -> list[threading.Thread]:

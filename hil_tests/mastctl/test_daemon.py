@@ -21,14 +21,14 @@ import pytest
 from service_fakes import CONFIG, FakeHardware, Hang, ScriptedLoop, eventually, fake_daemon, rig
 
 from calib.errors import BadFile
-from calib.store import save_rig
+from calib.files.mast_file import save_rig
 from drivers.errors import DriverError
-from mastctl import devices as devices_module
 from mastctl import operations as operations_module
-from mastctl import service as service_module
 from mastctl.client import Client
 from mastctl.config import Listen, load_config
 from mastctl.daemon import AddressInUse, RunningDaemon, _tcp_socket
+from mastctl.devices import devices as devices_module
+from mastctl.service import service as service_module
 
 LINE_TIMEOUT_S = 60.0  # for a cold start on a busy machine; only bounds a failing test
 

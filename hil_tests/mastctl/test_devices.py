@@ -18,12 +18,12 @@ from service_fakes import FakeCamera, FakeHardware, Hang, eventually, rig
 from drivers.clock import SystemClock
 from drivers.errors import BadFrame, BadReply, DriverError, LineLost, NoFreshFrame, NoReply
 from drivers.interfaces import Frame, FrameTime, Reading
-from mastctl import devices as devices_module
-from mastctl.devices import Devices, UnknownCamera
+from mastctl.devices import devices as devices_module
+from mastctl.devices.devices import Devices, UnknownCamera
+from mastctl.devices.frames import KEPT_FRAMES, StampedFrame
+from mastctl.devices.joint_history import JointHistory
+from mastctl.devices.limits import Limits, OutsideLimits
 from mastctl.errors import FrameGone, Stopped
-from mastctl.frames import KEPT_FRAMES, StampedFrame
-from mastctl.joint_history import JointHistory
-from mastctl.limits import Limits, OutsideLimits
 
 LIMITS = Limits((-2.0, 2.0), (-1.0, 1.0), 0.5)
 DIGEST = "0123456789abcdef" * 4

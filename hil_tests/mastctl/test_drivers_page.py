@@ -17,12 +17,12 @@ from drivers import interfaces
 from drivers.clock import SystemClock
 from drivers.errors import DriverError
 from drivers.interfaces import Frame, Reading
-from mastctl import devices as devices_module
-from mastctl import frames, joint_history, rest, stops
-from mastctl import service as service_module
-from mastctl.devices import Devices
-from mastctl.limits import Limits
+from mastctl.devices import devices as devices_module
+from mastctl.devices import frames, joint_history, rest, stops
+from mastctl.devices.devices import Devices
+from mastctl.devices.limits import Limits
 from mastctl.pointing.requests import PointingSettings
+from mastctl.service import service as service_module
 
 
 @pytest.fixture(scope="module")

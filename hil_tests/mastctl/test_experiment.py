@@ -11,7 +11,7 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
-from calib.store import load_rig
+from calib.files.mast_file import load_rig
 from drivers.sim.rover import simulation_settings
 from mastctl.cli.experiment import turned
 from mastctl.cli.main import main

@@ -14,11 +14,11 @@ from service_fakes import SIZE_PX, FakeCamera, FakeHardware, Hang, ScriptedLoop,
 
 from drivers.clock import SystemClock
 from drivers.errors import DriverError, NoReply, Refused
-from mastctl import devices as devices_module
-from mastctl import exposure_hold as exposure_hold_module
 from mastctl.client import Client
-from mastctl.devices import Devices
-from mastctl.limits import Limits
+from mastctl.devices import devices as devices_module
+from mastctl.devices import exposure_hold as exposure_hold_module
+from mastctl.devices.devices import Devices
+from mastctl.devices.limits import Limits
 
 DEADLINE_S = 0.3
 

@@ -13,13 +13,13 @@ import pytest
 from scipy.spatial.transform import Rotation
 from service_fakes import Hang, eventually
 
-from calib.mast import Rig
-from calib.matched_handoff import MatchedHandoff
-from calib.store import load_rig
+from calib.files.mast_file import load_rig
+from calib.handoff.matched import MatchedHandoff
+from calib.mast.rig import Rig
 from drivers.clock import ManualClock
-from mastctl import handoff_check as module
-from mastctl.handoff_check import NAME, HandoffCheck
-from mastctl.handoff_log import HandoffLog, read_log
+from mastctl.handoff import check as module
+from mastctl.handoff.check import NAME, HandoffCheck
+from mastctl.handoff.log import HandoffLog, read_log
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "calib"))
 from handed_over import HAZCAMS, hand_offs, moved_hazcams, pixel, plain_rig, targets, vectors

@@ -13,11 +13,11 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
-from calib.handoff import Joints, Predicted
-from calib.handoff_refined import RefinedPixel, Verdict
-from calib.matched_handoff import Landed, MatchedHandoff
+from calib.files.mast_file import load_rig
+from calib.handoff.by_image import RefinedPixel, RefinedVerdict
+from calib.handoff.geometric import Joints, PredictedPixel
+from calib.handoff.matched import Landed, MatchedHandoff
 from calib.rigid import Rigid
-from calib.store import load_rig
 from drivers.sim import bricks
 from drivers.sim.rover import SimulatedRover
 from drivers.sim.scene import Scene, tiny_scene
@@ -28,7 +28,7 @@ from mastctl.experiment.handoff import run_handoff_experiment
 from mastctl.experiment.handoff_record import Handed, HandoffExperiment, HandoffRecord, summarise
 from mastctl.experiment.handoff_report import table_rows, target_rows, view_picture, write_report
 from mastctl.experiment.known_points import BrickPoints, KnownPoint
-from mastctl.handoff_log import read_log
+from mastctl.handoff.log import read_log
 
 STEP = "navcam to hazcam"
 FRAME = "hazcam_left-000001-00000000-0000"
@@ -38,13 +38,13 @@ def handed(
     geometric: tuple[float, float],
     refined: tuple[float, float],
     true: tuple[float, float] | None,
-    verdict: Verdict = "accepted",
+    verdict: RefinedVerdict = "accepted",
 ) -> Handed:
     nowhere = np.full(2, math.nan)
     found = np.array(refined) if verdict == "accepted" else nowhere
     return Handed(
         "hazcam_left",
-        Predicted(np.array(geometric), np.eye(2), 4 * np.eye(2)),
+        PredictedPixel(np.array(geometric), np.eye(2), 4 * np.eye(2)),
         RefinedPixel(verdict, "" if verdict == "accepted" else "hidden <b>", found, np.eye(2), nowhere),
         true,
         np.zeros((480, 640), np.uint8),

@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 
 from calib.errors import BadFile
-from calib.handoff import Joints
-from calib.matched_handoff import Landed, MatchedHandoff
-from mastctl.handoff_log import HandoffLog, as_json, read_log
+from calib.handoff.geometric import Joints
+from calib.handoff.matched import Landed, MatchedHandoff
+from mastctl.handoff.log import HandoffLog, as_json, read_log
 
 
 def one(index: int = 0) -> MatchedHandoff:

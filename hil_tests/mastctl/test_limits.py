@@ -6,7 +6,7 @@ import math
 
 import pytest
 
-from mastctl.limits import Limits, OutsideLimits
+from mastctl.devices.limits import Limits, OutsideLimits
 
 LIMITS = Limits((-2.6, 2.6), (-1.2, 1.57), 1.0)
 

@@ -14,13 +14,13 @@ import numpy as np
 import pytest
 from service_fakes import FakeHardware, ScriptedLoop, eventually, fake_daemon, rig
 
-from calib.mast import Mast, RigCamera
-from calib.rig_covariance import stored_covariance
-from calib.store import load_rig, save_rig
+from calib.files.mast_file import load_rig, save_rig
+from calib.mast.covariance import stored_covariance
+from calib.mast.rig import Mast, RigCamera
 from drivers.errors import NoReply
-from mastctl import service as service_module
 from mastctl.daemon import RunningDaemon
 from mastctl.errors import Stopped
+from mastctl.service import service as service_module
 
 
 @pytest.fixture

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from pointing_world import SIZE_PX, World, clean, click, rig, run
 
-from calib.shown_view import Posed, shown_view
+from calib.pictures.shown_view import Posed, shown_view
 from mastctl.pointing.loop import Aim, PointingError, PointRequest, PositionTarget
 
 MIDDLE_PX = (np.array(SIZE_PX) - 1) / 2

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from calib.store import load_rig
+from calib.files.mast_file import load_rig
 from drivers.interfaces import AxisReport, Reporting
 from mastctl.pointing.counts import counts_told
 

@@ -15,14 +15,14 @@ import numpy as np
 import pytest
 from pointing_world import SIZE_PX, World, click, rig, run
 
-from calib.mast import Rig, RigCamera
-from calib.store import load_rig, save_rig
+from calib.files.mast_file import load_rig, save_rig
+from calib.mast.rig import Rig, RigCamera
 from drivers.clock import ManualClock
 from drivers.faults import CAMERA_WORDS, HEAD_WORDS
 from drivers.interfaces import Reading
 from drivers.open_hardware import DeviceSettings, Hardware, HardwareSettings, open_hardware
-from mastctl.devices import RESTING_PERIOD_S, Devices
-from mastctl.limits import Limits
+from mastctl.devices.devices import RESTING_PERIOD_S, Devices
+from mastctl.devices.limits import Limits
 from mastctl.packaged import config_folder
 from mastctl.pointing.loop import (
     AnglesTarget,

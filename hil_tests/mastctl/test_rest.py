@@ -14,11 +14,11 @@ from service_fakes import FakeHardware, eventually, rig
 
 from drivers.clock import SystemClock
 from drivers.interfaces import Reading
-from mastctl.devices import Devices
-from mastctl.joint_history import JointHistory
-from mastctl.limits import Limits
+from mastctl.devices.devices import Devices
+from mastctl.devices.joint_history import JointHistory
+from mastctl.devices.limits import Limits
+from mastctl.devices.rest import DITHER_RAD, RestWatch, dithers
 from mastctl.pointing.loop import AnglesTarget, PointingError, PointRequest
-from mastctl.rest import DITHER_RAD, RestWatch, dithers
 
 XM430_RAD = 2 * math.pi / 4096
 """A count of a 12-bit servo."""

@@ -17,11 +17,11 @@ from service_fakes import FakeHardware, Hang, ScriptedLoop, eventually, fake_dae
 
 from drivers.errors import DriverError
 from drivers.faults import FaultPanel
-from mastctl import api as api_module
 from mastctl import operations as operations_module
-from mastctl import stop_threads as stop_threads_module
 from mastctl.client import Client, ClientError
 from mastctl.pointing.loop import PointingLoop
+from mastctl.service import stop_threads as stop_threads_module
+from mastctl.web import app as api_module
 
 
 def test_the_head_is_told_before_the_track_and_before_any_word(

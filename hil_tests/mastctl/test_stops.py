@@ -15,11 +15,11 @@ from service_fakes import FakeHardware, Hang, eventually, rig
 from drivers.clock import SystemClock
 from drivers.errors import DriverError, NoReply, Refused
 from drivers.interfaces import Reading
-from mastctl import devices as devices_module
-from mastctl.devices import Devices
+from mastctl.devices import devices as devices_module
+from mastctl.devices.devices import Devices
+from mastctl.devices.limits import Limits
+from mastctl.devices.stops import room_s
 from mastctl.errors import MastctlError, Stopped
-from mastctl.limits import Limits
-from mastctl.stops import room_s
 
 DEADLINE_S = 0.3
 BUSY_MACHINE_S = 5.0

@@ -11,12 +11,12 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from calib.errors import CalibError
-from calib.handoff_refined import Eye
-from calib.mast import Rig
+from calib.files.mast_file import load_rig
+from calib.handoff.by_image import Eye
+from calib.mast.rig import Rig
 from calib.rigid import Rigid, carried_covariance
-from calib.store import load_rig
-from calib.tracking import Key, Track
-from mastctl.limits import Limits
+from calib.tracking.track import Key, Track
+from mastctl.devices.limits import Limits
 from mastctl.tracking.carried import Carried
 from mastctl.tracking.choice import HandoffRules, PairBounds, choose_pairs
 from mastctl.tracking.pose import (

@@ -13,12 +13,12 @@ from pointing_world import LIMITS, SIZE_PX, World, moving_world, rig
 from scipy.spatial.transform import Rotation
 
 from calib.errors import CalibError
-from calib.mast import Rig
+from calib.mast.rig import Rig
 from calib.rigid import Rigid
-from calib.tracking import Track, moved
+from calib.tracking.track import Track, moved_track
 from drivers.errors import DriverError, NoReply
+from mastctl.devices.frames import StampedFrame
 from mastctl.errors import MastctlError
-from mastctl.frames import StampedFrame
 from mastctl.pointing.requests import PixelTarget, PointingError, PointingSettings
 from mastctl.pointing.steps import Step, Steps
 from mastctl.tracking.look import Looker, NotTrackable
@@ -238,12 +238,12 @@ def test_a_pose_that_the_pictures_contradict_is_told_by_the_look(found_by: str) 
     steps: list[Step] = []
     track, _ = begun(world)
     told = np.diag([1e-3**2] * 3 + [0.015**2] * 3)
-    said = moved(track, Rigid(np.eye(3), np.array([0.0, -0.12, 0.0])), told)
+    said = moved_track(track, Rigid(np.eye(3), np.array([0.0, -0.12, 0.0])), told)
     _, seen = looker(world, steps).look(said, found_by)
     off = re.search(r"([\d.]+) cm \(([\d.]+) sigma\) from where the pose", seen.pose_doubt)
     assert off is not None and float(off[1]) == pytest.approx(12.0, abs=1.5) and float(off[2]) > 4.0
     assert any(step.detail.get("pose_doubt") == seen.pose_doubt for step in steps)
-    honest = moved(track, Rigid(np.eye(3), np.zeros(3)), told)
+    honest = moved_track(track, Rigid(np.eye(3), np.zeros(3)), told)
     assert looker(world).look(honest, found_by)[1].pose_doubt == ""
 
 

@@ -15,18 +15,18 @@ import numpy as np
 import pytest
 from service_fakes import CONFIG, FakeHardware, Hang, ScriptedLoop, eventually, fake_daemon, rig
 
-from calib.handoff import Joints
-from calib.handoff_refined import Eye
-from calib.mast import Mast
-from calib.matched_handoff import Landed, MatchedHandoff
+from calib.files.mast_file import save_rig
+from calib.handoff.by_image import Eye
+from calib.handoff.geometric import Joints
+from calib.handoff.matched import Landed, MatchedHandoff
+from calib.mast.rig import Mast
 from calib.rigid import Rigid
-from calib.store import save_rig
-from calib.tracking import Key, Track
+from calib.tracking.track import Key, Track
 from drivers.errors import NoReply
 from mastctl.cli.main import main
 from mastctl.client import Client, ClientError
 from mastctl.daemon import RunningDaemon
-from mastctl.handoff_log import read_log
+from mastctl.handoff.log import read_log
 from mastctl.tracking import tracker as tracker_module
 from mastctl.tracking.look import EyePixel, NotTrackable, Seen
 

@@ -13,14 +13,14 @@ import pytest
 from scipy.spatial.transform import Rotation
 from service_fakes import eventually
 
-from calib.mast import Rig, RigCamera
+from calib.files.mast_file import load_rig, save_rig
+from calib.mast.rig import Rig, RigCamera
 from calib.rigid import FloatArray, Rigid
-from calib.store import load_rig, save_rig
 from mastctl.client import Client, ClientError
 from mastctl.config import load_config
 from mastctl.daemon import RunningDaemon
 from mastctl.experiment.targets import textured
-from mastctl.handoff_log import read_log
+from mastctl.handoff.log import read_log
 
 CROPPED_PX = (400, 300)
 STEP_M = 0.45

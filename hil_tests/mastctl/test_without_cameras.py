@@ -11,11 +11,11 @@ import httpx
 import pytest
 from service_fakes import FakeHardware, eventually, rig
 
-from calib.store import save_rig
-from mastctl import service as service_module
+from calib.files.mast_file import save_rig
 from mastctl.cli.main import main
 from mastctl.config import load_config
 from mastctl.daemon import RunningDaemon
+from mastctl.service import service as service_module
 
 BARE_MAST = """
 schema: mastctl/mast/1

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import cv2
 
-from calib.detect_survey import Progress, detect_survey
+from calib.dots.find_in_survey import Progress, detect_survey
 from calib.survey import Survey
 from mastctl.errors import MastctlError
 

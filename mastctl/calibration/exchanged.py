@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from calib.calibration import Calibration, ImageResiduals
+from calib.fit.calibration import Calibration, ImageResiduals
 from calib.survey import Survey
 
 CLOSER = 0.1

@@ -7,11 +7,11 @@ from typing import NamedTuple
 import numpy as np
 from scipy.stats import chi2
 
-from calib.align import Alignment, NotAligned, rover_from_station, station_from_board
-from calib.calibration import Calibration, ImageResiduals
+from calib.fit.calibration import Calibration, ImageResiduals
+from calib.fit.uncertainty import pixel_covariance
 from calib.rigid import FloatArray
 from calib.survey import Survey
-from calib.uncertainty import pixel_covariance
+from calib.survey.alignment import Alignment, NotAligned, rover_from_station, station_from_board
 
 RARELY = 0.001
 

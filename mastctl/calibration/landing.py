@@ -11,11 +11,11 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import ArrayLike
 
+from calib.camera.stereo import triangulate
 from calib.errors import CalibError
-from calib.mast import Rig
-from calib.pointing import solve
+from calib.mast.pointing import solve
+from calib.mast.rig import Rig
 from calib.rigid import FloatArray
-from calib.stereo import triangulate
 
 
 def click(

@@ -7,14 +7,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from calib.cahvor import CameraModel
-from calib.calibration import Calibration
+from calib.camera.cahvor import CameraModel
+from calib.camera.stereo import triangulate
 from calib.errors import CalibError
-from calib.mast import Mast, Rig
-from calib.pointing import solve
+from calib.fit.calibration import Calibration
+from calib.fit.uncertainty import pixel_covariance, rig_moved_along
+from calib.mast.pointing import solve
+from calib.mast.rig import Mast, Rig
 from calib.rigid import FloatArray
-from calib.stereo import triangulate
-from calib.uncertainty import moved_rig, pixel_covariance
 from mastctl.calibration.landing import click, pointing_error_px, position_error_px
 
 PAN_RAD = (-2.6, 2.6)
@@ -85,8 +85,8 @@ def change_map(new: Rig, old: Rig, pair: str, range_m: float) -> PointingMap | N
 class _Clicks:
     """A click near a corner, pointed at by rigs that are off by one sigma in one direction each.
 
-    `calib.uncertainty.pointing_covariance` for many joint angles: a target that keeps its place in the head
-    frame is triangulated once a rig, not once for each pan and tilt. The directions are the columns of a
+    `calib.fit.uncertainty.pointing_covariance` for many joint angles: a target that keeps its place in the
+    head frame is triangulated once a rig, not once for each pan and tilt. The directions are the columns of a
     square root of the covariance, so that their squares add up to the variance.
     """
 
@@ -111,7 +111,7 @@ class _Clicks:
         narrow = replace(calibration, rig=self.rig)
         self.believed: list[tuple[Mast, CameraModel, FloatArray]] = []
         for step in (np.zeros(len(columns)), *(STEP * step for step in steps)):
-            moved = moved_rig(narrow, columns, step)
+            moved = rig_moved_along(narrow, columns, step)
             left, right = (moved.cameras[name].model for name in names)
             found = triangulate(left, right, clicks[0], clicks[1]).position_m
             self.believed.append((moved.mast, left, found))

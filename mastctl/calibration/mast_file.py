@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from calib.calibration import Calibration
-from calib.mast import Rig
+from calib.fit.calibration import Calibration
+from calib.mast.rig import Rig
 from calib.survey import Survey
 
 DIGITS = 9
@@ -24,7 +24,7 @@ def with_fit(calibration: Calibration, survey: Survey, verdict: Mapping[str, Any
 
     ``fit.covariance`` is square, its rows and columns in the order of ``fit.parameters``: ``mast.KEY.x`` and
     ``cameras.NAME.C.x``; A and O have two each (``A.1``, ``A.2``), radians along
-    `calib.camera_parameters.tangents`.
+    `calib.camera.parameters.tangents`.
     """
     fit = {
         "method": calibration.method,

@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from calib.calibration import Calibration, ImageResiduals
-from calib.mast import Rig
+from calib.fit.calibration import Calibration, ImageResiduals
+from calib.mast.rig import Rig
 from calib.rigid import Rigid
 from calib.survey import Board
 from mastctl.calibration.maps import PointingMap

@@ -9,20 +9,20 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from calib.body_pose import PRIOR_SHIFT_M, PRIOR_TURN_RAD, BodyPose
-from calib.body_sights import body_groups
-from calib.corrected_rig import corrected_covariance, corrected_rig
 from calib.errors import NoCorrection
-from calib.fit_body_pose import fit_body_pose
-from calib.handoff_bias import HandoffBias, handoff_bias
-from calib.mast import Rig
-from calib.matched_handoff import MatchedHandoff
-from calib.rig_covariance import stored_covariance
-from calib.store import StoredRig
-from calib.uncertainty import sigma_by_key
+from calib.files.mast_file import StoredRig
+from calib.fit.uncertainty import sigma_by_key
+from calib.handoff.bias import HandoffBias, handoff_bias
+from calib.handoff.body_pose import PRIOR_SHIFT_M, PRIOR_TURN_RAD, BodyPose
+from calib.handoff.body_sights import body_groups
+from calib.handoff.corrected_rig import corrected_covariance, corrected_rig
+from calib.handoff.fit_body_pose import fit_body_pose
+from calib.handoff.matched import MatchedHandoff
+from calib.mast.covariance import stored_covariance
+from calib.mast.rig import Rig
 from mastctl.calibration.mast_file import plain, rounded
 from mastctl.calibration.run import save_new
-from mastctl.handoff_log import ReadLog
+from mastctl.handoff.log import ReadLog
 
 
 @dataclass(frozen=True, eq=False)

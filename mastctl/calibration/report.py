@@ -8,13 +8,13 @@ from pathlib import Path
 
 import numpy as np
 
-from calib.calibration import HELD_FIXED, Calibration
-from calib.formats.atomic import save_bytes
-from calib.store import StoredRig
+from calib.files.atomic import save_bytes
+from calib.files.mast_file import StoredRig
+from calib.fit.calibration import HELD_FIXED, Calibration
 from calib.survey import Survey
-from mastctl import html
 from mastctl.calibration.maps import change_map, uncertainty_map
 from mastctl.calibration.verdict import POINTING_RANGE_M, Verdict
+from mastctl.report import html
 
 NO_PLOTS = "No pictures: matplotlib is not installed (pip install 'mastctl[report]')."
 WORST_IMAGES = 12

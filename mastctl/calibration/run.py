@@ -7,14 +7,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from calib.calibration import Calibration
-from calib.fit_joint import fit_joint
-from calib.fit_paper import fit_paper
-from calib.formats.atomic import keep_previous, previous_path
-from calib.mast import Rig
-from calib.store import StoredRig, save_rig
+from calib.files.atomic import keep_previous, previous_path
+from calib.files.mast_file import StoredRig, save_rig
+from calib.fit.calibration import Calibration
+from calib.fit.joint import fit_joint
+from calib.fit.paper import fit_paper
+from calib.mast.rig import Rig
 from calib.survey import Finding, Survey
-from calib.survey_check import check_survey
+from calib.survey.check import check_survey
 from mastctl.calibration.mast_file import with_fit
 from mastctl.calibration.verdict import Verdict, judge
 from mastctl.errors import MastctlError

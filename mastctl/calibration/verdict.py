@@ -9,10 +9,10 @@ from typing import Literal
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from calib.calibration import Calibration
 from calib.errors import CalibError
+from calib.fit.calibration import Calibration
+from calib.fit.uncertainty import pointing_covariance
 from calib.survey import Survey
-from calib.uncertainty import pointing_covariance
 from mastctl.calibration.exchanged import exchanged_boards
 from mastctl.calibration.expected import RARELY, check_sizes
 
@@ -174,7 +174,7 @@ def _open(calibration: Calibration) -> list[Reason]:
 def _turned(calibration: Calibration) -> list[Reason]:
     """Whether the mast is turned about: a tilt that counts down fits as well, with the head half a turn off.
 
-    `calib.survey_joints` mostly refuses such a survey before.
+    `calib.survey.joint_doubts` mostly refuses such a survey before.
     """
     angle = float(np.linalg.norm(Rotation.from_euler("XYZ", calibration.rig.mast.rotation_rad).as_rotvec()))
     if angle < TURNED_RAD:

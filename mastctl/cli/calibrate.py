@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from mastctl.cli import output
 
 if TYPE_CHECKING:
-    from calib.store import StoredRig
+    from calib.files.mast_file import StoredRig
     from calib.survey import Survey
     from mastctl.calibration.run import Calibrated
 
@@ -159,7 +159,7 @@ def _unusable(what: str, why: str) -> output.CommandError:
 def _in_use(args: argparse.Namespace) -> StoredRig | None:
     """The mast file to compare with; one at --out that cannot be read is no reason to stop."""
     from calib.errors import BadFile
-    from calib.store import load_rig
+    from calib.files.mast_file import load_rig
 
     if args.in_use is not None:
         return load_rig(args.in_use)
@@ -214,7 +214,7 @@ def _report(args: argparse.Namespace, done: Calibrated, in_use: StoredRig | None
 
 def _document(done: Calibrated, in_use: StoredRig | None, page: Path | None) -> dict[str, Any]:
     """The contract's keys, and what else a program may want."""
-    from calib.calibration import HELD_FIXED
+    from calib.fit.calibration import HELD_FIXED
     from mastctl.calibration.mast_file import as_lists, mast_keys, plain
     from mastctl.calibration.report import change_summary
 

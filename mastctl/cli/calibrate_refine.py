@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 from mastctl.cli import output
 
 if TYPE_CHECKING:
-    from calib.body_pose import BodyPose
-    from calib.store import StoredRig
+    from calib.files.mast_file import StoredRig
+    from calib.handoff.body_pose import BodyPose
     from mastctl.calibration.refined import Proposal
 
 OUTLIERS_SHOWN = 20
@@ -18,9 +18,9 @@ OUTLIERS_SHOWN = 20
 
 def run(args: argparse.Namespace) -> int:
     """Propose a correction as a new mast file; 1, and no file, if the hand-offs tell none."""
-    from calib.store import load_rig
+    from calib.files.mast_file import load_rig
     from mastctl.calibration.refined import propose, save_refined
-    from mastctl.handoff_log import read_log
+    from mastctl.handoff.log import read_log
 
     unused = {"--report": args.report, "--in-use": args.in_use, "--method": args.method, "--mast": args.mast}
     if given := [option for option, value in unused.items() if value is not None]:
@@ -58,7 +58,7 @@ def _check_out(out: Path, read: list[Path]) -> None:
 
 def _document(proposal: Proposal, saved: StoredRig | None, previous: Path | None) -> dict[str, Any]:
     from mastctl.calibration.refined import pose_told
-    from mastctl.handoff_log import bias_told
+    from mastctl.handoff.log import bias_told
 
     return {
         "mast_file": None
@@ -105,7 +105,7 @@ def _show(proposal: Proposal) -> None:
 
 
 def _show_pose(group: str, pose: BodyPose) -> None:
-    from calib.body_pose import WORDS
+    from calib.handoff.body_pose import WORDS
 
     sigma = pose.covariance.diagonal() ** 0.5
     rows = [

@@ -14,8 +14,8 @@ from mastctl.cli import output
 from mastctl.cli.output import positive_number
 
 if TYPE_CHECKING:
-    from calib.mast import Rig
-    from mastctl.camera_sync.sweep import Sweep
+    from calib.mast.rig import Rig
+    from mastctl.cameras.sync_sweep import Sweep
     from mastctl.config import Config
 
 SIGNIFICANT_SIGMAS = 3.0
@@ -51,10 +51,10 @@ def camera_sync(args: argparse.Namespace) -> int:
 
     from drivers.clock import SystemClock
     from drivers.open_hardware import open_hardware
-    from mastctl.camera_sync.sweep import Sweep, plan_sweep
+    from mastctl.cameras.sync_sweep import Sweep, plan_sweep
     from mastctl.config import load_config
-    from mastctl.devices import Devices
-    from mastctl.mast_in_use import read_mast
+    from mastctl.devices.devices import Devices
+    from mastctl.service.mast_in_use import read_mast
 
     config = load_config(args.config)
     mast = read_mast(config.mast_file, config)
@@ -116,7 +116,7 @@ def _ending_signals() -> Iterator[threading.Event]:
 
 def _found(sweep: Sweep, name: str, in_use_s: float) -> dict[str, Any]:
     """One camera's result, as JSON."""
-    from mastctl.camera_sync.fit import CannotTell
+    from mastctl.cameras.sync_fit import CannotTell
 
     seen = sweep.seen[name]
     told: dict[str, Any] = {

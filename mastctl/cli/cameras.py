@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from drivers.interfaces import Image
     from drivers.v4l2.camera import V4l2Camera
     from mastctl.config import Config
-    from mastctl.frames import StampedFrame
+    from mastctl.devices.frames import StampedFrame
 
 FRAME_TIMEOUT_S = 5.0
 
@@ -100,7 +100,7 @@ def camera_list(args: argparse.Namespace) -> int:
 
 def camera_check(args: argparse.Namespace) -> int:
     """Measure what a camera delivers, and show what it can do."""
-    from mastctl.picture_quality import quality_of
+    from mastctl.cameras.quality import quality_of
 
     if (
         args.config is not None
@@ -135,8 +135,8 @@ def camera_check(args: argparse.Namespace) -> int:
 
 def camera_grab(args: argparse.Namespace) -> int:
     """Write one fresh picture with its facts."""
-    from mastctl.api import encoded
-    from mastctl.png_text import with_text
+    from mastctl.report.png_text import with_text
+    from mastctl.web.app import encoded
 
     if args.out.suffix.lower() != ".png":
         raise output.WrongUse(
@@ -183,7 +183,7 @@ def camera_grab(args: argparse.Namespace) -> int:
 
 def camera_focus(args: argparse.Namespace) -> int:
     """Show the sharpness twice a second, and the best so far."""
-    from mastctl.picture_quality import sharpness
+    from mastctl.cameras.quality import sharpness
 
     best, seen = 0.0, []
     with _opened(args) as camera:
@@ -269,8 +269,8 @@ def _check_any(args: argparse.Namespace, config: Config) -> int:
 
     from drivers.clock import SystemClock
     from drivers.open_hardware import open_hardware, open_one_camera
-    from mastctl.camera_check import CameraCheck
-    from mastctl.mast_in_use import read_mast
+    from mastctl.cameras.check import CameraCheck
+    from mastctl.service.mast_in_use import read_mast
 
     _refuse_settings(args)
     rig = read_mast(config.mast_file, config).stored.rig
@@ -301,8 +301,8 @@ def _configured_frame(args: argparse.Namespace) -> StampedFrame:
     from drivers.absent_camera import AbsentCamera
     from drivers.clock import SystemClock
     from drivers.open_hardware import open_hardware
-    from mastctl.devices import Devices
-    from mastctl.mast_in_use import read_mast
+    from mastctl.devices.devices import Devices
+    from mastctl.service.mast_in_use import read_mast
 
     _refuse_settings(args)
     config = _config_of(args)

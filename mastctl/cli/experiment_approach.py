@@ -42,7 +42,7 @@ def run(args: argparse.Namespace) -> int:
     """Run the approaches; 1 if no target at all was kept."""
     from rich.console import Console
 
-    from calib.store import load_rig
+    from calib.files.mast_file import load_rig
     from mastctl.cli.experiment import check_writable
     from mastctl.experiment.approach import run_approach
     from mastctl.experiment.approach_report import counted, summary, table_rows, write_record, write_strip

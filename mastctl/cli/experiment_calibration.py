@@ -56,7 +56,7 @@ def add_parser(kinds: Any) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Run the study; 1 if no survey at all could be fitted."""
-    from calib.store import load_rig
+    from calib.files.mast_file import load_rig
     from mastctl.cli.experiment import check_writable
     from mastctl.experiment.calibration import variants
     from mastctl.packaged import config_folder

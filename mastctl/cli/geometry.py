@@ -15,9 +15,9 @@ from mastctl.cli import cameras, output
 from mastctl.cli.output import finite_number, positive_number
 
 if TYPE_CHECKING:
-    from calib.cahvor import CameraModel
-    from calib.mast import Rig
-    from calib.store import StoredRig
+    from calib.camera.cahvor import CameraModel
+    from calib.files.mast_file import StoredRig
+    from calib.mast.rig import Rig
 
 
 def add_commands(subparsers: Any) -> None:
@@ -88,7 +88,7 @@ def _add_camera_options(parser: argparse.ArgumentParser) -> None:
 
 def camera_project(args: argparse.Namespace) -> int:
     """Project points of a CSV table: x_m,y_m,z_m to x_px,y_px."""
-    from calib.tables import read_table, write_table
+    from calib.files.tables import read_table, write_table
 
     model = _chosen_model(args)
     pixels, _ = model.project(read_table(args.points, ("x_m", "y_m", "z_m")))
@@ -100,7 +100,7 @@ def camera_ray(args: argparse.Namespace) -> int:
     """Give the rays through pixels of a CSV table: x_px,y_px to origin and direction."""
     import numpy as np
 
-    from calib.tables import read_table, write_table
+    from calib.files.tables import read_table, write_table
 
     model = _chosen_model(args)
     rays = model.ray(read_table(args.pixels, ("x_px", "y_px")))
@@ -111,8 +111,8 @@ def camera_ray(args: argparse.Namespace) -> int:
 
 def camera_convert(args: argparse.Namespace) -> int:
     """Write a camera of a file in another format, and say what that format cannot hold."""
-    from calib.formats import CameraFile
-    from calib.formats.any_camera import load_any, save_any
+    from calib.files import CameraFile
+    from calib.files.any_camera import load_any, save_any
 
     source = load_any(args.source)
     if not isinstance(source, CameraFile):
@@ -145,8 +145,8 @@ def camera_convert(args: argparse.Namespace) -> int:
 
 def solve_pointing(args: argparse.Namespace) -> int:
     """Solve for the joint angles that bring a target in the rover frame onto a pixel."""
-    from calib.pointing import solve
-    from calib.store import load_rig
+    from calib.files.mast_file import load_rig
+    from calib.mast.pointing import solve
 
     stored = load_rig(args.mast)
     _tell_notes(stored.notes)
@@ -188,9 +188,9 @@ def solve_pointing(args: argparse.Namespace) -> int:
 
 def triangulate_pair(args: argparse.Namespace) -> int:
     """Triangulate the point seen at a pixel of each camera of a pair, in the rover frame."""
-    from calib.ray_gap import clicked_point
-    from calib.rig_covariance import stored_covariance
-    from calib.store import load_rig
+    from calib.files.mast_file import load_rig
+    from calib.mast.covariance import stored_covariance
+    from calib.mast.ray_gap import clicked_point
 
     stored = load_rig(args.mast)
     _tell_notes(stored.notes)
@@ -233,7 +233,7 @@ def triangulate_pair(args: argparse.Namespace) -> int:
 
 def error_budget(args: argparse.Namespace) -> int:
     """Compute the paper's Table I."""
-    from calib.budget import target_approach_budget
+    from calib.mast.budget import target_approach_budget
 
     rows = target_approach_budget()
     keys = ("stereo_cm", "untracked_cm", "tracked_cm")
@@ -252,8 +252,8 @@ def error_budget(args: argparse.Namespace) -> int:
 
 def _chosen_model(args: argparse.Namespace) -> CameraModel:
     """Return the camera of --camera at --pan and --tilt in the rover frame, or a single camera as it is."""
-    from calib.formats import CameraFile
-    from calib.formats.any_camera import load_any
+    from calib.files import CameraFile
+    from calib.files.any_camera import load_any
 
     source = load_any(args.file)
     _tell_notes(source.notes)
@@ -300,7 +300,7 @@ def _refuse_name(args: argparse.Namespace) -> None:
 
 
 def _nearest(word: str, known: Iterable[str]) -> str:
-    from calib.formats.strict import nearest
+    from calib.files.strict import nearest
 
     return nearest(word, list(known)) if known else "it has none"
 

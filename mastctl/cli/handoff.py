@@ -11,9 +11,9 @@ from mastctl.cli import output
 from mastctl.cli.output import finite_number, positive_number
 
 if TYPE_CHECKING:
-    from calib.handoff import Handoff, Joints
-    from calib.mast import Rig
-    from calib.rig_covariance import RigCovariance
+    from calib.handoff.geometric import Handoff, Joints
+    from calib.mast.covariance import RigCovariance
+    from calib.mast.rig import Rig
 
 
 def add_commands(subparsers: Any) -> None:
@@ -44,9 +44,9 @@ def add_commands(subparsers: Any) -> None:
 
 def hand_over(args: argparse.Namespace) -> int:
     """Hand a target over, geometrically."""
-    from calib.handoff import Joints, hand_off
-    from calib.rig_covariance import stored_covariance
-    from calib.store import load_rig
+    from calib.files.mast_file import load_rig
+    from calib.handoff.geometric import Joints, hand_off
+    from calib.mast.covariance import stored_covariance
 
     stored = load_rig(args.mast)
     for note in stored.notes:
@@ -94,9 +94,9 @@ def _destination(
     calibration: RigCovariance | None,
 ) -> Joints | None:
     """The joint angles of the destination images; None where the head does not turn."""
-    from calib.handoff import Joints
-    from calib.pointing import solve
-    from calib.ray_gap import clicked_point
+    from calib.handoff.geometric import Joints
+    from calib.mast.pointing import solve
+    from calib.mast.ray_gap import clicked_point
 
     if args.point:
         if args.to_pan is not None or args.to_tilt is not None:

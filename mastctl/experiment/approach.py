@@ -10,14 +10,14 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.cahvor import CameraModel
+from calib.camera.cahvor import CameraModel
 from calib.errors import CalibError
-from calib.handoff_refined import Eye
-from calib.mast import Rig
-from calib.match import Match
-from calib.pointing import solve
+from calib.handoff.by_image import Eye
+from calib.mast.pointing import solve
+from calib.mast.rig import Rig
+from calib.pictures.patch_match import PatchMatch
 from calib.rigid import FloatArray
-from calib.tracking import Track, moved, seen_by, start_track
+from calib.tracking.track import Track, moved_track, seen_by, start_track
 from drivers.interfaces import Image
 from drivers.sim.scene import SceneSettings, build_scene
 from mastctl.experiment.approach_world import World, WorldErrors
@@ -231,7 +231,7 @@ def _drive(
         x, y = here.translation_m[:2] + step * np.array([math.cos(bearing), math.sin(bearing)])
         facing = math.atan2(target[1] - y, target[0] - x) + rng.normal(0.0, 0.08)
         motion, covariance = world.drive(float(x), float(y), facing)
-        track, carried = moved(track, motion, covariance), motion.points(carried)
+        track, carried = moved_track(track, motion, covariance), motion.points(carried)
         if not relit and left_m < 4.0:
             sun = light.sun_azimuth_rad + SUN_MOVES_RAD
             world.relight(build_scene(replace(light, sun_azimuth_rad=sun)))
@@ -285,7 +285,7 @@ def _look(world: World, track: Track, target: FloatArray, carried_m: FloatArray)
     )
 
 
-def _place(found: Match | None) -> FloatArray:
+def _place(found: PatchMatch | None) -> FloatArray:
     """Where a match found the target, or expected it."""
     if found is None:
         return np.full(2, np.nan)

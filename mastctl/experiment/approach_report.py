@@ -12,7 +12,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from calib.budget import target_approach_budget
+from calib.mast.budget import target_approach_budget
 from calib.rigid import FloatArray
 from drivers.interfaces import Image
 from mastctl.experiment.approach import ApproachRun, Stop

@@ -15,10 +15,10 @@ from typing import Any
 
 import numpy as np
 
-from calib.calibration import Calibration
 from calib.errors import CalibError
-from calib.mast import Rig
-from calib.pointing import solve
+from calib.fit.calibration import Calibration
+from calib.mast.pointing import solve
+from calib.mast.rig import Rig
 from calib.rigid import FloatArray
 from calib.survey import Sigma
 from drivers.sim.survey import SurveyPlan, simulate_survey

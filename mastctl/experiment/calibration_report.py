@@ -10,8 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from calib.mast import Rig
-from mastctl import html
+from calib.mast.rig import Rig
 from mastctl.experiment.calibration import (
     DISTANCES_M,
     HANDOFFS,
@@ -24,6 +23,7 @@ from mastctl.experiment.calibration import (
     Outcome,
     Summary,
 )
+from mastctl.report import html
 
 SIX = ("txm, m", "tym, m", "tzm, m", "θxm, rad", "θym, rad", "θzm, rad")
 STUDIES = {

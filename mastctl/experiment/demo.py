@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from calib.mast import Rig
+from calib.mast.rig import Rig
 from calib.rigid import FloatArray
 from drivers.sim.rover import SimulatedRover
 from mastctl.config import Config, Listen
-from mastctl.frames import camera_and_sequence
+from mastctl.devices.frames import camera_and_sequence
 
 
 def demo_config(

@@ -16,13 +16,13 @@ from typing import Any
 import numpy as np
 
 from calib.errors import CalibError
-from calib.handoff import Joints, hand_off
-from calib.handoff_refined import Eye, refine_handoff
-from calib.mast import Rig
-from calib.matched_handoff import matched_handoff
-from calib.rig_covariance import RigCovariance, stored_covariance
-from calib.store import parse_rig
-from calib.warp import grey
+from calib.files.mast_file import parse_rig
+from calib.handoff.by_image import Eye, refine_handoff
+from calib.handoff.geometric import Joints, hand_off
+from calib.handoff.matched import matched_handoff
+from calib.mast.covariance import RigCovariance, stored_covariance
+from calib.mast.rig import Rig
+from calib.pictures.warp import grey
 from mastctl.client import Client, ClientError, Snapshot
 from mastctl.experiment.handoff_record import Handed, HandoffExperiment, HandoffRecord, summarise
 from mastctl.experiment.known_points import KnownPoint, KnownPoints

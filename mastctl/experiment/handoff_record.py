@@ -8,12 +8,12 @@ from typing import Any
 
 import numpy as np
 
-from calib.handoff import Predicted
-from calib.handoff_bias import HandoffBias, handoff_bias
-from calib.handoff_refined import RefinedPixel
-from calib.matched_handoff import MatchedHandoff
+from calib.handoff.bias import HandoffBias, handoff_bias
+from calib.handoff.by_image import RefinedPixel
+from calib.handoff.geometric import PredictedPixel
+from calib.handoff.matched import MatchedHandoff
 from drivers.interfaces import Image
-from mastctl.handoff_log import bias_told
+from mastctl.handoff.log import bias_told
 
 PAPER_WORST_PX: Mapping[str, float] = {"pancam to navcam": 2.5, "navcam to hazcam": 4.0}
 """The paper's worst geometric hand-off, Pancam to Navcam at 6 m and Navcam to Hazcam at 2 m."""
@@ -28,7 +28,7 @@ class Handed:
     """
 
     camera: str
-    geometric: Predicted
+    geometric: PredictedPixel
     refined: RefinedPixel
     true_px: tuple[float, float] | None
     image: Image | None = None

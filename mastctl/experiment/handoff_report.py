@@ -11,7 +11,6 @@ from typing import Any
 import cv2
 import numpy as np
 
-from mastctl import html
 from mastctl.experiment.handoff_record import (
     PAPER_WORST_PX,
     Handed,
@@ -20,7 +19,8 @@ from mastctl.experiment.handoff_record import (
     HandoffSummary,
 )
 from mastctl.experiment.report import FIRST_COLOUR, SECOND_COLOUR, bgr, jpeg_tag
-from mastctl.handoff_log import HandoffLog
+from mastctl.handoff.log import HandoffLog
+from mastctl.report import html
 
 CSV_COLUMNS = (
     "handoff", "target", "kind", "range_m", "frame_id", "clicked_x_px", "clicked_y_px", "camera",
@@ -40,7 +40,7 @@ LEGEND = (
 def write_report(experiment: HandoffExperiment, folder: Path) -> Path:
     """Write report.html, the tables and the record into ``folder`` (made if need be); return the page.
 
-    ``handoffs.jsonl`` is what `mastctl calibrate --refine` reads (`mastctl.handoff_log`).
+    ``handoffs.jsonl`` is what `mastctl calibrate --refine` reads (`mastctl.handoff.log`).
 
     Raises
     ------

@@ -10,7 +10,7 @@ import numpy as np
 
 from calib.rigid import FloatArray
 from drivers.sim.rover import SimulatedRover
-from mastctl.frames import camera_and_sequence
+from mastctl.devices.frames import camera_and_sequence
 
 HIDDEN_M = 0.003
 """What stands before a point by less does not hide it: a ray at a corner meets the brick there or passes."""

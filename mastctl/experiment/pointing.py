@@ -15,8 +15,8 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from calib.mast import Rig
-from calib.store import parse_rig
+from calib.files.mast_file import parse_rig
+from calib.mast.rig import Rig
 from drivers.interfaces import Image
 from mastctl.client import Client, ClientError
 from mastctl.experiment.targets import Target

@@ -13,8 +13,8 @@ import cv2
 import numpy as np
 
 from drivers.interfaces import Image
-from mastctl import html
 from mastctl.experiment.pointing import PAPER_TABLE_VI, DistanceSummary, PointingExperiment, TargetRecord
+from mastctl.report import html
 
 PICTURES_PER_DISTANCE = 4
 CROP_PX = 60  # half the side of the piece of image shown around the aim

@@ -8,12 +8,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.cahvor import CameraModel
-from calib.epipolar import find_partner
+from calib.camera.cahvor import CameraModel
+from calib.camera.stereo import triangulate
 from calib.errors import NoStereoPoint
+from calib.pictures.epipolar import find_partner
+from calib.pictures.warp import grey
 from calib.rigid import FloatArray
-from calib.stereo import triangulate
-from calib.warp import grey
 from drivers.interfaces import Image
 from mastctl.client import Snapshot
 

@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from calib import pointing
 from calib.errors import Unreachable
-from calib.mast import Rig
+from calib.mast import pointing
+from calib.mast.rig import Rig
 from calib.rigid import FloatArray
 from mastctl.client import Client, ClientError, Snapshot
 from mastctl.experiment.targets import Target, choose_target

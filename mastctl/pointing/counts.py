@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from calib.cahvor import CameraModel
+from calib.camera.cahvor import CameraModel
 from drivers.errors import DriverError
 from drivers.interfaces import AxisReport
 

@@ -10,20 +10,20 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from calib.cahvor import CameraModel
-from calib.epipolar import UP, StereoMatch, find_partner
+from calib.camera.cahvor import CameraModel
 from calib.errors import CalibError
-from calib.mast import Rig
-from calib.match import Match, MatchSettings, match
+from calib.mast.rig import Rig
+from calib.pictures.epipolar import UP, StereoMatch, find_partner
+from calib.pictures.patch_match import MatchSettings, PatchMatch, match_patch
+from calib.pictures.warp import Grey, Plane, carry, facing_plane, grey
 from calib.rigid import FloatArray
-from calib.warp import Grey, Plane, carry, facing_plane, grey
 from drivers.interfaces import Reading
-from mastctl.frames import StampedFrame
+from mastctl.devices.frames import StampedFrame
 from mastctl.pointing.requests import PointingError, PointingSettings, rounded
 
 
 class CamerasLike(Protocol):
-    """What of `mastctl.devices.Devices` brings pictures."""
+    """What of `mastctl.devices.devices.Devices` brings pictures."""
 
     def frames(
         self, cameras: Sequence[str], exposed_after_s: float, timeout_s: float
@@ -117,7 +117,7 @@ class Eyes:
             views[name] = self._view(frame)
         return views
 
-    def again(self, view: View, pixel_px: FloatArray, now: View) -> Match:
+    def again(self, view: View, pixel_px: FloatArray, now: View) -> PatchMatch:
         """Find a clicked pixel in a new frame of the same camera, before its range is known.
 
         Raises
@@ -129,7 +129,8 @@ class Eyes:
         here = max(abs(view.frame.pan_rad - now.frame.pan_rad), abs(view.frame.tilt_rad - now.frame.tilt_rad))
         planes = [_plane_at(view.camera, pixel_px, range_m) for range_m in (1.0, 2.0, 1e3)]
         if here <= settings.same_pose_rad:
-            return _good(match(view.image, view.camera, pixel_px, planes[1], now.image, now.camera, 12.0,
+            return _good(match_patch(view.image, view.camera, pixel_px, planes[1], now.image, now.camera,
+            12.0,
                                settings.match), now)  # fmt: skip
         places = np.array([carry(pixel_px, view.camera, plane, now.camera)[0] for plane in planes])
         size = np.array(now.camera.size_px)
@@ -143,7 +144,7 @@ class Eyes:
         search = min(settings.wide_search_px, settings.search_px / 2 + spread)
         normals: list[FloatArray | None] = [None, UP]
         found = [
-            match(
+            match_patch(
                 view.image, view.camera, pixel_px,
                 planes[1] if normal is None else Plane(planes[1].point_m, normal),
                 now.image, now.camera, search, settings.match,
@@ -176,7 +177,7 @@ class Eyes:
             )
         return found
 
-    def look_for(self, clicked: Clicked, now: View) -> Match:
+    def look_for(self, clicked: Clicked, now: View) -> PatchMatch:
         """Find the clicked thing in a new view: near where it should be, then further around.
 
         Raises
@@ -189,11 +190,11 @@ class Eyes:
         ray = clicked.view.camera.ray(clicked.pixel_px)
         if abs(float(ray.directions @ clicked.plane.normal)) < 0.97:
             planes.append(Plane(clicked.plane.point_m, -ray.directions))  # if the slope was misjudged
-        found: list[Match] = []
+        found: list[PatchMatch] = []
         for search in (settings.search_px, settings.wide_search_px):
             for plane, sizes in product(planes, self._sizes()):
                 found.append(
-                    match(
+                    match_patch(
                         clicked.view.image, clicked.view.camera, clicked.pixel_px, plane,
                         now.image, now.camera, search, sizes,
                     )
@@ -205,8 +206,8 @@ class Eyes:
         return _good(_best(found), now)
 
     def agree(
-        self, clicked: Clicked, now: View, seen: Match, other: View, same_pair: bool
-    ) -> tuple[Match, dict[str, Any]]:
+        self, clicked: Clicked, now: View, seen: PatchMatch, other: View, same_pair: bool
+    ) -> tuple[PatchMatch, dict[str, Any]]:
         """Find the clicked thing in the other eye too and check that both mean the same place.
 
         One eye alone would believe a shifted picture. Compared is the place in the other eye with where
@@ -274,7 +275,7 @@ class Eyes:
         return View(frame, grey(frame.image), camera)
 
 
-def facts(found: Match) -> Mapping[str, Any]:
+def facts(found: PatchMatch) -> Mapping[str, Any]:
     """Return a match's numbers for a step's detail."""
     return {
         "pixel_px": rounded(found.pixel_px),
@@ -284,13 +285,13 @@ def facts(found: Match) -> Mapping[str, Any]:
     }
 
 
-def _best(found: Sequence[Match]) -> Match:
+def _best(found: Sequence[PatchMatch]) -> PatchMatch:
     """Return the good match of several, else the one that came nearest to one."""
     ranks = {"good": 0, "ambiguous": 1, "flat": 2, "weak": 3, "border": 4}
     return min(found, key=lambda one: (ranks[one.verdict], -one.correlation))
 
 
-def _good(found: Match, view: View) -> Match:
+def _good(found: PatchMatch, view: View) -> PatchMatch:
     """Pass a good match. Raises PointingError with the verdict in its code."""
     if found.verdict == "good":
         return found

@@ -22,17 +22,17 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
+from calib.camera.stereo import triangulate
 from calib.errors import CalibError
-from calib.mast import Rig
-from calib.match import Match
-from calib.pointing import Solution, choose, solve
+from calib.mast.pointing import Solution, choose, solve
+from calib.mast.rig import Rig
+from calib.pictures.patch_match import PatchMatch
 from calib.rigid import FloatArray
-from calib.stereo import triangulate
 from drivers.clock import Clock
 from drivers.errors import DriverError
 from drivers.interfaces import Reading
+from mastctl.devices.limits import Limits
 from mastctl.errors import MastctlError
-from mastctl.limits import Limits
 from mastctl.pointing.looking import Clicked, View, facts
 from mastctl.pointing.requests import (
     Aim,
@@ -279,7 +279,7 @@ class _Run:
         self._steps.before(eyes, (best.pan_rad, best.tilt_rad))
         return (best.pan_rad, best.tilt_rad), self._steps.go(best.pan_rad, best.tilt_rad, aim.camera)
 
-    def _pointing(self, commanded: Pair, now: View, aim_px: FloatArray, seen: Match | None) -> Pointing:
+    def _pointing(self, commanded: Pair, now: View, aim_px: FloatArray, seen: PatchMatch | None) -> Pointing:
         """Put together what one pointing did."""
         assert self._position_m is not None
         place, valid = now.camera.project(self._position_m)

@@ -8,13 +8,13 @@ from typing import Protocol
 
 from drivers.clock import Clock
 from drivers.interfaces import Reading
-from mastctl.limits import Limits
+from mastctl.devices.limits import Limits
+from mastctl.devices.rest import RestWatch
 from mastctl.pointing.requests import PointingError, PointingSettings
-from mastctl.rest import RestWatch
 
 
 class HeadLike(Protocol):
-    """What of `mastctl.devices.Devices` moves the head."""
+    """What of `mastctl.devices.devices.Devices` moves the head."""
 
     def read(self) -> Reading: ...
     def move(self, pan_rad: float, tilt_rad: float, speed_rad_per_s: float | None = None) -> None: ...
@@ -26,8 +26,8 @@ class Head:
 
     A reading must be finite, of now, not before the last one, and free of faults; it must be reachable from
     the last one at twice the speed cap, or lie on the way to the commanded angles (a replayed head is there
-    at once). The head has settled when it rests (`mastctl.rest`); it has arrived when it rests where it was
-    sent.
+    at once). The head has settled when it rests (`mastctl.devices.rest`); it has arrived when it rests where
+    it was sent.
     """
 
     def __init__(

@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from calib.mast import Rig
+from calib.mast.rig import Rig
+from calib.pictures.shown_view import Posed, ShownView, ViewLimits, overlap, shown_view
 from calib.rigid import FloatArray
-from calib.shown_view import Posed, ShownView, ViewLimits, overlap, shown_view
 from drivers.errors import BadFrame
 from mastctl.pointing.looking import View
 

@@ -8,11 +8,11 @@ from typing import Any, Literal
 
 import numpy as np
 
-from calib.match import MatchSettings
+from calib.pictures.patch_match import MatchSettings
+from calib.pictures.shown_view import ViewLimits
 from calib.rigid import FloatArray
-from calib.shown_view import ViewLimits
+from mastctl.devices.rest import DITHER_RAD
 from mastctl.errors import MastctlError
-from mastctl.rest import DITHER_RAD
 
 Pair = tuple[float, float]
 
@@ -177,7 +177,8 @@ class PointingSettings:
         Between readings while the head moves.
     dwell_s
         How long the reading must stay the same: three exposures, and longer than a mast's ringing after the
-        axis reports its position reached. A reading that dithers is watched for a second (`mastctl.rest`).
+        axis reports its position reached. A reading that dithers is watched for a second
+        (`mastctl.devices.rest`).
     rest_tolerance_rad
         How far the readings of a head at rest may lie from each other: three counts of a 12-bit servo.
     arrival_tolerance_rad

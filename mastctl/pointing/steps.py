@@ -9,11 +9,11 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any, ParamSpec, Protocol, TypeVar
 
-from calib.mast import Rig
+from calib.mast.rig import Rig
 from calib.rigid import FloatArray
 from drivers.clock import Clock
 from drivers.interfaces import Reading
-from mastctl.limits import Limits
+from mastctl.devices.limits import Limits
 from mastctl.pointing.abandoned import result_unless
 from mastctl.pointing.counts import counts_told
 from mastctl.pointing.looking import CamerasLike, Eyes, View, facts
@@ -29,7 +29,7 @@ T = TypeVar("T")
 
 
 class DevicesLike(HeadLike, CamerasLike, Protocol):
-    """What the steps need of `mastctl.devices.Devices`."""
+    """What the steps need of `mastctl.devices.devices.Devices`."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from calib.mast import Rig
+from calib.mast.rig import Rig
 from calib.rigid import FloatArray
 from mastctl.pointing.requests import Aim, PixelTarget, PointingError, PointRequest, PositionTarget
 

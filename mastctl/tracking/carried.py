@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from calib.rigid import FloatArray, carried_covariance
-from calib.tracking import Track, moved
+from calib.tracking.track import Track, moved_track
 from mastctl.tracking.pose import RoverPose, motion_between
 
 
@@ -62,4 +62,4 @@ class Carried:
                 f"the pose jumped by {way_m:.2f} m with the target {range_m:.2f} m away; a track is carried "
                 f"over at most {most_step:g} of the range at a time"
             )
-        return Carried(moved(self.track, motion, covariance), pose), ""
+        return Carried(moved_track(self.track, motion, covariance), pose), ""

@@ -14,13 +14,13 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from calib.budget import stereo_range_error_m
-from calib.cahvor import CameraModel
+from calib.camera.cahvor import CameraModel
 from calib.errors import CalibError
-from calib.mast import Rig
-from calib.pointing import choose, solve
+from calib.mast.budget import stereo_range_error_m
+from calib.mast.pointing import choose, solve
+from calib.mast.rig import Rig
 from calib.rigid import FloatArray
-from mastctl.limits import Limits
+from mastctl.devices.limits import Limits
 
 CENTRING_STEPS = 3
 """Each solves exactly for one eye; the other eye's place follows within a pixel after two."""

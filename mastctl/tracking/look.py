@@ -18,16 +18,16 @@ from typing import Literal
 import numpy as np
 
 from calib.errors import CalibError
-from calib.handoff_refined import Eye
-from calib.mast import Rig
-from calib.match import Match
-from calib.matched_handoff import MatchedHandoff
+from calib.handoff.by_image import Eye
+from calib.handoff.matched import MatchedHandoff
+from calib.mast.rig import Rig
+from calib.pictures.patch_match import PatchMatch
 from calib.rigid import FloatArray
-from calib.tracking import Look, Track, seen_by, start_track
+from calib.tracking.track import Look, Track, seen_by, start_track
 from drivers.errors import DriverError
 from drivers.interfaces import Reading
+from mastctl.devices.limits import Limits
 from mastctl.errors import MastctlError
-from mastctl.limits import Limits
 from mastctl.pointing.looking import View
 from mastctl.pointing.requests import PixelTarget, rounded
 from mastctl.pointing.steps import Steps
@@ -49,7 +49,10 @@ class NotTrackable(MastctlError):
 
 @dataclass(frozen=True)
 class EyePixel:
-    """What one eye told: the verdict is `calib.match`'s or ``no_frame``; pixel and sigma if it is good."""
+    """What one eye told: the verdict is `calib.pictures.patch_match`'s or ``no_frame``; pixel and sigma if it
+
+    is good.
+    """
 
     frame_id: str
     verdict: str
@@ -77,7 +80,7 @@ class Seen:
     pixels
         By camera.
     chi2, renewed
-        As `calib.tracking.Look`.
+        As `calib.tracking.track.Look`.
     pose_doubt
         What the pictures say against the pose, one sentence; empty if they do not.
     matched
@@ -114,7 +117,7 @@ class _Sight:
     track: Track
     seen: Seen
     taken: _Taken
-    found: Mapping[str, Match]
+    found: Mapping[str, PatchMatch]
 
 
 class Looker:
@@ -354,7 +357,7 @@ class Looker:
         return float(np.linalg.norm(position_m - (left.C + right.C) / 2))
 
 
-def _eye_pixel(view: View, found: Match) -> EyePixel:
+def _eye_pixel(view: View, found: PatchMatch) -> EyePixel:
     x, y = (float(value) for value in found.pixel_px)
     sigma = found.sigma_px
     return EyePixel(

@@ -1,6 +1,6 @@
 """The record of a hand-off at one stop: what the former pair's pictures predict, what the next pair's show.
 
-The next pair's pictures are searched as `calib.handoff_refined` does it, from the former pair's, and not as
+The next pair's pictures are searched as `calib.handoff.by_image` does it, from the former pair's, and not as
 the track would: a track that is sure of its target refuses what lies off the prediction, and an offset
 between the two pairs is what the record is made for.
 """
@@ -12,12 +12,12 @@ from collections.abc import Mapping
 import numpy as np
 
 from calib.errors import CalibError
-from calib.handoff import Joints, hand_off
-from calib.handoff_refined import Eye, RefineSettings, refine_handoff
-from calib.mast import Rig
-from calib.match import Match
-from calib.matched_handoff import MatchedHandoff, matched_handoff
-from calib.rig_covariance import stored_covariance
+from calib.handoff.by_image import Eye, RefineSettings, refine_handoff
+from calib.handoff.geometric import Joints, hand_off
+from calib.handoff.matched import MatchedHandoff, matched_handoff
+from calib.mast.covariance import stored_covariance
+from calib.mast.rig import Rig
+from calib.pictures.patch_match import PatchMatch
 from mastctl.pointing.looking import View
 
 JOINT_SIGMA_RAD = 3e-5
@@ -29,7 +29,7 @@ enough that this is found also by a mast file that says nothing of its own error
 
 
 def record_of(
-    rig: Rig, pair: tuple[str, str], views: Mapping[str, View], found: Mapping[str, Match],
+    rig: Rig, pair: tuple[str, str], views: Mapping[str, View], found: Mapping[str, PatchMatch],
     to: Mapping[str, View],
 ) -> MatchedHandoff | str:  # fmt: skip
     """Return the record of a target that was found by one pair and is looked up in another's pictures.

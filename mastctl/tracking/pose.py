@@ -40,7 +40,8 @@ class RoverPose:
         The pose.
     covariance
         (6, 6) of the motion since the pose before: small rotation, rad², then translation, m², both along
-        the rover's axes of this pose; None if it was not said. `calib.tracking.moved` takes it so.
+        the rover's axes of this pose; None if it was not said. `calib.tracking.track.moved_track` takes it
+        so.
     time_s
         By the sender's clock, which need not be the daemon's; None if it was not said.
     received_s

@@ -16,12 +16,12 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from calib.mast import Rig
-from calib.matched_handoff import MatchedHandoff
-from calib.tracking import Track
+from calib.handoff.matched import MatchedHandoff
+from calib.mast.rig import Rig
+from calib.tracking.track import Track
 from drivers.clock import Clock
+from mastctl.devices.limits import Limits
 from mastctl.errors import MastctlError
-from mastctl.limits import Limits
 from mastctl.operations import Operation, Operations
 from mastctl.pointing.requests import PixelTarget, PointingSettings, PositionTarget
 from mastctl.pointing.steps import DevicesLike, Steps
@@ -56,7 +56,7 @@ class NoTrack(MastctlError):
 
 
 class HoldingDevices(DevicesLike, Protocol):
-    """What the tracker needs of `mastctl.devices.Devices`."""
+    """What the tracker needs of `mastctl.devices.devices.Devices`."""
 
     def exposure_held(self) -> AbstractContextManager[None]: ...
 

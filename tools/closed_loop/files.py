@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from calib.formats.yaml_text import parse_mapping
+from calib.files.yaml_text import parse_mapping
 from tools.closed_loop.hdmi import SIZE_PX
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"

@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.cahvor import CameraModel
+from calib.camera.cahvor import CameraModel
+from calib.files.mast_file import load_rig
 from calib.rigid import FloatArray
-from calib.store import load_rig
 from drivers.clock import SystemClock
 from drivers.faults import FaultPanel
 from drivers.sim.cameras import CameraSettings, SimulatedCamera
@@ -30,7 +30,7 @@ from drivers.sim.wire.line import PtyLine
 from drivers.v4l2.controls import list_controls, set_value
 from drivers.v4l2.find import Address, open_node
 from mastctl.client import Client
-from mastctl.frames import camera_and_sequence
+from mastctl.devices.frames import camera_and_sequence
 from tools.closed_loop import files, hdmi
 
 Joints = tuple[float, float]

@@ -8,12 +8,12 @@ from dataclasses import replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from calib.cahvor import CameraModel
+from calib.camera.cahvor import CameraModel
+from calib.camera.stereo import triangulate
 from calib.errors import Unreachable
-from calib.mast import Rig
-from calib.pointing import choose, solve
+from calib.mast.pointing import choose, solve
+from calib.mast.rig import Rig
 from calib.rigid import Rigid
-from calib.stereo import triangulate
 from drivers.clock import ManualClock
 from drivers.sim.pan_tilt import HeadSettings, SimulatedPanTilt
 

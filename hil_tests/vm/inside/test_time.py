@@ -15,8 +15,8 @@ from drivers.interfaces import Reading
 from drivers.pairing import learned
 from drivers.v4l2.camera import V4l2Camera, open_camera
 from drivers.v4l2.options import CameraOptions
-from mastctl.devices import Devices
-from mastctl.limits import Limits
+from mastctl.devices.devices import Devices
+from mastctl.devices.limits import Limits
 
 from .conftest import RATE_HZ, options
 

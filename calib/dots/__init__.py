@@ -1,0 +1,1 @@
+"""The dot board in a picture: found, put in order, measured."""

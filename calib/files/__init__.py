@@ -1,0 +1,156 @@
+"""Reading and writing files: what every format shares.
+
+Every reader refuses with `calib.errors.BadFile` and nothing else; every writer is atomic
+(`calib.files.atomic`).
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from calib.camera.cahvor import CameraModel, Kind
+from calib.errors import BadFile
+
+#: A shift of a pixel by the normalisation of A and O is told from this size on.
+TOLD_SHIFT_PX = 0.01
+#: No component of a camera model or a mast is larger; beyond it the arithmetic would overflow.
+LARGEST_COMPONENT = 1e9
+LARGEST_IMAGE_PX = 65536
+
+
+@dataclass(frozen=True, eq=False)
+class CameraFile:
+    """One camera as a file holds it.
+
+    Attributes
+    ----------
+    model
+        The camera model, in ``frame``.
+    frame
+        Name of the frame of the model's vectors; ``unknown`` where the format has no place for it.
+    fit, provenance
+        Carried through unread; a covariance in ``fit`` names its parameter order.
+    notes
+        Sentences for the user: what was changed on reading, what was not read.
+    path, digest
+        Where it was read and the SHA-256 of the bytes read; None and empty for one made in the program.
+    """
+
+    model: CameraModel
+    frame: str
+    fit: Mapping[str, Any] = field(default_factory=dict)
+    provenance: Mapping[str, Any] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
+    path: Path | None = None
+    digest: str = ""
+
+    def __post_init__(self) -> None:
+        for name in ("fit", "provenance"):
+            object.__setattr__(self, name, MappingProxyType(dict(getattr(self, name))))
+
+
+def read_bytes(path: str | Path, limit_bytes: int) -> bytes:
+    """Return the whole file, or raise BadFile if it cannot be read, is empty, or is larger than the limit."""
+    try:
+        with Path(path).open("rb") as file:
+            data = file.read(limit_bytes + 1)
+    except OSError as error:
+        raise BadFile(path, "", f"cannot be read: {error.strerror or error}") from None
+    except ValueError as error:  # a path with a NUL
+        raise BadFile(path, "", f"cannot be read: {error}") from None
+    if len(data) > limit_bytes:
+        raise BadFile(path, "", f"is larger than {limit_bytes} bytes, the most that is read")
+    if not data:
+        raise BadFile(path, "", "is empty")
+    return data
+
+
+def digest_of(data: bytes) -> str:
+    """Return the SHA-256 of the bytes, in hexadecimal: the name of a file's content."""
+    return hashlib.sha256(data).hexdigest()
+
+
+def build_model(
+    path: str | Path,
+    place: str,
+    kind: Kind,
+    size_px: tuple[int, int],
+    vectors: Mapping[str, ArrayLike],
+    cahvore_type: int = 0,
+    linearity: float | None = None,
+) -> tuple[CameraModel, tuple[str, ...]]:
+    """Return the camera model of numbers read from a file, A and O normalised, with the notes to tell.
+
+    Parameters
+    ----------
+    path, place
+        For messages: the file, and the key or group of the camera in it.
+    kind, size_px, cahvore_type, linearity
+        As in `calib.camera.cahvor.CameraModel`; ``linearity`` None where the type fixes it.
+    vectors
+        C, A, H, V and, as the kind needs, O, R, E, each (3,).
+
+    Raises
+    ------
+    BadFile
+        If the numbers are no camera: not finite, beyond 1e9, A or O zero, A H V in one plane.
+    """
+
+    def at(letter: str) -> str:
+        return f"{place}.{letter}" if place else letter
+
+    arrays = {letter: np.asarray(vector, dtype=np.float64) for letter, vector in vectors.items()}
+    for letter, array in arrays.items():
+        if not (np.isfinite(array).all() and (np.abs(array) <= LARGEST_COMPONENT).all()):
+            raise BadFile(path, at(letter), f"{array.tolist()} where finite numbers up to 1e9 are expected")
+    for letter in "AO":
+        if letter in arrays and np.linalg.norm(arrays[letter]) < 1e-6:
+            raise BadFile(path, at(letter), f"{arrays[letter].tolist()} where a unit vector is expected")
+    rows = np.array([arrays[letter] for letter in "AHV"])
+    norms = np.linalg.norm(rows, axis=1, keepdims=True)
+    if norms.min() < 1e-9 or abs(np.linalg.det(rows / norms)) < 1e-12:
+        raise BadFile(path, place, "A, H and V lie in one plane; no image can be formed")
+    if not 0 < min(size_px) <= max(size_px) <= LARGEST_IMAGE_PX:
+        raise BadFile(
+            path, at("size_px"), f"{list(size_px)} where 1 to {LARGEST_IMAGE_PX} pixels are expected"
+        )
+
+    notes = []
+    where = f"{place}: " if place else ""
+    fixed = {1: 1.0, 2: 0.0}.get(cahvore_type)
+    if fixed is not None:
+        if linearity is not None and linearity != fixed:
+            notes.append(f"{where}linearity {linearity:g} is not used; type {cahvore_type} means {fixed:g}")
+        linearity = fixed
+    try:
+        with np.errstate(all="ignore"):
+            model, shift_px = CameraModel.normalised(
+                kind,
+                size_px,
+                arrays["C"],
+                arrays["A"],
+                arrays["H"],
+                arrays["V"],
+                arrays.get("O"),
+                arrays.get("R"),
+                arrays.get("E"),
+                cahvore_type,
+                1.0 if linearity is None else linearity,
+            )
+    except (ValueError, ArithmeticError, np.linalg.LinAlgError) as error:
+        raise BadFile(path, place, f"is no usable camera model: {error}") from None
+    if not shift_px <= TOLD_SHIFT_PX:
+        sizes = " and ".join(
+            f"|{letter}| = {np.linalg.norm(arrays[letter]):.6g}" for letter in "AO" if letter in arrays
+        )
+        moved = f"by up to {shift_px:.2g} px" if shift_px < LARGEST_IMAGE_PX else "out of the image"
+        notes.append(f"{where}{sizes} made 1, which moves pixels {moved}")
+    return model, tuple(notes)

@@ -1,0 +1,241 @@
+"""The mast file (``mastctl/mast/1``) and the camera file (``mastctl/camera/1``): strict in, atomic out.
+
+Contract section 2. A and O are normalised on load; a note says so when that moves a pixel by more than
+0.01. The digest of a file is the SHA-256 of its bytes. The version before a save is kept as
+``NAME.previous.yaml`` (see `calib.files.atomic`).
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal, cast
+
+from calib.camera.cahvor import CameraModel, Kind
+from calib.errors import BadFile
+from calib.files import LARGEST_IMAGE_PX, CameraFile, build_model, digest_of, read_bytes
+from calib.files.atomic import save_bytes
+from calib.files.strict import Section
+from calib.files.yaml_text import MAX_BYTES, dump_mapping, kind_of, parse_mapping
+from calib.mast.rig import Mast, Rig, RigCamera
+
+MAST_SCHEMA = "mastctl/mast/1"
+CAMERA_SCHEMA = "mastctl/camera/1"
+
+CAMERA_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]*_(?:left|right)")
+_PAIR_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]*")
+_LETTERS: dict[str, str] = {"CAHV": "CAHV", "CAHVOR": "CAHVOR", "CAHVORE": "CAHVORE"}
+_MODEL_KEYS = ("size_px", "model", "C", "A", "H", "V")
+_MODEL_OPTIONS = ("O", "R", "E", "type", "linearity")
+
+
+@dataclass(frozen=True, eq=False)
+class StoredRig:
+    """A rig as a mast file holds it: with the digest of the bytes, and sentences for the user."""
+
+    rig: Rig
+    digest: str
+    path: Path
+    notes: tuple[str, ...]
+
+
+def load_rig(path: str | Path) -> StoredRig:
+    """Read a mast file.
+
+    Raises
+    ------
+    BadFile
+        If it cannot be read or is no valid mast file: which key, what it holds, what is expected.
+    """
+    return parse_rig(read_bytes(path, MAX_BYTES), path)
+
+
+def parse_rig(data: bytes, path: str | Path) -> StoredRig:
+    """Read a mast file's bytes; ``path`` is for messages only. Raises BadFile as ``load_rig``."""
+    document = parse_mapping(data, path)
+    _check_schema(document, path, MAST_SCHEMA)
+    top = Section(path, "", document, ("schema", "name", "mast", "cameras"), ("stereo", "fit", "provenance"))
+    mast = top.section("mast", ("translation_m", "rotation_rad"), ("axis_offset_m", "axis_twist_rad"))
+    cameras: dict[str, RigCamera] = {}
+    notes: tuple[str, ...] = ()
+    for name in top.mapping("cameras"):
+        if not CAMERA_NAME.fullmatch(name):
+            raise top.bad(f"cameras.{name}", "a camera's name is <pair>_left or <pair>_right")
+        place = f"cameras.{name}"
+        section = Section(path, place, top.mapping("cameras")[name], ("on", *_MODEL_KEYS), _MODEL_OPTIONS)
+        on = cast(Literal["head", "rover"], section.choice("on", ("head", "rover")))
+        model, camera_notes = _model(section)
+        cameras[name] = RigCamera(on, model)
+        notes += camera_notes
+    rig = Rig(
+        name=top.text("name"),
+        mast=Mast(
+            translation_m=mast.vector("translation_m"),
+            rotation_rad=mast.vector("rotation_rad"),
+            axis_offset_m=mast.number("axis_offset_m") if "axis_offset_m" in mast else 0.0,
+            axis_twist_rad=mast.number("axis_twist_rad") if "axis_twist_rad" in mast else 0.0,
+        ),
+        cameras=cameras,
+        stereo=read_stereo(top, cameras),
+        fit=top.free("fit"),
+        provenance=top.free("provenance"),
+    )
+    return StoredRig(rig, digest_of(data), Path(path), notes)
+
+
+def save_rig(rig: Rig, path: str | Path) -> StoredRig:
+    """Save a mast file atomically, keep the version before it, and return what a reader will find.
+
+    Raises
+    ------
+    BadFile
+        If the rig is none that the file can hold, or the file system refuses; then nothing has changed.
+    """
+    mast = rig.mast
+    document: dict[str, Any] = {
+        "schema": MAST_SCHEMA,
+        "name": rig.name,
+        "mast": {
+            "translation_m": mast.translation_m,
+            "rotation_rad": mast.rotation_rad,
+            "axis_offset_m": float(mast.axis_offset_m),
+            "axis_twist_rad": float(mast.axis_twist_rad),
+        },
+        "cameras": {
+            name: {"on": camera.on, **_model_keys(camera.model)} for name, camera in rig.cameras.items()
+        },
+        "stereo": rig.stereo,
+        "fit": rig.fit,
+        "provenance": rig.provenance,
+    }
+    data = _dump(document, path)
+    stored = parse_rig(data, path)
+    save_bytes(path, data)
+    return stored
+
+
+def load_camera(path: str | Path) -> CameraFile:
+    """Read a camera file (``mastctl/camera/1``). Raises BadFile as ``load_rig``."""
+    return parse_camera(read_bytes(path, MAX_BYTES), path)
+
+
+def parse_camera(data: bytes, path: str | Path) -> CameraFile:
+    """Read a camera file's bytes; ``path`` is for messages only. Raises BadFile as ``load_rig``."""
+    document = parse_mapping(data, path)
+    _check_schema(document, path, CAMERA_SCHEMA)
+    top = Section(
+        path, "", document, ("schema", "frame", *_MODEL_KEYS), (*_MODEL_OPTIONS, "fit", "provenance")
+    )
+    model, notes = _model(top)
+    return CameraFile(
+        model=model,
+        frame=top.text("frame"),
+        fit=top.free("fit"),
+        provenance=top.free("provenance"),
+        notes=notes,
+        path=Path(path),
+        digest=digest_of(data),
+    )
+
+
+def save_camera(camera: CameraFile, path: str | Path) -> CameraFile:
+    """Save a camera file atomically and return what a reader will find. Raises BadFile as ``save_rig``."""
+    document: dict[str, Any] = {"schema": CAMERA_SCHEMA, "frame": camera.frame, **_model_keys(camera.model)}
+    for key in ("fit", "provenance"):
+        if getattr(camera, key):
+            document[key] = getattr(camera, key)
+    data = _dump(document, path)
+    stored = parse_camera(data, path)
+    save_bytes(path, data)
+    return stored
+
+
+def schema_of(data: bytes) -> str:
+    """Return the schema that the bytes of a YAML file name, '' if they name none or are no YAML."""
+    try:
+        schema = parse_mapping(data, "").get("schema")
+    except BadFile:
+        return ""
+    return schema if isinstance(schema, str) else ""
+
+
+def _check_schema(document: dict[str, Any], path: str | Path, expected: str) -> None:
+    """Refuse another schema before its keys are looked at."""
+    if "schema" not in document:
+        raise BadFile(path, "schema", f"the key is missing; 'schema: {expected}' is expected")
+    if document["schema"] != expected:
+        raise BadFile(path, "schema", f"{kind_of(document['schema'])} where '{expected}' is expected")
+
+
+def _model(section: Section) -> tuple[CameraModel, tuple[str, ...]]:
+    """Read the keys of one camera model."""
+    kind = cast(Kind, section.choice("model", tuple(_LETTERS)))
+    letters = _LETTERS[kind]
+    for letter in letters:
+        if letter not in section:
+            raise section.bad(letter, f"the key is missing; {kind} has it")
+    vectors = {letter: section.vector(letter) for letter in letters}
+    for letter in "ORE":
+        # A vector that the kind has no use for is harmless only while it says nothing.
+        if letter not in letters and letter in section and section.vector(letter).any() and letter != "O":
+            raise section.bad(letter, f"{kind} has no {letter}; expected zeros or another 'model'")
+    cahvore_type, linearity = 0, None
+    if kind == "CAHVORE":
+        if "type" not in section:
+            raise section.bad("type", "the key is missing; CAHVORE has type 1, 2 or 3")
+        cahvore_type = section.integer("type", 1, 3)
+        linearity = section.number("linearity", 100.0) if "linearity" in section else None
+        if cahvore_type == 3 and linearity is None:
+            raise section.bad("linearity", "the key is missing; CAHVORE type 3 has it")
+    else:
+        for key in ("type", "linearity"):
+            if key in section:
+                raise section.bad(key, f"{kind} has no '{key}'; CAHVORE has it")
+    size = section.integers("size_px", 2, 1, LARGEST_IMAGE_PX)
+    return build_model(
+        section.path, section.place, kind, (size[0], size[1]), vectors, cahvore_type, linearity
+    )
+
+
+def _model_keys(model: CameraModel) -> dict[str, Any]:
+    """Return one camera model's keys in the contract's order."""
+    keys: dict[str, Any] = {"size_px": list(model.size_px), "model": model.kind}
+    keys.update({letter: getattr(model, letter) for letter in _LETTERS[model.kind]})
+    if model.kind == "CAHVORE":
+        keys.update(type=int(model.cahvore_type), linearity=float(model.linearity))
+    return keys
+
+
+def read_stereo(top: Section, cameras: Mapping[str, object]) -> dict[str, tuple[str, str]]:
+    """Return the stereo pairs under ``stereo``: (left, right) names of cameras that are there.
+
+    Raises
+    ------
+    BadFile
+        For a pair that is not two known cameras, left and right.
+    """
+    pairs: dict[str, tuple[str, str]] = {}
+    for pair, names in top.mapping("stereo").items():
+        key = f"stereo.{pair}"
+        if not _PAIR_NAME.fullmatch(pair):
+            raise top.bad(key, "a pair's name is letters, digits, '_' and '-'")
+        if not isinstance(names, list) or len(names) != 2 or not all(isinstance(n, str) for n in names):
+            raise top.bad(key, f"{kind_of(names)} where [left camera, right camera] is expected")
+        for name, side in zip(names, ("_left", "_right"), strict=True):
+            if name not in cameras:
+                raise top.bad(
+                    key, f"'{name}' is no camera of this file; there are {', '.join(cameras) or 'none'}"
+                )
+            if not name.endswith(side):
+                raise top.bad(key, f"'{name}' where a camera named ...{side} is expected")
+        pairs[pair] = (names[0], names[1])
+    return pairs
+
+
+def _dump(document: dict[str, Any], path: str | Path) -> bytes:
+    try:
+        return dump_mapping(document)
+    except (TypeError, UnicodeEncodeError, RecursionError) as error:
+        raise BadFile(path, "", f"cannot hold this: {error}") from None

@@ -1,0 +1,120 @@
+"""Tables of numbers as CSV: points and pixels in, points, pixels and rays out.
+
+In: UTF-8, with or without a byte-order mark, any line ends; the first line names the columns exactly; a cell
+is a number, ``nan`` and ``inf`` included; a row whose cells are all empty is a row of not-a-numbers, as this
+module writes them. Out: a header, one row an input row, shortest round-trip numbers, empty cells where there
+is no number.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TextIO
+
+import numpy as np
+
+from calib.errors import BadFile
+from calib.files import read_bytes
+from calib.rigid import FloatArray
+
+MAX_BYTES = 1 << 29
+
+NUMBER = re.compile(
+    r"[-+]?(?:(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][-+]?[0-9]+)?|inf|infinity|nan)", re.IGNORECASE
+)
+_OTHER_DELIMITERS = {";": "';'", "\t": "tab", "|": "'|'"}
+
+
+def read_table(path: str | Path, columns: Sequence[str]) -> FloatArray:
+    """Return the table's numbers as (rows, columns).
+
+    Parameters
+    ----------
+    path
+        The CSV file.
+    columns
+        The names that the header must have, in this order.
+
+    Raises
+    ------
+    BadFile
+        For another header, a row of another length, or a cell that is no number; the place is the row,
+        counted from 1 after the header, and the line of the file.
+    """
+    return parse_table(read_bytes(path, MAX_BYTES), path, columns)
+
+
+def parse_table(data: bytes, path: str | Path, columns: Sequence[str]) -> FloatArray:
+    """Return the numbers of a table's bytes; ``path`` is for messages. Raises BadFile as ``read_table``."""
+    try:
+        text = data.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        line = data.count(b"\n", 0, error.start) + 1
+        raise BadFile(path, f"line {line}", f"byte 0x{data[error.start]:02x} is not UTF-8 text") from None
+    lines = csv.reader(io.StringIO(text, newline=""), strict=True)
+    # Python's float reads 1_000 and digits of other scripts too; without them it knows just our numbers.
+    float_is_strict = text.isascii() and text.count("_") == sum(name.count("_") for name in columns)
+    values: list[list[float]] = []
+    blank_line = 0
+    try:
+        check_header(next(lines, []), path, columns)
+        for cells in lines:
+            if not cells:
+                blank_line = blank_line or lines.line_num
+                continue
+            if blank_line:
+                raise BadFile(path, f"line {blank_line}", "is blank; a row is expected on every line")
+            if float_is_strict and len(cells) == len(columns):
+                try:
+                    values.append([float(cell) for cell in cells])
+                    continue
+                except ValueError:
+                    pass
+            place = f"row {len(values) + 1} (line {lines.line_num})"
+            values.append(_row(cells, path, place, columns))
+    except csv.Error as error:
+        raise BadFile(path, f"line {lines.line_num}", f"is not CSV: {error}") from None
+    return np.array(values, dtype=np.float64).reshape(len(values), len(columns))
+
+
+def write_table(stream: TextIO, columns: Sequence[str], values: FloatArray) -> None:
+    """Write (rows, columns) numbers as CSV; a row with a number that is not finite becomes empty cells."""
+    stream.write(",".join(columns) + "\n")
+    empty = "," * (len(columns) - 1) + "\n"
+    finite = np.logical_and.reduce(np.isfinite(values), axis=1)
+    rows = zip(values.tolist(), finite.tolist(), strict=True)
+    stream.writelines(",".join(map(repr, row)) + "\n" if good else empty for row, good in rows)
+
+
+def check_header(cells: Sequence[str], path: str | Path, columns: Sequence[str]) -> None:
+    """Refuse a header that does not name exactly these columns in this order. Raises BadFile."""
+    found = [cell.strip() for cell in cells]
+    if found == list(columns):
+        return
+    expected = ",".join(columns)
+    joined = ",".join(found)
+    for delimiter, name in _OTHER_DELIMITERS.items():
+        if [part.strip() for part in joined.split(delimiter)] == list(columns):
+            raise BadFile(path, "line 1", f"the columns are separated by {name}; expected '{expected}'")
+    raise BadFile(path, "line 1", f"the header is '{joined[:60]}'; expected '{expected}'")
+
+
+def _row(cells: Sequence[str], path: str | Path, place: str, columns: Sequence[str]) -> list[float]:
+    """Read one row's numbers."""
+    if len(cells) != len(columns):
+        hint = ""
+        for delimiter, name in _OTHER_DELIMITERS.items():
+            if len(cells) == 1 and delimiter in cells[0]:
+                hint = f", separated by ',' and not by {name}"
+        raise BadFile(path, place, f"{len(cells)} cells where {len(columns)} are expected{hint}")
+    words = [cell.strip() for cell in cells]
+    if not any(words):
+        return [np.nan] * len(words)
+    for word, column in zip(words, columns, strict=True):
+        if not NUMBER.fullmatch(word):
+            raise BadFile(path, f"{place}, {column}", f"'{word[:40]}' where a number is expected")
+    return [float(word) for word in words]

@@ -1,0 +1,1 @@
+"""From measurements to a rig: starts, least squares, outliers, covariance."""

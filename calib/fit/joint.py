@@ -1,0 +1,269 @@
+"""Fit a survey in one piece: boards, set-ups, cameras and mast together, each measurement by its sigma.
+
+From a start (``calib.fit.start_values``) the fit goes on with pulls bounded (Huber), so that blunders can be
+told by the tests of ``calib.fit.outliers``; then plain least squares without them. A fit that ends far above
+the noise is refused.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+
+import numpy as np
+from scipy.stats import chi2
+
+from calib.fit.adjustment import HUBER, MAST, Adjustment, Estimate
+from calib.fit.calibration import Calibration
+from calib.fit.least_squares import Minimum, covariance_of, minimise
+from calib.fit.outliers import FALSE_ALARMS, judge, name_outliers
+from calib.fit.residuals import check_rms, image_residuals, rms_by_camera, station_residuals
+from calib.fit.start_values import Start, SurveyNotFitted, start_values
+from calib.fit.terms import ImageTerm, StationTerm, with_kept
+from calib.fit.uncertainty import open_directions, sigma_by_key
+from calib.fit.usual_lens import lens_notes
+from calib.mast.rig import Rig, RigCamera
+from calib.rigid import FloatArray
+from calib.survey import Survey
+
+ROUNDS = 40
+"""Times that measurements are judged and the fit done again, at most."""
+
+WRONG_MINIMUM = 3.0
+"""A fit is refused if the typical dot is this many times farther off than its sigma says."""
+
+MANY = 0.15
+"""More than this part of the tapes left out (and more than three) are no blunders: the model fails."""
+
+
+def fit_joint(survey: Survey, mast_parameters: int = 6) -> Calibration:
+    """Fit cameras and mast to a survey, every measurement weighted by its sigma.
+
+    Parameters
+    ----------
+    survey
+        The measurements; images without dots, and check images, take no part.
+    mast_parameters
+        4 for a mast that stands upright, 6 for the paper's, 8 for two skew axes.
+
+    Raises
+    ------
+    SurveyNotFitted
+        If the survey determines no start, the fit does not settle, or it ends far from the noise: it is never
+        reported as done.
+    """
+    began = time.perf_counter()
+    from_here = start_values(survey, mast_parameters)
+    problem = joint_problem(survey, from_here, mast_parameters)
+    problem, fit = without_blunders(problem, from_here)
+    covariance = covariance_of(fit.normal.matrix, problem.weak)
+    _refuse_wrong_minimum(problem, fit.state)
+    _refuse_unsettled(fit)
+    return _calibration(survey, mast_parameters, from_here, problem, fit, covariance, began)
+
+
+def joint_problem(survey: Survey, from_here: Start, mast_parameters: int) -> Adjustment:
+    """Return the least-squares problem of a survey, without images that disagree with the start."""
+    problem = Adjustment(
+        with_kept(from_here.images, from_here.doubtful),
+        from_here.station,
+        from_here.estimate,
+        mast_parameters=mast_parameters if from_here.reference_rad else 0,
+        prisms_cad_m=survey.prisms_in_rover_m,
+        prism_cad_m=survey.sigma.prism_cad_m,
+        joint_rad=survey.sigma.joint_rad,
+        huber=HUBER,
+    )
+    unseen = {
+        t.name for t in problem.images if not np.isfinite(problem.image_residual(from_here.estimate, t)).all()
+    }
+    return problem.with_terms(with_kept(problem.images, unseen), problem.station)
+
+
+def without_blunders(problem: Adjustment, from_here: Start) -> tuple[Adjustment, Minimum[Estimate]]:
+    """Fit, judge, and fit again until nothing fails; the last fit is plain least squares."""
+    fit = minimise(problem, from_here.estimate, weak=problem.weak, gain=1e-7)
+    _refuse_lost(fit)
+    for huber in (HUBER, None):
+        problem = problem.with_huber(huber)
+        fit = minimise(problem, fit.state, weak=problem.weak, gain=1e-7 if huber else 1e-11)
+        kept = {_kept(problem.images, problem.station)}
+        for _ in range(ROUNDS):
+            verdict = judge(
+                problem, fit.state, covariance_of(fit.normal.matrix, problem.weak), from_here.images
+            )
+            pattern = _kept(verdict.images, verdict.station)
+            if pattern in kept:  # nothing new, or a measurement on its limit that comes and goes
+                break
+            kept.add(pattern)
+            problem = problem.with_terms(verdict.images, verdict.station)
+            fit = minimise(problem, fit.state, weak=problem.weak, gain=1e-7 if huber else 1e-11)
+            _refuse_lost(fit)
+    return problem, fit
+
+
+def _kept(images: Sequence[ImageTerm], station: Sequence[StationTerm]) -> bytes:
+    """Which measurements count, as something to compare."""
+    return b"".join(t.keep.tobytes() for t in images) + bytes(p.keep for p in station)
+
+
+def _refuse_lost(fit: Minimum[Estimate]) -> None:
+    if not np.isfinite(fit.normal.cost):
+        raise SurveyNotFitted(
+            "the fit starts where a camera does not see a dot that it saw: no start was found"
+        )
+
+
+def _refuse_unsettled(fit: Minimum[Estimate]) -> None:
+    if not fit.settled:
+        raise SurveyNotFitted(
+            f"the fit did not settle: after {fit.steps} steps it was still finding better values, so that "
+            "neither they nor their sigmas are good; take more images, at more joint angles and distances"
+        )
+
+
+def _refuse_wrong_minimum(problem: Adjustment, state: Estimate) -> None:
+    """Raise if a camera's typical dot is far above its noise, or if the station contradicts the rest."""
+    tapes = [p for p in problem.station if p.board is not None]
+    left_out = sum(not p.keep for p in tapes)
+    if left_out > max(3, MANY * len(tapes)) and len(problem.mast_free) != 4:
+        raise SurveyNotFitted(
+            f"{left_out} of {len(tapes)} tapes do not agree with the images: too many for blunders; check "
+            "the sigmas and the joint angles, and whether the mast's axes meet at a right angle (else fit "
+            "eight parameters)"
+        )
+    for name in state.cameras:
+        mine = [t for t in problem.images if t.camera == name]
+        kept = [t for t in mine if t.keep.any()]
+        if len(kept) < max(2, len(mine) // 2):
+            raise SurveyNotFitted(
+                f"camera {name}: {len(mine) - len(kept)} of its {len(mine)} images do not agree with the "
+                "rest; check which placement each belongs to and the joint angles"
+            )
+        lengths = [np.linalg.norm(problem.image_residual(state, t).reshape(-1, 2), axis=1) for t in kept]
+        typical = float(np.median(np.concatenate(lengths))) / np.sqrt(chi2.median(2))
+        if typical > WRONG_MINIMUM:
+            raise SurveyNotFitted(
+                f"camera {name}: the fit leaves {typical:.1f} times the stated noise of a dot "
+                f"({np.median(np.concatenate([t.sigma_px for t in kept])):g} px); either it ended in a wrong "
+                "minimum or the sigmas in survey.yaml are too small"
+            )
+
+
+def _calibration(
+    survey: Survey,
+    mast_parameters: int,
+    from_here: Start,
+    problem: Adjustment,
+    fit: Minimum[Estimate],
+    covariance: FloatArray,
+    began: float,
+) -> Calibration:
+    """Put together what the fit says."""
+    state = fit.state
+    size = problem.parts[MAST].stop
+    names = problem.names[:size]
+    chi_square, freedom = goodness(problem, state, covariance)
+    probability = float(chi2.sf(chi_square, freedom)) if freedom > 0 else float("nan")
+    notes = list(from_here.notes)
+    mine = covariance[:size, :size]
+    if probability < 0.001:
+        notes.append(
+            f"the residuals are {np.sqrt(chi_square / freedom):.2f} times what the stated sigmas allow "
+            f"(chi-square {chi_square:.0f} for {freedom:.0f}); uncertainties are scaled up by as much"
+        )
+        mine = mine * chi_square / freedom
+    notes += _prism_notes(problem, state, mast_parameters)
+    rig = rig_of(survey, state)
+    order = mast_first(names)
+    names = [names[i] for i in order]
+    mine = mine[np.ix_(order, order)]
+    sigma = sigma_by_key(rig, names, mine)
+    notes += lens_notes(rig, sigma)
+    images = image_residuals(survey, problem, state, from_here.images, from_here.checks)
+    return Calibration(
+        method="joint",
+        mast_parameters=mast_parameters,
+        rig=rig,
+        parameter_names=tuple(names),
+        estimate=estimate_values(names, state),
+        covariance=mine,
+        sigma=sigma,
+        rms_px=rms_by_camera(images),
+        check_rms_px=check_rms(survey, state, images),
+        outliers=name_outliers(problem, state, covariance, from_here.images),
+        false_alarms=3 * FALSE_ALARMS,
+        degenerate=open_directions(problem, problem.names[:size], covariance[:size, :size]),
+        notes=tuple(notes),
+        chi2=chi_square,
+        degrees_of_freedom=freedom,
+        chi2_probability=probability,
+        images=images,
+        station=station_residuals(problem, state),
+        rover_from_station=state.rover_from_station,
+        rover_from_board=state.rover_from_board,
+        prisms_in_rover_m=state.prisms_in_rover_m,
+        seconds=time.perf_counter() - began,
+    )
+
+
+def _prism_notes(problem: Adjustment, state: Estimate, mast_parameters: int) -> list[str]:
+    """Sentences on set-ups whose prisms do not fit the rover, though each may be the wrong one."""
+    notes = []
+    for setup in state.rover_from_station:
+        prisms = [p for p in problem.station if p.setup == setup and p.board is None and p.keep]
+        residuals = np.array([problem.station_residual(state, p) for p in prisms])
+        if float(np.sum(residuals**2)) > chi2.isf(0.001, 3 * len(prisms)):
+            worst = 1000 * float(np.linalg.norm(residuals, axis=1).max()) * prisms[0].sigma_m
+            why = "an upright mast" if mast_parameters == 4 else "their CAD positions"
+            notes.append(
+                f"the prisms of set-up {setup} do not agree with {why}: they are off by up to {worst:.1f} mm"
+            )
+    return notes
+
+
+def goodness(problem: Adjustment, state: Estimate, covariance: FloatArray) -> tuple[float, float]:
+    """Return the weighted sum of squares of all measurements and its degrees of freedom.
+
+    What is known of lenses beforehand counts as information but not as a measurement: the unknowns cost
+    only as many degrees of freedom as the measurements have paid for, tr(JᵀJ C).
+    """
+    total, count, paid = 0.0, 0, 0.0
+    for what, block in problem.blocks(state):
+        if isinstance(what, str) and what.startswith("lens "):
+            continue
+        total += float(block.residual @ block.residual)
+        count += len(block.residual)
+        mine = covariance[np.ix_(block.columns, block.columns)]
+        paid += float(np.einsum("ik,kl,il->", block.jacobian, mine, block.jacobian))
+    return total, count - paid
+
+
+def mast_first(names: Sequence[str]) -> list[int]:
+    """Return the order of parameters that a calibration has: the mast's, then the cameras'."""
+    return sorted(range(len(names)), key=lambda i: not names[i].startswith("mast."))
+
+
+def estimate_values(names: Sequence[str], state: Estimate) -> FloatArray:
+    """Return the values of parameters by name; 0 for those of A and O, which count from the camera's own."""
+    mast = {"translation_m": state.mast[:3], "rotation_rad": state.mast[3:6]}
+    values = []
+    for name in names:
+        owner, *rest = name.split(".")
+        if owner == "mast":
+            if rest[0] in mast:
+                values.append(float(mast[rest[0]]["xyz".index(rest[1])]))
+            else:
+                values.append(float(state.mast[6 if rest[0] == "axis_offset_m" else 7]))
+            continue
+        camera, letter, which = rest
+        index = int(which) if which.isdigit() else "xyz".index(which)
+        values.append(0.0 if letter in "AO" else float(getattr(state.cameras[camera], letter)[index]))
+    return np.array(values)
+
+
+def rig_of(survey: Survey, state: Estimate) -> Rig:
+    """Return the rig of a state; it has the survey folder's name."""
+    cameras = {n: RigCamera(survey.cameras[n].on, m) for n, m in state.cameras.items()}
+    stereo = {p: pair for p, pair in survey.stereo.items() if set(pair) <= set(cameras)}
+    return Rig(survey.folder.name or "calibrated", state.as_mast, cameras, stereo)

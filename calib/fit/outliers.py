@@ -1,0 +1,261 @@
+"""Which measurements cannot belong to the rest: explicit tests of standardised residuals.
+
+A measurement with residual r (in sigmas) and Jacobian J has, if all is right, cov(r) = I - J C Jᵀ (I + J C Jᵀ
+where it was not fitted), C being the covariance of the unknowns; rᵀ cov(r)⁻¹ r is chi-square. Limits are set
+so that one survey in a hundred without blunders loses any dot, any image, or any tape or prism.
+
+A whole image is judged by the sum over its dots. Stated sigmas may be too small: the typical dot and the
+typical station point then say by how much, and limits widen with them. Blunders hide one another, so
+the worst goes first and the fit is done again.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+from scipy.stats import chi2
+
+from calib.fit.adjustment import Adjustment, Estimate
+from calib.fit.calibration import Outlier
+from calib.fit.terms import ImageTerm, StationTerm
+from calib.rigid import FloatArray, moved_rigid
+
+FALSE_ALARMS = 0.01
+"""Chance, for each of the three kinds of measurement, that a survey without blunders loses any."""
+
+BAD_IMAGE = 0.25
+"""With more than this part of its dots beyond their limit an image is judged as a whole."""
+
+REDUNDANT = 0.02
+"""Directions of a residual with less than this part of the noise left in them cannot be tested."""
+
+BOARD_STEPS = 4
+"""Gauss-Newton steps of a board's pose: it starts within millimetres."""
+
+PRISMS_LEFT = 3
+"""A set-up keeps at least so many prisms: with fewer nothing says which of them is wrong."""
+
+
+@dataclass(frozen=True, eq=False)
+class OutlierVerdict:
+    """Terms with what failed left out and what passed readmitted."""
+
+    images: tuple[ImageTerm, ...]
+    station: tuple[StationTerm, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Judged:
+    """Statistics of one term: per dot (n,) for an image, one number for a station point; the degrees of
+    freedom of that point; and whether it was fitted."""
+
+    statistic: FloatArray
+    freedom: int
+
+
+def judge(
+    problem: Adjustment, state: Estimate, covariance: FloatArray, all_images: Sequence[ImageTerm]
+) -> OutlierVerdict:
+    """Test every measurement at a fitted state and leave out the worst; readmit what passes.
+
+    Parameters
+    ----------
+    problem, state, covariance
+        The fit; its terms' ``keep`` say what was left out so far.
+    all_images
+        The images with every dot that was measured, in the order of the problem's.
+    """
+    dots, points, limits = _tested(problem, state, covariance, all_images)
+    images, worst, worst_ratio = [], None, 1.0
+    bad_dots: list[tuple[int, np.ndarray]] = []
+    for index, (term, statistic) in enumerate(zip(problem.images, dots, strict=True)):
+        good = statistic <= limits.dot
+        bad = good.mean() < 1 - BAD_IMAGE or float(statistic[good].sum()) > limits.image(int(good.sum()))
+        images.append(term)
+        if not term.keep.any():
+            if not bad:
+                images[index] = replace(term, keep=good)
+            continue
+        if bad:
+            ratio = float(np.minimum(statistic, 1e12).sum()) / limits.image(len(statistic))
+            if ratio > worst_ratio:
+                worst, worst_ratio = ("image", index), ratio
+        elif (good != term.keep).any():
+            bad_dots.append((index, good))
+    readmitted = []
+    image_failed = worst is not None
+    for index, (point, judged) in enumerate(zip(problem.station, points, strict=True)):
+        if not judged.freedom:
+            continue
+        ratio = float(judged.statistic[()]) / limits.point(judged.freedom)
+        # A tape or prism cannot pull hundreds of dots along: where an image fails, it goes first.
+        if point.keep and not image_failed and ratio > worst_ratio and _may_go(problem, point):
+            worst, worst_ratio = ("station", index), ratio
+        if not point.keep and ratio <= 1.0:
+            readmitted.append(index)
+    station = list(problem.station)
+    for index in readmitted:
+        station[index] = replace(station[index], keep=True)
+    if worst is not None and worst[0] == "image":
+        worst = ("image", _culprit(problem, state, worst[1]))
+        images[worst[1]] = replace(images[worst[1]], keep=np.zeros_like(images[worst[1]].keep))
+    elif worst is not None:
+        station[worst[1]] = replace(station[worst[1]], keep=False)
+    for index, good in bad_dots:
+        images[index] = replace(images[index], keep=good)
+    return OutlierVerdict(tuple(images), tuple(station))
+
+
+def name_outliers(
+    problem: Adjustment, state: Estimate, covariance: FloatArray, all_images: Sequence[ImageTerm]
+) -> tuple[Outlier, ...]:
+    """Return everything that the problem leaves out, with the statistic it was left out for and its limit."""
+    found: list[Outlier] = []
+    dots, points, limits = _tested(problem, state, covariance, all_images)
+    for whole, term, statistic in zip(all_images, problem.images, dots, strict=True):
+        if term.keep.all():
+            continue
+        residual = problem.image_residual(state, whole).reshape(-1, 2) * whole.sigma_px[:, None]
+        if not term.keep.any():
+            limit = limits.image(len(statistic))
+            size = float(np.sqrt(np.mean(np.sum(residual**2, axis=1))))
+            found.append(Outlier("image", f"image {term.name}", float(statistic.sum()), limit, size))
+            continue
+        for row in np.flatnonzero(~term.keep):
+            name = f"image {term.name} dot (row {term.rows[row]}, column {term.columns[row]})"
+            size = float(np.linalg.norm(residual[row]))
+            found.append(Outlier("dot", name, float(statistic[row]), limits.dot, size))
+    for point, judged in zip(problem.station, points, strict=True):
+        if point.keep:
+            continue
+        limit = limits.point(judged.freedom or 3)
+        size = float(np.linalg.norm(problem.station_residual(state, point)) * point.sigma_m)
+        kind: Literal["prism", "tape"] = "prism" if point.board is None else "tape"
+        found.append(Outlier(kind, point.name, float(judged.statistic[()]), limit, size))
+    return tuple(found)
+
+
+@dataclass(frozen=True)
+class _Limits:
+    """Beyond what a statistic fails: a dot's, an image's by its dots, a station point's by its freedom.
+
+    Where the typical measurement is farther off than its sigma says, they are wider by as much.
+    """
+
+    dots: int
+    images: int
+    points: int
+    dot_scale: float
+    point_scale: float
+
+    @property
+    def dot(self) -> float:
+        return float(chi2.isf(FALSE_ALARMS / max(self.dots, 1), 2)) * self.dot_scale
+
+    def image(self, dots: int) -> float:
+        return float(chi2.isf(FALSE_ALARMS / max(self.images, 1), 2 * max(dots, 1))) * self.dot_scale
+
+    def point(self, freedom: int) -> float:
+        return float(chi2.isf(FALSE_ALARMS / max(self.points, 1), freedom)) * self.point_scale
+
+
+def _tested(
+    problem: Adjustment, state: Estimate, covariance: FloatArray, all_images: Sequence[ImageTerm]
+) -> tuple[list[FloatArray], list[Judged], _Limits]:
+    """The statistics of every image's dots and of every station point, and their limits."""
+    dots = [
+        _dots(problem, state, covariance, whole, term)
+        for whole, term in zip(all_images, problem.images, strict=True)
+    ]
+    points = [_point(problem, state, covariance, term) for term in problem.station]
+    kept = [d[t.keep] for d, t in zip(dots, problem.images, strict=True) if t.keep.any()]
+    whole = [
+        np.array([p.statistic])
+        for p, t in zip(points, problem.station, strict=True)
+        if t.keep and p.freedom == 3
+    ]
+    count = sum(len(d) for d in dots)
+    return dots, points, _Limits(count, len(dots), len(points), _scale(kept, 2), _scale(whole, 3))
+
+
+def _dots(
+    problem: Adjustment, state: Estimate, covariance: FloatArray, whole: ImageTerm, term: ImageTerm
+) -> FloatArray:
+    """The statistic of each dot of an image (n,); infinite where it has no pixel."""
+    block = problem.image_block(state, whole)
+    residual = block.residual.reshape(-1, 2)
+    jacobian = block.jacobian.reshape(len(residual), 2, -1)
+    mine = covariance[np.ix_(block.columns, block.columns)]
+    spread = np.einsum("nik,nkj->nij", jacobian @ mine, jacobian.transpose(0, 2, 1))
+    sign = np.where(term.keep, -1.0, 1.0)[:, None, None]
+    expected = np.eye(2) + sign * np.nan_to_num(spread)
+    values, vectors = np.linalg.eigh(expected)
+    along = np.einsum("nji,nj->ni", vectors, residual)
+    return np.asarray(np.nan_to_num((along**2 / np.maximum(values, REDUNDANT)).sum(axis=1), nan=np.inf))
+
+
+def _point(problem: Adjustment, state: Estimate, covariance: FloatArray, term: StationTerm) -> Judged:
+    """The statistic of a prism or tape, in the directions in which the rest of the survey checks it."""
+    block = problem.station_block(state, term)
+    mine = covariance[np.ix_(block.columns, block.columns)]
+    spread = block.jacobian @ mine @ block.jacobian.T
+    values, vectors = np.linalg.eigh(np.eye(3) + (-spread if term.keep else spread))
+    tested = values > REDUNDANT
+    along = vectors.T @ block.residual
+    return Judged(np.asarray(np.sum(along[tested] ** 2 / values[tested])), int(tested.sum()))
+
+
+def _culprit(problem: Adjustment, state: Estimate, suspect: int) -> int:
+    """Which image of the suspect's board is to blame: the one without which the others and the tapes agree.
+
+    Two images that contradict each other look equally bad where the fit has ended between them.
+    """
+    board = problem.images[suspect].board
+    together = [i for i, t in enumerate(problem.images) if t.board == board and t.keep.any()]
+    if len(together) < 2:
+        return suspect
+    misfits = {i: _board_misfit(problem, state, board, [j for j in together if j != i]) for i in together}
+    best = min(misfits, key=lambda i: misfits[i])
+    return best if misfits[best] < misfits[suspect] else suspect
+
+
+def _board_misfit(
+    problem: Adjustment, state: Estimate, board: tuple[str, str], images: Sequence[int]
+) -> float:
+    """Sum of squares of a board's tapes and some of its images with its pose fitted to these alone."""
+    tapes = [p for p in problem.station if p.board == board and p.keep]
+    cost = float("inf")
+    for _ in range(BOARD_STEPS):
+        blocks = [problem.image_block(state, problem.images[i]) for i in images]
+        blocks += [problem.station_block(state, p) for p in tapes]
+        cost = float(sum(b.residual @ b.residual for b in blocks))
+        if not np.isfinite(cost):
+            return float("inf")
+        jacobian = np.concatenate([b.jacobian[:, -6:] for b in blocks])  # a board's pose comes last
+        residual = np.concatenate([b.residual for b in blocks])
+        step = np.linalg.lstsq(jacobian, -residual, rcond=None)[0]
+        moved = moved_rigid(state.rover_from_board[board], step)
+        state = replace(state, rover_from_board={**state.rover_from_board, board: moved})
+    return cost
+
+
+def _may_go(problem: Adjustment, point: StationTerm) -> bool:
+    """Whether a set-up has prisms enough without this one; tapes may always go.
+
+    Prisms are all that contradicts a mast taken as upright (four parameters): there they stay.
+    """
+    if point.board is not None:
+        return True
+    kept = sum(p.setup == point.setup and p.board is None and p.keep for p in problem.station)
+    return kept > PRISMS_LEFT and len(problem.mast_free) != 4
+
+
+def _scale(statistics: Sequence[FloatArray], freedom: int) -> float:
+    """By how much the typical statistic is larger than it should be; at least 1."""
+    if not statistics:
+        return 1.0
+    typical = float(np.median(np.concatenate([s.ravel() for s in statistics])))
+    return max(1.0, typical / float(chi2.median(freedom)))

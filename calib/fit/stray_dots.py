@@ -1,0 +1,90 @@
+"""Dots that are not where the rest of their image says, told without a camera.
+
+Over one board, pixels are a smooth function of the place on it, whatever the lens and the board's pose: a
+polynomial of the fourth degree is good to some hundredths of a pixel. What is left of a dot is its own
+noise, and its square in sigmas chi-square with two degrees of freedom. This is the test for fits that
+take boards as exact: there the station's error moves all dots of an image, and would hide a wrong one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from scipy.stats import chi2
+
+from calib.fit.calibration import Outlier
+from calib.rigid import FloatArray
+from calib.survey import Dots, Survey
+
+FALSE_ALARMS = 0.01
+"""Chance that a survey without blunders loses any dot."""
+
+DEGREES = ((60, 4), (30, 3))
+"""Fewest dots for a polynomial of that degree; with fewer than the last nothing is tested."""
+
+POLYNOMIAL_PX = 0.08
+"""What a polynomial of the fourth degree may miss, at the corners of a near board in a wide lens."""
+
+MANY = 0.25
+"""With more than this part of its dots beyond the limit, it is not the dots that are wrong."""
+
+STEPS = 10
+PULL = 2.5
+"""Beyond so many times the typical residual a dot pulls no harder."""
+
+
+def without_stray_dots(survey: Survey) -> tuple[Survey, tuple[Outlier, ...]]:
+    """Return the survey without dots that disagree with the rest of their image, and these.
+
+    Check images are left as they are. Where the typical dot is farther off than its stated sigma, the limit
+    is wider by as much.
+    """
+    tested = {}
+    for image in survey.images:
+        dots = survey.dots.get(image.name)
+        degree = 0 if dots is None else next((d for n, d in DEGREES if len(dots.rows) >= n), 0)
+        if image.purpose != "check" and dots is not None and degree:
+            tested[image.name] = _test(survey, dots, degree)
+    if not tested:
+        return survey, ()
+    every = np.concatenate([statistic for statistic, _ in tested.values()])
+    scale = max(1.0, float(np.median(every) / chi2.median(2)))
+    limit = float(chi2.isf(FALSE_ALARMS / len(every), 2)) * scale
+    kept, outliers = dict(survey.dots), list[Outlier]()
+    for name, (statistic, off_px) in tested.items():
+        bad = statistic > limit
+        if not bad.any() or bad.mean() > MANY:
+            continue
+        dots = survey.dots[name]
+        kept[name] = _some(dots, ~bad)
+        for i in np.flatnonzero(bad):
+            where = f"image {name} dot (row {dots.rows[i]}, column {dots.columns[i]})"
+            outliers.append(Outlier("dot", where, float(statistic[i]), limit, float(off_px[i])))
+    return replace(survey, dots=kept), tuple(outliers)
+
+
+def _test(survey: Survey, dots: Dots, degree: int) -> tuple[FloatArray, FloatArray]:
+    """The statistic of each dot (n,), and how far it is (n,), pixels, from where the others say."""
+    x, y, _ = survey.board.dots_in_board_m(dots.rows, dots.columns).T / survey.board.spacing_m / 5
+    terms = np.stack([x**i * y**j for i in range(degree + 1) for j in range(degree + 1 - i)], axis=1)
+    sigma = np.full(len(x), survey.sigma.dot_px) if dots.sigma_px is None else dots.sigma_px
+    sigma = np.hypot(sigma, POLYNOMIAL_PX)
+    weight = 1 / sigma**2
+    for _ in range(STEPS):
+        root = np.sqrt(weight)[:, None]
+        numbers = np.linalg.lstsq(root * terms, root * dots.pixels_px, rcond=None)[0]
+        off_px = np.linalg.norm(terms @ numbers - dots.pixels_px, axis=1)
+        size = off_px / sigma
+        size = size / max(1.0, float(np.median(size)))
+        weight = np.minimum(1.0, PULL / np.maximum(size, PULL)) ** 2 / sigma**2
+    root = np.sqrt(weight)[:, None]
+    share = np.linalg.norm(np.linalg.qr(root * terms)[0], axis=1) ** 2
+    # A dot alone in its corner bends the polynomial to itself: judge it by what that leaves.
+    return (off_px / sigma) ** 2 / np.maximum(1 - share, 0.1), off_px
+
+
+def _some(dots: Dots, keep: Sequence[bool] | np.ndarray) -> Dots:
+    sigma = None if dots.sigma_px is None else dots.sigma_px[keep]
+    return Dots(dots.rows[keep], dots.columns[keep], dots.pixels_px[keep], sigma)

@@ -1,0 +1,301 @@
+"""The check of a survey before it is fitted: is all there, does it span enough, does it agree with itself.
+
+Nothing here is fitted beyond rigid alignments, so it takes well under a second. What a single image, tape or
+dot does to the result is judged again, and finer, by the tests of the fit.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+
+import numpy as np
+
+from calib.files.strict import nearest
+from calib.rigid import FloatArray, Rigid
+from calib.survey import Finding, Survey, SurveyCamera, SurveyImage
+from calib.survey.doubts import dot_doubts, grid_doubts, station_doubts, unit_doubts
+from calib.survey.joint_doubts import joint_doubts
+from calib.survey.mixups import Placement, eyes_in_rover_m, mixups, rover_from_boards
+
+FEWEST_BOARDS, ENOUGH_BOARDS = 3, 5
+"""For a camera, and for the mast; the paper finds 5 to 8 positions adequate."""
+
+DEPTH_RATIO = 1.3
+"""Furthest to nearest board of a camera; at one distance, focal length and place trade for each other."""
+
+AREA = 0.6
+"""Part of a 4 x 3 division of the picture that dots should reach."""
+
+PAN_RANGE_RAD, TILT_RANGE_RAD, STILL_RAD = 0.5, 0.2, 0.02
+FEWEST_DOTS = 20
+
+PAN_LIMITS_RAD = (-np.pi, np.pi)
+TILT_LIMITS_RAD = (-np.pi / 2, np.pi / 2)
+
+
+def check_survey(
+    survey: Survey,
+    pan_limits_rad: tuple[float, float] = PAN_LIMITS_RAD,
+    tilt_limits_rad: tuple[float, float] = TILT_LIMITS_RAD,
+    *,
+    only_camera_images: bool = False,
+) -> tuple[Finding, ...]:
+    """Return what is missing, too little, or at odds with itself in a survey; errors first.
+
+    Parameters
+    ----------
+    survey
+        As `calib.survey.read_survey` gives it; pictures are looked for in its folder.
+    pan_limits_rad, tilt_limits_rad
+        Beyond these, joint angles are refused.
+    only_camera_images
+        Whether cameras will be fitted to images of purpose camera alone, as the paper does.
+    """
+    purposes = ("camera",) if only_camera_images else ("camera", "mast")
+    findings = [*_missing(survey), *_set_ups(survey), *_placements(survey)]
+    angles = list(_angles(survey, pan_limits_rad, tilt_limits_rad))
+    units = list(unit_doubts(survey))
+    findings += [*angles, *units, *grid_doubts(survey), *dot_doubts(survey)]
+    if not units:
+        findings += station_doubts(survey)
+    if not units and not angles:
+        findings += list(joint_doubts(survey)) or mixups(survey)
+    boards = rover_from_boards(survey)
+    for name, camera in survey.cameras.items():
+        mine = [image for image in survey.images if image.camera == name]
+        if mine:
+            fitted = [image for image in mine if image.purpose in purposes]
+            findings += _camera_spread(survey, camera, purposes, fitted, {} if units else boards)
+    if not angles:
+        findings += _mast_spread(survey)
+    if survey.images and not any(image.purpose == "check" for image in survey.images):
+        findings.append(
+            Finding(
+                "warning",
+                "images.csv",
+                "there is no image of purpose check, so nothing independent tells how good the result is",
+                "Photograph two to four more placements and mark those images check; they are never fitted",
+            )
+        )
+    return tuple(sorted(findings, key=lambda finding: finding.severity))
+
+
+def _missing(survey: Survey) -> Iterator[Finding]:
+    """Images without dots and picture; cameras without images; images with next to no dots."""
+    clicked = {click.image for click in survey.clicks}
+    for name in survey.cameras:
+        mine = [image for image in survey.images if image.camera == name]
+        if not mine:
+            yield Finding(
+                "error",
+                f"camera {name}",
+                "it has no image in images.csv",
+                "Photograph five to eight placements with it, or take it out of survey.yaml",
+            )
+        empty = [
+            image
+            for image in mine
+            if image.name not in survey.dots
+            and not (image.purpose == "check" and image.name in clicked)
+            and not (survey.folder / image.file).is_file()
+        ]
+        if empty:
+            first = empty[0]
+            missing = (
+                f"the file {first.file.as_posix()} is missing" if first.file.name else "no file is named"
+            )
+            yield Finding(
+                "error",
+                f"images.csv line {first.row}, camera {name}",
+                f"{len(empty)} of {len(mine)} images have neither dots in dots.csv nor a picture "
+                f"({_some([i.name for i in empty])}): {missing}",
+                "Put the picture there, add its dots, or take out the row",
+            )
+        found = {i.name: len(survey.dots[i.name].rows) for i in mine if i.name in survey.dots}
+        few = [image for image, count in found.items() if count < FEWEST_DOTS]
+        if few:
+            yield Finding(
+                "warning",
+                f"camera {name}",
+                f"{len(few)} images have fewer than {FEWEST_DOTS} dots ({_some(few)})",
+                "Find more of their dots or photograph these placements again",
+            )
+
+
+def _set_ups(survey: Survey) -> Iterator[Finding]:
+    """Set-ups with too few prisms."""
+    for setup in dict.fromkeys(image.setup for image in survey.images):
+        prisms = [p.point for p in survey.station if p.setup == setup and p.kind == "prism"]
+        if len(prisms) < 3:
+            yield Finding(
+                "error",
+                f"set-up {setup}",
+                f"{len(prisms)} prisms are measured ({', '.join(prisms) or 'none'}) where three are needed",
+                "Measure at least three prisms, better four, from this standing of the station",
+            )
+        elif len(prisms) == 3:
+            yield Finding(
+                "warning",
+                f"set-up {setup}",
+                f"only three prisms are measured ({', '.join(prisms)}), so none can be left out if it is off",
+                "Measure a fourth prism",
+            )
+
+
+def _placements(survey: Survey) -> Iterator[Finding]:
+    """Images of placements not measured; placements with too few tapes, or not photographed."""
+    tapes: dict[tuple[str, str], list[str]] = {}
+    for point in survey.station:
+        if point.kind == "tape":
+            tapes.setdefault((point.setup, point.placement), []).append(point.point)
+    seen = {(image.setup, image.placement) for image in survey.images}
+    for image in survey.images:
+        at = image.setup, image.placement
+        if image.placement and at not in tapes:
+            there = [placement for setup, placement in tapes if setup == image.setup]
+            hint = f"; {nearest(image.placement, there)}" if there else ""
+            yield Finding(
+                "error",
+                f"images.csv line {image.row}, image {image.name}",
+                f"placement {image.placement} has no tapes in set-up {image.setup} of station.csv{hint}",
+                "Correct the name, or measure the tapes of this placement",
+            )
+    for (setup, placement), names in tapes.items():
+        place = f"set-up {setup}, placement {placement}"
+        if len(names) < 3:
+            yield Finding(
+                "error",
+                place,
+                f"{len(names)} of three tapes are measured ({', '.join(names)})",
+                "Measure the missing tapes, or take out the placement and its images",
+            )
+        if (setup, placement) not in seen:
+            yield Finding(
+                "warning",
+                place,
+                "it was measured but no image shows it",
+                "Check the names of placements in images.csv",
+            )
+
+
+def _angles(
+    survey: Survey, pan_limits_rad: tuple[float, float], tilt_limits_rad: tuple[float, float]
+) -> Iterator[Finding]:
+    """Joint angles outside their limits; many of them are degrees."""
+    for joint, (low, high) in (("pan", pan_limits_rad), ("tilt", tilt_limits_rad)):
+        angles = [(getattr(i, f"{joint}_rad"), i) for i in survey.images if i.pan_rad is not None]
+        off = [(angle, image) for angle, image in angles if not low <= angle <= high]
+        if not off:
+            continue
+        worst, image = max(off, key=lambda entry: abs(entry[0]))
+        advice = "Correct the angle, or the limits if the mast goes there"
+        if abs(worst) > np.pi:
+            advice = (
+                f"If the angles are in degrees, write radians: {worst:g} degrees are "
+                f"{np.radians(worst):.4f} rad, one radian is 57.3 degrees"
+            )
+        yield Finding(
+            "error",
+            f"images.csv line {image.row}, {joint}_rad",
+            f"{joint} of {len(off)} of {len(angles)} images is outside {low:.2f} to {high:.2f} rad, "
+            f"the furthest {worst:g} (image {image.name})",
+            advice,
+        )
+
+
+def _camera_spread(
+    survey: Survey,
+    camera: SurveyCamera,
+    purposes: Sequence[str],
+    fitted: Sequence[SurveyImage],
+    in_rover: Mapping[Placement, Rigid],
+) -> Iterator[Finding]:
+    """Too few boards, at one distance, or in one part of the picture."""
+    boards = list(dict.fromkeys((image.setup, image.placement) for image in fitted))
+    of_purpose = "" if len(purposes) > 1 else f" of purpose {purposes[0]}"
+    if len(boards) < ENOUGH_BOARDS:
+        yield Finding(
+            "error" if len(boards) < FEWEST_BOARDS else "warning",
+            f"camera {camera.name}",
+            f"{len(boards)} placements{of_purpose} are there to fit it; {FEWEST_BOARDS} are the least and "
+            f"{ENOUGH_BOARDS} to 8 adequate",
+            "Photograph more placements, near and far, towards all corners of the picture",
+        )
+    eye_m = eyes_in_rover_m(survey)[camera.name]
+    ranges_m = [float(np.linalg.norm(in_rover[at].translation_m - eye_m)) for at in boards if at in in_rover]
+    if len(ranges_m) > 1 and max(ranges_m) < DEPTH_RATIO * min(ranges_m):
+        yield Finding(
+            "warning",
+            f"camera {camera.name}",
+            f"all its boards stand between {min(ranges_m):.1f} and {max(ranges_m):.1f} m, so focal length "
+            "and place of the camera can trade for each other",
+            f"Photograph boards at about {min(ranges_m) / 2:.1f} m or {2 * max(ranges_m):.0f} m as well",
+        )
+    pixels = [survey.dots[image.name].pixels_px for image in fitted if image.name in survey.dots]
+    if pixels:
+        yield from _area(camera, np.concatenate(pixels))
+
+
+def _area(camera: SurveyCamera, pixels_px: FloatArray) -> Iterator[Finding]:
+    """Say where in the picture there are no dots, if that is much of it."""
+    cells = np.clip(((pixels_px + 0.5) / np.array(camera.size_px) * (4, 3)).astype(int), 0, (3, 2))
+    reached = np.zeros((3, 4), dtype=bool)
+    reached[cells[:, 1], cells[:, 0]] = True
+    if reached.mean() >= AREA:
+        return
+    sides = {
+        "left": reached[:, :2].mean(),
+        "right": reached[:, 2:].mean(),
+        "upper": reached[0].mean(),
+        "lower": reached[2].mean(),
+    }
+    emptiest = min(sides, key=sides.__getitem__)
+    (left, top), (right, bottom) = pixels_px.min(axis=0), pixels_px.max(axis=0)
+    yield Finding(
+        "warning",
+        f"camera {camera.name}",
+        f"its dots reach {100 * reached.mean():.0f} % of the picture (x {left:.0f} to {right:.0f}, "
+        f"y {top:.0f} to {bottom:.0f} of {camera.size_px[0]}x{camera.size_px[1]} px); "
+        "the lens is not measured elsewhere",
+        f"Photograph boards in the {emptiest} part of the picture",
+    )
+
+
+def _mast_spread(survey: Survey) -> Iterator[Finding]:
+    """Too little turning of the head."""
+    head = [i for i in survey.images if i.pan_rad is not None and i.purpose != "check"]
+    if not head:
+        return
+    joints = np.array([(i.pan_rad, i.tilt_rad) for i in head])
+    pan_rad, tilt_rad = np.ptp(joints, axis=0)
+    if max(pan_rad, tilt_rad) < STILL_RAD:
+        yield Finding(
+            "error",
+            "the mast",
+            f"the head did not move: pan changes by {pan_rad:.3f} rad and tilt by {tilt_rad:.3f} rad",
+            "Turn the head to five to eight boards over the range of pan and tilt, with purpose mast",
+        )
+        return
+    for joint, found, wanted in (("pan", pan_rad, PAN_RANGE_RAD), ("tilt", tilt_rad, TILT_RANGE_RAD)):
+        if found < wanted:
+            column = joints[:, 0 if joint == "pan" else 1]
+            yield Finding(
+                "warning",
+                "the mast",
+                f"{joint} goes from {column.min():.2f} to {column.max():.2f} rad only, {found:.2f} rad where "
+                f"{wanted:g} are wanted, which leaves parts of the mast unknown",
+                f"Photograph boards at other angles of {joint}, best over the whole range of use",
+            )
+    boards = {(i.setup, i.placement) for i in head if i.purpose == "mast"}
+    if len(boards) < ENOUGH_BOARDS:
+        yield Finding(
+            "warning",
+            "the mast",
+            f"{len(boards)} placements of purpose mast; {ENOUGH_BOARDS} to 8 are adequate",
+            "Photograph more placements over the range of pan and tilt",
+        )
+
+
+def _some(names: Sequence[str]) -> str:
+    """The first few names."""
+    return ", ".join(names[:4]) + (f" and {len(names) - 4} more" if len(names) > 4 else "")

@@ -1,0 +1,1 @@
+"""One target followed while the rover moves."""

@@ -1,0 +1,159 @@
+"""What a camera of any driver really delivers, held against what a driver promises (docs/drivers.md)."""
+
+from __future__ import annotations
+
+import statistics
+import time
+from itertools import pairwise
+from typing import Any
+
+from drivers.clock import Clock
+from drivers.errors import DriverError, NoFreshFrame
+from drivers.interfaces import Camera, HoldsExposure, KnowsSize, Paced
+from mastctl.cameras.quality import quality_of
+from mastctl.devices import frames as frame_checks
+from mastctl.devices.frames import CheckedFrame
+from mastctl.devices.thread import DeviceThread
+
+FRAME_TIMEOUT_S = 5.0
+GRACE_S = 6.0  # beyond that a call hangs: the service gives it no more either
+NEVER_S, SHORT_S = 60.0, 0.2  # asked for a frame of the future, and how long: it must be refused in time
+PACE_TOLERANCE = 0.2
+MOST_PROBLEMS = 20
+
+
+class CameraCheck:
+    """One check of one open camera.
+
+    Parameters
+    ----------
+    name, camera, clock
+        The camera, and the clock that its stamps are judged by.
+    size_px
+        (width, height) by the mast file; None where that does not know it.
+    """
+
+    def __init__(self, name: str, camera: Camera, clock: Clock, size_px: tuple[int, int] | None) -> None:
+        self._name = name
+        self._camera = camera
+        self._clock = clock
+        self._size_px = size_px
+        self._frames: list[CheckedFrame] = []
+        self._delays_s: list[float] = []
+        self._refused = 0
+        self._uncertainty_s: float | None = None
+        self._problems: list[str] = []
+
+    def run(self, seconds: float) -> dict[str, Any]:
+        """Take frames for some seconds and return what was found, as JSON.
+
+        A driver that fails, hangs or answers what cannot be true is a problem in the answer, not an error.
+        """
+        thread = DeviceThread(self._name)
+        try:
+            self._take_frames(thread, seconds)
+            self._ask_for_the_future(thread)
+        finally:
+            thread.close(1.0)
+        self._check_count()
+        self._check_abilities()
+        return self._told(seconds)
+
+    def _problem(self, words: str) -> None:
+        if words not in self._problems and len(self._problems) < MOST_PROBLEMS:
+            self._problems.append(words)
+
+    def _next(self, thread: DeviceThread, after_s: float, timeout_s: float) -> Any:
+        """The driver's answer, within a deadline. Raises DriverError."""
+        return thread.call(
+            "next_frame", lambda: self._camera.next_frame(after_s, timeout_s), timeout_s + GRACE_S
+        )
+
+    def _take_frames(self, thread: DeviceThread, seconds: float) -> None:
+        """One frame after the other, by turns the next one and one exposed from now on."""
+        until_s = time.monotonic() + seconds
+        after_s = self._clock.now_s()
+        while time.monotonic() < until_s:
+            try:
+                answer = self._next(thread, after_s, FRAME_TIMEOUT_S)
+                now_s = self._clock.now_s()
+                frame = frame_checks.checked(answer, self._name, self._size_px, after_s, now_s)
+            except DriverError as error:
+                self._refused += 1
+                self._problem(str(error))
+                if self._refused >= MOST_PROBLEMS or (thread.faults() and not self._frames):
+                    return
+                after_s = self._clock.now_s()
+                continue
+            told_s = getattr(answer, "mid_uncertainty_s", None)
+            self._uncertainty_s = float(told_s) if isinstance(told_s, float) else None
+            self._frames.append(frame)
+            self._delays_s.append(now_s - (frame.mid_exposure_s + frame.exposure_s / 2))
+            after_s = now_s if len(self._frames) % 5 == 0 else frame.exposure_began_s
+
+    def _ask_for_the_future(self, thread: DeviceThread) -> None:
+        """A frame exposed after a minute from now cannot come; the driver has to say so in time."""
+        began_s = time.monotonic()
+        words = f"asked for a frame exposed in {NEVER_S:g} s, within {SHORT_S:g} s"
+        try:
+            self._next(thread, self._clock.now_s() + NEVER_S, SHORT_S)
+            self._problem(f"{words}, it gave one that was exposed before")
+        except NoFreshFrame:
+            took_s = time.monotonic() - began_s
+            if took_s > SHORT_S + 1.0:
+                self._problem(f"{words}, it said no only after {took_s:.1f} s")
+        except DriverError as error:
+            self._problem(f"{words}, it raised no NoFreshFrame: {error}")
+
+    def _check_count(self) -> None:
+        """Count and time must grow together."""
+        for before, frame in pairwise(self._frames):
+            ahead, later_s = frame.sequence - before.sequence, frame.mid_exposure_s - before.mid_exposure_s
+            if ahead <= 0 or later_s <= 0:
+                self._problem(
+                    f"frame {frame.sequence} came after frame {before.sequence}, {later_s:.3f} s later: "
+                    "count and time must grow together"
+                )
+
+    def _check_abilities(self) -> None:
+        """What it says of itself must be what came."""
+        camera = self._camera
+        if isinstance(camera, KnowsSize) and self._frames:
+            height, width = self._frames[-1].image.shape[:2]
+            if tuple(camera.size_px) != (width, height):
+                self._problem(f"size_px is {tuple(camera.size_px)}, its pictures have ({width}, {height})")
+        rate_hz = self._rate_hz()
+        if isinstance(camera, Paced) and rate_hz and abs(camera.period_s * rate_hz - 1) > PACE_TOLERANCE:
+            self._problem(f"period_s is {camera.period_s:.4g} s, frames come every {1 / rate_hz:.4g} s")
+
+    def _rate_hz(self) -> float | None:
+        if len(self._frames) < 2:
+            return None
+        first, last = self._frames[0], self._frames[-1]
+        counted, span_s = last.sequence - first.sequence, last.mid_exposure_s - first.mid_exposure_s
+        return counted / span_s if counted > 0 and span_s > 0 else None
+
+    def _told(self, seconds: float) -> dict[str, Any]:
+        frames, camera = self._frames, self._camera
+        abilities = (("size_px", KnowsSize), ("exposure_held", HoldsExposure), ("period_s", Paced))
+        told: dict[str, Any] = {
+            "camera": self._name,
+            "seconds": seconds,
+            "frames": len(frames),
+            "refused": self._refused,
+            "rate_hz": self._rate_hz(),
+            "mid_exposure_uncertainty_s": self._uncertainty_s,
+            "abilities": [word for word, protocol in abilities if isinstance(camera, protocol)],
+            "problems": self._problems,
+        }
+        if frames:
+            image = frames[-1].image
+            told |= {
+                "size_px": [image.shape[1], image.shape[0]],
+                "colour": image.ndim == 3,
+                "missed": sum(max(0, b.sequence - a.sequence - 1) for a, b in pairwise(frames)),
+                "delay_s": [min(self._delays_s), statistics.median(self._delays_s), max(self._delays_s)],
+                "exposure_s": [min(f.exposure_s for f in frames), max(f.exposure_s for f in frames)],
+                "quality": quality_of(image).told(),
+            }
+        return told

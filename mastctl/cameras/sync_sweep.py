@@ -1,0 +1,254 @@
+"""Turns the head to and fro, and takes what the cameras and the joints tell meanwhile.
+
+The cameras are asked directly, not through the service's checks: stamps that cannot be true are what this is
+to find out. The head goes through `mastctl.devices.devices`, so that limits and stop are the service's own.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from calib.mast.rig import Rig
+from calib.rigid import FloatArray
+from drivers.errors import DriverError, NoFreshFrame, NoReply
+from drivers.interfaces import Camera, Frame, Reading
+from mastctl.cameras.sync_fit import REACH_S, CannotTell, Motion, OffsetFit, fit_offset
+from mastctl.cameras.sync_patches import Patches, choose_patches
+from mastctl.devices.devices import Devices
+from mastctl.devices.limits import Limits
+from mastctl.errors import MastctlError, Stopped
+
+SPEEDS = (
+    1.0,
+    0.4,
+    0.7,
+)  # parts of the chosen speed, way after way: an odd number, so that each goes both ways
+USUAL_AMPLITUDE_RAD = 0.07
+MOST_OF_VIEW = 0.15  # of the narrowest camera's view, to either side
+USUAL_SPEED = 5.0  # amplitudes a second
+READ_EVERY_S = 0.005
+REST_S = REACH_S + 0.4  # before the picture at rest: also one that is stamped too new shows the rest
+ARRIVE_S = 10.0
+FRAME_TIMEOUT_S = 5.0
+LOST_FRAMES = 3
+
+
+@dataclass(frozen=True)
+class SweepPlan:
+    """How the head is turned: pan goes ``amplitude_rad`` to either side for ``seconds``."""
+
+    amplitude_rad: float
+    speed_rad_per_s: float
+    seconds: float
+
+
+@dataclass
+class Seen:
+    """What one camera gave: stamps, places of its patches, and why it gave no more."""
+
+    patches: Patches | None = None
+    stamps_s: list[float] = field(default_factory=list)
+    places_px: list[FloatArray] = field(default_factory=list)
+    uncertainty_s: float = 0.0
+    failure: str = ""
+
+
+def plan_sweep(
+    rig: Rig,
+    cameras: Sequence[str],
+    limits: Limits,
+    amplitude_rad: float | None,
+    speed_rad_per_s: float | None,
+    seconds: float,
+) -> SweepPlan:
+    """Return a sweep that the cameras' views allow, as far as it was not asked for otherwise."""
+    if amplitude_rad is None:
+        narrowest = min(_view_rad(rig, name) for name in cameras)
+        amplitude_rad = min(USUAL_AMPLITUDE_RAD, MOST_OF_VIEW * narrowest)
+    if speed_rad_per_s is None:
+        speed_rad_per_s = min(USUAL_SPEED * amplitude_rad, limits.speed_rad_per_s)
+    return SweepPlan(amplitude_rad, speed_rad_per_s, seconds)
+
+
+def _view_rad(rig: Rig, camera: str) -> float:
+    """How wide a camera sees along its middle row."""
+    model = rig.cameras[camera].model
+    width, height = model.size_px
+    ends = model.ray(np.array([[0.0, (height - 1) / 2], [width - 1.0, (height - 1) / 2]])).directions
+    return float(np.arccos(np.clip(ends[0] @ ends[1], -1.0, 1.0)))
+
+
+class Sweep:
+    """One measurement: go, and take everything down.
+
+    Parameters
+    ----------
+    devices
+        The head; cameras are not asked through it.
+    cameras
+        Open cameras on the head, by name.
+    rig, limits
+        The mast file's content and the soft limits.
+    stop
+        Set from anywhere it ends the sweep: the head is halted where it is.
+    """
+
+    def __init__(
+        self, devices: Devices, cameras: Mapping[str, Camera], rig: Rig, limits: Limits, stop: threading.Event
+    ) -> None:
+        self._devices = devices
+        self._cameras = cameras
+        self._rig = rig
+        self._limits = limits
+        self._stop = stop
+        self._over = threading.Event()
+        self._readings: list[Reading] = []
+        self.seen = {name: Seen() for name in cameras}
+
+    def run(self, plan: SweepPlan) -> None:
+        """Sweep, and bring the head back to where it stood.
+
+        Raises
+        ------
+        Stopped
+            If it was stopped; the head stands where that was.
+        OutsideLimits
+            Before anything moves, if the sweep would pass a limit.
+        DriverError
+            If the head fails; it is halted. A camera that fails is only told of (`seen`).
+        """
+        start = self._devices.read()
+        for side in (-1, 1):
+            self._limits.check(start.pan_rad + side * plan.amplitude_rad, start.tilt_rad)
+        self._limits.speed(plan.speed_rad_per_s)
+        threads = [threading.Thread(target=self._watch, args=(name,), daemon=True) for name in self._cameras]
+        try:
+            self._rest(start)
+            self._choose(start, plan)
+            for thread in threads:
+                thread.start()
+            self._to_and_fro(start, plan)
+            self._go(start.pan_rad, start.tilt_rad, plan.speed_rad_per_s)
+        except BaseException:
+            self._devices.stop()
+            raise
+        finally:
+            self._over.set()
+            for thread in threads:
+                if thread.ident is not None:
+                    thread.join(FRAME_TIMEOUT_S + 1.0)
+
+    def fit(self, camera: str) -> OffsetFit:
+        """Return a camera's offset to the joint readings. Raises CannotTell."""
+        seen = self.seen[camera]
+        if seen.failure and not seen.stamps_s:
+            raise CannotTell(seen.failure)
+        if seen.patches is None or not seen.stamps_s:
+            raise CannotTell("it gave no picture while the head turned")
+        motion = Motion(
+            np.array([reading.time_s for reading in self._readings]),
+            np.array([reading.pan_rad for reading in self._readings]),
+        )
+        try:
+            return fit_offset(motion, np.array(seen.stamps_s), np.array(seen.places_px), seen.patches.rows)
+        except CannotTell as error:
+            raise CannotTell(f"{error}; {seen.failure}" if seen.failure else str(error)) from None
+
+    def _check_stop(self) -> None:
+        if self._stop.is_set():
+            raise Stopped("it was stopped; the head stands where that was")
+
+    def _note(self) -> Reading:
+        """Take the newest reading down."""
+        reading = self._devices.last_reading
+        if reading is None:
+            reading = self._devices.read()
+        if not self._readings or reading.time_s > self._readings[-1].time_s:
+            self._readings.append(reading)
+        return reading
+
+    def _pause(self) -> None:
+        self._check_stop()
+        self._stop.wait(READ_EVERY_S)
+        self._check_stop()
+
+    def _rest(self, start: Reading) -> None:
+        """Wait until the head has stood still for long enough."""
+        since_s = time.monotonic()
+        until_s = since_s + ARRIVE_S
+        while time.monotonic() - since_s < REST_S:
+            if self._note().moving:
+                since_s = time.monotonic()
+            if time.monotonic() > until_s:
+                raise NoReply("the head does not come to rest", device="pan_tilt")
+            self._pause()
+
+    def _choose(self, start: Reading, plan: SweepPlan) -> None:
+        """Take each camera's picture at rest and choose what to follow in it."""
+        for name, camera in self._cameras.items():
+            seen = self.seen[name]
+            try:
+                frame = camera.next_frame(time.monotonic(), FRAME_TIMEOUT_S)
+                joints_rad = (start.pan_rad, start.tilt_rad)
+                seen.patches = choose_patches(frame.image, self._rig, name, joints_rad, plan.amplitude_rad)
+            except (DriverError, MastctlError) as error:
+                seen.failure = str(error)
+            except Exception as error:  # somebody else's driver may raise what it likes
+                seen.failure = f"its driver failed in next_frame: {type(error).__name__}: {error}"
+            self._check_stop()
+
+    def _to_and_fro(self, start: Reading, plan: SweepPlan) -> None:
+        until_s = time.monotonic() + plan.seconds
+        way, side = 0, 1
+        while time.monotonic() < until_s:
+            speed = plan.speed_rad_per_s * SPEEDS[way % len(SPEEDS)]
+            self._go(start.pan_rad + side * plan.amplitude_rad, start.tilt_rad, speed)
+            way, side = way + 1, -side
+            if all(seen.failure for seen in self.seen.values()):
+                return
+
+    def _go(self, pan_rad: float, tilt_rad: float, speed_rad_per_s: float) -> None:
+        """Go there, and take readings down until the head stands."""
+        self._check_stop()
+        self._devices.move(pan_rad, tilt_rad, speed_rad_per_s)
+        sent_s = time.monotonic()
+        while True:
+            reading = self._note()
+            if reading.time_s > sent_s + 0.05 and not reading.moving:
+                return
+            if time.monotonic() - sent_s > ARRIVE_S:
+                raise NoReply(f"the head does not come to pan {pan_rad:.3f} rad", device="pan_tilt")
+            self._pause()
+
+    def _watch(self, name: str) -> None:
+        """In a thread of its own: take a camera's frames and find the patches in them."""
+        seen, camera = self.seen[name], self._cameras[name]
+        patches = seen.patches
+        lost, after_s = 0, time.monotonic()
+        while patches is not None and not self._over.is_set():
+            try:
+                frame = camera.next_frame(after_s, FRAME_TIMEOUT_S)
+                self._take(seen, patches, frame)
+                after_s, lost = max(after_s, frame.mid_exposure_s - frame.exposure_s / 2), 0
+            except Exception as error:  # somebody else's driver may raise what it likes
+                lost += 1
+                if lost == LOST_FRAMES and not self._over.is_set():
+                    known = isinstance(error, (NoFreshFrame, DriverError))
+                    seen.failure = str(error) if known else f"{type(error).__name__}: {error}"
+                    return
+                self._over.wait(0.05)
+
+    def _take(self, seen: Seen, patches: Patches, frame: Frame) -> None:
+        stamp_s = float(frame.mid_exposure_s)
+        if seen.stamps_s and stamp_s <= seen.stamps_s[-1]:
+            self._over.wait(0.002)  # the same one again
+            return
+        places_px = patches.places_px(frame.image)
+        seen.uncertainty_s = float(getattr(frame, "mid_uncertainty_s", 0.0))
+        seen.stamps_s.append(stamp_s)
+        seen.places_px.append(places_px)

@@ -1,0 +1,174 @@
+"""What the head measured lately: checked readings, from which a frame's joint angles are told."""
+
+from __future__ import annotations
+
+import bisect
+import math
+import threading
+from collections import deque
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from drivers.errors import BadReply
+from drivers.interfaces import Reading
+from mastctl.devices.rest import DITHER_S, dithers
+
+KEPT_READINGS = 3000  # one minute at 50 Hz
+OLDEST_READING_S = 1.0  # a reading stamped further back is not a present measurement
+CLOCK_TOLERANCE_S = 0.005  # what a stamp may lie in the future by rounding
+LARGEST_GAP_S = 1.0  # between the readings around an exposure; beyond it the angles are a guess
+STILL_RAD = 3e-3  # between neighbours; two counts of a 12-bit servo
+
+
+@dataclass(frozen=True)
+class JointsAtExposure:
+    """Joint angles at mid-exposure, radians, and whether the head moved during the exposure."""
+
+    pan_rad: float
+    tilt_rad: float
+    moving: bool
+
+
+def checked(answer: object, device: str, now_s: float, newest_s: float | None) -> Reading:
+    """Return a driver's answer to ``read`` as a Reading, if it can be true.
+
+    Parameters
+    ----------
+    answer
+        Whatever the driver returned.
+    device
+        The device's name, for errors.
+    now_s, newest_s
+        The present, and the stamp of the last good reading (None before it), seconds of CLOCK_MONOTONIC.
+
+    Raises
+    ------
+    BadReply
+        If it is no reading, an angle is not finite or beyond a full turn, or the stamp lies in the future,
+        more than 1 s back, or before the last one.
+    """
+    numbers = {}
+    for name in ("pan_rad", "tilt_rad", "time_s"):
+        value = getattr(answer, name, None)
+        if isinstance(value, (bool, str)) or not isinstance(value, (int, float, np.integer, np.floating)):
+            words = f"read returned {type(answer).__name__} whose {name} is {str(value)[:40]}"
+            raise BadReply(f"{words} where a number is expected", device=device)
+        numbers[name] = float(value)
+        if not math.isfinite(numbers[name]):
+            raise BadReply(f"{name} is {numbers[name]} where a finite number is expected", device=device)
+    moving = getattr(answer, "moving", None)
+    if not isinstance(moving, (bool, np.bool_)):
+        raise BadReply(f"moving is {str(moving)[:40]} where true or false is expected", device=device)
+    for name in ("pan_rad", "tilt_rad"):
+        if abs(numbers[name]) > math.tau:
+            raise BadReply(
+                f"{name} {numbers[name]:.6g} rad is beyond a full turn (6.28319 rad)", device=device
+            )
+    time_s = numbers["time_s"]
+    if time_s > now_s + CLOCK_TOLERANCE_S:
+        raise BadReply(f"the reading is stamped {time_s - now_s:.3f} s in the future", device=device)
+    if time_s < now_s - OLDEST_READING_S:
+        raise BadReply(
+            f"the reading is {now_s - time_s:.3f} s old, at most {OLDEST_READING_S} s is taken", device=device
+        )
+    if newest_s is not None and time_s < newest_s:
+        words = f"the reading's time goes back by {newest_s - time_s:.3f} s"
+        raise BadReply(words, device=device)
+    words_given = getattr(answer, "faults", ()) or ()
+    faults = (
+        (words_given,) if isinstance(words_given, str) else tuple(str(word)[:200] for word in words_given)
+    )
+    return Reading(numbers["pan_rad"], numbers["tilt_rad"], bool(moving), time_s, faults)
+
+
+class JointHistory:
+    """Readings of the last minute, and when moves were sent. Safe to use from any thread.
+
+    A head that says now and then that it moves, although its readings are those of a head at rest
+    (`mastctl.devices.rest.dithers`) and no move was sent for a second, is taken to rest.
+    """
+
+    def __init__(self) -> None:
+        self._readings: deque[Reading] = deque(maxlen=KEPT_READINGS)  # as the driver gave them
+        self._newest: Reading | None = None  # with what is true of its motion
+        self._moves_s: deque[float] = deque(maxlen=200)
+        self._lock = threading.Lock()
+
+    @property
+    def newest(self) -> Reading | None:
+        """The last good reading; read without a lock."""
+        return self._newest
+
+    def add(self, reading: Reading) -> Reading:
+        """Keep a checked reading and return it with ``moving`` as the class says.
+
+        One of the same time replaces the last.
+        """
+        with self._lock:
+            if self._readings and reading.time_s <= self._readings[-1].time_s:
+                self._readings.pop()
+            self._readings.append(reading)
+            rests = reading.moving and self._dithers(reading.time_s)
+            self._newest = replace(reading, moving=False) if rests else reading
+            return self._newest
+
+    def move_sent(self, time_s: float) -> None:
+        """Remember that a move went out, so that no exposure around it counts as still."""
+        with self._lock:
+            self._moves_s.append(time_s)
+
+    def at_exposure(self, began_s: float, mid_s: float, ended_s: float, device: str) -> JointsAtExposure:
+        """Return the joint angles at mid-exposure, linear between the readings around it.
+
+        The head counts as moving if a move was sent between the last reading before the exposure and the
+        first one after it, if any of them says so, or if these differ by more than 3 mrad; the last two not
+        of a head that dithers at rest.
+
+        Raises
+        ------
+        BadReply
+            If the readings do not reach around the exposure, or leave a gap of more than 1 s in it.
+        """
+        with self._lock:
+            times_s = [reading.time_s for reading in self._readings]
+            first = bisect.bisect_right(times_s, began_s) - 1
+            last = bisect.bisect_left(times_s, ended_s)
+            around = [self._readings[i] for i in range(max(first, 0), min(last + 1, len(times_s)))]
+            moves_s = list(self._moves_s)
+            rests = bool(around) and self._dithers(around[-1].time_s)
+        if first < 0 or last >= len(times_s):
+            side = "before" if first < 0 else "after"
+            raise BadReply(f"there is no joint reading {side} the frame's exposure", device=device)
+        stamps_s = [reading.time_s for reading in around]
+        gap_s = max(np.diff(stamps_s), default=0.0)
+        if gap_s > LARGEST_GAP_S:
+            words = f"the joint readings around the exposure are {gap_s:.2f} s apart"
+            raise BadReply(f"{words}, at most {LARGEST_GAP_S} s is taken", device=device)
+        pans = [reading.pan_rad for reading in around]
+        tilts = [reading.tilt_rad for reading in around]
+        seems = (
+            any(reading.moving for reading in around)
+            or max(pans) - min(pans) > STILL_RAD
+            or max(tilts) - min(tilts) > STILL_RAD
+        )
+        moving = (seems and not rests) or any(stamps_s[0] <= sent_s <= stamps_s[-1] for sent_s in moves_s)
+        return JointsAtExposure(
+            float(np.interp(mid_s, stamps_s, pans)), float(np.interp(mid_s, stamps_s, tilts)), moving
+        )
+
+    def _dithers(self, until_s: float) -> bool:
+        """Whether the readings up to a moment are those of a head that dithers at rest; the lock is held."""
+        return any(self._dithers_for(for_s, until_s) for for_s in (DITHER_S, 2 * DITHER_S))
+
+    def _dithers_for(self, for_s: float, until_s: float) -> bool:
+        since_s = until_s - for_s
+        if any(since_s <= sent_s <= until_s for sent_s in self._moves_s):
+            return False
+        window: list[Reading] = []
+        for reading in reversed(self._readings):
+            if reading.time_s < since_s:
+                break
+            if reading.time_s <= until_s:
+                window.append(reading)
+        return bool(window) and dithers(window[::-1], for_s=for_s)

@@ -1,0 +1,230 @@
+"""The stops of a head: each goes out whatever hangs, and no move goes out before all of them are back.
+
+A driver that hangs may carry out an old stop much later. A move that was sent meanwhile would end half-way
+without a reason, so moves are refused until every stop is back, and one that comes back late is told.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+from drivers.errors import DriverError, NoReply
+from mastctl.devices.thread import DeviceThread, Fault, log
+from mastctl.errors import MastctlError, Stopped
+
+PATIENCE_S = 0.05  # how long a stop waits for the head's own thread before it goes out beside it
+LATEST_SHARE = 1 / 8  # of the time that a head hangs already: a new stop waits no longer for its own way
+MAY_MOVE = "the head may still move"
+UNTIL = "a stop is confirmed, or a later move is taken and the head then rests"
+
+
+@dataclass(frozen=True)
+class _Inside:
+    """A stop inside the driver: when it was asked for, and when it went in."""
+
+    asked_s: float
+    began_s: float
+
+
+class Stops:
+    """Sends the stops of one head and knows which of them are still on their way; safe from any thread.
+
+    A stop goes before everything that waits in the head's own thread. If that hangs in an earlier call, the
+    stop also goes out beside it, from a thread of its own: a driver that is not made for two threads may then
+    answer badly, but a stop that arrives is worth more than an answer. The one in the queue follows when the
+    hanging call is back, since that may have been a move.
+
+    Parameters
+    ----------
+    thread
+        The head's own thread.
+    device
+        The head's name.
+    stop
+        The driver's stop.
+    """
+
+    def __init__(self, thread: DeviceThread, device: str, stop: Callable[[], None]) -> None:
+        self._thread = thread
+        self._device = device
+        self._stop = stop
+        self._changed = threading.Condition()
+        self._asked = 0
+        self._queued_s: float | None = None  # when the stop was asked for that waits in the head's thread
+        self._inside: list[_Inside] = []
+        self._good_s = float("-inf")  # when a stop came back last that went well
+        self._failed: tuple[_Inside, Exception] | None = None
+        self._fault: Fault | None = None
+        self._late_s = float("-inf")  # when a stop came back last that came too late
+        self._overdue_s = float("inf")
+
+    def ticket(self) -> int:
+        """Return what a move hands to `check` later. Raises Stopped if a stop is overdue."""
+        with self._changed:
+            overdue = self._overdue(time.monotonic())
+            if overdue:
+                raise Stopped(overdue)
+            return self._asked
+
+    def check(self, ticket: int) -> None:
+        """Pass a move that may go out now, in the head's own thread. Raises Stopped."""
+        with self._changed:
+            if ticket != self._asked:
+                raise Stopped("a stop came before the move was sent")
+            if self._inside:
+                raise Stopped(self._told(self._inside[0].asked_s, time.monotonic()))
+
+    def send(self, timeout_s: float) -> None:
+        """Stop the head and return when that is confirmed, by this stop or by another on its way.
+
+        Raises
+        ------
+        NoReply
+            If no stop was confirmed within ``timeout_s`` seconds; the head may still move.
+        DriverError, MastctlError
+            If the driver refused it.
+        """
+        asked_s = time.monotonic()
+        try:
+            self._send(asked_s, timeout_s)
+        except (DriverError, MastctlError) as error:
+            words = str(error) if MAY_MOVE in str(error) else f"{error}; {MAY_MOVE}"
+            with self._changed:
+                since_s = asked_s if self._fault is None else self._fault.since_s
+                self._fault = Fault(self._device, error.code, words, since_s, UNTIL)
+            raise
+        with self._changed:
+            if self._late_s < asked_s:
+                self._fault = None
+
+    def proved(self) -> None:
+        """Take back what was wrong with earlier stops: a later move was taken and the head rests."""
+        with self._changed:
+            self._fault = None
+
+    def faults(self) -> tuple[Fault, ...]:
+        """Return what is wrong with the stops at this moment; takes no lock."""
+        now_s = time.monotonic()
+        fault, queued_s = self._fault, self._queued_s
+        overdue = self._overdue(now_s)
+        if overdue:
+            since_s = min([one.asked_s for one in tuple(self._inside)] + [queued_s or now_s])
+            words = f"{self._device}: {overdue}; {MAY_MOVE}"
+            return (Fault(self._device, NoReply.code, words, since_s, f"it is back, and then {UNTIL}"),)
+        return () if fault is None else (fault,)
+
+    def _send(self, asked_s: float, timeout_s: float) -> None:
+        deadline_s = asked_s + timeout_s
+        beside, alone = False, ""
+        with self._changed:
+            self._asked += 1
+            self._overdue_s = timeout_s
+            if self._queued_s is None:
+                self._thread.submit("stop", self._in_turn, timeout_s, first=True, told=False)
+                self._queued_s = asked_s
+            while self._good_s < asked_s:
+                now_s = time.monotonic()
+                failed = self._failed is not None and self._failed[0].began_s >= asked_s
+                if failed and self._failed is not None and (self._queued_s is None or now_s >= deadline_s):
+                    raise self._failed[1]
+                if now_s >= deadline_s:
+                    words = f"stop did not end within its deadline{alone}; {MAY_MOVE}"
+                    raise NoReply(words, device=self._device)
+                again_s = deadline_s
+                if self._queued_s is not None and not beside:
+                    began_s = [one.began_s for one in self._inside]
+                    at_s = max(asked_s + PATIENCE_S, room_s(began_s, timeout_s))
+                    beside = now_s >= at_s
+                    if beside:
+                        alone = self._go_beside(asked_s, timeout_s)
+                        continue
+                    again_s = min(deadline_s, at_s)
+                self._changed.wait(again_s - now_s)
+
+    def _go_beside(self, asked_s: float, timeout_s: float) -> str:
+        """Send a stop from a thread of its own; return why that cannot be done. The lock is held."""
+        inside = _Inside(asked_s, time.monotonic())
+        thread = threading.Thread(
+            target=self._beside, args=(inside, timeout_s), name="stop beside", daemon=True
+        )
+        self._inside.append(inside)
+        try:
+            thread.start()
+        except RuntimeError as error:  # no more threads: the one in the queue is what is left
+            self._inside.remove(inside)
+            return f", and none could be sent beside the call that hangs ({error})"
+        return ""
+
+    def _beside(self, inside: _Inside, timeout_s: float) -> None:
+        try:
+            self._into_driver(inside, timeout_s)
+        except (DriverError, MastctlError) as error:
+            log.warning("a stop beside a hanging call failed: %s", error)
+
+    def _in_turn(self) -> None:
+        """The stop in the head's own thread."""
+        with self._changed:
+            now_s = time.monotonic()
+            inside = _Inside(now_s if self._queued_s is None else self._queued_s, now_s)
+            self._queued_s = None
+            self._inside.append(inside)
+        self._into_driver(inside, self._overdue_s)
+
+    def _into_driver(self, inside: _Inside, timeout_s: float) -> None:
+        """Make one stop; whoever waits for one is told."""
+        error: Exception | None = None
+        try:
+            self._stop()
+        except BaseException as anything:  # a driver from outside may raise what it likes
+            error = self._thread.typed("stop", anything)
+        ended_s = time.monotonic()
+        words = f"{self._device}: a stop asked for {ended_s - inside.asked_s:.1f} s ago "
+        words += "ended only now" if error is None else f"failed only now: {error}"
+        with self._changed:
+            self._inside.remove(inside)
+            if error is None:
+                self._good_s = ended_s
+            else:
+                self._failed = inside, error
+            given_up = self._fault is not None and ended_s > inside.asked_s + timeout_s
+            late = given_up or ended_s > inside.began_s + timeout_s
+            if late:
+                self._late_s = ended_s
+                self._fault = Fault(self._device, NoReply.code, words, inside.asked_s, UNTIL)
+            self._changed.notify_all()
+        if late:
+            log.warning("%s", words)
+        if error is not None:
+            raise error
+
+    def _overdue(self, now_s: float) -> str:
+        """Say which stop has not come back in time; empty if none."""
+        waiting_s = [one.asked_s for one in tuple(self._inside) if now_s >= one.asked_s + self._overdue_s]
+        return self._told(min(waiting_s), now_s) if waiting_s else ""
+
+    @staticmethod
+    def _told(asked_s: float, now_s: float) -> str:
+        words = f"a stop asked for {now_s - asked_s:.1f} s ago has not come back from the driver yet"
+        return f"{words}; no move goes out before it has"
+
+
+def room_s(began_s: Sequence[float], timeout_s: float) -> float:
+    """Return from when on one more stop may go into a driver in which others hang.
+
+    The newest one must have hung for its deadline, or for an eighth of the time that the oldest hangs: so the
+    number of threads grows with the logarithm of that time, and a stop is never long without its own try.
+
+    Parameters
+    ----------
+    began_s
+        When those inside went in, seconds, in any order.
+    timeout_s
+        The deadline of a stop, seconds.
+    """
+    if not began_s:
+        return float("-inf")
+    newest_s = max(began_s)
+    return newest_s + max(timeout_s, LATEST_SHARE * (newest_s - min(began_s)))

@@ -1,0 +1,1 @@
+"""What a daemon holds: devices, loops, state, the mast file in use."""

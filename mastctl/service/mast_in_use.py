@@ -1,0 +1,97 @@
+"""The mast file in use: its bytes as they were read, and what another must fulfil to take its place."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from calib.errors import BadFile
+from calib.files import read_bytes
+from calib.files.mast_file import StoredRig, parse_rig
+from calib.files.yaml_text import MAX_BYTES
+from mastctl.config import Config, check_cameras
+from mastctl.errors import MastctlError
+
+
+class BadMastFile(MastctlError):
+    """A mast file that cannot take the place of the one in use; the sentence says why."""
+
+    code = "bad_mast_file"
+
+
+@dataclass(frozen=True, eq=False)
+class MastInUse:
+    """A mast file as read, and its bytes: what the file holds later does not matter."""
+
+    stored: StoredRig
+    data: bytes
+    path: Path
+
+    def told(self) -> dict[str, Any]:
+        """Return its file, name and digest as JSON."""
+        return {"file": self.path.name, "name": self.stored.rig.name, "digest": self.stored.digest}
+
+
+def read_mast(path: Path, config: Config) -> MastInUse:
+    """Read a mast file for a configuration.
+
+    Raises
+    ------
+    BadFile
+        If it cannot be used, or lacks a configured camera.
+    """
+    data = read_bytes(path, MAX_BYTES)
+    stored = parse_rig(data, path)
+    check_cameras(config, stored.rig)
+    return MastInUse(stored, data, path)
+
+
+def read_next(name: str, config: Config, now: MastInUse) -> MastInUse:
+    """Read the mast file that shall take the place of another.
+
+    Parameters
+    ----------
+    name
+        Of a file in the folder of the configured mast file, without any folder.
+    config
+        Names the folder, and the cameras that it must have.
+    now
+        The one in use: configured cameras must be mounted alike and take images of the same size.
+
+    Raises
+    ------
+    BadMastFile
+        If it may not, cannot be read, or does not fit.
+    """
+    folder = config.mast_file.parent
+    if Path(name).name != name or name.startswith(".") or "\\" in name or "\0" in name:
+        raise BadMastFile(
+            f"file is '{name[:80]}' where the plain name of a file beside the configured one is expected"
+        )
+    path = folder / name
+    if not path.is_file():
+        raise BadMastFile(
+            f"there is no file {name[:80]} beside the configured mast file {config.mast_file.name}"
+        )
+    try:
+        data = read_bytes(path, MAX_BYTES)
+        stored = parse_rig(data, name)
+    except BadFile as error:
+        raise BadMastFile(str(error)) from None
+    for camera in config.hardware.cameras:
+        _check_camera(camera, stored, now.stored)
+    return MastInUse(stored, data, path)
+
+
+def _check_camera(camera: str, stored: StoredRig, now: StoredRig) -> None:
+    """Refuse a file whose camera is not the one that is mounted."""
+    if camera not in stored.rig.cameras:
+        known = ", ".join(stored.rig.cameras)
+        raise BadMastFile(f"{stored.path.name} has no camera {camera}, which is configured; it has {known}")
+    new, old = stored.rig.cameras[camera], now.rig.cameras[camera]
+    if new.on != old.on:
+        raise BadMastFile(f"{stored.path.name} has {camera} on the {new.on} where it is on the {old.on}")
+    if new.model.size_px != old.model.size_px:
+        sizes = ["x".join(map(str, entry.model.size_px)) for entry in (new, old)]
+        raise BadMastFile(f"{stored.path.name} has {camera} with {sizes[0]} px where it takes {sizes[1]} px")

@@ -1,0 +1,1 @@
+"""The HTTP interface: routes, what they take, and what stands before them."""

@@ -1,0 +1,325 @@
+"""The bodies and queries that the API takes, and how it says what is wrong with one."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping, Sequence
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+from scipy.spatial.transform import Rotation
+
+from calib.files.strict import nearest
+from calib.rigid import Rigid
+from mastctl.pointing.requests import Aim, AnglesTarget, PixelTarget, PointRequest, PositionTarget
+from mastctl.tracking.pose import RoverPose
+
+LARGEST_PX = 1e5
+LARGEST_M = 1e6
+
+Name = Annotated[str, Field(min_length=1, max_length=200)]
+Pixel = Annotated[float, Field(ge=-LARGEST_PX, le=LARGEST_PX)]
+Metres = Annotated[float, Field(ge=-LARGEST_M, le=LARGEST_M)]
+Angle = Annotated[float, Field(ge=-2 * math.pi, le=2 * math.pi)]
+Slope = Annotated[float, Field(ge=-1.0, le=1.0)]
+Sigma = Annotated[float, Field(ge=0.0, le=LARGEST_M)]
+Part = Annotated[float, Field(ge=-1e9, le=1e9)]
+
+
+class _Strict(BaseModel):
+    """Unknown keys, wrong types and numbers that are not finite are refused."""
+
+    model_config = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False, frozen=True)
+
+
+class PixelBody(_Strict):
+    """A pixel of a named frame; ``mast_digest`` may say by which mast file it was taken."""
+
+    camera: Name
+    frame_id: Name
+    x_px: Pixel
+    y_px: Pixel
+    mast_digest: Name | None = None
+
+
+class AimBody(_Strict):
+    """Where in which camera's image the target shall come."""
+
+    camera: Name
+    x_px: Pixel
+    y_px: Pixel
+
+
+class PointBody(_Strict):
+    """``POST /point``: exactly one of pixel, position_m, or pan_rad with tilt_rad."""
+
+    pixel: PixelBody | None = None
+    position_m: Annotated[list[Metres], Field(min_length=3, max_length=3)] | None = None
+    frame: Literal["rover", "site"] | None = None
+    pan_rad: Angle | None = None
+    tilt_rad: Angle | None = None
+    aim: AimBody | None = None
+    pointings: Annotated[int, Field(ge=1, le=2)] = 1
+
+    @model_validator(mode="after")
+    def _one_target(self) -> PointBody:
+        angles = (self.pan_rad is not None) + (self.tilt_rad is not None)
+        targets = (self.pixel is not None) + (self.position_m is not None) + (angles > 0)
+        if targets != 1:
+            raise ValueError(
+                f"{targets} targets where exactly one of pixel, position_m, pan_rad with tilt_rad is expected"
+            )
+        if angles == 1:
+            missing = "tilt_rad" if self.tilt_rad is None else "pan_rad"
+            raise ValueError(f"{missing} is missing; pan_rad and tilt_rad go together")
+        if self.frame is not None and self.position_m is None:
+            raise ValueError("frame goes with position_m only")
+        if self.aim is not None and angles:
+            raise ValueError("aim goes with pixel or position_m, not with joint angles")
+        if self.pointings == 2 and self.pixel is None:
+            raise ValueError("pointings is 2, which goes with pixel only: nothing else can be measured again")
+        return self
+
+    def request(self) -> PointRequest:
+        """Return it as the pointing loop takes it."""
+        aim = None if self.aim is None else Aim(self.aim.camera, self.aim.x_px, self.aim.y_px)
+        target: PixelTarget | PositionTarget | AnglesTarget
+        if self.pixel is not None:
+            pixel = self.pixel
+            target = PixelTarget(pixel.camera, pixel.frame_id, pixel.x_px, pixel.y_px)
+        elif self.position_m is not None:
+            x, y, z = self.position_m
+            target = PositionTarget((x, y, z), self.frame or "rover")
+        else:
+            assert self.pan_rad is not None and self.tilt_rad is not None
+            target = AnglesTarget(self.pan_rad, self.tilt_rad)
+        return PointRequest(target=target, aim=aim, pointings=self.pointings)
+
+
+class TrackBody(_Strict):
+    """``POST /track``: exactly one of pixel and position_m."""
+
+    pixel: PixelBody | None = None
+    position_m: Annotated[list[Metres], Field(min_length=3, max_length=3)] | None = None
+    frame: Literal["rover", "site"] | None = None
+
+    @model_validator(mode="after")
+    def _one_target(self) -> TrackBody:
+        if (self.pixel is None) == (self.position_m is None):
+            raise ValueError("exactly one of pixel and position_m is expected")
+        if self.frame is not None and self.position_m is None:
+            raise ValueError("frame goes with position_m only")
+        return self
+
+    def target(self) -> PixelTarget | PositionTarget:
+        """Return it as the tracker takes it."""
+        if self.pixel is not None:
+            pixel = self.pixel
+            return PixelTarget(pixel.camera, pixel.frame_id, pixel.x_px, pixel.y_px)
+        assert self.position_m is not None
+        x, y, z = self.position_m
+        return PositionTarget((x, y, z), self.frame or "rover")
+
+
+class SigmaBody(_Strict):
+    """One sigma of each axis of a motion: of its translation, metres, and of its rotation, radians."""
+
+    position_m: Sigma
+    rotation_rad: Annotated[float, Field(ge=0.0, le=math.pi)]
+
+
+class PoseBody(_Strict):
+    """``POST /pose``: site_from_rover, and how well the motion since the pose before is known.
+
+    ``covariance`` has its rows and columns in the order x, y, z, turn about x, about y, about z: metres and
+    radians along the rover's axes of this pose.
+    """
+
+    position_m: Annotated[list[Metres], Field(min_length=3, max_length=3)]
+    quaternion: Annotated[list[Part], Field(min_length=4, max_length=4)]
+    covariance: list[list[Part]] | None = None
+    sigma: SigmaBody | None = None
+    time_s: Annotated[float, Field(ge=-1e12, le=1e12)] | None = None
+    look: bool = True
+
+    @model_validator(mode="after")
+    def _sound(self) -> PoseBody:
+        length = math.sqrt(sum(part * part for part in self.quaternion))
+        if abs(length - 1.0) > 1e-3:
+            raise ValueError(f"quaternion (w, x, y, z) has the length {length:g} where 1 is expected")
+        if self.covariance is not None and self.sigma is not None:
+            raise ValueError("covariance and sigma say the same; one of them is expected")
+        if self.covariance is not None:
+            _check_covariance(self.covariance)
+        return self
+
+    def pose(self, received_s: float) -> RoverPose:
+        """Return it as the tracker takes it."""
+        w, x, y, z = self.quaternion
+        rotation = Rotation.from_quat([x, y, z, w]).as_matrix()
+        covariance = None
+        if self.covariance is not None:
+            order = [3, 4, 5, 0, 1, 2]  # rotation first, as calib.tracking.track has it
+            covariance = np.array(self.covariance)[np.ix_(order, order)]
+        elif self.sigma is not None:
+            covariance = np.diag([self.sigma.rotation_rad**2] * 3 + [self.sigma.position_m**2] * 3)
+        return RoverPose(Rigid(rotation, np.array(self.position_m)), covariance, self.time_s, received_s)
+
+
+_NEGATIVE = "covariance has a negative variance in some direction"
+
+
+def _check_covariance(rows: list[list[float]]) -> None:
+    """Pass a matrix that can be a covariance. Raises ValueError."""
+    if len(rows) != 6 or any(len(row) != 6 for row in rows):
+        raise ValueError("covariance: 6 rows of 6 numbers are expected")
+    matrix = np.array(rows)
+    variances = np.diag(matrix)
+    if (variances < 0).any():
+        raise ValueError(_NEGATIVE)
+    # Each axis by its own sigma: a large one in metres hides nothing that is wrong with a small one.
+    sigma = np.where(variances > 0, np.sqrt(np.abs(variances)), 1.0)
+    correlation = matrix / sigma / sigma[:, None]
+    if np.abs(correlation - correlation.T).max() > 1e-6:
+        raise ValueError("covariance is not symmetric")
+    if np.linalg.eigvalsh(correlation)[0] < -1e-6:
+        raise ValueError(_NEGATIVE)
+
+
+class StandBody(_Strict):
+    """``POST /simulation/pose``: where the simulated rover truly stands on its ground."""
+
+    x_m: Metres
+    y_m: Metres
+    heading_rad: Angle
+    pitch_rad: Slope = 0.0
+    roll_rad: Slope = 0.0
+
+
+class MastBody(_Strict):
+    """``POST /mast``: the name of a file beside the configured mast file, or ``previous``: true."""
+
+    file: Name | None = None
+    previous: bool = False
+
+    @model_validator(mode="after")
+    def _one(self) -> MastBody:
+        if (self.file is not None) == self.previous:
+            raise ValueError("file, or previous: true, is expected, and not both")
+        return self
+
+
+class FaultBody(_Strict):
+    """``POST /simulation/faults``: a fault word for a simulated device, with its parameters."""
+
+    device: Name
+    word: Name
+    parameters: dict[str, float] = Field(default_factory=dict)
+
+    @model_validator(mode="after")
+    def _free_names(self) -> FaultBody:
+        for name in ("device", "word", "self"):
+            if name in self.parameters:
+                raise ValueError(f"parameters.{name}: unknown key; no fault has a parameter of this name")
+        return self
+
+
+class SnapshotQuery(BaseModel):
+    """``GET /snapshot/{camera}``; ``frame_id`` asks for a frame that is still kept."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    format: Literal["png", "jpeg"] = "png"
+    fresh: bool = False
+    frame_id: Name | None = None
+
+
+class FaultsQuery(BaseModel):
+    """``DELETE /simulation/faults``; without a device all faults are taken back."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    device: Name | None = None
+
+
+class ErrorTold(BaseModel):
+    """Why a request was refused: a word for programs, a sentence for people, more where there is more."""
+
+    code: str
+    message: str
+    detail: dict[str, Any] | None = None
+
+
+class ErrorBody(BaseModel):
+    """Every answer that is not a success."""
+
+    error: ErrorTold
+
+
+_KEYS: Mapping[tuple[str, ...], Sequence[str]] = {
+    ("body", "pixel"): tuple(PixelBody.model_fields),
+    ("body", "aim"): tuple(AimBody.model_fields),
+    ("body", "sigma"): tuple(SigmaBody.model_fields),
+}
+_ROUTE_KEYS: Mapping[tuple[str, str], Sequence[str]] = {
+    ("body", "point"): tuple(PointBody.model_fields),
+    ("body", "mast"): tuple(MastBody.model_fields),
+    ("body", "track"): tuple(TrackBody.model_fields),
+    ("body", "simulation/pose"): tuple(StandBody.model_fields),
+    ("body", "pose"): tuple(PoseBody.model_fields),
+    ("body", "faults"): tuple(FaultBody.model_fields),
+    ("query", "snapshot"): tuple(SnapshotQuery.model_fields),
+    ("query", "faults"): tuple(FaultsQuery.model_fields),
+}
+
+
+def sentence(problem: Mapping[str, Any], route: str) -> str:
+    """Return one validation problem of pydantic as a plain sentence: place, value, what is expected.
+
+    Parameters
+    ----------
+    problem
+        One entry of pydantic's list of errors.
+    route
+        A word that names the route (``point``, ``snapshot``, ``faults``), for the keys it knows.
+    """
+    where = tuple(str(step) for step in problem["loc"])
+    place = _place(where)
+    kind = problem["type"]
+    words = str(problem["msg"])
+    if kind == "value_error":
+        return words.removeprefix("Value error, ")
+    if kind == "missing":
+        return f"{place} is missing" if len(where) > 1 else "the body is missing; a JSON object is expected"
+    if kind == "extra_forbidden":
+        known = _KEYS.get(where[:-1]) or _ROUTE_KEYS.get((where[0], route)) or ()
+        return f"{place}: unknown key; {nearest(where[-1], known)}" if known else f"{place}: unknown key"
+    value = _short(problem.get("input"))
+    if kind in ("too_short", "too_long"):
+        size = 4 if where[-1] == "quaternion" else 3
+        return f"{place}: {value} where a list of {size} numbers is expected"
+    if kind in ("model_attributes_type", "model_type", "dict_type"):
+        return f"{place}: {value} where an object with keys is expected"
+    for start in ("Input should be ", "String should have "):
+        if words.startswith(start):
+            return f"{place}: {value} where {words.removeprefix(start)} is expected"
+    return f"{place}: {value}: {words}"
+
+
+def _place(where: tuple[str, ...]) -> str:
+    """``("body", "position_m", "0")`` as ``position_m[0]``."""
+    place = ""
+    for step in where[1:]:
+        place += f"[{step}]" if step.isdecimal() else f".{step}" if place else step
+    return place[:120] or f"the {where[0]}"
+
+
+def _short(value: Any) -> str:
+    """A value as JSON, cut short."""
+    try:
+        text = json.dumps(value)
+    except (TypeError, ValueError):
+        text = str(value)
+    return text if len(text) <= 60 else f"{text[:57]}..."
