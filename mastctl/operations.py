@@ -24,7 +24,6 @@ from drivers.clock import Clock
 from drivers.errors import DriverError
 from mastctl.as_json import as_json
 from mastctl.errors import MastctlError, Stopped
-from mastctl.service.state import Motion, Residual
 
 log = logging.getLogger(__name__)
 
@@ -68,6 +67,40 @@ class UnknownOperation(MastctlError):
     """An operation was named that this run of the service does not know (any more)."""
 
     code = "operation_unknown"
+
+
+@dataclass(frozen=True)
+class Residual:
+    """The last measured residual, pixels (x, y), with one sigma, and the operation that measured it."""
+
+    residual_px: tuple[float, float]
+    residual_sigma_px: tuple[float, float]
+    operation: str
+
+
+@dataclass(frozen=True)
+class Motion:
+    """What the operations say about themselves.
+
+    Attributes
+    ----------
+    operation
+        Id of the running operation, None when none runs.
+    target
+        The request that runs, or ran last, as it came; None before the first.
+    residual
+        The last one measured.
+    stopped
+        Whether the last thing that happened was a stop.
+    stopping
+        Whether a stop is under way: the head has not confirmed it, or the operation has not ended yet.
+    """
+
+    operation: str | None = None
+    target: Mapping[str, Any] | None = None
+    residual: Residual | None = None
+    stopped: bool = False
+    stopping: bool = False
 
 
 class Mover(Protocol):

@@ -13,7 +13,7 @@ import pytest
 
 from calib.files.mast_file import load_rig
 from drivers.sim.rover import simulation_settings
-from mastctl.cli.experiment import turned
+from mastctl.cli.experiment_common import turned
 from mastctl.cli.main import main
 from mastctl.client import Client, ClientError
 from mastctl.config import load_config

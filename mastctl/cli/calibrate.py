@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import argparse
-import tempfile
 from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mastctl.cli import output
+from mastctl.cli.places import check_file, check_folder, unusable
 
 if TYPE_CHECKING:
     from calib.files.mast_file import StoredRig
@@ -84,7 +84,7 @@ def _from_survey(args: argparse.Namespace) -> int:
             output.tell(str(finding))  # the first is told last, as the reason
         raise
     _check_out(args.out, survey)
-    _check_report(args.report)
+    check_folder(args.report, "--report")
     in_use = _in_use(args)
     survey, undetected = _with_dots(args, survey)
     warnings = checked(survey, args.method)  # once more, with the dots that were found
@@ -108,52 +108,9 @@ def _check_out(out: Path, survey: Survey) -> None:
         pictures = (survey.folder / image.file for image in survey.images if image.file != Path())
         texts = (survey.folder / name for name in SURVEY_FILES)
         if target in {path.resolve() for path in (*texts, *pictures)}:
-            raise _unusable(f"--out {out}", "is a file of the survey itself; name another one")
+            raise unusable(f"--out {out}", "is a file of the survey itself; name another one")
     except (OSError, ValueError) as error:
-        raise _unusable(f"--out {out}", str(error)) from None
-
-
-def check_file(path: Path, option: str) -> None:
-    """Refuse a file that cannot be written, by what is there now."""
-    try:
-        target = path.resolve()
-        if not target.parent.is_dir():
-            raise _unusable(f"{option} {path}", f"there is no folder {path.parent}; make it first")
-        if target.is_dir():
-            raise _unusable(f"{option} {path}", "is a folder; a file is expected")
-        if target.exists() and not target.is_file():
-            raise _unusable(f"{option} {path}", "is no regular file; a file is expected")
-        _try_to_write(target.parent, f"{option} {path}")
-    except (OSError, ValueError) as error:
-        raise _unusable(f"{option} {path}", str(error)) from None
-
-
-def _check_report(report: Path | None) -> None:
-    """Refuse an impossible --report as well."""
-    if report is None:
-        return
-    try:
-        folder = report.resolve()
-        while not folder.exists() and folder != folder.parent:
-            folder = folder.parent
-        if not folder.is_dir():
-            raise _unusable(f"--report {report}", f"{folder} is a file; a folder is expected")
-        _try_to_write(folder, f"--report {report}")
-    except (OSError, ValueError) as error:
-        raise _unusable(f"--report {report}", str(error)) from None
-
-
-def _try_to_write(folder: Path, what: str) -> None:
-    """Write a nameless file there: permissions alone do not tell (read-only disks, root)."""
-    try:
-        with tempfile.TemporaryFile(dir=folder):
-            pass
-    except OSError as error:
-        raise _unusable(what, f"nothing can be written to {folder}: {error.strerror or error}") from None
-
-
-def _unusable(what: str, why: str) -> output.CommandError:
-    return output.CommandError("file_system", f"{what}: {why}", exit_code=2)
+        raise unusable(f"--out {out}", str(error)) from None
 
 
 def _in_use(args: argparse.Namespace) -> StoredRig | None:

@@ -48,7 +48,7 @@ def run(args: argparse.Namespace) -> int:
 
 def _check_out(out: Path, read: list[Path]) -> None:
     """Refuse to overwrite what is read: a proposal is a new file."""
-    from mastctl.cli.calibrate import check_file
+    from mastctl.cli.places import check_file
 
     for path in read:
         if out.resolve() == path.resolve():

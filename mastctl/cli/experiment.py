@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mastctl.cli import output
+from mastctl.cli.experiment_common import at_least_one, check_writable, seed, tell_report, turned
 
 if TYPE_CHECKING:
     from mastctl.client import Client
@@ -16,9 +16,6 @@ if TYPE_CHECKING:
 
 DEFAULT_TARGETS = 10
 DEFAULT_DISTANCES_M = (10.0, 6.0, 2.0)
-
-at_least_one = output.at_least(1)
-seed = output.at_least(0)
 
 
 def add_commands(subparsers: Any) -> None:
@@ -162,34 +159,3 @@ def _report(args: argparse.Namespace, experiment: PointingExperiment) -> int:
 
     tell_report(args, partial(write_report, experiment), experiment.as_json, show)
     return 0 if any(record.landings for record in experiment.records) else 1
-
-
-def tell_report(
-    args: argparse.Namespace,
-    write: Callable[[Path], Path],
-    document: Callable[[], dict[str, Any]],
-    show: Callable[[list[str]], None],
-) -> None:
-    """Write the report if asked; print the document for programs, or have the tables shown, with its page."""
-    page = None if args.out is None else write(args.out)
-    if args.json:
-        output.print_json(document() | ({} if page is None else {"report": str(page)}))
-    else:
-        show([] if page is None else [f"report: {page}"])
-
-
-def turned(headings: list[str], rows: list[list[str]]) -> tuple[list[str], list[list[str]]]:
-    """Return a table with rows and columns exchanged: a column a distance fits a terminal of 80 columns."""
-    table = [list(column) for column in zip(headings, *rows, strict=True)]
-    return table[0], table[1:]
-
-
-def check_writable(folder: Path) -> None:
-    """Refuse an impossible --out before the minutes of the run, not after them."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        probe = folder / ".writable"
-        probe.touch()
-        probe.unlink()
-    except OSError as error:
-        raise output.CommandError("file_system", f"--out {folder}: {error.strerror}", exit_code=2) from error

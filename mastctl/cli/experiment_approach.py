@@ -11,7 +11,7 @@ from mastctl.cli import output
 
 def add_parser(kinds: Any) -> None:
     """Add ``approach`` to the experiments."""
-    from mastctl.cli.experiment import at_least_one, seed
+    from mastctl.cli.experiment_common import at_least_one, seed
 
     parser = kinds.add_parser(
         "approach",
@@ -43,7 +43,7 @@ def run(args: argparse.Namespace) -> int:
     from rich.console import Console
 
     from calib.files.mast_file import load_rig
-    from mastctl.cli.experiment import check_writable
+    from mastctl.cli.experiment_common import check_writable
     from mastctl.experiment.approach import run_approach
     from mastctl.experiment.approach_report import counted, summary, table_rows, write_record, write_strip
     from mastctl.packaged import config_folder

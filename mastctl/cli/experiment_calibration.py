@@ -18,7 +18,7 @@ DEFAULT_TARGETS = 20
 
 def add_parser(kinds: Any) -> None:
     """Add ``calibration`` to the experiments."""
-    from mastctl.cli.experiment import at_least_one, seed
+    from mastctl.cli.experiment_common import at_least_one, seed
 
     parser = kinds.add_parser(
         "calibration",
@@ -57,7 +57,7 @@ def add_parser(kinds: Any) -> None:
 def run(args: argparse.Namespace) -> int:
     """Run the study; 1 if no survey at all could be fitted."""
     from calib.files.mast_file import load_rig
-    from mastctl.cli.experiment import check_writable
+    from mastctl.cli.experiment_common import check_writable
     from mastctl.experiment.calibration import variants
     from mastctl.packaged import config_folder
 
@@ -103,7 +103,7 @@ def _run(args: argparse.Namespace, rig: Any, chosen: list[Variant]) -> Calibrati
 
 
 def _tell(args: argparse.Namespace, experiment: CalibrationExperiment) -> int:
-    from mastctl.cli.experiment import tell_report, turned
+    from mastctl.cli.experiment_common import tell_report, turned
     from mastctl.experiment.calibration_report import as_json, short_rows, table_iv, table_v, write_report
 
     def show(notes: list[str]) -> None:

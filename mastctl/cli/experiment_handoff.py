@@ -26,7 +26,7 @@ MOST_POINTS = 9  # of one brick: its upper corners and its faces but the bottom
 
 def add_parser(kinds: Any) -> None:
     """Add ``handoff`` to the experiments."""
-    from mastctl.cli.experiment import at_least_one, seed
+    from mastctl.cli.experiment_common import at_least_one, seed
     from mastctl.cli.service import add_daemon_options
 
     parser = kinds.add_parser(
@@ -69,7 +69,7 @@ def add_parser(kinds: Any) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Run the experiment; 1 if no target at all was handed over."""
-    from mastctl.cli.experiment import check_writable
+    from mastctl.cli.experiment_common import check_writable
     from mastctl.cli.service import client_of
 
     if args.mast_file is not None and not args.simulated:
@@ -136,7 +136,7 @@ def _run(
 
 
 def _tell(args: argparse.Namespace, experiment: HandoffExperiment) -> int:
-    from mastctl.cli.experiment import tell_report, turned
+    from mastctl.cli.experiment_common import tell_report, turned
     from mastctl.experiment.handoff_report import bias_sentences, table_rows, write_report
 
     def show(notes: list[str]) -> None:

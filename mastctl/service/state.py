@@ -13,43 +13,10 @@ from drivers.interfaces import Reading
 from mastctl.devices.frames import StampedFrame
 from mastctl.devices.limits import Limits
 from mastctl.devices.thread import Fault
+from mastctl.operations import Motion
 from mastctl.tracking.status import TrackStatus
 
 StateWord = Literal["idle", "moving", "pointing", "stopping", "stopped", "fault"]
-
-
-@dataclass(frozen=True)
-class Residual:
-    """The last measured residual, pixels (x, y), with one sigma, and the operation that measured it."""
-
-    residual_px: tuple[float, float]
-    residual_sigma_px: tuple[float, float]
-    operation: str
-
-
-@dataclass(frozen=True)
-class Motion:
-    """What the operations say about themselves.
-
-    Attributes
-    ----------
-    operation
-        Id of the running operation, None when none runs.
-    target
-        The request that runs, or ran last, as it came; None before the first.
-    residual
-        The last one measured.
-    stopped
-        Whether the last thing that happened was a stop.
-    stopping
-        Whether a stop is under way: the head has not confirmed it, or the operation has not ended yet.
-    """
-
-    operation: str | None = None
-    target: Mapping[str, Any] | None = None
-    residual: Residual | None = None
-    stopped: bool = False
-    stopping: bool = False
 
 
 @dataclass(frozen=True)

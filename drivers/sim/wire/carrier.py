@@ -14,13 +14,12 @@ import select
 import threading
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from types import TracebackType
 from typing import Literal, Protocol, TypeVar, runtime_checkable
 
 from drivers.clock import Clock
 from drivers.faults import FaultPanel
-from drivers.sim.wire.line_faults import LineFaults
+from drivers.sim.wire.line_faults import LineFaults, Reply
 
 log = logging.getLogger(__name__)
 
@@ -33,25 +32,6 @@ Observer = Callable[[Literal["host", "device"], bytes, float], None]
 """Called in the line's thread with who sent it, the bytes, and when they were through."""
 
 _L = TypeVar("_L", bound="Line")
-
-
-@dataclass(frozen=True)
-class Reply:
-    """Bytes that a simulated device sends, a whole packet or line of text.
-
-    Attributes
-    ----------
-    data
-        The bytes as they leave the device.
-    delay_s
-        From the end of what it answers: of the received packet, or of the reply before it in the sequence.
-    sender
-        The servo's id; 0 for a pan/tilt unit.
-    """
-
-    data: bytes
-    delay_s: float = 0.0
-    sender: int = 0
 
 
 class WireDevice(Protocol):

@@ -4,16 +4,31 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 from drivers.faults import PAN_TILT, Fault, FaultPanel
 from drivers.sim.wire.dynamixel_packets import renamed
 
-if TYPE_CHECKING:
-    from drivers.sim.wire.carrier import Reply
-
 MOST_NOISE = 12
 """The longest garbage in front of a reply, bytes."""
+
+
+@dataclass(frozen=True)
+class Reply:
+    """Bytes that a simulated device sends, a whole packet or line of text.
+
+    Attributes
+    ----------
+    data
+        The bytes as they leave the device.
+    delay_s
+        From the end of what it answers: of the received packet, or of the reply before it in the sequence.
+    sender
+        The servo's id; 0 for a pan/tilt unit.
+    """
+
+    data: bytes
+    delay_s: float = 0.0
+    sender: int = 0
 
 
 @dataclass(frozen=True)
