@@ -4,28 +4,27 @@ from __future__ import annotations
 
 import runpy
 import sys
-from pathlib import Path
 
 import pytest
 
 CASES = {
-    "refine_campaign --rig /nosuch": "/nosuch: cannot be read: No such file or directory",
-    "refine_campaign --rig /nosuch --click-px 0": "--click-px: '0' where a number above zero is expected",
-    "compare_trackers --work /dev/null/x": "/dev/null/x: Not a directory",
-    "handoff_campaign --cases 0": "--cases: '0' where a whole number of at least 1 is expected",
-    "handoff_campaign --out /dev/null/x.csv": "--out: /dev/null/x.csv: Not a directory",
+    "campaigns.refine --rig /nosuch": "/nosuch: cannot be read: No such file or directory",
+    "campaigns.refine --rig /nosuch --click-px 0": "--click-px: '0' where a number above zero is expected",
+    "against_others.trackers --work /dev/null/x": "/dev/null/x: Not a directory",
+    "campaigns.handoff --cases 0": "--cases: '0' where a whole number of at least 1 is expected",
+    "campaigns.handoff --out /dev/null/x.csv": "--out: /dev/null/x.csv: Not a directory",
     "motion_campaign --moves 0": "--moves: '0' where a whole number of at least 1 is expected",
-    "calibration_coverage --joint-sigma-rad -1": "--joint-sigma-rad: '-1' where zero or more is expected",
+    "campaigns.coverage --joint-sigma-rad -1": "--joint-sigma-rad: '-1' where zero or more is expected",
 }
 
 
 @pytest.mark.parametrize("words", CASES)
 def test_what_a_tool_cannot_use_is_one_sentence(
-    words: str, repository: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    words: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     name, *arguments = words.split()
     monkeypatch.setattr(sys, "argv", [name, *arguments])
     with pytest.raises(SystemExit) as ended:
-        runpy.run_path(str(repository / "tools" / f"{name}.py"), run_name="__main__")
+        runpy.run_module(f"tools.{name}", run_name="__main__")
     assert ended.value.code == 2
     assert capsys.readouterr().err.rstrip("\n").endswith(CASES[words])

@@ -21,7 +21,7 @@ from drivers.interfaces import PanTilt, Reading
 from drivers.open_hardware import DeviceSettings, HardwareSettings, open_hardware
 from mastctl.config import Config, load_config
 from mastctl.pointing.requests import PointingSettings
-from tools.servo_rigs import LIMITS_RAD, Rig
+from tools.campaigns.servo_rigs import LIMITS_RAD, Rig
 
 CHOSEN: str | None = None
 """The configuration that --hardware names."""

@@ -35,7 +35,7 @@ from hil_tests.drivers.test_head_contract import (
 )
 from mastctl.config import load_config
 from mastctl.devices.devices import MOVE_TIMEOUT_S, READ_TIMEOUT_S, STOP_TIMEOUT_S
-from tools.servo_rigs import LIMITS_RAD, Rig
+from tools.campaigns.servo_rigs import LIMITS_RAD, Rig
 
 if CHOSEN is None:
     pytest.skip("moves a real head; name its configuration with --hardware FILE", allow_module_level=True)

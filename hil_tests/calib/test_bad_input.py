@@ -15,8 +15,8 @@ from hypothesis import strategies as st
 from calib.errors import BadFile
 from calib.files.any_camera import load_any
 from calib.files.yaml_text import dump_mapping, parse_mapping
-from tools import fuzz_readers
-from tools.fuzz_readers import COMMANDS, READERS, VALID, broken, check_command, check_reader
+from tools.campaigns import fuzz_readers
+from tools.campaigns.fuzz_readers import COMMANDS, READERS, VALID, broken, check_command, check_reader
 
 # Generous: a case takes milliseconds; only a hang or a blow-up comes near.
 no_hang = settings(deadline=timedelta(seconds=10), max_examples=100)

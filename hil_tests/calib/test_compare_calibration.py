@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from calib.fit.least_squares import minimise
-from tools.compare_calibration import WORST_RATIO, boards_problem, boards_residuals, rms
-from tools.compare_points import Views, opencv_views, read_views
+from tools.against_others.calibration import WORST_RATIO, boards_problem, boards_residuals, rms
+from tools.against_others.points import Views, opencv_views, read_views
 
 
 @pytest.fixture(scope="module", params=["left", "right"])

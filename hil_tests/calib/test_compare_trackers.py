@@ -1,4 +1,4 @@
-"""tools/compare_trackers.py: its arithmetic, and the other trackers on pictures moved by a known amount."""
+"""The comparison of trackers: its arithmetic, and the other trackers on pictures moved by a known amount."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from tools.compare_trackers import Row, judged, row, verdicts
-from tools.tracker_methods import lucas_kanade, lucas_kanade_grid, match_template
+from tools.against_others.tracker_methods import lucas_kanade, lucas_kanade_grid, match_template
+from tools.against_others.trackers import Row, judged, row, verdicts
 
 STEPS = 20
 

@@ -1,16 +1,12 @@
 """Exact pointing: re-projection, completeness, the edges of reach, the zenith, order, limits and refusals.
 
-The kinematics that judge the solver are SciPy's rotations, in tools/pointing_campaign.py.
+The kinematics that judge the solver are SciPy's rotations, in tools/campaigns/pointing.py.
 """
 
 from __future__ import annotations
 
-import importlib.util
 import math
 import re
-import sys
-from pathlib import Path
-from types import ModuleType
 
 import numpy as np
 import pytest
@@ -23,25 +19,12 @@ from calib.camera.cahvor import CameraModel
 from calib.errors import Unreachable
 from calib.mast.pointing import Solution, choose, solve, solve_ray
 from calib.mast.rig import Mast, Rig, RigCamera
+from tools.campaigns import pointing as campaign
 
 WORST_PX = 1e-7
 PANCAM_PX = 3441.0
 ROUNDING_RAD = 1e-12
 FORWARD, RIGHT, DOWN = np.eye(3)
-
-
-def load_campaign() -> ModuleType:
-    """Return tools/pointing_campaign.py as a module."""
-    path = Path(__file__).resolve().parents[2] / "tools" / "pointing_campaign.py"
-    spec = importlib.util.spec_from_file_location("pointing_campaign", path)
-    assert spec is not None and spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module
-    spec.loader.exec_module(module)
-    return module
-
-
-campaign = load_campaign()
 
 
 def straight_mast(offset_m: float = 0.0, twist_rad: float = 0.0) -> Mast:

@@ -19,7 +19,7 @@ from drivers.interfaces import PanTilt
 from mastctl.devices.devices import Devices
 from mastctl.devices.limits import Limits
 from mastctl.pointing.loop import AnglesTarget, PointingError, PointingLoop, PointRequest
-from tools.servo_rigs import dynamixel_pty, ptu_pty
+from tools.campaigns.servo_rigs import dynamixel_pty, ptu_pty
 
 BARE = Rig("bare", Mast(np.zeros(3), np.zeros(3)), {}, {})
 LIMITS = Limits((-0.9, 0.9), (-0.5, 0.3), 0.5)

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from tools.servo_rigs import LIMITS_RAD, RIGS
+from tools.campaigns.servo_rigs import LIMITS_RAD, RIGS
 
 MAST = """schema: mastctl/mast/1
 name: bare_head

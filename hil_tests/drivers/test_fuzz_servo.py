@@ -1,12 +1,7 @@
-"""A short share of tools/fuzz_servo.py: the parsers of drivers and simulators on broken bytes."""
+"""A short share of tools/campaigns/fuzz_servo.py: the parsers of drivers and simulators on broken bytes."""
 
 from __future__ import annotations
 
-import importlib
-import sys
-from pathlib import Path
-
-import pytest
 from dynamixel_host import SETTINGS, servo
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -16,17 +11,15 @@ from drivers.flir_ptu.replies import LineSplitter, answer_of
 from drivers.sim.wire.axis import WireAxis
 from drivers.sim.wire.dynamixel_bus import DynamixelBus
 from drivers.sim.wire.ptu import SimulatedPtu
+from tools.campaigns import fuzz_servo
 
 AWKWARD = st.lists(st.sampled_from([0xFF, 0xFD, 0x00, 0x01, 0x03, 0x55, 0xFE]), max_size=80).map(bytes)
 CHUNKS = st.lists(st.one_of(st.binary(max_size=60), AWKWARD), max_size=6)
 LETTERS = st.lists(st.text("PTORSUL WFHQEACIBD@!*-+0123456789,.\r\n", max_size=20), max_size=6)
 
 
-def test_no_parser_fails(repository: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.syspath_prepend(str(repository / "tools"))
-    fuzz = importlib.import_module("fuzz_servo")
-    monkeypatch.delitem(sys.modules, "fuzz_servo")
-    counts, _, failures = fuzz.campaign(3000, seed=11)
+def test_no_parser_fails() -> None:
+    counts, _, failures = fuzz_servo.campaign(3000, seed=11)
     assert failures == []
     for name, counter in counts.items():
         assert counter["right"] > 0.7 * 500, name

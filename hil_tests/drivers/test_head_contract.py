@@ -24,7 +24,7 @@ from mastctl.config import load_config
 from mastctl.daemon import RunningDaemon
 from mastctl.experiment.demo import SimulationTruth, demo_config
 from mastctl.experiment.pointing import run_pointing_experiment
-from tools.servo_rigs import LIMITS_RAD, RIGS, Rig
+from tools.campaigns.servo_rigs import LIMITS_RAD, RIGS, Rig
 
 PATIENCE_S = 30.0
 """No driver needs a tenth of this; it only keeps a broken one from hanging the suite on a busy machine."""

@@ -2,12 +2,8 @@
 
 from __future__ import annotations
 
-import importlib.util
-import sys
 import threading
 from dataclasses import replace
-from pathlib import Path
-from types import ModuleType
 
 import numpy as np
 import pytest
@@ -19,25 +15,12 @@ from drivers.sim import render, texture
 from drivers.sim.compiled import is_compiled, kernels
 from drivers.sim.render import Renderer, compile_renderer, ray_table
 from drivers.sim.scene import Scene, SceneSettings, build_scene
+from tools.campaigns import render_bias as bias
 
 MOST_BIAS_PX = 0.01
 MOST_RMS_PX = 0.05
 TABLE_PX = 1e-4
 """float32 directions: one part in 1.7e7 of a unit vector seen through 3441 px."""
-
-
-def load_bias_tool() -> ModuleType:
-    """Return tools/render_bias.py as a module."""
-    path = Path(__file__).resolve().parents[2] / "tools" / "render_bias.py"
-    spec = importlib.util.spec_from_file_location("render_bias", path)
-    assert spec is not None and spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module
-    spec.loader.exec_module(module)
-    return module
-
-
-bias = load_bias_tool()
 
 
 @pytest.fixture(scope="module")
@@ -67,7 +50,7 @@ def small(camera: CameraModel, part: int) -> CameraModel:
 def test_matched_patches_lie_where_geometry_puts_them(
     ground: str, name: str, range_m: float, request: pytest.FixtureRequest
 ) -> None:
-    """60 patches carried between two pointings at 2x2 samples; tools/render_bias.py takes thousands."""
+    """60 patches carried between pointings at 2x2 samples; `tools.campaigns.render_bias` takes thousands."""
     camera = getattr(bias, name)
     poses = bias.body_poses if name == "HAZCAM" else bias.turned_poses
     rng = np.random.default_rng(11)

@@ -1,11 +1,11 @@
-"""A short share of tools/servo_campaign.py: a few episodes of some faults with each real driver."""
+"""A short share of tools/campaigns/servo.py: a few episodes of some faults with each real driver."""
 
 from __future__ import annotations
 
 import pytest
 
-from tools.servo_campaign import DRIVERS, WORDS, Judge, Row, run_word
-from tools.servo_rigs import in_memory
+from tools.campaigns.servo import DRIVERS, WORDS, Judge, Row, run_word
+from tools.campaigns.servo_rigs import in_memory
 
 
 @pytest.mark.parametrize("driver", list(DRIVERS))

@@ -235,24 +235,21 @@ def test_blunders_change_what_they_say_and_nothing_else(simulated: tuple[Survey,
 
 
 def test_the_command_writes_a_folder_and_never_over_it(tmp_path: Path) -> None:
-    command = [sys.executable, str(ROOT / "tools/simulate_survey.py"), "--rig", str(RIG_FILE)]
+    command = [sys.executable, "-m", "tools.simulated.survey", "--rig", str(RIG_FILE)]
     out = tmp_path / "survey"
     arguments = [*command, "--out", str(out), "--mast-boards", "3", "--check-boards", "0", "--seed", "5"]
-    done = subprocess.run(arguments, capture_output=True, text=True, check=True)
+    done = subprocess.run(arguments, capture_output=True, text=True, check=True, cwd=ROOT)
     assert read_survey(out).digest[:12] in done.stdout
-    again = subprocess.run(arguments, capture_output=True, text=True, check=False)
+    again = subprocess.run(arguments, capture_output=True, text=True, check=False, cwd=ROOT)
     assert again.returncode == 2
     assert "not empty" in again.stderr
 
 
 def test_rendered_pictures_show_the_dots(rig: Rig) -> None:
     """The mean of dark pixels around a dot is where the dot was noted, within its noise."""
-    sys.path.insert(0, str(ROOT / "tools"))
-    try:
-        import simulate_survey as command
-    finally:
-        sys.path.pop(0)
     import cv2
+
+    from tools.simulated import survey as command
 
     plan = SurveyPlan(rings=(Ring("navcam", 3.0, 1, -0.2),), mast_boards=0, check_boards=0, noise=0.0)
     survey, truth = simulate_survey(rig, 6, plan)

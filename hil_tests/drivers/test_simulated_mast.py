@@ -10,7 +10,7 @@ import pytest
 
 from calib.files.mast_file import load_rig
 from calib.mast.covariance import stored_covariance
-from tools.simulated_mast.check import projection_error_px, turned_rover_frame
+from tools.simulated.check import projection_error_px, turned_rover_frame
 
 SAME_PX = 1e-3
 """Another processor's arithmetic may end the fit this far away."""
@@ -21,9 +21,9 @@ PAIRS = [("rocky8_simulated", "rocky8"), ("skew8_simulated", "skew8")]
 def run_tool(repository: Path, words: list[str], monkeypatch: pytest.MonkeyPatch) -> int:
     """Run the tool as its command does, in this process."""
     monkeypatch.chdir(repository)
-    monkeypatch.setattr("sys.argv", words)
+    monkeypatch.setattr("sys.argv", words[2:])
     with pytest.raises(SystemExit) as ended:
-        runpy.run_path(words[0], run_name="__main__")
+        runpy.run_module(words[2], run_name="__main__")
     return int(ended.value.code or 0)
 
 
@@ -71,7 +71,15 @@ def test_the_shipped_mast_file_is_as_good_as_a_survey_and_no_better(
 def test_a_true_rig_that_is_not_there_is_one_line(
     repository: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    words = ["tools/make_simulated_mast.py", "--rig", "nowhere.yaml", "--out", str(tmp_path / "x.yaml")]
+    words = [
+        "python",
+        "-m",
+        "tools.simulated.mast",
+        "--rig",
+        "nowhere.yaml",
+        "--out",
+        str(tmp_path / "x.yaml"),
+    ]
     assert run_tool(repository, words, monkeypatch) == 2
     told = capsys.readouterr().err
     assert told.count("\n") == 1 and "nowhere.yaml" in told

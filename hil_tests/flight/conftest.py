@@ -1,35 +1,26 @@
-"""The measuring parts of tools/flight_validation.py, so that tests repeat what docs/validation.md reports."""
+"""The measuring parts of `tools.flight.validation`, so that tests repeat what docs/validation.md reports."""
 
 from __future__ import annotations
 
-import importlib
-import sys
-from collections.abc import Iterator
 from pathlib import Path
 from types import ModuleType
 
 import pytest
 
-
-@pytest.fixture(scope="session")
-def flight_tools(repository: Path) -> Iterator[Path]:
-    """The tools folder, importable while tests run."""
-    folder = str(repository / "tools")
-    sys.path.insert(0, folder)
-    yield repository / "tools"
-    sys.path.remove(folder)
+from tools.flight import mer as mer_labels
+from tools.flight import msl as msl_labels
 
 
 @pytest.fixture(scope="session")
-def msl(flight_tools: Path) -> ModuleType:
-    """tools/flight_msl.py."""
-    return importlib.import_module("flight_msl")
+def msl() -> ModuleType:
+    """What `tools.flight.msl` measures."""
+    return msl_labels
 
 
 @pytest.fixture(scope="session")
-def mer(flight_tools: Path) -> ModuleType:
-    """tools/flight_mer.py."""
-    return importlib.import_module("flight_mer")
+def mer() -> ModuleType:
+    """What `tools.flight.mer` measures."""
+    return mer_labels
 
 
 @pytest.fixture(scope="session")

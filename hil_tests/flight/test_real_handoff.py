@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tools import real_handoff
-from tools.flight_mer import View
-from tools.real_handoff import Carried, carried, level_plane, targets, told
+from tools.flight import real_handoff
+from tools.flight.mer import View
+from tools.flight.real_handoff import Carried, carried, level_plane, targets, told
 
 
 @pytest.fixture(scope="module")

@@ -1,6 +1,6 @@
 """Provoke the check of which view a picture shows: false alarms, missed lies, error and time.
 
-    .venv/bin/python -m tools.motion_campaign [--moves 30] [--seed 1] [--json]
+    .venv/bin/python -m tools.campaigns.motion [--moves 30] [--seed 1] [--json]
 
 The simulated rover's head goes from view to view; its pictures come from the true rig, the check believes the
 packaged mast file. Each move is judged by both eyes of Navcam and Pancam: with the honest pictures; with

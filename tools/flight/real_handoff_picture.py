@@ -17,8 +17,8 @@ from matplotlib.patches import Ellipse
 
 from calib.rigid import FloatArray
 from calib.tracking.track import TrackSettings
-from tools.flight_mer import View
-from tools.real_handoff import Carried
+from tools.flight.mer import View
+from tools.flight.real_handoff import Carried
 
 matplotlib.use("Agg")
 

@@ -1,6 +1,6 @@
 """Time the simulated cameras: milliseconds a picture and stereo pairs a second, as medians.
 
-    .venv/bin/python tools/bench_render.py --repeats 15
+    .venv/bin/python -m tools.benchmarks.render --repeats 15
 
 Scene of seed 1 with relief and 50 rocks. Rates depend on what else the machine is doing; its load is printed.
 """

@@ -4,7 +4,7 @@ The believed rig is the true one with its Hazcams moved by two disagreeing prism
 axis), or not at all. Navcam hands targets over; clicks and matches err. Errors are of geometric hand-offs of
 other targets, 1.5 to 4 m away, with exact clicks:
 
-    .venv/bin/python tools/refine_campaign.py --rig configs/sim/rocky8.yaml --cases 100 --seed 1
+    .venv/bin/python -m tools.campaigns.refine --rig configs/sim/rocky8.yaml --cases 100 --seed 1
 """
 
 from __future__ import annotations

@@ -2,7 +2,7 @@
 
 Same arguments, same folder. The truth is not written: a calibration that reads it proves nothing.
 
-    .venv/bin/python tools/simulate_survey.py --rig configs/sim/rocky8.yaml --out survey --seed 1 --render
+    .venv/bin/python -m tools.simulated.survey --rig configs/sim/rocky8.yaml --out survey --seed 1 --render
 """
 
 from __future__ import annotations

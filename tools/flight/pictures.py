@@ -17,7 +17,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
 from calib.rigid import FloatArray
-from tools import flight_mer as mer
+from tools.flight import mer
 
 matplotlib.use("Agg")
 

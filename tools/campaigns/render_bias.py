@@ -5,7 +5,7 @@ a shift of all pixels hides from a turn, but not from a roll. Patches of the fir
 their range (``Scene.cast``) into the second (``CameraModel.project``) and found there by OpenCV's ECC with an
 affine warp, which knows nothing of the renderer. Mean error tells of bias, rms of aliasing and poor texture.
 
-    .venv/bin/python tools/render_bias.py --pairs 12
+    .venv/bin/python -m tools.campaigns.render_bias --pairs 12
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Time the camera models and the pointing solution, beside mrcal and SciPy, in one run on one thread.
 
-    .venv/bin/python tools/bench_geometry.py [--rounds 7] [--json]
+    .venv/bin/python -m tools.benchmarks.geometry [--rounds 7] [--json]
 
 Times are processor times of the one thread, so that other work on the machine counts little; both sides take
 turns, round by round, and the table has medians.

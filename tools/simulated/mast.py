@@ -4,7 +4,7 @@ The true rig is read only to simulate measurements. They are written down as a s
 ``mastctl calibrate`` does is done with that folder alone, and the mast file is what comes of it. Same
 arguments, same file:
 
-    .venv/bin/python tools/make_simulated_mast.py --rig configs/sim/rocky8.yaml --seed 8 \\
+    .venv/bin/python -m tools.simulated.mast --rig configs/sim/rocky8.yaml --seed 8 \\
         --out configs/masts/rocky8_simulated.yaml
 
 Then it tells what the file costs: where it puts points that the true rig sees, and where targets land.
@@ -13,21 +13,11 @@ Then it tells what the file costs: where it puts points that the true rig sees, 
 from __future__ import annotations
 
 import argparse
-import sys
 import tempfile
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-
-sys.path.insert(0, str(Path(__file__).resolve().parent))
-
-from simulated_mast.check import (
-    hazcam_range_error_m,
-    pointing_error_px,
-    projection_error_px,
-    turned_rover_frame,
-)
 
 from calib.files.mast_file import load_rig, save_rig
 from calib.mast.rig import Rig
@@ -37,6 +27,12 @@ from drivers.sim.survey import Ring, SurveyPlan, simulate_survey
 from mastctl.calibration.run import Calibrated, calibrate, checked
 from mastctl.cli.output import at_least
 from tools.arguments import end
+from tools.simulated.check import (
+    hazcam_range_error_m,
+    pointing_error_px,
+    projection_error_px,
+    turned_rover_frame,
+)
 
 SIGMA = Sigma(station_m=0.001, dot_px=0.1, joint_rad=3e-5)
 """The joints' is half a step of the packaged rover's head."""
@@ -132,7 +128,7 @@ def tell_pointing(true: Rig, believed: Rig, options: argparse.Namespace) -> None
 def _provenance(options: argparse.Namespace, digest: str, done: Calibrated) -> dict[str, object]:
     """The ``provenance`` section of the mast file."""
     command = (
-        f"tools/make_simulated_mast.py --rig {options.rig.as_posix()} --seed {options.seed} "
+        f"python -m tools.simulated.mast --rig {options.rig.as_posix()} --seed {options.seed} "
         f"--mast {options.mast} --head {options.head} --out {options.out.as_posix()}"
     )
     return {

@@ -1,9 +1,9 @@
 """Follow the same targets with this project's tracker, OpenCV's and opencv-contrib's, in one run, one thread.
 
-    .venv/bin/python -m tools.compare_trackers --work SEQUENCES [--contrib ENVIRONMENT] [--targets 12]
+    .venv/bin/python -m tools.against_others.trackers --work SEQUENCES [--contrib ENVIRONMENT] [--targets 12]
 
-Renders the sequences of tools/tracker_sequences.py into --work (half a minute each, once), runs every method
-of tools/tracker_methods.py on them, and a tracker of opencv-contrib (--kind, CSRT by default) in the
+Renders the sequences of `tracker_sequences` into --work (half a minute each, once), runs every method of
+`tracker_methods` on them, and a tracker of opencv-contrib (--kind, CSRT by default) in the
 environment of --contrib, which is made with pip if the folder is not there; without --contrib its rows stay
 empty. Each row says, over both eyes:
 
@@ -40,11 +40,11 @@ import numpy as np
 
 from calib.camera.cahvor import CameraModel
 from mastctl.cli.output import at_least
+from tools.against_others.tracker_methods import HALF_PX, METHODS, Tracked
+from tools.against_others.tracker_sequences import SETTINGS, STEPS, WORLDS, Sequence, loaded, rigs, sequences
 from tools.arguments import end
-from tools.tracker_methods import HALF_PX, METHODS, Tracked
-from tools.tracker_sequences import SETTINGS, STEPS, WORLDS, Sequence, loaded, rigs, sequences
 
-REPOSITORY = Path(__file__).resolve().parent.parent
+REPOSITORY = Path(__file__).resolve().parents[2]
 WRONG_PX = 5.0
 WANTED_MS, WANTED_DRIFT_PX, WANTED_RATIO = 10.0, 0.2, 2.0
 CONTRIB = "opencv-contrib-python-headless>=4.10,<5"

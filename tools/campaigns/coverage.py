@@ -1,8 +1,8 @@
 """Fit many simulated surveys and count how often stated intervals hold the truth.
 
-    .venv/bin/python tools/calibration_coverage.py --surveys 400 --seed 1
-    .venv/bin/python tools/calibration_coverage.py --surveys 100 --seed 1 --method paper
-    .venv/bin/python tools/calibration_coverage.py --surveys 100 --seed 1 --mast 8
+    .venv/bin/python -m tools.campaigns.coverage --surveys 400 --seed 1
+    .venv/bin/python -m tools.campaigns.coverage --surveys 100 --seed 1 --method paper
+    .venv/bin/python -m tools.campaigns.coverage --surveys 100 --seed 1 --mast 8
 
 Surveys are those of the simulator (``drivers.sim.survey``). Prints, over the surveys, how often the 95 %
 interval of each mast parameter and of predicted pixels (points at 2 to 10 m, three directions, every camera)
@@ -135,7 +135,7 @@ def main() -> int:
         "--prism-cad-sigma-m", type=not_negative, default=0.0, help="noise of the prisms' drawing"
     )
     parser.add_argument("--workers", type=at_least(1), default=os.cpu_count() or 1)
-    root = Path(__file__).resolve().parent.parent
+    root = Path(__file__).resolve().parents[2]
     parser.add_argument("--rig", type=Path, default=root / "configs" / "sim" / "rocky8.yaml")
     options = parser.parse_args()
     true = load_rig(options.rig).rig

@@ -3,7 +3,7 @@
 Each case chooses the joint angles first and puts the target on the pixel's ray, so a solution is known to
 exist; losing it is a failure. The kinematics here are SciPy's rotations, not the project's own.
 
-    .venv/bin/python tools/pointing_campaign.py --cases 10000 --seed 1
+    .venv/bin/python -m tools.campaigns.pointing --cases 10000 --seed 1
 """
 
 from __future__ import annotations

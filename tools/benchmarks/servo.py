@@ -1,6 +1,6 @@
 """Time a sync read of two servos, and a write with a read, beside the plain SDK and lerobot's bus class.
 
-    python tools/bench_servo.py [--calls 300] [--batches 10] [--delay-ms 0 1] [--json]
+    python -m tools.benchmarks.servo [--calls 300] [--batches 10] [--delay-ms 0 1] [--json]
 
 The servos are simulated in a process of their own behind a pseudo terminal, without wire time; each servo
 waits ``--delay-ms`` before it answers. Batches of the drivers take turns, so that all see the same load of
@@ -27,13 +27,10 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from multiprocessing.connection import Connection
-from pathlib import Path
 from typing import Any
 
 from mastctl.cli.output import at_least, not_negative
 from tools.arguments import end
-
-sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
 BAUD = 1_000_000
 IDS = (1, 2)

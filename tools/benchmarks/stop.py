@@ -1,6 +1,6 @@
 """Stop pointings of the simulated rover at many moments; tell when it is answered and when they end.
 
-python -m tools.bench_stop
+python -m tools.benchmarks.stop
 """
 
 from __future__ import annotations

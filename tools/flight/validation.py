@@ -1,6 +1,6 @@
 """Make all numbers and pictures of docs/validation.md from the flight data beside the checkout.
 
-    python tools/flight_validation.py [--data FOLDER] [--write] [--mast-file OUT.yaml]
+    python -m tools.flight.validation [--data FOLDER] [--write] [--mast-file OUT.yaml]
 
 The tables go to stdout. With --write they also replace the text between the marks
 ``<!-- numbers: NAME -->`` and ``<!-- end -->`` of docs/validation.md, and the pictures are renewed.
@@ -23,11 +23,10 @@ from calib.files.pds3 import PdsProduct
 from calib.fit.poses import PoseFit
 from drivers.clock import ManualClock
 from drivers.errors import DriverError
-from tools import flight_mer as mer
-from tools import flight_msl as msl
 from tools.arguments import end
+from tools.flight import mer, msl
 
-REPOSITORY = Path(__file__).resolve().parent.parent
+REPOSITORY = Path(__file__).resolve().parents[2]
 DOCUMENT = REPOSITORY / "docs" / "validation.md"
 PICTURES = REPOSITORY / "docs" / "img"
 PRINTED_SEEDS = range(10)
@@ -189,7 +188,7 @@ def mer_blocks(folder: Path, pictures: bool, mast_file: Path | None) -> dict[str
         for name, pair in found.items()
     }
     if pictures:
-        from tools import flight_pictures
+        from tools.flight import pictures as flight_pictures
 
         flight_pictures.pointing(first, second, done, PICTURES / "opportunity_pointing.jpg")
         pairs = [

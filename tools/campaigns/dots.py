@@ -3,8 +3,8 @@
 The truth is the projected centre of each dot. Every prediction is wrong by up to 20 cm, 10 degrees and 5 % of
 the focal length, as rough cameras of a survey may be. Stresses: more noise, little contrast, uneven light.
 
-    .venv/bin/python tools/dot_campaign.py --poses 12 --seed 1
-    .venv/bin/python tools/dot_campaign.py --poses 4 --stress contrast --pictures FOLDER
+    .venv/bin/python -m tools.campaigns.dots --poses 12 --seed 1
+    .venv/bin/python -m tools.campaigns.dots --poses 4 --stress contrast --pictures FOLDER
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """Measure the V4L2 cameras: gaps, the age of frames, processor time beside OpenCV, memory, descriptors.
 
-    tools/vm run --timeout 3000 .venv/bin/python tools/bench_camera.py
-    tools/vm run --cameras three .venv/bin/python tools/bench_camera.py --only gaps --hdmi-rate 40
-    .venv/bin/python tools/bench_camera.py --device /dev/v4l/by-id/...   (once to three times)
+    tools/vm run --timeout 3000 .venv/bin/python -m tools.benchmarks.camera
+    tools/vm run --cameras three .venv/bin/python -m tools.benchmarks.camera --only gaps --hdmi-rate 40
+    .venv/bin/python -m tools.benchmarks.camera --device /dev/v4l/by-id/...   (once to three times)
 
 Without --device the cameras that are connected are taken, three at most; in the virtual machine these are
 vivid's. Two are ours; a third one is read by v4l2-ctl at the same time, for what the computer itself loses.

@@ -1,4 +1,6 @@
-"""Feed broken bytes to the drivers' and the simulators' parsers: ``tools/fuzz_servo.py --cases 1000000``.
+"""Feed broken bytes to the drivers' and the simulators' parsers.
+
+    .venv/bin/python -m tools.campaigns.fuzz_servo --cases 1000000
 
 A case is a stream of noise, broken packets and good ones, in chunks of any size, with a good one at the end.
 A parser passes if it lets no exception out, takes nothing for a packet that is none, and takes the good one
@@ -15,13 +17,9 @@ import argparse
 import math
 import random
 import re
-import sys
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator
-from pathlib import Path
-
-sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
 from dynamixel_sdk import PacketHandler
 

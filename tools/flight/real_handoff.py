@@ -1,6 +1,6 @@
 """Carry targets from one picture of Opportunity's Navcam to the next, as the tracker would: what is left.
 
-    .venv/bin/python -m tools.real_handoff ../shared/data/mer_navcam [--picture FILE] [--json]
+    .venv/bin/python -m tools.flight.real_handoff ../shared/data/mer_navcam [--picture FILE] [--json]
 
 Five left-Navcam frames of one rover pose and five pointings; six ordered pairs overlap. Each frame is taken
 as a camera of its own, with the CAHVOR model of its label (computed at the MEASURED joint angles). Targets
@@ -41,10 +41,10 @@ from calib.pictures.warp import Plane, carry
 from calib.rigid import FloatArray
 from calib.tracking.track import Key, Look, Track, TrackSettings, seen_by
 from drivers.clock import ManualClock
-from tools import flight_mer as mer
 from tools.arguments import end, new_file
-from tools.render_bias import BLUR_PX, GRID_PX, HALF_PX, MARGIN_PX, best_affine
-from tools.render_bias import match as ecc
+from tools.campaigns.render_bias import BLUR_PX, GRID_PX, HALF_PX, MARGIN_PX, best_affine
+from tools.campaigns.render_bias import match as ecc
+from tools.flight import mer
 
 PAIRS = ((0, 1), (1, 0), (2, 3), (3, 2), (3, 4), (4, 3))
 EVERY_PX = 32
@@ -262,7 +262,7 @@ def main() -> int:
             {"from": "all", "to": "", "range": way, **told([o for w in found.values() for o in w[way]])}
         )
     if arguments.picture is not None:
-        from tools.real_handoff_picture import draw
+        from tools.flight.real_handoff_picture import draw
 
         draw(frames[2], frames[3], found[2, 3], arguments.picture)
     if arguments.json:

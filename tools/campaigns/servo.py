@@ -10,9 +10,9 @@ words, and from its end to a good reading.
 An encoder that lies (``wrong``, ``drifting``, ``garbage``) cannot be told from a moving axis by its bytes;
 for those words the worst error of a reading that calls itself settled and healthy is told instead.
 
-    .venv/bin/python tools/servo_campaign.py --transactions 10000 --seed 1
-    .venv/bin/python tools/servo_campaign.py --hours 8 --driver ptu_pty
-    .venv/bin/python tools/servo_campaign.py --openings 100
+    .venv/bin/python -m tools.campaigns.servo --transactions 10000 --seed 1
+    .venv/bin/python -m tools.campaigns.servo --hours 8 --driver ptu_pty
+    .venv/bin/python -m tools.campaigns.servo --openings 100
 
 With ``--openings`` a healthy Dynamixel head fresh from the factory is opened so many times under each fault
 that repeats, holds back, swaps or misnames replies, with ``on_hardware_error: reboot``. Told is how often it
@@ -42,7 +42,15 @@ from drivers.faults import HEAD_WORDS
 from drivers.interfaces import Reading
 from mastctl.cli.output import at_least, positive_number
 from tools.arguments import end, new_file
-from tools.servo_rigs import LIMITS_RAD, Rig, as_opened, dynamixel_pty, fresh_servos, opened_on, ptu_pty
+from tools.campaigns.servo_rigs import (
+    LIMITS_RAD,
+    Rig,
+    as_opened,
+    dynamixel_pty,
+    fresh_servos,
+    opened_on,
+    ptu_pty,
+)
 
 DRIVERS: dict[str, Callable[[], AbstractContextManager[Rig]]] = {
     "dynamixel_pty": partial(dynamixel_pty, watchdog_s=0.3, reply_timeout_s=0.05),

@@ -23,7 +23,7 @@ from calib.handoff.by_image import Eye
 from calib.pictures.warp import grey
 from calib.rigid import FloatArray
 from calib.tracking.track import moved_track, seen_by, start_track
-from tools.tracker_sequences import STEPS, Sequence
+from tools.against_others.tracker_sequences import STEPS, Sequence
 
 HALF_PX = 20
 """Half side of the others' patch: 41 px, as the bench that this repeats has it."""

@@ -4,7 +4,7 @@ What the verdicts have to judge is what correlation answers without them: the so
 its range, its best place in the window. A case is wrong if that is more than 4 px from the exact projection
 in either eye, and caught if no such eye is accepted; an accepted pixel is judged by itself.
 
-    .venv/bin/python -m tools.handoff_campaign --cases 100 --seed 1
+    .venv/bin/python -m tools.campaigns.handoff --cases 100 --seed 1
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from drivers.sim.render import compile_renderer
 from mastctl.cli.output import at_least
 from mastctl.packaged import config_folder
 from tools.arguments import end, new_file
-from tools.handoff_provocations import KINDS, Case, Stage
+from tools.campaigns.handoff_provocations import KINDS, Case, Stage
 
 WRONG_PX = 4.0
 RIGHT_PX = 1.0

@@ -1,6 +1,6 @@
 """Fit cameras to the same points with this project, OpenCV, mrcal and plain SciPy, in one run on one thread.
 
-    .venv/bin/python tools/compare_calibration.py --data ../shared/data/opencv_stereo [--surveys 20] [--json]
+    .venv/bin/python -m tools.against_others.calibration --data ../shared/data/opencv_stereo [--surveys 20]
 
 Three problems, each given to all who can solve it:
 
@@ -51,8 +51,7 @@ from calib.fit.least_squares import minimise
 from calib.fit.terms import ImageTerm
 from calib.rigid import Rigid
 from mastctl.cli.output import at_least
-from tools.arguments import end
-from tools.compare_points import (
+from tools.against_others.points import (
     COLUMNS,
     NOISE_PX,
     REPOSITORY,
@@ -65,6 +64,7 @@ from tools.compare_points import (
     simulated_survey,
     views_as_points,
 )  # fmt: skip
+from tools.arguments import end
 
 T = TypeVar("T")
 ROUGH_FOCAL = 1.2

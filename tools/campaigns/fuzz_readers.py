@@ -1,4 +1,6 @@
-"""Feed broken files to every reader and command: ``python tools/fuzz_readers.py --cases 100000 --seed 1``.
+"""Feed broken files to every reader and command.
+
+    .venv/bin/python -m tools.campaigns.fuzz_readers --cases 100000 --seed 1
 
 A case takes a valid file (or none), breaks it, and reads it. Allowed is a result or a refusal in one line
 (`BadFile` from a reader; exit code 1 or 2 without code ``internal`` from a command) that changes no file.

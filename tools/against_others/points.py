@@ -14,7 +14,7 @@ from calib.camera.published import project_as_published
 from calib.files.mast_file import load_rig
 from calib.rigid import Rigid
 
-REPOSITORY = Path(__file__).resolve().parent.parent
+REPOSITORY = Path(__file__).resolve().parents[2]
 COLUMNS, ROWS, SQUARE_M = 9, 6, 0.025
 NOISE_PX = 0.1
 SETTLED = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT, 200, 1e-12)

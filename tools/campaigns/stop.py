@@ -1,6 +1,6 @@
 """How soon a stop brakes one axis of a Dynamixel head while the other's servo fails, on the byte simulator.
 
-    python -m tools.stop_campaign [--trials N] [--seed S]
+    python -m tools.campaigns.stop [--trials N] [--seed S]
 
 Each trial moves both axes, lets one servo fail, waits a random while (the failure is then unnoticed, being
 missed, or has already ended the session) and calls stop. For the axis that can be reached it tells when its
@@ -21,7 +21,7 @@ from dataclasses import dataclass
 from drivers.errors import DriverError
 from drivers.sim.wire.dynamixel_bus import DynamixelBus
 from drivers.sim.wire.dynamixel_servo import VOLTAGE
-from tools.servo_rigs import ACCELERATION_RAD_PER_S2, Rig, dynamixel_pty
+from tools.campaigns.servo_rigs import ACCELERATION_RAD_PER_S2, Rig, dynamixel_pty
 
 LONGEST_S = 20.0
 LATEST_S = 0.25

@@ -1,1 +1,0 @@
-"""What a simulated rover's mast file costs."""
