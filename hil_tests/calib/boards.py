@@ -12,7 +12,7 @@ from calib.camera.cahvor import CameraModel
 from calib.dots.find import PredictedBoard
 from calib.rigid import Rigid
 from calib.survey import Board
-from drivers.sim.board import BoardLook, draw_board, photograph
+from drivers.sim_survey.board import BoardLook, draw_board, photograph
 
 BOARD = Board(10, 10, 0.08, 0.04, {})
 LOOK = BoardLook()

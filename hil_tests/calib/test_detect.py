@@ -13,7 +13,7 @@ from calib.camera.cahvor import CameraModel
 from calib.dots.find import DetectionFailure, DotsFound, PredictedBoard, Upright, find_dots
 from calib.rigid import Rigid
 from calib.survey import Board
-from drivers.sim.board import BoardLook
+from drivers.sim_survey.board import BoardLook
 
 WANTED_PX = 0.03
 WANTED_FAR_PX = 0.08

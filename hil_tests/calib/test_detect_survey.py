@@ -16,8 +16,8 @@ from calib.dots.find import PredictedBoard, Upright
 from calib.dots.find_in_survey import detect_survey, expectations
 from calib.files.mast_file import load_rig
 from calib.survey import Survey
-from drivers.sim.board import draw_board, photograph
-from drivers.sim.survey import Ring, SurveyPlan, simulate_survey
+from drivers.sim_survey.board import draw_board, photograph
+from drivers.sim_survey.survey import Ring, SurveyPlan, simulate_survey
 
 RMS_PX = 0.03
 PICTURES = 6

@@ -34,7 +34,7 @@ from calib.pictures.patch_match import match_patch
 from calib.pictures.warp import Plane, facing_plane
 from calib.rigid import Rigid
 from calib.survey.alignment import NotAligned, align, mirrored
-from drivers.sim.board import draw_board, photograph
+from drivers.sim_survey.board import draw_board, photograph
 
 NO_NUMBERS = (math.nan, math.inf, -math.inf)
 HEAD = CameraModel("CAHV", (101, 101), np.zeros(3), [1, 0, 0], [50, 100, 0], [50, 0, 100])

@@ -13,8 +13,8 @@ from calib.fit.paper import fit_paper
 from calib.fit.stray_dots import without_stray_dots
 from calib.mast.rig import Rig
 from calib.survey import Dots, Survey
-from drivers.sim.survey import simulate_survey
-from drivers.sim.survey_blunders import with_outlier_dots
+from drivers.sim_survey.blunders import with_outlier_dots
+from drivers.sim_survey.survey import simulate_survey
 
 ROOT = Path(__file__).resolve().parents[2]
 

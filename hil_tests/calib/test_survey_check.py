@@ -14,8 +14,8 @@ from calib.files.mast_file import load_rig
 from calib.mast.rig import Rig
 from calib.survey import Board, Finding, StationPoint, Survey, SurveyImage
 from calib.survey.check import check_survey
-from drivers.sim.survey import SurveyPlan, simulate_survey
-from drivers.sim.survey_blunders import with_moved_tape, with_swapped_boards, with_wrong_prism
+from drivers.sim_survey.blunders import with_moved_tape, with_swapped_boards, with_wrong_prism
+from drivers.sim_survey.survey import SurveyPlan, simulate_survey
 
 ROOT = Path(__file__).resolve().parents[2]
 

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from calib.camera.cahvor import CameraModel
 from calib.rigid import Rigid
 from calib.survey import Board
-from drivers.sim.board import BoardLook, draw_board, photograph
+from drivers.sim_survey.board import BoardLook, draw_board, photograph
 
 BOARD = Board(4, 5, 0.08, 0.04, {})
 LOOK = BoardLook(paper_dn=200.0, dot_dn=40.0, margin_m=0.08)

@@ -15,13 +15,13 @@ from calib.files.mast_file import load_rig
 from calib.mast.rig import Rig
 from calib.rigid import Rigid
 from calib.survey import Sigma, Survey, read_survey, write_survey
-from drivers.sim.survey import Ring, SurveyPlan, SurveyTruth, simulate_survey
-from drivers.sim.survey_blunders import (
+from drivers.sim_survey.blunders import (
     with_moved_tape,
     with_outlier_dots,
     with_swapped_boards,
     with_wrong_prism,
 )
+from drivers.sim_survey.survey import Ring, SurveyPlan, SurveyTruth, simulate_survey
 
 ROOT = Path(__file__).resolve().parents[2]
 RIG_FILE = ROOT / "configs/sim/rocky8.yaml"

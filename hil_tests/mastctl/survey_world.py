@@ -12,7 +12,7 @@ import yaml
 from calib.files.mast_file import load_rig
 from calib.mast.rig import Rig
 from calib.survey import Survey, write_survey
-from drivers.sim.survey import Ring, SurveyPlan, SurveyTruth, simulate_survey
+from drivers.sim_survey.survey import Ring, SurveyPlan, SurveyTruth, simulate_survey
 
 RIG_FILE = Path(__file__).resolve().parents[2] / "configs" / "sim" / "rocky8.yaml"
 RINGS = (Ring("navcam", 3.0, 4, -0.17), Ring("navcam", 6.0, 4, -0.17))

@@ -16,7 +16,7 @@ from survey_world import edit_yaml, navcam_rig, navcam_survey, write_folder
 
 from calib.files.mast_file import load_rig, save_rig
 from calib.survey import read_survey
-from drivers.sim.board import draw_board, photograph
+from drivers.sim_survey.board import draw_board, photograph
 from mastctl.calibration.detection import missing, with_dots
 from mastctl.cli.main import main
 

@@ -18,13 +18,13 @@ from survey_world import edit_yaml, navcam_survey, write_folder
 
 from calib.survey import Dots, Survey, SurveyImage, read_survey
 from calib.survey.check import check_survey
-from drivers.sim.survey import Ring
-from drivers.sim.survey_blunders import (
+from drivers.sim_survey.blunders import (
     with_moved_tape,
     with_outlier_dots,
     with_swapped_boards,
     with_wrong_prism,
 )
+from drivers.sim_survey.survey import Ring
 from mastctl.calibration.detection import with_dots
 from mastctl.calibration.run import sentence_of
 from mastctl.cli.main import main

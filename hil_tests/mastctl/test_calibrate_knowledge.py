@@ -16,8 +16,8 @@ from calib.camera.cahvor import CameraModel
 from calib.files.mast_file import load_rig
 from calib.mast.rig import Rig
 from calib.survey import Dots, Sigma, Survey, SurveyImage
-from drivers.sim.survey import Ring, SurveyPlan, simulate_survey
-from drivers.sim.survey_plan import rover_from_head
+from drivers.sim_survey.plan import rover_from_head
+from drivers.sim_survey.survey import Ring, SurveyPlan, simulate_survey
 from mastctl.cli.main import main
 
 SIGMAS = 4.5

@@ -21,7 +21,7 @@ from calib.files.mast_file import load_rig
 from calib.fit.calibration import Calibration
 from calib.fit.start_values import SurveyNotFitted
 from calib.survey import Sigma, Survey
-from drivers.sim.survey import SurveyPlan
+from drivers.sim_survey.survey import SurveyPlan
 from mastctl.calibration.run import FITS
 from mastctl.cli.main import main
 from mastctl.experiment.calibration import (

@@ -21,7 +21,7 @@ from calib.mast.pointing import solve
 from calib.mast.rig import Rig
 from calib.rigid import FloatArray
 from calib.survey import Sigma
-from drivers.sim.survey import SurveyPlan, simulate_survey
+from drivers.sim_survey.survey import SurveyPlan, simulate_survey
 from mastctl.calibration.landing import click, handoff_errors_px, pointing_error_px, seen
 from mastctl.calibration.run import FITS, Method
 from mastctl.experiment.executors import run_all

@@ -4,7 +4,7 @@
     .venv/bin/python -m tools.campaigns.coverage --surveys 100 --seed 1 --method paper
     .venv/bin/python -m tools.campaigns.coverage --surveys 100 --seed 1 --mast 8
 
-Surveys are those of the simulator (``drivers.sim.survey``). Prints, over the surveys, how often the 95 %
+Surveys are those of the simulator (``drivers.sim_survey.survey``). Prints, over the surveys, how often the 95 %
 interval of each mast parameter and of predicted pixels (points at 2 to 10 m, three directions, every camera)
 holds the truth, both pooled, and how the weighted sum of squares compares with its chi-square.
 
@@ -33,7 +33,7 @@ from calib.fit.calibration import Calibration
 from calib.fit.uncertainty import pixel_covariance
 from calib.mast.rig import Rig
 from calib.survey import Sigma, Survey
-from drivers.sim.survey import SurveyPlan, SurveyTruth, simulate_survey
+from drivers.sim_survey.survey import SurveyPlan, SurveyTruth, simulate_survey
 from mastctl.calibration.run import FITS
 from mastctl.cli.output import at_least, not_negative
 from tools.arguments import end

@@ -23,9 +23,9 @@ from calib.camera.cahvor import CameraModel
 from calib.dots.find import DetectionFailure, DotsFound, PredictedBoard, find_dots
 from calib.rigid import Rigid
 from calib.survey import Board
-from drivers.sim.board import BoardLook, draw_board, half_size_m, photograph
 from drivers.sim.render import Renderer
 from drivers.sim.scene import SceneSettings, build_scene
+from drivers.sim_survey.board import BoardLook, draw_board, half_size_m, photograph
 from mastctl.cli.output import at_least
 from tools.arguments import end
 

@@ -23,7 +23,7 @@ from calib.files.mast_file import load_rig, save_rig
 from calib.mast.rig import Rig
 from calib.survey import Sigma, read_survey, write_survey
 from drivers.sim.pan_tilt import PRESETS
-from drivers.sim.survey import Ring, SurveyPlan, simulate_survey
+from drivers.sim_survey.survey import Ring, SurveyPlan, simulate_survey
 from mastctl.calibration.run import Calibrated, calibrate, checked
 from mastctl.cli.output import at_least
 from tools.arguments import end

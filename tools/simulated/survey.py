@@ -19,10 +19,10 @@ import numpy as np
 from calib.errors import BadFile
 from calib.files.mast_file import load_rig
 from calib.survey import Sigma, Survey, write_survey
-from drivers.sim.board import draw_board, photograph
 from drivers.sim.render import Renderer
 from drivers.sim.scene import build_scene
-from drivers.sim.survey import SurveyPlan, SurveyTruth, simulate_survey
+from drivers.sim_survey.board import draw_board, photograph
+from drivers.sim_survey.survey import SurveyPlan, SurveyTruth, simulate_survey
 from mastctl.cli.output import at_least, not_negative
 from tools.arguments import end
 

@@ -18,7 +18,7 @@ from calib.mast.rig import Rig
 from calib.rigid import FloatArray, Rigid
 from calib.survey import Dots, StationPoint, Survey, SurveyCamera, SurveyImage
 from calib.survey.records import Purpose, StationKind
-from drivers.sim.survey_plan import (
+from drivers.sim_survey.plan import (
     BOARD,
     PRISMS_IN_ROVER_M,
     Ring,

@@ -1,0 +1,1 @@
+"""Surveys that nobody made: a total station, prisms and boards, for calibration to be tried on."""
