@@ -33,7 +33,7 @@ from drivers.sim.cameras import CameraSettings, SimulatedCamera
 from drivers.sim.pan_tilt import HeadSettings, SimulatedPanTilt, head_settings
 from drivers.sim.render import Renderer, compile_renderer
 from drivers.sim.scene import SceneSettings, build_scene
-from drivers.sim.wire.head import DEFAULT_HEADS, WiredHead, check_head
+from drivers.sim.wired_head import DEFAULT_HEADS, WiredHead, check_head
 
 TRUTH_FRAMES = 512
 """How many frames of each camera ``frame_truth`` remembers."""
