@@ -1,10 +1,11 @@
 """Stop pointings of the simulated rover at many moments; tell when it is answered and when they end.
 
-python -m tools.benchmarks.stop
+.venv/bin/python -m tools.benchmarks.stop
 """
 
 from __future__ import annotations
 
+import argparse
 import sys
 import time
 from dataclasses import replace
@@ -19,6 +20,11 @@ CAMERAS = ("pancam_left", "navcam_left")
 
 def main() -> None:
     """Print a line for each stop, and the longest of each time."""
+    argparse.ArgumentParser(
+        prog="python -m tools.benchmarks.stop",
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    ).parse_args()
     config = replace(load_config(None), listen=Listen(port=0))
     longest_ms = [0.0, 0.0]
     with RunningDaemon(config) as daemon, Client(daemon.url) as client:

@@ -5,7 +5,8 @@
     .venv/bin/python -m tools.campaigns.coverage --surveys 100 --seed 1 --mast 8
 
 Surveys are simulated (`drivers.sim_survey.survey`). Prints, over the surveys, how often the 95 % interval of
-each mast parameter and of predicted pixels (points at 2 to 10 m, three directions, every camera) holds the truth, both pooled, and how the weighted sum of squares compares with its chi-square.
+each mast parameter and of predicted pixels (points at 2 to 10 m, three directions, every camera) holds the
+truth, both pooled, and how the weighted sum of squares compares with its chi-square.
 
 Errors of one survey go together (a shift of the mast is seen by all its pixels), so a pooled rate scatters
 far more than so many independent intervals would: behind ± stands its standard error, from the scatter of
