@@ -104,7 +104,7 @@ def few_descriptors() -> None:
 def test_more_silent_connections_than_descriptors_do_not_keep_a_stop_out(
     tmp_path: Path, begun: bytes
 ) -> None:
-    with daemon_process(tmp_path, write_config(tmp_path), preexec_fn=few_descriptors) as daemon:
+    with daemon_process(tmp_path, write_config(tmp_path), prepare=few_descriptors) as daemon:
         url = line(daemon)
         host, port = url.removeprefix("http://").split(":")
         with contextlib.ExitStack() as open_ones:

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import pytest
 from outside_daemon import (
@@ -54,8 +52,7 @@ def test_a_signal_that_ends_stops_the_mast_first(tmp_path: Path, name: str) -> N
 
 
 def test_a_closed_terminal_is_survived_where_nohup_asked_for_it(tmp_path: Path) -> None:
-    ignore: Callable[[], Any] = lambda: signal.signal(signal.SIGHUP, signal.SIG_IGN)  # noqa: E731
-    with daemon_process(tmp_path, write_config(tmp_path), preexec_fn=ignore) as daemon:
+    with daemon_process(tmp_path, write_config(tmp_path), ignored=[signal.SIGHUP]) as daemon:
         url = line(daemon)
         daemon.send_signal(signal.SIGHUP)
         with Client(url) as client:
@@ -104,9 +101,10 @@ def test_a_command_that_is_ended_unwinds_once_and_tells_the_signal(
         return 0
 
     words: list[str] = []
+    before = signal.getsignal(signal.SIGHUP)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("mastctl.cli.service._status", ended)
         assert main(["status"]) == 128 + signal.SIGUSR1
     assert words == ["made safe"]
     assert capsys.readouterr().err == "mastctl: interrupted\n"
-    assert signal.getsignal(signal.SIGHUP) is signal.SIG_DFL
+    assert signal.getsignal(signal.SIGHUP) is before
