@@ -43,7 +43,8 @@ class CorrectedCamera:
         frame: Frame = self._camera.next_frame(exposed_after_s - self._offset_s, timeout_s)
         try:
             uncertainty_s = float(getattr(frame, "mid_uncertainty_s", 0.0))
-            self._narrower_s = min(abs(self._offset_s), max(0.0, uncertainty_s))
+            widest_s = max(0.0, min(uncertainty_s, frame.exposure_s / 2))
+            self._narrower_s = min(abs(self._offset_s), widest_s)
             changes: dict[str, Any] = {
                 "mid_exposure_s": frame.mid_exposure_s + self._offset_s,
                 "exposure_s": frame.exposure_s - 2 * self._narrower_s,

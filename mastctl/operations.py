@@ -252,14 +252,19 @@ class Operations:
         DriverError
             If the head did not confirm the stop; the operation is stopped all the same.
         """
-        name: str | None = None
         with self.held():
+            running = self._current
+            if running is not None:  # what ends from here on, ends by the stop
+                self._cancelled_because = STOP_ASKED
+                running[1].set()
             try:
                 self._mover.stop()
             finally:
                 with self._lock:
                     name = self._cancel(STOP_ASKED)
                     self._motion = replace(self._motion, stopped=True)
+        if name is None and running is not None and self.get(running[0]).state == "stopped":
+            name = running[0]
         log.info("stop%s", f": operation {name}" if name else "")
         return name
 
@@ -381,13 +386,13 @@ class Operations:
         with self._lock:
             if self._current is None or self._current[0] != name:
                 return  # given up before
-            known = self._records.get(name)
-            if known is not None:
-                ended_s = self._clock.now_s()
-                self._keep(replace(known, state=state, result=result, error=error, ended_s=ended_s))
             self._current = None
             self._motion = replace(self._motion, operation=None, residual=residual or self._motion.residual)
             self._mover.allow_moves(name)
+            known = self._records.get(name)
+            if known is not None:  # last, since it is what clients wait for
+                ended_s = self._clock.now_s()
+                self._keep(replace(known, state=state, result=result, error=error, ended_s=ended_s))
 
 
 def error_body(error: BaseException) -> dict[str, Any]:

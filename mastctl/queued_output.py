@@ -137,6 +137,13 @@ class QueuedHandler(logging.Handler):
     def createLock(self) -> None:
         self.lock = None
 
+    def handle(self, record: logging.LogRecord) -> bool:
+        """Emit a record that the filters pass; the library's own way takes the lock (3.13: unasked)."""
+        passed = self.filter(record)
+        if passed:
+            self.emit(passed if isinstance(passed, logging.LogRecord) else record)
+        return bool(passed)
+
     def emit(self, record: logging.LogRecord) -> None:
         self._writer.put(lambda: self.format(record) + "\n")
 

@@ -338,34 +338,37 @@ def try_out(link: Link, servo_id: int, amplitude_rad: float, torque_percent: flo
     registers = model.registers
     block = Block(registers, "goal_velocity", "present_temperature")
 
-    def write(name: str, value: int) -> None:
-        _patient(lambda: link.write(servo_id, registers[name], value))
+    def put(name: str, value: int) -> None:
+        _set(link, servo_id, registers[name], value)
+
+    def go_to(goal: int) -> None:
+        _patient(lambda: link.write(servo_id, registers["goal_position"], goal))
 
     steps: list[TrialStep] = []
     with _restored(link, servo_id, model, values):
         if values["bus_watchdog"]:  # it refuses goals; once cleared, the old goal is void in the same moment
             parts = [("bus_watchdog", 0), ("goal_position", start)]
             link.shout([_part(servo_id, registers[name], value) for name, value in parts])
-            write("bus_watchdog", 0)
-        write("goal_position", start)
-        write(
+            put("bus_watchdog", 0)
+        put("goal_position", start)
+        put(
             "profile_acceleration",
             max(1, round(TRIAL_ACCELERATION_RAD_PER_S2 / model.acceleration_unit_rad_per_s2)),
         )
-        write("profile_velocity", max(1, round(TRIAL_SPEED_RAD_PER_S / model.velocity_unit_rad_per_s)))
-        write("goal_pwm", round(values["pwm_limit"] * torque_percent / 100))
-        write("torque_enable", 1)
+        put("profile_velocity", max(1, round(TRIAL_SPEED_RAD_PER_S / model.velocity_unit_rad_per_s)))
+        put("goal_pwm", round(values["pwm_limit"] * torque_percent / 100))
+        put("torque_enable", 1)
         if firmware >= model.watchdog_firmware:
-            write("bus_watchdog", TRIAL_WATCHDOG)
+            put("bus_watchdog", TRIAL_WATCHDOG)
         try:
             for goal in (start + reach, start - reach, start):
-                write("goal_position", goal)
+                go_to(goal)
                 steps.append(
                     _step(link, servo_id, model, block, goal, (start - 2 * reach, start + 2 * reach))
                 )
         except BaseException:
             with suppress(DriverError):  # what went wrong first is told
-                write("goal_position", link.proven(servo_id, registers["present_position"])[0])
+                go_to(link.proven(servo_id, registers["present_position"])[0])
             raise
     return Trial(servo_id, model.name, model.count_rad, start, tuple(steps))
 
@@ -413,23 +416,28 @@ def _restored(link: Link, servo_id: int, model: Model, values: dict[str, int]) -
     if values["bus_watchdog"] != WATCHDOG_TRIPPED:
         wanted += [("bus_watchdog", values["bus_watchdog"])]
     left: dict[str, DriverError] = {}
-    for name, value in wanted:
+    while wanted:
+        name, value = wanted[0]
         try:
-            _restore(link, servo_id, model.registers[name], value)
+            _set(link, servo_id, model.registers[name], value)
         except DriverError as error:
             left[name] = error
-        except KeyboardInterrupt as error:  # Ctrl-C again: the rest is tried all the same
+        except KeyboardInterrupt as error:  # Ctrl-C again: it is tried once more, and the rest too
             wrong = wrong or error
+            continue
+        del wanted[0]
     if left:
         names = " and ".join(left)
         limp = "its torque may be on; " if "torque_enable" in left else ""
         words = f"servo {servo_id} is not left as it was found in {names}: {limp}{next(iter(left.values()))}"
-        raise WrongDevice(words if wrong is None else f"{wrong or 'interrupted'}; and {words}") from wrong
+        raise WrongDevice(
+            words if wrong is None else f"{str(wrong) or 'interrupted'}; and {words}"
+        ) from wrong
     if wrong is not None:
         raise wrong
 
 
-def _restore(link: Link, servo_id: int, register: Register, value: int) -> None:
+def _set(link: Link, servo_id: int, register: Register, value: int) -> None:
     """Write a register and see that it holds the value."""
     for _ in range(ATTEMPTS):
         _patient(lambda: link.write(servo_id, register, value))

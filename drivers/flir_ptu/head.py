@@ -155,8 +155,9 @@ class FlirPtu:
     def stop(self) -> None:
         """Halt both axes; they hold where they come to rest, and no second leg of a move follows.
 
-        If another call is under way, or anything has to be asked first, the halt goes out at once, and again
-        in order. A line that is away is tried at once: a unit has no watchdog that silence would trip.
+        If another call is under way, anything has to be asked first, or bytes came that nobody asked for, the
+        halt goes out at once, and again in order. A line that is away is tried at once: a unit has no
+        watchdog that silence would trip.
 
         Raises
         ------
@@ -167,12 +168,14 @@ class FlirPtu:
         free = self._lock.acquire(timeout=STOP_PATIENCE_S)
         try:
             self._forget_legs()
-            talk = self._talk
-            if talk is not None and not (free and talk.is_in_step and not self._count.doubted):
-                with suppress(LineLost):  # told below
-                    talk.shout("H")
-            with self._talking() as talk:
-                self._halt(talk)
+            in_order = free and self._talk is not None and self._talk.is_in_step and not self._count.doubted
+            if not in_order:
+                self._halt_beside()
+            try:
+                self._halt_in_order()
+            except BadReply:  # perhaps of bytes that nobody asked for, and nothing was sent yet
+                self._halt_beside()
+                self._halt_in_order()
         finally:
             self._forget_legs()  # those of a move that was under way beside it, whatever the unit has said
             self._stop_asked.clear()
@@ -288,6 +291,18 @@ class FlirPtu:
         self._count.halt_owed = False
         for axis in self._axes.values():
             axis.stopped(self._clock.now_s())
+
+    def _halt_beside(self) -> None:
+        """Send a halt at once beside whatever is under way, if there is a line."""
+        talk = self._talk
+        if talk is not None:
+            with suppress(LineLost):  # told by what is asked next
+                talk.shout("H")
+
+    def _halt_in_order(self) -> None:
+        """Halt both axes in a conversation that is in step."""
+        with self._talking() as talk:
+            self._halt(talk)
 
     def _forget_legs(self) -> None:
         """Let no axis go on from where an approach begins."""

@@ -104,6 +104,17 @@ def test_an_offset_beyond_what_the_driver_says_moves_the_rest_as_it_is() -> None
     assert frame.mid_exposure_s == pytest.approx(100.105 + 0.1 * frame.sequence)
 
 
+def test_an_exposure_shorter_than_the_drivers_uncertainty_does_not_become_negative() -> None:
+    """A driver from outside may tell the true exposure, and beside it how uncertain its middle is."""
+    eye = AbleEye()
+    eye.next_frame = lambda exposed_after_s, timeout_s: SpanFrame(IMAGE, 1, 100.1005, 0.001, 0.005)  # type: ignore[method-assign]
+    for offset_s in (0.012, -0.012, 0.0002):
+        frame = corrected(eye, offset_s).next_frame(100.0, 1.0)
+        assert isinstance(frame, SpanFrame)
+        assert 0.0 <= frame.exposure_s <= 0.001 and 0.0 <= frame.mid_uncertainty_s <= 0.005
+        assert frame.mid_exposure_s == pytest.approx(100.1005 + offset_s)
+
+
 def test_it_can_what_the_camera_can_and_nothing_else() -> None:
     plain, able = corrected(Eye(), 0.1), corrected(AbleEye(), 0.1)
     assert isinstance(plain, Camera) and isinstance(able, Camera)

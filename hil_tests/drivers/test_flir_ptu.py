@@ -18,6 +18,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from dynamixel_rig import until
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scripted_ptu import ScriptedPtu
@@ -634,6 +635,22 @@ def test_no_second_leg_follows_a_stop_that_was_not_confirmed(opened: Opener) -> 
     for _ in range(5):
         head.read()
     assert unit.positions["P"] == began
+
+
+@pytest.mark.parametrize("capitals", [False, True], ids=["exact_echo", "echo_in_capitals"])
+@pytest.mark.parametrize("unasked", [b"* Current Pan position is 22\r", b"PP * Current Pan pos", b"\xff\x80"])
+def test_a_stop_is_sent_though_something_came_that_nobody_asked_for(
+    opened: Opener, unasked: bytes, capitals: bool
+) -> None:
+    head, unit = opened(ScriptedPtu(capitals=capitals))
+    head.move(0.5, 0.2)
+    assert head._talk is not None
+    unit.heard.clear()
+    unit.unasked = unasked
+    until(lambda: head._talk._line._serial.in_waiting == len(unasked), "the bytes")
+    head.stop()
+    assert unit.heard[0] == "H"
+    assert unit.heard[-1] == "H", "and confirmed"
 
 
 def test_a_stop_tries_a_line_that_is_away_at_once_and_halts_before_it_asks(opened: Opener) -> None:

@@ -21,6 +21,7 @@ SHIFTED = '''
 """The same cameras with stamps that are off by a known time; a picture never comes before its stamp."""
 
 import dataclasses
+import threading
 import time
 
 from bench_rig import head
@@ -45,6 +46,12 @@ class Shifted(FloorCamera):
         return told
 
 
+class Hanging(FloorCamera):
+    def next_frame(self, exposed_after_s, timeout_s):
+        HANGS.set()
+        time.sleep(600.0)
+
+
 def head_that_tells():
     told = head.open_head(speed_rad_per_s=1.0)
     HEADS.append(told)
@@ -52,6 +59,7 @@ def head_that_tells():
 
 
 HEADS = []
+HANGS = threading.Event()
 '''
 
 
@@ -92,9 +100,9 @@ def config(folder: Path, repository: Path, cameras: dict[str, dict[str, object]]
         "pan_tilt": {"driver": "shifted_rig:head_that_tells"},
         "cameras": {
             name: {
-                "driver": "shifted_rig:Shifted",
+                "driver": f"shifted_rig:{more.get('make', 'Shifted')}",
                 "options": {"mast_file": str(folder / "mast.yaml"), "name": name}
-                | {key: value for key, value in more.items() if key != "offset_s"},
+                | {key: value for key, value in more.items() if key not in ("offset_s", "make")},
             }
             | ({"offset_s": more["offset_s"]} if "offset_s" in more else {})
             for name, more in cameras.items()
@@ -179,6 +187,65 @@ def test_a_signal_stops_the_head_where_it_is(
     time.sleep(0.05)
     assert sys.modules["shifted_rig"].HEADS[-1].at(time.monotonic())[0] == pan_rad != 0.0
     assert signal.getsignal(signal.SIGTERM) is before
+
+
+@pytest.fixture
+def soon(package: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A camera's driver that does not come back is given up soon."""
+    from mastctl.camera_sync import sweep
+
+    monkeypatch.setattr(sweep, "FRAME_TIMEOUT_S", 0.5)
+    monkeypatch.setattr(sweep, "GRACE_S", 0.5)
+
+
+@pytest.mark.usefixtures("soon")
+def test_a_camera_whose_driver_hangs_is_told_of_and_the_other_one_measured(
+    package: Path, repository: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = config(package, repository, {"navcam_left": {"make": "Hanging"}, "navcam_right": {}})
+    code, told = sync(capsys, "--config", file, "--seconds", "10")
+    assert code == 0 and told["cameras"]["navcam_right"]["offset_s"] is not None, told
+    assert "did not come back" in told["cameras"]["navcam_left"]["failure"]
+
+
+@pytest.mark.usefixtures("soon")
+def test_nothing_moves_where_no_camera_gives_a_picture(
+    package: Path, repository: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = config(package, repository, {"navcam_left": {"make": "Hanging"}})
+    moves: list[tuple[object, ...]] = []
+    import mastctl.devices
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(mastctl.devices.Devices, "move", lambda self, *goal: moves.append(goal))
+        code, told = sync(capsys, "--config", file, "--seconds", "10")
+    assert code == 1 and "did not come back" in told["cameras"]["navcam_left"]["failure"]
+    assert not moves
+
+
+def test_a_signal_ends_it_while_a_cameras_driver_hangs(
+    package: Path, repository: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from mastctl.camera_sync import sweep
+
+    monkeypatch.setattr(sweep, "FRAME_TIMEOUT_S", 300.0)
+    monkeypatch.setattr(sweep, "END_S", 0.5)
+    file = config(package, repository, {"navcam_left": {"make": "Hanging"}})
+
+    def interrupt() -> None:
+        until_s = time.monotonic() + 60.0
+        while time.monotonic() < until_s:
+            module = sys.modules.get("shifted_rig")
+            if module and module.HANGS.is_set():
+                break
+            time.sleep(0.01)
+        os.kill(os.getpid(), signal.SIGTERM)
+
+    thread = threading.Thread(target=interrupt)
+    thread.start()
+    code, told = sync(capsys, "--config", file)
+    thread.join()
+    assert code == 1 and told["error"]["code"] == "stopped"
 
 
 def test_a_sweep_that_would_pass_a_limit_moves_nothing(

@@ -6,13 +6,15 @@ The small world's geometry, pictures and motion are its own; what its cameras do
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import pytest
 from pointing_world import SIZE_PX, World, clean, click, rig, run
 
 from calib.pictures.shown_view import Posed, shown_view
+from drivers.errors import NoReply
+from mastctl.devices.frames import StampedFrame
 from mastctl.pointing.loop import Aim, PointingError, PointRequest, PositionTarget
 
 MIDDLE_PX = (np.array(SIZE_PX) - 1) / 2
@@ -265,6 +267,43 @@ def test_a_position_without_a_residual_is_not_pointed_at_by_a_stale_picture_eith
     error = refusal(world, PointRequest(PositionTarget((4.0, 0.7, 0.0))))
     assert error.code == "bad_frame"
     assert "that of before the move" in str(error)
+
+
+def without(world: World, *dead: str) -> None:
+    """Some cameras do not answer."""
+    frames = world.frames
+
+    def fewer(cameras: Sequence[str], exposed_after_s: float, timeout_s: float) -> dict[str, StampedFrame]:
+        for camera in cameras:
+            if camera in dead:
+                raise NoReply("unplugged", device=camera)
+        return frames(cameras, exposed_after_s, timeout_s)
+
+    world.frames = fewer  # type: ignore[method-assign]
+
+
+def test_a_position_is_pointed_at_without_the_aiming_cameras_partner_and_with_evidence() -> None:
+    world = World()
+    without(world, "navcam_right")
+    result, steps = run(world, PointRequest(PositionTarget((4.0, 0.7, 0.0))))
+    assert result.pointings[0].motion_evidence["navcam_left"]["verdict"] == "seen"
+    (before,) = (step for step in steps if step.name == "before")
+    assert before.detail["missing"] == {"navcam_right": "navcam_right: unplugged"}
+
+
+def test_a_stale_picture_is_told_though_the_partner_does_not_answer() -> None:
+    world = World()
+    without(world, "navcam_right")
+    buffered(world)
+    error = refusal(world, PointRequest(PositionTarget((4.0, 0.7, 0.0))))
+    assert error.code == "bad_frame" and "that of before the move" in str(error)
+
+
+def test_an_aiming_camera_that_does_not_answer_before_the_move_moves_nothing() -> None:
+    world = World()
+    without(world, "navcam_left")
+    error = refusal(world, PointRequest(PositionTarget((4.0, 0.7, 0.0))))
+    assert (error.code, error.step) == ("no_reply", "before") and not world.moves
 
 
 def posed(camera: str, told: tuple[float, float], shown: tuple[float, float] | None = None) -> Posed:

@@ -58,6 +58,22 @@ def test_what_does_not_fit_is_dropped_and_counted_and_said_when_it_flows_again()
     assert b"again" in pipe.drain(b"again")
 
 
+def test_words_need_no_lock_of_the_handler_in_any_python(monkeypatch: pytest.MonkeyPatch) -> None:
+    def since_3_13(self: logging.Handler, record: logging.LogRecord) -> bool:
+        assert self.lock is not None, "'with None' is a TypeError in whoever logs"
+        with self.lock:
+            self.emit(record)
+        return True
+
+    monkeypatch.setattr(logging.Handler, "handle", since_3_13)
+    pipe = Pipe()
+    handler = QueuedHandler(QueuedWriter(pipe.write))
+    handler.addFilter(lambda record: record.msg != "left out")
+    for words in ("left out", "said"):
+        handler.handle(logging.makeLogRecord({"msg": words}))
+    assert pipe.drain(b"said") == b"said\n"
+
+
 def test_words_that_take_for_ever_to_be_made_hold_only_the_thread_that_writes() -> None:
     pipe, hang = Pipe(), Hang()
 

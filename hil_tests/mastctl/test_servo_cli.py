@@ -269,6 +269,72 @@ def test_a_test_after_one_that_was_killed_works_at_once(
     assert (table["torque_enable"], table["bus_watchdog"], table["goal_position"]) == (1, 0, 2048)
 
 
+@pytest.mark.parametrize("interrupted", ["torque_enable", "goal_pwm"])
+def test_a_second_ctrl_c_leaves_nothing_unrestored(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch, interrupted: str
+) -> None:
+    servo, link = bench.servos[0], quiet_link(bench)
+    before = dict(servo.table.values)
+    true_write, hits = link.write, iter([True])
+    restoring = False
+
+    def write(servo_id: int, register: Any, value: int) -> None:
+        if restoring and register.name == interrupted and next(hits, False):
+            raise KeyboardInterrupt
+        true_write(servo_id, register, value)
+
+    def step(*how: Any) -> Any:
+        nonlocal restoring
+        restoring = True
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(link, "write", write)
+    monkeypatch.setattr(workshop, "_step", step)
+    with pytest.raises(KeyboardInterrupt):
+        workshop.try_out(link, 1, math.radians(1), 30.0)
+    link.close()
+    for name in ("torque_enable", "profile_velocity", "profile_acceleration", "goal_pwm", "bus_watchdog"):
+        assert servo.table[name] == before[name], name
+
+
+def test_a_servo_that_ctrl_c_could_not_leave_as_it_was_is_told(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    link = quiet_link(bench)
+
+    def step(*how: Any) -> Any:
+        deaf_to(bench, monkeypatch, "torque_enable")
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(workshop, "_step", step)
+    words = "^interrupted; and servo 1 is not left as it was found in torque_enable: its torque may be on"
+    with pytest.raises(workshop.WrongDevice, match=words):
+        workshop.try_out(link, 1, math.radians(1), 30.0)
+    link.close()
+
+
+@pytest.mark.parametrize("lost", ["goal_pwm", "profile_velocity", "profile_acceleration"])
+def test_test_begins_only_when_it_is_certain_to_be_slow_and_weak(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch, lost: str
+) -> None:
+    servo, link = bench.servos[0], quiet_link(bench)
+    true_write, lose = link.write, iter([True])
+    at_torque: dict[str, int] = {}
+
+    def write(servo_id: int, register: Any, value: int) -> None:
+        if register.name == lost and next(lose, False):
+            return  # the instruction was lost, and a repeated answer to the last one taken for its own
+        if register.name == "torque_enable" and value:
+            at_torque.update(servo.table.values)
+        true_write(servo_id, register, value)
+
+    monkeypatch.setattr(link, "write", write)
+    workshop.try_out(link, 1, math.radians(1), 30.0)
+    link.close()
+    slow_and_weak = {"goal_pwm": 266, "profile_velocity": 8, "profile_acceleration": 3}  # 0.2 rad/s, 1 rad/s2
+    assert {name: at_torque[name] for name in slow_and_weak} == slow_and_weak
+
+
 def test_test_stops_at_its_fence(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
     # A servo that does not stand where it was sent: here one whose place is misread by 100 counts.
     link = Link(bench.line.path, int(BAUD))

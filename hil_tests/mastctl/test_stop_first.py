@@ -6,7 +6,7 @@ import contextlib
 import logging
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -15,10 +15,13 @@ import pytest
 from outside_daemon import BOUND_S
 from service_fakes import FakeHardware, Hang, ScriptedLoop, eventually, fake_daemon
 
+from drivers.clock import SystemClock
 from drivers.errors import DriverError
 from drivers.faults import FaultPanel
 from mastctl import operations as operations_module
 from mastctl.client import Client, ClientError
+from mastctl.errors import Stopped
+from mastctl.operations import Operation, Operations
 from mastctl.pointing.loop import PointingLoop
 from mastctl.service import stop_threads as stop_threads_module
 from mastctl.web import app as api_module
@@ -228,6 +231,66 @@ def test_nothing_starts_and_nothing_moves_while_a_stop_is_under_way(
         stopping.join()
         assert client.status()["state"] == "stopped"
         assert client.wait(client.point(pan_rad=0.1, tilt_rad=0.1))["state"] == "done"
+
+
+class ScriptedMover:
+    """What stops the mast: the first stop returns when ``first`` has, the others at once."""
+
+    def __init__(self, first: Callable[[], None]) -> None:
+        self._first = [first]
+
+    def stop(self) -> None:
+        if self._first:
+            self._first.pop()()
+
+    def block_moves(self, holder: object, reason: str) -> None: ...
+    def allow_moves(self, holder: object) -> None: ...
+
+
+def test_an_operation_that_ends_while_the_head_is_being_stopped_was_stopped_by_that() -> None:
+    go = threading.Event()
+
+    def refused(record: Any, cancelled: threading.Event) -> None:
+        assert go.wait(BOUND_S)
+        raise Stopped("a move was refused, since the mast is being stopped")
+
+    def until_it_has_ended() -> None:
+        go.set()
+        eventually(lambda: operations.motion.operation is None, "the operation's end", BOUND_S)
+
+    operations = Operations(ScriptedMover(until_it_has_ended), SystemClock())
+    name = operations.start({}, refused).id
+    assert operations.stop() == name
+    record = operations.get(name).told()
+    assert (record["state"], record["error"]["message"]) == ("stopped", "a stop was asked for")
+
+
+def test_an_operation_that_was_done_before_its_stop_is_not_told_as_stopped() -> None:
+    go = threading.Event()
+
+    def until_it_has_ended() -> None:
+        go.set()
+        eventually(lambda: operations.motion.operation is None, "the operation's end", BOUND_S)
+
+    operations = Operations(ScriptedMover(until_it_has_ended), SystemClock())
+    name = operations.start({}, lambda record, cancelled: go.wait(BOUND_S)).id
+    assert operations.stop() is None
+    assert operations.get(name).state == "done"
+
+
+def test_whoever_sees_a_record_that_has_ended_sees_no_operation_running() -> None:
+    operations = Operations(ScriptedMover(lambda: None), SystemClock())
+    seen: list[str | None] = []
+    keep = operations._keep
+
+    def keep_and_look(operation: Operation) -> None:
+        keep(operation)
+        if operation.ended_s is not None:
+            seen.append(operations.motion.operation)
+
+    operations._keep = keep_and_look  # type: ignore[method-assign]
+    operations.start({}, lambda record, cancelled: None)
+    eventually(lambda: seen == [None], "the end, seen as one")
 
 
 def waiting_pointing(client: Client, hardware: FakeHardware, hang: Hang) -> str:

@@ -305,6 +305,28 @@ def test_a_stop_that_failed_once_is_a_fault_until_a_move_was_taken_and_the_head_
     eventually(lambda: devices.faults() == (), "the end of the fault")
 
 
+def test_rest_after_a_move_of_before_the_stop_proves_nothing(
+    devices: Devices, hardware: FakeHardware
+) -> None:
+    def fail(name: str) -> None:
+        if name == "stop":
+            raise Refused("the servo refused")
+
+    hardware.head.moving = True
+    devices.move(0.2, 0.1)
+    hardware.head.hook = fail
+    with pytest.raises(Refused, match="the servo refused"):
+        devices.stop()
+    fault = one_fault(devices)
+    hardware.head.moving = False
+    since_s = time.monotonic()
+    eventually(lambda: time.monotonic() > since_s + 2 * devices_module.REST_S and devices.read(), "rest")
+    assert devices.faults() == (fault,)
+    hardware.head.hook = lambda name: None
+    devices.move(0.3, 0.1)
+    eventually(lambda: devices.faults() == (), "the end of the fault")
+
+
 def test_every_fault_says_what_takes_it_back(devices: Devices, hardware: FakeHardware) -> None:
     hardware.head.faults = ("tilt motor is hot",)
     devices.read()

@@ -15,7 +15,7 @@ import numpy as np
 
 from calib.mast.rig import Rig
 from calib.rigid import FloatArray
-from drivers.errors import DriverError, NoFreshFrame, NoReply
+from drivers.errors import DriverError, NoReply
 from drivers.interfaces import Camera, Frame, Reading
 from mastctl.cameras.sync_fit import REACH_S, CannotTell, Motion, OffsetFit, fit_offset
 from mastctl.cameras.sync_patches import Patches, choose_patches
@@ -35,6 +35,8 @@ READ_EVERY_S = 0.005
 REST_S = REACH_S + 0.4  # before the picture at rest: also one that is stamped too new shows the rest
 ARRIVE_S = 10.0
 FRAME_TIMEOUT_S = 5.0
+GRACE_S = 1.0  # beyond it a driver that should have answered hangs
+END_S = FRAME_TIMEOUT_S + GRACE_S  # a driver that is still at work at the end is left to itself
 LOST_FRAMES = 3
 
 
@@ -126,22 +128,26 @@ class Sweep:
         for side in (-1, 1):
             self._limits.check(start.pan_rad + side * plan.amplitude_rad, start.tilt_rad)
         self._limits.speed(plan.speed_rad_per_s)
-        threads = [threading.Thread(target=self._watch, args=(name,), daemon=True) for name in self._cameras]
+        threads = [
+            threading.Thread(target=self._watch, args=(name, start, plan), daemon=True)
+            for name in self._cameras
+        ]
         try:
             self._rest(start)
-            self._choose(start, plan)
             for thread in threads:
                 thread.start()
-            self._to_and_fro(start, plan)
-            self._go(start.pan_rad, start.tilt_rad, plan.speed_rad_per_s)
+            self._wait_for_choices()
+            if self._to_and_fro(start, plan):
+                self._go(start.pan_rad, start.tilt_rad, plan.speed_rad_per_s)
         except BaseException:
             self._devices.stop()
             raise
         finally:
             self._over.set()
+            end_s = time.monotonic() + END_S
             for thread in threads:
                 if thread.ident is not None:
-                    thread.join(FRAME_TIMEOUT_S + 1.0)
+                    thread.join(max(0.0, end_s - time.monotonic()))
 
     def fit(self, camera: str) -> OffsetFit:
         """Return a camera's offset to the joint readings. Raises CannotTell."""
@@ -188,29 +194,25 @@ class Sweep:
                 raise NoReply("the head does not come to rest", device="pan_tilt")
             self._pause()
 
-    def _choose(self, start: Reading, plan: SweepPlan) -> None:
-        """Take each camera's picture at rest and choose what to follow in it."""
-        for name, camera in self._cameras.items():
-            seen = self.seen[name]
-            try:
-                frame = camera.next_frame(time.monotonic(), FRAME_TIMEOUT_S)
-                joints_rad = (start.pan_rad, start.tilt_rad)
-                seen.patches = choose_patches(frame.image, self._rig, name, joints_rad, plan.amplitude_rad)
-            except (DriverError, MastctlError) as error:
-                seen.failure = str(error)
-            except Exception as error:  # somebody else's driver may raise what it likes
-                seen.failure = f"its driver failed in next_frame: {type(error).__name__}: {error}"
-            self._check_stop()
-
-    def _to_and_fro(self, start: Reading, plan: SweepPlan) -> None:
-        until_s = time.monotonic() + plan.seconds
-        way, side = 0, 1
-        while time.monotonic() < until_s:
-            speed = plan.speed_rad_per_s * SPEEDS[way % len(SPEEDS)]
-            self._go(start.pan_rad + side * plan.amplitude_rad, start.tilt_rad, speed)
-            way, side = way + 1, -side
-            if all(seen.failure for seen in self.seen.values()):
+    def _wait_for_choices(self) -> None:
+        """Wait until for each camera patches are chosen or it is known why not."""
+        until_s = time.monotonic() + FRAME_TIMEOUT_S + GRACE_S
+        while waiting := [one for one in self.seen.values() if one.patches is None and not one.failure]:
+            if time.monotonic() > until_s:
+                for seen in waiting:
+                    seen.failure = "its driver did not come back from next_frame in time"
                 return
+            self._pause()
+
+    def _to_and_fro(self, start: Reading, plan: SweepPlan) -> int:
+        """Turn for the plan's time, and return how many ways that made: no more than any camera sees."""
+        until_s = time.monotonic() + plan.seconds
+        ways, side = 0, 1
+        while time.monotonic() < until_s and not all(seen.failure for seen in self.seen.values()):
+            speed = plan.speed_rad_per_s * SPEEDS[ways % len(SPEEDS)]
+            self._go(start.pan_rad + side * plan.amplitude_rad, start.tilt_rad, speed)
+            ways, side = ways + 1, -side
+        return ways
 
     def _go(self, pan_rad: float, tilt_rad: float, speed_rad_per_s: float) -> None:
         """Go there, and take readings down until the head stands."""
@@ -225,12 +227,28 @@ class Sweep:
                 raise NoReply(f"the head does not come to pan {pan_rad:.3f} rad", device="pan_tilt")
             self._pause()
 
-    def _watch(self, name: str) -> None:
-        """In a thread of its own: take a camera's frames and find the patches in them."""
+    def _choose(self, name: str, start: Reading, plan: SweepPlan) -> Patches:
+        """Take a camera's picture at rest and choose what to follow in it."""
+        frame = self._cameras[name].next_frame(time.monotonic(), FRAME_TIMEOUT_S)
+        joints_rad = (start.pan_rad, start.tilt_rad)
+        return choose_patches(frame.image, self._rig, name, joints_rad, plan.amplitude_rad)
+
+    def _watch(self, name: str, start: Reading, plan: SweepPlan) -> None:
+        """In a thread of its own: choose patches of a picture at rest, and find them in what comes."""
         seen, camera = self.seen[name], self._cameras[name]
-        patches = seen.patches
+        try:
+            patches = self._choose(name, start, plan)
+        except (DriverError, MastctlError) as error:
+            seen.failure = str(error)
+            return
+        except Exception as error:  # somebody else's driver may raise what it likes
+            seen.failure = f"its driver failed in next_frame: {type(error).__name__}: {error}"
+            return
+        if seen.failure:  # it took too long: the head may be turning already
+            return
+        seen.patches = patches
         lost, after_s = 0, time.monotonic()
-        while patches is not None and not self._over.is_set():
+        while not self._over.is_set():
             try:
                 frame = camera.next_frame(after_s, FRAME_TIMEOUT_S)
                 self._take(seen, patches, frame)
@@ -238,7 +256,7 @@ class Sweep:
             except Exception as error:  # somebody else's driver may raise what it likes
                 lost += 1
                 if lost == LOST_FRAMES and not self._over.is_set():
-                    known = isinstance(error, (NoFreshFrame, DriverError))
+                    known = isinstance(error, DriverError)
                     seen.failure = str(error) if known else f"{type(error).__name__}: {error}"
                     return
                 self._over.wait(0.05)

@@ -10,6 +10,7 @@ from contextlib import contextmanager
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
+from mastctl import signals
 from mastctl.cli import output
 from mastctl.cli.output import positive_number
 
@@ -105,8 +106,7 @@ def _ending_signals() -> Iterator[threading.Event]:
     if threading.current_thread() is not threading.main_thread():
         yield stop
         return
-    signals = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-    before = {number: signal.signal(number, lambda *ignored: stop.set()) for number in signals}
+    before = {number: signal.signal(number, lambda *ignored: stop.set()) for number in signals.wanted()}
     try:
         yield stop
     finally:

@@ -130,7 +130,8 @@ class Devices:
         self._blocks: dict[object, str] = {}  # who lets no move out, and why
         self._closed = False
         self._last_faults: tuple[str, ...] = ()
-        self._moved_s = math.inf  # when the last move was taken, until the head was read at rest after it
+        # The last move's ticket and when it was taken, until the head was read at rest after it.
+        self._moved: tuple[int, float] | None = None
         self._camera_threads = {name: self._thread_of(name) for name in self._cameras}
         if rig is not None:
             self._check_sizes()
@@ -199,7 +200,7 @@ class Devices:
             speed = self._limits.speed(speed_rad_per_s)
             self._history.move_sent(self._clock.now_s())
             self._pan_tilt.move(float(pan_rad), float(tilt_rad), speed)
-            self._moved_s = time.monotonic()
+            self._moved = ticket, time.monotonic()
 
         self._head.call("move", send, MOVE_TIMEOUT_S)
 
@@ -413,9 +414,11 @@ class Devices:
         if reading.faults != self._last_faults:
             self._last_faults = tuple(reading.faults)
             log.warning("%s reports: %s", HEAD, "; ".join(reading.faults) or "healthy again")
-        if not reading.moving and time.monotonic() - self._moved_s > REST_S:
-            self._moved_s = math.inf
-            self._stops.proved()
+        if self._moved is not None and not reading.moving:
+            ticket, moved_s = self._moved
+            if time.monotonic() - moved_s > REST_S:
+                self._moved = None
+                self._stops.proved(ticket)
         return reading
 
     def _thread_of(self, camera: str) -> DeviceThread:

@@ -100,10 +100,11 @@ class Stops:
             if self._late_s < asked_s:
                 self._fault = None
 
-    def proved(self) -> None:
-        """Take back what was wrong with earlier stops: a later move was taken and the head rests."""
+    def proved(self, ticket: int) -> None:
+        """Take back what earlier stops left: the move of a later ticket was taken, and the head rests."""
         with self._changed:
-            self._fault = None
+            if ticket == self._asked:
+                self._fault = None
 
     def faults(self) -> tuple[Fault, ...]:
         """Return what is wrong with the stops at this moment; takes no lock."""

@@ -276,7 +276,7 @@ class _Run:
             detail.update(chosen=_told(best))
         self._range_m = best.range_m
         eyes = [name for name in (aim.camera, self._eyes.partner(aim.camera)) if name is not None]
-        self._steps.before(eyes, (best.pan_rad, best.tilt_rad))
+        self._steps.before(eyes, (best.pan_rad, best.tilt_rad), needed=(aim.camera,))
         return (best.pan_rad, best.tilt_rad), self._steps.go(best.pan_rad, best.tilt_rad, aim.camera)
 
     def _pointing(self, commanded: Pair, now: View, aim_px: FloatArray, seen: PatchMatch | None) -> Pointing:

@@ -12,6 +12,7 @@ from typing import Any, ParamSpec, Protocol, TypeVar
 from calib.mast.rig import Rig
 from calib.rigid import FloatArray
 from drivers.clock import Clock
+from drivers.errors import DriverError
 from drivers.interfaces import Reading
 from mastctl.devices.limits import Limits
 from mastctl.pointing.abandoned import result_unless
@@ -179,14 +180,20 @@ class Steps:
         return settled
 
     def before(
-        self, cameras: Sequence[str], goal_rad: tuple[float, float], timeout_s: float | None = None
+        self,
+        cameras: Sequence[str],
+        goal_rad: tuple[float, float],
+        needed: Sequence[str] = (),
+        timeout_s: float | None = None,
     ) -> None:
         """Take pictures to compare with after a move, where there are none yet and they will tell something.
+
+        A camera that gives none is left out, and named in the record, unless it is ``needed``.
 
         Raises
         ------
         PointingError, DriverError
-            If none comes; nothing has moved.
+            If a needed one gives none, or the head does not answer; nothing has moved.
         """
         configured = self._devices.newest_frames()
         here = self.head.read()
@@ -196,10 +203,20 @@ class Steps:
         if not lacking:
             return
         with self.step("before") as detail:
-            began_s = self._clock.now_s()
-            views = self.unless_stopped(self.eyes.new, lacking, began_s, self.head.resting(), timeout_s)
-            detail.update(frame_ids=[view.frame.frame_id for view in views.values()])
-            self._motion_seen.remember(views)
+            began_s, resting, missing = self._clock.now_s(), self.head.resting(), dict[str, str]()
+            while asked := [name for name in lacking if name not in missing]:
+                try:
+                    views = self.unless_stopped(self.eyes.new, asked, began_s, resting, timeout_s)
+                except DriverError as error:
+                    if error.device not in asked or error.device in needed:
+                        raise
+                    missing[error.device] = " ".join(str(error).split())
+                    continue
+                detail.update(frame_ids=[view.frame.frame_id for view in views.values()])
+                self._motion_seen.remember(views)
+                break
+            if missing:
+                detail.update(missing=missing)
 
     def look(self, cameras: Sequence[str], settled: Reading) -> dict[str, View]:
         """Take new pictures, exposed after the head had settled, that moved as the head did.

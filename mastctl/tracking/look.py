@@ -298,12 +298,8 @@ class Looker:
         if choice.pan_rad is None or choice.tilt_rad is None:
             return self._steps.rest()
         eyes = self._rig.stereo[choice.pair]
-        try:
-            self._steps.before(eyes, (choice.pan_rad, choice.tilt_rad), BEFORE_TIMEOUT_S)
-        except DriverError as error:  # whether it comes after the move is what counts
-            if error.device not in eyes:
-                raise
-        return self._steps.go(choice.pan_rad, choice.tilt_rad, self._rig.stereo[choice.pair][0])
+        self._steps.before(eyes, (choice.pan_rad, choice.tilt_rad), timeout_s=BEFORE_TIMEOUT_S)
+        return self._steps.go(choice.pan_rad, choice.tilt_rad, eyes[0])
 
     def _pictures(self, eyes: tuple[str, str], settled: Reading) -> tuple[dict[str, View], dict[str, str]]:
         """New pictures, left first, and why an eye has none. Raises PointingError, the head's DriverError."""
