@@ -80,7 +80,7 @@ def through_devices(folder: Path, port: str, head: Any) -> Path:
         "acceleration_rad_per_s2": head.pan.acceleration_rad_per_s2, **axes,
         # One busy processor draws the pictures, simulates the servos and computes: answers may take longer
         # than on a line, and silence of the host does not mean that it is gone.
-        "reply_timeout_s": 0.5, "watchdog_s": 0,
+        "reply_timeout_s": 0.3, "watchdog_s": 0,
     }  # fmt: skip
     controls = {
         "loop_video": True,  # the HDMI cable from the output to this input
