@@ -1,0 +1,146 @@
+"""Places of a module where one small change can be made, and the change.
+
+A change is what a slip of the keyboard could be: an operator beside the right one, a condition turned round,
+a call left out, a number one off, a sign lost. Words, annotations and what only logs are left alone: no test
+is asked to watch them.
+"""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+COMPARISONS: dict[type[ast.cmpop], type[ast.cmpop]] = {
+    ast.Lt: ast.LtE,
+    ast.LtE: ast.Lt,
+    ast.Gt: ast.GtE,
+    ast.GtE: ast.Gt,
+    ast.Eq: ast.NotEq,
+    ast.NotEq: ast.Eq,
+    ast.Is: ast.IsNot,
+    ast.IsNot: ast.Is,
+    ast.In: ast.NotIn,
+    ast.NotIn: ast.In,
+}
+OPERATORS: dict[type[ast.operator], type[ast.operator]] = {
+    ast.Add: ast.Sub,
+    ast.Sub: ast.Add,
+    ast.Mult: ast.Div,
+    ast.Div: ast.Mult,
+    ast.MatMult: ast.Mult,
+    ast.FloorDiv: ast.Mult,
+    ast.Mod: ast.FloorDiv,
+    ast.BitAnd: ast.BitOr,
+    ast.BitOr: ast.BitAnd,
+    ast.LShift: ast.RShift,
+    ast.RShift: ast.LShift,
+}
+ONLY_TELLS = frozenset({"debug", "info", "warning", "error", "exception"})  # calls of a logger
+
+
+@dataclass(frozen=True)
+class Site:
+    """One possible change.
+
+    Attributes
+    ----------
+    file
+        The module, relative to the checkout.
+    line, column, end_line, end_column
+        What is replaced: lines from 1, columns in bytes from 0, as in `ast`.
+    kind
+        The sort of change.
+    text
+        What takes its place.
+    """
+
+    file: str
+    line: int
+    column: int
+    end_line: int
+    end_column: int
+    kind: str
+    text: str
+
+    def applied(self, source: str) -> str:
+        """Return the module's text with this change made."""
+        lines = source.encode().splitlines(keepends=True)
+        before = b"".join(lines[: self.line - 1]) + lines[self.line - 1][: self.column]
+        after = lines[self.end_line - 1][self.end_column :] + b"".join(lines[self.end_line :])
+        return (before + self.text.encode() + after).decode()
+
+    def told(self, source: str) -> str:
+        """Return the place, what stands there, and what would."""
+        old = " ".join(self._old(source).split())
+        return f"{self.file}:{self.line}  {self.kind}: {old}  ->  {self.text}"
+
+    def _old(self, source: str) -> str:
+        lines = source.encode().splitlines(keepends=True)
+        if self.line == self.end_line:
+            return lines[self.line - 1][self.column : self.end_column].decode()
+        parts = [lines[self.line - 1][self.column :], *lines[self.line : self.end_line - 1]]
+        return b"".join([*parts, lines[self.end_line - 1][: self.end_column]]).decode()
+
+
+def sites(repository: Path, file: str) -> list[Site]:
+    """Return every possible change of one module, in the order of its text."""
+    tree = ast.parse((repository / file).read_text())
+    found = [
+        Site(file, node.lineno, node.col_offset, node.end_lineno, node.end_col_offset, kind, text)
+        for node, kind, text in _changes(tree)
+        if node.end_lineno is not None and node.end_col_offset is not None
+    ]
+    return sorted(found, key=lambda site: (site.line, site.column, site.kind))
+
+
+def _changes(tree: ast.Module) -> Iterator[tuple[ast.expr | ast.stmt, str, str]]:
+    """Each node that can be changed, with the change."""
+    for node in _code(tree):
+        if isinstance(node, ast.Compare) and type(node.ops[0]) in COMPARISONS:
+            ops = [COMPARISONS[type(node.ops[0])](), *node.ops[1:]]
+            yield node, "comparison", _text(ast.Compare(node.left, ops, node.comparators))
+        elif isinstance(node, ast.BinOp) and type(node.op) in OPERATORS and not _words(node):
+            yield node, "operator", _text(ast.BinOp(node.left, OPERATORS[type(node.op)](), node.right))
+        elif isinstance(node, ast.UnaryOp) and isinstance(node.op, ast.USub):
+            yield node, "sign", _text(node.operand)
+        elif isinstance(node, ast.BoolOp):
+            other = ast.Or() if isinstance(node.op, ast.And) else ast.And()
+            yield node, "and, or", _text(ast.BoolOp(other, node.values))
+        elif isinstance(node, ast.Constant) and type(node.value) in (int, float):
+            yield node, "number", repr(node.value + 1)
+        elif isinstance(node, ast.Expr) and isinstance(node.value, ast.Call) and not _tells(node.value):
+            yield node, "call dropped", "pass"
+        if isinstance(node, (ast.If, ast.While, ast.IfExp)):
+            yield node.test, "condition", _text(ast.UnaryOp(ast.Not(), node.test))
+
+
+def _code(node: ast.AST) -> Iterator[ast.AST]:
+    """What runs and decides: neither annotations nor words nor what a logger or an error is told."""
+    yield node
+    for name, value in ast.iter_fields(node):
+        if name in ("annotation", "returns", "decorator_list", "type_params"):
+            continue
+        if isinstance(node, ast.Raise) or (isinstance(node, ast.Call) and _tells(node)):
+            continue
+        for child in value if isinstance(value, list) else [value]:
+            if isinstance(child, ast.AST) and not isinstance(child, ast.JoinedStr):
+                yield from _code(child)
+
+
+def _tells(call: ast.Call) -> bool:
+    return isinstance(call.func, ast.Attribute) and call.func.attr in ONLY_TELLS
+
+
+def _words(node: ast.BinOp) -> bool:
+    """Whether an operator joins texts, or types (``int | None``)."""
+    return any(
+        isinstance(side, ast.JoinedStr)
+        or (isinstance(side, ast.Constant) and not isinstance(side.value, (int, float)))
+        for side in (node.left, node.right)
+    )
+
+
+def _text(node: ast.expr) -> str:
+    return f"({ast.unparse(node)})"
