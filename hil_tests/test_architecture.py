@@ -1,0 +1,80 @@
+"""The house as docs/architecture.md tells it: files that are there, tools that answer, a true picture."""
+
+from __future__ import annotations
+
+import re
+import runpy
+import sys
+from pathlib import Path
+
+import pytest
+
+from tools.rooms import PACKAGES, drawn, read_package
+
+TOOLS = sorted(
+    {
+        f"{family}.{name}"
+        for family, names in {
+            "benchmarks": ("camera", "geometry", "render", "servo", "stop"),
+            "against_others": ("calibration", "trackers"),
+            "campaigns": (
+                "coverage", "dots", "fuzz_readers", "fuzz_servo", "handoff", "motion", "pointing", "refine",
+                "render_bias", "servo", "stop",
+            ),
+            "flight": ("validation", "real_handoff"),
+            "simulated": ("survey", "mast"),
+        }.items()
+        for name in names
+    }
+    | {"rooms", "mutants", "closed_loop"}
+)  # fmt: skip
+
+
+def page(repository: Path) -> str:
+    return (repository / "docs" / "architecture.md").read_text()
+
+
+def test_every_file_that_the_page_names_is_there(repository: Path) -> None:
+    named = set(re.findall(r"`((?:[a-z_]+/)+[a-z_]+\.py)`", page(repository)))
+    assert len(named) > 20
+    for file in named:
+        places = [repository / file, repository / "mastctl" / file]
+        assert any(place.is_file() for place in places), file
+
+
+def test_the_page_lists_every_tool(repository: Path) -> None:
+    listed = page(repository).partition("## The tools")[2]
+    for tool in TOOLS:
+        family, _, name = tool.rpartition(".")
+        assert f"`{tool}`" in listed or (family in listed and f"`.{name}`" in listed), tool
+
+
+def test_the_list_of_tools_is_the_folders(repository: Path) -> None:
+    commands = {
+        ".".join(file.relative_to(repository / "tools").with_suffix("").parts).removesuffix(".__main__")
+        for file in (repository / "tools").rglob("*.py")
+        if 'if __name__ == "__main__"' in file.read_text() and "argparse" in file.read_text()
+    }
+    workers = {"closed_loop.run", "against_others.mrcal_fit", "benchmarks.mrcal_worker"}
+    assert commands - workers == set(TOOLS)
+
+
+@pytest.mark.parametrize("tool", TOOLS)
+def test_every_tool_says_how_it_is_used(
+    tool: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(sys, "argv", [tool, "--help"])
+    with pytest.raises(SystemExit) as ended:
+        runpy.run_module(f"tools.{tool}", run_name="__main__")
+    assert ended.value.code == 0
+    assert capsys.readouterr().out.startswith("usage:")
+
+
+def test_no_room_imports_upwards_or_in_a_circle() -> None:
+    for name in PACKAGES:
+        assert read_package(name).circles == [], name
+
+
+def test_the_picture_of_the_rooms_is_the_one_of_the_code(repository: Path) -> None:
+    picture = (repository / "docs" / "img" / "rooms.svg").read_text()
+    assert picture == drawn([read_package(name) for name in PACKAGES]), "run python -m tools.rooms --svg"
