@@ -64,6 +64,7 @@ def test_every_tool_says_how_it_is_used(
     tool: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(sys, "argv", [tool, "--help"])
+    monkeypatch.delitem(sys.modules, f"tools.{tool}", raising=False)  # it is to run as its command does
     with pytest.raises(SystemExit) as ended:
         runpy.run_module(f"tools.{tool}", run_name="__main__")
     assert ended.value.code == 0
