@@ -97,7 +97,7 @@ def test_no_move_goes_out_while_an_old_stop_is_inside_the_driver(
         Stopped, match=r"a stop asked for \d+\.\d s ago has not come back from the driver yet"
     ):
         devices.move(0.5, 0.5)
-    assert "the head may still move" in one_fault(devices).message
+    eventually(lambda: "the head may still move" in one_fault(devices).message, "the first one overdue")
     with caplog.at_level(logging.WARNING):
         stops.let_go()
         eventually(lambda: "ended only now" in one_fault(devices).message, "the late stop told")
