@@ -9,6 +9,7 @@ from __future__ import annotations
 import importlib
 import logging
 import threading
+import time
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import wait
 from contextlib import contextmanager
@@ -45,6 +46,9 @@ OPENING_PATIENCE_S = 5.0
 
 CLOSING_PATIENCE_S = 0.5
 """After that the next device is closed beside one that is not closed yet."""
+
+CLOSING_S = 10.0
+"""Devices that are not closed by then are left behind, so that a driver that hangs holds no command's end."""
 
 HEAD_OPENING_S = 60.0
 """A head that takes longer to open is refused: without its readings nothing can be done."""
@@ -393,11 +397,14 @@ def _close(devices: Mapping[str, Any]) -> None:
         except BaseException:  # whatever a foreign driver raises, SystemExit too: there is only the log
             log.exception("%s did not close", name)
 
-    closing = []
+    until_s = time.monotonic() + CLOSING_S
+    closing = {}
     for name, device in devices.items():
         thread = threading.Thread(target=close, args=(name, device), name=f"closing {name}", daemon=True)
-        closing.append(thread)
+        closing[name] = thread
         thread.start()
         thread.join(CLOSING_PATIENCE_S)
-    for thread in closing:
-        thread.join()
+    for name, thread in closing.items():
+        thread.join(max(0.0, until_s - time.monotonic()))
+        if thread.is_alive():
+            log.error("%s is not closed yet and is left behind", name)

@@ -294,7 +294,12 @@ class Operations:
         return list(self._records.values())[::-1]
 
     def close(self) -> None:
-        """Take no more, stop the mast and what runs, and wait some seconds for it to end; never raises."""
+        """Take no more, stop the mast and what runs, and wait some seconds for it to end; never raises.
+
+        The second time nothing is done: the devices may be closed by then.
+        """
+        if self._closed:
+            return
         self._closed = True
         self._mover.block_moves(self, CLOSING)
         self._stop_unasked("as the service closes")

@@ -15,7 +15,7 @@ which joints with play make themselves, and a picture of another moment of the s
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Literal
 
@@ -98,10 +98,10 @@ class ShownView:
     ----------
     verdict
         ``seen``: the told one. ``small_move``: the told one, but the way is so small that the picture of
-        before would pass too. ``contradicted``: another one. ``unlike``: nothing of what the earlier picture
-        shows, though much of it should be there. ``too_plain``: too little texture, or a pattern that fits
-        both views. ``no_overlap``: the told view shares too little with the earlier one, and the picture
-        shows none of it either.
+        before would pass too, or that the shown view is as near to the one before. ``contradicted``: another
+        one. ``unlike``: nothing of what the earlier picture shows, though much of it should be there.
+        ``too_plain``: too little texture, or a pattern that fits both views. ``no_overlap``: the told view
+        shares too little with the earlier one, and the picture shows none of it either.
     pan_rad, tilt_rad
         The shown view; not-a-number if none was found.
     off_rad
@@ -384,6 +384,9 @@ def shown_view(
                 if rival is not None and rival.agreeing >= 0.8 * fit.agreeing:
                     stayed = np.abs(rival.angles_rad - before.angles_rad) <= limits.floor_rad
                     if stayed.all():
+                        # The same match, between the two views: the head played back. Else a pattern.
+                        if (np.abs(rival.angles_rad - fit.angles_rad) <= limits.floor_rad / 2).all():
+                            return replace(told_view, verdict="small_move")
                         return ShownView("too_plain", expected=fit.expected, agreeing=fit.agreeing)
             return told_view
     known = inside if overlaps else every.some(_spread(np.arange(len(every.places))))

@@ -97,7 +97,8 @@ _REGISTERS = """
 """
 FIRST_RAM_ADDRESS = 64
 
-# A reply does not say which register it is of, but its length does if no two of these have the same one. Each
+# A reply does not say which register it is of, but its length does if no two have the same one: here only
+# torque and goal PWM, and shutdown and bus watchdog, which are never asked for one after the other. Each
 # window holds registers only that every servo of the table has, without gaps, which servos may refuse. The
 # registers around the counter (realtime_tick) are read together with it.
 #   X/MX address, bytes   what stands there

@@ -132,14 +132,14 @@ class Servo:
             If it does not answer.
         """
         model = self._settings.model
-        pinged = self._pinged()
-        if pinged.model_number != model.number:
-            other = MODELS_BY_NUMBER.get(pinged.model_number)
-            found = f"a {other.name}" if other else f"of the unknown model number {pinged.model_number}"
+        number, firmware = self._model_and_firmware()
+        if number != model.number:
+            other = MODELS_BY_NUMBER.get(number)
+            found = f"a {other.name}" if other else f"of the unknown model number {number}"
             raise WrongDevice(f"{self.name} is {found}, the configuration says {model.name}")
-        if self._head.watchdog_s > 0 and pinged.firmware < model.watchdog_firmware:
+        if self._head.watchdog_s > 0 and firmware < model.watchdog_firmware:
             raise WrongDevice(
-                f"{self.name} has firmware {pinged.firmware}; the bus watchdog needs "
+                f"{self.name} has firmware {firmware}; the bus watchdog needs "
                 f"{model.watchdog_firmware} or newer: update it, or set watchdog_s: 0 and do without"
             )
         level = self._registers["status_return_level"]
@@ -149,6 +149,18 @@ class Servo:
             answering = False
         if not answering:
             self._link.write_unanswered(self._settings.servo_id, level, FULL_STATUS_RETURN)
+
+    def _model_and_firmware(self) -> tuple[int, int]:
+        """Who it is, by its registers; only who does not answer that is asked by a ping.
+
+        A ping's reply is as long as one that holds the hardware error: it is not to be under way then.
+        """
+        try:
+            held = self.get_all("model_number", "firmware")
+        except (NoReply, Refused):
+            pinged = self._pinged()
+            return pinged.model_number, pinged.firmware
+        return held["model_number"], held["firmware"]
 
     def _pinged(self) -> Pinged:
         """Who answers a ping, twice in a row and around a silence: a servo may answer nothing else yet."""
@@ -188,7 +200,7 @@ class Servo:
         until_s = time.monotonic() + REBOOT_S
         while True:
             try:
-                self._pinged()
+                self.get("model_number")
                 return
             except (NoReply, BadReply):
                 if time.monotonic() > until_s:

@@ -191,7 +191,9 @@ class Session:
         """
         failed = self._stop_each()
         for axis in self.pair.axes:
-            if axis not in failed and axis.settings.at_stop == "torque_off" and axis.motion.holds:
+            if axis in failed or axis.settings.at_stop != "torque_off":
+                continue
+            if axis.motion.holds or not axis.hardware_error:  # a move that was broken off may have taken hold
                 try:
                     axis.let_go()
                 except DriverError as error:

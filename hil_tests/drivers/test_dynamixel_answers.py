@@ -6,11 +6,14 @@ order of the bytes is set by hand, so that nothing depends on how quick the mach
 
 from __future__ import annotations
 
+import time
 from collections import deque
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
+from functools import partial
 
 import pytest
+from dynamixel_rig import failed, until
 
 from drivers.clock import SystemClock
 from drivers.dynamixel.head import open_head
@@ -21,7 +24,7 @@ from drivers.sim.pan_tilt import AxisSettings
 from drivers.sim.wire.axis import WireAxis
 from drivers.sim.wire.dynamixel_bus import DynamixelBus
 from drivers.sim.wire.dynamixel_packets import unstuffed
-from drivers.sim.wire.dynamixel_servo import SimulatedServo
+from drivers.sim.wire.dynamixel_servo import VOLTAGE, SimulatedServo
 from drivers.sim.wire.line import PtyLine, Reply
 
 COUNT_RAD = 2 * 3.141592653589793 / 4096
@@ -105,11 +108,12 @@ class Servos:
         ]
         self.reboots = 0
         for servo in self.servos:
-            servo.reboot = self._counted  # type: ignore[method-assign]
+            servo.reboot = partial(self._counted, servo)  # type: ignore[method-assign]
         self.bus = DynamixelBus(self.servos)
 
-    def _counted(self, time_s: float) -> None:
+    def _counted(self, servo: SimulatedServo, time_s: float) -> None:
         self.reboots += 1
+        SimulatedServo.reboot(servo, time_s)
 
     def options(self, path: str, **changes: object) -> dict[str, object]:
         ends = [
@@ -159,6 +163,22 @@ def test_a_head_whose_every_answer_comes_questions_late_is_not_opened(lag: int) 
     with it.line(HoldingBack(it.bus, lag)) as line, pytest.raises(DriverError):
         open_head(it.options(line.path, reply_timeout_s=0.02)).close()
     assert it.reboots == 0
+
+
+@pytest.mark.parametrize("lag", [1, 2, 3])
+def test_a_servo_that_is_rebooted_for_an_error_is_taken_for_no_other_and_has_no_other(lag: int) -> None:
+    it = Servos()
+    with it.line(Repeating(it.bus, lag)) as line:
+        head = open_head(it.options(line.path))
+        told = set()
+        it.servos[0].raise_error(VOLTAGE)
+        until(lambda: failed(head), "the error")
+        while (error := failed(head)) is not None:
+            told.add(str(error))
+            time.sleep(0.002)
+        head.close()
+    assert all("hardware error 0x01" in words for words in told), told
+    assert it.reboots == 1
 
 
 def test_what_was_lost_is_not_filled_in_from_another_moment() -> None:

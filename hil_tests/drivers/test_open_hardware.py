@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from drivers import open_hardware as open_hardware_module
 from drivers.clock import ManualClock
 from drivers.errors import BadOptions, DriverError, LineLost, NoReply
 from drivers.interfaces import Frame, Reading
@@ -333,6 +334,28 @@ def test_a_v4l2_camera_that_is_not_plugged_in_is_absent(outside: None, tmp_path:
         with pytest.raises(DriverError, match=r"cam_left: absent since the start: .*video0") as caught:
             hardware.cameras["cam_left"].next_frame(0.0, 0.1)
         assert caught.value.code == "no_camera"
+
+
+def test_a_head_that_hangs_while_it_is_closed_keeps_no_refusal_of_a_camera(
+    outside: None, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    go = threading.Event()
+
+    class Slow(Head):
+        def close(self) -> None:
+            go.wait(30.0)
+
+    monkeypatch.setattr(open_hardware_module, "CLOSING_S", 0.1)
+    monkeypatch.setattr(sys.modules["outside_drivers"], "Slow", Slow, raising=False)
+    settings = HardwareSettings(
+        DeviceSettings("outside_drivers:Slow"), {"cam_left": DeviceSettings("outside_drivers:nothing")}
+    )
+    began_s = time.monotonic()
+    with pytest.raises(BadOptions, match="has no 'nothing'"):
+        open_hardware(settings)
+    assert time.monotonic() - began_s < 15.0
+    assert "pan_tilt is not closed yet and is left behind" in caplog.text
+    go.set()
 
 
 def test_a_head_that_hangs_while_it_is_closed_keeps_no_camera_open() -> None:

@@ -87,7 +87,9 @@ def test_the_driver_comes_back_without_moving(
     with PtyLine(bus, clock) as line:
         options: dict[str, Any] = {
             "port": line.path,
-            "reply_timeout_s": 0.15,
+            "reply_timeout_s": 0.3,
+            "watchdog_s": 0.4,
+            "acceleration_rad_per_s2": 15.0,
             "pan": {"id": 1, "model": "XM430-W350", "limits_rad": [-2, 2]},
             "tilt": {"id": 2, "model": "XM430-W350", "limits_rad": [-1, 1]},
         }

@@ -237,7 +237,7 @@ def test_a_pattern_that_repeats_with_the_move_is_said_to_be_too_plain() -> None:
     pattern = np.tile(np.kron(tile, np.ones((4, 4), np.uint8)), (10, 13))[: SIZE_PX[1], : SIZE_PX[0]]
     world.image = lambda camera, number, image: pattern.copy()
     result, _ = run(world, PointRequest(PositionTarget((4.0, 0.02, 0.0))))
-    assert result.pointings[0].motion_evidence["navcam_left"]["verdict"] != "seen"
+    assert result.pointings[0].motion_evidence["navcam_left"]["verdict"] == "too_plain"
 
 
 def test_a_picture_out_of_reach_of_the_one_before_says_that_nothing_is_shared() -> None:
@@ -325,6 +325,14 @@ def test_the_view_is_told_to_a_fraction_of_a_milliradian() -> None:
         assert (seen.pan_rad, seen.tilt_rad) == pytest.approx(shown, abs=4e-4)
         assert seen.agreeing >= 0.8 * seen.expected
         assert max(seen.sigma_rad) < 4e-4
+
+
+@pytest.mark.parametrize("played_rad", [0.003, 0.0044])
+def test_a_small_move_of_which_play_took_half_is_small_and_not_too_plain(played_rad: float) -> None:
+    before, beside = (posed(name, (0.0, -0.45)) for name in ("navcam_left", "navcam_right"))
+    after = posed("navcam_left", (0.009, -0.45), (0.009 - played_rad, -0.45))
+    seen = shown_view(rig(), "navcam_left", before, after, ("navcam_right", beside))
+    assert seen.verdict == "small_move" and seen.off_rad[0] == pytest.approx(-played_rad, abs=4e-4)
 
 
 def test_one_eye_alone_tells_as_much_as_unknown_ranges_leave() -> None:

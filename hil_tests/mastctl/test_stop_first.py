@@ -278,6 +278,16 @@ def test_an_operation_that_was_done_before_its_stop_is_not_told_as_stopped() -> 
     assert operations.get(name).state == "done"
 
 
+def test_closing_twice_asks_the_head_once() -> None:
+    stops: list[str] = []
+    mover = ScriptedMover(lambda: stops.append("first"))
+    operations = Operations(mover, SystemClock())
+    operations.close()
+    mover.stop = lambda: stops.append("again, of devices that may be closed by now")  # type: ignore[method-assign]
+    operations.close()
+    assert stops == ["first"]
+
+
 def test_whoever_sees_a_record_that_has_ended_sees_no_operation_running() -> None:
     operations = Operations(ScriptedMover(lambda: None), SystemClock())
     seen: list[str | None] = []

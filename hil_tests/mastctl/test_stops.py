@@ -97,7 +97,7 @@ def test_no_move_goes_out_while_an_old_stop_is_inside_the_driver(
         Stopped, match=r"a stop asked for \d+\.\d s ago has not come back from the driver yet"
     ):
         devices.move(0.5, 0.5)
-    assert "the head may still move" in one_fault(devices).message
+    eventually(lambda: "the head may still move" in one_fault(devices).message, "the first one overdue")
     with caplog.at_level(logging.WARNING):
         stops.let_go()
         eventually(lambda: "ended only now" in one_fault(devices).message, "the late stop told")
@@ -173,6 +173,29 @@ def test_a_stop_is_confirmed_by_an_earlier_one_that_comes_back(
     for asker in askers:
         asker.join(BUSY_MACHINE_S)
     assert len(done) == 5
+
+
+def test_a_stop_behind_one_that_was_confirmed_is_overdue_by_its_own_time_only(
+    devices: Devices, hardware: FakeHardware
+) -> None:
+    hangs = [Hang(), Hang()]
+    left = list(hangs)
+    hardware.head.hook = lambda name: left.pop(0)() if name == "stop" and left else None
+    askers = [threading.Thread(target=devices.stop) for _ in range(2)]
+    askers[0].start()
+    assert hangs[0].entered.wait(BUSY_MACHINE_S)
+    askers[1].start()
+    eventually(lambda: devices._stops._queued_s is not None, "the second one queued")
+    hangs[0].let_go()
+    for asker in askers:
+        asker.join(BUSY_MACHINE_S)
+    assert hangs[1].entered.wait(BUSY_MACHINE_S)
+    (inside,) = devices._stops._inside
+    waited_s = inside.began_s - inside.asked_s
+    assert waited_s > 0.0
+    assert devices._stops._overdue(inside.began_s + DEADLINE_S - waited_s / 2) == ""
+    assert "has not come back" in devices._stops._overdue(inside.began_s + DEADLINE_S)
+    hangs[1].let_go()
 
 
 def test_stops_repeated_into_a_hanging_driver_pile_up_neither_threads_nor_calls(

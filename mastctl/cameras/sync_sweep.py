@@ -6,6 +6,7 @@ to find out. The head goes through `mastctl.devices.devices`, so that limits and
 
 from __future__ import annotations
 
+import math
 import threading
 import time
 from collections.abc import Mapping, Sequence
@@ -38,6 +39,7 @@ FRAME_TIMEOUT_S = 5.0
 GRACE_S = 1.0  # beyond it a driver that should have answered hangs
 END_S = FRAME_TIMEOUT_S + GRACE_S  # a driver that is still at work at the end is left to itself
 LOST_FRAMES = 3
+LATEST_S = 2.0  # from a frame's exposure to its coming, beside what its stamps may be off
 
 
 @dataclass(frozen=True)
@@ -56,8 +58,19 @@ class Seen:
     patches: Patches | None = None
     stamps_s: list[float] = field(default_factory=list)
     places_px: list[FloatArray] = field(default_factory=list)
+    came_after_s: float = math.inf  # the least time from a stamp to the moment its frame came
     uncertainty_s: float = 0.0
     failure: str = ""
+
+    def check_clock(self) -> None:
+        """Refuse stamps far from when frames came: rounds of a sweep look alike. Raises CannotTell."""
+        if -REACH_S <= self.came_after_s <= REACH_S + LATEST_S:
+            return
+        side = "earlier" if self.came_after_s > 0 else "later"
+        raise CannotTell(
+            f"its stamps are {abs(self.came_after_s):.1f} s {side} than the moments at which its frames "
+            "came; seconds of CLOCK_MONOTONIC are expected"
+        )
 
 
 def plan_sweep(
@@ -156,6 +169,7 @@ class Sweep:
             raise CannotTell(seen.failure)
         if seen.patches is None or not seen.stamps_s:
             raise CannotTell("it gave no picture while the head turned")
+        seen.check_clock()
         motion = Motion(
             np.array([reading.time_s for reading in self._readings]),
             np.array([reading.pan_rad for reading in self._readings]),
@@ -263,6 +277,7 @@ class Sweep:
 
     def _take(self, seen: Seen, patches: Patches, frame: Frame) -> None:
         stamp_s = float(frame.mid_exposure_s)
+        seen.came_after_s = min(seen.came_after_s, time.monotonic() - stamp_s)
         if seen.stamps_s and stamp_s <= seen.stamps_s[-1]:
             self._over.wait(0.002)  # the same one again
             return

@@ -203,7 +203,12 @@ class Stops:
 
     def _overdue(self, now_s: float) -> str:
         """Say which stop has not come back in time; empty if none."""
-        waiting_s = [one.asked_s for one in tuple(self._inside) if now_s >= one.asked_s + self._overdue_s]
+        good_s = self._good_s  # who asked before that has been answered, by another stop
+        waiting_s = [
+            one.asked_s
+            for one in tuple(self._inside)
+            if now_s >= (one.began_s if one.asked_s <= good_s else one.asked_s) + self._overdue_s
+        ]
         return self._told(min(waiting_s), now_s) if waiting_s else ""
 
     @staticmethod
