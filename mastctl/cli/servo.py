@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import math
-import signal
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
@@ -94,20 +93,6 @@ def _line(args: argparse.Namespace) -> Iterator[Link]:
         yield link
     finally:
         link.close()
-
-
-@contextmanager
-def _signals_interrupt() -> Iterator[None]:
-    """SIGTERM and a closed terminal end a trial as Ctrl-C does, so that the servo is left as it was found."""
-    before = {
-        number: signal.signal(number, signal.default_int_handler)
-        for number in (signal.SIGTERM, signal.SIGHUP)
-    }
-    try:
-        yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
 
 
 def _scan(args: argparse.Namespace) -> int:
@@ -204,7 +189,7 @@ def _test(args: argparse.Namespace) -> int:
         f"servo {args.id} is to turn {args.degrees:g} degrees to each side and back, at most "
         f"{args.torque_percent:g} % of its strength"
     )
-    with _line(args) as link, _signals_interrupt():
+    with _line(args) as link:
         trial = try_out(link, args.id, math.radians(args.degrees), args.torque_percent)
     count_deg = math.degrees(trial.count_rad)
     worst = max(abs(step.left_counts) for step in trial.steps)
