@@ -2,12 +2,25 @@
 
 from __future__ import annotations
 
+import signal
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
 
 REPOSITORY = Path(__file__).resolve().parent.parent
 SHARED_DATA = REPOSITORY.parent / "shared" / "data"
+
+# Whoever runs the tests may ignore signals, as nohup does and a shell for what it puts into the background;
+# that is inherited, and would make daemons and commands under test ignore them too.
+with suppress(ValueError):  # not the main thread
+    for _number, _usual in (
+        (signal.SIGHUP, signal.SIG_DFL),
+        (signal.SIGQUIT, signal.SIG_DFL),
+        (signal.SIGINT, signal.default_int_handler),
+    ):
+        if signal.getsignal(_number) is signal.SIG_IGN:
+            signal.signal(_number, _usual)
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:

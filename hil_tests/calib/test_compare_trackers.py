@@ -102,7 +102,7 @@ def test_ours_is_held_against_the_best_of_those_that_keep_targets() -> None:
 
 
 def test_without_opencv_contrib_the_worker_says_so(repository: Path) -> None:
-    worker = repository / "tools" / "contrib_tracker.py"
+    worker = repository / "tools" / "against_others" / "contrib_tracker.py"
     done = subprocess.run(
         [sys.executable, str(worker), "NoSuchTracker", "41"], capture_output=True, text=True, check=False
     )

@@ -5,12 +5,11 @@ from __future__ import annotations
 import contextlib
 import fcntl
 import os
-import signal
 import socket
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -18,7 +17,6 @@ from typing import Any
 from service_fakes import CONFIG, eventually, rig
 
 from calib.files.mast_file import save_rig
-from mastctl import signals
 from mastctl.client import Client, ClientError
 
 BOUND_S = 60.0  # only ends a failing test
@@ -90,22 +88,13 @@ def daemon_process(
     *,
     stdout: Any = subprocess.PIPE,
     stderr: Any = subprocess.PIPE,
-    ignored: Collection[signal.Signals] = (),
-    prepare: Callable[[], None] = lambda: None,
+    prepare: Callable[[], object] = lambda: None,
 ) -> Iterator[subprocess.Popen[str]]:
-    """A daemon in a process of its own, which ignores only the signals named: whoever runs the tests may
-    ignore some, as nohup does, and that is inherited.
-    """
-
-    def begin() -> None:
-        for number in signals.ENDING:
-            signal.signal(number, signal.SIG_IGN if number in ignored else signal.SIG_DFL)
-        prepare()
-
+    """A daemon in a process of its own, on the devices above."""
     environment = {**os.environ, "PYTHONPATH": str(folder)}
     command = [sys.executable, "-m", "mastctl", "run", "--config", str(config)]
     with subprocess.Popen(
-        command, stdout=stdout, stderr=stderr, text=True, env=environment, cwd=folder, preexec_fn=begin
+        command, stdout=stdout, stderr=stderr, text=True, env=environment, cwd=folder, preexec_fn=prepare
     ) as made:
         try:
             yield made

@@ -214,7 +214,7 @@ def test_stamps_of_another_clock_are_told_as_that(
 @pytest.fixture
 def soon(package: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A camera's driver that does not come back is given up soon."""
-    from mastctl.camera_sync import sweep
+    from mastctl.cameras import sync_sweep as sweep
 
     monkeypatch.setattr(sweep, "FRAME_TIMEOUT_S", 0.5)
     monkeypatch.setattr(sweep, "GRACE_S", 0.5)
@@ -236,10 +236,10 @@ def test_nothing_moves_where_no_camera_gives_a_picture(
 ) -> None:
     file = config(package, repository, {"navcam_left": {"make": "Hanging"}})
     moves: list[tuple[object, ...]] = []
-    import mastctl.devices
+    from mastctl.devices.devices import Devices
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(mastctl.devices.Devices, "move", lambda self, *goal: moves.append(goal))
+        patch.setattr(Devices, "move", lambda self, *goal: moves.append(goal))
         code, told = sync(capsys, "--config", file, "--seconds", "10")
     assert code == 1 and "did not come back" in told["cameras"]["navcam_left"]["failure"]
     assert not moves
@@ -248,7 +248,7 @@ def test_nothing_moves_where_no_camera_gives_a_picture(
 def test_a_signal_ends_it_while_a_cameras_driver_hangs(
     package: Path, repository: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from mastctl.camera_sync import sweep
+    from mastctl.cameras import sync_sweep as sweep
 
     monkeypatch.setattr(sweep, "FRAME_TIMEOUT_S", 300.0)
     monkeypatch.setattr(sweep, "END_S", 0.5)

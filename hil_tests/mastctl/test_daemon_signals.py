@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -52,7 +53,8 @@ def test_a_signal_that_ends_stops_the_mast_first(tmp_path: Path, name: str) -> N
 
 
 def test_a_closed_terminal_is_survived_where_nohup_asked_for_it(tmp_path: Path) -> None:
-    with daemon_process(tmp_path, write_config(tmp_path), ignored=[signal.SIGHUP]) as daemon:
+    ignore = partial(signal.signal, signal.SIGHUP, signal.SIG_IGN)
+    with daemon_process(tmp_path, write_config(tmp_path), prepare=ignore) as daemon:
         url = line(daemon)
         daemon.send_signal(signal.SIGHUP)
         with Client(url) as client:

@@ -13,7 +13,7 @@ import pytest
 from service_fakes import FakeHardware, Hang, eventually, rig
 
 from drivers.clock import SystemClock
-from drivers.errors import DriverError, NoReply, Refused
+from drivers.errors import DriverError, LineLost, NoReply, Refused
 from drivers.interfaces import Reading
 from mastctl.devices import devices as devices_module
 from mastctl.devices.devices import Devices
@@ -324,6 +324,25 @@ def test_a_stop_that_failed_once_is_a_fault_until_a_move_was_taken_and_the_head_
     devices.move(0.2, 0.1)
     devices.read()
     assert devices.faults() == (fault,)
+    hardware.head.moving = False
+    eventually(lambda: devices.faults() == (), "the end of the fault")
+
+
+def test_a_stop_that_a_lost_line_kept_back_is_a_fault_until_the_head_is_read_at_rest(
+    devices: Devices, hardware: FakeHardware
+) -> None:
+    def lose(name: str) -> None:
+        raise LineLost("the line hung up")
+
+    hardware.head.moving = True
+    devices.read()
+    hardware.head.hook = lose
+    with pytest.raises(LineLost):
+        devices.stop()
+    hardware.head.hook = lambda name: None
+    devices.read()
+    assert "the head may still move" in one_fault(devices).message
+    assert one_fault(devices).until == "the line is back and the head rests, or a stop is confirmed"
     hardware.head.moving = False
     eventually(lambda: devices.faults() == (), "the end of the fault")
 

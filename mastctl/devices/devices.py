@@ -23,7 +23,7 @@ import numpy as np
 from calib.mast.rig import Rig
 from drivers.absent_camera import AbsentCamera
 from drivers.clock import Clock
-from drivers.errors import BadFrame, BadReply, DriverError, NoFreshFrame, NoReply
+from drivers.errors import BadFrame, BadReply, DriverError, LineLost, NoFreshFrame, NoReply
 from drivers.interfaces import (
     AxisReport,
     Camera,
@@ -132,6 +132,7 @@ class Devices:
         self._last_faults: tuple[str, ...] = ()
         # The last move's ticket and when it was taken, until the head was read at rest after it.
         self._moved: tuple[int, float] | None = None
+        self._stop_lost = False  # a lost line kept a stop from the head, which was not read at rest since
         self._camera_threads = {name: self._thread_of(name) for name in self._cameras}
         if rig is not None:
             self._check_sizes()
@@ -213,7 +214,11 @@ class Devices:
         NoReply, DriverError
             If the head did not confirm within 1 s; it may still move.
         """
-        self._stops.send(STOP_TIMEOUT_S)
+        try:
+            self._stops.send(STOP_TIMEOUT_S)
+        except LineLost:
+            self._stop_lost = True
+            raise
 
     def block_moves(self, holder: object, reason: str) -> None:
         """Refuse every further move, with this reason, until the holder (any key) allows them again."""
@@ -414,6 +419,9 @@ class Devices:
         if reading.faults != self._last_faults:
             self._last_faults = tuple(reading.faults)
             log.warning("%s reports: %s", HEAD, "; ".join(reading.faults) or "healthy again")
+        if self._stop_lost and not reading.moving:
+            self._stop_lost = False
+            self._stops.rests()
         if self._moved is not None and not reading.moving:
             ticket, moved_s = self._moved
             if time.monotonic() - moved_s > REST_S:

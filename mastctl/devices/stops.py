@@ -11,7 +11,7 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-from drivers.errors import DriverError, NoReply
+from drivers.errors import DriverError, LineLost, NoReply
 from mastctl.devices.thread import DeviceThread, Fault, log
 from mastctl.errors import MastctlError, Stopped
 
@@ -19,6 +19,7 @@ PATIENCE_S = 0.05  # how long a stop waits for the head's own thread before it g
 LATEST_SHARE = 1 / 8  # of the time that a head hangs already: a new stop waits no longer for its own way
 MAY_MOVE = "the head may still move"
 UNTIL = "a stop is confirmed, or a later move is taken and the head then rests"
+UNTIL_LINE = "the line is back and the head rests, or a stop is confirmed"
 
 
 @dataclass(frozen=True)
@@ -94,7 +95,8 @@ class Stops:
             words = str(error) if MAY_MOVE in str(error) else f"{error}; {MAY_MOVE}"
             with self._changed:
                 since_s = asked_s if self._fault is None else self._fault.since_s
-                self._fault = Fault(self._device, error.code, words, since_s, UNTIL)
+                until = UNTIL_LINE if error.code == LineLost.code else UNTIL
+                self._fault = Fault(self._device, error.code, words, since_s, until)
             raise
         with self._changed:
             if self._late_s < asked_s:
@@ -105,6 +107,14 @@ class Stops:
         with self._changed:
             if ticket == self._asked:
                 self._fault = None
+
+    def rests(self) -> None:
+        """Take back a stop that a lost line kept from the head: the head was read, and rests."""
+        fault = self._fault
+        if fault is not None and fault.until == UNTIL_LINE:
+            with self._changed:
+                if self._fault is fault:
+                    self._fault = None
 
     def faults(self) -> tuple[Fault, ...]:
         """Return what is wrong with the stops at this moment; takes no lock."""
