@@ -76,6 +76,13 @@ def rot_z(angle_rad: float) -> FloatArray:
     return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 
 
+def tangents(axis: FloatArray) -> FloatArray:
+    """Return two unit vectors (2, 3) that make right-handed axes with a unit vector (3,), the third."""
+    across = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))])
+    across /= math.sqrt(float(across @ across))
+    return np.array([across, np.cross(axis, across)])
+
+
 NO_ROTATION = 1e-6
 """How far R Rᵀ may be from the identity: a label's six digits make a part of it."""
 

@@ -13,12 +13,12 @@ from dataclasses import replace
 import numpy as np
 
 from calib.camera.cahvor import CameraModel
-from calib.camera.parameters import parameter_names, parameter_part, tangents
+from calib.camera.parameters import parameter_names, parameter_part
 from calib.handoff.body_pose import BodyPose
 from calib.mast.covariance import RigCovariance
 from calib.mast.rig import Rig
 from calib.mast.rig_rates import click_rates, pixel_rates
-from calib.rigid import FloatArray, rigid_rates
+from calib.rigid import FloatArray, rigid_rates, tangents
 
 
 def corrected_rig(rig: Rig, correction: BodyPose) -> Rig:

@@ -21,7 +21,7 @@ from handed_over import (
 from scipy.spatial.transform import Rotation
 
 from calib.camera.cahvor import CameraModel
-from calib.camera.parameters import parameter_names, parameter_part, tangents
+from calib.camera.parameters import parameter_names, parameter_part
 from calib.errors import NoCorrection
 from calib.files.mast_file import load_rig
 from calib.handoff.body_pose import PRIOR_SHIFT_M, PRIOR_TURN_RAD, BodyPose
@@ -30,6 +30,7 @@ from calib.handoff.corrected_rig import corrected_covariance, corrected_rig
 from calib.handoff.fit_body_pose import fit_body_pose
 from calib.mast.covariance import RigCovariance, moved_rig
 from calib.mast.rig import Rig
+from calib.rigid import tangents
 
 TURN_RAD = np.array([0.001, 0.005, -0.002])
 SHIFT_M = np.array([0.003, -0.002, 0.001])
