@@ -1,7 +1,8 @@
 """Rotations and rigid transforms.
 
 A transform is named ``b_from_a`` and maps coordinates in frame a to coordinates in frame b, so inner
-names touch in a product: ``c_from_a = c_from_b @ b_from_a``. Quaternions are (w, x, y, z).
+names touch in a product: ``c_from_a = c_from_b @ b_from_a``. Quaternions are (w, x, y, z). The six numbers of
+a small motion are a turn, then a shift (docs/conventions.md).
 """
 
 from __future__ import annotations
@@ -73,6 +74,13 @@ def rot_z(angle_rad: float) -> FloatArray:
     """Return the (3, 3) right-handed rotation about z."""
     c, s = np.cos(angle_rad), np.sin(angle_rad)
     return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+
+
+def tangents(axis: FloatArray) -> FloatArray:
+    """Return two unit vectors (2, 3) that make right-handed axes with a unit vector (3,), the third."""
+    across = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))])
+    across /= math.sqrt(float(across @ across))
+    return np.array([across, np.cross(axis, across)])
 
 
 NO_ROTATION = 1e-6
@@ -158,15 +166,13 @@ def _off_rotation(matrix: FloatArray) -> float:
 def carried_covariance(covariance: FloatArray, now_from_then: Rigid) -> FloatArray:
     """Return a motion's covariance (6, 6), stated in one frame, along the axes and at the origin of another.
 
-    Small rotation, then translation. A rotation error r and a translation error t of then move a point x of
-    now by R r x (x - p) + R t. What comes back is exactly symmetric and has no negative variance.
+    A turn r and a shift t of then move a point x of now by R r x (x - p) + R t. What comes back is exactly
+    symmetric and has no negative variance.
     """
     turn, shift = now_from_then.rotation, now_from_then.translation_m
-    x, y, z = shift
-    across = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
     carried = np.zeros((6, 6))
     carried[:3, :3] = carried[3:, 3:] = turn
-    carried[3:, :3] = across @ turn
+    carried[3:, :3] = np.cross(shift, turn.T).T
     moved = carried @ covariance @ carried.T
     moved = (moved + moved.T) / 2
     # A variance of nothing may come out of the product as -1e-20.
@@ -175,15 +181,18 @@ def carried_covariance(covariance: FloatArray, now_from_then: Rigid) -> FloatArr
 
 
 def moved_rigid(pose: Rigid, step: FloatArray) -> Rigid:
-    """Return a pose shifted by step[:3] and turned by the rotation vector step[3:] about its origin."""
+    """Return a pose turned by the rotation vector step[:3] about its origin and shifted by step[3:]."""
     from scipy.spatial.transform import Rotation  # slow to load, and a command on files needs no fit
 
-    turned = Rotation.from_rotvec(step[3:]).as_matrix() @ pose.rotation
-    return Rigid(turned, pose.translation_m + step[:3])
+    turned = Rotation.from_rotvec(step[:3]).as_matrix() @ pose.rotation
+    return Rigid(turned, pose.translation_m + step[3:])
 
 
 def rigid_rates(per_point: FloatArray, points_m: FloatArray, origin_m: FloatArray) -> FloatArray:
-    """Return (n, m, 6): rates of something per point (n, m, 3) for a shift and a turn about ``origin_m``."""
+    """Return (n, m, 6): rates of something per point (n, m, 3) for a turn about ``origin_m`` and a shift.
+
+    With ``np.eye(3)[None]`` for ``per_point`` they are those of the points (n, 3) themselves.
+    """
     arm = points_m - origin_m
     moment = np.cross(arm[:, None, :], per_point)
-    return np.concatenate([np.broadcast_to(per_point, moment.shape), moment], axis=2)
+    return np.concatenate([moment, np.broadcast_to(per_point, moment.shape)], axis=2)

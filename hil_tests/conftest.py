@@ -33,6 +33,14 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     )
 
 
+LONG = ("test_on_a_real_driver", "test_closed_loop", "test_bench_suite", "test_packaging", "test_camera_sync")
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Put the few files that take longest first: none of them is to begin when all others have ended."""
+    items.sort(key=lambda item: item.path.stem not in LONG)
+
+
 @pytest.fixture(scope="session")
 def repository() -> Path:
     """The checkout that holds these tests."""

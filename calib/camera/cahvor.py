@@ -21,7 +21,7 @@ from numpy.typing import ArrayLike
 from calib.camera.lens import Lens
 from calib.camera.projection import Place, Projection
 from calib.camera.published import project_as_published
-from calib.rigid import FloatArray, ReadOnlyArrays, Rigid, frozen_array
+from calib.rigid import FloatArray, ReadOnlyArrays, Rigid, frozen_array, tangents
 
 Kind = Literal["CAHV", "CAHVOR", "CAHVORE"]
 
@@ -119,7 +119,7 @@ class CameraModel(ReadOnlyArrays):
         lengths = np.sqrt(np.einsum("ij,ij->i", hva, hva))
         if not lengths.all() or not abs(np.linalg.det(hva / lengths[:, None])) > _FLAT:
             raise ValueError("H, V and A lie in one plane where three directions are expected")
-        axes = _axes_around(self.O)
+        axes = np.array([*tangents(self.O), self.O])
         self._set("_rows", np.array([self.C, *hva, *axes]))
         self._rows.setflags(write=False)
         self._set("_projection", self._make_projection(hva @ axes.T))
@@ -333,13 +333,6 @@ def _as_rows(values: ArrayLike, width: int, what: str) -> FloatArray:
     if array.ndim == 0 or array.shape[-1] != width:
         raise ValueError(f"{what} of shape {array.shape} where (..., {width}) is expected")
     return array
-
-
-def _axes_around(o: FloatArray) -> FloatArray:
-    """Return a right-handed set of axes, as rows, whose last is the unit vector ``o``."""
-    across = np.cross(o, np.eye(3)[np.argmin(np.abs(o))])
-    across /= sqrt(float(across @ across))
-    return np.array([across, np.cross(o, across), o])
 
 
 def _largest_slope(size_px: tuple[int, int], slope_from_pixel: FloatArray) -> float:

@@ -23,7 +23,7 @@ from calib.camera.cahvor import CameraModel, Kind
 from calib.camera.entrance import ray_angle
 from calib.camera.lens import TINY, Lens
 from calib.camera.lens_arrays import bend
-from calib.rigid import FloatArray
+from calib.rigid import FloatArray, tangents
 
 _LETTERS = {
     "C": ("C.x", "C.y", "C.z"),
@@ -59,13 +59,6 @@ def parameter_part(kind: Kind, letter: str) -> slice:
             return slice(start, start + size)
         start += size
     raise KeyError(letter)
-
-
-def tangents(axis: FloatArray) -> FloatArray:
-    """Return two unit vectors (2, 3) at right angles to a unit vector (3,) and to each other."""
-    across = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))])
-    across /= np.linalg.norm(across)
-    return np.stack([across, np.cross(axis, across)])
 
 
 def stepped(model: CameraModel, step: FloatArray) -> CameraModel:

@@ -8,9 +8,10 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from calib.camera.cahvor import CameraModel
 from calib.errors import NoStereoPoint
@@ -18,6 +19,8 @@ from calib.rigid import FloatArray, ReadOnlyArrays, finite_float, frozen_array
 
 PARALLEL_RAD = 1e-9
 """Rays that meet under a smaller angle are parallel: rounding alone would place the point."""
+
+SIDES = ("left", "right")
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,6 +55,42 @@ class Triangulation(ReadOnlyArrays):
     gap_m_per_px: FloatArray
 
 
+@dataclass(frozen=True, eq=False)
+class Triangulations(ReadOnlyArrays):
+    """Many points seen by two cameras, by `triangulate` on arrays; read-only.
+
+    Attributes
+    ----------
+    position_m, covariance_m2, ray_gap_m, ranges_m
+        (..., 3), (..., 3, 3), (...) and (..., 2) as those of `Triangulation`, the ranges left and right;
+        not-a-number where there is no point.
+    refused
+        (...) of text: empty where there is a point, else the code of `calib.errors.NoStereoPoint`.
+    """
+
+    position_m: FloatArray
+    covariance_m2: FloatArray
+    ray_gap_m: FloatArray
+    ranges_m: FloatArray
+    refused: NDArray[np.str_]
+
+
+class _Meeting(NamedTuple):
+    """Where n pairs of rays come nearest: sines (n,) of their angles, ranges (n, 2), gaps (n, 3).
+
+    has_ray (2, n) of the left and the right pixels; positions (n, 3) with rates (n, 3, 4) and gap rates
+    (n, 4) to (left x, left y, right x, right y). Parallel rays and missing ones leave rows that mean nothing.
+    """
+
+    has_ray: NDArray[np.bool_]
+    sines: FloatArray
+    ranges_m: FloatArray
+    gaps_m: FloatArray
+    positions_m: FloatArray
+    rates_m_per_px: FloatArray
+    gap_m_per_px: FloatArray
+
+
 def triangulate(
     left: CameraModel,
     right: CameraModel,
@@ -66,9 +105,15 @@ def triangulate(
     left, right
         Camera models in one common frame; the result is in that frame.
     left_px, right_px
-        (2,) pixel (x, y) of the point in each image.
+        (2,) pixel (x, y) of the point in each image; or (..., 2) many of them, broadcast.
     sigma_px
         One-sigma noise of each pixel coordinate, independent in both axes and both images.
+
+    Returns
+    -------
+    Triangulation
+        For arrays of more than one axis what ``triangulate_many`` returns, which says so to a type checker
+        too.
 
     Raises
     ------
@@ -90,67 +135,165 @@ def triangulate(
     >>> round(float(seen.position_m[0]), 6), round(float(seen.covariance_m2[0, 0]) ** 0.5, 6)
     (5.0, 0.353553)
     """
-    if finite_float("sigma_px", sigma_px) < 0.0:
-        raise ValueError(f"sigma_px is {sigma_px} where 0 or more is expected")
-    origins = np.empty((2, 3))
-    directions = np.empty((2, 3))
-    d_origins = np.empty((2, 3, 2))
-    d_directions = np.empty((2, 3, 2))
-    for eye, (side, model, pixel) in enumerate((("left", left, left_px), ("right", right, right_px))):
-        xy = np.asarray(pixel, dtype=np.float64)
+    _check_sigma(sigma_px)
+    pixels = [np.asarray(pixel, dtype=np.float64) for pixel in (left_px, right_px)]
+    if max(xy.ndim for xy in pixels) > 1:
+        return triangulate_many(  # type: ignore[return-value]  # a type checker cannot tell the shapes apart
+            left, right, pixels[0], pixels[1], sigma_px
+        )
+    for side, xy in zip(SIDES, pixels, strict=True):
         if xy.shape != (2,) or not np.isfinite(xy).all():
             raise NoStereoPoint("bad_pixel", f"{side} pixel {xy.tolist()} is not two finite numbers")
-        rays, d_directions[eye], d_origins[eye] = model.ray_jacobian(xy)
-        if not rays.valid:
+    seen = _meeting(left, right, pixels[0][None], pixels[1][None])
+    for side, model, xy, has_ray in zip(SIDES, (left, right), pixels, seen.has_ray, strict=True):
+        if not has_ray[0]:
             raise NoStereoPoint(
                 "bad_pixel", f"{side} pixel {xy.tolist()} has no ray in this {model.kind} camera"
             )
-        origins[eye], directions[eye] = rays.origins_m, rays.directions
-
-    # The common normal's feet o1 + s1 d1 and o2 + s2 d2: the gap between them is perpendicular to d1 and d2.
-    (d1, d2), between = directions, origins[0] - origins[1]
-    cosine = float(d1 @ d2)
-    normal = np.cross(d1, d2)
-    sine = float(np.linalg.norm(normal))
+    sine, (s1, s2) = float(seen.sines[0]), seen.ranges_m[0].tolist()
     if sine < PARALLEL_RAD:
         raise NoStereoPoint(
             "parallel_rays", f"the two rays are parallel to {sine:.2g} rad: no point where they meet"
         )
-    solve_ranges = np.array([[-1.0, cosine], [-cosine, 1.0]]) / (sine * sine)
-    s1, s2 = solve_ranges @ np.array([d1 @ between, d2 @ between])
     if not (s1 > 0.0 and s2 > 0.0):
         raise NoStereoPoint(
             "behind_camera",
             f"the two rays diverge: they come nearest {s1:.4g} m along the left "
             f"and {s2:.4g} m along the right one, and both must be ahead",
         )
-    foot1, foot2 = origins + np.array([[s1], [s2]]) * directions
-    gap = foot1 - foot2
+    jacobian, gap = seen.rates_m_per_px[0], seen.gaps_m[0]
+    return Triangulation(
+        position_m=frozen_array(seen.positions_m[0], (3,)),
+        covariance_m2=frozen_array(sigma_px * sigma_px * (jacobian @ jacobian.T), (3, 3)),
+        ray_gap_m=math.sqrt(float(gap @ gap)),
+        ranges_m=(s1, s2),
+        rates_m_per_px=frozen_array(jacobian, (3, 4)),
+        gap_m_per_px=frozen_array(seen.gap_m_per_px[0], (4,)),
+    )
+
+
+def triangulate_many(
+    left: CameraModel,
+    right: CameraModel,
+    left_px: ArrayLike,
+    right_px: ArrayLike,
+    sigma_px: float = 0.2,
+) -> Triangulations:
+    """Return the points seen at many pixels of two cameras, each as ``triangulate`` gives it alone.
+
+    A pair of pixels without a point does not stop the others: ``refused`` has its code.
+
+    Parameters
+    ----------
+    left, right, sigma_px
+        As ``triangulate``.
+    left_px, right_px
+        (..., 2) pixels (x, y) of the points in each image, broadcast.
+
+    Raises
+    ------
+    NoStereoPoint
+        ``bad_pixel``: arrays of another shape, or that do not go together.
+    ValueError
+        If the sigma is negative or not finite.
+    """
+    _check_sigma(sigma_px)
+    pixels = [np.asarray(pixel, dtype=np.float64) for pixel in (left_px, right_px)]
+    for side, xy in zip(SIDES, pixels, strict=True):
+        if xy.ndim == 0 or xy.shape[-1] != 2:
+            raise NoStereoPoint("bad_pixel", f"{side} pixels of shape {xy.shape} where (..., 2) is expected")
+    try:
+        both = np.broadcast_arrays(*pixels)
+    except ValueError:
+        raise NoStereoPoint(
+            "bad_pixel",
+            f"left pixels of shape {pixels[0].shape} and right pixels of shape {pixels[1].shape} "
+            "do not go together",
+        ) from None
+    shape = both[0].shape[:-1]
+    seen = _meeting(left, right, both[0].reshape(-1, 2), both[1].reshape(-1, 2))
+    refused = np.select(
+        [~seen.has_ray.all(axis=0), seen.sines < PARALLEL_RAD, ~(seen.ranges_m > 0.0).all(axis=1)],
+        ["bad_pixel", "parallel_rays", "behind_camera"],
+        "",
+    )
+    rates = seen.rates_m_per_px
+    arrays = (
+        seen.positions_m,
+        sigma_px * sigma_px * (rates @ rates.transpose(0, 2, 1)),
+        np.sqrt(_dot(seen.gaps_m, seen.gaps_m)),
+        seen.ranges_m,
+    )
+    for array in arrays:
+        array[refused != ""] = np.nan
+    position_m, covariance_m2, ray_gap_m, ranges_m = (a.reshape(*shape, *a.shape[1:]) for a in arrays)
+    refused = refused.reshape(shape)
+    for array in (position_m, covariance_m2, ray_gap_m, ranges_m, refused):
+        array.setflags(write=False)
+    return Triangulations(position_m, covariance_m2, ray_gap_m, ranges_m, refused)
+
+
+def _check_sigma(sigma_px: float) -> None:
+    if finite_float("sigma_px", sigma_px) < 0.0:
+        raise ValueError(f"sigma_px is {sigma_px} where 0 or more is expected")
+
+
+@np.errstate(all="ignore")
+def _meeting(left: CameraModel, right: CameraModel, left_px: FloatArray, right_px: FloatArray) -> _Meeting:
+    """Return where the rays of pixels (n, 2) of both cameras come nearest."""
+    rays1, turn1, shift1 = left.ray_jacobian(left_px)
+    rays2, turn2, shift2 = right.ray_jacobian(right_px)
+    d1, d2, between = rays1.directions, rays2.directions, rays1.origins_m - rays2.origins_m
+    # The common normal's feet o1 + s1 d1 and o2 + s2 d2: the gap between them is perpendicular to d1 and d2.
+    cosines, normals = _dot(d1, d2)[:, None], _cross(d1, d2)
+    sines = np.sqrt(_dot(normals, normals))
+    per_sine2 = (1.0 / (sines * sines))[:, None]
+    along1, along2 = _dot(d1, between)[:, None], _dot(d2, between)[:, None]
+    s1 = per_sine2 * (cosines * along2 - along1)
+    s2 = per_sine2 * (along2 - cosines * along1)
+    foot1, foot2 = rays1.origins_m + s1 * d1, rays2.origins_m + s2 * d2
+    gaps = foot1 - foot2
 
     # Derivatives to the four pixel coordinates (left x, y, right x, y): the feet with s1, s2 held, then
     # s1, s2 from d1·gap = d2·gap = 0, which the turned directions disturb as well.
-    none = np.zeros((3, 2))
-    d_foot1 = np.hstack([d_origins[0] + s1 * d_directions[0], none])
-    d_foot2 = np.hstack([none, d_origins[1] + s2 * d_directions[1]])
-    d_gap = d_foot1 - d_foot2
-    d_s1, d_s2 = solve_ranges @ np.array(
-        [
-            d1 @ d_gap + np.hstack([gap @ d_directions[0], [0.0, 0.0]]),
-            d2 @ d_gap + np.hstack([[0.0, 0.0], gap @ d_directions[1]]),
-        ]
-    )
+    d_feet = np.concatenate([shift1 + s1[..., None] * turn1, shift2 + s2[..., None] * turn2], axis=2)
+    d_gap = d_feet * [1.0, 1.0, -1.0, -1.0]
+    r1, r2 = _times(d1, d_gap), _times(d2, d_gap)
+    r1[:, :2] += _times(gaps, turn1)
+    r2[:, 2:] += _times(gaps, turn2)
+    d_s1 = per_sine2 * (cosines * r2 - r1)
+    d_s2 = per_sine2 * (r2 - cosines * r1)
+    d_feet += d1[:, :, None] * d_s1[:, None]
+    d_feet += d2[:, :, None] * d_s2[:, None]
     d_product = np.concatenate(
         [
-            normal @ d_origins[0] + np.cross(d2, between) @ d_directions[0],
-            -normal @ d_origins[1] + np.cross(between, d1) @ d_directions[1],
-        ]
+            _times(normals, shift1) + _times(_cross(d2, between), turn1),
+            _times(_cross(between, d1), turn2) - _times(normals, shift2),
+        ],
+        axis=1,
     )
-    jacobian = 0.5 * (d_foot1 + np.outer(d1, d_s1) + d_foot2 + np.outer(d2, d_s2))
-    return Triangulation(
-        position_m=frozen_array(0.5 * (foot1 + foot2), (3,)),
-        covariance_m2=frozen_array(sigma_px * sigma_px * (jacobian @ jacobian.T), (3, 3)),
-        ray_gap_m=math.sqrt(float(gap @ gap)),
-        ranges_m=(float(s1), float(s2)),
-        rates_m_per_px=frozen_array(jacobian, (3, 4)),
-        gap_m_per_px=frozen_array(d_product / sine, (4,)),
+    return _Meeting(
+        np.array([rays1.valid, rays2.valid]),
+        sines,
+        np.concatenate([s1, s2], axis=1),
+        gaps,
+        0.5 * (foot1 + foot2),
+        0.5 * d_feet,
+        d_product / sines[:, None],
     )
+
+
+def _dot(a: FloatArray, b: FloatArray) -> FloatArray:
+    """Dot products (n,) of vectors (n, 3)."""
+    return np.asarray(np.einsum("ni,ni->n", a, b))
+
+
+def _times(a: FloatArray, b: FloatArray) -> FloatArray:
+    """Products (n, k) of rows (n, 3) and matrices (n, 3, k)."""
+    return np.asarray((a[:, None] @ b)[:, 0])
+
+
+def _cross(a: FloatArray, b: FloatArray) -> FloatArray:
+    """Cross products (n, 3); NumPy's own takes three times as long for a single one."""
+    (ax, ay, az), (bx, by, bz) = a.T, b.T
+    return np.array([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx]).T

@@ -7,8 +7,8 @@ prisms and tapes (station), prisms from CAD and joint angles; each residual is d
 prisms' CAD positions define the rover frame.
 
 A residual of the station is taken in the rover frame: turning it does not change its size, since the
-station's sigma is the same for each axis. Rigid unknowns move by a shift (3, metres) and a turn (3, a
-rotation vector about the moved frame's own origin, applied from the left).
+station's sigma is the same for each axis. Rigid unknowns move by a turn (3, a rotation vector
+about the moved frame's own origin, applied from the left) and a shift (3, metres).
 
 Structure: an image touches one camera, one board, the mast and one attitude, so its Jacobian is a small
 dense block that is summed into the normal equations at once; these (some 300 unknowns) are solved densely.
@@ -106,7 +106,7 @@ class Adjustment:
         for name, model in start.cameras.items():
             self._add(("camera", name), [f"cameras.{name}.{p}" for p in parameter_names(model.kind)])
         self._add(MAST, [f"mast.{MAST_NAMES[i]}" for i in self.mast_free])
-        rigid = [*(f"shift_m.{a}" for a in "xyz"), *(f"turn_rad.{a}" for a in "xyz")]
+        rigid = [*(f"turn_rad.{a}" for a in "xyz"), *(f"shift_m.{a}" for a in "xyz")]
         for setup in start.rover_from_station:
             self._add(("setup", setup), [f"set-up {setup}.{p}" for p in rigid])
         for board in start.rover_from_board:

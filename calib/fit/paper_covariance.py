@@ -16,13 +16,13 @@ from typing import NamedTuple
 import numpy as np
 
 from calib.camera.cahvor import CameraModel
-from calib.camera.parameters import parameter_names, parameter_part, predict, stepped, tangents
+from calib.camera.parameters import parameter_names, parameter_part, predict, stepped
 from calib.fit.adjustment import MAST, Adjustment, Estimate
 from calib.fit.least_squares import covariance_of
 from calib.fit.terms import ImageTerm
 from calib.fit.usual_lens import lens_knowledge
 from calib.mast.gimbal import gimbal, gimbal_rates
-from calib.rigid import FloatArray, rigid_rates
+from calib.rigid import FloatArray, rigid_rates, tangents
 
 
 class _Block(NamedTuple):

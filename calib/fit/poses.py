@@ -49,7 +49,7 @@ round a Navcam's pixels by some 0.002."""
 WEAK = 1.0
 """One over the square of how far an unknown could be off at all: 1 m, 1 rad."""
 
-CAMERA_NAMES = (*(f"camera.shift_m.{a}" for a in "xyz"), *(f"camera.turn_rad.{a}" for a in "xyz"))
+CAMERA_NAMES = (*(f"camera.turn_rad.{a}" for a in "xyz"), *(f"camera.shift_m.{a}" for a in "xyz"))
 
 
 class PosesTooFew(CalibError):
@@ -69,7 +69,7 @@ class PoseFit:
     residuals
         For each given model, how far the fitted one is from it.
     parameter_names, covariance
-        (p,) ``mast.translation_m.x`` and so on, then the camera's shift and its turn about C in the head
+        (p,) ``mast.translation_m.x`` and so on, then the camera's turn about C and its shift in the head
         frame; and (p, p) of these, as the residuals show the models' errors to be.
     """
 

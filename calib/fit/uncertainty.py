@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from scipy.optimize import approx_fprime
 
-from calib.camera.parameters import parameter_part, tangents
+from calib.camera.parameters import parameter_part
 from calib.camera.stereo import triangulate
 from calib.errors import CalibError
 from calib.fit.adjustment import Adjustment
@@ -17,7 +17,7 @@ from calib.mast import covariance as rig_covariance
 from calib.mast.pointing import solve
 from calib.mast.rig import Rig
 from calib.mast.rig_rates import pixel_rates
-from calib.rigid import FloatArray
+from calib.rigid import FloatArray, tangents
 
 OPEN = 0.05
 """A direction is open if the data leave more than this part of how far it could be off at all (1 m, 1 rad,

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 
 from calib.camera.cahvor import CameraModel
-from calib.camera.parameters import parameter_names, parameter_part, tangents
+from calib.camera.parameters import parameter_names, parameter_part
 from calib.mast.rig import Rig
-from calib.rigid import FloatArray
+from calib.rigid import FloatArray, tangents
 
 O_SIGMA_RAD = 0.02
 R_SIGMA = (0.5, 1.0)

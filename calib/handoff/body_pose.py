@@ -16,8 +16,8 @@ PRIOR_SHIFT_M, PRIOR_TURN_RAD = 0.005, 0.005
 """Sigma an axis of how far two prism set-ups disagree: the paper's 5 mrad (2 mm at prisms 40 to 60 cm apart),
 and what that and the 2 mm themselves do at a camera some 0.7 m from the prisms."""
 
-WORDS = ("shift forward", "shift right", "shift down", "roll", "pitch", "yaw")
-"""A step's six numbers: along and about the rover's x (forward), y (right), z (down)."""
+WORDS = ("roll", "pitch", "yaw", "shift forward", "shift right", "shift down")
+"""A step's six numbers: about and along the rover's x (forward), y (right), z (down)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,7 +68,7 @@ class BodyPose:
     origin_m
         (3,) the middle of their centres before, rover frame: the turn is about it.
     step
-        (6,) shift, metres, and rotation vector, radians, rover axes.
+        (6,) rotation vector, radians, and shift, metres, rover axes.
     covariance
         (6, 6) of the step, with the prior.
     gain

@@ -91,7 +91,7 @@ class BodySights:
             residual[on, eye] = self.found_px[on, eye] - pixels
             point_rates[on, eye] = per_point
             # A camera that moves one way sees its targets go the other.
-            rates[on, eye] = -rigid_rates(per_point, self.positions_m[on], self.origin_m + step[:3])
+            rates[on, eye] = -rigid_rates(per_point, self.positions_m[on], self.origin_m + step[3:])
             covariance[on, eye, :, eye] = self.noise_px2[on, eye]
             covariance[~on, eye, :, eye] = np.eye(2)
         flat = point_rates.reshape(count, 2 * eyes, 3)

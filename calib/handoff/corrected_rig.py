@@ -13,12 +13,12 @@ from dataclasses import replace
 import numpy as np
 
 from calib.camera.cahvor import CameraModel
-from calib.camera.parameters import parameter_names, parameter_part, tangents
+from calib.camera.parameters import parameter_names, parameter_part
 from calib.handoff.body_pose import BodyPose
 from calib.mast.covariance import RigCovariance
 from calib.mast.rig import Rig
 from calib.mast.rig_rates import click_rates, pixel_rates
-from calib.rigid import FloatArray
+from calib.rigid import FloatArray, rigid_rates, tangents
 
 
 def corrected_rig(rig: Rig, correction: BodyPose) -> Rig:
@@ -68,24 +68,16 @@ def _moved_parameters(model: CameraModel, correction: BodyPose) -> tuple[FloatAr
         if letter in "RE":
             continue
         now: FloatArray = getattr(moved, letter)
-        if letter == "C":
-            arm = now - correction.origin_m - correction.step[:3]
-            rates[part, :3], rates[part, 3:] = np.eye(3), -_cross(arm)
-            turn[part, part] = rotation
-        elif letter in "AO":
+        about = correction.origin_m + correction.step[3:] if letter == "C" else np.zeros(3)
+        follows = rigid_rates(np.eye(3)[None], now[None], about)[0]
+        if letter != "C":
+            follows[:, 3:] = 0.0  # no place: it turns, and a shift leaves it
+        if letter in "AO":
             on, before = tangents(now), tangents(getattr(model, letter))
-            rates[part, 3:] = -on @ _cross(now)
-            turn[part, part] = on @ rotation @ before.T
+            rates[part], turn[part, part] = on @ follows, on @ rotation @ before.T
         else:
-            rates[part, 3:] = -_cross(now)
-            turn[part, part] = rotation
+            rates[part], turn[part, part] = follows, rotation
     return rates, turn
-
-
-def _cross(vector: FloatArray) -> FloatArray:
-    """The matrix M with M x = vector × x."""
-    x, y, z = vector
-    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
 
 
 def _parameter_rates(rig: Rig, known: RigCovariance, correction: BodyPose) -> FloatArray:

@@ -102,7 +102,7 @@ class _BodyFit:
         return np.asarray(np.linalg.inv(self.information / self.scale + _PRIOR))
 
 
-_PRIOR_SIGMA = np.array([PRIOR_SHIFT_M] * 3 + [PRIOR_TURN_RAD] * 3)
+_PRIOR_SIGMA = np.array([PRIOR_TURN_RAD] * 3 + [PRIOR_SHIFT_M] * 3)
 _PRIOR = np.diag(1.0 / _PRIOR_SIGMA**2)
 _STEPS, _ROBUST_STEPS = 20, 10
 """Of Gauss and Newton at most. Weights by residuals need not settle: they only find what to leave out."""

@@ -26,12 +26,13 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from calib.camera.cahvor import CameraModel
 from calib.errors import Unreachable
 from calib.mast.quartic import roots_between
 from calib.mast.rig import Mast
+from calib.rigid import FloatArray, ReadOnlyArrays
 
 _EDGE = 1e-12
 """A miss up to this part of the target's distance is rounding: the target counts as on the edge of reach."""
@@ -51,6 +52,9 @@ _FAR_OUT = 1e4
 _FARTHEST_M = 1e9
 """Coordinates from here on are taken for a mistake; their squares would overflow in the end."""
 
+_MOST = 4
+"""Pairs of joint angles that a target can have: as many as the quartic has roots."""
+
 Triple = tuple[float, float, float]
 
 
@@ -69,6 +73,31 @@ class Solution:
     pan_rad: float
     tilt_rad: float
     range_m: float
+
+
+@dataclass(frozen=True, eq=False)
+class Solutions(ReadOnlyArrays):
+    """Joint angles of many targets, by `solve` on arrays; read-only.
+
+    Attributes
+    ----------
+    pan_rad, tilt_rad, range_m
+        (..., 4) as those of `Solution`, the best first; a target that has fewer solutions, or none, is filled
+        up with not-a-number. So ``pan_rad[..., 0]`` is the best pan of every target.
+    refused
+        (...) of text: empty where there is a solution, else the code of `calib.errors.Unreachable`
+        (``blind_cone``, ``too_near``, ``bad_target``, ``bad_pixel``). The target by itself says by how much.
+    """
+
+    pan_rad: FloatArray
+    tilt_rad: FloatArray
+    range_m: FloatArray
+    refused: NDArray[np.str_]
+
+    def at(self, *index: int) -> list[Solution]:
+        """Return the solutions of one target as `choose` takes them; none if it was refused."""
+        rows = (self.pan_rad[index].tolist(), self.tilt_rad[index].tolist(), self.range_m[index].tolist())
+        return [Solution(*one) for one in zip(*rows, strict=True) if math.isfinite(one[2])]
 
 
 @dataclass(frozen=True, slots=True)
@@ -146,17 +175,19 @@ def solve(
     camera_in_head
         Camera model in the head frame (a rig camera that is ``on: head``).
     target_in_rover_m
-        (3,) target in the rover frame, metres.
+        (3,) target in the rover frame, metres; or (..., 3) many of them.
     pixel_px
-        (x, y) of the wanted pixel; the image centre if left out.
+        (x, y) of the wanted pixel; the image centre if left out; or (..., 2), broadcast against the targets.
     from_pan_rad, from_tilt_rad
         Where the head is now, for the order.
 
     Returns
     -------
     list of Solution
-        Never empty. Upright solutions (tilt within ±π/2) first, then by the larger of |Δpan| and |Δtilt|.
-        The differences are plain ones, not taken round the circle: a head with a cable cannot pass ±π.
+        For arrays of more than one axis what ``solve_many`` returns, which says so to a type checker too.
+        For one target never empty. Upright solutions (tilt within ±π/2) first, then by the larger of |Δpan|
+        and |Δtilt|. The differences are plain ones, not taken round the circle: a head with a cable cannot
+        pass ±π.
         Each has the target in front of the camera (range_m > 0). Limits are left to ``choose``. For a target
         on the pan axis every pan does; from_pan_rad is returned.
 
@@ -186,9 +217,84 @@ def solve(
     (1.570796, 0.0, 3.0)
     """
     _check_here(from_pan_rad, from_tilt_rad)
-    x_px, y_px = camera_in_head.image_center_px if pixel_px is None else _two_numbers(pixel_px)
+    target = np.asarray(target_in_rover_m, dtype=np.float64)
+    pixel = None if pixel_px is None else np.asarray(pixel_px, dtype=np.float64)
+    if target.ndim > 1 or (pixel is not None and pixel.ndim > 1):
+        return solve_many(  # type: ignore[return-value]  # a type checker cannot tell the shapes apart
+            mast, camera_in_head, target, pixel, from_pan_rad=from_pan_rad, from_tilt_rad=from_tilt_rad
+        )
+    x_px, y_px = camera_in_head.image_center_px if pixel is None else _two_numbers(pixel)
     ray = _camera_ray(camera_in_head, x_px, y_px)
-    return _solve(_axes(mast), ray, target_in_rover_m, from_pan_rad, from_tilt_rad)
+    return _solve(_axes(mast), ray, target, from_pan_rad, from_tilt_rad)
+
+
+def solve_many(
+    mast: Mast,
+    camera_in_head: CameraModel,
+    targets_in_rover_m: ArrayLike,
+    pixels_px: ArrayLike | None = None,
+    *,
+    from_pan_rad: float = 0.0,
+    from_tilt_rad: float = 0.0,
+) -> Solutions:
+    """Return the joint angles of many targets, each as ``solve`` gives them for that target alone.
+
+    A target that cannot be reached, or is no target, does not stop the others: ``refused`` has its code.
+
+    Parameters
+    ----------
+    mast, camera_in_head, from_pan_rad, from_tilt_rad
+        As ``solve``; the head stands there before each target.
+    targets_in_rover_m
+        (..., 3) targets in the rover frame, metres.
+    pixels_px
+        (..., 2) wanted pixels (x, y), broadcast against the targets; the image centre if left out.
+
+    Raises
+    ------
+    Unreachable
+        ``bad_target``, ``bad_pixel``: arrays of another shape, or that do not go together.
+        ``parallel_axes``, ``bad_joints``: as ``solve``.
+    """
+    _check_here(from_pan_rad, from_tilt_rad)
+    axes = _axes(mast)
+    targets = np.asarray(targets_in_rover_m, dtype=np.float64)
+    pixels = np.asarray(camera_in_head.image_center_px if pixels_px is None else pixels_px, dtype=np.float64)
+    for array, width, code, what in (
+        (targets, 3, "bad_target", "targets"),
+        (pixels, 2, "bad_pixel", "pixels"),
+    ):
+        if array.ndim == 0 or array.shape[-1] != width:
+            raise Unreachable(code, f"{what} of shape {array.shape} where (..., {width}) is expected")
+    try:
+        shape = np.broadcast_shapes(targets.shape[:-1], pixels.shape[:-1])
+    except ValueError:
+        raise Unreachable(
+            "bad_target",
+            f"targets of shape {targets.shape} and pixels of shape {pixels.shape} do not go together",
+        ) from None
+    each = zip(
+        np.broadcast_to(targets, (*shape, 3)).reshape(-1, 3),
+        np.broadcast_to(pixels, (*shape, 2)).reshape(-1, 2).tolist(),
+        strict=True,
+    )
+    found, refused = np.full((3, math.prod(shape), _MOST), np.nan), [""] * math.prod(shape)
+    for row, (target, (x_px, y_px)) in enumerate(each):
+        try:
+            ray = _camera_ray(camera_in_head, x_px, y_px)
+            some = _solve(axes, ray, target, from_pan_rad, from_tilt_rad, told=False)
+        except Unreachable as refusal:
+            if refusal.code == "parallel_axes":  # the mast's fault, not the target's
+                raise
+            refused[row] = refusal.code
+            continue
+        for column, one in enumerate(some[:_MOST]):
+            found[:, row, column] = one.pan_rad, one.tilt_rad, one.range_m
+    pan_rad, tilt_rad, range_m = found.reshape(3, *shape, _MOST)
+    codes = np.array(refused, dtype=np.str_).reshape(shape)
+    for rows in (pan_rad, tilt_rad, range_m, codes):
+        rows.setflags(write=False)
+    return Solutions(pan_rad, tilt_rad, range_m, codes)
 
 
 def solve_ray(
@@ -227,13 +333,20 @@ def solve_ray(
             "bad_pixel", f"ray from {origin.tolist()} along {direction.tolist()} has no finite direction"
         )
     ray = _ray(origin.tolist(), (direction / length).tolist())
-    return _solve(_axes(mast), ray, target_in_rover_m, from_pan_rad, from_tilt_rad)
+    target = np.asarray(target_in_rover_m, dtype=np.float64)
+    return _solve(_axes(mast), ray, target, from_pan_rad, from_tilt_rad)
 
 
 def _solve(
-    axes: _Axes, ray: _Ray, target_in_rover_m: ArrayLike, from_pan_rad: float, from_tilt_rad: float
+    axes: _Axes,
+    ray: _Ray,
+    target: FloatArray,
+    from_pan_rad: float,
+    from_tilt_rad: float,
+    told: bool = True,
 ) -> list[Solution]:
-    x, y, z = _target_in_mast(axes, target_in_rover_m)
+    """Solve for one target; a refusal tells by how much only if asked, as that takes a search."""
+    x, y, z = _target_in_mast(axes, target)
     if abs(axes.cos_k) < _PARALLEL:
         raise Unreachable(
             "parallel_axes", f"pan and tilt axes are parallel (cos k = {axes.cos_k:.2g}): not a pan/tilt head"
@@ -254,7 +367,7 @@ def _solve(
         if not any(_same(pan, other.pan_rad) and _same(tilt, other.tilt_rad) for other in found):
             found.append(Solution(pan, _wrapped(tilt), s))
     if not found:
-        raise _why_not(axes, ray, rho, z)
+        raise _why_not(axes, ray, rho, z, told)
     if len(found) > 1:
         found.sort(key=lambda one: _order(one, from_pan_rad, from_tilt_rad))
     return found
@@ -338,16 +451,14 @@ def _check_here(from_pan_rad: float, from_tilt_rad: float) -> None:
         )
 
 
-def _two_numbers(pixel_px: ArrayLike) -> tuple[float, float]:
-    pixel = np.asarray(pixel_px, dtype=np.float64)
+def _two_numbers(pixel: FloatArray) -> tuple[float, float]:
     if pixel.shape != (2,) or not np.isfinite(pixel).all():
         raise Unreachable("bad_pixel", f"pixel {pixel.tolist()} is not two finite numbers")
     x_px, y_px = pixel.tolist()
     return x_px, y_px
 
 
-def _target_in_mast(axes: _Axes, target_in_rover_m: ArrayLike) -> Triple:
-    target = np.asarray(target_in_rover_m, dtype=np.float64)
+def _target_in_mast(axes: _Axes, target: FloatArray) -> Triple:
     if target.shape != (3,):
         raise Unreachable(
             "bad_target", f"target of shape {target.shape} where three coordinates are expected"
@@ -424,7 +535,7 @@ def _arm_points(axes: _Axes, ray: _Ray, rho: float, z: float) -> Iterator[tuple[
                 yield 0.5 * excess - t * (b + 0.5 * a * t), u_y0 + u_y1 * t, s
 
 
-def _why_not(axes: _Axes, ray: _Ray, rho: float, z: float) -> Unreachable:
+def _why_not(axes: _Axes, ray: _Ray, rho: float, z: float, told: bool) -> Unreachable:
     """Return the refusal for a target that no pan and tilt bring onto the ray."""
     # The tilt axis turns about its point (a, 0, 0) of the arm frame; |w| is the target's distance from there.
     farthest = math.hypot(rho + abs(axes.a), z)
@@ -435,6 +546,8 @@ def _why_not(axes: _Axes, ray: _Ray, rho: float, z: float) -> Unreachable:
             f"target is at most {farthest:.6g} m from the tilt axis centre, {nearest - farthest:.3g} m "
             f"nearer than this pixel's ray comes ({nearest:.6g} m)",
         )
+    if not told:
+        return Unreachable("blind_cone", "target is too near the pan axis")
     edge = _reach_edge_m(axes, ray, rho, z)
     side = "up" if z < 0.0 else "down"
     angle = math.atan2(rho, abs(z))

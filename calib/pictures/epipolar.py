@@ -360,10 +360,14 @@ def normal_seen(
     if own is not None:
         mine = own.pixel_px + _deformed(mine - own.predicted_px, own)
     theirs = found.pixel_px + _deformed(offsets, found)
-    left, right, top, bottom = _meeting(camera.ray(mine), partner.ray(theirs))
+    try:
+        left, right, top, bottom = (
+            triangulate(camera, partner, *pixels).position_m for pixels in zip(mine, theirs, strict=True)
+        )
+    except NoStereoPoint:
+        return plane.normal
     normal = np.cross(right - left, bottom - top)
     sight, length = target_m - camera.C, float(np.linalg.norm(normal))
-    # Written so that a neighbour without a point in both eyes falls back too.
     if not abs(normal @ sight) > GRAZING * length * np.linalg.norm(sight):
         return plane.normal
     return np.asarray(normal / length)
@@ -372,20 +376,6 @@ def normal_seen(
 def _deformed(offsets: FloatArray, found: PatchMatch) -> FloatArray:
     """Offsets (n, 2) from the target as a match saw them deformed."""
     return offsets if found.deformation is None else offsets + offsets @ found.deformation.T
-
-
-def _meeting(first: Rays, second: Rays) -> FloatArray:
-    """Return the middles (n, 3) of the common normals of rays; not-a-number where there are none."""
-    between = second.origins_m - first.origins_m
-    cosine = np.einsum("ij,ij->i", first.directions, second.directions)
-    ahead, back = (np.einsum("ij,ij->i", between, rays.directions) for rays in (first, second))
-    with np.errstate(invalid="ignore", divide="ignore"):
-        sine2 = 1.0 - cosine * cosine
-        ranges = (ahead - cosine * back) / sine2, (cosine * ahead - back) / sine2
-    feet = [
-        rays.origins_m + r[:, None] * rays.directions for rays, r in zip((first, second), ranges, strict=True)
-    ]
-    return np.asarray((feet[0] + feet[1]) / 2)
 
 
 def _across(

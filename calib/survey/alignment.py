@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 from scipy.stats import chi2
 
 from calib.errors import CalibError
-from calib.rigid import FloatArray, Rigid
+from calib.rigid import FloatArray, Rigid, rigid_rates
 from calib.survey import Survey
 
 FALSE_ALARM = 1e-4
@@ -231,16 +231,8 @@ def _limit(freedom: int, false_alarm: float) -> float:
 
 def _covariance(pose: Rigid, a: FloatArray, sigma: FloatArray) -> FloatArray:
     """Inverse of the weighted normal matrix of turn and shift."""
-    normal = np.zeros((6, 6))
-    for arm, one in zip(pose.vectors(a), sigma, strict=True):
-        rates = np.hstack([-_cross(arm), np.eye(3)])
-        normal += rates.T @ rates / one**2
-    return np.asarray(np.linalg.inv(normal))
-
-
-def _cross(v: FloatArray) -> FloatArray:
-    """(3, 3) with ``_cross(v) @ w`` the cross product of v and w."""
-    return np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
+    rates = rigid_rates(np.eye(3)[None], pose.vectors(a), np.zeros(3)) / sigma[:, None, None]
+    return np.asarray(np.linalg.inv(np.einsum("nip,niq->pq", rates, rates)))
 
 
 def _culprit(

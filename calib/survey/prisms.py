@@ -11,10 +11,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 from scipy.stats import chi2 as chi_square
 
-from calib.rigid import FloatArray, Rigid
+from calib.rigid import FloatArray, Rigid, moved_rigid, rigid_rates
 from calib.survey import Survey
 from calib.survey.alignment import FALSE_ALARM, NotAligned, align
 
@@ -188,21 +187,20 @@ def _fit(drawing: FloatArray, drawn: np.ndarray, seen: Seen, station_m: float, c
         for number, (setup, points) in enumerate(seen.items()):
             at = places.size + 6 * number
             for index, position in points.items():
-                arm = poses[setup].vectors(position)
-                residual = (arm + poses[setup].translation_m - places[index]) / station_m
+                at_rover = poses[setup].points(position)
+                residual = (at_rover - places[index]) / station_m
                 rates = np.zeros((3, size))
-                rates[:, at : at + 3] = np.cross(np.eye(3), arm).T / station_m
-                rates[:, at + 3 : at + 6] = np.eye(3) / station_m
+                follows = rigid_rates(np.eye(3)[None], at_rover[None], poses[setup].translation_m)[0]
+                rates[:, at : at + 6] = follows / station_m
                 rates[:, 3 * index : 3 * index + 3] = -np.eye(3) / station_m
                 normal += rates.T @ rates
                 gradient += rates.T @ residual
                 total, count = total + float(residual @ residual), count + 3
-        step = -np.linalg.solve(normal, gradient)
+        step = -np.asarray(np.linalg.solve(normal, gradient), dtype=np.float64)
         places = places + step[: places.size].reshape(-1, 3)
         for number, setup in enumerate(seen):
-            turn, shift = step[places.size + 6 * number :][:3], step[places.size + 6 * number :][3:6]
-            turned = Rotation.from_rotvec(turn).as_matrix() @ poses[setup].rotation
-            poses[setup] = Rigid(turned, poses[setup].translation_m + shift)
+            at = places.size + 6 * number
+            poses[setup] = moved_rigid(poses[setup], step[at : at + 6])
         settled = float(np.abs(step).max()) < ENOUGH
         if settled:
             break

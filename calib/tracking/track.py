@@ -31,7 +31,7 @@ from calib.pictures.distinct import indistinct
 from calib.pictures.epipolar import find_partner, normal_seen
 from calib.pictures.patch_match import MatchSettings, PatchMatch, match_patch
 from calib.pictures.warp import Plane
-from calib.rigid import FloatArray, Rigid, carried_covariance, moved_rigid
+from calib.rigid import FloatArray, Rigid, carried_covariance, moved_rigid, rigid_rates
 from calib.tracking.pose_doubt import PoseDoubt, pose_doubt
 
 State = Literal["tracked", "lost"]
@@ -258,8 +258,7 @@ def moved_track(track: Track, now_from_then: Rigid, covariance: FloatArray) -> T
 
 def _motion_rate(position_m: FloatArray) -> FloatArray:
     """Return d position / d motion (3, 6): how a small rotation, then a translation, move a point."""
-    x, y, z = position_m
-    return np.hstack([np.array([[0.0, z, -y], [-z, 0.0, x], [y, -x, 0.0]]), np.eye(3)])
+    return np.asarray(rigid_rates(np.eye(3)[None], position_m[None], np.zeros(3))[0])
 
 
 def _carried(key: Key, motion: Rigid) -> Key:
@@ -396,7 +395,7 @@ def _turned(track: Track, position_m: FloatArray) -> Rigid:
     weight = track.motion_covariance @ _motion_rate(track.position_m).T
     spread = track.covariance_m2 + 1e-12 * np.eye(3)
     error = weight @ np.linalg.solve(spread, position_m - track.position_m)
-    return moved_rigid(Rigid.identity(), np.concatenate([error[3:], error[:3]]))
+    return moved_rigid(Rigid.identity(), error)
 
 
 def _anchored(track: Track) -> Key | None:

@@ -21,7 +21,7 @@ from handed_over import (
 from scipy.spatial.transform import Rotation
 
 from calib.camera.cahvor import CameraModel
-from calib.camera.parameters import parameter_names, parameter_part, tangents
+from calib.camera.parameters import parameter_names, parameter_part
 from calib.errors import NoCorrection
 from calib.files.mast_file import load_rig
 from calib.handoff.body_pose import PRIOR_SHIFT_M, PRIOR_TURN_RAD, BodyPose
@@ -30,6 +30,7 @@ from calib.handoff.corrected_rig import corrected_covariance, corrected_rig
 from calib.handoff.fit_body_pose import fit_body_pose
 from calib.mast.covariance import RigCovariance, moved_rig
 from calib.mast.rig import Rig
+from calib.rigid import tangents
 
 TURN_RAD = np.array([0.001, 0.005, -0.002])
 SHIFT_M = np.array([0.003, -0.002, 0.001])
@@ -45,7 +46,7 @@ def rig(repository: Path) -> Rig:
 def fitted(rig: Rig, step: np.ndarray, seed: int, count: int = 24, **noise: float) -> BodyPose:
     """The correction of a rig whose Hazcams truly stand elsewhere by a step."""
     rng = np.random.default_rng(seed)
-    true = moved_hazcams(rig, Rotation.from_rotvec(step[3:]), step[:3])
+    true = moved_hazcams(rig, Rotation.from_rotvec(step[:3]), step[3:])
     made = hand_offs(true, rig, targets(rng, count), rng, **noise)  # type: ignore[arg-type]
     return fit_body_pose(rig, HAZCAMS, made)
 
@@ -56,7 +57,7 @@ def chi2_of(fit: BodyPose, step: np.ndarray) -> float:
 
 
 def test_exact_hand_offs_give_the_motion_exactly_and_no_residual(rig: Rig) -> None:
-    step = np.concatenate([SHIFT_M, TURN_RAD])
+    step = np.concatenate([TURN_RAD, SHIFT_M])
     rng = np.random.default_rng(1)
     true = moved_hazcams(rig, Rotation.from_rotvec(TURN_RAD), SHIFT_M)
     made = hand_offs(true, rig, targets(rng, 400), rng, click_px=1e-3, match_px=0.0)
@@ -82,7 +83,7 @@ def test_exact_hand_offs_give_the_motion_exactly_and_no_residual(rig: Rig) -> No
 
 def test_drawn_motions_come_back_within_the_stated_covariance(rig: Rig) -> None:
     rng = np.random.default_rng(21)
-    prior = np.array([PRIOR_SHIFT_M] * 3 + [PRIOR_TURN_RAD] * 3)
+    prior = np.array([PRIOR_TURN_RAD] * 3 + [PRIOR_SHIFT_M] * 3)
     found = []
     for seed in range(DRAWS):
         step = rng.normal(0.0, prior)
@@ -93,7 +94,7 @@ def test_drawn_motions_come_back_within_the_stated_covariance(rig: Rig) -> None:
 
 
 def test_the_papers_bias_is_found_and_the_residuals_go(rig: Rig) -> None:
-    step = np.concatenate([SHIFT_M, TURN_RAD])
+    step = np.concatenate([TURN_RAD, SHIFT_M])
     fit = fitted(rig, step, 5)
     assert fit.significant and fit.sigmas > 10
     assert chi2_of(fit, step) < 22.5  # one in a thousand
@@ -116,7 +117,7 @@ def test_without_a_motion_it_is_significant_as_rarely_as_stated(rig: Rig, match_
 
 def test_blunders_are_named_and_do_not_move_the_result(rig: Rig) -> None:
     rng = np.random.default_rng(9)
-    step = np.concatenate([SHIFT_M, TURN_RAD])
+    step = np.concatenate([TURN_RAD, SHIFT_M])
     made = hand_offs(moved_hazcams(rig, Rotation.from_rotvec(TURN_RAD), SHIFT_M), rig, targets(rng, 30), rng)
     for index, camera, off in (
         (3, 0, (8.0, 0.0)),
@@ -163,7 +164,7 @@ def test_what_turns_mast_and_body_alike_is_no_correction(rig: Rig) -> None:
         cameras[name] = replace(cameras[name], model=CameraModel("CAHVOR", size, **carried, R=own["R"]))
     elsewhere = replace(rig, mast=mast, cameras=cameras)
     rng = np.random.default_rng(4)
-    step = np.concatenate([SHIFT_M, TURN_RAD])
+    step = np.concatenate([TURN_RAD, SHIFT_M])
     made = hand_offs(moved_hazcams(rig, Rotation.from_rotvec(TURN_RAD), SHIFT_M), rig, targets(rng, 24), rng)
     here, there = (fit_body_pose(which, HAZCAMS, made) for which in (rig, elsewhere))
     np.testing.assert_allclose(there.step[:3], turn.apply(here.step[:3]), atol=2e-7)
@@ -184,7 +185,7 @@ def test_targets_at_one_range_leave_directions_to_the_prior_by_name(rig: Rig) ->
     assert fit.seen < 6 and len(fit.unseen) == 6 - fit.seen
     assert all("not told" in sentence and "prior" in sentence for sentence in fit.unseen)
     sigma = np.sqrt(np.diag(fit.covariance))
-    assert (sigma <= np.array([PRIOR_SHIFT_M] * 3 + [PRIOR_TURN_RAD] * 3)).all()
+    assert (sigma <= np.array([PRIOR_TURN_RAD] * 3 + [PRIOR_SHIFT_M] * 3)).all()
 
 
 def test_an_eye_that_moved_by_itself_is_told(rig: Rig) -> None:
@@ -253,7 +254,7 @@ def parameters(rig: Rig, names: tuple[str, ...], against: Rig) -> np.ndarray:
 def test_the_covariance_after_is_what_differences_of_the_whole_fit_give(rig: Rig) -> None:
     """Each direction u of the believed parameters, taken as their only uncertainty."""
     rng = np.random.default_rng(3)
-    step = np.concatenate([SHIFT_M, TURN_RAD])
+    step = np.concatenate([TURN_RAD, SHIFT_M])
     made = hand_offs(moved_hazcams(rig, Rotation.from_rotvec(TURN_RAD), SHIFT_M), rig, targets(rng, 24), rng)
     fit = fit_body_pose(rig, HAZCAMS, made)
     assert chi2_of(fit, step) < 22.5

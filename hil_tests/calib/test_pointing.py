@@ -418,7 +418,7 @@ def test_target_nearer_than_the_ray_passes_the_head_is_too_near() -> None:
         [1.0, np.nan, 0.0],
         [0.0, 0.0, np.inf],
         [1.0, 2.0],
-        [[1.0, 2.0, 3.0]],
+        2.0,
         [2e9, 0.0, 0.0],
     ],
 )

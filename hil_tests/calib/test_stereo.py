@@ -149,7 +149,7 @@ def test_diverging_rays_are_refused() -> None:
     assert "-100 m along the left" in str(refusal.value)
 
 
-@pytest.mark.parametrize("pixel", [[np.nan, 400.0], [520.0, np.inf], [520.0], [[520.0, 400.0]]])
+@pytest.mark.parametrize("pixel", [[np.nan, 400.0], [520.0, np.inf], [520.0], 520.0])
 def test_bad_pixels_are_refused_by_side(pixel: list[float]) -> None:
     with pytest.raises(NoStereoPoint, match="left pixel") as refusal:
         triangulate(LEFT, RIGHT_EYE, pixel, [480.0, 400.0])

@@ -15,9 +15,11 @@ from scipy.spatial.transform import Rotation
 from calib.camera.parameters import parameter_names
 from calib.files import digest_of
 from calib.files.mast_file import load_rig, save_rig
+from calib.handoff.fit_body_pose import fit_body_pose
 from calib.handoff.matched import MatchedHandoff
 from calib.mast.covariance import stored_covariance
 from calib.mast.rig import Rig
+from mastctl.calibration.refined import pose_told
 from mastctl.cli.main import main
 from mastctl.handoff.log import HandoffLog
 
@@ -191,3 +193,17 @@ def test_people_read_the_correction_its_sigma_and_what_becomes_of_the_residual(
     ):
         assert words in shown
     assert "proposed mast file" in shown and "chi-square" in shown
+    assert shown.index("shift forward") < shown.index("shift down") < shown.index("roll") < shown.index("yaw")
+
+
+def test_a_file_holds_the_shift_before_the_turn(mast: Path, tmp_path: Path) -> None:
+    pose = fit_body_pose(load_rig(mast).rig, HAZCAMS, record(mast, tmp_path / "h.jsonl"))
+    told = pose_told(pose)
+    shift = pose.motion.points(pose.origin_m) - pose.origin_m
+    np.testing.assert_allclose(told["shift_m"], shift, atol=1e-12)
+    np.testing.assert_allclose(
+        told["turn_rad"], Rotation.from_matrix(pose.motion.rotation).as_rotvec(), atol=1e-12
+    )
+    variances = np.diag(told["covariance"])
+    np.testing.assert_allclose(variances[:3], np.diag(pose.covariance)[3:], rtol=1e-6)
+    np.testing.assert_allclose(variances[3:], np.diag(pose.covariance)[:3], rtol=1e-6)

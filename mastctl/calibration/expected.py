@@ -9,7 +9,7 @@ from scipy.stats import chi2
 
 from calib.fit.calibration import Calibration, ImageResiduals
 from calib.fit.uncertainty import pixel_covariance
-from calib.rigid import FloatArray
+from calib.rigid import rigid_rates
 from calib.survey import Survey
 from calib.survey.alignment import Alignment, NotAligned, rover_from_station, station_from_board
 
@@ -69,18 +69,10 @@ def _expected_px2(
     points = calibration.rover_from_board[image.setup, image.placement].points(in_board)
     model = calibration.rig.camera_in_rover(image.camera, pan, tilt)
     _, rates, _ = model.project_jacobian(points)
-    in_station = rates @ setup.b_from_a.rotation @ _moves(board.b_from_a.vectors(in_board))
+    in_station = rigid_rates(rates @ setup.b_from_a.rotation, board.b_from_a.vectors(in_board), np.zeros(3))
     by_board = np.einsum("nip,pq,niq->ni", in_station, board.covariance, in_station)
-    in_rover = rates @ _moves(points - setup.b_from_a.translation_m)
+    in_rover = rigid_rates(rates, points, setup.b_from_a.translation_m)
     common = np.einsum("nip,pq,niq->ni", in_rover, setup.covariance, in_rover)
     _, by_fit = pixel_covariance(calibration, image.camera, pan, tilt, points)
     relative = np.maximum(np.einsum("nii->ni", by_fit) - common, 0.0)
     return float(np.nanmean(by_board + relative + image.sigma_px[:, None] ** 2))
-
-
-def _moves(points_m: FloatArray) -> FloatArray:
-    """How points (n, 3) follow a small turn and shift of their frame: (n, 3, 6)."""
-    x, y, z = points_m.T
-    zero, one = np.zeros_like(x), np.ones_like(x)
-    rows = [zero, z, -y, one, zero, zero, -z, zero, x, zero, one, zero, y, -x, zero, zero, zero, one]
-    return np.stack(rows, axis=-1).reshape(-1, 3, 6)

@@ -9,6 +9,8 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from calib.errors import NoCorrection
 from calib.files.mast_file import StoredRig
 from calib.fit.uncertainty import sigma_by_key
@@ -23,6 +25,9 @@ from calib.mast.rig import Rig
 from mastctl.calibration.mast_file import plain, rounded
 from mastctl.calibration.run import save_new
 from mastctl.handoff.log import ReadLog
+
+SHIFT_FIRST = (3, 4, 5, 0, 1, 2)
+"""In files and on the terminal a correction is its shift, then its turn."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -154,13 +159,16 @@ def refined_rig(proposal: Proposal) -> Rig:
 
 
 def pose_told(pose: BodyPose) -> dict[str, Any]:
-    """Return a correction as JSON or YAML; the shift is of the origin, the turn about it, rover axes."""
+    """Return a correction as JSON or YAML; the shift is of the origin, the turn about it, rover axes.
+
+    Its covariance is of the shift, then the turn.
+    """
     told: dict[str, Any] = {
         "cameras": list(pose.cameras),
         "origin_m": pose.origin_m.tolist(),
-        "shift_m": pose.step[:3].tolist(),
-        "turn_rad": pose.step[3:].tolist(),
-        "covariance": rounded(pose.covariance).tolist(),
+        "shift_m": pose.step[3:].tolist(),
+        "turn_rad": pose.step[:3].tolist(),
+        "covariance": rounded(pose.covariance[np.ix_(SHIFT_FIRST, SHIFT_FIRST)]).tolist(),
         "prior_sigma": {"shift_m": PRIOR_SHIFT_M, "turn_rad": PRIOR_TURN_RAD},
         "significance_sigmas": pose.sigmas,
         "chance": pose.chance,

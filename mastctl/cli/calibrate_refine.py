@@ -106,11 +106,12 @@ def _show(proposal: Proposal) -> None:
 
 def _show_pose(group: str, pose: BodyPose) -> None:
     from calib.handoff.body_pose import WORDS
+    from mastctl.calibration.refined import SHIFT_FIRST
 
     sigma = pose.covariance.diagonal() ** 0.5
     rows = [
-        [word, f"{1e3 * value:+.2f}", f"{1e3 * one:.2f}", unit]
-        for word, value, one, unit in zip(WORDS, pose.step, sigma, ["mm"] * 3 + ["mrad"] * 3, strict=True)
+        [WORDS[i], f"{1e3 * pose.step[i]:+.2f}", f"{1e3 * sigma[i]:.2f}", "mrad" if i < 3 else "mm"]
+        for i in SHIFT_FIRST
     ]
     notes = [
         f"chi-square {pose.chi2_before:.0f} before, {pose.chi2_after:.0f} after, "

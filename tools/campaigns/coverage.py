@@ -32,6 +32,7 @@ from calib.fit.adjustment import MAST_NAMES
 from calib.fit.calibration import Calibration
 from calib.fit.uncertainty import pixel_covariance
 from calib.mast.rig import Rig
+from calib.rigid import rigid_rates
 from calib.survey import Sigma, Survey
 from drivers.sim_survey.survey import SurveyPlan, SurveyTruth, simulate_survey
 from mastctl.calibration.run import FITS
@@ -93,18 +94,13 @@ def _prisms_alone(true: Rig, survey: Survey, of_truth: SurveyTruth) -> np.ndarra
     measured = {p.point: p.position_m for p in survey.station if (p.setup, p.kind) == ("level", "prism")}
     places = np.array([survey.prisms_in_rover_m[name] for name in measured])
     seen = of_truth.rover_from_station["level"].points(np.array(list(measured.values())))
-    moves = np.concatenate([_moves(place) for place in places])
+    moves = rigid_rates(np.eye(3)[None], places, np.zeros(3)).reshape(-1, 6)
     error, *_ = np.linalg.lstsq(moves, (seen - places).ravel(), rcond=None)
     sigma = np.hypot(survey.sigma.station_m, survey.sigma.prism_cad_m)
-    carry = np.concatenate([_moves(true.mast.translation_m), np.eye(6)[3:]])
+    at_mast = rigid_rates(np.eye(3)[None], np.array(true.mast.translation_m)[None], np.zeros(3))[0]
+    carry = np.concatenate([at_mast, np.eye(6)[:3]])
     spread = sigma * np.sqrt(np.diag(carry @ np.linalg.inv(moves.T @ moves) @ carry.T))
     return np.asarray(carry @ error / spread)
-
-
-def _moves(place_m: np.ndarray) -> np.ndarray:
-    """How a point follows a small shift and turn of its frame: (3, 6)."""
-    x, y, z = place_m
-    return np.array([[1, 0, 0, 0, z, -y], [0, 1, 0, -z, 0, x], [0, 0, 1, y, -x, 0]])
 
 
 def _pixel_errors(true: Rig, name: str, fit: Calibration) -> np.ndarray:

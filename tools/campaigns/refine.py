@@ -108,7 +108,7 @@ def moved(true: Rig, step: FloatArray) -> tuple[Rig, FloatArray]:
     # The correction turns about the believed middle, which lies a little beside the true one.
     believed_middle = np.mean([cameras[name].model.C for name in names], axis=0)
     shift = motion.inverse.points(believed_middle) - believed_middle
-    return replace(true, cameras={**true.cameras, **cameras}), np.concatenate([shift, step[3:]])
+    return replace(true, cameras={**true.cameras, **cameras}), np.concatenate([step[:3], shift])
 
 
 def main() -> int:
@@ -125,14 +125,14 @@ def main() -> int:
     true = load_rig(options.rig).rig
     if lacking := [pair for pair in ("navcam", "hazcam") if pair not in true.stereo]:
         parser.error(f"--rig {options.rig} has no stereo pair '{lacking[0]}'")
-    prior = np.array([PRIOR_SHIFT_M] * 3 + [PRIOR_TURN_RAD] * 3)
     print("targets     moved  significant  told  chi2 of 6   before rms, worst px   after rms, worst px")
     for words, ranges_m in (("2 m", (2.0, 2.0)), ("1.5 to 4 m", (1.5, 4.0))):
         for size in (1.0, 0.0):
             rng = np.random.default_rng(options.seed)
             fits, chi2, before, after = [], [], [], []
             for _ in range(options.cases):
-                believed, step = moved(true, rng.normal(0.0, size * prior))
+                shift_m, turn_rad = (rng.normal(0.0, size * s, 3) for s in (PRIOR_SHIFT_M, PRIOR_TURN_RAD))
+                believed, step = moved(true, np.concatenate([turn_rad, shift_m]))
                 fit = fit_body_pose(
                     believed, true.stereo["hazcam"], handed(believed, true, ranges_m, options, rng)
                 )
