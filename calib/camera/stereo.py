@@ -226,7 +226,7 @@ def triangulate_many(
     )
     for array in arrays:
         array[refused != ""] = np.nan
-    position_m, covariance_m2, ray_gap_m, ranges_m = (a.reshape(*shape, *a.shape[1:]) for a in arrays)
+    position_m, covariance_m2, ray_gap_m, ranges_m = (a.reshape((*shape, *a.shape[1:])) for a in arrays)
     refused = refused.reshape(shape)
     for array in (position_m, covariance_m2, ray_gap_m, ranges_m, refused):
         array.setflags(write=False)

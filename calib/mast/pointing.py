@@ -96,6 +96,8 @@ class Solutions(ReadOnlyArrays):
 
     def at(self, *index: int) -> list[Solution]:
         """Return the solutions of one target as `choose` takes them; none if it was refused."""
+        if len(index) != self.refused.ndim:
+            raise IndexError(f"{len(index)} indices where {self.refused.ndim} are expected")
         rows = (self.pan_rad[index].tolist(), self.tilt_rad[index].tolist(), self.range_m[index].tolist())
         return [Solution(*one) for one in zip(*rows, strict=True) if math.isfinite(one[2])]
 

@@ -120,6 +120,11 @@ def clicked_point(
     NoStereoPoint
         As `calib.camera.stereo.triangulate`, and ``not_one_point``.
     """
+    for name, pixel in zip(pair, (left_px, right_px), strict=True):
+        if np.shape(pixel) != (2,):
+            raise NoStereoPoint(
+                "bad_pixel", f"a pixel of {name} of shape {np.shape(pixel)} where (2,) is expected"
+            )
     left, right = (rig.camera_in_rover(name, pan_rad, tilt_rad) for name in pair)
     seen = triangulate(left, right, left_px, right_px, sigma_px)
     allowed = click_covariance(

@@ -12,6 +12,7 @@ from calib.camera.cahvor import CameraModel
 from calib.camera.stereo import Triangulations, triangulate, triangulate_many
 from calib.errors import NoStereoPoint, Unreachable
 from calib.files.mast_file import load_rig
+from calib.handoff.geometric import Joints, hand_off
 from calib.mast.pointing import Solutions, choose, solve, solve_many
 from calib.mast.rig import Mast, Rig
 
@@ -89,6 +90,10 @@ def test_a_choice_is_made_among_the_solutions_of_one_target(rig: Rig) -> None:
     many = solve_many(rig.mast, model, targets)
     limits = (-3.0, 3.0), (-1.5, 1.5)
     assert choose(many.at(1), *limits) == choose(solve(rig.mast, model, targets[1]), *limits)
+    assert solve_many(rig.mast, model, targets[1]).at() == many.at(1)
+    for index in ((), (0, 0)):
+        with pytest.raises(IndexError, match=rf"{len(index)} indices where 1 are expected"):
+            many.at(*index)
 
 
 def test_a_bad_target_or_pixel_stops_no_other(rig: Rig) -> None:
@@ -183,6 +188,8 @@ def test_triangulate_takes_arrays_as_project_does(eyes: tuple[CameraModel, Camer
         triangulate(*eyes, left_px[0], right_px[0] + [0.0, 0.1]).position_m,
         rtol=LAST_BITS,
     )
+    one = triangulate_many(*eyes, left_px[5], right_px[5])  # no axis but the last: a point without one
+    assert one.position_m.shape == (3,) and one.ray_gap_m.shape == one.refused.shape == ()
     nothing = triangulate(*eyes, np.zeros((0, 2)), np.zeros((0, 2)))
     assert isinstance(nothing, Triangulations)
     assert nothing.position_m.shape == (0, 3)
@@ -225,6 +232,14 @@ def test_pixels_of_a_wrong_shape_are_refused_by_side(
     for ask in (triangulate, triangulate_many):
         with pytest.raises(NoStereoPoint, match=words) as refusal:
             ask(*eyes, left_px, right_px)
+        assert refusal.value.code == "bad_pixel"
+
+
+def test_what_hands_over_one_target_refuses_the_pixels_of_many(rig: Rig) -> None:
+    pair, here = rig.stereo["navcam"], Joints(0.1, -0.6)
+    for clicks_px in (([[592.6, 485.5]], [455.3, 494.3]), ([592.6, 485.5], [[455.3, 494.3], [455.3, 494.3]])):
+        with pytest.raises(NoStereoPoint, match=r"where \(2,\) is expected") as refusal:
+            hand_off(rig, pair, rig.stereo["hazcam"], here, *clicks_px)
         assert refusal.value.code == "bad_pixel"
 
 
