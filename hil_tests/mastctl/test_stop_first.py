@@ -24,7 +24,7 @@ from mastctl.errors import Stopped
 from mastctl.operations import Operation, Operations
 from mastctl.pointing.loop import PointingLoop
 from mastctl.service import stop_threads as stop_threads_module
-from mastctl.web import app as api_module
+from mastctl.web import routes as routes_module
 
 
 def test_the_head_is_told_before_the_track_and_before_any_word(
@@ -117,7 +117,7 @@ def test_a_fifth_stop_is_answered_honestly_while_four_hang(
 ) -> None:
     hang = Hang()
     monkeypatch.setattr(stop_threads_module, "OVERDUE_S", 0.2)
-    monkeypatch.setattr(api_module, "STOP_ANSWER_S", 0.5)
+    monkeypatch.setattr(routes_module, "STOP_ANSWER_S", 0.5)
     with fake_daemon(monkeypatch, tmp_path) as (daemon, _):
         monkeypatch.setattr(daemon.service, "stop", hang)
         told: list[ClientError] = []

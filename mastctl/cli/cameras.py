@@ -135,8 +135,8 @@ def camera_check(args: argparse.Namespace) -> int:
 
 def camera_grab(args: argparse.Namespace) -> int:
     """Write one fresh picture with its facts."""
+    from mastctl.report.encoding import encoded
     from mastctl.report.png_text import with_text
-    from mastctl.web.app import encoded
 
     if args.out.suffix.lower() != ".png":
         raise output.WrongUse(

@@ -1,0 +1,77 @@
+"""Routes of pictures with their facts, and of the mast file that they are to be read by."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Annotated, Any
+
+from fastapi import FastAPI, Query
+from fastapi.responses import Response
+
+from mastctl.devices.frames import StampedFrame
+from mastctl.report.encoding import encoded
+from mastctl.service.mast_in_use import MastInUse
+from mastctl.service.service import Service
+from mastctl.web import PREFIX
+from mastctl.web.models import MastBody, SnapshotQuery
+from mastctl.web.waiting import Waiting
+
+
+def add_pictures(app: FastAPI, service: Service, waiting: Waiting) -> None:
+    """Frames with their facts, and the mast file they are to be read by."""
+
+    @app.get(
+        f"{PREFIX}/snapshot/{{camera}}",
+        summary="A picture; its facts are in X-Mastctl headers",
+        response_class=Response,
+        responses={200: {"content": {"image/png": {}, "image/jpeg": {}}}},
+    )
+    async def snapshot(camera: str, query: Annotated[SnapshotQuery, Query()]) -> Response:
+        service.check_camera(camera)
+        frame_id = query.frame_id
+        if frame_id is not None:
+            return await waiting.run(lambda: picture(service.kept_frame(camera, frame_id), query.format))
+        return await waiting.picture(
+            camera, lambda: picture(service.snapshot(camera, query.fresh), query.format)
+        )
+
+    def picture(frame: StampedFrame, kind: str) -> Response:
+        return Response(encoded(frame.image, kind), media_type=f"image/{kind}", headers=frame_headers(frame))
+
+    @app.get(f"{PREFIX}/mast", summary="The mast file in use, byte for byte", response_class=Response)
+    async def mast() -> Response:
+        in_use = service.mast
+        return Response(
+            in_use.data,
+            media_type="application/yaml",
+            headers={"X-Mastctl-Mast-Digest": in_use.stored.digest},
+        )
+
+    @app.post(f"{PREFIX}/mast", summary="Use another mast file, or the former one, from now on")
+    async def load_mast(body: MastBody) -> dict[str, Any]:
+        name = body.file
+        work = service.former_mast if name is None else partial(service.load_mast, name)
+        return told(await waiting.run(work))
+
+    @app.post(f"{PREFIX}/mast/back", summary="Go back to the former mast file")
+    async def back() -> dict[str, Any]:
+        return told(await waiting.run(service.former_mast))
+
+    def told(mast: MastInUse) -> dict[str, Any]:
+        former = service.former
+        return {"mast": mast.told(), "former_mast": None if former is None else former.told()}
+
+
+def frame_headers(frame: StampedFrame) -> dict[str, str]:
+    """Return a frame's facts as headers; numbers in shortest round-trip form."""
+    return {
+        "X-Mastctl-Frame-Id": frame.frame_id,
+        "X-Mastctl-Camera": frame.camera,
+        "X-Mastctl-Sequence": str(frame.sequence),
+        "X-Mastctl-Mid-Exposure-S": repr(frame.mid_exposure_s),
+        "X-Mastctl-Exposure-S": repr(frame.exposure_s),
+        "X-Mastctl-Pan-Rad": repr(frame.pan_rad),
+        "X-Mastctl-Tilt-Rad": repr(frame.tilt_rad),
+        "X-Mastctl-Moving": "true" if frame.moving else "false",
+        "X-Mastctl-Mast-Digest": frame.mast_digest,
+    }

@@ -1,0 +1,83 @@
+"""Routes of a simulated rover: its fault switches, and where it truly stands."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Annotated, Any
+
+from fastapi import FastAPI, Query
+
+from drivers.faults import Fault as SetFault
+from drivers.faults import FaultPanel
+from mastctl.as_json import as_json
+from mastctl.errors import MastctlError
+from mastctl.service.service import Service
+from mastctl.tracking.pose import RoverPose
+from mastctl.web import PREFIX
+from mastctl.web.models import FaultBody, FaultsQuery, StandBody
+from mastctl.web.waiting import Waiting
+
+if TYPE_CHECKING:
+    from drivers.sim.rover import SimulatedRover
+
+
+class NotSimulated(MastctlError):
+    """Faults and the true pose are a simulated rover's only."""
+
+    code = "not_simulated"
+
+
+def add_simulation(app: FastAPI, service: Service, waiting: Waiting) -> None:
+    """The fault switches of a simulated rover, and where it truly stands."""
+
+    def simulated(what: str) -> SimulatedRover:
+        if service.hardware.simulation is None:
+            kind = service.hardware.kind
+            raise NotSimulated(
+                f"{what} are for this program's own simulated rover only; the hardware is {kind}"
+            )
+        return service.hardware.simulation
+
+    def panel() -> FaultPanel:
+        return simulated("faults").faults
+
+    def stands() -> dict[str, Any]:
+        pose = RoverPose(simulated("true poses").site_from_rover).told(0.0)
+        return {"position_m": pose["position_m"], "quaternion": pose["quaternion"]}
+
+    @app.get(f"{PREFIX}/simulation/pose", summary="Where the simulated rover truly stands")
+    async def true_pose() -> dict[str, Any]:
+        return await waiting.run(stands)
+
+    @app.post(f"{PREFIX}/simulation/pose", summary="Put the simulated rover somewhere on its ground")
+    async def stand(body: StandBody) -> dict[str, Any]:
+        def put() -> dict[str, Any]:
+            rover = simulated("true poses")
+            rover.stand(body.x_m, body.y_m, body.heading_rad, body.pitch_rad, body.roll_rad)
+            return stands()
+
+        return await waiting.run(put)
+
+    def told() -> dict[str, Any]:
+        return {"faults": [_fault_told(fault) for fault in panel().active()]}
+
+    @app.get(f"{PREFIX}/simulation/faults", summary="The faults that are switched on")
+    async def faults() -> dict[str, Any]:
+        return await waiting.run(told)
+
+    @app.post(f"{PREFIX}/simulation/faults", summary="Switch a fault on")
+    async def set_fault(body: FaultBody) -> dict[str, Any]:
+        await waiting.run(lambda: panel().set(body.device, body.word, **body.parameters))
+        return await waiting.run(told)
+
+    @app.delete(f"{PREFIX}/simulation/faults", summary="Switch the faults of one device, or all, off")
+    async def clear_faults(query: Annotated[FaultsQuery, Query()]) -> dict[str, Any]:
+        await waiting.run(lambda: panel().clear(query.device))
+        return await waiting.run(told)
+
+
+def _fault_told(fault: SetFault) -> dict[str, Any]:
+    """A set fault as JSON; one without an end has ``end_s`` null."""
+    finite = {name: value for name, value in fault.parameters.items() if math.isfinite(value)}
+    told = {"device": fault.device, "word": fault.word, "parameters": finite}
+    return {**told, "begin_s": fault.begin_s, "end_s": as_json(fault.end_s)}
