@@ -135,6 +135,15 @@ def test_of_three_points_the_distances_say_which_is_off() -> None:
     assert found.doubt.endswith("is one of a")
 
 
+def test_of_several_distances_that_disagree_the_worst_is_told_with_its_size() -> None:
+    """Tape a moved 5 mm towards b, and c 30 mm away from a."""
+    tapes = np.array([(-0.44, -0.44, 0.0), (0.44, -0.44, 0.0), (-0.44, 0.44, 0.0)])
+    moved = tapes + np.array([(0.005, 0, 0), (0, 0, 0), (0, 0.03, 0)])
+    found = align(tapes, some_pose(np.random.default_rng(8)).points(moved), SIGMA_M, ("a", "b", "c"))
+    told = f"a and c are 0.8800 m apart in one list and {np.hypot(0.005, 0.91):.4f} m in the other (30.0 mm"
+    assert told in found.doubt
+
+
 @pytest.mark.parametrize(
     "points", [PRISMS[:2], np.outer([0, 1, 2, 3], [1, 2, 3]), np.ones((4, 3)), np.zeros((0, 3))]
 )
