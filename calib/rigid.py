@@ -188,11 +188,15 @@ def moved_rigid(pose: Rigid, step: FloatArray) -> Rigid:
     return Rigid(turned, pose.translation_m + step[3:])
 
 
+_NEXT, _LAST = [1, 2, 0], [2, 0, 1]
+
+
 def rigid_rates(per_point: FloatArray, points_m: FloatArray, origin_m: FloatArray) -> FloatArray:
     """Return (n, m, 6): rates of something per point (n, m, 3) for a turn about ``origin_m`` and a shift.
 
     With ``np.eye(3)[None]`` for ``per_point`` they are those of the points (n, 3) themselves.
     """
-    arm = points_m - origin_m
-    moment = np.cross(arm[:, None, :], per_point)
+    arm = (points_m - origin_m)[:, None, :]
+    # As np.cross, in half the time.
+    moment = arm[..., _NEXT] * per_point[..., _LAST] - arm[..., _LAST] * per_point[..., _NEXT]
     return np.concatenate([moment, np.broadcast_to(per_point, moment.shape)], axis=2)

@@ -132,8 +132,6 @@ def _gaps(
     i, j = (a.ravel() for a in np.mgrid[low[0] : high[0] + 1, low[1] : high[1] + 1])
     known = set(map(tuple, places.tolist()))
     free = np.array([p for p in zip(i.tolist(), j.tolist(), strict=True) if p not in known], dtype=np.int64)
-    if not len(free):
-        return np.empty((0, 2), dtype=np.int64), np.empty((0, 2))
     points = free.astype(np.float64)
     at, shapes = plane_map.pixels(points), plane_map.jacobian(points) * radius
     darker, spread = contrasts(image, at, shapes)

@@ -1,12 +1,10 @@
 """The image of a circle: where a round dot's image lies when its centre's image is known.
 
-A camera does not carry the centre of a circle to the middle of the circle's image. Through a pinhole the
-image is a conic, and its centre has a closed form; through a lens with distortion the boundary is carried
-over point by point and the centroid of the area inside is taken. Both are exact; the difference to the
-centre's own image is what a measurement of dots must be corrected by.
+A camera does not carry the centre of a circle to the middle of the circle's image. The boundary is carried
+over point by point and the centroid of the area inside is taken, which is exact through any lens; the
+difference to the centre's own image is what a measurement of dots must be corrected by.
 
-Sources: Heikkilä 2000, "Geometric camera calibration using circular control points", section 3 (conic);
-Song et al. 2024, arXiv 2403.04583 (centroid of the distorted area).
+Source: Song et al. 2024, arXiv 2403.04583 (centroid of the distorted area).
 """
 
 from __future__ import annotations
@@ -16,38 +14,9 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import ArrayLike
 
-from calib.camera.cahvor import CameraModel
-from calib.rigid import FloatArray, Rigid
-from calib.survey import Board
+from calib.rigid import FloatArray
 
 BOUNDARY_POINTS = 32
-
-
-def conic_centres(pixel_from_plane: ArrayLike, centres: ArrayLike, radius: float) -> FloatArray:
-    """Return the centres of the ellipses that circles of a plane become under a homography.
-
-    Parameters
-    ----------
-    pixel_from_plane
-        (3, 3), any scale.
-    centres
-        (n, 2) of the circles, in the plane's unit.
-    radius
-        Of the circles, same unit.
-
-    Returns
-    -------
-    centres_px : (n, 2)
-        With Q = inv(H)' C inv(H) = [[A, b], [b', c]], the centre is -inv(A) b. In the adjugate
-        D = H diag(r², r², -1) H' (circle about the origin) that is D[:2, 2] / D[2, 2].
-    """
-    H = np.asarray(pixel_from_plane, dtype=np.float64)
-    centres = np.asarray(centres, dtype=np.float64)
-    moved = np.broadcast_to(np.eye(3), (len(centres), 3, 3)).copy()
-    moved[:, :2, 2] = centres
-    moved = H @ moved
-    dual = moved @ np.diag([radius**2, radius**2, -1.0]) @ moved.transpose(0, 2, 1)
-    return np.asarray(dual[:, :2, 2] / dual[:, 2:, 2])
 
 
 def area_centroids(boundaries_px: ArrayLike) -> FloatArray:
@@ -89,35 +58,3 @@ def bias_through(
     centres = np.asarray(centres_m, dtype=np.float64)
     boundaries = pixel_of(outline_points_m(centres, radius_m))
     return np.asarray(area_centroids(boundaries) - pixel_of(centres))
-
-
-def centre_bias(
-    camera: CameraModel, frame_from_board: Rigid, board: Board, rows: ArrayLike, columns: ArrayLike
-) -> FloatArray:
-    """Return by how much the middle of each dot's image differs from the image of its centre.
-
-    Parameters
-    ----------
-    camera
-        The model, in any frame.
-    frame_from_board
-        The board's pose in that frame.
-    board
-        Gives the dots' places and diameter.
-    rows, columns
-        (n,) which dots.
-
-    Returns
-    -------
-    bias_px : (n, 2)
-        Centroid of the dot's image minus projected centre: subtract it from a measured centroid. Exact for
-        every model, to 1e-9 px. Not-a-number where the camera does not
-        see the whole dot.
-    """
-
-    def pixel_of(points_m: FloatArray) -> FloatArray:
-        in_board = np.concatenate([points_m, np.zeros_like(points_m[..., :1])], axis=-1)
-        return camera.project(frame_from_board.points(in_board))[0]
-
-    centres = board.dots_in_board_m(rows, columns)[:, :2]
-    return bias_through(pixel_of, centres, board.dot_diameter_m / 2)

@@ -74,7 +74,8 @@ class Adjustment:
     images, station
         What was measured.
     prisms_cad_m, prism_cad_m
-        The prisms from CAD, metres in the rover frame, and their sigma (0: exact).
+        The prisms from CAD, metres in the rover frame, and their sigma (0: exact). With a sigma, one that the
+        start has and CAD has not is known by the station alone.
     joint_rad
         Sigma of a joint reading (0: exact).
     mast_parameters
@@ -112,7 +113,7 @@ class Adjustment:
         for board in start.rover_from_board:
             self._add(("board", board), [f"placement {board[0]}/{board[1]}.{p}" for p in rigid])
         if prism_cad_m > 0:
-            for prism in prisms_cad_m:
+            for prism in start.prisms_in_rover_m:
                 self._add(("prism", prism), [f"prism {prism}.{a}" for a in "xyz"])
         if joint_rad > 0:
             for index in range(len(start.joints_rad)):
@@ -304,8 +305,8 @@ class Adjustment:
                 residual, jacobian = lens_knowledge(model)
                 yield f"lens {name}", Block(residual, jacobian, self.at(("camera", name)), width=1)
         if self.prism_cad_m > 0:
-            for name, place in state.prisms_in_rover_m.items():
-                residual = (place - self.prisms_cad_m[name]) / self.prism_cad_m
+            for name, place in self.prisms_cad_m.items():
+                residual = (state.prisms_in_rover_m[name] - place) / self.prism_cad_m
                 yield (
                     f"prism {name}",
                     Block(residual, np.eye(3) / self.prism_cad_m, self.at(("prism", name)), width=1),

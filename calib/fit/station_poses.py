@@ -10,10 +10,10 @@ import numpy as np
 from scipy.stats import chi2
 
 from calib.fit.calibration import Outlier
+from calib.fit.prisms import adjust_prisms
 from calib.rigid import FloatArray, Rigid
 from calib.survey import Survey
 from calib.survey.alignment import Alignment, rover_from_station, station_from_board
-from calib.survey.prisms import adjust_prisms
 
 GROSS = 1e-9
 """Tapes or prisms whose shape chance alone makes so seldom are not trusted for a start: only gross errors,
@@ -41,7 +41,7 @@ def station_poses(survey: Survey) -> StationPoses:
     """Return the poses that prisms and tapes give, each placement's alone.
 
     Set-ups are taken each alone where the drawing of the prisms is exact, else together
-    (``calib.survey.prisms``), as the paper does.
+    (``calib.fit.prisms``), as the paper does.
 
     Raises
     ------

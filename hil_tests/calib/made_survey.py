@@ -43,7 +43,10 @@ def rover_from_head(mast: Mast, pan_rad: float, tilt_rad: float) -> Rigid:
 
 @dataclass(frozen=True)
 class Plan:
-    """What to measure: boards of each ring and of the mast, and how the head moves."""
+    """What to measure: boards of each ring and of the mast, and how the head moves.
+
+    Every second camera image is taken with pan ``apart_rad`` beside the others.
+    """
 
     ring: int = 4
     mast_boards: int = 8
@@ -53,6 +56,7 @@ class Plan:
     hazcam: bool = True
     one_tilt_rad: float | None = None
     setups: int = 1
+    apart_rad: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -170,7 +174,8 @@ class _Making:
                 for index, (x, y) in enumerate(corners[: plan.ring]):
                     placement = f"{pair}-{range_m:g}-{index}"
                     board = self._place(setups[0], placement, view, range_m, x * right, y * up)
-                    self._shoot(cameras, setups[0], placement, "camera", board, 0.0, tilt)
+                    pan = plan.apart_rad * (index % 2)
+                    self._shoot(cameras, setups[0], placement, "camera", board, pan, tilt)
         count = plan.mast_boards + plan.checks if head else 0
         outer = -(-3 * count // 8)
         downs = np.concatenate([np.linspace(0, 0.2, outer), np.linspace(0.25, 1, count - outer)])

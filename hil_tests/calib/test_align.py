@@ -11,11 +11,11 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 from survey_case import write_files
 
+from calib.fit.prisms import adjust_prisms
 from calib.fit.station_poses import station_poses
 from calib.rigid import Rigid
 from calib.survey import Sigma, StationPoint, Survey, read_survey
 from calib.survey.alignment import NotAligned, align, mirrored, rover_from_station, station_from_board
-from calib.survey.prisms import adjust_prisms
 
 PRISMS = np.array([(0.10, -0.25, -0.75), (0.10, 0.25, -0.80), (-0.30, -0.25, -0.90), (-0.30, 0.25, -0.70)])
 NAMES = ("p1", "p2", "p3", "p4")
@@ -135,6 +135,15 @@ def test_of_three_points_the_distances_say_which_is_off() -> None:
     assert found.doubt.endswith("is one of a")
 
 
+def test_of_several_distances_that_disagree_the_worst_is_told_with_its_size() -> None:
+    """Tape a moved 5 mm towards b, and c 30 mm away from a."""
+    tapes = np.array([(-0.44, -0.44, 0.0), (0.44, -0.44, 0.0), (-0.44, 0.44, 0.0)])
+    moved = tapes + np.array([(0.005, 0, 0), (0, 0, 0), (0, 0.03, 0)])
+    found = align(tapes, some_pose(np.random.default_rng(8)).points(moved), SIGMA_M, ("a", "b", "c"))
+    told = f"a and c are 0.8800 m apart in one list and {np.hypot(0.005, 0.91):.4f} m in the other (30.0 mm"
+    assert told in found.doubt
+
+
 @pytest.mark.parametrize(
     "points", [PRISMS[:2], np.outer([0, 1, 2, 3], [1, 2, 3]), np.ones((4, 3)), np.zeros((0, 3))]
 )
@@ -173,9 +182,11 @@ def test_a_set_up_with_two_prisms_is_named(tmp_path: Path) -> None:
 CAD_M = 0.01
 
 
-def several_set_ups(base: Survey, rng: np.random.Generator, setups: int = 5) -> tuple[Survey, np.ndarray]:
+def several_set_ups(
+    base: Survey, rng: np.random.Generator, setups: int = 5, drawing: np.ndarray = PRISMS
+) -> tuple[Survey, np.ndarray]:
     """A survey of prisms whose drawing is off by 10 mm (one sigma), and where they are."""
-    true = PRISMS + rng.normal(0, CAD_M, PRISMS.shape)
+    true = drawing + rng.normal(0, CAD_M, PRISMS.shape)
     station = []
     for number in range(setups):
         measured = some_pose(rng).points(true) + rng.normal(0, SIGMA_M, PRISMS.shape)
@@ -183,7 +194,7 @@ def several_set_ups(base: Survey, rng: np.random.Generator, setups: int = 5) -> 
             station.append(StationPoint(f"s{number}", "prism", "", name, place, len(station) + 2))
     changed = vars(base) | {
         "station": tuple(station),
-        "prisms_in_rover_m": dict(zip(NAMES, PRISMS, strict=True)),
+        "prisms_in_rover_m": dict(zip(NAMES, drawing, strict=True)),
         "sigma": Sigma(SIGMA_M, 0.1, 0.0, CAD_M),
     }
     return Survey(**changed), true
@@ -224,6 +235,16 @@ def test_a_prism_wrong_in_one_set_up_is_named(base: Survey) -> None:
     assert refined.rejected == (("s1", "p3"),)
     assert refined.doubt == ""
     assert _spacing(refined.places_in_rover_m) == pytest.approx(_spacing(true), abs=0.002)
+
+
+def test_a_wrong_prism_is_named_where_the_others_but_one_stand_on_a_line(base: Survey) -> None:
+    """Without that one no set-up stands: it cannot be the one to leave out."""
+    line = np.array([(0.1, -0.3, -0.8), (0.1, 0.0, -0.8), (0.1, 0.3, -0.8), (-0.3, 0.1, -0.7)])
+    survey, _ = several_set_ups(base, np.random.default_rng(15), drawing=line)
+    survey.station[5].position_m[:] += (0.05, 0.03, 0.0)
+    refined = adjust_prisms(survey)
+    assert refined.rejected == (("s1", "p2"),)
+    assert refined.doubt == ""
 
 
 def test_a_prism_wrong_in_the_drawing_is_named(base: Survey) -> None:

@@ -12,6 +12,7 @@ from camera_cases import CENTER_PX, KINDS, SIZE, at_angle, plain, random_model
 from scipy.optimize import brentq
 
 from calib.camera.cahvor import CameraModel
+from calib.camera.entrance import angle_by_search
 
 PIXEL_PX = 1e-8
 
@@ -214,3 +215,15 @@ def test_every_pixel_of_the_image_sees_far_points_on_its_ray(kind: str) -> None:
         again, valid = model.project(points)
         assert valid.all(), f"model {number} of seed 5"
         assert (np.abs(again - pixels) <= 1e-6).all(), f"model {number} of seed 5"
+
+
+def test_the_search_finds_the_ray_of_a_point_that_was_laid_on_it() -> None:
+    """As published: the entrance point lies (theta / sin theta - 1) (e0 + e1 theta^2 + ...) from C."""
+    for e in ((0.02, 0.0, 0.0), (0.02, -0.01, 0.004)):
+        model = plain("CAHVORE", E=list(e))
+        theta = np.linspace(0.02, 0.6, 30)
+        entrance_m = (theta / np.sin(theta) - 1.0) * (e[0] + e[1] * theta**2 + e[2] * theta**4)
+        for range_m in (0.05, 2.0):
+            lam, w = range_m * np.sin(theta), entrance_m + range_m * np.cos(theta)
+            found = angle_by_search(model.lens, lam, w)
+            assert np.abs(found - theta).max() < 1e-11, (e, range_m)

@@ -226,3 +226,13 @@ def test_every_row_and_column_is_there_once() -> None:
     found = find_dots(shot.image, BOARD, shot.roughly(rng))
     seen = sorted(zip(found.rows.tolist(), found.columns.tolist(), strict=True))
     assert seen == sorted(zip(ROWS.tolist(), COLUMNS.tolist(), strict=True))
+
+
+def test_a_board_with_a_quarter_of_its_dots_covered_is_refused_though_its_rim_is_whole() -> None:
+    rng = np.random.default_rng(27)
+    shot = shoot(rng, SIDE, pose(4.0))
+    image = shot.image.copy()
+    rows, columns = (a.ravel() for a in np.mgrid[2:7, 2:7])
+    for x, y in shot.true_px(rows, columns):
+        cv2.circle(image, (round(x), round(y)), 11, 200, -1)
+    assert "10 x 10 are expected" in reason(find_dots(image, BOARD, shot.roughly(rng)))

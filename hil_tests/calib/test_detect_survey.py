@@ -118,3 +118,13 @@ def test_without_tapes_nothing_is_expected_and_without_rough_the_upright(drawn) 
     assert set(expectations(replace(survey, station=prisms)).values()) == {None}
     upright = expectations(without_rough(survey))
     assert all(isinstance(expected, Upright) for expected in upright.values())
+    for name, expected in upright.items():
+        image = next(image for image in survey.images if image.name == name)
+        size_px = survey.cameras[image.camera].size_px
+        assert isinstance(expected, Upright)
+        # z ahead through the middle of the picture, x to its right, y down: nothing else is known
+        middle = [(n - 1) / 2 for n in size_px]
+        ray = expected.camera.ray(np.array([middle, [middle[0] + 9, middle[1]], [middle[0], middle[1] + 9]]))
+        assert np.allclose(ray.directions[0], [0, 0, 1], atol=1e-9)
+        assert ray.directions[1, 0] > 0 and abs(ray.directions[1, 1]) < 1e-9
+        assert ray.directions[2, 1] > 0 and abs(ray.directions[2, 0]) < 1e-9

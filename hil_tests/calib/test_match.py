@@ -189,6 +189,27 @@ def test_target_outside_the_other_picture_is_at_the_border() -> None:
     guess = facing_plane(LEFT.model, (180.0, 140.0), 4.0)
     found = match_patch(seen(LEFT, 0), LEFT.model, (180.0, 140.0), guess, seen(TURNED, 0), away.model, 20)
     assert found.verdict == "border"
+    assert (found.correlation, found.second, found.half_px) == (0.0, 0.0, 0)  # nothing was compared
+
+
+def test_a_line_that_leaves_the_other_picture_altogether_has_no_partner() -> None:
+    turned = Pinhole(RIGHT.position_m, 1.2, 0.0, FOCAL_PX, SIZE_PX)
+    found = find_partner(seen(LEFT, 5), LEFT.model, (200.0, 140.0), seen(RIGHT, 5), turned.model)
+    assert found.match.verdict == "border"
+    assert found.match.reason == "nothing that this pixel may show lies in the other eye's picture"
+
+
+def test_a_line_too_short_for_a_second_place_has_no_rival() -> None:
+    """From 3.9 m on the line is a few pixels long: the wall at 4 m is the only place on it."""
+    pixel = np.array([200.0, 140.0])
+    point = wall(5).hit(LEFT.position_m, LEFT.rays(pixel))
+    near = Pinhole(np.array([0.0, 0.02, 0.0]), 0.0, 0.0, FOCAL_PX, SIZE_PX)
+    found = find_partner(
+        seen(LEFT, 5), LEFT.model, pixel, seen(near, 5), near.model, float(np.linalg.norm(point)) * 0.9
+    )
+    assert found.match.verdict == "good", found.match.reason
+    assert np.linalg.norm(found.match.pixel_px - near.pixel(point)) < 4 * RMS_PX
+    assert found.match.second < found.match.correlation
 
 
 def test_small_shift_of_the_window_does_not_hide_a_target_at_its_edge() -> None:

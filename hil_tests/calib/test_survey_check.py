@@ -135,6 +135,19 @@ def test_dots_in_one_part_of_the_picture(good: Survey) -> None:
     assert "x " in finding.message
 
 
+def test_dots_in_one_column_of_cells_ask_for_the_half_that_has_none(good: Survey) -> None:
+    """All dots right of the middle and left of the last quarter: 0 % of the left half, 50 % of the right."""
+    size_px = np.array(good.cameras["navcam_left"].size_px)
+    dots = {
+        n: replace(d, pixels_px=d.pixels_px * (0.2, 1) + (0.52 * size_px[0], 0))
+        if n.startswith("navcam_left")
+        else d
+        for n, d in good.dots.items()
+    }
+    finding = only(tuple(f for f in check_survey(replace(good, dots=dots)) if "of the picture" in f.message))
+    assert finding.advice == "Photograph boards in the left part of the picture"
+
+
 def test_few_boards(good: Survey) -> None:
     kept = {i.placement for i in good.images if i.camera == "hazcam_left" and i.purpose == "camera"}
     for count, severity in ((2, "error"), (4, "warning")):
@@ -272,6 +285,30 @@ def test_two_boards_mixed_up(good: Survey, rig: Rig) -> None:
     told = {f.place.split("image ")[1] for f in findings}
     assert told == mixed
     assert "times" in findings[0].message
+
+
+def test_a_camera_whose_placements_slipped_by_some_rows_is_one_error_and_not_one_an_image(
+    good: Survey,
+) -> None:
+    mine = [i for i in good.images if i.camera == "navcam_left" and i.purpose == "mast"]
+    half = len(mine) // 2
+    slipped = {i.name: o for i, o in zip(mine, mine[half:] + mine[:half], strict=True)}
+    changed = with_images(
+        good,
+        lambda i: (
+            (
+                replace(i, setup=slipped[i.name].setup, placement=slipped[i.name].placement)
+                if i.name in slipped
+                else i
+            )
+            if i.camera != "navcam_left" or i.name in slipped
+            else None
+        ),
+    )
+    told = [f for f in check_survey(changed) if "cannot show" in f.message]
+    finding = only(tuple(told))
+    assert finding.severity == "error" and finding.place == "camera navcam_left"
+    assert f"of {len(mine)} images cannot show the board they name, e.g. {mine[0].name}" in finding.message
 
 
 def with_joints(survey: Survey, read: Callable[[float, float], tuple[float, float]]) -> Survey:

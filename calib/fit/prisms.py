@@ -1,0 +1,183 @@
+"""Better places of the prisms than the drawing's, from several set-ups (paper section III.B).
+
+"If the CAD model of the prism positions is inaccurate, it needs to be refined iteratively at different total
+station locations": here all set-ups and the drawing are one least-squares problem, a generalised Procrustes
+alignment with the drawing as prior. The drawing also defines the rover frame, by the mean of its prisms.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.stats import chi2 as chi_square
+
+from calib.fit.adjustment import Adjustment, Estimate
+from calib.fit.least_squares import covariance_of, minimise
+from calib.fit.terms import StationTerm, station_terms
+from calib.mast.gimbal import MAST_NAMES
+from calib.rigid import FloatArray, Rigid
+from calib.survey import Survey
+from calib.survey.alignment import FALSE_ALARM, NotAligned, align
+
+STEPS = 50
+"""At most; three or four do from the aligned start, more where a prism is off."""
+
+
+@dataclass(frozen=True, eq=False)
+class AdjustedPrisms:
+    """Where the prisms are on the rover.
+
+    Attributes
+    ----------
+    names, places_in_rover_m
+        The prisms and (n, 3) their places, metres.
+    covariance
+        (3n, 3n) of the places, metres squared. Where the whole set stands is known no better than the
+        drawing says, however many set-ups there are.
+    rover_from_station
+        The pose of every set-up.
+    rejected
+        Measurements left out: set-up and prism, or None and prism where the set-ups agree with each other
+        on another place than the drawing's.
+    doubt
+        '' if what was used agrees; else a sentence.
+    chi2, degrees_of_freedom
+        Of what was used.
+    """
+
+    names: tuple[str, ...]
+    places_in_rover_m: FloatArray
+    covariance: FloatArray
+    rover_from_station: Mapping[str, Rigid]
+    rejected: tuple[tuple[str | None, str], ...]
+    doubt: str
+    chi2: float
+    degrees_of_freedom: int
+
+
+@dataclass(frozen=True, eq=False)
+class _PrismFit:
+    state: Estimate
+    covariance: FloatArray
+    chi2: float
+    freedom: int
+    settled: bool
+
+
+def adjust_prisms(survey: Survey, *, false_alarm: float = FALSE_ALARM) -> AdjustedPrisms:
+    """Fit the places of the prisms to all set-ups of a survey and to the drawing.
+
+    Parameters
+    ----------
+    survey
+        With ``sigma.prism_cad_m`` above 0; at 0 the drawing is exact and there is nothing to refine.
+    false_alarm
+        How often measurements without a blunder may be called in doubt.
+
+    Raises
+    ------
+    NotAligned
+        If a set-up has fewer than three prisms, or the places do not settle.
+    ValueError
+        If the drawing is stated to be exact.
+    """
+    if survey.sigma.prism_cad_m <= 0:
+        raise ValueError("sigma.prism_cad_m is 0: the drawing is taken as exact, nothing can be refined")
+    station = station_terms(survey, {})
+    for setup in dict.fromkeys(point.setup for point in survey.station):
+        count = sum(term.setup == setup for term in station)
+        if count < 3:
+            raise NotAligned(f"set-up {setup}: {count} prisms where at least three are expected")
+    drawing = survey.prisms_in_rover_m
+    fit = _fit(survey, drawing, station)
+    rejected: list[tuple[str | None, str]] = []
+    while fit.chi2 > _limit(fit.freedom, false_alarm):
+        found = _culprit(survey, drawing, station, fit.chi2, false_alarm)
+        if found is None:
+            break
+        rejected.append(found)
+        drawing, station = _without(drawing, station, *found)
+        fit = _fit(survey, drawing, station)
+    if not fit.settled:
+        raise NotAligned(
+            f"the prisms' places did not settle in {STEPS} steps: the set-ups stand too differently from the "
+            "drawing; check the prisms' names and places"
+        )
+    doubt = ""
+    if fit.chi2 > _limit(fit.freedom, false_alarm):
+        rms = np.sqrt(fit.chi2 / fit.freedom)
+        doubt = f"the set-ups and the drawing of the prisms disagree by {rms:.1f} times their sigmas"
+    places = fit.state.prisms_in_rover_m
+    return AdjustedPrisms(
+        tuple(places),
+        np.array(list(places.values())),
+        fit.covariance,
+        fit.state.rover_from_station,
+        tuple(rejected),
+        doubt,
+        fit.chi2,
+        fit.freedom,
+    )
+
+
+def _limit(freedom: int, false_alarm: float) -> float:
+    return float(chi_square.isf(false_alarm, freedom))
+
+
+def _without(
+    drawing: Mapping[str, FloatArray], station: Sequence[StationTerm], setup: str | None, prism: str
+) -> tuple[dict[str, FloatArray], tuple[StationTerm, ...]]:
+    """The measurements without one of them: a prism in a set-up, or in the drawing (None)."""
+    drawn = {name: place for name, place in drawing.items() if (setup, name) != (None, prism)}
+    return drawn, tuple(term for term in station if (term.setup, term.point) != (setup, prism))
+
+
+def _culprit(
+    survey: Survey,
+    drawing: Mapping[str, FloatArray],
+    station: Sequence[StationTerm],
+    now: float,
+    false_alarm: float,
+) -> tuple[str | None, str] | None:
+    """The measurement whose leaving helps by far the most; None if two would do about as well."""
+    setups = Counter(term.setup for term in station)
+    known = Counter([*drawing, *(term.point for term in station)])
+    candidates: list[tuple[str | None, str]] = [
+        (term.setup, term.point) for term in station if setups[term.setup] > 3 and known[term.point] > 1
+    ]
+    if len(drawing) > 3:
+        candidates += [(None, prism) for prism in drawing if known[prism] > 1]
+    left = []
+    for one in candidates:
+        with suppress(NotAligned):  # three on a line are no set-up
+            left.append((_fit(survey, *_without(drawing, station, *one)).chi2, one))
+    left.sort(key=lambda entry: entry[0])
+    clear = _limit(3, false_alarm)
+    if len(left) < 2 or now - left[0][0] < clear or left[1][0] - left[0][0] < _limit(1, false_alarm):
+        return None
+    return left[0][1]
+
+
+def _fit(survey: Survey, drawing: Mapping[str, FloatArray], station: Sequence[StationTerm]) -> _PrismFit:
+    """Places and poses together: an adjustment without images, of the prisms that ``drawing`` holds."""
+    places = survey.prisms_in_rover_m
+    sigma_m = float(np.hypot(survey.sigma.station_m, survey.sigma.prism_cad_m))
+    poses = {}
+    for setup in dict.fromkeys(term.setup for term in station):
+        mine = [term for term in station if term.setup == setup]
+        names = [term.point for term in mine]
+        measured = [term.position_m for term in mine]
+        poses[setup] = align(measured, [places[name] for name in names], sigma_m, names).b_from_a
+    start = Estimate({}, np.zeros(len(MAST_NAMES)), poses, {}, places, np.zeros((0, 2)))
+    problem = Adjustment(
+        (), station, start, mast_parameters=0, prisms_cad_m=drawing, prism_cad_m=survey.sigma.prism_cad_m
+    )
+    fit = minimise(problem, start, steps=STEPS, gain=1e-13)
+    at = np.concatenate([problem.at(("prism", name)) for name in places])
+    covariance = covariance_of(fit.normal.matrix)[np.ix_(at, at)]
+    freedom = 3 * (len(drawing) + len(station)) - len(problem.names)
+    return _PrismFit(fit.state, covariance, fit.normal.cost, freedom, fit.settled)
