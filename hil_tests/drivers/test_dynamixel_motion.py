@@ -227,6 +227,12 @@ def test_a_watchdog_and_braking_that_fill_half_a_second_exactly_are_taken() -> N
     assert settings.watchdog_counts == 14
 
 
+def test_a_line_is_left_silent_for_the_watchdog_the_braking_and_a_twentieth_of_a_second() -> None:
+    settings = head_settings({**options(), "watchdog_s": 0.28, "acceleration_rad_per_s2": 5.0})
+    assert settings.silence_s == pytest.approx(0.28 + 1.0 / 5.0 + 0.05)
+    assert head_settings({**options(), "watchdog_s": 0}).silence_s == 0.0
+
+
 def test_the_acceleration_that_braking_relies_on_is_not_rounded_down() -> None:
     settings = head_settings(options()).pan
     unit = settings.model.acceleration_unit_rad_per_s2
