@@ -7,7 +7,6 @@ Clicks and joint readings err once per hand-off, so the eyes of one hand-off sha
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -19,7 +18,7 @@ from calib.errors import NoStereoPoint
 from calib.handoff.matched import MODEL_PX, MatchedHandoff
 from calib.mast.covariance import RigCovariance, stored_covariance
 from calib.mast.gimbal import gimbal, gimbal_rates, numbers_of
-from calib.mast.ray_gap import MOST_SIGMAS, RIG_PX, RayGap, ray_gap
+from calib.mast.ray_gap import MOST_SIGMAS, RIG_PX, RayGap, ray_gap, silent_cameras
 from calib.mast.rig import Rig
 from calib.mast.rig_rates import click_covariance
 from calib.rigid import FloatArray, Rigid, moved_rigid, rigid_rates
@@ -165,11 +164,13 @@ def _allowed_px2(
     rig: Rig, one: MatchedHandoff, seen: Triangulation, known: RigCovariance | None, model_px: float
 ) -> FloatArray:
     """Covariance (4, 4) of a hand-off's clicks that a gap of its rays is judged by."""
-    return click_covariance(
+    allowed = click_covariance(
         rig, one.pair, one.joints.pan_rad, one.joints.tilt_rad, seen.position_m,
-        sigma_px=math.hypot(one.sigma_px, model_px if known else RIG_PX),
-        sigma_rad=one.joints.sigma_rad, calibration=known,
+        sigma_px=one.sigma_px, sigma_rad=one.joints.sigma_rad, calibration=known,
     )  # fmt: skip
+    unknown = silent_cameras(one.pair, known)
+    model_px2 = [RIG_PX**2 if name in unknown else model_px**2 for name in one.pair]
+    return np.asarray(allowed + np.diag(np.repeat(model_px2, 2)))
 
 
 def _row(

@@ -28,8 +28,8 @@ MOST_SIGMAS = 3.2905
 """Beyond it a normal error is, either side, in that part of cases."""
 
 RIG_PX = 1.0
-"""One sigma, each pixel coordinate, of what a rig is taken to be wrong by that tells none of its errors: the
-residuals of the paper's mast calibration are 0.85 to 1.13 px rms."""
+"""One sigma, each pixel coordinate, of what a camera is taken to be wrong by whose errors its rig does not
+tell: the residuals of the paper's mast calibration are 0.85 to 1.13 px rms."""
 
 
 @dataclass(frozen=True)
@@ -61,6 +61,12 @@ def ray_gap(seen: Triangulation, clicks_px2: FloatArray) -> RayGap:
     sigma_m = math.sqrt(max(float(rates @ clicks_px2 @ rates), 0.0))
     per_right_px = float(np.linalg.norm(rates[2:]))
     return RayGap(seen.ray_gap_m, sigma_m, seen.ray_gap_m / per_right_px, sigma_m / per_right_px)
+
+
+def silent_cameras(pair: tuple[str, str], calibration: RigCovariance | None) -> tuple[str, ...]:
+    """Return the cameras of a pair of whose errors a rig's covariance says nothing: all if there is none."""
+    names = calibration.names if calibration else ()
+    return tuple(one for one in pair if not any(name.startswith(f"cameras.{one}.") for name in names))
 
 
 def refuse_two_points(gap: RayGap, pair: tuple[str, str], by: str) -> None:
@@ -113,7 +119,7 @@ def clicked_point(
     sigma_px, sigma_rad
         Of each pixel coordinate of a click, and of each joint reading.
     calibration
-        Covariance of the rig. A rig that says nothing of its own errors is taken to be wrong by ``RIG_PX``.
+        Covariance of the rig. A camera of which it says nothing is taken to be wrong by ``RIG_PX``.
 
     Raises
     ------
@@ -131,9 +137,11 @@ def clicked_point(
         rig, pair, pan_rad, tilt_rad, seen.position_m,
         sigma_px=sigma_px, sigma_rad=sigma_rad, calibration=calibration,
     )  # fmt: skip
-    if calibration is None:
-        allowed += RIG_PX**2 * np.eye(4)
+    unknown = silent_cameras(pair, calibration)
+    allowed += np.diag(np.repeat([RIG_PX**2 if name in unknown else 0.0 for name in pair], 2))
     gap = ray_gap(seen, allowed)
     by = f"clicks good to {sigma_px:g} px and " + ("the mast file's covariance" if calibration else "the rig")
+    if calibration and unknown:
+        by += f", which knows nothing of {' and '.join(unknown)},"
     refuse_two_points(gap, pair, by)
     return seen, gap

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from calib.camera.cahvor import CameraModel, Rays
-from calib.camera.stereo import triangulate
+from calib.camera.stereo import triangulate, triangulate_many
 from calib.errors import NoStereoPoint
 from calib.pictures.patch_match import (
     MatchSettings,
@@ -360,14 +360,10 @@ def normal_seen(
     if own is not None:
         mine = own.pixel_px + _deformed(mine - own.predicted_px, own)
     theirs = found.pixel_px + _deformed(offsets, found)
-    try:
-        left, right, top, bottom = (
-            triangulate(camera, partner, *pixels).position_m for pixels in zip(mine, theirs, strict=True)
-        )
-    except NoStereoPoint:
-        return plane.normal
+    left, right, top, bottom = triangulate_many(camera, partner, mine, theirs).position_m
     normal = np.cross(right - left, bottom - top)
     sight, length = target_m - camera.C, float(np.linalg.norm(normal))
+    # Written so that a neighbour without a point in both eyes falls back too.
     if not abs(normal @ sight) > GRAZING * length * np.linalg.norm(sight):
         return plane.normal
     return np.asarray(normal / length)

@@ -149,13 +149,12 @@ def rover_from_station(survey: Survey, *, false_alarm: float = FALSE_ALARM) -> d
         Naming the set-up with fewer than three prisms.
     """
     sigma_m = float(np.hypot(survey.sigma.station_m, survey.sigma.prism_cad_m))
-    measured: dict[str, dict[str, FloatArray]] = {point.setup: {} for point in survey.station}
-    for point in survey.station:
-        if point.kind == "prism" and point.point in survey.prisms_in_rover_m:
-            measured[point.setup][point.point] = point.position_m
+    measured = survey.measured("prism")
     poses: dict[str, Alignment] = {}
-    for setup, points in measured.items():
-        design = [survey.prisms_in_rover_m[name] for name in points]
+    for setup in dict.fromkeys(point.setup for point in survey.station):
+        drawn = survey.prisms_in_rover_m
+        points = {name: place for name, place in measured.get((setup, ""), {}).items() if name in drawn}
+        design = [drawn[name] for name in points]
         try:
             poses[setup] = align(
                 list(points.values()), design, sigma_m, list(points), false_alarm=false_alarm
@@ -175,12 +174,9 @@ def station_from_board(
     NotAligned
         Naming the placement whose tapes are on one line.
     """
-    measured: dict[tuple[str, str], dict[str, FloatArray]] = {}
-    for point in survey.station:
-        if point.kind == "tape" and point.point in survey.board.tapes_in_board_m:
-            measured.setdefault((point.setup, point.placement), {})[point.point] = point.position_m
     poses: dict[tuple[str, str], Alignment] = {}
-    for (setup, placement), points in measured.items():
+    for (setup, placement), seen in survey.measured("tape").items():
+        points = {name: place for name, place in seen.items() if name in survey.board.tapes_in_board_m}
         if len(points) < 3:
             continue
         design = [survey.board.tapes_in_board_m[name] for name in points]

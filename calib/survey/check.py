@@ -124,8 +124,9 @@ def _missing(survey: Survey) -> Iterator[Finding]:
 
 def _set_ups(survey: Survey) -> Iterator[Finding]:
     """Set-ups with too few prisms."""
+    measured = survey.measured("prism")
     for setup in dict.fromkeys(image.setup for image in survey.images):
-        prisms = [p.point for p in survey.station if p.setup == setup and p.kind == "prism"]
+        prisms = list(measured.get((setup, ""), ()))
         if len(prisms) < 3:
             yield Finding(
                 "error",
@@ -144,10 +145,7 @@ def _set_ups(survey: Survey) -> Iterator[Finding]:
 
 def _placements(survey: Survey) -> Iterator[Finding]:
     """Images of placements not measured; placements with too few tapes, or not photographed."""
-    tapes: dict[tuple[str, str], list[str]] = {}
-    for point in survey.station:
-        if point.kind == "tape":
-            tapes.setdefault((point.setup, point.placement), []).append(point.point)
+    tapes = survey.measured("tape")
     seen = {(image.setup, image.placement) for image in survey.images}
     for image in survey.images:
         at = image.setup, image.placement

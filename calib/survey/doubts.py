@@ -27,14 +27,12 @@ SAME_PLACE_M = 1e-6
 NEAR_DOT = 0.25
 """Two dots nearer than this part of the usual distance are one dot found twice."""
 
-Group = tuple[str, str]
-
 
 def unit_doubts(survey: Survey) -> Iterator[Finding]:
     """Yield what is wrong with the scale of all prisms, or of all tapes."""
     ratios = {
-        "prisms": _ratio(survey.prisms_in_rover_m, prism_groups(survey).values()),
-        "tapes": _ratio(survey.board.tapes_in_board_m, tape_groups(survey).values()),
+        "prisms": _ratio(survey.prisms_in_rover_m, survey.measured("prism").values()),
+        "tapes": _ratio(survey.board.tapes_in_board_m, survey.measured("tape").values()),
     }
     off = {what: ratio for what, ratio in ratios.items() if ratio is not None and abs(ratio - 1) > SCALE}
     if len(off) == 2 and abs(off["prisms"] / off["tapes"] - 1) < SCALE:
@@ -61,7 +59,7 @@ def unit_doubts(survey: Survey) -> Iterator[Finding]:
 def station_doubts(survey: Survey) -> Iterator[Finding]:
     """Yield columns that mirror the world, points that disagree with the design, rows that are copies."""
     sigma_m = float(np.hypot(survey.sigma.station_m, survey.sigma.prism_cad_m))
-    prisms, tapes = prism_groups(survey), tape_groups(survey)
+    prisms, tapes = survey.measured("prism"), survey.measured("tape")
     design = survey.prisms_in_rover_m
     inverted = [
         s for s, seen in prisms.items() if mirrored(list(seen.values()), [design[n] for n in seen], sigma_m)
@@ -128,24 +126,6 @@ def grid_doubts(survey: Survey) -> Iterator[Finding]:
                 f"Correct board.{what}s or dots.csv ({what}s count from 0), and tapes_in_board_m, which "
                 "count from the middle of the grid",
             )
-
-
-def prism_groups(survey: Survey) -> dict[Group, dict[str, FloatArray]]:
-    """Return set-up (with '') to the prisms measured there, metres."""
-    groups: dict[Group, dict[str, FloatArray]] = {}
-    for point in survey.station:
-        if point.kind == "prism":
-            groups.setdefault((point.setup, ""), {})[point.point] = point.position_m
-    return groups
-
-
-def tape_groups(survey: Survey) -> dict[Group, dict[str, FloatArray]]:
-    """Return set-up and placement to the tapes measured there, metres."""
-    groups: dict[Group, dict[str, FloatArray]] = {}
-    for point in survey.station:
-        if point.kind == "tape":
-            groups.setdefault((point.setup, point.placement), {})[point.point] = point.position_m
-    return groups
 
 
 def _ratio(design: Mapping[str, FloatArray], groups: Iterable[Mapping[str, FloatArray]]) -> float | None:

@@ -9,7 +9,7 @@ import numpy as np
 from calib.rigid import FloatArray, Rigid
 from calib.survey import Finding, Survey, SurveyCamera, SurveyImage
 from calib.survey.alignment import NotAligned, align
-from calib.survey.doubts import pixels_per_metre, prism_groups, tape_groups
+from calib.survey.doubts import pixels_per_metre
 
 EYE_M, ROUGH_EYE_M = 1.0, 0.25
 """How far a camera may be from where it is taken to be: the middle of the prisms, or its rough place."""
@@ -39,13 +39,13 @@ def mixups(survey: Survey) -> Iterator[Finding]:
 def rover_from_boards(survey: Survey) -> dict[Placement, Rigid]:
     """Return where boards stand, by set-up and placement, as far as three prisms and three tapes tell."""
     rover: dict[str, Rigid] = {}
-    for (setup, _), seen in prism_groups(survey).items():
+    for (setup, _), seen in survey.measured("prism").items():
         design = [survey.prisms_in_rover_m[name] for name in seen]
         pose = _aligned(list(seen.values()), design)
         if pose is not None:
             rover[setup] = pose
     boards: dict[Placement, Rigid] = {}
-    for (setup, placement), seen in tape_groups(survey).items():
+    for (setup, placement), seen in survey.measured("tape").items():
         pose = _aligned([survey.board.tapes_in_board_m[name] for name in seen], list(seen.values()))
         if pose is not None and setup in rover:
             boards[setup, placement] = rover[setup] @ pose

@@ -145,6 +145,14 @@ class Survey:
     clicks: tuple[Click, ...] = ()
     digest: str = ""
 
+    def measured(self, kind: StationKind) -> dict[tuple[str, str], dict[str, FloatArray]]:
+        """Return set-up and placement ('' for prisms) to the points (3,) of a kind measured there, metres."""
+        groups: dict[tuple[str, str], dict[str, FloatArray]] = {}
+        for point in self.station:
+            if point.kind == kind:
+                groups.setdefault((point.setup, point.placement), {})[point.point] = point.position_m
+        return groups
+
 
 @dataclass(frozen=True)
 class Finding:

@@ -136,9 +136,10 @@ class DynamixelHead(Reporting):
         LineLost, NoReply, BadReply
             If a servo did not confirm. The driver then keeps silent until its watchdog has stopped it, a
             further stop included: both were told to brake when the line was given up, and every packet more
-            would feed the watchdog of one that did not hear it.
+            would feed the watchdog of one that did not hear it. With ``watchdog_s: 0`` nothing can be fed:
+            a stop tries a line that is away at once.
         """
-        self._call("stop", Session.stop, first=True)
+        self._call("stop", Session.stop, first=True, tries=not self.settings.watchdog_counts)
 
     def close(self) -> None:
         """Stop, leave each servo as its ``at_close`` says, and let go of the line; never raises."""
@@ -156,16 +157,28 @@ class DynamixelHead(Reporting):
     # In the thread that owns the bus
 
     def _call(
-        self, what: str, function: Callable[[Session], T], *, first: bool = False, moves: bool = False
+        self,
+        what: str,
+        function: Callable[[Session], T],
+        *,
+        first: bool = False,
+        moves: bool = False,
+        tries: bool = False,
     ) -> T:
+        """Have something done in the bus thread; one that ``tries`` does not leave an absent line alone."""
         with self._state:
             if self._closed:
                 raise NoReply(f"the head on {self.settings.port} is closed; {what} was not sent")
-        self._absence.check()
-        return self._bus.call(what, lambda: self._within(function), CALL_TIMEOUT_S, first=first, moves=moves)
+        if not tries:
+            self._absence.check()
+        return self._bus.call(
+            what, lambda: self._within(function, tries), CALL_TIMEOUT_S, first=first, moves=moves
+        )
 
-    def _within(self, function: Callable[[Session], T]) -> T:
+    def _within(self, function: Callable[[Session], T], tries: bool = False) -> T:
         """Do something with the servos, which may end in giving the line up."""
+        if tries and self._session is None:
+            self._come_back()
         self._absence.check()
         session = self._session
         assert session is not None

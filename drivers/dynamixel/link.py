@@ -17,6 +17,7 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 
 from dynamixel_sdk import (
@@ -153,6 +154,10 @@ class Link:
     def close(self) -> None:
         """Let go of the line; never raises."""
         self._port.closePort()
+
+    def undisturbed(self) -> AbstractContextManager[None]:
+        """Within it nothing urgent breaks off what is said; for what must not be left half done."""
+        return self._port.undisturbed()
 
     def ping(self, servo_id: int) -> Pinged:
         """Ask one servo who it is. Raises NoReply, BadReply, LineLost."""

@@ -15,11 +15,12 @@ from drivers.dynamixel.models import Block
 from drivers.dynamixel.motion import AxisMotion, Sample, motion_blocks
 from drivers.dynamixel.servo import Reboots, Servo
 from drivers.dynamixel.settings import AxisSettings, HeadSettings
-from drivers.errors import DriverError
+from drivers.errors import DriverError, LineLost
 
 log = logging.getLogger(__name__)
 
 FAST_TRIALS = 10
+STAND_ROUNDS = 2
 BRAKE_COPIES = 3  # more than a reply of 54 bytes can collide with
 
 
@@ -228,6 +229,9 @@ class Pair:
 def ready_pair(head: HeadSettings, reboots: Reboots, urgent: Callable[[], bool]) -> Pair:
     """Open the line and make both servos ready, without moving them: checked, set up, holding, armed.
 
+    Without a watchdog an axis may still be under way: each is told to stand first, whatever the other does.
+    An axis whose torque was dropped to set it up holds again if it cannot be made ready.
+
     ``reboots`` are those done to this head; ``urgent`` is that of `Link`.
 
     Raises
@@ -240,7 +244,35 @@ def ready_pair(head: HeadSettings, reboots: Reboots, urgent: Callable[[], bool])
     link = Link(head.port, head.baud, head.reply_timeout_s, urgent)
     try:
         pair = Pair(link, head)
-        servos = [axis.servo for axis in pair.axes]
+        if not head.watchdog_counts:
+            _stand(pair)
+        _make_ready(pair, reboots)
+        pair.fast = head.fast_read and pair.prove_fast_read()
+    except BaseException:
+        link.close()
+        raise
+    return pair
+
+
+def _stand(pair: Pair) -> None:
+    """Tell each axis that is under way to stand, as far as it answers. Raises LineLost."""
+    waiting = list(pair.axes)
+    for _ in range(STAND_ROUNDS):
+        for axis in tuple(waiting):
+            try:
+                axis.servo.stand()
+            except LineLost:
+                raise
+            except DriverError as error:  # told, with what it is, when the servo is made ready
+                log.debug("%s was not told to stand: %s", axis.servo.name, error)
+            else:
+                waiting.remove(axis)
+
+
+def _make_ready(pair: Pair, reboots: Reboots) -> None:
+    """Make both servos ready; raises as `ready_pair`."""
+    servos = [axis.servo for axis in pair.axes]
+    try:
         for servo in servos:
             servo.check_identity()
         for servo in servos:
@@ -252,8 +284,8 @@ def ready_pair(head: HeadSettings, reboots: Reboots, urgent: Callable[[], bool])
         for axis in pair.axes:
             axis.take_hold()
         pair.arm()
-        pair.fast = head.fast_read and pair.prove_fast_read()
-    except BaseException:
-        link.close()
+    except BaseException:  # a stop or a closing that broke it off too: what hangs on an axis is not to fall
+        with pair.link.undisturbed():
+            for servo in servos:
+                servo.hold_again()
         raise
-    return pair

@@ -197,6 +197,15 @@ class Port(PortHandler):  # type: ignore[misc]
 
     # What our layers use
 
+    @contextlib.contextmanager
+    def undisturbed(self) -> Iterator[None]:
+        """Within it nothing urgent is given way to."""
+        urgent, self._urgent = self._urgent, lambda: False
+        try:
+            yield
+        finally:
+            self._urgent = urgent
+
     @property
     def byte_s(self) -> float:
         """Time of one byte on the wire, seconds."""

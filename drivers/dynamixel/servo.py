@@ -12,7 +12,6 @@ import logging
 import math
 import time
 from collections.abc import Callable
-from contextlib import suppress
 from typing import TypeVar
 
 from drivers.dynamixel.link import Link, Part, Pinged
@@ -83,6 +82,7 @@ class Servo:
         self._registers = settings.model.registers
         self.name = f"{axis} (servo {settings.servo_id})"
         self.truth = Truth(self.name, settings)
+        self._dropped = False  # its torque, by us, and not yet taken hold again
         self._blocks = itertools.cycle(motion_blocks(settings))
 
     def get(self, register: str) -> int:
@@ -173,6 +173,24 @@ class Servo:
             before = now
         raise BadReply(f"{self.name} says another thing about itself each time it is asked")
 
+    def stand(self) -> None:
+        """Make where the servo is its goal, if it is of the model configured and its torque is on.
+
+        Asked one time and not read back: whatever it is, another axis may wait for the same.
+
+        Raises
+        ------
+        NoReply, BadReply, Refused, LineLost
+            As `Link.proven` and `Link.write`.
+        """
+        servo_id, registers = self._settings.servo_id, self._registers
+        asked = (registers["model_number"], registers["torque_enable"])
+        if self._link.proven(servo_id, *asked) != [self._settings.model.number, 1]:
+            return
+        low, high = self._settings.limit_counts
+        goal = min(max(self.look_once().counts, low), high)
+        self._link.write(servo_id, registers["goal_position"], goal)
+
     def check_health(self, reboots: Reboots) -> None:
         """See that the servo reports no hardware error; restart it if the configuration says so.
 
@@ -254,6 +272,8 @@ class Servo:
     def set_up(self) -> None:
         """Bring the servo's permanent settings to what the configuration says.
 
+        The torque may be off then: `take_hold` follows, or `hold_again` if that is not to be.
+
         Raises
         ------
         WrongDevice
@@ -275,17 +295,22 @@ class Servo:
                     "on and the axis may fall: support it and set torque_off_at_start: true, or switch the "
                     "servo off and on"
                 )
+            self._dropped = True
             self.set("torque_enable", 0)
         log.info("%s: setting %s", self.name, told)
+        for name in sorted(different, key=lambda n: n != "operating_mode"):  # a new mode resets others
+            self.set(name, different[name])
+
+    def hold_again(self) -> None:
+        """Switch on the torque that `set_up` has dropped, if nothing has since; never raises."""
+        if not self._dropped:
+            return
         try:
-            for name in sorted(different, key=lambda n: n != "operating_mode"):  # a new mode resets others
-                self.set(name, different[name])
-        except DriverError:
-            if torque:  # what hangs on the axis is not left to fall
-                with suppress(DriverError):
-                    self.set("goal_position", self.look().counts)
-                    self.set("torque_enable", 1)
-            raise
+            self.set("goal_position", self.look().counts)
+            self.set("torque_enable", 1)
+        except DriverError as error:
+            log.warning("%s: its torque is off and could not be switched on again: %s", self.name, error)
+        self._dropped = False
 
     def _wanted(self) -> dict[str, int]:
         """The permanent settings, by register."""
@@ -341,6 +366,7 @@ class Servo:
                 raise HardwareFault(
                     f"{self.name} does not switch its torque on; it may be shut down by a hardware error"
                 ) from None
+        self._dropped = False
         return self._come_to_rest()
 
     @property

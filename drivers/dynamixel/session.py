@@ -9,6 +9,7 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 
 from drivers.clock import Clock
 from drivers.dynamixel.pair import Axis, Pair
@@ -136,7 +137,8 @@ class Session:
         GivenUp
             As `look`, and if the servos do not confirm the goals: silence stops them.
         NoReply, BadReply, Refused, WrongDevice, LineLost
-            If they cannot be asked or set; nothing moves.
+            If they cannot be asked or set. Nothing moves, or where the goals were sent and then no answer
+            came, both were told to brake.
         """
         self.look()
         self._watch.check_free()
@@ -150,7 +152,12 @@ class Session:
             axis.motion.plan(angle_rad, speed_rad_per_s, axis.acceleration_rad_per_s2)
             for axis, angle_rad in zip(self.pair.axes, angles_rad, strict=True)
         ]
-        self._send_goals(goals, speeds)
+        try:
+            self._send_goals(goals, speeds)
+        except DriverError:  # whoever is told that it failed takes it to stand
+            with suppress(LineLost):
+                self.pair.brake()
+            raise
 
     def _send_goals(self, goals: Sequence[int], speeds: Sequence[int]) -> None:
         """Write profile and goal of both axes with one packet and see that they are held."""

@@ -142,7 +142,7 @@ class HeadSettings:
     @property
     def watchdog_counts(self) -> int:
         """The watchdog register's value, rounded down; 0 for off."""
-        return math.floor(self.watchdog_s / WATCHDOG_STEP_S + 1e-6)
+        return _watchdog_counts(self.watchdog_s)
 
     @property
     def silence_s(self) -> float:
@@ -151,6 +151,11 @@ class HeadSettings:
             return 0.0
         brakes_s = self.speed_rad_per_s / self.acceleration_rad_per_s2
         return self.watchdog_counts * WATCHDOG_STEP_S + brakes_s + SILENCE_SPARE_S
+
+
+def _watchdog_counts(watchdog_s: float) -> int:
+    """The watchdog register's value, rounded down."""
+    return math.floor(watchdog_s / WATCHDOG_STEP_S + 1e-6)
 
 
 def head_settings(options: Mapping[str, Any]) -> HeadSettings:
@@ -198,10 +203,13 @@ def head_settings(options: Mapping[str, Any]) -> HeadSettings:
             f"s or more, and {STANDS_WITHIN_S:g} s in all, the last poll's age included; or 0 to do without"
         )
     reply_timeout_s = read.number("reply_timeout_s", 0.05, 0.002, LONGEST_REPLY_S)
-    if watchdog_s and reply_timeout_s > watchdog_s - 1 / poll_hz - QUIET_S:
+    trips_s = _watchdog_counts(watchdog_s) * WATCHDOG_STEP_S
+    most_s = round(trips_s - 1 / poll_hz - QUIET_S, 9)
+    if watchdog_s and reply_timeout_s > most_s:
         raise BadOptions(
-            f"options.reply_timeout_s is {reply_timeout_s:g} s with watchdog_s {watchdog_s:.3g}: one lost "
-            f"reply would stop the head; expected {watchdog_s - 1 / poll_hz - QUIET_S:.3g} s or less"
+            f"options.reply_timeout_s is {reply_timeout_s:g} s with watchdog_s {watchdog_s:.3g}, which the "
+            f"servos count as {trips_s:.3g} s: one lost reply would stop the head; expected {most_s:.3g} s "
+            "or less"
         )
     return HeadSettings(
         port=port,

@@ -25,7 +25,7 @@ from calib.camera.parameters import parameter_names, parameter_part
 from calib.errors import NoCorrection
 from calib.files.mast_file import load_rig
 from calib.handoff.body_pose import PRIOR_SHIFT_M, PRIOR_TURN_RAD, BodyPose
-from calib.handoff.body_sights import body_groups
+from calib.handoff.body_sights import body_groups, body_sights
 from calib.handoff.corrected_rig import corrected_covariance, corrected_rig
 from calib.handoff.fit_body_pose import fit_body_pose
 from calib.mast.covariance import RigCovariance, moved_rig
@@ -145,6 +145,15 @@ def test_clicks_of_two_things_are_named_and_not_used(rig: Rig) -> None:
     assert [one.name for one in fit.outliers] == ["line 8"]
     assert "its two clicks do not mean one point, they are " in fit.outliers[0].sentence
     assert len(fit.used.handoffs) == 23
+
+
+def test_clicks_of_cameras_that_the_covariance_leaves_out_may_be_off_as_without_one(rig: Rig) -> None:
+    rng = np.random.default_rng(12)
+    made = hand_offs({name: vectors(rig, name) for name in HAZCAMS}, rig, targets(rng, 24), rng)
+    made[7] = replace(made[7], clicks_px=made[7].clicks_px + np.array([[0.0, 0.0], [0.0, 3.0]]))
+    fit = {"parameters": ["mast.translation_m.z"], "covariance": [[1e-12]]}
+    for one in (rig, replace(rig, fit=fit)):
+        assert body_sights(one, HAZCAMS, made).apart == ()
 
 
 def test_what_turns_mast_and_body_alike_is_no_correction(rig: Rig) -> None:

@@ -269,16 +269,32 @@ def test_clicks_whose_rays_pass_each_other_are_refused_with_gap_and_pixels(
     hand_off(rig, PAIR, HAZCAMS, AT, left, right + np.array([3.0, 0.0]))
 
 
+@pytest.mark.parametrize(("added", "allowed_px"), [(PAIR, 4.0), (PAIR[1:], 3.0)], ids=["both", "right"])
+def test_cameras_added_by_hand_to_a_calibrated_mast_file_are_not_taken_for_exact(
+    rig: Rig, added: tuple[str, ...], allowed_px: float
+) -> None:
+    parts = [(n, p) for n in PAIR if n not in added for p in parameter_names(rig.cameras[n].model.kind)[:5]]
+    names = ("mast.translation_m.z", *(f"cameras.{name}.{part}" for name, part in parts))
+    known = RigCovariance(names, 1e-12 * np.eye(len(names)))
+    left, right = clicks(rig, PAIR, TARGET, AT)
+    hand_off(rig, PAIR, HAZCAMS, AT, left, right + np.array([0.0, allowed_px]), calibration=known)
+    with pytest.raises(NoStereoPoint, match=rf"knows nothing of {' and '.join(added)}, explain"):
+        hand_off(rig, PAIR, HAZCAMS, AT, left, right + np.array([0.0, allowed_px + 1.0]), calibration=known)
+
+
 def test_a_rig_that_says_how_wrong_it_is_may_be(rig: Rig) -> None:
     """A principal point 4 px too low is explained by a calibration as unsure, and by no better one."""
     name = f"cameras.{PAIR[1]}.V.x"
+    names = (name, f"cameras.{PAIR[0]}.V.x")  # the other one is known well
     left, right = clicks(rig, PAIR, TARGET, AT)
     wrong = moved_rig(rig, [name], np.array([4.0]))
     shift = clicks(wrong, PAIR, TARGET, AT)[1] - right
     assert abs(shift[1]) == pytest.approx(4.0, abs=0.3)
-    hand_off(wrong, PAIR, HAZCAMS, AT, left, right, calibration=RigCovariance((name,), np.array([[16.0]])))
+    hand_off(wrong, PAIR, HAZCAMS, AT, left, right, calibration=RigCovariance(names, np.diag([16.0, 1e-4])))
     with pytest.raises(NoStereoPoint, match="do not mean one point"):
-        hand_off(wrong, PAIR, HAZCAMS, AT, left, right, calibration=RigCovariance((name,), np.eye(1)))
+        hand_off(
+            wrong, PAIR, HAZCAMS, AT, left, right, calibration=RigCovariance(names, np.diag([1.0, 1e-4]))
+        )
 
 
 @pytest.mark.parametrize(("calibrated", "draws"), [(False, 10_000), (True, 3_000)])

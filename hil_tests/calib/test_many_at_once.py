@@ -147,6 +147,21 @@ def test_what_is_wrong_for_every_target_is_raised(rig: Rig) -> None:
     assert refusal.value.code == "bad_joints"
 
 
+def test_four_solutions_come_in_the_order_that_they_have_alone() -> None:
+    # A camera half a metre behind the head's origin sees targets about the axes in four ways.
+    forward, right_hand, down = np.eye(3)
+    H, V = 1000 * right_hand + 500 * forward, 1000 * down + 400 * forward
+    behind = CameraModel("CAHV", (1000, 800), -0.5 * forward, forward, H, V)
+    mast, target = Mast(np.zeros(3), np.zeros(3), 0.3), [0.07, -0.08, 0.08]
+    orders = set()
+    for pan_rad, tilt_rad in ((1.3, -0.4), (-0.4, 1.3)):
+        alone = solve(mast, behind, target, from_pan_rad=pan_rad, from_tilt_rad=tilt_rad)
+        many = solve_many(mast, behind, [target], from_pan_rad=pan_rad, from_tilt_rad=tilt_rad)
+        assert len(alone) == 4 and many.at(0) == alone
+        orders.add(tuple(alone))
+    assert len(orders) == 2
+
+
 # -- triangulate
 
 
@@ -211,6 +226,16 @@ def test_a_bad_pair_of_pixels_stops_no_other() -> None:
     for name in ("position_m", "covariance_m2", "ray_gap_m", "ranges_m"):
         array = getattr(many, name)
         assert np.isfinite(array[0]).all() and np.isnan(array[1:]).all(), name
+
+
+def test_rays_that_meet_behind_one_eye_alone_are_refused() -> None:
+    forward, right_hand, down = np.eye(3)
+    H, V = 100 * right_hand + 50 * forward, 100 * down + 50 * forward
+    ahead = CameraModel("CAHV", (101, 101), np.zeros(3), forward, H, V)
+    H, V = -100 * forward + 50 * right_hand, 100 * down + 50 * right_hand
+    aside = CameraModel("CAHV", (101, 101), forward + right_hand, right_hand, H, V)  # it looks right
+    assert triangulate_many(ahead, aside, [[50, 50]], [50, 50]).refused.tolist() == ["behind_camera"]
+    assert triangulate_many(aside, ahead, [[50, 50]], [50, 50]).refused.tolist() == ["behind_camera"]
 
 
 @pytest.mark.parametrize(

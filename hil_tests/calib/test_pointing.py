@@ -493,3 +493,14 @@ def test_any_target_is_hit_or_refused_by_name(
         there = campaign.rover_from_head(mast, one.pan_rad, one.tilt_rad, origin + one.range_m * direction)
         assert one.range_m > 0.0
         assert np.linalg.norm(there - target) <= 3e-12 * size
+
+
+def test_without_a_word_the_head_is_taken_to_stand_at_zero() -> None:
+    """On the pan axis every pan does: the one where the head stands is told."""
+    mast = Mast(np.array([0.0, 0.0, -1.5]), np.zeros(3))
+    above = [0.0, 0.0, -9.0]
+    ray = [0.0, 0.0, 0.0], [1.0, 0.0, 0.0]
+    assert solve_ray(mast, *ray, above)[0].pan_rad == 0.0
+    assert solve_ray(mast, *ray, above, from_pan_rad=0.3)[0].pan_rad == 0.3
+    beside = [4.0 * np.cos(2.0), 4.0 * np.sin(2.0), -1.5]
+    assert solve_ray(mast, *ray, beside) == solve_ray(mast, *ray, beside, from_pan_rad=0.0, from_tilt_rad=0.0)

@@ -136,6 +136,22 @@ def test_covariance_is_the_numeric_derivative(kind: str) -> None:
     np.testing.assert_allclose(told, 0.09 * numeric @ numeric.T, rtol=1e-5, atol=1e-8 * np.abs(told).max())
 
 
+@pytest.mark.parametrize("kind", KINDS)
+def test_rates_of_the_gap_are_those_of_the_rays(kind: str) -> None:
+    eyes = wide_eye(-0.05, 0.02, kind), wide_eye(0.05, -0.03, kind)
+    px = np.concatenate([eye.project([1.5, 0.2, 0.5])[0] for eye in eyes])
+
+    def gap_m(px: np.ndarray) -> float:
+        one, two = eyes[0].ray(px[:2]), eyes[1].ray(px[2:])
+        normal = np.cross(one.directions, two.directions)
+        return float((one.origins_m - two.origins_m) @ normal / np.linalg.norm(normal))
+
+    steps = 1e-3 * np.eye(4)
+    expected = [(gap_m(px + step) - gap_m(px - step)) / 2e-3 for step in steps]
+    told = triangulate(*eyes, px[:2], px[2:]).gap_m_per_px
+    np.testing.assert_allclose(told, expected, rtol=1e-5, atol=1e-10)
+
+
 def test_parallel_rays_are_refused() -> None:
     with pytest.raises(NoStereoPoint) as refusal:
         triangulate(LEFT, RIGHT_EYE, [500.0, 400.0], [500.0, 400.0])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import random
 import shutil
 from collections.abc import Iterator, Mapping
@@ -315,3 +316,21 @@ def test_any_bytes_of_a_picture_are_taken_or_refused(tmp_path: Path, head: bytes
         read_survey(folder)
     except BadFile as error:
         assert "one.png is" in error.reason
+
+
+def test_every_file_of_a_survey_is_on_the_disk_before_the_folder_gets_its_name(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A machine that loses its power after the renaming must not be left with empty files."""
+    survey, target = read_survey(folder), tmp_path / "new"
+    fsync, early = os.fsync, set()
+
+    def noted(descriptor: int) -> None:
+        fsync(descriptor)
+        if not target.exists():
+            early.add(Path(f"/proc/self/fd/{descriptor}").readlink().name)
+
+    monkeypatch.setattr(os, "fsync", noted)
+    write_survey(survey, target, [("pictures/x.png", b"x")])
+    written = {path.name for path in target.rglob("*") if path.is_file()}
+    assert {"survey.yaml", "station.csv", "images.csv", "x.png"} <= written <= early

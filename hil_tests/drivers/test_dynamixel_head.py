@@ -6,6 +6,7 @@ what must happen is waited for, and a wait that is long enough for a busy machin
 
 from __future__ import annotations
 
+import math
 import multiprocessing as mp
 import os
 import signal
@@ -222,6 +223,16 @@ def test_a_profile_that_is_zeroed_under_way_is_noticed_and_put_right(register: s
         until(lambda: read_or_none(head), "the head")
         assert it.servos[0].table[register] > 0
         head.close()
+
+
+def test_a_move_is_sent_with_its_own_speed_and_the_configured_acceleration() -> None:
+    """XM430: 214.577 rev/min2 and 0.229 rev/min a count (its table in the manufacturer's e-manual)."""
+    with opened(options={"acceleration_rad_per_s2": 20.0}) as (it, head):
+        head.move(0.2, -0.1, 0.8)
+        settled(head)
+        for servo in it.servos:
+            assert servo.table["profile_acceleration"] == math.ceil(20.0 / (214.577 * math.tau / 3600))
+            assert servo.table["profile_velocity"] == math.floor(0.8 / (0.229 * math.tau / 60))
 
 
 def test_both_axes_go_to_the_nearest_count_and_the_report_says_what_is_left() -> None:

@@ -209,7 +209,8 @@ def test_options_that_cannot_be_are_refused_in_words(change: dict[str, Any], wor
         ({"speed_rad_per_s": 2.0}, "acceleration_rad_per_s2 is 4: braking from 2 rad/s takes 0.5 s"),
         ({"speed_rad_per_s": 2.0}, "0.5 s in all"),
         ({"poll_hz": 1}, "from 10 to 500"),
-        ({"reply_timeout_s": 0.2}, "one lost reply would stop the head; expected 0.19 s or less"),
+        ({"reply_timeout_s": 0.2}, "one lost reply would stop the head; expected 0.18 s or less"),
+        ({"reply_timeout_s": 0.185, "watchdog_s": 0.23}, "which the servos count as 0.22 s"),
         ({"reply_timeout_s": 1.0, "watchdog_s": 0}, "from 0.002 to 0.3"),
         ({"speed_rad_s": 1}, "did you mean 'speed_rad_per_s'"),
         ({"tilt": 3}, "expected a mapping"),
@@ -224,6 +225,12 @@ def test_options_of_the_head_that_cannot_be_are_refused_in_words(change: dict[st
 def test_a_watchdog_and_braking_that_fill_half_a_second_exactly_are_taken() -> None:
     settings = head_settings({**options(), "watchdog_s": 0.28, "acceleration_rad_per_s2": 5.0})
     assert settings.watchdog_counts == 14
+
+
+def test_a_line_is_left_silent_for_the_watchdog_the_braking_and_a_twentieth_of_a_second() -> None:
+    settings = head_settings({**options(), "watchdog_s": 0.28, "acceleration_rad_per_s2": 5.0})
+    assert settings.silence_s == pytest.approx(0.28 + 1.0 / 5.0 + 0.05)
+    assert head_settings({**options(), "watchdog_s": 0}).silence_s == 0.0
 
 
 def test_the_acceleration_that_braking_relies_on_is_not_rounded_down() -> None:

@@ -17,7 +17,10 @@ from dynamixel_rig import COUNT_RAD, LONG_S, Rig, failed, opened, read_or_none, 
 
 from drivers.dynamixel.bus import Bus
 from drivers.dynamixel.head import DynamixelHead
-from drivers.errors import DriverError, NoReply
+from drivers.dynamixel.link import Link
+from drivers.dynamixel.pair import Pair
+from drivers.dynamixel.servo import Servo
+from drivers.errors import DriverError, LineLost, NoReply
 from drivers.sim.wire.carrier import Reply
 from drivers.sim.wire.dynamixel_packets import BROADCAST, Instruction
 from drivers.sim.wire.dynamixel_servo import VOLTAGE
@@ -134,8 +137,9 @@ def test_a_stop_brakes_each_axis_at_once_whatever_the_other_does(
         if not unnoticed:
             heard = len(it.ear.heard)
             until(lambda: len(it.ear.heard) >= heard + 2, "a question that is not answered as it should be")
+            now_s = time.monotonic()
             # if that was the end of the line already, the axes were told to brake when it was given up
-            told_s = time.monotonic() if head._absence.error is None else told_s
+            told_s = told_s if any(goals_after(it, told_s).values()) else now_s
         with suppress(DriverError):
             head.stop()
         assert_each_stands_where_it_brakes(it, told_s)
@@ -398,3 +402,83 @@ def test_a_stop_that_breaks_off_a_taking_hold_leaves_no_torque_on_where_it_lets_
 def failed_move(head: DynamixelHead) -> None:
     with suppress(DriverError):
         head.move(0.5, 0.3)
+
+
+@pytest.mark.parametrize("silent", [None, 0, 1], ids=["none", "pan", "tilt"])
+def test_without_a_watchdog_a_stop_tries_a_line_that_is_away_at_once(silent: int | None) -> None:
+    with opened(options={"watchdog_s": 0}) as (it, head):
+        head.move(2.4, 0.9, 0.2)
+        until(lambda: all(axis.angle_rad(time.monotonic()) > 0.05 for axis in it.axes), "motion")
+        it.line.hang_up()
+        until(lambda: failed(head) and head._session is None, "the line to be given up")
+        with pytest.raises(LineLost):
+            head.stop()
+        head._absence.again_s = time.monotonic() + LONG_S  # not before somebody asks for it
+        if silent is not None:
+            unpowered(it, silent)
+        it.line.come_back()
+        back_s = time.monotonic()
+        if silent is None:
+            head.stop()
+        else:
+            with pytest.raises(NoReply):
+                head.stop()
+        for axis in (it.axes[number] for number in reachable(it)):
+            until(lambda a=axis: a.velocity_rad_per_s(time.monotonic()) == 0, "rest")
+            assert axis.angle_rad(time.monotonic()) - axis.angle_rad(back_s) < 0.4, "it ran on to its goal"
+        if silent is None:
+            assert settled(head).faults == ()
+
+
+@pytest.mark.parametrize("register", ["min_position_limit", "goal_position"])
+@pytest.mark.parametrize("overtaking", ["close", "stop"])
+def test_an_axis_whose_torque_was_dropped_to_set_it_up_holds_again_when_that_is_broken_off(
+    register: str, overtaking: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    options = {"torque_off_at_start": True, "watchdog_s": 0}
+    with opened(options=options) as (it, head):
+        it.line.hang_up()
+        until(lambda: failed(head) and head._session is None, "the line to be given up")
+        table = it.servos[1].table
+        table["min_position_limit"] += 1  # somebody else has set it, so that it must be set up anew
+        limp, true_set = threading.Event(), Servo.set
+
+        def set_late(servo: Servo, name: str, value: int) -> None:
+            if name == register and not table["torque_enable"] and not limp.is_set():
+                limp.set()
+                until(head._bus.urgent, "who overtakes it")
+            true_set(servo, name, value)
+
+        monkeypatch.setattr(Servo, "set", set_late)
+        broken_off: list[int] = []
+        true_close = Link.close
+
+        def close(link: Link) -> None:
+            broken_off.append(table["torque_enable"])
+            true_close(link)
+
+        monkeypatch.setattr(Link, "close", close)
+        it.line.come_back()
+        assert limp.wait(LONG_S)
+        getattr(head, overtaking)()
+        assert broken_off == [1]
+        assert table["torque_enable"] == 1
+
+
+def test_a_move_whose_goals_went_out_but_that_is_told_as_failed_brakes(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    with opened() as (it, head):
+        true_send = Pair.send
+
+        def send(pair: Pair, values: Any) -> None:
+            true_send(pair, values)
+            mute(it, 0)
+
+        monkeypatch.setattr(Pair, "send", send)
+        with pytest.raises(NoReply):
+            head.move(2.0, 0.9)
+        it.panel.clear()
+        until(lambda: all(not axis.under_way(time.monotonic()) for axis in it.axes), "rest")
+        assert it.axes[0].angle_rad(time.monotonic()) < 1.5
+        assert it.axes[1].angle_rad(time.monotonic()) < 0.8

@@ -438,6 +438,7 @@ def test_a_limit_hit_of_a_resting_head_that_has_moved_meanwhile_stays(opened: Op
         ({}, "Input 30 VDC @ 167 degF", "the unit is at 75 °C, expected 60 °C at most"),
         ({}, "30.1V,90F,158F,88F", "the unit is at 70 °C"),
         ({"hottest_C": 80}, "Input 30 VDC @ 167 degF", ""),
+        ({}, "Input 24 VDC @ 140 degF", ""),  # 60 degrees Celsius: both at their bounds
         ({}, "something else", ""),
     ],
 )

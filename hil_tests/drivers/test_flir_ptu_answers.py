@@ -7,13 +7,16 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, suppress
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
 
 import pytest
 from scripted_ptu import ScriptedPtu
 
 from drivers.clock import ManualClock, SystemClock
 from drivers.errors import DriverError
+from drivers.flir_ptu.axis import Axis
+from drivers.flir_ptu.count import StepCount
 from drivers.flir_ptu.head import FlirPtu, open_head
 from drivers.sim.wire.line import PtyLine
 
@@ -144,3 +147,34 @@ def test_both_angles_are_of_the_moment_told_however_slowly_the_unit_answers(
         # The driver does not know when within the question's time on the wire the unit has looked: 4 ms.
         assert reading.pan_rad == pytest.approx(pan_rad, abs=(300 * 0.005 + 1) * PAN_STEP_RAD)
         assert reading.tilt_rad == pytest.approx(tilt_rad, abs=(700 * 0.005 + 1) * TILT_STEP_RAD)
+
+
+@pytest.mark.parametrize(
+    ("at_rad", "possible"), [(0.251, True), (0.253, False), (0.049, True), (0.047, False)]
+)
+def test_an_axis_that_was_under_way_may_be_on_its_way_or_half_a_second_beyond(
+    at_rad: float, possible: bool
+) -> None:
+    """From 0.1 to 0.2 rad at 100 steps a second of 1 mrad: 0.05 rad beyond either end, and 1.5 steps."""
+
+    def axis(angle_rad: float, seen: bool = True) -> Axis:
+        known = {
+            "name": "pan",
+            "seen": object() if seen else None,
+            "angle_rad": angle_rad,
+            "position_rad": 0.001,
+            "target": 200,
+            "next_target": None,
+            "at_target": False,
+            "speed": 100,
+            "fastest": 900,
+            "rad_from_position": lambda position: position * 0.001,
+        }
+        return cast(Axis, SimpleNamespace(**known))
+
+    count = StepCount()
+    count.compare(axis(0.1), axis(at_rad))
+    assert (not count.lost) == possible
+    unseen = StepCount()
+    unseen.compare(axis(0.1, seen=False), axis(2.0))
+    assert not unseen.lost

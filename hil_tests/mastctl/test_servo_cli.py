@@ -149,6 +149,7 @@ def test_test_turns_a_little_to_each_side_and_leaves_the_servo_as_it_was(
     reach = math.ceil(3 / told["count_deg"])
     assert [step["goal_counts"] for step in told["steps"]] == [2048 + reach, 2048 - reach, 2048]
     assert all(abs(step["left_counts"]) <= 1 for step in told["steps"])
+    assert all(0.0 <= step["most_current_A"] < 2.3 for step in told["steps"])  # an XM430 stalls at 2.3 A
     for name in ("torque_enable", "profile_velocity", "profile_acceleration", "goal_pwm", "bus_watchdog"):
         assert bench.servos[0].table[name] == before[name], name
 

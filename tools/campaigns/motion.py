@@ -5,9 +5,9 @@
 The simulated rover's head goes from view to view; its pictures come from the true rig, the check believes the
 packaged mast file. Each move is judged by both eyes of Navcam and Pancam: with the honest pictures; with
 those of before the move; with those of the next view, which the joints will tell only later. Moves are
-log-uniform from 1 mrad to 0.4 rad. A lie is missed if the picture's view is farther from the told one than
-allowed and no contradiction is told. Times are of the processor on one thread, both eyes together, reduction
-of the pictures included.
+log-uniform from 1 mrad to 0.4 rad. A lie is missed if the joints truly stood, when the picture was taken,
+farther from the told angles than allowed and no contradiction is told. Times are of the processor on one
+thread, both eyes together, reduction of the pictures included.
 """
 # ruff: noqa: E402  the number of threads is set before numpy is imported
 
@@ -37,7 +37,14 @@ from mastctl.packaged import config_folder
 from tools.arguments import end
 
 PAIRS = {"navcam": ("navcam_left", "navcam_right"), "pancam": ("pancam_left", "pancam_right")}
-Views = list[dict[str, Posed]]
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """Pictures by camera with the joint angles that the head reads, and the true angles (pan, tilt) then."""
+
+    pictures: dict[str, Posed]
+    true_rad: tuple[float, float]
 
 
 @dataclass
@@ -51,8 +58,8 @@ class Tally:
     missed: int = 0
 
 
-def taken(moves: int, seed: int, head: str) -> Views:
-    """Return the pictures of ``moves`` + 2 views with the joint angles that the head reads."""
+def taken(moves: int, seed: int, head: str) -> list[View]:
+    """Return ``moves`` + 2 views."""
     rng = np.random.default_rng(seed)
     names = [name for pair in PAIRS.values() for name in pair]
     folder, clock = config_folder(), ManualClock(50.0)
@@ -60,8 +67,9 @@ def taken(moves: int, seed: int, head: str) -> Views:
     settings = HardwareSettings(
         DeviceSettings("sim"), dict.fromkeys(names, DeviceSettings("sim")), rover, folder
     )
-    views: Views = []
+    views: list[View] = []
     with open_hardware(settings, clock) as hardware:
+        assert hardware.simulation is not None
         at = np.array([0.0, -0.4])
         while len(views) < moves + 2:
             hardware.pan_tilt.move(*(float(angle) for angle in at))
@@ -70,16 +78,15 @@ def taken(moves: int, seed: int, head: str) -> Views:
             clock.advance(0.3)
             reading, begun_s = hardware.pan_tilt.read(), clock.now_s()
             clock.advance(1.0)
-            views.append(
-                {
-                    name: Posed(
-                        hardware.cameras[name].next_frame(begun_s, 20.0).image.astype(np.float32),
-                        reading.pan_rad,
-                        reading.tilt_rad,
-                    )
-                    for name in names
-                }
-            )
+            pictures = {
+                name: Posed(
+                    hardware.cameras[name].next_frame(begun_s, 20.0).image.astype(np.float32),
+                    reading.pan_rad,
+                    reading.tilt_rad,
+                )
+                for name in names
+            }
+            views.append(View(pictures, hardware.simulation.true_joints(begun_s)))
             way = np.exp(rng.uniform(np.log(1e-3), np.log(0.4))) * rng.choice([-1.0, 1.0], 2)
             at = np.clip(at + way * rng.uniform([0.5, 0.1], [1.0, 0.5]), [-1.2, -0.75], [1.2, -0.15])
     return views
@@ -90,31 +97,37 @@ def fresh(view: Posed, told: Posed | None = None) -> Posed:
     return Posed(view.image, *(told or view).angles_rad)
 
 
-def judged(rig: Rig, views: Views) -> dict[str, dict[str, Tally]]:
+def is_lie(shown: View, told: Posed, allowed_rad: tuple[float, float]) -> bool:
+    """Whether a view is truly another than the told one, by more than is allowed."""
+    return bool((np.abs(np.subtract(shown.true_rad, told.angles_rad)) > allowed_rad).any())
+
+
+def judged(rig: Rig, views: list[View]) -> dict[str, dict[str, Tally]]:
     """Judge every move by every pair: honest pictures, those of before, those of the next view."""
     tallies = {pair: {kind: Tally() for kind in ("honest", "before", "next")} for pair in PAIRS}
     for before, after, later in zip(views, views[1:], views[2:], strict=False):
         for pair, names in PAIRS.items():
             for kind, shown in (("honest", after), ("before", before), ("next", later)):
                 tally = tallies[pair][kind]
-                former = {name: fresh(before[name]) for name in names}
-                new = {name: fresh(shown[name], after[name]) for name in names}
+                former = {name: fresh(before.pictures[name]) for name in names}
+                told_as = after.pictures[names[0]]
+                new = {name: fresh(shown.pictures[name], told_as) for name in names}
                 begun_s = time.thread_time()
                 results = [
                     shown_view(rig, name, former[name], new[name], (other, former[other]))
                     for name, other in (names, names[::-1])
                 ]
                 tally.look_ms.append(1e3 * (time.thread_time() - begun_s))
-                true = np.array(shown[names[0]].angles_rad)
+                read = np.array(shown.pictures[names[0]].angles_rad)
                 for result in results:
                     tally.verdicts[result.verdict] += 1
                     if np.isfinite(result.pan_rad):
-                        off = np.array([result.pan_rad, result.tilt_rad]) - true
+                        off = np.array([result.pan_rad, result.tilt_rad]) - read
                         tally.off_rad.append(float(np.abs(off).max()))
                         share = np.abs(off) / np.array(result.allowed_rad)
                         tally.share_of_allowed.append(float(share.max()))
-                        lie = np.abs(true - after[names[0]].angles_rad) > np.array(result.allowed_rad)
-                        tally.missed += bool(lie.any()) and result.verdict != "contradicted"
+                        lie = is_lie(shown, told_as, result.allowed_rad)
+                        tally.missed += lie and result.verdict != "contradicted"
     return tallies
 
 

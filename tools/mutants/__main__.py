@@ -5,7 +5,8 @@
 Each mutant is one change in one line of a copy of the checkout; the eight test files nearest to the module
 run against it until the first failure. A mutant that no test objects to has survived: either the tests lack
 something, or the line decides nothing. Survivors are printed with their place, to be looked at one by one.
-Test files that fail without any change, or take longer than --slow seconds, are left out.
+Test files that take longer than --slow seconds see only what the others let through; those that fail without
+any change, or take longer than --timeout seconds, are left out.
 """
 
 from __future__ import annotations
@@ -61,8 +62,12 @@ class Copies:
                 (copy.parent / "shared").symlink_to(shared)
             self._free.put(copy)
 
-    def tried(self, site: Site, tests: list[str], timeout_s: float) -> Tried:
-        """Make one change, run the tests, and take it back."""
+    def tried(self, site: Site, runs: list[dict[str, float]], timeout_s: float) -> Tried:
+        """Make one change, run tests run by run until one objects, and take it back.
+
+        A run is test files with the seconds that each takes unchanged; ``timeout_s`` is on top of these.
+        """
+        tests = [test for run in runs for test in run]
         if not tests:
             return Tried(site, "untested", 0.0, [])
         copy = self._free.get()
@@ -71,17 +76,18 @@ class Copies:
         began_s = time.monotonic()
         try:
             file.write_text(site.applied(source))
-            passed = _passes(copy, tests, timeout_s)
+            passed = all(_passes(copy, [*run], timeout_s + sum(run.values())) for run in runs if run)
         finally:
             file.write_text(source)
             self._free.put(copy)
         return Tried(site, "survived" if passed else "killed", time.monotonic() - began_s, tests)
 
-    def passes(self, tests: list[str], timeout_s: float) -> bool:
-        """Whether tests pass within the time without a change."""
+    def unchanged(self, test: str, timeout_s: float) -> float | None:
+        """How many seconds a test file takes without a change; None if it fails, or takes too long."""
         copy = self._free.get()
+        began_s = time.monotonic()
         try:
-            return _passes(copy, tests, timeout_s)
+            return time.monotonic() - began_s if _passes(copy, [test], timeout_s) else None
         finally:
             self._free.put(copy)
 
@@ -143,7 +149,7 @@ def main() -> int:
     parser.add_argument("--seed", type=at_least(0), default=1)
     parser.add_argument("--tests", type=number, default=8, metavar="N", help="test files a mutant")
     parser.add_argument("--jobs", type=number, default=os.cpu_count() or 1, metavar="N")
-    parser.add_argument("--slow", type=number, default=40, metavar="S", help="no slower test files")
+    parser.add_argument("--slow", type=number, default=40, metavar="S", help="slower test files come last")
     parser.add_argument("--timeout", type=number, default=240, metavar="S", help="who hangs is killed")
     parser.add_argument("--out", type=new_file, metavar="FILE", help="every mutant and its end, as JSON")
     args = parser.parse_args()
@@ -153,13 +159,18 @@ def main() -> int:
     with tempfile.TemporaryDirectory(prefix="mutants-") as folder, ThreadPoolExecutor(args.jobs) as pool:
         copies = Copies(Path(folder), args.jobs)
         files = sorted({test for tests in near.values() for test in tests})
-        passes = dict(zip(files, pool.map(lambda test: copies.passes([test], args.slow), files), strict=True))
-        for test in (test for test in files if not passes[test]):
-            print(f"left out, fails or takes over {args.slow} s unchanged: {test}", flush=True)
+        took_s = dict(
+            zip(files, pool.map(lambda test: copies.unchanged(test, args.timeout), files), strict=True)
+        )
+        for test, seconds in took_s.items():
+            if seconds is None:
+                print(f"left out, fails or takes over {args.timeout} s unchanged: {test}", flush=True)
 
         def told(site: Site) -> Tried:
-            tests = [test for test in near[site.file] if passes[test]]
-            one = copies.tried(site, tests, args.timeout)
+            timed = {test: seconds for test in near[site.file] if (seconds := took_s[test]) is not None}
+            quick = {test: seconds for test, seconds in timed.items() if seconds <= args.slow}
+            slow = {test: seconds for test, seconds in timed.items() if seconds > args.slow}
+            one = copies.tried(site, [quick, slow], args.timeout)
             if one.outcome != "killed":
                 print(f"{one.outcome}: {site.told((REPOSITORY / site.file).read_text())}", flush=True)
             return one
