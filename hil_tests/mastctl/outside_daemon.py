@@ -69,9 +69,10 @@ class Camera:
 """
 
 
-def write_config(folder: Path, listen: str = "{port: 0}") -> Path:
+def write_config(folder: Path, listen: str = "{port: 0}", devices: str = OUTSIDE) -> Path:
+    """A configuration with devices from outside this repository."""
     save_rig(rig(), folder / "little.yaml")
-    (folder / "outside_devices.py").write_text(OUTSIDE)
+    (folder / "outside_devices.py").write_text(devices)
     text = CONFIG.format(listen=listen).replace(
         "pan_tilt: {driver: fake}",
         f"pan_tilt: {{driver: 'outside_devices:Head', options: {{log: '{folder / 'head.log'}'}}}}",

@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from outside_daemon import write_config as outside_config
 from service_fakes import CONFIG, FakeHardware, Hang, ScriptedLoop, eventually, fake_daemon, rig
 
 from calib.errors import BadFile
@@ -77,16 +78,7 @@ class Camera:
 
 
 def write_config(folder: Path, listen: str) -> Path:
-    """A configuration with devices from outside this repository."""
-    save_rig(rig(), folder / "little.yaml")
-    (folder / "outside_devices.py").write_text(OUTSIDE)
-    text = CONFIG.format(listen=listen).replace(
-        "pan_tilt: {driver: fake}",
-        f"pan_tilt: {{driver: 'outside_devices:Head', options: {{log: '{folder / 'head.log'}'}}}}",
-    )
-    path = folder / "daemon.yaml"
-    path.write_text(text.replace("driver: fake", "driver: 'outside_devices:Camera'"))
-    return path
+    return outside_config(folder, listen, OUTSIDE)
 
 
 @contextmanager

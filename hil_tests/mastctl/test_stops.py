@@ -347,6 +347,30 @@ def test_a_stop_that_a_lost_line_kept_back_is_a_fault_until_the_head_is_read_at_
     eventually(lambda: devices.faults() == (), "the end of the fault")
 
 
+def test_a_line_that_is_lost_after_a_refused_stop_does_not_make_rest_the_proof(
+    devices: Devices, hardware: FakeHardware
+) -> None:
+    def fail(name: str) -> None:
+        if name == "stop":
+            raise Refused("the servo refused")
+
+    def lose(name: str) -> None:
+        raise LineLost("the line hung up")
+
+    hardware.head.hook = fail
+    with pytest.raises(Refused):
+        devices.stop()
+    hardware.head.hook = lose
+    with pytest.raises(LineLost):
+        devices.stop()
+    hardware.head.hook = lambda name: None
+    for _ in range(3):
+        assert not devices.read().moving
+    assert one_fault(devices).until == "a stop is confirmed, or a later move is taken and the head then rests"
+    devices.stop()
+    assert devices.faults() == ()
+
+
 def test_rest_after_a_move_of_before_the_stop_proves_nothing(
     devices: Devices, hardware: FakeHardware
 ) -> None:

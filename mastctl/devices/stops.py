@@ -95,7 +95,10 @@ class Stops:
             words = str(error) if MAY_MOVE in str(error) else f"{error}; {MAY_MOVE}"
             with self._changed:
                 since_s = asked_s if self._fault is None else self._fault.since_s
-                until = UNTIL_LINE if error.code == LineLost.code else UNTIL
+                only_line = error.code == LineLost.code and (
+                    self._fault is None or self._fault.until == UNTIL_LINE
+                )  # a lost line takes nothing back of what another stop has left
+                until = UNTIL_LINE if only_line else UNTIL
                 self._fault = Fault(self._device, error.code, words, since_s, until)
             raise
         with self._changed:
