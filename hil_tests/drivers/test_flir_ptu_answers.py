@@ -14,10 +14,11 @@ import pytest
 from scripted_ptu import ScriptedPtu
 
 from drivers.clock import ManualClock, SystemClock
-from drivers.errors import DriverError
+from drivers.errors import DriverError, NoReply
 from drivers.flir_ptu.axis import Axis
 from drivers.flir_ptu.count import StepCount
 from drivers.flir_ptu.head import FlirPtu, open_head
+from drivers.interfaces import Reading
 from drivers.sim.wire.line import PtyLine
 
 PAN_STEP_RAD, TILT_STEP_RAD = (math.radians(arcsec / 3600) for arcsec in (185.142857, 46.285714))
@@ -32,13 +33,22 @@ Opener = Callable[..., tuple[FlirPtu, PtyLine]]
 def opened() -> Iterator[Opener]:
     with ExitStack() as stack:
 
-        def open_on(unit: ScriptedPtu, clock: Any = None) -> tuple[FlirPtu, PtyLine]:
+        def open_on(unit: ScriptedPtu, clock: Any = None, **options: Any) -> tuple[FlirPtu, PtyLine]:
             line = stack.enter_context(PtyLine(unit, SystemClock(), wire_time=False))
-            head = open_head({**OPTIONS, "port": line.path}, clock)
+            head = open_head({**OPTIONS, "port": line.path, **options}, clock)
             stack.callback(head.close)
             return head, line
 
         yield open_on
+
+
+def answered(head: FlirPtu) -> Reading:
+    """Read until the unit is there again."""
+    for _ in range(200):
+        with suppress(DriverError):
+            return head.read()
+        time.sleep(0.02)
+    raise AssertionError("the unit did not come back")
 
 
 class Damaged(ScriptedPtu):
@@ -62,12 +72,7 @@ def test_a_version_that_was_damaged_when_the_head_was_opened_does_not_lock_the_u
     with pytest.raises(DriverError):
         head.read()
     line.come_back()
-    for _ in range(200):
-        with suppress(DriverError):
-            assert head.read().faults == ()
-            return
-        time.sleep(0.02)
-    raise AssertionError("the unit did not come back")
+    assert answered(head).faults == ()
 
 
 def test_digits_that_were_damaged_when_the_head_was_opened_are_not_kept(opened: Opener) -> None:
@@ -147,6 +152,43 @@ def test_both_angles_are_of_the_moment_told_however_slowly_the_unit_answers(
         # The driver does not know when within the question's time on the wire the unit has looked: 4 ms.
         assert reading.pan_rad == pytest.approx(pan_rad, abs=(300 * 0.005 + 1) * PAN_STEP_RAD)
         assert reading.tilt_rad == pytest.approx(tilt_rad, abs=(700 * 0.005 + 1) * TILT_STEP_RAD)
+
+
+def test_a_head_that_was_stopped_rests_only_after_it_has_stood_from_then_on(opened: Opener) -> None:
+    clock = ManualClock()
+    head, _ = opened(ScriptedPtu(), clock, settle_s=0.5)
+    head.read()
+    clock.advance(60.0)
+    assert not head.read().moving
+    head.stop()
+    clock.advance(0.4)
+    assert head.read().moving
+    clock.advance(0.2)
+    assert not head.read().moving
+
+
+def test_only_silent_calls_in_a_row_make_the_line_be_opened_anew(
+    opened: Opener, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("drivers.flir_ptu.head.SILENT_CALLS", 2)
+    unit = ScriptedPtu()
+    head, _ = opened(unit)
+    unit.heard.clear()
+
+    def silent_call() -> None:
+        unit.answers["TP"] = lambda command: None
+        with pytest.raises(NoReply):
+            head.read()
+        del unit.answers["TP"]
+
+    for _ in range(3):
+        silent_call()
+        head.read()
+    assert "V" not in unit.heard, "the unit is checked only after the line was opened anew"
+    silent_call()
+    silent_call()
+    answered(head)
+    assert "V" in unit.heard
 
 
 @pytest.mark.parametrize(
