@@ -1,10 +1,49 @@
-"""One clock for everything: the machine's monotonic clock, or one that a test turns by hand."""
+"""One clock for everything: the machine's monotonic clock, or one that a test turns by hand.
+
+Whoever waits, waits on the clock that it was given, also for another thread: `Clock.signal` is a condition
+whose waits end by this clock, and `Clock.thread` makes a thread that the clock knows of.
+`drivers.simulation_clock` says what a clock does with that which is not bound to real time.
+"""
 
 from __future__ import annotations
 
 import threading
 import time
-from typing import Protocol
+from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
+from types import TracebackType
+from typing import Any, Protocol
+
+
+class Signal(Protocol):
+    """A condition variable whose waits end by a clock."""
+
+    def __enter__(self) -> Any:
+        """Take its lock."""
+        ...
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> Any:
+        """Let go of its lock."""
+        ...
+
+    def wait(self, timeout_s: float | None = None, *, idle: bool = False) -> bool:
+        """Let go of the lock, wait, and take it again; return whether somebody has notified.
+
+        Parameters
+        ----------
+        timeout_s
+            How long at most, seconds of the clock; None for as long as it takes.
+        idle
+            Whether nobody waits for what follows: pacing, or a thread that waits for work. Such a wait alone
+            makes no time pass on a clock that need not go on.
+        """
+        ...
+
+    def notify_all(self) -> None:
+        """Let all go on that wait; the lock is held."""
+        ...
 
 
 class Clock(Protocol):
@@ -18,8 +57,40 @@ class Clock(Protocol):
         """Wait for ``duration_s`` seconds of this clock; nothing for zero or less."""
         ...
 
+    def signal(self) -> Signal:
+        """Return a new condition variable whose waits end by this clock."""
+        ...
 
-class SystemClock:
+    def thread(self, target: Callable[[], None], name: str) -> threading.Thread:
+        """Return a new daemon thread, not yet started, whose computing this clock waits for if it can."""
+        ...
+
+    def at_work(self) -> AbstractContextManager[None]:
+        """Make the calling thread one whose computing this clock waits for if it can, inside the block."""
+        ...
+
+
+class _MachineSignal(threading.Condition):
+    """A plain condition: real time passes by itself."""
+
+    def wait(self, timeout: float | None = None, *, idle: bool = False) -> bool:
+        return super().wait(timeout)
+
+
+class _MachineTime:
+    """Signals and threads of a clock that waits for nobody's computing."""
+
+    def signal(self) -> Signal:
+        return _MachineSignal(threading.Lock())
+
+    def thread(self, target: Callable[[], None], name: str) -> threading.Thread:
+        return threading.Thread(target=target, name=name, daemon=True)
+
+    def at_work(self) -> AbstractContextManager[None]:
+        return nullcontext()
+
+
+class SystemClock(_MachineTime):
     """CLOCK_MONOTONIC."""
 
     def now_s(self) -> float:
@@ -30,8 +101,11 @@ class SystemClock:
             time.sleep(duration_s)
 
 
-class ManualClock:
-    """A clock that stands still until somebody sleeps on it or advances it: tests turn it by hand."""
+class ManualClock(_MachineTime):
+    """A clock that stands still until somebody sleeps on it or advances it: tests turn it by hand.
+
+    Signals wait in real time, since nobody would turn the clock for them.
+    """
 
     def __init__(self, start_s: float = 0.0) -> None:
         self._now_s = start_s
