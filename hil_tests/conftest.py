@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import signal
+from collections import Counter
+from collections.abc import Generator
 from contextlib import suppress
 from pathlib import Path
 
 import pytest
 
 REPOSITORY = Path(__file__).resolve().parent.parent
+VM_CONFTEST = REPOSITORY / "hil_tests" / "vm" / "conftest.py"
 SHARED_DATA = REPOSITORY.parent / "shared" / "data"
 
 # Whoever runs the tests may ignore signals, as nohup does and a shell for what it puts into the background;
@@ -39,6 +42,19 @@ LONG = ("test_on_a_real_driver", "test_closed_loop", "test_bench_suite", "test_p
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Put the few files that take longest first: none of them is to begin when all others have ended."""
     items.sort(key=lambda item: item.path.stem not in LONG)
+
+
+@pytest.hookimpl(wrapper=True, tryfirst=True)
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> Generator[None]:
+    """Say in the last line before the counts what did not run for want of the kernel, and what mends it."""
+    yield
+    skipped = terminalreporter.getreports("skipped")
+    reasons = Counter(
+        why for path, _, why in (told.longrepr for told in skipped) if Path(path) == VM_CONFTEST
+    )
+    for reason, tests in reasons.items():
+        what = f"{tests} test{'s' if tests > 1 else ''} on a kernel with virtual cameras"
+        terminalreporter.write_line(f"not run: {what}: {reason.removeprefix('Skipped: ')}")
 
 
 @pytest.fixture(scope="session")

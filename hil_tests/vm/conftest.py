@@ -19,7 +19,7 @@ def vm_kernel(request: pytest.FixtureRequest) -> Path:
     found = kernel.find()
     if found is not None and not kernel.why_not():
         return found
-    reason = kernel.why_not() or "the kernel with virtual cameras is not built: tools/vm setup builds it"
+    reason = kernel.why_not() or "the kernel is not built; tools/vm setup builds it"
     if request.config.getoption("--require-vm"):
         pytest.fail(reason)
     pytest.skip(reason)

@@ -15,11 +15,15 @@ import re
 import shutil
 import subprocess
 import tempfile
-from collections.abc import Mapping
+import time
+from collections import deque
 from pathlib import Path
+
+from tools.virtual_machine.apt import TOLD_AGAIN_S, Busy, Tell, apt_get, install
 
 INPUTS = Path(__file__).resolve().parents[2] / "hil_tests" / "vm" / "kernel"
 PACKAGE = "linux-source-6.1"
+USUAL_FILES = 1000
 BUILD_PROGRAMS = {
     "flex": "flex",
     "bison": "bison",
@@ -79,13 +83,15 @@ def why_not() -> str:
     return ""
 
 
-def build(package: Path | None = None) -> Path:
+def build(package: Path | None, tell: Tell) -> Path:
     """Build the kernel unless it is there, and return it.
 
     Parameters
     ----------
     package
-        The source package as a file; fetched by apt-get when left out.
+        The source package as a file; None fetches it by apt-get.
+    tell
+        Is given a sentence at each step, and while one takes long.
 
     Raises
     ------
@@ -96,12 +102,15 @@ def build(package: Path | None = None) -> Path:
         raise CannotBuild(reason)
     if package is None and (found := find()):
         return found
+    if package is not None and not package.is_file():
+        raise CannotBuild(f"there is no file {package}")
     if package is None and (reason := _no_source()):
         raise CannotBuild(reason)
-    _install_programs()
+    if reason := install(BUILD_PROGRAMS, tell):
+        raise CannotBuild(f"the build needs {reason}")
     with tempfile.TemporaryDirectory(prefix="mastctl-kernel-") as name:
         folder = Path(name)
-        deb = _fetch(folder) if package is None else package
+        deb = _fetch(folder, tell) if package is None else package
         digest = hashlib.sha256(deb.read_bytes()).hexdigest()
         if digest not in sources().values() and digest not in offered().values():
             raise CannotBuild(
@@ -110,7 +119,7 @@ def build(package: Path | None = None) -> Path:
             )
         kernel = path_for(digest)
         if not kernel.is_file():
-            _make(deb, folder, kernel)
+            _make(deb, folder, kernel, tell)
     return kernel
 
 
@@ -123,53 +132,33 @@ def _no_source() -> str:
     return f"{PACKAGE} comes from Debian 12, this is {here}: give the package by tools/vm setup --source FILE"
 
 
-def _install_programs() -> None:
-    """See to the programs of the build. Raises CannotBuild."""
-    if reason := install(BUILD_PROGRAMS):
-        raise CannotBuild(f"the build needs {reason}")
-
-
-def install(programs: Mapping[str, str]) -> str:
-    """See to programs, Debian's package by name; by apt-get where they are missing and we may.
-
-    Returns the missing packages and how to get them, empty when all are there.
-    """
-    missing = sorted({debian for program, debian in programs.items() if not shutil.which(program)})
-    if not missing:
-        return ""
-    command = ["apt-get", "install", "-qq", "-y", "--no-install-recommends", *missing]
-    told = f"{', '.join(missing)}; as root on Debian: {' '.join(command)}"
-    if os.geteuid() != 0 or not shutil.which("apt-get"):
-        return told
-    _run(["apt-get", "update", "-qq"], check=False)
-    done = _run(command, check=False, env={**os.environ, "DEBIAN_FRONTEND": "noninteractive"})
-    if done.returncode == 0:
-        return ""
-    return f"{told}, which failed just now: {' '.join(done.stderr.split())[-200:]}"
-
-
-def _fetch(folder: Path) -> Path:
+def _fetch(folder: Path, tell: Tell) -> Path:
     """Fetch the first known source package that apt offers, or else the newest that it offers."""
     failed = ""
-    for update_first in (False, True):
-        if update_first:
-            if os.geteuid() != 0:
-                break
-            _run(["apt-get", "update", "-qq"], check=False)
-        # With lists of yesterday a known version may be gone: only fresh ones say that none is left.
-        for version in [*sources(), *(offered() if update_first else ())]:
-            done = _run(["apt-get", "download", "-qq", f"{PACKAGE}={version}"], cwd=folder, check=False)
-            if deb := next(folder.glob("*.deb"), None):
-                return deb
-            failed = " ".join(done.stderr.split())[-200:]
+    tell(f"fetching {PACKAGE} (130 MB)")
+    try:
+        for update_first in (False, True):
+            if update_first:
+                if os.geteuid() != 0:
+                    break
+                apt_get("update", tell=tell)
+            # With lists of yesterday a known version may be gone: only fresh ones say that none is left.
+            for version in [*sources(), *(offered() if update_first else ())]:
+                done = apt_get("download", f"{PACKAGE}={version}", cwd=folder, tell=tell)
+                if deb := next(folder.glob("*.deb"), None):
+                    return deb
+                failed = " ".join(done.stderr.split())[-200:]
+    except Busy as busy:
+        raise CannotBuild(str(busy)) from None
     raise CannotBuild(f"apt-get fetches no {PACKAGE}: {failed}; give the package by --source FILE")
 
 
-def _make(deb: Path, folder: Path, kernel: Path) -> None:
+def _make(deb: Path, folder: Path, kernel: Path, tell: Tell) -> None:
     """Unpack, patch, configure, compile; the result appears under its name only when it is whole."""
     unpack = (
         'dpkg-deb --fsys-tarfile "$1" | tar -xO --wildcards "./usr/src/*.tar.xz" | xz -dc | tar -x -C "$2"'
     )
+    tell("unpacking and configuring")
     _run(["bash", "-o", "pipefail", "-c", unpack, "unpack", str(deb.resolve()), str(folder)])
     tree = folder / PACKAGE
     for patch in sorted(INPUTS.glob("*.patch")):
@@ -180,11 +169,29 @@ def _make(deb: Path, folder: Path, kernel: Path) -> None:
     _run(["scripts/kconfig/merge_config.sh", "-m", ".config", str(fragment)], cwd=tree)
     _run([*make, "olddefconfig"], cwd=tree)
     _check_configuration(fragment, tree / ".config")
-    _run([*make, f"-j{os.cpu_count() or 1}", "linux"], cwd=tree)
+    _compile(["nice", "make", "ARCH=um", f"-j{os.cpu_count() or 1}", "linux"], tree, tell)
     kernel.parent.mkdir(parents=True, exist_ok=True)
     partial = kernel.with_name(f"linux.{os.getpid()}")
     _run(["strip", "-o", str(partial), "linux"], cwd=tree)
     partial.replace(kernel)
+
+
+def _compile(command: list[str], tree: Path, tell: Tell) -> None:
+    """Run make, which names each file that it makes; now and then tell how many there are."""
+    tell("compiling, which takes some minutes")
+    told_s, files, tail = time.monotonic(), 0, deque[str](maxlen=15)
+    process = subprocess.Popen(
+        command, cwd=tree, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, errors="replace"
+    )
+    with process, process.stdout as lines:  # type: ignore[union-attr]
+        for line in lines:
+            tail.append(line.rstrip())
+            files += line.startswith("  CC ")
+            if time.monotonic() - told_s >= TOLD_AGAIN_S:
+                tell(f"compiling: {files} files of some {USUAL_FILES}")
+                told_s = time.monotonic()
+    if process.returncode != 0:
+        raise CannotBuild(f"{' '.join(command)} failed with {process.returncode}:\n" + "\n".join(tail))
 
 
 def _check_configuration(fragment: Path, result: Path) -> None:
@@ -195,11 +202,9 @@ def _check_configuration(fragment: Path, result: Path) -> None:
         raise CannotBuild(f"the kernel's configuration does not take {', '.join(lost)}")
 
 
-def _run(
-    command: list[str], cwd: Path | None = None, check: bool = True, env: dict[str, str] | None = None
-) -> subprocess.CompletedProcess[str]:
+def _run(command: list[str], cwd: Path | None = None, check: bool = True) -> subprocess.CompletedProcess[str]:
     """Run a program quietly; one that fails tells its last lines."""
-    done = subprocess.run(command, cwd=cwd, env=env, capture_output=True, text=True, errors="replace")
+    done = subprocess.run(command, cwd=cwd, capture_output=True, text=True, errors="replace")
     if check and done.returncode != 0:
         tail = "\n".join((done.stdout + done.stderr).splitlines()[-15:])
         raise CannotBuild(f"{' '.join(command[:4])} failed with {done.returncode}:\n{tail}")
