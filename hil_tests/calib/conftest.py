@@ -6,13 +6,13 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from made_survey import make_survey
 
 from calib.files.mast_file import load_rig
 from calib.fit.calibration import Calibration
 from calib.fit.joint import fit_joint
 from calib.fit.paper import fit_paper
 from calib.mast.rig import Rig
+from hil_tests.calib.fit.made_survey import make_survey
 
 
 @pytest.fixture(scope="session")

@@ -13,8 +13,6 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from boards import BOARD, COLUMNS, ROWS, SIZE_PX, camera, gravel, pose
-from made_survey import Blunders, make_survey
 from scipy.spatial.transform import Rotation
 
 from calib.camera.cahvor import CameraModel
@@ -35,6 +33,8 @@ from calib.pictures.warp import Plane, facing_plane
 from calib.rigid import Rigid
 from calib.survey.alignment import NotAligned, align, mirrored
 from drivers.sim_survey.board import draw_board, photograph
+from hil_tests.calib.dots.boards import BOARD, COLUMNS, ROWS, SIZE_PX, camera, gravel, pose
+from hil_tests.calib.fit.made_survey import Blunders, make_survey
 
 NO_NUMBERS = (math.nan, math.inf, -math.inf)
 HEAD = CameraModel("CAHV", (101, 101), np.zeros(3), [1, 0, 0], [50, 100, 0], [50, 0, 100])

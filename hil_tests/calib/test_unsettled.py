@@ -7,10 +7,7 @@ from functools import partial
 
 import numpy as np
 import pytest
-from handed_over import HAZCAMS, hand_offs, moved_hazcams, plain_rig, targets
-from made_survey import make_survey
 from scipy.spatial.transform import Rotation
-from test_fit_camera import boards
 
 from calib.camera import one_point
 from calib.errors import CalibError
@@ -23,6 +20,9 @@ from calib.fit import poses as fit_poses
 from calib.handoff import fit_body_pose
 from calib.mast.rig import Rig
 from calib.rigid import FloatArray
+from hil_tests.calib.fit.made_survey import make_survey
+from hil_tests.calib.fit.test_fit_camera import boards
+from hil_tests.calib.handoff.handed_over import HAZCAMS, hand_offs, moved_hazcams, plain_rig, targets
 
 
 @pytest.fixture

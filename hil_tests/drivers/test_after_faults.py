@@ -11,11 +11,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-from dynamixel_rig import LONG_S, failed, opened, read_or_none, until
 
 from calib.mast.rig import Mast, Rig
 from drivers.clock import SystemClock
 from drivers.interfaces import PanTilt
+from hil_tests.drivers.dynamixel.dynamixel_rig import LONG_S, failed, opened, read_or_none, until
 from mastctl.devices.devices import Devices
 from mastctl.devices.limits import Limits
 from mastctl.pointing.loop import AnglesTarget, PointingError, PointingLoop, PointRequest

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dynamixel_host import SETTINGS, servo
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -11,6 +10,7 @@ from drivers.flir_ptu.replies import LineSplitter, answer_of
 from drivers.sim.wire.axis import WireAxis
 from drivers.sim.wire.dynamixel_bus import DynamixelBus
 from drivers.sim.wire.ptu import SimulatedPtu
+from hil_tests.drivers.sim.wire.dynamixel_host import SETTINGS, servo
 from tools.campaigns import fuzz_servo
 
 AWKWARD = st.lists(st.sampled_from([0xFF, 0xFD, 0x00, 0x01, 0x03, 0x55, 0xFE]), max_size=80).map(bytes)

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from dynamixel_rig import X, rig, settled, until
 
 from drivers.clock import SystemClock
 from drivers.dynamixel import workshop
@@ -21,6 +20,7 @@ from drivers.sim.wire.axis import WireAxis
 from drivers.sim.wire.dynamixel_servo import SimulatedServo
 from drivers.sim.wire.line import PtyLine
 from drivers.sim.wire.ptu import SimulatedPtu
+from hil_tests.drivers.dynamixel.dynamixel_rig import X, rig, settled, until
 
 
 @pytest.fixture(scope="module")

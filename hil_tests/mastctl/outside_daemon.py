@@ -14,9 +14,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from service_fakes import CONFIG, eventually, rig
-
 from calib.files.mast_file import save_rig
+from hil_tests.mastctl.service_fakes import CONFIG, eventually, rig
 from mastctl.client import Client, ClientError
 
 BOUND_S = 60.0  # only ends a failing test

@@ -10,9 +10,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from service_fakes import FakeHardware, ScriptedLoop, fake_daemon
 
 from calib.files.mast_file import parse_rig
+from hil_tests.mastctl.service_fakes import FakeHardware, ScriptedLoop, fake_daemon
 from mastctl.client import Client, ClientError
 from mastctl.daemon import RunningDaemon
 

@@ -9,9 +9,9 @@ import pytest
 import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from service_fakes import rig
 
 from calib.errors import BadFile
+from hil_tests.mastctl.service_fakes import rig
 from mastctl.config import Config, Listen, check_cameras, load_config, parse_config
 from mastctl.packaged import config_folder, default_config
 from mastctl.tracking.choice import PairBounds

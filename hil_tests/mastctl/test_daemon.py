@@ -18,12 +18,20 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from outside_daemon import write_config as outside_config
-from service_fakes import CONFIG, FakeHardware, Hang, ScriptedLoop, eventually, fake_daemon, rig
 
 from calib.errors import BadFile
 from calib.files.mast_file import save_rig
 from drivers.errors import DriverError
+from hil_tests.mastctl.outside_daemon import write_config as outside_config
+from hil_tests.mastctl.service_fakes import (
+    CONFIG,
+    FakeHardware,
+    Hang,
+    ScriptedLoop,
+    eventually,
+    fake_daemon,
+    rig,
+)
 from mastctl import operations as operations_module
 from mastctl.client import Client
 from mastctl.config import Listen, load_config

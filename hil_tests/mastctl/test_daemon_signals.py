@@ -8,7 +8,8 @@ from functools import partial
 from pathlib import Path
 
 import pytest
-from outside_daemon import (
+
+from hil_tests.mastctl.outside_daemon import (
     BOUND_S,
     SHORT_OF_GOAL_RAD,
     daemon_process,
@@ -17,8 +18,7 @@ from outside_daemon import (
     under_way,
     write_config,
 )
-from service_fakes import eventually
-
+from hil_tests.mastctl.service_fakes import eventually
 from mastctl import signals
 from mastctl.cli.main import main
 from mastctl.client import Client

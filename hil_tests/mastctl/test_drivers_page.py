@@ -11,12 +11,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-from service_fakes import FakeHardware, Hang, eventually, rig
 
 from drivers import interfaces
 from drivers.clock import SystemClock
 from drivers.errors import DriverError
 from drivers.interfaces import Frame, Reading
+from hil_tests.mastctl.service_fakes import FakeHardware, Hang, eventually, rig
 from mastctl.devices import devices as devices_module
 from mastctl.devices import frames, joint_history, rest, stops
 from mastctl.devices.devices import Devices

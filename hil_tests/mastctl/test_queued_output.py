@@ -7,7 +7,8 @@ import signal
 from pathlib import Path
 
 import pytest
-from outside_daemon import (
+
+from hil_tests.mastctl.outside_daemon import (
     BOUND_S,
     Pipe,
     answers,
@@ -17,8 +18,7 @@ from outside_daemon import (
     under_way,
     write_config,
 )
-from service_fakes import Hang, eventually
-
+from hil_tests.mastctl.service_fakes import Hang, eventually
 from mastctl.client import Client
 from mastctl.queued_output import QueuedHandler, QueuedText, QueuedWriter
 

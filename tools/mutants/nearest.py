@@ -17,7 +17,6 @@ def imports(repository: Path) -> dict[str, frozenset[str]]:
     folders = [repository / folder for folder in (*PACKAGES, TESTS)]
     paths = [path.relative_to(repository) for folder in folders for path in sorted(folder.rglob("*.py"))]
     names = {_module(path): str(path) for path in paths}
-    names |= {path.stem: str(path) for path in paths if path.parts[0] == TESTS}  # tests name each other so
     wanted = {
         str(path): {names[name] for name in _wanted(repository / path) if name in names} for path in paths
     }

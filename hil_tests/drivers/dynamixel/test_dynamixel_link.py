@@ -1,0 +1,414 @@
+"""Each defect of the SDK (facts of the servo layer, section 1), shown to the driver by scripted servos."""
+
+from __future__ import annotations
+
+import socket
+import termios
+import threading
+import time
+from collections.abc import Callable, Sequence
+
+import dynamixel_sdk as sdk
+import pytest
+import serial
+import serial.rfc2217
+
+from drivers.clock import SystemClock
+from drivers.dynamixel.bus import Bus
+from drivers.dynamixel.link import Link, Part
+from drivers.dynamixel.models import REGISTERS
+from drivers.dynamixel.packets import PacketHandler
+from drivers.dynamixel.port import Port
+from drivers.errors import BadOptions, BadReply, LineLost, NoReply, Refused
+from drivers.sim.wire.dynamixel_packets import Instruction, fast_status_packets
+from drivers.sim.wire.line import Reply, TcpLine
+from hil_tests.drivers.dynamixel.scripted_servos import ScriptedServos, number, says, scripted
+
+X = REGISTERS["X"]
+POSITION, TORQUE, BAUD_RATE = X["present_position"], X["torque_enable"], 1_000_000
+PING, READ, WRITE, REBOOT, SYNC_READ, SYNC_WRITE, BULK_READ, BULK_WRITE = 1, 2, 3, 8, 0x82, 0x83, 0x92, 0x93
+FAST_SYNC_READ = 0x8A
+PATIENT_S = 5.0  # where an answer comes: no test depends on the machine's load
+SHORT_S = 0.03  # where none comes
+BOTH = [Part(1, 132, 4), Part(2, 132, 4)]
+
+
+def always(*replies: Reply) -> Callable[[Instruction, int], Sequence[Reply]]:
+    """The same answer to everything."""
+    return lambda instruction, count: replies
+
+
+def test_values_are_signed() -> None:  # defect 15
+    with scripted(always(says(1, number(-5)))) as (line, _):
+        assert Link(line.path, BAUD_RATE, PATIENT_S).read(1, POSITION) == -5
+
+
+def test_an_error_without_data_is_an_error_and_no_value() -> None:  # defect 7
+    with scripted(always(says(1, error=5))) as (line, _):
+        link = Link(line.path, BAUD_RATE, PATIENT_S)
+        for register in (TORQUE, POSITION):
+            with pytest.raises(Refused, match="wrong length") as caught:
+                link.read(1, register)
+            assert caught.value.detail == {
+                "port": line.path, "baud": BAUD_RATE, "servo_id": 1, "register": register.name,
+                "instruction": "read", "error": 5,
+            }  # fmt: skip
+
+
+def test_the_sdks_own_methods_give_no_value_for_an_error_either() -> None:  # defect 7
+    with scripted(always(says(1, error=5))) as (line, _):
+        port = Port(line.path, BAUD_RATE, PATIENT_S)
+        for read in (PacketHandler().read1ByteTxRx, PacketHandler().read4ByteTxRx):
+            value, result, error = read(port, 1, 132)
+            assert (value, result, error) == (0, sdk.COMM_RX_CORRUPT, 5)
+
+
+def test_a_missing_servo_is_named_and_the_other_is_read() -> None:  # defect 5
+    with scripted(always(says(2, number(77)))) as (line, _):
+        answer = Link(line.path, BAUD_RATE, SHORT_S).group_read(BOTH)
+    assert isinstance(answer.missing[1], NoReply)
+    assert answer.missing[1].detail["servo_id"] == 1
+    assert list(answer.missing) == [1]
+    assert answer.statuses[2].data == number(77)
+
+
+def test_group_reads_keep_the_error_byte() -> None:  # defect 6
+    with scripted(always(says(1, number(1), error=0x80), says(2, error=7))) as (line, _):
+        answer = Link(line.path, BAUD_RATE, PATIENT_S).group_read(BOTH)
+    assert answer.statuses[1].alert
+    assert isinstance(answer.missing[2], Refused)
+
+
+@pytest.mark.parametrize("value", [-131073, -1, 0])
+def test_what_is_sent_is_stuffed(value: int) -> None:  # defect 8
+    # -131073 is FF FF FD FF: sent as it is, its first three bytes would begin a packet
+    with scripted(lambda i, n: [says(i.packet_id)]) as (line, servos):
+        Link(line.path, BAUD_RATE, PATIENT_S).write(1, X["goal_position"], value)
+    assert servos.heard[0].parameters == number(116, 2) + number(value)
+    assert servos.bytes_heard[4:].find(b"\xff\xff\xfd\xff") < 0
+
+
+def test_stuffed_answers_are_read_right() -> None:
+    # a register that itself holds a packet's head
+    with scripted(always(says(1, b"\xff\xff\xfd\xff"), says(2, b"\x00\xff\xff\xfd"))) as (line, _):
+        answer = Link(line.path, BAUD_RATE, PATIENT_S).group_read(BOTH)
+    assert POSITION.decode(answer.statuses[1].data) == -131073
+    assert answer.statuses[2].data == b"\x00\xff\xff\xfd"
+
+
+def test_a_late_reply_is_not_taken_for_the_next_answer() -> None:  # defect 10
+    def answer(instruction: Instruction, count: int) -> list[Reply]:
+        return [says(1, number(555), delay_s=1.5 * SHORT_S) if count == 0 else says(1, number(2048))]
+
+    with scripted(answer) as (line, _):
+        link = Link(line.path, BAUD_RATE, SHORT_S)
+        with pytest.raises(NoReply):
+            link.read(1, X["present_velocity"])
+        link.quiet(4 * SHORT_S)
+        link._port.reply_timeout_s = PATIENT_S
+        assert link.read(1, POSITION) == 2048
+
+
+def test_after_a_timeout_the_line_is_listened_to_before_the_next_question() -> None:  # defect 10
+    with scripted(always()) as (line, _):
+        link = Link(line.path, BAUD_RATE, SHORT_S)
+        with pytest.raises(NoReply):
+            link.read(1, POSITION)
+        assert link._port.suspect
+        link._port.clearPort()
+        assert not link._port.suspect
+
+
+def test_what_came_unasked_is_dropped_before_a_question() -> None:
+    extra = says(1, number(555))
+
+    def answer(instruction: Instruction, count: int) -> list[Reply]:
+        return [says(1, number(count)), *([extra] if count == 0 else [])]
+
+    with scripted(answer) as (line, _):
+        link = Link(line.path, BAUD_RATE, PATIENT_S)
+        assert link.read(1, POSITION) == 0
+        assert link._port.buffer or link._port._fetch(PATIENT_S)  # the stray one is there now
+        assert link.read(1, POSITION) == 1
+
+
+def test_replies_of_others_and_of_other_lengths_are_stepped_over() -> None:
+    with scripted(always(says(2, number(1)), says(1, b"\x01"), says(1, number(9)))) as (line, _):
+        link = Link(line.path, BAUD_RATE, PATIENT_S)
+        assert link.read(1, POSITION) == 9
+        assert link.counts.strays == 2
+
+
+def test_noise_and_a_broken_packet_before_the_answer_cost_nothing() -> None:
+    broken = bytearray(says(1, number(4)).data)
+    broken[-1] ^= 1
+    noise = Reply(b"\x00\xff\xff\xfd\x00\x01\xff\x00\x55" + bytes(broken))
+    with scripted(always(noise, says(1, number(9)))) as (line, _):
+        assert Link(line.path, BAUD_RATE, PATIENT_S).read(1, POSITION) == 9
+
+
+def test_a_line_that_is_never_quiet_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    with scripted(always()) as (line, _):
+        port = Port(line.path, BAUD_RATE, SHORT_S)
+        monkeypatch.setattr(port, "_fetch", lambda wait_s: port.buffer.extend(b"x") or True)
+        with pytest.raises(BadReply, match="never quiet"):
+            port.drain(longest_s=0.0)
+
+
+def test_a_pulled_plug_is_a_lost_line_and_nothing_stays_busy() -> None:  # defects 1 and 13
+    with scripted(lambda i, n: [says(i.packet_id, number(3))]) as (line, _):
+        link = Link(line.path, BAUD_RATE, PATIENT_S)
+        assert link.read(1, POSITION) == 3
+        line.hang_up()
+        for act in (
+            lambda: link.read(1, POSITION),
+            lambda: link.write(1, TORQUE, 0),
+            lambda: link.group_read(BOTH),
+            lambda: link.group_write([Part(1, 64, 1, b"\0"), Part(2, 64, 1, b"\0")]),
+            lambda: link.ping(1),
+        ):
+            with pytest.raises(LineLost) as caught:
+                act()
+            assert caught.value.detail["port"] == line.path
+            assert caught.value.detail["servo_id"] == 1
+            assert not link._port.is_using
+        link.close()
+        line.come_back()
+        again = Link(line.path, BAUD_RATE, PATIENT_S)
+        assert again.read(1, POSITION) == 3
+
+
+def test_the_port_cannot_be_opened_twice() -> None:  # defect 12
+    with scripted(always()) as (line, _):
+        link = Link(line.path, BAUD_RATE)
+        with pytest.raises(LineLost, match="held by another program"):
+            Link(line.path, BAUD_RATE)
+        link.close()
+        Link(line.path, BAUD_RATE).close()
+
+
+@pytest.mark.parametrize("baud", [4_500_000, 10_500_000, 12_345])
+def test_any_baud_rate_is_tried(baud: int) -> None:  # defect 16
+    with scripted(always(says(1, number(8)))) as (line, _):
+        assert Link(line.path, baud, PATIENT_S).read(1, POSITION) == 8
+
+
+def test_a_port_that_is_not_there_and_a_url_that_cannot_be(tmp_path: object) -> None:
+    with pytest.raises(LineLost, match="no such file"):
+        Link(f"{tmp_path}/none", BAUD_RATE)
+    with pytest.raises(BadOptions, match="protocol 'foo' not known"):
+        Link("foo://x", BAUD_RATE)
+
+
+def test_over_a_socket() -> None:  # defect 17
+    servos = ScriptedServos(lambda i, n: [says(i.packet_id, number(42))])
+    with TcpLine(servos, SystemClock()) as line:
+        link = Link(f"socket://127.0.0.1:{line.port}", BAUD_RATE, PATIENT_S)
+        assert link.read(1, POSITION) == 42
+        line.hang_up()
+        with pytest.raises(LineLost):
+            for _ in range(3):  # the first bytes into a dead connection may still seem to leave
+                link.read(1, POSITION)
+        link.close()
+
+
+class NoModemLines(serial.Serial):  # type: ignore[misc]
+    """A pseudo terminal as pyserial's server wants a port: with modem lines."""
+
+    cts = dsr = ri = cd = True
+
+    def _update_rts_state(self) -> None:
+        pass
+
+    def _update_dtr_state(self) -> None:
+        pass
+
+
+class SerialServer:
+    """pyserial's RFC 2217 server between one connection and a line."""
+
+    def __init__(self, path: str) -> None:
+        self.listener = socket.create_server(("127.0.0.1", 0))
+        self.url = f"rfc2217://127.0.0.1:{self.listener.getsockname()[1]}"
+        self._path = path
+        threading.Thread(target=self._serve, daemon=True).start()
+
+    def write(self, data: bytes) -> None:
+        self._connection.sendall(data)
+
+    def _serve(self) -> None:
+        self._connection, _ = self.listener.accept()
+        port = NoModemLines(self._path, BAUD_RATE, timeout=0.01)
+        manager = serial.rfc2217.PortManager(port, self)
+        self._connection.settimeout(0.005)
+        while True:
+            try:
+                data = self._connection.recv(1024)
+                if not data:
+                    break
+                port.write(b"".join(manager.filter(data)))
+            except TimeoutError:
+                pass
+            self.write(b"".join(manager.escape(port.read(port.in_waiting))))
+        port.close()
+
+
+def test_over_rfc2217() -> None:
+    with scripted(always(says(1, number(-7)), says(2, b"\xff\xff\xfd\xff"))) as (line, _):
+        server = SerialServer(line.path)
+        link = Link(server.url, BAUD_RATE, PATIENT_S)
+        assert link.read(1, POSITION) == -7
+        answer = link.group_read(BOTH)
+        assert answer.statuses[2].data == b"\xff\xff\xfd\xff"
+        link.close()
+        server.listener.close()
+
+
+def test_a_host_that_is_not_there_is_a_lost_line() -> None:
+    with socket.socket() as taken:  # bound but not listening: refused at once
+        taken.bind(("127.0.0.1", 0))
+        with pytest.raises(LineLost, match="cannot be opened"):
+            Link(f"socket://127.0.0.1:{taken.getsockname()[1]}", BAUD_RATE)
+
+
+def test_the_clock_on_the_wall_means_nothing(monkeypatch: pytest.MonkeyPatch) -> None:  # defect 4
+    def steps_back() -> float:
+        raise AssertionError("the driver asked for the time of day")
+
+    with scripted(always(says(1, number(1)))) as (line, _):
+        link = Link(line.path, BAUD_RATE, PATIENT_S)
+        monkeypatch.setattr(time, "time", steps_back)
+        assert link.read(1, POSITION) == 1
+        assert PacketHandler().read4ByteTxRx(link._port, 1, 132)[0] == 1
+
+
+def test_waiting_costs_no_processor_time() -> None:  # defect 2
+    with scripted(always()) as (line, _):
+        link = Link(line.path, BAUD_RATE, 0.5)
+        before_s = time.thread_time()
+        with pytest.raises(NoReply):
+            link.read(1, POSITION)
+        assert time.thread_time() - before_s < 0.1  # the SDK spins: 0.5 s; load only makes it less
+
+
+def test_group_reads_are_sync_for_equal_blocks_and_bulk_for_others() -> None:
+    answer = always(says(1, number(1)), says(2, number(2)))
+    with scripted(answer) as (line, servos):
+        link = Link(line.path, BAUD_RATE, PATIENT_S)
+        link.group_read(BOTH)
+        link.group_read([Part(1, 132, 4), Part(2, 580, 4)])
+        link.group_write([Part(1, 116, 4, number(-1)), Part(2, 116, 4, number(7))])
+        link.group_write([Part(1, 116, 4, number(-1)), Part(2, 564, 4, number(7))])
+        link.group_read(BOTH)
+    codes = [i.code for i in servos.heard]
+    assert codes == [SYNC_READ, BULK_READ, SYNC_WRITE, BULK_WRITE, SYNC_READ]
+    assert servos.heard[0].parameters == bytes((132, 0, 4, 0, 1, 2))
+    assert servos.heard[1].parameters == bytes((1, 132, 0, 4, 0, 2, 0x44, 0x02, 4, 0))
+    assert servos.heard[2].parameters == bytes((116, 0, 4, 0, 1)) + number(-1) + bytes((2,)) + number(7)
+    assert servos.heard[3].parameters == (
+        bytes((1, 116, 0, 4, 0)) + number(-1) + bytes((2, 0x34, 0x02, 4, 0)) + number(7)
+    )
+
+
+def test_a_fast_group_read_checks_every_block() -> None:
+    whole = b"".join(fast_status_packets([(0, 1, number(-3)), (0x80, 2, b"\xff\xff\xfd\x07")], 16))
+
+    def answer(instruction: Instruction, count: int) -> list[Reply]:
+        spoilt = bytearray(whole)
+        if count == 1:
+            spoilt[12] ^= 1
+        return [Reply(bytes(spoilt))]
+
+    with scripted(answer) as (line, _):
+        link = Link(line.path, BAUD_RATE, PATIENT_S)
+        good = link.group_read(BOTH, fast=True)
+        assert POSITION.decode(good.statuses[1].data) == -3
+        assert good.statuses[2].data == b"\xff\xff\xfd\x07"  # not stuffed in a fast answer
+        assert good.statuses[2].alert
+        link._port.reply_timeout_s = SHORT_S
+        assert not link.group_read(BOTH, fast=True).statuses
+
+
+def test_the_sdks_group_classes_run_on_the_hardened_layers() -> None:
+    with scripted(always(says(1, number(5)), says(2, b"\xff\xff\xfd\x01"))) as (line, _):
+        port = Port(line.path, BAUD_RATE, PATIENT_S)
+        group = sdk.GroupSyncRead(port, PacketHandler(), 132, 4)
+        for servo_id in (1, 2):
+            group.addParam(servo_id)
+        assert group.txRxPacket() == sdk.COMM_SUCCESS
+        assert group.getData(1, 132, 4) == 5
+        assert group.getData(2, 132, 4) == 0x01FDFFFF
+
+
+def test_calls_of_many_threads_queue_instead_of_failing() -> None:  # defect 11
+    with scripted(lambda i, n: [says(i.packet_id, number(i.packet_id))]) as (line, _):
+        link = Link(line.path, BAUD_RATE, PATIENT_S)
+        bus = Bus(line.path, lambda: time.monotonic() + 60.0)
+        bus.start()
+        got: list[tuple[int, int]] = []
+
+        def ask(servo_id: int) -> None:
+            for _ in range(30):
+                got.append((servo_id, bus.call("read", lambda: link.read(servo_id, POSITION), 30.0)))
+
+        threads = [threading.Thread(target=ask, args=(servo_id,)) for servo_id in range(1, 6)]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+        bus.close(link.close, PATIENT_S)
+    assert len(got) == 150
+    assert all(asked == answered for asked, answered in got)
+
+
+def test_a_call_whose_turn_does_not_come_is_never_made() -> None:
+    bus = Bus("test", lambda: time.monotonic() + 60.0)
+    bus.start()
+    begun, free = threading.Event(), threading.Event()
+    made: list[int] = []
+
+    def hang() -> None:
+        begun.set()
+        free.wait(PATIENT_S)
+
+    hanging = threading.Thread(target=lambda: bus.call("hang", hang, 2 * PATIENT_S))
+    hanging.start()
+    assert begun.wait(PATIENT_S)
+    with pytest.raises(NoReply, match="its turn did not come"):
+        bus.call("late", lambda: made.append(1), 0.05)
+    free.set()
+    hanging.join()
+    bus.call("after", lambda: None, PATIENT_S)
+    bus.close(lambda: None, PATIENT_S)
+    with pytest.raises(NoReply, match="closed"):
+        bus.call("too late", lambda: made.append(2), PATIENT_S)
+    assert made == []
+
+
+def test_what_goes_wrong_in_the_owner_threads_round_does_not_end_it() -> None:
+    rounds: list[int] = []
+
+    def between() -> float:
+        rounds.append(1)
+        if len(rounds) == 1:
+            raise RuntimeError("a defect")
+        return time.monotonic() + 60.0
+
+    bus = Bus("test", between)
+    bus.start()
+    assert bus.call("ask", lambda: 7, PATIENT_S) == 7
+    bus.close(lambda: None, PATIENT_S)
+    assert rounds
+
+
+def test_a_low_level_error_of_any_kind_becomes_a_lost_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    with scripted(always()) as (line, _):
+        port = Port(line.path, BAUD_RATE, SHORT_S)
+        for error in (
+            termios.error(5, "Input/output error"),
+            OSError(5, "Input/output error"),
+            TypeError("'NoneType' object cannot be interpreted"),
+            IndexError("list index out of range"),
+        ):
+            with pytest.raises(LineLost, match=port.port_name), port.low_level("writing"):
+                raise error

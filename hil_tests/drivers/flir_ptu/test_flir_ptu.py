@@ -1,0 +1,748 @@
+"""The FLIR PTU driver: what it takes for an answer, and what it does with odd firmwares and bad lines.
+
+The answers are those printed in the manuals. How the driver behaves on a unit that moves is in
+test_head_contract.py.
+"""
+
+from __future__ import annotations
+
+import itertools
+import json
+import math
+import socket
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, suppress
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from serial import rfc2217
+
+from drivers.clock import SystemClock
+from drivers.errors import (
+    BadOptions,
+    BadReply,
+    DriverError,
+    HardwareFault,
+    LineLost,
+    NoReply,
+    OutOfRange,
+    Refused,
+    WrongDevice,
+)
+from drivers.flir_ptu.head import FlirPtu, open_head
+from drivers.flir_ptu.options import options_from
+from drivers.flir_ptu.replies import LineSplitter, answer_of, hits_of, number_of
+from drivers.flir_ptu.workshop import AxisFacts, facts, home
+from drivers.sim.wire.line import PtyLine
+from hil_tests.drivers.dynamixel.dynamixel_rig import until
+from hil_tests.drivers.flir_ptu.scripted_ptu import ScriptedPtu
+from mastctl.cli.main import main
+
+ARCSEC = math.pi / 180 / 3600
+PAN_STEP_RAD, TILT_STEP_RAD = 185.142857 * ARCSEC, 46.285714 * ARCSEC
+OPTIONS: dict[str, Any] = {
+    "pan": {"limits_rad": [-2.5, 2.5]},
+    "tilt": {"limits_rad": [-0.7, 0.5]},
+    "settle_s": 0.0,
+}
+
+Opener = Callable[..., tuple[FlirPtu, ScriptedPtu]]
+
+
+@pytest.fixture
+def opened() -> Iterator[Opener]:
+    """Open a head on a scripted unit; both are closed at the end. Bytes take no time on the wire."""
+    with ExitStack() as stack:
+
+        def open_on(unit: ScriptedPtu | None = None, **options: Any) -> tuple[FlirPtu, ScriptedPtu]:
+            unit = unit or ScriptedPtu()
+            line = stack.enter_context(PtyLine(unit, SystemClock(), wire_time=False))
+            head = open_head({**OPTIONS, "port": line.path, **options})
+            stack.callback(head.close)
+            return head, unit
+
+        yield open_on
+
+
+def settled(head: FlirPtu) -> tuple[float, float]:
+    """Read until the head has settled; return its angles."""
+    for _ in range(1000):
+        reading = head.read()
+        if not reading.moving:
+            return reading.pan_rad, reading.tilt_rad
+        time.sleep(0.002)
+    raise AssertionError("the head never settled")
+
+
+# What is an answer
+
+
+@pytest.mark.parametrize(
+    ("line", "good", "text", "echo"),
+    [
+        (b"* 22", True, "22", False),
+        (b"*", True, "", False),
+        (b"PP * 22", True, "22", True),
+        (b"pp * Current Pan position is -2500", True, "Current Pan position is -2500", True),
+        (
+            b"\n! Maximum allowable Pan position is 3090",
+            False,
+            "Maximum allowable Pan position is 3090",
+            False,
+        ),
+        (b"!T!T!P!P*", True, "", False),
+        (b"!P PP * 22", True, "22", True),
+        (b"PP !T* 22", True, "22", True),
+        (b"!PPP * 22", True, "22", True),
+        (b"! Illegal Command Entered", False, "Illegal Command Entered", False),
+    ],
+)
+def test_answers_of_the_manuals_are_understood(line: bytes, good: bool, text: str, echo: bool) -> None:
+    answer = answer_of(line, "PP")
+    assert answer is not None
+    assert (answer.good, answer.text, answer.echo) == (good, text, echo)
+
+
+@pytest.mark.parametrize(
+    "line", [b"", b"22", b"*22", b"* 2\xb2", b"TP * 22", b"PP", b"!P", b"PPP * 22", b"\x00* 22", b"Welcome *"]
+)
+def test_anything_else_is_no_answer(line: bytes) -> None:
+    assert answer_of(line, "PP") is None
+
+
+@pytest.mark.parametrize(
+    ("text", "words", "number"),
+    [
+        ("Current Pan position is 22", ("current", "pan", "position"), 22),
+        ("Current pan position is -0", ("current", "pan", "position"), 0),
+        ("185.142857 seconds arc per Pan position", ("arc", "pan", "position"), 185.142857),
+        ("Pan acceleration is 2000 positions/sec^2", ("pan", "acceleration"), 2000),
+        ("Current Tilt position is 22", ("current", "pan", "position"), None),
+        ("Target Pan position is 22", ("current", "pan", "position"), None),
+        ("Current Pan position is 2 2", ("current", "pan", "position"), None),
+        ("Current Pan position is 2:2", ("current", "pan", "position"), None),
+        ("Current Pan position is", ("current", "pan", "position"), None),
+        ("Current Pan p0sition is 22", ("current", "pan"), None),
+        ("22", ("current", "pan", "position"), None),
+    ],
+)
+def test_a_number_counts_only_in_the_words_of_its_question(
+    text: str, words: tuple[str, ...], number: float | None
+) -> None:
+    assert number_of(text, words, verbose=True) == number
+
+
+def test_a_terse_number_stands_alone() -> None:
+    assert number_of("-22", ("any",), verbose=False) == -22
+    assert number_of("is 22", ("any",), verbose=False) is None
+
+
+def test_limit_hits_are_found_and_errors_are_none() -> None:
+    assert hits_of(b"!T!T!P!P*") == ("tilt", "tilt", "pan", "pan")
+    assert hits_of(b"!P* 22") == ("pan",)
+    assert hits_of(b"!PPP * 22") == ("pan",)
+    assert hits_of(b"! Pan speed cannot exceed 600 pos/sec") == ()
+    assert hits_of(b"!Pan") == ()
+
+
+@settings(max_examples=300, deadline=None)
+@given(st.binary(max_size=200), st.lists(st.integers(0, 200), max_size=8))
+def test_no_bytes_whatever_break_the_parser_and_pieces_do_not_matter(data: bytes, cuts: list[int]) -> None:
+    whole = LineSplitter()
+    lines = whole.feed(data)
+    piecewise, ends = LineSplitter(), sorted({0, len(data), *(min(cut, len(data)) for cut in cuts)})
+    pieces = [line for a, b in itertools.pairwise(ends) for line in piecewise.feed(data[a:b])]
+    assert pieces == lines and piecewise.clear() == whole.clear()
+    for line in lines:
+        answer = answer_of(line, "PP")
+        if answer is not None:
+            number_of(answer.text, ("current",), verbose=True)
+            number_of(answer.text, ("current",), verbose=False)
+
+
+# Odd firmwares
+
+
+@pytest.mark.parametrize("verbose", [True, False])
+@pytest.mark.parametrize("echo", [True, False])
+@pytest.mark.parametrize("obeys", [True, False])
+@pytest.mark.parametrize(
+    ("start", "end", "e_series"), [(b"", b"\r", False), (b"\n", b"\r\n", False), (b"\n", b"\r\n", True)]
+)
+def test_every_way_of_answering_gives_the_same_head(
+    opened: Opener, verbose: bool, echo: bool, obeys: bool, start: bytes, end: bytes, e_series: bool
+) -> None:
+    unit = ScriptedPtu(verbose=verbose, echo=echo, obeys=obeys, start=start, end=end, e_series=e_series)
+    unit.positions = {"P": 100, "T": -40}
+    head, _ = opened(unit)
+    reading = head.read()
+    assert reading.pan_rad == pytest.approx(100 * PAN_STEP_RAD)
+    assert reading.tilt_rad == pytest.approx(-40 * TILT_STEP_RAD)
+    head.move(0.5, 0.2)
+    assert unit.positions == {"P": round(0.5 / PAN_STEP_RAD), "T": round(0.2 / TILT_STEP_RAD)}
+
+
+def test_opening_moves_nothing_and_voids_what_was_left_in_slaved_mode(opened: Opener) -> None:
+    unit = ScriptedPtu()
+    unit.positions, unit.slaved = {"P": 7, "T": 8}, {"P": 500, "T": -500}
+    head, _ = opened(unit)
+    assert unit.positions == {"P": 7, "T": 8} and unit.slaved is None
+    head.close()
+    assert not {"R", "RP", "RT", "DS", "DF", "DR", "LD"} & set(unit.heard), "never reset, never saved"
+    assert not [command for command in unit.heard if command.startswith("W")], "step mode left alone"
+
+
+def test_goals_are_rounded_to_the_nearest_step_and_start_together(opened: Opener) -> None:
+    head, unit = opened()
+    for steps in (10.4, 10.6, -10.4, -10.6):
+        unit.heard.clear()
+        head.move(steps * PAN_STEP_RAD, -steps * TILT_STEP_RAD)
+        assert unit.positions == {"P": round(steps), "T": round(-steps)}
+        assert unit.heard[-4:] == ["S", f"PP{round(steps)}", f"TP{round(-steps)}", "I"]
+
+
+def test_sign_and_zero_turn_steps_into_the_masts_angles(opened: Opener) -> None:
+    head, unit = opened(tilt={"limits_rad": [-0.3, 0.5], "sign": -1, "zero_rad": 0.1})
+    head.move(0.0, 0.4)
+    assert unit.positions["T"] == -round(0.3 / TILT_STEP_RAD)
+    assert head.read().tilt_rad == pytest.approx(0.4, abs=TILT_STEP_RAD / 2)
+
+
+def test_limits_go_into_the_unit_and_are_checked_before_it(opened: Opener) -> None:
+    head, unit = opened()
+    low, high = round(-2.5 / PAN_STEP_RAD), round(2.5 / PAN_STEP_RAD)
+    at = unit.heard.index(f"PNU{low}")
+    assert unit.heard[at : at + 2] == [f"PNU{low}", f"PXU{high}"] and "LU" in unit.heard
+    before = len(unit.heard)
+    for pan, tilt in ((2.6, 0.0), (0.0, -0.71), (math.nan, 0.0), (0.0, math.inf)):
+        with pytest.raises(OutOfRange, match=r"(pan|tilt) .* rad is outside its limits"):
+            head.move(pan, tilt)
+    assert len(unit.heard) == before, "nothing was sent"
+
+
+def test_a_unit_without_user_limits_keeps_its_factory_limits(opened: Opener) -> None:
+    unit = ScriptedPtu()
+    unit.user_limits = False
+    head, _ = opened(unit)
+    assert "LU" not in unit.heard and unit.heard.count("LE") == 2
+    head.move(0.1, 0.1)
+    assert unit.positions["P"] == round(0.1 / PAN_STEP_RAD)
+
+
+def test_limits_beyond_the_units_own_are_refused(opened: Opener) -> None:
+    with pytest.raises(
+        WrongDevice, match=r"options.pan.limits_rad is -3.0000 to 2.5000 rad, the unit itself"
+    ):
+        opened(pan={"limits_rad": [-3.0, 2.5]})
+
+
+@pytest.mark.parametrize("answer", [b"* 0 seconds arc per Pan position", b"! Gear ratio unknown"])
+def test_a_unit_that_does_not_know_its_resolution_has_to_be_homed(opened: Opener, answer: bytes) -> None:
+    unit = ScriptedPtu()
+    unit.answers["PR"] = answer
+    with pytest.raises(DriverError, match=r"home it|Gear ratio unknown"):
+        opened(unit)
+
+
+def test_another_resolution_after_a_reset_is_taken_over(opened: Opener) -> None:
+    head, unit = opened()
+    head.move(0.5, 0.2)
+    settled(head)
+    unit.resolutions = {"P": "92.571428", "T": "46.285714"}
+    unit.limits["P"] = (-6180, 6180)
+    unit.positions["P"] *= 2
+    unit.answers["PP"] = b"* What"
+    with pytest.raises(BadReply):
+        head.read()
+    del unit.answers["PP"]
+    assert head.read().pan_rad == pytest.approx(0.5, abs=PAN_STEP_RAD / 2)
+    head.move(0.25, 0.2)
+    assert unit.positions["P"] == round(0.25 / (PAN_STEP_RAD / 2))
+
+
+def test_speed_is_set_in_steps_a_second_within_what_the_unit_does(opened: Opener) -> None:
+    head, unit = opened(speed_rad_per_s=0.5)
+    head.move(0.1, 0.1)
+    assert unit.speeds == {"P": int(0.5 / PAN_STEP_RAD), "T": int(0.5 / TILT_STEP_RAD)}
+    head.move(0.2, 0.2, 0.1)
+    assert unit.speeds["P"] == int(0.1 / PAN_STEP_RAD)
+    head.move(0.2, 0.2, 100.0)
+    assert unit.speeds == {"P": 2902, "T": 2902}
+    head.move(0.2, 0.2, 1e-6)
+    assert unit.speeds == {"P": 31, "T": 31}
+    for bad in (0.0, -1.0, math.nan):
+        with pytest.raises(OutOfRange, match="not a positive number"):
+            head.move(0.1, 0.1, bad)
+
+
+def test_acceleration_is_set_only_where_it_differs(opened: Opener) -> None:
+    _, unit = opened(acceleration_rad_per_s2=2000 * PAN_STEP_RAD)
+    assert not [command for command in unit.heard if command.startswith("PA") and command != "PA"]
+    assert f"TA{round(2000 * PAN_STEP_RAD / TILT_STEP_RAD)}" in unit.heard
+
+
+@pytest.mark.parametrize(("approach", "way"), [("positive", 1), ("negative", -1), ("gravity", 1)])
+def test_a_goal_is_approached_from_one_side(opened: Opener, approach: str, way: int) -> None:
+    axis = {"limits_rad": [-2.5, 2.5], "approach": approach, "approach_rad": 20 * PAN_STEP_RAD}
+    head, unit = opened(pan=axis)
+    for goal in (0.5, -0.3, -0.31, 2.5, -2.5):
+        unit.heard.clear()
+        head.move(goal, 0.0)
+        settled(head)
+        steps = [int(command[2:]) for command in unit.heard if command.startswith("PP") and command != "PP"]
+        assert steps[-1] == round(goal / PAN_STEP_RAD)
+        if len(steps) == 2:
+            assert 0 <= (steps[1] - steps[0]) * way <= 21
+        else:
+            assert abs(goal) in (0.5, 2.5), "only from the right side, or with no room"
+
+
+# Bad lines
+
+
+def test_a_refusal_carries_the_units_own_words(opened: Opener) -> None:
+    head, unit = opened()
+    unit.answers["S"] = b"! Pan-tilt is not feeling well"
+    before = dict(unit.positions)
+    with pytest.raises(Refused, match="refuses S: Pan-tilt is not feeling well"):
+        head.move(0.1, 0.1)
+    assert unit.positions == before
+    head.read()
+
+
+@pytest.mark.parametrize("step", ["S", "PP", "TP"])
+def test_a_move_that_is_not_confirmed_step_by_step_never_starts(opened: Opener, step: str) -> None:
+    head, unit = opened()
+    goal = {"S": "S", "PP": f"PP{round(0.5 / PAN_STEP_RAD)}", "TP": f"TP{round(0.2 / TILT_STEP_RAD)}"}[step]
+    usual = unit._usual
+    unit.answers[goal] = lambda command: usual(command) and None
+    with pytest.raises(NoReply, match=f"did not answer {goal} within its deadline"):
+        head.move(0.5, 0.2)
+    assert unit.positions == {"P": 0, "T": 0} and "I" not in unit.heard[-3:]
+    del unit.answers[goal]
+    assert head.read().pan_rad == 0.0
+    head.move(-0.5, -0.2)
+    assert unit.positions == {"P": -round(0.5 / PAN_STEP_RAD), "T": -round(0.2 / TILT_STEP_RAD)}
+
+
+def test_a_late_answer_is_never_taken_for_the_next(opened: Opener) -> None:
+    head, unit = opened()
+    settled(head)
+    held: list[bytes] = []
+
+    def hold(command: str) -> bytes | None:
+        held.append(b"PP * Current Pan position is 777\r")
+        return None
+
+    unit.answers["PP"] = hold
+    with pytest.raises(NoReply):
+        head.read()
+    del unit.answers["PP"]
+    unit.unasked = held[0]  # it comes while the driver gets into step, or before
+    assert head.read().pan_rad == 0.0
+    unit.unasked = held[0]
+    time.sleep(0.05)
+    assert head.read().pan_rad == 0.0
+
+
+def test_a_damaged_digit_is_asked_again(opened: Opener) -> None:
+    head, unit = opened()
+    head.move(0.5, 0.2)
+    at = settled(head)[0]
+    time.sleep(0.25)
+    settled(head)
+    lies = iter([b"* Current Pan position is 9557"])
+    usual = unit._usual
+    unit.answers["PP"] = lambda command: next(lies, None) or usual(command)
+    assert head.read().pan_rad == at
+
+
+def test_positions_that_contradict_each_other_are_refused(opened: Opener) -> None:
+    head, unit = opened()
+    settled(head)
+    time.sleep(0.25)
+    settled(head)
+    lies = itertools.count(1000, 300)
+    unit.answers["PP"] = lambda command: f"* Current Pan position is {next(lies)}".encode()
+    with pytest.raises(BadReply, match="gives pan positions that contradict each other: 1000, 1300"):
+        head.read()
+
+
+def test_a_limit_hit_stops_the_head_until_it_is_homed(opened: Opener) -> None:
+    head, unit = opened()
+    settled(head)
+    head.move(0.2, 0.0)
+    unit.heard.clear()
+    unit.unasked = b"!P"
+    time.sleep(0.05)
+    reading = head.read()
+    assert any("pan axis ran into its limit switch" in word for word in reading.faults)
+    assert "H" in unit.heard
+    with pytest.raises(HardwareFault, match="lost count of its position; home it"):
+        head.move(0.1, 0.1)
+    assert any("limit switch" in word for word in head.read().faults), "it does not go away by itself"
+    head.close()
+    unit.answers["R"] = b"!T!T!P!P*"
+    home(head._options.port, 9600)
+    assert "R" in unit.heard
+    head = open_head({**OPTIONS, "port": head._options.port})
+    assert head.read().faults == ()
+    head.move(0.1, 0.1)
+    head.close()
+
+
+def rested(head: FlirPtu) -> None:
+    """Read until the head has stood for so long that it cannot be anywhere else."""
+    until_s = time.monotonic() + 20
+    while not all(axis.rests for axis in head._axes.values()):
+        head.read()
+        assert time.monotonic() < until_s
+
+
+def test_a_limit_hit_of_a_resting_head_is_looked_into_and_forgotten(opened: Opener) -> None:
+    head, unit = opened()
+    rested(head)
+    before = head.read()
+    unit.heard.clear()
+    unit.unasked = b"!P"
+    time.sleep(0.05)
+    head.read()
+    reading = head.read()
+    assert reading.faults == () and (reading.pan_rad, reading.tilt_rad) == (before.pan_rad, before.tilt_rad)
+    assert {"V", "LU", "PP"} <= set(unit.heard), "the unit was checked from version to limits"
+    assert not [c for c in unit.heard if c.startswith(("PP", "TP")) and c[2:]], "and not moved"
+    head.move(0.1, 0.1)
+
+
+def test_a_limit_hit_of_a_resting_head_that_has_moved_meanwhile_stays(opened: Opener) -> None:
+    head, unit = opened()
+    rested(head)
+    unit.unasked, unit.positions = b"!T!T!P!P*\r", {"P": 400, "T": 0}
+    time.sleep(0.05)
+    head.read()
+    assert any("unit may have lost count" in word for word in head.read().faults)
+    with pytest.raises(HardwareFault, match="home it"):
+        head.move(0.1, 0.1)
+
+
+@pytest.mark.parametrize(
+    ("options", "answer", "words"),
+    [
+        ({}, "Input 23 VDC @ 95 degF", "the supply is 23.0 V, expected 24.0 V or more"),
+        ({"supply_V": [26, 32]}, "Input 25 VDC @ 95 degF", "25.0 V, expected 26.0 to 32.0 V"),
+        ({}, "Input 30 VDC @ 167 degF", "the unit is at 75 °C, expected 60 °C at most"),
+        ({}, "30.1V,90F,158F,88F", "the unit is at 70 °C"),
+        ({"hottest_C": 80}, "Input 30 VDC @ 167 degF", ""),
+        ({}, "Input 24 VDC @ 140 degF", ""),  # 60 degrees Celsius: both at their bounds
+        ({}, "something else", ""),
+    ],
+)
+def test_supply_and_temperature_are_watched_while_the_head_rests(
+    opened: Opener, monkeypatch: pytest.MonkeyPatch, options: dict[str, Any], answer: str, words: str
+) -> None:
+    monkeypatch.setattr("drivers.flir_ptu.supply.EVERY_S", 0.0)
+    unit = ScriptedPtu()
+    unit.answers["O"] = b"* Input 30 VDC @ 86 degF"
+    head, _ = opened(unit, **options)
+    settled(head)
+    assert head.read().faults == ()
+    unit.answers["O"] = f"* {answer}".encode()
+    faults = head.read().faults
+    assert words in "; ".join(faults) and bool(faults) == bool(words)
+    unit.answers["O"] = b"* Input 30 VDC @ 86 degF"
+    assert head.read().faults == ()
+
+
+def test_an_e46_has_to_be_told_its_resolution(opened: Opener) -> None:
+    unit = ScriptedPtu()
+    unit.answers["V"] = b"* Pan-Tilt Controller v3.2.2(E46-C14/E), (C)2011 FLIR Commercial Systems, Inc."
+    with pytest.raises(WrongDevice, match="an E46, which does not know its gears before it was homed"):
+        opened(unit)
+    right = {
+        "pan": {**OPTIONS["pan"], "resolution_arcsec": 46.2857},
+        "tilt": {**OPTIONS["tilt"], "resolution_arcsec": 46.2857},
+    }
+    with pytest.raises(WrongDevice, match=r"pan position is 185.143 .*resolution_arcsec 46.2857; either"):
+        opened(unit, **right)
+    unit.resolutions["P"], unit.limits["P"] = "46.285714", (-12366, 12366)
+    opened(unit, **right)
+
+
+def test_facts_of_a_unit_are_told_without_moving_it() -> None:
+    unit = ScriptedPtu(verbose=False, echo=False)
+    unit.answers |= {"O": b"* Input 30 VDC @ 86 degF", "WP": b"* Pan in HALF step mode"}
+    with PtyLine(unit, SystemClock(), wire_time=False) as line:
+        found = facts(line.path, 9600)
+    assert (
+        found.version.startswith("Pan-Tilt Controller v2.13.0") and found.supply == "Input 30 VDC @ 86 degF"
+    )
+    assert found.pan == AxisFacts(185.142857, 0, -3090, 3090, 1000, 2902, 2000, "Pan in HALF step mode")
+    assert found.tilt.step_mode == "", "refused by this unit"
+    assert not {"R", "I", "S"} & set(unit.heard)
+
+
+def test_homing_by_command_needs_to_be_meant(capsys: pytest.CaptureFixture[str]) -> None:
+    unit = ScriptedPtu()
+    with PtyLine(unit, SystemClock(), wire_time=False) as line:
+        assert main(["ptu", "home", line.path]) == 2
+        assert "sweeps both axes over their full range" in capsys.readouterr().err
+        assert unit.heard == []
+        unit.positions = {"P": 3, "T": 4}
+        unit.answers["R"] = lambda command: unit.positions.update(P=0, T=0) or b"!T!T!P!P*"
+        assert main(["ptu", "home", line.path, "--sweep-full-range", "--json"]) == 0
+        told = json.loads(capsys.readouterr().out)
+        assert told["pan"]["position"] == 0 and told["tilt"]["resolution_arcsec"] == 46.285714
+        assert main(["ptu", "info", line.path]) == 0
+        assert "resolution arcsec" in capsys.readouterr().out
+    assert main(["ptu", "info", line.path, "--json"]) == 1
+    assert json.loads(capsys.readouterr().out)["error"]["code"] == "line_lost"
+    assert main(["ptu", "info", "/dev/null", "--baud", "1"]) == 2
+
+
+def test_a_limit_hit_before_an_answer_does_not_hide_it(opened: Opener) -> None:
+    head, unit = opened()
+    unit.answers["TP"] = b"!T* Current Tilt position is 0"
+    reading = head.read()
+    assert reading.tilt_rad == 0.0 and "tilt axis" in reading.faults[0]
+
+
+def test_an_axis_that_does_not_come_to_its_target_is_told(opened: Opener) -> None:
+    head, unit = opened()
+    settled(head)
+    unit.answers[f"PP{round(0.5 / PAN_STEP_RAD)}"] = b"*"  # says yes and does nothing
+    unit.speeds["P"] = 1000
+    head.move(0.5, 0.0)
+    until_s = time.monotonic() + 10
+    while not (words := head.read().faults) and time.monotonic() < until_s:
+        time.sleep(0.05)
+    assert words == ("pan stands at 0.0000 rad and does not reach its target 0.5000 rad",)
+    assert head.read().moving
+
+
+def test_a_unit_that_lost_count_while_the_line_was_down_is_not_moved(opened: Opener) -> None:
+    with ExitStack() as stack:
+        unit = ScriptedPtu()
+        line = stack.enter_context(PtyLine(unit, SystemClock(), wire_time=False))
+        head = open_head({**OPTIONS, "port": line.path})
+        stack.callback(head.close)
+        head.move(0.5, 0.2)
+        settled(head)
+        line.hang_up()
+        with pytest.raises(LineLost, match="is gone"):
+            head.read()
+        with pytest.raises(LineLost):
+            head.move(0.1, 0.1)
+        unit.positions["P"] = 0
+        line.come_back()
+        unit.heard.clear()
+        until_s = time.monotonic() + 10
+        while time.monotonic() < until_s:
+            try:
+                reading = head.read()
+                break
+            except LineLost:
+                time.sleep(0.02)
+        assert reading.faults[0].startswith(
+            "pan was at 0.5000 rad before the unit or its line was away and is at 0.0"
+        )
+        assert unit.positions == {"P": 0, "T": round(0.2 / TILT_STEP_RAD)}, "it comes back without moving"
+        assert {"LU", "PN", "PR", "H"} <= set(unit.heard), "and is checked again"
+        with pytest.raises(HardwareFault, match="before the unit or its line was away"):
+            head.move(0.1, 0.1)
+
+
+def test_a_power_cycle_behind_an_open_line_is_noticed(opened: Opener) -> None:
+    head, unit = opened(speed_rad_per_s=0.5)
+    head.move(0.5, 0.2)
+    settled(head)
+    unit.answers["PP"] = lambda command: None  # power gone for a moment; it comes back as it was delivered
+    with pytest.raises(NoReply):
+        head.read()
+    del unit.answers["PP"]
+    unit.positions, unit.speeds = {"P": 0, "T": 0}, {"P": 1000, "T": 1000}
+    unit.heard.clear()
+    words = head.read().faults
+    assert [word.split()[0] for word in words] == ["pan", "tilt"] and "home it" in words[0]
+    assert {"LU", "H"} <= set(unit.heard) and unit.positions == {"P": 0, "T": 0}
+
+
+def test_another_unit_on_the_line_is_refused(opened: Opener) -> None:
+    with ExitStack() as stack:
+        unit = ScriptedPtu()
+        line = stack.enter_context(PtyLine(unit, SystemClock(), wire_time=False))
+        head = open_head({**OPTIONS, "port": line.path})
+        stack.callback(head.close)
+        line.hang_up()
+        unit.answers["V"] = b"* Pan-Tilt Controller v3.02(D48)"
+        with pytest.raises(LineLost):
+            head.read()
+        line.come_back()
+        until_s = time.monotonic() + 10
+        with pytest.raises(WrongDevice, match="another unit answers"):
+            while time.monotonic() < until_s:
+                try:
+                    head.read()
+                except LineLost:
+                    time.sleep(0.02)
+
+
+def test_a_stop_does_not_wait_for_a_call_under_way(opened: Opener) -> None:
+    head, unit = opened()
+    unit.answers["PP"] = lambda command: None
+    began = threading.Event()
+
+    def reading() -> None:
+        began.set()
+        with pytest.raises(DriverError):
+            head.read()
+
+    thread = threading.Thread(target=reading)
+    thread.start()
+    began.wait()
+    while "PP" not in unit.heard[-1:]:
+        time.sleep(0.001)
+    before = len(unit.heard)
+    head.stop()
+    thread.join()
+    assert unit.heard[before] == "H", "it went out beside the reading"
+    assert unit.heard[-1] == "H", "and once more in order"
+
+
+def test_a_stop_goes_out_before_a_unit_that_is_in_doubt_is_checked(opened: Opener) -> None:
+    head, unit = opened()
+    rested(head)
+    unit.unasked = b"!P"
+    while not head._count.doubted:
+        with suppress(DriverError):
+            head.move(0.1, 0.1)
+    unit.heard.clear()
+    head.stop()
+    assert unit.heard[0] == "H"
+
+
+def test_no_second_leg_follows_a_stop_that_was_not_confirmed(opened: Opener) -> None:
+    axis = {"limits_rad": [-2.5, 2.5], "approach": "positive", "approach_rad": 20 * PAN_STEP_RAD}
+    head, unit = opened(pan=axis)
+    head.move(-0.5, 0.0)
+    began = unit.positions["P"]
+    unit.answers["H"] = lambda command: None
+    with pytest.raises(DriverError):
+        head.stop()
+    for _ in range(5):
+        head.read()
+    assert unit.positions["P"] == began
+
+
+@pytest.mark.parametrize("capitals", [False, True], ids=["exact_echo", "echo_in_capitals"])
+@pytest.mark.parametrize("unasked", [b"* Current Pan position is 22\r", b"PP * Current Pan pos", b"\xff\x80"])
+def test_a_stop_is_sent_though_something_came_that_nobody_asked_for(
+    opened: Opener, unasked: bytes, capitals: bool
+) -> None:
+    head, unit = opened(ScriptedPtu(capitals=capitals))
+    head.move(0.5, 0.2)
+    assert head._talk is not None
+    unit.heard.clear()
+    unit.unasked = unasked
+    until(lambda: head._talk._line._serial.in_waiting == len(unasked), "the bytes")
+    head.stop()
+    assert unit.heard[0] == "H"
+    assert unit.heard[-1] == "H", "and confirmed"
+
+
+def test_a_stop_tries_a_line_that_is_away_at_once_and_halts_before_it_asks(opened: Opener) -> None:
+    head, unit = opened()
+    head._give_up(LineLost("the line is gone", device="ptu"))
+    head._absence.again_s = time.monotonic() + 60.0
+    unit.heard.clear()
+    head.stop()
+    assert unit.heard[0] == "H"
+
+
+def serve_rfc2217(listener: socket.socket, unit: ScriptedPtu) -> None:
+    """A serial server with a unit behind it, by pyserial's own server side, for one client."""
+    connection, _ = listener.accept()
+    lines = {"cts": True, "dsr": True, "ri": False, "cd": True, "rts": True, "dtr": True}
+    settings = {
+        "baudrate": 9600,
+        "bytesize": 8,
+        "parity": "N",
+        "stopbits": 1,
+        "xonxoff": False,
+        "rtscts": False,
+    }
+    port = SimpleNamespace(
+        **lines, **settings, break_condition=False,
+        reset_input_buffer=lambda: None, reset_output_buffer=lambda: None,
+    )  # fmt: skip
+    manager = rfc2217.PortManager(port, SimpleNamespace(write=connection.sendall))
+    with connection, suppress(OSError):
+        while data := connection.recv(4096):
+            heard = b"".join(manager.filter(data))
+            for reply in unit.receive(heard, 0.0):
+                connection.sendall(b"".join(manager.escape(reply.data)))
+
+
+def test_a_serial_server_by_rfc2217_serves_as_well() -> None:
+    unit = ScriptedPtu()
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        server = threading.Thread(target=serve_rfc2217, args=(listener, unit), daemon=True)
+        server.start()
+        head = open_head({**OPTIONS, "port": f"rfc2217://127.0.0.1:{listener.getsockname()[1]}"})
+        head.move(0.5, 0.2)
+        assert settled(head)[0] == pytest.approx(0.5, abs=PAN_STEP_RAD / 2)
+        head.close()
+        server.join(10)
+        assert not server.is_alive()
+        assert unit.heard[-1] == "H"
+
+
+@pytest.mark.parametrize("scheme", ["socket", "rfc2217"])
+def test_a_host_that_does_not_listen_is_a_lost_line(scheme: str) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        port = listener.getsockname()[1]
+    with pytest.raises(LineLost, match="cannot be opened"):
+        open_head({**OPTIONS, "port": f"{scheme}://127.0.0.1:{port}"})
+    with pytest.raises(LineLost, match="cannot be opened"):
+        open_head({**OPTIONS, "port": f"{scheme}://127.0.0.1"})
+
+
+def test_two_programs_cannot_have_the_same_line(opened: Opener) -> None:
+    with PtyLine(ScriptedPtu(), SystemClock(), wire_time=False) as line:
+        head = open_head({**OPTIONS, "port": line.path})
+        try:
+            with pytest.raises(LineLost, match="cannot be opened"):
+                open_head({**OPTIONS, "port": line.path})
+        finally:
+            head.close()
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"port": "http://x"}, "options.port is 'http://x', expected a serial device"),
+        ({"baud": 1234}, "options.baud is 1234, expected 600, 1200"),
+        ({"speed_rad_per_s": 0}, "options.speed_rad_per_s is 0, expected a number from 0.0001 to 20"),
+        ({"settle_s": math.nan}, "options.settle_s is nan"),
+        ({"pan": {}}, "options.pan.limits_rad is missing"),
+        ({"pan": {"limits_rad": [1, 0]}}, r"options.pan.limits_rad is \[1, 0\], expected \[low, high\]"),
+        ({"pan": {"limits_rad": "all"}}, "options.pan.limits_rad is 'all'"),
+        ({"tilt": {"limits_rad": [0, 1], "sgin": 1}}, "options.tilt.sgin: there is no such option; did you"),
+        ({"tilt": {"limits_rad": [0, 1], "sign": True}}, "options.tilt.sign is True, expected 1, -1"),
+        (
+            {"tilt": {"limits_rad": [0, 1], "approach": "positive"}},
+            "options.tilt.approach_rad is None, expected",
+        ),
+        (
+            {"tilt": {"limits_rad": [0, 1], "zero_rad": "0"}},
+            "options.tilt.zero_rad is '0', expected a number",
+        ),
+    ],
+)
+def test_options_that_cannot_be_are_refused_by_name(change: dict[str, Any], message: str) -> None:
+    with pytest.raises(BadOptions, match=message):
+        options_from({**OPTIONS, "port": "/dev/ttyUSB0", **change})

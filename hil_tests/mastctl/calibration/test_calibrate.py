@@ -1,0 +1,238 @@
+"""``mastctl calibrate``: what it writes, what it refuses, and what it then leaves alone."""
+
+from __future__ import annotations
+
+import json
+import re
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from calib.files.mast_file import load_rig, save_rig
+from calib.survey import read_survey
+from drivers.sim_survey.board import draw_board, photograph
+from hil_tests.mastctl.calibration.survey_world import edit_yaml, navcam_rig, navcam_survey, write_folder
+from mastctl.calibration.detection import missing, with_dots
+from mastctl.cli.main import main
+
+SIGMAS = 4.5
+"""How many stated sigmas the truth may be off in one seeded survey."""
+
+
+@pytest.fixture(scope="module")
+def survey_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    survey, _ = navcam_survey(1)
+    return write_folder(survey, tmp_path_factory.mktemp("survey") / "field-1")
+
+
+@pytest.fixture(scope="module")
+def first(survey_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    """A mast file and its report, which compares with the true rig."""
+    out = tmp_path_factory.mktemp("out")
+    save_rig(navcam_rig(), out / "use.yaml")
+    words = ["calibrate", str(survey_folder), "--out", str(out / "m.yaml")]
+    assert main([*words, "--report", str(out / "r"), "--in-use", str(out / "use.yaml")]) == 0
+    return out / "m.yaml", out / "r" / "calibration.html"
+
+
+def refused(capsys: pytest.CaptureFixture[str], code: int, words: list[str]) -> dict[str, Any]:
+    """Run with --json, check the exit code and that a refusal is one document; return its error."""
+    capsys.readouterr()
+    assert main([*words, "--json"]) == code
+    captured = capsys.readouterr()
+    assert "Traceback" not in captured.out + captured.err
+    return dict(json.loads(captured.out)["error"])
+
+
+def test_json_has_the_contracts_keys_and_the_truth_within_its_sigmas(
+    survey_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["calibrate", str(survey_folder), "--out", str(tmp_path / "m.yaml"), "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert set(told["rms_px"]) == set(told["check_rms_px"]) == {"navcam_left", "navcam_right"}
+    assert all(0.08 < value < 0.12 for pair in told["rms_px"].values() for value in pair)
+    true = navcam_rig().mast
+    for key, values in (("translation_m", true.translation_m), ("rotation_rad", true.rotation_rad)):
+        error, sigma = np.array(told["mast"][key]) - values, np.array(told["sigma"][key])
+        assert (np.abs(error) < SIGMAS * sigma).all(), (key, error, sigma)
+        assert told["sigma"]["mast"][key] == told["sigma"][key]
+        assert (sigma < 0.01).all()
+    assert told["mast"]["axis_offset_m"] == 0.0
+    assert told["seconds"] > 0
+    assert told["verdict"]["grade"] == "good", told["verdict"]
+    assert load_rig(tmp_path / "m.yaml").digest == told["mast_file"]["digest"]
+
+
+def test_the_mast_file_holds_fit_covariance_and_provenance(
+    first: tuple[Path, Path], survey_folder: Path
+) -> None:
+    rig = load_rig(first[0]).rig
+    names, covariance = rig.fit["parameters"], np.array(rig.fit["covariance"])
+    assert covariance.shape == (len(names), len(names))
+    np.testing.assert_array_equal(covariance, covariance.T)
+    spread = np.sqrt(np.diag(covariance))
+    assert np.linalg.eigvalsh(covariance / np.outer(spread, spread)).min() > 0.0
+    at = names.index("mast.translation_m.x")
+    assert spread[at] == pytest.approx(rig.fit["sigma"]["mast"]["translation_m"][0], rel=1e-6)
+    assert rig.provenance["survey_digest"] == read_survey(survey_folder).digest
+    assert rig.provenance["survey"] == "field-1"
+    assert re.fullmatch(r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d\+00:00", rig.provenance["date"])
+    assert "numpy" in rig.provenance["versions"]
+
+
+def test_a_second_calibration_keeps_the_first_and_compares_with_it(
+    survey_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "m.yaml"
+    true = navcam_rig()
+    old = save_rig(replace(true, mast=replace(true.mast, rotation_rad=[0.0, 0.0, 0.0])), out)
+    before = out.read_bytes()
+    assert main(["calibrate", str(survey_folder), "--out", str(out), "--method", "paper", "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert (tmp_path / "m.previous.yaml").read_bytes() == before
+    assert told["method"] == "paper"
+    assert told["in_use"]["digest"] == old.digest
+    change = told["in_use"]["pointing_change"]["navcam"]
+    # The old file's mast is off by 9 and 18 mrad: positions move by up to 26 px of a lens of 1290 px.
+    assert 15.0 < change["position_most_px"] < 40.0
+
+
+def test_the_report_is_one_page_with_everything_in_it(first: tuple[Path, Path]) -> None:
+    page = first[1].read_text()
+    assert "<script" not in page and "<link" not in page
+    assert not re.findall(r'(?:src|href)="(?!data:)', page)
+    for title in (
+        "Verdict and reasons", "Residuals over the image", "Where the boards stood",
+        "Error by distance and angle", "Correlation of parameters", "Predicted uncertainty of pointing",
+        "Against the mast file in use: use.yaml",
+    ):  # fmt: skip
+        assert title in page, title
+    assert page.count("data:image/png") >= 6
+    assert "TRUST IT" in page
+
+
+def test_a_mast_taken_as_upright_is_not_to_be_trusted(
+    survey_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["calibrate", str(survey_folder), "--out", str(tmp_path / "m.yaml"), "--method", "paper"]
+    assert main([*words, "--mast", "4", "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert told["verdict"]["grade"] == "bad"
+    assert any("--mast 6" in reason["sentence"] for reason in told["verdict"]["reasons"])
+
+
+def test_a_blunder_is_named_in_the_tables(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], survey_folder: Path
+) -> None:
+    survey, _ = navcam_survey(1)
+    name = next(i.name for i in survey.images if i.purpose == "mast")
+    dots = survey.dots[name]
+    pixels = dots.pixels_px.copy()
+    pixels[42] += (2.0, -1.5)
+    moved = replace(survey, dots={**survey.dots, name: replace(dots, pixels_px=pixels)})
+    folder = write_folder(moved, tmp_path / "s")
+    assert main(["calibrate", str(folder), "--out", str(tmp_path / "m.yaml")]) == 0
+    told = capsys.readouterr().out
+    assert f"image {name} dot (row 4, column 2)" in " ".join(told.replace("│", " ").split())
+    rows = [line for line in told.splitlines() if line.startswith("│")]
+    reasons = [line for line in rows if line.startswith("│ good │")]
+    assert reasons and all(line.startswith("│ good │ ") and line[9] != " " for line in reasons)
+    assert any(line.startswith("│ tx        │   +0.3") for line in rows), "numbers stand on the right"
+
+
+# Refusals
+
+
+def test_a_refused_survey_writes_nothing_and_says_what_to_measure(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    survey, _ = navcam_survey(1)
+    gone = next(i.placement for i in survey.images if i.purpose == "mast")
+    station = tuple(p for p in survey.station if p.placement != gone or p.point == "a")
+    folder = write_folder(replace(survey, station=station), tmp_path / "s")
+    out = tmp_path / "m.yaml"
+    out.write_text("kept")
+    error = refused(capsys, 2, ["calibrate", str(folder), "--out", str(out)])
+    assert error["code"] == "survey_refused"
+    assert gone in error["message"]
+    assert error["detail"]["findings"][0]["advice"]
+    assert out.read_text() == "kept"
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["m.yaml", "s"]
+
+
+def test_a_fit_far_above_its_noise_writes_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    survey, _ = navcam_survey(1)
+    folder = write_folder(survey, tmp_path / "s")
+    edit_yaml(folder, lambda document: document["sigma"].update(dot_px="0.01"))
+    out = tmp_path / "m.yaml"
+    error = refused(capsys, 1, ["calibrate", str(folder), "--out", str(out)])
+    assert error["code"] == "survey_not_fitted", error
+    assert not out.exists()
+
+
+def test_bad_arguments_are_refused_before_anything_is_done(
+    survey_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = str(tmp_path / "m.yaml")
+    assert refused(capsys, 2, ["calibrate", str(tmp_path / "none"), "--out", out])["code"] == "bad_file"
+    assert "--out" in refused(capsys, 2, ["calibrate", str(survey_folder)])["message"]
+    assert (
+        "folder" in refused(capsys, 2, ["calibrate", str(survey_folder), "--out", str(tmp_path)])["message"]
+    )
+    nowhere = str(tmp_path / "no" / "m.yaml")
+    assert "no folder" in refused(capsys, 2, ["calibrate", str(survey_folder), "--out", nowhere])["message"]
+    assert (
+        refused(capsys, 2, ["calibrate", str(survey_folder), "--out", out, "--mast", "5"])["code"]
+        == "wrong_use"
+    )
+    words = ["calibrate", str(survey_folder), "--out", out, "--in-use", str(survey_folder / "survey.yaml")]
+    assert refused(capsys, 2, words)["code"] == "bad_file"
+    assert not (tmp_path / "m.yaml").exists()
+
+
+# Pictures
+
+
+def test_dots_are_found_where_dots_csv_has_none(tmp_path: Path) -> None:
+    survey, truth = navcam_survey(1)
+    rng = np.random.default_rng(3)
+    pictures = {}
+    for image in survey.images[:3]:
+        model, pose = truth.camera_from_board(survey, image.name)
+        ground = np.full(model.size_px[::-1], 120.0)
+        picture = photograph(draw_board(ground, model, pose, survey.board), 0.7, 2.0, rng)
+        pictures[image.file.as_posix()] = cv2.imencode(".png", picture)[1].tobytes()
+    empty = cv2.imencode(".png", np.full(model.size_px[::-1], 90, dtype=np.uint8))[1].tobytes()
+    pictures[survey.images[3].file.as_posix()] = empty
+    names = [image.name for image in survey.images[:4]]
+    known = {name: dots for name, dots in survey.dots.items() if name not in names}
+    folder = write_folder(replace(survey, dots=known), tmp_path / "s", pictures)
+    read = read_survey(folder)
+    assert missing(read) == tuple(names)
+    steps: list[int] = []
+    with ThreadPoolExecutor(1) as executor:
+        found, undetected = with_dots(read, lambda done, of, name: steps.append(of - done), executor)
+    assert steps == [3, 2, 1, 0]
+    assert [name for name, _ in undetected] == [names[3]]
+    for image in survey.images[:3]:
+        dots = found.dots[image.name]
+        model, pose = truth.camera_from_board(survey, image.name)
+        exact, _ = model.project(pose.points(survey.board.dots_in_board_m(dots.rows, dots.columns)))
+        assert len(dots.rows) > 95
+        assert np.sqrt(np.mean((dots.pixels_px - exact) ** 2)) < 0.05
+
+
+def test_pictures_are_searched_by_processes_of_their_own(tmp_path: Path) -> None:
+    survey, _ = navcam_survey(1)
+    name, file = survey.images[0].name, survey.images[0].file.as_posix()
+    grey = cv2.imencode(".png", np.full((768, 1024), 90, dtype=np.uint8))[1].tobytes()
+    known = {k: v for k, v in survey.dots.items() if k != name}
+    folder = write_folder(replace(survey, dots=known), tmp_path / "s", {file: grey})
+    found, undetected = with_dots(read_survey(folder))
+    assert [n for n, _ in undetected] == [name]
+    assert set(found.dots) == set(known)

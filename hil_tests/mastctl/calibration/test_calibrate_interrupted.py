@@ -1,0 +1,222 @@
+"""``mastctl calibrate`` that is killed, or finds the disk full: no half-written file, nothing lost."""
+
+from __future__ import annotations
+
+import json
+import os
+import resource
+import select
+import shutil
+import signal
+import subprocess
+import sys
+from concurrent.futures.process import BrokenProcessPool
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from calib.files.mast_file import load_rig, save_rig
+from calib.fit.calibration import Calibration
+from calib.fit.paper import fit_paper
+from calib.survey import read_survey
+from hil_tests.mastctl.calibration.survey_world import navcam_rig, navcam_survey, write_folder
+from mastctl.calibration import detection
+from mastctl.calibration.run import FITS
+from mastctl.cli.main import main
+from mastctl.report import html
+
+KILLED_AT = """
+import os, signal, sys
+from mastctl.cli.main import main
+fsync, calls = os.fsync, []
+def deadly(file):
+    calls.append(file)
+    if len(calls) == int(sys.argv[1]):
+        os.kill(os.getpid(), signal.SIGKILL)
+    fsync(file)
+os.fsync = deadly
+sys.exit(main(sys.argv[2:]))
+"""
+
+FILE_LIMIT_BYTES = 20_000
+"""Less than a mast file with its covariance."""
+
+
+@pytest.fixture(scope="module")
+def survey(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_folder(navcam_survey(1)[0], tmp_path_factory.mktemp("survey") / "s")
+
+
+@pytest.fixture(scope="module")
+def fitted(survey: Path) -> Calibration:
+    return fit_paper(read_survey(survey))
+
+
+@pytest.fixture(autouse=True)
+def one_fit(fitted: Calibration, monkeypatch: pytest.MonkeyPatch) -> None:
+    """In this process the survey is fitted once: what comes after the fit is tried here."""
+    monkeypatch.setitem(FITS, "paper", lambda survey, mast_parameters: fitted)
+
+
+def words(survey: Path, out: Path, *more: str) -> list[str]:
+    return ["calibrate", str(survey), "--out", str(out), "--method", "paper", "--json", *more]
+
+
+def run(code: str, *argv: str, **options: Any) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-c", code, *argv]
+    return subprocess.run(command, capture_output=True, text=True, timeout=120, check=False, **options)
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in folder.iterdir() if path.is_file()}
+
+
+@pytest.mark.parametrize("at", [1, 2, 3])
+def test_a_kill_while_writing_leaves_whole_files(survey: Path, tmp_path: Path, at: int) -> None:
+    """The first two syncs are of the mast file and its folder, the third is of the report."""
+    out = tmp_path / "m.yaml"
+    save_rig(navcam_rig(), out)
+    old = out.read_bytes()
+    done = run(KILLED_AT, str(at), *words(survey, out, "--report", str(tmp_path / "r")))
+    assert done.returncode == -signal.SIGKILL, done.stderr
+    load_rig(out)
+    assert (out.read_bytes() == old) == (at == 1)
+    assert old in contents(tmp_path).values()
+    assert not (tmp_path / "r" / "calibration.html").exists()
+    assert main(words(survey, out)) == 0
+    load_rig(out)
+
+
+def test_a_full_disk_leaves_everything_as_it_was(survey: Path, tmp_path: Path) -> None:
+    out = tmp_path / "m.yaml"
+    save_rig(navcam_rig(), out)
+    save_rig(navcam_rig(), out)
+    before = contents(tmp_path)
+
+    def limit() -> None:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (FILE_LIMIT_BYTES, FILE_LIMIT_BYTES))
+
+    code = "import sys; from mastctl.cli.main import main; sys.exit(main(sys.argv[1:]))"
+    done = run(code, *words(survey, out), preexec_fn=limit)
+    assert done.returncode == 2, done.stderr
+    assert "cannot be saved: File too large" in json.loads(done.stdout)["error"]["message"]
+    assert "Traceback" not in done.stderr
+    assert contents(tmp_path) == before
+
+
+def test_every_former_mast_file_is_kept_and_the_last_is_told(
+    survey: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "m.yaml"
+    written = []
+    for _ in range(4):
+        assert main(words(survey, out)) == 0
+        told = json.loads(capsys.readouterr().out)["mast_file"]
+        assert told["previous"] == (str(tmp_path / "m.previous.yaml") if written else None)
+        if written:
+            assert Path(told["previous"]).read_bytes() == written[-1]
+        # Two runs of one second may write the same: make each its own.
+        out.write_text(out.read_text() + f"# number {len(written)}\n")
+        written.append(out.read_bytes())
+    names = {"m.yaml", "m.previous.yaml", "m.previous-1.yaml", "m.previous-2.yaml"}
+    kept = contents(tmp_path)
+    assert set(kept) == names
+    assert set(kept.values()) == set(written)
+    assert main(words(survey, out)[:-1]) == 0
+    assert f"kept from before: {tmp_path / 'm.previous.yaml'}" in capsys.readouterr().out.replace("\n", "")
+
+
+def test_a_refused_save_does_not_multiply_former_files(
+    survey: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out = tmp_path / "m.yaml"
+    save_rig(navcam_rig(), out)
+    save_rig(navcam_rig(), out)
+    before = contents(tmp_path)
+
+    def full(descriptor: int) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", full)
+    assert main(words(survey, out)) == 2
+    assert "No space left on device" in json.loads(capsys.readouterr().out)["error"]["message"]
+    assert contents(tmp_path) == before
+
+
+def test_a_report_that_cannot_be_written_does_not_hide_the_mast_file(
+    survey: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*ignored: Any) -> str:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(html, "page", full)
+    out = tmp_path / "m.yaml"
+    assert main(words(survey, out, "--report", str(tmp_path / "r"))) == 1
+    error = json.loads(capsys.readouterr().out)["error"]
+    assert error["code"] == "report_not_written"
+    assert f"the mast file {out} is saved" in error["message"]
+    load_rig(out)
+
+
+def test_a_second_report_keeps_the_first(
+    survey: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pages = iter(["one", "two"])
+    monkeypatch.setattr(html, "page", lambda *ignored: next(pages))
+    for _ in range(2):
+        assert main(words(survey, tmp_path / "m.yaml", "--report", str(tmp_path / "r"))) == 0
+    assert contents(tmp_path / "r") == {"calibration.html": b"two", "calibration.previous.html": b"one"}
+
+
+WORKERS = """
+import os, sys, time
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
+from mastctl.calibration.detection import _worker
+if __name__ == "__main__":
+    with ProcessPoolExecutor(1, get_context("spawn"), _worker) as pool:
+        print(pool.submit(os.getpid).result(), flush=True)
+        pool.submit(time.sleep, 3600.0)
+        time.sleep(3600.0)
+"""
+
+
+def test_no_searching_process_outlives_the_command(tmp_path: Path) -> None:
+    script = tmp_path / "workers.py"
+    script.write_text(WORKERS)
+    with subprocess.Popen(
+        [sys.executable, str(script)], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL
+    ) as it:
+        assert it.stdout is not None
+        worker = int(it.stdout.readline())
+        assert Path(f"/proc/{worker}").exists()
+        it.kill()
+        # Its end comes when the last process that holds it has gone; the worker alone would sleep an hour.
+        gone = select.select([it.stdout], [], [], 60.0)[0]
+        if not gone:
+            os.kill(worker, signal.SIGKILL)
+        assert gone, "the worker outlived the command"
+    assert it.returncode == -signal.SIGKILL
+
+
+def test_a_searching_process_that_is_ended_is_told(
+    survey: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = shutil.copytree(survey, tmp_path / "s")
+    table = (folder / "images.csv").read_text().splitlines()
+    table[1] += "one.png"
+    (folder / "images.csv").write_text("\n".join(table) + "\n")
+    dots = (folder / "dots.csv").read_text().splitlines()
+    (folder / "dots.csv").write_text("\n".join(d for d in dots if "left-001" not in d) + "\n")
+    (folder / "one.png").write_bytes(b"")
+    assert detection.missing(read_survey(folder))
+
+    def ended(*ignored: Any) -> None:
+        raise BrokenProcessPool("a process was terminated")
+
+    monkeypatch.setattr(detection, "detect_survey", ended)
+    assert main(words(folder, tmp_path / "m.yaml")) == 1
+    error = json.loads(capsys.readouterr().out)["error"]
+    assert error["code"] == "search_cut_short"
+    assert not (tmp_path / "m.yaml").exists()

@@ -1,0 +1,206 @@
+"""``mastctl calibrate --refine``: a new mast file or a refusal, never a silent change."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from calib.camera.parameters import parameter_names
+from calib.files import digest_of
+from calib.files.mast_file import load_rig, save_rig
+from calib.handoff.fit_body_pose import fit_body_pose
+from calib.handoff.matched import MatchedHandoff
+from calib.mast.covariance import stored_covariance
+from calib.mast.rig import Rig
+from hil_tests.calib.handoff.handed_over import HAZCAMS, hand_offs, moved_hazcams, plain_rig, targets, vectors
+from mastctl.calibration.refined import pose_told
+from mastctl.cli.main import main
+from mastctl.handoff.log import HandoffLog
+
+TURN_RAD = (0.0, 0.004, 0.003)
+SHIFT_M = (0.002, 0.0, -0.002)
+
+
+@pytest.fixture
+def mast(repository: Path, tmp_path: Path) -> Path:
+    """A mast file with a covariance."""
+    rig = plain_rig(load_rig(repository / "configs/sim/rocky8.yaml").rig)
+    names = [f"mast.{key}.{axis}" for key in ("translation_m", "rotation_rad") for axis in "xyz"]
+    for name, camera in rig.cameras.items():
+        names += [f"cameras.{name}.{part}" for part in parameter_names(camera.model.kind)]
+    sigma = np.array([0.5 if n.split(".")[-2] in "HV" else 2e-3 if ".R." not in n else 1e-4 for n in names])
+    fit = {
+        "parameters": names,
+        "covariance": np.diag(sigma**2).tolist(),
+        "rms_px": {"hazcam_left": [0.1, 0.1]},
+    }
+    path = tmp_path / "mast.yaml"
+    save_rig(replace(rig, fit=fit, provenance={"survey": "s"}), path)
+    return path
+
+
+def record(
+    mast: Path, path: Path, moved: bool = True, count: int = 24, seed: int = 1
+) -> list[MatchedHandoff]:
+    """A record of hand-offs that the mast file hands over while its Hazcams truly stand elsewhere."""
+    stored = load_rig(mast)
+    rng = np.random.default_rng(seed)
+    true = (
+        moved_hazcams(stored.rig, Rotation.from_rotvec(TURN_RAD), SHIFT_M)
+        if moved
+        else {name: vectors(stored.rig, name) for name in HAZCAMS}
+    )
+    made = hand_offs(true, stored.rig, targets(rng, count), rng, digest=stored.digest)
+    made = [replace(one, time=f"2026-01-01T00:00:{i:02d}Z") for i, one in enumerate(made)]
+    for one in made:
+        HandoffLog(path).append(one)
+    return made
+
+
+def refine(capsys: pytest.CaptureFixture[str], *words: object) -> tuple[int, dict[str, Any]]:
+    capsys.readouterr()
+    code = main(["calibrate", *map(str, words), "--json"])
+    told = capsys.readouterr()
+    assert "Traceback" not in told.out + told.err
+    document: dict[str, Any] = json.loads(told.out, parse_constant=lambda word: pytest.fail(word))
+    return code, document
+
+
+def corrected(rig: Rig, name: str) -> np.ndarray:
+    return np.array([getattr(rig.cameras[name].model, letter) for letter in "CAHVO"])
+
+
+def test_a_significant_offset_gives_a_new_mast_file_that_says_where_it_is_from(
+    mast: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    log, out = tmp_path / "h.jsonl", tmp_path / "new.yaml"
+    record(mast, log)
+    before = mast.read_bytes()
+    code, told = refine(capsys, mast, "--refine", log, "--out", out)
+    assert code == 0 and mast.read_bytes() == before
+    said = told["corrections"]["hazcam"]
+    assert said["significant"] and said["significance_sigmas"] > 10 and said["handoffs"] == 24
+    off = np.array(said["shift_m"] + said["turn_rad"]) - [*SHIFT_M, *TURN_RAD]
+    assert off @ np.linalg.solve(np.array(said["covariance"]), off) < 22.5
+    for rms in said["rms_px"].values():
+        assert np.hypot(*rms["before"]) > 1.2 > 0.9 > np.hypot(*rms["after"])
+
+    old, new = load_rig(mast), load_rig(out)
+    assert told["mast_file"] == {"path": str(out), "digest": new.digest, "previous": None}
+    for name in old.rig.cameras:
+        same = (corrected(old.rig, name) == corrected(new.rig, name)).all()
+        assert same == (name not in HAZCAMS)
+    step = new.rig.provenance["refined"][0]
+    assert step["former_digest"] == digest_of(before) and step["records"][0]["digest"] == digest_of(
+        log.read_bytes()
+    )
+    assert new.rig.provenance["survey"] == "s" and new.rig.fit["rms_px"] == old.rig.fit["rms_px"]
+    known, was = stored_covariance(new.rig), stored_covariance(old.rig)
+    assert known is not None and was is not None and known.names == was.names
+    assert np.linalg.eigvalsh(known.covariance)[0] > -1e-12
+    at = known.names.index("cameras.hazcam_left.C.z")
+    tie = known.names.index("mast.translation_m.z")
+    assert (
+        was.covariance[at, tie] == 0.0 and known.covariance[at, tie] > 1e-7
+    )  # the Hazcam now hangs on the mast
+    head = known.names.index("cameras.navcam_left.C.z")
+    assert known.covariance[head, head] == pytest.approx(was.covariance[head, head], rel=1e-6)
+    assert new.rig.fit["sigma"]["cameras"]["hazcam_left"]["C"][2] == pytest.approx(
+        known.covariance[at, at] ** 0.5
+    )
+
+    # The same record says nothing of the new file: it was made with the old one.
+    code, told = refine(capsys, out, "--refine", log, "--out", tmp_path / "again.yaml")
+    assert (
+        code == 1 and told["error"]["code"] == "too_few" and "another mast file" in told["error"]["message"]
+    )
+
+
+def test_without_an_offset_nothing_is_written_and_the_exit_code_is_one(
+    mast: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    log, out = tmp_path / "h.jsonl", tmp_path / "new.yaml"
+    record(mast, log, moved=False)
+    code, told = refine(capsys, mast, "--refine", log, "--out", out)
+    assert code == 1 and not out.exists()
+    assert told["error"]["code"] == "not_significant" and "nothing was written" in told["error"]["message"]
+    assert told["error"]["detail"]["corrections"]["hazcam"]["significance_sigmas"] < 3
+
+
+def test_several_records_count_each_hand_off_once(
+    mast: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    first, second = tmp_path / "a.jsonl", tmp_path / "b.jsonl"
+    record(mast, first, count=12, seed=2)
+    second.write_bytes(first.read_bytes())
+    record(mast, second, count=12, seed=3)
+    words = ("--refine", first, "--refine", second, mast, "--out", tmp_path / "new.yaml")
+    code, told = refine(capsys, *words)
+    assert code == 0 and told["handoffs"] == 24
+
+
+@pytest.mark.parametrize("which", ["mast", "record"])
+def test_what_is_read_is_never_overwritten(
+    mast: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], which: str
+) -> None:
+    log = tmp_path / "h.jsonl"
+    record(mast, log)
+    out = {"mast": mast, "record": log}[which]
+    before = out.read_bytes()
+    code, told = refine(capsys, mast, "--refine", log, "--out", out)
+    assert code == 2 and told["error"]["code"] == "wrong_use" and out.read_bytes() == before
+
+
+def test_bad_use_and_bad_files_end_with_two(
+    mast: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    log, out = tmp_path / "h.jsonl", tmp_path / "new.yaml"
+    record(mast, log, count=8)
+    for words in (
+        (mast, "--refine", log, "--out", out, "--method", "paper"),
+        (mast, "--refine", tmp_path / "none.jsonl", "--out", out),
+        (mast, "--refine", mast, "--out", out),
+        (tmp_path, "--refine", log, "--out", out),
+        (mast, "--refine", log, "--out", tmp_path / "no" / "new.yaml"),
+    ):
+        code, told = refine(capsys, *words)
+        assert code == 2 and told["error"]["message"], words
+    assert not out.exists()
+
+
+def test_people_read_the_correction_its_sigma_and_what_becomes_of_the_residual(
+    mast: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    log, out = tmp_path / "h.jsonl", tmp_path / "new.yaml"
+    record(mast, log)
+    assert main(["calibrate", str(mast), "--refine", str(log), "--out", str(out)]) == 0
+    shown = capsys.readouterr().out
+    for words in (
+        "hazcam against the mast cameras",
+        "pitch",
+        "mrad",
+        "after the correction",
+        "hazcam_left sees",
+    ):
+        assert words in shown
+    assert "proposed mast file" in shown and "chi-square" in shown
+    assert shown.index("shift forward") < shown.index("shift down") < shown.index("roll") < shown.index("yaw")
+
+
+def test_a_file_holds_the_shift_before_the_turn(mast: Path, tmp_path: Path) -> None:
+    pose = fit_body_pose(load_rig(mast).rig, HAZCAMS, record(mast, tmp_path / "h.jsonl"))
+    told = pose_told(pose)
+    shift = pose.motion.points(pose.origin_m) - pose.origin_m
+    np.testing.assert_allclose(told["shift_m"], shift, atol=1e-12)
+    np.testing.assert_allclose(
+        told["turn_rad"], Rotation.from_matrix(pose.motion.rotation).as_rotvec(), atol=1e-12
+    )
+    variances = np.diag(told["covariance"])
+    np.testing.assert_allclose(variances[:3], np.diag(pose.covariance)[3:], rtol=1e-6)
+    np.testing.assert_allclose(variances[3:], np.diag(pose.covariance)[:3], rtol=1e-6)

@@ -1,0 +1,106 @@
+"""The numbers of the report: predicted uncertainty against draws, check images against their expectation."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from calib.fit.calibration import Calibration, Degenerate, Outlier
+from calib.fit.joint import fit_joint
+from calib.fit.uncertainty import rig_moved_along
+from calib.survey import Survey
+from hil_tests.mastctl.calibration.survey_world import navcam_rig, navcam_survey
+from mastctl.calibration.expected import check_sizes
+from mastctl.calibration.landing import click, handoff_errors_px, pointing_error_px
+from mastctl.calibration.maps import CORNER, change_map, uncertainty_map
+from mastctl.calibration.verdict import judge
+
+DRAWS = 100
+TURN_RAD = np.array([0.0, 0.0, 0.01])
+
+
+@pytest.fixture(scope="module")
+def fitted() -> tuple[Survey, Calibration]:
+    survey, _ = navcam_survey(2)
+    return survey, fit_joint(survey, 6)
+
+
+def test_a_rig_that_is_believed_rightly_points_exactly() -> None:
+    rig = navcam_rig()
+    pair = rig.stereo["navcam"]
+    target, left, right = click(rig, pair, 0.4, -0.3, [200.0, 600.0], 6.0)
+    assert np.abs(pointing_error_px(rig, rig, pair, 0.4, -0.3, target, left, right)).max() < 1e-6
+    errors = handoff_errors_px(rig, rig, pair, pair, 0.4, -0.3, target, left, right)
+    assert set(errors) == set(pair)
+    assert max(np.abs(error).max() for error in errors.values()) < 1e-6
+
+
+def test_the_map_of_uncertainty_is_the_spread_of_drawn_rigs(fitted: tuple[Survey, Calibration]) -> None:
+    _, calibration = fitted
+    found = uncertainty_map(calibration, "navcam", 6.0)
+    row, column = 4, 9
+    pan, tilt = found.pan_rad[column], found.tilt_rad[row]
+    rig, pair = calibration.rig, calibration.rig.stereo["navcam"]
+    size = np.array(rig.cameras[pair[0]].model.size_px)
+    target, left, right = click(rig, pair, pan, tilt, size * CORNER, 6.0)
+    rng = np.random.default_rng(5)
+    steps = rng.multivariate_normal(
+        np.zeros(len(calibration.covariance)), calibration.covariance, DRAWS, method="eigh"
+    )
+    columns = np.arange(len(calibration.parameter_names))
+    errors = [
+        pointing_error_px(
+            rig_moved_along(calibration, columns, step), rig, pair, pan, tilt, target, left, right
+        )
+        for step in steps
+    ]
+    spread = float(np.sqrt(np.mean(np.square(errors))))
+    assert found.by_click[row, column] == pytest.approx(spread, rel=0.2), "the spread of 200 numbers: 5 %"
+
+
+def test_a_turned_mast_changes_pointing_at_positions_but_not_at_clicks() -> None:
+    rig = navcam_rig()
+    turned = replace(rig, mast=replace(rig.mast, rotation_rad=rig.mast.rotation_rad + TURN_RAD))
+    change = change_map(rig, turned, "navcam", 6.0)
+    assert change is not None
+    middle = change.by_position[len(change.tilt_rad) // 2]
+    # 10 mrad about the pan axis at a focal length of 1290 px; the axis' own place stays.
+    np.testing.assert_allclose(middle, 12.9, rtol=0.1)
+    assert np.nanmax(change.by_click) < 1e-3
+    assert change_map(rig, replace(rig, cameras={}, stereo={}), "navcam", 6.0) is None
+
+
+def test_check_images_are_as_far_off_as_the_survey_noise_explains() -> None:
+    ratios = []
+    for seed in range(10, 14):
+        survey, _ = navcam_survey(seed, check_boards=6)
+        for size in check_sizes(survey, fit_joint(survey, 6)).values():
+            assert size.seen_px < size.limit_px, seed
+            ratios.append((size.seen_px / size.expected_px) ** 2)
+    assert 0.4 < np.mean(ratios) < 1.8
+
+
+def test_the_worst_reason_decides(fitted: tuple[Survey, Calibration]) -> None:
+    survey, calibration = fitted
+    assert judge(survey, calibration).grade == "good"
+    assert judge(survey, calibration, undetected=["a"]).grade == "care"
+    assert judge(survey, calibration, warnings=["w"]).grade == "care"
+    unseen = replace(calibration, check_rms_px={})
+    assert judge(survey, unseen).grade == "care"
+    prism = Outlier("prism", "prism p3 of set-up level", 50.0, 20.0, 0.02)
+    care = judge(survey, replace(calibration, outliers=(prism,)))
+    assert care.grade == "care"
+    assert "prism p3" in care.reasons[-1].sentence
+    left_open = Degenerate(("mast.translation_m.z",), "tilt hardly moved")
+    assert judge(survey, replace(calibration, degenerate=(left_open,))).grade == "bad"
+    noisy = replace(calibration, chi2=9.0 * calibration.degrees_of_freedom, chi2_probability=0.0)
+    assert judge(survey, noisy).grade == "bad"
+    off = [
+        replace(i, residuals_px=i.residuals_px + 3.0) if i.purpose == "check" else i
+        for i in calibration.images
+    ]
+    bad = judge(survey, replace(calibration, images=tuple(off)))
+    assert bad.grade == "bad"
+    assert any(r.grade == "bad" and "check images of navcam_left" in r.sentence for r in bad.reasons)

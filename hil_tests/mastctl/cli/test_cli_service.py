@@ -1,0 +1,244 @@
+"""The commands of the service: documents for programs, lines for people, the contract's exit codes."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from drivers.errors import NoReply
+from hil_tests.mastctl.service_fakes import FakeHardware, FakePointing, FakeResult, ScriptedLoop, fake_daemon
+from mastctl.cli.main import main
+from mastctl.daemon import RunningDaemon
+
+BOTH = tuple[RunningDaemon, FakeHardware]
+Run = Callable[..., tuple[int, str, str]]
+
+
+@pytest.fixture
+def pair(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[BOTH]:
+    with fake_daemon(monkeypatch, tmp_path) as made:
+        yield made
+
+
+@pytest.fixture
+def run(pair: BOTH, capsys: pytest.CaptureFixture[str]) -> Run:
+    """Run a command against the daemon: exit code, stdout, stderr."""
+
+    def call(*words: str) -> tuple[int, str, str]:
+        capsys.readouterr()
+        code = main([*words, "--url", pair[0].url])
+        out, log = capsys.readouterr()
+        return code, out, log
+
+    return call
+
+
+def document(result: tuple[int, str, str], code: int = 0) -> dict[str, Any]:
+    """The one JSON document on stdout."""
+    assert result[0] == code, result
+    found = json.loads(result[1])
+    assert isinstance(found, dict)
+    return found
+
+
+def error_of(result: tuple[int, str, str], code: int) -> dict[str, Any]:
+    """The refusal on stdout."""
+    error = document(result, code)["error"]
+    assert "\n" not in error["message"]
+    return dict(error)
+
+
+def test_status_for_programs_and_for_people(run: Run, pair: BOTH) -> None:
+    pair[0].service.devices.read()
+    assert document(run("status", "--json"))["mast"]["name"] == "little"
+    code, out, _ = run("status")
+    assert code == 0
+    for words in ("idle (real)", "pan limits", "-2.0000 to +2.0000 rad", "navcam_left", "little.yaml"):
+        assert words in out
+
+
+def test_status_tells_faults(run: Run, pair: BOTH) -> None:
+    def fail(name: str) -> None:
+        raise NoReply("no answer on the bus", device="pan_tilt")
+
+    pair[1].head.hook = fail
+    with pytest.raises(NoReply):
+        pair[0].service.devices.read()
+    assert "fault: pan_tilt: no answer on the bus" in run("status")[1]
+
+
+def test_point_in_each_of_its_forms(
+    run: Run, pair: BOTH, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    shot = document(run("snapshot", "navcam_left", "--out", str(tmp_path / "a.png"), "--json"))
+    frame_id = shot["frame_id"]
+    forms = {
+        "pixel": (
+            "--pixel",
+            "navcam_left",
+            frame_id,
+            "3.5",
+            "4",
+            "--aim",
+            "navcam_right",
+            "1",
+            "2",
+            "--pointings",
+            "2",
+        ),
+        "fresh": ("--camera", "navcam_left", "--at", "5", "6"),
+        "position": ("--position", "6", "-1e-1", "0.1", "--frame", "site"),
+        "angles": ("--angles", "0.5", "-0.25"),
+    }
+    records = {name: document(run("point", *words, "--json")) for name, words in forms.items()}
+    assert {record["state"] for record in records.values()} == {"done"}
+    requests = {name: record["request"] for name, record in records.items()}
+    assert requests["pixel"] == {
+        "pixel": {"camera": "navcam_left", "frame_id": frame_id, "x_px": 3.5, "y_px": 4.0},
+        "aim": {"camera": "navcam_right", "x_px": 1.0, "y_px": 2.0},
+        "pointings": 2,
+    }
+    fresh = requests["fresh"]["pixel"]
+    assert (fresh["x_px"], fresh["y_px"]) == (5.0, 6.0)
+    assert fresh["frame_id"] != frame_id
+    assert requests["position"] == {"position_m": [6.0, -0.1, 0.1], "frame": "site", "pointings": 1}
+    assert requests["angles"] == {"pan_rad": 0.5, "tilt_rad": -0.25, "pointings": 1}
+
+
+def test_point_shows_a_person_steps_and_residual(run: Run) -> None:
+    code, out, log = run("point", "--angles", "0.1", "0.1")
+    assert code == 0
+    assert "✓ look" in log
+    assert "+0.250 ± 0.050" in out
+    assert "-0.500 ± 0.060" in out
+    assert "pointing 1: looked at in frame navcam_left-000001-x-y\n" in out
+
+
+def test_point_shows_a_person_why_there_is_no_residual(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    blind = FakeResult(None, None, (FakePointing(None, None, "", note="no picture was taken"),))
+    monkeypatch.setattr(ScriptedLoop, "script", staticmethod(lambda *any: blind))
+    assert "pointing 1: no picture was taken\n" in run("point", "--angles", "0.1", "0.1")[1]
+
+
+def test_point_without_waiting_tells_the_id(run: Run) -> None:
+    first = document(run("point", "--angles", "0.1", "0.1", "--no-wait", "--json"))["id"]
+    assert first.startswith("000001-")
+
+
+def test_a_failed_operation_ends_with_1_and_its_reason(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(*ignored: Any) -> None:
+        raise NoReply("the head does not answer", device="pan_tilt")
+
+    monkeypatch.setattr(ScriptedLoop, "script", staticmethod(fail))
+    error = error_of(run("point", "--angles", "0.1", "0.1", "--json"), 1)
+    assert (error["code"], error["message"]) == ("no_reply", "pan_tilt: the head does not answer")
+    assert error["detail"]["operation"]["state"] == "failed"
+    code, out, log = run("point", "--angles", "0.1", "0.1")
+    assert (code, out) == (1, "")
+    assert log.splitlines()[-1] == "mastctl: pan_tilt: the head does not answer"
+
+
+@pytest.mark.parametrize(
+    ("words", "code"),
+    [
+        (("point", "--angles", "0", "1.5"), "outside_limits"),
+        (("point", "--angles", "0", "nan"), "wrong_use"),
+        (("point", "--angles", "0"), "wrong_use"),
+        (("point",), "wrong_use"),
+        (("point", "--angles", "0", "0", "--position", "1", "2", "3"), "wrong_use"),
+        (("point", "--camera", "navcam_left"), "wrong_use"),
+        (("point", "--angles", "0", "0", "--at", "1", "2"), "wrong_use"),
+        (("point", "--angles", "0", "0", "--frame", "rover"), "wrong_use"),
+        (("point", "--angles", "0", "0", "--pointings", "3"), "wrong_use"),
+        (("point", "--pixel", "navcam_left", "f", "x", "2"), "wrong_use"),
+        (("point", "--pixel", "navcam_left", "f", "1", "2"), "frame_unknown"),
+        (("point", "--position", "1", "2", "3", "--aim", "navcam_left", "1", "inf"), "wrong_use"),
+        (("point", "--position", "1", "2", "3", "--aim", "hazcam_left", "1", "1"), "bad_aim"),
+        (("point", "--camera", "mastcam", "--at", "1", "2"), "unknown_camera"),
+        (("snapshot", "mastcam", "--out", "x.png"), "unknown_camera"),
+        (("snapshot", "navcam_left", "--out", "x.gif"), "wrong_use"),
+        (("snapshot", "navcam_left"), "wrong_use"),
+        (("snapshot", "navcam_left", "--out", "no/such/folder/x.png"), "file_system"),
+        (("snapshot", "navcam_left", "--out", "x.png", "--frame-id", "?"), "frame_unknown"),
+        (("status", "--config", "nowhere.yaml", "--url", "mars"), "bad_url"),
+        (("experiment", "pointing", "--targets", "1", "--out", "/proc/x"), "file_system"),
+    ],
+)
+def test_wrong_use_and_bad_input_end_with_2(
+    run: Run, pair: BOTH, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, words: tuple[str, ...], code: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    if "mars" in words:
+        assert main([*words, "--json"]) == 2
+        return
+    assert error_of(run(*words, "--json"), 2)["code"] == code
+    exit_code, out, log = run(*words)
+    assert (exit_code, out) == (2, "")
+    assert log.startswith("mastctl: ")
+    assert log.count("\n") == 1
+    assert [call for call in pair[1].head.calls if call[0] == "move"] == []
+
+
+def test_stop_tells_what_it_stopped(run: Run, pair: BOTH) -> None:
+    assert document(run("stop", "--json")) == {"stopped": True, "operation": None}
+    assert run("stop")[:2] == (0, "stopped\n")
+    assert pair[1].head.calls == [("stop",), ("stop",)]
+
+
+def test_a_snapshot_becomes_a_file(run: Run, pair: BOTH, tmp_path: Path) -> None:
+    out = tmp_path / "left.png"
+    shot = document(run("snapshot", "navcam_left", "--out", str(out), "--json"))
+    kept = pair[0].service.devices.frame_by_id(shot["frame_id"])
+    np.testing.assert_array_equal(cv2.imread(str(out), cv2.IMREAD_UNCHANGED), kept.image)
+    assert shot["mast_digest"] == pair[0].service.stored.digest
+    assert shot["size_px"] == [64, 48]
+    jpeg = tmp_path / "left.jpg"
+    assert run("snapshot", "navcam_left", "--out", str(jpeg), "--frame-id", shot["frame_id"])[0] == 0
+    assert jpeg.read_bytes()[:3] == b"\xff\xd8\xff"
+
+
+def test_no_daemon_is_one_line_and_1(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    url = f"unix:{tmp_path}/none.sock"
+    for words in (
+        ("status",),
+        ("stop",),
+        ("point", "--angles", "0", "0"),
+        ("snapshot", "a", "--out", "a.png"),
+    ):
+        assert main([*words, "--url", url]) == 1
+        assert capsys.readouterr().err == f"mastctl: no daemon answers at {url}; 'mastctl run' starts one\n"
+
+
+def test_the_address_comes_from_the_configuration(
+    pair: BOTH, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    config = tmp_path / "daemon.yaml"
+    port = pair[0].url.rpartition(":")[2]
+    assert main(["status", "--json", "--config", str(config)]) == 2  # port 0: nobody knows which it became
+    assert "give --url" in capsys.readouterr().out
+    config.write_text(config.read_text().replace("port: 0", f"port: {port}"))
+    assert main(["status", "--json", "--config", str(config)]) == 0
+    config.write_text(config.read_text().replace("limits", "limit"))
+    capsys.readouterr()
+    assert main(["status", "--config", str(config)]) == 2
+    assert capsys.readouterr().err.startswith(
+        f"mastctl: {config}: limit: unknown key; the nearest known is 'limits'"
+    )
+
+
+def test_run_refuses_a_bad_configuration_in_one_line(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    config = tmp_path / "daemon.yaml"
+    config.write_text("schema: mastctl/config/1\nmast_file: [\n")
+    assert main(["run", "--config", str(config)]) == 2
+    out, log = capsys.readouterr()
+    assert out == ""
+    assert log.startswith(f"mastctl: {config}: line ")
+    assert log.count("\n") == 1

@@ -1,0 +1,713 @@
+"""Devices behind their threads: checked answers, typed faults, deadlines, and a stop that always goes out."""
+
+from __future__ import annotations
+
+import logging
+import math
+import threading
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from drivers.clock import SystemClock
+from drivers.errors import BadFrame, BadReply, DriverError, LineLost, NoFreshFrame, NoReply
+from drivers.interfaces import Frame, FrameTime, Reading
+from hil_tests.mastctl.service_fakes import FakeCamera, FakeHardware, Hang, eventually, rig
+from mastctl.devices import devices as devices_module
+from mastctl.devices.devices import Devices, UnknownCamera
+from mastctl.devices.frames import KEPT_FRAMES, StampedFrame
+from mastctl.devices.joint_history import JointHistory
+from mastctl.devices.limits import Limits, OutsideLimits
+from mastctl.errors import FrameGone, Stopped
+
+LIMITS = Limits((-2.0, 2.0), (-1.0, 1.0), 0.5)
+DIGEST = "0123456789abcdef" * 4
+ANGLE_TOLERANCE_RAD = 1e-12
+
+
+@pytest.fixture
+def hardware() -> FakeHardware:
+    return FakeHardware()
+
+
+@pytest.fixture
+def deadline_s() -> float:
+    """More than a busy machine takes; nothing waits for it but what hangs."""
+    return 10.0
+
+
+impatient = pytest.mark.parametrize("deadline_s", [0.4])
+"""For what hangs, so that the test ends."""
+
+
+@pytest.fixture
+def devices(hardware: FakeHardware, monkeypatch: pytest.MonkeyPatch, deadline_s: float) -> Iterator[Devices]:
+    for name in ("READ_TIMEOUT_S", "MOVE_TIMEOUT_S", "STOP_TIMEOUT_S", "CAMERA_GRACE_S"):
+        monkeypatch.setattr(devices_module, name, deadline_s)
+    made = Devices(hardware, LIMITS, DIGEST, SystemClock(), rig())
+    yield made
+    hardware.head.hook = lambda name: None
+    made.close()
+
+
+def now() -> float:
+    return time.monotonic()
+
+
+# The head
+
+
+def test_a_reading_is_measured_after_it_was_asked_for(devices: Devices) -> None:
+    asked_s = now()
+    assert devices.read().time_s >= asked_s
+
+
+def test_the_head_is_read_all_the_time_by_one_thread(devices: Devices, hardware: FakeHardware) -> None:
+    eventually(lambda: devices.last_reading is not None, "a first reading")
+    first = devices.last_reading
+    assert first is not None
+    eventually(lambda: (devices.last_reading or first).time_s > first.time_s, "a second reading")
+    devices.read()
+    devices.move(0.1, 0.1)
+    assert len(hardware.head.threads) == 1
+    assert threading.get_ident() not in hardware.head.threads
+
+
+JUNK_READINGS: list[tuple[str, Any]] = [
+    ("nothing", lambda head: None or SimpleNamespace()),
+    ("text", "pan 0 tilt 0"),
+    ("nan", lambda head: Reading(math.nan, 0.0, False, now())),
+    ("infinite", lambda head: Reading(0.0, math.inf, False, now())),
+    ("beyond a turn", lambda head: Reading(6.3, 0.0, False, now())),
+    (
+        "text angle",
+        lambda head: SimpleNamespace(pan_rad="0", tilt_rad=0.0, moving=False, time_s=now(), faults=()),
+    ),
+    (
+        "true angle",
+        lambda head: SimpleNamespace(pan_rad=True, tilt_rad=0.0, moving=False, time_s=now(), faults=()),
+    ),
+    ("moving 2", lambda head: SimpleNamespace(pan_rad=0.0, tilt_rad=0.0, moving=2, time_s=now(), faults=())),
+    ("future", lambda head: Reading(0.0, 0.0, False, now() + 0.5)),
+    ("old", lambda head: Reading(0.0, 0.0, False, now() - 1.5)),
+    ("backwards", lambda head: Reading(0.0, 0.0, False, now() - 0.5)),
+]
+
+
+@pytest.mark.parametrize("answer", [a for _, a in JUNK_READINGS], ids=[n for n, _ in JUNK_READINGS])
+def test_a_reading_that_cannot_be_true_is_a_bad_reply_and_never_kept(
+    devices: Devices, hardware: FakeHardware, answer: Any
+) -> None:
+    devices.read()
+    hardware.head.answer = answer
+    with pytest.raises(BadReply, match=r"^pan_tilt: "):
+        devices.read()
+    kept = devices.last_reading
+    assert kept is not None
+    assert (kept.pan_rad, kept.tilt_rad) == (0.0, 0.0)
+    assert [fault.code for fault in devices.faults()] == ["bad_reply"]
+    hardware.head.answer = None
+    devices.read()
+    assert devices.faults() == ()
+
+
+def test_what_the_head_says_about_itself_is_a_fault(devices: Devices, hardware: FakeHardware) -> None:
+    hardware.head.faults = ("tilt motor is hot",)
+    devices.read()
+    assert [fault.message for fault in devices.faults()] == ["pan_tilt: tilt motor is hot"]
+
+
+def test_a_move_outside_the_limits_never_reaches_the_driver(devices: Devices, hardware: FakeHardware) -> None:
+    for pan, tilt in ((2.01, 0.0), (0.0, -1.01), (math.nan, 0.0)):
+        with pytest.raises(OutsideLimits):
+            devices.move(pan, tilt)
+    with pytest.raises(OutsideLimits):
+        devices.move(0.0, 0.0, 0.0)
+    assert hardware.head.calls == []
+
+
+def test_speed_is_always_told_and_never_above_the_cap(devices: Devices, hardware: FakeHardware) -> None:
+    devices.move(0.1, 0.2)
+    devices.move(0.2, 0.1, 9.0)
+    devices.move(0.3, 0.0, 0.1)
+    assert [call[3] for call in hardware.head.calls] == [0.5, 0.5, 0.1]
+
+
+class Absurd(BaseException):
+    """Not even an Exception."""
+
+
+@pytest.mark.parametrize(
+    "error", [ValueError("what\nnow"), SystemExit(3), Absurd(), StopIteration(), MemoryError()]
+)
+def test_whatever_a_driver_raises_comes_as_one_typed_line(
+    devices: Devices, hardware: FakeHardware, error: BaseException
+) -> None:
+    def raise_it(name: str) -> None:
+        raise error
+
+    hardware.head.hook = raise_it
+    for call in (devices.read, lambda: devices.move(0.1, 0.1), devices.stop):
+        with pytest.raises(DriverError, match=type(error).__name__) as refused:
+            call()
+        assert "\n" not in str(refused.value)
+    hardware.head.hook = lambda name: None
+    assert devices.read().pan_rad == 0.0
+
+
+@impatient
+def test_a_hanging_read_ends_in_no_reply_and_the_cameras_go_on(
+    devices: Devices, hardware: FakeHardware
+) -> None:
+    devices.read()
+    hang = Hang()
+    hardware.head.hook = lambda name: hang() if name == "read" else None
+    with pytest.raises(NoReply):
+        devices.read()
+    assert {fault.device for fault in devices.faults()} == {"pan_tilt"}
+    with pytest.raises(NoReply, match="does not answer"):  # at once: nobody queues behind a hanging call
+        devices.read()
+    assert hardware.fake_cameras["navcam_left"].asked == []
+    with pytest.raises(DriverError):  # the frame comes, but nobody knows the joint angles
+        devices.frames(["navcam_left"], now(), 0.3)
+    assert len(hardware.fake_cameras["navcam_left"].asked) == 1
+    hardware.head.hook = lambda name: None
+    hang.let_go()
+    eventually(lambda: devices.faults() == (), "the head working again")
+    assert devices.frames(["navcam_left"], now(), 1.0)
+
+
+def test_a_lost_line_is_forgotten_when_any_call_finds_it_back(
+    devices: Devices, hardware: FakeHardware
+) -> None:
+    gone = True
+
+    def unplugged(name: str) -> None:
+        if gone:
+            raise LineLost("/dev/mast hung up")
+
+    hardware.head.hook = unplugged
+    for call in (devices.read, lambda: devices.move(0.1, 0.1)):
+        with pytest.raises(LineLost):
+            call()
+    assert {fault.code for fault in devices.faults()} == {"line_lost"}
+    gone = False
+    devices.read()
+    assert devices.faults() == ()
+
+
+def stop_polling(devices: Devices) -> None:
+    """From now on the head is only read when somebody asks."""
+    devices._head.call("no polls", lambda: setattr(devices._head, "_between", None), 1.0)
+
+
+@pytest.mark.parametrize("error", [NoReply("lost on the line"), BadReply("damaged on the line")])
+def test_a_reading_lost_on_the_line_is_asked_for_once_more(
+    devices: Devices, hardware: FakeHardware, error: DriverError
+) -> None:
+    stop_polling(devices)
+    failures = iter([error])
+    reads: list[str] = []
+
+    def fails(name: str) -> None:
+        reads.append(name)
+        for failure in failures:
+            raise failure
+
+    hardware.head.hook = fails
+    assert devices.read().pan_rad == 0.0 and reads == ["read", "read"]
+    assert devices.faults() == ()
+    failures = iter([error, LineLost("and then it is gone")])
+    with pytest.raises(type(error), match="on the line"):
+        devices.read()
+    failures = iter([LineLost("gone")])
+    reads.clear()
+    with pytest.raises(LineLost):
+        devices.read()
+    assert reads == ["read"], "a line that is gone is not asked again"
+
+
+@impatient
+def test_a_reading_that_hangs_when_asked_once_more_ends_with_the_first_error(
+    devices: Devices, hardware: FakeHardware
+) -> None:
+    stop_polling(devices)
+    hang = Hang()
+    failures = iter([NoReply("lost on the line")])
+
+    def fails(name: str) -> None:
+        for failure in failures:
+            raise failure
+        if name == "read":
+            hang()
+
+    hardware.head.hook = fails
+    with pytest.raises(NoReply, match="lost on the line"):
+        devices.read()
+    assert hang.entered.is_set()
+    devices.stop()
+    assert hardware.head.calls == [("stop",)], "a stop goes out beside it"
+    hang.let_go()
+
+
+@impatient
+def test_a_late_answer_is_dropped(devices: Devices, hardware: FakeHardware) -> None:
+    hang = Hang()
+    hardware.head.hook = lambda name: hang() if name == "move" else None
+    with pytest.raises(NoReply):
+        devices.move(0.5, 0.5)
+    hardware.head.hook = lambda name: None
+    hang.let_go()
+    eventually(lambda: "ended only now" in devices.faults()[0].message, "the late move's return")
+    assert devices.faults()[0].until == "a later move is taken in time"
+    devices.move(0.1, 0.2)
+    assert devices.faults() == ()
+    assert [call[:3] for call in hardware.head.calls] == [("move", 0.5, 0.5), ("move", 0.1, 0.2)]
+
+
+# Stop
+
+
+def test_stop_goes_before_moves_that_wait_and_they_are_never_sent(
+    devices: Devices, hardware: FakeHardware
+) -> None:
+    hang = Hang()
+    hardware.head.hook = lambda name: hang() if name == "read" else None
+    assert hang.entered.wait(5.0)
+    refused: list[BaseException] = []
+
+    def move() -> None:
+        try:
+            devices.move(0.5, 0.5)
+        except (DriverError, Stopped) as error:
+            refused.append(error)
+
+    mover = threading.Thread(target=move)
+    mover.start()
+    devices.stop()
+    assert hardware.head.calls == [("stop",)]  # beside the hanging thread
+    hang.let_go()
+    hardware.head.hook = lambda name: None
+    mover.join(5.0)
+    assert len(refused) == 1
+    devices.read()
+    assert [call[0] for call in hardware.head.calls] == ["stop", "stop"]  # once more, in order
+
+
+@impatient
+def test_a_move_that_hung_while_a_stop_went_out_is_followed_by_a_stop(
+    devices: Devices, hardware: FakeHardware
+) -> None:
+    hang = Hang()
+    hardware.head.hook = lambda name: hang() if name == "move" else None
+    with pytest.raises(NoReply):
+        devices.move(0.5, 0.5)
+    devices.stop()
+    hang.let_go()
+    eventually(lambda: len(hardware.head.calls) == 3, "the owed stop")
+    assert [call[0] for call in hardware.head.calls] == ["stop", "move", "stop"]
+
+
+@impatient
+def test_a_stop_that_hangs_says_that_the_head_may_still_move(
+    devices: Devices, hardware: FakeHardware
+) -> None:
+    hang = Hang()
+    hardware.head.hook = hang
+    assert hang.entered.wait(5.0)
+    with pytest.raises(NoReply, match="may still move"):
+        devices.stop()
+    hang.let_go()
+
+
+def test_a_stop_reaches_a_head_that_only_fails_to_read(devices: Devices, hardware: FakeHardware) -> None:
+    def fail(name: str) -> None:
+        if name == "read":
+            raise RuntimeError("no bytes")
+
+    hardware.head.hook = fail
+    devices.stop()
+    assert hardware.head.calls == [("stop",)]
+
+
+def test_blocked_moves_are_refused_until_they_are_allowed(devices: Devices, hardware: FakeHardware) -> None:
+    devices.block_moves("stop", "a stop was asked for")
+    with pytest.raises(Stopped, match="a stop was asked for"):
+        devices.move(0.1, 0.1)
+    devices.allow_moves("stop")
+    devices.move(0.1, 0.1)
+    assert len(hardware.head.calls) == 1
+
+
+# Cameras
+
+
+def test_a_frame_carries_its_facts(devices: Devices, hardware: FakeHardware) -> None:
+    hardware.head.pan_rad, hardware.head.tilt_rad = 0.25, -0.125
+    assert devices.read().pan_rad == 0.25
+    asked_s = now()
+    frame = devices.frames(["navcam_left"], asked_s, 1.0)["navcam_left"]
+    assert frame.camera == "navcam_left"
+    assert frame.frame_id.startswith(f"navcam_left-000001-{DIGEST[:8]}-")
+    assert frame.exposure_began_s > asked_s
+    assert frame.mast_digest == DIGEST
+    assert frame.pan_rad == pytest.approx(0.25, abs=ANGLE_TOLERANCE_RAD)
+    assert frame.tilt_rad == pytest.approx(-0.125, abs=ANGLE_TOLERANCE_RAD)
+    assert not frame.image.flags.writeable
+    assert devices.frame_by_id(frame.frame_id) is frame
+
+
+def test_cameras_are_asked_in_parallel(devices: Devices, hardware: FakeHardware) -> None:
+    together = threading.Barrier(2)
+    for name in ("navcam_left", "navcam_right"):
+        hardware.fake_cameras[name].hook = lambda: together.wait(5.0)
+    assert set(devices.frames(["navcam_left", "navcam_right"], now(), 3.0)) == {"navcam_left", "navcam_right"}
+
+
+class Ticking(FakeCamera):
+    """A free-running camera: exposes every 50 ms, ``phase_s`` after the full ones."""
+
+    period_s, trigger, phase_s = 0.05, "", 0.0
+    every_s = 0.05
+
+    def recent_times(self) -> list[FrameTime]:
+        newest = math.floor((now() - 0.002 - self.phase_s) / self.every_s)
+        return [FrameTime(n, n * self.every_s + self.phase_s - 0.001) for n in range(newest - 20, newest + 1)]
+
+    def next_frame(self, exposed_after_s: float, timeout_s: float) -> Any:
+        self.hook()
+        sequence = math.floor((exposed_after_s + 0.001 - self.phase_s) / self.every_s) + 1
+        mid_s = sequence * self.every_s + self.phase_s
+        time.sleep(max(0.0, mid_s + 0.001 - now()))
+        image = self._random.integers(0, 255, (48, 64), dtype=np.uint8)
+        return self.change(Frame(image, sequence, mid_s, 0.002))
+
+
+@pytest.fixture
+def ticking(hardware: FakeHardware) -> tuple[Ticking, Ticking]:
+    eyes = Ticking("navcam_left", 1), Ticking("navcam_right", 2)
+    eyes[1].phase_s = 0.024
+    hardware.fake_cameras |= {eye.name: eye for eye in eyes}
+    return eyes
+
+
+def apart_s(frames: dict[str, StampedFrame]) -> float:
+    return frames["navcam_right"].mid_exposure_s - frames["navcam_left"].mid_exposure_s
+
+
+EYES = ("navcam_left", "navcam_right")
+
+
+def test_frames_of_two_eyes_are_always_the_same_partners(
+    ticking: tuple[Ticking, Ticking], devices: Devices
+) -> None:
+    for later_s in (0.0, 0.013, 0.031, 0.007, 0.022):  # now the one, now the other is first after it
+        assert apart_s(devices.frames(EYES, now() + later_s, 2.0)) == pytest.approx(0.024, abs=1e-6)
+
+
+def test_each_frame_serves_one_pair(ticking: tuple[Ticking, Ticking], devices: Devices) -> None:
+    asked_s = now()
+    pairs = [devices.frames(EYES, asked_s, 2.0) for _ in range(3)]
+    for eye in EYES:
+        assert len({pair[eye].frame_id for pair in pairs}) == 3
+
+
+def test_eyes_that_never_belong_together_are_told(ticking: tuple[Ticking, Ticking], devices: Devices) -> None:
+    for eye in ticking:
+        eye.recent_times = list  # type: ignore[assignment]  # nothing learned
+        eye.period_s = 0.04  # wrong: it is 50 ms
+    ticking[1].phase_s = 0.025  # from either neighbour more than half of what is said to be the period
+    with pytest.raises(NoFreshFrame, match="no frames of navcam_left, navcam_right that belong together"):
+        devices.frames(EYES, now(), 0.3)
+
+
+@pytest.mark.parametrize("times", [lambda: [(1, math.nan)] * 9, lambda: ["noon"] * 9, lambda: 1 / 0])
+def test_times_that_cannot_be_true_are_a_typed_error(
+    ticking: tuple[Ticking, Ticking], devices: Devices, times: Callable[[], Any]
+) -> None:
+    ticking[1].recent_times = times  # type: ignore[method-assign]
+    with pytest.raises(DriverError, match=r"tell no times of navcam_left and navcam_right|in recent_times"):
+        devices.frames(EYES, now(), 2.0)
+
+
+def test_a_move_between_two_exposures_moves_both(
+    devices: Devices, hardware: FakeHardware, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Even if the readings around either exposure do not reach over the pause between them."""
+    still = JointHistory.at_exposure
+
+    def at_exposure(self: JointHistory, began_s: float, mid_s: float, ended_s: float, device: str) -> Any:
+        return replace(still(self, began_s, mid_s, ended_s, device), moving=ended_s - began_s > 0.004)
+
+    monkeypatch.setattr(JointHistory, "at_exposure", at_exposure)
+    assert not devices.frames(["navcam_left"], now(), 1.0)["navcam_left"].moving  # 2 ms of exposure
+    exposed = threading.Event()
+
+    def tell(frame: Frame) -> Frame:
+        exposed.set()
+        return frame
+
+    hardware.fake_cameras["navcam_left"].change = tell
+    hardware.fake_cameras["navcam_right"].hook = lambda: exposed.wait(10.0)
+    assert all(frame.moving for frame in devices.frames(EYES, now(), 2.0).values())
+
+
+def test_a_frame_that_serves_already_is_not_taken_again(devices: Devices, hardware: FakeHardware) -> None:
+    asked_s = now()
+    first = devices.frames(["navcam_left"], asked_s, 1.0)["navcam_left"]
+    assert devices.frames(["navcam_left"], asked_s, 1.0)["navcam_left"] is first
+    assert devices.frames(["navcam_left"], first.exposure_began_s, 1.0)["navcam_left"] is not first
+
+
+def test_an_unknown_camera_is_named_with_those_that_are_known(devices: Devices) -> None:
+    with pytest.raises(UnknownCamera, match=r"navcam_center is not configured.*navcam_left"):
+        devices.frames(["navcam_center"], now(), 1.0)
+
+
+Change = Callable[[Any], Any]
+BAD_FRAMES: list[tuple[str, Change, type[DriverError], str]] = [
+    ("none", lambda f: None, BadFrame, "not a frame"),
+    ("float image", lambda f: replace(f, image=f.image.astype(float)), BadFrame, "float64"),
+    ("list image", lambda f: replace(f, image=[[1]]), BadFrame, "list"),
+    (
+        "other size",
+        lambda f: replace(f, image=f.image[:-1]),
+        BadFrame,
+        "64x47 px where the mast file has 64x48",
+    ),
+    ("alpha", lambda f: replace(f, image=np.zeros((48, 64, 4), np.uint8)), BadFrame, "shape"),
+    ("empty", lambda f: replace(f, image=np.zeros((0, 64), np.uint8)), BadFrame, "shape"),
+    ("dark", lambda f: replace(f, image=f.image // 64), BadFrame, "dark"),
+    ("future", lambda f: replace(f, mid_exposure_s=f.mid_exposure_s + 1), BadFrame, "future"),
+    ("nan time", lambda f: replace(f, mid_exposure_s=math.nan), BadFrame, "finite"),
+    ("negative exposure", lambda f: replace(f, exposure_s=-0.1), BadFrame, "below 0"),
+    ("text sequence", lambda f: replace(f, sequence="7"), BadFrame, "whole number"),
+    (
+        "stale",
+        lambda f: replace(f, mid_exposure_s=f.mid_exposure_s - 1),
+        NoFreshFrame,
+        "before the asked moment",
+    ),
+]
+
+
+@pytest.mark.parametrize(
+    ("change", "error", "words"), [b[1:] for b in BAD_FRAMES], ids=[b[0] for b in BAD_FRAMES]
+)
+def test_a_frame_that_cannot_be_used_is_refused(
+    devices: Devices, hardware: FakeHardware, change: Change, error: type[DriverError], words: str
+) -> None:
+    camera = hardware.fake_cameras["navcam_left"]
+    camera.change = change
+    with pytest.raises(error, match=f"^navcam_left: .*{words}"):
+        devices.frames(["navcam_left"], now(), 1.0)
+    assert [fault.device for fault in devices.faults()] == ["navcam_left"]
+    assert devices.frames(["navcam_right"], now(), 1.0)
+    camera.change = lambda frame: frame
+    assert devices.frames(["navcam_left"], now(), 1.0)
+    assert devices.faults() == ()
+
+
+@pytest.mark.parametrize("step", [0, -1])
+def test_count_and_time_must_grow_together(devices: Devices, hardware: FakeHardware, step: int) -> None:
+    first = devices.frames(["navcam_left"], now(), 1.0)["navcam_left"]
+    camera = hardware.fake_cameras["navcam_left"]
+    camera.change = lambda frame: replace(frame, sequence=first.sequence + step)
+    with pytest.raises(BadFrame, match="must grow together"):
+        devices.frames(["navcam_left"], now(), 1.0)
+    # A camera that came back and counts anew is served again, and the old number names no picture.
+    again = devices.frames(["navcam_left"], now(), 1.0)["navcam_left"]
+    assert again.sequence == first.sequence + step
+    assert again.frame_id != first.frame_id
+    with pytest.raises(FrameGone):
+        devices.frame_by_id(first.frame_id)
+
+
+def test_a_head_camera_that_shows_the_same_after_a_move_is_frozen(
+    devices: Devices, hardware: FakeHardware
+) -> None:
+    still = np.random.default_rng(7).integers(0, 255, (48, 64), dtype=np.uint8)
+    for camera in hardware.fake_cameras.values():
+        camera.change = lambda frame: replace(frame, image=still.copy())
+    before = devices.frames(["navcam_left", "hazcam_left"], now(), 1.0)
+    again = devices.frames(["navcam_left"], now(), 1.0)  # nothing moved: a still picture is no proof
+    assert again["navcam_left"].frame_id != before["navcam_left"].frame_id
+    devices.move(0.001, 0.0)
+    with pytest.raises(BadFrame, match="frozen"):
+        devices.frames(["navcam_left"], now(), 1.0)
+    assert devices.frames(["hazcam_left"], now(), 1.0)  # on the body the same picture is right
+
+
+@impatient
+def test_a_hanging_camera_is_faulty_and_the_others_go_on(devices: Devices, hardware: FakeHardware) -> None:
+    hang = Hang()
+    hardware.fake_cameras["navcam_left"].hook = hang
+    with pytest.raises(NoReply, match=r"^navcam_left: next_frame did not end"):
+        devices.frames(["navcam_left", "navcam_right"], now(), 0.1)
+    eventually(lambda: "does not answer" in devices.faults()[0].message, "the fault in plain words")
+    with pytest.raises(NoReply, match="does not answer"):
+        devices.frames(["navcam_left"], now(), 0.1)
+    assert devices.frames(["navcam_right"], now(), 1.0)
+    hardware.fake_cameras["navcam_left"].hook = lambda: None
+    hang.let_go()
+    eventually(lambda: devices.faults() == (), "the camera working again")
+    assert devices.frames(["navcam_left"], now(), 1.0)
+
+
+def test_a_frame_exposed_around_a_move_command_counts_as_moving(
+    devices: Devices, hardware: FakeHardware
+) -> None:
+    devices.read()
+
+    def move_meanwhile(frame: Any) -> Any:
+        devices.move(1e-4, 0.0)
+        return frame
+
+    hardware.fake_cameras["navcam_left"].change = move_meanwhile
+    assert devices.frames(["navcam_left"], now(), 1.0)["navcam_left"].moving
+
+
+def test_only_the_newest_frames_are_kept_and_the_refusal_says_which_case_it_is(devices: Devices) -> None:
+    first = devices.frames(["navcam_left"], now(), 1.0)["navcam_left"]
+    for _ in range(KEPT_FRAMES):
+        devices.frames(["navcam_left"], now(), 1.0)
+    camera, sequence, mast, run = first.frame_id.rsplit("-", 3)
+    cases = {
+        first.frame_id: "frame_too_old",
+        f"{camera}-{sequence}-ffffffff-{run}": "other_mast_file",
+        f"{camera}-{sequence}-{mast}-{int(run, 16) ^ 1:04x}": "frame_unknown",
+        f"{camera}-999999-{mast}-{run}": "frame_unknown",
+        "nonsense": "frame_unknown",
+        "": "frame_unknown",
+    }
+    for frame_id, code in cases.items():
+        with pytest.raises(FrameGone) as refused:
+            devices.frame_by_id(frame_id)
+        assert refused.value.code == code, frame_id
+
+
+def test_a_kept_frame_can_still_be_too_old(devices: Devices) -> None:
+    frame = devices.frames(["navcam_left"], now(), 1.0)["navcam_left"]
+    with pytest.raises(FrameGone, match="s old, at most 0 s"):
+        devices.frame_by_id(frame.frame_id, max_age_s=0.0)
+
+
+# Joint angles at mid-exposure: numbers worked by hand
+
+
+def history(*readings: tuple[float, float, float, bool]) -> JointHistory:
+    made = JointHistory()
+    for time_s, pan_rad, tilt_rad, moving in readings:
+        made.add(Reading(pan_rad, tilt_rad, moving, time_s))
+    return made
+
+
+def test_angles_at_mid_exposure_lie_on_the_line_between_the_readings_around_it() -> None:
+    joints = history((10.0, 0.0, 1.0, True), (10.1, 0.2, 0.8, True)).at_exposure(10.02, 10.025, 10.03, "head")
+    assert joints.pan_rad == pytest.approx(0.05, abs=ANGLE_TOLERANCE_RAD)
+    assert joints.tilt_rad == pytest.approx(0.95, abs=ANGLE_TOLERANCE_RAD)
+    assert joints.moving
+
+
+@pytest.mark.parametrize(
+    ("pans", "flags", "moving"),
+    [
+        ((0.0, 0.0, 0.0), (False, False, False), False),
+        ((0.0, 0.002, 0.0), (False, False, False), False),  # one count of a 12-bit servo is 1.5 mrad
+        ((0.0, 0.004, 0.004), (False, False, False), True),
+        ((0.0, 0.0, 0.0), (False, True, False), True),
+        ((0.0, 0.0, 0.0), (True, False, False), True),
+        ((0.0, 0.0, 0.0), (False, False, True), True),
+    ],
+)
+def test_any_motion_from_before_to_after_the_exposure_counts(
+    pans: tuple[float, ...], flags: tuple[bool, ...], moving: bool
+) -> None:
+    rows = zip((1.0, 1.05, 1.1), pans, (0.0,) * 3, flags, strict=True)
+    assert history(*rows).at_exposure(1.01, 1.05, 1.09, "head").moving is moving
+
+
+@pytest.mark.parametrize(
+    ("times_s", "words"),
+    [
+        ((5.1, 5.2), "no joint reading before"),
+        ((4.8, 4.9), "no joint reading after"),
+        ((4.2, 5.5), "1.30 s apart"),
+    ],
+)
+def test_readings_that_do_not_reach_around_the_exposure_are_refused(
+    times_s: tuple[float, float], words: str
+) -> None:
+    with pytest.raises(BadReply, match=words):
+        history(*((t, 0.0, 0.0, False) for t in times_s)).at_exposure(5.0, 5.01, 5.02, "head")
+
+
+def test_a_move_sent_between_the_readings_counts_even_if_they_are_alike() -> None:
+    still = history((1.0, 0.0, 0.0, False), (1.05, 0.0, 0.0, False))
+    still.move_sent(1.04)
+    assert still.at_exposure(1.01, 1.015, 1.02, "head").moving
+
+
+class SizedCamera(FakeCamera):
+    """A camera that tells its size before the first picture."""
+
+    size_px = (64, 47)
+
+
+def test_a_camera_of_another_size_than_the_mast_files_is_refused_at_the_start() -> None:
+    hardware = FakeHardware()
+    hardware.fake_cameras["navcam_left"] = SizedCamera("navcam_left", 0)
+    with pytest.raises(
+        BadFrame, match=r"navcam_left: the image is 64x47 px where the mast file has 64x48 px"
+    ):
+        Devices(hardware, LIMITS, DIGEST, SystemClock(), rig())
+
+
+# The end
+
+
+def test_close_stops_the_head_and_leaves_no_thread() -> None:
+    before = set(threading.enumerate())
+    hardware = FakeHardware()
+    devices = Devices(hardware, LIMITS, DIGEST, SystemClock(), rig())
+    devices.frames(list(hardware.cameras), now(), 1.0)
+    devices.move(0.1, 0.1)
+    devices.close()
+    devices.close()
+    assert hardware.head.calls[-1] == ("stop",)
+    assert set(threading.enumerate()) <= before
+    with pytest.raises(DriverError):
+        devices.read()
+    with pytest.raises((Stopped, DriverError)):
+        devices.move(0.0, 0.0)
+
+
+def test_close_ends_although_every_driver_hangs(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(devices_module, "STOP_TIMEOUT_S", 0.2)
+    hardware, hang = FakeHardware(), Hang()
+    devices = Devices(hardware, LIMITS, DIGEST, SystemClock(), rig())
+    before = set(threading.enumerate())
+    hardware.head.hook = hang
+    for camera in hardware.fake_cameras.values():
+        camera.hook = hang
+
+    def ask() -> None:
+        with pytest.raises(NoReply):
+            devices.frames(["navcam_left"], now(), 0.1)
+
+    asker = threading.Thread(target=ask)
+    asker.start()
+    assert hang.entered.wait(5.0)
+    with caplog.at_level(logging.WARNING):
+        devices.close()
+    assert "did not confirm the last stop" in caplog.text
+    asker.join(10.0)
+    hang.let_go()
+    eventually(lambda: set(threading.enumerate()) <= before, "all threads gone once the drivers return")

@@ -1,0 +1,194 @@
+"""The self-check in service: what hand-offs tell together, and a record that cannot be written."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from calib.files.mast_file import load_rig
+from calib.handoff.matched import MatchedHandoff
+from calib.mast.rig import Rig
+from drivers.clock import ManualClock
+from hil_tests.calib.handoff.handed_over import (
+    HAZCAMS,
+    hand_offs,
+    moved_hazcams,
+    pixel,
+    plain_rig,
+    targets,
+    vectors,
+)
+from hil_tests.mastctl.service_fakes import Hang, eventually
+from mastctl.handoff import check as module
+from mastctl.handoff.check import NAME, HandoffCheck
+from mastctl.handoff.log import HandoffLog, read_log
+
+DIGEST, OTHER = "d" * 64, "e" * 64
+
+
+@pytest.fixture(scope="module")
+def rig(repository: Path) -> Rig:
+    return plain_rig(load_rig(repository / "configs/sim/rocky8.yaml").rig)
+
+
+def handed(rig: Rig, count: int, yaw_rad: float = 0.0, digest: str = DIGEST) -> list[MatchedHandoff]:
+    """Hand-offs by a mast file from which the true Hazcams are turned; matches with 0.3 px of noise."""
+    rng = np.random.default_rng(4)
+    points = targets(rng, count)
+    true = moved_hazcams(rig, Rotation.from_rotvec((0.0, 0.0, yaw_rad)), (0.0, 0.0, 0.0))
+    made = hand_offs(true, rig, points, rng, match_px=0.3, digest=digest)
+    believed = {name: vectors(rig, name) for name in HAZCAMS}
+    return [
+        replace(
+            one,
+            landed={
+                name: replace(
+                    landed,
+                    geometric_px=pixel(believed[name], point),
+                    geometric_covariance_px2=0.04 * np.eye(2),
+                )
+                for name, landed in one.landed.items()
+            },
+        )
+        for one, point in zip(made, points, strict=True)
+    ]
+
+
+def check(path: Path | None, clock: ManualClock | None = None) -> HandoffCheck:
+    return HandoffCheck(path, DIGEST, clock or ManualClock(10.0))
+
+
+def test_a_turned_body_pair_is_told_after_enough_hand_offs(
+    rig: Rig, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    first, *others = handed(rig, 20, yaw_rad=0.004)  # turned to the right: targets appear further left
+    selfcheck = check(tmp_path / "h.jsonl")
+    selfcheck.add(first)
+    assert selfcheck.told() == {"handoffs": 1, "offsets": []}
+    for one in others:
+        selfcheck.add(one)
+    told = selfcheck.told()
+    assert told["handoffs"] == 20
+    assert [one["camera"] for one in told["offsets"]] == list(HAZCAMS)
+    for one in told["offsets"]:
+        model = rig.cameras[one["camera"]].model
+        focal_px = float(np.linalg.norm(np.cross(model.A, model.H)))
+        assert one["offset_px"] == pytest.approx([-0.004 * focal_px, 0.0], abs=0.5)
+        assert one["sigmas"] > 5.0
+        assert f"{one['camera']} sees targets" in one["sentence"]
+        assert "px left" in one["sentence"] and "of where navcam puts them" in one["sentence"]
+    assert sum("tell an offset: hazcam_left" in words for words in caplog.messages) == 1, "told once"
+    selfcheck.close()
+    assert len(read_log(tmp_path / "h.jsonl").handoffs) == 20
+
+
+def test_hand_offs_without_an_offset_tell_none(rig: Rig) -> None:
+    selfcheck = check(None)
+    for one in handed(rig, 20):
+        selfcheck.add(one)
+    assert selfcheck.told() == {"handoffs": 20, "offsets": []}
+    selfcheck.close()
+
+
+def test_only_hand_offs_of_the_mast_file_in_use_count(rig: Rig) -> None:
+    selfcheck = check(None)
+    for one in [*handed(rig, 12, 0.004), *handed(rig, 5, 0.0, OTHER)]:
+        selfcheck.add(one)
+    assert (selfcheck.told()["handoffs"], len(selfcheck.told()["offsets"])) == (12, 2)
+    selfcheck.use_mast(OTHER)
+    assert selfcheck.told() == {"handoffs": 5, "offsets": []}
+    selfcheck.use_mast(DIGEST)
+    assert len(selfcheck.told()["offsets"]) == 2
+
+
+def test_what_was_written_down_before_counts_after_a_restart(rig: Rig, tmp_path: Path) -> None:
+    writer = HandoffLog(tmp_path / "h.jsonl")
+    for one in handed(rig, 12, 0.004):
+        writer.append(one)
+    selfcheck = check(tmp_path / "h.jsonl")
+    eventually(lambda: selfcheck.told()["handoffs"] == 12, "the record is read")
+    assert len(selfcheck.told()["offsets"]) == 2
+    assert selfcheck.faults() == ()
+    selfcheck.close()
+
+
+def full(tmp_path: Path) -> Path:
+    return Path("/dev/full")
+
+
+def folder_in_the_way(tmp_path: Path) -> Path:
+    (tmp_path / "h.jsonl").mkdir()
+    return tmp_path / "h.jsonl"
+
+
+@pytest.mark.parametrize("where", [folder_in_the_way, full])
+def test_a_record_that_cannot_be_written_is_a_fault_and_nothing_else(
+    rig: Rig, tmp_path: Path, where: Callable[[Path], Path]
+) -> None:
+    path = where(tmp_path)
+    if path == Path("/dev/full") and not path.exists():
+        pytest.skip("this machine has no /dev/full")
+    selfcheck = check(path)
+    for one in handed(rig, 12, 0.004):
+        selfcheck.add(one)
+    assert len(selfcheck.told()["offsets"]) == 2
+    eventually(lambda: any(one.code == "unwritable" for one in selfcheck.faults()), "the fault")
+    fault = selfcheck.faults()[-1]
+    assert fault.device == NAME
+    assert fault.message.startswith(str(path)) and "hand-offs count, and wait" in fault.message
+    assert "\n" not in fault.message
+    selfcheck.close()
+
+
+def test_what_waited_is_written_down_when_the_file_can_be_written_again(rig: Rig, tmp_path: Path) -> None:
+    path = folder_in_the_way(tmp_path)
+    selfcheck = check(path)
+    one, two, three = handed(rig, 3)
+    selfcheck.add(one)
+    selfcheck.add(two)
+    eventually(lambda: any(one.code == "unwritable" for one in selfcheck.faults()), "the fault")
+    path.rmdir()
+    selfcheck.add(three)
+    selfcheck.close()
+    assert not [each for each in selfcheck.faults() if each.code == "unwritable"]
+    clicks = [each.clicks_px.tolist() for each in read_log(path).handoffs]
+    assert clicks == [each.clicks_px.tolist() for each in (one, two, three)]
+
+
+def test_a_spoilt_record_is_a_fault_and_what_comes_counts(rig: Rig, tmp_path: Path) -> None:
+    path = tmp_path / "h.jsonl"
+    path.write_text("something else\nthat is no record\n")
+    selfcheck = check(path)
+    selfcheck.add(handed(rig, 1)[0])
+    eventually(lambda: len(selfcheck.faults()) == 2, "neither read nor written")
+    assert [one.code for one in selfcheck.faults()] == ["unreadable", "unwritable"]
+    assert "line 1" in selfcheck.faults()[0].message
+    assert selfcheck.told()["handoffs"] == 1
+    selfcheck.close()
+    assert path.read_text().startswith("something else\n")
+
+
+def test_a_file_that_hangs_keeps_nobody_waiting(
+    rig: Rig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    hang, clock = Hang(), ManualClock(10.0)
+    monkeypatch.setattr(HandoffLog, "append", lambda self, handoff: hang())
+    monkeypatch.setattr(module, "CLOSE_S", 0.05)
+    selfcheck = check(tmp_path / "h.jsonl", clock)
+    for one in handed(rig, 3):
+        selfcheck.add(one)
+    assert hang.entered.wait(10.0)
+    assert (selfcheck.told()["handoffs"], selfcheck.faults()) == (3, ())
+    clock.advance(60.0)
+    (fault,) = selfcheck.faults()
+    assert (fault.code, fault.since_s) == ("slow", 10.0)
+    assert "does not answer" in fault.message
+    selfcheck.close()
+    hang.let_go()
+    eventually(lambda: not any(t.name == NAME for t in threading.enumerate()), "its thread ends")

@@ -1,0 +1,232 @@
+"""The pointing loop in a small world whose truth is the test's own geometry."""
+
+from __future__ import annotations
+
+import json
+import threading
+
+import numpy as np
+import pytest
+
+from hil_tests.mastctl.pointing.pointing_world import LIMITS, SIZE_PX, World, click, rig, run
+from mastctl.as_json import as_json
+from mastctl.pointing.loop import (
+    Aim,
+    AnglesTarget,
+    PixelTarget,
+    PointingError,
+    PointingLoop,
+    PointRequest,
+    PositionTarget,
+    Step,
+)
+
+MIDDLE_PX = ((SIZE_PX[0] - 1) / 2, (SIZE_PX[1] - 1) / 2)
+MEASURED_PX = 0.1  # the measured residual against the true one
+
+
+def true_residual_px(
+    world: World, frame_id: str, point_m: np.ndarray, aim_px: tuple[float, float]
+) -> np.ndarray:
+    return world.true_pixel(frame_id, point_m) - np.array(aim_px)
+
+
+@pytest.mark.parametrize("pixel", [(75.0, 50.0), (250.5, 190.25), (149.5, 119.5)])
+def test_a_clicked_pixel_lands_on_the_aim_and_the_residual_is_the_true_one(
+    pixel: tuple[float, float],
+) -> None:
+    world = World()
+    frame = world.shoot()
+    point = world.true_point(frame, *pixel)
+    result, _ = run(world, click(frame, *pixel, pointings=2))
+    assert result.position_m is not None
+    assert np.linalg.norm(np.array(result.position_m) - point) < 0.03
+    assert len(result.pointings) == 2
+    for pointing in result.pointings:
+        assert pointing.residual_px is not None
+        assert pointing.residual_sigma_px is not None
+        truth = true_residual_px(world, pointing.frame_id, point, MIDDLE_PX)
+        assert np.abs(truth).max() < 0.5
+        assert np.abs(np.array(pointing.residual_px) - truth).max() < MEASURED_PX
+        assert max(pointing.residual_sigma_px) < MEASURED_PX
+
+
+def test_a_wrong_mast_file_shows_as_a_residual_and_not_as_nothing() -> None:
+    world, pixel = World(), (60.0, 50.0)
+    frame = world.shoot()
+    point = world.true_point(frame, *pixel)
+    result, _ = run(world, click(frame, *pixel, pointings=2), rig(twist_error_rad=0.05))
+    for pointing in result.pointings:
+        assert pointing.residual_px is not None
+        truth = true_residual_px(world, pointing.frame_id, point, MIDDLE_PX)
+        assert np.abs(np.array(pointing.residual_px) - truth).max() < MEASURED_PX
+    first = true_residual_px(world, result.pointings[0].frame_id, point, MIDDLE_PX)
+    assert np.linalg.norm(first) > 1.0
+
+
+def test_any_pixel_of_another_camera_can_be_the_aim() -> None:
+    world, pixel = World(), (150.0, 120.0)
+    frame = world.shoot("navcam_left")
+    point = world.true_point(frame, *pixel)
+    aim = Aim("pancam_right", 200.0, 130.0)
+    result, steps = run(world, click(frame, *pixel, aim=aim, pointings=2))
+    eyes = next(step for step in steps if step.name == "eyes")
+    assert eyes.detail["confirmed_by"] == ["navcam_left", "navcam_right"]  # pancam_left cannot see it so near
+    last = result.pointings[-1]
+    assert last.camera == "pancam_right"
+    assert last.residual_px is not None
+    truth = true_residual_px(world, last.frame_id, point, (aim.x_px, aim.y_px))
+    assert np.abs(truth).max() < 1.0
+    assert np.abs(np.array(last.residual_px) - truth).max() < MEASURED_PX
+
+
+def test_a_frame_from_before_the_head_moved_still_serves_while_the_target_is_in_view() -> None:
+    world, pixel = World(), (150.0, 120.0)
+    frame = world.shoot()
+    point = world.true_point(frame, *pixel)
+    world.place(0.08, -0.5)
+    result, _ = run(world, click(frame, *pixel))
+    residual = result.pointings[0].residual_px
+    assert residual is not None
+    truth = true_residual_px(world, result.pointings[0].frame_id, point, MIDDLE_PX)
+    assert np.abs(np.array(residual) - truth).max() < MEASURED_PX
+
+
+def test_a_frame_from_a_pose_that_looks_elsewhere_is_refused_by_name() -> None:
+    world = World()
+    frame = world.shoot()
+    world.place(1.0, -0.5)
+    with pytest.raises(PointingError, match=frame.frame_id) as refusal:
+        run(world, click(frame, 150.0, 120.0))
+    assert refusal.value.code == "not_in_view"
+    assert not world.moves
+
+
+@pytest.mark.parametrize("frame", ["rover", "site"])
+def test_a_position_is_pointed_at_and_its_missing_residual_is_explained(frame: str) -> None:
+    world = World()
+    result, steps = run(world, PointRequest(PositionTarget((4.0, 0.7, 0.0), frame)))
+    (pointing,) = result.pointings
+    assert pointing.residual_px is None
+    assert pointing.residual_sigma_px is None
+    assert "no picture" in pointing.note
+    assert np.allclose(world.true_pixel(pointing.frame_id, np.array([4.0, 0.7, 0.0])), MIDDLE_PX, atol=1e-6)
+    assert np.allclose(pointing.predicted_px, MIDDLE_PX, atol=1e-6)
+    assert [step.name for step in steps] == ["rest", "solve", "before", "limits", "move", "settle", "look"]
+
+
+def test_joint_angles_are_taken_up_without_a_picture() -> None:
+    world = World()
+    result, _ = run(world, PointRequest(AnglesTarget(0.4, -0.2)))
+    assert world.moves == [(0.4, -0.2)]
+    assert result.position_m is None
+    assert result.pointings[0].measured_pan_rad == pytest.approx(0.4)
+    assert result.pointings[0].residual_px is None
+
+
+def test_the_record_names_every_step_in_order_with_plain_numbers() -> None:
+    world = World()
+    result, steps = run(world, click(world.shoot(), 120.0, 90.0, pointings=2))
+    one = ["solve", "limits", "move", "settle", "look", "measure", "eyes"]
+    assert [step.name for step in steps] == [
+        "rest", "frames", "target", "stereo", "triangulate", *one, "triangulate", "rest", *one
+    ]  # fmt: skip
+    assert all(step.state == "done" for step in steps)
+    assert all(step.duration_s >= 0.0 for step in steps)
+    json.dumps([as_json(step) for step in steps])
+    json.dumps(as_json(result), allow_nan=False)
+
+
+def test_the_new_picture_is_exposed_after_the_head_has_settled() -> None:
+    world = World()
+    frame = world.shoot()
+    result, steps = run(world, click(frame, 100.0, 90.0))
+    settled = next(step for step in steps if step.name == "settle")
+    new = world.frame_by_id(result.pointings[0].frame_id)
+    assert new.exposure_began_s >= settled.started_s + settled.duration_s
+
+
+def test_a_target_beyond_the_limits_is_refused_with_how_far_and_nothing_moves() -> None:
+    world = World()
+    steps: list[Step] = []
+    loop = PointingLoop(rig(), world, LIMITS, world.clock)
+    with pytest.raises(PointingError, match="beyond the limit") as refusal:
+        loop.run(PointRequest(PositionTarget((-4.0, 0.1, 0.0))), steps.append, threading.Event())
+    assert refusal.value.code == "outside_limits"
+    assert refusal.value.step == "solve"
+    assert steps[-1].state == "failed"
+    assert steps[-1].detail["code"] == "outside_limits"
+    assert not world.moves
+    assert world.stops == 1
+
+
+BAD = {
+    "unknown_camera": PointRequest(PixelTarget("fishcam", "navcam_left-000001", 1, 1)),
+    "frame_unknown": PointRequest(PixelTarget("navcam_left", "navcam_left-000099", 1, 1)),
+    "wrong_camera": PointRequest(PixelTarget("navcam_right", "navcam_left-000001", 1, 1)),
+    "outside_image": PointRequest(PixelTarget("navcam_left", "navcam_left-000001", 300.0, 1)),
+    "bad_request": PointRequest(PositionTarget((1.0, float("nan"), 0.0))),
+    "bad_request ": PointRequest(PositionTarget((1.0, 0.0, 0.0), "board")),
+    "bad_request  ": PointRequest(PositionTarget((4.0, 0.0, 0.0)), pointings=2),
+    "bad_request   ": PointRequest(AnglesTarget(0.0, 0.0), pointings=3),
+    "unknown_camera ": PointRequest(PositionTarget((4.0, 0.0, 0.0)), aim=Aim("fishcam", 1, 1)),
+    "outside_image ": PointRequest(PositionTarget((4.0, 0.0, 0.0)), aim=Aim("navcam_left", 1, 240.0)),
+    "outside_image  ": PointRequest(PixelTarget("navcam_left", "navcam_left-000001", float("nan"), 1)),
+    "outside_limits": PointRequest(AnglesTarget(2.0, 0.0)),
+    "target_border": PointRequest(PixelTarget("navcam_left", "navcam_left-000001", 2.0, 120.0)),
+}
+
+
+@pytest.mark.parametrize("code", BAD)
+def test_a_request_that_cannot_be_met_is_refused_by_its_code_and_nothing_moves(code: str) -> None:
+    world = World()
+    world.shoot()
+    with pytest.raises(PointingError) as refusal:
+        run(world, BAD[code])
+    assert refusal.value.code == code.strip()
+    assert str(refusal.value)
+    assert "\n" not in str(refusal.value)
+    assert not world.moves
+
+
+def test_a_click_beside_the_overlap_of_the_eyes_is_refused() -> None:
+    world = World()
+    world.place(0.0, -1.1)  # at 1.5 m the right eye does not see the left edge of the left picture
+    with pytest.raises(PointingError) as refusal:
+        run(world, click(world.shoot(), 30.0, 140.0))
+    assert refusal.value.code in ("target_border", "target_not_found", "target_ambiguous")
+    assert not world.moves
+
+
+def test_cancelling_during_the_move_stops_the_head() -> None:
+    world, cancelled = World(), threading.Event()
+    frame = world.shoot()
+
+    def cancel_under_way() -> None:
+        if world.moves:
+            cancelled.set()
+
+    world.on_read = cancel_under_way
+    steps: list[Step] = []
+    loop = PointingLoop(rig(), world, LIMITS, world.clock)
+    with pytest.raises(PointingError) as refusal:
+        loop.run(click(frame, 90.0, 60.0), steps.append, cancelled)
+    assert refusal.value.code == "stopped"
+    assert steps[-1].name == "settle"
+    assert world.stops == 1
+
+
+def test_a_failure_after_the_first_pointing_keeps_its_result() -> None:
+    world = World()
+    frame = world.shoot()
+
+    def lost(camera: str, number: int, image: np.ndarray) -> np.ndarray:
+        return np.full_like(image, 90) if number > frame.sequence + 4 else image
+
+    world.image = lost
+    with pytest.raises(PointingError) as refusal:
+        run(world, click(frame, 120.0, 90.0, pointings=2))
+    assert refusal.value.code == "target_not_found"
+    assert refusal.value.result is not None
+    assert len(refusal.value.result.pointings) == 1
+    assert refusal.value.result.pointings[0].residual_px is not None

@@ -1,0 +1,140 @@
+"""A head alone, as on the bench before anything is mounted; and a rig of which one eye is configured."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import httpx
+import pytest
+
+from calib.files.mast_file import save_rig
+from hil_tests.mastctl.service_fakes import FakeHardware, eventually, rig
+from mastctl.cli.main import main
+from mastctl.config import load_config
+from mastctl.daemon import RunningDaemon
+from mastctl.service import service as service_module
+
+BARE_MAST = """
+schema: mastctl/mast/1
+name: bare_head
+mast: {translation_m: [0, 0, 0], rotation_rad: [0, 0, 0]}
+cameras: {}
+"""
+
+CONFIG = """
+schema: mastctl/config/1
+mast_file: little.yaml
+listen: {{port: 0}}
+pan_tilt: {{driver: fake}}
+{cameras}
+limits: {{pan_rad: [-2.0, 2.0], tilt_rad: [-1.0, 1.0], speed_rad_per_s: 0.5}}
+"""
+
+ANGLES = {"pan_rad": 0.3, "tilt_rad": -0.2}
+
+
+def started(
+    monkeypatch: pytest.MonkeyPatch, folder: Path, cameras: str, mounted: tuple[str, ...], mast: str = ""
+) -> RunningDaemon:
+    """A daemon on fakes whose configuration has these lines about cameras."""
+    hardware = FakeHardware(mounted)
+    if mast:
+        (folder / "little.yaml").write_text(mast)
+    else:
+        save_rig(rig(), folder / "little.yaml")
+    (folder / "daemon.yaml").write_text(CONFIG.format(cameras=cameras))
+    monkeypatch.setattr(service_module, "open_hardware", lambda settings, clock: hardware)
+    return RunningDaemon(load_config(folder / "daemon.yaml"))
+
+
+@pytest.fixture(params=["", "cameras: {}", "bare"])
+def bare(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, request: pytest.FixtureRequest
+) -> Iterator[RunningDaemon]:
+    """A head alone: no key, an empty one, and a mast file that has no cameras either."""
+    mast = BARE_MAST if request.param == "bare" else ""
+    cameras = "" if request.param == "bare" else request.param
+    with started(monkeypatch, tmp_path, cameras, (), mast) as daemon:
+        yield daemon
+
+
+def outcome(daemon: RunningDaemon, command: str, body: dict[str, object]) -> dict[str, Any]:
+    """The error object of a request or of its operation; empty where it was done."""
+    answer = httpx.post(f"{daemon.url}/api/v1/{command}", json=body)
+    if answer.status_code != 202:
+        error = answer.json()["error"]
+        assert 400 <= answer.status_code < 500, answer.text
+    else:
+        place = f"{daemon.url}/api/v1/operations/{answer.json()['id']}"
+        eventually(lambda: httpx.get(place).json()["state"] not in ("queued", "running"), "the end")
+        error = httpx.get(place).json()["error"] or {}
+    assert isinstance(error, dict)
+    return error
+
+
+def test_a_head_without_cameras_is_moved_by_angles(bare: RunningDaemon) -> None:
+    status = httpx.get(f"{bare.url}/api/v1/status").json()
+    assert status["state"] == "idle" and not status["cameras"] and status["faults"] == []
+    assert outcome(bare, "point", ANGLES) == {}
+    assert httpx.get(f"{bare.url}/api/v1/status").json()["joints"]["pan_rad"] == 0.3
+
+
+@pytest.mark.parametrize(
+    "body",
+    [
+        {"pixel": {"camera": "navcam_left", "frame_id": "navcam_left-000001-0-0", "x_px": 3, "y_px": 4}},
+        {"position_m": [6.0, 1.0, 0.0], "frame": "rover"},
+        {"position_m": [6.0, 1.0, 0.0], "aim": {"camera": "navcam_left", "x_px": 3, "y_px": 4}},
+    ],
+)
+@pytest.mark.parametrize("command", ["point", "track"])
+def test_what_needs_a_picture_is_refused_in_a_sentence(
+    bare: RunningDaemon, body: dict[str, object], command: str
+) -> None:
+    if command == "track" and "aim" in body:
+        return
+    error = outcome(bare, command, body)
+    assert "mast file has no" not in error["message"], "the mast file is not what lacks it"
+    assert re.search("configured|no longer kept|not kept|unknown", error["message"]), error
+    assert [call for call in bare.hardware.head.calls if call[0] == "move"] == []  # type: ignore[attr-defined]
+
+
+def test_commands_and_page_serve_a_head_alone(
+    bare: RunningDaemon, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["status", "--url", bare.url]) == 0
+    assert main(["point", "--url", bare.url, "--angles", "0.1", "0"]) == 0
+    assert main(["stop", "--url", bare.url]) == 0
+    capsys.readouterr()
+    assert main(["snapshot", "navcam_left", "--url", bare.url, "--out", "never.png"]) != 0
+    told = capsys.readouterr().err.strip().splitlines()[-1]
+    assert "navcam_left is not configured" in told
+    answer = httpx.post(f"{bare.url}/api/v1/mast", json={"file": "little.yaml"})
+    assert answer.status_code == 200, answer.text
+
+
+def test_one_eye_of_a_pair_is_not_said_to_be_missing_from_the_mast_file(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    cameras = "cameras: {navcam_left: {driver: fake}, hazcam_left: {driver: fake}}"
+    mounted = ("navcam_left", "hazcam_left")
+    with started(monkeypatch, tmp_path, cameras, mounted) as daemon:
+        for camera, reason in (
+            (
+                "navcam_left",
+                "the other eye of the stereo pair navcam, navcam_right, is not in the configuration",
+            ),
+            ("hazcam_left", "hazcam_left is in no stereo pair of the mast file"),
+        ):
+            answer = httpx.get(f"{daemon.url}/api/v1/snapshot/{camera}")
+            frame_id = next(value for key, value in answer.headers.items() if key.endswith("frame-id"))
+            body = {"pixel": {"camera": camera, "frame_id": frame_id, "x_px": 30, "y_px": 20}}
+            for command in ("point", "track"):
+                error = outcome(daemon, command, body)
+                assert error["code"] == "no_stereo"
+                assert reason in error["message"]
+        error = outcome(daemon, "track", {"position_m": [6.0, 0.0, 0.0]})
+        assert "none is configured with both eyes" in error["message"]

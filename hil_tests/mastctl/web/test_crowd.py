@@ -1,0 +1,188 @@
+"""Many at once: dead cameras, waiting requests, silent connections keep nobody else out."""
+
+from __future__ import annotations
+
+import contextlib
+import resource
+import signal
+import socket
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from hil_tests.mastctl.outside_daemon import (
+    BOUND_S,
+    daemon_process,
+    line,
+    stands_short_of_its_goal,
+    under_way,
+    write_config,
+)
+from hil_tests.mastctl.service_fakes import Hang, eventually, fake_daemon
+from mastctl import daemon as daemon_module
+from mastctl.client import Client, ClientError
+from mastctl.web import connections as connections_module
+
+
+def in_threads(count: int, ask: Callable[[], Any]) -> list[threading.Thread]:
+    made = [threading.Thread(target=ask) for _ in range(count)]
+    for one in made:
+        one.start()
+    return made
+
+
+def test_snapshots_of_a_dead_camera_keep_nobody_else_waiting(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    hang, codes = Hang(), list[str]()
+    with fake_daemon(monkeypatch, tmp_path) as (daemon, hardware):
+        hardware.fake_cameras["navcam_left"].hook = hang
+
+        def ask() -> None:
+            with Client(daemon.url) as client:
+                try:
+                    client.snapshot("navcam_left", fresh=True)
+                except ClientError as error:
+                    codes.append(error.code)
+
+        asking = in_threads(45, ask)
+        assert hang.entered.wait(BOUND_S)
+        eventually(lambda: codes, "a refusal", BOUND_S)
+        assert set(codes) == {"too_many"}, "the first refusals are of those that wait behind four"
+        with Client(daemon.url, timeout_s=3.0) as client:
+            assert client.pose([0, 0, 0], [1, 0, 0, 0])["operation"] is None
+            assert client.snapshot("hazcam_left").camera == "hazcam_left"
+        eventually(lambda: len(codes) >= 41, "the refusal of all but four", BOUND_S)
+        hang.let_go()
+        for one in asking:
+            one.join()
+
+
+def test_what_waits_when_the_daemon_ends_is_refused_and_the_end_is_bounded(tmp_path: Path) -> None:
+    codes: list[str] = []
+    with daemon_process(tmp_path, write_config(tmp_path)) as daemon:
+        url = line(daemon)
+
+        def ask() -> None:
+            with Client(url) as client:
+                try:
+                    client.snapshot("navcam_left", fresh=True)
+                except ClientError as error:
+                    codes.append(error.code)
+
+        asking = in_threads(3, ask)
+        time.sleep(0.5)
+        daemon.send_signal(signal.SIGTERM)
+        for one in asking:
+            one.join()
+        _, log = daemon.communicate(timeout=BOUND_S)
+    assert codes == ["closing"] * 3
+    assert daemon.returncode == 0, log
+    assert not {"Traceback", "ERROR"} & set(log.replace(":", " ").split()), log
+    assert "next_frame did not end" not in log, "nobody waited for the picture's own deadline"
+
+
+def test_an_answer_that_nobody_reads_does_not_hold_the_end(tmp_path: Path) -> None:
+    with daemon_process(tmp_path, write_config(tmp_path)) as daemon:
+        host, port = line(daemon).removeprefix("http://").split(":")
+        with socket.create_connection((host, int(port)), timeout=1.0) as client:
+            with contextlib.suppress(TimeoutError):
+                while True:  # until nothing more goes in: the daemon's answers are stuck
+                    client.sendall(b"GET /openapi.json HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n" * 100)
+            daemon.send_signal(signal.SIGTERM)
+            _, log = daemon.communicate(timeout=BOUND_S)
+    assert daemon.returncode == 0
+    assert "Traceback" not in log, log
+
+
+SILENT = 70
+DESCRIPTORS = 64
+
+
+def few_descriptors() -> None:
+    resource.setrlimit(resource.RLIMIT_NOFILE, (DESCRIPTORS, DESCRIPTORS))
+
+
+@pytest.mark.parametrize("begun", [b"", b"POST /api/v1/stop HT"], ids=["silent", "slow"])
+def test_more_silent_connections_than_descriptors_do_not_keep_a_stop_out(
+    tmp_path: Path, begun: bytes
+) -> None:
+    with daemon_process(tmp_path, write_config(tmp_path), prepare=few_descriptors) as daemon:
+        url = line(daemon)
+        host, port = url.removeprefix("http://").split(":")
+        with contextlib.ExitStack() as open_ones:
+            with Client(url) as client:
+                under_way(client)
+            for _ in range(SILENT):
+                one = open_ones.enter_context(socket.create_connection((host, int(port)), timeout=BOUND_S))
+                with contextlib.suppress(OSError):
+                    one.sendall(begun)
+            began_s = time.monotonic()
+            with Client(url, timeout_s=BOUND_S) as client:
+                client.stop()
+                assert time.monotonic() - began_s < 2.0, "a stop gets in at once"
+                stands_short_of_its_goal(client)
+        daemon.send_signal(signal.SIGTERM)
+        _, log = daemon.communicate(timeout=BOUND_S)
+        assert "Traceback" not in log, log
+
+
+def get(connection: socket.socket, path: str, method: str = "GET") -> bytes:
+    """Ask on a connection of one's own and return the beginning of the answer."""
+    connection.sendall(f"{method} /api/v1{path} HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n".encode())
+    return connection.recv(65536)
+
+
+def test_when_every_connection_is_at_work_stop_and_status_are_still_served(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr(daemon_module, "most_connections", lambda: 8)
+    with fake_daemon(monkeypatch, tmp_path) as (daemon, hardware), contextlib.ExitStack() as open_ones:
+        host, port = daemon.url.removeprefix("http://").split(":")
+
+        def connection() -> socket.socket:
+            return open_ones.enter_context(socket.create_connection((host, int(port)), timeout=BOUND_S))
+
+        streams = [connection() for _ in range(8)]
+        for one in streams:
+            assert b"200 OK" in get(one, "/track/stream")
+        refused = get(connection(), "/operations")
+        assert b"503" in refused
+        assert b"retry-after" in refused
+        assert b"200 OK" in get(connection(), "/status")
+        assert b"200 OK" in get(connection(), "/stop", "POST")
+        assert ("stop",) in hardware.head.calls
+
+
+@pytest.mark.parametrize(
+    "begun", [b"", b"GET /api/v1/st", b"POST /api/v1/stop HTTP/1.1\r\nContent-Length: 9\r\n\r\n{"]
+)
+def test_a_request_that_does_not_come_whole_is_left(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, begun: bytes
+) -> None:
+    monkeypatch.setattr(connections_module, "REQUEST_S", 0.3)
+    monkeypatch.setattr(connections_module, "SWEEP_S", 0.05)
+    with fake_daemon(monkeypatch, tmp_path) as (daemon, _):
+        host, port = daemon.url.removeprefix("http://").split(":")
+        with socket.create_connection((host, int(port)), timeout=BOUND_S) as client:
+            client.sendall(begun)
+            with contextlib.suppress(ConnectionResetError):
+                while client.recv(65536):  # an answer may come; then the end
+                    pass
+
+
+def test_a_client_that_does_not_read_is_left(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(connections_module, "STALLED_S", 0.3)
+    monkeypatch.setattr(connections_module, "SWEEP_S", 0.05)
+    with fake_daemon(monkeypatch, tmp_path) as (daemon, _):
+        host, port = daemon.url.removeprefix("http://").split(":")
+        with (
+            socket.create_connection((host, int(port)), timeout=BOUND_S) as client,
+            pytest.raises((ConnectionResetError, BrokenPipeError)),
+        ):
+            while True:
+                client.sendall(b"GET /openapi.json HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n" * 100)
