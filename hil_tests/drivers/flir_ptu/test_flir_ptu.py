@@ -241,6 +241,29 @@ def test_limits_beyond_the_units_own_are_refused(opened: Opener) -> None:
         opened(pan={"limits_rad": [-3.0, 2.5]})
 
 
+@pytest.mark.parametrize(("steps", "reachable"), [(3090, True), (3091, False)])
+def test_limits_may_go_as_far_as_the_unit_itself_and_not_a_step_further(
+    opened: Opener, steps: int, reachable: bool
+) -> None:
+    for ends in ([-steps, 0], [0, steps]):
+        with ExitStack() as stack:
+            if not reachable:
+                stack.enter_context(pytest.raises(WrongDevice, match="the unit itself goes from"))
+            opened(pan={"limits_rad": [end * PAN_STEP_RAD for end in ends]})
+
+
+@pytest.mark.parametrize(("told", "right"), [("185.142857", True), ("92.571428", False)])
+def test_a_unit_in_another_step_mode_than_the_options_say_is_refused(
+    opened: Opener, told: str, right: bool
+) -> None:
+    unit = ScriptedPtu()
+    unit.resolutions["P"] = told
+    with ExitStack() as stack:
+        if not right:
+            stack.enter_context(pytest.raises(WrongDevice, match="either its step mode was changed"))
+        opened(unit, pan={**OPTIONS["pan"], "resolution_arcsec": 185.0})
+
+
 @pytest.mark.parametrize("answer", [b"* 0 seconds arc per Pan position", b"! Gear ratio unknown"])
 def test_a_unit_that_does_not_know_its_resolution_has_to_be_homed(opened: Opener, answer: bytes) -> None:
     unit = ScriptedPtu()
@@ -611,6 +634,26 @@ def test_a_stop_does_not_wait_for_a_call_under_way(opened: Opener) -> None:
     thread.join()
     assert unit.heard[before] == "H", "it went out beside the reading"
     assert unit.heard[-1] == "H", "and once more in order"
+
+
+def test_a_stop_goes_out_while_the_unit_still_owes_another_call_its_answer(opened: Opener) -> None:
+    head, unit = opened()
+    assert head._talk is not None
+    head._talk.reply_s = 0.8
+    asked, under_way = threading.Event(), []
+    unit.answers["TP"] = lambda command: asked.set()
+    unit.answers["H"] = lambda command: under_way.append(thread.is_alive()) or b"*"
+
+    def reading() -> None:
+        with suppress(DriverError):
+            head.read()
+
+    thread = threading.Thread(target=reading)
+    thread.start()
+    assert asked.wait(10.0)
+    head.stop()
+    thread.join()
+    assert under_way[0]
 
 
 def test_a_stop_goes_out_before_a_unit_that_is_in_doubt_is_checked(opened: Opener) -> None:
