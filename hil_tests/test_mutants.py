@@ -5,8 +5,11 @@ from __future__ import annotations
 import ast
 from pathlib import Path
 
+import pytest
+
 from tools.mutants.nearest import imports, nearest
 from tools.mutants.sites import sites
+from tools.mutants.trial import run
 
 MODULE = '''"""Words."""
 import logging
@@ -54,6 +57,78 @@ def test_a_change_is_told_with_its_place_and_both_texts(tmp_path: Path) -> None:
     (tmp_path / "module.py").write_text(MODULE)
     (sign,) = [site for site in sites(tmp_path, "module.py") if site.kind == "sign"]
     assert sign.told(MODULE) == "module.py:14  sign: -a  ->  (a)"
+
+
+def test_what_never_runs_is_not_changed(tmp_path: Path) -> None:
+    (tmp_path / "module.py").write_text(
+        """class Head(Protocol):
+    def read(self, tries: int = 3) -> float: ...
+
+class Limit:
+    def __repr__(self) -> str:
+        return shown(self.low + 1)
+
+if __name__ == "__main__":
+    end(main)
+"""
+    )
+    assert sites(tmp_path, "module.py") == []
+
+
+def test_a_change_knows_the_function_that_a_test_must_enter_to_see_it(tmp_path: Path) -> None:
+    (tmp_path / "module.py").write_text(
+        """TOP = 1
+
+@cached
+def outer(bound=2):
+    def inner():
+        return 3
+    return 4
+"""
+    )
+    functions = {site.text: site.function for site in sites(tmp_path, "module.py")}
+    assert functions == {"2": 0, "3": 0, "4": 5, "5": 3}
+
+
+CODE = "def doubled(a):\n    return a * 2\n\n\ndef unused(a):\n    while a:\n        a -= 1\n"
+
+
+@pytest.fixture
+def checkout(tmp_path: Path) -> Path:
+    copy = tmp_path / "0" / "checkout"
+    (copy / "calib").mkdir(parents=True)
+    (copy / "calib" / "__init__.py").write_text("")
+    (copy / "calib" / "code.py").write_text(CODE)
+    (copy / "pyproject.toml").write_text("[tool.pytest.ini_options]\n")
+    (copy / "test_code.py").write_text(
+        "from calib.code import doubled\n\n\ndef test_two():\n    assert doubled(2) == 4\n"
+    )
+    return copy
+
+
+def test_a_run_says_who_objected_and_which_functions_were_entered(checkout: Path) -> None:
+    passed = run(checkout, {"test_code.py": 30.0}, 120.0, watched=True)
+    assert passed.outcome == "passed"
+    assert passed.reached is not None
+    assert ("calib/code.py", 1) in passed.reached
+    assert ("calib/code.py", 5) not in passed.reached
+    (checkout / "calib" / "code.py").write_text(CODE.replace("* 2", "* 3"))
+    killed = run(checkout, {"test_code.py": 30.0}, 120.0)
+    assert (killed.outcome, killed.test) == ("killed", "test_code.py::test_two")
+
+
+@pytest.mark.parametrize(
+    ("code", "outcome"),
+    [
+        ("def doubled(a):\n    while True:\n        a += 1\n", "killed by timeout"),
+        ("import nothing_of_the_kind\n", "broken"),
+    ],
+)
+def test_neither_an_endless_loop_nor_a_module_that_cannot_be_imported_is_a_test_that_objects(
+    checkout: Path, code: str, outcome: str
+) -> None:
+    (checkout / "calib" / "code.py").write_text(code)
+    assert run(checkout, {"test_code.py": 1.0}, 120.0).outcome == outcome
 
 
 def test_the_nearest_tests_of_a_module_are_those_that_import_it(repository: Path) -> None:

@@ -23,8 +23,10 @@ def imports(repository: Path) -> dict[str, frozenset[str]]:
     return {file: frozenset(used - {file}) for file, used in wanted.items()}
 
 
-def nearest(repository: Path, graph: Mapping[str, frozenset[str]], file: str, count: int) -> list[str]:
-    """Return up to ``count`` test files: fewest imports away first, then those that name the most of it."""
+def nearest(
+    repository: Path, graph: Mapping[str, frozenset[str]], file: str, count: int, among: str = TESTS
+) -> list[str]:
+    """Return up to ``count`` test files of a folder: fewest imports away first, then most mentions of it."""
     users: dict[str, set[str]] = {}
     for user, used in graph.items():
         for name in used:
@@ -37,7 +39,9 @@ def nearest(repository: Path, graph: Mapping[str, frozenset[str]], file: str, co
             if user not in away:
                 away[user] = away[at] + 1
                 queue.append(user)
-    tests = [name for name in away if name.startswith(TESTS) and Path(name).name.startswith("test_")]
+    tests = [
+        name for name in away if Path(among) in Path(name).parents and Path(name).name.startswith("test_")
+    ]
     words = _defined(repository / file)
     mentions = {name: len(words.findall((repository / name).read_text())) for name in tests}
     return sorted(tests, key=lambda name: (away[name], -mentions[name], name))[:count]

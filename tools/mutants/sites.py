@@ -54,6 +54,8 @@ class Site:
         The sort of change.
     text
         What takes its place.
+    function
+        First line of the function that holds it, its decorators included; 0 outside functions.
     """
 
     file: str
@@ -63,6 +65,7 @@ class Site:
     end_column: int
     kind: str
     text: str
+    function: int = 0
 
     def applied(self, source: str) -> str:
         """Return the module's text with this change made."""
@@ -87,12 +90,32 @@ class Site:
 def sites(repository: Path, file: str) -> list[Site]:
     """Return every possible change of one module, in the order of its text."""
     tree = ast.parse((repository / file).read_text())
+    functions = _functions(tree)
     found = [
-        Site(file, node.lineno, node.col_offset, node.end_lineno, node.end_col_offset, kind, text)
+        Site(
+            file,
+            node.lineno,
+            node.col_offset,
+            node.end_lineno,
+            node.end_col_offset,
+            kind,
+            text,
+            functions.get(node.lineno, 0),
+        )
         for node, kind, text in _changes(tree)
         if node.end_lineno is not None and node.end_col_offset is not None
     ]
     return sorted(found, key=lambda site: (site.line, site.column, site.kind))
+
+
+def _functions(tree: ast.Module) -> dict[int, int]:
+    """For each line of a function's body, the function's first line; the innermost function's."""
+    first: dict[int, int] = {}
+    for node in ast.walk(tree):  # breadth first: inner functions come after outer ones
+        if isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef)) and node.end_lineno:
+            start = min([node.lineno, *(decorator.lineno for decorator in node.decorator_list)])
+            first |= dict.fromkeys(range(node.body[0].lineno, node.end_lineno + 1), start)
+    return first
 
 
 def _changes(tree: ast.Module) -> Iterator[tuple[ast.expr | ast.stmt, str, str]]:
@@ -118,6 +141,8 @@ def _changes(tree: ast.Module) -> Iterator[tuple[ast.expr | ast.stmt, str, str]]
 
 def _code(node: ast.AST) -> Iterator[ast.AST]:
     """What runs and decides: neither annotations nor words nor what a logger or an error is told."""
+    if _only_for_readers(node):
+        return
     yield node
     for name, value in ast.iter_fields(node):
         if name in ("annotation", "returns", "decorator_list", "type_params"):
@@ -127,6 +152,19 @@ def _code(node: ast.AST) -> Iterator[ast.AST]:
         for child in value if isinstance(value, list) else [value]:
             if isinstance(child, ast.AST) and not isinstance(child, ast.JoinedStr):
                 yield from _code(child)
+
+
+def _only_for_readers(node: ast.AST) -> bool:
+    """Whether it never runs, or only makes words: a Protocol, what the type checker sees."""
+    if isinstance(node, ast.ClassDef):
+        return any("Protocol" in ast.unparse(base) for base in node.bases)
+    if isinstance(node, ast.FunctionDef):
+        return node.name in ("__repr__", "__str__") or any(
+            ast.unparse(decorator) in ("overload", "abstractmethod") for decorator in node.decorator_list
+        )
+    if isinstance(node, ast.If):
+        return ast.unparse(node.test) in ("TYPE_CHECKING", "__name__ == '__main__'")
+    return False
 
 
 def _tells(call: ast.Call) -> bool:

@@ -1,0 +1,153 @@
+"""One run of pytest in a copy of the checkout, in a fork of a process that holds the large libraries already.
+
+The project's own modules are imported anew in each fork, from the copy. What counts against the limits is
+processor time, so that a machine with other work does not kill what is only waiting for its turn.
+"""
+
+from __future__ import annotations
+
+import importlib
+import json
+import os
+import signal
+import sys
+import threading
+import time
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from pathlib import Path
+from types import FrameType
+from typing import NamedTuple, NoReturn
+
+import pytest
+
+from tools.mutants.nearest import PACKAGES, TESTS
+
+LIBRARIES = ("cv2", "fastapi", "httpx", "hypothesis", "numba", "numpy.testing", "scipy.interpolate")
+LIBRARIES += ("scipy.optimize", "scipy.spatial.transform", "scipy.stats", "uvicorn", "yaml")
+BROKEN = (2, 3, 4)  # pytest's codes for what ended before a test could judge: a module that fails on import
+STARTS_PROCESSES = ("os.exec", "os.fork", "os.posix_spawn", "os.spawn", "subprocess.Popen")
+
+
+class Ended(NamedTuple):
+    """How a run ended.
+
+    ``outcome`` is ``passed``, ``killed`` (a test objected), ``killed by timeout`` or ``broken`` (the tests
+    could not be collected); ``test`` is who objected, ``cpu_s`` the processor time of the run and all that it
+    started. ``reached`` are the functions entered, as (file, first line); None where they were not watched,
+    or where other processes ran the code as well.
+    """
+
+    outcome: str
+    test: str
+    cpu_s: float
+    reached: frozenset[tuple[str, int]] | None
+
+
+def warm() -> None:
+    """Import what nearly every test needs, once for all runs."""
+    for name in LIBRARIES:
+        importlib.import_module(name)
+
+
+def run(copy: Path, allowed_s: Mapping[str, float], patience_s: float, *, watched: bool = False) -> Ended:
+    """Run test files until one test objects.
+
+    ``allowed_s`` names the files in their order with the processor time that a single test of each may take;
+    ``patience_s`` is what the whole may take by the clock on the wall.
+    """
+    said = copy.parent / "said"
+    said.write_text("")
+    pid = os.fork()
+    if pid == 0:
+        _in_the_fork(copy, said, allowed_s, watched)
+    until_s = time.monotonic() + patience_s
+    ended, status, used = os.wait4(pid, os.WNOHANG)
+    while not ended and time.monotonic() < until_s:
+        time.sleep(0.02)
+        ended, status, used = os.wait4(pid, os.WNOHANG)
+    with suppress(ProcessLookupError):
+        os.killpg(pid, signal.SIGKILL)  # and whatever the tests left running
+    if not ended:
+        _, status, used = os.wait4(pid, 0)
+    return _judged(said, bool(ended), status, used.ru_utime + used.ru_stime)
+
+
+def _judged(said: Path, in_time: bool, status: int, cpu_s: float) -> Ended:
+    lines = [json.loads(line) for line in said.read_text().splitlines()]
+    begun = [line["begins"] for line in lines if "begins" in line]
+    objected = [line["objects"] for line in lines if "objects" in line]
+    reached = [line["reached"] for line in lines if line.get("reached") is not None]
+    functions = frozenset((file, first) for file, first in reached[0]) if reached else None
+    last = (objected or begun or [""])[-1]
+    code = os.waitstatus_to_exitcode(status)
+    if not in_time or code == -signal.SIGPROF:
+        return Ended("killed by timeout", last, cpu_s, None)
+    if code in BROKEN or not begun:
+        return Ended("broken", last, cpu_s, None)
+    return Ended("killed" if code else "passed", last if code else "", cpu_s, functions)
+
+
+def _in_the_fork(copy: Path, said: Path, allowed_s: Mapping[str, float], watched: bool) -> NoReturn:
+    """Be the process that runs the tests."""
+    code = 4
+    try:
+        os.setsid()
+        os.chdir(copy)
+        silence = os.open(os.devnull, os.O_RDWR)
+        for stream in (0, 1, 2):
+            os.dup2(silence, stream)
+        for name in [*sys.modules]:
+            if name.partition(".")[0] in (*PACKAGES, TESTS, "__main__"):
+                del sys.modules[name]
+        sys.path.insert(0, str(copy))
+        sys.dont_write_bytecode = not watched
+        with said.open("a", buffering=1) as file:
+            tests = _Watch(copy, file.write, allowed_s, watched)
+            code = pytest.main(["-x", "-q", "-p", "no:cacheprovider", *allowed_s], plugins=[tests])
+            tests.tell()
+    finally:
+        os._exit(code)
+
+
+class _Watch:
+    """A pytest plugin: says which test runs and which objects, and lets none take too long."""
+
+    def __init__(
+        self, copy: Path, write: Callable[[str], object], allowed_s: Mapping[str, float], watched: bool
+    ) -> None:
+        self._write = write
+        self._allowed_s = allowed_s
+        self._root = f"{copy}{os.sep}"
+        self._codes: set[tuple[str, int]] = set()
+        self._others = False
+        self._watched = watched
+        if watched:
+            sys.addaudithook(self._hears)
+            threading.settrace(self._enters)
+            sys.settrace(self._enters)
+
+    def pytest_runtest_logstart(self, nodeid: str) -> None:
+        self._say(begins=nodeid)
+        signal.setitimer(signal.ITIMER_PROF, self._allowed_s.get(nodeid.partition("::")[0], 60.0))
+
+    def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
+        if report.failed:
+            self._say(objects=report.nodeid)
+
+    def tell(self) -> None:
+        """Say what was entered."""
+        sys.settrace(None)
+        found = sorted((name.removeprefix(self._root), line) for name, line in self._codes)
+        self._say(reached=None if self._others or not self._watched else found)
+
+    def _say(self, **line: object) -> None:
+        self._write(json.dumps(line) + "\n")
+
+    def _enters(self, frame: FrameType, event: str, arg: object) -> None:
+        code = frame.f_code
+        if code.co_filename.startswith(self._root):
+            self._codes.add((code.co_filename, code.co_firstlineno))
+
+    def _hears(self, event: str, arguments: object) -> None:
+        self._others = self._others or event in STARTS_PROCESSES
