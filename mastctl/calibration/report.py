@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -12,11 +13,13 @@ from calib.files.atomic import save_bytes
 from calib.files.mast_file import StoredRig
 from calib.fit.calibration import HELD_FIXED, Calibration
 from calib.survey import Survey
+from mastctl.calibration import drawn
 from mastctl.calibration.maps import change_map, uncertainty_map
 from mastctl.calibration.verdict import POINTING_RANGE_M, Verdict
-from mastctl.report import html
+from mastctl.report import pages, plots
+from mastctl.report.figures import Figure
+from mastctl.report.tables import Table, x_y
 
-NO_PLOTS = "No pictures: matplotlib is not installed (pip install 'mastctl[report]')."
 WORST_IMAGES = 12
 
 
@@ -37,7 +40,7 @@ class Told:
     saved: StoredRig
 
 
-def write_report(told: Told, folder: Path) -> Path:
+def write_calibration_report(told: Told, folder: Path) -> Path:
     """Write calibration.html into ``folder`` (made if need be) in one step and return it.
 
     A report that was there is kept as calibration.previous.html.
@@ -47,15 +50,15 @@ def write_report(told: Told, folder: Path) -> Path:
     OSError, BadFile
         If it cannot be written; then the file is as it was.
     """
-    page = html.page("Mast calibration", _parts(told)).encode()
+    page = _page(told).encode()
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / "calibration.html"
     save_bytes(path, page)
     return path
 
 
-def mast_rows(calibration: Calibration) -> list[list[str]]:
-    """Return the mast's parameters with their sigmas, one row each: name, value, sigma."""
+def mast_table(calibration: Calibration) -> Table:
+    """Return the mast's parameters with their sigmas, one row each."""
     mast, sigma = calibration.rig.mast, calibration.sigma["mast"]
     rows = []
     for key, unit, word in (("translation_m", "m", "t"), ("rotation_rad", "rad", "θ")):
@@ -65,11 +68,11 @@ def mast_rows(calibration: Calibration) -> list[list[str]]:
     if calibration.mast_parameters == 8:
         for key, unit in (("axis_offset_m", "m"), ("axis_twist_rad", "rad")):
             rows.append([key, f"{getattr(mast, key):+.5f} {unit}", _spread(sigma[key], unit)])
-    return rows
+    return Table(("parameter", "value", "sigma"), rows)
 
 
-def camera_rows(calibration: Calibration) -> list[list[str]]:
-    """Return per camera: images, dots, rms of the fit x and y, rms of check images x and y."""
+def camera_table(calibration: Calibration) -> Table:
+    """Return the cameras: images, dots, rms of the fit x and y, rms of check images x and y."""
     rows = []
     for name in calibration.rig.cameras:
         mine = [i for i in calibration.images if i.camera == name and i.purpose != "check" and i.used.any()]
@@ -80,15 +83,12 @@ def camera_rows(calibration: Calibration) -> list[list[str]]:
                 name,
                 f"{len(mine)}",
                 f"{sum(int(i.used.sum()) for i in mine)}",
-                _pair(fitted),
+                x_y(fitted, 3),
                 f"{len(checks)}",
-                _pair(check),
+                x_y(check, 3),
             ]
         )
-    return rows
-
-
-CAMERA_HEADINGS = ("camera", "images", "dots", "rms x, y px", "checks", "check rms x, y px")
+    return Table(("camera", "images", "dots", "rms x, y px", "checks", "check rms x, y px"), rows)
 
 
 def _spread(sigma: float, unit: str) -> str:
@@ -97,56 +97,32 @@ def _spread(sigma: float, unit: str) -> str:
     return f"± {1000 * sigma:.2f} m{unit}"
 
 
-def _pair(value: tuple[float, float] | None) -> str:
-    return "" if value is None else f"{value[0]:.3f}, {value[1]:.3f}"
-
-
-def _parts(told: Told) -> Iterator[str]:
+def _page(told: Told) -> str:
     calibration, survey, verdict = told.calibration, told.survey, told.verdict
-    yield f"<h1>Mast calibration {html.badge(verdict.words.upper(), verdict.grade)}</h1>"
-    facts = [
-        ("survey", survey.folder.resolve().name),
-        ("digest", survey.digest[:12]),
-        ("method", f"{calibration.method}, {calibration.mast_parameters} mast parameters"),
-        ("mast file", f"{told.saved.path.name} ({told.saved.digest[:12]})"),
-        ("fitted in", f"{calibration.seconds:.1f} s"),
-        (
-            "made",
-            f"{_when(told.saved)} by {told.saved.rig.provenance.get('program')}",
-        ),
-    ]
-    yield "<p>" + " · ".join(f"{k} <b>{html.escape(v)}</b>" for k, v in facts) + "</p>"
-    yield "<h2>Verdict and reasons</h2>"
-    grades = {"good": "good", "care": "care", "bad": "bad"}
-    rows = "".join(
-        f'<tr><td style="font-size:1.4em">{html.badge(grades[r.grade], r.grade)}</td>'
-        f"<td>{html.escape(r.sentence)}</td></tr>"
-        for r in verdict.reasons
+    return pages.page(
+        "calibration.html",
+        title="Mast calibration",
+        badge=pages.Badge(verdict.words.upper(), verdict.grade),
+        facts=[
+            ("survey", survey.folder.resolve().name),
+            ("digest", survey.digest[:12]),
+            ("method", f"{calibration.method}, {calibration.mast_parameters} mast parameters"),
+            ("mast file", f"{told.saved.path.name} ({told.saved.digest[:12]})"),
+            ("fitted in", f"{calibration.seconds:.1f} s"),
+            ("made", f"{_when(told.saved)} by {told.saved.rig.provenance.get('program')}"),
+        ],
+        reasons=[(pages.Badge(one.grade, one.grade), one.sentence) for one in verdict.reasons],
+        mast=mast_table(calibration),
+        cameras=camera_table(calibration),
+        notes=calibration.notes,
+        held_fixed=HELD_FIXED,
+        warnings=told.warnings,
+        left_out=[outlier.sentence for outlier in calibration.outliers],
+        undetected=[f"{name}: {reason}" for name, reason in told.undetected],
+        plots=_plots(told) if plots.installed() else None,
+        station=_station_table(calibration),
+        worst_images=_worst_images(calibration),
     )
-    yield f"<table>{rows}</table>"
-    yield "<h2>Mast</h2>"
-    yield html.table(["parameter", "value", "sigma"], mast_rows(calibration))
-    yield "<h2>Cameras</h2>"
-    yield html.table(CAMERA_HEADINGS, camera_rows(calibration))
-    yield (
-        "<p>Check images were not fitted. Their boards stand where tapes and prisms put them, so errors of "
-        "the total station show in them: 1 mm at 5 m is 0.7 px of a 16 mm lens.</p>"
-    )
-    yield from _words("Notes of the fit", calibration.notes)
-    yield from _words("Held fixed, since no survey can tell it", HELD_FIXED)
-    yield from _words("Warnings of the survey's check", told.warnings)
-    yield from _words(
-        f"Left out ({len(calibration.outliers)})", [outlier.sentence for outlier in calibration.outliers]
-    )
-    yield from _words("Images without dots", [f"{name}: {reason}" for name, reason in told.undetected])
-    try:
-        yield from _pictures(told)
-    except ImportError:
-        yield f"<p>{NO_PLOTS}</p>"
-    yield "<h2>Tapes and prisms</h2>"
-    yield _station_table(calibration)
-    yield "<h2>Images with the largest residuals</h2>"
-    yield _worst_images(calibration)
 
 
 def _when(saved: StoredRig) -> str:
@@ -155,77 +131,54 @@ def _when(saved: StoredRig) -> str:
     return date.replace("T", " ").replace("+00:00", " UTC")
 
 
-def _words(title: str, sentences: Sequence[str]) -> Iterator[str]:
-    if sentences:
-        yield f"<h2>{html.escape(title)}</h2>" + html.bullets(sentences)
-
-
-def _pictures(told: Told) -> Iterator[str]:
-    """Every plot; ImportError before the first where matplotlib is missing."""
-    import matplotlib.figure  # noqa: F401  so that nothing is begun that cannot be ended
-
-    from mastctl.calibration import plots
-
+def _plots(told: Told) -> dict[str, Any]:
+    """Every plot, by the name that the template has for it."""
     calibration = told.calibration
-    yield "<h2>Residuals over the image (predicted less measured)</h2>"
-    for name in calibration.rig.cameras:
-        picture = html.plot_tag(plots.residuals(calibration, name), f"residuals of {name}")
-        yield html.figure(picture, _mean(told, name))
-    yield "<h2>Where the boards stood</h2>"
-    yield html.plot_tag(plots.boards(calibration, told.survey.board), "boards in plan and side view")
-    yield (
-        "<p>In the rover frame, so boards that the rover saw while it was tilted back stand low. "
-        "Boards for the mast and for checks are named where there is room.</p>"
-    )
-    yield "<h2>Error by distance and angle</h2>"
-    yield html.plot_tag(plots.errors_by(calibration), "rms of images over range, angle, pan and tilt")
-    yield "<p>Circles: fitted images. Triangles: check images.</p>"
-    yield "<h2>Correlation of parameters</h2>"
-    mast = calibration.part("mast.")
-    names = calibration.parameter_names
-    tags: list[str] = []
+    pairs = [p for p, c in calibration.rig.stereo.items() if calibration.rig.cameras[c[0]].on == "head"]
+    uncertainties = []
+    for name in pairs:
+        made = drawn.pointing_map(uncertainty_map(calibration, name, POINTING_RANGE_M), calibration, "sigma")
+        uncertainties.append(plots.plot(made, f"uncertainty of {name}", kind="map"))
+    return {
+        "residuals": [
+            plots.plot(drawn.residuals(calibration, name), f"residuals of {name}", _mean(told, name))
+            for name in calibration.rig.cameras
+        ],
+        "boards": plots.plot(drawn.boards(calibration, told.survey.board), "boards in plan and side view"),
+        "errors": plots.plot(drawn.errors_by(calibration), "rms of images over range, angle, pan and tilt"),
+        "correlations": _correlations(calibration),
+        "uncertainties": uncertainties,
+        "change": None if told.in_use is None else _change(calibration, told.in_use, pairs),
+    }
+
+
+def _correlations(calibration: Calibration) -> list[Figure]:
+    """Of the mast's parameters, where it was fitted, and of all."""
+    mast, names = calibration.part("mast."), calibration.parameter_names
+    found = []
     if len(mast):
         mine = calibration.covariance[np.ix_(mast, mast)]
-        one = plots.correlation([names[i] for i in mast], mine, "mast")
-        tags.append(html.figure(html.plot_tag(one, "correlation of mast parameters"), "Mast parameters."))
-    every = plots.correlation(names, calibration.covariance, "mast and cameras")
+        made = drawn.correlation([names[i] for i in mast], mine, "mast")
+        found.append(plots.plot(made, "correlation of mast parameters", "Mast parameters."))
     caption = "All parameters. What the prisms leave open turns mast and cameras together."
-    tags.append(html.figure(html.plot_tag(every, "correlation of all parameters"), caption))
-    yield '<div class="row pairs">' + "".join(tags) + "</div>"
-    pairs = [p for p, c in calibration.rig.stereo.items() if calibration.rig.cameras[c[0]].on == "head"]
-    if pairs:
-        yield "<h2>Predicted uncertainty of pointing</h2>"
-        yield (
-            "<p>One sigma an axis from the calibration alone. Clicked: found by stereo and pointed at with "
-            "the same rig, so what prisms got wrong cancels. Position: a place in the rover frame, as "
-            "another instrument would give it; what prisms got wrong counts in full. Dots: the survey's "
-            "joint angles.</p>"
-        )
-        for pair in pairs:
-            found = uncertainty_map(calibration, pair, POINTING_RANGE_M)
-            yield html.plot_tag(plots.pointing_map(found, calibration, "sigma"), f"uncertainty of {pair}")
-    if told.in_use is not None:
-        yield from _comparison(told, told.in_use, pairs)
+    made = drawn.correlation(names, calibration.covariance, "mast and cameras")
+    return [*found, plots.plot(made, "correlation of all parameters", caption)]
 
 
-def _comparison(told: Told, in_use: StoredRig, pairs: Sequence[str]) -> Iterator[str]:
-    """By how many pixels pointing would change."""
-    from mastctl.calibration import plots
-
-    yield f"<h2>Against the mast file in use: {html.escape(in_use.path.name)} ({in_use.digest[:12]})</h2>"
-    rows, tags = [], []
-    for pair in pairs:
-        change = change_map(told.calibration.rig, in_use.rig, pair, POINTING_RANGE_M)
+def _change(calibration: Calibration, in_use: StoredRig, pairs: Sequence[str]) -> dict[str, Any]:
+    """By how many pixels pointing would change against the mast file in use."""
+    rows, maps = [], []
+    for name in pairs:
+        change = change_map(calibration.rig, in_use.rig, name, POINTING_RANGE_M)
         if change is None:
-            rows.append([pair, "", "", "the mast file in use lacks these cameras"])
+            rows.append([name, "", "", "the mast file in use lacks these cameras"])
             continue
-        rows.append([pair, _typical(change.by_click), _typical(change.by_position), ""])
-        tags.append(
-            html.plot_tag(plots.pointing_map(change, told.calibration, "change"), f"change of {pair}")
+        rows.append([name, _typical(change.by_click), _typical(change.by_position), ""])
+        maps.append(
+            plots.plot(drawn.pointing_map(change, calibration, "change"), f"change of {name}", kind="map")
         )
-    yield "<p>By how many pixels pointing would change: median over the joints' range, and the most.</p>"
-    yield html.table(["pair", "clicked, px", "position in the rover frame, px", ""], rows)
-    yield from tags
+    table = Table(("pair", "clicked, px", "position in the rover frame, px", ""), rows)
+    return {"file": f"{in_use.path.name} ({in_use.digest[:12]})", "table": table, "maps": maps}
 
 
 def change_summary(calibration: Calibration, in_use: StoredRig) -> dict[str, dict[str, float]]:
@@ -254,12 +207,12 @@ def _typical(values: np.ndarray) -> str:
 def _mean(told: Told, camera: str) -> str:
     fitted = told.calibration.rms_px.get(camera)
     check = told.calibration.check_rms_px.get(camera)
-    words = [f"fitted {_pair(fitted)} px rms"] if fitted else []
-    words += [f"check {_pair(check)} px rms"] if check else []
+    words = [f"fitted {x_y(fitted, 3)} px rms"] if fitted else []
+    words += [f"check {x_y(check, 3)} px rms"] if check else []
     return f"{camera}: " + ", ".join(words)
 
 
-def _station_table(calibration: Calibration) -> str:
+def _station_table(calibration: Calibration) -> Table:
     """Rms of the residuals of prisms by set-up and of tapes by placement, worst first."""
     groups: dict[tuple[str, str, str], list[float]] = {}
     for point in calibration.station:
@@ -277,10 +230,11 @@ def _station_table(calibration: Calibration) -> str:
         for (kind, setup, placement), sizes in groups.items()
     ]
     rows.sort(key=lambda row: (row[0], -float(row[5])))
-    return html.table(["kind", "set-up", "placement", "points", "rms mm", "worst mm"], rows)
+    return Table(("kind", "set-up", "placement", "points", "rms mm", "worst mm"), rows)
 
 
-def _worst_images(calibration: Calibration) -> str:
+def _worst_images(calibration: Calibration) -> Table:
+    """The images that fit worst."""
     sizes = []
     for image in calibration.images:
         which = image.used if image.purpose != "check" else np.ones(len(image.used), dtype=bool)
@@ -300,6 +254,6 @@ def _worst_images(calibration: Calibration) -> str:
         ]
         for rms, image in sizes[:WORST_IMAGES]
     ]
-    return html.table(
-        ["rms px", "range m", "turned deg", "dots out", "purpose", "set-up / placement", "image"], rows
+    return Table(
+        ("rms px", "range m", "turned deg", "dots out", "purpose", "set-up / placement", "image"), rows
     )

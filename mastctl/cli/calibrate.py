@@ -156,14 +156,14 @@ def _report(args: argparse.Namespace, done: Calibrated, in_use: StoredRig | None
     if args.report is None:
         return None
     from calib.errors import BadFile
-    from mastctl.calibration.report import Told, write_report
+    from mastctl.calibration.report import Told, write_calibration_report
 
     with _waiting(args, "writing the report"):
         told = Told(
             done.survey, done.calibration, done.verdict, done.warnings, done.undetected, in_use, done.saved
         )
         try:
-            return write_report(told, args.report)
+            return write_calibration_report(told, args.report)
         except (OSError, BadFile) as error:
             saved = f"the mast file {done.saved.path} is saved, but its report is not"
             raise output.CommandError("report_not_written", f"{saved}: {error}") from None
@@ -224,15 +224,13 @@ def _finite(number: float) -> float | None:
 
 def _show(done: Calibrated, in_use: StoredRig | None, page: Path | None) -> None:
     """Tables for people."""
-    from mastctl.calibration.report import CAMERA_HEADINGS, camera_rows, change_summary, mast_rows
+    from mastctl.calibration.report import camera_table, change_summary, mast_table
 
     fit = done.calibration
     output.print_table(
-        f"Mast ({fit.method}, {fit.mast_parameters} parameters, {fit.seconds:.1f} s)",
-        ["parameter", "value", "sigma"],
-        mast_rows(fit),
+        f"Mast ({fit.method}, {fit.mast_parameters} parameters, {fit.seconds:.1f} s)", *mast_table(fit)
     )
-    output.print_table("Cameras", list(CAMERA_HEADINGS), camera_rows(fit), fit.notes)
+    output.print_table("Cameras", *camera_table(fit), fit.notes)
     if fit.outliers:
         shown = [[outlier.name, _off(outlier)] for outlier in fit.outliers[:OUTLIERS_SHOWN]]
         more = len(fit.outliers) - len(shown)

@@ -14,7 +14,6 @@ from mastctl.cli import camera_sync, output
 from mastctl.cli.output import finite_number, positive_number
 
 if TYPE_CHECKING:
-    from drivers.interfaces import Image
     from drivers.v4l2.camera import V4l2Camera
     from mastctl.config import Config
     from mastctl.devices.frames import StampedFrame
@@ -135,7 +134,7 @@ def camera_check(args: argparse.Namespace) -> int:
 
 def camera_grab(args: argparse.Namespace) -> int:
     """Write one fresh picture with its facts."""
-    from mastctl.report.encoding import encoded
+    from mastctl.report.pictures import encoded, with_cross
     from mastctl.report.png_text import with_text
 
     if args.out.suffix.lower() != ".png":
@@ -170,7 +169,7 @@ def camera_grab(args: argparse.Namespace) -> int:
             size = f"{image.shape[1]}x{image.shape[0]}"
             raise output.WrongUse(f"--aim {x:g} {y:g} is outside the picture of {size} px")
         facts |= {"aim_x_px": repr(x), "aim_y_px": repr(y)}
-        image = _with_cross(image, x, y)
+        image = with_cross(image, x, y)
     args.out.write_bytes(with_text(encoded(image, "png"), facts))
     if args.json:
         output.print_json({"out": str(args.out), "size_px": [image.shape[1], image.shape[0]], **facts})
@@ -415,18 +414,6 @@ def _print_any_check(told: dict[str, Any]) -> None:
     output.print_table(f"check of {told['camera']}", ("what", "found"), rows, problems)
     if told["frames"]:
         _print_levels(told["quality"])
-
-
-def _with_cross(image: Image, x_px: float, y_px: float) -> Image:
-    """A colour copy with a cross that leaves the aim pixel itself free."""
-    import cv2
-    import numpy as np
-
-    drawn = cv2.cvtColor(image, cv2.COLOR_GRAY2BGR) if image.ndim == 2 else image.copy()
-    x, y = round(x_px), round(y_px)
-    for dx, dy in ((1, 0), (-1, 0), (0, 1), (0, -1)):
-        cv2.line(drawn, (x + 4 * dx, y + 4 * dy), (x + 16 * dx, y + 16 * dy), (0, 255, 255), 1)
-    return np.asarray(drawn, dtype=np.uint8)
 
 
 def _utc(monotonic_s: float) -> str:

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mastctl.cli import output
-from mastctl.cli.experiment_common import at_least_one, check_writable, seed, tell_report, turned
+from mastctl.cli.experiment_common import at_least_one, check_writable, seed, tell_report
 
 if TYPE_CHECKING:
     from mastctl.client import Client
@@ -121,7 +121,7 @@ def _run(
     """Run with a progress bar on stderr, one step a target."""
 
     from mastctl.experiment.pointing import TargetRecord, run_pointing_experiment
-    from mastctl.experiment.report import PICTURES_PER_DISTANCE
+    from mastctl.experiment.pointing_report import PICTURES_PER_DISTANCE
 
     with output.progress_bar(args.json) as progress:
         task = progress.add_task("pointing", total=args.targets * len(distances_m))
@@ -147,15 +147,15 @@ def _run(
 
 def _report(args: argparse.Namespace, experiment: PointingExperiment) -> int:
     """Write the report if asked, print the table or the document; 1 if no target at all landed."""
-    from mastctl.experiment.report import table_rows, write_report
+    from mastctl.experiment.pointing_report import pointing_table, write_pointing_report
 
     def show(notes: list[str]) -> None:
         hardware = experiment.status.get("hardware")
         output.print_table(
             f"Pointing residuals, rms px ({experiment.camera}, {hardware} hardware)",
-            *turned(*table_rows(experiment.summaries)),
+            *pointing_table(experiment.summaries).turned(),
             [*experiment.notes, *notes],
         )
 
-    tell_report(args, partial(write_report, experiment), experiment.as_json, show)
+    tell_report(args, partial(write_pointing_report, experiment), experiment.as_json, show)
     return 0 if any(record.landings for record in experiment.records) else 1

@@ -45,7 +45,7 @@ def run(args: argparse.Namespace) -> int:
     from calib.files.mast_file import load_rig
     from mastctl.cli.experiment_common import check_writable
     from mastctl.experiment.approach import run_approach
-    from mastctl.experiment.approach_report import counted, summary, table_rows, write_record, write_strip
+    from mastctl.experiment.approach_report import approach_table, counted, summary, write_record, write_strip
     from mastctl.packaged import config_folder
 
     if args.out is not None:
@@ -72,6 +72,6 @@ def run(args: argparse.Namespace) -> int:
         notes += ["3 times the rms, along the line of sight, to its right and below it, in the rover frame"]
         notes += [f"record: {args.out}"] if args.out is not None else []
         output.print_table(
-            f"Approach from 10 m to 1 m, targets on {args.on}, simulated rover", *table_rows(runs), notes
+            f"Approach from 10 m to 1 m, targets on {args.on}, simulated rover", *approach_table(runs), notes
         )
     return 0 if any(one.kept for one in runs) else 1

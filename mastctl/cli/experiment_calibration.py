@@ -103,15 +103,21 @@ def _run(args: argparse.Namespace, rig: Any, chosen: list[Variant]) -> Calibrati
 
 
 def _tell(args: argparse.Namespace, experiment: CalibrationExperiment) -> int:
-    from mastctl.cli.experiment_common import tell_report, turned
-    from mastctl.experiment.calibration_report import as_json, short_rows, table_iv, table_v, write_report
+    from mastctl.cli.experiment_common import tell_report
+    from mastctl.experiment.calibration_report import (
+        as_json,
+        short_rows,
+        table_iv,
+        table_v,
+        write_study_report,
+    )
 
     def show(notes: list[str]) -> None:
-        headings, rows = table_iv(experiment)
-        if len(rows) > 1:
-            output.print_table("Table IV, mast parameters", *turned(headings, rows))
+        mast = table_iv(experiment)
+        if len(mast.rows) > 1:
+            output.print_table("Table IV, mast parameters", *mast.turned())
             output.print_table("Table V, rms residuals of the mast's images, px", *table_v(experiment))
         output.print_table("Errors, px: rms an axis, and worst", *short_rows(experiment.summaries), notes)
 
-    tell_report(args, partial(write_report, experiment), lambda: as_json(experiment), show)
+    tell_report(args, partial(write_study_report, experiment), lambda: as_json(experiment), show)
     return 0 if any(not outcome.failure for outcome in experiment.outcomes) else 1

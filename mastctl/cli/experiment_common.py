@@ -27,12 +27,6 @@ def tell_report(
         show([] if page is None else [f"report: {page}"])
 
 
-def turned(headings: list[str], rows: list[list[str]]) -> tuple[list[str], list[list[str]]]:
-    """Return a table with rows and columns exchanged: a column a distance fits a terminal of 80 columns."""
-    table = [list(column) for column in zip(headings, *rows, strict=True)]
-    return table[0], table[1:]
-
-
 def check_writable(folder: Path) -> None:
     """Refuse an impossible --out before the minutes of the run, not after them."""
     try:

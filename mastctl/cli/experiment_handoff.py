@@ -136,8 +136,8 @@ def _run(
 
 
 def _tell(args: argparse.Namespace, experiment: HandoffExperiment) -> int:
-    from mastctl.cli.experiment_common import tell_report, turned
-    from mastctl.experiment.handoff_report import bias_sentences, table_rows, write_report
+    from mastctl.cli.experiment_common import tell_report
+    from mastctl.experiment.handoff_report import bias_sentences, handoff_table, write_handoff_report
 
     def show(notes: list[str]) -> None:
         noise = f"clicks with {experiment.click_px:g} px of noise; lengths in px of the destination camera"
@@ -145,10 +145,10 @@ def _tell(args: argparse.Namespace, experiment: HandoffExperiment) -> int:
         if not kinds:
             sys.stdout.write("\n".join(["no target was found to hand over", *notes]) + "\n")
         for kind in kinds:
-            headings, rows = table_rows([row for row in experiment.summaries if row.kind == kind])
+            table = handoff_table([row for row in experiment.summaries if row.kind == kind])
             title = f"Hand-off errors of {TARGETS[kind]}, px ({experiment.status.get('hardware')} hardware)"
             last = [noise, *bias_sentences(experiment), *notes] if kind == kinds[-1] else []
-            output.print_table(title, *turned(headings, rows), last)
+            output.print_table(title, *table.turned(), last)
 
-    tell_report(args, partial(write_report, experiment), experiment.as_json, show)
+    tell_report(args, partial(write_handoff_report, experiment), experiment.as_json, show)
     return 0 if any(record.handed for record in experiment.records) else 1

@@ -5,16 +5,14 @@ from __future__ import annotations
 import argparse
 import json
 import math
-import re
 import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
+from mastctl.report import tables
+
 if TYPE_CHECKING:
     from rich.progress import Progress
-
-# How a cell with a number begins; a lone dash stands for a number that there is not.
-_NUMBER = re.compile(r"[-+±]? ?\.?\d|[-–—]$|nan$")
 
 
 class CommandError(Exception):
@@ -63,9 +61,8 @@ def print_table(
 
     rows = list(rows)
     table = Table(title=Text(title), title_justify="left")
-    for column, cells in zip(columns, zip(*rows, strict=True) if rows else [()] * len(columns), strict=True):
-        words = not all(_NUMBER.match(cell) for cell in cells if cell)
-        table.add_column(Text(column), justify="left" if words else "right")
+    for column, numeric in zip(columns, tables.Table(columns, rows).numeric, strict=True):
+        table.add_column(Text(column), justify="right" if numeric else "left")
     for row in rows:
         table.add_row(*(Text(cell) for cell in row))
     console = Console(file=sys.stdout, soft_wrap=True)

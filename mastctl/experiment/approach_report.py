@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import csv
-import json
 import math
 from collections.abc import Sequence
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -16,6 +15,9 @@ from calib.mast.budget import target_approach_budget
 from calib.rigid import FloatArray
 from drivers.interfaces import Image
 from mastctl.experiment.approach import ApproachRun, Stop
+from mastctl.report import pictures, plots
+from mastctl.report.records import write_csv, write_json
+from mastctl.report.tables import Table
 
 PAPER_CM = {"stereo": 9.7, "untracked": 22.2, "tracked": 1.5}
 """Table I as printed, Pancam: stereo at 10 m, the approach without and with ideal tracking; 3 sigma."""
@@ -86,8 +88,8 @@ def _errors(name: str, errors_m: Sequence[FloatArray]) -> dict[str, float]:
     return parts | {f"{name}_position_rms_m": float(np.sqrt(np.sum(rms**2)))}
 
 
-def table_rows(runs: Sequence[ApproachRun]) -> tuple[list[str], list[list[str]]]:
-    """Return headings and rows: Table I's three columns, by its equations, as printed, and as measured."""
+def approach_table(runs: Sequence[ApproachRun]) -> Table:
+    """Return Table I's three columns, by its equations, as printed, and as measured."""
     found = summary(runs)
     theory = next(row for row in target_approach_budget() if row.name == "pancam")
     rows = [
@@ -104,7 +106,7 @@ def table_rows(runs: Sequence[ApproachRun]) -> tuple[list[str], list[list[str]]]
         far = f"{low:g} to {high:g} m" if math.isfinite(high) else f"beyond {low:g} m"
         words = f"tracked, {far} ({found[f'stops_from_{low:g}_m']} stops)"
         rows.append([words, "", "", *_cm(found, f"from_{low:g}_m")])
-    return ["3 rms, cm", "eqs. (1)-(4)", "paper", "range", "right", "below", "3-D"], rows
+    return Table(("3 rms, cm", "eqs. (1)-(4)", "paper", "range", "right", "below", "3-D"), rows)
 
 
 def _cm(found: dict[str, float], name: str) -> list[str]:
@@ -132,16 +134,8 @@ def write_record(runs: Sequence[ApproachRun], folder: Path) -> None:
         If the folder or a file in it cannot be written.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    with (folder / "stops.csv").open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(STOPS_CSV)
-        for one in runs:
-            for index, stop in enumerate(one.stops):
-                numbers = [*stop.error_m.tolist(), *stop.sigma_m.tolist()]
-                pixel = "" if math.isnan(stop.pixel_error_px) else stop.pixel_error_px
-                start = [one.seed, index, stop.range_m, stop.pair, stop.state]
-                rest = [*stop.untracked_m.tolist(), stop.reason]
-                writer.writerow([*start, *numbers, pixel, int(stop.renewed), *rest])
+    rows = [_csv_row(run.seed, index, stop) for run in runs for index, stop in enumerate(run.stops)]
+    write_csv(folder / "stops.csv", STOPS_CSV, rows)
     document = {
         "summary": {key: None if math.isnan(value) else value for key, value in summary(runs).items()},
         "runs": [
@@ -149,8 +143,16 @@ def write_record(runs: Sequence[ApproachRun], folder: Path) -> None:
             for one in runs
         ],
     }
-    (folder / "record.json").write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
-    write_plot(runs, folder / "error.png")
+    write_json(folder / "record.json", document)
+    stops = [stop for run in runs for stop in run.stops]
+    if stops and plots.installed():
+        (folder / "error.png").write_bytes(plots.as_png(_errors_by_range(runs, stops)))
+
+
+def _csv_row(seed: int, index: int, stop: Stop) -> list[Any]:
+    """One stop as a row of stops.csv."""
+    start = [seed, index, stop.range_m, stop.pair, stop.state, *stop.error_m, *stop.sigma_m]
+    return [*start, stop.pixel_error_px, int(stop.renewed), *stop.untracked_m, stop.reason]
 
 
 def write_strip(run: ApproachRun, folder: Path) -> None:
@@ -162,8 +164,7 @@ def write_strip(run: ApproachRun, folder: Path) -> None:
         If the file cannot be written.
     """
     if run.stops:
-        _, png = cv2.imencode(".png", strip(run))
-        (folder / f"strip_{run.seed}.png").write_bytes(png.tobytes())
+        (folder / f"strip_{run.seed}.png").write_bytes(pictures.encoded(strip(run), "png"))
 
 
 def strip(run: ApproachRun) -> Image:
@@ -174,8 +175,8 @@ def strip(run: ApproachRun) -> Image:
         tiles = []
         for row, patch in enumerate(stop.patches):
             side = patch.shape[0] * SCALE
-            tile = cv2.resize(patch, (side, side), interpolation=cv2.INTER_NEAREST)
-            tile = cv2.cvtColor(tile, cv2.COLOR_GRAY2BGR)
+            large = cv2.resize(patch, (side, side), interpolation=cv2.INTER_NEAREST)
+            tile = cv2.cvtColor(large, cv2.COLOR_GRAY2BGR)
             tone = (200, 160, 60) if row == 0 else colour
             cv2.drawMarker(tile, (side // 2, side // 2), tone, cv2.MARKER_CROSS, 12, 1)
             cv2.rectangle(tile, (0, 0), (side - 1, side - 1), tone, 1)
@@ -187,31 +188,24 @@ def strip(run: ApproachRun) -> Image:
     return np.asarray(np.hstack(columns), dtype=np.uint8)
 
 
-def write_plot(runs: Sequence[ApproachRun], path: Path) -> None:
-    """Draw the errors over the range, with the track's own sigma; nothing where matplotlib is missing."""
-    try:
-        from matplotlib.figure import Figure
-    except ImportError:
-        return
-    stops = [stop for run in runs for stop in run.stops]
-    if not stops:
-        return
-    figure = Figure(figsize=(9.0, 9.0), layout="constrained")
+def _errors_by_range(runs: Sequence[ApproachRun], stops: Sequence[Stop]) -> Any:
+    """The errors over the range, with the track's own sigma."""
+    figure = plots.new(9.0, 9.0)
+    tracked = [stop for stop in stops if stop.state == "tracked"]
     for k, axis in enumerate(figure.subplots(3, 1, sharex=True)):
         for run in runs:
             kept = [s for s in run.stops if s.state == "tracked"]
             axis.plot(
                 [s.range_m for s in kept],
                 [100 * s.error_m[k] for s in kept],
-                color="#1f6f8b",
+                color=plots.BLUE,
                 lw=0.7,
                 alpha=0.6,
             )
-        tracked = sorted((s.range_m, 300 * s.sigma_m[k]) for s in stops if s.state == "tracked")
         if tracked:
-            ranges, bounds = np.array(tracked).T
+            ranges, bounds = np.array(sorted((s.range_m, 300 * s.sigma_m[k]) for s in tracked)).T
             axis.fill_between(
-                ranges, -bounds, bounds, color="#c1440e", alpha=0.15, lw=0, label="3 sigma, told"
+                ranges, -bounds, bounds, color=plots.RUST, alpha=0.15, lw=0, label="3 sigma, told"
             )
         axis.set_ylabel(f"{('along the line of sight', 'to its right', 'below it')[k]}, cm")
         axis.grid(alpha=0.25)
@@ -220,4 +214,4 @@ def write_plot(runs: Sequence[ApproachRun], path: Path) -> None:
     axis.set_xticks([10, 6, 4, 2, 1.2], ["10", "6", "4", "2", "1.2"])
     axis.set_xlabel("range, m")
     figure.axes[0].legend(loc="upper right")
-    figure.savefig(path, dpi=110)
+    return figure

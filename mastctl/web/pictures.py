@@ -9,7 +9,7 @@ from fastapi import FastAPI, Query
 from fastapi.responses import Response
 
 from mastctl.devices.frames import StampedFrame
-from mastctl.report.encoding import encoded
+from mastctl.report.pictures import encoded
 from mastctl.service.mast_in_use import MastInUse
 from mastctl.service.service import Service
 from mastctl.web import PREFIX

@@ -22,11 +22,11 @@ from mastctl.cli.main import main
 from mastctl.experiment import approach
 from mastctl.experiment.approach import ROCK_M, ROCKS, START_M, ApproachRun, Stop
 from mastctl.experiment.approach_report import (
+    approach_table,
     handoffs,
     losses,
     strip,
     summary,
-    table_rows,
     write_record,
     write_strip,
 )
@@ -62,7 +62,7 @@ def test_runs_are_counted_and_averaged_by_hand() -> None:
     assert math.isclose(found["untracked_along_rms_m"], 0.1)
     assert (found["losses"], found["recoveries"], found["handoffs"]) == (1, 0, 0)
     assert [found[f"stops_from_{low}_m"] for low in (6, 2, 0)] == [0, 1, 3]
-    headings, rows = table_rows(runs)
+    headings, rows = approach_table(runs)
     assert headings[1:3] == ["eqs. (1)-(4)", "paper"]
     assert [row[1:3] for row in rows[:3]] == [["9.7", "9.7"], ["22.2", "22.2"], ["1.45", "1.5"]]
     assert rows[2][4] == f"{300 * math.sqrt(0.002**2 / 3):.2f}"

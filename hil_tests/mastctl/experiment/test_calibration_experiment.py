@@ -30,7 +30,7 @@ from mastctl.experiment.calibration import (
     run_calibration_experiment,
     variants,
 )
-from mastctl.experiment.calibration_report import as_json, table_iv, table_v, write_report
+from mastctl.experiment.calibration_report import as_json, table_iv, table_v, write_study_report
 from mastctl.experiment.executors import NoExecutor, open_executor
 
 PLAN = SurveyPlan(sigma=Sigma(0.002, 0.1))
@@ -119,11 +119,11 @@ def test_a_survey_that_cannot_be_fitted_is_counted_and_told(
     with ThreadPoolExecutor(1) as executor:
         found = run(executor)
     assert [summary.failed for summary in found.summaries] == [1, 1]
-    assert "no start was found" in write_report(found, tmp_path).read_text()
+    assert "no start was found" in write_study_report(found, tmp_path).read_text()
 
 
 def test_the_report_and_the_document(experiment: CalibrationExperiment, tmp_path: Path) -> None:
-    page = write_report(experiment, tmp_path).read_text()
+    page = write_study_report(experiment, tmp_path).read_text()
     assert "Table V" in page and "data:image/png" in page
     record = json.loads((tmp_path / "record.json").read_text())
     assert record["variants"][1]["mast_parameters"] == 6

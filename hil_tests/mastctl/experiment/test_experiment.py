@@ -13,13 +13,12 @@ import pytest
 
 from calib.files.mast_file import load_rig
 from drivers.sim.rover import simulation_settings
-from mastctl.cli.experiment_common import turned
 from mastctl.cli.main import main
 from mastctl.client import Client, ClientError
 from mastctl.config import load_config
 from mastctl.experiment.demo import demo_config
 from mastctl.experiment.pointing import Landing, PointingExperiment, TargetRecord, rms, summarise
-from mastctl.experiment.report import CSV_COLUMNS, table_rows, write_report
+from mastctl.experiment.pointing_report import CSV_COLUMNS, pointing_table, write_pointing_report
 from mastctl.experiment.targets import on_level_ground, textured
 from mastctl.experiment.views import pointed
 
@@ -80,7 +79,7 @@ def test_document_has_the_keys_of_the_contract_and_every_failure() -> None:
 
 def test_report_holds_every_target_and_what_devices_say_is_escaped(tmp_path: Path) -> None:
     folder = tmp_path / "new" / "report"
-    page = write_report(experiment(landed(0, 0.25, -0.5), lost(1, "<b>no & reply</b>")), folder)
+    page = write_pointing_report(experiment(landed(0, 0.25, -0.5), lost(1, "<b>no & reply</b>")), folder)
     words = page.read_text(encoding="utf-8")
     assert "&lt;b&gt;no &amp; reply&lt;/b&gt;" in words
     assert "<b>no" not in words
@@ -96,7 +95,7 @@ def test_report_holds_every_target_and_what_devices_say_is_escaped(tmp_path: Pat
 
 
 def test_table_fits_80_columns_when_it_is_turned() -> None:
-    headings, rows = turned(*table_rows(experiment(landed(0, 0.1, 0.2)).summaries))
+    headings, rows = pointing_table(experiment(landed(0, 0.1, 0.2)).summaries).turned()
     assert headings == ["distance", "6 m", "4 m"]
     assert ["paper first x, y", "0.743, 1.243", ""] in rows
     assert ["failed", "0", "0"] in rows

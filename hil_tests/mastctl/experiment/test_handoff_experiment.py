@@ -26,7 +26,12 @@ from mastctl.cli.main import main
 from mastctl.client import Client, ClientError
 from mastctl.experiment.handoff import run_handoff_experiment
 from mastctl.experiment.handoff_record import Handed, HandoffExperiment, HandoffRecord, summarise
-from mastctl.experiment.handoff_report import table_rows, target_rows, view_picture, write_report
+from mastctl.experiment.handoff_report import (
+    handoff_table,
+    handoff_targets,
+    view_picture,
+    write_handoff_report,
+)
 from mastctl.experiment.known_points import BrickPoints, KnownPoint
 from mastctl.handoff.log import read_log
 
@@ -87,16 +92,16 @@ def test_without_the_truth_the_refined_pixel_stands_in() -> None:
 def test_the_report_holds_every_target_and_escapes_what_it_is_told(tmp_path: Path) -> None:
     summaries = (summarise(STEP, "ground", "hazcam_left", RECORDS),)
     experiment = HandoffExperiment({"hardware": "simulated"}, 1, 0.2, RECORDS, summaries, "now", 3.0)
-    page = write_report(experiment, tmp_path / "new").read_text()
+    page = write_handoff_report(experiment, tmp_path / "new").read_text()
     assert "&lt;i&gt;none" in page and "hidden &lt;b&gt;" in page and "<i>none" not in page
-    assert page.count("<figure>") == 4
+    assert page.count("<figure ") == 5  # the plot, and pictures of two targets
     assert "errors of each target" in page
     rows = list(csv.DictReader((tmp_path / "new/targets.csv").open()))
     assert [row["verdict"] for row in rows] == ["accepted", "occluded", ""]
     assert rows[0]["search_sigma_major_px"] == "2.0" and rows[1]["refined_x_px"] == ""
     document = json.loads((tmp_path / "new/record.json").read_text())
     assert document["handoffs"][0]["paper_worst_px"] == 4.0
-    assert table_rows(summaries)[1][0][-1] == "4"
+    assert handoff_table(summaries)[1][0][-1] == "4"
 
 
 def test_kinds_of_targets_have_rows_of_their_own() -> None:
@@ -104,7 +109,7 @@ def test_kinds_of_targets_have_rows_of_their_own() -> None:
     records = (*RECORDS, corner)
     assert summarise(STEP, "ground", "hazcam_left", records).targets == 3
     assert summarise(STEP, "corner", "hazcam_left", records).targets == 1
-    headings, rows = target_rows(records)
+    headings, rows = handoff_targets(records)
     assert all(len(row) == len(headings) for row in rows)
     assert rows[3][:3] == [STEP, "3", "corner"] and rows[3][4:6] == ["3.00, -4.00", "0.50, 0.00"]
     assert rows[1][5] == "occluded"
@@ -230,8 +235,8 @@ def test_the_record_of_hand_offs_and_a_constant_offset_are_told(tmp_path: Path) 
         )
         records.append(replace(record(index), matched=matched))
     experiment = HandoffExperiment({"hardware": "simulated"}, 1, 0.2, tuple(records), (), "now", 3.0)
-    page = write_report(experiment, tmp_path).read_text()
-    write_report(experiment, tmp_path)  # a second run replaces the first one's record
+    page = write_handoff_report(experiment, tmp_path).read_text()
+    write_handoff_report(experiment, tmp_path)  # a second run replaces the first one's record
     assert len(read_log(tmp_path / "handoffs.jsonl").handoffs) == 10
     told = "2.00 +- 0.13 px higher of where navcam puts them"
     assert told in page and "calibrate --refine" in page

@@ -1,4 +1,4 @@
-"""The report's pictures, by matplotlib: each function returns a figure."""
+"""What is drawn of a calibration: each function returns a matplotlib figure."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from calib.mast.rig import Rig
 from calib.rigid import Rigid
 from calib.survey import Board
 from mastctl.calibration.maps import PointingMap
+from mastctl.report import plots
 
-FITTED, CHECK, LEFT_OUT = "#1f6f8b", "#c1440e", "#999999"
-COLOURS = ("#1f6f8b", "#c1440e", "#2d7d46", "#7a4b9d", "#b26a00", "#555555")
+FITTED, CHECK, LEFT_OUT = plots.BLUE, plots.RUST, "#999999"
 ARROW_PART = 0.025
 """The typical residual is drawn this part of the image's width long; check images have their own scale."""
 
@@ -30,7 +30,7 @@ def residuals(calibration: Calibration, camera: str) -> Any:
     check = _dots(mine, lambda image: np.full(len(image.used), image.purpose == "check"))
     out = _dots(mine, lambda image: ~image.used & (image.purpose != "check"))
     shown = [("fitted images", fitted, FITTED)] + ([("check images", check, CHECK)] if len(check[0]) else [])
-    figure = _figure(11.5, 4.3)
+    figure = plots.new(11.5, 4.3)
     axes = figure.subplots(1, 2, sharey=True)
     for axis, (title, (places, arrows), colour) in zip(axes, shown, strict=False):
         _arrows(axis, places, arrows, colour, calibration.rig.cameras[camera].model.size_px)
@@ -63,7 +63,7 @@ def _arrows(axis: Any, places: np.ndarray, arrows: np.ndarray, colour: str, size
 
 def boards(calibration: Calibration, board: Board) -> Any:
     """Draw every board and camera in the rover frame, from above and from the side."""
-    figure = _figure(10.5, 5.2)
+    figure = plots.new(10.5, 5.2)
     plan, side = figure.subplots(1, 2)
     corners = board.dots_in_board_m(
         [0, 0, board.rows - 1, board.rows - 1, 0], [0, board.columns - 1, board.columns - 1, 0, 0]
@@ -71,7 +71,7 @@ def boards(calibration: Calibration, board: Board) -> Any:
     purposes: dict[tuple[str, str], str] = {}
     for image in calibration.images:
         purposes.setdefault((image.setup, image.placement), image.purpose)
-    colour_of = {"camera": COLOURS[0], "mast": COLOURS[2], "check": COLOURS[1]}
+    colour_of = {"camera": FITTED, "mast": plots.GREEN, "check": CHECK}
     labelled: set[str] = set()
     names: list[np.ndarray] = []
     for key, pose in calibration.rover_from_board.items():
@@ -98,9 +98,7 @@ def boards(calibration: Calibration, board: Board) -> Any:
 
 def errors_by(calibration: Calibration) -> Any:
     """Draw each image's rms over the board's range, its angle to the line of sight, pan and tilt."""
-    from matplotlib.ticker import LogLocator
-
-    figure = _figure(11.5, 3.6)
+    figure = plots.new(11.5, 3.6)
     axes = figure.subplots(1, 4, sharey=True)
     values: Sequence[tuple[str, Any]] = (
         ("range, m", lambda image: image.range_m),
@@ -121,17 +119,12 @@ def errors_by(calibration: Calibration) -> Any:
                     and (image.purpose == "check" or image.used.any())
                 ]
                 if points:
-                    colour = COLOURS[index % len(COLOURS)]
+                    colour = plots.COLOURS[index % len(plots.COLOURS)]
                     name = camera if purpose == "fitted" else None
                     axis.scatter(*np.array(points, dtype=float).T, s=18, marker=marker, color=colour,
                                  alpha=0.75, label=name)  # fmt: skip
         axis.set_xlabel(label)
-        axis.set_yscale("log")
-        axis.yaxis.set_major_formatter("{x:g}")
-        axis.yaxis.set_minor_locator(LogLocator(subs=(2, 3, 5)))
-        axis.yaxis.set_minor_formatter("{x:g}")
-        axis.tick_params(which="both", labelsize=8)
-        axis.grid(alpha=0.25, which="both")
+        plots.errors_upwards(axis)
     axes[0].set_ylabel("rms of an image, px an axis")
     figure.legend(*axes[0].get_legend_handles_labels(), loc="outside upper center", ncols=6, fontsize=8)
     return figure
@@ -142,7 +135,7 @@ def correlation(names: Sequence[str], covariance: np.ndarray, title: str) -> Any
     spread = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
     matrix = covariance / np.outer(spread, spread)
     few = len(names) <= 10
-    figure = _figure(5.6 if few else 7.4, 4.8 if few else 6.6)
+    figure = plots.new(5.6 if few else 7.4, 4.8 if few else 6.6)
     axis = figure.subplots()
     shown = axis.imshow(matrix, vmin=-1, vmax=1, cmap="RdBu_r", interpolation="nearest")
     if few:
@@ -167,7 +160,7 @@ def correlation(names: Sequence[str], covariance: np.ndarray, title: str) -> Any
 
 def pointing_map(found: PointingMap, calibration: Calibration, what: str) -> Any:
     """Draw a map over pan and tilt, both ways of naming a target, with the survey's own joint angles."""
-    figure = _figure(11.5, 3.9)
+    figure = plots.new(11.5, 3.9)
     axes = figure.subplots(1, 2, sharey=True)
     joints = {
         (image.pan_rad, image.tilt_rad)
@@ -190,12 +183,6 @@ def pointing_map(found: PointingMap, calibration: Calibration, what: str) -> Any
         axis.title.set_fontsize(9)
     axes[0].set_ylabel("tilt, deg")
     return figure
-
-
-def _figure(width: float, height: float) -> Any:
-    from matplotlib.figure import Figure
-
-    return Figure(figsize=(width, height), layout="constrained")
 
 
 def _dots(images: Sequence[ImageResiduals], which: Any) -> tuple[np.ndarray, np.ndarray]:

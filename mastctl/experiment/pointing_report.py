@@ -1,0 +1,193 @@
+"""What a pointing experiment leaves: the raw record as CSV and JSON, and one self-contained HTML page."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from mastctl.experiment.pointing import PAPER_TABLE_VI, DistanceSummary, PointingExperiment, TargetRecord
+from mastctl.report import pages, pictures, plots
+from mastctl.report.figures import Figure
+from mastctl.report.records import write_csv, write_json
+from mastctl.report.tables import Table, number, x_y
+
+PICTURES_PER_DISTANCE = 4
+CROP_PX, CROP_SCALE = 60, 4  # half the side of the piece of image shown around the aim, and how much larger
+
+CSV_COLUMNS = (
+    "distance_m", "target", "camera", "frame_id", "clicked_x_px", "clicked_y_px", "range_m",
+    "pan_before_rad", "tilt_before_rad",
+    "first_x_px", "first_y_px", "first_sigma_x_px", "first_sigma_y_px",
+    "first_true_x_px", "first_true_y_px", "first_frame_id",
+    "second_x_px", "second_y_px", "second_sigma_x_px", "second_sigma_y_px",
+    "second_true_x_px", "second_true_y_px", "second_frame_id",
+    "seconds", "error",
+)  # fmt: skip
+
+
+def write_pointing_report(experiment: PointingExperiment, folder: Path) -> Path:
+    """Write report.html, targets.csv and record.json into ``folder`` (made if need be); return the page.
+
+    Raises
+    ------
+    OSError
+        If the folder or a file in it cannot be written.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    write_csv(folder / "targets.csv", CSV_COLUMNS, [_csv_row(record) for record in experiment.records])
+    targets = [
+        {"distance_m": r.distance_m, "target": r.index, "error": r.error, "operation": dict(r.operation)}
+        for r in experiment.records
+    ]
+    record = experiment.as_json() | {"status": dict(experiment.status), "targets": targets}
+    write_json(folder / "record.json", record)
+    page = folder / "report.html"
+    page.write_text(_page(experiment), encoding="utf-8")
+    return page
+
+
+def pointing_table(summaries: Sequence[DistanceSummary]) -> Table:
+    """Return the table beside the paper's Table VI; true residuals where they are known."""
+    with_truth = any(row.true_first_rms_px is not None for row in summaries)
+    headings = ["distance", "targets", "failed", "first x, y", "second x, y"]
+    if with_truth:
+        headings += ["true first x, y", "true second x, y"]
+    headings += ["paper first x, y", "paper second x, y", "s per target"]
+    rows = []
+    for row in summaries:
+        values = [row.first_rms_px, row.second_rms_px]
+        if with_truth:
+            values += [row.true_first_rms_px, row.true_second_rms_px]
+        values += PAPER_TABLE_VI.get(row.distance_m, (None, None))
+        cells = [f"{row.distance_m:g} m", str(row.targets), str(row.failed)]
+        cells += [x_y(value, 3) for value in values]
+        rows.append([*cells, number(row.seconds / row.targets if row.targets else None, 1)])
+    return Table(headings, rows)
+
+
+def _csv_row(record: TargetRecord) -> list[Any]:
+    """One target as a row of targets.csv; empty cells for what does not exist."""
+    cells: list[Any] = [
+        record.distance_m, record.index, record.camera, record.frame_id, *record.clicked_px, record.range_m,
+        record.pan_before_rad, record.tilt_before_rad,
+    ]  # fmt: skip
+    for which in range(2):
+        if which < len(record.landings):
+            landing = record.landings[which]
+            true = landing.true_px or ("", "")
+            cells += [*landing.residual_px, *landing.sigma_px, *true, landing.frame_id]
+        else:
+            cells += [""] * 7
+    return [*cells, round(record.seconds, 3), record.error]
+
+
+def _page(experiment: PointingExperiment) -> str:
+    badge, facts = pages.of_daemon(experiment.status)
+    facts += [
+        ("camera", experiment.camera),
+        ("seed", str(experiment.seed)),
+        ("started", experiment.started),
+        ("took", f"{experiment.seconds:.0f} s"),
+    ]
+    failures = [[f"{r.distance_m:g} m", str(r.index), r.error] for r in experiment.records if r.error]
+    landed = any(record.landings for record in experiment.records)
+    return pages.page(
+        "pointing.html",
+        title="Pointing experiment",
+        badge=badge,
+        facts=facts,
+        residuals=pointing_table(experiment.summaries),
+        aim=f"{experiment.aim_px[0]:g}, {experiment.aim_px[1]:g}",
+        notes=experiment.notes,
+        failures=Table(("distance", "target", "reason"), failures),
+        landed=landed,
+        scatter=_scatter(experiment) if landed and plots.installed() else None,
+        views=_views(experiment),
+        targets=_targets(experiment.records),
+    )
+
+
+def _targets(records: Sequence[TargetRecord]) -> Table:
+    """Every target for people."""
+    headings = (
+        "distance", "target", "range m", "clicked x, y", "first x, y ± sigma", "second x, y ± sigma", "s", "",
+    )  # fmt: skip
+    rows = []
+    for record in records:
+        landings = [
+            f"{one.residual_px[0]:+.2f}, {one.residual_px[1]:+.2f} ± {max(one.sigma_px):.2f}"
+            for one in record.landings
+        ]
+        start = [f"{record.distance_m:g} m", str(record.index), number(record.range_m)]
+        clicked = "" if math.isnan(record.clicked_px[0]) else x_y(record.clicked_px, 0)
+        rows.append([*start, clicked, *[*landings, "", ""][:2], f"{record.seconds:.1f}", record.error])
+    return Table(headings, rows)
+
+
+def _scatter(experiment: PointingExperiment) -> Figure:
+    """Residuals over x and y, one plot a distance, on one scale."""
+    landings = [landing for record in experiment.records for landing in record.landings]
+    reach = max(1.0, 1.1 * max(max(abs(v) for v in landing.residual_px) for landing in landings))
+    count = len(experiment.summaries)
+    figure = plots.new(4.2 * count, 4.4)
+    for axis, summary in zip(figure.subplots(1, count, squeeze=False)[0], experiment.summaries, strict=True):
+        rows = [record for record in experiment.records if record.distance_m == summary.distance_m]
+        for which, (label, colour, marker) in enumerate(
+            (("first pointing", plots.RUST, "o"), ("second pointing", plots.BLUE, "^"))
+        ):
+            points = np.array([r.landings[which].residual_px for r in rows if which < len(r.landings)])
+            if len(points):
+                axis.scatter(*points.T, s=22, c=colour, marker=marker, alpha=0.75, label=label)
+        axis.axhline(0, color="0.6", lw=0.8)
+        axis.axvline(0, color="0.6", lw=0.8)
+        axis.set(
+            xlim=(-reach, reach), ylim=(reach, -reach), aspect="equal", title=f"{summary.distance_m:g} m",
+            xlabel="x residual, px (right)", ylabel="y residual, px (down)",
+        )  # fmt: skip
+        axis.grid(alpha=0.25)
+    handles, labels = next(
+        axis.get_legend_handles_labels() for axis in figure.axes if axis.get_legend_handles_labels()[0]
+    )
+    figure.axes[0].legend(handles, labels, loc="upper left", fontsize=8)
+    return plots.plot(figure, "scatter of the residuals")
+
+
+def _views(experiment: PointingExperiment) -> list[tuple[str, list[list[Figure]]]]:
+    """By distance the pictures of those targets that kept theirs."""
+    found: dict[str, list[list[Figure]]] = {}
+    for record in experiment.records:
+        if record.clicked_image is not None and record.landed_images:
+            title = f"Targets at {record.distance_m:g} m"
+            found.setdefault(title, []).append(_pictures(experiment, record))
+    return list(found.items())
+
+
+def _pictures(experiment: PointingExperiment, record: TargetRecord) -> list[Figure]:
+    """The view with the click, and what the cross-hair then saw after each pointing."""
+    assert record.clicked_image is not None
+    view = pictures.in_colour(record.clicked_image)
+    clicked = tuple(round(v) for v in record.clicked_px)
+    cv2.circle(view, clicked, 22, pictures.ORANGE_BGR, 3, cv2.LINE_AA)
+    cv2.circle(view, clicked, 3, pictures.ORANGE_BGR, -1, cv2.LINE_AA)
+    small = cv2.resize(view, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
+    caption = f"target {record.index}: clicked in {record.frame_id}"
+    chosen = pictures.enlarged(record.clicked_image, record.clicked_px, CROP_PX, CROP_SCALE)
+    shown = [
+        pictures.photo(small, "the target chosen", caption),
+        pictures.photo(chosen, "the target, enlarged", "the target, enlarged"),
+    ]
+    middle = CROP_PX * CROP_SCALE
+    for name, landing, image in zip(("first", "second"), record.landings, record.landed_images, strict=False):
+        piece = pictures.enlarged(image, experiment.aim_px, CROP_PX, CROP_SCALE)
+        cv2.drawMarker(piece, (middle, middle), (255, 255, 255), cv2.MARKER_CROSS, 90, 1, cv2.LINE_AA)
+        found = tuple(round(middle + v * CROP_SCALE) for v in landing.residual_px)
+        cv2.circle(piece, found, 12, pictures.ORANGE_BGR, 2, cv2.LINE_AA)
+        x, y = landing.residual_px
+        caption = f"{name}: {x:+.2f}, {y:+.2f} px from the cross-hair"
+        shown.append(pictures.photo(piece, f"{name} pointing", caption))
+    return shown
