@@ -45,6 +45,8 @@ def test_wheel_holds_three_packages_and_the_configs(wheel: Path) -> None:
     tops = {name.split("/")[0] for name in names}
     assert {top for top in tops if not top.endswith(".dist-info")} == {"mastctl", "drivers", "calib"}
     assert "mastctl/configs/default.yaml" in names
+    templates = {f"mastctl/report/templates/{name}" for name in ("base.html", "style.css", "pointing.html")}
+    assert templates <= set(names)
 
 
 def test_installed_wheel_runs_the_demo_from_another_folder(wheel: Path, tmp_path: Path) -> None:
@@ -71,4 +73,5 @@ def test_installed_wheel_runs_the_demo_from_another_folder(wheel: Path, tmp_path
     distances = json.loads(done.stdout)["distances"]
     assert [row["distance_m"] for row in distances] == [10.0, 6.0, 2.0]
     assert all(row["targets"] == 1 for row in distances)
-    assert (elsewhere / "demo" / "report.html").is_file()
+    page = (elsewhere / "demo" / "report.html").read_text(encoding="utf-8")
+    assert page.endswith("</html>\n") and "Every target" in page and 'src="data:image/png;base64,' in page
