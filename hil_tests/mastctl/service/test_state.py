@@ -1,0 +1,94 @@
+"""The snapshot that status tells, made by hand: the word for it, and ages against its own moment."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from drivers.interfaces import Reading
+from mastctl.devices.frames import StampedFrame
+from mastctl.devices.limits import Limits
+from mastctl.devices.thread import Fault
+from mastctl.operations import Motion, Residual
+from mastctl.service.state import State
+from mastctl.tracking.status import TrackStatus
+
+REST = State(
+    now_s=100.0,
+    started_s=40.0,
+    version="1",
+    hardware="real",
+    mast={"file": "a.yaml"},
+    former_mast=None,
+    limits=Limits((-2.0, 2.0), (-1.0, 1.0), 0.5),
+    reading=Reading(0.1, -0.2, False, 99.75),
+    frames={"navcam_left": None},
+    motion=Motion(),
+    track=TrackStatus(),
+    faults=(),
+)
+MOVING = Reading(0.1, -0.2, True, 99.75)
+OF_THE_HEAD = Fault("head", "no_reply", "the head is silent", 98.5, "it answers")
+OF_A_CAMERA = replace(OF_THE_HEAD, device="navcam_left")
+
+
+@pytest.mark.parametrize(
+    ("change", "word"),
+    [
+        ({}, "idle"),
+        ({"reading": None}, "fault"),
+        ({"faults": (OF_THE_HEAD,)}, "fault"),
+        ({"faults": (OF_A_CAMERA,)}, "idle"),
+        ({"reading": MOVING}, "moving"),
+        ({"reading": MOVING, "motion": Motion(operation="1")}, "pointing"),
+        ({"reading": MOVING, "motion": Motion(operation="1", stopping=True)}, "stopping"),
+        ({"motion": Motion(stopped=True, stopping=True), "faults": (OF_THE_HEAD,)}, "fault"),
+        ({"reading": MOVING, "motion": Motion(stopped=True)}, "moving"),
+        ({"motion": Motion(stopped=True)}, "stopped"),
+    ],
+)
+def test_the_word_is_that_of_the_gravest_thing(change: dict[str, object], word: str) -> None:
+    assert replace(REST, **change).told("head")["state"] == word  # type: ignore[arg-type]
+
+
+def test_moving_is_what_the_head_said_last() -> None:
+    assert [replace(REST, reading=one).told("head")["moving"] for one in (None, REST.reading, MOVING)] == [
+        False, False, True,
+    ]  # fmt: skip
+
+
+def test_ages_count_to_the_moment_of_the_snapshot_and_are_never_below_zero() -> None:
+    frame = StampedFrame(
+        "id", "navcam_left", np.zeros((2, 2), np.uint8), 7, 99.5, 0.01, 0.0, 0.0, False, "digest"
+    )
+    state = replace(REST, frames={"navcam_left": frame}, faults=(OF_A_CAMERA,))
+    for later_s, ages_s in ((0.0, (0.25, 0.5, 1.5, 60.0)), (-5.0, (0.0, 0.0, 0.0, 55.0))):
+        told = replace(state, now_s=100.0 + later_s).told("head")
+        camera, fault = told["cameras"]["navcam_left"], told["faults"][0]
+        assert (told["joints"]["age_s"], camera["age_s"], fault["for_s"], told["uptime_s"]) == ages_s
+    assert (camera["frame_id"], camera["sequence"], camera["exposure_s"]) == ("id", 7, 0.01)
+
+
+def test_what_is_not_known_yet_is_null() -> None:
+    told = replace(REST, reading=None).told("head")
+    names = ("joints", "operation", "target", "last_residual", "pose", "former_mast")
+    assert [told[name] for name in names] == [None] * len(names)
+    assert set(told["cameras"]["navcam_left"].values()) == {None}
+
+
+def test_what_is_known_is_told() -> None:
+    motion = Motion("3", {"pan_rad": 0.5}, Residual((0.25, -0.5), (0.1, 0.2), "2"))
+    told = replace(REST, motion=motion, hardware="simulated", former_mast={"file": "b.yaml"}).told("head")
+    assert told["simulated"] and not REST.told("head")["simulated"]
+    assert (told["operation"], told["target"], told["former_mast"]) == (
+        "3",
+        {"pan_rad": 0.5},
+        {"file": "b.yaml"},
+    )
+    assert told["last_residual"] == {
+        "residual_px": [0.25, -0.5], "residual_sigma_px": [0.1, 0.2], "operation": "2",
+    }  # fmt: skip
+    assert told["joints"] == {"pan_rad": 0.1, "tilt_rad": -0.2, "measured_s": 99.75, "age_s": 0.25}
+    assert told["limits"] == {"pan_rad": [-2.0, 2.0], "tilt_rad": [-1.0, 1.0], "speed_rad_per_s": 0.5}
