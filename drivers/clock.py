@@ -49,6 +49,11 @@ class Signal(Protocol):
 class Clock(Protocol):
     """Seconds of a monotonic clock, and waiting on it."""
 
+    @property
+    def runs(self) -> bool:
+        """Whether time passes while somebody waits; else waits for other threads run in real time."""
+        ...
+
     def now_s(self) -> float:
         """Return the time now, seconds."""
         ...
@@ -80,6 +85,8 @@ class _MachineSignal(threading.Condition):
 class _MachineTime:
     """Signals and threads of a clock that waits for nobody's computing."""
 
+    runs = True
+
     def signal(self) -> Signal:
         return _MachineSignal(threading.Lock())
 
@@ -107,6 +114,8 @@ class ManualClock(_MachineTime):
     Signals wait in real time, since nobody would turn the clock for them.
     """
 
+    runs = False
+
     def __init__(self, start_s: float = 0.0) -> None:
         self._now_s = start_s
         self._lock = threading.Lock()
@@ -123,3 +132,8 @@ class ManualClock(_MachineTime):
         """Turn the clock forward."""
         with self._lock:
             self._now_s += duration_s
+
+
+def deadlines_on(clock: Clock) -> Clock:
+    """Return the clock that deadlines run on where ``clock`` stamps the data."""
+    return clock if clock.runs else SystemClock()

@@ -62,6 +62,8 @@ class SimulationClock:
         Its first reading, seconds.
     """
 
+    runs = True
+
     def __init__(self, speed: float = math.inf, start_s: float = 0.0) -> None:
         if not speed > 0:
             raise ValueError(f"speed is {speed}, expected a positive number")

@@ -11,7 +11,6 @@ from __future__ import annotations
 import logging
 import math
 import threading
-import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -22,7 +21,7 @@ import numpy as np
 
 from calib.mast.rig import Rig
 from drivers.absent_camera import AbsentCamera
-from drivers.clock import Clock
+from drivers.clock import Clock, deadlines_on
 from drivers.errors import BadFrame, BadReply, DriverError, LineLost, NoFreshFrame, NoReply
 from drivers.interfaces import (
     AxisReport,
@@ -94,7 +93,7 @@ class Devices:
     mast_digest
         SHA-256 (hex) of the mast file in use, part of every frame's facts.
     clock
-        Stamps are judged against it; deadlines run on the machine's own clock.
+        Stamps are judged against it; deadlines run on it too, or in real time if it is turned by hand.
     rig
         The mast file's content: image sizes, and which cameras ride on the head. Without it sizes are
         not checked and no camera is taken for frozen.
@@ -115,6 +114,7 @@ class Devices:
         self._cameras = dict(hardware.cameras)
         self._limits = limits
         self._clock = clock
+        self._time = deadlines_on(clock)
         self._grace_s = CAMERA_GRACE_S if camera_grace_s is None else camera_grace_s
         self._history = JointHistory()
         self._store = FrameStore(mast_digest)
@@ -136,8 +136,10 @@ class Devices:
         self._camera_threads = {name: self._thread_of(name) for name in self._cameras}
         if rig is not None:
             self._check_sizes()
-        self._head = DeviceThread(HEAD, between=self._poll, between_timeout_s=READ_TIMEOUT_S, words=WORDS)
-        self._stops = Stops(self._head, HEAD, lambda: self._pan_tilt.stop())
+        self._head = DeviceThread(
+            HEAD, between=self._poll, between_timeout_s=READ_TIMEOUT_S, words=WORDS, clock=self._time
+        )
+        self._stops = Stops(self._head, HEAD, lambda: self._pan_tilt.stop(), self._time)
 
     # The head
 
@@ -155,11 +157,11 @@ class Devices:
             If the head does not answer in 1 s, both questions together, or answers what cannot be true. The
             error is that of the first question.
         """
-        until_s = time.monotonic() + READ_TIMEOUT_S
+        until_s = self._time.now_s() + READ_TIMEOUT_S
         try:
             return self._head.call("read", self._read_once, READ_TIMEOUT_S)
         except (NoReply, BadReply) as error:
-            left_s = until_s - time.monotonic()
+            left_s = until_s - self._time.now_s()
             if left_s <= 0:
                 raise
             try:
@@ -201,7 +203,7 @@ class Devices:
             speed = self._limits.speed(speed_rad_per_s)
             self._history.move_sent(self._clock.now_s())
             self._pan_tilt.move(float(pan_rad), float(tilt_rad), speed)
-            self._moved = ticket, time.monotonic()
+            self._moved = ticket, self._time.now_s()
 
         self._head.call("move", send, MOVE_TIMEOUT_S)
 
@@ -263,7 +265,7 @@ class Devices:
             if camera not in self._cameras:
                 known = ", ".join(sorted(self._cameras)) or "none"
                 raise UnknownCamera(f"camera {camera} is not configured; configured are {known}")
-        deadline_s = time.monotonic() + timeout_s
+        deadline_s = self._time.now_s() + timeout_s
         names = tuple(dict.fromkeys(cameras))
         if len(names) < 2:
             frames = self._fetched(dict.fromkeys(names, exposed_after_s), deadline_s)
@@ -272,7 +274,7 @@ class Devices:
         pairing = Pairing(names[0], self._offsets(names, deadline_s))
         frames = self._fetched(pairing.moments(max(exposed_after_s, used_s)), deadline_s)
         while after_s := pairing.again(frames):
-            if time.monotonic() > deadline_s:
+            if self._time.now_s() > deadline_s:
                 words = f"no frames of {', '.join(names)} that belong together came within {timeout_s:g} s"
                 raise NoFreshFrame(words, device=min(after_s))
             frames |= self._fetched(after_s, deadline_s)
@@ -285,7 +287,7 @@ class Devices:
         asked: dict[str, Asked[_Times | None]] = {}
         for name in names:
             tell = partial(self._times_of, name)
-            left_s = max(0.0, deadline_s - time.monotonic())
+            left_s = max(0.0, deadline_s - self._time.now_s())
             asked[name] = self._camera_threads[name].submit("recent_times", tell, left_s + self._grace_s)
         times = {
             name: self._camera_threads[name].wait(told, deadline_s + self._grace_s)
@@ -307,7 +309,7 @@ class Devices:
         asked: dict[str, Asked[CheckedFrame | StampedFrame]] = {}
         for camera, exposed_after_s in after_s.items():
             take = self._taker(camera, exposed_after_s, deadline_s)
-            left_s = max(0.0, deadline_s - time.monotonic())
+            left_s = max(0.0, deadline_s - self._time.now_s())
             asked[camera] = self._camera_threads[camera].submit("next_frame", take, left_s + self._grace_s)
         return {
             camera: self._camera_threads[camera].wait(told, deadline_s + self._grace_s)
@@ -403,9 +405,9 @@ class Devices:
             self.stop()
         except (DriverError, MastctlError) as error:
             log.error("the head did not confirm the last stop: %s", error)
-        until_s = time.monotonic() + 2.0
+        until_s = self._time.now_s() + 2.0
         for thread in (self._head, *self._camera_threads.values()):
-            thread.close(max(0.1, until_s - time.monotonic()))
+            thread.close(max(0.1, until_s - self._time.now_s()))
 
     # In the devices' own threads
 
@@ -424,7 +426,7 @@ class Devices:
             self._stops.rests()
         if self._moved is not None and not reading.moving:
             ticket, moved_s = self._moved
-            if time.monotonic() - moved_s > REST_S:
+            if self._time.now_s() - moved_s > REST_S:
                 self._moved = None
                 self._stops.proved(ticket)
         return reading
@@ -432,10 +434,14 @@ class Devices:
     def _thread_of(self, camera: str) -> DeviceThread:
         """The thread of a camera; that of an absent one looks after it, and tells its absence as a fault."""
         if not isinstance(self._cameras[camera], AbsentCamera):
-            return DeviceThread(camera, words=WORDS)
+            return DeviceThread(camera, words=WORDS, clock=self._time)
         words = {**WORDS, "next_frame": Words("it is there, or a picture comes")}
         return DeviceThread(
-            camera, between=lambda: self._join(camera), between_name="next_frame", words=words
+            camera,
+            between=lambda: self._join(camera),
+            between_name="next_frame",
+            words=words,
+            clock=self._time,
         )
 
     def _join(self, name: str) -> None:
@@ -448,7 +454,7 @@ class Devices:
 
     def _check_sizes(self) -> None:
         """Pass cameras that do not tell their size now, or have the mast file's. Raises BadFrame."""
-        until_s = time.monotonic() + SIZE_TIMEOUT_S
+        until_s = self._time.now_s() + SIZE_TIMEOUT_S
         asked = {
             name: thread.submit("size_px", partial(self._check_size, name), SIZE_TIMEOUT_S, told=False)
             for name, thread in self._camera_threads.items()
@@ -498,7 +504,7 @@ class Devices:
             if newest is not None and newest.exposure_began_s > exposed_after_s:
                 return newest  # somebody else's request brought it a moment ago
             answer = self._cameras[camera].next_frame(
-                exposed_after_s, max(0.0, deadline_s - time.monotonic())
+                exposed_after_s, max(0.0, deadline_s - self._time.now_s())
             )
             now_s = self._clock.now_s()
             frame = frame_checks.checked(answer, camera, self._sizes_px.get(camera), exposed_after_s, now_s)
@@ -518,10 +524,10 @@ class Devices:
         """Give a frame its joint angles and id, and keep it."""
         began_s = frame.mid_exposure_s - frame.exposure_s / 2
         ended_s = frame.mid_exposure_s + frame.exposure_s / 2
-        until_s = time.monotonic() + READ_TIMEOUT_S
+        until_s = self._time.now_s() + READ_TIMEOUT_S
         while (newest := self._history.newest) is None or newest.time_s < ended_s:
             self.read()
-            if time.monotonic() > until_s:
+            if self._time.now_s() > until_s:
                 raise BadReply("the readings stay behind the frame's exposure", device=HEAD)
         joints = self._history.at_exposure(began_s, frame.mid_exposure_s, ended_s, HEAD)
         frame_id, mast_digest = self._store.name(camera, frame.sequence)

@@ -6,11 +6,10 @@ without a reason, so moves are refused until every stop is back, and one that co
 
 from __future__ import annotations
 
-import threading
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
+from drivers.clock import Clock, SystemClock
 from drivers.errors import DriverError, LineLost, NoReply
 from mastctl.devices.thread import DeviceThread, Fault, log
 from mastctl.errors import MastctlError, Stopped
@@ -46,13 +45,18 @@ class Stops:
         The head's name.
     stop
         The driver's stop.
+    clock
+        What deadlines run on; the machine's own by default.
     """
 
-    def __init__(self, thread: DeviceThread, device: str, stop: Callable[[], None]) -> None:
+    def __init__(
+        self, thread: DeviceThread, device: str, stop: Callable[[], None], clock: Clock | None = None
+    ) -> None:
+        self._clock = clock or SystemClock()
         self._thread = thread
         self._device = device
         self._stop = stop
-        self._changed = threading.Condition()
+        self._changed = self._clock.signal()
         self._asked = 0
         self._queued_s: float | None = None  # when the stop was asked for that waits in the head's thread
         self._inside: list[_Inside] = []
@@ -65,7 +69,7 @@ class Stops:
     def ticket(self) -> int:
         """Return what a move hands to `check` later. Raises Stopped if a stop is overdue."""
         with self._changed:
-            overdue = self._overdue(time.monotonic())
+            overdue = self._overdue(self._clock.now_s())
             if overdue:
                 raise Stopped(overdue)
             return self._asked
@@ -76,7 +80,7 @@ class Stops:
             if ticket != self._asked:
                 raise Stopped("a stop came before the move was sent")
             if self._inside:
-                raise Stopped(self._told(self._inside[0].asked_s, time.monotonic()))
+                raise Stopped(self._told(self._inside[0].asked_s, self._clock.now_s()))
 
     def send(self, timeout_s: float) -> None:
         """Stop the head and return when that is confirmed, by this stop or by another on its way.
@@ -88,7 +92,7 @@ class Stops:
         DriverError, MastctlError
             If the driver refused it.
         """
-        asked_s = time.monotonic()
+        asked_s = self._clock.now_s()
         try:
             self._send(asked_s, timeout_s)
         except (DriverError, MastctlError) as error:
@@ -121,7 +125,7 @@ class Stops:
 
     def faults(self) -> tuple[Fault, ...]:
         """Return what is wrong with the stops at this moment; takes no lock."""
-        now_s = time.monotonic()
+        now_s = self._clock.now_s()
         fault, queued_s = self._fault, self._queued_s
         overdue = self._overdue(now_s)
         if overdue:
@@ -140,7 +144,7 @@ class Stops:
                 self._thread.submit("stop", self._in_turn, timeout_s, first=True, told=False)
                 self._queued_s = asked_s
             while self._good_s < asked_s:
-                now_s = time.monotonic()
+                now_s = self._clock.now_s()
                 failed = self._failed is not None and self._failed[0].began_s >= asked_s
                 if failed and self._failed is not None and (self._queued_s is None or now_s >= deadline_s):
                     raise self._failed[1]
@@ -160,10 +164,8 @@ class Stops:
 
     def _go_beside(self, asked_s: float, timeout_s: float) -> str:
         """Send a stop from a thread of its own; return why that cannot be done. The lock is held."""
-        inside = _Inside(asked_s, time.monotonic())
-        thread = threading.Thread(
-            target=self._beside, args=(inside, timeout_s), name="stop beside", daemon=True
-        )
+        inside = _Inside(asked_s, self._clock.now_s())
+        thread = self._clock.thread(lambda: self._beside(inside, timeout_s), "stop beside")
         self._inside.append(inside)
         try:
             thread.start()
@@ -181,7 +183,7 @@ class Stops:
     def _in_turn(self) -> None:
         """The stop in the head's own thread."""
         with self._changed:
-            now_s = time.monotonic()
+            now_s = self._clock.now_s()
             inside = _Inside(now_s if self._queued_s is None else self._queued_s, now_s)
             self._queued_s = None
             self._inside.append(inside)
@@ -194,7 +196,7 @@ class Stops:
             self._stop()
         except BaseException as anything:  # a driver from outside may raise what it likes
             error = self._thread.typed("stop", anything)
-        ended_s = time.monotonic()
+        ended_s = self._clock.now_s()
         words = f"{self._device}: a stop asked for {ended_s - inside.asked_s:.1f} s ago "
         words += "ended only now" if error is None else f"failed only now: {error}"
         with self._changed:

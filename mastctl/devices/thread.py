@@ -5,20 +5,19 @@ the status shows, while the other devices go on. A result that came too late is 
 told. A thread that hangs inside a driver cannot be ended from outside: it is left alone (it is a daemon
 thread), calls to it fail at once, and it serves again when the driver returns.
 
-Deadlines and pacing run on the machine's own clock, whatever clock stamps the data.
+Deadlines and pacing run on a clock that goes on while somebody waits, whatever clock stamps the data.
 """
 
 from __future__ import annotations
 
 import logging
-import threading
-import time
 from collections import deque
 from collections.abc import Callable, Mapping
 from concurrent.futures import CancelledError, Future
 from dataclasses import dataclass
 from typing import Any, Generic, TypeVar
 
+from drivers.clock import Clock, SystemClock
 from drivers.errors import DriverError, LineLost, NoReply
 from mastctl.errors import MastctlError
 
@@ -106,6 +105,8 @@ class DeviceThread:
         ``between_timeout_s``; returns the seconds until it wants to run again, None for never.
     words
         What belongs to the faults of its calls, by their names.
+    clock
+        What deadlines and pacing run on; the machine's own by default.
     """
 
     def __init__(
@@ -117,19 +118,21 @@ class DeviceThread:
         between_timeout_s: float = 1.0,
         between_after_error_s: float = 0.2,
         words: Mapping[str, Words] | None = None,
+        clock: Clock | None = None,
     ) -> None:
         self._device = device
+        self._clock = clock or SystemClock()
         self._between = between
         self._between_name = between_name
         self._between_timeout_s = between_timeout_s
         self._between_after_error_s = between_after_error_s
         self._words = dict(words or {})
-        self._wake = threading.Condition()
+        self._wake = self._clock.signal()
         self._jobs: deque[Asked[Any]] = deque()
         self._closing = False
         self._now: _Now | None = None
         self._faults: Mapping[str, Fault] = {}  # replaced, never edited: read without a lock
-        self._thread = threading.Thread(target=self._serve, name=f"device {device}", daemon=True)
+        self._thread = self._clock.thread(self._serve, f"device {device}")
         self._thread.start()
 
     def submit(
@@ -161,7 +164,7 @@ class DeviceThread:
         NoReply
             At once, if the device is already overdue with an earlier call, or closed.
         """
-        asked = Asked(what, function, timeout_s, first, told, time.monotonic(), Future[T]())
+        asked = Asked(what, function, timeout_s, first, told, self._clock.now_s(), Future[T]())
         with self._wake:
             if self._closing:
                 raise NoReply(f"{what} was asked after the device was closed", device=self._device)
@@ -169,11 +172,11 @@ class DeviceThread:
             if overdue and not first and not anyway:
                 raise NoReply(overdue, device=self._device)
             (self._jobs.appendleft if first else self._jobs.append)(asked)
-            self._wake.notify()
+            self._wake.notify_all()
         return asked
 
     def wait(self, asked: Asked[T], deadline_s: float) -> T:
-        """Return a call's result, waiting until ``deadline_s`` (of `time.monotonic`) at most.
+        """Return a call's result, waiting until ``deadline_s`` (of the clock) at most.
 
         Raises
         ------
@@ -182,20 +185,25 @@ class DeviceThread:
         DriverError, MastctlError
             Whatever of these it raised.
         """
-        try:
-            return asked.future.result(max(0.0, deadline_s - time.monotonic()))
-        except CancelledError:
-            raise NoReply(f"{asked.what} did not begin before the end", device=self._device) from None
-        except TimeoutError:
-            asked.given_up = True
-            if asked.future.cancel():
-                with self._wake:
-                    if asked in self._jobs:
-                        self._jobs.remove(asked)
-            error = NoReply(f"{asked.what} did not end within its deadline", device=self._device)
-            if asked.told:
-                self._note(asked.what, error)
-            raise error from None
+        with self._wake:
+            while not asked.future.done():
+                left_s = deadline_s - self._clock.now_s()
+                if left_s <= 0:
+                    break
+                self._wake.wait(left_s)
+            if not asked.future.done():
+                asked.given_up = True
+                if asked.future.cancel() and asked in self._jobs:
+                    self._jobs.remove(asked)
+        if not asked.given_up:
+            try:
+                return asked.future.result(0)
+            except CancelledError:
+                raise NoReply(f"{asked.what} did not begin before the end", device=self._device) from None
+        error = NoReply(f"{asked.what} did not end within its deadline", device=self._device)
+        if asked.told:
+            self._note(asked.what, error)
+        raise error
 
     def call(self, what: str, function: Callable[[], T], timeout_s: float, *, told: bool = True) -> T:
         """Run ``function`` in the thread and return its result within ``timeout_s`` seconds.
@@ -207,7 +215,7 @@ class DeviceThread:
         DriverError, MastctlError
             Whatever of these ``function`` raises; any other exception comes as a DriverError.
         """
-        deadline_s = time.monotonic() + timeout_s
+        deadline_s = self._clock.now_s() + timeout_s
         return self.wait(self.submit(what, function, timeout_s, told=told), deadline_s)
 
     def faults(self) -> tuple[Fault, ...]:
@@ -233,7 +241,7 @@ class DeviceThread:
                 if not asked.first:
                     asked.future.cancel()
             self._jobs = deque(asked for asked in self._jobs if asked.first)
-            self._wake.notify()
+            self._wake.notify_all()
         self._thread.join(timeout_s)
         if self._thread.is_alive():
             log.warning("%s: the driver hangs; its thread is left behind", self._device)
@@ -252,10 +260,9 @@ class DeviceThread:
             device=self._device,
         )
 
-    @staticmethod
-    def _overdue(now: _Now | None) -> str:
+    def _overdue(self, now: _Now | None) -> str:
         """Say in plain words how late the call under way is; empty when it is not."""
-        now_s = time.monotonic()
+        now_s = self._clock.now_s()
         if now is None or now_s <= now.until_s:
             return ""
         return f"does not answer: {now.what} has been under way for {now_s - now.began_s:.1f} s"
@@ -268,15 +275,15 @@ class DeviceThread:
         )
 
     def _serve(self) -> None:
-        next_between_s = time.monotonic()
+        next_between_s = self._clock.now_s()
         while True:
             asked: Asked[Any] | None = None
             with self._wake:
                 while not self._jobs and not self._closing:
-                    wait_s = None if self._between is None else next_between_s - time.monotonic()
+                    wait_s = None if self._between is None else next_between_s - self._clock.now_s()
                     if wait_s is not None and wait_s <= 0.0:
                         break
-                    self._wake.wait(wait_s)
+                    self._wake.wait(wait_s, idle=True)
                 if self._jobs:
                     asked = self._jobs.popleft()
                 elif self._closing:
@@ -288,27 +295,29 @@ class DeviceThread:
                 pause_s, error = self._run(
                     Asked(
                         self._between_name, self._between, self._between_timeout_s, False, True,
-                        time.monotonic(), Future(),
+                        self._clock.now_s(), Future(),
                     )
                 )  # fmt: skip
                 if error is None and pause_s is None:
                     self._between = None
                     continue
-                next_between_s = time.monotonic() + (
+                next_between_s = self._clock.now_s() + (
                     float(pause_s) if error is None else self._between_after_error_s
                 )
 
     def _answer(self, asked: Asked[Any]) -> None:
         """Make a call that somebody asked for."""
         result, error = self._run(asked)
-        if error is None:
-            asked.future.set_result(result)
-        else:
-            asked.future.set_exception(error)
+        with self._wake:
+            if error is None:
+                asked.future.set_result(result)
+            else:
+                asked.future.set_exception(error)
+            self._wake.notify_all()
 
     def _run(self, asked: Asked[Any]) -> tuple[Any, Exception | None]:
         """Make one call; whatever happens comes back as a result or a typed error."""
-        began_s = time.monotonic()
+        began_s = self._clock.now_s()
         with self._wake:
             self._now = _Now(asked.what, asked.first, began_s, began_s + asked.timeout_s)
         result: Any = None
@@ -320,7 +329,7 @@ class DeviceThread:
         finally:
             with self._wake:
                 self._now = None
-        ended_s = time.monotonic()
+        ended_s = self._clock.now_s()
         if asked.told:
             late = asked.given_up or ended_s > began_s + asked.timeout_s
             self._note(asked.what, error, ended_s - asked.asked_s if late else None)
@@ -349,7 +358,7 @@ class DeviceThread:
                     if other != what and fault.code != LineLost.code  # whoever found the line gone
                 }
             else:
-                since_s = known.since_s if known else time.monotonic()
+                since_s = known.since_s if known else self._clock.now_s()
                 code = getattr(error, "code", DriverError.code)
                 fault = self._fault(what, code, str(error), since_s)
                 self._faults = {**self._faults, what: fault}
