@@ -18,34 +18,21 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.interpolate import CubicHermiteSpline
 
 from calib.rigid import FloatArray
-from mastctl.errors import MastctlError
+from mastctl.cameras.sync_motion import LEAST_FRAMES, CannotTell, Motion
 
 REACH_S = 0.6
 """How far off a camera's stamps are looked for, seconds either way."""
 
 SEARCH_STEP_S = 0.01
-LEAST_REVERSAL_RAD = 5e-4
-LEAST_WAY_RAD = 0.010  # after a turn back: until then the gears of a plain servo are not all on one side
-LARGEST_GAP_S = 0.1  # between the readings around a frame; beyond it the angle is a guess
-LEAST_FRAMES = 30
 LEAST_LEGS = 8
-LEAST_SPEED_RAD_PER_S = 0.06
-SMOOTHING_S = 0.065  # readings so far to either side even each other out; short beside a ramp of the speed
 ROBUST_SIGMAS = 2.5
 WILD_SIGMAS = 6.0
 MOST_STEPS = 40
 WEIGHTED_STEPS = 8
 SETTLED_S = 1e-6
 UNEXPLAINED = 0.15  # of the patches' own motion, rms: then pictures did not move with the joint
-
-
-class CannotTell(MastctlError):
-    """The pictures do not tell the offset; the message says why."""
-
-    code = "cannot_tell"
 
 
 @dataclass(frozen=True)
@@ -78,79 +65,15 @@ class OffsetFit:
     rms_px: float
 
 
-class Motion:
-    """The joint angle over time by its readings, cut into legs between turns back.
+@dataclass(frozen=True, eq=False)
+class _Problem:
+    """What was measured, as `fit_offset` takes it, and which of (o, c, h) are free."""
 
-    Parameters
-    ----------
-    times_s, angles_rad
-        (m,) readings in the order of their times.
-    """
-
-    def __init__(self, times_s: FloatArray, angles_rad: FloatArray) -> None:
-        self.times_s, first = np.unique(times_s, return_index=True)
-        self.angles_rad = angles_rad[first]
-        if len(self.times_s) < LEAST_FRAMES:
-            raise CannotTell(f"the head was read {len(self.times_s)} times, {LEAST_FRAMES} are needed")
-        self._turns, self._signs = _legs(self.angles_rad)
-        self._curve = _smoothed(self.times_s, self.angles_rad)
-        self._speed = self._curve.derivative()
-
-    def at(self, times_s: FloatArray) -> FloatArray:
-        """Return the angle, radians, on a curve through the readings that evens their counts out."""
-        return np.asarray(self._curve(np.clip(times_s, self.times_s[0], self.times_s[-1])))
-
-    def slope(self, times_s: FloatArray) -> FloatArray:
-        """Return the speed, rad/s."""
-        return np.asarray(self._speed(np.clip(times_s, self.times_s[0], self.times_s[-1])))
-
-    def leg(self, times_s: FloatArray) -> tuple[NDArray[np.int64], FloatArray]:
-        """Return which leg a moment is of (-1: it tells nothing) and the sign of that leg's motion."""
-        turns_s = self.times_s[self._turns]
-        leg = np.searchsorted(turns_s, times_s, side="right") - 1
-        after = np.clip(np.searchsorted(self.times_s, times_s), 1, len(self.times_s) - 1)
-        sure = (leg >= 0) & (times_s < self.times_s[-1])
-        sure &= self.times_s[after] - self.times_s[after - 1] <= LARGEST_GAP_S
-        known = np.clip(leg, 0, len(self._turns) - 1)
-        sure &= np.abs(self.slope(times_s)) >= LEAST_SPEED_RAD_PER_S  # one at rest tells nothing of time
-        sure &= np.abs(self.at(times_s) - self.angles_rad[self._turns[known]]) >= LEAST_WAY_RAD
-        return np.where(sure, leg, -1), self._signs[known]
-
-
-def _smoothed(times_s: FloatArray, angles_rad: FloatArray) -> CubicHermiteSpline:
-    """A curve with, at each reading, the place and speed of the parabola that fits its neighbours best."""
-    place, speed = np.empty(len(times_s)), np.empty(len(times_s))
-    first = np.searchsorted(times_s, times_s - SMOOTHING_S)
-    last = np.searchsorted(times_s, times_s + SMOOTHING_S, side="right")
-    for number, (begin, end) in enumerate(zip(first, last, strict=True)):
-        if end - begin < 4:
-            begin, end = max(0, number - 2), min(len(times_s), number + 3)
-        since_s = times_s[begin:end] - times_s[number]
-        parabola = np.linalg.lstsq(np.vander(since_s, 3), angles_rad[begin:end], rcond=None)[0]
-        place[number], speed[number] = parabola[2], parabola[1]
-    return CubicHermiteSpline(times_s, place, speed)
-
-
-def _legs(angles_rad: FloatArray) -> tuple[NDArray[np.int64], FloatArray]:
-    """Where the motion turns back (indices), and its sign from there on; dither of a count is no turn."""
-    steps = np.abs(np.diff(np.unique(angles_rad)))
-    count_rad = float(steps.min()) if len(steps) else 0.0
-    threshold_rad = max(LEAST_REVERSAL_RAD, 2.5 * count_rad if count_rad < LEAST_WAY_RAD / 3 else 0.0)
-    turns, signs = [0], [0.0]
-    extreme = 0
-    for index, angle_rad in enumerate(angles_rad):
-        way_rad = angle_rad - angles_rad[extreme]
-        if signs[-1] == 0.0:
-            if abs(way_rad) > threshold_rad:
-                signs[-1] = np.sign(way_rad)
-                extreme = index
-        elif way_rad * signs[-1] >= 0:
-            extreme = index
-        elif abs(way_rad) > threshold_rad:
-            turns.append(extreme)
-            signs.append(-signs[-1])
-            extreme = index
-    return np.array(turns), np.array(signs)
+    motion: Motion
+    stamps_s: FloatArray
+    places_px: FloatArray
+    rows: FloatArray
+    free: NDArray[np.bool_]
 
 
 def fit_offset(motion: Motion, stamps_s: FloatArray, places_px: FloatArray, rows: FloatArray) -> OffsetFit:
@@ -181,9 +104,10 @@ def fit_offset(motion: Motion, stamps_s: FloatArray, places_px: FloatArray, rows
     places_px, rows = places_px[:, patches], rows[patches]
     state = np.array([_search(motion, stamps_s, places_px), 0.0, 0.0])
     free = np.array([True, float(np.ptp(rows)) > 0.2, True])
+    problem = _Problem(motion, stamps_s, places_px, rows, free)
     weights = np.isfinite(places_px).astype(np.float64)
     for step in range(MOST_STEPS):
-        equations = _Equations(motion, stamps_s, places_px, rows, state, free, weights)
+        equations = _Equations(problem, state, weights)
         change = equations.step()
         state = state + change
         state[0] = np.clip(state[0], -1.5 * REACH_S, 1.5 * REACH_S)
@@ -193,8 +117,8 @@ def fit_offset(motion: Motion, stamps_s: FloatArray, places_px: FloatArray, rows
             break
     else:
         raise CannotTell("the fit of the time offset does not settle; a longer or wider sweep is needed")
-    sigmas = _sigmas(motion, stamps_s, places_px, rows, state, free, weights)
-    return _told(equations, state, free, sigmas)
+    sigmas = _sigmas(problem, state, weights)
+    return _told(equations, state, sigmas)
 
 
 def _search(motion: Motion, stamps_s: FloatArray, places_px: FloatArray) -> float:
@@ -241,25 +165,17 @@ def _unexplained(angles_rad: FloatArray, places_px: FloatArray) -> float:
 class _Equations:
     """The problem linearised at a state (o, c, h), each patch's cubic taken out of it."""
 
-    def __init__(
-        self,
-        motion: Motion,
-        stamps_s: FloatArray,
-        places_px: FloatArray,
-        rows: FloatArray,
-        state: FloatArray,
-        free: NDArray[np.bool_],
-        weights: FloatArray,
-    ) -> None:
-        self.free = free
+    def __init__(self, problem: _Problem, state: FloatArray, weights: FloatArray) -> None:
+        motion, places_px = problem.motion, problem.places_px
+        self.free = problem.free
         self.residuals_px = np.full(places_px.shape, np.nan)
         self.weights = np.zeros(places_px.shape)
         self.normal = np.zeros((3, 3))
         self.right = np.zeros(3)
         self.legs: set[int] = set()
         self.frames: set[int] = set()
-        for patch, row in enumerate(rows):
-            times_s = stamps_s + state[0] + state[1] * row
+        for patch, row in enumerate(problem.rows):
+            times_s = problem.stamps_s + state[0] + state[1] * row
             leg, sign = motion.leg(times_s)
             seen = np.isfinite(places_px[:, patch]) & (leg >= 0) & (weights[:, patch] > 0)
             if seen.sum() < LEAST_FRAMES // 2:
@@ -315,30 +231,22 @@ class _Equations:
         return np.where(np.isfinite(sizes), np.maximum(weights, 1e-6), 1e-3)
 
 
-def _sigmas(
-    motion: Motion,
-    stamps_s: FloatArray,
-    places_px: FloatArray,
-    rows: FloatArray,
-    state: FloatArray,
-    free: NDArray[np.bool_],
-    weights: FloatArray,
-) -> FloatArray:
+def _sigmas(problem: _Problem, state: FloatArray, weights: FloatArray) -> FloatArray:
     """One sigma of the state, (3,), by leaving out each way of the head in turn (the jackknife).
 
     Errors within one way go together: a reading's stamp, the phase of its counts, the play's side.
     """
-    leg, _ = motion.leg(stamps_s + state[0])
+    leg, _ = problem.motion.leg(problem.stamps_s + state[0])
     changes = []
     for number in np.unique(leg[leg >= 0]):
         rest = np.where((leg == number)[:, None], 0.0, weights)
-        changes.append(_Equations(motion, stamps_s, places_px, rows, state, free, rest).step())
+        changes.append(_Equations(problem, state, rest).step())
     spread = np.array(changes) - np.mean(changes, axis=0)
     sigmas: FloatArray = np.sqrt((len(changes) - 1) / len(changes) * np.sum(spread**2, axis=0))
     return sigmas
 
 
-def _told(equations: _Equations, state: FloatArray, free: NDArray[np.bool_], sigmas: FloatArray) -> OffsetFit:
+def _told(equations: _Equations, state: FloatArray, sigmas: FloatArray) -> OffsetFit:
     if abs(state[0]) > REACH_S:
         raise CannotTell(f"the stamps are further than {REACH_S:g} s off the joint readings")
     seen = equations.weights > 0
@@ -346,8 +254,8 @@ def _told(equations: _Equations, state: FloatArray, free: NDArray[np.bool_], sig
     return OffsetFit(
         offset_s=float(state[0]),
         sigma_s=float(sigmas[0]),
-        rolling_s=float(state[1]) if free[1] else None,
-        rolling_sigma_s=float(sigmas[1]) if free[1] else None,
+        rolling_s=float(state[1]) if equations.free[1] else None,
+        rolling_sigma_s=float(sigmas[1]) if equations.free[1] else None,
         play_rad=float(2 * state[2]),
         play_sigma_rad=float(2 * sigmas[2]),
         frames=len(equations.frames),

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from calib.mast.rig import Rig
 from calib.rigid import FloatArray
 from drivers.interfaces import Image
-from mastctl.cameras.sync_fit import CannotTell
+from mastctl.cameras.sync_motion import CannotTell
 
 HALF_PX = 15
 MOST_PATCHES = 12

@@ -18,7 +18,8 @@ from calib.mast.rig import Rig
 from calib.rigid import FloatArray
 from drivers.errors import DriverError, NoReply
 from drivers.interfaces import Camera, Frame, Reading
-from mastctl.cameras.sync_fit import REACH_S, CannotTell, Motion, OffsetFit, fit_offset
+from mastctl.cameras.sync_fit import REACH_S, OffsetFit, fit_offset
+from mastctl.cameras.sync_motion import CannotTell, Motion
 from mastctl.cameras.sync_patches import Patches, choose_patches
 from mastctl.devices.devices import Devices
 from mastctl.devices.limits import Limits

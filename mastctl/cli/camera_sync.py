@@ -116,7 +116,7 @@ def _ending_signals() -> Iterator[threading.Event]:
 
 def _found(sweep: Sweep, name: str, in_use_s: float) -> dict[str, Any]:
     """One camera's result, as JSON."""
-    from mastctl.cameras.sync_fit import CannotTell
+    from mastctl.cameras.sync_motion import CannotTell
 
     seen = sweep.seen[name]
     told: dict[str, Any] = {

@@ -12,7 +12,8 @@ from mastctl.cli.experiment_common import at_least_one, check_writable, seed, te
 
 if TYPE_CHECKING:
     from mastctl.client import Client
-    from mastctl.experiment.pointing import PointingExperiment, Truth
+    from mastctl.experiment.pointing import Truth
+    from mastctl.experiment.pointing_record import PointingExperiment
 
 DEFAULT_TARGETS = 10
 DEFAULT_DISTANCES_M = (10.0, 6.0, 2.0)
@@ -120,7 +121,8 @@ def _run(
 ) -> PointingExperiment:
     """Run with a progress bar on stderr, one step a target."""
 
-    from mastctl.experiment.pointing import TargetRecord, run_pointing_experiment
+    from mastctl.experiment.pointing import run_pointing_experiment
+    from mastctl.experiment.pointing_record import TargetRecord
     from mastctl.experiment.pointing_report import PICTURES_PER_DISTANCE
 
     with output.progress_bar(args.json) as progress:

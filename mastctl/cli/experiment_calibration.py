@@ -10,7 +10,9 @@ from typing import TYPE_CHECKING, Any
 from mastctl.cli import output
 
 if TYPE_CHECKING:
-    from mastctl.experiment.calibration import CalibrationExperiment, Outcome, Variant
+    from mastctl.experiment.calibration import CalibrationExperiment
+    from mastctl.experiment.calibration_survey import SurveyOutcome
+    from mastctl.experiment.calibration_variants import Variant
 
 DEFAULT_SURVEYS = 10
 DEFAULT_TARGETS = 20
@@ -58,7 +60,7 @@ def run(args: argparse.Namespace) -> int:
     """Run the study; 1 if no survey at all could be fitted."""
     from calib.files.mast_file import load_rig
     from mastctl.cli.experiment_common import check_writable
-    from mastctl.experiment.calibration import variants
+    from mastctl.experiment.calibration_variants import variants
     from mastctl.packaged import config_folder
 
     rig = load_rig(args.rig or config_folder() / "sim" / "rocky8.yaml").rig
@@ -85,7 +87,7 @@ def _run(args: argparse.Namespace, rig: Any, chosen: list[Variant]) -> Calibrati
     ):
         task = progress.add_task("surveys", total=len(chosen) * args.surveys)
 
-        def done(outcome: Outcome) -> None:
+        def done(outcome: SurveyOutcome) -> None:
             if outcome.failure:
                 words = f"{outcome.variant.study} {outcome.variant.label}: {outcome.failure}"
                 progress.console.print(words, style="yellow", markup=False)

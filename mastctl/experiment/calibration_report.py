@@ -9,18 +9,16 @@ from typing import Any
 import numpy as np
 
 from calib.mast.rig import Rig
-from mastctl.experiment.calibration import (
+from mastctl.experiment.calibration import PAPER_TABLE_V, CalibrationExperiment, VariantSummary
+from mastctl.experiment.calibration_survey import (
     DISTANCES_M,
     HANDOFFS,
     NAVCAM_TO_HAZCAM,
     PANCAM_TO_NAVCAM,
-    PAPER_STATION_M,
-    PAPER_TABLE_V,
-    CalibrationExperiment,
     Handoff,
-    Outcome,
-    Summary,
+    SurveyOutcome,
 )
+from mastctl.experiment.calibration_variants import PAPER_STATION_M
 from mastctl.report import pages, plots
 from mastctl.report.figures import Figure
 from mastctl.report.records import write_csv, write_json
@@ -49,7 +47,7 @@ def as_json(experiment: CalibrationExperiment) -> dict[str, Any]:
     }
 
 
-def pointing_rows(summaries: Sequence[Summary]) -> Table:
+def pointing_rows(summaries: Sequence[VariantSummary]) -> Table:
     """Return headings and rows on pointing and on the fits: one row a variant."""
     headings = ["study", "", "failed", *(f"{d:g} m" for d in DISTANCES_M)]
     headings += [*(f"exact clicks, {d:g} m" for d in DISTANCES_M), "fit, s"]
@@ -62,7 +60,7 @@ def pointing_rows(summaries: Sequence[Summary]) -> Table:
     return Table(headings, rows)
 
 
-def handoff_rows(summaries: Sequence[Summary]) -> Table:
+def handoff_rows(summaries: Sequence[VariantSummary]) -> Table:
     """Return headings and rows on hand-off, rms and worst: one row a variant."""
     headings = ["study", "", *(f"{name}, {d:g} m" for name, d in HANDOFFS)]
     rows = []
@@ -75,7 +73,7 @@ def handoff_rows(summaries: Sequence[Summary]) -> Table:
     return Table(headings, rows)
 
 
-def short_rows(summaries: Sequence[Summary]) -> Table:
+def short_rows(summaries: Sequence[VariantSummary]) -> Table:
     """Return the study for a terminal: x and y of all distances together."""
     headings = ["", "", "pointing", "exact", "Pancam to Navcam", "worst", "Navcam to Hazcam", "worst"]
     rows = []
@@ -163,7 +161,7 @@ def _page(experiment: CalibrationExperiment) -> str:
     )
 
 
-def _plots(summaries: Sequence[Summary]) -> Iterator[tuple[str, Figure]]:
+def _plots(summaries: Sequence[VariantSummary]) -> Iterator[tuple[str, Figure]]:
     """Pointing and hand-off against each thing that was varied."""
     for study, label in STUDIES.items():
         mine = [s for s in summaries if s.variant.study.startswith(study)]
@@ -172,7 +170,7 @@ def _plots(summaries: Sequence[Summary]) -> Iterator[tuple[str, Figure]]:
             yield label, plots.plot(_errors_against(label, mine), f"errors against {label}", caption)
 
 
-def _errors_against(label: str, summaries: Sequence[Summary]) -> Any:
+def _errors_against(label: str, summaries: Sequence[VariantSummary]) -> Any:
     """One study's three plots."""
     figure = plots.new(11.5, 3.8)
     axes = figure.subplots(1, 3)
@@ -207,7 +205,7 @@ def _errors_against(label: str, summaries: Sequence[Summary]) -> Any:
     return figure
 
 
-def _variant_told(summary: Summary) -> dict[str, Any]:
+def _variant_told(summary: VariantSummary) -> dict[str, Any]:
     variant = summary.variant
     return {
         "study": variant.study,
@@ -234,7 +232,7 @@ def _table_told(table: Table) -> dict[str, Any]:
     return {"columns": table[0], "rows": table[1]}
 
 
-def _csv_rows(outcome: Outcome) -> Iterator[list[Any]]:
+def _csv_rows(outcome: SurveyOutcome) -> Iterator[list[Any]]:
     start = [outcome.variant.study, outcome.variant.label]
     if outcome.failure:
         yield [*start, "", "", "", "", outcome.failure]
@@ -245,7 +243,7 @@ def _csv_rows(outcome: Outcome) -> Iterator[list[Any]]:
         yield [*start, name, distance, *np.sqrt(np.nanmean(errors**2, axis=0)).tolist(), ""]
 
 
-def _with_parameters(experiment: CalibrationExperiment, parameters: int) -> list[Outcome]:
+def _with_parameters(experiment: CalibrationExperiment, parameters: int) -> list[SurveyOutcome]:
     return [
         outcome
         for outcome in experiment.of("mast parameters")

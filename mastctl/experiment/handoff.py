@@ -24,7 +24,7 @@ from calib.mast.covariance import RigCovariance, stored_covariance
 from calib.mast.rig import Rig
 from calib.pictures.warp import grey
 from mastctl.client import Client, ClientError, Snapshot
-from mastctl.experiment.handoff_record import Handed, HandoffExperiment, HandoffRecord, summarise
+from mastctl.experiment.handoff_record import Handed, HandoffExperiment, HandoffRecord, summarise_handoffs
 from mastctl.experiment.known_points import KnownPoint, KnownPoints
 from mastctl.experiment.pointing import Truth
 from mastctl.experiment.targets import Target
@@ -102,7 +102,7 @@ def run_handoff_experiment(
                 on_target(record)
     kinds = list(dict.fromkeys(record.kind for record in records))
     summaries = [
-        summarise(f"{source} to {to}", kind, camera, records)
+        summarise_handoffs(f"{source} to {to}", kind, camera, records)
         for source, to, _ in steps
         for kind in kinds
         for camera in rig.stereo[to]

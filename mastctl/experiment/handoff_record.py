@@ -137,7 +137,7 @@ class HandoffExperiment:
         }
 
 
-def summarise(step: str, kind: str, camera: str, records: Sequence[HandoffRecord]) -> HandoffSummary:
+def summarise_handoffs(step: str, kind: str, camera: str, records: Sequence[HandoffRecord]) -> HandoffSummary:
     """Return the table's row of one kind of target in one camera of one step."""
     mine = [r for r in records if r.step == step and r.kind == kind]
     seen = [h for r in mine for h in r.handed if h.camera == camera]

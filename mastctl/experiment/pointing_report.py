@@ -10,7 +10,12 @@ from typing import Any
 import cv2
 import numpy as np
 
-from mastctl.experiment.pointing import PAPER_TABLE_VI, DistanceSummary, PointingExperiment, TargetRecord
+from mastctl.experiment.pointing_record import (
+    PAPER_TABLE_VI,
+    DistanceSummary,
+    PointingExperiment,
+    TargetRecord,
+)
 from mastctl.report import pages, pictures, plots
 from mastctl.report.figures import Figure
 from mastctl.report.records import write_csv, write_json

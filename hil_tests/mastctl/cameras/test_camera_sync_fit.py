@@ -7,7 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from mastctl.cameras.sync_fit import CannotTell, Motion, OffsetFit, fit_offset
+from mastctl.cameras.sync_fit import OffsetFit, fit_offset
+from mastctl.cameras.sync_motion import CannotTell, Motion
 
 
 @dataclass(frozen=True)

@@ -24,13 +24,9 @@ from drivers.sim_survey.survey import SurveyPlan
 from hil_tests.mastctl.calibration.survey_world import RIG_FILE
 from mastctl.calibration.run import FITS
 from mastctl.cli.main import main
-from mastctl.experiment.calibration import (
-    CalibrationExperiment,
-    Variant,
-    run_calibration_experiment,
-    variants,
-)
+from mastctl.experiment.calibration import CalibrationExperiment, run_calibration_experiment
 from mastctl.experiment.calibration_report import as_json, table_iv, table_v, write_study_report
+from mastctl.experiment.calibration_variants import Variant, variants
 from mastctl.experiment.executors import NoExecutor, open_executor
 
 PLAN = SurveyPlan(sigma=Sigma(0.002, 0.1))
@@ -139,7 +135,7 @@ def test_the_report_and_the_document(experiment: CalibrationExperiment, tmp_path
 
 def test_the_command(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
     few = tuple(replace(v, study="prisms") for v in CHOSEN[1:])
-    monkeypatch.setattr("mastctl.experiment.calibration.variants", lambda: few)
+    monkeypatch.setattr("mastctl.experiment.calibration_variants.variants", lambda: few)
     words = ["experiment", "calibration", "--study", "prisms", "--surveys", "1", "--targets", "2"]
     assert main([*words, "--workers", "1", "--json"]) == 0
     told = json.loads(capsys.readouterr().out)

@@ -17,7 +17,13 @@ from mastctl.cli.main import main
 from mastctl.client import Client, ClientError
 from mastctl.config import load_config
 from mastctl.experiment.demo import demo_config
-from mastctl.experiment.pointing import Landing, PointingExperiment, TargetRecord, rms, summarise
+from mastctl.experiment.pointing_record import (
+    Landing,
+    PointingExperiment,
+    TargetRecord,
+    rms,
+    summarise_distance,
+)
 from mastctl.experiment.pointing_report import CSV_COLUMNS, pointing_table, write_pointing_report
 from mastctl.experiment.targets import on_level_ground, textured
 from mastctl.experiment.views import pointed
@@ -46,7 +52,7 @@ def lost(index: int, error: str) -> TargetRecord:
 def experiment(*records: TargetRecord) -> PointingExperiment:
     """An experiment at 6 m and an empty one at 4 m."""
     status = {"hardware": "simulated", "mast": {"file": "m.yaml", "digest": "ab" * 32}, "cameras": {}}
-    summaries = (summarise(6.0, records, 12.0), summarise(4.0, [], 0.0))
+    summaries = (summarise_distance(6.0, records, 12.0), summarise_distance(4.0, [], 0.0))
     return PointingExperiment(
         "http://127.0.0.1:1", status, 1, "navcam_left", (511.5, 383.5), records, summaries,
         "2026-01-01T00:00:00Z", 12.0, ("a note",),
@@ -54,7 +60,7 @@ def experiment(*records: TargetRecord) -> PointingExperiment:
 
 
 def test_failed_targets_are_counted_and_not_averaged() -> None:
-    row = summarise(6.0, [landed(0, 3.0, 0.0), landed(1, -1.0, 2.0), lost(2, "flat")], 12.0)
+    row = summarise_distance(6.0, [landed(0, 3.0, 0.0), landed(1, -1.0, 2.0), lost(2, "flat")], 12.0)
     assert (row.targets, row.failed) == (3, 1)
     assert row.first_rms_px == pytest.approx((math.sqrt(5.0), math.sqrt(2.0)))
     assert row.true_second_rms_px == pytest.approx((0.0, 0.1))
@@ -63,7 +69,7 @@ def test_failed_targets_are_counted_and_not_averaged() -> None:
 
 
 def test_a_distance_without_any_landing_has_no_rms() -> None:
-    row = summarise(6.0, [lost(0, "flat")], 1.0)
+    row = summarise_distance(6.0, [lost(0, "flat")], 1.0)
     assert row.first_rms_px is None
     assert experiment(lost(0, "flat")).as_json()["distances"][0]["first_rms_px"] is None
 

@@ -25,7 +25,7 @@ from mastctl.cli import experiment_handoff
 from mastctl.cli.main import main
 from mastctl.client import Client, ClientError
 from mastctl.experiment.handoff import run_handoff_experiment
-from mastctl.experiment.handoff_record import Handed, HandoffExperiment, HandoffRecord, summarise
+from mastctl.experiment.handoff_record import Handed, HandoffExperiment, HandoffRecord, summarise_handoffs
 from mastctl.experiment.handoff_report import (
     handoff_table,
     handoff_targets,
@@ -71,7 +71,7 @@ RECORDS = (
 
 
 def test_errors_are_against_the_truth_and_only_accepted_ones_are_refined() -> None:
-    row = summarise(STEP, "ground", "hazcam_left", RECORDS)
+    row = summarise_handoffs(STEP, "ground", "hazcam_left", RECORDS)
     assert (row.targets, row.failed, row.accepted) == (3, 1, 1)
     assert row.geometric_rms_px == pytest.approx((math.sqrt(5.0), math.sqrt(8.0)))
     assert row.geometric_bias_px == pytest.approx((1.0, -2.0))
@@ -85,12 +85,12 @@ def test_without_the_truth_the_refined_pixel_stands_in() -> None:
     assert one.geometric_error_px == (3.0, -4.0)
     assert one.refined_error_px is None
     assert handed((1.0, 1.0), (0.0, 0.0), None, "flat").geometric_error_px is None
-    empty = summarise(STEP, "ground", "hazcam_right", RECORDS)
+    empty = summarise_handoffs(STEP, "ground", "hazcam_right", RECORDS)
     assert empty.geometric_rms_px is None and empty.refined_rms_px is None
 
 
 def test_the_report_holds_every_target_and_escapes_what_it_is_told(tmp_path: Path) -> None:
-    summaries = (summarise(STEP, "ground", "hazcam_left", RECORDS),)
+    summaries = (summarise_handoffs(STEP, "ground", "hazcam_left", RECORDS),)
     experiment = HandoffExperiment({"hardware": "simulated"}, 1, 0.2, RECORDS, summaries, "now", 3.0)
     page = write_handoff_report(experiment, tmp_path / "new").read_text()
     assert "&lt;i&gt;none" in page and "hidden &lt;b&gt;" in page and "<i>none" not in page
@@ -107,8 +107,8 @@ def test_the_report_holds_every_target_and_escapes_what_it_is_told(tmp_path: Pat
 def test_kinds_of_targets_have_rows_of_their_own() -> None:
     corner = replace(RECORDS[0], index=3, kind="corner")
     records = (*RECORDS, corner)
-    assert summarise(STEP, "ground", "hazcam_left", records).targets == 3
-    assert summarise(STEP, "corner", "hazcam_left", records).targets == 1
+    assert summarise_handoffs(STEP, "ground", "hazcam_left", records).targets == 3
+    assert summarise_handoffs(STEP, "corner", "hazcam_left", records).targets == 1
     headings, rows = handoff_targets(records)
     assert all(len(row) == len(headings) for row in rows)
     assert rows[3][:3] == [STEP, "3", "corner"] and rows[3][4:6] == ["3.00, -4.00", "0.50, 0.00"]

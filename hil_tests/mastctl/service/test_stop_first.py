@@ -90,7 +90,7 @@ def test_no_lock_that_somebody_holds_keeps_the_event_loop(
                     with contextlib.suppress(httpx.TimeoutException):  # these may wait for it
                         hasty.request(method, path, json=body)
                 for path in ("/status", "/track", "/operations", f"/operations/{operation}", "/mast"):
-                    assert client._http.get(f"/api/v1{path}").status_code == 200, (
+                    assert client._daemon._http.get(f"/api/v1{path}").status_code == 200, (
                         f"{path} while {place} is held"
                     )
             client.stop()

@@ -261,9 +261,9 @@ def test_hand_offs_that_tell_an_offset_say_so(
     eventually(lambda: path.exists() and len(read_log(path).handoffs) == 12, "the record is written")
     folder = daemon.service.config.mast_file.parent
     save_rig(replace(rig(), name="better"), folder / "better.yaml")
-    client._json("POST", "/mast", json={"file": "better.yaml"})
+    client._daemon.json("POST", "/mast", json={"file": "better.yaml"})
     assert client.track()["self_check"] == {"handoffs": 0, "offsets": []}
-    client._json("POST", "/mast/back")
+    client._daemon.json("POST", "/mast/back")
     assert len(client.track()["self_check"]["offsets"]) == 1
 
 
@@ -363,7 +363,7 @@ def test_bodies_of_poses_that_make_no_sense_are_refused(
 ) -> None:
     body = {"position_m": [0, 0, 0], "quaternion": [1, 0, 0, 0], **change}
     with pytest.raises(ClientError) as refused:
-        client._json("POST", "/pose", json=body)
+        client._daemon.json("POST", "/pose", json=body)
     assert (refused.value.code, refused.value.exit_code) == ("bad_request", 2)
     assert words in str(refused.value)
     assert client.track()["pose"] is None
@@ -559,7 +559,7 @@ def test_another_mast_file_ends_the_track(client: Client, daemon: RunningDaemon)
         replace(rig(), name="better", mast=Mast(np.array([0.31, 0, -1.41]), np.zeros(3))),
         folder / "better.yaml",
     )
-    client._json("POST", "/mast", json={"file": "better.yaml"})
+    client._daemon.json("POST", "/mast", json={"file": "better.yaml"})
     track = client.track()
     assert track["state"] == "stopped"
     assert "mast file better.yaml came into use" in track["reason"]

@@ -1,0 +1,287 @@
+"""A small client of a running daemon: what the command line and the experiments use."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any, Literal
+from urllib.parse import quote
+
+from mastctl.client.connection import ClientError, Connection
+from mastctl.client.snapshot import Snapshot, read_snapshot
+
+DEFAULT_URL = "http://127.0.0.1:8420"
+POLL_S = 0.05
+
+
+class Client:
+    """A connection to one daemon. A context manager; usable from one thread at a time.
+
+    Parameters
+    ----------
+    url
+        ``http://127.0.0.1:8420``, or ``unix:/path/of/socket``.
+    timeout_s
+        What each request is given, seconds.
+
+    Raises
+    ------
+    ClientError
+        ``bad_url``, if the address is of neither form. Every method raises it for whatever goes wrong.
+    """
+
+    def __init__(self, url: str = DEFAULT_URL, timeout_s: float = 30.0) -> None:
+        self.url = url
+        self._daemon = Connection(url, timeout_s)
+
+    def status(self) -> dict[str, Any]:
+        """Return what the daemon knows at this moment."""
+        return self._daemon.json("GET", "/status")
+
+    def point(
+        self,
+        *,
+        pixel: tuple[str, str, float, float] | None = None,
+        position_m: Sequence[float] | None = None,
+        frame: Literal["rover", "site"] | None = None,
+        pan_rad: float | None = None,
+        tilt_rad: float | None = None,
+        aim: tuple[str, float, float] | None = None,
+        pointings: int | None = None,
+    ) -> str:
+        """Start a pointing operation and return its id.
+
+        Parameters
+        ----------
+        pixel
+            (camera, frame id, x, y), pixels; or
+        position_m, frame
+            a point, metres, in the ``rover`` (default) or ``site`` frame; or
+        pan_rad, tilt_rad
+            joint angles.
+        aim
+            (camera, x, y): where the target shall come; the daemon's default when left out.
+        pointings
+            1 (default) or 2.
+        """
+        body = _target(pixel, position_m, frame)
+        if aim is not None:
+            body["aim"] = dict(zip(("camera", "x_px", "y_px"), aim, strict=True))
+        others = {"pan_rad": pan_rad, "tilt_rad": tilt_rad, "pointings": pointings}
+        body |= {key: value for key, value in others.items() if value is not None}
+        return str(self._daemon.json("POST", "/point", json=body)["id"])
+
+    def operation(self, operation_id: str) -> dict[str, Any]:
+        """Return an operation's record."""
+        return self._daemon.json("GET", f"/operations/{quote(operation_id, safe='')}")
+
+    def operations(self) -> list[dict[str, Any]]:
+        """Return the newest operations, newest first, without their steps."""
+        return list(self._daemon.json("GET", "/operations")["operations"])
+
+    def wait(
+        self,
+        operation_id: str,
+        timeout_s: float = 60.0,
+        on_step: Callable[[dict[str, Any]], None] | None = None,
+    ) -> dict[str, Any]:
+        """Wait until an operation has ended (done, failed or stopped) and return its record.
+
+        Parameters
+        ----------
+        on_step
+            Called with each step as it comes.
+
+        Raises
+        ------
+        ClientError
+            ``timeout``, if it has not ended in time; it goes on.
+        """
+        until_s = time.monotonic() + timeout_s
+        told = 0
+        while True:
+            record = self.operation(operation_id)
+            for step in record["steps"][told:]:
+                told += 1
+                if on_step is not None:
+                    on_step(step)
+            if record["state"] in ("done", "failed", "stopped"):
+                return record
+            if time.monotonic() > until_s:
+                raise ClientError("timeout", f"operation {operation_id} has not ended after {timeout_s:g} s")
+            time.sleep(POLL_S)
+
+    def stop(self) -> dict[str, Any]:
+        """Stop the mast and the running operation."""
+        return self._daemon.json("POST", "/stop")
+
+    def pose(
+        self,
+        position_m: Sequence[float],
+        quaternion: Sequence[float],
+        *,
+        covariance: Sequence[Sequence[float]] | None = None,
+        sigma: tuple[float, float] | None = None,
+        time_s: float | None = None,
+        look: bool = True,
+    ) -> dict[str, Any]:
+        """Say where the rover stands; return the track as it is then, and the ``operation`` of a look.
+
+        Parameters
+        ----------
+        position_m, quaternion
+            site_from_rover: (x, y, z), metres, and (w, x, y, z).
+        covariance
+            6 rows of 6 of the motion since the pose before, along the rover's axes of this pose: x, y, z in
+            metres, then the turns about them in radians; or
+        sigma
+            (metres, radians): one sigma of each axis of its translation and of its rotation.
+        time_s
+            By the sender's clock.
+        look
+            Whether a track's target shall be looked for.
+        """
+        body: dict[str, Any] = {
+            "position_m": [float(value) for value in position_m],
+            "quaternion": [float(value) for value in quaternion],
+            "look": look,
+        }
+        if covariance is not None:
+            body["covariance"] = [[float(value) for value in row] for row in covariance]
+        if sigma is not None:
+            body["sigma"] = {"position_m": sigma[0], "rotation_rad": sigma[1]}
+        if time_s is not None:
+            body["time_s"] = time_s
+        return self._daemon.json("POST", "/pose", json=body)
+
+    def track(self) -> dict[str, Any]:
+        """Return the track as it is."""
+        return self._daemon.json("GET", "/track")
+
+    def start_track(
+        self,
+        *,
+        pixel: tuple[str, str, float, float] | None = None,
+        position_m: Sequence[float] | None = None,
+        frame: Literal["rover", "site"] | None = None,
+    ) -> str:
+        """Start to follow a target and return the operation's id; arguments as for `point`."""
+        return str(self._daemon.json("POST", "/track", json=_target(pixel, position_m, frame))["id"])
+
+    def look(self) -> str:
+        """Look for the track's target once more; return the operation's id."""
+        return str(self._daemon.json("POST", "/track/look")["id"])
+
+    def wait_track(
+        self,
+        operation_id: str | None,
+        timeout_s: float = 60.0,
+        on_step: Callable[[dict[str, Any]], None] | None = None,
+    ) -> dict[str, Any]:
+        """Wait until a start or a look of the track has ended; return the track after it.
+
+        ``None`` for the operation returns the track as it is. Raises ClientError as `wait`.
+        """
+        if operation_id is not None:
+            self.wait(operation_id, timeout_s, on_step)
+        until_s = time.monotonic() + timeout_s
+        while (track := self.track())["operation"] == operation_id is not None:
+            if time.monotonic() > until_s:
+                raise ClientError("timeout", f"the track did not take up operation {operation_id}")
+            time.sleep(POLL_S)
+        return track
+
+    def watch_track(self) -> Iterator[dict[str, Any]]:
+        """Yield the track as it is, and again at each change, until the daemon ends."""
+        yield from self._daemon.events("/track/stream")
+
+    def stop_track(self) -> dict[str, Any]:
+        """End the track; return it as it is then."""
+        return self._daemon.json("POST", "/track/stop")
+
+    def snapshot(
+        self,
+        camera: str,
+        *,
+        fresh: bool = True,
+        frame_id: str | None = None,
+        format: Literal["png", "jpeg"] = "png",
+    ) -> Snapshot:
+        """Return a picture with its facts.
+
+        Parameters
+        ----------
+        camera
+            The camera's name.
+        fresh
+            Whether it must be exposed after the daemon got the request; else it is at most a second old.
+        frame_id
+            A frame that the daemon still keeps, instead of a new one.
+        format
+            ``png`` is lossless.
+        """
+        query: dict[str, str] = {"format": format}
+        if frame_id is None:
+            query["fresh"] = "true" if fresh else "false"
+        else:
+            query["frame_id"] = frame_id
+        answer = self._daemon.ask("GET", f"/snapshot/{quote(camera, safe='')}", params=query)
+        try:
+            return read_snapshot(answer.content, answer.headers)
+        except ValueError as reason:
+            raise self._daemon.bad_answer(str(reason)) from None
+
+    def mast_file(self) -> bytes:
+        """Return the mast file that the daemon uses, byte for byte."""
+        return bytes(self._daemon.ask("GET", "/mast").content)
+
+    def true_pose(self) -> dict[str, Any]:
+        """Return where a simulated rover truly stands: ``position_m`` and ``quaternion``, site_from_rover."""
+        return self._daemon.json("GET", "/simulation/pose")
+
+    def stand(
+        self, x_m: float, y_m: float, heading_rad: float, pitch_rad: float = 0.0, roll_rad: float = 0.0
+    ) -> dict[str, Any]:
+        """Put a simulated rover somewhere on its ground, truly; return its true pose."""
+        body = {"x_m": x_m, "y_m": y_m, "heading_rad": heading_rad}
+        body |= {"pitch_rad": pitch_rad, "roll_rad": roll_rad}
+        return self._daemon.json("POST", "/simulation/pose", json=body)
+
+    def faults(self) -> list[dict[str, Any]]:
+        """Return the faults that are switched on in a simulated rover."""
+        return list(self._daemon.json("GET", "/simulation/faults")["faults"])
+
+    def set_fault(self, device: str, word: str, **parameters: float) -> list[dict[str, Any]]:
+        """Switch a fault of a simulated device on; return all that are on."""
+        body = {"device": device, "word": word, "parameters": parameters}
+        return list(self._daemon.json("POST", "/simulation/faults", json=body)["faults"])
+
+    def clear_faults(self, device: str | None = None) -> None:
+        """Switch the faults of one simulated device off, or all."""
+        self._daemon.json("DELETE", "/simulation/faults", params={} if device is None else {"device": device})
+
+    def close(self) -> None:
+        """Let go of the connection."""
+        self._daemon.close()
+
+    def __enter__(self) -> Client:
+        return self
+
+    def __exit__(self, *ignored: object) -> None:
+        self.close()
+
+
+def _target(
+    pixel: tuple[str, str, float, float] | None,
+    position_m: Sequence[float] | None,
+    frame: Literal["rover", "site"] | None,
+) -> dict[str, Any]:
+    """What a request says of its target: a pixel of a frame, or a point; what was not given is left out."""
+    body: dict[str, Any] = {}
+    if pixel is not None:
+        body["pixel"] = dict(zip(("camera", "frame_id", "x_px", "y_px"), pixel, strict=True))
+    if position_m is not None:
+        body["position_m"] = [float(value) for value in position_m]
+    if frame is not None:
+        body["frame"] = frame
+    return body

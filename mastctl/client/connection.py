@@ -1,0 +1,127 @@
+"""Questions to a daemon over HTTP; whatever goes wrong is a `ClientError`."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from typing import Any
+from urllib.parse import unquote, urlsplit
+
+import httpx
+
+PREFIX = "/api/v1"
+_BAD_INPUT = frozenset({400, 404, 413, 415, 422})
+
+
+class ClientError(Exception):
+    """The daemon refused, failed, or did not answer.
+
+    Attributes
+    ----------
+    code
+        The daemon's word, or the client's own: ``no_daemon``, ``bad_url``, ``timeout``, ``bad_answer``.
+    detail
+        What else the daemon told, or None.
+    exit_code
+        What a command ends with: 2 for bad input, 1 for a failure.
+    """
+
+    def __init__(
+        self, code: str, message: str, detail: Mapping[str, Any] | None = None, exit_code: int = 1
+    ) -> None:
+        self.code = code
+        self.detail = detail
+        self.exit_code = exit_code
+        super().__init__(message)
+
+
+class Connection:
+    """A connection to one daemon; parameters and errors as `Client` has them."""
+
+    def __init__(self, url: str, timeout_s: float) -> None:
+        self.url = url
+        transport: httpx.HTTPTransport | None = None
+        base = url.rstrip("/")
+        if url.startswith("unix:"):
+            transport = httpx.HTTPTransport(uds=unquote(url.removeprefix("unix:").removeprefix("//")))
+            base = "http://localhost"
+        try:
+            parts = urlsplit(base)
+            if parts.scheme not in ("http", "https") or not parts.hostname or (parts.port or 1) < 1:
+                raise ValueError
+            # No proxy of the environment: the daemon is on this machine, or reached by a tunnel to it.
+            self._http = httpx.Client(base_url=base, timeout=timeout_s, trust_env=False, transport=transport)
+        except (ValueError, httpx.InvalidURL):
+            raise ClientError(
+                "bad_url",
+                f"'{url}' is no address of a daemon; http://127.0.0.1:8420 or unix:/path is expected",
+                exit_code=2,
+            ) from None
+
+    def json(self, method: str, path: str, **options: Any) -> dict[str, Any]:
+        """Ask, and return the answer, which must be a JSON object."""
+        answer = self.ask(method, path, **options)
+        try:
+            document = answer.json()
+        except ValueError:
+            document = None
+        if not isinstance(document, dict):
+            raise self.bad_answer("the answer is not a JSON object")
+        return document
+
+    def ask(self, method: str, path: str, **options: Any) -> httpx.Response:
+        """Ask, and return a good answer; everything else is a ClientError."""
+        with self._failures(f"the daemon at {self.url} took the request but did not answer"):
+            try:
+                answer = self._http.request(method, PREFIX + path, **options)
+            except ValueError as error:
+                raise ClientError(
+                    "bad_request", f"the request cannot be sent: {error}", exit_code=2
+                ) from None
+        if answer.is_success:
+            return answer
+        try:
+            told = answer.json()["error"]
+            code, message, detail = str(told["code"]), str(told["message"]), told.get("detail")
+        except (ValueError, LookupError, TypeError, AttributeError):
+            raise self.bad_answer(f"it says {answer.status_code}, not in the way of this program") from None
+        exit_code = 2 if answer.status_code in _BAD_INPUT else 1
+        raise ClientError(code, message, detail if isinstance(detail, dict) else None, exit_code)
+
+    def events(self, path: str) -> Iterator[dict[str, Any]]:
+        """Yield what a stream of the daemon tells, until the daemon ends."""
+        with (
+            self._failures(f"the daemon at {self.url} fell silent"),
+            self._http.stream("GET", PREFIX + path) as answer,
+        ):
+            if not answer.is_success:
+                raise self.bad_answer(f"the stream says {answer.status_code}")
+            for line in answer.iter_lines():
+                if line.startswith("data:"):
+                    try:
+                        event = json.loads(line.removeprefix("data:"))
+                    except ValueError:
+                        raise self.bad_answer("an event of the stream is not JSON") from None
+                    yield event
+
+    def close(self) -> None:
+        """Let go of the connection."""
+        self._http.close()
+
+    def bad_answer(self, reason: str) -> ClientError:
+        """Return the error of an answer that no daemon of this program gives."""
+        return ClientError("bad_answer", f"what answers at {self.url} is no mastctl daemon: {reason}")
+
+    @contextmanager
+    def _failures(self, silent: str) -> Iterator[None]:
+        """What a connection may meet, as ClientError."""
+        try:
+            yield
+        except (httpx.ConnectError, httpx.ConnectTimeout):
+            words = f"no daemon answers at {self.url}; 'mastctl run' starts one"
+            raise ClientError("no_daemon", words) from None
+        except httpx.TimeoutException:
+            raise ClientError("timeout", silent) from None
+        except httpx.HTTPError as error:
+            raise ClientError("no_daemon", f"the connection to {self.url} broke: {error}") from None
