@@ -25,6 +25,7 @@ from drivers.clock import Clock, SystemClock
 from drivers.errors import BadOptions, DriverError, NoReply
 from drivers.faults import PAN_TILT, nearest
 from drivers.interfaces import Camera, PanTilt
+from drivers.simulation_clock import SimulationClock, simulation_speed
 
 if TYPE_CHECKING:
     from drivers.sim.rover import SimulatedRover
@@ -37,7 +38,7 @@ HEADS = {"dynamixel": "drivers.dynamixel.head", "flir_ptu": "drivers.flir_ptu.he
 """Pan/tilt drivers of this repository: the module whose ``open_head(options, clock)`` opens them."""
 
 OURS = ("sim", "replay")
-"""No device behind them: they neither fail for a moment nor block."""
+"""No device behind them: they neither fail for a moment nor block, and live on any clock."""
 
 BUILT_IN = (*HEADS, "v4l2", *OURS)
 
@@ -138,6 +139,27 @@ class Hardware:
         self.close()
 
 
+def clock_for(settings: HardwareSettings) -> Clock:
+    """Return the clock that these devices live on: the simulation's, if it is not to go as life does.
+
+    Raises
+    ------
+    BadOptions
+        If a speed is asked for that is none, or that a device cannot follow: real ones, those from outside,
+        and simulated wires live in real time.
+    """
+    speed = simulation_speed(settings.simulation.get("speed", 1.0))
+    if speed == 1.0:
+        return SystemClock()
+    told = f"simulation.speed is {settings.simulation['speed']}, expected 1:"
+    for name, device in {PAN_TILT: settings.pan_tilt, **settings.cameras}.items():
+        if device.driver not in OURS:
+            raise BadOptions(f"{told} driver {device.driver!r} lives in real time", device=name)
+    if settings.simulation.get("wire") is not None:
+        raise BadOptions(f"{told} the bytes of simulation.wire travel in real time")
+    return SimulationClock(speed)
+
+
 def open_hardware(settings: HardwareSettings, clock: Clock | None = None) -> Hardware:
     """Open the head and every camera that the settings name, one after the other.
 
@@ -149,7 +171,8 @@ def open_hardware(settings: HardwareSettings, clock: Clock | None = None) -> Har
     settings
         Drivers and their options.
     clock
-        Time for simulated and replayed devices; the machine's monotonic clock when left out.
+        Time for simulated and replayed devices, as a rule that of `clock_for`; the machine's monotonic clock
+        when left out.
 
     Raises
     ------

@@ -25,6 +25,31 @@ from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import TracebackType
+from typing import Any
+
+from drivers.errors import BadOptions
+from drivers.options import is_number
+
+FASTEST = 1000.0
+MAX = "max"
+
+
+def simulation_speed(value: Any) -> float:
+    """Return the speed that ``simulation.speed`` asks for: seconds in a second, infinite for ``max``.
+
+    Raises
+    ------
+    BadOptions
+        For anything but a number from 0.1 to 1000 or ``max``.
+    """
+    if value == MAX:
+        return math.inf
+    if not is_number(value) or not 0.1 <= value <= FASTEST:
+        raise BadOptions(
+            f"simulation.speed is {value!r}, expected 1 (as life), up to {FASTEST:g} (so many times faster), "
+            f"or {MAX} (nothing waits)"
+        )
+    return float(value)
 
 
 class _Member:

@@ -34,6 +34,7 @@ from drivers.sim.pan_tilt import HeadSettings, SimulatedPanTilt, head_settings
 from drivers.sim.render import Renderer, compile_renderer
 from drivers.sim.scene import SceneSettings, build_scene
 from drivers.sim.wired_head import DEFAULT_HEADS, WiredHead, check_head
+from drivers.simulation_clock import simulation_speed
 
 TRUTH_FRAMES = 512
 """How many frames of each camera ``frame_truth`` remembers."""
@@ -69,6 +70,8 @@ class SimulationSettings:
     wire
         None: the head is in memory. ``dynamixel`` or ``flir_ptu``: the real driver turns it through a
         simulated line.
+    speed
+        Of the clock that the rover is told to live on (`drivers.open_hardware.clock_for`); infinite: ``max``.
     """
 
     rover: Path
@@ -78,9 +81,10 @@ class SimulationSettings:
     scene: SceneSettings = field(default_factory=SceneSettings)
     faults: tuple[Mapping[str, Any], ...] = ()
     wire: str | None = None
+    speed: float = 1.0
 
 
-_KEYS = ("rover", "head", "seed", "samples", "scene", "cameras", "faults", "wire")
+_KEYS = ("rover", "head", "seed", "samples", "scene", "cameras", "faults", "wire", "speed")
 
 
 def simulation_settings(section: Mapping[str, Any], folder: Path) -> SimulationSettings:
@@ -92,7 +96,8 @@ def simulation_settings(section: Mapping[str, Any], folder: Path) -> SimulationS
         Keys ``rover`` (a mast file, relative to ``folder``), ``head`` (a preset, see
         ``drivers.sim.pan_tilt.head_settings``), ``seed`` (of scene and noise), ``samples``, ``scene``
         (fields of ``SceneSettings``), ``cameras`` (fields of ``CameraSettings``), ``faults`` (a list, or a
-        script's name), ``wire``. Only ``rover`` is needed.
+        script's name), ``wire``, ``speed`` (`drivers.simulation_clock.simulation_speed`). Only ``rover`` is
+        needed.
     folder
         Where relative paths start.
 
@@ -140,6 +145,7 @@ def simulation_settings(section: Mapping[str, Any], folder: Path) -> SimulationS
         scene=_filled(SceneSettings(), scene, "simulation.scene"),
         faults=tuple(faults),
         wire=wire,
+        speed=simulation_speed(section.get("speed", 1.0)),
     )
 
 

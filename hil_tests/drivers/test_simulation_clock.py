@@ -8,9 +8,13 @@ import random
 import threading
 import time
 from collections.abc import Callable
+from dataclasses import replace
 
 import pytest
 
+from drivers.clock import SystemClock
+from drivers.errors import BadOptions
+from drivers.open_hardware import DeviceSettings, HardwareSettings, clock_for
 from drivers.simulation_clock import SimulationClock
 
 LONG_S = 20.0
@@ -221,3 +225,42 @@ def test_at_a_finite_speed_computing_holds_the_time() -> None:
 def test_a_speed_that_is_none_is_refused(speed: float) -> None:
     with pytest.raises(ValueError, match="positive"):
         SimulationClock(speed)
+
+
+SIMULATED = HardwareSettings(
+    DeviceSettings("sim", {}), {"navcam_left": DeviceSettings("sim", {})}, {"rover": "rover.yaml"}
+)
+
+
+@pytest.mark.parametrize(("asked", "speed"), [("max", math.inf), (10, 10.0), (0.5, 0.5)])
+def test_a_simulation_lives_on_the_clock_that_it_asks_for(asked: object, speed: float) -> None:
+    clock = clock_for(replace(SIMULATED, simulation={"rover": "rover.yaml", "speed": asked}))
+    assert isinstance(clock, SimulationClock)
+    assert clock.speed == speed
+
+
+def test_as_life_is_the_machines_own_clock() -> None:
+    assert isinstance(clock_for(SIMULATED), SystemClock)
+    assert isinstance(clock_for(replace(SIMULATED, simulation={"speed": 1})), SystemClock)
+
+
+@pytest.mark.parametrize("asked", [0, -1, 1001, "fast", True, None, math.nan, [10]])
+def test_a_speed_that_is_none_is_refused_with_what_would_be_right(asked: object) -> None:
+    with pytest.raises(BadOptions, match=r"simulation\.speed is .*expected 1 .* or max"):
+        clock_for(replace(SIMULATED, simulation={"rover": "rover.yaml", "speed": asked}))
+
+
+@pytest.mark.parametrize("driver", ["dynamixel", "flir_ptu", "v4l2", "package.module:factory"])
+def test_real_devices_refuse_a_time_of_another_speed(driver: str) -> None:
+    simulation = {"rover": "rover.yaml", "speed": "max"}
+    head = HardwareSettings(DeviceSettings(driver, {}), SIMULATED.cameras, simulation)
+    eye = HardwareSettings(SIMULATED.pan_tilt, {"navcam_left": DeviceSettings(driver, {})}, simulation)
+    for settings, device in ((head, "pan_tilt"), (eye, "navcam_left")):
+        with pytest.raises(BadOptions, match=rf"{device}: .*'{driver}' lives in real time"):
+            clock_for(settings)
+
+
+def test_bytes_on_a_simulated_wire_refuse_it_too() -> None:
+    simulation = {"rover": "rover.yaml", "speed": 10, "wire": "dynamixel"}
+    with pytest.raises(BadOptions, match="travel in real time"):
+        clock_for(replace(SIMULATED, simulation=simulation))
