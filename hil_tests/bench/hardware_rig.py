@@ -20,7 +20,7 @@ from drivers.faults import FaultPanel
 from drivers.interfaces import PanTilt, Reading
 from drivers.open_hardware import DeviceSettings, HardwareSettings, open_hardware
 from mastctl.config import Config, load_config
-from mastctl.pointing.requests import PointingSettings
+from mastctl.pointing.settings import PointingSettings
 from tools.campaigns.servo_rigs import LIMITS_RAD, Rig
 
 CHOSEN: str | None = None

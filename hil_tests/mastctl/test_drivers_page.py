@@ -21,7 +21,7 @@ from mastctl.devices import devices as devices_module
 from mastctl.devices import frames, joint_history, rest, stops
 from mastctl.devices.devices import Devices
 from mastctl.devices.limits import Limits
-from mastctl.pointing.requests import PointingSettings
+from mastctl.pointing.settings import PointingSettings
 from mastctl.service import service as service_module
 
 

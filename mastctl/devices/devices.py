@@ -42,7 +42,7 @@ from mastctl.devices.joint_history import JointHistory
 from mastctl.devices.limits import Limits
 from mastctl.devices.stops import Stops
 from mastctl.devices.thread import Asked, DeviceThread, Fault, Words
-from mastctl.errors import FrameGone, MastctlError, Stopped
+from mastctl.errors import MastctlError, NoLonger, Stopped
 
 log = logging.getLogger(__name__)
 
@@ -64,12 +64,6 @@ WORDS = {
     "release_exposure": Words("an operation has held and released the exposure again"),
 }
 MOVED_RAD = 1e-5  # a head camera's picture that stays the same to the last bit beyond this is frozen
-
-
-class UnknownCamera(MastctlError):
-    """A camera was named that is not configured."""
-
-    code = "unknown_camera"
 
 
 class HardwareLike(Protocol):
@@ -254,17 +248,15 @@ class Devices:
 
         Raises
         ------
-        UnknownCamera
-            If a name is not configured.
+        NotKnown
+            ``unknown_camera`` if a name is not configured.
         NoFreshFrame, BadFrame, NoReply, DriverError
             If a camera did not deliver, or none that belong together; the first in the order asked.
         BadReply
             If the head's readings do not reach around an exposure.
         """
         for camera in cameras:
-            if camera not in self._cameras:
-                known = ", ".join(sorted(self._cameras)) or "none"
-                raise UnknownCamera(f"camera {camera} is not configured; configured are {known}")
+            frame_checks.check_known(camera, self._cameras)
         deadline_s = self._time.now_s() + timeout_s
         names = tuple(dict.fromkeys(cameras))
         if len(names) < 2:
@@ -336,13 +328,13 @@ class Devices:
 
         Raises
         ------
-        FrameGone
-            With the code ``frame_unknown``, ``frame_too_old`` or ``other_mast_file``.
+        NotKnown, NoLonger, NotNow
+            ``frame_unknown``, ``frame_too_old`` or ``other_mast_file``.
         """
         frame = self._store.by_id(frame_id)
         age_s = self._clock.now_s() - frame.mid_exposure_s
         if max_age_s is not None and age_s > max_age_s:
-            raise FrameGone(
+            raise NoLonger(
                 "frame_too_old", f"frame {frame_id} is {age_s:.0f} s old, at most {max_age_s:.0f} s is taken"
             )
         return frame

@@ -11,14 +11,14 @@ import re
 import secrets
 import threading
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
 
 from drivers.errors import BadFrame, NoFreshFrame
 from drivers.interfaces import Image
-from mastctl.errors import FrameGone
+from mastctl.errors import NoLonger, NotKnown, NotNow
 
 _FRAME_ID = re.compile(r"(.{1,100})-([0-9]{6,20})-([0-9a-f]{8})-([0-9a-f]{4})", re.ASCII)
 KEPT_FRAMES = 16  # per camera; six cameras of 1024x768 grey are 75 MB
@@ -76,6 +76,14 @@ class CheckedFrame:
     def exposure_began_s(self) -> float:
         """When the exposure began, seconds of CLOCK_MONOTONIC."""
         return self.mid_exposure_s - self.exposure_s / 2
+
+
+def check_known(camera: str, configured: Iterable[str]) -> None:
+    """Pass the name of a configured camera. Raises NotKnown ``unknown_camera``."""
+    known = sorted(configured)
+    if camera not in known:
+        words = f"camera {camera[:80]} is not configured; configured are {', '.join(known) or 'none'}"
+        raise NotKnown("unknown_camera", words)
 
 
 def check_size(camera: str, size_px: tuple[int, int], wanted_px: tuple[int, int]) -> None:
@@ -202,7 +210,7 @@ class FrameStore:
 
         Raises
         ------
-        FrameGone
+        NoLonger, NotNow, NotKnown
             ``frame_too_old`` if it was taken in this run but is no longer kept, ``other_mast_file`` if it
             was taken with another mast file, ``frame_unknown`` otherwise.
         """
@@ -218,16 +226,16 @@ class FrameStore:
         if named is not None:
             camera, sequence, mast, run = named.groups()
             if mast != in_use:
-                raise FrameGone(
+                raise NotNow(
                     "other_mast_file",
                     f"frame {frame_id} was taken with mast file {mast}..., the one in use is {in_use}...",
                 )
             if run == runs.get(camera) and int(sequence) <= newest.get(camera, -1):
-                raise FrameGone(
+                raise NoLonger(
                     "frame_too_old",
                     f"frame {frame_id} is no longer kept (the newest {self._kept} of a camera are)",
                 )
-        raise FrameGone("frame_unknown", f"frame {frame_id[:120]} was not taken by this run of the service")
+        raise NotKnown("frame_unknown", f"frame {frame_id[:120]} was not taken by this run of the service")
 
 
 def camera_and_sequence(frame_id: str) -> tuple[str, int]:

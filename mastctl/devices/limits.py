@@ -10,10 +10,10 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from mastctl.errors import MastctlError
+from mastctl.errors import BadRequest
 
 
-class OutsideLimits(MastctlError):
+class OutsideLimits(BadRequest):
     """A joint angle or speed that must not be commanded.
 
     Attributes
@@ -24,14 +24,12 @@ class OutsideLimits(MastctlError):
         The asked value and the limit it breaks, in ``unit``; the bound is NaN for a value that is no number.
     """
 
-    code = "outside_limits"
-
     def __init__(self, what: str, value: float, bound: float, unit: str, message: str) -> None:
         self.what = what
         self.value = value
         self.bound = bound
         self.unit = unit
-        super().__init__(message)
+        super().__init__("outside_limits", message)
 
     @property
     def detail(self) -> dict[str, float | str]:

@@ -19,7 +19,8 @@ from calib.pictures.warp import Grey, Plane, carry, facing_plane, grey
 from calib.rigid import FloatArray
 from drivers.interfaces import Reading
 from mastctl.devices.frames import StampedFrame
-from mastctl.pointing.requests import PointingError, PointingSettings, rounded
+from mastctl.pointing.results import PointingError, rounded
+from mastctl.pointing.settings import PointingSettings
 
 
 class CamerasLike(Protocol):
@@ -82,10 +83,6 @@ class Eyes:
                 return pair
         return ()
 
-    def named(self, frame_id: str) -> View:
-        """Return a kept frame by its id. Raises FrameGone."""
-        return self._view(self._cameras.frame_by_id(frame_id))
-
     def new(
         self, names: Sequence[str], after_s: float, resting: Reading, timeout_s: float | None = None
     ) -> dict[str, View]:
@@ -114,7 +111,7 @@ class Eyes:
                     f"the head moved while frame {frame.frame_id} was exposed ({apart:.4f} rad off its rest)"
                 )
                 raise PointingError("head_moving", words)
-            views[name] = self._view(frame)
+            views[name] = self.view(frame)
         return views
 
     def again(self, view: View, pixel_px: FloatArray, now: View) -> PatchMatch:
@@ -268,7 +265,7 @@ class Eyes:
         usual = self._settings.match
         return usual, replace(usual, half_px=self._settings.small_half_px)
 
-    def _view(self, frame: StampedFrame) -> View:
+    def view(self, frame: StampedFrame) -> View:
         if not (math.isfinite(frame.pan_rad) and math.isfinite(frame.tilt_rad)):
             raise PointingError("bad_reading", f"frame {frame.frame_id} has no finite joint angles")
         camera = self._rig.camera_in_rover(frame.camera, frame.pan_rad, frame.tilt_rad)

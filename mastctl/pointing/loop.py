@@ -34,24 +34,20 @@ from drivers.interfaces import Reading
 from mastctl.devices.limits import Limits
 from mastctl.errors import MastctlError
 from mastctl.pointing.looking import Clicked, View, facts
-from mastctl.pointing.requests import (
-    Aim,
-    AnglesTarget,
+from mastctl.pointing.requests import Aim, AnglesTarget, PixelTarget, PointRequest, PositionTarget
+from mastctl.pointing.results import (
     Pair,
-    PixelTarget,
     Pointing,
     PointingError,
     PointingResult,
-    PointingSettings,
-    PointRequest,
-    PositionTarget,
     Step,
     pair,
     rounded,
     triple,
 )
+from mastctl.pointing.settings import PointingSettings
 from mastctl.pointing.steps import DevicesLike, Steps
-from mastctl.pointing.wanted import aim_of, check_pointings, position_in_rover_m
+from mastctl.pointing.wanted import aim_of
 
 __all__ = [
     "Aim",
@@ -164,7 +160,6 @@ class _Run:
 
     def _do(self, request: PointRequest) -> None:
         target, rig = request.target, self._rig
-        check_pointings(request)
         if isinstance(target, AnglesTarget):
             self._steps.rest()
             settled = self._steps.go(target.pan_rad, target.tilt_rad)
@@ -173,7 +168,7 @@ class _Run:
         aim = aim_of(request, rig)
         aim_px = np.array([aim.x_px, aim.y_px])
         if isinstance(target, PositionTarget):
-            self._position_m = position_in_rover_m(target)
+            self._position_m = np.array(target.position_m)
             commanded, settled = self._solve_and_go(aim, aim_px, self._steps.rest())
             now = self._steps.look((aim.camera,), settled)[aim.camera]
             self._done(self._pointing(commanded, now, aim_px, None))

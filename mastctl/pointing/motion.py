@@ -10,7 +10,8 @@ from drivers.clock import Clock
 from drivers.interfaces import Reading
 from mastctl.devices.limits import Limits
 from mastctl.devices.rest import RestWatch
-from mastctl.pointing.requests import PointingError, PointingSettings
+from mastctl.pointing.results import PointingError
+from mastctl.pointing.settings import PointingSettings
 
 
 class HeadLike(Protocol):

@@ -10,7 +10,8 @@ import numpy as np
 from calib.rigid import FloatArray
 from drivers.interfaces import Reading
 from mastctl.pointing.looking import Eyes, View
-from mastctl.pointing.requests import PointingError, PointingSettings
+from mastctl.pointing.results import PointingError
+from mastctl.pointing.settings import PointingSettings
 
 
 def check_one_moment(

@@ -7,7 +7,7 @@ from contextlib import contextmanager
 from typing import Any
 
 from drivers.clock import Clock
-from mastctl.pointing.requests import Step
+from mastctl.pointing.results import Step
 
 
 class Recorder:

@@ -9,12 +9,15 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any, ParamSpec, Protocol, TypeVar
 
+import numpy as np
+
 from calib.mast.rig import Rig
 from calib.rigid import FloatArray
 from drivers.clock import Clock
 from drivers.errors import DriverError
 from drivers.interfaces import Reading
 from mastctl.devices.limits import Limits
+from mastctl.errors import NotNow
 from mastctl.pointing.abandoned import result_unless
 from mastctl.pointing.counts import counts_told
 from mastctl.pointing.looking import CamerasLike, Eyes, View, facts
@@ -22,8 +25,10 @@ from mastctl.pointing.motion import Head, HeadLike
 from mastctl.pointing.motion_seen import MotionSeen
 from mastctl.pointing.one_moment import apart, check_one_moment
 from mastctl.pointing.record import Recorder
-from mastctl.pointing.requests import PixelTarget, PointingError, PointingSettings, Step
-from mastctl.pointing.wanted import clicked_px
+from mastctl.pointing.requests import PixelTarget
+from mastctl.pointing.results import Step
+from mastctl.pointing.settings import PointingSettings
+from mastctl.pointing.wanted import clicked_frame
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -123,21 +128,13 @@ class Steps:
 
         Raises
         ------
-        PointingError, FrameGone, DriverError
-            If camera, frame or pixel do not fit, or the thing is not found.
+        MastctlError, DriverError
+            If camera, frame or pixel do not fit (`clicked_frame`), or the thing is not found.
         """
-        pixel = clicked_px(target, self._rig)
+        view = self.eyes.view(clicked_frame(target, self._rig, self._devices.frame_by_id))
+        pixel = np.array([target.x_px, target.y_px])
         partner = self.eyes.partner(target.camera)
-        if partner is None:
-            words = f"{target.camera} is in no stereo pair with both eyes configured: no range"
-            raise PointingError("no_stereo", words)
-        view = self.eyes.named(target.frame_id)
-        if view.frame.camera != target.camera:
-            words = f"frame {target.frame_id} is of camera {view.frame.camera}, not of {target.camera}"
-            raise PointingError("wrong_camera", words)
-        if view.frame.moving:
-            words = f"the head moved while frame {target.frame_id} was exposed; click in another"
-            raise PointingError("head_moving", words)
+        assert partner is not None
         resting = self.rest()
         with self.step("frames") as detail:
             began_s = self._clock.now_s()
@@ -146,9 +143,8 @@ class Steps:
             detail.update(frame_ids=[now.frame.frame_id, other.frame.frame_id], **apart(now, [other]))
             self._motion_seen.remember(fresh)
             if view.frame.mast_digest != now.frame.mast_digest:
-                raise PointingError(
-                    "other_mast_file", f"frame {target.frame_id} was taken with another mast file"
-                )
+                words = f"frame {target.frame_id} was taken with another mast file"
+                raise NotNow("other_mast_file", words)
         with self.step("target") as detail:
             again = self.unless_stopped(self.eyes.again, view, pixel, now)
             detail.update(facts(again))

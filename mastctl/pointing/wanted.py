@@ -1,14 +1,13 @@
-"""A request judged against the mast file before anything moves: is there such a camera, pixel, frame?"""
+"""A request judged before anything moves: is there such a camera, such a pixel, a frame that serves?"""
 
 from __future__ import annotations
 
-import numpy as np
+from collections.abc import Callable
 
 from calib.mast.rig import Rig
-from calib.rigid import FloatArray
-from mastctl.pointing.requests import Aim, PixelTarget, PointingError, PointRequest, PositionTarget
-
-FRAMES_KNOWN = ("rover", "site")
+from mastctl.devices.frames import StampedFrame, check_known
+from mastctl.errors import BadRequest, NotNow
+from mastctl.pointing.requests import Aim, PixelTarget, PointRequest
 
 
 def aim_of(request: PointRequest, rig: Rig) -> Aim:
@@ -16,67 +15,83 @@ def aim_of(request: PointRequest, rig: Rig) -> Aim:
 
     Raises
     ------
-    PointingError
-        ``unknown_camera``, ``bad_aim`` (a camera that does not turn with the head), ``outside_image``.
+    BadRequest
+        ``bad_aim`` (no camera that is configured and turns with the head), ``outside_image``.
     """
     aim = request.aim
+    on_head = [name for name, camera in rig.cameras.items() if camera.on == "head"]
     if aim is None:
         clicked = [request.target.camera] if isinstance(request.target, PixelTarget) else []
         lefts = [left for left, _ in rig.stereo.values()]
-        for name in [*clicked, *lefts, *rig.cameras]:
-            if name in rig.cameras and rig.cameras[name].on == "head":
-                x, y = rig.cameras[name].model.image_center_px
-                return Aim(name, x, y)
+        for name in [*clicked, *lefts, *on_head]:
+            if name in on_head:
+                return Aim(name, *rig.cameras[name].model.image_center_px)
         words = "no camera on the head is configured to aim with; only joint angles can be pointed at"
-        raise PointingError("bad_aim", words)
-    camera = rig.cameras.get(aim.camera)
-    if camera is None:
-        raise PointingError("unknown_camera", f"aim.camera {aim.camera[:80]} is not configured")
-    if camera.on != "head":
-        raise PointingError("bad_aim", f"aim.camera: {aim.camera} is on the rover's body and cannot be aimed")
-    _inside(rig, aim.camera, aim.x_px, aim.y_px, "aim")
+        raise BadRequest("bad_aim", words)
+    if aim.camera not in on_head:
+        known = ", ".join(on_head) or "there is none"
+        words = f"'{aim.camera[:80]}' where a configured camera on the head is expected: {known}"
+        raise BadRequest("bad_aim", f"aim.camera is {words}")
+    _check_inside(rig, aim.camera, aim.x_px, aim.y_px, "aim")
     return aim
 
 
-def clicked_px(target: PixelTarget, rig: Rig) -> FloatArray:
-    """Return the clicked pixel (2,), checked. Raises PointingError."""
-    if target.camera not in rig.cameras:
-        raise PointingError("unknown_camera", f"camera {target.camera[:80]} is not configured")
-    _inside(rig, target.camera, target.x_px, target.y_px, "pixel")
-    return np.array([target.x_px, target.y_px])
+def clicked_frame(
+    target: PixelTarget, rig: Rig, find: Callable[[str], StampedFrame], mast_file: Rig | None = None
+) -> StampedFrame:
+    """Return the frame that was clicked in, if its camera, the pixel and its moment serve.
 
+    Parameters
+    ----------
+    target
+        What was clicked.
+    rig
+        The cameras that are configured.
+    find
+        Returns a kept frame by its id.
+    mast_file
+        The whole mast file's rig, to tell a pair that it lacks from one that the configuration lacks.
 
-def position_in_rover_m(target: PositionTarget) -> FloatArray:
-    """Return a position target (3,) as it stands, checked. Raises PointingError.
-
-    Who knows the rover's pose carries a ``site`` position to the rover frame first; without one they are one.
+    Raises
+    ------
+    NotKnown, BadRequest, NotNow
+        ``unknown_camera``, ``no_stereo``, ``wrong_camera``, ``outside_image``, ``frame_moving``; whatever
+        ``find`` raises.
     """
-    if target.frame not in FRAMES_KNOWN:
-        words = f"frame is {target.frame[:80]} where rover or site is expected"
-        raise PointingError("bad_request", words)
-    position = np.array(target.position_m, dtype=np.float64)
-    if position.shape != (3,) or not np.isfinite(position).all():
-        words = f"position_m is {target.position_m} where 3 finite numbers are expected"
-        raise PointingError("bad_request", words)
-    return position
+    camera = target.camera
+    check_known(camera, rig.cameras)
+    _check_pair(camera, rig, mast_file or rig)
+    frame = find(target.frame_id)
+    if frame.camera != camera:
+        raise wrong_camera(frame, camera)
+    if frame.moving:
+        words = f"the head moved while frame {frame.frame_id} was exposed; take another"
+        raise NotNow("frame_moving", words)
+    _check_inside(rig, camera, target.x_px, target.y_px, "pixel")
+    return frame
 
 
-def check_pointings(request: PointRequest) -> None:
-    """Pass 1, and 2 where a second one can do something. Raises PointingError."""
-    if request.pointings not in (1, 2):
-        raise PointingError("bad_request", f"pointings is {request.pointings} where 1 or 2 is expected")
-    if request.pointings == 2 and not isinstance(request.target, PixelTarget):
-        raise PointingError(
-            "bad_request",
-            "a second pointing measures a clicked target again: it goes with a pixel, not with "
-            "a position or joint angles",
-        )
+def wrong_camera(frame: StampedFrame, camera: str) -> BadRequest:
+    """Return what is wrong with a frame that is of another camera than was said."""
+    return BadRequest("wrong_camera", f"frame {frame.frame_id} is of camera {frame.camera}, not of {camera}")
 
 
-def _inside(rig: Rig, camera: str, x_px: float, y_px: float, what: str) -> None:
-    """Pass a pixel of the camera's image."""
+def _check_pair(camera: str, rig: Rig, mast_file: Rig) -> None:
+    """Pass a camera whose other eye is configured too: without it there is no range. Raises BadRequest."""
+    if any(camera in eyes for eyes in rig.stereo.values()):
+        return
+    words = f"{camera} is in no stereo pair of the mast file"
+    for pair, eyes in mast_file.stereo.items():
+        if camera in eyes:
+            other = eyes[1] if camera == eyes[0] else eyes[0]
+            words = f"the other eye of the stereo pair {pair}, {other}, is not in the configuration"
+    raise BadRequest("no_stereo", f"{words}, so a pixel of {camera} has no range")
+
+
+def _check_inside(rig: Rig, camera: str, x_px: float, y_px: float, what: str) -> None:
+    """Pass a pixel of the camera's image. Raises BadRequest."""
     model = rig.cameras[camera].model
     if not model.holds((x_px, y_px)):
         width, height = model.size_px
-        words = f"{what}: pixel ({x_px:g}, {y_px:g}) is outside the {width}x{height} px of {camera}"
-        raise PointingError("outside_image", words)
+        words = f"{what} ({x_px:g}, {y_px:g}) is outside the image of {width}x{height} px of {camera}"
+        raise BadRequest("outside_image", words)

@@ -2,22 +2,29 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import logging
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from calib.errors import BadFile
+from calib.errors import BadFile, CalibError
 from calib.files import read_bytes
 from calib.files.mast_file import StoredRig, parse_rig
 from calib.files.yaml_text import MAX_BYTES
+from calib.mast.covariance import stored_covariance
+from calib.mast.rig import Rig
 from mastctl.config import Config, check_cameras
-from mastctl.errors import MastctlError
+from mastctl.errors import BadRequest
+
+log = logging.getLogger(__name__)
 
 
-class BadMastFile(MastctlError):
+class BadMastFile(BadRequest):
     """A mast file that cannot take the place of the one in use; the sentence says why."""
 
-    code = "bad_mast_file"
+    def __init__(self, message: str) -> None:
+        super().__init__("bad_mast_file", message)
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,6 +89,26 @@ def read_next(name: str, config: Config, now: MastInUse) -> MastInUse:
     for camera in config.hardware.cameras:
         _check_camera(camera, stored, now.stored)
     return MastInUse(stored, data, path)
+
+
+def configured(rig: Rig, cameras: Iterable[str]) -> Rig:
+    """Return the part of a rig that this daemon can see with: nothing is aimed with a camera it lacks."""
+    names = set(cameras)
+    fit = {key: value for key, value in rig.fit.items() if key not in ("parameters", "covariance")}
+    try:
+        known = stored_covariance(rig)
+    except CalibError as error:
+        log.warning("the calibration counts as exact: %s", error)
+        known = None
+    if known is not None:
+        part = known.of(tuple(names))
+        fit |= {"parameters": list(part.names), "covariance": part.covariance.tolist()}
+    return replace(
+        rig,
+        fit=fit,
+        cameras={name: camera for name, camera in rig.cameras.items() if name in names},
+        stereo={pair: eyes for pair, eyes in rig.stereo.items() if names.issuperset(eyes)},
+    )
 
 
 def _check_camera(camera: str, stored: StoredRig, now: StoredRig) -> None:

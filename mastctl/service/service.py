@@ -4,27 +4,28 @@ from __future__ import annotations
 
 import logging
 import threading
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
+from functools import partial
 from importlib.metadata import version
 from typing import Any
 
-from calib.errors import CalibError
+import numpy as np
+
 from calib.files.mast_file import StoredRig
-from calib.mast.covariance import stored_covariance
-from calib.mast.rig import Rig
 from drivers.clock import Clock, SystemClock
 from drivers.open_hardware import Hardware, open_hardware
 from mastctl.config import Config
-from mastctl.devices.devices import HEAD, Devices, UnknownCamera
-from mastctl.devices.frames import StampedFrame
-from mastctl.errors import FrameGone, MastctlError
+from mastctl.devices.devices import HEAD, Devices
+from mastctl.devices.frames import StampedFrame, check_known
+from mastctl.errors import NotNow
 from mastctl.handoff.check import HandoffCheck
-from mastctl.operations import STOP_ASKED, Busy, Operation, Operations
+from mastctl.operations.operations import STOP_ASKED, Operations, busy
+from mastctl.operations.records import Operation
 from mastctl.pointing.loop import PointingLoop
-from mastctl.pointing.requests import Aim, AnglesTarget, PixelTarget, PointRequest, PositionTarget
-from mastctl.pointing.wanted import position_in_rover_m
-from mastctl.service.mast_in_use import MastInUse, read_mast, read_next
+from mastctl.pointing.requests import AnglesTarget, PixelTarget, PointRequest, PositionTarget
+from mastctl.pointing.wanted import aim_of, clicked_frame, wrong_camera
+from mastctl.service.mast_in_use import MastInUse, configured, read_mast, read_next
 from mastctl.service.state import State
 from mastctl.service.stop_threads import StopThreads
 from mastctl.tracking.pose import RoverPose
@@ -39,26 +40,6 @@ SNAPSHOT_TIMEOUT_S = 5.0
 RENDERING_S = 20.0  # six simulated cameras share one renderer, on a machine that may be busy
 HARDWARE_CLOSE_S = 3.0
 ENDS_SOON_S = 0.25  # a stopped operation ends within 20 ms or so; then the next one may follow at once
-
-
-class Refused(MastctlError):
-    """A request that makes no sense for this rig; ``code`` names why."""
-
-    def __init__(self, code: str, message: str) -> None:
-        self.code = code
-        super().__init__(message)
-
-
-class NoFormerMast(MastctlError):
-    """There is no former mast file to go back to."""
-
-    code = "no_former_mast"
-
-
-class HeadMoves(MastctlError):
-    """Something that needs a head at rest was asked for while it moves."""
-
-    code = "moving"
 
 
 class Service:
@@ -99,7 +80,7 @@ class Service:
         self.devices = Devices(hardware, config.limits, mast.stored.digest, clock, mast.stored.rig, grace_s)
         self.operations = Operations(self.devices, clock)
         self.stop_threads = StopThreads()
-        self._rig = _configured(mast.stored.rig, config.hardware.cameras)
+        self._rig = configured(mast.stored.rig, config.hardware.cameras)
         self._loop = PointingLoop(self._rig, self.devices, config.limits, clock)
         self.handoffs = HandoffCheck(config.tracking.handoff_log, mast.stored.digest, clock)
         self.tracker = Tracker(
@@ -175,7 +156,7 @@ class Service:
 
         Raises
         ------
-        UnknownCamera, DriverError
+        NotKnown, DriverError
             As `mastctl.devices.devices.Devices.frames`.
         """
         now_s = self.clock.now_s()
@@ -183,29 +164,24 @@ class Service:
         return self.devices.frames([camera], after_s, SNAPSHOT_TIMEOUT_S)[camera]
 
     def check_camera(self, camera: str) -> None:
-        """Pass a configured camera's name. Raises UnknownCamera."""
-        known = self.devices.newest_frames()
-        if camera not in known:
-            words = ", ".join(sorted(known)) or "none"
-            raise UnknownCamera(f"camera {camera[:80]} is not configured; configured are {words}")
+        """Pass a configured camera's name. Raises NotKnown."""
+        check_known(camera, self.devices.newest_frames())
 
     def kept_frame(self, camera: str, frame_id: str) -> StampedFrame:
         """Return a frame that is still kept, by its id.
 
         Raises
         ------
-        FrameGone, Refused, UnknownCamera
+        NotKnown, NoLonger, NotNow, BadRequest
             If it is not kept, is of another camera, or there is no such camera.
         """
         self.check_camera(camera)
         frame = self.devices.frame_by_id(frame_id)
         if frame.camera != camera:
-            raise Refused("wrong_camera", f"frame {frame_id} is of camera {frame.camera}, not of {camera}")
+            raise wrong_camera(frame, camera)
         return frame
 
-    def point(
-        self, request: PointRequest, told: Mapping[str, Any], mast_digest: str | None = None
-    ) -> Operation:
+    def point(self, request: PointRequest, told: Mapping[str, Any]) -> Operation:
         """Start a pointing operation and return its first record.
 
         Parameters
@@ -214,24 +190,18 @@ class Service:
             What to point at.
         told
             The request as it came, for the record.
-        mast_digest
-            The mast file that the client took the pixel by, if it says so.
 
         Raises
         ------
-        FrameGone
-            If the clicked frame is unknown, too old, or of another mast file.
-        OutsideLimits
-            If joint angles were asked for that may not be commanded.
-        Refused
-            If a camera or pixel does not fit this rig, or the head moved while the frame was exposed.
-        Busy
-            If another operation runs.
+        NotKnown, NoLonger, BadRequest
+            If camera, frame, pixel or joint angles do not fit this rig.
+        NotNow
+            If the frame is of another mast file, head or rover moved since, or another operation runs.
         """
         with self._mast_lock:
             if isinstance(request.target, PositionTarget):
                 request = replace(request, target=self._in_rover(request.target))
-            self._check(request, mast_digest)
+            self._check(request)
             loop = self._loop
 
             def run(record: Callable[[Any], None], cancelled: threading.Event) -> Any:
@@ -240,22 +210,18 @@ class Service:
 
             return self.operations.start(told, run)
 
-    def start_track(
-        self, target: PixelTarget | PositionTarget, told: Mapping[str, Any], mast_digest: str | None = None
-    ) -> Operation:
+    def start_track(self, target: PixelTarget | PositionTarget, told: Mapping[str, Any]) -> Operation:
         """Begin to follow what a pixel shows, or what is seen at a position; return the start's record.
 
         Raises
         ------
-        TrackRuns, Busy
-            If a track or another operation runs.
-        FrameGone, Refused
-            As for `point`.
+        NotKnown, NoLonger, BadRequest, NotNow
+            As for `point`; ``busy`` also while a track runs.
         """
         with self._mast_lock:
             if isinstance(target, PositionTarget):
                 target = self._in_rover(target)
-            self._check(PointRequest(target), mast_digest)
+            self._check(PointRequest(target))
             return self.tracker.start(target, told)
 
     def take_pose(self, pose: RoverPose, look: bool) -> str | None:
@@ -263,7 +229,7 @@ class Service:
 
         Raises
         ------
-        PoseRefused
+        BadRequest, NotNow
             As `mastctl.tracking.tracker.Tracker.take_pose`.
         """
         with self._mast_lock:
@@ -274,7 +240,7 @@ class Service:
 
         Raises
         ------
-        NoTrack, Busy
+        NotNow, Unable
             As `mastctl.tracking.tracker.Tracker.look`.
         """
         with self._mast_lock:
@@ -298,8 +264,8 @@ class Service:
         ------
         BadMastFile
             If it cannot be used; nothing has changed.
-        Busy, HeadMoves
-            If an operation runs or the head moves.
+        NotNow
+            ``busy``, ``moving``: if an operation runs or the head moves.
         DriverError
             If the head does not say whether it moves.
         """
@@ -310,14 +276,12 @@ class Service:
 
         Raises
         ------
-        NoFormerMast
-            If none was loaded since the start.
-        Busy, HeadMoves, DriverError
-            As for `load_mast`.
+        NotNow, DriverError
+            ``no_former_mast`` if none was loaded since the start; else as for `load_mast`.
         """
         former = self.former
         if former is None:
-            raise NoFormerMast("no other mast file was in use since the daemon started")
+            raise NotNow("no_former_mast", "no other mast file was in use since the daemon started")
         return self._use(former)
 
     def _use(self, mast: MastInUse) -> MastInUse:
@@ -326,11 +290,11 @@ class Service:
         with self._mast_lock:
             running = self.operations.motion.operation
             if running is not None:
-                raise Busy(running)
+                raise busy(running)
             if reading.moving:
-                raise HeadMoves("the head moves; a mast file is changed while it rests")
+                raise NotNow("moving", "the head moves; a mast file is changed while it rests")
             self.devices.use_rig(mast.stored.rig, mast.stored.digest)
-            self._rig = _configured(mast.stored.rig, self.config.hardware.cameras)
+            self._rig = configured(mast.stored.rig, self.config.hardware.cameras)
             self._loop = PointingLoop(self._rig, self.devices, self.config.limits, self.clock)
             self.tracker.use_rig(self._rig, mast.path.name)
             self.handoffs.use_mast(mast.stored.digest)
@@ -340,28 +304,22 @@ class Service:
         log.info("mast file %s (%s) is in use", mast.path.name, mast.stored.digest[:12])
         return mast
 
-    def _check(self, request: PointRequest, mast_digest: str | None) -> None:
+    def _check(self, request: PointRequest) -> None:
         """Refuse a request that does not fit the mast file in use; see `point`."""
         target = request.target
-        if mast_digest is not None and mast_digest != self.stored.digest:
-            raise FrameGone(
-                "other_mast_file",
-                f"the pixel was taken with mast file {mast_digest[:8]}..., "
-                f"the one in use is {self.stored.digest[:8]}...",
-            )
         if isinstance(target, PixelTarget):
             self._check_pixel(target)
         if isinstance(target, AnglesTarget):
             self.config.limits.check(target.pan_rad, target.tilt_rad)
         if request.aim is not None:
-            self._check_aim(request.aim)
+            aim_of(request, self._rig)
 
     def _in_rover(self, target: PositionTarget) -> PositionTarget:
         """A position in the rover frame of now; before the first pose that is the site frame."""
         pose = self.tracker.pose
         if target.frame != "site" or pose is None:
             return target
-        x, y, z = pose.site_from_rover.inverse.points(position_in_rover_m(target)).tolist()
+        x, y, z = pose.site_from_rover.inverse.points(np.array(target.position_m)).tolist()
         return PositionTarget((x, y, z), "rover")
 
     def stop(self) -> str | None:
@@ -391,71 +349,16 @@ class Service:
         _bounded("closing the hardware", self.hardware.close, HARDWARE_CLOSE_S)
 
     def _check_pixel(self, target: PixelTarget) -> None:
-        if target.camera not in self._rig.cameras:
-            known = ", ".join(self._rig.cameras) or "none"
-            raise UnknownCamera(f"camera {target.camera[:80]} is not configured; configured are {known}")
-        self._check_pair(target.camera)
-        frame = self.devices.frame_by_id(target.frame_id, CLICK_AGE_S)
-        if frame.camera != target.camera:
-            words = f"frame {target.frame_id} is of camera {frame.camera}, not of {target.camera}"
-            raise Refused("wrong_camera", words)
-        if frame.moving:
-            words = f"the head moved while frame {target.frame_id} was exposed; take another"
-            raise Refused("frame_moving", words)
+        taken_with, in_use = target.mast_digest, self.stored.digest
+        if taken_with not in (None, in_use):
+            words = f"the pixel was taken with mast file {taken_with:.8}..., the one in use is {in_use:.8}..."
+            raise NotNow("other_mast_file", words)
+        find = partial(self.devices.frame_by_id, max_age_s=CLICK_AGE_S)
+        frame = clicked_frame(target, self._rig, find, self.stored.rig)
         moved_s = self.tracker.moved_s
         if moved_s is not None and frame.exposure_began_s < moved_s:
             words = f"the rover moved since frame {target.frame_id} was exposed; take another"
-            raise Refused("rover_moved", words)
-        height, width = frame.image.shape[:2]
-        _check_inside("pixel", target.x_px, target.y_px, (width, height))
-
-    def _check_pair(self, camera: str) -> None:
-        """Pass a camera whose other eye is configured too: without it there is no range. Raises Refused."""
-        if any(camera in eyes for eyes in self._rig.stereo.values()):
-            return
-        words = f"{camera} is in no stereo pair of the mast file"
-        for pair, eyes in self.stored.rig.stereo.items():
-            if camera in eyes:
-                other = eyes[1] if camera == eyes[0] else eyes[0]
-                words = f"the other eye of the stereo pair {pair}, {other}, is not in the configuration"
-        raise Refused("no_stereo", f"{words}, so a pixel of {camera} has no range")
-
-    def _check_aim(self, aim: Aim) -> None:
-        known = self._rig.cameras.get(aim.camera)
-        if known is None or known.on != "head":
-            on_head = [name for name, entry in self._rig.cameras.items() if entry.on == "head"]
-            known_words = ", ".join(on_head) or "there is none"
-            words = f"'{aim.camera[:80]}' where a configured camera on the head is expected: {known_words}"
-            raise Refused("bad_aim", f"aim.camera is {words}")
-        _check_inside("aim", aim.x_px, aim.y_px, known.model.size_px)
-
-
-def _configured(rig: Rig, cameras: Iterable[str]) -> Rig:
-    """Return the part of a rig that this daemon can see with: nothing is aimed with a camera it lacks."""
-    names = set(cameras)
-    fit = {key: value for key, value in rig.fit.items() if key not in ("parameters", "covariance")}
-    try:
-        known = stored_covariance(rig)
-    except CalibError as error:
-        log.warning("the calibration counts as exact: %s", error)
-        known = None
-    if known is not None:
-        part = known.of(tuple(names))
-        fit |= {"parameters": list(part.names), "covariance": part.covariance.tolist()}
-    return replace(
-        rig,
-        fit=fit,
-        cameras={name: camera for name, camera in rig.cameras.items() if name in names},
-        stereo={pair: eyes for pair, eyes in rig.stereo.items() if names.issuperset(eyes)},
-    )
-
-
-def _check_inside(what: str, x_px: float, y_px: float, size_px: tuple[int, int]) -> None:
-    """Pass a pixel inside an image. Raises Refused."""
-    width, height = size_px
-    if not (-0.5 <= x_px <= width - 0.5 and -0.5 <= y_px <= height - 0.5):
-        words = f"{what} ({x_px:g}, {y_px:g}) is outside the image of {width}x{height} px"
-        raise Refused("outside_image", words)
+            raise NotNow("rover_moved", words)
 
 
 def _bounded(what: str, function: Callable[[], None], timeout_s: float) -> None:

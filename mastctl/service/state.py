@@ -13,7 +13,7 @@ from drivers.interfaces import Reading
 from mastctl.devices.frames import StampedFrame
 from mastctl.devices.limits import Limits
 from mastctl.devices.thread import Fault
-from mastctl.operations import Motion
+from mastctl.operations.records import Motion
 from mastctl.tracking.status import TrackStatus
 
 StateWord = Literal["idle", "moving", "pointing", "stopping", "stopped", "fault"]

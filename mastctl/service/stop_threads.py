@@ -9,7 +9,7 @@ from concurrent.futures import Future
 from queue import SimpleQueue
 from typing import TypeVar
 
-from mastctl.errors import MastctlError
+from mastctl.errors import Unable
 
 T = TypeVar("T")
 
@@ -17,10 +17,11 @@ THREADS = 4
 OVERDUE_S = 1.5  # a stop is given 1 s by the devices
 
 
-class StopsHang(MastctlError):
+class StopsHang(Unable):
     """As many stops as there are threads have not come back; another one could not be sent."""
 
-    code = "stop_pending"
+    def __init__(self, message: str) -> None:
+        super().__init__("stop_pending", message)
 
 
 class StopThreads:

@@ -29,7 +29,8 @@ from drivers.interfaces import Reading
 from mastctl.devices.limits import Limits
 from mastctl.errors import MastctlError
 from mastctl.pointing.looking import View
-from mastctl.pointing.requests import PixelTarget, rounded
+from mastctl.pointing.requests import PixelTarget
+from mastctl.pointing.results import rounded
 from mastctl.pointing.steps import Steps
 from mastctl.tracking.choice import Choice, choose_pairs
 from mastctl.tracking.matched import record_of
@@ -146,7 +147,7 @@ class Looker:
 
         Raises
         ------
-        NotTrackable, PointingError, FrameGone, DriverError
+        MastctlError, DriverError
             If it cannot be followed.
         """
         found = self._steps.clicked(target)

@@ -13,21 +13,10 @@ from typing import Any
 import numpy as np
 
 from calib.rigid import FloatArray, Rigid
-from mastctl.errors import MastctlError
+from mastctl.errors import BadRequest, NotNow
 
 STANDS_M, STANDS_RAD = 0.005, 0.001
 """Within these of each other two poses are one standing, told twice: an odometer's noise, no motion."""
-
-
-class PoseRefused(MastctlError):
-    """A pose that cannot be taken; ``code`` names why.
-
-    Codes: ``pose_runs_backwards``, ``pose_without_time``, ``pose_without_covariance``, ``no_pose_before``.
-    """
-
-    def __init__(self, code: str, message: str) -> None:
-        self.code = code
-        super().__init__(message)
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,17 +56,17 @@ class RoverPose:
 
 
 def check_follows(pose: RoverPose, before: RoverPose | None) -> None:
-    """Pass a pose that is later than the one before it. Raises PoseRefused."""
+    """Pass a pose that is later than the one before it. Raises BadRequest, NotNow."""
     if before is None or before.time_s is None:
         return
     if pose.time_s is None:
-        raise PoseRefused(
+        raise BadRequest(
             "pose_without_time",
             f"time_s is missing; the pose before had one ({before.time_s:g} s), and without it nobody knows "
             "which of the two is later",
         )
     if pose.time_s <= before.time_s:
-        raise PoseRefused(
+        raise NotNow(
             "pose_runs_backwards",
             f"time_s is {pose.time_s:g} s, which is not later than the pose before it ({before.time_s:g} s)",
         )

@@ -21,14 +21,15 @@ from calib.mast.rig import Rig
 from calib.tracking.track import Track
 from drivers.clock import Clock
 from mastctl.devices.limits import Limits
-from mastctl.errors import MastctlError
-from mastctl.operations import Operation, Operations
-from mastctl.pointing.requests import PixelTarget, PointingSettings, PositionTarget
+from mastctl.errors import BadRequest, MastctlError, NotNow
+from mastctl.operations.operations import Operations
+from mastctl.operations.records import Operation
+from mastctl.pointing.requests import PixelTarget, PositionTarget
+from mastctl.pointing.settings import PointingSettings
 from mastctl.pointing.steps import DevicesLike, Steps
 from mastctl.tracking.carried import Carried
 from mastctl.tracking.look import Looker, Seen
 from mastctl.tracking.pose import (
-    PoseRefused,
     RoverPose,
     check_follows,
     motion_between,
@@ -41,18 +42,6 @@ log = logging.getLogger(__name__)
 
 Told = Mapping[str, Any]
 Outcome = tuple[Track, Seen]
-
-
-class TrackRuns(MastctlError):
-    """A track runs already; there is one at a time."""
-
-    code = "busy"
-
-
-class NoTrack(MastctlError):
-    """Something was asked of a track, and none runs."""
-
-    code = "no_track"
 
 
 class HoldingDevices(DevicesLike, Protocol):
@@ -123,14 +112,12 @@ class Tracker:
 
         Raises
         ------
-        TrackRuns
-            If a track runs.
-        Busy
-            If an operation runs.
+        NotNow
+            ``busy`` if a track or an operation runs; else as `Operations.start`.
         """
         with self._held():
             if self._status.state in ACTIVE:
-                raise TrackRuns(f"track {self._status.id} runs; stop it before another is started")
+                raise NotNow("busy", f"track {self._status.id} runs; stop it before another is started")
 
             def begin(looker: Looker) -> Outcome:
                 if isinstance(target, PixelTarget):
@@ -157,7 +144,7 @@ class Tracker:
 
         Raises
         ------
-        PoseRefused
+        BadRequest, NotNow
             If it is not later than the one before, or, while a track runs, if it has no covariance or no
             pose came before it.
         """
@@ -166,13 +153,13 @@ class Tracker:
             check_follows(pose, before)
             active = self._status.state in ACTIVE
             if active and before is None:
-                raise PoseRefused(
+                raise NotNow(
                     "no_pose_before",
                     "no pose was known when the track began, so that the motion since is not known; stop the "
                     "track, send the pose, and start it again",
                 )
             if active and pose.covariance is None:
-                raise PoseRefused(
+                raise BadRequest(
                     "pose_without_covariance",
                     "covariance (6 rows of 6) or sigma of the motion since the pose before is missing; while "
                     "a track runs it says where to look",
@@ -200,17 +187,15 @@ class Tracker:
 
         Raises
         ------
-        NoTrack
-            If no track runs, or the newest pose jumped away from it.
-        Busy
-            If an operation runs.
+        NotNow
+            ``no_track`` if none runs, or the newest pose jumped away from it; ``busy`` if an operation runs.
         """
         with self._held():
             carried = self._carried
             if carried is None:
-                raise NoTrack("no track runs that could be looked for")
+                raise NotNow("no_track", "no track runs that could be looked for")
             if carried.jumped:
-                raise NoTrack(self._status.reason)
+                raise NotNow("no_track", self._status.reason)
             operation = self._begin_look(carried)
             self._publish(replace(self._status, operation=operation.id))
             return operation
@@ -268,7 +253,7 @@ class Tracker:
         )
 
     def _begin_look(self, carried: Carried) -> Operation:
-        """Start a look. Raises Busy, MastctlError."""
+        """Start a look. Raises NotNow, Unable."""
         found_by = self._status.found_by
         operation = self._run({"track": self._status.id}, lambda looker: looker.look(carried.track, found_by))
         self._look_again = False

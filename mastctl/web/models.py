@@ -1,31 +1,34 @@
-"""The bodies and queries that the API takes, and how it says what is wrong with one."""
+"""The bodies and queries that the API takes."""
 
 from __future__ import annotations
 
-import json
 import math
-from collections.abc import Mapping, Sequence
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 from scipy.spatial.transform import Rotation
 
-from calib.files.strict import nearest
 from calib.rigid import Rigid
-from mastctl.pointing.requests import Aim, AnglesTarget, PixelTarget, PointRequest, PositionTarget
+from mastctl.pointing.requests import (
+    LARGEST_M,
+    Aim,
+    Angle,
+    AnglesTarget,
+    Metres,
+    Name,
+    PixelTarget,
+    Pointings,
+    PointRequest,
+    PositionTarget,
+    Target,
+)
 from mastctl.tracking.pose import RoverPose
 
-LARGEST_PX = 1e5
-LARGEST_M = 1e6
-
-Name = Annotated[str, Field(min_length=1, max_length=200)]
-Pixel = Annotated[float, Field(ge=-LARGEST_PX, le=LARGEST_PX)]
-Metres = Annotated[float, Field(ge=-LARGEST_M, le=LARGEST_M)]
-Angle = Annotated[float, Field(ge=-2 * math.pi, le=2 * math.pi)]
 Slope = Annotated[float, Field(ge=-1.0, le=1.0)]
 Sigma = Annotated[float, Field(ge=0.0, le=LARGEST_M)]
 Part = Annotated[float, Field(ge=-1e9, le=1e9)]
+Place = Annotated[list[Metres], Field(min_length=3, max_length=3)]
 
 
 class _Strict(BaseModel):
@@ -34,37 +37,44 @@ class _Strict(BaseModel):
     model_config = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False, frozen=True)
 
 
-class PixelBody(_Strict):
-    """A pixel of a named frame; ``mast_digest`` may say by which mast file it was taken."""
+class TrackBody(_Strict):
+    """``POST /track``: exactly one of pixel and position_m."""
 
-    camera: Name
-    frame_id: Name
-    x_px: Pixel
-    y_px: Pixel
-    mast_digest: Name | None = None
-
-
-class AimBody(_Strict):
-    """Where in which camera's image the target shall come."""
-
-    camera: Name
-    x_px: Pixel
-    y_px: Pixel
-
-
-class PointBody(_Strict):
-    """``POST /point``: exactly one of pixel, position_m, or pan_rad with tilt_rad."""
-
-    pixel: PixelBody | None = None
-    position_m: Annotated[list[Metres], Field(min_length=3, max_length=3)] | None = None
+    pixel: PixelTarget | None = None
+    position_m: Place | None = None
     frame: Literal["rover", "site"] | None = None
-    pan_rad: Angle | None = None
-    tilt_rad: Angle | None = None
-    aim: AimBody | None = None
-    pointings: Annotated[int, Field(ge=1, le=2)] = 1
 
     @model_validator(mode="after")
-    def _one_target(self) -> PointBody:
+    def _whole(self) -> Self:
+        if self.frame is not None and self.position_m is None:
+            raise ValueError("frame goes with position_m only")
+        self._check_targets()
+        return self
+
+    def _check_targets(self) -> None:
+        """Pass exactly one target. Raises ValueError."""
+        if (self.pixel is None) == (self.position_m is None):
+            raise ValueError("exactly one of pixel and position_m is expected")
+
+    def target(self) -> PixelTarget | PositionTarget:
+        """Return it as the tracker takes it."""
+        if self.pixel is not None:
+            return self.pixel
+        assert self.position_m is not None
+        x, y, z = self.position_m
+        return PositionTarget((x, y, z), self.frame or "rover")
+
+
+class PointBody(TrackBody):
+    """``POST /point``: exactly one of pixel, position_m, or pan_rad with tilt_rad."""
+
+    pan_rad: Angle | None = None
+    tilt_rad: Angle | None = None
+    aim: Aim | None = None
+    pointings: Pointings = 1
+
+    def _check_targets(self) -> None:
+        """Pass exactly one target, and what goes with it. Raises ValueError."""
         angles = (self.pan_rad is not None) + (self.tilt_rad is not None)
         targets = (self.pixel is not None) + (self.position_m is not None) + (angles > 0)
         if targets != 1:
@@ -74,53 +84,16 @@ class PointBody(_Strict):
         if angles == 1:
             missing = "tilt_rad" if self.tilt_rad is None else "pan_rad"
             raise ValueError(f"{missing} is missing; pan_rad and tilt_rad go together")
-        if self.frame is not None and self.position_m is None:
-            raise ValueError("frame goes with position_m only")
-        if self.aim is not None and angles:
-            raise ValueError("aim goes with pixel or position_m, not with joint angles")
-        if self.pointings == 2 and self.pixel is None:
-            raise ValueError("pointings is 2, which goes with pixel only: nothing else can be measured again")
-        return self
+        self.request()
 
     def request(self) -> PointRequest:
-        """Return it as the pointing loop takes it."""
-        aim = None if self.aim is None else Aim(self.aim.camera, self.aim.x_px, self.aim.y_px)
-        target: PixelTarget | PositionTarget | AnglesTarget
-        if self.pixel is not None:
-            pixel = self.pixel
-            target = PixelTarget(pixel.camera, pixel.frame_id, pixel.x_px, pixel.y_px)
-        elif self.position_m is not None:
-            x, y, z = self.position_m
-            target = PositionTarget((x, y, z), self.frame or "rover")
+        """Return it as the pointing loop takes it. Raises ValueError."""
+        target: Target
+        if self.pan_rad is None or self.tilt_rad is None:
+            target = self.target()
         else:
-            assert self.pan_rad is not None and self.tilt_rad is not None
             target = AnglesTarget(self.pan_rad, self.tilt_rad)
-        return PointRequest(target=target, aim=aim, pointings=self.pointings)
-
-
-class TrackBody(_Strict):
-    """``POST /track``: exactly one of pixel and position_m."""
-
-    pixel: PixelBody | None = None
-    position_m: Annotated[list[Metres], Field(min_length=3, max_length=3)] | None = None
-    frame: Literal["rover", "site"] | None = None
-
-    @model_validator(mode="after")
-    def _one_target(self) -> TrackBody:
-        if (self.pixel is None) == (self.position_m is None):
-            raise ValueError("exactly one of pixel and position_m is expected")
-        if self.frame is not None and self.position_m is None:
-            raise ValueError("frame goes with position_m only")
-        return self
-
-    def target(self) -> PixelTarget | PositionTarget:
-        """Return it as the tracker takes it."""
-        if self.pixel is not None:
-            pixel = self.pixel
-            return PixelTarget(pixel.camera, pixel.frame_id, pixel.x_px, pixel.y_px)
-        assert self.position_m is not None
-        x, y, z = self.position_m
-        return PositionTarget((x, y, z), self.frame or "rover")
+        return PointRequest(target, self.aim, self.pointings)
 
 
 class SigmaBody(_Strict):
@@ -137,7 +110,7 @@ class PoseBody(_Strict):
     radians along the rover's axes of this pose.
     """
 
-    position_m: Annotated[list[Metres], Field(min_length=3, max_length=3)]
+    position_m: Place
     quaternion: Annotated[list[Part], Field(min_length=4, max_length=4)]
     covariance: list[list[Part]] | None = None
     sigma: SigmaBody | None = None
@@ -256,70 +229,3 @@ class ErrorBody(BaseModel):
     """Every answer that is not a success."""
 
     error: ErrorTold
-
-
-_KEYS: Mapping[tuple[str, ...], Sequence[str]] = {
-    ("body", "pixel"): tuple(PixelBody.model_fields),
-    ("body", "aim"): tuple(AimBody.model_fields),
-    ("body", "sigma"): tuple(SigmaBody.model_fields),
-}
-_ROUTE_KEYS: Mapping[tuple[str, str], Sequence[str]] = {
-    ("body", "point"): tuple(PointBody.model_fields),
-    ("body", "mast"): tuple(MastBody.model_fields),
-    ("body", "track"): tuple(TrackBody.model_fields),
-    ("body", "simulation/pose"): tuple(StandBody.model_fields),
-    ("body", "pose"): tuple(PoseBody.model_fields),
-    ("body", "faults"): tuple(FaultBody.model_fields),
-    ("query", "snapshot"): tuple(SnapshotQuery.model_fields),
-    ("query", "faults"): tuple(FaultsQuery.model_fields),
-}
-
-
-def sentence(problem: Mapping[str, Any], route: str) -> str:
-    """Return one validation problem of pydantic as a plain sentence: place, value, what is expected.
-
-    Parameters
-    ----------
-    problem
-        One entry of pydantic's list of errors.
-    route
-        A word that names the route (``point``, ``snapshot``, ``faults``), for the keys it knows.
-    """
-    where = tuple(str(step) for step in problem["loc"])
-    place = _place(where)
-    kind = problem["type"]
-    words = str(problem["msg"])
-    if kind == "value_error":
-        return words.removeprefix("Value error, ")
-    if kind == "missing":
-        return f"{place} is missing" if len(where) > 1 else "the body is missing; a JSON object is expected"
-    if kind == "extra_forbidden":
-        known = _KEYS.get(where[:-1]) or _ROUTE_KEYS.get((where[0], route)) or ()
-        return f"{place}: unknown key; {nearest(where[-1], known)}" if known else f"{place}: unknown key"
-    value = _short(problem.get("input"))
-    if kind in ("too_short", "too_long"):
-        size = 4 if where[-1] == "quaternion" else 3
-        return f"{place}: {value} where a list of {size} numbers is expected"
-    if kind in ("model_attributes_type", "model_type", "dict_type"):
-        return f"{place}: {value} where an object with keys is expected"
-    for start in ("Input should be ", "String should have "):
-        if words.startswith(start):
-            return f"{place}: {value} where {words.removeprefix(start)} is expected"
-    return f"{place}: {value}: {words}"
-
-
-def _place(where: tuple[str, ...]) -> str:
-    """``("body", "position_m", "0")`` as ``position_m[0]``."""
-    place = ""
-    for step in where[1:]:
-        place += f"[{step}]" if step.isdecimal() else f".{step}" if place else step
-    return place[:120] or f"the {where[0]}"
-
-
-def _short(value: Any) -> str:
-    """A value as JSON, cut short."""
-    try:
-        text = json.dumps(value)
-    except (TypeError, ValueError):
-        text = str(value)
-    return text if len(text) <= 60 else f"{text[:57]}..."

@@ -4,64 +4,38 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from typing import Any
 
 from fastapi import FastAPI, Request
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse
+from fastapi.routing import APIRoute
 from starlette.exceptions import HTTPException
 
 from calib.errors import CalibError
-from drivers.errors import BadFrame, BadOptions, BadReply, DriverError
-from mastctl.devices.limits import OutsideLimits
-from mastctl.errors import MastctlError
-from mastctl.operations import error_body
-from mastctl.web import PREFIX
+from drivers.errors import BadOptions, DriverError, NoFreshFrame, NoReply
+from mastctl.errors import BadRequest, MastctlError, NoLonger, NotKnown, NotNow, Unable, error_body
 from mastctl.web.guard import error_response
-from mastctl.web.models import sentence
+from mastctl.web.sentences import sentence
 
-STATUS_OF_CODE: Mapping[str, int] = {
-    "busy": 409,
-    "moving": 409,
-    "no_former_mast": 409,
-    "no_pose_before": 409,
-    "no_track": 409,
-    "pose_runs_backwards": 409,
-    "rover_moved": 409,
-    "stopped": 409,
-    "stopping": 409,
-    "frame_moving": 409,
-    "other_mast_file": 409,
-    "frame_too_old": 410,
-    "frame_unknown": 404,
-    "operation_unknown": 404,
-    "unknown_camera": 404,
-    "not_simulated": 404,
-    "bad_aim": 422,
-    "bad_mast_file": 422,
-    "no_stereo": 422,
-    "outside_image": 422,
-    "outside_limits": 422,
-    "pose_without_covariance": 422,
-    "pose_without_time": 422,
-    "wrong_camera": 422,
-    "failed": 503,
-    "closing": 503,
-    "no_thread": 503,
-    "stop_pending": 503,
-    "too_many": 503,
+STATUS_OF_KIND: Mapping[type[Exception], int] = {
+    BadRequest: 422,
+    NotKnown: 404,
+    NoLonger: 410,
+    NotNow: 409,
+    Unable: 503,
+    MastctlError: 500,
+    CalibError: 422,
+    BadOptions: 422,
+    NoReply: 504,
+    NoFreshFrame: 504,
+    DriverError: 502,
 }
 
 
 def status_of(error: Exception) -> int:
-    """Return the HTTP status that fits an error."""
-    code = getattr(error, "code", "")
-    if isinstance(error, (BadOptions, OutsideLimits, CalibError)):
-        return 422
-    if isinstance(error, (BadReply, BadFrame)):
-        return 502
-    if isinstance(error, DriverError):
-        return 504 if code in ("no_reply", "no_fresh_frame") else 502
-    return STATUS_OF_CODE.get(code, 500)
+    """Return the HTTP status of an error's family, the nearest one above its class."""
+    return next(STATUS_OF_KIND[kind] for kind in type(error).__mro__ if kind in STATUS_OF_KIND)
 
 
 def add_errors(app: FastAPI) -> None:
@@ -78,10 +52,7 @@ def add_errors(app: FastAPI) -> None:
 
     @app.exception_handler(RequestValidationError)
     async def invalid(request: Request, error: RequestValidationError) -> JSONResponse:
-        path = request.url.path.removeprefix(PREFIX)
-        words = ("point", "faults", "snapshot", "mast", "track", "simulation/pose", "pose")
-        route = next((word for word in words if word in path), "")
-        sentences = [sentence(problem, route) for problem in error.errors()[:10]]
+        sentences = [sentence(problem, _read_by(request, problem)) for problem in error.errors()[:10]]
         return error_response(422, "bad_request", sentences[0], {"problems": sentences})
 
     @app.exception_handler(HTTPException)
@@ -97,3 +68,12 @@ def add_errors(app: FastAPI) -> None:
     async def defect(request: Request, error: Exception) -> JSONResponse:
         body = error_body(error)
         return error_response(500, body["code"], body["message"])
+
+
+def _read_by(request: Request, problem: Mapping[str, Any]) -> object:
+    """The model by which the route reads its body or its query, wherever the problem is."""
+    route = request.scope.get("route")
+    if not isinstance(route, APIRoute):
+        return None
+    params = route.dependant.body_params if problem["loc"][0] == "body" else route.dependant.query_params
+    return params[0].field_info.annotation if params else None

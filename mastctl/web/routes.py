@@ -11,7 +11,7 @@ from typing import Any, TypeVar
 from fastapi import FastAPI
 from fastapi.responses import StreamingResponse
 
-from mastctl.errors import MastctlError
+from mastctl.errors import Unable
 from mastctl.service.service import Service
 from mastctl.web import PREFIX
 from mastctl.web.models import PointBody, PoseBody, TrackBody
@@ -24,20 +24,13 @@ STREAM_POLL_S = 0.05  # how late a change may be told
 STREAM_ALIVE_S = 5.0
 
 
-class StopUnconfirmed(MastctlError):
-    """A stop was sent, and nothing came back."""
-
-    code = "stop_pending"
-
-
 async def _stopped(service: Service, stop: Callable[[], T]) -> T:
-    """Run a stop in the threads that are there for it. Raises StopsHang, StopUnconfirmed, DriverError."""
+    """Run a stop in the threads that are there for it. Raises Unable ``stop_pending``, DriverError."""
     try:
         return await asyncio.wait_for(asyncio.wrap_future(service.stop_threads.submit(stop)), STOP_ANSWER_S)
     except TimeoutError:
-        raise StopUnconfirmed(
-            f"the stop did not come back within {STOP_ANSWER_S:g} s; the head may still move"
-        ) from None
+        words = f"the stop did not come back within {STOP_ANSWER_S:g} s; the head may still move"
+        raise Unable("stop_pending", words) from None
 
 
 def add_pointing(app: FastAPI, service: Service, waiting: Waiting) -> None:
@@ -50,8 +43,7 @@ def add_pointing(app: FastAPI, service: Service, waiting: Waiting) -> None:
     @app.post(f"{PREFIX}/point", status_code=202, summary="Point at a pixel, a position, or joint angles")
     async def point(body: PointBody) -> dict[str, Any]:
         told = body.model_dump(exclude_none=True)
-        digest = None if body.pixel is None else body.pixel.mast_digest
-        return {"id": (await waiting.run(lambda: service.point(body.request(), told, digest))).id}
+        return {"id": (await waiting.run(lambda: service.point(body.request(), told))).id}
 
     @app.get(f"{PREFIX}/operations", summary="The newest operations, without their steps")
     async def operations() -> dict[str, Any]:
@@ -83,8 +75,7 @@ def add_tracking(app: FastAPI, service: Service, waiting: Waiting) -> None:
     @app.post(f"{PREFIX}/track", status_code=202, summary="Follow what a pixel shows, or is at a position")
     async def start(body: TrackBody) -> dict[str, Any]:
         asked = body.model_dump(exclude_none=True)
-        digest = None if body.pixel is None else body.pixel.mast_digest
-        work = partial(service.start_track, body.target(), {"track": asked}, digest)
+        work = partial(service.start_track, body.target(), {"track": asked})
         return {"id": (await waiting.run(work)).id}
 
     @app.post(f"{PREFIX}/track/look", status_code=202, summary="Look for the target once more")

@@ -10,7 +10,7 @@ from fastapi import FastAPI, Query
 from drivers.faults import Fault as SetFault
 from drivers.faults import FaultPanel
 from mastctl.as_json import as_json
-from mastctl.errors import MastctlError
+from mastctl.errors import NotKnown
 from mastctl.service.service import Service
 from mastctl.tracking.pose import RoverPose
 from mastctl.web import PREFIX
@@ -21,21 +21,14 @@ if TYPE_CHECKING:
     from drivers.sim.rover import SimulatedRover
 
 
-class NotSimulated(MastctlError):
-    """Faults and the true pose are a simulated rover's only."""
-
-    code = "not_simulated"
-
-
 def add_simulation(app: FastAPI, service: Service, waiting: Waiting) -> None:
     """The fault switches of a simulated rover, and where it truly stands."""
 
     def simulated(what: str) -> SimulatedRover:
         if service.hardware.simulation is None:
             kind = service.hardware.kind
-            raise NotSimulated(
-                f"{what} are for this program's own simulated rover only; the hardware is {kind}"
-            )
+            words = f"{what} are for this program's own simulated rover only; the hardware is {kind}"
+            raise NotKnown("not_simulated", words)
         return service.hardware.simulation
 
     def panel() -> FaultPanel:

@@ -14,35 +14,13 @@ import threading
 from collections.abc import Awaitable, Callable
 from typing import TypeVar
 
-from mastctl.errors import MastctlError
+from mastctl.errors import Unable
 
 T = TypeVar("T")
 
 AT_ONCE = 40  # worker threads for everything but pictures
 PICTURES_AT_ONCE = 4  # of one camera
 PICTURE_QUEUE_S = 2.0  # how long a request waits for those before it
-
-
-class TooMany(MastctlError):
-    """More is asked at once than can be done; it may be asked again after ``retry_after_s`` seconds."""
-
-    code = "too_many"
-
-    def __init__(self, message: str, retry_after_s: float) -> None:
-        self.retry_after_s = retry_after_s
-        super().__init__(message)
-
-
-class NoThread(MastctlError):
-    """The machine had no thread for a request."""
-
-    code = "no_thread"
-
-
-class Ending(MastctlError):
-    """The daemon ends, and what was waited for will not come."""
-
-    code = "closing"
 
 
 class Waiting:
@@ -62,8 +40,8 @@ class Waiting:
 
         Raises
         ------
-        Ending
-            If the daemon ends before it returns.
+        Unable
+            ``closing`` if the daemon ends before it returns, ``no_thread`` if the machine has none for it.
         """
         return await self._unless_ending(self._worked(function))
 
@@ -72,10 +50,9 @@ class Waiting:
 
         Raises
         ------
-        TooMany
-            If so many others wait for this camera that it does not come to this one's turn in 2 s.
-        Ending
-            As `run`.
+        Unable
+            ``too_many`` if so many others wait for this camera that it does not come to this one's turn in
+            2 s; else as `run`.
         """
         return await self._unless_ending(self._in_turn(camera, function))
 
@@ -88,7 +65,8 @@ class Waiting:
         try:
             await asyncio.wait_for(turn.acquire(), PICTURE_QUEUE_S)
         except TimeoutError:
-            raise TooMany(
+            raise Unable(
+                "too_many",
                 f"{PICTURES_AT_ONCE} pictures of {camera} are waited for, and none came in "
                 f"{PICTURE_QUEUE_S:g} s; ask again later",
                 PICTURE_QUEUE_S,
@@ -105,7 +83,7 @@ class Waiting:
             await asyncio.wait({call, ending}, return_when=asyncio.FIRST_COMPLETED)
             if call.done():
                 return call.result()
-            raise Ending("the daemon ends; what was asked for will not come")
+            raise Unable("closing", "the daemon ends; what was asked for will not come")
         finally:
             for one in (call, ending):
                 one.cancel()
@@ -136,5 +114,5 @@ async def _in_thread(function: Callable[[], T]) -> T:
     try:
         threading.Thread(target=run, name="request", daemon=True).start()
     except RuntimeError as error:
-        raise NoThread(f"the request was not begun: {error}") from None
+        raise Unable("no_thread", f"the request was not begun: {error}") from None
     return await answer

@@ -21,7 +21,7 @@ from drivers.interfaces import Reading
 from hil_tests.calib.pictures.textured_planes import Pinhole, TexturedPlane, picture, random_texture
 from mastctl.devices.frames import StampedFrame
 from mastctl.devices.limits import Limits
-from mastctl.errors import FrameGone
+from mastctl.errors import NotKnown
 from mastctl.pointing.loop import PixelTarget, PointingLoop, PointingResult, PointRequest, Step
 
 SIZE_PX = (300, 240)
@@ -153,7 +153,7 @@ class World:
 
     def frame_by_id(self, frame_id: str) -> StampedFrame:
         if frame_id not in self._frames:
-            raise FrameGone("frame_unknown", f"frame {frame_id} was not taken here")
+            raise NotKnown("frame_unknown", f"frame {frame_id} was not taken here")
         return self._frames[frame_id]
 
     def newest_frames(self) -> dict[str, StampedFrame | None]:

@@ -8,7 +8,8 @@ import pytest
 from hil_tests.mastctl.pointing.pointing_world import LATE_S, World, click, moving_world, rig, run
 from mastctl.pointing.looking import Eyes
 from mastctl.pointing.one_moment import check_one_moment
-from mastctl.pointing.requests import PointingError, PointingSettings, Step
+from mastctl.pointing.results import PointingError, Step
+from mastctl.pointing.settings import PointingSettings
 
 
 def detail(steps: list[Step], name: str) -> dict[str, object]:

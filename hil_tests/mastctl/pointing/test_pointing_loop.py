@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import threading
+from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -165,16 +166,28 @@ BAD = {
     "frame_unknown": PointRequest(PixelTarget("navcam_left", "navcam_left-000099", 1, 1)),
     "wrong_camera": PointRequest(PixelTarget("navcam_right", "navcam_left-000001", 1, 1)),
     "outside_image": PointRequest(PixelTarget("navcam_left", "navcam_left-000001", 300.0, 1)),
-    "bad_request": PointRequest(PositionTarget((1.0, float("nan"), 0.0))),
-    "bad_request ": PointRequest(PositionTarget((1.0, 0.0, 0.0), "board")),
-    "bad_request  ": PointRequest(PositionTarget((4.0, 0.0, 0.0)), pointings=2),
-    "bad_request   ": PointRequest(AnglesTarget(0.0, 0.0), pointings=3),
-    "unknown_camera ": PointRequest(PositionTarget((4.0, 0.0, 0.0)), aim=Aim("fishcam", 1, 1)),
+    "bad_aim": PointRequest(PositionTarget((4.0, 0.0, 0.0)), aim=Aim("fishcam", 1, 1)),
     "outside_image ": PointRequest(PositionTarget((4.0, 0.0, 0.0)), aim=Aim("navcam_left", 1, 240.0)),
-    "outside_image  ": PointRequest(PixelTarget("navcam_left", "navcam_left-000001", float("nan"), 1)),
     "outside_limits": PointRequest(AnglesTarget(2.0, 0.0)),
     "target_border": PointRequest(PixelTarget("navcam_left", "navcam_left-000001", 2.0, 120.0)),
 }
+
+
+NO_REQUEST: dict[str, Callable[[], object]] = {
+    "finite number": lambda: PositionTarget((1.0, float("nan"), 0.0)),
+    "finite number ": lambda: PixelTarget("navcam_left", "navcam_left-000001", float("nan"), 1),
+    "'rover' or 'site'": lambda: PositionTarget((1.0, 0.0, 0.0), "board"),  # type: ignore[arg-type]
+    "valid number": lambda: AnglesTarget(True, 0.0),
+    "goes with pixel only": lambda: PointRequest(PositionTarget((4.0, 0.0, 0.0)), pointings=2),
+    "not with joint angles": lambda: PointRequest(AnglesTarget(0.0, 0.0), Aim("navcam_left", 1, 1)),
+    "less than or equal to 2": lambda: PointRequest(AnglesTarget(0.0, 0.0), pointings=3),
+}
+
+
+@pytest.mark.parametrize("words", NO_REQUEST)
+def test_what_makes_no_sense_for_any_rig_never_becomes_a_request(words: str) -> None:
+    with pytest.raises(ValueError, match=words.strip()):
+        NO_REQUEST[words]()
 
 
 @pytest.mark.parametrize("code", BAD)

@@ -18,10 +18,11 @@ from drivers.errors import DriverError
 from drivers.faults import FaultPanel
 from hil_tests.mastctl.outside_daemon import BOUND_S
 from hil_tests.mastctl.service_fakes import FakeHardware, Hang, ScriptedLoop, eventually, fake_daemon
-from mastctl import operations as operations_module
 from mastctl.client import Client, ClientError
-from mastctl.errors import Stopped
-from mastctl.operations import Operation, Operations
+from mastctl.errors import Stopped, Unable
+from mastctl.operations import operations as operations_module
+from mastctl.operations.operations import Operations
+from mastctl.operations.records import Operation
 from mastctl.pointing.loop import PointingLoop
 from mastctl.service import stop_threads as stop_threads_module
 from mastctl.web import routes as routes_module
@@ -159,7 +160,7 @@ def test_an_operation_without_a_thread_is_refused_and_the_next_one_runs(
     with fake_daemon(monkeypatch, tmp_path) as (daemon, _), Client(daemon.url) as client:
         with monkeypatch.context() as patch:
             patch.setattr(operations_module.threading, "Thread", NoThread)
-            with pytest.raises(operations_module.NotStarted, match="can't start new thread"):
+            with pytest.raises(Unable, match="can't start new thread"):
                 daemon.service.operations.start({}, lambda record, cancelled: None)
         assert daemon.service.operations.all()[0].state == "failed"
         assert client.status()["operation"] is None

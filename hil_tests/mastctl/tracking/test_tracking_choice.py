@@ -17,10 +17,10 @@ from calib.mast.rig import Rig
 from calib.rigid import Rigid, carried_covariance
 from calib.tracking.track import Key, Track
 from mastctl.devices.limits import Limits
+from mastctl.errors import MastctlError
 from mastctl.tracking.carried import Carried
 from mastctl.tracking.choice import HandoffRules, PairBounds, choose_pairs
 from mastctl.tracking.pose import (
-    PoseRefused,
     RoverPose,
     check_follows,
     motion_between,
@@ -100,7 +100,7 @@ def pose(time_s: float | None, x_m: float = 0.0, heading_rad: float = 0.0) -> Ro
     [(5.0, 4.9, "pose_runs_backwards"), (5.0, 5.0, "pose_runs_backwards"), (5.0, None, "pose_without_time")],
 )
 def test_poses_come_in_order(before_s: float, now_s: float | None, code: str) -> None:
-    with pytest.raises(PoseRefused) as refused:
+    with pytest.raises(MastctlError) as refused:
         check_follows(pose(now_s), pose(before_s))
     assert refused.value.code == code
     check_follows(pose(5.1), pose(5.0))

@@ -19,7 +19,9 @@ from drivers.errors import DriverError, NoReply
 from hil_tests.mastctl.pointing.pointing_world import LIMITS, SIZE_PX, World, moving_world, rig
 from mastctl.devices.frames import StampedFrame
 from mastctl.errors import MastctlError
-from mastctl.pointing.requests import PixelTarget, PointingError, PointingSettings
+from mastctl.pointing.requests import PixelTarget
+from mastctl.pointing.results import PointingError
+from mastctl.pointing.settings import PointingSettings
 from mastctl.pointing.steps import Step, Steps
 from mastctl.tracking.look import Looker, NotTrackable
 from mastctl.tracking.settings import TrackingSettings

@@ -16,14 +16,14 @@ import secrets
 import threading
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
-from typing import Any, Literal, Protocol
+from dataclasses import replace
+from typing import Any, Protocol
 
 from calib.errors import CalibError
 from drivers.clock import Clock
 from drivers.errors import DriverError
-from mastctl.as_json import as_json
-from mastctl.errors import MastctlError, Stopped
+from mastctl.errors import MastctlError, NotKnown, NotNow, Stopped, Unable, error_body
+from mastctl.operations.records import Motion, Operation, OperationState, last_residual
 
 log = logging.getLogger(__name__)
 
@@ -33,75 +33,6 @@ END_TIMEOUT_S = 5.0  # for a cancelled operation to notice, when the service clo
 STOP_ASKED = "a stop was asked for"
 CLOSING = "the service is closing"
 
-OperationState = Literal["queued", "running", "done", "failed", "stopped"]
-
-
-class Busy(MastctlError):
-    """Another operation runs; ``operation`` is its id."""
-
-    code = "busy"
-
-    def __init__(self, operation: str, *, stopping: bool = False) -> None:
-        self.operation = operation
-        what = (
-            "is being stopped; ask again when it has ended"
-            if stopping
-            else "is running; wait for it or stop it"
-        )
-        super().__init__(f"operation {operation} {what}")
-
-
-class Stopping(MastctlError):
-    """The mast is being stopped, and nothing is started until that is over."""
-
-    code = "stopping"
-
-
-class NotStarted(MastctlError):
-    """The machine had no thread for an operation."""
-
-    code = "no_thread"
-
-
-class UnknownOperation(MastctlError):
-    """An operation was named that this run of the service does not know (any more)."""
-
-    code = "operation_unknown"
-
-
-@dataclass(frozen=True)
-class Residual:
-    """The last measured residual, pixels (x, y), with one sigma, and the operation that measured it."""
-
-    residual_px: tuple[float, float]
-    residual_sigma_px: tuple[float, float]
-    operation: str
-
-
-@dataclass(frozen=True)
-class Motion:
-    """What the operations say about themselves.
-
-    Attributes
-    ----------
-    operation
-        Id of the running operation, None when none runs.
-    target
-        The request that runs, or ran last, as it came; None before the first.
-    residual
-        The last one measured.
-    stopped
-        Whether the last thing that happened was a stop.
-    stopping
-        Whether a stop is under way: the head has not confirmed it, or the operation has not ended yet.
-    """
-
-    operation: str | None = None
-    target: Mapping[str, Any] | None = None
-    residual: Residual | None = None
-    stopped: bool = False
-    stopping: bool = False
-
 
 class Mover(Protocol):
     """What of `mastctl.devices.devices.Devices` is needed to stop and to keep stopped."""
@@ -109,45 +40,6 @@ class Mover(Protocol):
     def stop(self) -> None: ...
     def block_moves(self, holder: object, reason: str) -> None: ...
     def allow_moves(self, holder: object) -> None: ...
-
-
-@dataclass(frozen=True, eq=False)
-class Operation:
-    """One operation's record so far; replaced as it goes on, never edited. Times of CLOCK_MONOTONIC."""
-
-    id: str
-    state: OperationState
-    request: Mapping[str, Any]
-    created_s: float
-    started_s: float | None = None
-    ended_s: float | None = None
-    steps: tuple[Any, ...] = ()
-    result: Any = None
-    error: Mapping[str, Any] | None = None
-
-    def told(self, *, steps: bool = True) -> dict[str, Any]:
-        """Return the record as JSON; the last pointing's residual stands in front too."""
-        made = as_json(self.result)
-        result = made if isinstance(made, dict) else {}
-        pointings = result.get("pointings") or []
-        last = pointings[-1] if pointings else {}
-        told: dict[str, Any] = {
-            "id": self.id,
-            "state": self.state,
-            "request": as_json(self.request),
-            "created_s": self.created_s,
-            "started_s": self.started_s,
-            "ended_s": self.ended_s,
-            "residual_px": last.get("residual_px"),
-            "residual_sigma_px": last.get("residual_sigma_px"),
-            "position_m": result.get("position_m"),
-            "range_m": result.get("range_m"),
-            "pointings": pointings,
-            "error": None if self.error is None else dict(self.error),
-        }
-        if steps:
-            told["steps"] = as_json(self.steps)
-        return told
 
 
 Work = Callable[[Callable[[Any], None], threading.Event], Any]
@@ -197,22 +89,18 @@ class Operations:
 
         Raises
         ------
-        Busy
-            If another operation runs.
-        Stopping
-            If the mast is being stopped.
-        NotStarted
-            If the machine has no thread for it; the record says so too.
-        MastctlError
-            If the service is closing.
+        NotNow
+            ``busy`` if another operation runs, ``stopping`` if the mast is being stopped.
+        Unable
+            ``no_thread`` if the machine has none for it (the record says so too), ``closing``.
         """
         with self._lock:
             if self._closed:
-                raise MastctlError(CLOSING)
+                raise Unable("closing", CLOSING)
             if self._stops:
-                raise Stopping("the mast is being stopped; ask again when that is over")
+                raise NotNow("stopping", "the mast is being stopped; ask again when that is over")
             if self._current is not None:
-                raise Busy(self._current[0], stopping=self._current[1].is_set())
+                raise busy(self._current[0], stopping=self._current[1].is_set())
             name = f"{next(self._numbers):06d}-{self._run}"
             operation = Operation(name, "queued", dict(request), self._clock.now_s())
             cancelled = threading.Event()
@@ -225,7 +113,7 @@ class Operations:
         try:
             thread.start()
         except RuntimeError as error:  # no thread to be had: nothing has moved, and the next may have one
-            refusal = NotStarted(f"operation {name} was not started: {error}")
+            refusal = Unable("no_thread", f"operation {name} was not started: {error}")
             self._end(name, "failed", None, error_body(refusal))
             raise refusal from None
         return operation
@@ -279,14 +167,13 @@ class Operations:
 
         Raises
         ------
-        UnknownOperation
-            If this run of the service does not know it, or no longer.
+        NotKnown
+            ``operation_unknown`` if this run of the service does not know it, or no longer.
         """
         operation = self._records.get(name)
         if operation is None:
-            raise UnknownOperation(
-                f"operation {name[:80]} is not known; the newest {KEPT_OPERATIONS} of this run are kept"
-            )
+            words = f"operation {name[:80]} is not known; the newest {KEPT_OPERATIONS} of this run are kept"
+            raise NotKnown("operation_unknown", words)
         return operation
 
     def all(self) -> list[Operation]:
@@ -384,7 +271,7 @@ class Operations:
     def _end(self, name: str, state: OperationState, result: Any, error: dict[str, Any] | None) -> None:
         """Close a record and make room for the next operation."""
         try:
-            residual = _last_residual(result, name)
+            residual = last_residual(result, name)
         except Exception:  # a result that is none must not keep the next operation out
             log.exception("the result of operation %s tells no residual", name)
             residual, result = None, None
@@ -400,33 +287,9 @@ class Operations:
                 self._keep(replace(known, state=state, result=result, error=error, ended_s=ended_s))
 
 
-def error_body(error: BaseException) -> dict[str, Any]:
-    """Return an error as programs read it: code, one plain sentence, more detail or null; never raises."""
-    try:
-        if isinstance(error, (MastctlError, DriverError, CalibError)):
-            code = getattr(error, "code", None)
-            detail = getattr(error, "detail", None)
-            return {
-                "code": code if isinstance(code, str) else "failed",
-                "message": " ".join(str(error).split()),
-                "detail": as_json(detail) if isinstance(detail, Mapping) else None,
-            }
-    except Exception:  # a driver from outside raised what cannot even be put into words
-        log.debug("an error without words", exc_info=True)
-    return {
-        "code": "internal",
-        "message": f"the service met a defect of its own ({type(error).__name__}); its log says more",
-        "detail": None,
-    }
-
-
-def _last_residual(result: Any, name: str) -> Residual | None:
-    """The residual that a result ends with, if it measured one."""
-    pointings = getattr(result, "pointings", None) or ()
-    if not pointings:
-        return None
-    told = as_json(pointings[-1])
-    residual, sigma = told.get("residual_px"), told.get("residual_sigma_px")
-    if not (residual and sigma and None not in residual and None not in sigma):
-        return None
-    return Residual((residual[0], residual[1]), (sigma[0], sigma[1]), name)
+def busy(operation: str, *, stopping: bool = False) -> NotNow:
+    """Return the refusal of what cannot be done beside a running operation."""
+    what = (
+        "is being stopped; ask again when it has ended" if stopping else "is running; wait for it or stop it"
+    )
+    return NotNow("busy", f"operation {operation} {what}")

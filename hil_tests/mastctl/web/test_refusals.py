@@ -1,0 +1,127 @@
+"""Every error has a word of its own and a status by its family, and docs/http.md lists both."""
+
+from __future__ import annotations
+
+import ast
+import importlib
+import pkgutil
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+import drivers
+import mastctl
+from calib.errors import CalibError
+from drivers.errors import DriverError
+from mastctl.errors import BadRequest, MastctlError, NoLonger, NotKnown, NotNow, Stopped, Unable
+from mastctl.pointing.results import PointingError
+from mastctl.web.guard import GuardError, error_response
+from mastctl.web.refusals import status_of
+
+FAMILIES = {kind.__name__: kind for kind in (BadRequest, NotKnown, NoLonger, NotNow, Unable)}
+PLAIN = {GuardError.__name__, error_response.__name__}  # status first, then the code
+NO_ANSWER = {"search_cut_short", "survey_refused", "cannot_tell", "address_in_use", "no_executor"}
+"""Of commands that ask no daemon."""
+
+
+def below(kind: type[Exception]) -> Iterator[type[Exception]]:
+    for one in kind.__subclasses__():
+        yield one
+        yield from below(one)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _every_module() -> None:
+    for package in (mastctl, drivers):
+        for module in pkgutil.walk_packages(package.__path__, f"{package.__name__}."):
+            if not module.name.endswith("__main__"):
+                importlib.import_module(module.name)
+
+
+@pytest.fixture(scope="module")
+def documented(repository: Path) -> dict[str, set[str]]:
+    """The table's codes by its first column."""
+    page = (repository / "docs" / "http.md").read_text(encoding="utf-8")
+    section = page.split("## Refusals", 1)[1].split("\n## ", 1)[0]
+    rows = re.findall(r"^\| (\w[^|]*?) \| ([^|]*`[^|]*) \|", section, re.MULTILINE)
+    return {status: set(re.findall(r"`(\w+)`", codes)) for status, codes in rows}
+
+
+@pytest.fixture(scope="module")
+def written(repository: Path) -> dict[str, set[str]]:
+    """The codes that the service's code names, by status; under ``operation`` those of a pointing."""
+    codes: dict[str, set[str]] = {"operation": set()}
+    for path in sorted((repository / "mastctl").rglob("*.py")):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            for status, code in _named(node):
+                codes.setdefault(status, set()).add(code)
+    return codes
+
+
+def _named(node: ast.AST) -> Iterator[tuple[str, str]]:
+    """Codes given in a call of a family, in a class below one, or beside a status."""
+    if isinstance(node, ast.Call) and isinstance(node.func, ast.Name):
+        words = [one.value for one in node.args[:2] if isinstance(one, ast.Constant)]
+        if node.func.id in FAMILIES and words:
+            yield str(status_of(FAMILIES[node.func.id](str(words[0]), ""))), str(words[0])
+        elif node.func.id == PointingError.__name__ and words:
+            yield "operation", str(words[0])
+        elif node.func.id in PLAIN and len(words) == 2:
+            yield str(words[0]), str(words[1])
+    if isinstance(node, ast.ClassDef):
+        kind = next(
+            (FAMILIES[b.id] for b in node.bases if isinstance(b, ast.Name) and b.id in FAMILIES), None
+        )
+        for call in ast.walk(node) if kind is not None else ():
+            if isinstance(call, ast.Call) and ast.unparse(call.func) == "super().__init__":
+                code = ast.literal_eval(call.args[0])
+                yield str(status_of(kind(code, ""))), code  # type: ignore[misc]
+
+
+def test_each_code_of_the_service_stands_in_the_table_under_its_status(
+    documented: dict[str, set[str]], written: dict[str, set[str]]
+) -> None:
+    assert len(written["409"]) > 10
+    assert len(written["operation"]) > 10
+    for status, codes in written.items():
+        assert codes <= documented[status], status
+
+
+def test_each_error_class_of_service_and_drivers_has_its_own_code_and_stands_in_the_table(
+    documented: dict[str, set[str]],
+) -> None:
+    known = {code for codes in documented.values() for code in codes}
+    for kind in below(DriverError):
+        if kind.__module__.startswith("drivers."):
+            assert "code" in vars(kind), f"{kind.__name__} has no code of its own"
+            assert kind("").code in documented[str(status_of(kind("")))], kind.__name__
+    for kind in below(MastctlError):
+        if kind.__module__.startswith("mastctl.") and not issubclass(kind, tuple(FAMILIES.values())):
+            told = vars(kind).get("code") or kind.__name__ in ("_Family", PointingError.__name__)
+            assert told, f"{kind.__name__} has neither a family nor a code of its own"
+            assert told is True or told in known | NO_ANSWER, kind.__name__
+
+
+def test_no_code_has_two_statuses(documented: dict[str, set[str]]) -> None:
+    answers = {status: codes for status, codes in documented.items() if status.isdecimal()}
+    for status, codes in answers.items():
+        others = set[str]().union(*(those for other, those in answers.items() if other != status))
+        assert codes & others <= {"not_json"}, status  # no JSON by its name, and by its content
+
+
+@pytest.mark.parametrize(
+    ("error", "status"),
+    [
+        (BadRequest("bad_aim", "no"), 422),
+        (NotKnown("unknown_camera", "no"), 404),
+        (NoLonger("frame_too_old", "no"), 410),
+        (Stopped("no"), 409),
+        (Unable("closing", "no"), 503),
+        (CalibError("no"), 422),
+        (DriverError("no"), 502),
+    ],
+)
+def test_a_family_answers_with_one_status(error: Exception, status: int) -> None:
+    assert status_of(error) == status

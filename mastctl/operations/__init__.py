@@ -1,0 +1,1 @@
+"""Operations: what runs, one at a time, and the records of what ran."""

@@ -1,0 +1,89 @@
+"""What is known of operations: the record of each, and what they say together. All frozen."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any, Literal
+
+from mastctl.as_json import as_json
+
+OperationState = Literal["queued", "running", "done", "failed", "stopped"]
+
+
+@dataclass(frozen=True)
+class Residual:
+    """The last measured residual, pixels (x, y), with one sigma, and the operation that measured it."""
+
+    residual_px: tuple[float, float]
+    residual_sigma_px: tuple[float, float]
+    operation: str
+
+
+@dataclass(frozen=True)
+class Motion:
+    """What the operations say about themselves.
+
+    Attributes
+    ----------
+    operation
+        Id of the running operation, None when none runs.
+    target
+        The request that runs, or ran last, as it came; None before the first.
+    residual
+        The last one measured.
+    stopped
+        Whether the last thing that happened was a stop.
+    stopping
+        Whether a stop is under way: the head has not confirmed it, or the operation has not ended yet.
+    """
+
+    operation: str | None = None
+    target: Mapping[str, Any] | None = None
+    residual: Residual | None = None
+    stopped: bool = False
+    stopping: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class Operation:
+    """One operation's record so far; replaced as it goes on, never edited. Times of CLOCK_MONOTONIC."""
+
+    id: str
+    state: OperationState
+    request: Mapping[str, Any]
+    created_s: float
+    started_s: float | None = None
+    ended_s: float | None = None
+    steps: tuple[Any, ...] = ()
+    result: Any = None
+    error: Mapping[str, Any] | None = None
+
+    def told(self, *, steps: bool = True) -> dict[str, Any]:
+        """Return the record as JSON; the last pointing's residual stands in front too."""
+        told: dict[str, Any] = as_json(self if steps else replace(self, steps=()))
+        made = told.pop("result")
+        result = made if isinstance(made, dict) else {}
+        pointings = result.get("pointings") or []
+        last = pointings[-1] if pointings else {}
+        if not steps:
+            del told["steps"]
+        return told | {
+            "residual_px": last.get("residual_px"),
+            "residual_sigma_px": last.get("residual_sigma_px"),
+            "position_m": result.get("position_m"),
+            "range_m": result.get("range_m"),
+            "pointings": pointings,
+        }
+
+
+def last_residual(result: Any, name: str) -> Residual | None:
+    """Return the residual that a result ends with, if it measured one."""
+    pointings = getattr(result, "pointings", None) or ()
+    if not pointings:
+        return None
+    told = as_json(pointings[-1])
+    residual, sigma = told.get("residual_px"), told.get("residual_sigma_px")
+    if not (residual and sigma and None not in residual and None not in sigma):
+        return None
+    return Residual((residual[0], residual[1]), (sigma[0], sigma[1]), name)

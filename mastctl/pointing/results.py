@@ -1,0 +1,123 @@
+"""What the pointing loop answers: steps, pointings with their residuals, and how a request fails."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+import numpy as np
+
+from calib.rigid import FloatArray
+from mastctl.errors import MastctlError
+
+Pair = tuple[float, float]
+
+
+@dataclass(frozen=True)
+class Step:
+    """One step of an operation, for the record: what it was, how it ended, when, and its numbers.
+
+    ``detail`` holds plain values with units in their names; of a failed step also ``code`` and ``message``.
+    """
+
+    name: str
+    state: Literal["done", "failed"]
+    started_s: float
+    duration_s: float
+    detail: Mapping[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Pointing:
+    """One pointing and what was measured after it.
+
+    Attributes
+    ----------
+    commanded_pan_rad, commanded_tilt_rad, measured_pan_rad, measured_tilt_rad
+        Joint angles that were sent, and those measured at the new picture's mid-exposure.
+    camera, frame_id
+        The new picture: exposed after the head had settled.
+    aim_px
+        (x, y) where the target was wanted; None for joint angles.
+    predicted_px
+        (x, y) where target position, mast file and measured joint angles put it; None if out of view.
+    target_px
+        (x, y) where the picture shows it; None where nothing was clicked that could be looked for.
+    residual_px, residual_sigma_px
+        target_px - aim_px, and one sigma of the match; None as above.
+    note
+        One sentence that says why there is no residual; empty otherwise.
+    motion_evidence
+        By camera of the new pictures: whether they moved as the joints did, as a ``verdict`` with numbers.
+    """
+
+    commanded_pan_rad: float
+    commanded_tilt_rad: float
+    measured_pan_rad: float
+    measured_tilt_rad: float
+    camera: str
+    frame_id: str
+    aim_px: Pair | None
+    predicted_px: Pair | None
+    target_px: Pair | None
+    residual_px: Pair | None
+    residual_sigma_px: Pair | None
+    note: str = ""
+    motion_evidence: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, eq=False)
+class PointingResult:
+    """What came of a request: position in the rover frame, range from the aim camera, the pointings.
+
+    ``position_m`` and ``range_m`` are those of the last pointing, None for joint angles.
+    """
+
+    position_m: tuple[float, float, float] | None
+    range_m: float | None
+    pointings: tuple[Pointing, ...]
+
+
+class PointingError(MastctlError):
+    """The request failed; the mast was told to stop.
+
+    Attributes
+    ----------
+    code
+        For programs. Own codes: ``stopped``, ``outside_image``, ``no_stereo``, ``head_fault``,
+        ``head_moving``, ``bad_reading``, ``no_fresh_frame``, ``did_not_arrive``, ``did_not_settle``,
+        ``not_in_view``, ``target_flat``, ``target_ambiguous``, ``target_border``, ``target_not_found``,
+        ``target_moving``, ``eyes_disagree``. That of a request that does not fit (`mastctl.pointing.wanted`),
+        of a driver, of the limits or of the geometry passes through.
+    step
+        The step that failed.
+    result
+        The pointings done before it, None if there were none.
+    """
+
+    def __init__(self, code: str, message: str, step: str = "", result: PointingResult | None = None) -> None:
+        self.code = code
+        self.step = step
+        self.result = result
+        super().__init__(message)
+
+    @property
+    def detail(self) -> dict[str, str]:
+        """The failed step, for the error's detail."""
+        return {"step": self.step}
+
+
+def pair(values: FloatArray) -> Pair:
+    """Return (2,) as plain floats."""
+    return float(values[0]), float(values[1])
+
+
+def triple(values: FloatArray) -> tuple[float, float, float]:
+    """Return (3,) as plain floats."""
+    return float(values[0]), float(values[1]), float(values[2])
+
+
+def rounded(values: FloatArray | Pair, digits: int = 4) -> list[float]:
+    """Return numbers for a step's detail."""
+    return [round(float(value), digits) for value in np.asarray(values).ravel()]

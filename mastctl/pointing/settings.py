@@ -1,0 +1,84 @@
+"""How the pointing loop is set: times and tolerances, with the reasons for their values."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from calib.pictures.patch_match import MatchSettings
+from calib.pictures.shown_view import ViewLimits
+from mastctl.devices.rest import DITHER_RAD
+
+
+@dataclass(frozen=True)
+class PointingSettings:
+    """Times and tolerances of the loop, with the reasons for their values.
+
+    Attributes
+    ----------
+    poll_s
+        Between readings while the head moves.
+    dwell_s
+        How long the reading must stay the same: three exposures, and longer than a mast's ringing after the
+        axis reports its position reached. A reading that dithers is watched for a second
+        (`mastctl.devices.rest`).
+    rest_tolerance_rad
+        How far the readings of a head at rest may lie from each other: three counts of a 12-bit servo.
+    arrival_tolerance_rad
+        How far from the commanded angle a head may rest: three counts and half the backlash of a 12-bit
+        servo, 6 mrad. What remains is measured in the picture.
+    acceleration_s, margin_s
+        Beyond distance over speed: ramps and an approach from one side; then everything else.
+    reading_age_s
+        Oldest reading that is one of now.
+    jump_rad
+        Beyond what the speed allows between two readings (twice over): two encoder slips of a degree.
+    rest_wait_s
+        How long a request waits for a head that still moves.
+    frame_timeout_s
+        For a new picture: some frames of a slow camera, on a busy machine.
+    same_pose_rad
+        Joint angles nearer than this are one pose: a tenth of a Pancam pixel.
+    same_moment_s
+        Exposures less apart than this are one: half a pixel would take 5000 px/s, which blurs any picture.
+    between_eyes_px
+        How far the target may move between the exposures of a pair that serves a measurement.
+    nearest_m
+        Nothing nearer is looked for.
+    search_px, wide_search_px
+        Half windows around the predicted place: what arrival tolerance and mast file explain in a Navcam
+        (6 mrad are 8 px) with room; then what a slipped encoder may do (2 degrees are 45 px in a Navcam, 120
+        in a Pancam).
+    eyes_px, range_px
+        Largest offset across the epipolar line, and along it after the move (same pair only), that is still
+        put down to calibration: the paper's mast fit leaves 1.1 px rms.
+    triangulation_sigma_px
+        Of a pixel for the position's covariance: matching and calibration together.
+    view
+        What may lie between the view that joints tell and the one that a picture shows.
+    match, small_half_px
+        Of the matching itself; and the half patch that is tried where the usual one fits nowhere, because
+        part of it lies on something nearer or farther.
+    """
+
+    poll_s: float = 0.02
+    dwell_s: float = 0.15
+    rest_tolerance_rad: float = DITHER_RAD
+    arrival_tolerance_rad: float = 6e-3
+    acceleration_s: float = 1.5
+    margin_s: float = 2.5
+    reading_age_s: float = 1.0
+    jump_rad: float = 0.035
+    rest_wait_s: float = 2.0
+    frame_timeout_s: float = 8.0
+    same_pose_rad: float = 3e-5
+    same_moment_s: float = 1e-4
+    between_eyes_px: float = 0.5
+    nearest_m: float = 0.4
+    search_px: float = 48.0
+    wide_search_px: float = 200.0
+    eyes_px: float = 2.0
+    range_px: float = 4.0
+    triangulation_sigma_px: float = 0.2
+    small_half_px: int = 12
+    view: ViewLimits = field(default_factory=ViewLimits)
+    match: MatchSettings = field(default_factory=MatchSettings)
