@@ -32,11 +32,11 @@ from hil_tests.mastctl.service_fakes import (
     fake_daemon,
     rig,
 )
-from mastctl import operations as operations_module
 from mastctl.client import Client
 from mastctl.config import Listen, load_config
 from mastctl.daemon import AddressInUse, RunningDaemon, _tcp_socket
 from mastctl.devices import devices as devices_module
+from mastctl.operations import operations as operations_module
 from mastctl.service import service as service_module
 
 LINE_TIMEOUT_S = 60.0  # for a cold start on a busy machine; only bounds a failing test
