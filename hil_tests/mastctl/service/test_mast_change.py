@@ -21,6 +21,7 @@ from hil_tests.mastctl.service_fakes import FakeHardware, ScriptedLoop, eventual
 from mastctl.daemon import RunningDaemon
 from mastctl.errors import Stopped
 from mastctl.service import service as service_module
+from mastctl.service.mast_in_use import configured
 
 
 @pytest.fixture
@@ -196,11 +197,11 @@ def test_bodies_that_make_no_sense_are_refused(web: httpx.Client, body: dict[str
 def test_a_daemon_with_fewer_cameras_keeps_the_covariance_of_those_it_has() -> None:
     names = ["mast.rotation_rad.x", "cameras.navcam_left.C.x", "cameras.hazcam_left.C.x"]
     fit = {"parameters": names, "covariance": np.diag([1e-6, 4e-6, 9e-6]).tolist(), "rms_px": 0.1}
-    part = service_module._configured(replace(rig(), fit=fit), ["navcam_left", "navcam_right"])
+    part = configured(replace(rig(), fit=fit), ["navcam_left", "navcam_right"])
     known = stored_covariance(part)
     assert known is not None
     assert known.names == tuple(names[:2])
     assert np.diag(known.covariance).tolist() == [1e-6, 4e-6]
     assert part.fit["rms_px"] == 0.1
-    spoilt = service_module._configured(replace(rig(), fit={**fit, "covariance": [[1.0]]}), ["navcam_left"])
+    spoilt = configured(replace(rig(), fit={**fit, "covariance": [[1.0]]}), ["navcam_left"])
     assert stored_covariance(spoilt) is None
