@@ -13,7 +13,8 @@ from drivers.clock import ManualClock
 from drivers.interfaces import Reading
 from mastctl.devices.limits import Limits
 from mastctl.pointing.motion import Head
-from mastctl.pointing.requests import PointingError, PointingSettings
+from mastctl.pointing.results import PointingError
+from mastctl.pointing.settings import PointingSettings
 
 SPEED_RAD_PER_S = 0.5
 SETTINGS = PointingSettings(

@@ -11,7 +11,7 @@ from drivers.interfaces import Reading
 from mastctl.devices.frames import StampedFrame
 from mastctl.devices.limits import Limits
 from mastctl.devices.thread import Fault
-from mastctl.operations import Motion, Residual
+from mastctl.operations.records import Motion, Residual
 from mastctl.service.state import State
 from mastctl.tracking.status import TrackStatus
 
