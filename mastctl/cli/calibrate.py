@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -90,7 +89,7 @@ def _from_survey(args: argparse.Namespace) -> int:
     warnings = checked(survey, args.method)  # once more, with the dots that were found
     for warning in warnings:
         output.tell(f"warning: {warning}")
-    with _waiting(args, f"fitting {len(survey.images)} images ({args.method})"):
+    with output.waiting(args.json, f"fitting {len(survey.images)} images ({args.method})"):
         done = calibrate(survey, args.out, args.method, args.mast, warnings, undetected)
     page = _report(args, done, in_use)
     if args.json:
@@ -145,20 +144,13 @@ def _with_dots(args: argparse.Namespace, survey: Survey) -> tuple[Survey, tuple[
     return survey, undetected
 
 
-def _waiting(args: argparse.Namespace, what: str) -> AbstractContextManager[Any]:
-    """Show on stderr what a person is waiting for."""
-    from rich.console import Console
-
-    return Console(stderr=True, quiet=args.json).status(what)
-
-
 def _report(args: argparse.Namespace, done: Calibrated, in_use: StoredRig | None) -> Path | None:
     if args.report is None:
         return None
     from calib.errors import BadFile
     from mastctl.calibration.report import Told, write_calibration_report
 
-    with _waiting(args, "writing the report"):
+    with output.waiting(args.json, "writing the report"):
         told = Told(
             done.survey, done.calibration, done.verdict, done.warnings, done.undetected, in_use, done.saved
         )

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from mastctl import signals
 from mastctl.cli import output
+from mastctl.cli.camera_choice import with_cameras
 from mastctl.cli.output import positive_number
 
 if TYPE_CHECKING:
@@ -48,8 +49,6 @@ def add_action(actions: Any) -> None:
 
 def camera_sync(args: argparse.Namespace) -> int:
     """Measure, and tell each camera's offset_s; 1 if no camera's could be told."""
-    from dataclasses import replace
-
     from drivers.clock import SystemClock
     from drivers.open_hardware import open_hardware
     from mastctl.cameras.sync_sweep import Sweep, plan_sweep
@@ -62,7 +61,7 @@ def camera_sync(args: argparse.Namespace) -> int:
     rig = mast.stored.rig
     names = _chosen(args, config, rig)
     plan = plan_sweep(rig, names, config.limits, args.amplitude, args.speed, args.seconds)
-    settings = replace(config.hardware, cameras={name: config.hardware.cameras[name] for name in names})
+    settings = with_cameras(config, names)
     clock = SystemClock()
     with _ending_signals() as stop, open_hardware(settings, clock) as hardware:
         head = SimpleNamespace(pan_tilt=hardware.pan_tilt, cameras={})

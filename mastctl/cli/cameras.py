@@ -1,24 +1,25 @@
-"""Commands on connected cameras: camera list, check, grab, focus; sync is in a module of its own."""
+"""Commands on connected cameras: camera list, grab, focus; check and sync are in modules of their own."""
 
 from __future__ import annotations
 
 import argparse
 import sys
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from mastctl.cli import camera_sync, output
+from mastctl.cli import camera_check, camera_sync, output
+from mastctl.cli.camera_choice import (
+    FRAME_TIMEOUT_S,
+    add_camera_options,
+    config_of,
+    opened_camera,
+    with_cameras,
+)
 from mastctl.cli.output import finite_number, positive_number
 
 if TYPE_CHECKING:
-    from drivers.v4l2.camera import V4l2Camera
-    from mastctl.config import Config
     from mastctl.devices.frames import StampedFrame
-
-FRAME_TIMEOUT_S = 5.0
 
 
 def add_actions(actions: Any) -> None:
@@ -28,46 +29,23 @@ def add_actions(actions: Any) -> None:
 
     camera_sync.add_action(actions)
 
-    check = actions.add_parser("check", help="what a camera can do, and what it really delivers")
-    _add_camera(check)
-    check.add_argument(
-        "--seconds", type=positive_number, default=5.0, metavar="S", help="how long (default 5)"
-    )
-    check.add_argument(
-        "--with-head", action="store_true",
-        help="with --config: open the head first, for cameras of a simulator that look from it",
-    )  # fmt: skip
-    check.set_defaults(run=camera_check)
+    camera_check.add_action(actions)
 
     grab = actions.add_parser(
         "grab", help="one fresh picture as PNG, with time, joints and mast digest in it"
     )
-    _add_camera(grab)
+    add_camera_options(grab)
     grab.add_argument("--out", required=True, type=Path, metavar="FILE.png")
     grab.add_argument("--aim", nargs=2, type=finite_number, metavar=("X", "Y"), help="mark this pixel")
     grab.set_defaults(run=camera_grab)
 
     focus = actions.add_parser("focus", help="sharpness again and again, while the lens is turned")
-    _add_camera(focus)
+    add_camera_options(focus)
     focus.add_argument(
         "--aim", nargs=2, type=finite_number, metavar=("X", "Y"), help="around this pixel only"
     )
     focus.add_argument("--seconds", type=positive_number, default=60.0, metavar="S", help="default 60")
     focus.set_defaults(run=camera_focus)
-
-
-def _add_camera(parser: argparse.ArgumentParser) -> None:
-    """Add the options that choose and set up a camera."""
-    parser.add_argument(
-        "camera", metavar="CAMERA", help="link, node, card name or bus; with --config its name there"
-    )
-    parser.add_argument("--config", metavar="FILE", help="a configuration that has the camera")
-    parser.add_argument("--format", metavar="CODE", help="YUYV, MJPG, GREY ... (default: the first it has)")
-    parser.add_argument("--size", nargs=2, type=int, metavar=("W", "H"), help="default: as it is set")
-    parser.add_argument("--rate", type=positive_number, metavar="HZ", help="default: as it is set")
-    parser.add_argument(
-        "--set", action="append", default=[], metavar="CONTROL=VALUE", help="a control; may be given often"
-    )
 
 
 def camera_list(args: argparse.Namespace) -> int:
@@ -97,41 +75,6 @@ def camera_list(args: argparse.Namespace) -> int:
     return 0
 
 
-def camera_check(args: argparse.Namespace) -> int:
-    """Measure what a camera delivers, and show what it can do."""
-    from mastctl.cameras.quality import quality_of
-
-    if (
-        args.config is not None
-        and (config := _config_of(args)).hardware.cameras[args.camera].driver != "v4l2"
-    ):
-        return _check_any(args, config)
-    if args.with_head:
-        raise output.WrongUse("--with-head goes with --config and a camera of another driver than v4l2")
-    with _opened(args) as camera:
-        measured = _measured(camera, args.seconds)
-        frame = camera.next_frame(time.monotonic(), FRAME_TIMEOUT_S)
-        quality = quality_of(frame.image)
-        problems = [problem.message for problem in camera.capture.problems]
-        document: dict[str, Any] = {
-            "card": camera.capture.identity.card,
-            "bus": camera.capture.identity.bus,
-            "driver": camera.capture.identity.driver,
-            "format": camera.capture.format.code,
-            "size_px": list(camera.capture.format.size_px),
-            "asked_rate_hz": 1 / camera.capture.period_s,
-            **measured,
-            "quality": quality.told(),
-            "problems": problems,
-            **camera.abilities(),
-        }
-    if args.json:
-        output.print_json(document)
-    else:
-        _print_check(document)
-    return 0
-
-
 def camera_grab(args: argparse.Namespace) -> int:
     """Write one fresh picture with its facts."""
     from mastctl.report.pictures import encoded, with_cross
@@ -153,7 +96,7 @@ def camera_grab(args: argparse.Namespace) -> int:
         }
         image, mid_s, window_s, sequence = frame.image, frame.mid_exposure_s, frame.exposure_s, frame.sequence
     else:
-        with _opened(args) as camera:
+        with opened_camera(args) as camera:
             taken = camera.next_frame(time.monotonic(), FRAME_TIMEOUT_S)
             facts = {"camera": camera.capture.identity.card, "bus": camera.capture.identity.bus}
         image, mid_s, window_s, sequence = taken.image, taken.mid_exposure_s, taken.exposure_s, taken.sequence
@@ -185,7 +128,7 @@ def camera_focus(args: argparse.Namespace) -> int:
     from mastctl.cameras.quality import sharpness
 
     best, seen = 0.0, []
-    with _opened(args) as camera:
+    with opened_camera(args) as camera:
         until_s = time.monotonic() + args.seconds
         while True:
             frame = camera.next_frame(time.monotonic(), FRAME_TIMEOUT_S)
@@ -204,111 +147,18 @@ def camera_focus(args: argparse.Namespace) -> int:
     return 0
 
 
-@contextmanager
-def _opened(args: argparse.Namespace) -> Iterator[V4l2Camera]:
-    """The camera of the arguments, open; by itself or by its name in a configuration."""
-    from drivers.v4l2.camera import open_camera
-    from drivers.v4l2.choice import options_for
-
-    if args.config is not None:
-        options = _configured_options(args)
-    else:
-        options = options_for(
-            args.camera,
-            args.format,
-            None if args.size is None else tuple(args.size),
-            args.rate,
-            _settings(args.set),
-        )
-    camera = open_camera(options, name=args.camera)
-    try:
-        yield camera
-    finally:
-        camera.close()
-
-
-def _settings(words: list[str]) -> dict[str, int | str]:
-    """``CONTROL=VALUE`` words."""
-    settings: dict[str, int | str] = {}
-    for word in words:
-        name, equals, value = word.partition("=")
-        if not name or not equals or not value:
-            raise output.WrongUse(f"--set {word}: CONTROL=VALUE is expected")
-        try:
-            settings[name] = int(value)
-        except ValueError:
-            settings[name] = value
-    return settings
-
-
-def _configured_options(args: argparse.Namespace) -> dict[str, Any]:
-    """A v4l2 camera's options in a configuration."""
-    config = _config_of(args)
-    device = config.hardware.cameras[args.camera]
-    if device.driver != "v4l2":
-        raise output.WrongUse(f"{args.camera} in {config.path} is of driver {device.driver!r}, not 'v4l2'")
-    _refuse_settings(args)
-    return dict(device.options)
-
-
-def _config_of(args: argparse.Namespace) -> Config:
-    """The configuration, which has the camera."""
-    from mastctl.config import load_config
-
-    config = load_config(args.config)
-    if args.camera not in config.hardware.cameras:
-        known = ", ".join(config.hardware.cameras)
-        raise output.WrongUse(f"{config.path} has no camera {args.camera}; it has {known}")
-    return config
-
-
-def _check_any(args: argparse.Namespace, config: Config) -> int:
-    """Hold a configured camera of any driver against what a driver promises."""
-    from dataclasses import replace
-
-    from drivers.clock import SystemClock
-    from drivers.open_hardware import open_hardware, open_one_camera
-    from mastctl.cameras.check import CameraCheck
-    from mastctl.service.mast_in_use import read_mast
-
-    _refuse_settings(args)
-    rig = read_mast(config.mast_file, config).stored.rig
-    settings = replace(config.hardware, cameras={args.camera: config.hardware.cameras[args.camera]})
-    clock = SystemClock()
-    size_px = rig.cameras[args.camera].model.size_px
-    if args.with_head:
-        with open_hardware(settings, clock) as hardware:
-            found = CameraCheck(args.camera, hardware.cameras[args.camera], clock, size_px).run(args.seconds)
-    else:
-        with open_one_camera(settings, args.camera, clock) as camera:
-            found = CameraCheck(args.camera, camera, clock, size_px).run(args.seconds)
-    found |= {
-        "driver": settings.cameras[args.camera].driver,
-        "offset_s": settings.cameras[args.camera].offset_s,
-    }
-    if args.json:
-        output.print_json(found)
-    else:
-        _print_any_check(found)
-    return 0 if found["frames"] else 1
-
-
 def _configured_frame(args: argparse.Namespace) -> StampedFrame:
     """One fresh frame of a configured camera (of any driver) with the joint angles of its moment."""
-    from dataclasses import replace
-
     from drivers.absent_camera import AbsentCamera
     from drivers.clock import SystemClock
     from drivers.open_hardware import open_hardware
     from mastctl.devices.devices import Devices
     from mastctl.service.mast_in_use import read_mast
 
-    _refuse_settings(args)
-    config = _config_of(args)
+    config = config_of(args)
     mast = read_mast(config.mast_file, config)
-    settings = replace(config.hardware, cameras={args.camera: config.hardware.cameras[args.camera]})
     clock = SystemClock()
-    with open_hardware(settings, clock) as hardware:
+    with open_hardware(with_cameras(config, [args.camera]), clock) as hardware:
         place = hardware.cameras[args.camera]
         if isinstance(place, AbsentCamera) and place.error is not None:
             raise place.error  # nobody waits here until it joins
@@ -317,103 +167,6 @@ def _configured_frame(args: argparse.Namespace) -> StampedFrame:
             return devices.frames([args.camera], clock.now_s(), FRAME_TIMEOUT_S)[args.camera]
         finally:
             devices.close()
-
-
-def _refuse_settings(args: argparse.Namespace) -> None:
-    for option in ("format", "size", "rate", "set"):
-        if getattr(args, option):
-            raise output.WrongUse(f"--{option} does not go with --config, which says it")
-
-
-def _measured(camera: V4l2Camera, seconds: float) -> dict[str, Any]:
-    """Rate, losses and delays over some seconds."""
-    before = camera.counters
-    frame = camera.next_frame(time.monotonic(), FRAME_TIMEOUT_S)
-    first, until_s = frame, time.monotonic() + seconds
-    delays_s, count = [frame.received_s - frame.stamp_s], 0
-    while time.monotonic() < until_s:
-        after_s = frame.mid_exposure_s - frame.exposure_s / 2
-        frame = camera.next_frame(after_s, FRAME_TIMEOUT_S)
-        delays_s.append(frame.received_s - frame.stamp_s)
-        count += 1
-    counters = camera.counters
-    span_s = frame.stamp_s - first.stamp_s
-    return {
-        "rate_hz": (frame.sequence - first.sequence) / span_s if span_s > 0 else None,
-        "dropped": counters.dropped - before.dropped,
-        "damaged": counters.damaged - before.damaged,
-        "late": counters.late - before.late,
-        "delay_s": [min(delays_s), sorted(delays_s)[len(delays_s) // 2], max(delays_s)],
-        "mid_exposure_uncertainty_s": frame.mid_uncertainty_s,
-        "seconds": seconds,
-    }
-
-
-def _print_check(told: dict[str, Any]) -> None:
-    """The check as tables for people."""
-    quality = told["quality"]
-    low, median, high = (1e3 * delay_s for delay_s in told["delay_s"])
-    rate = "-" if told["rate_hz"] is None else f"{told['rate_hz']:.2f} Hz"
-    width, height = told["size_px"]
-    rows = [
-        ("camera", f"{told['card']} at {told['bus']} ({told['driver']})"),
-        ("format", f"{told['format']} {width}x{height}, {told['asked_rate_hz']:.4g} Hz promised"),
-        ("rate", f"{rate} over {told['seconds']:g} s"),
-        ("dropped, damaged, late", f"{told['dropped']}, {told['damaged']}, {told['late']}"),
-        ("stamp to here", f"{low:.1f} to {high:.1f} ms, median {median:.1f} ms"),
-        ("mid-exposure known to", f"+-{1e3 * told['mid_exposure_uncertainty_s']:.1f} ms"),
-        ("grey levels", f"mean {quality['mean']:.0f}, median {quality['median']:.0f}"),
-        ("dark, saturated", f"{quality['dark_share']:.1%}, {quality['saturated_share']:.1%} of the pixels"),
-        ("sharpness", f"{quality['sharpness']:.1f}"),
-    ]
-    output.print_table("check", ("what", "found"), rows, [f"problem: {p}" for p in told["problems"]])
-    _print_levels(quality)
-    output.print_table(
-        "formats", ("code", "sizes"), [(f["code"], f["sizes"]) for f in told["formats"] if f["readable"]]
-    )
-    controls = [
-        (c["name"], c["kind"], str(c["value"]), f"{c['minimum']} to {c['maximum']}") for c in told["controls"]
-    ]
-    output.print_table("controls", ("name", "kind", "value", "range"), controls)
-
-
-def _print_levels(quality: dict[str, Any]) -> None:
-    """The histogram as bars."""
-    most = max(quality["histogram"]) or 1.0
-    bars = [
-        (f"{16 * i:3d}-{16 * i + 15:3d}", f"{share:6.1%}", "#" * round(40 * share / most))
-        for i, share in enumerate(quality["histogram"])
-    ]
-    output.print_table("grey levels", ("level", "share", ""), bars)
-
-
-def _print_any_check(told: dict[str, Any]) -> None:
-    """The check of any driver's camera as tables for people."""
-    problems = [f"problem: {p}" for p in told["problems"]] or ["no problem was found"]
-    rows = [("driver", told["driver"]), ("frames", f"{told['frames']} in {told['seconds']:g} s")]
-    if told["frames"]:
-        width, height = told["size_px"]
-        low, median, high = (1e3 * delay_s for delay_s in told["delay_s"])
-        shortest, longest = (1e3 * exposure_s for exposure_s in told["exposure_s"])
-        uncertainty_s = told["mid_exposure_uncertainty_s"]
-        rows += [
-            ("pictures", f"{width}x{height}, {'colour' if told['colour'] else 'grey'}"),
-            ("rate", "-" if told["rate_hz"] is None else f"{told['rate_hz']:.2f} Hz by counts and stamps"),
-            ("passed over, refused", f"{told['missed']}, {told['refused']}"),
-            ("exposure's end to here", f"{low:.1f} to {high:.1f} ms, median {median:.1f} ms"),
-            ("exposure", f"{shortest:.1f} to {longest:.1f} ms"),
-            (
-                "mid-exposure known to",
-                "not told; mastctl camera sync measures it"
-                if uncertainty_s is None
-                else f"+-{1e3 * uncertainty_s:.1f} ms",
-            ),
-            ("offset_s in use", f"{told['offset_s']:g}"),
-            ("tells of itself", ", ".join(told["abilities"]) or "nothing"),
-        ]
-    output.print_table(f"check of {told['camera']}", ("what", "found"), rows, problems)
-    if told["frames"]:
-        _print_levels(told["quality"])
 
 
 def _utc(monotonic_s: float) -> str:

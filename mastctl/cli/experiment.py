@@ -8,7 +8,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mastctl.cli import output
-from mastctl.cli.experiment_common import at_least_one, check_writable, seed, tell_report
+from mastctl.cli.experiment_common import (
+    add_run_options,
+    at_least_one,
+    run_bar,
+    simulated_daemon,
+    tell_report,
+)
+from mastctl.cli.places import check_folder
 
 if TYPE_CHECKING:
     from mastctl.client import Client
@@ -63,37 +70,27 @@ def _add_common(parser: argparse.ArgumentParser, out_help: str) -> None:
         metavar="N",
         help="targets at each distance (default 10)",
     )
-    parser.add_argument(
-        "--seed", type=seed, default=1, metavar="S", help="chooses views and pixels (default 1)"
-    )
-    parser.add_argument("--out", type=Path, metavar="DIR", help=out_help)
+    add_run_options(parser, "chooses views and pixels", out_help)
 
 
 def run_pointing(args: argparse.Namespace) -> int:
     """Run the experiment on the daemon that --url or --config names."""
     from mastctl.cli.service import client_of
 
-    if args.out is not None:
-        check_writable(args.out)
+    check_folder(args.out, "--out")
     with client_of(args) as client:
         return _report(args, _run(args, client, tuple(args.distances), None, ()))
 
 
 def run_demo(args: argparse.Namespace) -> int:
     """Start the packaged simulated rover behind a daemon on a free port, and run the experiment on it."""
-    from mastctl.client import Client
     from mastctl.config import load_config
-    from mastctl.daemon import RunningDaemon
     from mastctl.experiment.demo import SimulationTruth, demo_config, head_note
     from mastctl.experiment.pointing import head_pair
 
-    check_writable(args.out)
+    check_folder(args.out, "--out")
     config = demo_config(load_config(None), head=args.head, wire=args.wire, seed=args.seed)
-    with _waiting(
-        args, "building the simulated rover and its ground (the first time also compiling the renderer)"
-    ):
-        daemon = RunningDaemon(config)
-    with daemon, Client(daemon.url) as client:
+    with simulated_daemon(args, config) as (daemon, client):
         rover = daemon.hardware.simulation
         assert rover is not None  # the packaged configuration is a simulated rover
         rig = daemon.service.stored.rig
@@ -103,13 +100,6 @@ def run_demo(args: argparse.Namespace) -> int:
         output.tell(f"simulated rover at {daemon.url}, head {rover.settings.head.name}{behind}")
         experiment = _run(args, client, DEFAULT_DISTANCES_M, SimulationTruth(rover), notes)
     return _report(args, experiment)
-
-
-def _waiting(args: argparse.Namespace, what: str) -> Any:
-    """Show on stderr what a person is waiting for."""
-    from rich.console import Console
-
-    return Console(stderr=True, quiet=args.json).status(what)
 
 
 def _run(
@@ -125,15 +115,11 @@ def _run(
     from mastctl.experiment.pointing_record import TargetRecord
     from mastctl.experiment.pointing_report import PICTURES_PER_DISTANCE
 
-    with output.progress_bar(args.json) as progress:
-        task = progress.add_task("pointing", total=args.targets * len(distances_m))
+    with run_bar(args, "pointing", args.targets * len(distances_m)) as step:
 
         def show(record: TargetRecord) -> None:
-            if record.error:
-                progress.console.print(
-                    f"{record.distance_m:g} m, target {record.index}: {record.error}", style="red"
-                )
-            progress.update(task, advance=1, description=f"pointing at {record.distance_m:g} m")
+            where = f"{record.distance_m:g} m, target {record.index}"
+            step(f"pointing at {record.distance_m:g} m", record.error and f"{where}: {record.error}")
 
         return run_pointing_experiment(
             client,

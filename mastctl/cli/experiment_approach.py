@@ -11,7 +11,7 @@ from mastctl.cli import output
 
 def add_parser(kinds: Any) -> None:
     """Add ``approach`` to the experiments."""
-    from mastctl.cli.experiment_common import at_least_one, seed
+    from mastctl.cli.experiment_common import add_run_options, at_least_one
 
     parser = kinds.add_parser(
         "approach",
@@ -23,18 +23,11 @@ def add_parser(kinds: Any) -> None:
     )  # fmt: skip
     parser.add_argument("--runs", type=at_least_one, default=5, metavar="N", help="approaches (default 5)")
     parser.add_argument(
-        "--seed", type=seed, default=1, metavar="S", help="of the first run's scene and errors (default 1)"
-    )
-    parser.add_argument(
         "--on", choices=("rocks", "ground"), default="rocks",
         help="what targets lie on (default rocks; ground: wherever there is texture)",
     )  # fmt: skip
-    parser.add_argument(
-        "--out",
-        type=Path,
-        metavar="DIR",
-        help="folder for stops.csv, record.json, a strip of pictures a run, and error.png",
-    )
+    out_help = "folder for stops.csv, record.json, a strip of pictures a run, and error.png"
+    add_run_options(parser, "of the first run's scene and errors", out_help)
     parser.set_defaults(run=run)
 
 
@@ -43,13 +36,12 @@ def run(args: argparse.Namespace) -> int:
     from rich.console import Console
 
     from calib.files.mast_file import load_rig
-    from mastctl.cli.experiment_common import check_writable
+    from mastctl.cli.places import check_folder
     from mastctl.experiment.approach import run_approach
     from mastctl.experiment.approach_report import approach_table, counted, summary, write_record, write_strip
     from mastctl.packaged import config_folder
 
-    if args.out is not None:
-        check_writable(args.out)
+    check_folder(args.out, "--out")
     true = load_rig(config_folder() / "sim" / "rocky8.yaml").rig
     believed = load_rig(args.mast or config_folder() / "masts" / "rocky8_simulated.yaml").rig
     if lacking := [pair for pair in true.stereo if pair not in believed.stereo]:

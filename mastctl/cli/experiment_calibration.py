@@ -20,7 +20,7 @@ DEFAULT_TARGETS = 20
 
 def add_parser(kinds: Any) -> None:
     """Add ``calibration`` to the experiments."""
-    from mastctl.cli.experiment_common import at_least_one, seed
+    from mastctl.cli.experiment_common import add_run_options, at_least_one
 
     parser = kinds.add_parser(
         "calibration",
@@ -42,7 +42,7 @@ def add_parser(kinds: Any) -> None:
         choices=("placements", "boards", "station", "prisms", "hazcam", "mast"),
         help="placements, boards, station, prisms, hazcam or mast; may be given several times (default: all)",
     )  # fmt: skip
-    parser.add_argument("--seed", type=seed, default=1, metavar="S", help="of everything random (default 1)")
+    add_run_options(parser, "of everything random", "folder for report.html, surveys.csv and record.json")
     parser.add_argument(
         "--executor", default="local", metavar="WHERE",
         help="local: processes of this machine (default); dask:ADDRESS: a Dask cluster",
@@ -50,16 +50,13 @@ def add_parser(kinds: Any) -> None:
     parser.add_argument(
         "--workers", type=at_least_one, metavar="N", help="local processes (default: one a processor)"
     )
-    parser.add_argument(
-        "--out", type=Path, metavar="DIR", help="folder for report.html, surveys.csv and record.json"
-    )
     parser.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> int:
     """Run the study; 1 if no survey at all could be fitted."""
     from calib.files.mast_file import load_rig
-    from mastctl.cli.experiment_common import check_writable
+    from mastctl.cli.places import check_folder
     from mastctl.experiment.calibration_variants import variants
     from mastctl.packaged import config_folder
 
@@ -68,8 +65,7 @@ def run(args: argparse.Namespace) -> int:
         raise output.CommandError(
             "no_navcam", "the rig has no stereo pair navcam, which the study clicks in", exit_code=2
         )
-    if args.out is not None:
-        check_writable(args.out)
+    check_folder(args.out, "--out")
     chosen = [v for v in variants() if args.study is None or v.study.startswith(tuple(args.study))]
     experiment = _run(args, rig, chosen)
     return _tell(args, experiment)
@@ -78,20 +74,18 @@ def run(args: argparse.Namespace) -> int:
 def _run(args: argparse.Namespace, rig: Any, chosen: list[Variant]) -> CalibrationExperiment:
     """Run with a progress bar on stderr, one step a survey."""
 
+    from mastctl.cli.experiment_common import run_bar
     from mastctl.experiment.calibration import run_calibration_experiment
     from mastctl.experiment.executors import open_executor
 
     with (
         open_executor(args.executor, args.workers) as executor,
-        output.progress_bar(args.json) as progress,
+        run_bar(args, "surveys", len(chosen) * args.surveys) as step,
     ):
-        task = progress.add_task("surveys", total=len(chosen) * args.surveys)
 
         def done(outcome: SurveyOutcome) -> None:
-            if outcome.failure:
-                words = f"{outcome.variant.study} {outcome.variant.label}: {outcome.failure}"
-                progress.console.print(words, style="yellow", markup=False)
-            progress.advance(task)
+            variant = outcome.variant
+            step("", outcome.failure and f"{variant.study} {variant.label}: {outcome.failure}")
 
         return run_calibration_experiment(
             rig,

@@ -26,7 +26,7 @@ MOST_POINTS = 9  # of one brick: its upper corners and its faces but the bottom
 
 def add_parser(kinds: Any) -> None:
     """Add ``handoff`` to the experiments."""
-    from mastctl.cli.experiment_common import at_least_one, seed
+    from mastctl.cli.experiment_common import add_run_options, at_least_one
     from mastctl.cli.service import add_daemon_options
 
     parser = kinds.add_parser(
@@ -55,29 +55,21 @@ def add_parser(kinds: Any) -> None:
         "--click-px", type=output.not_negative, default=0.2, metavar="PX",
         help="sigma of the noise added to the clicks (default 0.2)",
     )  # fmt: skip
-    parser.add_argument(
-        "--seed", type=seed, default=1, metavar="S", help="chooses views and pixels (default 1)"
-    )
-    parser.add_argument(
-        "--out",
-        type=Path,
-        metavar="DIR",
-        help="folder for report.html, targets.csv, handoffs.jsonl and record.json",
-    )
+    out_help = "folder for report.html, targets.csv, handoffs.jsonl and record.json"
+    add_run_options(parser, "chooses views and pixels", out_help)
     parser.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> int:
     """Run the experiment; 1 if no target at all was handed over."""
-    from mastctl.cli.experiment_common import check_writable
+    from mastctl.cli.places import check_folder
     from mastctl.cli.service import client_of
 
     if args.mast_file is not None and not args.simulated:
         raise output.WrongUse("--mast-file belongs to --simulated; a running daemon has its own mast file")
     if args.bricks is not None and not (args.simulated and args.bricks <= MOST_BRICKS):
         raise output.WrongUse(f"--bricks {args.bricks}: 1 to {MOST_BRICKS} are possible, with --simulated")
-    if args.out is not None:
-        check_writable(args.out)
+    check_folder(args.out, "--out")
     with ExitStack() as stack:
         if args.simulated:
             client, truth, points = _simulated(args, stack)
@@ -89,20 +81,19 @@ def run(args: argparse.Namespace) -> int:
 
 def _simulated(args: argparse.Namespace, stack: ExitStack) -> tuple[Client, Truth, KnownPoints | None]:
     """The packaged simulated rover behind a daemon on a free port, with its bricks if they are asked for."""
-    from mastctl.client import Client
+    from mastctl.cli.experiment_common import simulated_daemon
     from mastctl.config import load_config
-    from mastctl.daemon import RunningDaemon
     from mastctl.experiment.demo import SimulationTruth, demo_config
     from mastctl.experiment.known_points import BrickPoints
 
     config = demo_config(load_config(None), head="ptu_d46_70", seed=args.seed, bricks=args.bricks or 0)
     if args.mast_file is not None:
         config = replace(config, mast_file=args.mast_file)
-    daemon = stack.enter_context(RunningDaemon(config))
+    daemon, client = stack.enter_context(simulated_daemon(args, config))
     rover = daemon.hardware.simulation
     assert rover is not None  # the packaged configuration is a simulated rover
     points = BrickPoints(rover) if args.bricks else None
-    return stack.enter_context(Client(daemon.url)), SimulationTruth(rover), points
+    return client, SimulationTruth(rover), points
 
 
 def _run(
@@ -110,18 +101,16 @@ def _run(
 ) -> HandoffExperiment:
     """Run with a progress bar on stderr, one step a target."""
 
+    from mastctl.cli.experiment_common import run_bar
     from mastctl.experiment.handoff import STEPS, run_handoff_experiment
 
-    with output.progress_bar(args.json) as progress:
-        targets = args.targets or (MOST_POINTS * args.bricks if args.bricks else 10)
-        total = None if args.bricks else targets * len(STEPS)  # how many points show is not known before
-        task = progress.add_task("hand-off", total=total)
+    targets = args.targets or (MOST_POINTS * args.bricks if args.bricks else 10)
+    total = None if args.bricks else targets * len(STEPS)  # how many points show is not known before
+    with run_bar(args, "hand-off", total) as step:
 
         def show(record: HandoffRecord) -> None:
-            if record.error:
-                words = f"{record.step}, target {record.index}: {record.error}"
-                progress.console.print(words, style="red", markup=False)
-            progress.update(task, advance=1, description=record.step)
+            where = f"{record.step}, target {record.index}"
+            step(record.step, record.error and f"{where}: {record.error}")
 
         return run_handoff_experiment(
             client,

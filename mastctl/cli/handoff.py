@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mastctl.cli import output
+from mastctl.cli.mast_files import nearest_of, read_mast_file, stereo_pair
 from mastctl.cli.output import finite_number, positive_number
 
 if TYPE_CHECKING:
@@ -44,22 +45,14 @@ def add_commands(subparsers: Any) -> None:
 
 def hand_over(args: argparse.Namespace) -> int:
     """Hand a target over, geometrically."""
-    from calib.files.mast_file import load_rig
     from calib.handoff.geometric import Joints, hand_off
     from calib.mast.covariance import stored_covariance
 
-    stored = load_rig(args.mast)
-    for note in stored.notes:
-        output.tell(note)
-    rig = stored.rig
-    if args.source not in rig.stereo:
-        raise output.WrongUse(
-            f"--from: no stereo pair '{args.source}' in {args.mast}; it has {_names(rig.stereo)}"
-        )
+    stored = read_mast_file(args.mast)
+    rig, pair = stored.rig, stereo_pair(stored, args.source)
     if args.to not in rig.stereo and args.to not in rig.cameras:
-        known = _names({**rig.stereo, **rig.cameras})
-        raise output.WrongUse(f"--to: no stereo pair or camera '{args.to}' in {args.mast}; it has {known}")
-    pair = rig.stereo[args.source]
+        known = nearest_of(args.to, [*rig.stereo, *rig.cameras])
+        raise output.WrongUse(f"no stereo pair or camera '{args.to}' in {args.mast}; {known}")
     to = rig.stereo.get(args.to, (args.to,))
     on_head = any(rig.cameras[name].on == "head" for name in (*pair, *to))
     if on_head and (args.pan is None or args.tilt is None):
@@ -179,7 +172,3 @@ def _print(args: argparse.Namespace, rig: Rig, done: Handoff) -> None:
         rows,
         notes,
     )
-
-
-def _names(known: Any) -> str:
-    return ", ".join(known) or "none"

@@ -30,7 +30,8 @@ log = logging.getLogger(__name__)
 MODULES: dict[str, tuple[str, ...]] = {
     "mastctl.cli.service": ("run", "status", "point", "stop", "snapshot"),
     "mastctl.cli.track": ("track",),
-    "mastctl.cli.geometry": ("camera", "solve", "triangulate", "budget"),
+    "mastctl.cli.camera_files": ("camera",),
+    "mastctl.cli.geometry": ("solve", "triangulate", "budget"),
     "mastctl.cli.handoff": ("handoff",),
     "mastctl.cli.calibrate": ("calibrate",),
     "mastctl.cli.experiment": ("experiment", "demo"),

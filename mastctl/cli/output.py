@@ -7,6 +7,7 @@ import json
 import math
 import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import AbstractContextManager
 from typing import TYPE_CHECKING, Any
 
 from mastctl.report import tables
@@ -142,6 +143,13 @@ def progress_bar(quiet: bool) -> Progress:
 
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
     return Progress(*columns, console=Console(stderr=True, quiet=quiet))
+
+
+def waiting(quiet: bool, what: str) -> AbstractContextManager[Any]:
+    """Return what shows on stderr what a person is waiting for, meanwhile. ``quiet`` shows nothing."""
+    from rich.console import Console
+
+    return Console(stderr=True, quiet=quiet).status(what)
 
 
 def finite_number(text: str) -> float:

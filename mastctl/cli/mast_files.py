@@ -1,0 +1,66 @@
+"""What commands on a mast file share: reading it, and finding in it what the options name."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Collection, Iterable
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from mastctl.cli import output
+
+if TYPE_CHECKING:
+    from calib.files.mast_file import StoredRig
+    from calib.mast.rig import Rig
+
+
+def read_mast_file(path: Path) -> StoredRig:
+    """Read a mast file; what reading it changed is told on stderr, for stdout holds the result."""
+    from calib.files.mast_file import load_rig
+
+    stored = load_rig(path)
+    tell_notes(stored.notes)
+    return stored
+
+
+def tell_notes(notes: Iterable[str]) -> None:
+    """Tell what reading a file changed."""
+    for note in notes:
+        output.tell(note)
+
+
+def camera_name(stored: StoredRig, name: str | None) -> str:
+    """Return the camera that was asked for, the only one by default. Raises WrongUse."""
+    cameras = stored.rig.cameras
+    if name is None and len(cameras) == 1:
+        return next(iter(cameras))
+    if not cameras:
+        raise output.WrongUse(f"{stored.path} holds no camera")
+    if name is None:
+        raise output.WrongUse(
+            f"{stored.path} holds several cameras; --camera with one of {', '.join(cameras)}"
+        )
+    if name not in cameras:
+        raise output.WrongUse(f"no camera '{name}' in {stored.path}; {nearest_of(name, cameras)}")
+    return name
+
+
+def stereo_pair(stored: StoredRig, name: str) -> tuple[str, str]:
+    """Return the cameras (left, right) of a stereo pair. Raises WrongUse."""
+    stereo = stored.rig.stereo
+    if name not in stereo:
+        raise output.WrongUse(f"no stereo pair '{name}' in {stored.path}; {nearest_of(name, stereo)}")
+    return stereo[name]
+
+
+def need_joints(rig: Rig, name: str, args: argparse.Namespace) -> None:
+    """Refuse a camera on the head without --pan and --tilt. Raises WrongUse."""
+    if rig.cameras[name].on == "head" and (args.pan is None or args.tilt is None):
+        raise output.WrongUse(f"camera '{name}' is on the head; --pan RAD and --tilt RAD are expected")
+
+
+def nearest_of(word: str, known: Collection[str]) -> str:
+    """Return in words which of the known was meant, or what there is."""
+    from calib.files.strict import nearest
+
+    return nearest(word, list(known)) if known else "it has none"
