@@ -215,6 +215,19 @@ def test_values_beyond_the_bounds_on_the_page_are_refused_by_name(page: str, sou
             assert key.split(".")[-1] in str(refused.value), f"{key}: {value}"
 
 
+@pytest.mark.parametrize("source", SOURCES)
+def test_values_at_the_bounds_on_the_page_are_within_them(page: str, source: str) -> None:
+    """Refused, if at all, for what another value or the model makes of them."""
+    heading, read, minimal = SOURCES[source]
+    for key, bounds in bounded(rows(part(page, heading)), 2).items():
+        for bound, inwards in zip(bounds, (1, -1), strict=True):
+            inside = bound + inwards * 1e-3 * abs(bound)  # the page rounds
+            try:
+                read(changed(minimal(), key, int(bound) if bound == int(bound) else inside))
+            except (BadOptions, ValueError) as refused:
+                assert not re.search(r"number from \S+ to ", str(refused)), f"{key}: {bound}"
+
+
 def test_bounds_of_the_configuration_itself_are_those_on_the_page(
     page: str, examples: list[dict[str, Any]]
 ) -> None:

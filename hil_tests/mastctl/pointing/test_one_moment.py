@@ -59,6 +59,15 @@ def test_the_same_speed_does_no_harm_where_the_eyes_are_nearly_together() -> Non
     assert found["moved_px"] == pytest.approx(0.12, abs=0.01)
 
 
+def test_an_eye_that_exposes_before_the_first_one_counts_alike() -> None:
+    still = checked(moving_world(0.0, late_s=-LATE_S))
+    assert still["dt_s"] == {"navcam_right": pytest.approx(-LATE_S)}
+    assert "image_speed_px_per_s" in still
+    with pytest.raises(PointingError, match=r"0\.6\d px between exposures 10\.0 ms apart") as told:
+        checked(moving_world(62.0, late_s=-LATE_S))
+    assert told.value.code == "target_moving"
+
+
 def test_what_is_gone_a_moment_later_is_not_measured() -> None:
     words = "exposed 2.0 ms apart, and 100.0 ms later navcam_left does not see the target where it was"
     with pytest.raises(PointingError, match=words) as told:
