@@ -27,3 +27,8 @@ def as_json(value: Any) -> Any:
     if value is None or isinstance(value, (str, int, bool)):
         return value
     return str(value)
+
+
+def picked(value: object, *names: str) -> dict[str, Any]:
+    """Return some fields and properties of an object as `as_json` has them; all null for None."""
+    return {name: None if value is None else as_json(getattr(value, name)) for name in names}

@@ -9,10 +9,9 @@ from typing import Any
 
 from drivers.clock import Clock
 from drivers.errors import DriverError, NoFreshFrame
-from drivers.interfaces import Camera, HoldsExposure, KnowsSize, Paced
+from drivers.interfaces import Camera, Frame, HoldsExposure, KnowsSize, Paced
 from mastctl.cameras.quality import quality_of
 from mastctl.devices import frames as frame_checks
-from mastctl.devices.frames import CheckedFrame
 from mastctl.devices.thread import DeviceThread
 
 FRAME_TIMEOUT_S = 5.0
@@ -38,7 +37,7 @@ class CameraCheck:
         self._camera = camera
         self._clock = clock
         self._size_px = size_px
-        self._frames: list[CheckedFrame] = []
+        self._frames: list[Frame] = []
         self._delays_s: list[float] = []
         self._refused = 0
         self._uncertainty_s: float | None = None

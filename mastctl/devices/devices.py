@@ -26,6 +26,7 @@ from drivers.errors import BadFrame, BadReply, DriverError, LineLost, NoFreshFra
 from drivers.interfaces import (
     AxisReport,
     Camera,
+    Frame,
     FrameTime,
     KnowsSize,
     Paced,
@@ -37,7 +38,7 @@ from drivers.pairing import Offset, Pairing, learned
 from mastctl.devices import frames as frame_checks
 from mastctl.devices import joint_history
 from mastctl.devices.exposure_hold import ExposureHold
-from mastctl.devices.frames import CheckedFrame, FrameStore, StampedFrame
+from mastctl.devices.frames import FrameStore, StampedFrame
 from mastctl.devices.joint_history import JointHistory
 from mastctl.devices.limits import Limits
 from mastctl.devices.stops import Stops
@@ -294,11 +295,9 @@ class Devices:
                 raise DriverError(words, device=name) from None
         return {name: self._learned[first, name] for name in names[1:]}
 
-    def _fetched(
-        self, after_s: Mapping[str, float], deadline_s: float
-    ) -> dict[str, CheckedFrame | StampedFrame]:
+    def _fetched(self, after_s: Mapping[str, float], deadline_s: float) -> dict[str, Frame | StampedFrame]:
         """One frame of each named camera, exposed after its moment."""
-        asked: dict[str, Asked[CheckedFrame | StampedFrame]] = {}
+        asked: dict[str, Asked[Frame | StampedFrame]] = {}
         for camera, exposed_after_s in after_s.items():
             take = self._taker(camera, exposed_after_s, deadline_s)
             left_s = max(0.0, deadline_s - self._time.now_s())
@@ -308,7 +307,7 @@ class Devices:
             for camera, told in asked.items()
         }
 
-    def _stamped(self, camera: str, frame: CheckedFrame | StampedFrame) -> StampedFrame:
+    def _stamped(self, camera: str, frame: Frame | StampedFrame) -> StampedFrame:
         return frame if isinstance(frame, StampedFrame) else self._stamp(camera, frame)
 
     def _together(self, frames: dict[str, StampedFrame]) -> dict[str, StampedFrame]:
@@ -490,8 +489,8 @@ class Devices:
 
     def _taker(
         self, camera: str, exposed_after_s: float, deadline_s: float
-    ) -> Callable[[], CheckedFrame | StampedFrame]:
-        def take() -> CheckedFrame | StampedFrame:
+    ) -> Callable[[], Frame | StampedFrame]:
+        def take() -> Frame | StampedFrame:
             newest = self._store.newest(camera)
             if newest is not None and newest.exposure_began_s > exposed_after_s:
                 return newest  # somebody else's request brought it a moment ago
@@ -512,7 +511,7 @@ class Devices:
 
     # In the caller's thread
 
-    def _stamp(self, camera: str, frame: CheckedFrame) -> StampedFrame:
+    def _stamp(self, camera: str, frame: Frame) -> StampedFrame:
         """Give a frame its joint angles and id, and keep it."""
         began_s = frame.mid_exposure_s - frame.exposure_s / 2
         ended_s = frame.mid_exposure_s + frame.exposure_s / 2
@@ -565,7 +564,7 @@ class _Times:
         return self.recent
 
 
-def _check_order(frame: CheckedFrame, newest: StampedFrame) -> None:
+def _check_order(frame: Frame, newest: StampedFrame) -> None:
     """Refuse a frame whose count and time do not go forward together."""
     ahead = frame.sequence - newest.sequence
     later_s = frame.mid_exposure_s - newest.mid_exposure_s

@@ -17,8 +17,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from drivers.errors import BadFrame, NoFreshFrame
-from drivers.interfaces import Image
+from drivers.interfaces import Frame, Image
 from mastctl.errors import NoLonger, NotKnown, NotNow
+from mastctl.frame_facts import FrameFacts
 
 _FRAME_ID = re.compile(r"(.{1,100})-([0-9]{6,20})-([0-9a-f]{8})-([0-9a-f]{4})", re.ASCII)
 KEPT_FRAMES = 16  # per camera; six cameras of 1024x768 grey are 75 MB
@@ -27,50 +28,10 @@ DARK_GREY = 8  # a picture whose brightest hundredth is below this shows nothing
 
 
 @dataclass(frozen=True, eq=False)
-class StampedFrame:
-    """One picture and its facts.
-
-    Attributes
-    ----------
-    frame_id, camera, sequence
-        Its name; the camera's name in the mast file; the camera's own count.
-    image
-        uint8 (h, w) or (h, w, 3) BGR, read-only.
-    mid_exposure_s, exposure_s
-        Middle of the exposure, seconds of CLOCK_MONOTONIC, and its length, seconds.
-    pan_rad, tilt_rad
-        Joint angles at mid-exposure, radians, interpolated from the measured ones around it.
-    moving
-        Whether the head moved, or was told to, at any time of the exposure.
-    mast_digest
-        SHA-256 (hex) of the mast file in use.
-    """
-
-    frame_id: str
-    camera: str
-    image: Image
-    sequence: int
-    mid_exposure_s: float
-    exposure_s: float
-    pan_rad: float
-    tilt_rad: float
-    moving: bool
-    mast_digest: str
-
-    @property
-    def exposure_began_s(self) -> float:
-        """When the exposure began, seconds of CLOCK_MONOTONIC."""
-        return self.mid_exposure_s - self.exposure_s / 2
-
-
-@dataclass(frozen=True, eq=False)
-class CheckedFrame:
-    """A camera's frame that passed `checked`: types, size, time and order are right."""
+class StampedFrame(FrameFacts):
+    """One picture and its facts; the image is uint8 (h, w) or (h, w, 3) BGR, read-only."""
 
     image: Image
-    sequence: int
-    mid_exposure_s: float
-    exposure_s: float
 
     @property
     def exposure_began_s(self) -> float:
@@ -95,7 +56,7 @@ def check_size(camera: str, size_px: tuple[int, int], wanted_px: tuple[int, int]
 
 def checked(
     answer: object, camera: str, size_px: tuple[int, int] | None, exposed_after_s: float, now_s: float
-) -> CheckedFrame:
+) -> Frame:
     """Return a driver's answer to ``next_frame`` if it can be true and was exposed after the asked moment.
 
     Parameters
@@ -149,7 +110,7 @@ def checked(
         # The driver may use its buffer again; one that hands over a read-only array is spared the copy.
         image = image.copy()
         image.setflags(write=False)
-    return CheckedFrame(image, sequence, mid_s, exposure_s)
+    return Frame(image, sequence, mid_s, exposure_s)
 
 
 class FrameStore:

@@ -28,6 +28,7 @@ from calib.handoff.bias import HandoffBias
 from calib.handoff.by_image import RefinedVerdict
 from calib.handoff.geometric import Joints
 from calib.handoff.matched import Landed, MatchedHandoff
+from mastctl.as_json import picked
 
 SCHEMA = "mastctl/handoff/1"
 MAX_BYTES = 1 << 28
@@ -76,7 +77,7 @@ class HandoffLog:
         ValueError
             If a number is not finite.
         """
-        line = (json.dumps(as_json(handoff), allow_nan=False) + "\n").encode()
+        line = (json.dumps(line_of(handoff), allow_nan=False) + "\n").encode()
         try:
             self.path.parent.mkdir(parents=True, exist_ok=True)
             with self.path.open("a+b") as file:
@@ -106,7 +107,7 @@ class HandoffLog:
         return b"\n"
 
 
-def as_json(handoff: MatchedHandoff) -> dict[str, Any]:
+def line_of(handoff: MatchedHandoff) -> dict[str, Any]:
     """Return the keys of a hand-off's line."""
     return {
         "schema": SCHEMA,
@@ -139,16 +140,9 @@ def as_json(handoff: MatchedHandoff) -> dict[str, Any]:
 
 def bias_told(bias: HandoffBias) -> dict[str, Any]:
     """Return a camera's mean offset as JSON."""
-    return {
-        "source": bias.source,
-        "camera": bias.camera,
-        "handoffs": bias.handoffs,
-        "left_out": bias.left_out,
-        "offset_px": bias.offset_px.tolist(),
-        "sigma_px": np.sqrt(np.diag(bias.covariance_px2)).tolist(),
-        "sigmas": bias.sigmas,
-        "sentence": bias.sentence,
-    }
+    sigma_px = np.sqrt(np.diag(bias.covariance_px2)).tolist()
+    names = ("source", "camera", "handoffs", "left_out", "offset_px", "sigmas", "sentence")
+    return picked(bias, *names) | {"sigma_px": sigma_px}
 
 
 def read_log(path: str | Path) -> ReadLog:

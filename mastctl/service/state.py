@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 from drivers.interfaces import Reading
+from mastctl.as_json import as_json, picked
 from mastctl.devices.frames import StampedFrame
 from mastctl.devices.limits import Limits
 from mastctl.devices.thread import Fault
@@ -71,61 +72,32 @@ class State:
 
     def told(self, head: str) -> dict[str, Any]:
         """Return the snapshot as ``GET /status`` tells it: JSON, ages instead of times."""
-        reading, motion = self.reading, self.motion
+        reading, motion, track = self.reading, self.motion, self.track
         return {
             "state": self.word(head),
             "simulated": self.hardware == "simulated",
-            "hardware": self.hardware,
             "joints": None
             if reading is None
-            else {
-                "pan_rad": reading.pan_rad,
-                "tilt_rad": reading.tilt_rad,
-                "measured_s": reading.time_s,
-                "age_s": max(0.0, self.now_s - reading.time_s),
-            },
-            "moving": self.moving,
-            "limits": {
-                "pan_rad": list(self.limits.pan_rad),
-                "tilt_rad": list(self.limits.tilt_rad),
-                "speed_rad_per_s": self.limits.speed_rad_per_s,
-            },
+            else picked(reading, "pan_rad", "tilt_rad")
+            | {"measured_s": reading.time_s, "age_s": self._age_s(reading.time_s)},
             "operation": motion.operation,
-            "target": None if motion.target is None else dict(motion.target),
-            "last_residual": None
-            if motion.residual is None
-            else {
-                "residual_px": list(motion.residual.residual_px),
-                "residual_sigma_px": list(motion.residual.residual_sigma_px),
-                "operation": motion.residual.operation,
-            },
-            "pose": None if self.track.pose is None else self.track.pose.told(self.now_s),
-            "track": {"state": self.track.state, "reason": self.track.reason, "id": self.track.id},
+            "target": as_json(motion.target),
+            "last_residual": as_json(motion.residual),
+            "pose": None if track.pose is None else track.pose.told(self.now_s),
+            "track": picked(track, "state", "reason", "id"),
             "control": None,
-            "cameras": {name: self._camera_told(frame) for name, frame in self.frames.items()},
-            "mast": dict(self.mast),
-            "former_mast": None if self.former_mast is None else dict(self.former_mast),
+            "cameras": {
+                name: picked(frame, "frame_id", "sequence", "exposure_s")
+                | {"age_s": None if frame is None else self._age_s(frame.mid_exposure_s)}
+                for name, frame in self.frames.items()
+            },
             "faults": [
-                {
-                    "device": fault.device,
-                    "code": fault.code,
-                    "message": fault.message,
-                    "until": fault.until,
-                    "for_s": max(0.0, self.now_s - fault.since_s),
-                }
+                picked(fault, "device", "code", "message", "until") | {"for_s": self._age_s(fault.since_s)}
                 for fault in self.faults
             ],
-            "version": self.version,
             "uptime_s": self.now_s - self.started_s,
-            "now_s": self.now_s,
+            **picked(self, "hardware", "moving", "limits", "mast", "former_mast", "version", "now_s"),
         }
 
-    def _camera_told(self, frame: StampedFrame | None) -> dict[str, Any]:
-        if frame is None:
-            return {"frame_id": None, "sequence": None, "age_s": None, "exposure_s": None}
-        return {
-            "frame_id": frame.frame_id,
-            "sequence": frame.sequence,
-            "age_s": max(0.0, self.now_s - frame.mid_exposure_s),
-            "exposure_s": frame.exposure_s,
-        }
+    def _age_s(self, time_s: float) -> float:
+        return max(0.0, self.now_s - time_s)

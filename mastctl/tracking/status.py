@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 from calib.rigid import FloatArray
-from mastctl.as_json import as_json
+from mastctl.as_json import as_json, picked
 from mastctl.tracking.look import Seen
 from mastctl.tracking.pose import RoverPose, motion_between
 
@@ -85,28 +85,15 @@ class TrackStatus:
             position = moved.points(position)
             if covariance is not None:
                 covariance = moved.rotation @ covariance @ moved.rotation.T
-        seen = self.seen
-        told = {
-            "sequence": self.sequence,
-            "state": self.state,
-            "reason": self.reason,
-            "id": self.id,
-            "predicted": self.predicted,
-            "position_m": position,
-            "position_in_site_m": in_site,
-            "covariance_m2": covariance,
-            "range_m": None if seen is None else seen.range_m,
-            "pair": None if seen is None else seen.pair,
-            "pixels": {} if seen is None else seen.pixels,
-            "chi2": None if seen is None else seen.chi2,
-            "renewed": False if seen is None else seen.renewed,
-            "pose_doubt": "" if seen is None else seen.pose_doubt,
-            "looks": self.looks,
-            "misses": self.misses,
-            "handoffs": self.handoffs,
-            "renewals": self.renewals,
-            "operation": self.operation,
+        nothing = {"pixels": {}, "renewed": False, "pose_doubt": ""} if self.seen is None else {}
+        return {
+            **picked(self, "sequence", "state", "reason", "id", "predicted", "operation"),
+            **picked(self, "looks", "misses", "handoffs", "renewals"),
+            **picked(self.seen, "range_m", "pair", "pixels", "chi2", "renewed", "pose_doubt"),
+            **nothing,
+            "position_m": as_json(position),
+            "position_in_site_m": as_json(in_site),
+            "covariance_m2": as_json(covariance),
             "pose": None if self.pose is None else self.pose.told(now_s),
             "age_s": max(0.0, now_s - self.changed_s),
         }
-        return dict(as_json(told))

@@ -9,6 +9,7 @@ from fastapi import FastAPI, Query
 from fastapi.responses import Response
 
 from mastctl.devices.frames import StampedFrame
+from mastctl.frame_facts import headers_of
 from mastctl.report.pictures import encoded
 from mastctl.service.mast_in_use import MastInUse
 from mastctl.service.service import Service
@@ -36,7 +37,7 @@ def add_pictures(app: FastAPI, service: Service, waiting: Waiting) -> None:
         )
 
     def picture(frame: StampedFrame, kind: str) -> Response:
-        return Response(encoded(frame.image, kind), media_type=f"image/{kind}", headers=frame_headers(frame))
+        return Response(encoded(frame.image, kind), media_type=f"image/{kind}", headers=headers_of(frame))
 
     @app.get(f"{PREFIX}/mast", summary="The mast file in use, byte for byte", response_class=Response)
     async def mast() -> Response:
@@ -60,18 +61,3 @@ def add_pictures(app: FastAPI, service: Service, waiting: Waiting) -> None:
     def told(mast: MastInUse) -> dict[str, Any]:
         former = service.former
         return {"mast": mast.told(), "former_mast": None if former is None else former.told()}
-
-
-def frame_headers(frame: StampedFrame) -> dict[str, str]:
-    """Return a frame's facts as headers; numbers in shortest round-trip form."""
-    return {
-        "X-Mastctl-Frame-Id": frame.frame_id,
-        "X-Mastctl-Camera": frame.camera,
-        "X-Mastctl-Sequence": str(frame.sequence),
-        "X-Mastctl-Mid-Exposure-S": repr(frame.mid_exposure_s),
-        "X-Mastctl-Exposure-S": repr(frame.exposure_s),
-        "X-Mastctl-Pan-Rad": repr(frame.pan_rad),
-        "X-Mastctl-Tilt-Rad": repr(frame.tilt_rad),
-        "X-Mastctl-Moving": "true" if frame.moving else "false",
-        "X-Mastctl-Mast-Digest": frame.mast_digest,
-    }

@@ -15,7 +15,7 @@ import pytest
 from calib.errors import BadFile
 from calib.handoff.geometric import Joints
 from calib.handoff.matched import Landed, MatchedHandoff
-from mastctl.handoff.log import HandoffLog, as_json, read_log
+from mastctl.handoff.log import HandoffLog, line_of, read_log
 
 
 def one(index: int = 0) -> MatchedHandoff:
@@ -36,7 +36,7 @@ def test_what_is_appended_is_read_back_to_the_last_digit(tmp_path: Path) -> None
     for index in range(3):
         log.append(one(index))
     read = read_log(path)
-    assert [as_json(handoff) for handoff in read.handoffs] == [as_json(one(i)) for i in range(3)]
+    assert [line_of(handoff) for handoff in read.handoffs] == [line_of(one(i)) for i in range(3)]
     assert read.handoffs[1].name == "hand-off of 2026-01-02T03:04:05.678+00:00 (handoffs.jsonl line 2)"
     assert list(read.handoffs[0].found) == ["hazcam_left"]
     assert read.handoffs[0].landed["hazcam_right"].found_px is None
@@ -119,9 +119,9 @@ def test_a_bad_line_is_refused_by_its_number_and_key(
     tmp_path: Path, change: Callable[[dict[str, Any]], None], place: str, words: str
 ) -> None:
     path = tmp_path / "h.jsonl"
-    line = as_json(one(1))
+    line = line_of(one(1))
     change(line)
-    path.write_text("".join(json.dumps(each) + "\n" for each in (as_json(one(0)), line, as_json(one(2)))))
+    path.write_text("".join(json.dumps(each) + "\n" for each in (line_of(one(0)), line, line_of(one(2)))))
     with pytest.raises(BadFile) as caught:
         read_log(path)
     assert caught.value.place == place and words in caught.value.reason
@@ -129,7 +129,7 @@ def test_a_bad_line_is_refused_by_its_number_and_key(
 
 def test_a_broken_line_before_the_last_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "h.jsonl"
-    whole = json.dumps(as_json(one()))
+    whole = json.dumps(line_of(one()))
     path.write_text(f"{whole}\n{whole[:50]}\n{whole}\n")
     with pytest.raises(BadFile, match=r"line 2: is no JSON"):
         read_log(path)

@@ -183,7 +183,7 @@ class World:
         frame_id = f"{name}-{self._count:06d}"
         self._truth[frame_id] = self.true_joints(now_s)
         self._frames[frame_id] = StampedFrame(
-            frame_id, name, shown, self._count, now_s, 0.002, pan, tilt, moving, self.digest
+            frame_id, name, self._count, now_s, 0.002, pan, tilt, moving, self.digest, shown
         )
         return self._frames[frame_id]
 

@@ -61,7 +61,7 @@ def test_moving_is_what_the_head_said_last() -> None:
 
 def test_ages_count_to_the_moment_of_the_snapshot_and_are_never_below_zero() -> None:
     frame = StampedFrame(
-        "id", "navcam_left", np.zeros((2, 2), np.uint8), 7, 99.5, 0.01, 0.0, 0.0, False, "digest"
+        "id", "navcam_left", 7, 99.5, 0.01, 0.0, 0.0, False, "digest", np.zeros((2, 2), np.uint8)
     )
     state = replace(REST, frames={"navcam_left": frame}, faults=(OF_A_CAMERA,))
     for later_s, ages_s in ((0.0, (0.25, 0.5, 1.5, 60.0)), (-5.0, (0.0, 0.0, 0.0, 55.0))):

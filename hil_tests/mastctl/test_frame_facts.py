@@ -1,0 +1,32 @@
+"""A picture's facts come out of its headers as they went in, and nothing else passes for one."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+
+import pytest
+
+from mastctl.frame_facts import FrameFacts, facts_in, headers_of
+
+FACTS = FrameFacts(
+    "navcam_left-000007-d1-ab", "navcam_left", 7, 12345.1 + 1e-11, 1 / 3, -1e-17, 0.1, True, "d1" * 32
+)
+
+
+def test_every_fact_comes_back_to_the_last_bit() -> None:
+    headers = headers_of(FACTS)
+    assert headers["X-Mastctl-Mid-Exposure-S"] == repr(FACTS.mid_exposure_s)
+    assert (headers["X-Mastctl-Moving"], headers["X-Mastctl-Sequence"]) == ("true", "7")
+    assert facts_in(headers) == asdict(FACTS)
+
+
+@pytest.mark.parametrize(
+    ("header", "value"), [("Moving", "1"), ("Sequence", "7.0"), ("Pan-Rad", "left"), ("Camera", None)]
+)
+def test_a_fact_that_is_missing_or_of_another_kind_is_refused(header: str, value: str | None) -> None:
+    headers = headers_of(FACTS)
+    del headers[f"X-Mastctl-{header}"]
+    if value is not None:
+        headers[f"X-Mastctl-{header}"] = value
+    with pytest.raises((KeyError, ValueError)):
+        facts_in(headers)

@@ -1,0 +1,63 @@
+"""The facts of a picture: the one list of what stands beside it, in the daemon, in headers, in the client."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, fields
+from typing import Any
+
+
+@dataclass(frozen=True, eq=False)
+class FrameFacts:
+    """What a picture is worth little without.
+
+    Attributes
+    ----------
+    frame_id, camera, sequence
+        Its name; the camera's name in the mast file; the camera's own count.
+    mid_exposure_s, exposure_s
+        Middle of the exposure, seconds of CLOCK_MONOTONIC, and its length, seconds.
+    pan_rad, tilt_rad
+        Joint angles at mid-exposure, radians, interpolated from the measured ones around it.
+    moving
+        Whether the head moved, or was told to, at any time of the exposure.
+    mast_digest
+        SHA-256 (hex) of the mast file in use.
+    """
+
+    frame_id: str
+    camera: str
+    sequence: int
+    mid_exposure_s: float
+    exposure_s: float
+    pan_rad: float
+    tilt_rad: float
+    moving: bool
+    mast_digest: str
+
+
+def headers_of(facts: FrameFacts) -> dict[str, str]:
+    """Return the facts as headers; numbers in shortest round-trip form."""
+    told = {header: getattr(facts, name) for name, header in _HEADERS.items()}
+    return {header: value if isinstance(value, str) else json.dumps(value) for header, value in told.items()}
+
+
+def facts_in(headers: Mapping[str, str]) -> dict[str, Any]:
+    """Return the facts that stand in headers, by name.
+
+    Raises
+    ------
+    KeyError, ValueError
+        If one is missing, or is no value of its kind.
+    """
+    return {one.name: _READ[str(one.type)](headers[_HEADERS[one.name]]) for one in fields(FrameFacts)}
+
+
+_HEADERS = {one.name: "X-Mastctl-" + one.name.replace("_", "-").title() for one in fields(FrameFacts)}
+_READ: Mapping[str, Callable[[str], Any]] = {
+    "str": str,
+    "int": int,
+    "float": float,
+    "bool": {"true": True, "false": False}.__getitem__,
+}
