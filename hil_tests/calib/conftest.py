@@ -12,7 +12,7 @@ from calib.fit.calibration import Calibration
 from calib.fit.joint import fit_joint
 from calib.fit.paper import fit_paper
 from calib.mast.rig import Rig
-from hil_tests.calib.fit.made_survey import make_survey
+from hil_tests.calib.fit.small_surveys import survey_of
 
 
 @pytest.fixture(scope="session")
@@ -31,10 +31,10 @@ def navcams(true_rig: Rig) -> Rig:
 @pytest.fixture(scope="session")
 def joint(true_rig: Rig) -> Calibration:
     """The joint fit of survey 1."""
-    return fit_joint(make_survey(true_rig, 1))
+    return fit_joint(survey_of(true_rig, 1))
 
 
 @pytest.fixture(scope="session")
 def paper(true_rig: Rig) -> Calibration:
     """The paper's fit of survey 1."""
-    return fit_paper(make_survey(true_rig, 1))
+    return fit_paper(survey_of(true_rig, 1))

@@ -20,7 +20,7 @@ from calib.fit import poses as fit_poses
 from calib.handoff import fit_body_pose
 from calib.mast.rig import Rig
 from calib.rigid import FloatArray
-from hil_tests.calib.fit.made_survey import make_survey
+from hil_tests.calib.fit.small_surveys import survey_of
 from hil_tests.calib.fit.test_fit_camera import boards
 from hil_tests.calib.handoff.handed_over import HAZCAMS, hand_offs, moved_hazcams, plain_rig, targets
 
@@ -78,13 +78,13 @@ def mast_views(rig: Rig) -> list[fit_mast.MastView]:
 def test_a_survey_in_one_piece(navcams: Rig, stopped: Callable[..., None]) -> None:
     stopped(fit_joint)
     with pytest.raises(fit_joint.SurveyNotFitted, match="did not settle"):
-        fit_joint.fit_joint(make_survey(navcams, 2))
+        fit_joint.fit_joint(survey_of(navcams, 2))
 
 
 def test_a_survey_as_the_paper_does_it(navcams: Rig, stopped: Callable[..., None]) -> None:
     stopped(fit_mast)
     with pytest.raises(fit_joint.SurveyNotFitted, match="settled"):
-        fit_paper.fit_paper(make_survey(navcams, 2))
+        fit_paper.fit_paper(survey_of(navcams, 2))
 
 
 def test_a_mast_from_camera_models(navcams: Rig, stopped: Callable[..., None]) -> None:

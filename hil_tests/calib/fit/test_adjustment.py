@@ -15,7 +15,8 @@ from calib.fit.start_values import SurveyNotFitted, start_values
 from calib.fit.usual_lens import lens_knowledge
 from calib.mast.rig import Rig
 from calib.survey import Sigma, Survey
-from hil_tests.calib.fit.made_survey import BOARD, COLUMNS, ROWS, Plan, make_survey, rover_from_head
+from drivers.sim_survey.plan import BOARD, SurveyPlan, rover_from_head
+from hil_tests.calib.fit.small_surveys import of_cameras, rings, survey_of
 
 RELATIVE = 1e-5
 """Of central differences with steps of a few sigmas' thousandths."""
@@ -26,17 +27,16 @@ RECOVERED_PX = 1e-6
 EXACT = Sigma(station_m=1e-9, dot_px=1e-7)
 """So small that what lenses are usually like has no weight."""
 
-SMALL = Plan(ring=3, mast_boards=5, checks=1)
+SMALL = SurveyPlan(rings=rings(3), mast_boards=5, check_boards=1)
+ROWS, COLUMNS = np.divmod(np.arange(100), 10)
 
 
 @pytest.fixture(scope="module")
 def survey(true_rig: Rig) -> Survey:
     """Two cameras, skew axes, joints and prisms with sigmas, three set-ups: all that can be unknown."""
-    cameras = {n: true_rig.cameras[n] for n in ("navcam_left", "hazcam_left")}
-    rig = replace(true_rig, cameras=cameras, stereo={})
-    return make_survey(
-        rig, 5, Sigma(0.001, 0.1, 0.0005, 0.002), Plan(ring=2, mast_boards=3, checks=0, setups=2)
-    )
+    plan = SurveyPlan(rings=rings(2, "navcam", "hazcam"), mast_boards=3, check_boards=0, level_setups=2)
+    survey = survey_of(true_rig, 5, plan, sigma=Sigma(0.001, 0.1, 0.0005, 0.002))
+    return of_cameras(survey, "navcam_left", "hazcam_left")
 
 
 @pytest.fixture(scope="module")
@@ -81,7 +81,7 @@ def test_knowledge_of_lenses_has_the_derivatives_of_differences(true_rig: Rig) -
 
 
 def test_noise_free_survey_gives_back_the_rig(true_rig: Rig) -> None:
-    fit = fit_joint(make_survey(true_rig, 3, EXACT, SMALL, noise=0.0))
+    fit = fit_joint(survey_of(true_rig, 3, SMALL, sigma=EXACT, noise=0.0))
     assert np.abs(fit.rig.mast.translation_m - true_rig.mast.translation_m).max() < RECOVERED_M
     assert np.abs(fit.rig.mast.rotation_rad - true_rig.mast.rotation_rad).max() < RECOVERED_M
     points = BOARD.dots_in_board_m(ROWS, COLUMNS)[:, [2, 0, 1]] + [4.0, 0.1, -0.5]
@@ -100,7 +100,7 @@ def test_noise_free_survey_gives_back_the_rig(true_rig: Rig) -> None:
 
 def test_eight_parameters_find_skew_axes(true_rig: Rig) -> None:
     mast = replace(true_rig.mast, axis_offset_m=0.021, axis_twist_rad=-0.034)
-    fit = fit_joint(make_survey(replace(true_rig, mast=mast), 3, EXACT, SMALL, noise=0.0), 8)
+    fit = fit_joint(survey_of(replace(true_rig, mast=mast), 3, SMALL, sigma=EXACT, noise=0.0), 8)
     assert fit.rig.mast.axis_offset_m == pytest.approx(0.021, abs=RECOVERED_M)
     assert fit.rig.mast.axis_twist_rad == pytest.approx(-0.034, abs=RECOVERED_M)
 
@@ -108,11 +108,11 @@ def test_eight_parameters_find_skew_axes(true_rig: Rig) -> None:
 def test_skew_axes_fitted_as_if_they_met_are_refused(navcams: Rig) -> None:
     mast = replace(navcams.mast, axis_offset_m=0.05, axis_twist_rad=0.03)
     with pytest.raises(SurveyNotFitted, match="eight parameters"):
-        fit_joint(make_survey(replace(navcams, mast=mast), 3), 6)
+        fit_joint(survey_of(replace(navcams, mast=mast), 3), 6)
 
 
 def test_a_mast_of_four_parameters_stays_upright(true_rig: Rig) -> None:
-    fit = fit_joint(make_survey(true_rig, 1, plan=SMALL), 4)
+    fit = fit_joint(survey_of(true_rig, 1, SMALL), 4)
     assert fit.rig.mast.rotation_rad[:2].tolist() == [0.0, 0.0]
     assert any("upright" in note for note in fit.notes)
     assert [n for n in fit.parameter_names if "rotation" in n] == ["mast.rotation_rad.z"]

@@ -10,8 +10,9 @@ from calib.camera.cahvor import CameraModel
 from calib.fit.camera import CameraFit, CameraNotFitted, fit_camera
 from calib.fit.mast import MastNotFitted, fit_mast
 from calib.mast.rig import Rig
-from hil_tests.calib.fit.made_survey import BOARD, COLUMNS, ROWS
+from drivers.sim_survey.plan import BOARD
 
+ROWS, COLUMNS = np.divmod(np.arange(100), 10)
 PIXEL = 2e-3
 """Recovery on data without noise: what lenses are usually like pulls a little on what a board sees badly."""
 

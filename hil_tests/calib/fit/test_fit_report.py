@@ -14,9 +14,10 @@ from calib.fit.paper import fit_paper
 from calib.fit.start_values import SurveyNotFitted, start_values
 from calib.mast.rig import Rig
 from calib.survey import Sigma, Survey
-from hil_tests.calib.fit.made_survey import Blunders, Plan, make_survey, rover_from_head
+from drivers.sim_survey.plan import Ring, SurveyPlan, rover_from_head
+from hil_tests.calib.fit.small_surveys import rings, survey_of, with_shifted_dots
 
-SMALL = Plan(ring=2, mast_boards=5, checks=1, hazcam=False)
+SMALL = SurveyPlan(rings=rings(2), mast_boards=5, check_boards=1)
 NEAR_M, NEAR_RAD = 0.01, 0.02
 """What tapes and prisms of a millimetre leave open."""
 
@@ -26,7 +27,7 @@ NOISE_PX = 0.15
 
 @pytest.fixture(scope="module")
 def survey(navcams: Rig) -> Survey:
-    return make_survey(navcams, 21, plan=SMALL)
+    return survey_of(navcams, 21, SMALL)
 
 
 @pytest.fixture(scope="module")
@@ -77,23 +78,23 @@ def test_sigmas_of_the_mast_file_are_the_roots_of_the_covariance(fitted: Calibra
 
 def test_fitted_images_are_told_at_the_angles_as_fitted_and_checks_as_read(navcams: Rig) -> None:
     """Joints that are 2 mrad off move a Navcam's dots by some 2.5 px."""
-    fit = fit_joint(make_survey(navcams, 22, Sigma(0.001, 0.1, joint_rad=0.002), SMALL))
+    fit = fit_joint(survey_of(navcams, 22, SMALL, rings=rings(4), sigma=Sigma(0.001, 0.1, joint_rad=0.002)))
     head = [i for i in fit.images if i.used.any()]
     checks = [i for i in fit.images if i.purpose == "check"]
     assert np.sqrt(np.mean([np.mean(i.residuals_px**2) for i in head])) < NOISE_PX
     assert np.sqrt(np.mean([np.mean(i.residuals_px**2) for i in checks])) > 3 * NOISE_PX
 
 
-def test_where_everything_is_thrice_as_noisy_as_stated_nothing_is_an_outlier(navcams: Rig) -> None:
-    survey = make_survey(navcams, 23, Sigma(0.003, 0.3), SMALL)
+def test_where_everything_is_twice_as_noisy_as_stated_nothing_is_an_outlier(navcams: Rig) -> None:
+    survey = survey_of(navcams, 23, SMALL, sigma=Sigma(0.002, 0.2))
     fit = fit_joint(replace(survey, sigma=Sigma(0.001, 0.1)))
     assert fit.outliers == ()
 
 
 def test_the_papers_fit_tells_how_far_an_image_was_off_that_it_left_out(navcams: Rig) -> None:
-    name = next(i.name for i in make_survey(navcams, 24, plan=SMALL).images if i.purpose == "mast")
-    survey = make_survey(navcams, 24, plan=SMALL, blunders=Blunders(dots=((name, -1, (30.0, 0.0)),)))
-    (outlier,) = fit_paper(survey).outliers
+    survey = survey_of(navcams, 24, SMALL)
+    name = next(i.name for i in survey.images if i.purpose == "mast")
+    (outlier,) = fit_paper(with_shifted_dots(survey, name, (30.0, 0.0))).outliers
     assert outlier.name == f"image {name}"
     assert outlier.size == pytest.approx(30.0, abs=1.0)
     assert outlier.statistic == pytest.approx(100 * (outlier.size / 0.1) ** 2)
@@ -102,8 +103,9 @@ def test_the_papers_fit_tells_how_far_an_image_was_off_that_it_left_out(navcams:
 
 def test_the_papers_cameras_take_out_small_differences_of_their_joints(navcams: Rig) -> None:
     """0.5 mrad beside the others are 0.6 px of a Navcam; the readings tell it, and nothing else is wrong."""
-    plan = replace(SMALL, ring=4, apart_rad=0.0005)
-    fit = fit_paper(make_survey(navcams, 25, Sigma(1e-6, 0.1, joint_rad=0.001), plan, noise=0.0))
+    apart = (Ring("navcam", 3.0, head_tilt_rad=-0.17), Ring("navcam", 6.0, head_tilt_rad=-0.1705))
+    sigma = Sigma(1e-6, 0.1, joint_rad=0.001)
+    fit = fit_paper(survey_of(navcams, 25, SMALL, rings=apart, sigma=sigma, noise=0.0))
     for name, rms in fit.rms_px.items():
         assert max(rms) < 0.02, name
 

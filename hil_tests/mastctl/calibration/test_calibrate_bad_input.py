@@ -24,6 +24,7 @@ from drivers.sim_survey.blunders import (
     with_wrong_prism,
 )
 from drivers.sim_survey.survey import Ring
+from hil_tests.calib.fit.small_surveys import with_shifted_dots
 from hil_tests.mastctl.calibration.survey_world import edit_yaml, navcam_survey, write_folder
 from mastctl.calibration.detection import with_dots
 from mastctl.calibration.run import sentence_of
@@ -440,20 +441,15 @@ def test_a_wrong_dot_is_named(
 def test_a_shifted_image_is_named(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], shift_px: float
 ) -> None:
-    survey = navcam_survey(1)[0]
-    dots = survey.dots[IMAGE]
-    moved = replace(dots, pixels_px=dots.pixels_px + np.array([shift_px, -shift_px]))
-    folder = written(replace(survey, dots={**survey.dots, IMAGE: moved}), tmp_path)
+    shifted = with_shifted_dots(navcam_survey(1)[0], IMAGE, (shift_px, -shift_px))
+    folder = written(shifted, tmp_path)
     assert outliers(folder, capsys) == [f"image {IMAGE}"]
 
 
 def test_a_shifted_image_that_the_papers_method_keeps_is_told(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    survey = navcam_survey(1)[0]
-    dots = survey.dots[IMAGE]
-    moved = replace(dots, pixels_px=dots.pixels_px + np.array([3.0, -3.0]))
-    folder = written(replace(survey, dots={**survey.dots, IMAGE: moved}), tmp_path)
+    folder = written(with_shifted_dots(navcam_survey(1)[0], IMAGE, (3.0, -3.0)), tmp_path)
     code, told = calibrate(capsys, folder, "--method", "paper")
     assert code == 0
     assert told["verdict"]["grade"] == "care"

@@ -14,9 +14,9 @@ import pytest
 from calib.camera.cahvor import CameraModel
 from calib.files.mast_file import load_rig
 from calib.mast.rig import Rig
-from calib.survey import Dots, Sigma, Survey, SurveyImage
-from drivers.sim_survey.plan import rover_from_head
+from calib.survey import Sigma, SurveyImage
 from drivers.sim_survey.survey import Ring, SurveyPlan, simulate_survey
+from hil_tests.calib.fit.small_surveys import held
 from hil_tests.mastctl.calibration.survey_world import edit_yaml, navcam_survey, write_folder
 from mastctl.cli.main import main
 
@@ -77,35 +77,13 @@ def test_cameras_of_every_kind_are_fitted_from_a_rough_focal_length_alone(
 # What a survey leaves open is named, in the document and in the report
 
 
-def held(joint: str, at_rad: float, **plan: Any) -> Survey:
-    """A survey with one joint held still, dots where its cameras then see the boards."""
-    survey, truth = navcam_survey(2, **plan)
-    rng = np.random.default_rng(3)
-    images, dots = [], {}
-    for image in survey.images:
-        image = replace(image, **{joint: at_rad})
-        model = truth.rig.cameras[image.camera].model
-        assert image.pan_rad is not None and image.tilt_rad is not None
-        head = rover_from_head(truth.rig.mast, image.pan_rad, image.tilt_rad)
-        pose = head.inverse @ truth.rover_from_board[image.setup, image.placement]
-        seen = survey.dots[image.name]
-        at, valid = model.project(pose.points(survey.board.dots_in_board_m(seen.rows, seen.columns)))
-        if valid.all() and (at > 3).all() and (at < np.array(model.size_px) - 4).all():
-            images.append(image)
-            noise = survey.sigma.dot_px * rng.standard_normal(at.shape)
-            dots[image.name] = Dots(seen.rows, seen.columns, at + noise)
-    places = {(image.setup, image.placement) for image in images}
-    station = tuple(p for p in survey.station if p.kind != "tape" or (p.setup, p.placement) in places)
-    return replace(survey, images=tuple(images), dots=dots, station=station)
-
-
 @pytest.mark.parametrize("method", ["joint", "paper"])
 @pytest.mark.parametrize(
     ("joint", "survey", "axis"),
     [
         # Were pan 0 always, the mast's y would be that of tilt; were tilt one, its z that of pan.
-        ("pan", lambda: held("pan_rad", 0.0, pan_rad=0.0), "y"),
-        ("tilt", lambda: held("tilt_rad", -0.17, tilt_rad=(-0.17, -0.2)), "z"),
+        ("pan", lambda: held(navcam_survey(2, pan_rad=0.0), "pan_rad", 0.0), "y"),
+        ("tilt", lambda: held(navcam_survey(2, tilt_rad=(-0.17, -0.2)), "tilt_rad", -0.17), "z"),
     ],
     ids=["pan", "tilt"],
 )
