@@ -28,12 +28,12 @@ if TYPE_CHECKING:
     from calib.fit.start_values import SurveyNotFitted as SurveyNotFitted
     from calib.handoff.geometric import Joints as Joints
     from calib.handoff.geometric import hand_off as hand_off
-    from calib.mast.pointing import choose as choose
     from calib.mast.pointing import solve as solve
     from calib.mast.pointing import solve_many as solve_many
     from calib.mast.rig import Mast as Mast
     from calib.mast.rig import Rig as Rig
     from calib.mast.rig import RigCamera as RigCamera
+    from calib.mast.solutions import choose as choose
     from calib.survey.check import check_survey as check_survey
     from calib.survey.reader import read_survey as read_survey
     from calib.survey.writer import write_survey as write_survey
@@ -51,8 +51,9 @@ _MODULES = {
     "calib.fit.paper": ("fit_paper",),
     "calib.fit.start_values": ("SurveyNotFitted",),
     "calib.handoff.geometric": ("Joints", "hand_off"),
-    "calib.mast.pointing": ("choose", "solve", "solve_many"),
+    "calib.mast.pointing": ("solve", "solve_many"),
     "calib.mast.rig": ("Mast", "Rig", "RigCamera"),
+    "calib.mast.solutions": ("choose",),
     "calib.survey.check": ("check_survey",),
     "calib.survey.reader": ("read_survey",),
     "calib.survey.writer": ("write_survey",),

@@ -13,8 +13,9 @@ from calib.camera.stereo import Triangulations, triangulate, triangulate_many
 from calib.errors import NoStereoPoint, Unreachable
 from calib.files.mast_file import load_rig
 from calib.handoff.geometric import Joints, hand_off
-from calib.mast.pointing import Solutions, choose, solve, solve_many
+from calib.mast.pointing import solve, solve_many
 from calib.mast.rig import Mast, Rig
+from calib.mast.solutions import Solutions, choose
 
 LAST_BITS = 1e-12
 """Relative: sums of three terms in another order, over the two milliradians under which the rays meet."""

@@ -25,8 +25,9 @@ from calib.fit.camera import SAMPLES, fit_camera
 from calib.fit.joint import fit_joint
 from calib.handoff.geometric import Joints
 from calib.mast.covariance import RigCovariance
-from calib.mast.pointing import Solution, choose, solve
+from calib.mast.pointing import solve
 from calib.mast.rig import Mast, Rig
+from calib.mast.solutions import Solution, choose
 from calib.pictures.epipolar import find_partner
 from calib.pictures.patch_match import match_patch
 from calib.pictures.warp import Plane, facing_plane
@@ -34,7 +35,7 @@ from calib.rigid import Rigid
 from calib.survey.alignment import NotAligned, align, mirrored
 from drivers.sim_survey.board import draw_board, photograph
 from hil_tests.calib.dots.boards import BOARD, COLUMNS, ROWS, SIZE_PX, camera, gravel, pose
-from hil_tests.calib.fit.made_survey import Blunders, make_survey
+from hil_tests.calib.fit.small_surveys import survey_of, with_shifted_dots
 
 NO_NUMBERS = (math.nan, math.inf, -math.inf)
 HEAD = CameraModel("CAHV", (101, 101), np.zeros(3), [1, 0, 0], [50, 100, 0], [50, 0, 100])
@@ -215,7 +216,7 @@ def test_thirty_samples_of_many_images_cost_no_list_of_all_triples() -> None:
 
 def test_the_limit_told_of_an_outlier_is_the_one_it_failed(navcams: Rig) -> None:
     """Sigmas stated 3 times too small widen every limit; what is told is what was applied."""
-    survey = make_survey(navcams, 4, blunders=Blunders(dots=(("navcam_left-010", 40, (6.0, 0.0)),)))
+    survey = with_shifted_dots(survey_of(navcams, 4), "navcam_left-011", (6.0, 0.0), 40)
     survey = replace(survey, sigma=replace(survey.sigma, dot_px=survey.sigma.dot_px / 2.5))
     fit = fit_joint(survey)
     dots = [one for one in fit.outliers if one.kind == "dot"]

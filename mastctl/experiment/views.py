@@ -12,6 +12,7 @@ import numpy as np
 from calib.errors import Unreachable
 from calib.mast import pointing
 from calib.mast.rig import Rig
+from calib.mast.solutions import choose
 from calib.rigid import FloatArray
 from mastctl.client import Client, ClientError, Snapshot
 from mastctl.experiment.targets import Target, choose_target
@@ -66,7 +67,7 @@ class Views:
         """
         try:
             solutions = pointing.solve(self._rig.mast, self._rig.cameras[self._pair[0]].model, point_m)
-            angles = pointing.choose(solutions, self._pan_limits_rad, self._tilt_limits_rad)
+            angles = choose(solutions, self._pan_limits_rad, self._tilt_limits_rad)
         except Unreachable:
             return None
         operation = pointed(self._client, pan_rad=angles.pan_rad, tilt_rad=angles.tilt_rad)

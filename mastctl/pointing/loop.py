@@ -24,8 +24,9 @@ import numpy as np
 
 from calib.camera.stereo import triangulate
 from calib.errors import CalibError
-from calib.mast.pointing import Solution, choose, solve
+from calib.mast.pointing import solve
 from calib.mast.rig import Rig
+from calib.mast.solutions import Solution, choose
 from calib.pictures.patch_match import PatchMatch
 from calib.rigid import FloatArray
 from drivers.clock import Clock

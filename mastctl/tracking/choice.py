@@ -17,8 +17,9 @@ import numpy as np
 from calib.camera.cahvor import CameraModel
 from calib.errors import CalibError
 from calib.mast.budget import stereo_range_error_m
-from calib.mast.pointing import choose, solve
+from calib.mast.pointing import solve
 from calib.mast.rig import Rig
+from calib.mast.solutions import choose
 from calib.rigid import FloatArray
 from mastctl.devices.limits import Limits
 

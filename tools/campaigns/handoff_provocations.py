@@ -19,6 +19,7 @@ from calib.handoff.by_image import Eye
 from calib.mast import pointing
 from calib.mast.covariance import RigCovariance, moved_rig
 from calib.mast.rig import Rig
+from calib.mast.solutions import choose
 from drivers.sim import texture
 from drivers.sim.bricks import Brick, make_brick, meshes
 from drivers.sim.compiled import kernels
@@ -205,7 +206,7 @@ class Stage:
         along = math.sqrt(distance_m**2 - float(head[2]) ** 2)
         aim = np.array([head[0] + along * math.cos(azimuth), head[1] + along * math.sin(azimuth), 0.0])
         solutions = pointing.solve(world.believed.mast, world.believed.cameras[camera].model, aim)
-        chosen = pointing.choose(solutions, (-2.6, 2.6), (-1.2, 0.5))
+        chosen = choose(solutions, (-2.6, 2.6), (-1.2, 0.5))
         return chosen.pan_rad, chosen.tilt_rad
 
     def _candidates(

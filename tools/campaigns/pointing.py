@@ -18,8 +18,9 @@ from scipy.spatial.transform import Rotation
 
 from calib.camera.cahvor import CameraModel
 from calib.errors import Unreachable
-from calib.mast.pointing import Solution, solve
+from calib.mast.pointing import solve
 from calib.mast.rig import Mast
+from calib.mast.solutions import Solution
 from mastctl.cli.output import at_least
 from tools.arguments import end
 

@@ -27,8 +27,9 @@ from calib.camera.cahvor import CameraModel
 from calib.camera.stereo import triangulate
 from calib.files.pds3 import PdsProduct, read_product
 from calib.fit.poses import PoseFit, fit_poses
-from calib.mast.pointing import Solution, solve
+from calib.mast.pointing import solve
 from calib.mast.rig import Rig, RigCamera
+from calib.mast.solutions import Solution
 from calib.pictures.epipolar import find_partner
 from calib.pictures.patch_match import MatchSettings, match_patch, rivalled
 from calib.pictures.warp import Grey, Plane, grey

@@ -11,8 +11,9 @@ from scipy.spatial.transform import Rotation
 from calib.camera.cahvor import CameraModel
 from calib.camera.stereo import triangulate
 from calib.errors import Unreachable
-from calib.mast.pointing import choose, solve
+from calib.mast.pointing import solve
 from calib.mast.rig import Rig
+from calib.mast.solutions import choose
 from calib.rigid import Rigid
 from drivers.clock import ManualClock
 from drivers.sim.pan_tilt import HeadSettings, SimulatedPanTilt

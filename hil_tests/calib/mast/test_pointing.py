@@ -17,8 +17,9 @@ from scipy.spatial.transform import Rotation
 
 from calib.camera.cahvor import CameraModel
 from calib.errors import Unreachable
-from calib.mast.pointing import Solution, choose, solve, solve_ray
+from calib.mast.pointing import solve, solve_ray
 from calib.mast.rig import Mast, Rig, RigCamera
+from calib.mast.solutions import Solution, choose
 from tools.campaigns import pointing as campaign
 
 WORST_PX = 1e-7
