@@ -141,6 +141,7 @@ def _maps() -> dict[Map, Mapping[str, Register]]:
 
 
 REGISTERS = _maps()
+TICK_ADDRESSES = tuple(registers["realtime_tick"].address for registers in REGISTERS.values())
 
 BAUD_RATES = MappingProxyType(
     {

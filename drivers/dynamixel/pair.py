@@ -10,7 +10,8 @@ import logging
 import time
 from collections.abc import Callable, Sequence
 
-from drivers.dynamixel.link import GroupAnswer, Link, Part
+from drivers.dynamixel.group import GroupAnswer, Part
+from drivers.dynamixel.link import Link
 from drivers.dynamixel.models import Block
 from drivers.dynamixel.motion import AxisMotion, Sample, motion_blocks
 from drivers.dynamixel.servo import Reboots, Servo

@@ -14,7 +14,8 @@ import time
 from collections.abc import Callable
 from typing import TypeVar
 
-from drivers.dynamixel.link import Link, Part, Pinged
+from drivers.dynamixel.group import Part
+from drivers.dynamixel.link import Link, Pinged
 from drivers.dynamixel.models import HARDWARE_ERRORS, MODELS_BY_NUMBER, hardware_error_words
 from drivers.dynamixel.motion import Sample, Truth, motion_blocks
 from drivers.dynamixel.port import QUIET_S

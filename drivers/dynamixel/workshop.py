@@ -12,7 +12,8 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from typing import TypeVar
 
-from drivers.dynamixel.link import Link, Part, Pinged
+from drivers.dynamixel.group import Part
+from drivers.dynamixel.link import Link, Pinged
 from drivers.dynamixel.models import (
     BAUD_RATES,
     MODELS_BY_NUMBER,

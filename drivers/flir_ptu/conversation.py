@@ -23,8 +23,8 @@ from dataclasses import dataclass, replace
 from typing import TypeVar
 
 from drivers.errors import BadReply, NoReply, Refused
-from drivers.flir_ptu.line import Line
 from drivers.flir_ptu.replies import Answer, LineSplitter, answer_of, hits_of, number_of, without_hits
+from drivers.serial_line import SerialLine
 
 T = TypeVar("T")
 
@@ -86,7 +86,7 @@ class Conversation:
         Told the axis, ``pan`` or ``tilt``, whenever a limit hit comes that nobody asked for.
     """
 
-    def __init__(self, line: Line, device: str, on_hit: Callable[[str], None]) -> None:
+    def __init__(self, line: SerialLine, device: str, on_hit: Callable[[str], None]) -> None:
         self._line = line
         self._device = device
         self._on_hit = on_hit
@@ -122,7 +122,7 @@ class Conversation:
         found, manners = self._resolutions()
         if manners != self._manners:  # the first time, and after a power cycle
             for command in ("FV", "EE"):
-                self._line.send(f"{command} ".encode())
+                self._line.write(f"{command} ".encode())
                 self._next_answer(command, time.monotonic() + self.reply_s, skip=True)
                 self._quiet()
             found, self._manners = self._resolutions()
@@ -190,7 +190,7 @@ class Conversation:
             If the unit will not, or is gone.
         """
         self._quiet()
-        self._line.send(b"R ")
+        self._line.write(b"R ")
         answer = self._next_answer("R", time.monotonic() + patience_s, skip=True)
         if not answer.good:
             raise Refused(f"refuses R: {answer.text or 'without words'}", device=self._device)
@@ -200,7 +200,7 @@ class Conversation:
 
         Raises LineLost.
         """
-        self._line.send(f"{command} ".encode())
+        self._line.write(f"{command} ".encode())
 
     def close(self) -> None:
         """Close the line."""
@@ -229,7 +229,7 @@ class Conversation:
         if not self._in_step:
             raise BadReply("is out of step with this program", device=self._device)
         self._in_step = False
-        for line in self._splitter.feed(self._line.pending()):
+        for line in self._splitter.feed(self._line.read(0.0)):
             self._note_hits(line)
             if self._speaks_twice(line):
                 raise BadReply(f"said {_shown(line)}, which nobody asked for", device=self._device)
@@ -239,7 +239,7 @@ class Conversation:
             raise BadReply(f"was in the middle of saying {_shown(begun)}", device=self._device)
         self._lines.clear()
         written = self._written(command)
-        self._line.send(f"{written} ".encode())
+        self._line.write(f"{written} ".encode())
         answer = self._next_answer(written, time.monotonic() + patience_s, skip=False)
         if self._manners.echo and not answer.echo:
             raise BadReply(f"answered {command} without its echo", device=self._device)
@@ -289,7 +289,7 @@ class Conversation:
         """One of them, and how the unit answered."""
         while (written := self._written(query.letters)).isupper():
             pass  # that would not tell whether the echo keeps small letters
-        self._line.send(f"{written} ".encode())
+        self._line.write(f"{written} ".encode())
         until_s = time.monotonic() + self.reply_s
         refusal = ""
         while True:
@@ -332,7 +332,7 @@ class Conversation:
     def _next_line(self, command: str, until_s: float) -> bytes:
         """The next complete line."""
         while not self._lines:
-            data = self._line.receive(until_s)
+            data = self._line.read(max(0.0, until_s - time.monotonic()))
             for line in self._splitter.feed(data):
                 self._note_hits(line)
                 self._lines.append(line)
@@ -348,7 +348,7 @@ class Conversation:
         quiet_s = QUIET_S if unknown or self._manners.exact else max(QUIET_S, self.reply_s)
         until_s = time.monotonic() + quiet_s + LONGEST_DRAIN_S
         while time.monotonic() < until_s:
-            data = self._line.receive(time.monotonic() + quiet_s)
+            data = self._line.read(quiet_s)
             if not data:
                 break
             for line in self._splitter.feed(data):

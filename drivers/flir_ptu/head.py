@@ -27,12 +27,12 @@ from drivers.flir_ptu import conversation as ask
 from drivers.flir_ptu.axis import Axis
 from drivers.flir_ptu.conversation import Conversation
 from drivers.flir_ptu.count import StepCount
-from drivers.flir_ptu.line import Line
 from drivers.flir_ptu.options import DEVICE, Options, options_from
 from drivers.flir_ptu.position import measure
 from drivers.flir_ptu.ready import checked_version, ready_axes
 from drivers.flir_ptu.supply import SupplyWatch
 from drivers.interfaces import Reading
+from drivers.serial_line import SerialLine
 
 log = logging.getLogger(__name__)
 
@@ -224,7 +224,7 @@ class FlirPtu:
             self._absence.check()
         self._deaf = True  # a unit that homes itself at power-up reports its limit switches
         try:
-            line = Line(self._options.port, self._options.baud, DEVICE)
+            line = SerialLine(self._options.port, self._options.baud, DEVICE)
             talk = self._talk = Conversation(line, DEVICE, self._hit)
             talk.shout("H")  # before any question: it may still be under way
             resolutions = talk.in_step()

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 from drivers.errors import DriverError, Refused
 from drivers.flir_ptu import conversation as ask
 from drivers.flir_ptu.conversation import Conversation
-from drivers.flir_ptu.line import Line
 from drivers.flir_ptu.options import DEVICE
+from drivers.serial_line import SerialLine
 
 HOMING_S = 60.0
 """How long a reset may take; up to 30 s, the manual says."""
@@ -70,7 +70,7 @@ def home(port: str, baud: int) -> Facts:
 @contextmanager
 def _talking(port: str, baud: int) -> Iterator[Conversation]:
     """A conversation on a line of its own."""
-    talk = Conversation(Line(port, baud, DEVICE), DEVICE, lambda axis: None)
+    talk = Conversation(SerialLine(port, baud, DEVICE), DEVICE, lambda axis: None)
     try:
         with talk.patient():
             yield talk

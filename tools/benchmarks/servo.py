@@ -7,7 +7,6 @@ waits ``--delay-ms`` before it answers. Batches of the drivers take turns, so th
 the machine. CPU is that of the whole process of the caller, threads included.
 
 - ``plain SDK``: dynamixel_sdk's GroupSyncRead and GroupSyncWrite on its own port.
-- ``SDK over our port``: the same group classes over the hardened port and packet layers.
 - ``link``: the driver's transactions, called from one thread.
 - ``bus``: the same through the bus's owner thread, as the head does it.
 - ``lerobot``: its DynamixelMotorsBus, if it is installed.
@@ -93,33 +92,12 @@ def simulator(delay_s: float) -> Iterator[str]:
 
 @contextmanager
 def plain_sdk(path: str) -> Iterator[tuple[CALL, CALL]]:
-    """The SDK as it comes."""
+    """The SDK as it comes: a sync read, and a sync write with a sync read, by its group classes."""
     import dynamixel_sdk as sdk
 
     port = sdk.PortHandler(path)
     port.setBaudRate(BAUD)
-    with sdk_calls(sdk.Protocol2PacketHandler(), port) as calls:
-        yield calls
-    port.closePort()
-
-
-@contextmanager
-def hardened_sdk(path: str) -> Iterator[tuple[CALL, CALL]]:
-    """The SDK's group classes over the driver's port and packet layers."""
-    from drivers.dynamixel.packets import PacketHandler
-    from drivers.dynamixel.port import Port
-
-    port = Port(path, BAUD, 0.5)
-    with sdk_calls(PacketHandler(), port) as calls:
-        yield calls
-    port.closePort()
-
-
-@contextmanager
-def sdk_calls(packets: Any, port: Any) -> Iterator[tuple[CALL, CALL]]:
-    """A sync read, and a sync write with a sync read, by the SDK's group classes."""
-    import dynamixel_sdk as sdk
-
+    packets = sdk.Protocol2PacketHandler()
     reader = sdk.GroupSyncRead(port, packets, POSITION, SIZE)
     writer = sdk.GroupSyncWrite(port, packets, GOAL, SIZE)
     for servo_id in IDS:
@@ -140,11 +118,12 @@ def sdk_calls(packets: Any, port: Any) -> Iterator[tuple[CALL, CALL]]:
         read()
 
     yield read, write_read
+    port.closePort()
 
 
 def parts() -> tuple[list[Any], list[Any]]:
     """What the driver's link is asked to read and write."""
-    from drivers.dynamixel.link import Part
+    from drivers.dynamixel.group import Part
 
     reads = [Part(servo_id, POSITION, SIZE) for servo_id in IDS]
     writes = [Part(servo_id, GOAL, SIZE, (2048).to_bytes(4, "little")) for servo_id in IDS]
@@ -243,7 +222,6 @@ def main() -> int:
     args = parser.parse_args()
     drivers: dict[str, Any] = {
         "plain SDK": plain_sdk,
-        "SDK over our port": hardened_sdk,
         "link": link,
         "bus": bus,
     }

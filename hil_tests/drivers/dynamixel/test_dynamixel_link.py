@@ -2,24 +2,26 @@
 
 from __future__ import annotations
 
+import re
 import socket
 import termios
 import threading
 import time
 from collections.abc import Callable, Sequence
+from types import SimpleNamespace
 
-import dynamixel_sdk as sdk
 import pytest
 import serial
 import serial.rfc2217
 
 from drivers.clock import SystemClock
 from drivers.dynamixel.bus import Bus
-from drivers.dynamixel.link import Link, Part
-from drivers.dynamixel.models import REGISTERS
-from drivers.dynamixel.packets import PacketHandler
+from drivers.dynamixel.group import Part
+from drivers.dynamixel.link import Link
+from drivers.dynamixel.models import REGISTERS, Register
 from drivers.dynamixel.port import Port
 from drivers.errors import BadOptions, BadReply, LineLost, NoReply, Refused
+from drivers.serial_line import SerialLine
 from drivers.sim.wire.dynamixel_packets import Instruction, fast_status_packets
 from drivers.sim.wire.line import Reply, TcpLine
 from hil_tests.drivers.dynamixel.scripted_servos import ScriptedServos, number, says, scripted
@@ -38,9 +40,15 @@ def always(*replies: Reply) -> Callable[[Instruction, int], Sequence[Reply]]:
     return lambda instruction, count: replies
 
 
+def asked(link: Link, servo_id: int, register: Register) -> int:
+    """A register's value by one question, proven by nothing."""
+    data = link.exchange.read(servo_id, register.address, register.size, register.name)
+    return register.decode(data)
+
+
 def test_values_are_signed() -> None:  # defect 15
     with scripted(always(says(1, number(-5)))) as (line, _):
-        assert Link(line.path, BAUD_RATE, PATIENT_S).read(1, POSITION) == -5
+        assert asked(Link(line.path, BAUD_RATE, PATIENT_S), 1, POSITION) == -5
 
 
 def test_an_error_without_data_is_an_error_and_no_value() -> None:  # defect 7
@@ -48,19 +56,11 @@ def test_an_error_without_data_is_an_error_and_no_value() -> None:  # defect 7
         link = Link(line.path, BAUD_RATE, PATIENT_S)
         for register in (TORQUE, POSITION):
             with pytest.raises(Refused, match="wrong length") as caught:
-                link.read(1, register)
+                asked(link, 1, register)
             assert caught.value.detail == {
                 "port": line.path, "baud": BAUD_RATE, "servo_id": 1, "register": register.name,
                 "instruction": "read", "error": 5,
             }  # fmt: skip
-
-
-def test_the_sdks_own_methods_give_no_value_for_an_error_either() -> None:  # defect 7
-    with scripted(always(says(1, error=5))) as (line, _):
-        port = Port(line.path, BAUD_RATE, PATIENT_S)
-        for read in (PacketHandler().read1ByteTxRx, PacketHandler().read4ByteTxRx):
-            value, result, error = read(port, 1, 132)
-            assert (value, result, error) == (0, sdk.COMM_RX_CORRUPT, 5)
 
 
 def test_a_missing_servo_is_named_and_the_other_is_read() -> None:  # defect 5
@@ -103,19 +103,19 @@ def test_a_late_reply_is_not_taken_for_the_next_answer() -> None:  # defect 10
     with scripted(answer) as (line, _):
         link = Link(line.path, BAUD_RATE, SHORT_S)
         with pytest.raises(NoReply):
-            link.read(1, X["present_velocity"])
+            asked(link, 1, X["present_velocity"])
         link.quiet(4 * SHORT_S)
         link._port.reply_timeout_s = PATIENT_S
-        assert link.read(1, POSITION) == 2048
+        assert asked(link, 1, POSITION) == 2048
 
 
 def test_after_a_timeout_the_line_is_listened_to_before_the_next_question() -> None:  # defect 10
     with scripted(always()) as (line, _):
         link = Link(line.path, BAUD_RATE, SHORT_S)
         with pytest.raises(NoReply):
-            link.read(1, POSITION)
+            asked(link, 1, POSITION)
         assert link._port.suspect
-        link._port.clearPort()
+        link._port.send(b"", 0)
         assert not link._port.suspect
 
 
@@ -127,16 +127,16 @@ def test_what_came_unasked_is_dropped_before_a_question() -> None:
 
     with scripted(answer) as (line, _):
         link = Link(line.path, BAUD_RATE, PATIENT_S)
-        assert link.read(1, POSITION) == 0
-        assert link._port.buffer or link._port._fetch(PATIENT_S)  # the stray one is there now
-        assert link.read(1, POSITION) == 1
+        assert asked(link, 1, POSITION) == 0
+        assert link._port._buffer or link._port._fetch(PATIENT_S)  # the stray one is there now
+        assert asked(link, 1, POSITION) == 1
 
 
 def test_replies_of_others_and_of_other_lengths_are_stepped_over() -> None:
     with scripted(always(says(2, number(1)), says(1, b"\x01"), says(1, number(9)))) as (line, _):
         link = Link(line.path, BAUD_RATE, PATIENT_S)
-        assert link.read(1, POSITION) == 9
-        assert link.counts.strays == 2
+        assert asked(link, 1, POSITION) == 9
+        assert link._port.suspect  # whose replies they were may say more
 
 
 def test_noise_and_a_broken_packet_before_the_answer_cost_nothing() -> None:
@@ -144,13 +144,13 @@ def test_noise_and_a_broken_packet_before_the_answer_cost_nothing() -> None:
     broken[-1] ^= 1
     noise = Reply(b"\x00\xff\xff\xfd\x00\x01\xff\x00\x55" + bytes(broken))
     with scripted(always(noise, says(1, number(9)))) as (line, _):
-        assert Link(line.path, BAUD_RATE, PATIENT_S).read(1, POSITION) == 9
+        assert asked(Link(line.path, BAUD_RATE, PATIENT_S), 1, POSITION) == 9
 
 
 def test_a_line_that_is_never_quiet_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
     with scripted(always()) as (line, _):
         port = Port(line.path, BAUD_RATE, SHORT_S)
-        monkeypatch.setattr(port, "_fetch", lambda wait_s: port.buffer.extend(b"x") or True)
+        monkeypatch.setattr(port, "_fetch", lambda wait_s: port._buffer.extend(b"x") or True)
         with pytest.raises(BadReply, match="never quiet"):
             port.drain(longest_s=0.0)
 
@@ -158,10 +158,10 @@ def test_a_line_that_is_never_quiet_says_so(monkeypatch: pytest.MonkeyPatch) -> 
 def test_a_pulled_plug_is_a_lost_line_and_nothing_stays_busy() -> None:  # defects 1 and 13
     with scripted(lambda i, n: [says(i.packet_id, number(3))]) as (line, _):
         link = Link(line.path, BAUD_RATE, PATIENT_S)
-        assert link.read(1, POSITION) == 3
+        assert asked(link, 1, POSITION) == 3
         line.hang_up()
         for act in (
-            lambda: link.read(1, POSITION),
+            lambda: asked(link, 1, POSITION),
             lambda: link.write(1, TORQUE, 0),
             lambda: link.group_read(BOTH),
             lambda: link.group_write([Part(1, 64, 1, b"\0"), Part(2, 64, 1, b"\0")]),
@@ -171,11 +171,10 @@ def test_a_pulled_plug_is_a_lost_line_and_nothing_stays_busy() -> None:  # defec
                 act()
             assert caught.value.detail["port"] == line.path
             assert caught.value.detail["servo_id"] == 1
-            assert not link._port.is_using
         link.close()
         line.come_back()
         again = Link(line.path, BAUD_RATE, PATIENT_S)
-        assert again.read(1, POSITION) == 3
+        assert asked(again, 1, POSITION) == 3
 
 
 def test_the_port_cannot_be_opened_twice() -> None:  # defect 12
@@ -190,7 +189,7 @@ def test_the_port_cannot_be_opened_twice() -> None:  # defect 12
 @pytest.mark.parametrize("baud", [4_500_000, 10_500_000, 12_345])
 def test_any_baud_rate_is_tried(baud: int) -> None:  # defect 16
     with scripted(always(says(1, number(8)))) as (line, _):
-        assert Link(line.path, baud, PATIENT_S).read(1, POSITION) == 8
+        assert asked(Link(line.path, baud, PATIENT_S), 1, POSITION) == 8
 
 
 def test_a_port_that_is_not_there_and_a_url_that_cannot_be(tmp_path: object) -> None:
@@ -204,11 +203,11 @@ def test_over_a_socket() -> None:  # defect 17
     servos = ScriptedServos(lambda i, n: [says(i.packet_id, number(42))])
     with TcpLine(servos, SystemClock()) as line:
         link = Link(f"socket://127.0.0.1:{line.port}", BAUD_RATE, PATIENT_S)
-        assert link.read(1, POSITION) == 42
+        assert asked(link, 1, POSITION) == 42
         line.hang_up()
         with pytest.raises(LineLost):
             for _ in range(3):  # the first bytes into a dead connection may still seem to leave
-                link.read(1, POSITION)
+                asked(link, 1, POSITION)
         link.close()
 
 
@@ -257,7 +256,7 @@ def test_over_rfc2217() -> None:
     with scripted(always(says(1, number(-7)), says(2, b"\xff\xff\xfd\xff"))) as (line, _):
         server = SerialServer(line.path)
         link = Link(server.url, BAUD_RATE, PATIENT_S)
-        assert link.read(1, POSITION) == -7
+        assert asked(link, 1, POSITION) == -7
         answer = link.group_read(BOTH)
         assert answer.statuses[2].data == b"\xff\xff\xfd\xff"
         link.close()
@@ -278,8 +277,7 @@ def test_the_clock_on_the_wall_means_nothing(monkeypatch: pytest.MonkeyPatch) ->
     with scripted(always(says(1, number(1)))) as (line, _):
         link = Link(line.path, BAUD_RATE, PATIENT_S)
         monkeypatch.setattr(time, "time", steps_back)
-        assert link.read(1, POSITION) == 1
-        assert PacketHandler().read4ByteTxRx(link._port, 1, 132)[0] == 1
+        assert asked(link, 1, POSITION) == 1
 
 
 def test_waiting_costs_no_processor_time() -> None:  # defect 2
@@ -287,7 +285,7 @@ def test_waiting_costs_no_processor_time() -> None:  # defect 2
         link = Link(line.path, BAUD_RATE, 0.5)
         before_s = time.thread_time()
         with pytest.raises(NoReply):
-            link.read(1, POSITION)
+            asked(link, 1, POSITION)
         assert time.thread_time() - before_s < 0.1  # the SDK spins: 0.5 s; load only makes it less
 
 
@@ -329,17 +327,6 @@ def test_a_fast_group_read_checks_every_block() -> None:
         assert not link.group_read(BOTH, fast=True).statuses
 
 
-def test_the_sdks_group_classes_run_on_the_hardened_layers() -> None:
-    with scripted(always(says(1, number(5)), says(2, b"\xff\xff\xfd\x01"))) as (line, _):
-        port = Port(line.path, BAUD_RATE, PATIENT_S)
-        group = sdk.GroupSyncRead(port, PacketHandler(), 132, 4)
-        for servo_id in (1, 2):
-            group.addParam(servo_id)
-        assert group.txRxPacket() == sdk.COMM_SUCCESS
-        assert group.getData(1, 132, 4) == 5
-        assert group.getData(2, 132, 4) == 0x01FDFFFF
-
-
 def test_calls_of_many_threads_queue_instead_of_failing() -> None:  # defect 11
     with scripted(lambda i, n: [says(i.packet_id, number(i.packet_id))]) as (line, _):
         link = Link(line.path, BAUD_RATE, PATIENT_S)
@@ -349,7 +336,7 @@ def test_calls_of_many_threads_queue_instead_of_failing() -> None:  # defect 11
 
         def ask(servo_id: int) -> None:
             for _ in range(30):
-                got.append((servo_id, bus.call("read", lambda: link.read(servo_id, POSITION), 30.0)))
+                got.append((servo_id, bus.call("read", lambda: asked(link, servo_id, POSITION), 30.0)))
 
         threads = [threading.Thread(target=ask, args=(servo_id,)) for servo_id in range(1, 6)]
         for thread in threads:
@@ -403,12 +390,46 @@ def test_what_goes_wrong_in_the_owner_threads_round_does_not_end_it() -> None:
 
 def test_a_low_level_error_of_any_kind_becomes_a_lost_line(monkeypatch: pytest.MonkeyPatch) -> None:
     with scripted(always()) as (line, _):
-        port = Port(line.path, BAUD_RATE, SHORT_S)
+        port = SerialLine(line.path, BAUD_RATE)
         for error in (
             termios.error(5, "Input/output error"),
             OSError(5, "Input/output error"),
             TypeError("'NoneType' object cannot be interpreted"),
             IndexError("list index out of range"),
         ):
-            with pytest.raises(LineLost, match=port.port_name), port.low_level("writing"):
+
+            def fail(*_: object, error: Exception = error) -> int:
                 raise error
+
+            with monkeypatch.context() as patch:
+                patch.setattr("drivers.serial_line.os.write", fail)
+                with pytest.raises(LineLost, match=f"{port.port} failed in writing"):
+                    port.write(b"x")
+            with monkeypatch.context() as patch:
+                patch.setattr("drivers.serial_line.os.read", fail)
+                patch.setattr(port, "_poll", SimpleNamespace(poll=lambda wait_ms: [0]))
+                with pytest.raises(LineLost, match=f"{port.port} failed in reading"):
+                    port.read(0.0)
+        port.close()
+        port.close()
+
+
+@pytest.mark.parametrize(
+    "url", ["socket://127.0.0.1", "rfc2217://127.0.0.1", "socket://:4000", "socket://a:x"]
+)
+def test_a_url_without_host_or_port_is_no_lost_line(url: str) -> None:
+    with pytest.raises(BadOptions, match=re.escape(url)):
+        SerialLine(url, BAUD_RATE)
+
+
+def test_a_host_whose_name_nobody_knows_is_told_in_words() -> None:
+    with pytest.raises(LineLost, match=r"cannot be opened: .*(not known|resolution)"):
+        SerialLine("socket://no-such-host.invalid:4000", BAUD_RATE)
+
+
+def test_letting_go_of_a_socket_does_not_wait() -> None:
+    with TcpLine(ScriptedServos(always()), SystemClock()) as line:
+        port = SerialLine(f"socket://127.0.0.1:{line.port}", BAUD_RATE)
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(time, "sleep", lambda wait_s: pytest.fail("pyserial waits 0.3 s"))
+            port.close()

@@ -9,7 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.dynamixel.packets import PacketHandler, crc16, instruction_packet, take_status
+from drivers.dynamixel import packets
+from drivers.dynamixel.packets import crc16, instruction_packet, take_status
 from drivers.sim.wire import dynamixel_packets as wire
 
 PING, READ, WRITE, SYNC_READ = 1, 2, 3, 0x82
@@ -50,21 +51,24 @@ def test_checksum_is_the_sdks(data: bytes) -> None:
     assert crc16(data) == sdk.PacketHandler(2.0).updateCRC(0, list(data), len(data))
 
 
-def laid_out(body: bytes) -> list[int]:
-    """A packet as the SDK's layers pass it around: no checksum yet."""
-    length = len(body) + 2
-    return [0xFF, 0xFF, 0xFD, 0, 1, length & 255, length >> 8, *body, 0, 0]
+def test_instructions_have_the_sdks_numbers() -> None:
+    assert packets.BROADCAST_ID == sdk.BROADCAST_ID
+    for name in (
+        "PING", "READ", "WRITE", "REBOOT", "STATUS", "SYNC_READ", "SYNC_WRITE", "BULK_READ", "BULK_WRITE",
+        "FAST_SYNC_READ", "FAST_BULK_READ",
+    ):  # fmt: skip
+        assert getattr(packets, name) == getattr(sdk, f"INST_{name}"), name
 
 
 def test_what_is_stuffed_and_unstuffed_is_what_it_was() -> None:
     # Every body of up to seven bytes of those that make a header: the SDK fails on some of these.
-    packets = PacketHandler()
     for size in range(8):
         for tail in itertools.product((0xFF, 0xFD, 0x00), repeat=size):
-            packet = laid_out(bytes((3, *tail)))
-            there = packets.addStuffing(list(packet))
-            assert bytes(there[7:-2]).find(b"\xff\xff\xfd\x00") < 0
-            assert packets.removeStuffing(list(there)) == packet
+            sent = instruction_packet(1, packets.STATUS, bytes((0, *tail)))
+            assert sent[4:].find(b"\xff\xff\xfd\x00") < 0
+            status = take_status(bytearray(sent))
+            assert status is not None
+            assert status.data == bytes(tail)
 
 
 def test_stuffing_is_the_simulators() -> None:

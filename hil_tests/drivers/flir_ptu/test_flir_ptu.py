@@ -556,7 +556,7 @@ def test_a_unit_that_lost_count_while_the_line_was_down_is_not_moved(opened: Ope
         head.move(0.5, 0.2)
         settled(head)
         line.hang_up()
-        with pytest.raises(LineLost, match="is gone"):
+        with pytest.raises(LineLost, match=r"hung up|failed in"):
             head.read()
         with pytest.raises(LineLost):
             head.move(0.1, 0.1)
@@ -750,7 +750,7 @@ def test_a_host_that_does_not_listen_is_a_lost_line(scheme: str) -> None:
         port = listener.getsockname()[1]
     with pytest.raises(LineLost, match="cannot be opened"):
         open_head({**OPTIONS, "port": f"{scheme}://127.0.0.1:{port}"})
-    with pytest.raises(LineLost, match="cannot be opened"):
+    with pytest.raises(BadOptions, match=f"expected {scheme}://HOST:PORT"):
         open_head({**OPTIONS, "port": f"{scheme}://127.0.0.1"})
 
 

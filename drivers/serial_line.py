@@ -1,0 +1,190 @@
+"""An open line of bytes to a device: a serial device, ``socket://HOST:PORT`` or ``rfc2217://HOST:PORT``.
+
+pyserial opens it; what the bytes mean is not known here. What pyserial 3.5 leaves to do is done for every
+driver alike: a wait sleeps in the kernel, with a deadline of CLOCK_MONOTONIC; the line is this program's
+alone; a USB adapter's latency timer is set to its least; a host that is away costs 0.5 s, not 5 s, and
+closing closes at once; a pulled cable is a `LineLost`, what can never be opened `BadOptions`.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import os
+import select
+import socket
+import termios
+import time
+from urllib.parse import urlsplit
+
+import serial
+from serial.urlhandler import protocol_socket
+
+from drivers.errors import BadOptions, LineLost
+
+CHUNK_BYTES = 4096
+CONNECT_TIMEOUT_S = WRITE_TIMEOUT_S = 0.5
+SLICE_S = 0.01
+"""pyserial's own timeout of one read, where there is no file to wait on. It never changes while the line is
+open, since changing it makes pyserial set up the port anew (over the network with rfc2217)."""
+
+_BROKEN = (OSError, EOFError, termios.error, ValueError, TypeError, AttributeError, IndexError)
+"""What pyserial raises when the other side is gone: SerialException, which is an OSError; reset_input_buffer
+gives termios.error; a port closed under a read TypeError or AttributeError."""
+
+
+class _SocketPort(protocol_socket.Serial):  # type: ignore[misc]
+    """pyserial's ``socket://`` port; a host that is away costs 0.5 s, not 5 s, and closing closes."""
+
+    _socket: socket.socket | None = None
+
+    def open(self) -> None:
+        """Connect."""
+        self.logger = None
+        self._socket = socket.create_connection(self.from_url(self.portstr), CONNECT_TIMEOUT_S)
+        self._socket.setblocking(False)
+        self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        self.is_open = True
+
+    def close(self) -> None:
+        """Close at once; pyserial waits 0.3 s and leaves the descriptor to the garbage collector if the other
+        side is gone already."""
+        self.is_open = False
+        if self._socket is not None:
+            self._socket.close()
+            self._socket = None
+
+
+class SerialLine:
+    """An open line; closing twice does no harm.
+
+    One thread reads; any may write beside it.
+
+    Parameters
+    ----------
+    port
+        A serial device, or a URL that pyserial understands.
+    baud
+        Bits per second, any that the adapter can do; means nothing to ``socket://``.
+    device
+        The device's name in errors.
+
+    Raises
+    ------
+    LineLost
+        If it cannot be opened: no such device, no permission, or held by another program.
+    BadOptions
+        For a URL or a baud rate that cannot be.
+    """
+
+    def __init__(self, port: str, baud: int, device: str = "") -> None:
+        self.port = port
+        self.baud = baud
+        self.byte_s = 10.0 / baud
+        self._device = device
+        self._is_url = "://" in port
+        self._serial = self._opened()
+        self._descriptor: int | None = None
+        self._poll: select.poll | None = None
+        with contextlib.suppress(OSError, AttributeError, ValueError):  # rfc2217 has no file behind it
+            self._descriptor = self._serial.fileno()
+            self._poll = select.poll()
+            self._poll.register(self._descriptor, select.POLLIN)
+        with contextlib.suppress(OSError, ValueError, NotImplementedError, AttributeError):
+            self._serial.set_low_latency_mode(True)  # 1 ms instead of 16 ms, where the adapter has a timer
+        try:
+            self._serial.reset_input_buffer()
+        except _BROKEN as error:
+            self.close()
+            raise self._lost("emptying its input", error) from error
+
+    def write(self, data: bytes) -> None:
+        """Send bytes. Raises LineLost."""
+        sent = 0
+        try:
+            if self._descriptor is not None and not self._is_url:
+                with contextlib.suppress(BlockingIOError):
+                    sent = os.write(self._descriptor, data)
+            if sent < len(data):  # no file, or its buffer is full: pyserial waits for room
+                self._serial.write(data[sent:])
+        except _BROKEN as error:
+            raise self._lost("writing", error) from error
+
+    def read(self, wait_s: float) -> bytes:
+        """Return the bytes that have come or come within ``wait_s``, as soon as there are any; else none.
+
+        Raises
+        ------
+        LineLost
+            If the line is gone.
+        """
+        try:
+            if self._descriptor is None or self._poll is None:
+                return self._read_of_object(wait_s)
+            # poll counts whole milliseconds; rounding up never cuts a deadline short
+            if not self._poll.poll(-int(-wait_s * 1000 // 1)):
+                return b""
+            data = os.read(self._descriptor, CHUNK_BYTES)
+        except BlockingIOError:
+            return b""
+        except _BROKEN as error:
+            raise self._lost("reading", error) from error
+        if not data:
+            words = f"{self.port} hung up (unplugged?)"
+            raise LineLost(words, device=self._device, detail=self._at("reading"))
+        return data
+
+    def close(self) -> None:
+        """Let go of the line, whatever state it is in."""
+        self._descriptor = self._poll = None
+        with contextlib.suppress(*_BROKEN):
+            self._serial.close()
+
+    def _opened(self) -> serial.SerialBase:
+        """The pyserial port, for this program alone where the kind of port allows it."""
+        try:
+            if self.port.startswith(("socket://", "rfc2217://")):
+                parts = urlsplit(self.port)
+                if not parts.hostname or parts.port is None:
+                    raise ValueError(f"expected {parts.scheme}://HOST:PORT")
+            if self.port.startswith("socket://"):
+                return _SocketPort(self.port, timeout=SLICE_S, write_timeout=WRITE_TIMEOUT_S)
+            # rfc2217 refuses a write timeout, and a network port has no lock
+            own = {} if self._is_url else {"exclusive": True, "write_timeout": WRITE_TIMEOUT_S}
+            return serial.serial_for_url(self.port, baudrate=self.baud, timeout=SLICE_S, **own)
+        except (ValueError, TypeError, OverflowError, NotImplementedError) as error:
+            words = f"{self.port} at {self.baud} baud: {_words(error)}"
+            raise BadOptions(words, device=self._device) from error
+        except (OSError, EOFError, termios.error) as error:
+            words = f"{self.port} cannot be opened: {_words(error)}"
+            raise LineLost(words, device=self._device, detail=self._at("opening it")) from error
+
+    def _read_of_object(self, wait_s: float) -> bytes:
+        """The same for a line without a file descriptor."""
+        until_s = time.monotonic() + wait_s
+        while True:
+            waiting = self._serial.in_waiting
+            data = bytes(self._serial.read(max(1, waiting))) if wait_s or waiting else b""
+            if data or time.monotonic() >= until_s:
+                return data
+
+    def _lost(self, doing: str, error: BaseException) -> LineLost:
+        words = f"{self.port} failed in {doing} (unplugged?): {_words(error)}"
+        return LineLost(words, device=self._device, detail=self._at(doing))
+
+    def _at(self, doing: str) -> dict[str, object]:
+        return {"port": self.port, "while": doing}
+
+
+def _words(error: BaseException) -> str:
+    """What a low-level exception says, on one line, without what the caller says already."""
+    number = (
+        error.args[0] if isinstance(error, termios.error) and error.args else getattr(error, "errno", None)
+    )
+    if number in (errno.EAGAIN, errno.EBUSY):
+        return "held by another program"
+    if number == errno.ENOTTY or "Inappropriate ioctl" in str(error):
+        return "it is no serial line"
+    if isinstance(number, int) and number > 0:  # a host's name that is not known has one below zero
+        return os.strerror(number).lower()
+    return " ".join(str(getattr(error, "strerror", None) or error).split())[:200] or type(error).__name__
