@@ -1,7 +1,8 @@
-"""From which side an axis of a real head approaches its goal, to take the backlash of its gear up."""
+"""From which side an axis of a real head approaches its goal, to take the backlash of its gear up. No I/O."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Literal, get_args
 
 Approach = Literal["none", "positive", "negative", "gravity"]
@@ -25,3 +26,24 @@ def last_turn(approach: Approach, goal_rad: float, gravity_turnover_rad: float) 
     if approach == "gravity":
         return 1 if goal_rad < gravity_turnover_rad else -1
     return {"none": 0, "positive": 1, "negative": -1}[approach]
+
+
+def legs_to(
+    goal: int, turn: int, stretch: int, limits: tuple[int, int], places: Iterable[int] | None
+) -> list[int]:
+    """Return the goals of a move, the last one after another where it has to be approached from one side.
+
+    Parameters
+    ----------
+    goal, stretch, limits
+        Where the axis is to stand, how long its last stretch is at least, and the lowest and highest goal,
+        all in the device's counts.
+    turn
+        Which way the counts go on the last stretch: 1, -1, or 0 for either.
+    places
+        Where the axis stands or comes to rest before it can turn; None if nobody knows.
+    """
+    low, high = limits
+    start = min(max(goal - turn * stretch, low), high)
+    before = places is not None and all(turn * (start - place) >= 0 for place in places)
+    return [goal] if before or not turn or start == goal else [start, goal]

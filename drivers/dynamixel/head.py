@@ -22,8 +22,8 @@ from typing import Any, TypeVar
 from drivers.absence import Absence
 from drivers.clock import Clock, SystemClock
 from drivers.dynamixel.bus import Bus
+from drivers.dynamixel.hardware_errors import Reboots
 from drivers.dynamixel.pair import ready_pair
-from drivers.dynamixel.servo import Reboots
 from drivers.dynamixel.session import Session
 from drivers.dynamixel.settings import HeadSettings, head_settings
 from drivers.dynamixel.watch import GivenUp

@@ -6,6 +6,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+from drivers.approach import legs_to
 from drivers.dynamixel.models import Block
 from drivers.dynamixel.settings import AxisSettings
 from drivers.errors import BadReply
@@ -131,17 +132,17 @@ class AxisMotion:
         assert sample is not None
         low, high = settings.limit_counts  # a goal at a limit may round to a count that the servo refuses
         final = min(max(settings.counts(angle_rad), low), high)
-        side = settings.approach_sign(angle_rad)
+        turn = settings.approach_sign(angle_rad)
         stretch = math.ceil(settings.approach_rad / settings.model.count_rad)
-        there = final == self.goal and not self._legs and self.settled(sample.received_s)
-        legs = [final]
-        if side and not (there and self._side == _side(side * settings.sign)):
-            stop = self.stopping_counts(acceleration_rad_per_s2)
-            short = min(side * (final - sample.counts), side * (final - stop))
-            if short < stretch:
-                legs = [min(max(final - side * stretch, low), high), final]
+        if (
+            final == self.goal
+            and self._side == _side(turn * settings.sign)
+            and self.settled(sample.received_s)
+        ):
+            turn = 0  # it stands there, and came from that side
+        places = sample.counts, self.stopping_counts(acceleration_rad_per_s2)
         self._commanded_rad, self._speed_rad_per_s = angle_rad, speed_rad_per_s
-        self._set(legs)
+        self._set(legs_to(final, turn, stretch, (low, high), places))
         return self.goal
 
     def halt(self, goal: int) -> None:

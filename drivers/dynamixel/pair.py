@@ -11,10 +11,11 @@ import time
 from collections.abc import Callable, Sequence
 
 from drivers.dynamixel.group import GroupAnswer, Part
+from drivers.dynamixel.hardware_errors import Reboots
 from drivers.dynamixel.link import Link
 from drivers.dynamixel.models import Block
 from drivers.dynamixel.motion import AxisMotion, Sample, motion_blocks
-from drivers.dynamixel.servo import Reboots, Servo
+from drivers.dynamixel.servo import Servo
 from drivers.dynamixel.settings import AxisSettings, HeadSettings
 from drivers.errors import DriverError, LineLost
 
@@ -153,8 +154,7 @@ class Pair:
         for axis in self.axes:
             goal = axis.halt()
             if goal is not None:
-                entry = axis.settings.model.registers["goal_position"]
-                parts.append(Part(axis.settings.servo_id, entry.address, entry.size, entry.encode(goal)))
+                parts.append(axis.servo.part("goal_position", goal))
         if parts:
             self.link.shout(parts, BRAKE_COPIES)
 

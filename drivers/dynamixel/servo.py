@@ -9,55 +9,30 @@ from __future__ import annotations
 
 import itertools
 import logging
-import math
 import time
-from collections.abc import Callable
-from typing import TypeVar
 
+from drivers.dynamixel.control_table import ControlTable, again, identified
 from drivers.dynamixel.group import Part
-from drivers.dynamixel.link import Link, Pinged
-from drivers.dynamixel.models import HARDWARE_ERRORS, MODELS_BY_NUMBER, hardware_error_words
+from drivers.dynamixel.hardware_errors import Reboots, hardware_fault_words
+from drivers.dynamixel.link import Link
+from drivers.dynamixel.models import MODELS_BY_NUMBER, hardware_error_words
 from drivers.dynamixel.motion import Sample, Truth, motion_blocks
-from drivers.dynamixel.port import QUIET_S
+from drivers.dynamixel.register_words import NO_SECONDARY_ID
 from drivers.dynamixel.settings import AxisSettings, HeadSettings
 from drivers.errors import BadReply, DriverError, HardwareFault, NoReply, Refused, WrongDevice
 
 log = logging.getLogger(__name__)
-T = TypeVar("T")
 
 POSITION_MODE = 3
 FULL_STATUS_RETURN = 2
-NO_SECONDARY_ID = 253  # and above
 REVERSE_BIT, SLAVE_BIT = 0x01, 0x02
 WATCHDOG_TRIPPED = 255
 HOMING_LIMIT = 1024  # what position mode honours of an X servo's homing offset, counts
 REBOOT_S = 2.0  # how long a servo may be deaf after a reboot
-ATTEMPTS = 3
-LATE_S = 0.1  # a reply that did not come is waited out this long before the next question
 COME_TO_REST_S = 0.5
-MOST_REBOOTS, REBOOT_SPAN_S = 3, 600.0
 
 
-class Reboots:
-    """When the servos of a head were rebooted: `MOST_REBOOTS` times in `REBOOT_SPAN_S` at most.
-
-    Counted over all lines of the head, where a servo is rebooted and nowhere else.
-    """
-
-    def __init__(self) -> None:
-        self._times_s: list[float] = []
-
-    def left(self, now_s: float) -> int:
-        """Return how many may be done now."""
-        self._times_s = [then_s for then_s in self._times_s if now_s - then_s < REBOOT_SPAN_S]
-        return MOST_REBOOTS - len(self._times_s)
-
-    def note(self, now_s: float) -> None:
-        """Count one."""
-        self._times_s.append(now_s)
-
-
-class Servo:
+class Servo(ControlTable):
     """One configured servo on an open line.
 
     Parameters
@@ -76,51 +51,13 @@ class Servo:
     """
 
     def __init__(self, link: Link, axis: str, settings: AxisSettings, head: HeadSettings) -> None:
-        self._link = link
-        self._axis = axis
+        name = f"{axis} (servo {settings.servo_id})"
+        super().__init__(link, settings.servo_id, settings.model.registers, name)
         self._settings = settings
         self._head = head
-        self._registers = settings.model.registers
-        self.name = f"{axis} (servo {settings.servo_id})"
-        self.truth = Truth(self.name, settings)
+        self.truth = Truth(name, settings)
         self._dropped = False  # its torque, by us, and not yet taken hold again
         self._blocks = itertools.cycle(motion_blocks(settings))
-
-    def get(self, register: str) -> int:
-        """Return a register's value; a lost reply is asked for again. Raises as `Link.proven`."""
-        return self.get_all(register)[register]
-
-    def get_all(self, *registers: str) -> dict[str, int]:
-        """Return several registers' values by name, as `get` does one, at the cost of one."""
-        entries = [self._registers[register] for register in registers]
-        values = self._repeated(lambda: self._link.proven(self._settings.servo_id, *entries))
-        return dict(zip(registers, values, strict=True))
-
-    def set(self, register: str, value: int) -> None:
-        """Set a register and see that it holds the value.
-
-        Raises
-        ------
-        Refused, NoReply, BadReply, LineLost
-            As `Link.write` and `Link.proven`.
-        WrongDevice
-            If the servo says that it did but holds another value.
-        """
-        entry = self._registers[register]
-        refused: Refused | None = None
-        for _ in range(ATTEMPTS):
-            # a write may have been done and only its reply lost: writing again is the same
-            try:
-                self._repeated(lambda: self._link.write(self._settings.servo_id, entry, value))
-            except Refused as error:
-                if refused is not None:
-                    raise
-                refused = error  # it may be that of another write
-            held = self.get(register)
-            if held == value:
-                return
-            self._link.quiet(LATE_S if refused is None else QUIET_S)
-        raise WrongDevice(f"{self.name} holds {held} in {register} after {value} was written to it")
 
     def check_identity(self) -> None:
         """See that the servo is the one configured, and that it answers every instruction.
@@ -145,11 +82,11 @@ class Servo:
             )
         level = self._registers["status_return_level"]
         try:
-            answering = self._link.proven(self._settings.servo_id, level) == [FULL_STATUS_RETURN]
+            answering = self._link.proven(self._servo_id, level) == [FULL_STATUS_RETURN]
         except NoReply:
             answering = False
         if not answering:
-            self._link.write_unanswered(self._settings.servo_id, level, FULL_STATUS_RETURN)
+            self._link.write_unanswered(self._servo_id, level, FULL_STATUS_RETURN)
 
     def _model_and_firmware(self) -> tuple[int, int]:
         """Who it is, by its registers; only who does not answer that is asked by a ping.
@@ -159,20 +96,9 @@ class Servo:
         try:
             held = self.get_all("model_number", "firmware")
         except (NoReply, Refused):
-            pinged = self._pinged()
+            pinged = identified(self._link, self._servo_id, self.name)
             return pinged.model_number, pinged.firmware
         return held["model_number"], held["firmware"]
-
-    def _pinged(self) -> Pinged:
-        """Who answers a ping, twice in a row and around a silence: a servo may answer nothing else yet."""
-        before = self._repeated(lambda: self._link.ping(self._settings.servo_id))
-        for _ in range(ATTEMPTS):
-            self._link.quiet(QUIET_S)
-            now = self._repeated(lambda: self._link.ping(self._settings.servo_id))
-            if now == before:
-                return now
-            before = now
-        raise BadReply(f"{self.name} says another thing about itself each time it is asked")
 
     def stand(self) -> None:
         """Make where the servo is its goal, if it is of the model configured and its torque is on.
@@ -184,13 +110,13 @@ class Servo:
         NoReply, BadReply, Refused, LineLost
             As `Link.proven` and `Link.write`.
         """
-        servo_id, registers = self._settings.servo_id, self._registers
+        registers = self._registers
         asked = (registers["model_number"], registers["torque_enable"])
-        if self._link.proven(servo_id, *asked) != [self._settings.model.number, 1]:
+        if self._link.proven(self._servo_id, *asked) != [self._settings.model.number, 1]:
             return
         low, high = self._settings.limit_counts
         goal = min(max(self.look_once().counts, low), high)
-        self._link.write(servo_id, registers["goal_position"], goal)
+        self._link.write(self._servo_id, registers["goal_position"], goal)
 
     def check_health(self, reboots: Reboots) -> None:
         """See that the servo reports no hardware error; restart it if the configuration says so.
@@ -214,7 +140,7 @@ class Servo:
 
     def reboot(self) -> None:
         """Restart the servo and wait until it answers; torque drops. Raises NoReply, LineLost."""
-        self._link.reboot(self._settings.servo_id)
+        self._link.reboot(self._servo_id)
         self.truth.forget()
         until_s = time.monotonic() + REBOOT_S
         while True:
@@ -233,16 +159,13 @@ class Servo:
         NoReply, BadReply, Refused, LineLost
             As `Link.group_read`.
         """
-        return self._repeated(self.look_once)
+        return again(self._link, self.look_once)
 
     def look_once(self) -> Sample:
         """Return what the servo says about its motion now, asked one time; raises as `look`."""
         block = next(self._blocks)
-        part = Part(self._settings.servo_id, block.address, block.length)
-        answer = self._link.group_read([part])
-        if answer.missing:
-            raise answer.missing[part.servo_id]
-        status = answer.statuses[part.servo_id]
+        answer = self.block(block)
+        status = answer.statuses[self._servo_id]
         sample = Sample(block.decode(status.data), status.alert, answer.sent_s, answer.received_s)
         self.truth.check(sample)
         return sample
@@ -352,9 +275,8 @@ class Servo:
         held = self.get_all("torque_enable", "bus_watchdog")
         torque, tripped = bool(held["torque_enable"]), held["bus_watchdog"] != 0
         counts = self.check_place()
-        if tripped:  # once cleared, the servo may go on to its old goal: that is void in the same moment
-            self._link.shout([self._part("bus_watchdog", 0), self._part("goal_position", counts)])
-            self.set("bus_watchdog", 0)
+        if tripped:
+            self.clear_watchdog(counts)
         self.set("goal_position", counts)
         self._full_strength()
         self.set_profile()
@@ -375,7 +297,7 @@ class Servo:
         """Profile acceleration and velocity, as `set_profile` sets them."""
         settings, head = self._settings, self._head
         acceleration = settings.acceleration_counts(head.acceleration_rad_per_s2)
-        return acceleration, velocity_counts(settings, head.speed_rad_per_s)
+        return acceleration, settings.velocity_counts(head.speed_rad_per_s)
 
     def set_profile(self) -> None:
         """Set how fast the servo turns and brakes; raises as `set`, and WrongDevice where it cannot."""
@@ -391,7 +313,7 @@ class Servo:
     def send_leg(self, profile: tuple[int, int], goal: int) -> None:
         """Set a goal, with the profile that leads there in the same packet; raises as `set`."""
         parts = [
-            self._part(name, value)
+            self.part(name, value)
             for name, value in zip(
                 ("profile_acceleration", "profile_velocity", "goal_position"), (*profile, goal), strict=True
             )
@@ -411,11 +333,6 @@ class Servo:
             )
             self.set("goal_pwm", limit)
 
-    def _part(self, register: str, value: int) -> Part:
-        """A register and its new value, for a packet."""
-        entry = self._registers[register]
-        return Part(self._settings.servo_id, entry.address, entry.size, entry.encode(value))
-
     def _come_to_rest(self) -> int:
         """Wait until the axis stands (it may have been falling) and hold it there; returns the goal."""
         until_s = time.monotonic() + COME_TO_REST_S
@@ -428,15 +345,6 @@ class Servo:
             self.set("goal_position", goal)
         return goal
 
-    def _repeated(self, ask: Callable[[], T]) -> T:
-        """Ask again after a lost or wrong reply, when one that is merely late has come."""
-        for _ in range(ATTEMPTS - 1):
-            try:
-                return ask()
-            except (NoReply, BadReply):
-                self._link.quiet(LATE_S)
-        return ask()
-
     def release(self) -> None:
         """Switch the watchdog off, and torque too if the configuration says so; for the end."""
         for register in (
@@ -447,17 +355,3 @@ class Servo:
                 self.set(register, 0)
             except DriverError as error:
                 log.warning("%s: could not set %s at the end: %s", self.name, register, error)
-
-
-def velocity_counts(settings: AxisSettings, speed_rad_per_s: float) -> int:
-    """Return a profile velocity, not above the speed; never 0, which would mean as fast as it can."""
-    return max(1, math.floor(speed_rad_per_s / settings.model.velocity_unit_rad_per_s + 1e-9))
-
-
-def hardware_fault_words(name: str, error: int) -> str:
-    """Return one sentence for a hardware error."""
-    words = " and ".join(hardware_error_words(error & sum(HARDWARE_ERRORS)) or [f"bits 0x{error:02x}"])
-    return (
-        f"{name} reports {words} (hardware error 0x{error:02x}); it keeps saying so until it is rebooted or "
-        "switched off and on, which drops its torque"
-    )

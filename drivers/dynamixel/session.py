@@ -12,8 +12,9 @@ from collections.abc import Mapping, Sequence
 from contextlib import suppress
 
 from drivers.clock import Clock
+from drivers.dynamixel.hardware_errors import Reboots
 from drivers.dynamixel.pair import Axis, Pair
-from drivers.dynamixel.servo import WATCHDOG_TRIPPED, Reboots, velocity_counts
+from drivers.dynamixel.servo import WATCHDOG_TRIPPED
 from drivers.dynamixel.settings import HeadSettings
 from drivers.dynamixel.watch import GivenUp, Watch
 from drivers.errors import DriverError, LineLost, NoReply, WatchdogTripped
@@ -147,7 +148,7 @@ class Session:
                 axis.take_hold()
                 self._watch.arm()
         self.poll_once()
-        speeds = [velocity_counts(axis.settings, speed_rad_per_s) for axis in self.pair.axes]
+        speeds = [axis.settings.velocity_counts(speed_rad_per_s) for axis in self.pair.axes]
         goals = [
             axis.motion.plan(angle_rad, speed_rad_per_s, axis.acceleration_rad_per_s2)
             for axis, angle_rad in zip(self.pair.axes, angles_rad, strict=True)

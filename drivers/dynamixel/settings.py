@@ -95,6 +95,10 @@ class AxisSettings:
         """Return a profile acceleration, not below the one given: braking takes no longer than promised."""
         return max(1, math.ceil(acceleration_rad_per_s2 / self.model.acceleration_unit_rad_per_s2 - 1e-6))
 
+    def velocity_counts(self, speed_rad_per_s: float) -> int:
+        """Return a profile velocity, not above the speed; never 0, which would mean as fast as it can."""
+        return max(1, math.floor(speed_rad_per_s / self.model.velocity_unit_rad_per_s + 1e-9))
+
     def approach_sign(self, goal_rad: float) -> int:
         """Return the direction of the last stretch in counts: 1, -1, or 0 for none."""
         return self.sign * last_turn(self.approach, goal_rad, self.gravity_turnover_rad)

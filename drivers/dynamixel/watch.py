@@ -9,8 +9,9 @@ import logging
 import time
 from collections.abc import Sequence
 
+from drivers.dynamixel.hardware_errors import Reboots, hardware_fault_words
 from drivers.dynamixel.pair import Axis, Pair
-from drivers.dynamixel.servo import WATCHDOG_TRIPPED, Reboots, hardware_fault_words
+from drivers.dynamixel.servo import WATCHDOG_TRIPPED
 from drivers.dynamixel.settings import HeadSettings
 from drivers.errors import BadReply, DriverError, HardwareFault, Refused, WatchdogTripped
 

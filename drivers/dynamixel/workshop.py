@@ -1,56 +1,26 @@
-"""What a person does to servos on the bench: find them, read all they say, give them an id, try them out.
+"""What a person does to servos on the bench: find them, read all they say, give them an id.
 
-For one thread and a line that no daemon holds. Nothing here moves a servo but `try_out`.
+For one thread and a line that no daemon holds. Nothing here moves a servo; `trial` does.
 """
 
 from __future__ import annotations
 
-import math
 import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field
-from typing import TypeVar
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass
 
-from drivers.dynamixel.group import Part
+from drivers.dynamixel.control_table import ControlTable, again, identified
 from drivers.dynamixel.link import Link, Pinged
-from drivers.dynamixel.models import (
-    BAUD_RATES,
-    MODELS_BY_NUMBER,
-    OPERATING_MODES,
-    Block,
-    Model,
-    Register,
-    hardware_error_words,
-)
-from drivers.dynamixel.port import QUIET_S
-from drivers.errors import (
-    BadOptions,
-    BadReply,
-    DriverError,
-    HardwareFault,
-    NoReply,
-    OutOfRange,
-    Refused,
-    WrongDevice,
-)
+from drivers.dynamixel.models import BAUD_RATES, MODELS_BY_NUMBER, Model, hardware_error_words
+from drivers.dynamixel.register_words import register_words
+from drivers.errors import BadOptions, NoReply, Refused, WrongDevice
 
-T = TypeVar("T")
-
-ATTEMPTS = 3
 HIGHEST_ID = 252
-POSITION_MODE = 3
-NO_SECONDARY_ID = 253
-TRIAL_SPEED_RAD_PER_S = 0.2
-TRIAL_ACCELERATION_RAD_PER_S2 = 1.0
-TRIAL_WATCHDOG = 15  # times 20 ms
-WATCHDOG_TRIPPED = 255
-TRIAL_POLL_S = 0.02
-WARM_MARGIN_C = 10  # below the servo's own limit
 
 
 @dataclass(frozen=True)
-class Found:
+class FoundServo:
     """A servo that answered a scan."""
 
     baud: int
@@ -65,7 +35,7 @@ class Found:
 class Scan:
     """What a scan found; ``garbled`` are the baud rates at which bytes came that were no reply."""
 
-    found: tuple[Found, ...]
+    found: tuple[FoundServo, ...]
     bauds: tuple[int, ...]
     garbled: tuple[int, ...]
 
@@ -78,7 +48,7 @@ def scan(port: str, bauds: Sequence[int], reply_timeout_s: float) -> Scan:
     LineLost, BadOptions
         If the line cannot be opened at all, or the adapter cannot do a rate.
     """
-    found: list[Found] = []
+    found: list[FoundServo] = []
     garbled: list[int] = []
     for baud in bauds:
         link = Link(port, baud, reply_timeout_s)
@@ -92,19 +62,17 @@ def scan(port: str, bauds: Sequence[int], reply_timeout_s: float) -> Scan:
     return Scan(tuple(found), tuple(bauds), tuple(garbled))
 
 
-def _found(link: Link, ping: Pinged) -> Found:
+def _found(link: Link, ping: Pinged) -> FoundServo:
     model = MODELS_BY_NUMBER.get(ping.model_number)
     words: list[str] = []
     if ping.alert and model is not None:
-        words = hardware_error_words(
-            _patient(lambda: link.proven(ping.servo_id, model.registers["hardware_error"]))[0]
-        )
+        words = hardware_error_words(table_of(link, ping.servo_id, model).get("hardware_error"))
     name = model.name if model else "unknown"
-    return Found(link.baud, ping.servo_id, ping.model_number, name, ping.firmware, tuple(words))
+    return FoundServo(link.baud, ping.servo_id, ping.model_number, name, ping.firmware, tuple(words))
 
 
 @dataclass(frozen=True)
-class Facts:
+class ServoFacts:
     """Everything a servo says: its registers as they stand, and in words where a number needs them."""
 
     servo_id: int
@@ -114,7 +82,7 @@ class Facts:
     words: dict[str, str]
 
 
-def facts(link: Link, servo_id: int) -> Facts:
+def facts(link: Link, servo_id: int) -> ServoFacts:
     """Read every register of a servo that the table knows.
 
     Raises
@@ -124,90 +92,30 @@ def facts(link: Link, servo_id: int) -> Facts:
     NoReply, BadReply, Refused, LineLost
         If it cannot be read.
     """
-    model, firmware = _identify(link, servo_id)
+    model, firmware = identify(link, servo_id)
+    table = table_of(link, servo_id, model)
     values: dict[str, int] = {}
-    for name, register in model.registers.items():
-        try:
-            values[name] = _patient(lambda r=register: link.proven(servo_id, r))[0]  # type: ignore[misc]
-        except Refused:
-            continue  # this model has none
-    words = {name: _words(model, name, value) for name, value in values.items()}
-    return Facts(servo_id, model.name, firmware, values, {n: w for n, w in words.items() if w})
+    for name in model.registers:
+        with suppress(Refused):  # this model has none
+            values[name] = table.get(name)
+    words = {name: register_words(model, name, value) for name, value in values.items()}
+    return ServoFacts(servo_id, model.name, firmware, values, {n: w for n, w in words.items() if w})
 
 
-def _identify(link: Link, servo_id: int) -> tuple[Model, int]:
-    ping = _patient(lambda: link.ping(servo_id))
-    link.quiet(QUIET_S)
-    if (again := _patient(lambda: link.ping(servo_id))) != ping:
-        raise BadReply(
-            f"servo {servo_id} says another thing about itself each time it is asked: model "
-            f"{ping.model_number} and {again.model_number}"
-        )
-    model = MODELS_BY_NUMBER.get(ping.model_number)
+def identify(link: Link, servo_id: int) -> tuple[Model, int]:
+    """Return a servo's model and firmware. Raises as `facts`."""
+    pinged = identified(link, servo_id, f"servo {servo_id}")
+    model = MODELS_BY_NUMBER.get(pinged.model_number)
     if model is None:
         raise WrongDevice(
-            f"servo {servo_id} has the model number {ping.model_number}, which is not in the table"
+            f"servo {servo_id} has the model number {pinged.model_number}, which is not in the table"
         )
-    return model, ping.firmware
+    return model, pinged.firmware
 
 
-def _words(model: Model, name: str, value: int) -> str:
-    """What a register's number means, for people; empty where the number says it."""
-    if name == "model_number":
-        return model.name
-    if name == "baud":
-        return f"{BAUD_RATES[value]} baud" if value in BAUD_RATES else "unknown baud rate"
-    if name == "return_delay":
-        return f"{2 * value} us"
-    if name == "operating_mode":
-        return OPERATING_MODES.get(value, "unknown mode")
-    if name == "secondary_id":
-        return "none" if value >= NO_SECONDARY_ID else "also obeys this id"
-    if name in (
-        "min_position_limit",
-        "max_position_limit",
-        "present_position",
-        "goal_position",
-        "position_trajectory",
-    ):
-        return f"{math.degrees((value - model.centre_count) * model.count_rad):.3f} deg from its middle"
-    if name == "homing_offset":
-        return f"{math.degrees(value * model.count_rad):.3f} deg"
-    if name in (
-        "velocity_limit",
-        "goal_velocity",
-        "profile_velocity",
-        "present_velocity",
-        "velocity_trajectory",
-    ):
-        unlimited = name == "profile_velocity" and value == 0
-        return "as fast as it can" if unlimited else f"{value * model.velocity_unit_rad_per_s:.4f} rad/s"
-    if name == "moving_threshold":
-        return f"{value * model.velocity_unit_rad_per_s:.4f} rad/s"
-    if name == "profile_acceleration":
-        return (
-            "as hard as it can" if value == 0 else f"{value * model.acceleration_unit_rad_per_s2:.4f} rad/s2"
-        )
-    if name in ("current_limit", "goal_current", "present_current"):
-        if model.current_unit_A is None:
-            return f"{value / 10:.1f} % load" if name == "present_current" else ""
-        return f"{value * model.current_unit_A:.3f} A"
-    if name in ("max_voltage_limit", "min_voltage_limit", "present_voltage"):
-        return f"{value / 10:.1f} V"
-    if name in ("temperature_limit", "present_temperature"):
-        return f"{value} C"
-    if name in ("hardware_error", "shutdown"):
-        listed = ", ".join(hardware_error_words(value)) or "none"
-        return listed if name == "hardware_error" else f"shuts down on: {listed}"
-    if name == "bus_watchdog":
-        return {0: "off", 255: "tripped"}.get(value, f"{20 * value} ms")
-    if name == "torque_enable":
-        return "on" if value else "off"
-    if name == "status_return_level":
-        return {0: "answers pings", 1: "answers reads", 2: "answers everything"}.get(value, "unknown")
-    if name == "moving_status":
-        return "in position" if value & 1 else "not in position"
-    return ""
+def table_of(link: Link, servo_id: int, model: Model) -> ControlTable:
+    """Return a servo's control table."""
+    return ControlTable(link, servo_id, model.registers, f"servo {servo_id}")
 
 
 def set_id(link: Link, old: int, new: int, new_baud: int | None = None, *, torque_off: bool = False) -> None:
@@ -233,7 +141,7 @@ def set_id(link: Link, old: int, new: int, new_baud: int | None = None, *, torqu
         raise BadOptions(f"{new_baud} baud cannot be; there is {', '.join(str(rate) for rate in codes)}")
     if old == new and new_baud in (None, link.baud):
         raise BadOptions(f"servo {old} already has this id and baud rate; there is nothing to do")
-    model, _ = _identify(link, old)
+    model, _ = identify(link, old)
     if old != new:
         try:
             taken = link.ping(new)
@@ -242,14 +150,14 @@ def set_id(link: Link, old: int, new: int, new_baud: int | None = None, *, torqu
         else:
             other = MODELS_BY_NUMBER.get(taken.model_number)
             raise WrongDevice(f"id {new} is taken by a {other.name if other else 'servo'}; choose another")
-    torque = model.registers["torque_enable"]
-    if _patient(lambda: link.proven(old, torque)) != [0]:
+    table = table_of(link, old, model)
+    if table.get("torque_enable"):
         if not torque_off:
             raise WrongDevice(
                 f"the torque of servo {old} is on, which locks its id: support what hangs on it and give "
                 "--torque-off"
             )
-        _patient(lambda: link.write(old, torque, 0))
+        table.set("torque_enable", 0)
     if old != new:
         _change(link, old, model, "id", new)
         _confirm(link, new, model, f"servo {old} did not take the id {new}")
@@ -270,236 +178,8 @@ def _change(link: Link, servo_id: int, model: Model, register: str, value: int) 
 
 def _confirm(link: Link, servo_id: int, model: Model, otherwise: str) -> None:
     try:
-        found = _patient(lambda: link.ping(servo_id))
+        found = again(link, lambda: link.ping(servo_id))
     except NoReply:
         raise WrongDevice(otherwise) from None
     if found.model_number != model.number:
         raise WrongDevice(f"{otherwise}: model number {found.model_number} answers")
-
-
-@dataclass(frozen=True)
-class TrialStep:
-    """One short move of a trial: where it should have gone, where it went, and how hard it was."""
-
-    goal_counts: int
-    measured_counts: int
-    seconds: float
-    most_current_A: float | None
-    voltage_V: float
-    temperature_C: int
-
-    @property
-    def left_counts(self) -> int:
-        """Measured minus goal."""
-        return self.measured_counts - self.goal_counts
-
-
-@dataclass(frozen=True)
-class Trial:
-    """A trial's steps, and the servo's model."""
-
-    servo_id: int
-    model: str
-    count_rad: float
-    start_counts: int
-    steps: tuple[TrialStep, ...] = field(default=())
-
-
-def try_out(link: Link, servo_id: int, amplitude_rad: float, torque_percent: float) -> Trial:
-    """Turn a servo a little to one side, to the other and back: slowly, weakly, watched all the time.
-
-    Its bus watchdog is armed meanwhile; one that has tripped is cleared first. Whatever goes wrong, the
-    servo is stopped where it stands; torque, profile, strength and watchdog are left as they were found, each
-    of them even if another cannot be.
-
-    Parameters
-    ----------
-    link
-        An open line.
-    servo_id
-        Which servo.
-    amplitude_rad
-        How far to each side of where it stands.
-    torque_percent
-        Bound of the motor's drive (Goal PWM), percent of full.
-
-    Raises
-    ------
-    WrongDevice, HardwareFault, OutOfRange
-        If the servo is not fit for it: another operating mode, a hardware error, too warm, a voltage outside
-        its limits, no room to its position limits. Nothing has moved then.
-    NoReply, BadReply, Refused, LineLost
-        If it cannot be reached.
-    """
-    model, firmware = _identify(link, servo_id)
-    values = facts(link, servo_id).values
-    reach = math.ceil(amplitude_rad / model.count_rad)
-    start = values["present_position"]
-    _check_fit(servo_id, model, values, reach)
-    registers = model.registers
-    block = Block(registers, "goal_velocity", "present_temperature")
-
-    def put(name: str, value: int) -> None:
-        _set(link, servo_id, registers[name], value)
-
-    def go_to(goal: int) -> None:
-        _patient(lambda: link.write(servo_id, registers["goal_position"], goal))
-
-    steps: list[TrialStep] = []
-    with _restored(link, servo_id, model, values):
-        if values["bus_watchdog"]:  # it refuses goals; once cleared, the old goal is void in the same moment
-            parts = [("bus_watchdog", 0), ("goal_position", start)]
-            link.shout([_part(servo_id, registers[name], value) for name, value in parts])
-            put("bus_watchdog", 0)
-        put("goal_position", start)
-        put(
-            "profile_acceleration",
-            max(1, round(TRIAL_ACCELERATION_RAD_PER_S2 / model.acceleration_unit_rad_per_s2)),
-        )
-        put("profile_velocity", max(1, round(TRIAL_SPEED_RAD_PER_S / model.velocity_unit_rad_per_s)))
-        put("goal_pwm", round(values["pwm_limit"] * torque_percent / 100))
-        put("torque_enable", 1)
-        if firmware >= model.watchdog_firmware:
-            put("bus_watchdog", TRIAL_WATCHDOG)
-        try:
-            for goal in (start + reach, start - reach, start):
-                go_to(goal)
-                steps.append(
-                    _step(link, servo_id, model, block, goal, (start - 2 * reach, start + 2 * reach))
-                )
-        except BaseException:
-            with suppress(DriverError):  # what went wrong first is told
-                go_to(link.proven(servo_id, registers["present_position"])[0])
-            raise
-    return Trial(servo_id, model.name, model.count_rad, start, tuple(steps))
-
-
-def _check_fit(servo_id: int, model: Model, values: dict[str, int], reach: int) -> None:
-    """Refuse what a trial would make worse."""
-    if values["operating_mode"] != POSITION_MODE:
-        mode = OPERATING_MODES.get(values["operating_mode"], "an unknown")
-        raise WrongDevice(f"servo {servo_id} is in {mode} mode; the trial needs position mode (3)")
-    if values["hardware_error"]:
-        words = ", ".join(hardware_error_words(values["hardware_error"]))
-        raise HardwareFault(f"servo {servo_id} reports {words}; find the cause, then switch it off and on")
-    if values["present_temperature"] > values["temperature_limit"] - WARM_MARGIN_C:
-        raise HardwareFault(
-            f"servo {servo_id} is at {values['present_temperature']} C, near its limit of "
-            f"{values['temperature_limit']} C; let it cool"
-        )
-    voltage, low, high = (
-        values[f"{name}"] for name in ("present_voltage", "min_voltage_limit", "max_voltage_limit")
-    )
-    if not low <= voltage <= high:
-        raise HardwareFault(
-            f"servo {servo_id} gets {voltage / 10:.1f} V, expected {low / 10:.1f} to {high / 10:.1f} V"
-        )
-    start = values["present_position"]
-    least, most = values["min_position_limit"], values["max_position_limit"]
-    if not least + reach <= start <= most - reach:
-        raise OutOfRange(
-            f"servo {servo_id} stands at {start} counts; a move of {reach} counts to each side leaves its "
-            f"position limits {least} to {most}"
-        )
-
-
-@contextmanager
-def _restored(link: Link, servo_id: int, model: Model, values: dict[str, int]) -> Iterator[None]:
-    """Leave the servo as it was found: torque first, then all the rest, whatever of it fails."""
-    wrong: BaseException | None = None
-    try:
-        yield
-    except BaseException as error:  # goes on to the caller when the servo is as it was
-        wrong = error
-    wanted = [] if values["torque_enable"] else [("torque_enable", 0)]
-    wanted += [("bus_watchdog", 0)]  # one that trips would refuse goal_pwm
-    wanted += [(name, values[name]) for name in ("profile_acceleration", "profile_velocity", "goal_pwm")]
-    if values["bus_watchdog"] != WATCHDOG_TRIPPED:
-        wanted += [("bus_watchdog", values["bus_watchdog"])]
-    left: dict[str, DriverError] = {}
-    while wanted:
-        name, value = wanted[0]
-        try:
-            _set(link, servo_id, model.registers[name], value)
-        except DriverError as error:
-            left[name] = error
-        except KeyboardInterrupt as error:  # Ctrl-C again: it is tried once more, and the rest too
-            wrong = wrong or error
-            continue
-        del wanted[0]
-    if left:
-        names = " and ".join(left)
-        limp = "its torque may be on; " if "torque_enable" in left else ""
-        words = f"servo {servo_id} is not left as it was found in {names}: {limp}{next(iter(left.values()))}"
-        raise WrongDevice(
-            words if wrong is None else f"{str(wrong) or 'interrupted'}; and {words}"
-        ) from wrong
-    if wrong is not None:
-        raise wrong
-
-
-def _set(link: Link, servo_id: int, register: Register, value: int) -> None:
-    """Write a register and see that it holds the value."""
-    for _ in range(ATTEMPTS):
-        _patient(lambda: link.write(servo_id, register, value))
-        if _patient(lambda: link.proven(servo_id, register)) == [value]:
-            return
-    raise WrongDevice(f"{register.name} does not take {value}")
-
-
-def _part(servo_id: int, register: Register, value: int) -> Part:
-    """A register and its new value, for a packet."""
-    return Part(servo_id, register.address, register.size, register.encode(value))
-
-
-def _step(
-    link: Link, servo_id: int, model: Model, block: Block, goal: int, fence: tuple[int, int]
-) -> TrialStep:
-    """Watch one short move to its end."""
-    part = Part(servo_id, block.address, block.length)
-    began_s = time.monotonic()
-    most = 0
-    still = 0
-    while True:
-        answer = _patient(lambda: _one(link, part))
-        values = block.decode(answer)
-        most = max(most, abs(values["present_current"]))
-        if not fence[0] <= values["present_position"] <= fence[1]:
-            raise OutOfRange(
-                f"servo {servo_id} left the fence of the trial at {values['present_position']} counts "
-                f"(allowed {fence[0]} to {fence[1]}); it is stopped"
-            )
-        still = still + 1 if abs(values["present_velocity"]) <= 1 and not values["moving_status"] & 2 else 0
-        elapsed_s = time.monotonic() - began_s
-        if (still >= 5 and elapsed_s > 0.2) or elapsed_s > 10.0:
-            break
-        time.sleep(TRIAL_POLL_S)
-    left = abs(values["present_position"] - goal)
-    if left > max(abs(fence[1] - fence[0]) / 16, 4):
-        raise HardwareFault(
-            f"servo {servo_id} stands {left} counts from its goal: blocked, or too weak with this bound "
-            "of its drive; it is stopped"
-        )
-    current = None if model.current_unit_A is None else most * model.current_unit_A
-    voltage, temperature = values["present_voltage"] / 10, values["present_temperature"]
-    return TrialStep(goal, values["present_position"], elapsed_s, current, voltage, temperature)
-
-
-def _one(link: Link, part: Part) -> bytes:
-    answer = link.group_read([part])
-    if answer.missing:
-        raise answer.missing[part.servo_id]
-    status = answer.statuses[part.servo_id]
-    if status.alert:
-        raise HardwareFault(f"servo {part.servo_id} reports a hardware error; the trial is ended")
-    return status.data
-
-
-def _patient(ask: Callable[[], T]) -> T:
-    """Ask again after a lost reply."""
-    for _ in range(ATTEMPTS - 1):
-        try:
-            return ask()
-        except NoReply:
-            continue
-    return ask()

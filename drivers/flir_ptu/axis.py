@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+from drivers.approach import legs_to
 from drivers.errors import OutOfRange, WrongDevice
 from drivers.flir_ptu.options import DEVICE, AxisOptions
 
@@ -128,17 +129,13 @@ class Axis:
 
     def way_to(self, angle_rad: float) -> tuple[int, int | None]:
         """Return the first target and the one after it, so that the goal is reached from the right side."""
-        goal, side = self.position_from_rad(angle_rad), self.options.approach_sign(angle_rad)
-        low, high = self.soft_limits()
-        start = goal - side * math.ceil(self.options.approach_rad / self.position_rad)
-        start = min(max(start, low), high)
-        if start == goal or self.seen is None:
-            return goal, None
-        stands = self.rests and self.seen.position == self.target
-        here = self.seen.position
-        if stands and (here == goal or (start - here) * side >= 0):
-            return goal, None  # there already, or on the right side and far enough away
-        return start, goal
+        goal, turn = self.position_from_rad(angle_rad), self.options.approach_sign(angle_rad)
+        stretch = math.ceil(self.options.approach_rad / self.position_rad)
+        here = self.target if self.rests and self.seen and self.seen.position == self.target else None
+        if here == goal:
+            turn = 0  # there already
+        first, *then = legs_to(goal, turn, stretch, self.soft_limits(), None if here is None else [here])
+        return first, then[0] if then else None
 
     def sent(self, target: int, time_s: float) -> None:
         """Remember a target that the unit was given."""

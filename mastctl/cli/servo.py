@@ -179,7 +179,7 @@ def _set_id(args: argparse.Namespace) -> int:
 
 def _test(args: argparse.Namespace) -> int:
     """Turn a servo a little."""
-    from drivers.dynamixel.workshop import try_out
+    from drivers.dynamixel.trial import try_out
 
     if args.degrees > FARTHEST_DEG:
         raise WrongUse(f"--degrees is {args.degrees:g}, expected at most {FARTHEST_DEG:g} for a careful test")

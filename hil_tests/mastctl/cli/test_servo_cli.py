@@ -13,8 +13,9 @@ from typing import Any
 import pytest
 
 from drivers.clock import SystemClock
-from drivers.dynamixel import workshop
+from drivers.dynamixel import models, trial
 from drivers.dynamixel.link import Link
+from drivers.errors import HardwareFault, OutOfRange, WrongDevice
 from drivers.sim.pan_tilt import AxisSettings
 from drivers.sim.wire.axis import WireAxis
 from drivers.sim.wire.dynamixel_bus import DynamixelBus
@@ -209,15 +210,15 @@ def test_test_restores_the_torque_first_and_all_the_rest_whatever_fails(
     servo = bench.servos[0]
     before = dict(servo.table.values)
     link = quiet_link(bench)
-    true_step = workshop._step
+    true_step = trial._step
 
     def step(*how: Any) -> Any:
         deaf_to(bench, monkeypatch, "bus_watchdog", "profile_acceleration")
         return true_step(*how)
 
-    monkeypatch.setattr(workshop, "_step", step)
-    with pytest.raises(workshop.WrongDevice, match="left as it was found in bus_watchdog and profile_acc"):
-        workshop.try_out(link, 1, math.radians(1), 30.0)
+    monkeypatch.setattr(trial, "_step", step)
+    with pytest.raises(WrongDevice, match="left as it was found in bus_watchdog and profile_acc"):
+        trial.try_out(link, 1, math.radians(1), 30.0)
     link.close()
     for name in ("torque_enable", "profile_velocity", "goal_pwm"):
         assert servo.table[name] == before[name], name
@@ -230,12 +231,12 @@ def test_test_says_that_the_torque_may_be_on_and_what_went_wrong_before(
 
     def step(*how: Any) -> Any:
         deaf_to(bench, monkeypatch, "torque_enable")
-        raise workshop.HardwareFault("it is blocked")
+        raise HardwareFault("it is blocked")
 
-    monkeypatch.setattr(workshop, "_step", step)
+    monkeypatch.setattr(trial, "_step", step)
     words = "^it is blocked; and servo 1 is not left as it was found in torque_enable: its torque may be on"
-    with pytest.raises(workshop.WrongDevice, match=words):
-        workshop.try_out(link, 1, math.radians(1), 30.0)
+    with pytest.raises(WrongDevice, match=words):
+        trial.try_out(link, 1, math.radians(1), 30.0)
     link.close()
     assert bench.servos[0].table["goal_pwm"] == 885
 
@@ -245,13 +246,13 @@ def test_a_test_that_is_ended_leaves_the_servo_as_it_was(
     bench: Bench, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, number: signal.Signals
 ) -> None:
     before = dict(bench.servos[0].table.values)
-    true_step = workshop._step
+    true_step = trial._step
 
     def step(*how: Any) -> Any:
         signal.raise_signal(number)
         return true_step(*how)
 
-    monkeypatch.setattr(workshop, "_step", step)
+    monkeypatch.setattr(trial, "_step", step)
     handlers = [signal.getsignal(one) for one in (signal.SIGTERM, signal.SIGHUP)]
     code, _, err = run(capsys, "test", bench.line.path, "1", "--baud", BAUD, "--degrees", "3")
     assert code == 128 + number, err
@@ -290,9 +291,9 @@ def test_a_second_ctrl_c_leaves_nothing_unrestored(
         raise KeyboardInterrupt
 
     monkeypatch.setattr(link, "write", write)
-    monkeypatch.setattr(workshop, "_step", step)
+    monkeypatch.setattr(trial, "_step", step)
     with pytest.raises(KeyboardInterrupt):
-        workshop.try_out(link, 1, math.radians(1), 30.0)
+        trial.try_out(link, 1, math.radians(1), 30.0)
     link.close()
     for name in ("torque_enable", "profile_velocity", "profile_acceleration", "goal_pwm", "bus_watchdog"):
         assert servo.table[name] == before[name], name
@@ -307,10 +308,10 @@ def test_a_servo_that_ctrl_c_could_not_leave_as_it_was_is_told(
         deaf_to(bench, monkeypatch, "torque_enable")
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(workshop, "_step", step)
+    monkeypatch.setattr(trial, "_step", step)
     words = "^interrupted; and servo 1 is not left as it was found in torque_enable: its torque may be on"
-    with pytest.raises(workshop.WrongDevice, match=words):
-        workshop.try_out(link, 1, math.radians(1), 30.0)
+    with pytest.raises(WrongDevice, match=words):
+        trial.try_out(link, 1, math.radians(1), 30.0)
     link.close()
 
 
@@ -330,7 +331,7 @@ def test_test_begins_only_when_it_is_certain_to_be_slow_and_weak(
         true_write(servo_id, register, value)
 
     monkeypatch.setattr(link, "write", write)
-    workshop.try_out(link, 1, math.radians(1), 30.0)
+    trial.try_out(link, 1, math.radians(1), 30.0)
     link.close()
     slow_and_weak = {"goal_pwm": 266, "profile_velocity": 8, "profile_acceleration": 3}  # 0.2 rad/s, 1 rad/s2
     assert {name: at_torque[name] for name in slow_and_weak} == slow_and_weak
@@ -339,15 +340,15 @@ def test_test_begins_only_when_it_is_certain_to_be_slow_and_weak(
 def test_test_stops_at_its_fence(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
     # A servo that does not stand where it was sent: here one whose place is misread by 100 counts.
     link = Link(bench.line.path, int(BAUD))
-    true_decode = workshop.Block.decode
+    true_decode = models.Block.decode
 
-    def misread(block: workshop.Block, data: bytes) -> dict[str, int]:
+    def misread(block: models.Block, data: bytes) -> dict[str, int]:
         values = true_decode(block, data)
         return {**values, "present_position": values["present_position"] + 100}
 
-    monkeypatch.setattr(workshop.Block, "decode", misread)
-    with pytest.raises(workshop.OutOfRange, match="left the fence"):
-        workshop.try_out(link, 1, math.radians(3), 30.0)
+    monkeypatch.setattr(models.Block, "decode", misread)
+    with pytest.raises(OutOfRange, match="left the fence"):
+        trial.try_out(link, 1, math.radians(3), 30.0)
     link.close()
     assert bench.servos[0].table["torque_enable"] == 0
 
