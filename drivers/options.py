@@ -32,7 +32,9 @@ class OptionReader:
     known, needed
         The keys that may, and that must, be there.
     place
-        What stands before a key in a refusal: empty, or ``pan.`` for the options of the axis.
+        What stands before a key in a refusal, such as ``options.pan.``.
+    device
+        The device's name in refusals.
 
     Raises
     ------
@@ -41,32 +43,45 @@ class OptionReader:
     """
 
     def __init__(
-        self, values: Mapping[str, Any], known: Iterable[str], needed: Iterable[str] = (), place: str = ""
+        self,
+        values: Mapping[str, Any],
+        known: Iterable[str],
+        needed: Iterable[str] = (),
+        place: str = "options.",
+        device: str = "",
     ) -> None:
         self.values = values
         self._place = place
+        self._device = device
         known = tuple(known)
         for key in values:
             if key not in known:
-                raise BadOptions(f"options.{place}{key}: there is no such option{nearest(str(key), known)}")
+                raise self.refused(key, f": there is no such option{nearest(str(key), known)}")
         for key in needed:
             if key not in values:
-                raise BadOptions(f"options.{place}{key} is missing")
+                raise self.refused(key, " is missing")
 
     def bad(self, key: str, expected: str) -> BadOptions:
         """Return the refusal of a key's value."""
-        value = self.values.get(key)
-        return BadOptions(f"options.{self._place}{key} is {value!r}, expected {expected}")
+        return self.refused(key, f" is {self.values.get(key)!r}, expected {expected}")
 
-    def section(self, key: str, expected: str, known: Iterable[str], needed: Iterable[str]) -> OptionReader:
+    def refused(self, key: str, words: str) -> BadOptions:
+        """Return the refusal of a key, told in words that follow its name."""
+        return BadOptions(f"{self._place}{key}{words}", device=self._device)
+
+    def section(
+        self, key: str, expected: str, known: Iterable[str], needed: Iterable[str] = ()
+    ) -> OptionReader:
         """Return the reader of the mapping that a key holds."""
         value = self.values[key]
         if not isinstance(value, Mapping):
             raise self.bad(key, expected)
-        return OptionReader(value, known, needed, f"{self._place}{key}.")
+        return OptionReader(value, known, needed, f"{self._place}{key}.", self._device)
 
-    def text(self, key: str, expected: str) -> str:
-        """Return a text that is not blank."""
+    def text(self, key: str, expected: str, default: Any = None) -> Any:
+        """Return a text that is not blank, or the default where the key is left out."""
+        if key not in self.values:
+            return default
         value = self.values[key]
         if not isinstance(value, str) or not value.strip():
             raise self.bad(key, expected)
@@ -81,9 +96,11 @@ class OptionReader:
             raise self.bad(key, f"a number from {low:g} to {high:g}")
         return float(value)
 
-    def whole(self, key: str, default: int, low: int, high: int) -> int:
-        """Return a whole number within bounds."""
-        value = self.values.get(key, default)
+    def whole(self, key: str, default: Any, low: int, high: int) -> Any:
+        """Return a whole number within bounds, or the default where the key is left out."""
+        if key not in self.values:
+            return default
+        value = self.values[key]
         if not is_whole(value) or not low <= value <= high:
             raise self.bad(key, f"a whole number from {low} to {high}")
         return value

@@ -22,9 +22,9 @@ from typing import Any
 
 from drivers.clock import Clock
 from drivers.errors import BadOptions, DriverError, NoFreshFrame
-from drivers.faults import PAN_TILT, nearest
+from drivers.faults import PAN_TILT
 from drivers.interfaces import Camera, Frame, FrameTime, Image, PanTilt, Reading
-from drivers.options import is_number
+from drivers.options import OptionReader
 from drivers.recording import Pointing, read_folder, read_products
 
 TOLERANCE_RAD = 0.002
@@ -81,28 +81,25 @@ def open_replay(options: Mapping[str, Any], folder: Path, clock: Clock) -> Repla
     BadOptions
         For unknown or missing options and recordings that cannot be read.
     """
-    for key in options:
-        if key not in OPTIONS:
-            raise BadOptions(f"driver 'replay' has no option {key!r}{nearest(key, OPTIONS)}", device="replay")
+    read = OptionReader(options, OPTIONS, device="replay")
     if ("products" in options) == ("frames" in options):
-        raise BadOptions("either 'products' or 'frames' is expected among the options", device="replay")
-    tolerance_rad = _number(options, "tolerance_rad", TOLERANCE_RAD)
-    grey_range_dn = _grey_range(options)
+        raise BadOptions("either options.products or options.frames is expected", device="replay")
+    tolerance_rad = read.number("tolerance_rad", TOLERANCE_RAD, 1e-9, 1000.0)
+    grey_range_dn = None
+    if options.get("grey_range_dn") is not None:
+        grey_range_dn = read.pair("grey_range_dn", "[low, high]")
+        if not grey_range_dn[0] < grey_range_dn[1]:
+            raise read.bad("grey_range_dn", "[low, high], low below high")
     if "products" in options:
-        camera = options.get("camera")
-        if not isinstance(camera, str) or not camera:
-            raise BadOptions(
-                "'camera' is expected: the name that the products' frames go by", device="replay"
-            )
-        pointings = read_products(_files(options["products"], folder), camera, grey_range_dn)
+        camera = read.text("camera", "the name that the products' frames go by")
+        if camera is None:
+            raise read.refused("camera", " is missing: the name that the products' frames go by")
+        pointings = read_products(_files(read, folder), camera, grey_range_dn)
     else:
         if "camera" in options:
-            raise BadOptions(
-                "'camera' goes with 'products'; the table 'frames' names its own", device="replay"
-            )
-        if not isinstance(options["frames"], str):
-            raise BadOptions("'frames' is the path of a CSV file", device="replay")
-        pointings = read_folder(folder / options["frames"], grey_range_dn)
+            raise read.refused("camera", " goes with products; the table 'frames' names its own")
+        table = read.text("frames", "the path of a CSV file")
+        pointings = read_folder(folder / table, grey_range_dn)
     if not pointings:
         raise BadOptions("the recording is empty", device="replay")
     head = ReplayedHead(pointings, tolerance_rad, clock)
@@ -247,33 +244,15 @@ class ReplayedCamera:
         return Frame(image, sequence, begin_s + EXPOSURE_S / 2, EXPOSURE_S)
 
 
-def _files(products: Any, folder: Path) -> list[Path]:
-    """The files that the option names: a list, or a pattern whose matches are sorted by name."""
+def _files(read: OptionReader, folder: Path) -> list[Path]:
+    """The files that the option ``products`` names: a list, or a pattern whose matches are sorted by name."""
+    products = read.values["products"]
     if isinstance(products, str):
         pattern = folder / products
         found = sorted(pattern.parent.glob(pattern.name))
         if not found:
-            raise BadOptions(f"no file matches the pattern {str(pattern)!r}", device="replay")
+            raise read.refused("products", f": no file matches the pattern {str(pattern)!r}")
         return found
-    if isinstance(products, (list, tuple)) and all(isinstance(name, str) for name in products):
+    if isinstance(products, list | tuple) and all(isinstance(name, str) for name in products):
         return [folder / name for name in products]
-    raise BadOptions("'products' is a list of files or a pattern", device="replay")
-
-
-def _number(options: Mapping[str, Any], key: str, default: float) -> float:
-    """A positive number among the options."""
-    value = options.get(key, default)
-    if not is_number(value) or not value > 0:
-        raise BadOptions(f"{key!r} is {value!r} where a number above 0 is expected", device="replay")
-    return float(value)
-
-
-def _grey_range(options: Mapping[str, Any]) -> tuple[float, float] | None:
-    """The option ``grey_range_dn``."""
-    value = options.get("grey_range_dn")
-    if value is None:
-        return None
-    numbers = value if isinstance(value, (list, tuple)) else ()
-    if len(numbers) != 2 or not all(is_number(number) for number in numbers) or not numbers[0] < numbers[1]:
-        raise BadOptions(f"'grey_range_dn' is {value!r} where [low, high] is expected", device="replay")
-    return float(numbers[0]), float(numbers[1])
+    raise read.bad("products", "a list of files or a pattern")

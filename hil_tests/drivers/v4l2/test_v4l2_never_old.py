@@ -227,13 +227,13 @@ def test_a_stamp_a_little_ahead_of_the_clock_tells_nothing_later_than_the_clock(
     [
         (
             {"exposure_s": 0.1, "rate_hz": 25.0},
-            r"'exposure_s' is 0.1 s, longer than a frame at 'rate_hz' 25 \(0.04 s\)",
+            r"options.exposure_s is 0.1 s, longer than a frame at rate_hz 25 \(0.04 s\)",
         ),
         (
             {"exposure_s": 0.01, "rate_hz": 25.0, "auto_exposure": {"longest_s": 0.05}},
-            r"'auto_exposure.longest_s' is 0.05 s, longer than a frame at 'rate_hz' 25 \(0.04 s\)",
+            r"options.auto_exposure.longest_s is 0.05 s, longer than a frame at rate_hz 25 \(0.04 s\)",
         ),
-        ({"exposure_s": 0.04}, r"'exposure_s' is 0.04 s, longer than a frame at 'rate_hz' 30"),
+        ({"exposure_s": 0.04}, r"options.exposure_s is 0.04 s, longer than a frame at rate_hz 30"),
     ],
 )
 def test_an_exposure_longer_than_a_frame_is_refused(options: dict[str, object], message: str) -> None:
