@@ -8,31 +8,26 @@ from __future__ import annotations
 
 import importlib
 import logging
-import threading
-import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator
 from concurrent.futures import wait
 from contextlib import contextmanager
-from dataclasses import dataclass, field
 from functools import partial
-from pathlib import Path
-from types import MappingProxyType, TracebackType
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 from drivers.absent_camera import AbsentCamera, Opening, begin_opening, let_go
 from drivers.camera_offset import corrected
 from drivers.clock import Clock, SystemClock
 from drivers.errors import BadOptions, DriverError, NoReply
 from drivers.faults import PAN_TILT, nearest
+from drivers.hardware import DeviceSettings, Hardware, HardwareSettings, Kind, close_devices
 from drivers.interfaces import Camera, PanTilt
+from drivers.outside import device_from_outside
 from drivers.simulation_clock import SimulationClock, simulation_speed
 
 if TYPE_CHECKING:
     from drivers.sim.rover import SimulatedRover
 
 log = logging.getLogger(__name__)
-
-Kind = Literal["real", "simulated", "replayed", "mixed"]
 
 HEADS = {"dynamixel": "drivers.dynamixel.head", "flir_ptu": "drivers.flir_ptu.head"}
 """Pan/tilt drivers of this repository: the module whose ``open_head(options, clock)`` opens them."""
@@ -45,98 +40,8 @@ BUILT_IN = (*HEADS, "v4l2", *OURS)
 OPENING_PATIENCE_S = 5.0
 """A device that takes longer to open is named; if it is a camera, the others go on without it."""
 
-CLOSING_PATIENCE_S = 0.5
-"""After that the next device is closed beside one that is not closed yet."""
-
-CLOSING_S = 10.0
-"""Devices that are not closed by then are left behind, so that a driver that hangs holds no command's end."""
-
 HEAD_OPENING_S = 60.0
 """A head that takes longer to open is refused: without its readings nothing can be done."""
-
-
-@dataclass(frozen=True)
-class DeviceSettings:
-    """A device as a configuration names it: the driver, and its options.
-
-    ``offset_s`` is for cameras: how much later than its stamps say mid-exposure is, as it was measured.
-    """
-
-    driver: str
-    options: Mapping[str, Any] = field(default_factory=dict)
-    offset_s: float = 0.0
-
-
-@dataclass(frozen=True)
-class HardwareSettings:
-    """All devices of a configuration.
-
-    Attributes
-    ----------
-    pan_tilt
-        The head.
-    cameras
-        Cameras by name, as in the mast file.
-    simulation
-        The ``simulation`` section, which makes the one rover that all ``sim`` devices share.
-    folder
-        Where relative paths in options start: the configuration's folder.
-    """
-
-    pan_tilt: DeviceSettings
-    cameras: Mapping[str, DeviceSettings]
-    simulation: Mapping[str, Any] = field(default_factory=dict)
-    folder: Path = Path()
-
-
-class Hardware:
-    """Open devices. A context manager: leaving it closes them, the head first.
-
-    Attributes
-    ----------
-    pan_tilt, cameras
-        The devices.
-    kind
-        ``real``, ``simulated``, ``replayed``, or ``mixed``. Drivers from outside count as real, if they do
-        not say otherwise (`drivers.interfaces.SaysSimulated`).
-    simulation
-        The simulated rover behind ``sim`` devices, or None; only for experiments, tests and faults.
-    """
-
-    def __init__(
-        self,
-        pan_tilt: PanTilt,
-        cameras: Mapping[str, Camera],
-        kinds: Mapping[str, Kind | None],
-        simulation: SimulatedRover | None = None,
-    ) -> None:
-        self.pan_tilt = pan_tilt
-        self.cameras = MappingProxyType(dict(cameras))
-        self._kinds = dict(kinds)
-        self.simulation = simulation
-
-    @property
-    def kind(self) -> Kind:
-        """What the devices are, together."""
-        devices = {PAN_TILT: self.pan_tilt, **self.cameras}
-        found = {self._kinds.get(name) or _own_word(device) for name, device in devices.items()}
-        return found.pop() if len(found) == 1 else "mixed"
-
-    def close(self) -> None:
-        """Close every device; one that fails to is logged and does not keep the others open."""
-        devices = {PAN_TILT: self.pan_tilt, **self.cameras}
-        _close(devices if self.simulation is None else {**devices, "simulated rover": self.simulation})
-
-    def __enter__(self) -> Hardware:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
-        self.close()
 
 
 def clock_for(settings: HardwareSettings) -> Clock:
@@ -189,7 +94,7 @@ def open_hardware(settings: HardwareSettings, clock: Clock | None = None) -> Har
         for name, device in settings.cameras.items():
             devices[name] = opener.camera(name, device)
     except BaseException:
-        _close(devices if opener.rover is None else {**devices, "simulated rover": opener.rover})
+        close_devices(devices if opener.rover is None else {**devices, "simulated rover": opener.rover})
         raise
     pan_tilt = devices.pop(PAN_TILT)
     return Hardware(pan_tilt, devices, opener.kinds, opener.rover)
@@ -210,10 +115,10 @@ def open_one_camera(settings: HardwareSettings, name: str, clock: Clock | None =
         try:
             yield camera
         finally:
-            _close({name: camera})
+            close_devices({name: camera})
     finally:
         if opener.rover is not None:
-            _close({"simulated rover": opener.rover})
+            close_devices({"simulated rover": opener.rover})
 
 
 class _Opener:
@@ -278,7 +183,7 @@ class _Opener:
         """Open one device and check that it does what the protocol asks."""
         if ":" in device.driver:
             self.kinds[name] = None
-            return _from_outside(name, device, protocol)
+            return device_from_outside(name, device, protocol)
         if device.driver == "sim":
             self.kinds[name] = "simulated"
             return self._simulated(name, device)
@@ -354,80 +259,3 @@ class _Opener:
 def _ended(opening: Opening, within_s: float) -> bool:
     """Wait for an opening; return whether it has ended."""
     return bool(wait([opening], within_s).done)
-
-
-def _factory(name: str, driver: str) -> Callable[..., Any]:
-    """The callable that ``package.module:factory`` names."""
-    module_name, _, attribute = driver.partition(":")
-    try:
-        found: Any = importlib.import_module(module_name)
-    except (Exception, SystemExit) as error:  # whatever a foreign module does while it is imported
-        raise BadOptions(
-            f"driver {driver!r}: cannot import {module_name!r} ({_one_line(error)})", device=name
-        ) from error
-    for part in attribute.split("."):
-        if not hasattr(found, part):
-            raise BadOptions(f"driver {driver!r}: {module_name!r} has no {attribute!r}", device=name)
-        found = getattr(found, part)
-    if not callable(found):
-        raise BadOptions(f"driver {driver!r}: {attribute!r} cannot be called", device=name)
-    factory: Callable[..., Any] = found
-    return factory
-
-
-def _from_outside(name: str, device: DeviceSettings, protocol: type) -> Any:
-    """A device made by a factory that is not in this repository."""
-    factory = _factory(name, device.driver)
-    try:
-        made = factory(**device.options)
-    except DriverError:
-        raise
-    except (Exception, SystemExit) as error:  # a foreign factory may raise anything: one sentence tells it
-        raise BadOptions(
-            f"driver {device.driver!r} refuses the options {dict(device.options)!r} ({_one_line(error)})",
-            device=name,
-        ) from error
-    wanted = [m for m in ("read", "move", "stop", "next_frame", "close") if hasattr(protocol, m)]
-    missing = [method for method in wanted if not callable(getattr(made, method, None))]
-    if missing:
-        raise BadOptions(
-            f"driver {device.driver!r} made a {type(made).__name__} without {', '.join(missing)}", device=name
-        )
-    return made
-
-
-def _own_word(device: object) -> Kind:
-    """What a device from outside says that it is."""
-    if isinstance(device, AbsentCamera):
-        device = device.camera
-    try:
-        return "simulated" if getattr(device, "simulated", False) is True else "real"
-    except Exception:  # a property of somebody else's: what cannot be told is taken as real
-        return "real"
-
-
-def _one_line(error: BaseException) -> str:
-    """An error as one line."""
-    return " ".join(f"{type(error).__name__}: {error}".split())
-
-
-def _close(devices: Mapping[str, Any]) -> None:
-    """Close devices in this order, whatever some of them do; one that takes long keeps no other open."""
-
-    def close(name: str, device: Any) -> None:
-        try:
-            device.close()
-        except BaseException:  # whatever a foreign driver raises, SystemExit too: there is only the log
-            log.exception("%s did not close", name)
-
-    until_s = time.monotonic() + CLOSING_S
-    closing = {}
-    for name, device in devices.items():
-        thread = threading.Thread(target=close, args=(name, device), name=f"closing {name}", daemon=True)
-        closing[name] = thread
-        thread.start()
-        thread.join(CLOSING_PATIENCE_S)
-    for name, thread in closing.items():
-        thread.join(max(0.0, until_s - time.monotonic()))
-        if thread.is_alive():
-            log.error("%s is not closed yet and is left behind", name)

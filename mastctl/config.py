@@ -17,7 +17,7 @@ from calib.files.strict import Section, nearest
 from calib.files.yaml_text import parse_mapping
 from calib.mast.rig import Rig
 from drivers.camera_offset import MOST_OFFSET_S
-from drivers.open_hardware import DeviceSettings, HardwareSettings
+from drivers.hardware import DeviceSettings, HardwareSettings
 from mastctl.devices.limits import Limits
 from mastctl.packaged import default_config
 from mastctl.tracking.choice import HandoffRules, PairBounds

@@ -24,7 +24,7 @@ from typing import Any
 import uvicorn
 
 from drivers.clock import Clock
-from drivers.open_hardware import Hardware
+from drivers.hardware import Hardware
 from mastctl import signals
 from mastctl.config import Config, Listen
 from mastctl.errors import MastctlError

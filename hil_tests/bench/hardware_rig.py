@@ -17,8 +17,9 @@ from typing import Any
 import numpy as np
 
 from drivers.faults import FaultPanel
+from drivers.hardware import DeviceSettings, HardwareSettings
 from drivers.interfaces import PanTilt, Reading
-from drivers.open_hardware import DeviceSettings, HardwareSettings, open_hardware
+from drivers.open_hardware import open_hardware
 from mastctl.config import Config, load_config
 from mastctl.pointing.settings import PointingSettings
 from tools.campaigns.servo_rigs import LIMITS_RAD, Rig

@@ -12,8 +12,9 @@ import numpy as np
 import pytest
 
 from drivers.camera_offset import corrected
+from drivers.hardware import DeviceSettings, HardwareSettings
 from drivers.interfaces import Camera, Frame, FrameTime, HoldsExposure, KnowsSize, Paced, Reading
-from drivers.open_hardware import DeviceSettings, HardwareSettings, open_hardware
+from drivers.open_hardware import open_hardware
 
 IMAGE = np.full((4, 6), 90, np.uint8)
 

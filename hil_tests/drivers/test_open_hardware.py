@@ -13,11 +13,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from drivers import open_hardware as open_hardware_module
+from drivers import hardware as hardware_module
 from drivers.clock import ManualClock
 from drivers.errors import BadOptions, DriverError, LineLost, NoReply
+from drivers.hardware import DeviceSettings, Hardware, HardwareSettings
 from drivers.interfaces import Frame, Reading
-from drivers.open_hardware import DeviceSettings, Hardware, HardwareSettings, open_hardware
+from drivers.open_hardware import open_hardware
 
 SIM = DeviceSettings("sim")
 
@@ -345,7 +346,7 @@ def test_a_head_that_hangs_while_it_is_closed_keeps_no_refusal_of_a_camera(
         def close(self) -> None:
             go.wait(30.0)
 
-    monkeypatch.setattr(open_hardware_module, "CLOSING_S", 0.1)
+    monkeypatch.setattr(hardware_module, "CLOSING_S", 0.1)
     monkeypatch.setattr(sys.modules["outside_drivers"], "Slow", Slow, raising=False)
     settings = HardwareSettings(
         DeviceSettings("outside_drivers:Slow"), {"cam_left": DeviceSettings("outside_drivers:nothing")}

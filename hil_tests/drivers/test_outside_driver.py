@@ -18,8 +18,9 @@ from calib.files.mast_file import load_rig
 from calib.mast.pointing import solve
 from drivers.clock import SystemClock
 from drivers.errors import BadOptions, NoFreshFrame, NoReply
+from drivers.hardware import DeviceSettings, Hardware, HardwareSettings
 from drivers.interfaces import Camera, Frame, PanTilt
-from drivers.open_hardware import DeviceSettings, Hardware, HardwareSettings, open_hardware
+from drivers.open_hardware import open_hardware
 from mastctl.devices.devices import Devices
 from mastctl.devices.limits import Limits
 from mastctl.pointing.loop import (

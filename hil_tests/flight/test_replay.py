@@ -13,7 +13,8 @@ from calib.mast.pointing import solve
 from calib.pictures.patch_match import match_patch
 from calib.pictures.warp import Plane, grey
 from drivers.clock import ManualClock
-from drivers.open_hardware import DeviceSettings, HardwareSettings, open_hardware
+from drivers.hardware import DeviceSettings, HardwareSettings
+from drivers.open_hardware import open_hardware
 from drivers.replay import NoRecording
 
 FOUND_PX = 3.0

@@ -14,7 +14,8 @@ import numpy as np
 
 from calib.files.mast_file import StoredRig
 from drivers.clock import Clock, SystemClock
-from drivers.open_hardware import Hardware, open_hardware
+from drivers.hardware import Hardware
+from drivers.open_hardware import open_hardware
 from mastctl.config import Config
 from mastctl.devices.devices import HEAD, Devices
 from mastctl.devices.frames import StampedFrame, check_known

@@ -31,7 +31,8 @@ from calib.files.mast_file import load_rig
 from calib.mast.rig import Rig
 from calib.pictures.shown_view import Posed, shown_view
 from drivers.clock import ManualClock
-from drivers.open_hardware import DeviceSettings, HardwareSettings, open_hardware
+from drivers.hardware import DeviceSettings, HardwareSettings
+from drivers.open_hardware import open_hardware
 from mastctl.cli.output import at_least
 from mastctl.packaged import config_folder
 from tools.arguments import end

@@ -14,8 +14,9 @@ import pytest
 from drivers.clock import ManualClock
 from drivers.errors import BadOptions, DriverError
 from drivers.faults import PAN_TILT
+from drivers.hardware import DeviceSettings, HardwareSettings
 from drivers.interfaces import Reading
-from drivers.open_hardware import DeviceSettings, HardwareSettings, open_hardware
+from drivers.open_hardware import open_hardware
 from drivers.sim.render import Renderer
 from drivers.sim.rover import SimulatedRover, simulation_settings
 from drivers.sim.scene import Scene

@@ -18,8 +18,9 @@ from calib.files.mast_file import load_rig, save_rig
 from calib.mast.rig import Rig, RigCamera
 from drivers.clock import ManualClock
 from drivers.faults import CAMERA_WORDS, HEAD_WORDS
+from drivers.hardware import DeviceSettings, Hardware, HardwareSettings
 from drivers.interfaces import Reading
-from drivers.open_hardware import DeviceSettings, Hardware, HardwareSettings, open_hardware
+from drivers.open_hardware import open_hardware
 from hil_tests.mastctl.pointing.pointing_world import SIZE_PX, World, click, rig, run
 from mastctl.devices.devices import RESTING_PERIOD_S, Devices
 from mastctl.devices.limits import Limits
