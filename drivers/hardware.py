@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-Kind = Literal["real", "simulated", "replayed", "mixed"]
+HardwareKind = Literal["real", "simulated", "replayed", "mixed"]
 
 CLOSING_PATIENCE_S = 0.5
 """After that the next device is closed beside one that is not closed yet."""
@@ -81,7 +81,7 @@ class Hardware:
         self,
         pan_tilt: PanTilt,
         cameras: Mapping[str, Camera],
-        kinds: Mapping[str, Kind | None],
+        kinds: Mapping[str, HardwareKind | None],
         simulation: SimulatedRover | None = None,
     ) -> None:
         self.pan_tilt = pan_tilt
@@ -90,7 +90,7 @@ class Hardware:
         self.simulation = simulation
 
     @property
-    def kind(self) -> Kind:
+    def kind(self) -> HardwareKind:
         """What the devices are, together."""
         devices = {PAN_TILT: self.pan_tilt, **self.cameras}
         found = {self._kinds.get(name) or _own_word(device) for name, device in devices.items()}
@@ -113,7 +113,7 @@ class Hardware:
         self.close()
 
 
-def _own_word(device: object) -> Kind:
+def _own_word(device: object) -> HardwareKind:
     """What a device from outside says that it is."""
     if isinstance(device, AbsentCamera):
         device = device.camera

@@ -19,7 +19,7 @@ from drivers.camera_offset import corrected
 from drivers.clock import Clock, SystemClock
 from drivers.errors import BadOptions, DriverError, NoReply
 from drivers.faults import PAN_TILT, nearest
-from drivers.hardware import DeviceSettings, Hardware, HardwareSettings, Kind, close_devices
+from drivers.hardware import DeviceSettings, Hardware, HardwareKind, HardwareSettings, close_devices
 from drivers.interfaces import Camera, PanTilt
 from drivers.outside import device_from_outside
 from drivers.simulation_clock import SimulationClock, simulation_speed
@@ -127,7 +127,7 @@ class _Opener:
     def __init__(self, settings: HardwareSettings, clock: Clock) -> None:
         self._settings = settings
         self._clock = clock
-        self.kinds: dict[str, Kind | None] = {}
+        self.kinds: dict[str, HardwareKind | None] = {}
         """By device; None for one that says so itself, or not at all."""
         self._replays: dict[str, Any] = {}
         self.rover: SimulatedRover | None = None

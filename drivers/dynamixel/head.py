@@ -25,7 +25,7 @@ from drivers.dynamixel.bus import Bus
 from drivers.dynamixel.hardware_errors import Reboots
 from drivers.dynamixel.pair import ready_pair
 from drivers.dynamixel.session import Session
-from drivers.dynamixel.settings import HeadSettings, head_settings
+from drivers.dynamixel.settings import DynamixelSettings, dynamixel_settings
 from drivers.dynamixel.watch import GivenUp
 from drivers.errors import DriverError, LineLost, NoReply, OutOfRange
 from drivers.interfaces import AxisReport, Reading, Reporting
@@ -39,7 +39,7 @@ AXES = ("pan", "tilt")
 
 
 def open_head(options: Mapping[str, Any], clock: Clock | None = None) -> DynamixelHead:
-    """Open the head that the options of ``driver: dynamixel`` describe; see `settings.HeadSettings`.
+    """Open the head that the options of ``driver: dynamixel`` describe; see `settings.DynamixelSettings`.
 
     Raises
     ------
@@ -48,7 +48,7 @@ def open_head(options: Mapping[str, Any], clock: Clock | None = None) -> Dynamix
     LineLost, NoReply, WrongDevice, HardwareFault, Refused
         If the servos cannot be reached or do not fit; the line is closed again.
     """
-    return DynamixelHead(head_settings(options), clock)
+    return DynamixelHead(dynamixel_settings(options), clock)
 
 
 class DynamixelHead(Reporting):
@@ -67,7 +67,7 @@ class DynamixelHead(Reporting):
         As `open_head`.
     """
 
-    def __init__(self, settings: HeadSettings, clock: Clock | None = None) -> None:
+    def __init__(self, settings: DynamixelSettings, clock: Clock | None = None) -> None:
         self.settings = settings
         self._clock = clock or SystemClock()
         self._reboots = Reboots()

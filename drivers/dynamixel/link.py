@@ -17,7 +17,6 @@ from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 
-from drivers.dynamixel.counters import Counters
 from drivers.dynamixel.exchange import Exchange
 from drivers.dynamixel.group import (
     GroupAnswer,
@@ -31,6 +30,7 @@ from drivers.dynamixel.group import (
 from drivers.dynamixel.models import Register
 from drivers.dynamixel.packets import BROADCAST_ID, PING, REBOOT, WRITE, Status, instruction_packet
 from drivers.dynamixel.port import QUIET_S, Port
+from drivers.dynamixel.tick_counters import TickCounters
 from drivers.errors import BadReply, DriverError, LineLost, Refused
 
 REPLY_TIMEOUT_S = 0.05  # USB adapters hold bytes back for up to 16 ms, the servo for up to 0.5 ms
@@ -84,7 +84,7 @@ class Link:
         self.name = port
         self._port = Port(port, baud, reply_timeout_s, urgent)
         self.exchange = Exchange(self._port)
-        self._counters = Counters(self.exchange)
+        self._counters = TickCounters(self.exchange)
         self._group_questions: dict[tuple[bool, tuple[Part, ...]], GroupQuestion] = {}
 
     @property

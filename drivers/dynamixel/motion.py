@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 from drivers.approach import legs_to
 from drivers.dynamixel.models import Block
-from drivers.dynamixel.settings import AxisSettings
+from drivers.dynamixel.settings import ServoAxisSettings
 from drivers.errors import BadReply
 from drivers.interfaces import AxisReport, Side
 
@@ -19,7 +19,7 @@ STUCK_S = 1.0
 IN_POSITION_BIT, PROFILE_BIT = 0x01, 0x02
 
 
-def motion_blocks(settings: AxisSettings) -> tuple[Block, ...]:
+def motion_blocks(settings: ServoAxisSettings) -> tuple[Block, ...]:
     """Return what is read of a servo all the time, by turns: from its goals to its temperature.
 
     They differ in length, so that a reply to one of the last questions is none to the next.
@@ -52,7 +52,7 @@ class Truth:
     That a sample is of its question is seen by the link (`drivers.dynamixel.counter`).
     """
 
-    def __init__(self, name: str, settings: AxisSettings) -> None:
+    def __init__(self, name: str, settings: ServoAxisSettings) -> None:
         self._name = name
         self._settings = settings
         self._last: Sample | None = None
@@ -94,7 +94,7 @@ class AxisMotion:
         How long it must stand.
     """
 
-    def __init__(self, name: str, settings: AxisSettings, settle_s: float) -> None:
+    def __init__(self, name: str, settings: ServoAxisSettings, settle_s: float) -> None:
         self.name = name
         self.settings = settings
         self._settle_s = settle_s

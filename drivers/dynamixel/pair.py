@@ -16,7 +16,7 @@ from drivers.dynamixel.link import Link
 from drivers.dynamixel.models import Block
 from drivers.dynamixel.motion import AxisMotion, Sample, motion_blocks
 from drivers.dynamixel.servo import Servo
-from drivers.dynamixel.settings import AxisSettings, HeadSettings
+from drivers.dynamixel.settings import DynamixelSettings, ServoAxisSettings
 from drivers.errors import DriverError, LineLost
 
 log = logging.getLogger(__name__)
@@ -26,7 +26,7 @@ STAND_ROUNDS = 2
 BRAKE_COPIES = 3  # more than a reply of 54 bytes can collide with
 
 
-class Axis:
+class ServoAxis:
     """One axis while its servo is at hand.
 
     Parameters
@@ -48,7 +48,7 @@ class Axis:
         Of its profile, as the servo rounds it.
     """
 
-    def __init__(self, link: Link, name: str, settings: AxisSettings, head: HeadSettings) -> None:
+    def __init__(self, link: Link, name: str, settings: ServoAxisSettings, head: DynamixelSettings) -> None:
         self.settings = settings
         self.servo = Servo(link, name, settings, head)
         self.motion = AxisMotion(self.servo.name, settings, head.settle_s)
@@ -106,8 +106,8 @@ class Pair:
         Whether both servos are read by the fast group read.
     """
 
-    def __init__(self, link: Link, head: HeadSettings) -> None:
-        self.axes = (Axis(link, "pan", head.pan, head), Axis(link, "tilt", head.tilt, head))
+    def __init__(self, link: Link, head: DynamixelSettings) -> None:
+        self.axes = (ServoAxis(link, "pan", head.pan, head), ServoAxis(link, "tilt", head.tilt, head))
         self.link = link
         self.fast = False
         self._head = head
@@ -141,7 +141,7 @@ class Pair:
             axis.servo.truth.check(sample)
         return samples
 
-    def sample(self, axis: Axis) -> Sample:
+    def sample(self, axis: ServoAxis) -> Sample:
         """Return what one servo says about its motion now, asking it alone; raises as `samples`."""
         return axis.servo.look_once()
 
@@ -227,7 +227,7 @@ class Pair:
         self.link.close()
 
 
-def ready_pair(head: HeadSettings, reboots: Reboots, urgent: Callable[[], bool]) -> Pair:
+def ready_pair(head: DynamixelSettings, reboots: Reboots, urgent: Callable[[], bool]) -> Pair:
     """Open the line and make both servos ready, without moving them: checked, set up, holding, armed.
 
     Without a watchdog an axis may still be under way: each is told to stand first, whatever the other does.

@@ -11,14 +11,14 @@ import itertools
 import logging
 import time
 
-from drivers.dynamixel.control_table import ControlTable, again, identified
 from drivers.dynamixel.group import Part
 from drivers.dynamixel.hardware_errors import Reboots, hardware_fault_words
 from drivers.dynamixel.link import Link
 from drivers.dynamixel.models import MODELS_BY_NUMBER, hardware_error_words
 from drivers.dynamixel.motion import Sample, Truth, motion_blocks
 from drivers.dynamixel.register_words import NO_SECONDARY_ID
-from drivers.dynamixel.settings import AxisSettings, HeadSettings
+from drivers.dynamixel.servo_table import ServoTable, again, identified
+from drivers.dynamixel.settings import DynamixelSettings, ServoAxisSettings
 from drivers.errors import BadReply, DriverError, HardwareFault, NoReply, Refused, WrongDevice
 
 log = logging.getLogger(__name__)
@@ -32,7 +32,7 @@ REBOOT_S = 2.0  # how long a servo may be deaf after a reboot
 COME_TO_REST_S = 0.5
 
 
-class Servo(ControlTable):
+class Servo(ServoTable):
     """One configured servo on an open line.
 
     Parameters
@@ -50,7 +50,7 @@ class Servo(ControlTable):
         What its samples are compared with.
     """
 
-    def __init__(self, link: Link, axis: str, settings: AxisSettings, head: HeadSettings) -> None:
+    def __init__(self, link: Link, axis: str, settings: ServoAxisSettings, head: DynamixelSettings) -> None:
         name = f"{axis} (servo {settings.servo_id})"
         super().__init__(link, settings.servo_id, settings.model.registers, name)
         self._settings = settings
@@ -173,8 +173,8 @@ class Servo(ControlTable):
     def check_place(self) -> int:
         """See that the axis stands within its limits; returns the nearest count that may be its goal.
 
-        A few counts beyond a limit are passed (`AxisSettings.slack_counts`): an axis that holds at its limit
-        droops, and would be locked out for good.
+        A few counts beyond a limit are passed (`ServoAxisSettings.slack_counts`): an axis that holds at its
+        limit droops, and would be locked out for good.
 
         Raises
         ------

@@ -13,9 +13,9 @@ from contextlib import suppress
 
 from drivers.clock import Clock
 from drivers.dynamixel.hardware_errors import Reboots
-from drivers.dynamixel.pair import Axis, Pair
+from drivers.dynamixel.pair import Pair, ServoAxis
 from drivers.dynamixel.servo import WATCHDOG_TRIPPED
-from drivers.dynamixel.settings import HeadSettings
+from drivers.dynamixel.settings import DynamixelSettings
 from drivers.dynamixel.watch import GivenUp, Watch
 from drivers.errors import DriverError, LineLost, NoReply, WatchdogTripped
 from drivers.interfaces import Reading
@@ -47,7 +47,7 @@ class Session:
         When the servos want to be read again, seconds of CLOCK_MONOTONIC.
     """
 
-    def __init__(self, pair: Pair, head: HeadSettings, clock: Clock, reboots: Reboots) -> None:
+    def __init__(self, pair: Pair, head: DynamixelSettings, clock: Clock, reboots: Reboots) -> None:
         self.pair = pair
         self.poll_due_s = 0.0
         self._head = head
@@ -97,7 +97,7 @@ class Session:
         GivenUp
             If a servo has to be rebooted.
         DriverError
-            As `Pair.samples` and `Axis.go_on`.
+            As `Pair.samples` and `ServoAxis.go_on`.
         """
         samples = self.pair.samples()
         now_s = time.monotonic()
@@ -211,9 +211,9 @@ class Session:
         if self._watch.tripped:
             self._watch.end_trip()
 
-    def _stop_each(self) -> dict[Axis, DriverError]:
+    def _stop_each(self) -> dict[ServoAxis, DriverError]:
         """Brake each axis by itself; returns those that did not confirm, and why."""
-        failed: dict[Axis, DriverError] = {}
+        failed: dict[ServoAxis, DriverError] = {}
         try:
             self.pair.brake()
         except LineLost as error:
@@ -232,7 +232,7 @@ class Session:
                     failed.pop(axis, None)
         return failed
 
-    def _confirm(self, axis: Axis) -> None:
+    def _confirm(self, axis: ServoAxis) -> None:
         """See that an axis brakes as it was told, or tell it again; raises as `Pair.samples`, `Servo.set`."""
         motion = axis.motion
         told = motion.goal
@@ -264,7 +264,7 @@ class Session:
         self.pair.close()
 
 
-def _stop_error(pair: Pair, failed: Mapping[Axis, DriverError]) -> DriverError:
+def _stop_error(pair: Pair, failed: Mapping[ServoAxis, DriverError]) -> DriverError:
     """What to tell of a stop that not every axis has confirmed."""
     error = next(iter(failed.values()))
     names = " and ".join(axis.servo.name for axis in failed)

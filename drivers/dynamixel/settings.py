@@ -26,7 +26,7 @@ POLL_BYTES = 20 + 2 * (11 + 43)  # the longer of the two instructions, and two r
 
 
 @dataclass(frozen=True)
-class AxisSettings:
+class ServoAxisSettings:
     """One axis of the head. Angles are the mast's: pan positive to the right, tilt positive up.
 
     Attributes
@@ -105,7 +105,7 @@ class AxisSettings:
 
 
 @dataclass(frozen=True)
-class HeadSettings:
+class DynamixelSettings:
     """A head of two servos on one bus.
 
     Attributes
@@ -130,8 +130,8 @@ class HeadSettings:
     """
 
     port: str
-    pan: AxisSettings
-    tilt: AxisSettings
+    pan: ServoAxisSettings
+    tilt: ServoAxisSettings
     baud: int = 1_000_000
     speed_rad_per_s: float = 1.0
     acceleration_rad_per_s2: float = 4.0
@@ -162,7 +162,7 @@ def _watchdog_counts(watchdog_s: float) -> int:
     return math.floor(watchdog_s / WATCHDOG_STEP_S + 1e-6)
 
 
-def head_settings(options: Mapping[str, Any]) -> HeadSettings:
+def dynamixel_settings(options: Mapping[str, Any]) -> DynamixelSettings:
     """Return the head that the options of ``driver: dynamixel`` describe.
 
     Raises
@@ -215,7 +215,7 @@ def head_settings(options: Mapping[str, Any]) -> HeadSettings:
             f"servos count as {trips_s:.3g} s: one lost reply would stop the head; expected {most_s:.3g} s "
             "or less"
         )
-    return HeadSettings(
+    return DynamixelSettings(
         port=port,
         pan=pan,
         tilt=tilt,
@@ -231,7 +231,7 @@ def head_settings(options: Mapping[str, Any]) -> HeadSettings:
     )
 
 
-def _axis(options: OptionReader, name: str) -> AxisSettings:
+def _axis(options: OptionReader, name: str) -> ServoAxisSettings:
     """One axis of the options."""
     known = {
         "id", "model", "zero_counts", "sign", "limits_rad", "approach", "approach_rad",
@@ -246,7 +246,7 @@ def _axis(options: OptionReader, name: str) -> AxisSettings:
     limits_rad = read.pair("limits_rad", "[low, high] in radians")
     if not limits_rad[0] < limits_rad[1]:
         raise read.bad("limits_rad", "[low, high] with low below high")
-    axis = AxisSettings(
+    axis = ServoAxisSettings(
         servo_id=read.whole("id", 1, 0, 252),
         model=model,
         zero_counts=read.whole("zero_counts", model.centre_count, -(2**31), 2**31 - 1),

@@ -8,9 +8,9 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 
-from drivers.dynamixel.control_table import ControlTable, again
 from drivers.dynamixel.link import Link
 from drivers.dynamixel.models import OPERATING_MODES, Block, Model, hardware_error_words
+from drivers.dynamixel.servo_table import ServoTable, again
 from drivers.dynamixel.workshop import facts, identify, table_of
 from drivers.errors import DriverError, HardwareFault, OutOfRange, WrongDevice
 
@@ -102,7 +102,7 @@ def try_out(link: Link, servo_id: int, amplitude_rad: float, torque_percent: flo
 
 
 def _make_weak_and_slow(
-    table: ControlTable, model: Model, values: Mapping[str, int], torque_percent: float
+    table: ServoTable, model: Model, values: Mapping[str, int], torque_percent: float
 ) -> None:
     """Make where the servo stands its goal, and bound its drive, speed and acceleration."""
     if values["bus_watchdog"]:  # it refuses goals
@@ -144,7 +144,7 @@ def _check_fit(servo_id: int, model: Model, values: Mapping[str, int], reach: in
 
 
 @contextmanager
-def _restored(table: ControlTable, values: Mapping[str, int]) -> Iterator[None]:
+def _restored(table: ServoTable, values: Mapping[str, int]) -> Iterator[None]:
     """Leave the servo as it was found: torque first, then all the rest, whatever of it fails."""
     wrong: BaseException | None = None
     try:
@@ -178,7 +178,7 @@ def _restored(table: ControlTable, values: Mapping[str, int]) -> Iterator[None]:
         raise wrong
 
 
-def _step(link: Link, table: ControlTable, model: Model, goal: int, fence: tuple[int, int]) -> TrialStep:
+def _step(link: Link, table: ServoTable, model: Model, goal: int, fence: tuple[int, int]) -> TrialStep:
     """Watch one short move to its end."""
     block = Block(model.registers, "goal_velocity", "present_temperature")
     began_s = time.monotonic()

@@ -10,9 +10,9 @@ import time
 from collections.abc import Sequence
 
 from drivers.dynamixel.hardware_errors import Reboots, hardware_fault_words
-from drivers.dynamixel.pair import Axis, Pair
+from drivers.dynamixel.pair import Pair, ServoAxis
 from drivers.dynamixel.servo import WATCHDOG_TRIPPED
-from drivers.dynamixel.settings import HeadSettings
+from drivers.dynamixel.settings import DynamixelSettings
 from drivers.errors import BadReply, DriverError, HardwareFault, Refused, WatchdogTripped
 
 log = logging.getLogger(__name__)
@@ -49,7 +49,7 @@ class Watch:
         Whether a watchdog has stopped a motion; latched until `end_trip`.
     """
 
-    def __init__(self, pair: Pair, head: HeadSettings, reboots: Reboots) -> None:
+    def __init__(self, pair: Pair, head: DynamixelSettings, reboots: Reboots) -> None:
         self.tripped = False
         self._pair = pair
         self._head = head
@@ -95,13 +95,13 @@ class Watch:
             for axis, value in zip(self._pair.axes, glanced, strict=True)
         ]
 
-    def _as_left(self, axis: Axis, register: str, value: int) -> bool:
+    def _as_left(self, axis: ServoAxis, register: str, value: int) -> bool:
         """Whether a register is as this driver left it."""
         if register == "bus_watchdog":
             return value == self._head.watchdog_counts
         return bool(value) == axis.motion.holds
 
-    def _judge(self, axis: Axis, register: str, value: int | None) -> None:
+    def _judge(self, axis: ServoAxis, register: str, value: int | None) -> None:
         """Give up if a register is not as it was left."""
         if value is None or axis.hardware_error:
             return  # asked again soon, or known
@@ -128,7 +128,7 @@ class Watch:
         if self._head.watchdog_counts:
             self._looked_s = time.monotonic()
 
-    def arm_axis(self, axis: Axis) -> None:
+    def arm_axis(self, axis: ServoAxis) -> None:
         """Arm one watchdog; raises as `Servo.set`."""
         if self._head.watchdog_counts:
             axis.servo.set("bus_watchdog", self._head.watchdog_counts)
@@ -139,7 +139,7 @@ class Watch:
         self.look_soon()
         log.warning("the head is armed anew after its watchdog had stopped it")
 
-    def note_alert(self, axis: Axis) -> None:
+    def note_alert(self, axis: ServoAxis) -> None:
         """A servo reports a hardware error: brake both axes, say which error it is, follow the reboot policy.
 
         Not every hardware error switches the torque off, so the axis itself is braked too.

@@ -10,10 +10,10 @@ from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 
-from drivers.dynamixel.control_table import ControlTable, again, identified
 from drivers.dynamixel.link import Link, Pinged
 from drivers.dynamixel.models import BAUD_RATES, MODELS_BY_NUMBER, Model, hardware_error_words
 from drivers.dynamixel.register_words import register_words
+from drivers.dynamixel.servo_table import ServoTable, again, identified
 from drivers.errors import BadOptions, NoReply, Refused, WrongDevice
 
 HIGHEST_ID = 252
@@ -113,9 +113,9 @@ def identify(link: Link, servo_id: int) -> tuple[Model, int]:
     return model, pinged.firmware
 
 
-def table_of(link: Link, servo_id: int, model: Model) -> ControlTable:
+def table_of(link: Link, servo_id: int, model: Model) -> ServoTable:
     """Return a servo's control table."""
-    return ControlTable(link, servo_id, model.registers, f"servo {servo_id}")
+    return ServoTable(link, servo_id, model.registers, f"servo {servo_id}")
 
 
 def set_id(link: Link, old: int, new: int, new_baud: int | None = None, *, torque_off: bool = False) -> None:

@@ -30,7 +30,7 @@ class Seen:
     time_s: float
 
 
-class Axis:
+class StepAxis:
     """One axis.
 
     Parameters

@@ -11,7 +11,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Mapping
 
-from drivers.flir_ptu.axis import Axis
+from drivers.flir_ptu.axis import StepAxis
 from drivers.flir_ptu.options import DEVICE
 
 log = logging.getLogger(__name__)
@@ -46,7 +46,7 @@ class StepCount:
         self.doubted: dict[str, float] = {}
         self.halt_owed = False
 
-    def hit(self, axis: str, axes: Mapping[str, Axis]) -> None:
+    def hit(self, axis: str, axes: Mapping[str, StepAxis]) -> None:
         """Note a limit hit told of an axis; ``axes`` as they are known, empty before the unit is checked."""
         if self.doubted:
             return
@@ -59,14 +59,14 @@ class StepCount:
             self.lost[axis] = HIT.format(axis=axis)
             log.warning("%s: %s", DEVICE, self.lost[axis])
 
-    def look_back(self, axes: Mapping[str, Axis]) -> None:
+    def look_back(self, axes: Mapping[str, StepAxis]) -> None:
         """Compare the axes, checked anew, with where they stood when a limit hit was told; that is over."""
         stood, self.doubted = self.doubted, {}
         for name, before_rad in stood.items():
             if abs(axes[name].angle_rad - before_rad) > 1.5 * axes[name].position_rad:
                 self._note_jump(name, before_rad, axes[name].angle_rad)
 
-    def compare(self, before: Axis, after: Axis) -> None:
+    def compare(self, before: StepAxis, after: StepAxis) -> None:
         """Note a position, ``after``, that the axis cannot have reached since it was seen ``before``."""
         if before.seen is None or after.seen is None or after.name in self.lost:
             return

@@ -24,7 +24,7 @@ from drivers.absence import Absence
 from drivers.clock import Clock, SystemClock
 from drivers.errors import BadReply, DriverError, HardwareFault, LineLost, NoReply, OutOfRange
 from drivers.flir_ptu import conversation as ask
-from drivers.flir_ptu.axis import Axis
+from drivers.flir_ptu.axis import StepAxis
 from drivers.flir_ptu.conversation import Conversation
 from drivers.flir_ptu.count import StepCount
 from drivers.flir_ptu.options import DEVICE, Options, options_from
@@ -83,7 +83,7 @@ class FlirPtu:
         self._closed = False
         self._silent = 0  # calls in a row without an answer
         self._talk: Conversation | None = None
-        self._axes: dict[str, Axis] = {}
+        self._axes: dict[str, StepAxis] = {}
         self.version = ""
         self._connect()
 
@@ -278,7 +278,7 @@ class FlirPtu:
 
     # The unit
 
-    def _set_speed(self, talk: Conversation, axis: Axis, speed: int) -> None:
+    def _set_speed(self, talk: Conversation, axis: StepAxis, speed: int) -> None:
         """Set an axis's speed unless it is set already."""
         if axis.speed != speed:
             axis.speed = None
@@ -309,7 +309,7 @@ class FlirPtu:
         for axis in self._axes.values():
             axis.next_target = None
 
-    def _go_on(self, talk: Conversation, axis: Axis) -> None:
+    def _go_on(self, talk: Conversation, axis: StepAxis) -> None:
         """Send an axis that is where its approach begins to its goal."""
         if axis.next_target is not None and axis.at_target and not self._stop_asked.is_set():
             talk.tell(f"{axis.name[0].upper()}P{axis.next_target}")

@@ -16,7 +16,7 @@ from itertools import pairwise
 
 from drivers.clock import Clock
 from drivers.errors import BadReply
-from drivers.flir_ptu.axis import Axis, Seen
+from drivers.flir_ptu.axis import Seen, StepAxis
 from drivers.flir_ptu.conversation import POSITION, Conversation
 from drivers.flir_ptu.options import DEVICE
 
@@ -25,7 +25,7 @@ MOST_BEND_RAD = 0.01
 """How far tilt may be from the straight line, by what its speed changes there."""
 
 
-def measure(talk: Conversation, pan: Axis, tilt: Axis, clock: Clock) -> float:
+def measure(talk: Conversation, pan: StepAxis, tilt: StepAxis, clock: Clock) -> float:
     """Ask for both positions until they can be taken, have the axes take them, and return their moment.
 
     Raises
@@ -35,8 +35,8 @@ def measure(talk: Conversation, pan: Axis, tilt: Axis, clock: Clock) -> float:
     NoReply, Refused, LineLost
         As `Conversation.ask`.
     """
-    asked: dict[Axis, list[Seen]] = {tilt: [], pan: []}
-    at_rest: dict[Axis, Seen] = {}
+    asked: dict[StepAxis, list[Seen]] = {tilt: [], pan: []}
+    at_rest: dict[StepAxis, Seen] = {}
     found: tuple[Seen, Seen] | None = None
     while found is None:
         for axis, answers in asked.items():
@@ -56,7 +56,7 @@ def measure(talk: Conversation, pan: Axis, tilt: Axis, clock: Clock) -> float:
     return found[0].time_s
 
 
-def _ask(talk: Conversation, axis: Axis, clock: Clock) -> Seen:
+def _ask(talk: Conversation, axis: StepAxis, clock: Clock) -> Seen:
     """One answer, and when it was measured."""
     before_s = clock.now_s()
     number = talk.ask(POSITION[axis.name])
@@ -66,7 +66,7 @@ def _ask(talk: Conversation, axis: Axis, clock: Clock) -> Seen:
 
 
 def _found(
-    pan: Axis, tilt: Axis, pans: Sequence[Seen], tilts: Sequence[Seen], at_rest: dict[Axis, Seen]
+    pan: StepAxis, tilt: StepAxis, pans: Sequence[Seen], tilts: Sequence[Seen], at_rest: dict[StepAxis, Seen]
 ) -> tuple[Seen, Seen] | None:
     """Pan and tilt at one moment, as far as the answers tell; None if they do not yet."""
     if pan in at_rest and tilt in at_rest:
@@ -88,14 +88,14 @@ def _found(
     return seen, Seen(round(before.position + part * (other.position - before.position)), seen.time_s)
 
 
-def _middle(axis: Axis, answers: Sequence[Seen]) -> Seen | None:
+def _middle(axis: StepAxis, answers: Sequence[Seen]) -> Seen | None:
     """The last answer but one, if those around it confirm it."""
     if len(answers) < 3 or not axis.confirms(*answers[-3:]):
         return None
     return answers[-2]
 
 
-def _bend_rad(axis: Axis, four: Sequence[Seen]) -> float:
+def _bend_rad(axis: StepAxis, four: Sequence[Seen]) -> float:
     """How far from the straight line between the middle two of four answers the axis may have been.
 
     No further than these two are apart, and than its change of speed around them carries it.

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from drivers.clock import Clock
 from drivers.errors import Refused, WrongDevice
 from drivers.flir_ptu import conversation as ask
-from drivers.flir_ptu.axis import Axis
+from drivers.flir_ptu.axis import StepAxis
 from drivers.flir_ptu.conversation import Conversation
 from drivers.flir_ptu.options import DEVICE, Options
 from drivers.flir_ptu.position import measure
@@ -50,9 +50,9 @@ def ready_axes(
     talk: Conversation,
     options: Options,
     resolutions: Mapping[str, float],
-    known: Mapping[str, Axis],
+    known: Mapping[str, StepAxis],
     clock: Clock,
-) -> dict[str, Axis]:
+) -> dict[str, StepAxis]:
     """Halt the unit, set its limits and speeds, and return its axes, by name, as they are seen now.
 
     Parameters
@@ -75,7 +75,7 @@ def ready_axes(
         talk.tell(command)
     settings = {"pan": options.pan, "tilt": options.tilt}
     axes = {
-        name: Axis(name, settings[name], talk.sure(ask.RESOLUTION[name], resolutions[name]))
+        name: StepAxis(name, settings[name], talk.sure(ask.RESOLUTION[name], resolutions[name]))
         for name in settings
     }
     _try(talk, "LE")
@@ -97,7 +97,7 @@ def ready_axes(
     return axes
 
 
-def _limit(talk: Conversation, axes: Mapping[str, Axis]) -> None:
+def _limit(talk: Conversation, axes: Mapping[str, StepAxis]) -> None:
     """Put the configuration's limits into the unit, if it has user limits."""
     try:
         for name, axis in axes.items():
@@ -109,7 +109,7 @@ def _limit(talk: Conversation, axes: Mapping[str, Axis]) -> None:
         _try(talk, "LE")
 
 
-def _accelerate(talk: Conversation, axis: Axis, acceleration_rad_per_s2: float) -> None:
+def _accelerate(talk: Conversation, axis: StepAxis, acceleration_rad_per_s2: float) -> None:
     """Set the acceleration, if the unit has another."""
     positions = max(1, round(acceleration_rad_per_s2 / axis.position_rad))
     if int(talk.sure(ask.ACCELERATION[axis.name])) != positions:

@@ -11,7 +11,7 @@ import pytest
 import yaml
 
 from drivers.dynamixel.models import model_named
-from drivers.dynamixel.settings import head_settings
+from drivers.dynamixel.settings import dynamixel_settings
 from drivers.flir_ptu.options import AxisOptions, Options, options_from
 
 
@@ -25,7 +25,7 @@ def examples(repository: Path) -> dict[str, dict[str, Any]]:
 
 def test_the_examples_are_taken(repository: Path) -> None:
     found = examples(repository)
-    assert head_settings(found["dynamixel"]).tilt.sign == -1
+    assert dynamixel_settings(found["dynamixel"]).tilt.sign == -1
     assert options_from(found["flir_ptu"]).pan.sign == -1
 
 

@@ -10,7 +10,7 @@ import pytest
 
 from drivers.dynamixel import session
 from drivers.dynamixel.motion import Sample
-from drivers.flir_ptu.axis import Axis, Seen
+from drivers.flir_ptu.axis import Seen, StepAxis
 from drivers.flir_ptu.conversation import Conversation
 from drivers.flir_ptu.position import measure
 
@@ -92,6 +92,6 @@ def test_resting_axes_that_are_asked_one_after_the_other_are_told_at_the_middle_
 
     talk = cast(Conversation, SimpleNamespace(ask=ask, byte_s=0.001))
     pan, tilt = RestingAxis("pan"), RestingAxis("tilt")
-    told_s = measure(talk, cast(Axis, pan), cast(Axis, tilt), clock)
+    told_s = measure(talk, cast(StepAxis, pan), cast(StepAxis, tilt), clock)
     assert told_s == pytest.approx((10.004 + 10.204) / 2)
     assert [seen.time_s for axis in (pan, tilt) for seen in axis.taken] == [told_s, told_s]

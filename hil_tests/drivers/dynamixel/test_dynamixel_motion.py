@@ -9,7 +9,7 @@ import pytest
 
 from drivers.dynamixel.models import MODELS
 from drivers.dynamixel.motion import AxisMotion, Sample, Truth
-from drivers.dynamixel.settings import head_settings
+from drivers.dynamixel.settings import dynamixel_settings
 from drivers.errors import BadOptions, BadReply
 
 COUNT_RAD = math.tau / 4096
@@ -29,7 +29,7 @@ class Bench:
     """A pan axis whose samples the test makes."""
 
     def __init__(self, start: int = 2048, **pan: Any) -> None:
-        self.settings = head_settings(options(**pan)).pan
+        self.settings = dynamixel_settings(options(**pan)).pan
         self.motion = AxisMotion("pan", self.settings, settle_s=0.1)
         self.truth = Truth("pan", self.settings)
         self.now_s = 100.0
@@ -136,7 +136,9 @@ def test_a_head_with_the_sign_turned_approaches_in_the_masts_direction() -> None
 @pytest.mark.parametrize(("goal_rad", "side"), [(0.2, 1), (1.0, -1)])
 def test_gravity_decides_the_side(goal_rad: float, side: int) -> None:
     # Below the turnover the weight pulls the head down: coming up keeps gears and weight on one flank.
-    settings = head_settings(options(approach="gravity", approach_rad=0.03, gravity_turnover_rad=0.6)).pan
+    settings = dynamixel_settings(
+        options(approach="gravity", approach_rad=0.03, gravity_turnover_rad=0.6)
+    ).pan
     assert settings.approach_sign(goal_rad) == side
 
 
@@ -194,7 +196,7 @@ def test_a_position_that_leaps_is_refused() -> None:
 )
 def test_options_that_cannot_be_are_refused_in_words(change: dict[str, Any], words: str) -> None:
     with pytest.raises(BadOptions, match=r"options\.pan") as caught:
-        head_settings(options(**change))
+        dynamixel_settings(options(**change))
     assert words in str(caught.value)
 
 
@@ -218,29 +220,29 @@ def test_options_that_cannot_be_are_refused_in_words(change: dict[str, Any], wor
 )
 def test_options_of_the_head_that_cannot_be_are_refused_in_words(change: dict[str, Any], words: str) -> None:
     with pytest.raises(BadOptions) as caught:
-        head_settings({**options(), **change})
+        dynamixel_settings({**options(), **change})
     assert words in str(caught.value)
 
 
 def test_a_watchdog_and_braking_that_fill_half_a_second_exactly_are_taken() -> None:
-    settings = head_settings({**options(), "watchdog_s": 0.28, "acceleration_rad_per_s2": 5.0})
+    settings = dynamixel_settings({**options(), "watchdog_s": 0.28, "acceleration_rad_per_s2": 5.0})
     assert settings.watchdog_counts == 14
 
 
 def test_a_line_is_left_silent_for_the_watchdog_the_braking_and_a_twentieth_of_a_second() -> None:
-    settings = head_settings({**options(), "watchdog_s": 0.28, "acceleration_rad_per_s2": 5.0})
+    settings = dynamixel_settings({**options(), "watchdog_s": 0.28, "acceleration_rad_per_s2": 5.0})
     assert settings.silence_s == pytest.approx(0.28 + 1.0 / 5.0 + 0.05)
-    assert head_settings({**options(), "watchdog_s": 0}).silence_s == 0.0
+    assert dynamixel_settings({**options(), "watchdog_s": 0}).silence_s == 0.0
 
 
 def test_the_acceleration_that_braking_relies_on_is_not_rounded_down() -> None:
-    settings = head_settings(options()).pan
+    settings = dynamixel_settings(options()).pan
     unit = settings.model.acceleration_unit_rad_per_s2
     assert [settings.acceleration_counts(a * unit) for a in (0.5, 1.0, 1.1, 10.7)] == [1, 1, 2, 11]
 
 
 def test_limits_are_rounded_inwards() -> None:
-    settings = head_settings(options(limits_rad=[-0.5001, 0.5001])).pan
+    settings = dynamixel_settings(options(limits_rad=[-0.5001, 0.5001])).pan
     low, high = settings.limit_counts
     assert settings.angle_rad(low) >= -0.5001 > settings.angle_rad(low - 1)
     assert settings.angle_rad(high) <= 0.5001 < settings.angle_rad(high + 1)

@@ -14,7 +14,7 @@ import pytest
 
 from drivers.clock import ManualClock, SystemClock
 from drivers.errors import DriverError, NoReply
-from drivers.flir_ptu.axis import Axis
+from drivers.flir_ptu.axis import StepAxis
 from drivers.flir_ptu.count import StepCount
 from drivers.flir_ptu.head import FlirPtu, open_head
 from drivers.interfaces import Reading
@@ -199,7 +199,7 @@ def test_an_axis_that_was_under_way_may_be_on_its_way_or_half_a_second_beyond(
 ) -> None:
     """From 0.1 to 0.2 rad at 100 steps a second of 1 mrad: 0.05 rad beyond either end, and 1.5 steps."""
 
-    def axis(angle_rad: float, seen: bool = True) -> Axis:
+    def axis(angle_rad: float, seen: bool = True) -> StepAxis:
         known = {
             "name": "pan",
             "seen": object() if seen else None,
@@ -212,7 +212,7 @@ def test_an_axis_that_was_under_way_may_be_on_its_way_or_half_a_second_beyond(
             "fastest": 900,
             "rad_from_position": lambda position: position * 0.001,
         }
-        return cast(Axis, SimpleNamespace(**known))
+        return cast(StepAxis, SimpleNamespace(**known))
 
     count = StepCount()
     count.compare(axis(0.1), axis(at_rad))

@@ -47,7 +47,7 @@ def identified(link: Link, servo_id: int, name: str) -> Pinged:
     raise BadReply(f"{name} says another thing about itself each time it is asked")
 
 
-class ControlTable:
+class ServoTable:
     """The control table of one servo.
 
     Parameters

@@ -18,7 +18,7 @@ MEETING_SHAPES = ((12, 0), (8, 2), (4, 4), (0, 2), (8, 4), (4, 2), (12, 2), (0, 
 """Bytes read before and after the counter to get to know it; no two of the same length in all."""
 
 
-class Counters:
+class TickCounters:
     """Which servo's counter showed what when; for the thread that has the line."""
 
     def __init__(self, exchange: Exchange) -> None:
