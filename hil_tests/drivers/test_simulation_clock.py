@@ -14,7 +14,8 @@ import pytest
 
 from drivers.clock import SystemClock
 from drivers.errors import BadOptions
-from drivers.open_hardware import DeviceSettings, HardwareSettings, clock_for
+from drivers.hardware import DeviceSettings, HardwareSettings
+from drivers.open_hardware import clock_for
 from drivers.simulation_clock import SimulationClock
 
 LONG_S = 20.0
