@@ -42,6 +42,6 @@ def test_servos_are_rebooted_three_times_in_ten_minutes_and_no_more() -> None:
 
 @pytest.mark.parametrize("value", [math.nan, math.inf, 10**400, -(10**400), True, "1", None, [1.0]])
 def test_what_is_no_finite_number_is_refused_in_words(value: object) -> None:
-    read = OptionReader({"speed": value}, ("speed",), place="pan.")
+    read = OptionReader({"speed": value}, ("speed",), place="options.pan.")
     with pytest.raises(BadOptions, match=r"options\.pan\.speed is .*, expected a number from 0 to 1"):
         read.number("speed", None, 0.0, 1.0)
