@@ -11,7 +11,7 @@ from mastctl.cli import output
 from mastctl.cli.output import positive_number
 
 if TYPE_CHECKING:
-    from drivers.open_hardware import HardwareSettings
+    from drivers.hardware import HardwareSettings
     from drivers.v4l2.camera import V4l2Camera
     from mastctl.config import Config
 
