@@ -180,41 +180,10 @@ def dynamixel_settings(options: Mapping[str, Any]) -> DynamixelSettings:
     if pan.servo_id == tilt.servo_id:
         raise BadOptions(f"options.pan.id and options.tilt.id are both {pan.servo_id}, expected two ids")
     poll_hz = read.number("poll_hz", 50.0, 10.0, 500.0)
-    baud = read.whole("baud", 1_000_000, 9600, 10_500_000)
-    wire_s = POLL_BYTES * 10 / baud
-    if wire_s > 1 / poll_hz:
-        raise BadOptions(
-            f"options.baud {baud}: reading both servos takes {1000 * wire_s:.1f} ms, too long for "
-            f"poll_hz {poll_hz:g}; expected {math.ceil(POLL_BYTES * 10 * poll_hz)} baud or more "
-            "(mastctl servo set-id has --new-baud)"
-        )
+    baud = _baud(read, poll_hz)
     speed = read.number("speed_rad_per_s", 1.0, 0.03, 10.0)
     acceleration = read.number("acceleration_rad_per_s2", 4.0, 0.4, 1000.0)
-    longest_s = round(STANDS_WITHIN_S - 1 / poll_hz - speed / acceleration, 9)
-    if longest_s < SHORTEST_WATCHDOG_S and options.get("watchdog_s") != 0:
-        brakes_s = STANDS_WITHIN_S - 1 / poll_hz - SHORTEST_WATCHDOG_S
-        raise BadOptions(
-            f"options.acceleration_rad_per_s2 is {acceleration:g}: braking from {speed:g} rad/s takes "
-            f"{speed / acceleration:.3g} s, so that the bus watchdog cannot stop the head within "
-            f"{STANDS_WITHIN_S:g} s in all; expected {speed / brakes_s:.3g} or more, a lower "
-            "speed_rad_per_s, or watchdog_s: 0 to do without"
-        )
-    watchdog_s = read.number("watchdog_s", min(USUAL_WATCHDOG_S, longest_s), 0.0, STANDS_WITHIN_S)
-    if watchdog_s and not SHORTEST_WATCHDOG_S <= watchdog_s <= longest_s:
-        raise BadOptions(
-            f"options.watchdog_s is {watchdog_s:.3g} s, and the head brakes from {speed:g} rad/s at "
-            f"{acceleration:g} rad/s2 in {speed / acceleration:.3g} s; expected {SHORTEST_WATCHDOG_S:g} "
-            f"s or more, and {STANDS_WITHIN_S:g} s in all, the last poll's age included; or 0 to do without"
-        )
-    reply_timeout_s = read.number("reply_timeout_s", 0.05, 0.002, LONGEST_REPLY_S)
-    trips_s = _watchdog_counts(watchdog_s) * WATCHDOG_STEP_S
-    most_s = round(trips_s - 1 / poll_hz - QUIET_S, 9)
-    if watchdog_s and reply_timeout_s > most_s:
-        raise BadOptions(
-            f"options.reply_timeout_s is {reply_timeout_s:g} s with watchdog_s {watchdog_s:.3g}, which the "
-            f"servos count as {trips_s:.3g} s: one lost reply would stop the head; expected {most_s:.3g} s "
-            "or less"
-        )
+    watchdog_s = _watchdog_s(read, speed, acceleration, poll_hz)
     return DynamixelSettings(
         port=port,
         pan=pan,
@@ -224,11 +193,62 @@ def dynamixel_settings(options: Mapping[str, Any]) -> DynamixelSettings:
         acceleration_rad_per_s2=acceleration,
         watchdog_s=watchdog_s,
         poll_hz=poll_hz,
-        reply_timeout_s=reply_timeout_s,
+        reply_timeout_s=_reply_timeout_s(read, watchdog_s, poll_hz),
         settle_s=read.number("settle_s", 0.1, 0.0, 5.0),
         torque_off_at_start=read.flag("torque_off_at_start", False),
         fast_read=read.flag("fast_read", False),
     )
+
+
+def _baud(read: OptionReader, poll_hz: float) -> int:
+    """The bits per second, enough to read both servos as often as is asked."""
+    baud: int = read.whole("baud", 1_000_000, 9600, 10_500_000)
+    wire_s = POLL_BYTES * 10 / baud
+    if wire_s > 1 / poll_hz:
+        raise read.refused(
+            "baud",
+            f" {baud}: reading both servos takes {1000 * wire_s:.1f} ms, too long for "
+            f"poll_hz {poll_hz:g}; expected {math.ceil(POLL_BYTES * 10 * poll_hz)} baud or more "
+            "(mastctl servo set-id has --new-baud)",
+        )
+    return baud
+
+
+def _watchdog_s(read: OptionReader, speed: float, acceleration: float, poll_hz: float) -> float:
+    """The watchdog, short enough for the head to stand in time after the last poll."""
+    brakes_s = speed / acceleration
+    longest_s = round(STANDS_WITHIN_S - 1 / poll_hz - brakes_s, 9)
+    if longest_s < SHORTEST_WATCHDOG_S and read.values.get("watchdog_s") != 0:
+        left_s = STANDS_WITHIN_S - 1 / poll_hz - SHORTEST_WATCHDOG_S
+        raise read.refused(
+            "acceleration_rad_per_s2",
+            f" is {acceleration:g}: braking from {speed:g} rad/s takes {brakes_s:.3g} s, so that the bus "
+            f"watchdog cannot stop the head within {STANDS_WITHIN_S:g} s in all; expected "
+            f"{speed / left_s:.3g} or more, a lower speed_rad_per_s, or watchdog_s: 0 to do without",
+        )
+    watchdog_s: float = read.number("watchdog_s", min(USUAL_WATCHDOG_S, longest_s), 0.0, STANDS_WITHIN_S)
+    if watchdog_s and not SHORTEST_WATCHDOG_S <= watchdog_s <= longest_s:
+        raise read.refused(
+            "watchdog_s",
+            f" is {watchdog_s:.3g} s, and the head brakes from {speed:g} rad/s at {acceleration:g} rad/s2 in "
+            f"{brakes_s:.3g} s; expected {SHORTEST_WATCHDOG_S:g} s or more, and {STANDS_WITHIN_S:g} s in "
+            "all, the last poll's age included; or 0 to do without",
+        )
+    return watchdog_s
+
+
+def _reply_timeout_s(read: OptionReader, watchdog_s: float, poll_hz: float) -> float:
+    """The patience with a reply; a lost one must not trip the watchdog."""
+    reply_timeout_s: float = read.number("reply_timeout_s", 0.05, 0.002, LONGEST_REPLY_S)
+    trips_s = _watchdog_counts(watchdog_s) * WATCHDOG_STEP_S
+    most_s = round(trips_s - 1 / poll_hz - QUIET_S, 9)
+    if watchdog_s and reply_timeout_s > most_s:
+        raise read.refused(
+            "reply_timeout_s",
+            f" is {reply_timeout_s:g} s with watchdog_s {watchdog_s:.3g}, which the servos count as "
+            f"{trips_s:.3g} s: one lost reply would stop the head; expected {most_s:.3g} s or less",
+        )
+    return reply_timeout_s
 
 
 def _axis(options: OptionReader, name: str) -> ServoAxisSettings:
@@ -242,7 +262,7 @@ def _axis(options: OptionReader, name: str) -> ServoAxisSettings:
     try:
         model = model_named(read.values["model"])
     except BadOptions as error:
-        raise BadOptions(f"options.{name}.model: {error}") from None
+        raise read.refused("model", f": {error}") from None
     limits_rad = read.pair("limits_rad", "[low, high] in radians")
     if not limits_rad[0] < limits_rad[1]:
         raise read.bad("limits_rad", "[low, high] with low below high")
@@ -261,39 +281,59 @@ def _axis(options: OptionReader, name: str) -> ServoAxisSettings:
         current_limit_A=read.number("current_limit_A", None, 0.0001, 30.0),
         settle_rad=read.number("settle_rad", max(0.001, 3 * model.count_rad), model.count_rad, 0.1),
     )
+    _check_reach(read, axis)
+    _check_approach(read, axis)
+    _check_current(read, axis)
+    return axis
+
+
+def _check_reach(read: OptionReader, axis: ServoAxisSettings) -> None:
+    """Refuse limits that the servo cannot hold."""
+    model = axis.model
     low, high = axis.limit_counts
     if low >= high:
-        raise BadOptions(
-            f"options.{name}.limits_rad [{limits_rad[0]:g}, {limits_rad[1]:g}] hold no two counts of a "
-            f"{model.name}, whose count is {model.count_rad:.2g} rad; expected limits further apart"
+        raise read.refused(
+            "limits_rad",
+            f" [{axis.limits_rad[0]:g}, {axis.limits_rad[1]:g}] hold no two counts of a {model.name}, whose "
+            f"count is {model.count_rad:.2g} rad; expected limits further apart",
         )
     if low < model.low_count or high > model.high_count:
         reach = sorted((axis.angle_rad(model.low_count), axis.angle_rad(model.high_count)))
-        raise BadOptions(
-            f"options.{name}.limits_rad are the servo's counts {low} to {high}, but a {model.name} in "
-            f"position mode holds {model.low_count} to {model.high_count}, which with zero_counts "
-            f"{axis.zero_counts} is {reach[0]:.4f} to {reach[1]:.4f} rad; mount the horn so that the range "
-            "does not cross the seam"
+        raise read.refused(
+            "limits_rad",
+            f" are the servo's counts {low} to {high}, but a {model.name} in position mode holds "
+            f"{model.low_count} to {model.high_count}, which with zero_counts {axis.zero_counts} is "
+            f"{reach[0]:.4f} to {reach[1]:.4f} rad; mount the horn so that the range does not cross the seam",
         )
+
+
+def _check_approach(read: OptionReader, axis: ServoAxisSettings) -> None:
+    """Refuse an approach that takes no backlash up."""
     if (axis.approach == "none") != (axis.approach_rad == 0.0):
-        raise BadOptions(
-            f"options.{name}.approach is {axis.approach!r} with approach_rad {axis.approach_rad:g}; "
-            "expected a stretch above zero with a side, and neither or both"
+        raise read.refused(
+            "approach",
+            f" is {axis.approach!r} with approach_rad {axis.approach_rad:g}; expected a stretch above zero "
+            "with a side, and neither or both",
         )
-    least = model.backlash_rad or 0.0
+    least = axis.model.backlash_rad or 0.0
     if axis.approach != "none" and axis.approach_rad <= least:
-        raise BadOptions(
-            f"options.{name}.approach_rad {axis.approach_rad:g} rad does not take up the backlash of a "
-            f"{model.name}, {least:.4f} rad; expected more"
+        raise read.refused(
+            "approach_rad",
+            f" {axis.approach_rad:g} rad does not take up the backlash of a {axis.model.name}, "
+            f"{least:.4f} rad; expected more",
         )
-    if axis.current_limit_A is not None:
-        if model.current_unit_A is None:
-            raise BadOptions(f"options.{name}.current_limit_A: a {model.name} has no current limit")
-        counts = round(axis.current_limit_A / model.current_unit_A)
-        if not 1 <= counts <= model.most_current_counts:
-            most_A = model.most_current_counts * model.current_unit_A
-            raise BadOptions(
-                f"options.{name}.current_limit_A is {axis.current_limit_A:g} A, expected "
-                f"{model.current_unit_A:g} to {most_A:.4g} A for a {model.name}"
-            )
-    return axis
+
+
+def _check_current(read: OptionReader, axis: ServoAxisSettings) -> None:
+    """Refuse a limit of the current that the servo does not know."""
+    model, limit_A = axis.model, axis.current_limit_A
+    if limit_A is None:
+        return
+    if model.current_unit_A is None:
+        raise read.refused("current_limit_A", f": a {model.name} has no current limit")
+    if not 1 <= round(limit_A / model.current_unit_A) <= model.most_current_counts:
+        most_A = model.most_current_counts * model.current_unit_A
+        raise read.refused(
+            "current_limit_A",
+            f" is {limit_A:g} A, expected {model.current_unit_A:g} to {most_A:.4g} A for a {model.name}",
+        )
