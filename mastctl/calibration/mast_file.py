@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from calib.files.yaml_text import plain
 from calib.fit.calibration import Calibration
 from calib.mast.rig import Rig
 from calib.survey import Survey
@@ -38,7 +39,7 @@ def with_fit(calibration: Calibration, survey: Survey, verdict: Mapping[str, Any
         "degenerate": [direction.sentence for direction in calibration.degenerate],
         "verdict": dict(verdict),
         "parameters": list(calibration.parameter_names),
-        "covariance": rounded(calibration.covariance).tolist(),
+        "covariance": rounded_matrix(calibration.covariance).tolist(),
     }
     provenance = {
         "survey": survey.folder.resolve().name,
@@ -69,16 +70,7 @@ def as_lists(pairs: Mapping[str, tuple[float, float]]) -> dict[str, list[float]]
     return {name: [float(x), float(y)] for name, (x, y) in pairs.items()}
 
 
-def plain(value: Any) -> Any:
-    """Return nested mappings and sequences as dicts, lists and floats."""
-    if isinstance(value, Mapping):
-        return {key: plain(entry) for key, entry in value.items()}
-    if isinstance(value, (list, tuple, np.ndarray)):
-        return [plain(entry) for entry in value]
-    return float(value) if isinstance(value, np.floating) else value
-
-
-def rounded(matrix: np.ndarray) -> np.ndarray:
+def rounded_matrix(matrix: np.ndarray) -> np.ndarray:
     """Return a symmetric matrix with ``DIGITS`` significant digits in each number."""
     half = np.vectorize(lambda number: float(f"{number:.{DIGITS - 1}e}"))(matrix)
     return np.asarray(np.tril(half) + np.tril(half, -1).T)

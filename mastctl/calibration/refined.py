@@ -13,6 +13,7 @@ import numpy as np
 
 from calib.errors import NoCorrection
 from calib.files.mast_file import StoredRig
+from calib.files.yaml_text import plain
 from calib.fit.uncertainty import sigma_by_key
 from calib.handoff.bias import HandoffBias, handoff_bias
 from calib.handoff.body_pose import PRIOR_SHIFT_M, PRIOR_TURN_RAD, BodyPose
@@ -22,7 +23,7 @@ from calib.handoff.fit_body_pose import fit_body_pose
 from calib.handoff.matched import MatchedHandoff
 from calib.mast.covariance import stored_covariance
 from calib.mast.rig import Rig
-from mastctl.calibration.mast_file import plain, rounded
+from mastctl.calibration.mast_file import rounded_matrix
 from mastctl.calibration.run import save_new
 from mastctl.handoff.log import ReadLog
 
@@ -137,7 +138,7 @@ def refined_rig(proposal: Proposal) -> Rig:
     told = {group: pose_told(pose) for group, pose in proposal.significant.items()}
     fit = {**rig.fit, "refined": told}
     if known is not None:
-        fit["covariance"] = rounded(known.covariance).tolist()
+        fit["covariance"] = rounded_matrix(known.covariance).tolist()
         fit["sigma"] = plain(sigma_by_key(rig, known.names, known.covariance))
     before = rig.provenance.get("refined", [])
     provenance = {
@@ -168,7 +169,7 @@ def pose_told(pose: BodyPose) -> dict[str, Any]:
         "origin_m": pose.origin_m.tolist(),
         "shift_m": pose.step[3:].tolist(),
         "turn_rad": pose.step[:3].tolist(),
-        "covariance": rounded(pose.covariance[np.ix_(SHIFT_FIRST, SHIFT_FIRST)]).tolist(),
+        "covariance": rounded_matrix(pose.covariance[np.ix_(SHIFT_FIRST, SHIFT_FIRST)]).tolist(),
         "prior_sigma": {"shift_m": PRIOR_SHIFT_M, "turn_rad": PRIOR_TURN_RAD},
         "significance_sigmas": pose.sigmas,
         "chance": pose.chance,

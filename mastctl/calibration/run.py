@@ -16,7 +16,7 @@ from calib.mast.rig import Rig
 from calib.survey import Finding, Survey
 from calib.survey.check import check_survey
 from mastctl.calibration.mast_file import with_fit
-from mastctl.calibration.verdict import Verdict, judge
+from mastctl.calibration.verdict import Verdict, judge_calibration
 from mastctl.errors import MastctlError
 
 Method = Literal["paper", "joint"]
@@ -51,7 +51,7 @@ class Calibrated:
     previous: Path | None
 
 
-def checked(survey: Survey, method: Method = "joint") -> tuple[str, ...]:
+def checked_survey(survey: Survey, method: Method = "joint") -> tuple[str, ...]:
     """Return the sentences of the check's warnings; ``method`` decides which images have to show a camera.
 
     Raises
@@ -95,7 +95,7 @@ def calibrate(
         If ``out`` cannot be written; it holds what it held before.
     """
     calibration = FITS[method](survey, mast_parameters)
-    verdict = judge(survey, calibration, warnings, [name for name, _ in undetected])
+    verdict = judge_calibration(survey, calibration, warnings, [name for name, _ in undetected])
     saved, previous = save_new(with_fit(calibration, survey, verdict.told()), out)
     return Calibrated(survey, calibration, verdict, warnings, undetected, saved, previous)
 

@@ -70,7 +70,7 @@ class Verdict:
         return {"grade": self.grade, "words": self.words, "reasons": reasons}
 
 
-def judge(
+def judge_calibration(
     survey: Survey,
     calibration: Calibration,
     warnings: Sequence[str] = (),

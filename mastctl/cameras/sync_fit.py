@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.rigid import FloatArray
-from mastctl.cameras.sync_motion import LEAST_FRAMES, CannotTell, Motion
+from mastctl.cameras.sync_motion import LEAST_FRAMES, CannotTell, JointMotion
 
 REACH_S = 0.6
 """How far off a camera's stamps are looked for, seconds either way."""
@@ -69,14 +69,16 @@ class OffsetFit:
 class _Problem:
     """What was measured, as `fit_offset` takes it, and which of (o, c, h) are free."""
 
-    motion: Motion
+    motion: JointMotion
     stamps_s: FloatArray
     places_px: FloatArray
     rows: FloatArray
     free: NDArray[np.bool_]
 
 
-def fit_offset(motion: Motion, stamps_s: FloatArray, places_px: FloatArray, rows: FloatArray) -> OffsetFit:
+def fit_offset(
+    motion: JointMotion, stamps_s: FloatArray, places_px: FloatArray, rows: FloatArray
+) -> OffsetFit:
     """Fit the offset.
 
     Parameters
@@ -121,7 +123,7 @@ def fit_offset(motion: Motion, stamps_s: FloatArray, places_px: FloatArray, rows
     return _told(equations, state, sigmas)
 
 
-def _search(motion: Motion, stamps_s: FloatArray, places_px: FloatArray) -> float:
+def _search(motion: JointMotion, stamps_s: FloatArray, places_px: FloatArray) -> float:
     """The offset at which the best patches' places are most nearly a function of the angle."""
     best = np.argsort(-np.isfinite(places_px).sum(axis=0), kind="stable")[:3]
     offsets_s = np.arange(-REACH_S, REACH_S + SEARCH_STEP_S / 2, SEARCH_STEP_S)

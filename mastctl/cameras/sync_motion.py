@@ -23,7 +23,7 @@ class CannotTell(MastctlError):
     code = "cannot_tell"
 
 
-class Motion:
+class JointMotion:
     """The joint angle over time by its readings, cut into legs between turns back.
 
     Parameters

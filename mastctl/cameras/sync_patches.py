@@ -49,7 +49,7 @@ class Patches:
 
     def places_px(self, image: Image) -> FloatArray:
         """Return the (p,) places along their ways in a picture; not-a-number where a patch is not found."""
-        picture = grey(image)
+        picture = grey_bytes(image)
         return np.array([self._place_px(picture, number) for number in range(len(self.templates))])
 
     def _place_px(self, picture: Image, number: int) -> float:
@@ -68,8 +68,8 @@ class Patches:
         return float(place @ self.ways[number])
 
 
-def grey(image: Image) -> Image:
-    """Return a picture's grey levels, (h, w)."""
+def grey_bytes(image: Image) -> Image:
+    """Return a picture's grey levels, bytes, (h, w)."""
     return image if image.ndim == 2 else np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), dtype=np.uint8)
 
 
@@ -90,7 +90,7 @@ def choose_patches(
     CannotTell
         If nothing in it can be told from its surroundings.
     """
-    picture = grey(image)
+    picture = grey_bytes(image)
     height, width = picture.shape
     corners = cv2.goodFeaturesToTrack(picture, 400, 0.02, 2 * HALF_PX, blockSize=9, useHarrisDetector=False)
     if corners is None:

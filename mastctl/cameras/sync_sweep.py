@@ -19,7 +19,7 @@ from calib.rigid import FloatArray
 from drivers.errors import DriverError, NoReply
 from drivers.interfaces import Camera, Frame, Reading
 from mastctl.cameras.sync_fit import REACH_S, OffsetFit, fit_offset
-from mastctl.cameras.sync_motion import CannotTell, Motion
+from mastctl.cameras.sync_motion import CannotTell, JointMotion
 from mastctl.cameras.sync_patches import Patches, choose_patches
 from mastctl.devices.devices import Devices
 from mastctl.devices.limits import Limits
@@ -53,7 +53,7 @@ class SweepPlan:
 
 
 @dataclass
-class Seen:
+class Sightings:
     """What one camera gave: stamps, places of its patches, and why it gave no more."""
 
     patches: Patches | None = None
@@ -124,7 +124,7 @@ class Sweep:
         self._stop = stop
         self._over = threading.Event()
         self._readings: list[Reading] = []
-        self.seen = {name: Seen() for name in cameras}
+        self.seen = {name: Sightings() for name in cameras}
 
     def run(self, plan: SweepPlan) -> None:
         """Sweep, and bring the head back to where it stood.
@@ -171,7 +171,7 @@ class Sweep:
         if seen.patches is None or not seen.stamps_s:
             raise CannotTell("it gave no picture while the head turned")
         seen.check_clock()
-        motion = Motion(
+        motion = JointMotion(
             np.array([reading.time_s for reading in self._readings]),
             np.array([reading.pan_rad for reading in self._readings]),
         )
@@ -276,7 +276,7 @@ class Sweep:
                     return
                 self._over.wait(0.05)
 
-    def _take(self, seen: Seen, patches: Patches, frame: Frame) -> None:
+    def _take(self, seen: Sightings, patches: Patches, frame: Frame) -> None:
         stamp_s = float(frame.mid_exposure_s)
         seen.came_after_s = min(seen.came_after_s, time.monotonic() - stamp_s)
         if seen.stamps_s and stamp_s <= seen.stamps_s[-1]:

@@ -73,11 +73,11 @@ def run(args: argparse.Namespace) -> int:
 
 def _from_survey(args: argparse.Namespace) -> int:
     from calib.survey import read_survey
-    from mastctl.calibration.run import SurveyRefused, calibrate, checked
+    from mastctl.calibration.run import SurveyRefused, calibrate, checked_survey
 
     survey = read_survey(args.survey)
     try:
-        checked(survey, args.method)
+        checked_survey(survey, args.method)
     except SurveyRefused as refusal:
         for finding in refusal.findings[1:]:
             output.tell(str(finding))  # the first is told last, as the reason
@@ -86,7 +86,7 @@ def _from_survey(args: argparse.Namespace) -> int:
     check_folder(args.report, "--report")
     in_use = _in_use(args)
     survey, undetected = _with_dots(args, survey)
-    warnings = checked(survey, args.method)  # once more, with the dots that were found
+    warnings = checked_survey(survey, args.method)  # once more, with the dots that were found
     for warning in warnings:
         output.tell(f"warning: {warning}")
     with output.waiting(args.json, f"fitting {len(survey.images)} images ({args.method})"):
@@ -163,8 +163,9 @@ def _report(args: argparse.Namespace, done: Calibrated, in_use: StoredRig | None
 
 def _document(done: Calibrated, in_use: StoredRig | None, page: Path | None) -> dict[str, Any]:
     """The contract's keys, and what else a program may want."""
+    from calib.files.yaml_text import plain
     from calib.fit.calibration import HELD_FIXED
-    from mastctl.calibration.mast_file import as_lists, mast_keys, plain
+    from mastctl.calibration.mast_file import as_lists, mast_keys
     from mastctl.calibration.report import change_summary
 
     fit = done.calibration

@@ -19,7 +19,7 @@ from mastctl.cli.places import check_folder
 
 if TYPE_CHECKING:
     from mastctl.client import Client
-    from mastctl.experiment.pointing import Truth
+    from mastctl.experiment.pointing import ClickTruth
     from mastctl.experiment.pointing_record import PointingExperiment
 
 DEFAULT_TARGETS = 10
@@ -106,7 +106,7 @@ def _run(
     args: argparse.Namespace,
     client: Client,
     distances_m: tuple[float, ...],
-    truth: Truth | None,
+    truth: ClickTruth | None,
     notes: tuple[str, ...],
 ) -> PointingExperiment:
     """Run with a progress bar on stderr, one step a target."""

@@ -101,8 +101,8 @@ def _run(args: argparse.Namespace, rig: Any, chosen: list[Variant]) -> Calibrati
 def _tell(args: argparse.Namespace, experiment: CalibrationExperiment) -> int:
     from mastctl.cli.experiment_common import tell_report
     from mastctl.experiment.calibration_report import (
-        as_json,
         short_rows,
+        study_as_json,
         table_iv,
         table_v,
         write_study_report,
@@ -115,5 +115,5 @@ def _tell(args: argparse.Namespace, experiment: CalibrationExperiment) -> int:
             output.print_table("Table V, rms residuals of the mast's images, px", *table_v(experiment))
         output.print_table("Errors, px: rms an axis, and worst", *short_rows(experiment.summaries), notes)
 
-    tell_report(args, partial(write_study_report, experiment), lambda: as_json(experiment), show)
+    tell_report(args, partial(write_study_report, experiment), lambda: study_as_json(experiment), show)
     return 0 if any(not outcome.failure for outcome in experiment.outcomes) else 1

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from mastctl.client import Client
     from mastctl.experiment.handoff_record import HandoffExperiment, HandoffRecord
     from mastctl.experiment.known_points import KnownPoints
-    from mastctl.experiment.pointing import Truth
+    from mastctl.experiment.pointing import ClickTruth
 
 PICTURES_PER_STEP = 4
 TARGETS = {"ground": "textured ground", "corner": "bricks' corners", "face": "middles of bricks' faces"}
@@ -79,7 +79,7 @@ def run(args: argparse.Namespace) -> int:
     return _tell(args, experiment)
 
 
-def _simulated(args: argparse.Namespace, stack: ExitStack) -> tuple[Client, Truth, KnownPoints | None]:
+def _simulated(args: argparse.Namespace, stack: ExitStack) -> tuple[Client, ClickTruth, KnownPoints | None]:
     """The packaged simulated rover behind a daemon on a free port, with its bricks if they are asked for."""
     from mastctl.cli.experiment_common import simulated_daemon
     from mastctl.config import load_config
@@ -97,7 +97,7 @@ def _simulated(args: argparse.Namespace, stack: ExitStack) -> tuple[Client, Trut
 
 
 def _run(
-    args: argparse.Namespace, client: Client, truth: Truth | None, points: KnownPoints | None
+    args: argparse.Namespace, client: Client, truth: ClickTruth | None, points: KnownPoints | None
 ) -> HandoffExperiment:
     """Run with a progress bar on stderr, one step a target."""
 

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from mastctl.cli import output
 from mastctl.cli.output import CommandError, WrongUse, finite_number, positive_number
-from mastctl.cli.target import add_target_options, check_done, check_target, number_of, target_of
+from mastctl.cli.target import add_target_options, check_done, check_target, option_number, target_of
 
 if TYPE_CHECKING:
     from mastctl.client import Client
@@ -266,7 +266,7 @@ def _camera_pixel(words: list[str] | None) -> tuple[str, float, float] | None:
     """``CAMERA X Y`` of --aim."""
     if words is None:
         return None
-    return words[0], number_of("--aim", words[1]), number_of("--aim", words[2])
+    return words[0], option_number("--aim", words[1]), option_number("--aim", words[2])
 
 
 def tell_result(args: argparse.Namespace, document: dict[str, Any], line: str) -> None:

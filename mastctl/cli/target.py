@@ -50,7 +50,7 @@ def target_of(args: argparse.Namespace, client: Client) -> dict[str, Any]:
     """
     if args.pixel is not None:
         camera, frame_id, x, y = args.pixel
-        return {"pixel": (camera, frame_id, number_of("--pixel", x), number_of("--pixel", y))}
+        return {"pixel": (camera, frame_id, option_number("--pixel", x), option_number("--pixel", y))}
     if args.camera is not None:
         return {"pixel": (args.camera, client.snapshot(args.camera).frame_id, *args.at)}
     return {} if args.position is None else {"position_m": args.position, "frame": args.frame}
@@ -68,7 +68,7 @@ def check_done(record: dict[str, Any]) -> None:
     )
 
 
-def number_of(option: str, word: str) -> float:
+def option_number(option: str, word: str) -> float:
     """Read one word of an option as a finite number. Raises WrongUse."""
     try:
         return finite_number(word)

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import Any, Literal
 from urllib.parse import quote
 
-from mastctl.client.connection import ClientError, Connection
+from mastctl.client.connection import ClientError, DaemonHttp
 from mastctl.client.snapshot import Snapshot, read_snapshot
 
 DEFAULT_URL = "http://127.0.0.1:8420"
@@ -32,7 +32,7 @@ class Client:
 
     def __init__(self, url: str = DEFAULT_URL, timeout_s: float = 30.0) -> None:
         self.url = url
-        self._daemon = Connection(url, timeout_s)
+        self._daemon = DaemonHttp(url, timeout_s)
 
     def status(self) -> dict[str, Any]:
         """Return what the daemon knows at this moment."""

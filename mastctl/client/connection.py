@@ -36,7 +36,7 @@ class ClientError(Exception):
         super().__init__(message)
 
 
-class Connection:
+class DaemonHttp:
     """A connection to one daemon; parameters and errors as `Client` has them."""
 
     def __init__(self, url: str, timeout_s: float) -> None:

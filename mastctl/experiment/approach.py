@@ -20,8 +20,8 @@ from calib.rigid import FloatArray
 from calib.tracking.track import Track, moved_track, seen_by, start_track
 from drivers.interfaces import Image
 from drivers.sim.scene import SceneSettings, build_scene
-from mastctl.experiment.approach_world import World, WorldErrors
-from mastctl.experiment.targets import textured
+from mastctl.experiment.approach_world import ApproachWorld, WorldErrors
+from mastctl.experiment.targets import texture_mask
 from mastctl.tracking.choice import choose_pairs
 
 START_M, END_M = 10.0, 1.0
@@ -135,7 +135,7 @@ def run_approach(
     begun_s = time.monotonic()
     rng = np.random.default_rng([seed, 6])
     light = SceneSettings(seed=seed, rocks=ROCKS) if on == "rocks" else SceneSettings(seed=seed)
-    world = World(build_scene(light), true, believed, errors or WorldErrors(), rng)
+    world = ApproachWorld(build_scene(light), true, believed, errors or WorldErrors(), rng)
     try:
         begun = _begin(world, rng, on)
         if isinstance(begun, str):
@@ -150,7 +150,7 @@ def run_approach(
         world.close()
 
 
-def _begin(world: World, rng: np.random.Generator, on: On) -> tuple[Track, FloatArray] | str:
+def _begin(world: ApproachWorld, rng: np.random.Generator, on: On) -> tuple[Track, FloatArray] | str:
     """Pick a textured pixel of the left Pancam at the start range; the track, and the truth in the site."""
     pair = world.believed.stereo["pancam"]
     reason = "no view offered a target"
@@ -161,7 +161,7 @@ def _begin(world: World, rng: np.random.Generator, on: On) -> tuple[Track, Float
         angles = solve(world.believed.mast, world.believed.cameras[pair[0]].model, aim)[0]
         eyes = world.look(pair, angles.pan_rad, angles.tilt_rad)
         left, right = (eyes[name] for name in pair)
-        fit = textured(left.image.astype(np.uint8))
+        fit = texture_mask(left.image.astype(np.uint8))
         if on == "rocks":
             fit &= _near(left.camera, aim)
         rows, columns = np.nonzero(fit)
@@ -182,7 +182,7 @@ def _begin(world: World, rng: np.random.Generator, on: On) -> tuple[Track, Float
     return reason
 
 
-def _aim(world: World, rng: np.random.Generator, on: On) -> FloatArray | None:
+def _aim(world: ApproachWorld, rng: np.random.Generator, on: On) -> FloatArray | None:
     """Where to look for a target, (3,) in the rover frame; None without a rock."""
     if on == "rocks":
         rock = world.turn_to_rock(START_M, ROCK_M)
@@ -199,7 +199,7 @@ def _near(camera: CameraModel, aim_m: FloatArray) -> NDArray[np.bool_]:
 
 
 def _on_rock(
-    world: World, camera: str, pan_rad: float, tilt_rad: float, pixel: FloatArray, target: FloatArray
+    world: ApproachWorld, camera: str, pan_rad: float, tilt_rad: float, pixel: FloatArray, target: FloatArray
 ) -> bool:
     """Whether a target lies on a rock and not at its boundary, where nobody would put one."""
     if world.height_m(target) < ROCK_M:
@@ -212,7 +212,7 @@ def _on_rock(
 
 
 def _drive(
-    world: World, track: Track, target: FloatArray, light: SceneSettings, rng: np.random.Generator
+    world: ApproachWorld, track: Track, target: FloatArray, light: SceneSettings, rng: np.random.Generator
 ) -> list[Stop]:
     """Step by step up to the target."""
     stops: list[Stop] = []
@@ -242,13 +242,15 @@ def _drive(
     return stops
 
 
-def _front_m(world: World) -> float:
+def _front_m(world: ApproachWorld) -> float:
     """How far ahead of the rover's origin the last pair stands."""
     left, right = (world.believed.cameras[n].model.C[0] for n in world.believed.stereo["hazcam"])
     return float(left + right) / 2
 
 
-def _look(world: World, track: Track, target: FloatArray, carried_m: FloatArray) -> tuple[Track, Stop]:
+def _look(
+    world: ApproachWorld, track: Track, target: FloatArray, carried_m: FloatArray
+) -> tuple[Track, Stop]:
     """Look for the target with the pair of its range, again if it is lost; the track and the record."""
     rig = world.believed
     chosen = choose_pairs(rig, track.position_m)[0]

@@ -70,7 +70,7 @@ def windowed(rig: Rig, size_px: tuple[int, int]) -> Rig:
     return replace(rig, cameras=cameras)
 
 
-class World:
+class ApproachWorld:
     """The rover in its scene.
 
     Parameters

@@ -35,7 +35,7 @@ STUDIES = {
 CSV_COLUMNS = ("study", "variant", "quantity", "distance_m", "rms_x_px", "rms_y_px", "failure")
 
 
-def as_json(experiment: CalibrationExperiment) -> dict[str, Any]:
+def study_as_json(experiment: CalibrationExperiment) -> dict[str, Any]:
     """Return the whole study as JSON; x and y side by side, pixels."""
     return {
         "seed": experiment.seed,
@@ -133,7 +133,7 @@ def write_study_report(experiment: CalibrationExperiment, folder: Path) -> Path:
     folder.mkdir(parents=True, exist_ok=True)
     rows = [row for outcome in experiment.outcomes for row in _csv_rows(outcome)]
     write_csv(folder / "surveys.csv", CSV_COLUMNS, rows)
-    write_json(folder / "record.json", as_json(experiment))
+    write_json(folder / "record.json", study_as_json(experiment))
     page = folder / "report.html"
     page.write_text(_page(experiment), encoding="utf-8")
     return page

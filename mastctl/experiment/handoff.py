@@ -26,7 +26,7 @@ from calib.pictures.warp import grey
 from mastctl.client import Client, ClientError, Snapshot
 from mastctl.experiment.handoff_record import Handed, HandoffExperiment, HandoffRecord, summarise_handoffs
 from mastctl.experiment.known_points import KnownPoint, KnownPoints
-from mastctl.experiment.pointing import Truth
+from mastctl.experiment.pointing import ClickTruth
 from mastctl.experiment.targets import Target
 from mastctl.experiment.views import VIEWS_PER_TARGET, Views
 from mastctl.tracking.matched import JOINT_SIGMA_RAD
@@ -47,7 +47,7 @@ def run_handoff_experiment(
     targets: int,
     seed: int = 1,
     click_px: float = 0.2,
-    truth: Truth | None = None,
+    truth: ClickTruth | None = None,
     points: KnownPoints | None = None,
     on_target: Callable[[HandoffRecord], None] | None = None,
     pictures: int = 0,
@@ -133,7 +133,7 @@ class _Bench:
         limits: Mapping[str, Any],
         rng: np.random.Generator,
         click_px: float,
-        truth: Truth | None,
+        truth: ClickTruth | None,
         points: KnownPoints | None,
         calibration: RigCovariance | None,
     ) -> None:

@@ -31,7 +31,7 @@ from mastctl.experiment.views import VIEWS_PER_TARGET, Views, pointed
 PAN_RANGE_RAD = 1.0
 
 
-class Truth(Protocol):
+class ClickTruth(Protocol):
     """What only a simulation knows: where the clicked point really is in a later frame."""
 
     def residual_px(
@@ -51,7 +51,7 @@ def run_pointing_experiment(
     targets: int,
     distances_m: Sequence[float] = (10.0, 6.0, 2.0),
     seed: int = 1,
-    truth: Truth | None = None,
+    truth: ClickTruth | None = None,
     notes: Sequence[str] = (),
     on_target: Callable[[TargetRecord], None] | None = None,
     pictures: int = 0,
@@ -137,7 +137,7 @@ class _Bench:
         pair: tuple[str, str],
         limits: Mapping[str, Any],
         rng: np.random.Generator,
-        truth: Truth | None,
+        truth: ClickTruth | None,
     ) -> None:
         self._client = client
         self._rig = rig

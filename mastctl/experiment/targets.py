@@ -65,7 +65,7 @@ def choose_target(
     rng
         Chooses.
     """
-    candidates = textured(left.image)
+    candidates = texture_mask(left.image)
     likely = candidates & on_level_ground(left_in_rover, distance_m)
     rows, columns = np.nonzero(likely if likely.any() else candidates)
     if len(rows) == 0:
@@ -104,7 +104,7 @@ def on_level_ground(camera_in_rover: CameraModel, distance_m: float) -> NDArray[
     return np.repeat(np.repeat(near, step, axis=0), step, axis=1)[:height, :width]
 
 
-def textured(image: Image) -> NDArray[np.bool_]:
+def texture_mask(image: Image) -> NDArray[np.bool_]:
     """Return a mask (h, w) of pixels whose surroundings hold a position to 0.08 px an axis at 2 DN of noise.
 
     The smaller eigenvalue of the gradient's structure tensor over 41x41 px bounds the variance of a match.

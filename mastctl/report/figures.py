@@ -10,7 +10,7 @@ from dataclasses import dataclass
 class Figure:
     """A picture with its words.
 
-    ``source`` is what `inlined` returns. ``kind`` is ``photo``; ``lines``, which follow the page into the
+    ``source`` is what `data_url` returns. ``kind`` is ``photo``; ``lines``, which follow the page into the
     dark; or ``map``, whose colours mean numbers and stay.
     """
 
@@ -20,6 +20,6 @@ class Figure:
     kind: str = "photo"
 
 
-def inlined(content: bytes, kind: str) -> str:
+def data_url(content: bytes, kind: str) -> str:
     """Return the bytes of a picture (``png`` or ``jpeg``) as an address that holds them."""
     return f"data:image/{kind};base64,{base64.b64encode(content).decode()}"

@@ -7,7 +7,7 @@ import numpy as np
 
 from drivers.interfaces import Image
 from mastctl.errors import MastctlError
-from mastctl.report.figures import Figure, inlined
+from mastctl.report.figures import Figure, data_url
 
 JPEG_QUALITY = 90
 PAGE_JPEG_QUALITY = 80
@@ -30,7 +30,7 @@ def encoded(image: np.ndarray, kind: str, jpeg_quality: int = JPEG_QUALITY) -> b
 
 def photo(image: np.ndarray, alt: str, caption: str) -> Figure:
     """Return a picture as a figure of a page."""
-    return Figure(inlined(encoded(image, "jpeg", PAGE_JPEG_QUALITY), "jpeg"), alt, caption)
+    return Figure(data_url(encoded(image, "jpeg", PAGE_JPEG_QUALITY), "jpeg"), alt, caption)
 
 
 def in_colour(image: Image) -> Image:

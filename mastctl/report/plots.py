@@ -8,7 +8,7 @@ from __future__ import annotations
 import io
 from typing import Any
 
-from mastctl.report.figures import Figure, inlined
+from mastctl.report.figures import Figure, data_url
 
 BLUE, RUST, GREEN, VIOLET, AMBER, GREY = "#1f6f8b", "#c1440e", "#2d7d46", "#7a4b9d", "#b26a00", "#555555"
 COLOURS = (BLUE, RUST, GREEN, VIOLET, AMBER, GREY)
@@ -58,4 +58,4 @@ def as_png(figure: Any) -> bytes:
 
 def plot(figure: Any, alt: str, caption: str = "", kind: str = "lines") -> Figure:
     """Return a plot as a figure of a page; ``kind`` as `Figure` has it."""
-    return Figure(inlined(as_png(figure), "png"), alt, caption, kind)
+    return Figure(data_url(as_png(figure), "png"), alt, caption, kind)

@@ -38,7 +38,7 @@ from calib.tracking.track import start_track
 from drivers.sim.render import Renderer
 from drivers.sim.scene import Scene, SceneSettings, build_scene
 from mastctl.experiment.approach_world import WorldErrors
-from mastctl.experiment.targets import textured
+from mastctl.experiment.targets import texture_mask
 
 PAIR = ("pancam_left", "pancam_right")
 STEPS, START_M = 20, 10.0
@@ -127,7 +127,7 @@ def made(world: str, setting: str, seed: int, true: Rig, believed: Rig) -> dict[
                 continue
             first = _look(renderer, true, path, 0, rng)
             at = np.rint(path.pixels_px[0, 0]).astype(int)
-            if not textured(first[0])[at[1], at[0]]:
+            if not texture_mask(first[0])[at[1], at[0]]:
                 continue
             read = path.joints_rad + rng.normal(0.0, ERRORS.joint_rad, path.joints_rad.shape)
             eyes = [

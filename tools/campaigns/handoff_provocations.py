@@ -25,8 +25,8 @@ from drivers.sim.bricks import Brick, make_brick, meshes
 from drivers.sim.compiled import kernels
 from drivers.sim.rocks import together
 from drivers.sim.scene import Scene, SceneSettings, build_scene, sun_direction
-from mastctl.experiment.approach_world import World, WorldErrors
-from mastctl.experiment.targets import BORDER_PX, textured
+from mastctl.experiment.approach_world import ApproachWorld, WorldErrors
+from mastctl.experiment.targets import BORDER_PX, texture_mask
 
 Float64 = NDArray[np.float64]
 
@@ -107,7 +107,7 @@ class Stage:
     def __init__(self, true: Rig, believed: Rig, calibration: RigCovariance, seed: int) -> None:
         self._scene_seed = seed
         self._rng = np.random.default_rng(seed)
-        self._world: World | None = None
+        self._world: ApproachWorld | None = None
         self._true, self._believed, self._calibration = true, believed, calibration
         self._scenes: dict[SceneSettings, Scene] = {}
 
@@ -139,7 +139,7 @@ class Stage:
         azimuth = rng.uniform(-azimuth_rad, azimuth_rad)
         view = self._view(kind, distance_m, azimuth)
         if self._world is None:
-            self._world = World(view.source, self._true, self._believed, WorldErrors(), rng)
+            self._world = ApproachWorld(view.source, self._true, self._believed, WorldErrors(), rng)
         world = self._world
         believed, calibration = self._mast_file(world.true.stereo[to], off_px)
         world.believed = believed
@@ -200,7 +200,9 @@ class Stage:
             moved = moved_rig(moved, names, float(self._rng.normal(0.0, off_px)) * step)
         return moved, RigCovariance(names, covariance)
 
-    def _angles(self, world: World, camera: str, distance_m: float, azimuth: float) -> tuple[float, float]:
+    def _angles(
+        self, world: ApproachWorld, camera: str, distance_m: float, azimuth: float
+    ) -> tuple[float, float]:
         """Joint angles that look at level ground at the distance."""
         head = world.believed.mast.rover_from_head(0.0, 0.0).translation_m
         along = math.sqrt(distance_m**2 - float(head[2]) ** 2)
@@ -212,7 +214,7 @@ class Stage:
     def _candidates(
         self,
         view: View,
-        world: World,
+        world: ApproachWorld,
         camera: str,
         joints: tuple[float, float],
         image: Any,
@@ -220,7 +222,7 @@ class Stage:
         kind: str,
     ) -> Float64:
         """Points (n, 3) of the site that the picture shows about the distance, in random order."""
-        usable = textured(image.astype(np.uint8))
+        usable = texture_mask(image.astype(np.uint8))
         if kind in ("flat", "shadow"):
             usable[BORDER_PX:-BORDER_PX, BORDER_PX:-BORDER_PX] = True
         rows, columns = np.nonzero(usable)
@@ -240,7 +242,12 @@ class Stage:
         return np.asarray(points[keep])
 
     def _shows(
-        self, world: World, view: View, names: tuple[str, ...], joints: tuple[float, float], point: Float64
+        self,
+        world: ApproachWorld,
+        view: View,
+        names: tuple[str, ...],
+        joints: tuple[float, float],
+        point: Float64,
     ) -> list[bool]:
         """Whether cameras see a point of the site in the source's scene, by casting their rays at it."""
         shown = []

@@ -24,7 +24,7 @@ from calib.mast.rig import Rig
 from calib.survey import Sigma, read_survey, write_survey
 from drivers.sim.pan_tilt import PRESETS
 from drivers.sim_survey.survey import Ring, SurveyPlan, simulate_survey
-from mastctl.calibration.run import Calibrated, calibrate, checked
+from mastctl.calibration.run import Calibrated, calibrate, checked_survey
 from mastctl.cli.output import at_least
 from tools.arguments import end
 from tools.simulated.check import (
@@ -86,7 +86,7 @@ def survey_and_calibrate(true: Rig, seed: int, mast_parameters: int) -> Calibrat
     with tempfile.TemporaryDirectory() as folder:
         write_survey(replace(survey, images=nameless), Path(folder) / "survey")
         measured = read_survey(Path(folder) / "survey")
-        warnings = checked(measured)
+        warnings = checked_survey(measured)
         return calibrate(measured, Path(folder) / "mast.yaml", "joint", mast_parameters, warnings)
 
 

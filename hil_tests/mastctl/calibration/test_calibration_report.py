@@ -15,7 +15,7 @@ from hil_tests.mastctl.calibration.survey_world import navcam_rig, navcam_survey
 from mastctl.calibration.expected import check_sizes
 from mastctl.calibration.landing import click, handoff_errors_px, pointing_error_px
 from mastctl.calibration.maps import CORNER, change_map, uncertainty_map
-from mastctl.calibration.verdict import judge
+from mastctl.calibration.verdict import judge_calibration
 
 DRAWS = 100
 TURN_RAD = np.array([0.0, 0.0, 0.01])
@@ -84,23 +84,23 @@ def test_check_images_are_as_far_off_as_the_survey_noise_explains() -> None:
 
 def test_the_worst_reason_decides(fitted: tuple[Survey, Calibration]) -> None:
     survey, calibration = fitted
-    assert judge(survey, calibration).grade == "good"
-    assert judge(survey, calibration, undetected=["a"]).grade == "care"
-    assert judge(survey, calibration, warnings=["w"]).grade == "care"
+    assert judge_calibration(survey, calibration).grade == "good"
+    assert judge_calibration(survey, calibration, undetected=["a"]).grade == "care"
+    assert judge_calibration(survey, calibration, warnings=["w"]).grade == "care"
     unseen = replace(calibration, check_rms_px={})
-    assert judge(survey, unseen).grade == "care"
+    assert judge_calibration(survey, unseen).grade == "care"
     prism = Outlier("prism", "prism p3 of set-up level", 50.0, 20.0, 0.02)
-    care = judge(survey, replace(calibration, outliers=(prism,)))
+    care = judge_calibration(survey, replace(calibration, outliers=(prism,)))
     assert care.grade == "care"
     assert "prism p3" in care.reasons[-1].sentence
     left_open = Degenerate(("mast.translation_m.z",), "tilt hardly moved")
-    assert judge(survey, replace(calibration, degenerate=(left_open,))).grade == "bad"
+    assert judge_calibration(survey, replace(calibration, degenerate=(left_open,))).grade == "bad"
     noisy = replace(calibration, chi2=9.0 * calibration.degrees_of_freedom, chi2_probability=0.0)
-    assert judge(survey, noisy).grade == "bad"
+    assert judge_calibration(survey, noisy).grade == "bad"
     off = [
         replace(i, residuals_px=i.residuals_px + 3.0) if i.purpose == "check" else i
         for i in calibration.images
     ]
-    bad = judge(survey, replace(calibration, images=tuple(off)))
+    bad = judge_calibration(survey, replace(calibration, images=tuple(off)))
     assert bad.grade == "bad"
     assert any(r.grade == "bad" and "check images of navcam_left" in r.sentence for r in bad.reasons)

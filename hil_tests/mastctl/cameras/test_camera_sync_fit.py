@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from mastctl.cameras.sync_fit import OffsetFit, fit_offset
-from mastctl.cameras.sync_motion import CannotTell, Motion
+from mastctl.cameras.sync_motion import CannotTell, JointMotion
 
 
 @dataclass(frozen=True)
@@ -72,7 +72,7 @@ def measured(rig: Rig) -> OffsetFit:
     places[random.random(places.shape) < 0.05] = np.nan
     wild = random.random(places.shape) < rig.wild
     places[wild] = random.uniform(-60, 60, int(wild.sum()))
-    return fit_offset(Motion(read_s, read_rad), true_s - rig.offset_s, places, rows)
+    return fit_offset(JointMotion(read_s, read_rad), true_s - rig.offset_s, places, rows)
 
 
 @pytest.mark.parametrize("offset_s", [-0.3, -0.012, 0.0, 0.0051, 0.25])
@@ -136,14 +136,16 @@ def test_pictures_that_do_not_move_with_the_joint_are_told() -> None:
     stamps = np.arange(1.0, 20.0, 0.033)
     places = np.cumsum(random.normal(0, 3, (len(stamps), 4)), axis=0)
     with pytest.raises(CannotTell, match="did not move with the joint"):
-        fit_offset(Motion(times[::20], angles[::20]), stamps, places, np.zeros(4))
+        fit_offset(JointMotion(times[::20], angles[::20]), stamps, places, np.zeros(4))
 
 
 def test_a_scene_without_patches_is_told() -> None:
     times, angles = motor(Rig())
     stamps = np.arange(1.0, 20.0, 0.033)
     with pytest.raises(CannotTell, match="no patch was found"):
-        fit_offset(Motion(times[::20], angles[::20]), stamps, np.full((len(stamps), 3), np.nan), np.zeros(3))
+        fit_offset(
+            JointMotion(times[::20], angles[::20]), stamps, np.full((len(stamps), 3), np.nan), np.zeros(3)
+        )
 
 
 def test_too_short_a_sweep_is_told() -> None:

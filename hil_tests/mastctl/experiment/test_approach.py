@@ -30,7 +30,7 @@ from mastctl.experiment.approach_report import (
     write_record,
     write_strip,
 )
-from mastctl.experiment.approach_world import WINDOW_PX, World, WorldErrors, windowed
+from mastctl.experiment.approach_world import WINDOW_PX, ApproachWorld, WorldErrors, windowed
 
 
 def stop(range_m: float, error_m: tuple[float, float, float], state: str = "tracked") -> Stop:
@@ -120,14 +120,14 @@ def rig(repository: Path) -> Rig:
 
 
 @pytest.fixture
-def standing(rig: Rig) -> Iterator[Callable[..., World]]:
+def standing(rig: Rig) -> Iterator[Callable[..., ApproachWorld]]:
     """Make worlds of level ground with these parts exchanged; the rover stands at its middle."""
-    made: list[World] = []
+    made: list[ApproachWorld] = []
 
-    def world(seed: int = 1, **parts: Any) -> World:
+    def world(seed: int = 1, **parts: Any) -> ApproachWorld:
         scene = tiny_scene()
         scene = Scene(scene.settings, scene.world._replace(**parts))
-        made.append(World(scene, rig, rig, WorldErrors(), np.random.default_rng(seed)))
+        made.append(ApproachWorld(scene, rig, rig, WorldErrors(), np.random.default_rng(seed)))
         return made[-1]
 
     yield world
@@ -137,7 +137,7 @@ def standing(rig: Rig) -> Iterator[Callable[..., World]]:
 
 @pytest.mark.parametrize("range_m", [6.0, 10.0])
 def test_the_rover_turns_to_a_rock_at_the_range_that_stands_out_of_the_ground(
-    standing: Callable[..., World], range_m: float
+    standing: Callable[..., ApproachWorld], range_m: float
 ) -> None:
     stones = rocks.make_rocks(60, np.random.default_rng(5), lambda x, y: 0.0)
     world = standing(rocks=stones)
@@ -162,7 +162,7 @@ def test_the_rover_turns_to_a_rock_at_the_range_that_stands_out_of_the_ground(
 
 
 def test_without_a_rock_at_the_range_nothing_turns_and_the_run_says_so(
-    standing: Callable[..., World], rig: Rig, monkeypatch: pytest.MonkeyPatch
+    standing: Callable[..., ApproachWorld], rig: Rig, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A brick 8.2 m away, which some rays meet that would reach the ground 8.5 m away."""
     brick = bricks.make_brick(rig.mast.translation_m[0] + 8.1, 0.0, math.pi / 2, lambda x, y: 0.0)
@@ -183,7 +183,7 @@ def test_without_a_rock_at_the_range_nothing_turns_and_the_run_says_so(
     assert asked == [SceneSettings(seed=3, rocks=ROCKS)]
 
 
-def test_on_ground_the_rover_looks_at_level_ground_ahead(standing: Callable[..., World]) -> None:
+def test_on_ground_the_rover_looks_at_level_ground_ahead(standing: Callable[..., ApproachWorld]) -> None:
     world = standing()
     before = world.site_from_rover
     for _ in range(5):
@@ -194,13 +194,13 @@ def test_on_ground_the_rover_looks_at_level_ground_ahead(standing: Callable[...,
     assert world.site_from_rover == before
 
 
-def test_height_is_above_the_ground_under_a_point(standing: Callable[..., World]) -> None:
+def test_height_is_above_the_ground_under_a_point(standing: Callable[..., ApproachWorld]) -> None:
     raised = make_grid(np.full((9, 9), 0.25, dtype=np.float32), 8.0)
     assert standing().height_m(np.array([3.0, 1.0, -0.1])) == pytest.approx(0.1)
     assert standing(inner=raised).height_m(np.array([3.0, 1.0, -0.1])) == pytest.approx(-0.15)
 
 
-def test_a_target_is_on_a_rock_and_not_at_its_boundary(standing: Callable[..., World]) -> None:
+def test_a_target_is_on_a_rock_and_not_at_its_boundary(standing: Callable[..., ApproachWorld]) -> None:
     """The front of a brick 10 m ahead, 39 cm across and 17 cm out of the ground."""
     brick = bricks.make_brick(START_M, 0.0, math.pi / 2, lambda x, y: 0.0)
     world = standing(rocks=bricks.meshes([brick]))

@@ -25,7 +25,7 @@ from hil_tests.mastctl.calibration.survey_world import RIG_FILE
 from mastctl.calibration.run import FITS
 from mastctl.cli.main import main
 from mastctl.experiment.calibration import CalibrationExperiment, run_calibration_experiment
-from mastctl.experiment.calibration_report import as_json, table_iv, table_v, write_study_report
+from mastctl.experiment.calibration_report import study_as_json, table_iv, table_v, write_study_report
 from mastctl.experiment.calibration_variants import Variant, variants
 from mastctl.experiment.executors import NoExecutor, open_executor
 
@@ -49,7 +49,7 @@ def experiment() -> Iterator[CalibrationExperiment]:
 
 def numbers(experiment: CalibrationExperiment) -> dict[str, Any]:
     """All of it but how long it took."""
-    told = as_json(experiment)
+    told = study_as_json(experiment)
     told.pop("seconds")
     for variant in told["variants"]:
         variant.pop("fit_seconds")

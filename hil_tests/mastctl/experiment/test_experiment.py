@@ -25,7 +25,7 @@ from mastctl.experiment.pointing_record import (
     summarise_distance,
 )
 from mastctl.experiment.pointing_report import CSV_COLUMNS, pointing_table, write_pointing_report
-from mastctl.experiment.targets import on_level_ground, textured
+from mastctl.experiment.targets import on_level_ground, texture_mask
 from mastctl.experiment.views import pointed
 
 NAN = math.nan
@@ -112,7 +112,7 @@ def test_only_texture_in_both_directions_counts() -> None:
     image = np.full((400, 600), 120.0)
     image[:, 200:400] += rng.normal(0, 25, (400, 200))  # texture
     image[:, 400:] += 60.0 * (np.arange(200) // 20 % 2)  # stripes: one direction only
-    mask = textured(np.clip(image, 0, 255).astype(np.uint8))
+    mask = texture_mask(np.clip(image, 0, 255).astype(np.uint8))
     assert mask[100:300, 240:360].all()
     assert not mask[:, :170].any()
     assert not mask[100:300, 430:].any()

@@ -12,7 +12,7 @@ import pytest
 from jinja2 import UndefinedError
 
 from mastctl.report import pages, plots
-from mastctl.report.figures import Figure, inlined
+from mastctl.report.figures import Figure, data_url
 from mastctl.report.pictures import encoded, enlarged, photo
 from mastctl.report.tables import Table, number, x_y
 
@@ -51,7 +51,7 @@ def study(**changed: object) -> str:
         "badge": pages.Badge(EVIL, '"><script>'),
         "facts": [(EVIL, EVIL)],
         "station": EVIL,
-        "plots": [(EVIL, Figure(inlined(b"png", "png"), EVIL, EVIL, "lines"))],
+        "plots": [(EVIL, Figure(data_url(b"png", "png"), EVIL, EVIL, "lines"))],
         "failures": table,
         **dict.fromkeys(("table_iv", "table_v", "pointing", "handoff"), table),
     }

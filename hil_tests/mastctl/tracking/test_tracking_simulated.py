@@ -19,7 +19,7 @@ from hil_tests.mastctl.service_fakes import eventually
 from mastctl.client import Client, ClientError
 from mastctl.config import load_config
 from mastctl.daemon import RunningDaemon
-from mastctl.experiment.targets import textured
+from mastctl.experiment.targets import texture_mask
 from mastctl.handoff.log import read_log
 
 CROPPED_PX = (400, 300)
@@ -114,7 +114,7 @@ def begun(client: Client, daemon: RunningDaemon, range_m: float = 3.4) -> FloatA
     """A track of a textured place; returns where it truly is in the site frame."""
     client.wait(client.point(position_m=[range_m, 0.2, 0.0]))
     shot = client.snapshot("navcam_left")
-    rows, columns = np.nonzero(textured(shot.image)[60:-60, 60:-60])
+    rows, columns = np.nonzero(texture_mask(shot.image)[60:-60, 60:-60])
     simulation = daemon.hardware.simulation
     assert simulation is not None
     for pick in np.random.default_rng(2).integers(len(rows), size=8):
