@@ -19,6 +19,7 @@ from drivers.interfaces import Frame, Reading
 from hil_tests.mastctl.service_fakes import FakeHardware, Hang, eventually, rig
 from mastctl.devices import devices as devices_module
 from mastctl.devices import frames, joint_history, rest, stops
+from mastctl.devices.cameras import CAMERA_GRACE_S
 from mastctl.devices.devices import Devices
 from mastctl.devices.limits import Limits
 from mastctl.pointing.settings import PointingSettings
@@ -48,10 +49,10 @@ def test_deadlines_and_periods_are_the_programs_own(page: str) -> None:
         f"| {m.MOVE_TIMEOUT_S:g} s | returns at once",
         f"| `stop()` | {m.STOP_TIMEOUT_S:g} s |",
         f"has been busy for {stops.PATIENCE_S:g} s",
-        f"`timeout_s` and {m.CAMERA_GRACE_S:g} s |",
+        f"`timeout_s` and {CAMERA_GRACE_S:g} s |",
         f"up to {s.frame_timeout_s:g} s for a pointing and "
         f"{service_module.SNAPSHOT_TIMEOUT_S:g} s for a snapshot",
-        f"a camera has {s.frame_timeout_s + m.CAMERA_GRACE_S:g} s in all",
+        f"a camera has {s.frame_timeout_s + CAMERA_GRACE_S:g} s in all",
         f"| `close()` | {service_module.HARDWARE_CLOSE_S:g} s for all devices",
         f"{1 / m.MOVING_PERIOD_S:g} times a second while the head moves, {1 / m.RESTING_PERIOD_S:g} times",
         f"rests within {s.arrival_tolerance_rad:g} rad of the angles sent",

@@ -18,6 +18,7 @@ from drivers.clock import SystemClock
 from drivers.errors import BadFrame, BadReply, DriverError, LineLost, NoFreshFrame, NoReply
 from drivers.interfaces import Frame, FrameTime, Reading
 from hil_tests.mastctl.service_fakes import FakeCamera, FakeHardware, Hang, eventually, rig
+from mastctl.devices import cameras as cameras_module
 from mastctl.devices import devices as devices_module
 from mastctl.devices.devices import Devices
 from mastctl.devices.frames import KEPT_FRAMES, StampedFrame
@@ -47,8 +48,10 @@ impatient = pytest.mark.parametrize("deadline_s", [0.4])
 
 @pytest.fixture
 def devices(hardware: FakeHardware, monkeypatch: pytest.MonkeyPatch, deadline_s: float) -> Iterator[Devices]:
-    for name in ("READ_TIMEOUT_S", "MOVE_TIMEOUT_S", "STOP_TIMEOUT_S", "CAMERA_GRACE_S"):
+    for name in ("READ_TIMEOUT_S", "MOVE_TIMEOUT_S", "STOP_TIMEOUT_S"):
         monkeypatch.setattr(devices_module, name, deadline_s)
+    for name in ("READINGS_S", "CAMERA_GRACE_S"):
+        monkeypatch.setattr(cameras_module, name, deadline_s)
     made = Devices(hardware, LIMITS, DIGEST, SystemClock(), rig())
     yield made
     hardware.head.hook = lambda name: None

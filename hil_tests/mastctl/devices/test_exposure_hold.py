@@ -24,7 +24,7 @@ from hil_tests.mastctl.service_fakes import (
     rig,
 )
 from mastctl.client import Client
-from mastctl.devices import devices as devices_module
+from mastctl.devices import cameras as cameras_module
 from mastctl.devices import exposure_hold as exposure_hold_module
 from mastctl.devices.devices import Devices
 from mastctl.devices.limits import Limits
@@ -70,7 +70,7 @@ def hardware() -> FakeHardware:
 
 @pytest.fixture
 def devices(hardware: FakeHardware, monkeypatch: pytest.MonkeyPatch) -> Iterator[Devices]:
-    monkeypatch.setattr(devices_module, "CAMERA_GRACE_S", DEADLINE_S)
+    monkeypatch.setattr(cameras_module, "CAMERA_GRACE_S", DEADLINE_S)
     monkeypatch.setattr(exposure_hold_module, "HOLD_TIMEOUT_S", DEADLINE_S, raising=False)
     made = Devices(hardware, Limits((-2.0, 2.0), (-1.0, 1.0), 0.5), "0" * 64, SystemClock(), rig())
     yield made
@@ -233,7 +233,7 @@ class Asked(FakeCamera):
 def test_a_camera_that_hangs_when_asked_for_its_size_keeps_the_service_from_nothing(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(devices_module, "SIZE_TIMEOUT_S", DEADLINE_S, raising=False)
+    monkeypatch.setattr(cameras_module, "SIZE_TIMEOUT_S", DEADLINE_S)
     hardware, hang = FakeHardware(), Hang()
     asked = Asked("navcam_left")
     asked.on_size = hang
@@ -255,7 +255,7 @@ def test_a_camera_that_hangs_when_asked_for_its_times_fails_its_own_pictures_onl
     hang = Hang()
     asked = Asked("navcam_left")
     asked.on_times = hang
-    devices._cameras["navcam_left"] = asked
+    devices._cameras._cameras["navcam_left"] = asked
     begun_s = time.monotonic()
     with pytest.raises(DriverError, match="navcam_left"):
         devices.frames(["navcam_left", "navcam_right"], time.monotonic(), 0.1)

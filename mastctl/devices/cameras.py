@@ -1,0 +1,386 @@
+"""The cameras as the service uses them: one thread each, sets that belong together, with their facts.
+
+A frame gets the joint angles at its mid-exposure from the head's readings around it. An answer that cannot
+be true is an error.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+import threading
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from functools import partial
+
+import numpy as np
+
+from calib.mast.rig import Rig
+from drivers.absent_camera import AbsentCamera
+from drivers.clock import Clock
+from drivers.errors import BadFrame, BadReply, DriverError, NoFreshFrame
+from drivers.interfaces import Camera, Frame, FrameTime, KnowsSize, Paced, Reading
+from drivers.pairing import Offset, Pairing, learned
+from mastctl.devices import frames as frame_checks
+from mastctl.devices.exposure_hold import ExposureHold
+from mastctl.devices.frames import FrameStore, StampedFrame
+from mastctl.devices.joint_history import JointHistory
+from mastctl.devices.thread import Asked, DeviceThread, Fault, Words
+from mastctl.errors import NoLonger
+
+log = logging.getLogger(__name__)
+
+READINGS_S = 1.0  # for the head's readings to reach beyond an exposure
+SIZE_TIMEOUT_S = 1.0
+CAMERA_GRACE_S = 3.0  # beyond the time given to next_frame: copying and decoding on a busy machine
+MOVED_RAD = 1e-5  # a head camera's picture that stays the same to the last bit beyond this is frozen
+WORDS = {
+    "next_frame": Words("a picture comes"),
+    "recent_times": Words("a pair of pictures comes"),
+    "hold_exposure": Words("an operation can hold the exposure again"),
+    "release_exposure": Words("an operation has held and released the exposure again"),
+}
+
+
+class Cameras:
+    """The cameras behind their threads.
+
+    Parameters
+    ----------
+    cameras
+        The opened drivers by name; closing them is left to their opener.
+    store
+        Keeps the frames.
+    history, read, head
+        The head's readings so far, what takes a new one, and the head's name, for errors.
+    clock, time
+        Stamps are judged against the one; deadlines run on the other.
+    rig
+        As in `mastctl.devices.devices.Devices`.
+    grace_s
+        How long past its time a camera may take before it counts as hanging, seconds; 3 by default.
+
+    Raises
+    ------
+    BadFrame
+        If a camera that knows its size has another than the mast file's.
+    """
+
+    def __init__(
+        self,
+        cameras: Mapping[str, Camera],
+        store: FrameStore,
+        history: JointHistory,
+        read: Callable[[], Reading],
+        head: str,
+        clock: Clock,
+        time: Clock,
+        rig: Rig | None,
+        grace_s: float | None,
+    ) -> None:
+        self._cameras = dict(cameras)
+        self._store = store
+        self._history = history
+        self._read = read
+        self._head = head
+        self._clock = clock
+        self._time = time
+        self._grace_s = CAMERA_GRACE_S if grace_s is None else grace_s
+        self._sizes_px: dict[str, tuple[int, int]] = {}
+        self._on_head: set[str] = set()
+        if rig is not None:
+            self.use_rig(rig)
+        self._paired_s: dict[str, float] = {}  # per camera when the last frame that served a set began
+        self._learned: dict[tuple[str, str], Offset] = {}
+        self._still_since: dict[str, StampedFrame] = {}  # per camera the first frame of the same content
+        self._stamping = {name: threading.Lock() for name in self._cameras}
+        self._threads = {name: self._thread_of(name) for name in self._cameras}
+        if rig is not None:
+            self._check_sizes()
+
+    def frames(
+        self, cameras: Sequence[str], exposed_after_s: float, timeout_s: float
+    ) -> dict[str, StampedFrame]:
+        """Return one frame of each camera, asked for in parallel, with its facts.
+
+        Frames of several cameras belong together (`drivers.pairing`): exposed at one trigger, or nearest in
+        time. Each serves one such set. All are ``moving`` if the head moved at any time from the first
+        exposure to the end of the last.
+
+        Parameters
+        ----------
+        cameras
+            Names of configured cameras.
+        exposed_after_s
+            Only frames whose exposure began after this moment count, seconds of CLOCK_MONOTONIC.
+        timeout_s
+            What each camera is given, seconds; the call itself ends at most the grace and 1 s later.
+
+        Raises
+        ------
+        NotKnown
+            ``unknown_camera`` if a name is not configured.
+        NoFreshFrame, BadFrame, NoReply, DriverError
+            If a camera did not deliver, or none that belong together; the first in the order asked.
+        BadReply
+            If the head's readings do not reach around an exposure.
+        """
+        for camera in cameras:
+            frame_checks.check_known(camera, self._cameras)
+        deadline_s = self._time.now_s() + timeout_s
+        names = tuple(dict.fromkeys(cameras))
+        if len(names) < 2:
+            frames = self._fetched(dict.fromkeys(names, exposed_after_s), deadline_s)
+            return {name: self._stamped(name, frame) for name, frame in frames.items()}
+        used_s = max(self._paired_s.get(name, -math.inf) for name in names)
+        pairing = Pairing(names[0], self._offsets(names, deadline_s))
+        frames = self._fetched(pairing.moments(max(exposed_after_s, used_s)), deadline_s)
+        while after_s := pairing.again(frames):
+            if self._time.now_s() > deadline_s:
+                words = f"no frames of {', '.join(names)} that belong together came within {timeout_s:g} s"
+                raise NoFreshFrame(words, device=min(after_s))
+            frames |= self._fetched(after_s, deadline_s)
+        self._paired_s |= {name: frame.exposure_began_s for name, frame in frames.items()}
+        return self._together({name: self._stamped(name, frame) for name, frame in frames.items()})
+
+    def _offsets(self, names: Sequence[str], deadline_s: float) -> dict[str, Offset]:
+        """What is known of each camera's times beside the first one's."""
+        first = names[0]
+        asked: dict[str, Asked[_Times | None]] = {}
+        for name in names:
+            tell = partial(self._times_of, name)
+            left_s = max(0.0, deadline_s - self._time.now_s())
+            asked[name] = self._threads[name].submit("recent_times", tell, left_s + self._grace_s)
+        times = {
+            name: self._threads[name].wait(told, deadline_s + self._grace_s) for name, told in asked.items()
+        }
+        for name in names[1:]:
+            before = self._learned.get((first, name))
+            try:
+                self._learned[first, name] = learned(times[first], times[name], before)
+            except Exception as error:
+                words = f"the drivers tell no times of {first} and {name}: {type(error).__name__}: {error}"
+                raise DriverError(words, device=name) from None
+        return {name: self._learned[first, name] for name in names[1:]}
+
+    def _fetched(self, after_s: Mapping[str, float], deadline_s: float) -> dict[str, Frame | StampedFrame]:
+        """One frame of each named camera, exposed after its moment."""
+        asked: dict[str, Asked[Frame | StampedFrame]] = {}
+        for camera, exposed_after_s in after_s.items():
+            take = self._taker(camera, exposed_after_s, deadline_s)
+            left_s = max(0.0, deadline_s - self._time.now_s())
+            asked[camera] = self._threads[camera].submit("next_frame", take, left_s + self._grace_s)
+        return {
+            camera: self._threads[camera].wait(told, deadline_s + self._grace_s)
+            for camera, told in asked.items()
+        }
+
+    def _stamped(self, camera: str, frame: Frame | StampedFrame) -> StampedFrame:
+        return frame if isinstance(frame, StampedFrame) else self._stamp(camera, frame)
+
+    def _together(self, frames: dict[str, StampedFrame]) -> dict[str, StampedFrame]:
+        """Frames that serve one measurement: if the head moved between two exposures, it moved in all."""
+        if any(frame.moving for frame in frames.values()):
+            moving = True
+        else:
+            began_s = min(frame.exposure_began_s for frame in frames.values())
+            ended_s = max(frame.mid_exposure_s + frame.exposure_s / 2 for frame in frames.values())
+            moving = self._history.at_exposure(began_s, (began_s + ended_s) / 2, ended_s, self._head).moving
+        if not moving:
+            return frames
+        return {name: replace(frame, moving=True) for name, frame in frames.items()}
+
+    def frame_by_id(self, frame_id: str, max_age_s: float | None = None) -> StampedFrame:
+        """Return a frame that is still kept.
+
+        Raises
+        ------
+        NotKnown, NoLonger, NotNow
+            ``frame_unknown``, ``frame_too_old`` or ``other_mast_file``.
+        """
+        frame = self._store.by_id(frame_id)
+        age_s = self._clock.now_s() - frame.mid_exposure_s
+        if max_age_s is not None and age_s > max_age_s:
+            raise NoLonger(
+                "frame_too_old", f"frame {frame_id} is {age_s:.0f} s old, at most {max_age_s:.0f} s is taken"
+            )
+        return frame
+
+    def newest_frames(self) -> dict[str, StampedFrame | None]:
+        """Return each configured camera's newest frame, None where there is none yet; asks no camera."""
+        return {camera: self._store.newest(camera) for camera in self._cameras}
+
+    @contextmanager
+    def exposure_held(self) -> Iterator[None]:
+        """Keep every camera's exposure as it is inside the block: a measurement compares its pictures.
+
+        Nothing is waited for; see `mastctl.devices.exposure_hold`.
+        """
+        holds = [
+            ExposureHold(thread, partial(self._cameras.__getitem__, name))
+            for name, thread in self._threads.items()
+        ]
+        begun = [hold for hold in holds if hold.begin()]
+        try:
+            yield
+        finally:
+            for hold in begun:
+                hold.end()
+
+    def use_rig(self, rig: Rig) -> None:
+        """Judge pictures by another mast file's sizes and mounts from now on."""
+        self._sizes_px = {name: camera.model.size_px for name, camera in rig.cameras.items()}
+        self._on_head = {name for name, camera in rig.cameras.items() if camera.on == "head"}
+
+    def faults(self) -> list[Fault]:
+        """Return what is wrong with any camera now."""
+        return [fault for thread in self._threads.values() for fault in thread.faults()]
+
+    def close(self, until_s: float) -> None:
+        """End the threads; waits until a moment of the deadlines' clock, and for each 0.1 s at least."""
+        for thread in self._threads.values():
+            thread.close(max(0.1, until_s - self._time.now_s()))
+
+    # In the cameras' own threads
+
+    def _thread_of(self, camera: str) -> DeviceThread:
+        """The thread of a camera; that of an absent one looks after it, and tells its absence as a fault."""
+        if not isinstance(self._cameras[camera], AbsentCamera):
+            return DeviceThread(camera, words=WORDS, clock=self._time)
+        words = {**WORDS, "next_frame": Words("it is there, or a picture comes")}
+        return DeviceThread(
+            camera,
+            between=lambda: self._join(camera),
+            between_name="next_frame",
+            words=words,
+            clock=self._time,
+        )
+
+    def _join(self, name: str) -> None:
+        """Put a camera that was absent at the start in its place, if it is there. Raises DriverError."""
+        place = self._cameras[name]
+        if isinstance(place, AbsentCamera):
+            self._cameras[name] = place.appeared()
+            log.warning("%s is here", name)
+        self._check_size(name)
+
+    def _check_sizes(self) -> None:
+        """Pass cameras that do not tell their size now, or have the mast file's. Raises BadFrame."""
+        until_s = self._time.now_s() + SIZE_TIMEOUT_S
+        asked = {
+            name: thread.submit("size_px", partial(self._check_size, name), SIZE_TIMEOUT_S, told=False)
+            for name, thread in self._threads.items()
+        }
+        for name, told in asked.items():
+            try:
+                self._threads[name].wait(told, until_s)
+            except BadFrame:
+                for thread in self._threads.values():
+                    thread.close(0.1)
+                raise
+            except DriverError as error:
+                log.warning("%s; the size is seen in its pictures", error)
+
+    def _check_size(self, name: str) -> None:
+        """Pass a camera that does not know its size, or has the mast file's. Raises BadFrame."""
+        camera = self._cameras[name]
+        if isinstance(camera, KnowsSize) and name in self._sizes_px:
+            width, height = camera.size_px
+            frame_checks.check_size(name, (int(width), int(height)), self._sizes_px[name])
+
+    def _times_of(self, name: str) -> _Times | None:
+        """What a camera tells of its frames' times; None if it is not `Paced`."""
+        camera = self._cameras[name]
+        if not isinstance(camera, Paced):
+            return None
+        recent = [FrameTime(one.sequence, one.exposure_began_s) for one in camera.recent_times()]
+        return _Times(float(camera.period_s), str(camera.trigger), recent)
+
+    def _taker(
+        self, camera: str, exposed_after_s: float, deadline_s: float
+    ) -> Callable[[], Frame | StampedFrame]:
+        def take() -> Frame | StampedFrame:
+            newest = self._store.newest(camera)
+            if newest is not None and newest.exposure_began_s > exposed_after_s:
+                return newest  # somebody else's request brought it a moment ago
+            answer = self._cameras[camera].next_frame(
+                exposed_after_s, max(0.0, deadline_s - self._time.now_s())
+            )
+            now_s = self._clock.now_s()
+            frame = frame_checks.checked(answer, camera, self._sizes_px.get(camera), exposed_after_s, now_s)
+            if newest is not None:
+                try:
+                    _check_order(frame, newest)
+                except BadFrame:  # refused once; a camera that came back counting from 0 goes on after that
+                    self._store.begin_again(camera)
+                    raise
+            return frame
+
+        return take
+
+    # In the caller's thread
+
+    def _stamp(self, camera: str, frame: Frame) -> StampedFrame:
+        """Give a frame its joint angles and id, and keep it."""
+        began_s = frame.mid_exposure_s - frame.exposure_s / 2
+        ended_s = frame.mid_exposure_s + frame.exposure_s / 2
+        until_s = self._time.now_s() + READINGS_S
+        while (newest := self._history.newest) is None or newest.time_s < ended_s:
+            self._read()
+            if self._time.now_s() > until_s:
+                raise BadReply("the readings stay behind the frame's exposure", device=self._head)
+        joints = self._history.at_exposure(began_s, frame.mid_exposure_s, ended_s, self._head)
+        frame_id, mast_digest = self._store.name(camera, frame.sequence)
+        stamped = StampedFrame(
+            frame_id=frame_id,
+            camera=camera,
+            image=frame.image,
+            sequence=frame.sequence,
+            mid_exposure_s=frame.mid_exposure_s,
+            exposure_s=frame.exposure_s,
+            pan_rad=joints.pan_rad,
+            tilt_rad=joints.tilt_rad,
+            moving=joints.moving,
+            mast_digest=mast_digest,
+        )
+        with self._stamping[camera]:
+            self._check_alive(stamped)
+            return self._store.add(stamped)
+
+    def _check_alive(self, frame: StampedFrame) -> None:
+        """Refuse a head camera's picture that did not change at all while the head moved."""
+        since = self._still_since.get(frame.camera)
+        if since is None or not np.array_equal(since.image, frame.image):
+            self._still_since[frame.camera] = frame
+            return
+        moved_rad = max(abs(frame.pan_rad - since.pan_rad), abs(frame.tilt_rad - since.tilt_rad))
+        if frame.camera in self._on_head and moved_rad > MOVED_RAD:
+            raise BadFrame(
+                f"the picture is frozen: equal to the last bit although the head moved {moved_rad:.6f} rad",
+                device=frame.camera,
+            )
+
+
+@dataclass(frozen=True)
+class _Times:
+    """A camera's times as it told them: what `drivers.pairing.learned` asks for."""
+
+    period_s: float
+    trigger: str
+    recent: Sequence[FrameTime]
+
+    def recent_times(self) -> Sequence[FrameTime]:
+        return self.recent
+
+
+def _check_order(frame: Frame, newest: StampedFrame) -> None:
+    """Refuse a frame whose count and time do not go forward together."""
+    ahead = frame.sequence - newest.sequence
+    later_s = frame.mid_exposure_s - newest.mid_exposure_s
+    if (ahead > 0) != (later_s > 0) or (ahead < 0) != (later_s < 0) or ahead < 0:
+        raise BadFrame(
+            f"frame {frame.sequence} is {later_s:.3f} s after frame {newest.sequence}: "
+            "count and time must grow together",
+            device=newest.camera,
+        )
