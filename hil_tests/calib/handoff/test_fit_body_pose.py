@@ -93,6 +93,16 @@ def test_drawn_motions_come_back_within_the_stated_covariance(rig: Rig) -> None:
     assert np.mean(np.array(found) < 12.59) > 0.85  # the 95 % point
 
 
+def test_where_the_scatter_is_three_times_what_is_stated_the_covariance_grows_with_it(rig: Rig) -> None:
+    found = []
+    for seed in range(20):
+        step = np.random.default_rng(seed).normal(0.0, [0.002] * 3 + [0.002] * 3)
+        fit = fitted(rig, step, 900 + seed, match_px=1.2)
+        assert fit.scale > 2.0
+        found.append(chi2_of(fit, step))
+    assert 3.0 < np.mean(found) < 9.0  # 6 expected; sigma of the mean of 20 draws is 0.8
+
+
 def test_the_papers_bias_is_found_and_the_residuals_go(rig: Rig) -> None:
     step = np.concatenate([TURN_RAD, SHIFT_M])
     fit = fitted(rig, step, 5)
@@ -115,6 +125,19 @@ def test_without_a_motion_it_is_significant_as_rarely_as_stated(rig: Rig, match_
     assert (chances >= 0.0027).all() or np.sum(chances < 0.0027) == 1
 
 
+def test_every_hand_off_that_is_used_counts_in_full_against_the_prior(rig: Rig) -> None:
+    """At the least squares' minimum what the hand-offs pull and what the prior pulls are the same."""
+    fit = fitted(rig, np.concatenate([TURN_RAD, SHIFT_M]), 5)
+    at = fit.used.equations(fit.step)
+    pulls = [
+        r.T @ np.linalg.solve(c, e)
+        for r, c, e in zip(at.rates, at.covariance_px2, at.residual_px, strict=True)
+    ]
+    prior = np.array([PRIOR_TURN_RAD] * 3 + [PRIOR_SHIFT_M] * 3)
+    sigma = np.sqrt(np.diag(fit.covariance))
+    assert (sigma * np.abs(np.sum(pulls, axis=0) / fit.scale - fit.step / prior**2)).max() < 0.01
+
+
 def test_blunders_are_named_and_do_not_move_the_result(rig: Rig) -> None:
     rng = np.random.default_rng(9)
     step = np.concatenate([TURN_RAD, SHIFT_M])
@@ -132,6 +155,19 @@ def test_blunders_are_named_and_do_not_move_the_result(rig: Rig) -> None:
     assert chi2_of(fit, step) < 22.5
     worst = max(fit.outliers, key=lambda one: one.off_px)
     assert worst.name == "hand-off 21" and abs(worst.off_px - np.hypot(30, 9)) < 2.0
+
+
+def test_a_quarter_that_err_alike_do_not_pull_the_rest_along(rig: Rig) -> None:
+    """As when the picture shows the next stone: as many as that shift a plain mean by 3 px."""
+    rng = np.random.default_rng(10)
+    step = np.concatenate([TURN_RAD, SHIFT_M])
+    made = hand_offs(moved_hazcams(rig, Rotation.from_rotvec(TURN_RAD), SHIFT_M), rig, targets(rng, 28), rng)
+    wrong = (1, 4, 9, 13, 16, 22, 27)
+    for index in wrong:
+        made[index] = with_found(with_found(made[index], HAZCAMS[0], (9.0, 7.0)), HAZCAMS[1], (9.0, 7.0))
+    fit = fit_body_pose(rig, HAZCAMS, made)
+    assert {one.name for one in fit.outliers} == {f"hand-off {i}" for i in wrong}
+    assert chi2_of(fit, step) < 22.5
 
 
 def test_clicks_of_two_things_are_named_and_not_used(rig: Rig) -> None:

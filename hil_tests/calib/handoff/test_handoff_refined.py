@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from calib.handoff.by_image import Eye, RefinedPixel, refine_handoff
+from calib.handoff.by_image import Eye, RefinedPixel, RefineSettings, refine_handoff
 from calib.handoff.geometric import Handoff, Joints, hand_off
 from calib.mast.covariance import RigCovariance, moved_rig
 from calib.mast.rig import Mast, Rig, RigCamera
@@ -43,12 +43,12 @@ class Case:
     handoff: Handoff
     clicks_px: NDArray[np.float64]
 
-    def refined(self) -> dict[str, RefinedPixel]:
+    def refined(self, settings: RefineSettings | None = None) -> dict[str, RefinedPixel]:
         def view(name: str) -> Eye:
             return Eye(self.images[name], CAMERAS[name].model)
 
         source = (view(SOURCE[0]), view(SOURCE[1]))
-        return refine_handoff(self.handoff, source, self.clicks_px, {n: view(n) for n in NEXT})
+        return refine_handoff(self.handoff, source, self.clicks_px, {n: view(n) for n in NEXT}, settings)
 
 
 def pictures(plane: TexturedPlane, noise_dn: float = 1.5) -> dict[str, NDArray[np.float32]]:
@@ -118,6 +118,35 @@ def test_a_target_that_both_eyes_see_moved_is_not_accepted(good: Case) -> None:
     assert all(refined[name].verdict == "occluded" for name in NEXT)
 
 
+def rolled(good: Case, left_px: int, right_px: int) -> Case:
+    """With clicks that are good to 0.02 px, and destination pictures that lie farther right by so much.
+
+    Along the rows the picture itself is good to less than 0.1 px, so what is left is the camera models'.
+    """
+    images = dict(good.images)
+    for name, shift_px in zip(NEXT, (left_px, right_px), strict=True):
+        images[name] = np.roll(images[name], shift_px, axis=1)
+    return case(images, sigma_px=0.02)
+
+
+@pytest.mark.parametrize(("model_px", "verdict"), [(0.6, "accepted"), (0.4, "occluded")])
+def test_an_eye_may_be_off_by_two_sigma_of_what_camera_models_are_wrong_by(
+    good: Case, model_px: float, verdict: str
+) -> None:
+    """A search of one sigma allows two: 1 px is 1.7 sigma of 0.6 px and 2.5 sigma of 0.4 px."""
+    refined = rolled(good, 1, 1).refined(RefineSettings(sigmas=1.0, model_px=model_px))
+    assert {one.verdict for one in refined.values()} == {verdict}
+
+
+@pytest.mark.parametrize(("model_px", "verdict"), [(0.4, "accepted"), (0.3, "occluded")])
+def test_eyes_may_disagree_by_what_camera_models_are_wrong_by(
+    good: Case, model_px: float, verdict: str
+) -> None:
+    """One pixel to each side is a chi-square of 2 / 0.16 = 12.5, or of 2 / 0.09 = 22: 18.5 is the most."""
+    refined = rolled(good, 1, -1).refined(RefineSettings(model_px=model_px))
+    assert {one.verdict for one in refined.values()} == {verdict}
+
+
 def test_a_repeated_pattern_is_ambiguous() -> None:
     turns = np.arange(64) * 2 * np.pi / 64
     tile = 120 + 30 * np.sin(turns)[:, None] + 30 * np.sin(turns)
@@ -177,16 +206,22 @@ def test_a_shadow_that_moved_between_the_pictures_is_not_accepted() -> None:
     assert all(refined[name].verdict != "accepted" for name in NEXT)
 
 
-def test_a_window_that_the_picture_cuts_is_no_search(good: Case) -> None:
+@pytest.mark.parametrize("cut", ["left", "right", "below"])
+def test_a_window_that_the_picture_cuts_is_no_search(good: Case, cut: str) -> None:
     """Where the target may be in a part that cannot be searched, the best of the rest means nothing."""
     eyes = {}
     for name in NEXT:
         model = CAMERAS[name].model
-        edge = int(CAMERAS[name].pixel(TARGET)[0]) - 26
-        size = (model.size_px[0] - edge, model.size_px[1])
+        x, y = CAMERAS[name].pixel(TARGET).astype(int)
+        width, height = model.size_px
+        low, right, down = {
+            "left": (x - 26, width, height),
+            "right": (0, x + 27, height),
+            "below": (0, width, y + 27),
+        }[cut]
         eyes[name] = Eye(
-            np.ascontiguousarray(good.images[name][:, edge:]),
-            replace(model, H=model.H - edge * model.A, size_px=size),
+            np.ascontiguousarray(good.images[name][:down, low:right]),
+            replace(model, H=model.H - low * model.A, size_px=(right - low, down)),
         )
     rig = replace(RIG, cameras={**RIG.cameras, **{n: RigCamera("rover", eyes[n].camera) for n in NEXT}})
     done = hand_off(rig, SOURCE, NEXT, Joints(0.0, 0.0), *good.clicks_px, sigma_px=3.0)

@@ -260,6 +260,13 @@ def test_a_joint_that_turns_past_half_a_turn_gets_the_angle_it_can_reach() -> No
     assert chosen.pan_rad == pytest.approx(math.tau - 1.0)
 
 
+def test_a_joint_that_turns_backwards_past_half_a_turn_gets_the_angle_it_can_reach() -> None:
+    chosen = choose([Solution(1.0, 0.2, 5.0)], (math.radians(-350.0), math.radians(-20.0)), (-1.0, 1.0))
+    assert chosen.pan_rad == pytest.approx(1.0 - math.tau)
+    chosen = choose([Solution(0.0, 2.0, 5.0)], (-1.0, 1.0), (-5.0, -4.0))
+    assert chosen.tilt_rad == pytest.approx(2.0 - math.tau)
+
+
 # -- the edge of reach, from both sides
 
 

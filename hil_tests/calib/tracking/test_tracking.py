@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from scipy.stats import chi2
 
 from calib.camera.one_point import OnePoint
 from calib.errors import CalibError
@@ -17,7 +18,7 @@ from calib.pictures.patch_match import match_patch
 from calib.pictures.warp import Plane
 from calib.rigid import Rigid, rot_y, rot_z
 from calib.tracking.pose_doubt import pose_doubt
-from calib.tracking.track import SIZES, Look, Track, moved_track, seen_by, start_track
+from calib.tracking.track import SIZES, Look, Track, TrackSettings, moved_track, seen_by, start_track
 from hil_tests.calib.pictures.textured_planes import Pinhole, TexturedPlane, picture, random_texture
 
 TARGET = np.array([3.0, 0.1, 0.0])
@@ -167,6 +168,39 @@ def test_a_target_is_kept_while_the_rover_nears_it_with_wrong_odometry(begun: Tr
         exact = pinholes(x, heading)["left"].pixel(TARGET)
         assert np.linalg.norm(look.found["left"].pixel_px - exact) < 0.6
     assert renewed >= 1
+
+
+def nearer_by(ratio: float) -> float:
+    """How far the rover has to drive for the cameras, 1.2 m up, to be that much nearer to the target."""
+    return float(TARGET[0] - np.sqrt((TARGET[0] ** 2 + 1.44) / ratio**2 - 1.44))
+
+
+@pytest.mark.parametrize(
+    ("ratio", "settings", "renewed"),
+    [
+        # Nearer by a ratio, flat ground is seen as much larger across, and by its square along the sight.
+        (1.44, TrackSettings(renew_shape=9.0, renew_below=0.0), False),  # 1.44^1.5 = 1.73 times larger
+        (1.52, TrackSettings(renew_shape=9.0, renew_below=0.0), True),  # 1.87 times
+        (1.46, TrackSettings(renew_grown=9.0, renew_below=0.0), False),  # 1.46 times another shape
+        (1.54, TrackSettings(renew_grown=9.0, renew_below=0.0), True),
+        (1.1, TrackSettings(renew_below=0.0), False),
+        (1.1, TrackSettings(renew_below=1.0), True),
+        (1.1, TrackSettings(renew_below=0.0, renew_shrunk=1.12), False),  # 1.15 times larger
+        (1.1, TrackSettings(renew_below=0.0, renew_shrunk=1.18), True),
+    ],
+)
+def test_the_key_is_renewed_when_the_ground_looks_larger_or_otherwise_or_less_alike(
+    begun: Track, ratio: float, settings: TrackSettings, renewed: bool
+) -> None:
+    x_m = nearer_by(ratio)
+    spread = np.diag([1e-6] * 3 + [0.003**2] * 3)
+    look = seen_by(step(begun, pose(0.0), pose(x_m), spread), eyes(x_m, seed=20), settings)
+    assert look.track.state == "tracked", look.reason
+    assert look.renewed == renewed
+
+
+def test_one_good_look_in_a_thousand_is_refused_with_both_eyes() -> None:
+    assert TrackSettings().worst_chi2 == pytest.approx(chi2.isf(0.001, 4), abs=0.05)
 
 
 def test_a_hidden_target_is_lost_and_found_again(begun: Track) -> None:
