@@ -100,11 +100,8 @@ class SerialLine:
 
     def write(self, data: bytes) -> None:
         """Send bytes. Raises LineLost."""
-        sent = 0
         try:
-            if self._descriptor is not None and not self._is_url:
-                with contextlib.suppress(BlockingIOError):
-                    sent = os.write(self._descriptor, data)
+            sent = 0 if self._descriptor is None or self._is_url else _written(self._descriptor, data)
             if sent < len(data):  # no file, or its buffer is full: pyserial waits for room
                 self._serial.write(data[sent:])
         except _BROKEN as error:
@@ -174,6 +171,14 @@ class SerialLine:
 
     def _at(self, doing: str) -> dict[str, object]:
         return {"port": self.port, "while": doing}
+
+
+def _written(descriptor: int, data: bytes) -> int:
+    """Write to a file what it takes at once; returns how much that was."""
+    try:
+        return os.write(descriptor, data)
+    except BlockingIOError:
+        return 0
 
 
 def _words(error: BaseException) -> str:

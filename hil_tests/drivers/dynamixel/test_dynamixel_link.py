@@ -433,3 +433,16 @@ def test_letting_go_of_a_socket_does_not_wait() -> None:
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(time, "sleep", lambda wait_s: pytest.fail("pyserial waits 0.3 s"))
             port.close()
+
+
+def test_what_a_full_buffer_does_not_take_is_left_to_pyserial(monkeypatch: pytest.MonkeyPatch) -> None:
+    with scripted(always()) as (line, _):
+        port = SerialLine(line.path, BAUD_RATE)
+        for taken, rest in ((0, b"abc"), (1, b"bc"), (3, None)):
+            left: list[bytes] = []
+            with monkeypatch.context() as patch:
+                patch.setattr("drivers.serial_line._written", lambda where, data, taken=taken: taken)
+                patch.setattr(port, "_serial", SimpleNamespace(write=left.append))
+                port.write(b"abc")
+            assert left == ([] if rest is None else [rest])
+        port.close()
