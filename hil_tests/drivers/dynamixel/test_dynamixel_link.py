@@ -446,3 +446,16 @@ def test_what_a_full_buffer_does_not_take_is_left_to_pyserial(monkeypatch: pytes
                 port.write(b"abc")
             assert left == ([] if rest is None else [rest])
         port.close()
+
+
+def test_a_host_that_is_away_costs_half_a_second(monkeypatch: pytest.MonkeyPatch) -> None:
+    patience_s: list[float] = []
+
+    def nobody_answers(address: object, timeout: float) -> socket.socket:
+        patience_s.append(timeout)
+        raise TimeoutError("timed out")
+
+    monkeypatch.setattr("drivers.serial_line.socket.create_connection", nobody_answers)
+    with pytest.raises(LineLost, match=r"10\.0\.0\.1:4000 cannot be opened: timed out"):
+        Link("socket://10.0.0.1:4000", BAUD_RATE)
+    assert patience_s == [0.5]
