@@ -24,7 +24,7 @@ from hil_tests.mastctl.calibration.survey_world import navcam_rig, navcam_survey
 from mastctl.calibration import detection
 from mastctl.calibration.run import FITS
 from mastctl.cli.main import main
-from mastctl.report import html
+from mastctl.report import pages
 
 KILLED_AT = """
 import os, signal, sys
@@ -147,10 +147,10 @@ def test_a_refused_save_does_not_multiply_former_files(
 def test_a_report_that_cannot_be_written_does_not_hide_the_mast_file(
     survey: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def full(*ignored: Any) -> str:
+    def full(*ignored: Any, **told: Any) -> str:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(html, "page", full)
+    monkeypatch.setattr(pages, "page", full)
     out = tmp_path / "m.yaml"
     assert main(words(survey, out, "--report", str(tmp_path / "r"))) == 1
     error = json.loads(capsys.readouterr().out)["error"]
@@ -162,8 +162,8 @@ def test_a_report_that_cannot_be_written_does_not_hide_the_mast_file(
 def test_a_second_report_keeps_the_first(
     survey: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    pages = iter(["one", "two"])
-    monkeypatch.setattr(html, "page", lambda *ignored: next(pages))
+    written = iter(["one", "two"])
+    monkeypatch.setattr(pages, "page", lambda *ignored, **told: next(written))
     for _ in range(2):
         assert main(words(survey, tmp_path / "m.yaml", "--report", str(tmp_path / "r"))) == 0
     assert contents(tmp_path / "r") == {"calibration.html": b"two", "calibration.previous.html": b"one"}

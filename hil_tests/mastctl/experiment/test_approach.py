@@ -63,7 +63,7 @@ def test_runs_are_counted_and_averaged_by_hand() -> None:
     assert (found["losses"], found["recoveries"], found["handoffs"]) == (1, 0, 0)
     assert [found[f"stops_from_{low}_m"] for low in (6, 2, 0)] == [0, 1, 3]
     headings, rows = approach_table(runs)
-    assert headings[1:3] == ["eqs. (1)-(4)", "paper"]
+    assert headings[1:3] == ("eqs. (1)-(4)", "paper")
     assert [row[1:3] for row in rows[:3]] == [["9.7", "9.7"], ["22.2", "22.2"], ["1.45", "1.5"]]
     assert rows[2][4] == f"{300 * math.sqrt(0.002**2 / 3):.2f}"
 
