@@ -32,10 +32,13 @@ log = logging.getLogger(__name__)
 HEADS = {"dynamixel": "drivers.dynamixel.head", "flir_ptu": "drivers.flir_ptu.head"}
 """Pan/tilt drivers of this repository: the module whose ``open_head(options, clock)`` opens them."""
 
+CAMERAS = {"v4l2": "drivers.v4l2.camera"}
+"""Camera drivers of this repository: the module whose ``open_camera(options, clock, name)`` opens one."""
+
 OURS = ("sim", "replay")
 """No device behind them: they neither fail for a moment nor block, and live on any clock."""
 
-BUILT_IN = (*HEADS, "v4l2", *OURS)
+BUILT_IN = (*HEADS, *CAMERAS, *OURS)
 
 OPENING_PATIENCE_S = 5.0
 """A device that takes longer to open is named; if it is a camera, the others go on without it."""
@@ -190,14 +193,18 @@ class _Opener:
         if device.driver == "replay":
             self.kinds[name] = "replayed"
             return self._replayed(name, device)
-        if device.driver == "v4l2":
-            self.kinds[name] = "real"
-            return self._v4l2(name, device)
         if device.driver in HEADS:
             if protocol is not PanTilt:
                 raise BadOptions(f"driver {device.driver!r} is for a pan/tilt head", device=name)
             self.kinds[name] = "real"
             return self._head(name, device)
+        if device.driver in CAMERAS:
+            if protocol is not Camera:
+                words = f"driver {device.driver!r} is for cameras, it moves nothing"
+                raise BadOptions(words, device=name)
+            self.kinds[name] = "real"
+            module = importlib.import_module(CAMERAS[device.driver])
+            return module.open_camera(device.options, self._clock, name)
         raise BadOptions(
             f"there is no driver {device.driver!r}{nearest(device.driver, BUILT_IN)}; "
             "a driver from outside is named package.module:factory",
@@ -246,14 +253,6 @@ class _Opener:
         if name not in replay.cameras:
             raise BadOptions(f"the recording has no such camera{nearest(name, replay.cameras)}", device=name)
         return replay.cameras[name]
-
-    def _v4l2(self, name: str, device: DeviceSettings) -> Any:
-        """A camera of this machine."""
-        if name == PAN_TILT:
-            raise BadOptions("driver 'v4l2' is for cameras, it moves nothing", device=name)
-        from drivers.v4l2.camera import open_camera
-
-        return open_camera(device.options, self._clock, name)
 
 
 def _ended(opening: Opening, within_s: float) -> bool:

@@ -11,6 +11,7 @@ import os
 import threading
 from collections import OrderedDict
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import fields
 from typing import NamedTuple
 
 import numpy as np
@@ -185,8 +186,8 @@ class Renderer:
 
     def _table(self, camera: CameraModel, samples: int) -> RayTable:
         """The rays of a camera, from the few kept ones if its numbers are the same."""
-        letters = (getattr(camera, letter).tobytes() for letter in "CAHVORE")
-        key = (camera.kind, camera.size_px, camera.cahvore_type, camera.linearity, samples, *letters)
+        numbers = (getattr(camera, one.name) for one in fields(camera) if one.init)
+        key = (samples, *(n.tobytes() if isinstance(n, np.ndarray) else n for n in numbers))
         with self._lock:
             if key not in self._tables:
                 self._tables[key] = ray_table(camera, samples)

@@ -13,6 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from calib.errors import BadFile
+from calib.files import any_camera
 from calib.files.any_camera import load_any
 from calib.files.yaml_text import dump_mapping, parse_mapping
 from tools.campaigns import fuzz_readers
@@ -42,6 +43,12 @@ trees = st.recursive(
     ),
     max_leaves=25,
 )
+
+
+def test_every_format_of_cameras_is_among_those_that_are_broken() -> None:
+    readers = {name for name in vars(any_camera) if name.startswith(("parse_", "load_"))} - {"load_any"}
+    assert len(readers) > 3
+    assert readers <= set(vars(fuzz_readers))
 
 
 @pytest.mark.parametrize("reader", READERS)

@@ -11,6 +11,8 @@ from pathlib import Path
 
 import pytest
 
+from drivers.open_hardware import HEADS
+from hil_tests.bench.hardware_rig import COUNTS
 from tools.campaigns.servo_rigs import LIMITS_RAD, RIGS
 
 MAST = """schema: mastctl/mast/1
@@ -61,6 +63,10 @@ def simulated_line(request: pytest.FixtureRequest) -> Iterator[tuple[str, str]]:
         assert rig.line is not None
         rig.head.close()
         yield ("dynamixel" if request.param == "dynamixel_pty" else "flir_ptu"), str(rig.line.path)
+
+
+def test_every_head_of_this_repository_can_go_through_it() -> None:
+    assert COUNTS.keys() == HEADS.keys()
 
 
 def test_a_head_of_this_repository_goes_through_it(

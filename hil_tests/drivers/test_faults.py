@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import math
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from drivers.errors import BadOptions, BadReply, DriverError, NoFreshFrame, NoRe
 from drivers.faults import CAMERA_WORDS, HEAD_WORDS, PAN_TILT, WHEN, FaultPanel, read_script
 from drivers.sim.cameras import CameraSettings, SimulatedCamera
 from drivers.sim.pan_tilt import PRESETS, REPLY_TIMEOUT_S, SimulatedPanTilt
+from tools.campaigns.servo_rigs import dynamixel_pty, in_memory, ptu_pty
 
 START = 100.0
 SIZE = (64, 48)
@@ -440,6 +442,53 @@ def test_a_bad_list_of_faults_sets_none(bench: Bench, faults: object) -> None:
     with pytest.raises(BadOptions):
         bench.panel.set_all(faults)
     assert bench.panel.active() == ()
+
+
+@pytest.mark.parametrize(
+    ("device", "word"),
+    [("cam_left", word) for word in CAMERA_WORDS] + [(PAN_TILT, word) for word in HEAD_WORDS],
+)
+def test_every_parameter_of_a_word_can_be_set_and_has_bounds(bench: Bench, device: str, word: str) -> None:
+    known = (HEAD_WORDS if device == PAN_TILT else CAMERA_WORDS)[word].parameters
+    assert bench.panel.set(device, word, **known).parameters.items() >= known.items()
+    for name in known:
+        with pytest.raises(BadOptions, match=f"{name} is -1e\\+300, expected a number from"):
+            bench.panel.set(device, word, **{name: -1e300})
+
+
+HEADS = {"in memory": in_memory, "Dynamixel": dynamixel_pty, "PTU": ptu_pty}
+NOT_HERE = {"in memory": {"duplicate", "noise", "misnamed"}}
+
+
+@pytest.mark.parametrize("name", HEADS)
+def test_every_word_of_a_head_is_asked_for_in_memory_and_behind_bytes(
+    name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked = set()
+    find = FaultPanel._entry
+
+    def noted(panel: FaultPanel, device: str, word: str, time_s: float) -> Any:
+        asked.add(word)
+        return find(panel, device, word, time_s)
+
+    monkeypatch.setattr(FaultPanel, "_entry", noted)
+    with HEADS[name]() as rig:
+        rig.head.move(0.1, 0.1)
+        rig.head.read()
+    assert set(HEAD_WORDS) - asked == NOT_HERE.get(name, set())
+
+
+def test_every_word_of_a_camera_is_asked_for(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked = set()
+    find = FaultPanel._entry
+
+    def noted(panel: FaultPanel, device: str, word: str, time_s: float) -> Any:
+        asked.add(word)
+        return find(panel, device, word, time_s)
+
+    monkeypatch.setattr(FaultPanel, "_entry", noted)
+    bench.camera.next_frame(bench.clock.now_s(), 5.0)
+    assert set(CAMERA_WORDS) <= asked
 
 
 def test_the_documentation_shows_the_same_words_and_parameters(repository: Path) -> None:

@@ -19,6 +19,7 @@ from drivers import options as driver_options
 from drivers.dynamixel import settings as dynamixel
 from drivers.errors import BadOptions
 from drivers.flir_ptu import options as flir_ptu
+from drivers.open_hardware import CAMERAS, HEADS, OURS
 from drivers.replay import OPTIONS as REPLAY_OPTIONS
 from drivers.sim import rover
 from drivers.sim.cameras import CameraSettings
@@ -133,10 +134,12 @@ def options_known(read: Callable[[dict[str, Any]], Any], options: dict[str, Any]
     known: set[str] = set()
     plain = driver_options.OptionReader.__init__
 
-    def watching(self: Any, values: Any, keys: Any, needed: Any = (), place: str = "") -> None:
+    def watching(
+        self: Any, values: Any, keys: Any, needed: Any = (), place: str = "", device: str = ""
+    ) -> None:
         keys = tuple(keys)
-        known.update(f"{place}{key}" for key in keys)
-        plain(self, values, keys, needed, place)
+        known.update(f"{place.removeprefix('options.')}{key}" for key in keys)
+        plain(self, values, keys, needed, place, device)
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(driver_options.OptionReader, "__init__", watching)
@@ -150,18 +153,26 @@ def simulated(values: dict[str, Any]) -> rover.SimulationSettings:
 
 def known_of(driver: str) -> set[str]:
     if driver == "dynamixel":
-        return options_known(dynamixel.head_settings, dynamixel_options())
+        return options_known(dynamixel.dynamixel_settings, dynamixel_options())
     if driver == "flir_ptu":
         return options_known(flir_ptu.options_from, ptu_options())
+    assert driver == "v4l2", f"say here how the options of {driver} are read"
     inner = {f"auto_exposure.{key}" for key in v4l2.AUTO_EXPOSURE_OPTIONS}
     return {*v4l2.OPTIONS, *inner}
 
 
-@pytest.mark.parametrize("driver", ["dynamixel", "flir_ptu", "v4l2"])
+@pytest.mark.parametrize("driver", [*HEADS, *CAMERAS])
 def test_every_option_of_a_driver_is_on_the_page_and_no_other(page: str, driver: str) -> None:
     told, known = rows(part(page, f"Options of `{driver}`")), known_of(driver)
     assert len(known) > 15
     assert set(told) == known
+
+
+def test_every_driver_is_where_the_page_says_what_may_be_named(page: str) -> None:
+    told = next(line for line in page.splitlines() if line.startswith("The `driver` of a head is "))
+    head, camera = told.split("; of a camera ")
+    assert [name for name in (*HEADS, *OURS) if f"`{name}`" not in head] == []
+    assert [name for name in (*CAMERAS, *OURS) if f"`{name}`" not in camera] == []
 
 
 def test_every_key_of_the_simulation_and_of_a_recording_is_on_the_page(page: str) -> None:
@@ -194,11 +205,15 @@ def bounded(told: dict[str, list[str]], column: int) -> dict[str, tuple[float, f
 
 
 SOURCES: dict[str, tuple[str, Callable[[dict[str, Any]], Any], Callable[[], dict[str, Any]]]] = {
-    "dynamixel": ("Options of `dynamixel`", dynamixel.head_settings, dynamixel_options),
+    "dynamixel": ("Options of `dynamixel`", dynamixel.dynamixel_settings, dynamixel_options),
     "flir_ptu": ("Options of `flir_ptu`", flir_ptu.options_from, ptu_options),
     "v4l2": ("Options of `v4l2`", lambda values: v4l2.parse_options(values, "cam_left"), v4l2_options),
     "simulation": ("Simulation", simulated, lambda: {"rover": "true.yaml"}),
 }
+
+
+def test_bounds_are_looked_at_for_every_driver() -> None:
+    assert {*HEADS, *CAMERAS} < set(SOURCES)
 
 
 @pytest.mark.parametrize("source", SOURCES)

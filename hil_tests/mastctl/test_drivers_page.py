@@ -16,6 +16,7 @@ from drivers import interfaces
 from drivers.clock import SystemClock
 from drivers.errors import DriverError
 from drivers.interfaces import Frame, Reading
+from drivers.open_hardware import BUILT_IN
 from hil_tests.mastctl.service_fakes import FakeHardware, Hang, eventually, rig
 from mastctl.devices import devices as devices_module
 from mastctl.devices import frames, joint_history, rest, stops
@@ -30,6 +31,12 @@ from mastctl.service import service as service_module
 def page(repository: Path) -> str:
     text = (repository / "docs" / "drivers.md").read_text(encoding="utf-8")
     return " ".join(text.split("## What a driver promises", 1)[1].split("\n## ", 1)[0].split())
+
+
+def test_every_driver_has_its_row(repository: Path) -> None:
+    text = (repository / "docs" / "drivers.md").read_text(encoding="utf-8")
+    named = re.findall(r"^\| `([^`]+)` \|", text.split("## What a driver promises", 1)[0], re.MULTILINE)
+    assert {*named} == {*BUILT_IN, "package.module:factory"}
 
 
 @pytest.fixture

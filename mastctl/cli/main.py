@@ -44,6 +44,16 @@ MODULES: dict[str, tuple[str, ...]] = {
 _NEGATIVE_NUMBER = re.compile(r"^-(?:\d+\.?\d*|\.\d+)(?:e[-+]?\d+)?$|^-(?:inf|infinity|nan)$", re.IGNORECASE)
 
 
+class _Commands(argparse._SubParsersAction):  # type: ignore[type-arg]
+    """Commands whose own --help says what they do, in the words of the list that they stand in."""
+
+    def add_parser(self, name: str, **options: Any) -> argparse.ArgumentParser:
+        words = str(options.get("help", ""))
+        options.setdefault("description", f"{words[:1].upper()}{words[1:]}." if words else None)
+        parser: argparse.ArgumentParser = super().add_parser(name, **options)
+        return parser
+
+
 class Parser(argparse.ArgumentParser):
     """A parser that refuses in one line, reads any negative number, and gives each command --json."""
 
@@ -51,6 +61,7 @@ class Parser(argparse.ArgumentParser):
         options.setdefault("allow_abbrev", False)
         super().__init__(*args, **options)
         self._negative_number_matcher = _NEGATIVE_NUMBER
+        self.register("action", "parsers", _Commands)
         self.add_argument(
             "--json",
             action="store_true",

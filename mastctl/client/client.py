@@ -235,6 +235,14 @@ class Client:
         """Return the mast file that the daemon uses, byte for byte."""
         return bytes(self._daemon.ask("GET", "/mast").content)
 
+    def use_mast(self, file: str) -> dict[str, Any]:
+        """Use another mast file of the same folder; return which is in use now, and the former one."""
+        return self._daemon.json("POST", "/mast", json={"file": file})
+
+    def use_former_mast(self) -> dict[str, Any]:
+        """Go back to the mast file that was in use before; return which is in use now, and the former one."""
+        return self._daemon.json("POST", "/mast/back")
+
     def true_pose(self) -> dict[str, Any]:
         """Return where a simulated rover truly stands: ``position_m`` and ``quaternion``, site_from_rover."""
         return self._daemon.json("GET", "/simulation/pose")

@@ -23,7 +23,7 @@ from tools.virtual_machine.apt import TOLD_AGAIN_S, Busy, Tell, apt_get, install
 
 INPUTS = Path(__file__).resolve().parents[2] / "hil_tests" / "vm" / "kernel"
 PACKAGE = "linux-source-6.1"
-USUAL_FILES = 1000
+USUAL_FILES = 700
 BUILD_PROGRAMS = {
     "flex": "flex",
     "bison": "bison",

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
 
 from drivers.dynamixel import models as ours
@@ -70,6 +72,18 @@ def test_what_a_head_is_made_ready_by_can_be_told_apart_by_its_length(map_name: 
     )  # fmt: skip
     windows = {ours.REGISTERS[map_name][name].window for name in deciding}
     assert len({length for _, length in windows}) == len(windows)
+
+
+def test_the_page_of_the_simulator_names_every_model(repository: Path) -> None:
+    text = (repository / "docs" / "dynamixel_simulator.md").read_text(encoding="utf-8")
+    cell = next(line for line in text.splitlines() if line.startswith("| models | ")).split("|")[2]
+    told = set()
+    for group in cell.replace("(2.0)", "").split(","):
+        first, *others = group.strip().split("/")
+        told |= {first} | {f"{first.rpartition('-')[0]}-{other}" for other in others}
+    plain = {name.lower().replace("-", "_") for name in told}
+    assert len(plain) == len(theirs.MODELS)
+    assert [name for name in theirs.MODELS if not any(name.startswith(one) for one in plain)] == []
 
 
 def test_every_simulated_model_is_one_of_the_drivers() -> None:
