@@ -24,9 +24,10 @@ from drivers.interfaces import Camera, Frame, FrameTime, KnowsSize, Paced, Readi
 from drivers.pairing import Offset, Pairing, learned
 from mastctl.devices import frames as frame_checks
 from mastctl.devices.exposure_hold import ExposureHold
+from mastctl.devices.faults import FaultWords, StandingFault
 from mastctl.devices.frames import FrameStore, StampedFrame
 from mastctl.devices.joint_history import JointHistory
-from mastctl.devices.thread import Asked, DeviceThread, Fault, Words
+from mastctl.devices.thread import Asked, DeviceThread
 from mastctl.errors import NoLonger
 
 log = logging.getLogger(__name__)
@@ -36,10 +37,10 @@ SIZE_TIMEOUT_S = 1.0
 CAMERA_GRACE_S = 3.0  # beyond the time given to next_frame: copying and decoding on a busy machine
 MOVED_RAD = 1e-5  # a head camera's picture that stays the same to the last bit beyond this is frozen
 WORDS = {
-    "next_frame": Words("a picture comes"),
-    "recent_times": Words("a pair of pictures comes"),
-    "hold_exposure": Words("an operation can hold the exposure again"),
-    "release_exposure": Words("an operation has held and released the exposure again"),
+    "next_frame": FaultWords("a picture comes"),
+    "recent_times": FaultWords("a pair of pictures comes"),
+    "hold_exposure": FaultWords("an operation can hold the exposure again"),
+    "release_exposure": FaultWords("an operation has held and released the exposure again"),
 }
 
 
@@ -233,7 +234,7 @@ class Cameras:
         self._sizes_px = {name: camera.model.size_px for name, camera in rig.cameras.items()}
         self._on_head = {name for name, camera in rig.cameras.items() if camera.on == "head"}
 
-    def faults(self) -> list[Fault]:
+    def faults(self) -> list[StandingFault]:
         """Return what is wrong with any camera now."""
         return [fault for thread in self._threads.values() for fault in thread.faults()]
 
@@ -248,7 +249,7 @@ class Cameras:
         """The thread of a camera; that of an absent one looks after it, and tells its absence as a fault."""
         if not isinstance(self._cameras[camera], AbsentCamera):
             return DeviceThread(camera, words=WORDS, clock=self._time)
-        words = {**WORDS, "next_frame": Words("it is there, or a picture comes")}
+        words = {**WORDS, "next_frame": FaultWords("it is there, or a picture comes")}
         return DeviceThread(
             camera,
             between=lambda: self._join(camera),

@@ -26,11 +26,12 @@ from drivers.interfaces import (
 )
 from mastctl.devices import joint_history
 from mastctl.devices.cameras import Cameras
+from mastctl.devices.faults import FaultWords, StandingFault
 from mastctl.devices.frames import FrameStore, StampedFrame
 from mastctl.devices.joint_history import JointHistory
 from mastctl.devices.limits import Limits
 from mastctl.devices.stops import Stops
-from mastctl.devices.thread import DeviceThread, Fault, Words
+from mastctl.devices.thread import DeviceThread
 from mastctl.errors import MastctlError, Stopped
 
 log = logging.getLogger(__name__)
@@ -43,8 +44,8 @@ MOVING_PERIOD_S = 0.02
 RESTING_PERIOD_S = 0.05
 REST_S = 0.3  # after a move was taken, before a reading that says rest is one of its end
 WORDS = {
-    "read": Words("the head is read again"),
-    "move": Words("a later move is taken in time", late_is_fault=True),
+    "read": FaultWords("the head is read again"),
+    "move": FaultWords("a later move is taken in time", late_is_fault=True),
 }
 
 
@@ -233,13 +234,13 @@ class Devices:
         self._cameras.use_rig(rig)
         self._store.change_mast(mast_digest)
 
-    def faults(self) -> tuple[Fault, ...]:
+    def faults(self) -> tuple[StandingFault, ...]:
         """Return what is wrong with any device now, what the head reports about itself included."""
         found = [*self._head.faults(), *self._stops.faults()]
         reading = self._history.newest
         if reading is not None:
             found += [
-                Fault(
+                StandingFault(
                     HEAD, "device_fault", f"{HEAD}: {word}", reading.time_s, "the head no longer reports it"
                 )
                 for word in reading.faults

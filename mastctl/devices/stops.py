@@ -11,7 +11,8 @@ from dataclasses import dataclass
 
 from drivers.clock import Clock, SystemClock
 from drivers.errors import DriverError, LineLost, NoReply
-from mastctl.devices.thread import DeviceThread, Fault, log
+from mastctl.devices.faults import StandingFault
+from mastctl.devices.thread import DeviceThread, log
 from mastctl.errors import MastctlError, Stopped
 
 PATIENCE_S = 0.05  # how long a stop waits for the head's own thread before it goes out beside it
@@ -62,7 +63,7 @@ class Stops:
         self._inside: list[_Inside] = []
         self._good_s = float("-inf")  # when a stop came back last that went well
         self._failed: tuple[_Inside, Exception] | None = None
-        self._fault: Fault | None = None
+        self._fault: StandingFault | None = None
         self._late_s = float("-inf")  # when a stop came back last that came too late
         self._overdue_s = float("inf")
 
@@ -103,7 +104,7 @@ class Stops:
                     self._fault is None or self._fault.until == UNTIL_LINE
                 )  # a lost line takes nothing back of what another stop has left
                 until = UNTIL_LINE if only_line else UNTIL
-                self._fault = Fault(self._device, error.code, words, since_s, until)
+                self._fault = StandingFault(self._device, error.code, words, since_s, until)
             raise
         with self._changed:
             if self._late_s < asked_s:
@@ -123,7 +124,7 @@ class Stops:
                 if self._fault is fault:
                     self._fault = None
 
-    def faults(self) -> tuple[Fault, ...]:
+    def faults(self) -> tuple[StandingFault, ...]:
         """Return what is wrong with the stops at this moment; takes no lock."""
         now_s = self._clock.now_s()
         fault, queued_s = self._fault, self._queued_s
@@ -131,7 +132,9 @@ class Stops:
         if overdue:
             since_s = min([one.asked_s for one in tuple(self._inside)] + [queued_s or now_s])
             words = f"{self._device}: {overdue}; {MAY_MOVE}"
-            return (Fault(self._device, NoReply.code, words, since_s, f"it is back, and then {UNTIL}"),)
+            return (
+                StandingFault(self._device, NoReply.code, words, since_s, f"it is back, and then {UNTIL}"),
+            )
         return () if fault is None else (fault,)
 
     def _send(self, asked_s: float, timeout_s: float) -> None:
@@ -209,7 +212,7 @@ class Stops:
             late = given_up or ended_s > inside.began_s + timeout_s
             if late:
                 self._late_s = ended_s
-                self._fault = Fault(self._device, NoReply.code, words, inside.asked_s, UNTIL)
+                self._fault = StandingFault(self._device, NoReply.code, words, inside.asked_s, UNTIL)
             self._changed.notify_all()
         if late:
             log.warning("%s", words)

@@ -19,46 +19,11 @@ from typing import Any, Generic, TypeVar
 
 from drivers.clock import Clock, SystemClock
 from drivers.errors import DriverError, LineLost, NoReply
+from mastctl.devices.faults import FaultWords, StandingFault
 from mastctl.errors import MastctlError
 
 log = logging.getLogger(__name__)
 T = TypeVar("T")
-
-
-@dataclass(frozen=True)
-class Fault:
-    """Something wrong with a device, in plain words.
-
-    Attributes
-    ----------
-    since_s
-        When it began, seconds of CLOCK_MONOTONIC.
-    until
-        What takes it back, in plain words that follow "until".
-    """
-
-    device: str
-    code: str
-    message: str
-    since_s: float
-    until: str
-
-
-@dataclass(frozen=True)
-class Words:
-    """What belongs to the faults of one kind of call.
-
-    Attributes
-    ----------
-    until
-        What takes such a fault back, in plain words that follow "until".
-    late_is_fault
-        Whether an answer that came too late is a fault itself, because the call moves something; any other
-        answer, however late, shows that the device works again.
-    """
-
-    until: str
-    late_is_fault: bool = False
 
 
 @dataclass(eq=False)
@@ -117,7 +82,7 @@ class DeviceThread:
         between_name: str = "read",
         between_timeout_s: float = 1.0,
         between_after_error_s: float = 0.2,
-        words: Mapping[str, Words] | None = None,
+        words: Mapping[str, FaultWords] | None = None,
         clock: Clock | None = None,
     ) -> None:
         self._device = device
@@ -131,7 +96,7 @@ class DeviceThread:
         self._jobs: deque[Asked[Any]] = deque()
         self._closing = False
         self._now: _Now | None = None
-        self._faults: Mapping[str, Fault] = {}  # replaced, never edited: read without a lock
+        self._faults: Mapping[str, StandingFault] = {}  # replaced, never edited: read without a lock
         self._thread = self._clock.thread(self._serve, f"device {device}")
         self._thread.start()
 
@@ -218,7 +183,7 @@ class DeviceThread:
         deadline_s = self._clock.now_s() + timeout_s
         return self.wait(self.submit(what, function, timeout_s, told=told), deadline_s)
 
-    def faults(self) -> tuple[Fault, ...]:
+    def faults(self) -> tuple[StandingFault, ...]:
         """Return what is wrong at this moment; a call that succeeds takes back its own earlier fault.
 
         It also takes back every call's lost line.
@@ -267,10 +232,10 @@ class DeviceThread:
             return ""
         return f"does not answer: {now.what} has been under way for {now_s - now.began_s:.1f} s"
 
-    def _fault(self, what: str, code: str, message: str, since_s: float) -> Fault:
+    def _fault(self, what: str, code: str, message: str, since_s: float) -> StandingFault:
         words = self._words.get(what)
         until = f"{what} goes well again" if words is None else words.until
-        return Fault(
+        return StandingFault(
             self._device, code, message, since_s, "the line is back" if code == LineLost.code else until
         )
 

@@ -16,7 +16,7 @@ from calib.errors import BadFile
 from calib.handoff.bias import HandoffBias, handoff_bias
 from calib.handoff.matched import MatchedHandoff
 from drivers.clock import Clock
-from mastctl.devices.thread import Fault
+from mastctl.devices.faults import StandingFault
 from mastctl.handoff.log import HandoffLog, bias_told, read_log
 
 log = logging.getLogger(__name__)
@@ -48,8 +48,8 @@ class HandoffCheck:
         self._handoffs: deque[MatchedHandoff] = deque(maxlen=KEPT)
         self._digest = digest
         self._judged: tuple[int, tuple[HandoffBias, ...]] = (0, ())  # how many count, what stands out
-        self._unread: Fault | None = None
-        self._unwritten: Fault | None = None
+        self._unread: StandingFault | None = None
+        self._unwritten: StandingFault | None = None
         self._asked_s: float | None = None  # since when the file has not answered
         self._queue: SimpleQueue[MatchedHandoff | None] = SimpleQueue()
         self._thread = threading.Thread(target=self._work, name=NAME, daemon=True)
@@ -77,13 +77,13 @@ class HandoffCheck:
         counted, offsets = self._judged
         return {"handoffs": counted, "offsets": [bias_told(one) for one in offsets]}
 
-    def faults(self) -> tuple[Fault, ...]:
+    def faults(self) -> tuple[StandingFault, ...]:
         """Return what is wrong with the record's file."""
         faults = [one for one in (self._unread, self._unwritten) if one is not None]
         asked_s = self._asked_s
         if asked_s is not None and self._clock.now_s() - asked_s > SLOW_S:
             faults.append(
-                Fault(
+                StandingFault(
                     NAME,
                     "slow",
                     f"{self._path} does not answer; hand-offs wait for it",
@@ -132,7 +132,7 @@ class HandoffCheck:
         except (BadFile, OSError) as error:
             words = f"{' '.join(str(error).split())}; what was written down before does not count"
             with self._lock:
-                self._unread = Fault(
+                self._unread = StandingFault(
                     NAME, "unreadable", words, self._clock.now_s(), "the file is right at the next start"
                 )
             log.error("%s", words)
@@ -161,7 +161,9 @@ class HandoffCheck:
             before = self._unwritten
             since_s = self._clock.now_s() if before is None else before.since_s
             self._unwritten = (
-                Fault(NAME, "unwritable", words, since_s, "a hand-off is written down") if words else None
+                StandingFault(NAME, "unwritable", words, since_s, "a hand-off is written down")
+                if words
+                else None
             )
         if words and before is None:
             log.error("%s", words)

@@ -272,7 +272,7 @@ class Eyes:
         return View(frame, grey(frame.image), camera)
 
 
-def facts(found: PatchMatch) -> Mapping[str, Any]:
+def match_facts(found: PatchMatch) -> Mapping[str, Any]:
     """Return a match's numbers for a step's detail."""
     return {
         "pixel_px": rounded(found.pixel_px),

@@ -34,7 +34,7 @@ from drivers.errors import DriverError
 from drivers.interfaces import Reading
 from mastctl.devices.limits import Limits
 from mastctl.errors import MastctlError
-from mastctl.pointing.looking import Clicked, View, facts
+from mastctl.pointing.looking import Clicked, View, match_facts
 from mastctl.pointing.requests import Aim, AnglesTarget, PixelTarget, PointRequest, PositionTarget
 from mastctl.pointing.results import (
     Pair,
@@ -190,7 +190,7 @@ class _Run:
         with self._steps.step("stereo") as detail:
             detail.update(self._steps.one_moment(now, found.pixel_px, [other], found.resting))
             partnered = self._steps.unless_stopped(self._eyes.stereo, now, found.pixel_px, other)
-            detail.update(facts(partnered.match), across_px=round(partnered.across_px, 3))
+            detail.update(match_facts(partnered.match), across_px=round(partnered.across_px, 3))
         assert partnered.plane is not None
         self._triangulate(now, found.pixel_px, other, partnered.match.pixel_px)
         return Clicked(found.view, found.clicked_px, partnered.plane)
@@ -218,7 +218,7 @@ class _Run:
             now = views.pop(aim.camera)
             with self._steps.step("measure") as detail:
                 seen = self._steps.unless_stopped(self._eyes.look_for, clicked, now)
-                detail.update(facts(seen), predicted_px=rounded(seen.predicted_px))
+                detail.update(match_facts(seen), predicted_px=rounded(seen.predicted_px))
                 detail.update(residual_px=rounded(seen.pixel_px - aim_px))
             confirmed: list[tuple[View, FloatArray]] = [(now, seen.pixel_px)]
             with self._steps.step("eyes") as detail:

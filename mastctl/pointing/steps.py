@@ -20,7 +20,7 @@ from mastctl.devices.limits import Limits
 from mastctl.errors import NotNow
 from mastctl.pointing.abandoned import result_unless
 from mastctl.pointing.counts import counts_told
-from mastctl.pointing.looking import CamerasLike, Eyes, View, facts
+from mastctl.pointing.looking import CamerasLike, Eyes, View, match_facts
 from mastctl.pointing.motion import Head, HeadLike
 from mastctl.pointing.motion_seen import MotionSeen
 from mastctl.pointing.one_moment import apart, check_one_moment
@@ -39,7 +39,7 @@ class DevicesLike(HeadLike, CamerasLike, Protocol):
 
 
 @dataclass(frozen=True, eq=False)
-class Found:
+class FoundAgain:
     """A clicked thing, found again in a fresh pair.
 
     Attributes
@@ -123,7 +123,7 @@ class Steps:
             detail.update(pan_rad=resting.pan_rad, tilt_rad=resting.tilt_rad)
         return resting
 
-    def clicked(self, target: PixelTarget) -> Found:
+    def clicked(self, target: PixelTarget) -> FoundAgain:
         """Take a fresh pair and find in it what was clicked.
 
         Raises
@@ -147,8 +147,8 @@ class Steps:
                 raise NotNow("other_mast_file", words)
         with self.step("target") as detail:
             again = self.unless_stopped(self.eyes.again, view, pixel, now)
-            detail.update(facts(again))
-        return Found(view, pixel, now, other, again.pixel_px, resting)
+            detail.update(match_facts(again))
+        return FoundAgain(view, pixel, now, other, again.pixel_px, resting)
 
     def go(self, pan_rad: float, tilt_rad: float, camera: str | None = None) -> Reading:
         """Check the limits, move, wait until settled; return the reading there.

@@ -11,9 +11,9 @@ from typing import Any, Literal
 
 from drivers.interfaces import Reading
 from mastctl.as_json import as_json, picked
+from mastctl.devices.faults import StandingFault
 from mastctl.devices.frames import StampedFrame
 from mastctl.devices.limits import Limits
-from mastctl.devices.thread import Fault
 from mastctl.operations.records import Motion
 from mastctl.tracking.status import TrackStatus
 
@@ -51,7 +51,7 @@ class State:
     frames: Mapping[str, StampedFrame | None]
     motion: Motion
     track: TrackStatus
-    faults: tuple[Fault, ...]
+    faults: tuple[StandingFault, ...]
 
     @property
     def moving(self) -> bool:

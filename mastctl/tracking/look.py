@@ -65,7 +65,7 @@ class EyePixel:
 
 
 @dataclass(frozen=True, eq=False)
-class Seen:
+class Sighting:
     """What a start or a look told.
 
     Attributes
@@ -116,7 +116,7 @@ class _Sight:
     """What one pair's pictures told."""
 
     track: Track
-    seen: Seen
+    seen: Sighting
     taken: _Taken
     found: Mapping[str, PatchMatch]
 
@@ -142,7 +142,7 @@ class Looker:
         self._limits = limits
         self._settings = settings
 
-    def begin_at_pixel(self, target: PixelTarget) -> tuple[Track, Seen]:
+    def begin_at_pixel(self, target: PixelTarget) -> tuple[Track, Sighting]:
         """Begin with a pixel of a named frame, found again in a fresh pair.
 
         Raises
@@ -155,7 +155,7 @@ class Looker:
         pair = next(name for name, eyes in self._rig.stereo.items() if target.camera in eyes)
         return track, self._first(pair, track, found.now, found.other, found.pixel_px)
 
-    def begin_at_position(self, position_m: FloatArray) -> tuple[Track, Seen]:
+    def begin_at_position(self, position_m: FloatArray) -> tuple[Track, Sighting]:
         """Begin with what is seen at a position (3,) of the rover frame.
 
         Raises
@@ -179,7 +179,7 @@ class Looker:
             )
         return track, self._first(choice.pair, track, views[left], views[right], pixel)
 
-    def look(self, track: Track, found_by: str = "") -> tuple[Track, Seen]:
+    def look(self, track: Track, found_by: str = "") -> tuple[Track, Sighting]:
         """Point, take a pair, look; with the next pair if the first does not find it.
 
         Parameters
@@ -261,13 +261,13 @@ class Looker:
                 detail.update(pose_doubt=seen.pose_doubt)
         return _Sight(look.track, seen, taken, look.found)
 
-    def _told(self, choice: Choice, look: Look, pixels: Mapping[str, EyePixel], settled: Reading) -> Seen:
+    def _told(self, choice: Choice, look: Look, pixels: Mapping[str, EyePixel], settled: Reading) -> Sighting:
         track, reason = look.track, look.reason
         gone = [one.reason for one in pixels.values() if one.verdict == "no_frame"]
         if track.state == "lost" and gone:
             reason = "; ".join([*gone, reason] if look.found else gone)
         range_m = self._range_m(choice.pair, track.position_m, settled)
-        return Seen(
+        return Sighting(
             track.state,
             reason,
             choice.pair,
@@ -329,11 +329,11 @@ class Looker:
             detail.update(position_m=rounded(track.position_m, 5), sigma_m=rounded(sigma_m, 5))
         return track
 
-    def _first(self, pair: str, track: Track, one: View, other: View, pixel_px: FloatArray) -> Seen:
+    def _first(self, pair: str, track: Track, one: View, other: View, pixel_px: FloatArray) -> Sighting:
         """What a start told; the other eye's pixel is where the triangulated point lies in it."""
         partner = np.asarray(other.camera.project(track.position_m)[0])
         middle = (one.camera.C + other.camera.C) / 2
-        return Seen(
+        return Sighting(
             "tracked",
             "",
             pair,

@@ -7,7 +7,7 @@ from typing import Any, Literal
 
 from calib.rigid import FloatArray
 from mastctl.as_json import as_json, picked
-from mastctl.tracking.look import Seen
+from mastctl.tracking.look import Sighting
 from mastctl.tracking.pose import RoverPose, motion_between
 
 TrackState = Literal["idle", "starting", "tracking", "lost", "stopped"]
@@ -66,7 +66,7 @@ class TrackStatus:
     covariance_m2: FloatArray | None = None
     stands_at: RoverPose | None = None
     pose: RoverPose | None = None
-    seen: Seen | None = None
+    seen: Sighting | None = None
     found_by: str = ""
     looks: int = 0
     misses: int = 0

@@ -28,7 +28,7 @@ from mastctl.pointing.requests import PixelTarget, PositionTarget
 from mastctl.pointing.settings import PointingSettings
 from mastctl.pointing.steps import DevicesLike, Steps
 from mastctl.tracking.carried import Carried
-from mastctl.tracking.look import Looker, Seen
+from mastctl.tracking.look import Looker, Sighting
 from mastctl.tracking.pose import (
     RoverPose,
     check_follows,
@@ -41,7 +41,7 @@ from mastctl.tracking.status import ACTIVE, HandedOver, TrackState, TrackStatus
 log = logging.getLogger(__name__)
 
 Told = Mapping[str, Any]
-Outcome = tuple[Track, Seen]
+Outcome = tuple[Track, Sighting]
 
 
 class HoldingDevices(DevicesLike, Protocol):
@@ -239,7 +239,7 @@ class Tracker:
         """Start an operation that looks; its outcome comes to `_ended`."""
         rig, outcomes = self._rig, list[Outcome]()
 
-        def run(record: Callable[[Any], None], cancelled: threading.Event) -> Seen:
+        def run(record: Callable[[Any], None], cancelled: threading.Event) -> Sighting:
             steps = Steps(
                 rig, self._devices, self._limits, self._clock, PointingSettings(), record, cancelled
             )

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from drivers.interfaces import Reading
+from mastctl.devices.faults import StandingFault
 from mastctl.devices.frames import StampedFrame
 from mastctl.devices.limits import Limits
-from mastctl.devices.thread import Fault
 from mastctl.operations.records import Motion, Residual
 from mastctl.service.state import State
 from mastctl.tracking.status import TrackStatus
@@ -30,7 +30,7 @@ REST = State(
     faults=(),
 )
 MOVING = Reading(0.1, -0.2, True, 99.75)
-OF_THE_HEAD = Fault("head", "no_reply", "the head is silent", 98.5, "it answers")
+OF_THE_HEAD = StandingFault("head", "no_reply", "the head is silent", 98.5, "it answers")
 OF_A_CAMERA = replace(OF_THE_HEAD, device="navcam_left")
 
 

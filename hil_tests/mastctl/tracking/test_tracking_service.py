@@ -36,7 +36,7 @@ from mastctl.client import Client, ClientError
 from mastctl.daemon import RunningDaemon
 from mastctl.handoff.log import read_log
 from mastctl.tracking import tracker as tracker_module
-from mastctl.tracking.look import EyePixel, NotTrackable, Seen
+from mastctl.tracking.look import EyePixel, NotTrackable, Sighting
 
 TARGET_M = (5.0, 0.5, 0.0)
 SIGMA = (0.01, 0.005)
@@ -46,14 +46,14 @@ LOGGED = "tracking: {{handoff_log: handed/over.jsonl}}\n"
 class ScriptedLooker:
     """Stands for `Looker`: a start is at `TARGET_M`; a look is what ``script(track)`` makes of it."""
 
-    script: Callable[[Track], tuple[Track, Seen]]
+    script: Callable[[Track], tuple[Track, Sighting]]
     begin: Callable[[], None] = lambda: None
     looks: list[Track]
 
     def __init__(self, steps: Any, *others: Any) -> None:
         self._steps = steps
 
-    def begin_at_pixel(self, target: Any) -> tuple[Track, Seen]:
+    def begin_at_pixel(self, target: Any) -> tuple[Track, Sighting]:
         with self._steps.step("start"):
             type(self).begin()
         camera = rig().cameras["navcam_left"].model
@@ -61,31 +61,31 @@ class ScriptedLooker:
         track = Track("tracked", np.array(TARGET_M), 1e-4 * np.eye(3), key)
         return track, seen(track)
 
-    def begin_at_position(self, position_m: Any) -> tuple[Track, Seen]:
+    def begin_at_position(self, position_m: Any) -> tuple[Track, Sighting]:
         track, told = self.begin_at_pixel(None)
         track = replace(track, position_m=position_m)
         return track, replace(told, position_m=position_m)
 
-    def look(self, track: Track, found_by: str = "") -> tuple[Track, Seen]:
+    def look(self, track: Track, found_by: str = "") -> tuple[Track, Sighting]:
         with self._steps.step("find"):
             type(self).looks.append(track)
         return type(self).script(track)
 
 
-def seen(track: Track, pair: str = "navcam", reason: str = "") -> Seen:
+def seen(track: Track, pair: str = "navcam", reason: str = "") -> Sighting:
     """A look that leaves the track where it is."""
     pixel = EyePixel("navcam_left-000001-x", "good", "", 31.5, 20.0, (0.1, 0.1), 0.95)
-    return Seen(
+    return Sighting(
         track.state, reason, pair, track.position_m, track.covariance_m2, 5.0, {"navcam_left": pixel}, 1.0
     )
 
 
-def found(track: Track) -> tuple[Track, Seen]:
+def found(track: Track) -> tuple[Track, Sighting]:
     after = replace(track, state="tracked", misses=0)
     return after, seen(after)
 
 
-def lost(track: Track) -> tuple[Track, Seen]:
+def lost(track: Track) -> tuple[Track, Sighting]:
     after = replace(track, state="lost", misses=track.misses + 1)
     return after, seen(after, reason="navcam_left: a stone is in the way")
 
@@ -200,7 +200,7 @@ def test_a_pose_that_pictures_contradict_is_told_while_the_target_is_tracked(
     started(client)
     words = "the pictures put the target 9.0 cm (3.4 sigma) from where the pose does"
 
-    def doubting(track: Track) -> tuple[Track, Seen]:
+    def doubting(track: Track) -> tuple[Track, Sighting]:
         after, told = found(track)
         return after, replace(told, pose_doubt=words)
 
@@ -243,7 +243,7 @@ def test_hand_offs_that_tell_an_offset_say_so(
     digest = client.status()["mast"]["digest"]
     numbers = iter(range(100))
 
-    def hand_over(track: Track) -> tuple[Track, Seen]:
+    def hand_over(track: Track) -> tuple[Track, Sighting]:
         return track, replace(seen(track, "hazcam"), matched=handed(digest, next(numbers)))
 
     monkeypatch.setattr(ScriptedLooker, "script", staticmethod(hand_over))
@@ -275,7 +275,7 @@ def test_a_record_that_cannot_be_written_is_told_and_stops_no_track(
     (folder / "handed").write_text("a file where the record's folder should be")
     digest = client.status()["mast"]["digest"]
 
-    def hand_over(track: Track) -> tuple[Track, Seen]:
+    def hand_over(track: Track) -> tuple[Track, Sighting]:
         return track, replace(seen(track, "hazcam"), matched=handed(digest, 0))
 
     monkeypatch.setattr(ScriptedLooker, "script", staticmethod(hand_over))
@@ -431,7 +431,7 @@ def test_poses_that_come_during_a_look_make_its_pictures_worthless(
     started(client)
     hang = Hang()
 
-    def slow(track: Track) -> tuple[Track, Seen]:
+    def slow(track: Track) -> tuple[Track, Sighting]:
         hang()
         return found(replace(track, position_m=track.position_m + 1.0))
 
@@ -457,7 +457,7 @@ def test_poses_of_a_standing_rover_leave_a_look_its_worth(
     started(client)
     hang = Hang()
 
-    def slow(track: Track) -> tuple[Track, Seen]:
+    def slow(track: Track) -> tuple[Track, Sighting]:
         hang()
         return found(replace(track, position_m=np.array([4.4, 0.6, 0.0])))
 
@@ -513,7 +513,7 @@ def test_a_device_that_fails_makes_the_target_lost_not_the_daemon(
 ) -> None:
     started(client)
 
-    def fail(track: Track) -> tuple[Track, Seen]:
+    def fail(track: Track) -> tuple[Track, Sighting]:
         raise NoReply("no answer on the bus", device="pan_tilt")
 
     monkeypatch.setattr(ScriptedLooker, "script", staticmethod(fail))
