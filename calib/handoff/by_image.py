@@ -18,7 +18,8 @@ import numpy as np
 from calib.camera.cahvor import CameraModel
 from calib.handoff.geometric import Handoff, PredictedPixel
 from calib.pictures.epipolar import find_partner
-from calib.pictures.patch_match import MatchSettings, PatchMatch, match_patch
+from calib.pictures.patch_match import match_patch
+from calib.pictures.patch_verdict import MatchSettings, PatchMatch
 from calib.pictures.warp import Grey, Plane
 from calib.rigid import FloatArray
 

@@ -15,7 +15,8 @@ import numpy as np
 
 from calib.camera.cahvor import CameraModel
 from calib.pictures.least_squares_matching import gaussian
-from calib.pictures.patch_match import MatchSettings, near_covariance, near_half_px, texture_lacks
+from calib.pictures.patch_match import near_covariance, near_half_px
+from calib.pictures.patch_verdict import MatchSettings, texture_lacks
 from calib.pictures.warp import Grey, Plane, patch_grid
 from calib.rigid import FloatArray
 

@@ -5,14 +5,13 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Literal, cast
+from typing import cast
 
 import numpy as np
 
-from calib.camera.cahvor import Kind
 from calib.errors import BadFile
-from calib.files import LARGEST_IMAGE_PX, digest_of, read_bytes
-from calib.files.mast_file import CAMERA_NAME, read_stereo
+from calib.files import digest_of, read_bytes
+from calib.files.mast_file import read_stereo
 from calib.files.strict import Section, nearest
 from calib.files.yaml_text import MAX_BYTES, kind_of, parse_mapping
 from calib.rigid import FloatArray
@@ -22,7 +21,6 @@ from calib.survey.records import (
     Click,
     Dots,
     Purpose,
-    Sigma,
     StationKind,
     StationPoint,
     Survey,
@@ -30,15 +28,20 @@ from calib.survey.records import (
     SurveyImage,
 )
 from calib.survey.rows import Row, rows_of
+from calib.survey.survey_yaml import BOARD_KEYS, FURTHEST_M, board_of, cameras_of, places_of, sigma_of
 
 SCHEMA = "mastctl/survey/1"
+
 STATION_COLUMNS = ("setup", "kind", "placement", "point", "x_m", "y_m", "z_m")
+
 IMAGE_COLUMNS = ("image", "camera", "setup", "placement", "purpose", "pan_rad", "tilt_rad", "file")
+
 DOT_COLUMNS = ("image", "row", "column", "x_px", "y_px")
+
 CLICK_COLUMNS = ("image", "point", "x_px", "y_px")
 
 CSV_MAX_BYTES = 200_000_000
-FURTHEST_M = 1e5
+
 LARGEST_ANGLE_RAD = 1e4
 """Beyond these a number is no measurement; what is merely unlikely is for the check of the survey."""
 
@@ -92,9 +95,9 @@ class _Reader:
         )
         if top.values["schema"] != SCHEMA:
             raise top.bad("schema", f"{kind_of(top.values['schema'])} where '{SCHEMA}' is expected")
-        board = _board(top.section("board", _BOARD_KEYS))
-        prisms = _places(top, "prisms_in_rover_m", "prism")
-        cameras = _cameras(top)
+        board = board_of(top.section("board", BOARD_KEYS))
+        prisms = places_of(top, "prisms_in_rover_m", "prism")
+        cameras = cameras_of(top)
         station = self._station(board, prisms)
         images = self._images(cameras, sorted({point.setup for point in station}))
         by_name = {image.name: image for image in images}
@@ -102,7 +105,7 @@ class _Reader:
             folder=self.folder,
             board=board,
             prisms_in_rover_m=prisms,
-            sigma=_sigma(top.section("sigma", ("station_m", "dot_px"), ("joint_rad", "prism_cad_m"))),
+            sigma=sigma_of(top.section("sigma", ("station_m", "dot_px"), ("joint_rad", "prism_cad_m"))),
             cameras=cameras,
             stereo=read_stereo(top, cameras),
             station=station,
@@ -235,88 +238,6 @@ class _Reader:
     def _digest(self) -> str:
         listing = "".join(f"{digest}  {name}\n" for name, digest in sorted(self.digests.items()))
         return digest_of(listing.encode("utf-8", "surrogatepass"))
-
-
-_BOARD_KEYS = ("rows", "columns", "spacing_m", "dot_diameter_m", "tapes_in_board_m")
-
-
-def _board(section: Section) -> Board:
-    spacing_m, dot_m = _positive(section, "spacing_m"), _positive(section, "dot_diameter_m")
-    if dot_m >= spacing_m:
-        raise section.bad("dot_diameter_m", f"{dot_m:g} where less than spacing_m {spacing_m:g} is expected")
-    return Board(
-        section.integer("rows", 2, 200),
-        section.integer("columns", 2, 200),
-        spacing_m,
-        dot_m,
-        _places(section, "tapes_in_board_m", "tape"),
-    )
-
-
-def _positive(section: Section, key: str) -> float:
-    value = section.number(key, FURTHEST_M)
-    if value <= 0:
-        raise section.bad(key, f"{value:g} where a number above 0 is expected")
-    return value
-
-
-def _places(section: Section, key: str, what: str) -> dict[str, FloatArray]:
-    """Read at least three named points that no two share and that are not on one line."""
-    names = section.mapping(key)
-    for name in names:
-        if not name.strip() or not name.isprintable():
-            raise section.bad(key, f"{name[:40]!r} where the name of a {what} is expected")
-    if len(names) < 3:
-        raise section.bad(key, f"{len(names)} {what}s where at least three are expected")
-    inner = section.section(key, tuple(names))
-    places = {name: inner.vector(name, FURTHEST_M) for name in names}
-    table = np.array(list(places.values()))
-    across = np.linalg.svd(table - table.mean(axis=0), compute_uv=False)
-    if across[1] < 1e-3 * max(across[0], 1e-3):
-        raise section.bad(key, f"the {what}s stand on one line; no pose follows from them")
-    for place in places.values():
-        place.setflags(write=False)
-    return places
-
-
-def _sigma(section: Section) -> Sigma:
-    optional = {
-        key: section.number(key, 10.0) if key in section else 0.0 for key in ("joint_rad", "prism_cad_m")
-    }
-    for key, value in optional.items():
-        if value < 0:
-            raise section.bad(key, f"{value:g} where 0 or more is expected")
-    return Sigma(_positive(section, "station_m"), _positive(section, "dot_px"), **optional)
-
-
-def _cameras(top: Section) -> dict[str, SurveyCamera]:
-    cameras: dict[str, SurveyCamera] = {}
-    for name in top.mapping("cameras"):
-        if not CAMERA_NAME.fullmatch(name):
-            raise top.bad(f"cameras.{name}", "a camera's name is <pair>_left or <pair>_right")
-        value: Any = top.mapping("cameras")[name]
-        place = f"cameras.{name}"
-        section = Section(top.path, place, value, ("on", "size_px", "model", "focal_px"), ("rough",))
-        width, height = section.integers("size_px", 2, 1, LARGEST_IMAGE_PX)
-        camera: dict[str, Any] = {}
-        if "rough" in section:
-            rough = section.section("rough", ("C", "A"))
-            camera["rough_C_m"], axis = rough.vector("C", FURTHEST_M), rough.vector("A")
-            length = float(np.linalg.norm(axis))
-            if length < 1e-6:
-                raise rough.bad("A", "is zero where a direction is expected")
-            camera["rough_A"] = axis / length
-        cameras[name] = SurveyCamera(
-            name=name,
-            on=cast(Literal["head", "rover"], section.choice("on", ("head", "rover"))),
-            size_px=(width, height),
-            kind=cast(Kind, section.choice("model", ("CAHV", "CAHVOR", "CAHVORE"))),
-            focal_px=_positive(section, "focal_px"),
-            **camera,
-        )
-    if not cameras:
-        raise top.bad("cameras", "holds no camera; at least one is expected")
-    return cameras
 
 
 def _joints(row: Row, camera: SurveyCamera) -> tuple[float | None, float | None]:

@@ -15,9 +15,11 @@ from calib.errors import CalibError
 from calib.handoff.by_image import Eye
 from calib.mast.pointing import solve
 from calib.mast.rig import Rig
-from calib.pictures.patch_match import PatchMatch
+from calib.pictures.patch_verdict import PatchMatch
 from calib.rigid import FloatArray
-from calib.tracking.track import Track, moved_track, seen_by, start_track
+from calib.tracking.look import seen_by
+from calib.tracking.start import start_track
+from calib.tracking.track import Track, moved_track
 from drivers.interfaces import Image
 from drivers.sim.scene import SceneSettings, build_scene
 from mastctl.experiment.approach_world import ApproachWorld, WorldErrors

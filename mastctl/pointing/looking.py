@@ -13,8 +13,10 @@ import numpy as np
 from calib.camera.cahvor import CameraModel
 from calib.errors import CalibError
 from calib.mast.rig import Rig
-from calib.pictures.epipolar import UP, StereoMatch, find_partner
-from calib.pictures.patch_match import MatchSettings, PatchMatch, match_patch
+from calib.pictures.epipolar import StereoMatch, find_partner
+from calib.pictures.epipolar_sweep import UP
+from calib.pictures.patch_match import match_patch
+from calib.pictures.patch_verdict import MatchSettings, PatchMatch
 from calib.pictures.warp import Grey, Plane, carry, facing_plane, grey
 from calib.rigid import FloatArray
 from drivers.interfaces import Reading

@@ -27,7 +27,7 @@ from calib.errors import CalibError
 from calib.mast.pointing import solve
 from calib.mast.rig import Rig
 from calib.mast.solutions import Solution, choose
-from calib.pictures.patch_match import PatchMatch
+from calib.pictures.patch_verdict import PatchMatch
 from calib.rigid import FloatArray
 from drivers.clock import Clock
 from drivers.errors import DriverError

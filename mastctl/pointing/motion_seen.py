@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 
 from calib.mast.rig import Rig
-from calib.pictures.shown_view import Posed, ShownView, ViewLimits, overlap, shown_view
+from calib.pictures.same_patches import Posed
+from calib.pictures.shown_view import ShownView, ViewLimits, overlap, shown_view
 from calib.rigid import FloatArray
 from drivers.errors import BadFrame
 from mastctl.pointing.looking import View

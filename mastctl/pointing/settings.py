@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from calib.pictures.patch_match import MatchSettings
+from calib.pictures.patch_verdict import MatchSettings
 from calib.pictures.shown_view import ViewLimits
 from mastctl.devices.rest import DITHER_RAD
 

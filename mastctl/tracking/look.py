@@ -21,9 +21,11 @@ from calib.errors import CalibError
 from calib.handoff.by_image import Eye
 from calib.handoff.matched import MatchedHandoff
 from calib.mast.rig import Rig
-from calib.pictures.patch_match import PatchMatch
+from calib.pictures.patch_verdict import PatchMatch
 from calib.rigid import FloatArray
-from calib.tracking.track import Look, Track, seen_by, start_track
+from calib.tracking.look import Look, seen_by
+from calib.tracking.start import start_track
+from calib.tracking.track import Track
 from drivers.errors import DriverError
 from drivers.interfaces import Reading
 from mastctl.devices.limits import Limits
@@ -81,7 +83,7 @@ class Sighting:
     pixels
         By camera.
     chi2, renewed
-        As `calib.tracking.track.Look`.
+        As `calib.tracking.look.Look`.
     pose_doubt
         What the pictures say against the pose, one sentence; empty if they do not.
     matched

@@ -17,7 +17,7 @@ from calib.handoff.geometric import Joints, hand_off
 from calib.handoff.matched import MatchedHandoff, matched_handoff
 from calib.mast.covariance import stored_covariance
 from calib.mast.rig import Rig
-from calib.pictures.patch_match import PatchMatch
+from calib.pictures.patch_verdict import PatchMatch
 from mastctl.pointing.looking import View
 
 JOINT_SIGMA_RAD = 3e-5

@@ -22,7 +22,9 @@ from calib.errors import CalibError
 from calib.handoff.by_image import Eye
 from calib.pictures.warp import grey
 from calib.rigid import FloatArray
-from calib.tracking.track import moved_track, seen_by, start_track
+from calib.tracking.look import seen_by
+from calib.tracking.start import start_track
+from calib.tracking.track import moved_track
 from tools.against_others.tracker_sequences import STEPS, Sequence
 
 HALF_PX = 20

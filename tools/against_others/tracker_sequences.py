@@ -34,7 +34,7 @@ from calib.mast.pointing import solve
 from calib.mast.rig import Rig
 from calib.pictures.warp import grey
 from calib.rigid import FloatArray, Rigid, rot_x, rot_y, rot_z
-from calib.tracking.track import start_track
+from calib.tracking.start import start_track
 from drivers.sim.render import Renderer
 from drivers.sim.scene import Scene, SceneSettings, build_scene
 from mastctl.experiment.approach_world import WorldErrors

@@ -28,7 +28,7 @@ from calib.handoff.by_image import Eye, RefineSettings, refine_handoff
 from calib.handoff.geometric import Handoff, Joints, PredictedPixel, hand_off
 from calib.mast.covariance import RigCovariance, stored_covariance
 from calib.pictures.epipolar import find_partner
-from calib.pictures.patch_match import MatchSettings
+from calib.pictures.patch_verdict import MatchSettings
 from calib.pictures.warp import Plane, warp_patch
 from drivers.sim.render import compile_renderer
 from mastctl.cli.output import at_least

@@ -29,7 +29,8 @@ import numpy as np
 
 from calib.files.mast_file import load_rig
 from calib.mast.rig import Rig
-from calib.pictures.shown_view import Posed, shown_view
+from calib.pictures.same_patches import Posed
+from calib.pictures.shown_view import shown_view
 from drivers.clock import ManualClock
 from drivers.hardware import DeviceSettings, HardwareSettings
 from drivers.open_hardware import open_hardware

@@ -31,7 +31,8 @@ from calib.mast.pointing import solve
 from calib.mast.rig import Rig, RigCamera
 from calib.mast.solutions import Solution
 from calib.pictures.epipolar import find_partner
-from calib.pictures.patch_match import MatchSettings, match_patch, rivalled
+from calib.pictures.patch_match import match_patch
+from calib.pictures.patch_verdict import MatchSettings, rivalled
 from calib.pictures.warp import Grey, Plane, grey
 from calib.rigid import FloatArray, Rigid
 from drivers.clock import ManualClock

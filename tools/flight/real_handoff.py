@@ -12,7 +12,7 @@ range, so it is assumed, in two ways:
 - neighbours: the plane through the eight nearest other targets found in the first way, each at the range that
   its own two pixels tell, uncertain by 3 %. A target's own match never tells its range.
 
-The target then goes through `calib.tracking.track.seen_by` with one eye: window by the covariance of the
+The target then goes through `calib.tracking.look.seen_by` with one eye: window by the covariance of the
 position, patch warped over the plane, correlation, sub-pixel place, verdict, misfit. Residual: found less
 predicted, in x and y, and across the epipolar line, where an unknown range does not reach.
 
@@ -39,7 +39,8 @@ from calib.errors import CalibError
 from calib.handoff.by_image import Eye
 from calib.pictures.warp import Plane, carry
 from calib.rigid import FloatArray
-from calib.tracking.track import Key, Look, Track, TrackSettings, seen_by
+from calib.tracking.look import Look, seen_by
+from calib.tracking.track import Key, Track, TrackSettings
 from drivers.clock import ManualClock
 from tools.arguments import end, new_file
 from tools.campaigns.render_bias import BLUR_PX, GRID_PX, HALF_PX, MARGIN_PX, best_affine

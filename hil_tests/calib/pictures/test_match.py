@@ -10,7 +10,8 @@ import pytest
 from calib.errors import CalibError
 from calib.pictures.epipolar import find_partner
 from calib.pictures.least_squares_matching import LeastSquaresMatch
-from calib.pictures.patch_match import MatchSettings, PatchFound, PatchMatch, judged, match_patch
+from calib.pictures.patch_match import match_patch
+from calib.pictures.patch_verdict import MatchSettings, PatchFound, PatchMatch, judged
 from calib.pictures.warp import Plane, Template, carry, facing_plane, grey
 from hil_tests.calib.pictures.textured_planes import Pinhole, TexturedPlane, picture, random_texture
 

@@ -17,8 +17,10 @@ from calib.pictures.epipolar import find_partner
 from calib.pictures.patch_match import match_patch
 from calib.pictures.warp import Plane
 from calib.rigid import Rigid, rot_y, rot_z
+from calib.tracking.look import Look, seen_by
 from calib.tracking.pose_doubt import pose_doubt
-from calib.tracking.track import SIZES, Look, Track, TrackSettings, moved_track, seen_by, start_track
+from calib.tracking.start import start_track
+from calib.tracking.track import SIZES, Track, TrackSettings, moved_track
 from hil_tests.calib.pictures.textured_planes import Pinhole, TexturedPlane, picture, random_texture
 
 TARGET = np.array([3.0, 0.1, 0.0])

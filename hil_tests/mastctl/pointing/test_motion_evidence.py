@@ -11,7 +11,8 @@ from collections.abc import Callable, Sequence
 import numpy as np
 import pytest
 
-from calib.pictures.shown_view import Posed, shown_view
+from calib.pictures.same_patches import Posed
+from calib.pictures.shown_view import shown_view
 from drivers.errors import NoReply
 from hil_tests.mastctl.pointing.pointing_world import SIZE_PX, World, clean, click, rig, run
 from mastctl.devices.frames import StampedFrame
