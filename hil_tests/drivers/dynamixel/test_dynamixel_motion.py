@@ -241,6 +241,39 @@ def test_the_acceleration_that_braking_relies_on_is_not_rounded_down() -> None:
     assert [settings.acceleration_counts(a * unit) for a in (0.5, 1.0, 1.1, 10.7)] == [1, 1, 2, 11]
 
 
+@pytest.mark.parametrize(("low", "high", "fits"), [(0, 4095, True), (-1, 4095, False), (0, 4096, False)])
+def test_limits_may_reach_the_last_count_that_position_mode_holds_and_no_further(
+    low: int, high: int, fits: bool
+) -> None:
+    asked = options(limits_rad=[(low - 2048) * COUNT_RAD, (high - 2048) * COUNT_RAD])
+    if fits:
+        assert dynamixel_settings(asked).pan.limit_counts == (low, high)
+    else:
+        with pytest.raises(BadOptions, match="holds 0 to 4095"):
+            dynamixel_settings(asked)
+
+
+@pytest.mark.parametrize(
+    ("current_A", "fits"), [(0.00269, True), (3.209, True), (0.0013, False), (3.211, False)]
+)
+def test_a_current_limit_is_one_count_to_what_the_model_takes(current_A: float, fits: bool) -> None:
+    """XM430-W350: 2.69 mA a count, 1193 counts at most."""
+    asked = options(current_limit_A=current_A)
+    if fits:
+        assert dynamixel_settings(asked).pan.current_limit_A == current_A
+    else:
+        with pytest.raises(BadOptions, match=r"expected 0\.00269 to 3\.209 A"):
+            dynamixel_settings(asked)
+
+
+def test_an_axis_is_in_position_within_three_counts_and_may_droop_as_far_unless_told_otherwise() -> None:
+    settings = dynamixel_settings(options()).pan
+    assert settings.settle_rad == pytest.approx(3 * COUNT_RAD)
+    assert settings.gravity_turnover_rad == pytest.approx(1.5707963267948966)
+    with pytest.raises(BadOptions, match=r"settle_rad is 0\.001, expected a number from 0\.00153"):
+        dynamixel_settings(options(settle_rad=0.001))
+
+
 def test_limits_are_rounded_inwards() -> None:
     settings = dynamixel_settings(options(limits_rad=[-0.5001, 0.5001])).pan
     low, high = settings.limit_counts
