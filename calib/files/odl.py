@@ -27,7 +27,7 @@ class Quantity(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Block:
+class LabelBlock:
     """A group or object of a label, or the whole label.
 
     Attributes
@@ -43,9 +43,9 @@ class Block:
     kind: str
     name: str
     values: Mapping[str, Any] = field(default_factory=dict)
-    blocks: tuple[Block, ...] = ()
+    blocks: tuple[LabelBlock, ...] = ()
 
-    def every(self) -> Iterator[Block]:
+    def every(self) -> Iterator[LabelBlock]:
         """Give every block inside, at any depth, in the label's order."""
         for block in self.blocks:
             yield block
@@ -69,7 +69,7 @@ _CLOSE = {"END_GROUP": "GROUP", "END_OBJECT": "OBJECT"}
 _CLOSING = {"(": ")", "{": "}"}
 
 
-def parse_label(text: str, path: str | Path) -> Block:
+def parse_label(text: str, path: str | Path) -> LabelBlock:
     """Return the label that the text begins with; what follows its ``END`` is not looked at.
 
     Raises
@@ -80,7 +80,7 @@ def parse_label(text: str, path: str | Path) -> Block:
     return _Parser(text, path).label()
 
 
-def number_in(block: Block, key: str, path: str | Path) -> float:
+def number_in(block: LabelBlock, key: str, path: str | Path) -> float:
     """Return a keyword's number of at most 1e9 in size, its unit left out; raises BadFile."""
     value = block.values.get(key)
     value = value.value if isinstance(value, Quantity) else value
@@ -89,7 +89,7 @@ def number_in(block: Block, key: str, path: str | Path) -> float:
     return float(value)
 
 
-def integer_in(block: Block, key: str, path: str | Path, low: int, high: int) -> int:
+def integer_in(block: LabelBlock, key: str, path: str | Path, low: int, high: int) -> int:
     """Return a keyword's integer from low to high, its unit left out; raises BadFile."""
     value = block.values.get(key)
     value = value.value if isinstance(value, Quantity) else value
@@ -99,7 +99,7 @@ def integer_in(block: Block, key: str, path: str | Path, low: int, high: int) ->
     return value
 
 
-def vector_in(block: Block, key: str, path: str | Path) -> list[float]:
+def vector_in(block: LabelBlock, key: str, path: str | Path) -> list[float]:
     """Return a keyword's three numbers, their units left out; raises BadFile."""
     value = block.values.get(key)
     items = value if isinstance(value, tuple) and not isinstance(value, Quantity) else ()
@@ -150,16 +150,16 @@ class _Parser:
     def is_mark(self, mark: str) -> bool:
         return self.kind == "mark" and self.word == mark
 
-    def label(self) -> Block:
+    def label(self) -> LabelBlock:
         """Read statements up to END."""
-        stack: list[tuple[str, str, dict[str, Any], list[Block]]] = [("", "", {}, [])]
+        stack: list[tuple[str, str, dict[str, Any], list[LabelBlock]]] = [("", "", {}, [])]
         while True:
             if self.kind != "word":
                 self.fail("a keyword or END is expected")
             keyword = self.word
             if keyword == "END" and len(stack) == 1:
                 kind, name, values, blocks = stack[0]
-                return Block(kind, name, values, tuple(blocks))
+                return LabelBlock(kind, name, values, tuple(blocks))
             self.step()
             if keyword in _CLOSE:
                 kind, name, values, blocks = stack[-1]
@@ -171,7 +171,7 @@ class _Parser:
                         self.fail(f"the end of {kind} {name[:40]} is expected")
                     self.step()
                 stack.pop()
-                stack[-1][3].append(Block(kind, name, values, tuple(blocks)))
+                stack[-1][3].append(LabelBlock(kind, name, values, tuple(blocks)))
                 continue
             if not self.is_mark("="):
                 self.fail(f"'=' is expected after {keyword[:40]}")

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from calib.camera.cahvor import CameraModel, Kind
 from calib.errors import BadFile
 from calib.files import LARGEST_IMAGE_PX, CameraFile, build_model, digest_of, read_bytes
-from calib.files.odl import Block, Quantity, integer_in, number_in, parse_label, vector_in
+from calib.files.odl import LabelBlock, Quantity, integer_in, number_in, parse_label, vector_in
 from calib.files.pds3_image import MAX_FILE_BYTES, read_pixels
 
 #: A label is looked for in the first bytes of a file; the longest known have some 60 kB.
@@ -37,7 +37,7 @@ class PdsLabel:
     """A label's content; ``attached`` if data follow it in the same file."""
 
     path: Path
-    root: Block
+    root: LabelBlock
     attached: bool
     digest: str
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from calib.errors import BadFile
 from calib.files import read_bytes
-from calib.files.odl import Block, Quantity, integer_in
+from calib.files.odl import LabelBlock, Quantity, integer_in
 
 MAX_FILE_BYTES = 1 << 30
 
@@ -27,7 +27,7 @@ _BITS = {"i": (8, 16, 32), "u": (8, 16, 32), "f": (32, 64)}
 
 
 def read_pixels(
-    path: Path, root: Block, block: Block, data: bytes, size_px: tuple[int, int]
+    path: Path, root: LabelBlock, block: LabelBlock, data: bytes, size_px: tuple[int, int]
 ) -> tuple[NDArray[Any] | None, tuple[str, ...]]:
     """Return the pixels that a label points to, and notes.
 
@@ -86,7 +86,7 @@ def read_pixels(
     return pixels.view(dtype).astype(dtype.newbyteorder("=")), ()
 
 
-def _pointer(path: Path, root: Block) -> tuple[str, int]:
+def _pointer(path: Path, root: LabelBlock) -> tuple[str, int]:
     """Return where ^IMAGE points: a file's name ('' for the label's own file) and a byte offset."""
     pointer = root.values.get("^IMAGE")
     items = list(pointer) if isinstance(pointer, tuple) and not isinstance(pointer, Quantity) else [pointer]
