@@ -663,12 +663,14 @@ class SizedCamera(FakeCamera):
 
 
 def test_a_camera_of_another_size_than_the_mast_files_is_refused_at_the_start() -> None:
+    before = set(threading.enumerate())
     hardware = FakeHardware()
     hardware.fake_cameras["navcam_left"] = SizedCamera("navcam_left", 0)
     with pytest.raises(
         BadFrame, match=r"navcam_left: the image is 64x47 px where the mast file has 64x48 px"
     ):
         Devices(hardware, LIMITS, DIGEST, SystemClock(), rig())
+    eventually(lambda: set(threading.enumerate()) <= before, "no thread is left")
 
 
 # The end
