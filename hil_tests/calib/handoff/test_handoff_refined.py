@@ -75,6 +75,11 @@ def test_good_pictures_give_the_exact_place(good: Case) -> None:
         assert off @ np.linalg.solve(refined[name].covariance_px2, off) < 16.0
 
 
+def test_clicks_that_are_off_by_no_more_than_the_match_is_uncertain_need_no_allowance(good: Case) -> None:
+    refined = good.refined(RefineSettings(click_px=0.0))
+    assert {one.verdict for one in refined.values()} == {"accepted"}, refined
+
+
 def test_a_wrong_geometric_hand_off_is_mended(good: Case) -> None:
     """Clicks that are off by some pixels together with a range that is wrong: the picture decides."""
     clicks = good.clicks_px + np.array([[0.0, 0.0], [1.2, 0.0]])

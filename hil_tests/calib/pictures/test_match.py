@@ -11,7 +11,7 @@ from calib.errors import CalibError
 from calib.pictures.epipolar import find_partner
 from calib.pictures.least_squares_matching import LeastSquaresMatch
 from calib.pictures.patch_match import match_patch
-from calib.pictures.patch_verdict import MatchSettings, PatchFound, PatchMatch, judged
+from calib.pictures.patch_verdict import MatchSettings, PatchFound, PatchMatch, judged, texture_lacks
 from calib.pictures.warp import Plane, Template, carry, facing_plane, grey
 from hil_tests.calib.pictures.textured_planes import Pinhole, TexturedPlane, picture, random_texture
 
@@ -143,6 +143,20 @@ def test_surface_without_texture_is_flat() -> None:
     found = find_partner(plain[0], LEFT.model, (180.0, 140.0), plain[1], RIGHT.model)
     assert found.match.verdict == "flat"
     assert np.isnan(found.match.pixel_px).all()
+
+
+@pytest.mark.parametrize(("sigma_px", "enough"), [(0.09, True), (0.3, False)])
+def test_waves_are_texture_enough_if_noise_moves_them_less_than_is_allowed(
+    sigma_px: float, enough: bool
+) -> None:
+    """Waves a sin kx + a sin ky over n pixels hold a place to sqrt(2) noise / sqrt(n a^2 k^2 / 2)."""
+    noise_dn, k, side = 0.5, 2 * np.pi / 16, 31
+    height_dn = 2 * noise_dn / (sigma_px * k * side)
+    x = np.arange(side)
+    waves = (100 + height_dn * (np.sin(k * x) + np.sin(k * x)[:, None])).astype(np.float32)
+    settings = MatchSettings(noise_dn=noise_dn)
+    assert 0.09 < settings.flat_sigma_px < 0.3
+    assert (texture_lacks(waves, settings) == "") == enough
 
 
 def test_straight_edge_is_flat_along_itself() -> None:
