@@ -531,6 +531,20 @@ def test_count_and_time_must_grow_together(devices: Devices, hardware: FakeHardw
         devices.frame_by_id(first.frame_id)
 
 
+def test_the_next_count_of_an_earlier_moment_is_no_next_picture(
+    devices: Devices, hardware: FakeHardware
+) -> None:
+    since_s = devices.read().time_s
+    eventually(lambda: now() > since_s + 0.2, "readings before the exposure")
+    camera = hardware.fake_cameras["navcam_left"]
+    camera.change = lambda frame: replace(frame, mid_exposure_s=frame.mid_exposure_s - 0.05, exposure_s=0.1)
+    first = devices.frames(["navcam_left"], since_s, 1.0)["navcam_left"]
+    earlier_s = first.mid_exposure_s - 0.01
+    camera.change = lambda frame: replace(frame, mid_exposure_s=earlier_s)
+    with pytest.raises(BadFrame, match=rf"is -0\.010 s after frame {first.sequence}: count and time must"):
+        devices.frames(["navcam_left"], first.exposure_began_s, 1.0)
+
+
 def test_a_head_camera_that_shows_the_same_after_a_move_is_frozen(
     devices: Devices, hardware: FakeHardware
 ) -> None:
