@@ -27,6 +27,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.stats import chi2, kstest
 
+from calib.errors import CalibError
 from calib.files.mast_file import load_rig
 from calib.fit.adjustment import MAST_NAMES
 from calib.fit.calibration import Calibration
@@ -63,10 +64,13 @@ class Score(NamedTuple):
     seconds: float
 
 
-def score(true: Rig, seed: int, plan: SurveyPlan, method: str, mast_parameters: int) -> Score:
-    """Return how far one survey's fit is from the truth, in its own sigmas."""
+def score(true: Rig, seed: int, plan: SurveyPlan, method: str, mast_parameters: int) -> Score | str:
+    """Return how far one survey's fit is from the truth, in its own sigmas, or why there is none."""
     survey, of_truth = simulate_survey(true, seed, plan)
-    fit = FITS[method](survey, mast_parameters)
+    try:
+        fit = FITS[method](survey, mast_parameters)
+    except CalibError as refused:
+        return f"seed {seed}: {refused}"
     m = true.mast
     numbers = [*m.translation_m, *m.rotation_rad, m.axis_offset_m, m.axis_twist_rad]
     truth = {f"mast.{n}": v for n, v in zip(MAST_NAMES, numbers, strict=True)}
@@ -144,8 +148,12 @@ def main() -> int:
         os.environ.setdefault(f"{library}_NUM_THREADS", "1")
     with ProcessPoolExecutor(options.workers, get_context("spawn")) as pool:
         again = [options.surveys * [value] for value in (true, plan, options.method, options.mast)]
-        scores = list(pool.map(score, again[0], seeds, *again[1:]))
-    report(scores)
+        found = list(pool.map(score, again[0], seeds, *again[1:]))
+    scores = [one for one in found if isinstance(one, Score)]
+    refused = [one for one in found if isinstance(one, str)]
+    if scores:
+        report(scores)
+    print("\n".join([f"surveys refused: {len(refused)}", *refused]))
     what = f"{options.surveys} surveys from seed {options.seed}, {options.method}, {options.mast} parameters"
     print(f"{what}: {time.monotonic() - began:.0f} s")
     return 0
