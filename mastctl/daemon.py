@@ -169,7 +169,7 @@ async def _serve(
     With a process of its own the signals are the daemon's, and the service is closed under their rule too.
     """
     loop = asyncio.get_running_loop()
-    waiting = Waiting()
+    waiting = Waiting(service.clock)
     server = _Server(
         uvicorn.Config(
             create_app(service, waiting),

@@ -255,6 +255,21 @@ class Client:
         body |= {"pitch_rad": pitch_rad, "roll_rad": roll_rad}
         return self._daemon.json("POST", "/simulation/pose", json=body)
 
+    def simulation_time(self) -> dict[str, Any]:
+        """Return a simulated rover's time: ``now_s``, and ``speed``, a number or ``max``."""
+        return self._daemon.json("GET", "/simulation/time")
+
+    def advance(self, duration_s: float) -> dict[str, Any]:
+        """Let time pass for a simulated rover whose ``simulation.speed`` is ``max``; return it as
+        `simulation_time` does.
+
+        Raises
+        ------
+        ClientError
+            ``time_passes`` where time passes by itself, ``not_simulated``.
+        """
+        return self._daemon.json("POST", "/simulation/time", json={"advance_s": duration_s})
+
     def faults(self) -> list[dict[str, Any]]:
         """Return the faults that are switched on in a simulated rover."""
         return list(self._daemon.json("GET", "/simulation/faults")["faults"])

@@ -76,6 +76,8 @@ class Devices:
         not checked and no camera is taken for frozen.
     camera_grace_s
         How long past its time a camera may take before it counts as hanging, seconds; 3 by default.
+    new_run
+        As in `mastctl.devices.frames.FrameStore`.
     """
 
     def __init__(
@@ -86,13 +88,14 @@ class Devices:
         clock: Clock,
         rig: Rig | None = None,
         camera_grace_s: float | None = None,
+        new_run: Callable[[], str] | None = None,
     ) -> None:
         self._pan_tilt = hardware.pan_tilt
         self._limits = limits
         self._clock = clock
         self._time = deadlines_on(clock)
         self._history = JointHistory()
-        self._store = FrameStore(mast_digest)
+        self._store = FrameStore(mast_digest, new_run=new_run)
         self._gate = threading.Lock()
         self._blocks: dict[object, str] = {}  # who lets no move out, and why
         self._closed = False

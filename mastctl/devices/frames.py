@@ -11,7 +11,7 @@ import re
 import secrets
 import threading
 from collections import deque
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -113,11 +113,25 @@ def checked(
     return Frame(image, sequence, mid_s, exposure_s)
 
 
-class FrameStore:
-    """The newest frames of each camera, found again by id. Safe to use from any thread."""
+def random_run() -> str:
+    """Return four hexadecimal digits that tell a run of the service from those before it."""
+    return secrets.token_hex(2)
 
-    def __init__(self, mast_digest: str, kept: int = KEPT_FRAMES) -> None:
+
+class FrameStore:
+    """The newest frames of each camera, found again by id. Safe to use from any thread.
+
+    ``new_run`` makes the last part of ids, four hexadecimal digits; `random_run` by default.
+    """
+
+    def __init__(
+        self,
+        mast_digest: str,
+        kept: int = KEPT_FRAMES,
+        new_run: Callable[[], str] | None = None,
+    ) -> None:
         self._digest = mast_digest
+        self._new_run = new_run or random_run
         self._runs: dict[str, str] = {}
         self._kept = kept
         self._frames: dict[str, deque[StampedFrame]] = {}
@@ -127,7 +141,9 @@ class FrameStore:
     def name(self, camera: str, sequence: int) -> tuple[str, str]:
         """Return the id of a camera's frame in this run, and the digest of the mast file that is in it."""
         with self._lock:
-            run = self._runs.setdefault(camera, secrets.token_hex(2))
+            if camera not in self._runs:
+                self._runs[camera] = self._new_run()
+            run = self._runs[camera]
             digest = self._digest
         return f"{camera}-{sequence:06d}-{digest[:8]}-{run}", digest
 
@@ -147,7 +163,7 @@ class FrameStore:
         with self._lock:
             self._frames.pop(camera, None)
             self._newest = {name: frame for name, frame in self._newest.items() if name != camera}
-            self._runs[camera] = secrets.token_hex(2)
+            self._runs[camera] = self._new_run()
 
     def add(self, frame: StampedFrame) -> StampedFrame:
         """Keep a frame and return it; if a frame of that id is kept already, that one is returned."""

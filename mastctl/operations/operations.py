@@ -20,7 +20,7 @@ from dataclasses import replace
 from typing import Any, Protocol
 
 from calib.errors import CalibError
-from drivers.clock import Clock
+from drivers.clock import Clock, deadlines_on
 from drivers.errors import DriverError
 from mastctl.errors import MastctlError, NotKnown, NotNow, Stopped, Unable, error_body
 from mastctl.operations.records import Motion, Operation, OperationState, last_residual
@@ -55,15 +55,19 @@ class Operations:
         Stops the mast.
     clock
         Stamps the records.
+    run
+        A word in every id, so that an id from before a restart names nothing; a random one by default.
     """
 
-    def __init__(self, mover: Mover, clock: Clock) -> None:
+    def __init__(self, mover: Mover, clock: Clock, run: str | None = None) -> None:
         self._mover = mover
         self._clock = clock
+        self._time = deadlines_on(clock)
+        self._ended = self._time.signal()
         self._lock = threading.Lock()
         self._records: Mapping[str, Operation] = {}  # oldest first
         self._numbers = itertools.count(1)
-        self._run = secrets.token_hex(2)  # so that an id from before a restart names nothing
+        self._run = run or secrets.token_hex(2)
         self._current: tuple[str, threading.Event, threading.Thread] | None = None
         self._motion = Motion()
         self._stops: set[object] = set()  # under way
@@ -104,8 +108,8 @@ class Operations:
             name = f"{next(self._numbers):06d}-{self._run}"
             operation = Operation(name, "queued", dict(request), self._clock.now_s())
             cancelled = threading.Event()
-            thread = threading.Thread(
-                target=self._work, args=(name, work, cancelled, on_end), name=f"operation {name}", daemon=True
+            thread = self._clock.thread(
+                lambda: self._work(name, work, cancelled, on_end), f"operation {name}"
             )
             self._keep(operation)
             self._current = (name, cancelled, thread)
@@ -158,9 +162,13 @@ class Operations:
 
     def wait_ended(self, name: str, timeout_s: float) -> None:
         """Wait until an operation has ended, ``timeout_s`` seconds at most."""
-        current = self._current
-        if current is not None and current[0] == name and current[2].is_alive():
-            current[2].join(timeout_s)
+        until_s = self._time.now_s() + timeout_s
+        with self._ended:
+            while (current := self._current) is not None and current[0] == name:
+                left_s = until_s - self._time.now_s()
+                if left_s <= 0:
+                    return
+                self._ended.wait(left_s)
 
     def get(self, name: str) -> Operation:
         """Return one record.
@@ -285,6 +293,8 @@ class Operations:
             if known is not None:  # last, since it is what clients wait for
                 ended_s = self._clock.now_s()
                 self._keep(replace(known, state=state, result=result, error=error, ended_s=ended_s))
+        with self._ended:
+            self._ended.notify_all()
 
 
 def busy(operation: str, *, stopping: bool = False) -> NotNow:

@@ -13,7 +13,7 @@ import numpy as np
 
 from calib.mast.rig import Rig
 from calib.rigid import FloatArray
-from drivers.clock import Clock
+from drivers.clock import Clock, deadlines_on
 from drivers.errors import DriverError
 from drivers.interfaces import Reading
 from mastctl.devices.limits import Limits
@@ -114,7 +114,8 @@ class Steps:
         PointingError
             ``stopped``, soon after a stop (`abandoned.LOOKED_S`), however long the work still takes.
         """
-        return result_unless(self.head.check_not_stopped, partial(work, *args, **options))
+        work_of = partial(work, *args, **options)
+        return result_unless(self.head.check_not_stopped, work_of, deadlines_on(self._clock))
 
     def rest(self) -> Reading:
         """Return the reading of a head that rests. Raises PointingError, DriverError."""

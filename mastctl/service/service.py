@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import logging
+import math
+import random
 import threading
 from collections.abc import Callable, Mapping
 from dataclasses import replace
@@ -13,12 +15,13 @@ from typing import Any
 import numpy as np
 
 from calib.files.mast_file import StoredRig
-from drivers.clock import Clock, SystemClock
+from drivers.clock import Clock
 from drivers.hardware import Hardware
-from drivers.open_hardware import open_hardware
+from drivers.open_hardware import clock_for, open_hardware
+from drivers.simulation_clock import SimulationClock
 from mastctl.config import Config
 from mastctl.devices.devices import HEAD, Devices
-from mastctl.devices.frames import StampedFrame, check_known
+from mastctl.devices.frames import StampedFrame, check_known, random_run
 from mastctl.errors import NotNow
 from mastctl.handoff.check import HandoffCheck
 from mastctl.operations.operations import STOP_ASKED, Operations, busy
@@ -78,8 +81,11 @@ class Service:
         self.clock = clock
         self.started_s = clock.now_s()
         grace_s = None if hardware.simulation is None else RENDERING_S
-        self.devices = Devices(hardware, config.limits, mast.stored.digest, clock, mast.stored.rig, grace_s)
-        self.operations = Operations(self.devices, clock)
+        new_run = _run_names(hardware, clock)
+        self.devices = Devices(
+            hardware, config.limits, mast.stored.digest, clock, mast.stored.rig, grace_s, new_run
+        )
+        self.operations = Operations(self.devices, clock, new_run())
         self.stop_threads = StopThreads()
         self._rig = configured(mast.stored.rig, config.hardware.cameras)
         self._loop = PointingLoop(self._rig, self.devices, config.limits, clock)
@@ -108,13 +114,14 @@ class Service:
         DriverError
             If a driver refuses its options or cannot reach its device.
         """
-        clock = clock or SystemClock()
+        clock = clock or clock_for(config.hardware)
         mast = read_mast(config.mast_file, config)
         for note in mast.stored.notes:
             log.warning("%s", note)
         hardware = open_hardware(config.hardware, clock)
         try:
-            return cls(config, mast, hardware, clock)
+            with clock.at_work():
+                return cls(config, mast, hardware, clock)
         except BaseException:
             hardware.close()
             raise
@@ -376,3 +383,12 @@ def _bounded(what: str, function: Callable[[], None], timeout_s: float) -> None:
     thread.join(timeout_s)
     if thread.is_alive():
         log.error("%s did not end within %.0f s and is left behind", what, timeout_s)
+
+
+def _run_names(hardware: Hardware, clock: Clock) -> Callable[[], str]:
+    """What makes a part of ids: random words, or the same ones every time where a run shall be the same."""
+    simulation = hardware.simulation
+    if simulation is None or not isinstance(clock, SimulationClock) or math.isfinite(clock.speed):
+        return random_run
+    seeded = random.Random(simulation.settings.camera.seed)
+    return lambda: f"{seeded.getrandbits(16):04x}"

@@ -25,7 +25,7 @@ from mastctl.web.waiting import Waiting
 
 def create_app(service: Service, waiting: Waiting | None = None) -> ASGIApp:
     """Return the ASGI application that serves one service; ``waiting`` tells its requests when it ends."""
-    waiting = waiting or Waiting()
+    waiting = waiting or Waiting(service.clock)
     app = FastAPI(
         title="mastctl",
         version=version("mastctl"),

@@ -171,6 +171,12 @@ class StandBody(_Strict):
     roll_rad: Slope = 0.0
 
 
+class TimeBody(_Strict):
+    """``POST /simulation/time``: let time pass where it does not pass by itself."""
+
+    advance_s: Annotated[float, Field(ge=0.0, le=3600.0)]
+
+
 class MastBody(_Strict):
     """``POST /mast``: the name of a file beside the configured mast file, or ``previous``: true."""
 

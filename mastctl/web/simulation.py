@@ -9,12 +9,13 @@ from fastapi import FastAPI, Query
 
 from drivers.faults import Fault as SetFault
 from drivers.faults import FaultPanel
+from drivers.simulation_clock import MAX, SimulationClock
 from mastctl.as_json import as_json
-from mastctl.errors import NotKnown
+from mastctl.errors import NotKnown, NotNow
 from mastctl.service.service import Service
 from mastctl.tracking.pose import RoverPose
 from mastctl.web import PREFIX
-from mastctl.web.models import FaultBody, FaultsQuery, StandBody
+from mastctl.web.models import FaultBody, FaultsQuery, StandBody, TimeBody
 from mastctl.web.waiting import Waiting
 
 if TYPE_CHECKING:
@@ -50,6 +51,28 @@ def add_simulation(app: FastAPI, service: Service, waiting: Waiting) -> None:
             return stands()
 
         return await waiting.run(put)
+
+    def time_now() -> dict[str, Any]:
+        simulated("clocks")
+        clock = service.clock
+        speed = clock.speed if isinstance(clock, SimulationClock) else 1.0
+        return {"now_s": clock.now_s(), "speed": MAX if speed == math.inf else speed}
+
+    @app.get(f"{PREFIX}/simulation/time", summary="The simulated rover's time, and how fast it goes")
+    async def time() -> dict[str, Any]:
+        return await waiting.run(time_now)
+
+    @app.post(f"{PREFIX}/simulation/time", summary="Let time pass where it does not pass by itself")
+    async def advance(body: TimeBody) -> dict[str, Any]:
+        def pass_by() -> dict[str, Any]:
+            speed = time_now()["speed"]
+            if speed != MAX:
+                words = f"at simulation.speed {speed:g} time passes by itself; it is let pass only at {MAX}"
+                raise NotNow("time_passes", words)
+            service.clock.sleep(body.advance_s)
+            return time_now()
+
+        return await waiting.run(pass_by)
 
     def told() -> dict[str, Any]:
         return {"faults": [_fault_told(fault) for fault in panel().active()]}

@@ -14,6 +14,7 @@ import threading
 from collections.abc import Awaitable, Callable
 from typing import TypeVar
 
+from drivers.clock import Clock, SystemClock
 from mastctl.errors import Unable
 
 T = TypeVar("T")
@@ -24,9 +25,13 @@ PICTURE_QUEUE_S = 2.0  # how long a request waits for those before it
 
 
 class Waiting:
-    """The waiting requests of one daemon; used on its event loop only."""
+    """The waiting requests of one daemon; used on its event loop only.
 
-    def __init__(self) -> None:
+    ``clock`` is the service's, which may have to wait while a request computes.
+    """
+
+    def __init__(self, clock: Clock | None = None) -> None:
+        self._clock = clock or SystemClock()
         self._ending = asyncio.Event()
         self._asked: dict[str, asyncio.Semaphore] = {}
         self._others = asyncio.Semaphore(AT_ONCE)
@@ -58,7 +63,7 @@ class Waiting:
 
     async def _worked(self, function: Callable[[], T]) -> T:
         async with self._others:
-            return await _in_thread(function)
+            return await _in_thread(self._at_work(function))
 
     async def _in_turn(self, camera: str, function: Callable[[], T]) -> T:
         turn = self._asked.setdefault(camera, asyncio.Semaphore(PICTURES_AT_ONCE))
@@ -72,9 +77,16 @@ class Waiting:
                 PICTURE_QUEUE_S,
             ) from None
         try:
-            return await _in_thread(function)
+            return await _in_thread(self._at_work(function))
         finally:
             turn.release()
+
+    def _at_work(self, function: Callable[[], T]) -> Callable[[], T]:
+        def work() -> T:
+            with self._clock.at_work():
+                return function()
+
+        return work
 
     async def _unless_ending(self, work: Awaitable[T]) -> T:
         call = asyncio.ensure_future(work)
