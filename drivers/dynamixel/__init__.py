@@ -1,1 +1,1 @@
-"""Heads of two Dynamixel servos (protocol 2.0) over the dynamixel-sdk's port and packet layers, hardened."""
+"""Heads of two Dynamixel servos (protocol 2.0) with packets of our own that the dynamixel-sdk judges."""
