@@ -322,3 +322,15 @@ def test_one_good_pair_of_clicks_in_a_thousand_is_refused(
     refused = int(np.sum(np.array(sigmas) > MOST_SIGMAS))
     assert (1 <= refused <= 24) if draws == 10_000 else refused <= 11
     assert np.mean(np.square(sigmas)) == pytest.approx(1.0, abs=6 * math.sqrt(2 / draws))
+
+
+@pytest.mark.parametrize("off_px", [3.0, -5.0])
+def test_how_far_a_click_is_off_the_epipolar_line_is_told_in_its_pixels(rig: Rig, off_px: float) -> None:
+    """The eyes stand level, so that the line runs along the rows."""
+    at = (AT.pan_rad, AT.tilt_rad)
+    exact = clicks(rig, PAIR, TARGET, AT)
+    eyes = [rig.camera_in_rover(name, *at) for name in PAIR]
+    allowed = click_covariance(rig, PAIR, *at, TARGET, sigma_px=0.2)
+    gap = ray_gap(triangulate(*eyes, exact[0], exact[1] + [0.0, off_px]), allowed)
+    assert gap.across_px == pytest.approx(abs(off_px), rel=0.05)
+    assert gap.across_px / gap.across_sigma_px == pytest.approx(gap.sigmas)
