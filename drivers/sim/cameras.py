@@ -8,7 +8,6 @@ a hardware trigger. A camera remembers as many finished frames as a capture ring
 from __future__ import annotations
 
 import threading
-import zlib
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -20,6 +19,7 @@ from drivers.clock import Clock
 from drivers.errors import NoFreshFrame, NoReply
 from drivers.faults import Fault, FaultPanel
 from drivers.interfaces import Frame, FrameTime, Image
+from drivers.sim.sensor import Noise
 
 RING_FRAMES = 4
 """Finished frames that can still be fetched, as in a capture ring of four buffers."""
@@ -85,7 +85,8 @@ class SimulatedCamera:
     size_px
         (width, height).
     expose
-        ``expose(begin_s, exposure_s)`` renders the noise-free float32 (h, w) picture of an exposure.
+        ``expose(begin_s, exposure_s)`` gives the noise-free float32 (h, w) picture of an exposure; one that
+        it keeps is read-only.
     taken
         ``taken(sequence, mid_exposure_s)`` is told of every frame that is handed out, before it is.
     clock
@@ -119,6 +120,9 @@ class SimulatedCamera:
         self._epochs = [_Epoch(start_s, 0, 1 / settings.rate_hz)]
         self._last: Frame | None = None
         self._frozen: tuple[Fault, Image] | None = None
+        self._noise = Noise(settings.read_noise_dn, settings.shot_noise_dn, settings.seed, name)
+        nothing = np.empty((0, 0), np.float32)
+        self._light = (nothing, nothing)  # of the last picture at rest, and its noise
         self._closed = threading.Event()
 
     def next_frame(self, exposed_after_s: float, timeout_s: float) -> Frame:
@@ -251,12 +255,12 @@ class SimulatedCamera:
 
     def _noisy(self, clean: NDArray[np.float32], sequence: int) -> Image:
         """Read and shot noise, rounded to grey levels; the same for the same seed, camera and sequence."""
-        s = self._settings
-        generator = np.random.default_rng([s.seed, zlib.crc32(self.name.encode()), sequence])
-        noise = generator.standard_normal(clean.shape, dtype=np.float32)
-        variance = s.read_noise_dn**2 + s.shot_noise_dn**2 / 128 * np.clip(clean, 0, None)
-        image: Image = np.rint(np.clip(clean + noise * np.sqrt(variance), 0, 255)).astype(np.uint8)
-        return image
+        light, sigma_dn = self._light
+        if light is not clean:
+            sigma_dn = self._noise.sigma_dn(clean)
+            if not clean.flags.writeable:  # a head at rest gives the same array again and again
+                self._light = (clean, sigma_dn)
+        return self._noise.levels(clean, sigma_dn, sequence)
 
     def _instead(self, exposed_after_s: float, timeout_s: float) -> str:
         """What to say when no fresh frame came."""

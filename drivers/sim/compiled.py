@@ -35,14 +35,8 @@ def is_compiled() -> bool:
     BadOptions
         If numba is not installed.
     """
-    module = kernels()
-    source_time_s = Path(str(module.__file__)).stat().st_mtime
-    for name in ("render_tiles", "cast_rays", "shadow_rays", "lay_pebbles"):
-        function = getattr(module, name)
-        if function.signatures:
-            continue
-        folder = function.stats.cache_path
-        indexes = list(Path(folder).glob(f"kernels.{name}-*.nbi")) if folder else []
-        if not any(index.stat().st_mtime >= source_time_s for index in indexes):
+    for function in kernels().ENTRIES:
+        folder = Path(function.stats.cache_path)
+        if not function.signatures and not any(folder.glob(f"*.{function.__name__}-*.nbi")):
             return False
     return True

@@ -12,7 +12,6 @@ import threading
 from collections import OrderedDict
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import fields
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,87 +20,17 @@ from calib.camera.cahvor import CameraModel
 from calib.rigid import Rigid
 from drivers.errors import BadOptions
 from drivers.sim.compiled import is_compiled, kernels
+from drivers.sim.rays import BLOCK_PX, TILE_PX, RayTable, ray_table
 from drivers.sim.scene import Scene, tiny_scene
+from drivers.sim.sensor import Noise
 
-__all__ = ["RayTable", "Renderer", "compile_renderer", "is_compiled", "ray_table"]
+__all__ = ["Renderer", "Stills", "compile_renderer", "is_compiled"]
 
 Float32 = NDArray[np.float32]
-Float64 = NDArray[np.float64]
 
-TILE_PX = 16  # squares for which rocks and the distance to the ground are bounded first...
-BLOCK_PX = 4  # ...and then more closely
 TABLES_KEPT = 12
+STILLS_KEPT = 12
 MAX_SAMPLES = 8
-
-
-class RayTable(NamedTuple):
-    """All rays of one camera model in the model's own frame, and beams that hold them, tile by tile.
-
-    rays (h, w, q, 3) unit directions, q = samples ** 2 in rows, not-a-number where the model has none; starts
-    (h, w, q, 3) where each ray begins relative to C, metres, or (0, 0, 0, 3) if all begin at C; beams of
-    tiles and of blocks (rows, columns, 6) as ``kernels.render_tiles`` wants them.
-
-    Directions are float32: in a frame whose x axis is near the optical axis, as mast files have it, the
-    rounding is below 1e-4 px at a focal length of 3441 px.
-    """
-
-    rays: Float32
-    starts: Float32
-    tile_beams: Float64
-    block_beams: Float64
-
-
-def ray_table(camera: CameraModel, samples: int) -> RayTable:
-    """Return the rays through every sample of every pixel of ``camera``, exactly as the model gives them."""
-    width, height = camera.size_px
-    q = samples * samples
-    offsets = (np.arange(samples) + 0.5) / samples - 0.5
-    rays = np.empty((height, width, q, 3), dtype=np.float32)
-    starts = np.empty((height, width, q, 3), dtype=np.float32)
-    y_px, x_px = np.mgrid[0:height, 0:width].astype(np.float64)
-    for i in range(q):
-        pixels = np.stack([x_px + offsets[i % samples], y_px + offsets[i // samples]], axis=-1)
-        origins_m, directions, valid = camera.ray(pixels)
-        rays[:, :, i] = np.where(valid[..., None], directions, np.nan)
-        starts[:, :, i] = np.where(valid[..., None], origins_m - camera.C, 0.0)
-    if not starts.any():
-        starts = np.empty((0, 0, 0, 3), dtype=np.float32)
-    return RayTable(rays, starts, *(beams(rays, starts, samples, size) for size in (TILE_PX, BLOCK_PX)))
-
-
-def beams(rays: Float32, starts: Float32, samples: int, size_px: int) -> Float64:
-    """Return (rows, columns, 6): the mean direction of each square of pixels, and how far its rays spread."""
-    blocks = in_squares(rays, size_px, np.nan)
-    valid = np.isfinite(blocks[..., 0])
-    table = np.zeros((*blocks.shape[:2], 6))
-    axis = np.where(valid[..., None], blocks, 0.0).sum(axis=(2, 3), dtype=np.float64)
-    length = np.linalg.norm(axis, axis=-1, keepdims=True)
-    table[..., :3] = axis / np.where(length > 0, length, 1.0)
-    apart = np.linalg.norm(blocks - table[:, :, None, None, :3].astype(np.float32), axis=-1)
-    table[..., 3] = np.where(valid, apart, -1.0).max(axis=(2, 3)) + 1e-6
-    table[..., 3][~valid.any(axis=(2, 3))] = np.nan
-    if len(starts):
-        table[..., 4] = np.linalg.norm(in_squares(starts, size_px, 0.0), axis=-1).max(axis=(2, 3)) + 1e-6
-    pitch = np.ones(table.shape[:2])
-    for across in (0, 1):
-        steps = np.linalg.norm(np.diff(rays[:, :, :1], axis=across), axis=-1)
-        steps = np.pad(steps, [(0, int(k == across)) for k in (0, 1)] + [(0, 0)], mode="edge")[..., None]
-        squares = in_squares(steps, size_px, np.nan)
-        known = np.isfinite(squares)
-        total = np.where(known, squares, 0.0).sum(axis=(2, 3, 4))
-        pitch *= total / np.maximum(known.sum(axis=(2, 3, 4)), 1)
-    table[..., 5] = np.sqrt(pitch) / samples
-    return table
-
-
-def in_squares(values: Float32, size_px: int, filler: float) -> Float32:
-    """(h, w, q, n) cut into squares: (rows, columns, pixels, q, n), filled up at the right and below."""
-    height, width, q, n = values.shape
-    padding = [(0, -height % size_px), (0, -width % size_px), (0, 0), (0, 0)]
-    padded = np.pad(values, padding, constant_values=filler)
-    rows, columns = padded.shape[0] // size_px, padded.shape[1] // size_px
-    cut = padded.reshape(rows, size_px, columns, size_px, q, n).transpose(0, 2, 1, 3, 4, 5)
-    return np.asarray(cut.reshape(rows, columns, size_px * size_px, q, n))
 
 
 class Renderer:
@@ -173,6 +102,7 @@ class Renderer:
                 int(edges[k + 1]),
                 rotation,
                 centre_m,
+                np.empty((5, BLOCK_PX * BLOCK_PX * samples * samples)),
                 image,
             )
 
@@ -186,8 +116,7 @@ class Renderer:
 
     def _table(self, camera: CameraModel, samples: int) -> RayTable:
         """The rays of a camera, from the few kept ones if its numbers are the same."""
-        numbers = (getattr(camera, one.name) for one in fields(camera) if one.init)
-        key = (samples, *(n.tobytes() if isinstance(n, np.ndarray) else n for n in numbers))
+        key = (*camera_key(camera), samples)
         with self._lock:
             if key not in self._tables:
                 self._tables[key] = ray_table(camera, samples)
@@ -195,6 +124,50 @@ class Renderer:
                     self._tables.popitem(last=False)
             self._tables.move_to_end(key)
             return self._tables[key]
+
+
+class Stills:
+    """Pictures of poses seen lately, so that a camera at rest before a scene that stands is drawn once.
+
+    A picture without noise is a function of scene, camera, pose and samples alone. The scene never changes
+    and the key holds every bit of the others, so nothing can be stale. Whatever else is to change what a
+    camera sees (light, dust, exposure, temperature) comes after this, or joins the key. Safe from any thread.
+    """
+
+    def __init__(self, renderer: Renderer) -> None:
+        self._renderer = renderer
+        self._lock = threading.Lock()
+        self._images: OrderedDict[tuple[object, ...], Float32] = OrderedDict()
+
+    def find(self, camera: CameraModel, site_from_camera_frame: Rigid, samples: int) -> Float32 | None:
+        """Return a picture that was drawn before, read-only; None if it is to be drawn."""
+        key = self._key(camera, site_from_camera_frame, samples)
+        with self._lock:
+            if key in self._images:
+                self._images.move_to_end(key)
+            return self._images.get(key)
+
+    def image(self, camera: CameraModel, site_from_camera_frame: Rigid, samples: int) -> Float32:
+        """Return what `Renderer.image` returns, read-only, and keep it. Raises what that raises."""
+        image = self.find(camera, site_from_camera_frame, samples)
+        if image is None:
+            image = self._renderer.image(camera, site_from_camera_frame, samples)
+            image.setflags(write=False)
+            with self._lock:
+                self._images[self._key(camera, site_from_camera_frame, samples)] = image
+                while len(self._images) > STILLS_KEPT:
+                    self._images.popitem(last=False)
+        return image
+
+    @staticmethod
+    def _key(camera: CameraModel, pose: Rigid, samples: int) -> tuple[object, ...]:
+        return (*camera_key(camera), samples, pose.rotation.tobytes(), pose.translation_m.tobytes())
+
+
+def camera_key(camera: CameraModel) -> tuple[object, ...]:
+    """Return all numbers of a camera model, to the last bit."""
+    numbers = (getattr(camera, one.name) for one in fields(camera) if one.init)
+    return tuple(n.tobytes() if isinstance(n, np.ndarray) else n for n in numbers)
 
 
 def compile_renderer() -> None:
@@ -217,6 +190,7 @@ def compile_renderer() -> None:
         V=np.array([3.5, 0.0, 8.0]),
     )
     renderer = Renderer(scene, workers=1)
-    renderer.image(camera, Rigid.identity(), samples=1)
+    image = renderer.image(camera, Rigid.identity(), samples=1)
     renderer.close()
+    Noise(1.0, 1.0, 0, "").levels(image, image, 0)
     scene.cast([0.0, 0.0, -1.5], [1.0, 0.0, 1.0])

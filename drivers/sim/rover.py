@@ -10,7 +10,8 @@ from __future__ import annotations
 import math
 import threading
 from collections import OrderedDict
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from types import MappingProxyType
@@ -31,7 +32,7 @@ from drivers.interfaces import PanTilt
 from drivers.options import is_number, is_whole
 from drivers.sim.cameras import CameraSettings, SimulatedCamera
 from drivers.sim.pan_tilt import HeadSettings, SimulatedPanTilt, head_settings
-from drivers.sim.render import Renderer, compile_renderer
+from drivers.sim.render import Renderer, Stills, compile_renderer
 from drivers.sim.scene import SceneSettings, build_scene
 from drivers.sim.wired_head import DEFAULT_HEADS, WiredHead, check_head
 from drivers.simulation_clock import simulation_speed
@@ -229,7 +230,8 @@ class SimulatedRover:
         compile_renderer()
         self.scene = build_scene(settings.scene)
         self._renderer = Renderer(self.scene)
-        self._render_lock = threading.Lock()  # one picture at a time: each keeps all processors busy
+        self._stills = Stills(self._renderer)
+        self._render_lock = threading.Lock()
         self._closed = False
         self._truth_lock = threading.Lock()
         self._truth: dict[str, OrderedDict[int, FrameTruth]] = {n: OrderedDict() for n in self.rig.cameras}
@@ -340,22 +342,40 @@ class SimulatedRover:
 
     def _exposed(self, name: str, begin_s: float, exposure_s: float) -> NDArray[np.float32]:
         """Render one exposure: one picture at its middle, or the mean along the head's way through it."""
-        camera = self.rig.cameras[name]
         steps = self._blur_steps(name, begin_s, exposure_s)
-        samples = self.settings.samples if steps == 1 else 1
+        if steps == 1:
+            return self._still(name, begin_s + 0.5 * exposure_s)
         total: NDArray[np.float32] | None = None
         for step in range(steps):
-            site_from_frame = self.site_from_rover
-            if camera.on == "head":
-                joints = self.true_joints(begin_s + (step + 0.5) / steps * exposure_s)
-                site_from_frame = site_from_frame @ self.rig.mast.rover_from_head(*joints)
-            with self._render_lock:
-                if self._closed:
-                    raise NoFreshFrame("it is closed", device=name)
-                image = self._renderer.image(camera.model, site_from_frame, samples)
+            pose = self._pose(name, begin_s + (step + 0.5) / steps * exposure_s)
+            with self._drawing(name):
+                image = self._renderer.image(self.rig.cameras[name].model, pose, 1)
             total = image if total is None else total + image
         assert total is not None
-        return total / np.float32(steps) if steps > 1 else total
+        return total / np.float32(steps)
+
+    def _still(self, name: str, time_s: float) -> NDArray[np.float32]:
+        """The picture of a moment, read-only; drawn before, if the camera stood there before."""
+        model, pose = self.rig.cameras[name].model, self._pose(name, time_s)
+        found = self._stills.find(model, pose, self.settings.samples)
+        if found is not None:
+            return found
+        with self._drawing(name):
+            return self._stills.image(model, pose, self.settings.samples)
+
+    def _pose(self, name: str, time_s: float) -> Rigid:
+        """site_from_frame of a camera's mounting frame at a moment."""
+        if self.rig.cameras[name].on != "head":
+            return self.site_from_rover
+        return self.site_from_rover @ self.rig.mast.rover_from_head(*self.true_joints(time_s))
+
+    @contextmanager
+    def _drawing(self, name: str) -> Iterator[None]:
+        """One picture at a time: each keeps all processors busy."""
+        with self._render_lock:
+            if self._closed:
+                raise NoFreshFrame("it is closed", device=name)
+            yield
 
     def _blur_steps(self, name: str, begin_s: float, exposure_s: float) -> int:
         """How many renderings an exposure takes: 1 when the camera stands still."""

@@ -79,7 +79,7 @@ def pyramid(tones: Float32, texel_m: float) -> Any:
     """Return the ``kernels.Texture`` of a square picture of relative brightness, side a power of two."""
     module = kernels()
     levels = halved(tones)
-    padded = [np.pad(level, [(0, 0), (0, module.PAD)]) for level in levels]
+    padded = [np.pad(level, [(0, 1), (0, module.PAD)], mode="wrap") for level in levels]
     texels = np.concatenate([level.ravel() for level in padded])
     start = np.cumsum([0, *(level.size for level in padded[:-1])]).astype(np.int64)
     stored = np.clip(np.rint(texels * module.ONE), 0, 65535).astype(np.uint16)

@@ -78,7 +78,9 @@ def through_devices(
     out.mkdir(parents=True, exist_ok=True)
     (out / RECORD).unlink(missing_ok=True)
     command = [sys.executable, "-m", "tools.closed_loop.run", "devices", *options, "--out", "/run/out"]
-    environment = {"PYTHONPATH": str(REPOSITORY), "OPENBLAS_NUM_THREADS": "1"}
+    # the machine has a home of its own, which is empty: what was compiled here is read from here
+    kept = os.environ.get("XDG_CACHE_HOME") or str(Path.home() / ".cache")
+    environment = {"PYTHONPATH": str(REPOSITORY), "OPENBLAS_NUM_THREADS": "1", "XDG_CACHE_HOME": kept}
     result = boot.run(
         found, command, out, folder=REPOSITORY, cameras=boot.CAMERAS["hdmi"], timeout_s=timeout_s,
         environment=environment, show=show,

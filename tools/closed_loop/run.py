@@ -7,8 +7,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
-import shutil
 import subprocess
 import sys
 import tempfile
@@ -17,7 +15,6 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-import drivers.sim
 from mastctl.cli.output import at_least, positive_number
 from mastctl.client import Client
 from mastctl.config import load_config
@@ -58,7 +55,6 @@ def in_memory(folder: Path, args: argparse.Namespace) -> dict[str, Any]:
 
 def through_devices(folder: Path, args: argparse.Namespace) -> dict[str, Any]:
     """Run on capture nodes and a serial line, with the world behind them, and a daemon of its own."""
-    _bring_compiled()
     from tools.closed_loop.world import World, WorldTruth
 
     files.write_rig(folder)
@@ -67,15 +63,6 @@ def through_devices(folder: Path, args: argparse.Namespace) -> dict[str, Any]:
         with _daemon(config) as url, Client(url) as client:
             document = _experiment(client, WorldTruth(world, client), args)
         return {**document, **world.facts()}
-
-
-def _bring_compiled() -> None:
-    """Lay a writable copy over the renderer's compiled code: numba reads none where it cannot write."""
-    cache = Path(drivers.sim.__path__[0]) / "__pycache__"
-    if cache.is_dir() and not os.access(cache, os.W_OK):
-        copy = tempfile.mkdtemp(prefix="compiled-")
-        shutil.copytree(cache, copy, dirs_exist_ok=True)
-        subprocess.run(["mount", "--bind", copy, str(cache)], check=True)
 
 
 @contextmanager

@@ -11,9 +11,12 @@ import pytest
 from calib.camera.cahvor import CameraModel
 from calib.rigid import Rigid
 from drivers.errors import BadOptions
+from drivers.sim import rays as ray_tables
 from drivers.sim import render, texture
-from drivers.sim.compiled import is_compiled, kernels
-from drivers.sim.render import Renderer, compile_renderer, ray_table
+from drivers.sim.compiled import is_compiled
+from drivers.sim.kernels.texture import stretched_brightness
+from drivers.sim.rays import ray_table
+from drivers.sim.render import Renderer, Stills, compile_renderer
 from drivers.sim.scene import Scene, SceneSettings, build_scene
 from tools.campaigns import render_bias as bias
 
@@ -89,7 +92,7 @@ def test_no_level_of_a_texture_is_shifted_against_another(axis: int) -> None:
         for stretch in (1.0, 4.0, 13.0):
             place = rng.uniform(0.35, 0.65, 2) * size * texel_m
             turn = rng.uniform(0, 2 * np.pi)
-            value = kernels().stretched_brightness(
+            value = stretched_brightness(
                 picture, *place, width * texel_m, stretch * width * texel_m, np.cos(turn), np.sin(turn)
             )
             expected = 0.2 + 1.6 * place[axis] / (size * texel_m)
@@ -127,8 +130,9 @@ def test_how_pixels_are_grouped_makes_no_difference(
     for name, pose in poses.items():
         camera = small(getattr(bias, name), 4)
         usual = rough.image(camera, pose, samples)
-        monkeypatch.setattr(render, "TILE_PX", 1)
-        monkeypatch.setattr(render, "BLOCK_PX", 1)
+        for module in (render, ray_tables):
+            monkeypatch.setattr(module, "TILE_PX", 1)
+            monkeypatch.setattr(module, "BLOCK_PX", 1)
         single = Renderer(rough.scene).image(camera, pose, samples)
         monkeypatch.undo()
         assert np.abs(usual - single).max() < 4.0, "only the footprint is shared by a group"
@@ -167,7 +171,7 @@ def test_beams_hold_all_their_rays() -> None:
     for camera in (small(bias.HAZCAM, 4), small(bias.NAVCAM, 5)):  # 160 x 120 and 204 x 153: not whole tiles
         table = ray_table(camera, 2)
         rng = np.random.default_rng(14)
-        for size, beams in ((render.TILE_PX, table.tile_beams), (render.BLOCK_PX, table.block_beams)):
+        for size, beams in ((ray_tables.TILE_PX, table.tile_beams), (ray_tables.BLOCK_PX, table.block_beams)):
             for _ in range(500):
                 x, y = rng.integers(0, camera.size_px[0]), rng.integers(0, camera.size_px[1])
                 beam = beams[y // size, x // size]
@@ -247,3 +251,55 @@ def test_samples_out_of_bounds_are_refused(rough: Renderer, samples: int) -> Non
 def test_compiling_is_known_to_be_done() -> None:
     compile_renderer()
     assert is_compiled()
+
+
+# ------------------------------------------------------------- one triangle for many rays
+
+
+def test_rays_meet_the_same_ground_together_as_alone(
+    rough: Renderer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    camera = small(bias.NAVCAM, 4)
+    for range_m, pan_rad in ((2.0, 0.3), (8.0, np.pi / 4), (30.0, -np.pi / 2), (0.3, 2.9)):
+        pose = bias.head_pose(range_m, pan_rad, 0.0)
+        swept = rough.image(camera, pose, 2)
+        table = ray_table(camera, 2)
+        alone = table._replace(starts=np.zeros_like(table.rays))  # rays with starts of their own walk alone
+        monkeypatch.setattr(rough, "_table", lambda camera, samples, alone=alone: alone)
+        walked = rough.image(camera, pose, 2)
+        monkeypatch.undo()
+        assert np.abs(swept - walked).max() < 1e-3, range_m
+
+
+# ------------------------------------------------------------- pictures that are drawn once
+
+
+def test_a_standing_camera_is_drawn_once_and_any_other_bit_makes_a_new_picture(
+    rough: Renderer,
+) -> None:
+    camera, pose = small(bias.NAVCAM, 8), bias.head_pose(4.0, 0.1, -0.1)
+    stills = Stills(rough)
+    first = stills.image(camera, pose, 1)
+    assert stills.image(camera, Rigid(pose.rotation.copy(), pose.translation_m.copy()), 1) is first
+    assert not first.flags.writeable
+    up = np.nextafter(pose.translation_m, np.inf)
+    others = (
+        (camera, bias.head_pose(4.0, np.nextafter(0.1, 1.0), -0.1), 1),
+        (camera, Rigid(pose.rotation, up), 1),
+        (camera, pose, 2),
+        (replace(camera, H=np.nextafter(camera.H, np.inf)), pose, 1),
+        (replace(camera, C=np.nextafter(camera.C, np.inf)), pose, 1),
+    )
+    for other in others:
+        assert stills.find(*other) is None
+        np.testing.assert_array_equal(stills.image(*other), rough.image(*other))
+    np.testing.assert_array_equal(first, rough.image(camera, pose, 1))
+
+
+def test_only_the_last_few_pictures_are_kept(rough: Renderer) -> None:
+    camera, stills = small(bias.NAVCAM, 32), Stills(rough)
+    poses = [bias.head_pose(4.0, 0.01 * k, -0.1) for k in range(render.STILLS_KEPT + 1)]
+    for pose in poses:
+        stills.image(camera, pose, 1)
+    assert stills.find(camera, poses[0], 1) is None
+    assert all(stills.find(camera, pose, 1) is not None for pose in poses[1:])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -186,3 +187,74 @@ def test_the_shipped_mast_file_is_near_the_true_rig_but_not_the_same(repository:
     assert not stored.notes and not true_rig.notes
     for camera, true_camera in true_rig.rig.cameras.items():
         assert not np.array_equal(stored.rig.cameras[camera].model.H, true_camera.model.H)
+
+
+def clean(device: SimulatedRover, clock: ManualClock, name: str = "navcam_left") -> np.ndarray:
+    """The next frame of a camera without noise."""
+    clock.advance(0.5)
+    return device.cameras[name].next_frame(clock.now_s(), 1.0).image
+
+
+QUIET = {"cameras": {"read_noise_dn": 0, "shot_noise_dn": 0}}
+
+
+def test_a_resting_head_is_drawn_once_and_each_frame_has_noise_of_its_own(
+    small_rig: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    device, clock = rover(small_rig)
+    settle(device, clock, 0.1, -0.3)
+    drawn = []
+    draw = device._renderer.image
+    monkeypatch.setattr(device._renderer, "image", lambda *a: drawn.append(a) or draw(*a))
+    frames = [clean(device, clock) for _ in range(4)]
+    assert len(drawn) == 1
+    for one, other in pairwise(frames):
+        apart = one.astype(float) - other
+        assert 1.0 < apart.std() < 5.0 and abs(apart.mean()) < 0.05
+        assert abs(np.corrcoef(apart[:-1].ravel(), apart[1:].ravel())[0, 1]) < 0.02
+
+
+def test_whatever_moves_shows_in_the_next_picture(small_rig: Path) -> None:
+    """The smallest move of the head, the rover put elsewhere, one camera and then another."""
+    device, clock = rover(small_rig, **QUIET)
+    settle(device, clock, 0.1, -0.3)
+    first = clean(device, clock)
+    np.testing.assert_array_equal(clean(device, clock), first)
+    head = device._head
+    joints = head.true_joints
+
+    def dithering(time_s: float) -> tuple[float, float]:
+        pan, tilt = joints(time_s)
+        return pan + 2e-3, tilt
+
+    head.true_joints = dithering  # type: ignore[method-assign]
+    moved = clean(device, clock)
+    assert (moved != first).mean() > 0.2
+    head.true_joints = joints  # type: ignore[method-assign]
+    np.testing.assert_array_equal(clean(device, clock), first)
+    right = clean(device, clock, "navcam_right")
+    assert (right != first).mean() > 0.5
+    device.stand(0.3, 0.0, 0.0)
+    elsewhere = clean(device, clock)
+    assert (elsewhere != first).mean() > 0.5
+    device.site_from_rover = Rigid.identity()
+    np.testing.assert_array_equal(clean(device, clock), first)
+
+
+@pytest.mark.parametrize("word", ["dark", "garbage", "frozen", "wrong"])
+def test_a_fault_shows_at_rest_and_is_gone_when_cleared(small_rig: Path, word: str) -> None:
+    device, clock = rover(small_rig)
+    settle(device, clock, 0.1, -0.3)
+    before = clean(device, clock)
+    more = {"wrong": {"dx_px": 7, "dy_px": 0}}.get(word, {})
+    device.faults.set("navcam_left", word, **more)
+    clock.advance(0.5)
+    faulty = [clean(device, clock) for _ in range(2)]
+    if word == "frozen":
+        np.testing.assert_array_equal(faulty[0], faulty[1])
+    else:
+        assert np.abs(faulty[1].astype(float) - before).mean() > 5.0
+    device.faults.clear("navcam_left")
+    clock.advance(0.5)
+    after = clean(device, clock)
+    assert np.abs(after.astype(float) - before).mean() < 3.0 and (after != faulty[1]).any()

@@ -1,0 +1,148 @@
+"""The light that comes back from ground, rocks and sky."""
+
+from __future__ import annotations
+
+import math
+
+from drivers.sim.kernels.compiling import inlined, part
+from drivers.sim.kernels.texture import brightness, stretched_brightness
+from drivers.sim.kernels.world import AMBIENT, Float64, Grid, Rocks, Texture
+
+GROUND_TONE = 108.0
+ROCK_TONE = 106.0
+SKY_HORIZON = 196.0
+SKY_ZENITH = 128.0
+HAZE_M = 900.0
+
+
+@inlined
+def ground_light(
+    grid: Grid,
+    broad: Texture,
+    detail: Texture,
+    ix: int,
+    iy: int,
+    x: float,
+    y: float,
+    s: float,
+    dx: float,
+    dy: float,
+    de: float,
+    pitch: float,
+) -> float:
+    """Brightness of a ground point seen from s metres with a sample pitch of ``pitch`` radians.
+
+    (x, y) counts from the inner grid's corner, so that its cells and the texels of ``broad`` coincide.
+    """
+    inv = 0.5 / grid.cell_m
+    h00 = grid.elevation_m[iy, ix]
+    h10 = grid.elevation_m[iy, ix + 1]
+    h01 = grid.elevation_m[iy + 1, ix]
+    h11 = grid.elevation_m[iy + 1, ix + 1]
+    sx = (h10 - h00 + h11 - h01) * inv
+    sy = (h01 - h00 + h11 - h10) * inv
+    norm = 1.0 / math.sqrt(1.0 + sx * sx + sy * sy)
+    facing = max((sx * dx + sy * dy - de) * norm, 0.03)  # cosine between ray and the normal (-sx, -sy, 1)
+    short = s * pitch
+    long = short / facing
+    level = 1.0 / math.sqrt(dx * dx + dy * dy + 1e-12)
+    ux, uy = dx * level, dy * level
+    tone = stretched_brightness(broad, x, y, short, long, ux, uy)
+    if short < 0.1:
+        tone *= stretched_brightness(detail, x, y, short, long, ux, uy)
+    haze = s / (s + HAZE_M)
+    return float(GROUND_TONE * tone * (1.0 - haze) + SKY_HORIZON * haze)
+
+
+@part
+def hits_light(
+    grid: Grid,
+    broad: Texture,
+    detail: Texture,
+    hits: Float64,
+    count: int,
+    together: bool,
+    pitch: float,
+    wide_pitch: float,
+) -> float:
+    """Sum of the brightness of ``count`` hits of one pixel on the ground (n, 6: x, y, s, dx, dy, de).
+
+    ``together`` looks the texture up once for all of them, at their middle and with the pixel's own pitch.
+    """
+    last = grid.cells - 1
+    inv_cell = 1.0 / grid.cell_m
+    looks, share = count, 1.0
+    if together:
+        for i in range(6):
+            total = 0.0
+            for k in range(count):
+                total += hits[k, i]
+            hits[0, i] = total / count
+        looks, share, pitch = 1, float(count), wide_pitch
+    total = 0.0
+    for k in range(looks):
+        x, y = hits[k, 0], hits[k, 1]
+        ix, iy = min(int(x * inv_cell), last), min(int(y * inv_cell), last)
+        total += ground_light(
+            grid, broad, detail, ix, iy, x, y, hits[k, 2], hits[k, 3], hits[k, 4], hits[k, 5], pitch
+        )
+    return total * share
+
+
+@part
+def rock_light(
+    rocks: Rocks,
+    texture: Texture,
+    sun: Float64,
+    k: int,
+    t: int,
+    u: float,
+    v: float,
+    x: float,
+    y: float,
+    z: float,
+    s: float,
+    dx: float,
+    dy: float,
+    dz: float,
+    pitch: float,
+) -> float:
+    """Brightness of a point of a rock: stone texture laid on from three sides, sun on the bent normal."""
+    w = 1.0 - u - v
+    normals = rocks.normals
+    nx = w * normals[k, t, 0, 0] + u * normals[k, t, 1, 0] + v * normals[k, t, 2, 0]
+    ny = w * normals[k, t, 0, 1] + u * normals[k, t, 1, 1] + v * normals[k, t, 2, 1]
+    nz = w * normals[k, t, 0, 2] + u * normals[k, t, 1, 2] + v * normals[k, t, 2, 2]
+    inv = 1.0 / math.sqrt(nx * nx + ny * ny + nz * nz)
+    nx, ny, nz = nx * inv, ny * inv, nz * inv
+    facing = max(-(nx * dx + ny * dy + nz * dz), 0.25)
+    width = s * pitch / math.sqrt(facing)
+    lx, ly, lz = (
+        x - rocks.spheres_m[k, 0],
+        y - rocks.spheres_m[k, 1],
+        z - rocks.spheres_m[k, 2],
+    )
+    shift = 0.37 * k
+    wx, wy, wz = nx * nx, ny * ny, nz * nz
+    wx, wy, wz = wx * wx, wy * wy, wz * wz
+    total = wx + wy + wz
+    tone = 0.0
+    if wx > 0.01 * total:
+        tone += wx * brightness(texture, ly + shift, lz, width, 0.0, 0.0, 1)
+    if wy > 0.01 * total:
+        tone += wy * brightness(texture, lx + shift, lz, width, 0.0, 0.0, 1)
+    if wz > 0.01 * total:
+        tone += wz * brightness(texture, lx + shift, ly, width, 0.0, 0.0, 1)
+    tone /= total
+    light = max(float(nx * sun[0] + ny * sun[1] + nz * sun[2]), 0.0)
+    above = 0.5 - 0.5 * nz
+    tone *= float(rocks.tones[k]) * (AMBIENT * (0.45 + 0.55 * above) + (1.0 - AMBIENT) * light) * 1.45
+    haze = s / (s + HAZE_M)
+    return float(ROCK_TONE * tone * (1.0 - haze) + SKY_HORIZON * haze)
+
+
+@inlined
+def sky_light(de: float) -> float:
+    """Brightness of the sky in a direction with upward part ``de``."""
+    up = max(de, 0.0)
+    return SKY_ZENITH + (SKY_HORIZON - SKY_ZENITH) * math.exp(-3.0 * up)
