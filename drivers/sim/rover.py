@@ -31,9 +31,10 @@ from drivers.faults import FaultPanel, nearest, read_script
 from drivers.interfaces import PanTilt
 from drivers.options import is_number, is_whole
 from drivers.sim.cameras import CameraSettings, SimulatedCamera
+from drivers.sim.kept_scenes import kept_scene
 from drivers.sim.pan_tilt import HeadSettings, SimulatedPanTilt, head_settings
 from drivers.sim.render import Renderer, Stills, compile_renderer
-from drivers.sim.scene import SceneSettings, build_scene
+from drivers.sim.scene import SceneSettings
 from drivers.sim.wired_head import DEFAULT_HEADS, WiredHead, check_head
 from drivers.simulation_clock import simulation_speed
 
@@ -228,7 +229,7 @@ class SimulatedRover:
         self.faults.set_all(settings.faults)
         # Before any camera is asked: a frame's deadline is no time for a compiler.
         compile_renderer()
-        self.scene = build_scene(settings.scene)
+        self.scene = kept_scene(settings.scene)
         self._renderer = Renderer(self.scene)
         self._stills = Stills(self._renderer)
         self._render_lock = threading.Lock()

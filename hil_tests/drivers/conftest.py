@@ -28,7 +28,7 @@ def scene() -> Scene:
 @pytest.fixture
 def one_scene(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
     """Every simulated rover gets the same scene, whatever it asks for: building one takes seconds."""
-    monkeypatch.setattr(rover, "build_scene", lambda settings: scene)
+    monkeypatch.setattr(rover, "kept_scene", lambda settings: scene)
 
 
 @pytest.fixture(scope="session")

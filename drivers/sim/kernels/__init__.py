@@ -5,6 +5,7 @@
 
 from drivers.sim.kernels.beams import hold_rays
 from drivers.sim.kernels.casting import cast_rays, shadow_rays
+from drivers.sim.kernels.compiling import SOURCES
 from drivers.sim.kernels.gravel import lay_pebbles
 from drivers.sim.kernels.ground import over_ground
 from drivers.sim.kernels.noise import noisy_levels
@@ -18,6 +19,7 @@ __all__ = [
     "ENTRIES",
     "ONE",
     "PAD",
+    "SOURCES",
     "Grid",
     "Rocks",
     "Texture",

@@ -7,6 +7,7 @@ missed and a fresh installation of the same sources finds what an earlier one co
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import logging
 import pickle
@@ -70,7 +71,11 @@ class Kept(caching.FunctionCache):  # type: ignore[misc]
         """Return the compiled function, or None."""
         try:
             return super().load_overload(signature, target_context)
-        except (OSError, EOFError, ValueError, pickle.UnpicklingError):  # not there, or damaged
+        except OSError:
+            return None
+        except (EOFError, ValueError, pickle.UnpicklingError):  # damaged
+            with contextlib.suppress(OSError):
+                self.flush()
             return None
 
     def save_overload(self, signature: Any, data: Any) -> None:

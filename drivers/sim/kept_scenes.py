@@ -1,0 +1,108 @@
+"""Scenes on disk: one that was built before is read in no time, and its pages are shared by all who use it."""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import json
+import os
+import shutil
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import scipy
+
+from drivers.sim import bricks, rocks, scene, texture
+from drivers.sim.bricks import Brick
+from drivers.sim.compiled import kernels
+from drivers.sim.kept import digest_of, keep_newest, kept_folder
+from drivers.sim.scene import Scene, SceneSettings, build_scene
+
+SCENES_KEPT = 4
+"""A scene takes some 85 MB of disk."""
+
+FACTS = "scene.json"
+
+
+def kept_scene(settings: SceneSettings) -> Scene:
+    """Return what `build_scene` returns, from disk if it was built before by the same sources.
+
+    A scene that cannot be read, or is damaged, is built and written again; where nothing can be written, it
+    is built each time. Raises what `build_scene` raises.
+    """
+    folder = folder_of(settings)
+    try:
+        found = read(folder, settings)
+    except (OSError, ValueError, KeyError, TypeError):  # not there, or not whole
+        found = build_scene(settings)
+        with contextlib.suppress(OSError):
+            write(folder, found)
+            keep_newest(folder, SCENES_KEPT)
+    return found
+
+
+def folder_of(settings: SceneSettings) -> Path:
+    """Return where a scene is kept: under the digest of its settings and of all that makes it."""
+    modules = (bricks, rocks, scene, texture)
+    makers = digest_of(Path(str(module.__file__)) for module in modules), kernels().SOURCES
+    words = (repr(settings), *makers, np.__version__, scipy.__version__)
+    return kept_folder("scenes", hashlib.sha256("\n".join(words).encode()).hexdigest())
+
+
+def write(folder: Path, made: Scene) -> None:
+    """Write a scene, whole or not at all: numbers to one file, each array to one of its own."""
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    scratch = Path(tempfile.mkdtemp(dir=folder.parent))
+    try:
+        facts: dict[str, float | int] = {}
+        for name, value in parts(made.world, "world"):
+            if isinstance(value, np.ndarray):
+                np.save(scratch / f"{name}.npy", value)
+            else:
+                facts[name] = value
+        np.save(
+            scratch / "bricks.npy", np.array([brick.corners_m for brick in made.bricks]).reshape(-1, 8, 3)
+        )
+        (scratch / FACTS).write_text(json.dumps(facts))
+        shutil.rmtree(folder, ignore_errors=True)  # what is there was not good
+        scratch.replace(folder)
+    finally:
+        shutil.rmtree(scratch, ignore_errors=True)
+
+
+def parts(value: Any, name: str) -> list[tuple[str, Any]]:
+    """Return names and values of all arrays and numbers in tuples in tuples."""
+    if not hasattr(value, "_fields"):
+        return [(name, value)]
+    return [part for field in value._fields for part in parts(getattr(value, field), f"{name}.{field}")]
+
+
+def read(folder: Path, settings: SceneSettings) -> Scene:
+    """Return a scene that was written. Raises OSError, ValueError, KeyError or TypeError if it is not whole."""
+    facts = json.loads((folder / FACTS).read_text())
+    module = kernels()
+
+    def tuple_of(kind: Any, name: str) -> Any:
+        return kind(
+            *(facts[f"{name}.{f}"] if f"{name}.{f}" in facts else array(f"{name}.{f}") for f in kind._fields)
+        )
+
+    def array(name: str) -> Any:
+        # private pages: a process that writes into one gets a copy of its own
+        return np.asarray(np.load(folder / f"{name}.npy", mmap_mode="c"))
+
+    kinds = {"inner": module.Grid, "outer": module.Grid, "rocks": module.Rocks}
+    world = module.World(
+        *(
+            array(f"world.{field}")
+            if field == "sun"
+            else tuple_of(kinds.get(field, module.Texture), f"world.{field}")
+            for field in module.World._fields
+        )
+    )
+    corners_m = np.load(folder / "bricks.npy")
+    with contextlib.suppress(OSError):
+        os.utime(folder)  # used last
+    return Scene(settings, world, tuple(Brick(one) for one in corners_m))
