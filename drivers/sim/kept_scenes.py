@@ -1,4 +1,4 @@
-"""Scenes on disk: one that was built before is read in no time, and its pages are shared by all who use it."""
+"""Scenes on disk: one that was built before is read in no time, and its pages are shared by all its users."""
 
 from __future__ import annotations
 
@@ -80,28 +80,22 @@ def parts(value: Any, name: str) -> list[tuple[str, Any]]:
 
 
 def read(folder: Path, settings: SceneSettings) -> Scene:
-    """Return a scene that was written. Raises OSError, ValueError, KeyError or TypeError if it is not whole."""
+    """Return a scene that was written; any of the errors that `kept_scene` knows if it is not whole."""
     facts = json.loads((folder / FACTS).read_text())
     module = kernels()
-
-    def tuple_of(kind: Any, name: str) -> Any:
-        return kind(
-            *(facts[f"{name}.{f}"] if f"{name}.{f}" in facts else array(f"{name}.{f}") for f in kind._fields)
-        )
-
-    def array(name: str) -> Any:
-        # private pages: a process that writes into one gets a copy of its own
-        return np.asarray(np.load(folder / f"{name}.npy", mmap_mode="c"))
-
     kinds = {"inner": module.Grid, "outer": module.Grid, "rocks": module.Rocks}
-    world = module.World(
-        *(
-            array(f"world.{field}")
-            if field == "sun"
-            else tuple_of(kinds.get(field, module.Texture), f"world.{field}")
-            for field in module.World._fields
-        )
-    )
+
+    def part(name: str) -> Any:
+        # private pages: a process that writes into one gets a copy of its own
+        return facts[name] if name in facts else np.asarray(np.load(folder / f"{name}.npy", mmap_mode="c"))
+
+    def of_world(field: str) -> Any:
+        if field == "sun":
+            return part("world.sun")
+        kind = kinds.get(field, module.Texture)
+        return kind(*(part(f"world.{field}.{name}") for name in kind._fields))
+
+    world = module.World(*(of_world(field) for field in module.World._fields))
     corners_m = np.load(folder / "bricks.npy")
     with contextlib.suppress(OSError):
         os.utime(folder)  # used last
