@@ -1,9 +1,10 @@
-"""One axis through time: motor in counts, backlash, sag, and approach from one side.
+"""One axis through time: motor in counts, encoder, backlash, sag, ringing, and approach from one side.
 
-Three angles are kept apart. The *motor* angle follows a trapezoid profile to the goal, rounded to the
-nearest count. The *reading* is the motor angle in whole counts, since the encoder sits on the motor's side
-of the gears. The *mechanical* angle is what the cameras ride on: the motor angle through the backlash,
-less the sag of the tilt axis. Only the simulated cameras and the experiments see it.
+Three angles are kept apart. The *motor* angle, as its encoder has it, follows a trapezoid profile to the
+goal, rounded to the nearest count. The *reading* is that angle in whole counts, since the encoder sits on the
+motor's side of the gears. The *mechanical* angle is what the cameras ride on: the motor's true angle, which
+differs by the encoder's harmonics, through the backlash, less the sag of the tilt axis, and ringing. Only the
+simulated cameras and the experiments see it.
 """
 
 from __future__ import annotations
@@ -12,7 +13,9 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
+from drivers.sim.gears import load_after_rad, shaft_rad
 from drivers.sim.motion import Motion
+from drivers.sim.ringing import Ringing
 
 
 @dataclass(frozen=True)
@@ -35,6 +38,15 @@ class AxisSettings:
         The way round may pass ``low_rad`` by as much.
     sag_rad
         Drop of a level load under gravity; at tilt t it is sag·cos(t), downwards.
+    gravity_turnover_rad, gravity_friction
+        The angle at which the load's centre of mass is straight above the axis, and the part of gravity's
+        largest torque that friction holds. 1: all; the load stays where it was left in the gap.
+    harmonics_rad
+        What the encoder is wrong by over a turn (`drivers.sim.gears`); empty: it reads true.
+    ring_hz, ring_damping, ring_gain
+        The mode that rings after a move (`drivers.sim.ringing`); 0 Hz: none.
+    settle_s
+        How long after it has come to rest the head in memory says that it moves.
     """
 
     count_rad: float
@@ -45,11 +57,20 @@ class AxisSettings:
     acceleration_rad_per_s2: float
     approach_rad: float = 0.0
     sag_rad: float = 0.0
+    gravity_turnover_rad: float = math.pi / 2
+    gravity_friction: float = 1.0
+    harmonics_rad: tuple[tuple[float, float], ...] = ()
+    ring_hz: float = 0.0
+    ring_damping: float = 0.03
+    ring_gain: float = 1.0
+    settle_s: float = 0.0
 
-
-def _play(load_rad: float, motor_rad: float, gap_rad: float) -> float:
-    """Where the load ends when the motor has gone one way to ``motor_rad`` from within the gap."""
-    return min(max(load_rad, motor_rad - gap_rad / 2), motor_rad + gap_rad / 2)
+    def load_after_rad(self, before_rad: float, motor_rad: float) -> float:
+        """Where the load ends when the motor has gone one way to ``motor_rad`` from within the gap."""
+        shaft = shaft_rad(motor_rad, self.harmonics_rad)
+        return load_after_rad(
+            before_rad, shaft, self.backlash_rad, self.gravity_turnover_rad, self.gravity_friction
+        )
 
 
 @dataclass(frozen=True)
@@ -61,24 +82,28 @@ class Axis:
     loads_rad: tuple[float, ...] = field(default=())
 
     @staticmethod
-    def resting(settings: AxisSettings, time_s: float) -> Axis:
-        """At zero, last moved in the positive direction."""
-        return Axis(settings, Motion.at_rest(time_s, 0.0), (-settings.backlash_rad / 2,))
+    def resting(settings: AxisSettings, time_s: float, motor_rad: float = 0.0) -> Axis:
+        """At an angle, last moved in the positive direction."""
+        load = settings.load_after_rad(-math.inf, motor_rad)
+        return Axis(settings, Motion.at_rest(time_s, motor_rad), (load,))
 
     def load_rad(self, time_s: float) -> float:
         """The load's angle behind the backlash."""
         return self._load_on(self.motion, self.loads_rad, self.motion.leg_index(time_s), time_s)
 
     def _load_on(self, motion: Motion, loads_rad: Sequence[float], index: int, time_s: float) -> float:
-        leg, load, gap = motion.legs[index], loads_rad[index], self.settings.backlash_rad
+        leg, load = motion.legs[index], loads_rad[index]
         if leg.turn_rad is not None and time_s >= leg.turn_s:
-            load = _play(load, leg.turn_rad, gap)
-        return _play(load, leg.at(time_s)[0], gap)
+            load = self.settings.load_after_rad(load, leg.turn_rad)
+        return self.settings.load_after_rad(load, leg.at(time_s)[0])
 
     def mechanical_rad(self, time_s: float) -> float:
         """What the cameras ride on."""
-        load = self.load_rad(time_s)
-        return load - self.settings.sag_rad * math.cos(load)
+        load, s = self.load_rad(time_s), self.settings
+        angle = load - s.sag_rad * math.cos(load)
+        if s.ring_hz > 0:
+            angle += Ringing(s.ring_hz, s.ring_damping, s.ring_gain).ahead_rad(self.motion, time_s)
+        return angle
 
     def followed_by(self, motion: Motion, time_s: float) -> Axis:
         """With a motion that continues this one from ``time_s``; the load's state is carried over."""

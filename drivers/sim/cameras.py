@@ -2,7 +2,8 @@
 
 Frame n of a camera is exposed at a fixed instant whether or not anybody looks, so its sequence number is a
 function of time and a frame that nobody fetched is a gap. All cameras of a rover share the instants, as with
-a hardware trigger. A camera remembers as many finished frames as a capture ring would.
+a hardware trigger, unless a camera's clock says otherwise. A camera remembers as many finished frames as a
+capture ring would.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from drivers.clock import Clock
 from drivers.errors import NoFreshFrame, NoReply
 from drivers.faults import Fault, FaultPanel
 from drivers.interfaces import Frame, FrameTime, Image
+from drivers.sim.camera_clock import CameraClock, ClockSettings
 from drivers.sim.sensor import Noise
 
 RING_FRAMES = 4
@@ -95,6 +97,8 @@ class SimulatedCamera:
         The panel that is asked for faults of this camera.
     start_s
         When the exposure of frame 0 begins: one value for all cameras of a rover.
+    own
+        What this camera's clock makes of it.
     """
 
     def __init__(
@@ -107,6 +111,7 @@ class SimulatedCamera:
         clock: Clock,
         faults: FaultPanel,
         start_s: float,
+        own: ClockSettings = ClockSettings(),  # noqa: B008  frozen
     ) -> None:
         self.name = name
         self._settings = settings
@@ -117,7 +122,8 @@ class SimulatedCamera:
         self._faults = faults
         self._lock = threading.Lock()
         self._epoch_lock = threading.Lock()
-        self._epochs = [_Epoch(start_s, 0, 1 / settings.rate_hz)]
+        self._own = CameraClock(own, start_s)
+        self._epochs = [_Epoch(self._own.first_s, 0, self._own.true_period_s(1 / settings.rate_hz))]
         self._last: Frame | None = None
         self._frozen: tuple[Fault, Image] | None = None
         self._noise = Noise(settings.read_noise_dn, settings.shot_noise_dn, settings.seed, name)
@@ -126,7 +132,7 @@ class SimulatedCamera:
         self._closed = threading.Event()
 
     def next_frame(self, exposed_after_s: float, timeout_s: float) -> Frame:
-        """Return the first frame whose exposure begins after ``exposed_after_s``, waiting for it if need be.
+        """Return the first frame stamped as exposed after ``exposed_after_s``, waiting for it if need be.
 
         When that frame has left the ring already, the newest finished one comes instead; it is fresh too.
         Rendering takes its own time on top of ``timeout_s``, which bounds the wait on the simulation's clock.
@@ -142,7 +148,7 @@ class SimulatedCamera:
         deadline_s = now_s + max(0.0, timeout_s)
         if self._faults.strikes(self.name, now_s):
             raise NoReply("no answer", device=self.name)
-        after_s = exposed_after_s
+        after_s = self._own.true_s(exposed_after_s)
         while not self._closed.is_set():
             now_s = self._clock.now_s()
             sequence, epoch = self._wanted(after_s, now_s)
@@ -190,7 +196,9 @@ class SimulatedCamera:
     def _epoch(self, now_s: float) -> _Epoch:
         """The frame rate of the moment; a ``slow`` fault that comes or goes begins a new epoch."""
         slow = self._faults.find(self.name, "slow", now_s)
-        period_s = 1 / self._settings.rate_hz / (slow.number("factor") if slow else 1.0)
+        period_s = self._own.true_period_s(1 / self._settings.rate_hz) / (
+            slow.number("factor") if slow else 1.0
+        )
         with self._epoch_lock:
             epoch = self._epochs[-1]
             if period_s != epoch.period_s:
@@ -225,8 +233,9 @@ class SimulatedCamera:
                 begin_s, exposure_s = epoch.begin_s(sequence), self._settings.exposure_s
                 image = self._picture(sequence, epoch)
                 image.setflags(write=False)
-                self._last = Frame(image, sequence, begin_s + exposure_s / 2, exposure_s)
-                self._taken(sequence, self._last.mid_exposure_s)
+                stamp_s = self._own.stamp_s(begin_s) + exposure_s / 2
+                self._last = Frame(image, sequence, stamp_s, exposure_s)
+                self._taken(sequence, begin_s + exposure_s / 2)
             return self._last
 
     def _picture(self, sequence: int, epoch: _Epoch) -> Image:

@@ -9,9 +9,10 @@ from __future__ import annotations
 
 import math
 from bisect import bisect_right
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 HISTORY_S = 60.0
 """How long a superseded leg is remembered, seconds."""
@@ -85,6 +86,15 @@ class Leg:
             return self.start_s
         return self.start_s + abs(self.start_rad_per_s) / self.acceleration_rad_per_s2
 
+    def accelerations(self) -> tuple[tuple[float, float], ...]:
+        """Return from when on it accelerates how much: moments (s) and signed values (rad/s²), the last 0."""
+        direction, cruise, ramp_s, cruise_s, _ = self._phases
+        change = cruise - direction * self.start_rad_per_s
+        ramp = math.copysign(self.acceleration_rad_per_s2, direction * change) if ramp_s > 0 else 0.0
+        brake_s = self.start_s + ramp_s + cruise_s
+        brake = -direction * self.acceleration_rad_per_s2 if cruise > 0 else 0.0
+        return (self.start_s, ramp), (self.start_s + ramp_s, 0.0), (brake_s, brake), (self.end_s, 0.0)
+
     def at(self, time_s: float) -> tuple[float, float]:
         """Return position (rad) and velocity (rad/s) at a moment; before the start, those of the start."""
         t = time_s - self.start_s
@@ -111,6 +121,14 @@ def rest(time_s: float, position_rad: float) -> Leg:
     return Leg(time_s, position_rad, 0.0, position_rad, 1.0, 1.0)
 
 
+class Shock(NamedTuple):
+    """From a moment on an axis accelerates this much; there its velocity jumps, if a fault seizes it."""
+
+    time_s: float
+    acceleration_rad_per_s2: float
+    jump_rad_per_s: float
+
+
 @dataclass(frozen=True)
 class Motion:
     """The legs of an axis, oldest first; a leg holds until the next one starts.
@@ -132,6 +150,24 @@ class Motion:
     def at(self, time_s: float) -> tuple[float, float]:
         """Return position (rad) and velocity (rad/s) at a moment."""
         return self.legs[self.leg_index(time_s)].at(time_s)
+
+    def shocks(self, until_s: float) -> Iterator[Shock]:
+        """Yield what shook the axis until a moment, oldest first."""
+        speed = self.legs[0].start_rad_per_s
+        for number, leg in enumerate(self.legs):
+            after = self.legs[number + 1 :]
+            end_s = after[0].start_s if after else math.inf
+            if leg.start_s > until_s:
+                return
+            if end_s <= leg.start_s:
+                continue  # replaced in the moment that it began
+            jump = leg.start_rad_per_s - speed
+            for time_s, acceleration in leg.accelerations():
+                if time_s >= end_s or time_s > until_s:
+                    break
+                yield Shock(time_s, acceleration, jump)
+                jump = 0.0
+            speed = leg.at(end_s)[1]
 
     @property
     def end_s(self) -> float:

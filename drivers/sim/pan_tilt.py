@@ -5,15 +5,15 @@ from __future__ import annotations
 import math
 import threading
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from typing import Any, TypeVar
 
 from drivers.clock import Clock
 from drivers.errors import BadOptions, BadReply, DriverError, NoReply
 from drivers.faults import PAN_TILT, Fault, FaultPanel, nearest
 from drivers.interfaces import Reading
-from drivers.options import is_number
 from drivers.sim.axis import AxisSettings
+from drivers.sim.head_options import axis_changes, check_together
 from drivers.sim.wire.axis import WireAxis
 
 _T = TypeVar("_T")
@@ -93,34 +93,25 @@ def head_settings(value: Any) -> HeadSettings:
     ----------
     value
         A preset's name, or a mapping with ``preset`` and any of ``count_rad``, ``backlash_rad``,
-        ``approach_rad``, ``speed_rad_per_s``, ``acceleration_rad_per_s2`` (both axes) and ``sag_rad`` (tilt).
+        ``approach_rad``, ``speed_rad_per_s``, ``acceleration_rad_per_s2``, ``ring_hz``, ``ring_damping``,
+        ``ring_gain``, ``settle_s`` (both axes), ``sag_rad``, ``gravity_turnover_rad``, ``gravity_friction``
+        (tilt), ``pan_harmonics_rad`` and ``tilt_harmonics_rad``.
 
     Raises
     ------
     BadOptions
-        For an unknown preset or key, or a value that is not a number of the right sign.
+        For an unknown preset or key, a value that is not a number of the right sign or within its bounds, or
+        values that do not go together.
     """
     changes = dict(value) if isinstance(value, Mapping) else {"preset": value}
     preset = changes.pop("preset", "ptu_d46_70")
     if not isinstance(preset, str) or preset not in PRESETS:
         raise BadOptions(f"simulation.head: there is no head {preset!r}{nearest(preset, PRESETS)}")
+    pan, tilt = axis_changes(changes)
     head = PRESETS[preset]
-    known = {f.name for f in fields(AxisSettings)} - {"low_rad", "high_rad"}
-    for name, number in changes.items():
-        if name not in known:
-            raise BadOptions(f"simulation.head has no key {name!r}{nearest(name, known)}")
-        zero_allowed = name in ("backlash_rad", "approach_rad", "sag_rad")
-        if not is_number(number) or number < 0 or (number == 0 and not zero_allowed):
-            raise BadOptions(f"simulation.head.{name} is {number!r}, expected a positive number")
-        if name != "sag_rad":
-            head = replace(head, pan=replace(head.pan, **{name: float(number)}))
-        head = replace(head, tilt=replace(head.tilt, **{name: float(number)}))
+    head = replace(head, pan=replace(head.pan, **pan), tilt=replace(head.tilt, **tilt))
     for axis in (head.pan, head.tilt):
-        if 0 < axis.approach_rad <= axis.backlash_rad:
-            raise BadOptions(
-                f"simulation.head.approach_rad {axis.approach_rad:g} rad does not take up the backlash "
-                f"{axis.backlash_rad:g} rad; expected more"
-            )
+        check_together(axis)
     return head
 
 
@@ -226,7 +217,7 @@ class SimulatedPanTilt:
         for axis in self._axes:
             count = axis.settings.count_rad
             counts.append(round(axis.angle_rad(now_s) / count) * count)
-        moving = any(axis.under_way(now_s) for axis in self._axes)
+        moving = any(axis.under_way(now_s - axis.settings.settle_s) for axis in self._axes)
         stuck = self._faults.find(PAN_TILT, "stuck", now_s)
         if stuck is not None and not self._faults.find(PAN_TILT, "off", now_s):
             seized = all(axis.seized(now_s) for axis in self._axes)

@@ -29,12 +29,15 @@ from drivers.clock import Clock
 from drivers.errors import BadOptions, NoFreshFrame
 from drivers.faults import FaultPanel, nearest, read_script
 from drivers.interfaces import PanTilt
-from drivers.options import is_number, is_whole
+from drivers.options import is_whole
+from drivers.sim.camera_clock import ClockSettings, clock_settings
 from drivers.sim.cameras import CameraSettings, SimulatedCamera
 from drivers.sim.kept_scenes import kept_scene
 from drivers.sim.pan_tilt import HeadSettings, SimulatedPanTilt, head_settings
 from drivers.sim.render import Renderer, Stills, compile_renderer
 from drivers.sim.scene import SceneSettings
+from drivers.sim.section import filled
+from drivers.sim.warmth import TemperatureSettings, temperature_settings
 from drivers.sim.wired_head import DEFAULT_HEADS, WiredHead, check_head
 from drivers.simulation_clock import simulation_speed
 
@@ -72,6 +75,10 @@ class SimulationSettings:
     wire
         None: the head is in memory. ``dynamixel`` or ``flir_ptu``: the real driver turns it through a
         simulated line.
+    temperature
+        What a day does to lenses and mount.
+    clocks
+        By camera's name: when it exposes and what its stamps are worth; those of no entry are one and true.
     speed
         Of the clock that the rover is told to live on (`drivers.open_hardware.clock_for`); infinite: ``max``.
     """
@@ -84,9 +91,14 @@ class SimulationSettings:
     faults: tuple[Mapping[str, Any], ...] = ()
     wire: str | None = None
     speed: float = 1.0
+    temperature: TemperatureSettings = field(default_factory=TemperatureSettings)
+    clocks: Mapping[str, ClockSettings] = field(default_factory=dict)
 
 
-_KEYS = ("rover", "head", "seed", "samples", "scene", "cameras", "faults", "wire", "speed")
+_KEYS = (
+    "rover", "head", "seed", "samples", "scene", "cameras", "temperature", "clocks", "faults", "wire",
+    "speed",
+)  # fmt: skip
 
 
 def simulation_settings(section: Mapping[str, Any], folder: Path) -> SimulationSettings:
@@ -97,7 +109,8 @@ def simulation_settings(section: Mapping[str, Any], folder: Path) -> SimulationS
     section
         Keys ``rover`` (a mast file, relative to ``folder``), ``head`` (a preset, see
         ``drivers.sim.pan_tilt.head_settings``), ``seed`` (of scene and noise), ``samples``, ``scene``
-        (fields of ``SceneSettings``), ``cameras`` (fields of ``CameraSettings``), ``faults`` (a list, or a
+        (fields of ``SceneSettings``), ``cameras`` (fields of ``CameraSettings``), ``temperature`` (fields of
+        ``TemperatureSettings``), ``clocks`` (fields of ``ClockSettings`` by camera), ``faults`` (a list, or a
         script's name), ``wire``, ``speed`` (`drivers.simulation_clock.simulation_speed`). Only ``rover`` is
         needed.
     folder
@@ -120,7 +133,7 @@ def simulation_settings(section: Mapping[str, Any], folder: Path) -> SimulationS
         faults = read_script(folder / faults)
     if not isinstance(faults, list | tuple):
         raise BadOptions(f"simulation.faults is {faults!r}, expected a list of {{device, word, ...}}")
-    camera: CameraSettings = _filled(CameraSettings(), section.get("cameras", {}), "simulation.cameras")
+    camera: CameraSettings = filled(CameraSettings(), section.get("cameras", {}), "simulation.cameras")
     for f in fields(camera):
         if getattr(camera, f.name) < 0:
             raise BadOptions(
@@ -144,10 +157,12 @@ def simulation_settings(section: Mapping[str, Any], folder: Path) -> SimulationS
         head=head,
         camera=replace(camera, seed=seed),
         samples=_whole(section.get("samples", 2), "simulation.samples", 1, 6),
-        scene=_filled(SceneSettings(), scene, "simulation.scene"),
+        scene=filled(SceneSettings(), scene, "simulation.scene"),
         faults=tuple(faults),
         wire=wire,
         speed=simulation_speed(section.get("speed", 1.0)),
+        temperature=temperature_settings(section.get("temperature", {})),
+        clocks=clock_settings(section.get("clocks", {})),
     )
 
 
@@ -156,27 +171,6 @@ def _whole(value: Any, key: str, low: int, high: int) -> int:
     if not is_whole(value) or not low <= value <= high:
         raise BadOptions(f"{key} is {value!r}, expected a whole number from {low} to {high}")
     return value
-
-
-def _filled(defaults: Any, values: Any, key: str) -> Any:
-    """A settings dataclass with numbers replaced by those of a mapping."""
-    if not isinstance(values, Mapping):
-        raise BadOptions(f"{key} is {values!r}, expected keys and values")
-    known = {f.name: getattr(defaults, f.name) for f in fields(defaults)}
-    changes: dict[str, Any] = {}
-    for name, value in values.items():
-        if name not in known:
-            raise BadOptions(f"{key} has no key {name!r}{nearest(str(name), known)}")
-        kind = type(known[name])
-        if kind in (int, float):
-            if not (is_whole(value) if kind is int else is_number(value)):
-                what = "a whole number" if kind is int else "a number"
-                raise BadOptions(f"{key}.{name} is {value!r}, expected {what}")
-            value = kind(value)
-        elif not isinstance(value, kind):
-            raise BadOptions(f"{key}.{name} is {value!r}, expected {kind.__name__}")
-        changes[str(name)] = value
-    return replace(defaults, **changes)
 
 
 @dataclass(frozen=True, eq=False)
@@ -225,6 +219,11 @@ class SimulatedRover:
             raise BadOptions(f"simulation.rover: {error}") from None
         self.settings = settings
         self.site_from_rover = Rigid.identity()
+        for name in settings.clocks:
+            if name not in self.rig.cameras:
+                raise BadOptions(
+                    f"simulation.clocks: there is no camera {name!r}{nearest(name, self.rig.cameras)}"
+                )
         self.faults = FaultPanel(clock.now_s, self.rig.cameras)
         self.faults.set_all(settings.faults)
         # Before any camera is asked: a frame's deadline is no time for a compiler.
@@ -244,7 +243,8 @@ class SimulatedRover:
         else:
             wired = WiredHead(settings.wire, settings.head, clock, self.faults)
             self.pan_tilt, self._head = wired.pan_tilt, wired
-        start_s = clock.now_s()
+        start_s = self._start_s = clock.now_s()
+        self._right_eyes = {right for _, right in self.rig.stereo.values()}
         self.cameras: Mapping[str, SimulatedCamera] = MappingProxyType(
             {name: self._camera(name, clock, start_s) for name in self.rig.cameras}
         )
@@ -337,38 +337,57 @@ class SimulatedRover:
             self._remember(name, sequence, mid_exposure_s)
 
         size_px = self.rig.cameras[name].model.size_px
+        own = self.settings.clocks.get(name, ClockSettings())
         return SimulatedCamera(
-            name, self.settings.camera, size_px, expose, taken, clock, self.faults, start_s
+            name, self.settings.camera, size_px, expose, taken, clock, self.faults, start_s, own
         )
 
     def _exposed(self, name: str, begin_s: float, exposure_s: float) -> NDArray[np.float32]:
         """Render one exposure: one picture at its middle, or the mean along the head's way through it."""
         steps = self._blur_steps(name, begin_s, exposure_s)
+        middle_s = begin_s + 0.5 * exposure_s
         if steps == 1:
-            return self._still(name, begin_s + 0.5 * exposure_s)
+            return self._still(name, middle_s)
+        model = self._model(name, middle_s)
         total: NDArray[np.float32] | None = None
         for step in range(steps):
             pose = self._pose(name, begin_s + (step + 0.5) / steps * exposure_s)
             with self._drawing(name):
-                image = self._renderer.image(self.rig.cameras[name].model, pose, 1)
+                image = self._renderer.image(model, pose, 1)
             total = image if total is None else total + image
         assert total is not None
         return total / np.float32(steps)
 
     def _still(self, name: str, time_s: float) -> NDArray[np.float32]:
         """The picture of a moment, read-only; drawn before, if the camera stood there before."""
-        model, pose = self.rig.cameras[name].model, self._pose(name, time_s)
+        model, pose = self._model(name, time_s), self._pose(name, time_s)
         found = self._stills.find(model, pose, self.settings.samples)
         if found is not None:
             return found
         with self._drawing(name):
             return self._stills.image(model, pose, self.settings.samples)
 
+    def _warmer_k(self, time_s: float) -> float:
+        return self.settings.temperature.change_k(time_s - self._start_s)
+
+    def _model(self, name: str, time_s: float) -> CameraModel:
+        """The camera in its mounting frame, as warm as it is at a moment."""
+        day, model = self.settings.temperature, self.rig.cameras[name].model
+        return day.camera(model, name in self._right_eyes, self._warmer_k(time_s))
+
+    def _rover_from_frame(self, name: str, time_s: float) -> Rigid:
+        """Where a camera's mounting frame is at a moment."""
+        if self.rig.cameras[name].on != "head":
+            return Rigid.identity()
+        rover_from_head = self.rig.mast.rover_from_head(*self.true_joints(time_s))
+        warmer_k = self._warmer_k(time_s)
+        return rover_from_head @ self.settings.temperature.mount(warmer_k) if warmer_k else rover_from_head
+
     def _pose(self, name: str, time_s: float) -> Rigid:
         """site_from_frame of a camera's mounting frame at a moment."""
         if self.rig.cameras[name].on != "head":
             return self.site_from_rover
-        return self.site_from_rover @ self.rig.mast.rover_from_head(*self.true_joints(time_s))
+        return self.site_from_rover @ self._rover_from_frame(name, time_s)
 
     @contextmanager
     def _drawing(self, name: str) -> Iterator[None]:
@@ -395,7 +414,9 @@ class SimulatedRover:
     def _remember(self, name: str, sequence: int, mid_exposure_s: float) -> None:
         """Keep the truth of a frame that is handed out."""
         pan_rad, tilt_rad = self.true_joints(mid_exposure_s)
-        model = self.rig.camera_in_rover(name, pan_rad, tilt_rad)
+        model = self._model(name, mid_exposure_s)
+        if self.rig.cameras[name].on == "head":
+            model = model.moved(self._rover_from_frame(name, mid_exposure_s))
         truth = FrameTruth(mid_exposure_s, pan_rad, tilt_rad, model, self.site_from_rover)
         with self._truth_lock:
             frames = self._truth[name]

@@ -109,6 +109,8 @@ class WiredHead:
         )
         make = _dynamixel if wire == "dynamixel" else _flir_ptu
         device, open_head, options = make(_HEADS[head.name], head, self._axes, now_s)
+        if head.pan.settle_s > 0:
+            options["settle_s"] = head.pan.settle_s
         self.line = PtyLine(device, clock, faults)
         try:
             self.pan_tilt: PanTilt = open_head({**options, "port": self.line.path}, clock)

@@ -23,7 +23,9 @@ from drivers.open_hardware import CAMERAS, HEADS, OURS
 from drivers.replay import OPTIONS as REPLAY_OPTIONS
 from drivers.sim import rover
 from drivers.sim.cameras import CameraSettings
+from drivers.sim.head_options import HEAD_KEYS
 from drivers.sim.scene import SceneSettings
+from drivers.sim.warmth import TemperatureSettings
 from drivers.v4l2 import options as v4l2
 from mastctl import config
 
@@ -176,7 +178,9 @@ def test_every_driver_is_where_the_page_says_what_may_be_named(page: str) -> Non
 
 
 def test_every_key_of_the_simulation_and_of_a_recording_is_on_the_page(page: str) -> None:
-    known = {key for key in rover._KEYS if key not in ("cameras", "scene")}
+    known = {key for key in rover._KEYS if key not in ("cameras", "scene", "temperature")}
+    known |= {f"temperature.{f.name}" for f in fields(TemperatureSettings)}
+    known |= {f"head.{name}" for name in HEAD_KEYS}
     known |= {f"cameras.{f.name}" for f in fields(CameraSettings)}
     known |= {f"scene.{f.name}" for f in fields(SceneSettings)}
     assert set(rows(part(page, "Simulation"))) == known

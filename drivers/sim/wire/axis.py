@@ -38,8 +38,8 @@ class WireAxis:
     Parameters
     ----------
     settings
-        Backlash and sag; its acceleration is what ``halt`` brakes with. Counts, speed and approach are for
-        ``to_count`` only; the range is not used here.
+        Encoder, backlash, sag and ringing; its acceleration is what ``halt`` brakes with. Counts, speed and
+        approach are for ``to_count`` only; range and ``settle_s`` are not used here.
     faults
         The panel that is asked for faults of ``pan_tilt``; none when left out.
     number
@@ -69,8 +69,7 @@ class WireAxis:
         self._falls_to_rad = falls_to_rad
         self._resumes = resumes
         self._lock = threading.RLock()
-        load_rad = start_rad - settings.backlash_rad / 2
-        self._axis = Axis(settings, Motion.at_rest(time_s, start_rad), (load_rad,))
+        self._axis = Axis.resting(settings, time_s, start_rad)
         self._order: Callable[[float], Motion] | None = None  # what the motor tries; None: to stand still
         self._jammed = self._pressing = False  # seized; pushing against an obstacle
         self._factor = 1.0
@@ -152,7 +151,7 @@ class WireAxis:
             return self._axis.motion.at(time_s)[1]
 
     def mechanical_rad(self, time_s: float) -> float:
-        """Return what the cameras ride on: the load behind the backlash, less the sag."""
+        """Return what the cameras ride on: the load behind the backlash, less the sag, ringing."""
         with self._lock:
             self._follow(time_s)
             return self._axis.mechanical_rad(time_s)
