@@ -35,6 +35,7 @@ MODULES: dict[str, tuple[str, ...]] = {
     "mastctl.cli.handoff": ("handoff",),
     "mastctl.cli.calibrate": ("calibrate",),
     "mastctl.cli.experiment": ("experiment", "demo"),
+    "mastctl.cli.conform": ("conform",),
     "mastctl.cli.sim": ("sim",),
     "mastctl.cli.servo": ("servo",),
     "mastctl.cli.ptu": ("ptu",),

@@ -72,13 +72,7 @@ class DaemonHttp:
 
     def ask(self, method: str, path: str, **options: Any) -> httpx.Response:
         """Ask, and return a good answer; everything else is a ClientError."""
-        with self._failures(f"the daemon at {self.url} took the request but did not answer"):
-            try:
-                answer = self._http.request(method, PREFIX + path, **options)
-            except ValueError as error:
-                raise ClientError(
-                    "bad_request", f"the request cannot be sent: {error}", exit_code=2
-                ) from None
+        answer = self.send(method, PREFIX + path, **options)
         if answer.is_success:
             return answer
         try:
@@ -88,6 +82,16 @@ class DaemonHttp:
             raise self.bad_answer(f"it says {answer.status_code}, not in the way of this program") from None
         exit_code = 2 if answer.status_code in _BAD_INPUT else 1
         raise ClientError(code, message, detail if isinstance(detail, dict) else None, exit_code)
+
+    def send(self, method: str, path: str, **options: Any) -> httpx.Response:
+        """Ask for a path of the whole address, and return the answer whatever it is."""
+        with self._failures(f"the daemon at {self.url} took the request but did not answer"):
+            try:
+                return self._http.request(method, path, **options)
+            except ValueError as error:
+                raise ClientError(
+                    "bad_request", f"the request cannot be sent: {error}", exit_code=2
+                ) from None
 
     def events(self, path: str) -> Iterator[dict[str, Any]]:
         """Yield what a stream of the daemon tells, until the daemon ends."""

@@ -1,0 +1,145 @@
+"""A true daemon on quick devices, and a proxy before it that tells one lie at a time."""
+
+from __future__ import annotations
+
+import http.client
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from urllib.parse import urlsplit
+
+import numpy as np
+
+from calib.files.mast_file import save_rig
+from drivers.clock import SystemClock
+from drivers.errors import NoFreshFrame, NoReply
+from drivers.faults import FaultPanel
+from drivers.interfaces import Frame
+from drivers.sim.pan_tilt import AxisSettings, HeadSettings, SimulatedPanTilt
+from hil_tests.mastctl.service_fakes import CONFIG, SIZE_PX, rig
+from mastctl.config import load_config
+from mastctl.daemon import RunningDaemon
+
+HERE = "hil_tests.mastctl.conform.conform_world"
+COUNT_RAD, FASTEST_RAD_PER_S = 1e-4, 2.0
+
+
+def open_head(low_rad: float = -2.0, high_rad: float = 2.0) -> SimulatedPanTilt:
+    """A head in memory."""
+    axis = AxisSettings(COUNT_RAD, 0.0, low_rad, high_rad, FASTEST_RAD_PER_S, 20.0)
+    clock = SystemClock()
+    return SimulatedPanTilt(HeadSettings("in memory", axis, axis), clock, FaultPanel(clock.now_s, ()))
+
+
+class NoiseCamera:
+    """A free-running camera of 50 Hz that sees noise."""
+
+    period_s, trigger = 0.02, ""
+
+    def __init__(self, seed: int = 0) -> None:
+        self._random = np.random.default_rng(seed)
+        self._closed = threading.Event()
+
+    def recent_times(self) -> list[object]:
+        return []
+
+    def next_frame(self, exposed_after_s: float, timeout_s: float) -> Frame:
+        now_s = time.monotonic()
+        sequence = int(max(exposed_after_s, now_s) / self.period_s) + 1
+        wait_s = sequence * self.period_s + 0.002 - now_s
+        if self._closed.wait(max(0.0, min(wait_s, timeout_s))):
+            raise NoReply("it is closed")
+        if wait_s > timeout_s:
+            raise NoFreshFrame(f"no frame within {timeout_s:g} s")
+        image = self._random.integers(0, 255, SIZE_PX[::-1], dtype=np.uint8)
+        return Frame(image, sequence, sequence * self.period_s + 0.001, 0.002)
+
+    def close(self) -> None:
+        self._closed.set()
+
+
+@contextmanager
+def true_daemon(folder: Path) -> Iterator[str]:
+    """A daemon as it is, on devices from outside that never wait; its address."""
+    save_rig(rig(), folder / "little.yaml")
+    text = CONFIG.format(listen="{port: 0}").replace("{driver: fake}", f"{{driver: '{HERE}:open_head'}}", 1)
+    (folder / "daemon.yaml").write_text(text.replace("{driver: fake}", f"{{driver: '{HERE}:NoiseCamera'}}"))
+    with RunningDaemon(load_config(folder / "daemon.yaml")) as daemon:
+        yield daemon.url
+
+
+@dataclass
+class Passing:
+    """A request and its answer as they pass; a lie edits the answer."""
+
+    method: str
+    path: str
+    body: bytes
+    status: int = 0
+    headers: dict[str, str] | None = None
+    data: bytes = b""
+
+
+class Proxy:
+    """Passes everything on. ``before(passing)`` may answer in the daemon's place by returning true;
+    ``after(passing)`` may edit what it answered.
+    """
+
+    def __init__(self, url: str) -> None:
+        self.target = urlsplit(url).netloc
+        self.honest()
+        proxy = self
+
+        class Handler(BaseHTTPRequestHandler):
+            protocol_version = "HTTP/1.1"
+
+            def log_message(self, *ignored: object) -> None: ...
+
+            def serve(self) -> None:
+                body = self.rfile.read(int(self.headers.get("Content-Length") or 0))
+                told = Passing(self.command, self.path, body)
+                if not proxy.before(told):
+                    proxy.ask(told, dict(self.headers))
+                    proxy.after(told)
+                if told.status == 0:  # the line is cut
+                    self.close_connection = True
+                    return
+                self.send_response_only(told.status)
+                for name, value in (told.headers or {}).items():
+                    if name.lower() not in ("content-length", "connection", "transfer-encoding"):
+                        self.send_header(name, value)
+                self.send_header("Content-Length", str(len(told.data)))
+                self.end_headers()
+                self.wfile.write(told.data)
+
+            do_GET = do_POST = do_DELETE = serve
+
+        self._server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
+        self._server.daemon_threads = True
+        self.url = f"http://127.0.0.1:{self._server.server_address[1]}"
+        self._thread = threading.Thread(target=self._server.serve_forever, args=(0.01,), daemon=True)
+        self._thread.start()
+
+    def honest(self) -> None:
+        """Tell no lie from now on."""
+        self.before: Callable[[Passing], object] = lambda passing: False
+        self.after: Callable[[Passing], object] = lambda passing: None
+
+    def ask(self, told: Passing, headers: dict[str, str]) -> None:
+        """Pass a request on, and take the answer."""
+        line = http.client.HTTPConnection(self.target, timeout=30)
+        try:
+            line.request(told.method, told.path, told.body or None, headers)
+            answer = line.getresponse()
+            told.status, told.headers, told.data = answer.status, dict(answer.getheaders()), answer.read()
+        finally:
+            line.close()
+
+    def close(self) -> None:
+        self._server.shutdown()
+        self._server.server_close()
+        self._thread.join()

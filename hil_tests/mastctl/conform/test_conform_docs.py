@@ -1,0 +1,13 @@
+"""docs/conform.md lists every check with its promise."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from mastctl.conform.daemon_run import CHECKS
+
+
+def test_the_page_has_a_row_for_every_check_and_no_other(repository: Path) -> None:
+    page = (repository / "docs" / "conform.md").read_text(encoding="utf-8")
+    rows = [f"| `{c.name}` | {'moves' if c.moves else ''} | {c.promise} |" for c in CHECKS]
+    assert [line for line in page.splitlines() if line.startswith("| `")] == rows
