@@ -20,7 +20,7 @@ from mastctl.cli.places import check_folder
 if TYPE_CHECKING:
     from mastctl.client import Client
     from mastctl.experiment.pointing import ClickTruth
-    from mastctl.experiment.pointing_record import PointingExperiment
+    from mastctl.experiment.pointing_record import PointingExperiment, TargetRecord
 
 DEFAULT_TARGETS = 10
 DEFAULT_DISTANCES_M = (10.0, 6.0, 2.0)
@@ -58,7 +58,19 @@ def add_commands(subparsers: Any) -> None:
         "--wire", choices=("dynamixel", "flir_ptu"),
         help="drive the head through the real driver and a byte simulator (default: in memory)",
     )  # fmt: skip
+    demo.add_argument(
+        "--speed", type=_speed, metavar="N",
+        help="1: the rover takes its time; 10: a tenth of it; max: nothing waits (default; 1 behind --wire)",
+    )  # fmt: skip
     demo.set_defaults(run=run_demo, out=Path("mastctl_demo"))
+
+
+def _speed(text: str) -> float | str:
+    """A number, or a word that the configuration judges."""
+    try:
+        return float(text)
+    except ValueError:
+        return text
 
 
 def _add_common(parser: argparse.ArgumentParser, out_help: str) -> None:
@@ -89,7 +101,7 @@ def run_demo(args: argparse.Namespace) -> int:
     from mastctl.experiment.pointing import head_pair
 
     check_folder(args.out, "--out")
-    config = demo_config(load_config(None), head=args.head, wire=args.wire, seed=args.seed)
+    config = demo_config(load_config(None), head=args.head, wire=args.wire, seed=args.seed, speed=args.speed)
     with simulated_daemon(args, config) as (daemon, client):
         rover = daemon.hardware.simulation
         assert rover is not None  # the packaged configuration is a simulated rover
@@ -112,14 +124,17 @@ def _run(
     """Run with a progress bar on stderr, one step a target."""
 
     from mastctl.experiment.pointing import run_pointing_experiment
-    from mastctl.experiment.pointing_record import TargetRecord
     from mastctl.experiment.pointing_report import PICTURES_PER_DISTANCE
 
     with run_bar(args, "pointing", args.targets * len(distances_m)) as step:
 
         def show(record: TargetRecord) -> None:
             where = f"{record.distance_m:g} m, target {record.index}"
-            step(f"pointing at {record.distance_m:g} m", record.error and f"{where}: {record.error}")
+            doing, failure = (
+                f"pointing at {record.distance_m:g} m",
+                record.error and f"{where}: {record.error}",
+            )
+            step(doing, failure, f"{where}: {_residuals(record)}")
 
         return run_pointing_experiment(
             client,
@@ -131,6 +146,12 @@ def _run(
             on_target=show,
             pictures=PICTURES_PER_DISTANCE if args.out is not None else 0,
         )
+
+
+def _residuals(record: TargetRecord) -> str:
+    """What each pointing at a target left, in one line."""
+    left = (f"{x:+.2f}, {y:+.2f} px" for x, y in (landing.residual_px for landing in record.landings))
+    return f"{record.range_m:.2f} m away, residual " + ", then ".join(left)
 
 
 def _report(args: argparse.Namespace, experiment: PointingExperiment) -> int:

@@ -41,18 +41,20 @@ def simulated_daemon(args: argparse.Namespace, config: Config) -> Iterator[tuple
 
 
 @contextmanager
-def run_bar(args: argparse.Namespace, what: str, total: int | None) -> Iterator[Callable[[str, str], None]]:
+def run_bar(args: argparse.Namespace, what: str, total: int | None) -> Iterator[Callable[..., None]]:
     """Show on stderr how far a run is.
 
-    It yields a function that is called after each part with what is done now (empty: as before) and why the
-    part failed (empty: it did not).
+    It yields a function that is called after each part with what is done now (empty: as before), why the
+    part failed (empty: it did not), and what it found if that is worth a line.
     """
     with output.progress_bar(args.json) as progress:
         task = progress.add_task(what, total=total)
 
-        def step(doing: str, failure: str) -> None:
+        def step(doing: str, failure: str, found: str = "") -> None:
             if failure:
                 progress.console.print(failure, style="red", markup=False)
+            elif found:
+                progress.console.print(found, markup=False, highlight=False)
             progress.update(task, advance=1, description=doing or None)
 
         yield step

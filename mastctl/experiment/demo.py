@@ -7,21 +7,31 @@ from dataclasses import replace
 from calib.mast.rig import Rig
 from calib.rigid import FloatArray
 from drivers.sim.rover import SimulatedRover
+from drivers.simulation_clock import MAX
 from mastctl.config import Config, Listen
 from mastctl.devices.frames import camera_and_sequence
 
 
 def demo_config(
-    config: Config, *, head: str | None, seed: int, wire: str | None = None, bricks: int = 0
+    config: Config,
+    *,
+    head: str | None,
+    seed: int,
+    wire: str | None = None,
+    bricks: int = 0,
+    speed: float | str | None = None,
 ) -> Config:
     """Return the packaged configuration on any free port, with the head, wire and seed of the demo.
 
     None leaves the head to the wire, and the wire away: see `drivers.sim.rover`. ``bricks`` stand in
-    the scene.
+    the scene. ``speed`` is `drivers.simulation_clock.simulation_speed`'s; without one nothing waits, but
+    behind a wire, whose bytes travel in real time.
     """
     chosen = {key: value for key, value in (("head", head), ("wire", wire)) if value is not None}
     packaged = {key: value for key, value in config.hardware.simulation.items() if key != "head"}
-    simulation = {**packaged, **chosen, "seed": seed}
+    if speed is None:
+        speed = MAX if wire is None else 1
+    simulation = {**packaged, **chosen, "seed": seed, "speed": speed}
     if bricks:
         simulation["scene"] = {**packaged.get("scene", {}), "bricks": bricks}
     return replace(config, listen=Listen(port=0), hardware=replace(config.hardware, simulation=simulation))

@@ -9,7 +9,6 @@ the refined pixel stands in for it.
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
@@ -27,6 +26,7 @@ from mastctl.client import Client, ClientError, Snapshot
 from mastctl.experiment.handoff_record import Handed, HandoffExperiment, HandoffRecord, summarise_handoffs
 from mastctl.experiment.known_points import KnownPoint, KnownPoints
 from mastctl.experiment.pointing import ClickTruth
+from mastctl.experiment.run_time import RunTime
 from mastctl.experiment.targets import Target
 from mastctl.experiment.views import VIEWS_PER_TARGET, Views
 from mastctl.tracking.matched import JOINT_SIGMA_RAD
@@ -79,7 +79,7 @@ def run_handoff_experiment(
     ClientError
         If the daemon cannot be reached, or serves no two pairs of the paper's steps.
     """
-    started, begun_s = time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()), time.monotonic()
+    clock = RunTime(client)
     status = client.status()
     rig = parse_rig(client.mast_file(), "the daemon's mast file").rig
     steps = [step for step in STEPS if all(_served(rig, status, pair) for pair in step[:2])]
@@ -93,7 +93,17 @@ def run_handoff_experiment(
     records: list[HandoffRecord] = []
     for source, to, distance_m in steps:
         bench = _Bench(
-            client, rig, (source, to), distance_m, status["limits"], rng, click_px, truth, points, calibration
+            client,
+            rig,
+            (source, to),
+            distance_m,
+            status["limits"],
+            rng,
+            click_px,
+            truth,
+            points,
+            calibration,
+            clock,
         )
         found = bench.known(points, targets, pictures) if points else bench.chosen(targets, pictures)
         for record in found:
@@ -108,7 +118,7 @@ def run_handoff_experiment(
         for camera in rig.stereo[to]
     ]
     return HandoffExperiment(
-        status, seed, click_px, tuple(records), tuple(summaries), started, time.monotonic() - begun_s
+        status, seed, click_px, tuple(records), tuple(summaries), clock.started, clock.since_s()
     )
 
 
@@ -136,7 +146,9 @@ class _Bench:
         truth: ClickTruth | None,
         points: KnownPoints | None,
         calibration: RigCovariance | None,
+        clock: RunTime,
     ) -> None:
+        self._clock = clock
         self.step = f"{pairs[0]} to {pairs[1]}"
         self._client = client
         self._rig = rig
@@ -171,7 +183,7 @@ class _Bench:
         for group in groups.values():
             if index == targets:
                 return
-            begun_s = time.monotonic()
+            begun_s = self._clock.now_s()
             try:
                 pair = self._views.look_at(np.mean([point.position_m for point in group], axis=0))
                 if pair is None:
@@ -193,7 +205,7 @@ class _Bench:
                 except CalibError as error:
                     record = self._failed(index, point.kind, _reason(error), begun_s)
                 index += 1
-                begun_s = time.monotonic()
+                begun_s = self._clock.now_s()
                 yield record
 
     def _known_target(
@@ -214,7 +226,7 @@ class _Bench:
 
     def _one_target(self, index: int, with_pictures: bool) -> HandoffRecord:
         """Find one target, hand it over, and return the record of it."""
-        begun_s = time.monotonic()
+        begun_s = self._clock.now_s()
         reason = f"no textured target found at {self._distance_m:g} m in {VIEWS_PER_TARGET} views"
         for _ in range(VIEWS_PER_TARGET):
             try:
@@ -230,7 +242,7 @@ class _Bench:
 
     def _failed(self, index: int, kind: str, reason: str, begun_s: float) -> HandoffRecord:
         """The record of a target that was not handed over."""
-        nan, seconds = (math.nan, math.nan), time.monotonic() - begun_s
+        nan, seconds = (math.nan, math.nan), self._clock.since_s(begun_s)
         return HandoffRecord(
             self.step,
             index,
@@ -286,7 +298,7 @@ class _Bench:
             target.shot.frame_id,
             (float(clicks[0, 0]), float(clicks[0, 1])),
             tuple(handed),
-            seconds=time.monotonic() - begun_s,
+            seconds=self._clock.since_s(begun_s),
             source_image=target.shot.image if with_pictures else None,
             kind=target.kind,
             matched=matched_handoff(

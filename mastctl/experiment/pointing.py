@@ -8,7 +8,6 @@ fails is a row of its own with the reason; it never leaves the record.
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Protocol
 
@@ -24,6 +23,7 @@ from mastctl.experiment.pointing_record import (
     TargetRecord,
     summarise_distance,
 )
+from mastctl.experiment.run_time import RunTime
 from mastctl.experiment.targets import Target
 from mastctl.experiment.views import VIEWS_PER_TARGET, Views, pointed
 
@@ -82,16 +82,16 @@ def run_pointing_experiment(
     ClientError
         If the daemon cannot be reached or refuses for another reason than the target itself.
     """
-    started, begun_s = time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()), time.monotonic()
+    clock = RunTime(client)
     status = client.status()
     rig = parse_rig(client.mast_file(), "the daemon's mast file").rig
     pair = head_pair(rig, set(status["cameras"]))
     aim_px = rig.cameras[pair[0]].model.image_center_px
-    bench = _Bench(client, rig, pair, status["limits"], np.random.default_rng(seed), truth)
+    bench = _Bench(client, rig, pair, status["limits"], np.random.default_rng(seed), truth, clock)
     records: list[TargetRecord] = []
     summaries = []
     for distance_m in distances_m:
-        distance_begun_s = time.monotonic()
+        distance_begun_s = clock.now_s()
         rows: list[TargetRecord] = []
         for index in range(targets):
             wanted = sum(bool(row.landed_images) for row in rows) < pictures
@@ -100,10 +100,10 @@ def run_pointing_experiment(
             if on_target is not None:
                 on_target(record)
         records += rows
-        summaries.append(summarise_distance(distance_m, rows, time.monotonic() - distance_begun_s))
+        summaries.append(summarise_distance(distance_m, rows, clock.since_s(distance_begun_s)))
     return PointingExperiment(
-        client.url, status, seed, pair[0], aim_px, tuple(records), tuple(summaries), started,
-        time.monotonic() - begun_s, tuple(notes),
+        clock.where, status, seed, pair[0], aim_px, tuple(records), tuple(summaries), clock.started,
+        clock.since_s(), tuple(notes),
     )  # fmt: skip
 
 
@@ -138,7 +138,9 @@ class _Bench:
         limits: Mapping[str, Any],
         rng: np.random.Generator,
         truth: ClickTruth | None,
+        clock: RunTime,
     ) -> None:
+        self._clock = clock
         self._client = client
         self._rig = rig
         self._pair = pair
@@ -147,7 +149,7 @@ class _Bench:
 
     def one_target(self, distance_m: float, index: int, with_pictures: bool) -> TargetRecord:
         """Find one target at the distance, point at it twice, and return the record of it."""
-        begun_s = time.monotonic()
+        begun_s = self._clock.now_s()
         reason = ""
         for _ in range(VIEWS_PER_TARGET):
             try:
@@ -170,7 +172,7 @@ class _Bench:
             nan,
             (),
             reason,
-            time.monotonic() - begun_s,
+            self._clock.since_s(begun_s),
         )
 
     def _point_at(
@@ -204,7 +206,7 @@ class _Bench:
             tilt_before_rad=target.shot.tilt_rad,
             landings=landings,
             error=error,
-            seconds=time.monotonic() - begun_s,
+            seconds=self._clock.since_s(begun_s),
             operation=operation,
             clicked_image=target.shot.image if with_pictures else None,
             landed_images=images,

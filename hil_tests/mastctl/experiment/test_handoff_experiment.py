@@ -163,13 +163,18 @@ def test_bricks_are_the_simulations_and_few(words: list[str], capsys: pytest.Cap
 class StuckDaemon:
     """What of a client the experiment uses; the first view takes too long, the others are refused."""
 
+    url = "http://127.0.0.1:1"
+
     def __init__(self, mast: bytes) -> None:
         self.mast, self.calls = mast, list[str]()
+
+    def simulation_time(self) -> dict[str, Any]:
+        raise ClientError("not_simulated", "clocks are for a simulated rover only")
 
     def status(self) -> dict[str, Any]:
         cameras = [f"{pair}_{eye}" for pair in ("pancam", "navcam") for eye in ("left", "right")]
         limits = {"pan_rad": [-2.0, 2.0], "tilt_rad": [-1.0, 1.0]}
-        return {"hardware": "simulated", "cameras": dict.fromkeys(cameras), "limits": limits}
+        return {"hardware": "simulated", "cameras": dict.fromkeys(cameras), "limits": limits, "now_s": 1.0}
 
     def mast_file(self) -> bytes:
         return self.mast

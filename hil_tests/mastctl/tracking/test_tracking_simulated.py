@@ -33,7 +33,7 @@ pan_tilt: {driver: sim}
 cameras: {navcam_left: {driver: sim}, navcam_right: {driver: sim},
           hazcam_left: {driver: sim}, hazcam_right: {driver: sim}}
 limits: {pan_rad: [-2.6, 2.6], tilt_rad: [-1.2, 0.5], speed_rad_per_s: 2.0}
-simulation: {rover: rig.yaml, samples: 1, seed: 3, cameras: {rate_hz: 30}}
+simulation: {rover: rig.yaml, samples: 1, seed: 3, speed: max, cameras: {rate_hz: 30}}
 tracking: {handoff: {pairs: {navcam: {nearest_m: 2.6}}}, handoff_log: handed.jsonl}
 """
 
