@@ -51,6 +51,10 @@ def add_commands(subparsers: Any) -> None:
     demo = subparsers.add_parser("demo", help="the pointing experiment on the packaged simulated rover")
     _add_common(demo, out_help="folder for the report (default mastctl_demo)")
     demo.add_argument(
+        "--config", type=Path, metavar="FILE",
+        help="a simulated rig of one's own, with its own seed; --seed then chooses views and pixels only",
+    )  # fmt: skip
+    demo.add_argument(
         "--head", choices=("ptu_d46_70", "dynamixel_x", "ph42"),
         help="simulated head (default ptu_d46_70; dynamixel_x behind --wire dynamixel)",
     )  # fmt: skip
@@ -95,16 +99,21 @@ def run_pointing(args: argparse.Namespace) -> int:
 
 
 def run_demo(args: argparse.Namespace) -> int:
-    """Start the packaged simulated rover behind a daemon on a free port, and run the experiment on it."""
+    """Start a simulated rover behind a daemon on a free port, and run the experiment on it."""
     from mastctl.config import load_config
-    from mastctl.experiment.demo import SimulationTruth, demo_config, head_note
+    from mastctl.experiment.demo import SimulationTruth, demo_config, head_note, own_config
     from mastctl.experiment.pointing import head_pair
 
     check_folder(args.out, "--out")
-    config = demo_config(load_config(None), head=args.head, wire=args.wire, seed=args.seed, speed=args.speed)
+    if args.config is None:
+        config = demo_config(
+            load_config(None), head=args.head, wire=args.wire, seed=args.seed, speed=args.speed
+        )
+    else:
+        config = own_config(load_config(args.config), head=args.head, wire=args.wire, speed=args.speed)
     with simulated_daemon(args, config) as (daemon, client):
         rover = daemon.hardware.simulation
-        assert rover is not None  # the packaged configuration is a simulated rover
+        assert rover is not None  # both configurations are of simulated rovers
         rig = daemon.service.stored.rig
         camera = head_pair(rig, set(config.hardware.cameras))[0]
         notes = (head_note(rover, rig, camera),)

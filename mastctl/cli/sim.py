@@ -1,6 +1,6 @@
 """Simulated servos behind real bytes, for any driver: `mastctl sim dynamixel` and `mastctl sim ptu`.
 
-The command runs until SIGTERM, SIGINT (Ctrl-C) or, with --until-eof, the end of its standard input. JSON
+Each runs until SIGTERM, SIGINT (Ctrl-C) or, with --until-eof, the end of its standard input. JSON
 lines on standard input switch faults on and off while it runs.
 """
 
@@ -17,7 +17,7 @@ from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from mastctl.cli import output
+from mastctl.cli import output, sim_new
 from mastctl.cli.output import WrongUse
 
 if TYPE_CHECKING:
@@ -38,9 +38,12 @@ _PAN_TILT: tuple[Literal[0], Literal[1]] = (0, 1)
 
 
 def add_commands(subparsers: argparse._SubParsersAction[Any]) -> None:
-    """Add sim dynamixel and sim ptu."""
-    sim = subparsers.add_parser("sim", help="simulated servos behind a serial line or a TCP port")
+    """Add sim dynamixel, sim ptu and sim new."""
+    sim = subparsers.add_parser(
+        "sim", help="simulated servos behind a serial line or a TCP port; a new simulated rover"
+    )
     kinds = sim.add_subparsers(dest="kind", metavar="KIND", required=True)
+    sim_new.add_parser(kinds)
     shape = argparse.RawDescriptionHelpFormatter
 
     dynamixel = kinds.add_parser(

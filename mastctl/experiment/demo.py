@@ -6,6 +6,8 @@ from dataclasses import replace
 
 from calib.mast.rig import Rig
 from calib.rigid import FloatArray
+from drivers.errors import BadOptions
+from drivers.faults import PAN_TILT
 from drivers.sim.rover import SimulatedRover
 from drivers.simulation_clock import MAX
 from mastctl.config import Config, Listen
@@ -35,6 +37,27 @@ def demo_config(
     if bricks:
         simulation["scene"] = {**packaged.get("scene", {}), "bricks": bricks}
     return replace(config, listen=Listen(port=0), hardware=replace(config.hardware, simulation=simulation))
+
+
+def own_config(
+    config: Config, *, head: str | None, wire: str | None, speed: float | str | None = None
+) -> Config:
+    """Return a simulated rig of one's own on any free port; what is None stays as it says.
+
+    Raises
+    ------
+    BadOptions
+        For a device that is not simulated: nobody knows the truth of it.
+    """
+    hardware = config.hardware
+    for name, device in {PAN_TILT: hardware.pan_tilt, **hardware.cameras}.items():
+        if device.driver != "sim":
+            words = f"driver {device.driver!r} where the demo expects 'sim', of which it knows the truth"
+            raise BadOptions(words, device=name)
+    given = (("head", head), ("wire", wire), ("speed", speed))
+    chosen = {key: value for key, value in given if value is not None}
+    kept = {key: value for key, value in hardware.simulation.items() if key != "head" or wire is None}
+    return replace(config, listen=Listen(port=0), hardware=replace(hardware, simulation={**kept, **chosen}))
 
 
 def head_note(rover: SimulatedRover, rig: Rig, camera: str) -> str:

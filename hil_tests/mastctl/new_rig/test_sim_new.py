@@ -1,0 +1,202 @@
+"""`mastctl sim new`: a rig of one's own that runs at once, drawn as its mast file says it was calibrated."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from scipy import stats
+
+from calib.files.mast_file import load_rig, save_rig
+from calib.rigid import tangents
+from mastctl.cli.main import main
+from mastctl.config import load_config
+from mastctl.daemon import RunningDaemon
+from mastctl.experiment.demo import own_config
+from mastctl.new_rig.twin import true_twin
+
+FILES = ("config.yaml", "mast.yaml", "true_rig.yaml")
+
+
+def made(folder: Path, *words: str) -> dict[str, bytes]:
+    assert main(["sim", "new", str(folder), *words]) == 0
+    return {name: (folder / name).read_bytes() for name in FILES}
+
+
+def parameters(believed: Path, drawn: Path) -> dict[str, float]:
+    """How far a rig is from another, by the names of a fit, without the code that moved it."""
+    one, other = load_rig(believed).rig, load_rig(drawn).rig
+    found = {}
+    for kind in ("translation_m", "rotation_rad"):
+        difference = getattr(other.mast, kind) - getattr(one.mast, kind)
+        found |= {f"mast.{kind}.{axis}": float(d) for axis, d in zip("xyz", difference, strict=True)}
+    for name, camera in one.cameras.items():
+        for letter in camera.model.kind:
+            at = getattr(camera.model, letter)
+            moved = getattr(other.cameras[name].model, letter)
+            if letter in "AO":  # the step before the vector was made one of length 1 again
+                moved = moved / (moved @ at)
+                parts = dict(zip("12", tangents(at) @ (moved - at), strict=True))
+            else:
+                names = {"R": "012", "E": "012"}.get(letter, "xyz")
+                parts = dict(zip(names, moved - at, strict=True))
+            found |= {f"cameras.{name}.{letter}.{part}": float(value) for part, value in parts.items()}
+    return found
+
+
+def test_all_that_is_drawn_comes_from_the_seed(tmp_path: Path) -> None:
+    first, again = made(tmp_path / "a", "--seed", "3"), made(tmp_path / "b", "--seed", "3")
+    other = made(tmp_path / "c", "--seed", "4")
+    assert first == again
+    assert first["mast.yaml"] != other["mast.yaml"] and first["true_rig.yaml"] != other["true_rig.yaml"]
+
+
+def test_the_numbers_asked_for_are_those_of_the_rig(tmp_path: Path) -> None:
+    words = "--height 2.2 --baseline 0.4 --size 800x600 --view-deg 50 --name tall --head ph42 --speed max"
+    made(tmp_path, *words.split())
+    rig = load_rig(tmp_path / "mast.yaml").rig
+    left, right = (rig.cameras[f"navcam_{side}"].model for side in ("left", "right"))
+    assert rig.name == "tall" and left.size_px == (800, 600)
+    assert rig.mast.translation_m == pytest.approx([0.0, 0.0, -2.2], abs=0.01)
+    assert np.linalg.norm(right.C - left.C) == pytest.approx(0.4, abs=0.015)
+    edges = left.ray([(-0.5, 299.5), (799.5, 299.5)]).directions
+    assert np.degrees(np.arccos(edges[0] @ edges[1])) == pytest.approx(50.0, abs=1.5)
+    config = load_config(tmp_path / "config.yaml")
+    assert config.hardware.simulation["head"] == "ph42" and config.hardware.simulation["speed"] == "max"
+
+
+def test_a_rig_is_never_overwritten_unless_that_is_asked_for(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    before = made(tmp_path, "--seed", "1")
+    (tmp_path / "config.yaml").unlink()
+    assert main(["sim", "new", str(tmp_path), "--seed", "2"]) == 2
+    told = capsys.readouterr().err
+    assert "mast.yaml exists" in told and "--force" in told
+    assert (tmp_path / "mast.yaml").read_bytes() == before["mast.yaml"]
+    assert not (tmp_path / "config.yaml").exists()
+    assert made(tmp_path, "--seed", "2", "--force") != before
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        ("--height 9", "--height is 9 m where 0.3 to 5 m"),
+        ("--height nan", "'nan' where a finite number"),
+        ("--baseline 0.001", "--baseline is 0.001 m where 0.02 to 1 m"),
+        ("--focal-px 10", "sees 178 degrees across 1024 px where 1 to 110 degrees"),
+        ("--view-deg 170", "--view-deg is 170 where 1 to 110 degrees"),
+        ("--view-deg 60 --focal-px 500", "not allowed with"),
+        ("--size 1024", "'1024' where WIDTHxHEIGHT"),
+        ("--size 20x20", "--size is 20x20 where 64 to 4096 pixels"),
+        ("--size 64x4096 --view-deg 60", "degrees across 4096 px where 1 to 110"),
+        ("--head roof", "invalid choice"),
+        ("--head ph42 --wire flir_ptu", "flir_ptu"),
+        ("--speed often", "speed"),
+        ("--seed -1", "'-1' where a whole number"),
+        ("--from nowhere.yaml", "nowhere.yaml"),
+        ("--from nowhere.yaml --height 2", "--height stands beside --from"),
+    ],
+)
+def test_a_bad_number_gets_one_sentence_and_leaves_nothing(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], words: str, told: str
+) -> None:
+    assert main(["sim", "new", str(tmp_path / "rig"), *words.split()]) == 2
+    lines = capsys.readouterr().err.strip().splitlines()
+    assert len(lines) == 1 and told in lines[0]
+    assert not (tmp_path / "rig").exists()
+
+
+def test_a_twin_believes_the_file_to_the_byte_and_is_drawn_from_its_covariance(
+    repository: Path, tmp_path: Path
+) -> None:
+    file = repository / "configs" / "masts" / "rocky8_simulated.yaml"
+    fit = load_rig(file).rig.fit
+    weight = np.linalg.inv(np.array(fit["covariance"]))
+    squares = []
+    for seed in range(6):
+        folder = tmp_path / str(seed)
+        assert made(folder, "--from", str(file), "--seed", str(seed))["mast.yaml"] == file.read_bytes()
+        apart = parameters(folder / "mast.yaml", folder / "true_rig.yaml")
+        step = np.array([apart[name] for name in fit["parameters"]])
+        squares.append(float(step @ weight @ step))
+    low, high = stats.chi2.ppf([0.001, 0.999], 6 * len(fit["parameters"]))
+    assert low < sum(squares) < high, squares
+
+
+def test_a_file_without_covariance_gets_stated_sigmas_and_they_are_told(
+    repository: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """All kinds of cameras, on the head and on the body; by the sigmas' own meaning."""
+    rig = replace(load_rig(repository / "configs" / "sim" / "skew8.yaml").rig, fit={})
+    save_rig(rig, tmp_path / "bare.yaml")
+    made(tmp_path / "twin", "--from", str(tmp_path / "bare.yaml"))
+    assert "no covariance" in capsys.readouterr().out
+    assert (
+        "stated sigmas"
+        in yaml.safe_load((tmp_path / "twin" / "true_rig.yaml").read_text())["provenance"]["drawn"]
+    )
+    focal, places, turns = [], [], []
+    for seed in range(60):
+        true_rig = true_twin(rig, np.random.default_rng(seed)).true_rig
+        for name, camera in rig.cameras.items():
+            one, other = camera.model, true_rig.cameras[name].model
+            lengths = [np.linalg.norm(np.cross(model.A, model.V)) for model in (one, other)]
+            focal.append(lengths[1] / lengths[0] - 1.0)
+            places.append(other.C - one.C)
+            turns.append(tangents(one.A) @ (other.A - one.A))
+    for values, sigma in ((focal, 1e-4), (places, 2e-4), (turns, 5e-5)):
+        assert np.std(np.array(values)) == pytest.approx(sigma, rel=0.12)
+
+
+def test_a_covariance_that_is_none_is_refused_before_anything_is_written(
+    repository: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    rig = load_rig(repository / "configs" / "masts" / "rocky8_simulated.yaml").rig
+    wide = (1e6 * np.array(rig.fit["covariance"])).tolist()
+    for fit, told in (
+        ({**rig.fit, "covariance": [[1.0]]}, "fit.covariance"),
+        ({**rig.fit, "covariance": wide}, "far too wide"),
+    ):
+        save_rig(replace(rig, fit=fit), tmp_path / "bad.yaml")
+        assert main(["sim", "new", str(tmp_path / "twin"), "--from", str(tmp_path / "bad.yaml")]) != 0
+        assert told in capsys.readouterr().err
+        assert not (tmp_path / "twin").exists()
+
+
+def test_a_new_rig_points_at_once(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    made(tmp_path, "--size", "320x240", "--view-deg", "45", "--speed", "max")
+    config = own_config(load_config(tmp_path / "config.yaml"), head=None, wire=None)
+    capsys.readouterr()
+    with RunningDaemon(config) as daemon:
+        words = [
+            "experiment",
+            "pointing",
+            "--url",
+            daemon.url,
+            "--targets",
+            "1",
+            "--distances",
+            "4",
+            "--json",
+        ]
+        assert main(words) == 0
+    (distance,) = json.loads(capsys.readouterr().out)["distances"]
+    assert distance["targets"] == 1
+    assert max(distance["second_rms_px"]) < 0.5
+
+
+def test_the_demo_refuses_a_rig_whose_truth_nobody_knows(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    made(tmp_path)
+    config = yaml.safe_load((tmp_path / "config.yaml").read_text())
+    config["cameras"]["navcam_left"] = {"driver": "v4l2"}
+    (tmp_path / "config.yaml").write_text(yaml.safe_dump(config))
+    capsys.readouterr()
+    assert main(["demo", "--config", str(tmp_path / "config.yaml"), "--out", str(tmp_path / "out")]) == 2
+    assert "driver 'v4l2' where the demo expects 'sim'" in capsys.readouterr().err
