@@ -28,6 +28,9 @@ _MAX_SCRIPT_BYTES = 1_000_000
 PAN_TILT = "pan_tilt"
 """The name of the head among the devices."""
 
+LOG = "log"
+"""The name of the daemon's log among the devices."""
+
 
 @dataclass(frozen=True)
 class Word:
@@ -92,6 +95,16 @@ HEAD_WORDS: Mapping[str, Word] = MappingProxyType(
         "noise": Word("so many replies have garbage in front of them (in memory: nothing)", _N),
         "half": Word("so many replies break off in the middle (in memory: NoReply)", _N),
         "hang_up": Word("the line is unplugged; it comes back when the fault ends", {}),
+        "silent": Word(
+            "one servo of two is dead: its axis stays where it is and it answers nothing, the other obeys "
+            "(PTU line: the unit answers for both)",
+            {"axis": 1},
+        ),
+        "not_a_number": Word(
+            "the reading is not a number, the motion is right (Dynamixel line, which has whole counts only: "
+            "nothing)",
+            _AXIS,
+        ),
     }
 )
 """Words of a head. ``axis`` is 0 for pan, 1 for tilt, 2 for both; ``replies`` says how many replies a fault
@@ -114,8 +127,20 @@ CAMERA_WORDS: Mapping[str, Word] = MappingProxyType(
         ),
         "dark": Word("pictures are black but for read noise", {}),
         "frozen": Word("the picture before the fault again and again, with new sequence and time", {}),
+        "hang": Word(
+            "the call does not return until the fault is over: 0 any, 1 next_frame, 2 close, 3 recent_times, "
+            "4 size_px, 5 exposure_held",
+            {"call": 0},
+        ),
     }
 )
+
+LOG_WORDS: Mapping[str, Word] = MappingProxyType(
+    {
+        "stalled": Word("nobody reads what the daemon says: what it writes to stderr and stdout waits", {}),
+    }
+)
+"""Words of the daemon's log, which is a device of its own here."""
 
 WHEN: Mapping[str, float] = MappingProxyType({"after_s": 0.0, "for_s": math.inf})
 """Parameters of every word: it begins ``after_s`` after it is set and lasts ``for_s`` seconds."""
@@ -126,6 +151,7 @@ _BOUNDS = {
     "delay_s": (0.0, 3600.0),
     "factor": (1e-4, 1.0),
     "probability": (0.0, 1.0),
+    "call": (0.0, 5.0),
     "moving": (0.0, 1.0),
     "axis": (0.0, 2.0),
     "angle_rad": (-math.pi, math.pi),
@@ -205,15 +231,20 @@ class FaultPanel:
     now_s
         The simulation's clock.
     cameras
-        Names of the cameras; the head is ``pan_tilt``.
+        Names of the cameras; the head is ``pan_tilt``, the daemon's log ``log``.
     """
 
     def __init__(self, now_s: Callable[[], float], cameras: Iterable[str]) -> None:
         self._now_s = now_s
-        self._words: dict[str, Mapping[str, Word]] = {PAN_TILT: HEAD_WORDS}
+        self._words: dict[str, Mapping[str, Word]] = {PAN_TILT: HEAD_WORDS, LOG: LOG_WORDS}
         self._words |= dict.fromkeys(cameras, CAMERA_WORDS)
         self._lock = threading.Lock()
         self._entries: dict[tuple[str, str], tuple[_Entry, ...]] = {}
+        self._listeners: tuple[Callable[[], None], ...] = ()
+
+    def listen(self, changed: Callable[[], None]) -> None:
+        """Have a function called whenever a fault was set or taken back."""
+        self._listeners = (*self._listeners, changed)
 
     def set(self, device: str, word: str, **parameters: Any) -> Fault:
         """Set a fault, in place of one with the same word on the same device.
@@ -221,9 +252,9 @@ class FaultPanel:
         Parameters
         ----------
         device
-            ``pan_tilt`` or a camera's name.
+            ``pan_tilt``, a camera's name, or ``log``.
         word
-            A key of ``HEAD_WORDS`` or ``CAMERA_WORDS``.
+            A key of ``HEAD_WORDS``, ``CAMERA_WORDS`` or ``LOG_WORDS``.
         **parameters
             Those of the word, and ``after_s`` and ``for_s`` of every word.
 
@@ -235,6 +266,7 @@ class FaultPanel:
         fault = self._fault(device, word, parameters)
         with self._lock:
             self._entries[device, word] = (_Entry(fault),)
+        self._tell()
         return fault
 
     def _fault(self, device: str, word: str, parameters: Mapping[str, Any]) -> Fault:
@@ -296,9 +328,10 @@ class FaultPanel:
             for one in made:
                 key = (one.fault.device, one.fault.word)
                 self._entries[key] = (*self._entries.get(key, ()), one)
+        self._tell()
 
-    def clear(self, device: str | None = None) -> None:
-        """Take back all faults of one device, or of every device.
+    def clear(self, device: str | None = None, word: str | None = None) -> None:
+        """Take back all faults of one device, or of every device; with a word only those of that word.
 
         Raises
         ------
@@ -308,8 +341,16 @@ class FaultPanel:
         if device is not None and device not in self._words:
             raise BadOptions(f"there is no device {device!r}{nearest(device, self._words)}")
         with self._lock:
-            kept = {k: v for k, v in self._entries.items() if device is not None and k[0] != device}
-            self._entries = kept
+            self._entries = {
+                (its_device, its_word): entries
+                for (its_device, its_word), entries in self._entries.items()
+                if device not in (None, its_device) or word not in (None, its_word)
+            }
+        self._tell()
+
+    def _tell(self) -> None:
+        for changed in self._listeners:
+            changed()
 
     def active(self) -> tuple[Fault, ...]:
         """Return the faults that are set and not over, also those that have not begun."""

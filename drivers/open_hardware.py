@@ -238,7 +238,10 @@ class _Opener:
             raise BadOptions(
                 f"the simulated rover has no such camera{nearest(name, self.rover.cameras)}", device=name
             )
-        return self.rover.cameras[name]
+        from drivers.sim.hanging import HangingCamera
+
+        size_px = self.rover.rig.cameras[name].model.size_px
+        return HangingCamera(self.rover.cameras[name], size_px, self._clock, self.rover.faults)
 
     def _replayed(self, name: str, device: DeviceSettings) -> Any:
         """The head or a camera of a recording; devices with the same options share one."""

@@ -4,15 +4,22 @@ from __future__ import annotations
 
 import json
 import os
+import re
+import signal
 import subprocess
 import sys
+import time
 import zipfile
+from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
 
 INSTALL_TIMEOUT_S = 600
 DEMO_TIMEOUT_S = 600
+PROJECT_TIMEOUT_S = 600
+LEFT_WITHIN_S = 30.0  # half a second is meant; the machine may be busy
 
 
 def run(*command: str | Path, timeout_s: float, **options: object) -> subprocess.CompletedProcess[str]:
@@ -49,29 +56,138 @@ def test_wheel_holds_three_packages_and_the_configs(wheel: Path) -> None:
     assert templates <= set(names)
 
 
-def test_installed_wheel_runs_the_demo_from_another_folder(wheel: Path, tmp_path: Path) -> None:
+@dataclass(frozen=True)
+class Installed:
+    """An environment with nothing but the wheel and pytest in it."""
+
+    folder: Path
+    environ: dict[str, str]
+
+    def program(self, name: str) -> Path:
+        return self.folder / "bin" / name
+
+    def processes(self) -> list[str]:
+        """What runs from it."""
+        lines = []
+        for file in Path("/proc").glob("[0-9]*/cmdline"):
+            with suppress(OSError):
+                lines.append(file.read_bytes().replace(b"\0", b" ").decode(errors="replace"))
+        return [line for line in lines if str(self.folder) in line]
+
+
+@pytest.fixture(scope="module")
+def installed(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Installed:
+    """The wheel, installed from a folder of wheels into an environment of its own."""
     wheels = Path(sys.prefix) / "wheels"
     if not wheels.is_dir():
         pytest.skip(f"no folder of wheels at {wheels}: tools/setup makes it")
-    environment = tmp_path / "environment"
+    environment = tmp_path_factory.mktemp("installed") / "environment"
     run(sys.executable, "-m", "venv", environment, timeout_s=INSTALL_TIMEOUT_S)
     clean = {
-        key: value for key, value in os.environ.items() if not key.startswith(("PYTHON", "PIP_", "VIRTUAL_"))
+        key: value
+        for key, value in os.environ.items()
+        if not key.startswith(("PYTHON", "PYTEST", "PIP_", "VIRTUAL_"))
     }
     clean["PIP_DISABLE_PIP_VERSION_CHECK"] = "1"
     run(
         environment / "bin" / "pip", "install", "-q", "--no-compile", "--no-index", "--find-links", wheels,
-        f"{wheel}[sim,report]",
+        f"{wheel}[sim,report]", "pytest", "pytest-xdist",
         timeout_s=INSTALL_TIMEOUT_S, env=clean,
     )  # fmt: skip
+    return Installed(environment, clean)
+
+
+def test_installed_wheel_runs_the_demo_from_another_folder(installed: Installed, tmp_path: Path) -> None:
     elsewhere = tmp_path / "elsewhere"
     elsewhere.mkdir()
     done = run(
-        environment / "bin" / "mastctl", "demo", "--targets", "1", "--out", "demo", "--json",
-        timeout_s=DEMO_TIMEOUT_S, env=clean, cwd=elsewhere,
+        installed.program("mastctl"), "demo", "--targets", "1", "--out", "demo", "--json",
+        timeout_s=DEMO_TIMEOUT_S, env=installed.environ, cwd=elsewhere,
     )  # fmt: skip
     distances = json.loads(done.stdout)["distances"]
     assert [row["distance_m"] for row in distances] == [10.0, 6.0, 2.0]
     assert all(row["targets"] == 1 for row in distances)
     page = (elsewhere / "demo" / "report.html").read_text(encoding="utf-8")
     assert page.endswith("</html>\n") and "Every target" in page and 'src="data:image/png;base64,' in page
+
+
+FAULT_ROW = re.compile(r"^\| `(\w+)` \| `([^`]+)` \| `?([\w.]+)`? \|$", re.MULTILINE)
+
+FAULT_TABLE = """
+import pytest
+from mastctl.client import ClientError
+
+ROWS = {rows}
+
+
+@pytest.mark.parametrize("device, words, ends_with", ROWS)
+def test_row(mast_client, fault, device, words, ends_with):
+    word, *numbers = words.split()
+    shot = mast_client.snapshot("navcam_left")
+    fault(device, word, **{{name: float(value) for name, value in (one.split("=") for one in numbers)}})
+    record = mast_client.wait(mast_client.point(pixel=("navcam_left", shot.frame_id, 400, 300)))
+    if record["state"] == "done":
+        assert max(map(abs, record["residual_px"])) < float(ends_with)
+    else:
+        assert record["error"]["code"] == ends_with
+"""
+
+STAYS = """
+import time
+
+def test_stays(mast_daemon):
+    print(mast_daemon, flush=True)
+    time.sleep(600)
+"""
+
+
+@pytest.fixture
+def project(repository: Path, tmp_path: Path) -> Path:
+    """The project of docs/testing-with-mastctl.md, with a test for each row of its table of faults."""
+    page = (repository / "docs" / "testing-with-mastctl.md").read_text()
+    blocks = re.findall(r"(?:`([\w/]+\.py)`)?[^\n`]*:\n\n```python\n(.*?)```", page, re.DOTALL)
+    named = {name: text for name, text in blocks if name}
+    assert set(named) == {"lookout.py", "test_lookout.py"} and len(blocks) == 4
+    for name, text in named.items():
+        (tmp_path / name).write_text(text)
+    head = named["test_lookout.py"].partition("def test")[0]
+    (tmp_path / "test_further.py").write_text(head + "".join(text for name, text in blocks if not name))
+    rows = FAULT_ROW.findall(page.partition("## Faults, and")[2].partition("\n## ")[0])
+    assert len(rows) > 12
+    (tmp_path / "test_faults.py").write_text(FAULT_TABLE.format(rows=rows))
+    (tmp_path / "pytest.ini").write_text("[pytest]\naddopts = --strict-markers --strict-config\n")
+    return tmp_path
+
+
+def test_an_outside_project_is_tested_in_parallel_and_nothing_is_left(
+    installed: Installed, project: Path
+) -> None:
+    done = run(
+        installed.program("pytest"), "-n", "2", "--durations=8",
+        timeout_s=PROJECT_TIMEOUT_S, env=installed.environ, cwd=project,
+    )  # fmt: skip
+    assert re.search(r"\b\d\d passed in", done.stdout), done.stdout
+    assert installed.processes() == []
+
+
+@pytest.mark.parametrize("workers", ["0", "1"])
+def test_nothing_is_left_when_pytest_is_killed(installed: Installed, tmp_path: Path, workers: str) -> None:
+    (tmp_path / "test_stays.py").write_text(STAYS)
+    log = tmp_path / "log.txt"
+    with log.open("w") as out:
+        pytest_process = subprocess.Popen(
+            [installed.program("pytest"), "-s", "-n", workers, "--basetemp", tmp_path / "base"],
+            stdout=out, stderr=out, env=installed.environ, cwd=tmp_path,
+        )  # fmt: skip
+    with pytest_process:
+        try:
+            until_s = time.monotonic() + PROJECT_TIMEOUT_S
+            while not any("mastctl.testing.serve" in line for line in installed.processes()):
+                assert pytest_process.poll() is None and time.monotonic() < until_s, log.read_text()
+                time.sleep(0.1)
+        finally:
+            pytest_process.send_signal(signal.SIGKILL)
+    until_s = time.monotonic() + LEFT_WITHIN_S
+    while installed.processes():
+        assert time.monotonic() < until_s, installed.processes()
+        time.sleep(0.1)

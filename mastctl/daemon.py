@@ -24,10 +24,12 @@ from typing import Any
 import uvicorn
 
 from drivers.clock import Clock
+from drivers.faults import LOG
 from drivers.hardware import Hardware
 from mastctl import signals
 from mastctl.config import Config, Listen
 from mastctl.errors import MastctlError
+from mastctl.queued_output import stall_while
 from mastctl.service.service import Service
 from mastctl.service.stop_threads import StopsHang
 from mastctl.web.app import create_app
@@ -71,6 +73,7 @@ def run(config: Config, on_ready: Callable[[str], None], clock: Clock | None = N
     """
     with _listening(config.listen) as (listener, url):
         service = Service.open(config, clock)
+        _let_log_stall(service)
         try:
             asyncio.run(_serve(service, listener, lambda _: on_ready(url), in_process=True))
         finally:
@@ -102,6 +105,8 @@ class RunningDaemon:
             self._exit.close()
             raise
         self._exit.callback(self.service.close)
+        _let_log_stall(self.service)
+        self._exit.callback(stall_while, lambda: False)
         self._ready = threading.Event()
         self._ended = threading.Event()
         self._stop: Callable[[], None] = lambda: None
@@ -147,6 +152,13 @@ class RunningDaemon:
             self._ended.set()
             self._ready.set()
             self._stop = lambda: None
+
+
+def _let_log_stall(service: Service) -> None:
+    """Let a fault of a simulated rover hold what this process says, as a pipe that nobody reads does."""
+    rover, clock = service.hardware.simulation, service.clock
+    if rover is not None:
+        stall_while(lambda: rover.faults.find(LOG, "stalled", clock.now_s()) is not None)
 
 
 class _Server(uvicorn.Server):

@@ -13,6 +13,7 @@ import logging
 import os
 import select
 import threading
+import time
 from collections.abc import Callable
 from functools import cache
 from queue import SimpleQueue
@@ -20,7 +21,16 @@ from queue import SimpleQueue
 KEPT = 1000  # messages that wait for an output that does not flow
 FLUSH_S = 1.0
 
+STALLED_LOOK_S = 0.05
+
 Message = str | Callable[[], str]
+
+_stalls: list[Callable[[], bool]] = []
+
+
+def stall_while(stalled: Callable[[], bool]) -> None:
+    """Have outputs of this process behave as if nobody read them, while the function given last says so."""
+    _stalls[:] = [stalled]
 
 
 class QueuedWriter:
@@ -86,6 +96,8 @@ class QueuedWriter:
             text = f"mastctl: a message could not be put into words: {type(error).__name__}\n"
         left = text.encode("utf-8", "backslashreplace")
         while left:
+            while any(stalled() for stalled in _stalls):
+                time.sleep(STALLED_LOOK_S)
             try:
                 left = left[os.write(self.descriptor, left) :]
             except BlockingIOError:  # whoever started us shares the pipe and does not wait on it

@@ -224,6 +224,10 @@ class SimulatedPanTilt:
             moving = stuck.number("moving") > 0 or (moving and not seized)
         if fault := self._faults.find(PAN_TILT, "garbage", now_s):
             counts = [self._absurd(fault) for _ in counts]
+        counts = [
+            math.nan if axis.no_number(now_s) else count
+            for axis, count in zip(self._axes, counts, strict=True)
+        ]
         return Reading(counts[0], counts[1], moving, now_s, tuple(self._complaints(now_s)))
 
     def _complaints(self, now_s: float) -> Iterator[str]:
@@ -257,12 +261,13 @@ class SimulatedPanTilt:
             if not deaf:
                 result = action(now_s)
                 silent = faults.takes(PAN_TILT, "mute", now_s) or faults.takes(PAN_TILT, "half", now_s)
+                dead = any(axis.silent(now_s) for axis in self._axes)
                 damaged = faults.takes(PAN_TILT, "corrupt", now_s) or faults.takes(PAN_TILT, "swapped", now_s)
                 late = faults.find(PAN_TILT, "delayed", now_s) or faults.takes(PAN_TILT, "late", now_s)
         if gone:
             raise NoReply("the line is gone", device=name)
         wait_s = late.number("delay_s") if not deaf and late else 0.0
-        if deaf or silent or (late and late.word == "late" and wait_s > REPLY_TIMEOUT_S):
+        if deaf or silent or dead or (late and late.word == "late" and wait_s > REPLY_TIMEOUT_S):
             self._clock.sleep(REPLY_TIMEOUT_S)
             raise NoReply(f"no answer within {REPLY_TIMEOUT_S:g} s", device=name)
         self._clock.sleep(wait_s)

@@ -4,21 +4,28 @@ from __future__ import annotations
 
 import contextlib
 import math
+import threading
+import time
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 
-from drivers.clock import ManualClock
+from drivers.clock import ManualClock, SystemClock
 from drivers.errors import BadOptions, BadReply, DriverError, NoFreshFrame, NoReply
-from drivers.faults import CAMERA_WORDS, HEAD_WORDS, PAN_TILT, WHEN, FaultPanel, read_script
+from drivers.faults import CAMERA_WORDS, HEAD_WORDS, LOG_WORDS, PAN_TILT, WHEN, FaultPanel, read_script
+from drivers.interfaces import Camera, HoldsExposure, KnowsSize, Paced
 from drivers.sim.cameras import CameraSettings, SimulatedCamera
+from drivers.sim.hanging import HangingCamera
 from drivers.sim.pan_tilt import PRESETS, REPLY_TIMEOUT_S, SimulatedPanTilt
+from drivers.simulation_clock import SimulationClock
 from tools.campaigns.servo_rigs import dynamixel_pty, in_memory, ptu_pty
 
 START = 100.0
 SIZE = (64, 48)
+PATIENCE_S = 20.0
 
 
 class Bench:
@@ -218,6 +225,58 @@ def test_head_overload_stops_at_the_obstacle_and_says_so(bench: Bench) -> None:
     assert bench.head.read().faults == ()
 
 
+@pytest.mark.parametrize("axis", [0, 1])
+def test_head_with_one_silent_servo_answers_nothing_while_the_other_obeys(bench: Bench, axis: int) -> None:
+    bench.panel.set(PAN_TILT, "silent", axis=axis)
+    for call in (bench.head.read, lambda: bench.head.move(0.3, 0.2)):
+        with pytest.raises(NoReply, match="no answer within"):
+            call()
+    bench.clock.advance(5.0)
+    meant = [0.3, 0.2]
+    meant[axis] = 0.0
+    assert bench.head.true_joints(bench.clock.now_s()) == pytest.approx(meant, abs=1e-3)
+    bench.panel.clear()
+    assert (bench.head.read().pan_rad, bench.head.read().tilt_rad) == pytest.approx(meant, abs=1e-3)
+
+
+def test_head_not_a_number_is_one_axis_or_both_and_the_motion_is_right(bench: Bench) -> None:
+    bench.panel.set(PAN_TILT, "not_a_number", axis=1)
+    bench.head.move(0.3, 0.2)
+    bench.clock.advance(5.0)
+    reading = bench.head.read()
+    assert reading.pan_rad == pytest.approx(0.3, abs=1e-3) and math.isnan(reading.tilt_rad)
+    bench.panel.set(PAN_TILT, "not_a_number")
+    assert math.isnan(bench.head.read().pan_rad)
+    bench.panel.clear()
+    assert bench.head.read().tilt_rad == pytest.approx(0.2, abs=1e-3)
+
+
+def test_a_bus_with_one_silent_servo_ends_in_no_reply_and_the_other_one_moves_on() -> None:
+    with dynamixel_pty(watchdog_s=0) as rig:
+        rig.head.move(0.1, 0.1)
+        rig.panel.set(PAN_TILT, "silent", axis=1)
+        with pytest.raises(DriverError):
+            for _ in range(20):
+                rig.head.read()
+        rig.panel.clear()
+        deadline_s = time.monotonic() + 30.0
+        while True:
+            with contextlib.suppress(DriverError):
+                assert math.isfinite(rig.head.read().tilt_rad)
+                break
+            assert time.monotonic() < deadline_s, "it does not come back"
+
+
+def test_a_unit_that_tells_no_number_ends_in_a_bad_reply() -> None:
+    with ptu_pty() as rig:
+        rig.head.read()
+        rig.panel.set(PAN_TILT, "not_a_number", axis=0)
+        with pytest.raises(BadReply):
+            rig.head.read()
+        rig.panel.clear()
+        assert math.isfinite(rig.head.read().pan_rad)
+
+
 def test_head_voltage_and_temperature_are_told(bench: Bench) -> None:
     bench.panel.set(PAN_TILT, "voltage_dip", factor=0.75)
     assert bench.head.read().faults == (
@@ -390,6 +449,44 @@ def test_a_cleared_camera_is_as_before(bench: Bench, word: str) -> None:
     assert texture_only.mean() < 3.0
 
 
+CALLS: dict[str, Any] = {
+    "next_frame": lambda camera: camera.next_frame(START, 5.0),
+    "close": lambda camera: camera.close(),
+    "recent_times": lambda camera: camera.recent_times(),
+    "size_px": lambda camera: camera.size_px,
+    "exposure_held": lambda camera: camera.exposure_held().__enter__(),
+}
+
+
+@pytest.mark.parametrize("clock", [SystemClock, SimulationClock])
+@pytest.mark.parametrize("number", [0, 1, 2, 3, 4, 5])
+def test_camera_hangs_in_the_call_that_is_named_until_the_fault_is_over(clock: Any, number: int) -> None:
+    time_now = clock()
+    panel = FaultPanel(time_now.now_s, ["cam_left"])
+    inner = SimpleNamespace(
+        name="cam_left", next_frame=lambda *_: None, close=lambda: None, recent_times=list, period_s=0.1
+    )
+    camera = HangingCamera(inner, SIZE, time_now, panel)
+    panel.set("cam_left", "hang", call=number)
+    for place, (name, call) in enumerate(CALLS.items(), 1):
+        back = threading.Event()
+        threading.Thread(target=lambda call=call, back=back: (call(camera), back.set()), daemon=True).start()
+        if number in (0, place):
+            assert not back.wait(0.05), name
+            panel.clear()
+        assert back.wait(PATIENCE_S), name
+        panel.set("cam_left", "hang", call=number)
+
+
+def test_a_hanging_camera_is_one_of_every_kind(bench: Bench) -> None:
+    camera = HangingCamera(bench.camera, SIZE, bench.clock, bench.panel)
+    for kind in (Camera, KnowsSize, HoldsExposure, Paced):
+        assert isinstance(camera, kind)
+    assert camera.next_frame(START, 5.0).image.shape[::-1] == camera.size_px == SIZE
+    with camera.exposure_held():
+        assert camera.next_frame(START + 1.0, 5.0).sequence > 0
+
+
 def test_the_panel_lists_what_is_set_and_until_when(bench: Bench) -> None:
     fault = bench.panel.set(PAN_TILT, "slow", after_s=1.0, for_s=2.0)
     assert (fault.begin_s, fault.end_s) == (START + 1.0, START + 3.0)
@@ -403,6 +500,13 @@ def test_the_panel_lists_what_is_set_and_until_when(bench: Bench) -> None:
     assert [f.device for f in bench.panel.active()] == ["cam_left"]
     bench.panel.clear()
     assert bench.panel.active() == ()
+
+
+def test_one_word_is_taken_back_and_the_others_stay(bench: Bench) -> None:
+    for device, word in ((PAN_TILT, "slow"), (PAN_TILT, "stuck"), ("cam_left", "slow")):
+        bench.panel.set(device, word)
+    bench.panel.clear(PAN_TILT, "slow")
+    assert {(f.device, f.word) for f in bench.panel.active()} == {(PAN_TILT, "stuck"), ("cam_left", "slow")}
 
 
 @pytest.mark.parametrize(
@@ -457,7 +561,7 @@ def test_every_parameter_of_a_word_can_be_set_and_has_bounds(bench: Bench, devic
 
 
 HEADS = {"in memory": in_memory, "Dynamixel": dynamixel_pty, "PTU": ptu_pty}
-NOT_HERE = {"in memory": {"duplicate", "noise", "misnamed"}}
+NOT_HERE = {"in memory": {"duplicate", "noise", "misnamed"}, "Dynamixel": {"not_a_number"}}
 
 
 @pytest.mark.parametrize("name", HEADS)
@@ -487,16 +591,16 @@ def test_every_word_of_a_camera_is_asked_for(bench: Bench, monkeypatch: pytest.M
         return find(panel, device, word, time_s)
 
     monkeypatch.setattr(FaultPanel, "_entry", noted)
-    bench.camera.next_frame(bench.clock.now_s(), 5.0)
+    HangingCamera(bench.camera, SIZE, bench.clock, bench.panel).next_frame(bench.clock.now_s(), 5.0)
     assert set(CAMERA_WORDS) <= asked
 
 
 def test_the_documentation_shows_the_same_words_and_parameters(repository: Path) -> None:
     text = (repository / "docs" / "drivers.md").read_text()
-    for title, words in (("head", HEAD_WORDS), ("camera", CAMERA_WORDS)):
+    for title, words in (("head", HEAD_WORDS), ("camera", CAMERA_WORDS), ("log", LOG_WORDS)):
         rows = {
             cells[0].strip("` "): (cells[1].strip(), cells[2].strip())
-            for line in text.split(f"Fault words of a {title}")[1].split("\n\n")[1].splitlines()[2:]
+            for line in text.split(f"Fault words of a {title}:")[1].split("\n\n")[1].splitlines()[2:]
             if len(cells := line.strip("|").split("|")) == 3
         }
         assert set(rows) == set(words)

@@ -144,6 +144,14 @@ class WireAxis:
             angle_rad = (2 * value - 1) * (1e3 if kind < 0.5 else math.pi)
         return angle_rad
 
+    def silent(self, time_s: float) -> bool:
+        """Return whether its servo is dead."""
+        return self._fault("silent", time_s) is not None
+
+    def no_number(self, time_s: float) -> bool:
+        """Return whether its angle is told as none, where a device can tell that."""
+        return self._fault("not_a_number", time_s) is not None
+
     def velocity_rad_per_s(self, time_s: float) -> float:
         """Return how fast the motor turns."""
         with self._lock:
@@ -232,7 +240,7 @@ class WireAxis:
         if self._faults is None or time_s < self._seen_s:
             return
         self._meet_obstacle(time_s)
-        jam = self._fault("off", time_s) or self._fault("stuck", time_s)
+        jam = self._fault("off", time_s) or self._fault("stuck", time_s) or self._fault("silent", time_s)
         if (jam is not None) != self._jammed:
             self._jammed = jam is not None
             if jam is not None:

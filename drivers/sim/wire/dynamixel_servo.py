@@ -118,8 +118,8 @@ class SimulatedServo:
         return self.table["return_delay_time"] * 2e-6
 
     def hears(self, time_s: float) -> bool:
-        """Return whether it takes part in the traffic: has power and is not starting."""
-        return self.powered and time_s >= self._started_s
+        """Return whether it takes part in the traffic: has power, is not starting and not dead."""
+        return self.powered and time_s >= self._started_s and not self._axis.silent(time_s)
 
     def alert(self) -> int:
         """Return the bit that every answer of a servo with a hardware error carries."""

@@ -116,6 +116,10 @@ class PtuAxis:
         """Return where the unit believes the axis to be."""
         return round(self._sign * self.axis.angle_rad(time_s) / self.step_rad)
 
+    def told_position(self, time_s: float) -> int | str:
+        """Return the position as the unit tells it."""
+        return "nan" if self.axis.no_number(time_s) else self.position(time_s)
+
     def speed(self, time_s: float) -> int:
         """Return how fast it goes, positions a second (signed)."""
         return round(self._sign * self.axis.velocity_rad_per_s(time_s) / self.step_rad)

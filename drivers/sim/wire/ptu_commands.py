@@ -94,7 +94,7 @@ class _Quantity:
 
 # What follows P or T.
 _QUANTITIES: Mapping[str, _Quantity] = {
-    "P": _Quantity("Current {axis} position is {value}", lambda a, t: a.position(t), PtuUnit.go),
+    "P": _Quantity("Current {axis} position is {value}", lambda a, t: a.told_position(t), PtuUnit.go),
     "O": _Quantity("Target {axis} position is {value}", lambda a, t: a.target, PtuUnit.go_by),
     "S": _Quantity(
         "Target {axis} speed is {value} positions/sec", lambda a, t: a.now.speed, PtuUnit.set_speed

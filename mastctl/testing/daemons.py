@@ -1,0 +1,151 @@
+"""One daemon after the other in this process, and what a test asks of its rover.
+
+A test gets a daemon of its own: nothing that the one before did (faults, a track, a stop, the mast file
+in use, where head and rover stand, what the clock says) is left, because none of it is there any more.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from drivers.errors import BadOptions
+from drivers.faults import PAN_TILT
+from drivers.sim.rover import SimulatedRover
+from mastctl.config import Config, Listen, load_config
+from mastctl.daemon import RunningDaemon
+from mastctl.devices.frames import camera_and_sequence
+from mastctl.errors import NotKnown
+from mastctl.testing.pictures import with_width
+from mastctl.tracking.pose import RoverPose
+
+USUAL = {"samples": 1, "speed": "max"}
+
+
+class Daemons:
+    """The daemon of the test that runs, if any."""
+
+    def __init__(self) -> None:
+        self._daemon: RunningDaemon | None = None
+
+    def do(self, word: str, order: dict[str, Any]) -> Any:
+        """Carry out an order and return what there is to say, fit for JSON."""
+        action = getattr(self, f"_do_{word}")
+        if word in ("open", "close") or self._daemon is None:
+            return action(**order)
+        with self._daemon.service.clock.at_work():
+            return action(**order)
+
+    @property
+    def _rover(self) -> SimulatedRover:
+        if self._daemon is None or self._daemon.hardware.simulation is None:
+            raise NotKnown("no_daemon", "no daemon runs for this test any more")
+        return self._daemon.hardware.simulation
+
+    def _do_open(
+        self, config: str | None, picture_width_px: int | None, simulation: dict[str, Any], folder: str
+    ) -> dict[str, Any]:
+        self._do_close()
+        wanted = config_for_a_test(config, picture_width_px, simulation, Path(folder))
+        self._daemon = RunningDaemon(wanted)
+        return {"url": self._daemon.url}
+
+    def _do_close(self) -> None:
+        daemon, self._daemon = self._daemon, None
+        if daemon is not None:
+            daemon.close()
+
+    def _do_joints(self) -> tuple[float, float]:
+        return self._rover.true_joints(self._now_s())
+
+    def _do_point(self, frame_id: str, pixel_px: list[float]) -> list[float] | None:
+        try:
+            point = self._rover.true_point(*_named(frame_id), pixel_px)
+        except LookupError as error:
+            raise NotKnown("frame_unknown", str(error)) from None
+        return None if point is None else point.tolist()
+
+    def _do_pixel(self, frame_id: str, position_m: list[float]) -> list[float] | None:
+        try:
+            pixel: list[float] = self._rover.true_pixel(*_named(frame_id), position_m).tolist()
+        except LookupError as error:
+            raise NotKnown("frame_unknown", str(error)) from None
+        return pixel if all(map(math.isfinite, pixel)) else None
+
+    def _do_pose(self) -> tuple[list[float], list[float]]:
+        pose = RoverPose(self._rover.site_from_rover).told(0.0)
+        return pose["position_m"], pose["quaternion"]
+
+    def _do_stand(self, place: list[float]) -> None:
+        self._rover.stand(*place)
+
+    def _do_set_fault(self, device: str, word: str, parameters: dict[str, float]) -> None:
+        self._rover.faults.set(device, word, **parameters)
+
+    def _do_clear_fault(self, device: str | None, word: str | None) -> None:
+        self._rover.faults.clear(device, word)
+
+    def _do_now(self) -> float:
+        return self._now_s()
+
+    def _do_advance(self, duration_s: float) -> float:
+        if not 0.0 <= duration_s <= 1e6:
+            raise BadOptions(f"time is to advance by {duration_s} s, expected a number from 0 to 1000000")
+        assert self._daemon is not None
+        self._daemon.service.clock.sleep(duration_s)
+        return self._now_s()
+
+    def _now_s(self) -> float:
+        assert self._rover is not None and self._daemon is not None
+        return self._daemon.service.clock.now_s()
+
+
+def config_for_a_test(
+    path: str | None, picture_width_px: int | None, simulation: dict[str, Any], folder: Path
+) -> Config:
+    """Return a configuration as a test wants it.
+
+    Parameters
+    ----------
+    path
+        Its file; None for the packaged one.
+    picture_width_px
+        The width of every camera's pictures; None as the files have it.
+    simulation
+        Keys of the ``simulation`` section, in place of the file's. A file that does not say gets one ray a
+        pixel, and ``speed: max`` if its head has no wire.
+    folder
+        Where to write mast files, if any.
+
+    Raises
+    ------
+    BadFile
+        As `load_config`.
+    BadOptions
+        If a device of it is not simulated.
+    """
+    config = load_config(path)
+    for name, device in {PAN_TILT: config.hardware.pan_tilt, **config.hardware.cameras}.items():
+        if device.driver != "sim":
+            raise BadOptions(
+                f"{config.path}: {name} has driver {device.driver!r}, expected 'sim': tests in parallel that "
+                "nobody watches move no real head"
+            )
+    section = dict(config.hardware.simulation)
+    if path is None:
+        section.pop("samples", None)  # what the demo looks best with
+    section = {**USUAL, **section, **simulation}
+    if section.get("wire") is not None and "speed" not in simulation:
+        section["speed"] = 1
+    config = replace(config, listen=Listen(port=0), hardware=replace(config.hardware, simulation=section))
+    return config if picture_width_px is None else with_width(config, picture_width_px, folder)
+
+
+def _named(frame_id: str) -> tuple[str, int]:
+    """The camera and the sequence of a frame. Raises NotKnown."""
+    try:
+        return camera_and_sequence(frame_id)
+    except ValueError as error:
+        raise NotKnown("frame_unknown", str(error)) from None

@@ -1,0 +1,185 @@
+"""The pytest plug-in: ``mast_daemon``, ``mast_client``, ``simulated_rover`` and ``fault``.
+
+pytest loads it at every start of every project beside which mastctl is installed: nothing is imported here
+but pytest and the standard library, and no process is started, until a test asks for a fixture.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from mastctl.client import Client
+    from mastctl.testing.process import RoverProcess
+    from mastctl.testing.rover import SetFault, SimulatedRover
+
+MARKER = "mastctl"
+USUAL_WIDTH_PX = 640
+AS_CONFIGURED = "as_configured"
+
+INI = {
+    "mastctl_config": "configuration of the simulated rover, a file relative to the root folder "
+    "(default: the packaged one)",
+    "mastctl_picture_width_px": f"width of every camera's pictures, pixels, or {AS_CONFIGURED} "
+    f"(default: {USUAL_WIDTH_PX})",
+    "mastctl_speed": "simulation.speed (default: max, or 1 where the head has a wire)",
+    "mastctl_seed": "simulation.seed (default: the configuration's)",
+    "mastctl_samples": "simulation.samples, rays a pixel each way (default: the configuration's, or 1)",
+}
+
+_LOG = pytest.StashKey["_Log"]()
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """Say which options a project's configuration may hold."""
+    for name, meaning in INI.items():
+        parser.addini(name, meaning, type="string", default="")
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Say what the marker is."""
+    config.addinivalue_line(
+        "markers",
+        f"{MARKER}(config=None, picture_width_px=None, **simulation): the test's simulated rover; further "
+        "keywords are keys of the configuration's simulation section",
+    )
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_runtest_makereport(item: pytest.Item, call: pytest.CallInfo[None]) -> None:
+    """Show with a failure what the test's daemon said."""
+    log = item.stash.get(_LOG, None)
+    if log is not None and call.excinfo is not None:
+        item.add_report_section(call.when, MARKER, log.new())
+
+
+class _Log:
+    """What daemons said since a test began."""
+
+    def __init__(self, file: Path) -> None:
+        self._file = file
+        self._read = file.stat().st_size
+
+    def new(self) -> str:
+        with self._file.open("rb") as log:
+            log.seek(self._read)
+            data = log.read()
+        self._read += len(data)
+        return data.decode(errors="replace")
+
+
+class _Processes:
+    """The process of this worker's daemons: made when first wanted, and anew if it has died."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._process: RoverProcess | None = None
+        self._opened = 0
+
+    def process(self) -> RoverProcess:
+        from mastctl.testing.process import RoverProcess
+
+        if self._process is None or not self._process.alive:
+            self.close()
+            workers = int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))
+            self._process = RoverProcess(self._folder / "daemon.log", workers)
+        return self._process
+
+    def folder(self) -> Path:
+        """An empty folder for one daemon."""
+        self._opened += 1
+        folder = self._folder / str(self._opened)
+        folder.mkdir()
+        return folder
+
+    def close(self) -> None:
+        if self._process is not None:
+            self._process.close()
+
+
+@pytest.fixture(scope="session")
+def _mast_processes(tmp_path_factory: pytest.TempPathFactory) -> Iterator[_Processes]:
+    processes = _Processes(tmp_path_factory.mktemp("mastctl"))
+    try:
+        yield processes
+    finally:
+        processes.close()
+
+
+@pytest.fixture
+def simulated_rover(request: pytest.FixtureRequest, _mast_processes: _Processes) -> Iterator[SimulatedRover]:
+    """The simulated rover of this test, with a daemon of its own that has just started."""
+    from mastctl.testing.rover import RoverError, SimulatedRover
+
+    process = _mast_processes.process()
+    request.node.stash[_LOG] = _Log(process.log)
+    try:
+        options = _options(request)
+        url = process.open({**options, "folder": str(_mast_processes.folder())})
+    except (RoverError, ValueError) as error:
+        pytest.fail(f"no simulated rover for this test: {error}", pytrace=False)
+    yield SimulatedRover(process.ask, url)
+    if process.alive:
+        process.ask("close")
+
+
+@pytest.fixture
+def mast_daemon(simulated_rover: SimulatedRover) -> str:
+    """The address of this test's daemon, ``http://127.0.0.1:PORT``."""
+    return simulated_rover.url
+
+
+@pytest.fixture
+def mast_client(mast_daemon: str) -> Iterator[Client]:
+    """A `mastctl.client.Client` of this test's daemon."""
+    from mastctl.client import Client
+
+    with Client(mast_daemon) as client:
+        yield client
+
+
+@pytest.fixture
+def fault(simulated_rover: SimulatedRover) -> Callable[..., SetFault]:
+    """``fault(device, word, **parameters)`` sets a fault; the end of the test takes it back."""
+    return simulated_rover.set_fault
+
+
+def _options(request: pytest.FixtureRequest) -> dict[str, Any]:
+    """What the marker and the project's configuration ask for. Raises ValueError."""
+    ini = {name.removeprefix("mastctl_"): str(request.config.getini(name)).strip() for name in INI}
+    wanted: dict[str, Any] = {"config": ini["config"] or None}
+    wanted["picture_width_px"] = _number("picture_width_px", ini, USUAL_WIDTH_PX, AS_CONFIGURED)
+    for name, word in (("speed", "max"), ("seed", None), ("samples", None)):
+        if ini[name]:
+            wanted[name] = _number(name, ini, 0, word)
+    for marker in reversed([*request.node.iter_markers(MARKER)]):  # the closest one last
+        if marker.args:
+            raise ValueError(f"the marker {MARKER} takes keywords only, found {marker.args[0]!r}")
+        wanted |= marker.kwargs
+    config, width_px = wanted.pop("config"), wanted.pop("picture_width_px")
+    if config is not None:
+        config = str(request.config.rootpath / config)
+    return {
+        "config": config,
+        "picture_width_px": None if width_px == AS_CONFIGURED else width_px,
+        "simulation": wanted,
+    }
+
+
+def _number(name: str, ini: dict[str, str], usual: int, word: str | None) -> int | float | str:
+    """A number of the project's configuration, or the one word that may stand for it."""
+    text = ini[name]
+    if not text or text == word:
+        return text or usual
+    try:
+        return int(text) if text.isascii() and text.isdigit() else float(text)
+    except ValueError:
+        expected = "a number" if word is None else f"a number or {word}"
+        raise ValueError(f"mastctl_{name} is '{text}', expected {expected}") from None

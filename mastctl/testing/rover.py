@@ -1,0 +1,149 @@
+"""The simulated rover as a test sees it: the truth beside the service, faults, and time."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from types import TracebackType
+from typing import Any
+
+Ask = Callable[..., Any]
+"""``ask(do, **what)``: has the daemon's process do something, and returns its answer; raises RoverError."""
+
+
+class RoverError(Exception):
+    """What was asked of the simulated rover cannot be: one plain sentence.
+
+    Attributes
+    ----------
+    code
+        The daemon's word for it.
+    """
+
+    def __init__(self, message: str, code: str = "failed") -> None:
+        self.code = code
+        super().__init__(message)
+
+
+class SetFault:
+    """A fault that is set. Leaving it as a context, or `clear`, takes it back.
+
+    Attributes
+    ----------
+    device, word
+        As they were given.
+    """
+
+    def __init__(self, ask: Ask, device: str, word: str) -> None:
+        self._ask = ask
+        self.device, self.word = device, word
+
+    def clear(self) -> None:
+        """Take the fault back; nothing if it is over already."""
+        self._ask("clear_fault", device=self.device, word=self.word)
+
+    def __enter__(self) -> SetFault:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        self.clear()
+
+
+class SimulatedRover:
+    """The rover behind a test's daemon. Angles in radians, lengths in metres; pixels as everywhere: (x, y),
+    the centre of the top-left pixel at (0, 0).
+
+    What is named true is what the daemon never reads: the mechanical angles, with backlash and sag, and the
+    true cameras. Every method raises `RoverError` when the daemon's process has ended.
+
+    Attributes
+    ----------
+    url
+        The daemon's address.
+    """
+
+    def __init__(self, ask: Ask, url: str) -> None:
+        self._ask = ask
+        self.url = url
+
+    def true_joints(self) -> tuple[float, float]:
+        """Return the mechanical pan and tilt of now, radians."""
+        pan_rad, tilt_rad = self._ask("joints")
+        return pan_rad, tilt_rad
+
+    def true_point(self, frame_id: str, x_px: float, y_px: float) -> tuple[float, float, float] | None:
+        """Return the point that a pixel of a frame shows, metres in the true rover frame; None for sky.
+
+        Raises
+        ------
+        RoverError
+            For a frame that this daemon did not take, or that is longer ago than the 512 newest.
+        """
+        point = self._ask("point", frame_id=frame_id, pixel_px=[float(x_px), float(y_px)])
+        return None if point is None else (point[0], point[1], point[2])
+
+    def true_pixel(self, frame_id: str, position_m: Sequence[float]) -> tuple[float, float] | None:
+        """Return the pixel where a point, metres in the true rover frame, lies in a frame.
+
+        None where the camera cannot see; whether something stands before the point is not asked. Raises
+        RoverError as `true_point`.
+        """
+        pixel = self._ask("pixel", frame_id=frame_id, position_m=[float(value) for value in position_m])
+        return None if pixel is None else (pixel[0], pixel[1])
+
+    def true_pose(self) -> tuple[tuple[float, float, float], tuple[float, float, float, float]]:
+        """Return where the rover truly stands in the site frame: metres, and a quaternion (w, x, y, z)."""
+        position_m, quaternion = self._ask("pose")
+        return tuple(position_m), tuple(quaternion)
+
+    def stand(
+        self, x_m: float, y_m: float, heading_rad: float, pitch_rad: float = 0.0, roll_rad: float = 0.0
+    ) -> None:
+        """Put the rover somewhere on its ground, at once; the daemon is not told.
+
+        Raises
+        ------
+        RoverError
+            Off the ground.
+        """
+        self._ask("stand", place=[float(v) for v in (x_m, y_m, heading_rad, pitch_rad, roll_rad)])
+
+    def now_s(self) -> float:
+        """Return the rover's time, seconds: that of frames, readings and ``now_s`` in the status."""
+        return float(self._ask("now"))
+
+    def advance(self, duration_s: float) -> float:
+        """Let time pass for the rover and return its time then.
+
+        At ``speed: max`` nothing else makes time pass between two commands, and this returns at once; at any
+        other speed it waits.
+        """
+        return float(self._ask("advance", duration_s=float(duration_s)))
+
+    def set_fault(self, device: str, word: str, **parameters: float) -> SetFault:
+        """Set a fault, in place of one with the same word on the same device.
+
+        Parameters
+        ----------
+        device
+            ``pan_tilt``, or a camera's name.
+        word
+            A fault word of docs/drivers.md.
+        **parameters
+            Those of the word, and ``after_s`` and ``for_s`` of every word.
+
+        Raises
+        ------
+        RoverError
+            For an unknown device, word or parameter, or a value out of its bounds.
+        """
+        self._ask("set_fault", device=device, word=word, parameters=parameters)
+        return SetFault(self._ask, device, word)
+
+    def clear_faults(self) -> None:
+        """Take back every fault, also those that the configuration sets."""
+        self._ask("clear_fault", device=None, word=None)
