@@ -1,105 +1,137 @@
-"""Time the simulated cameras: milliseconds a picture and stereo pairs a second, as medians.
+"""Time the simulated cameras: start, new pictures, pictures of a head at rest, and the daemon's memory.
 
-    .venv/bin/python -m tools.benchmarks.render --repeats 15
+    .venv/bin/python -m tools.benchmarks.render
+    .venv/bin/python -m tools.benchmarks.render --against ../an/older/checkout
 
-Scene of seed 1 with relief and 50 rocks. Rates depend on what else the machine is doing; its load is printed.
+Scene of seed 1 with relief and 50 rocks, Navcam 1024x768 looking at the ground 10, 6 and 2 m away (mean of
+the three). Each checkout is measured by processes of its own, by turns, and the best of all turns counts.
+Processor time depends little on what else the machine is doing, time on the clock much: the load is printed.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
 import os
 import statistics
+import subprocess
+import sys
 import time
-from dataclasses import replace
+from pathlib import Path
 
-import numpy as np
-
-from calib.camera.cahvor import CameraModel
-from calib.mast.rig import Mast
-from calib.rigid import Rigid
-from drivers.sim.compiled import is_compiled
-from drivers.sim.render import Renderer, compile_renderer, ray_table
-from drivers.sim.scene import SceneSettings, build_scene
-from mastctl.cli.output import at_least
-from tools.arguments import end
-
-MAST = Mast(np.array([0.3443, -0.0043, -1.4572]), np.array([-0.0088, -0.0181, 0.0027]))
-WANTED = {("navcam 640x480", 1): 17.0, ("navcam", 1): 8.0, ("navcam", 2): 3.0, ("pancam", 2): 3.0}
-"""Stereo pairs a second that the project set out for, on two idle processors."""
+STARTED_S = time.perf_counter()
+HERE = Path(__file__).resolve().parents[2]
+RANGES_M = (10.0, 6.0, 2.0)
+STREAM_HZ = 15.0
+FRAMES = 12
+MODULES = (
+    "mastctl.cli.main", "mastctl.daemon", "drivers.dynamixel.head", "drivers.flir_ptu.head", "drivers.v4l2"
+)  # fmt: skip
+"""What a daemon with real drivers imports."""
 
 
-def camera(size_px: tuple[int, int], focal_px: float) -> CameraModel:
-    """A CAHVOR camera that looks along x."""
-    ahead, right, down = np.eye(3)
-    return CameraModel(
-        kind="CAHVOR",
-        size_px=size_px,
-        C=np.array([0.05, -0.1, -0.02]),
-        A=ahead,
-        H=focal_px * right + (size_px[0] - 1) / 2 * ahead,
-        V=focal_px * down + (size_px[1] - 1) / 2 * ahead,
-        O=ahead,
-        R=np.array([0.0, -0.04, 0.0]),
-    )
+def measured(repeats: int) -> dict[str, float]:
+    """Return the figures of the checkout that is first on the path; lower is better in all."""
+    import cv2
+    import numpy as np
+
+    from calib.rigid import Rigid
+    from drivers.clock import SystemClock
+    from drivers.sim.render import Renderer
+    from drivers.sim.rover import SimulatedRover, simulation_settings
+
+    clock = SystemClock()
+    section = {"rover": "rocky8.yaml", "samples": 1, "cameras": {"rate_hz": 100.0, "readout_s": 0.0}}
+    rover = SimulatedRover(simulation_settings(section, HERE / "configs" / "sim"), clock)
+    rover.cameras["navcam_left"].next_frame(clock.now_s(), 5.0)
+    figures = {"start to first picture, s": time.perf_counter() - STARTED_S}
+    figures["  its processor time, s"] = time.process_time()
+    names = ("navcam_left", "navcam_right")
+    for name in names:
+        rover.cameras[name].next_frame(clock.now_s(), 5.0)
+    began_s = time.process_time()
+    for _ in range(FRAMES):
+        for name in names:
+            frame = rover.cameras[name].next_frame(clock.now_s(), 5.0)
+            cv2.imencode(".jpg", frame.image, [cv2.IMWRITE_JPEG_QUALITY, 90])
+    a_frame_s = (time.process_time() - began_s) / (FRAMES * len(names))
+    figures["two cameras at rest, 15 Hz, JPEG, % of a core"] = 100 * a_frame_s * STREAM_HZ * len(names)
+    model = rover.rig.cameras[names[0]].model
+    one, all_of_them = Renderer(rover.scene, 1), Renderer(rover.scene)
+    for samples in (1, 2):
+        cpu_ms, wall_ms = [], []
+        for range_m in RANGES_M:
+            pose: Rigid = rover.rig.mast.rover_from_head(0.1, -float(np.arctan2(1.5, range_m)))
+            for renderer, clock_of, times in (
+                (one, time.process_time, cpu_ms),
+                (all_of_them, time.perf_counter, wall_ms),
+            ):
+                renderer.image(model, pose, samples)
+                found = []
+                for _ in range(repeats):
+                    began_s = clock_of()
+                    renderer.image(model, pose, samples)
+                    found.append(1e3 * (clock_of() - began_s))
+                times.append(min(found))
+        rays = samples * samples
+        figures[f"new picture, {rays} a pixel, processor time, ms"] = statistics.mean(cpu_ms)
+        figures[f"new pair, {rays} a pixel, {os.cpu_count()} processors, ms"] = 2 * statistics.mean(wall_ms)
+    return figures
+
+
+def memory_mb() -> float:
+    """Return this process's resident memory after importing what a daemon with real drivers imports."""
+    for name in MODULES:
+        __import__(name)
+    status = Path("/proc/self/status").read_text()
+    return float(status.partition("VmRSS:")[2].split()[0]) / 1024
+
+
+def asked(checkout: Path, word: str, repeats: int) -> dict[str, float]:
+    """Return the figures of a checkout from a process of its own."""
+    command = [sys.executable, str(Path(__file__).resolve()), word, "--repeats", str(repeats)]
+    environment = {**os.environ, "PYTHONPATH": str(checkout), "OPENBLAS_NUM_THREADS": "1"}
+    told = subprocess.run(command, env=environment, cwd=checkout, check=True, stdout=subprocess.PIPE).stdout
+    return dict(json.loads(told))
 
 
 def main() -> None:
     """Print the table."""
+    from mastctl.cli.output import at_least  # of the checkout that is measured
+
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--repeats", type=at_least(1), default=9)
+    parser.add_argument("--repeats", type=at_least(1), default=5, help="pictures a figure")
+    parser.add_argument("--turns", type=at_least(1), default=2, help="processes a checkout")
+    parser.add_argument("--against", type=Path, metavar="DIR", help="another checkout, by turns")
+    parser.add_argument("--measure", action="store_true", help=argparse.SUPPRESS)
+    parser.add_argument("--memory", action="store_true", help=argparse.SUPPRESS)
     options = parser.parse_args()
-    navcam = camera((1024, 768), 1290.0)
-    hazcam = camera((640, 480), 309.0)
-    turn = np.array([[np.cos(0.6), 0, -np.sin(0.6)], [0, 1, 0], [np.sin(0.6), 0, np.cos(0.6)]])
-    hazcam = replace(
-        hazcam.moved(Rigid(turn, np.array([0.4, 0.05, -0.5]))),
-        kind="CAHVORE",
-        R=np.zeros(3),
-        E=np.array([0.008, 0.003, 0.0]),
-        cahvore_type=2,
-        linearity=0.0,
-    )
-    cameras = {
-        "navcam": navcam,
-        "navcam 640x480": camera((640, 480), 806.0),
-        "pancam": camera((1024, 768), 3441.0),
-        "hazcam 640x480": hazcam,
-    }
-    print(f"{os.cpu_count()} processors, load {os.getloadavg()[0]:.1f}, compiled before: {is_compiled()}")
-    started = time.perf_counter()
-    compile_renderer()
-    print(f"compile or load        {time.perf_counter() - started:7.2f} s")
-    started = time.perf_counter()
-    renderer = Renderer(build_scene(SceneSettings()))
-    print(f"build the scene        {time.perf_counter() - started:7.2f} s")
-    started = time.perf_counter()
-    ray_table(navcam, 2)
-    print(f"ray table navcam 2x2   {time.perf_counter() - started:7.2f} s, once a camera")
-    print("camera           looking at  samples   ms median   ms best   pairs/s   wanted")
-    for name, model in cameras.items():
-        ranges_m = (0.0,) if name.startswith("hazcam") else (10.0, 6.0, 2.0)
-        for range_m in ranges_m:
-            pose = Rigid.identity() if range_m == 0 else MAST.rover_from_head(0.1, -np.arctan2(1.5, range_m))
-            for samples in (1, 2):
-                renderer.image(model, pose, samples)
-                times_ms = []
-                for _ in range(options.repeats):
-                    started = time.perf_counter()
-                    renderer.image(model, pose, samples)
-                    times_ms.append(1e3 * (time.perf_counter() - started))
-                middle = statistics.median(times_ms)
-                wanted = WANTED.get((name, samples))
-                where = "ahead" if range_m == 0 else f"{range_m:.0f} m"
-                print(
-                    f"{name:15s} {where:>11s}      {samples}x{samples} {middle:11.0f} {min(times_ms):9.0f} "
-                    f"{500.0 / middle:9.1f} {'' if wanted is None else f'{wanted:8.0f}'}",
-                    flush=True,
-                )
+    if options.measure or options.memory:
+        figures = measured(options.repeats) if options.measure else {"daemon without sim, MB": memory_mb()}
+        print(json.dumps(figures))
+        return
+    checkouts = [HERE, *([options.against.resolve()] if options.against else [])]
+    best: list[dict[str, float]] = [{} for _ in checkouts]
+    print(f"{os.cpu_count()} processors, load {os.getloadavg()[0]:.1f}", flush=True)
+    for checkout in checkouts:  # what is compiled and kept is not the first figure
+        asked(checkout, "--measure", 1)
+    for _ in range(options.turns):
+        for checkout, figures in zip(checkouts, best, strict=True):
+            for word in ("--measure", "--memory"):
+                for name, value in asked(checkout, word, options.repeats).items():
+                    figures[name] = min(value, figures.get(name, value))
+    print(f"{'':56s}{'this':>9s}{'before    before/this' if options.against else '':>24s}")
+    for name, value in best[0].items():
+        before = best[-1][name]
+        print(
+            f"{name:56s}{value:9.2f}" + (f"{before:11.2f}{before / value:13.2f}" if options.against else "")
+        )
     print(f"load at the end {os.getloadavg()[0]:.1f}")
 
 
 if __name__ == "__main__":
+    from tools.arguments import end
+
     end(main)
