@@ -4,14 +4,18 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from mastctl.cli import output
+
+if TYPE_CHECKING:
+    from mastctl.experiment.approach import ApproachRun, ApproachTask
 
 
 def add_parser(kinds: Any) -> None:
     """Add ``approach`` to the experiments."""
     from mastctl.cli.experiment_common import add_run_options, at_least_one
+    from mastctl.cli.tasks import add_task_options
 
     parser = kinds.add_parser(
         "approach",
@@ -28,6 +32,7 @@ def add_parser(kinds: Any) -> None:
     )  # fmt: skip
     out_help = "folder for stops.csv, record.json, a strip of pictures a run, and error.png"
     add_run_options(parser, "of the first run's scene and errors", out_help)
+    add_task_options(parser)
     parser.set_defaults(run=run)
 
 
@@ -37,8 +42,9 @@ def run(args: argparse.Namespace) -> int:
 
     from calib.files.mast_file import load_rig
     from mastctl.cli.places import check_folder
-    from mastctl.experiment.approach import run_approach
-    from mastctl.experiment.approach_report import approach_table, counted, summary, write_record, write_strip
+    from mastctl.cli.tasks import results_of
+    from mastctl.experiment.approach import ApproachTask, one_approach
+    from mastctl.experiment.approach_report import write_record, write_strip
     from mastctl.packaged import config_folder
 
     check_folder(args.out, "--out")
@@ -46,17 +52,31 @@ def run(args: argparse.Namespace) -> int:
     believed = load_rig(args.mast or config_folder() / "masts" / "rocky8_simulated.yaml").rig
     if lacking := [pair for pair in true.stereo if pair not in believed.stereo]:
         raise output.WrongUse(f"--mast {args.mast} has no stereo pair '{lacking[0]}'")
-    runs = []
+    runs: dict[int, ApproachRun] = {}
     console = Console(stderr=True, quiet=args.json)
-    for index in range(args.runs):
-        with console.status(f"approach {index + 1} of {args.runs}"):
-            runs.append(run_approach(true, believed, args.seed + index, on=args.on))
-        one = runs[-1]
+
+    def done(one: ApproachRun) -> None:
         told = one.error or ("kept" if one.kept else f"lost: {one.stops[-1].reason}" if one.stops else "lost")
         console.print(f"seed {one.seed}: {told}", markup=False)
-        if args.out is not None:  # after every run: what is interrupted leaves its record
-            write_record(runs, args.out)
+        runs[one.seed] = one
+        if args.out is not None and not args.task:  # after every run: what is interrupted leaves its record
+            write_record([runs[seed] for seed in sorted(runs)], args.out)
             write_strip(one, args.out)
+
+    tasks = [ApproachTask(true, believed, args.seed + index, args.on) for index in range(args.runs)]
+    found = results_of(args, "approaches", one_approach, tasks, _label, done=done)
+    if found is None:
+        return 0
+    return _tell(args, found)
+
+
+def _label(task: ApproachTask) -> str:
+    return f"on {task.on}, seed {task.seed}"
+
+
+def _tell(args: argparse.Namespace, runs: list[ApproachRun]) -> int:
+    from mastctl.experiment.approach_report import approach_table, counted, summary
+
     if args.json:
         output.print_json(summary(runs))
     else:

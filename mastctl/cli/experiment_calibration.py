@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import time
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -11,8 +12,6 @@ from mastctl.cli import output
 
 if TYPE_CHECKING:
     from mastctl.experiment.calibration import CalibrationExperiment
-    from mastctl.experiment.calibration_survey import SurveyOutcome
-    from mastctl.experiment.calibration_variants import Variant
 
 DEFAULT_SURVEYS = 10
 DEFAULT_TARGETS = 20
@@ -21,6 +20,7 @@ DEFAULT_TARGETS = 20
 def add_parser(kinds: Any) -> None:
     """Add ``calibration`` to the experiments."""
     from mastctl.cli.experiment_common import add_run_options, at_least_one
+    from mastctl.cli.tasks import add_task_options
 
     parser = kinds.add_parser(
         "calibration",
@@ -43,13 +43,7 @@ def add_parser(kinds: Any) -> None:
         help="placements, boards, station, prisms, hazcam or mast; may be given several times (default: all)",
     )  # fmt: skip
     add_run_options(parser, "of everything random", "folder for report.html, surveys.csv and record.json")
-    parser.add_argument(
-        "--executor", default="local", metavar="WHERE",
-        help="local: processes of this machine (default); dask:ADDRESS: a Dask cluster",
-    )  # fmt: skip
-    parser.add_argument(
-        "--workers", type=at_least_one, metavar="N", help="local processes (default: one a processor)"
-    )
+    add_task_options(parser)
     parser.set_defaults(run=run)
 
 
@@ -57,6 +51,9 @@ def run(args: argparse.Namespace) -> int:
     """Run the study; 1 if no survey at all could be fitted."""
     from calib.files.mast_file import load_rig
     from mastctl.cli.places import check_folder
+    from mastctl.cli.tasks import results_of
+    from mastctl.experiment.calibration import CalibrationExperiment, survey_tasks
+    from mastctl.experiment.calibration_survey import one_survey
     from mastctl.experiment.calibration_variants import variants
     from mastctl.packaged import config_folder
 
@@ -67,35 +64,19 @@ def run(args: argparse.Namespace) -> int:
         )
     check_folder(args.out, "--out")
     chosen = [v for v in variants() if args.study is None or v.study.startswith(tuple(args.study))]
-    experiment = _run(args, rig, chosen)
-    return _tell(args, experiment)
-
-
-def _run(args: argparse.Namespace, rig: Any, chosen: list[Variant]) -> CalibrationExperiment:
-    """Run with a progress bar on stderr, one step a survey."""
-
-    from mastctl.cli.experiment_common import run_bar
-    from mastctl.experiment.calibration import run_calibration_experiment
-    from mastctl.experiment.executors import open_executor
-
-    with (
-        open_executor(args.executor, args.workers) as executor,
-        run_bar(args, "surveys", len(chosen) * args.surveys) as step,
-    ):
-
-        def done(outcome: SurveyOutcome) -> None:
-            variant = outcome.variant
-            step("", outcome.failure and f"{variant.study} {variant.label}: {outcome.failure}")
-
-        return run_calibration_experiment(
-            rig,
-            surveys=args.surveys,
-            targets=args.targets,
-            seed=args.seed,
-            executor=executor,
-            chosen=chosen,
-            done=done,
-        )
+    begun_s = time.monotonic()
+    outcomes = results_of(
+        args,
+        "surveys",
+        one_survey,
+        survey_tasks(rig, surveys=args.surveys, targets=args.targets, seed=args.seed, chosen=chosen),
+        lambda task: f"{task.variant.study} {task.variant.label}, survey {task.seed[1]}",
+        lambda outcome: outcome.failure,
+    )
+    if outcomes is None:
+        return 0
+    seconds = time.monotonic() - begun_s
+    return _tell(args, CalibrationExperiment(rig, args.seed, args.surveys, tuple(outcomes), seconds))
 
 
 def _tell(args: argparse.Namespace, experiment: CalibrationExperiment) -> int:

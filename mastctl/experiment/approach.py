@@ -120,6 +120,21 @@ class ApproachRun:
         return self.stops[-1].error_m if self.stops else np.full(3, np.nan)
 
 
+@dataclass(frozen=True, eq=False)
+class ApproachTask:
+    """One approach: the true and the believed rig, the seed, what the target lies on."""
+
+    true: Rig
+    believed: Rig
+    seed: int
+    on: On
+
+
+def one_approach(task: ApproachTask) -> ApproachRun:
+    """Drive the approach of a task, which comes to the same wherever it runs."""
+    return run_approach(task.true, task.believed, task.seed, on=task.on)
+
+
 def run_approach(
     true: Rig, believed: Rig, seed: int, errors: WorldErrors | None = None, on: On = "rocks"
 ) -> ApproachRun:

@@ -5,18 +5,15 @@ The paper's Tables IV and V come from the same runs.
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import Executor
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from calib.mast.rig import Rig
-from mastctl.experiment.calibration_survey import Handoff, SurveyOutcome, SurveyTask, one_survey, rms_px
+from mastctl.experiment.calibration_survey import Handoff, SurveyOutcome, SurveyTask, rms_px
 from mastctl.experiment.calibration_variants import Variant, variants
-from mastctl.experiment.executors import run_all
 
 PAPER_TABLE_V: Mapping[int, Mapping[str, tuple[float, float]]] = {
     6: {"pancam": (0.854, 1.102), "navcam": (1.129, 1.002)},
@@ -79,17 +76,10 @@ class CalibrationExperiment:
         return tuple(outcome for outcome in self.outcomes if outcome.variant.study == study)
 
 
-def run_calibration_experiment(
-    rig: Rig,
-    *,
-    surveys: int,
-    targets: int,
-    seed: int,
-    executor: Executor,
-    chosen: Sequence[Variant] | None = None,
-    done: Callable[[SurveyOutcome], None] = lambda _: None,
-) -> CalibrationExperiment:
-    """Survey a rig many times over, fit each survey, and point and hand off by the result.
+def survey_tasks(
+    rig: Rig, *, surveys: int, targets: int, seed: int, chosen: Sequence[Variant] | None = None
+) -> list[SurveyTask]:
+    """Return the tasks of a study, for `mastctl.experiment.calibration_survey.one_survey`.
 
     Parameters
     ----------
@@ -100,22 +90,15 @@ def run_calibration_experiment(
     targets
         Of each survey, at each distance, and for each hand-off.
     seed
-        The same seed gives the same numbers, whatever the executor and its workers.
-    executor
-        Runs the surveys.
+        The same seed gives the same numbers, wherever the tasks run.
     chosen
         Variants; all of `variants` by default.
-    done
-        Called with each outcome as it comes, in any order.
     """
-    began = time.monotonic()
     every = variants() if chosen is None else tuple(chosen)
     # Every variant has the same seeds: what differs between two is then the variant rather than the draw.
-    tasks = [
+    return [
         SurveyTask(rig, variant, (seed, number), targets) for variant in every for number in range(surveys)
     ]
-    outcomes = run_all(executor, one_survey, tasks, done)
-    return CalibrationExperiment(rig, seed, surveys, tuple(outcomes), time.monotonic() - began)
 
 
 def _summarise(variant: Variant, outcomes: Sequence[SurveyOutcome]) -> VariantSummary:

@@ -1,4 +1,4 @@
-"""Where the tasks of a Monte Carlo run: processes of this machine, or a Dask cluster.
+"""Where tasks run: processes of this machine, or a Dask cluster.
 
 Whatever runs them, a task carries its own seed and results are put in the order of the tasks, so the numbers
 are the same. To the last digit they are if linear algebra runs in one thread everywhere, as it does in
@@ -8,16 +8,14 @@ the workers of Dask and in those that are started here: more threads add up in a
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import Executor, ProcessPoolExecutor, as_completed
+import threading
+from collections.abc import Iterator, Mapping
+from concurrent.futures import Executor, ProcessPoolExecutor
 from contextlib import contextmanager
-from multiprocessing import get_context
-from typing import TypeVar, cast
+from multiprocessing import get_context, parent_process
+from typing import Any
 
 from mastctl.errors import MastctlError
-
-Task = TypeVar("Task")
-Result = TypeVar("Result")
 
 DASK = "dask:"
 ONE_THREAD = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"), "1")
@@ -50,7 +48,8 @@ def open_executor(name: str, workers: int | None = None) -> Iterator[Executor]:
     if name == "local":
         # Started afresh: the threads of a progress bar run here, which a fork would copy half.
         context = get_context("spawn")
-        with _environment(ONE_THREAD), ProcessPoolExecutor(workers or os.cpu_count() or 1, context) as pool:
+        processes = workers or os.cpu_count() or 1
+        with _environment(ONE_THREAD), ProcessPoolExecutor(processes, context, _end_with_parent) as pool:
             try:
                 yield pool
             except BaseException:
@@ -60,18 +59,19 @@ def open_executor(name: str, workers: int | None = None) -> Iterator[Executor]:
     if not name.startswith(DASK) or name == DASK:
         raise NoExecutor(f"--executor is '{name[:80]}' where local or dask:ADDRESS is expected")
     try:
-        from distributed import Client
+        import distributed
     except ImportError:
         raise NoExecutor(
             "--executor dask needs the package distributed, which is not installed (pip install distributed)"
         ) from None
     address = name.removeprefix(DASK)
     try:
-        client = Client(address, timeout=5)
+        connect: Any = distributed.Client
+        client = connect(address, timeout=5)
     except (OSError, ValueError) as error:
         raise NoExecutor(f"no Dask scheduler answers at {address[:80]}: {error}") from None
     with client:
-        yield cast(Executor, client.get_executor())
+        yield client.get_executor()
 
 
 @contextmanager
@@ -89,16 +89,13 @@ def _environment(values: Mapping[str, str]) -> Iterator[None]:
                 os.environ[name] = value
 
 
-def run_all(
-    executor: Executor,
-    function: Callable[[Task], Result],
-    tasks: Sequence[Task],
-    done: Callable[[Result], None] = lambda _: None,
-) -> list[Result]:
-    """Return the results in the order of the tasks; ``done`` is called here with each as it comes."""
-    futures = {executor.submit(function, task): index for index, task in enumerate(tasks)}
-    results: dict[int, Result] = {}
-    for future in as_completed(futures):
-        results[futures[future]] = future.result()
-        done(results[futures[future]])
-    return [results[index] for index in range(len(tasks))]
+def _end_with_parent() -> None:
+    """End this process when the one that started it is gone: a killed run leaves none behind."""
+    parent = parent_process()
+    assert parent is not None
+
+    def watch() -> None:
+        parent.join()
+        os._exit(1)
+
+    threading.Thread(target=watch, name="end with parent", daemon=True).start()

@@ -16,11 +16,8 @@ whole surveys. ``--mast 8`` gives the true mast skew axes (10 mm apart, 5 mrad o
 from __future__ import annotations
 
 import argparse
-import os
 import time
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
-from multiprocessing import get_context
 from pathlib import Path
 from typing import NamedTuple
 
@@ -36,8 +33,9 @@ from calib.mast.rig import Rig
 from calib.rigid import rigid_rates
 from calib.survey import Sigma, Survey
 from drivers.sim_survey.survey import SurveyPlan, SurveyTruth, simulate_survey
-from mastctl.calibration.run import FITS
+from mastctl.calibration.run import FITS, Method
 from mastctl.cli.output import at_least, not_negative
+from mastctl.cli.tasks import add_task_options, results_of
 from tools.arguments import end
 
 DIRECTIONS_RAD = ((-0.8, -0.2), (0.0, -0.4), (0.7, -0.7))
@@ -64,13 +62,24 @@ class Score(NamedTuple):
     seconds: float
 
 
-def score(true: Rig, seed: int, plan: SurveyPlan, method: str, mast_parameters: int) -> Score | str:
+class SurveyTask(NamedTuple):
+    """One survey of a true rig."""
+
+    true: Rig
+    seed: int
+    plan: SurveyPlan
+    method: Method
+    mast_parameters: int
+
+
+def score(task: SurveyTask) -> Score | str:
     """Return how far one survey's fit is from the truth, in its own sigmas, or why there is none."""
-    survey, of_truth = simulate_survey(true, seed, plan)
+    true = task.true
+    survey, of_truth = simulate_survey(true, task.seed, task.plan)
     try:
-        fit = FITS[method](survey, mast_parameters)
+        fit = FITS[task.method](survey, task.mast_parameters)
     except CalibError as refused:
-        return f"seed {seed}: {refused}"
+        return f"seed {task.seed}: {refused}"
     m = true.mast
     numbers = [*m.translation_m, *m.rotation_rad, m.axis_offset_m, m.axis_twist_rad]
     truth = {f"mast.{n}": v for n, v in zip(MAST_NAMES, numbers, strict=True)}
@@ -134,7 +143,7 @@ def main() -> int:
     parser.add_argument(
         "--prism-cad-sigma-m", type=not_negative, default=0.0, help="noise of the prisms' drawing"
     )
-    parser.add_argument("--workers", type=at_least(1), default=os.cpu_count() or 1)
+    add_task_options(parser)
     root = Path(__file__).resolve().parents[2]
     parser.add_argument("--rig", type=Path, default=root / "configs" / "sim" / "rocky8.yaml")
     options = parser.parse_args()
@@ -144,11 +153,10 @@ def main() -> int:
     plan = SurveyPlan(sigma=Sigma(0.001, 0.1, options.joint_sigma_rad, options.prism_cad_sigma_m))
     seeds = range(options.seed, options.seed + options.surveys)
     began = time.monotonic()
-    for library in ("OPENBLAS", "OMP"):  # one thread a worker; these read it as they start
-        os.environ.setdefault(f"{library}_NUM_THREADS", "1")
-    with ProcessPoolExecutor(options.workers, get_context("spawn")) as pool:
-        again = [options.surveys * [value] for value in (true, plan, options.method, options.mast)]
-        found = list(pool.map(score, again[0], seeds, *again[1:]))
+    tasks = [SurveyTask(true, seed, plan, options.method, options.mast) for seed in seeds]
+    found = results_of(options, "surveys", score, tasks, lambda task: f"seed {task.seed}")
+    if found is None:
+        return 0
     scores = [one for one in found if isinstance(one, Score)]
     refused = [one for one in found if isinstance(one, str)]
     if scores:

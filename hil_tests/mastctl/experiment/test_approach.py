@@ -31,6 +31,7 @@ from mastctl.experiment.approach_report import (
     write_strip,
 )
 from mastctl.experiment.approach_world import WINDOW_PX, ApproachWorld, WorldErrors, windowed
+from mastctl.experiment.tasks import Kept
 
 
 def stop(range_m: float, error_m: tuple[float, float, float], state: str = "tracked") -> Stop:
@@ -226,13 +227,34 @@ def test_a_target_is_on_a_rock_and_not_at_its_boundary(standing: Callable[..., A
 
 @pytest.mark.parametrize(("words", "on"), [([], "rocks"), (["--on", "ground"], "ground")])
 def test_the_command_says_what_targets_lie_on(
-    words: list[str], on: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    words: list[str],
+    on: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
-    def run(true: Rig, believed: Rig, seed: int, **more: Any) -> ApproachRun:
-        assert more == {"on": on}
-        return ApproachRun(seed, (stop(1.05, (0.001, 0.0, 0.0)),))
-
-    monkeypatch.setattr(approach, "run_approach", run)
-    assert main(["experiment", "approach", "--runs", "1", *words]) == 0
+    monkeypatch.setattr("mastctl.experiment.approach_report.write_strip", lambda run, folder: None)
+    command = ["experiment", "approach", "--runs", "2", "--results", str(tmp_path), *words]
+    assert main([*command, "--list-tasks", "--json"]) == 0
+    for row in json.loads(capsys.readouterr().out)["tasks"]:
+        assert row["task"].startswith(f"on {on}, seed ")
+        run = ApproachRun(int(row["task"].split()[-1]), (stop(1.05, (0.001, 0.0, 0.0)),))
+        Kept(tmp_path).write(row["id"], row["task"], run)
+    assert main([*command, "--out", str(tmp_path / "out")]) == 0
     assert f"targets on {on}" in capsys.readouterr().out
+    record = json.loads((tmp_path / "out" / "record.json").read_text())
+    assert [run["seed"] for run in record["runs"]] == [1, 2]
     assert main(["experiment", "approach", "--on", "sand"]) == 2
+
+
+def test_a_task_is_the_approach_of_its_seed(monkeypatch: pytest.MonkeyPatch, repository: Path) -> None:
+    asked = []
+
+    def run(*rigs: Rig, **more: Any) -> ApproachRun:
+        asked.append((*rigs, more))
+        return ApproachRun(7, ())
+
+    monkeypatch.setattr(approach, "run_approach", lambda a, b, seed, **more: run(a, b, seed=seed, **more))
+    rig = load_rig(repository / "configs/sim/rocky8.yaml").rig
+    assert approach.one_approach(approach.ApproachTask(rig, rig, 7, "ground")).seed == 7
+    assert asked == [(rig, rig, {"seed": 7, "on": "ground"})]

@@ -5,10 +5,10 @@ from __future__ import annotations
 import json
 import os
 import sys
-from collections.abc import Iterator
-from concurrent.futures import Executor, ProcessPoolExecutor, ThreadPoolExecutor
+from collections.abc import Iterator, Sequence
+from concurrent.futures import Executor, ThreadPoolExecutor
+from contextlib import nullcontext
 from dataclasses import replace
-from multiprocessing import get_context
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -22,12 +22,15 @@ from calib.fit.start_values import SurveyNotFitted
 from calib.survey import Sigma, Survey
 from drivers.sim_survey.survey import SurveyPlan
 from hil_tests.mastctl.calibration.survey_world import RIG_FILE
+from hil_tests.mastctl.experiment.dask_workers import two_dask_workers
 from mastctl.calibration.run import FITS
 from mastctl.cli.main import main
-from mastctl.experiment.calibration import CalibrationExperiment, run_calibration_experiment
+from mastctl.experiment.calibration import CalibrationExperiment, survey_tasks
 from mastctl.experiment.calibration_report import study_as_json, table_iv, table_v, write_study_report
+from mastctl.experiment.calibration_survey import SurveyOutcome, SurveyTask, one_survey
 from mastctl.experiment.calibration_variants import Variant, variants
 from mastctl.experiment.executors import NoExecutor, open_executor
+from mastctl.experiment.tasks import Work
 
 PLAN = SurveyPlan(sigma=Sigma(0.002, 0.1))
 CHOSEN = (
@@ -38,7 +41,13 @@ CHOSEN = (
 
 def run(executor: Executor, seed: int = 3) -> CalibrationExperiment:
     rig = load_rig(RIG_FILE).rig
-    return run_calibration_experiment(rig, surveys=1, targets=3, seed=seed, executor=executor, chosen=CHOSEN)
+    tasks = survey_tasks(rig, surveys=1, targets=3, seed=seed, chosen=CHOSEN)
+    return CalibrationExperiment(rig, seed, 1, outcomes(executor, tasks), 0.0)
+
+
+def outcomes(executor: Executor, tasks: Sequence[SurveyTask]) -> tuple[SurveyOutcome, ...]:
+    work = Work(one_survey, tasks, lambda task: task.variant.label)
+    return tuple(work.run(lambda: nullcontext(executor)))
 
 
 @pytest.fixture(scope="module")
@@ -54,11 +63,6 @@ def numbers(experiment: CalibrationExperiment) -> dict[str, Any]:
     for variant in told["variants"]:
         variant.pop("fit_seconds")
     return told
-
-
-def test_the_same_seed_gives_the_same_numbers_whatever_the_workers(experiment: CalibrationExperiment) -> None:
-    with ProcessPoolExecutor(2, get_context("spawn")) as executor:
-        assert numbers(run(executor)) == numbers(experiment)
 
 
 def test_another_seed_gives_other_numbers(experiment: CalibrationExperiment) -> None:
@@ -99,8 +103,7 @@ def test_variants_are_compared_on_the_same_surveys() -> None:
     rig = load_rig(RIG_FILE).rig
     twice = (CHOSEN[1], replace(CHOSEN[1], label="again"))
     with ThreadPoolExecutor(1) as executor:
-        found = run_calibration_experiment(rig, surveys=1, targets=2, seed=5, executor=executor, chosen=twice)
-    one, other = found.outcomes
+        one, other = outcomes(executor, survey_tasks(rig, surveys=1, targets=2, seed=5, chosen=twice))
     np.testing.assert_array_equal(one.mast, other.mast)
     np.testing.assert_array_equal(one.exact_px[6.0], other.exact_px[6.0])
 
@@ -171,30 +174,22 @@ def test_dask_without_its_package_is_refused_plainly(
     assert "pip install distributed" in error["message"]
 
 
-def test_a_dask_cluster_gives_the_same_numbers(
-    experiment: CalibrationExperiment, monkeypatch: pytest.MonkeyPatch
+def test_two_processes_and_a_dask_cluster_of_two_workers_give_the_same_bits(
+    experiment: CalibrationExperiment,
 ) -> None:
-    """A stand-in for the package, as far as it is used; tried by hand against the real one."""
-
-    class Client:
-        def __init__(self, address: str, timeout: float) -> None:
-            assert address == "tcp://cluster:8786"
-            self.pool = ThreadPoolExecutor(2)
-
-        def __enter__(self) -> Client:
-            return self
-
-        def __exit__(self, *ignored: object) -> None:
-            self.pool.shutdown()
-
-        def get_executor(self) -> Executor:
-            return self.pool
-
-    module = ModuleType("distributed")
-    module.Client = Client  # type: ignore[attr-defined]
-    monkeypatch.setitem(sys.modules, "distributed", module)
-    with open_executor("dask:tcp://cluster:8786") as executor:
-        assert numbers(run(executor)) == numbers(experiment)
+    with open_executor("local", 2) as executor:
+        here = run(executor)
+    with two_dask_workers() as address, open_executor(f"dask:{address}") as executor:
+        there = run(executor)
+    for one, other in zip(here.outcomes, there.outcomes, strict=True):
+        assert one.mast.tobytes() == other.mast.tobytes()
+        assert one.sigma.tobytes() == other.sigma.tobytes()
+        for name in ("pointing_px", "exact_px", "handoff_px"):
+            mine, theirs = getattr(one, name), getattr(other, name)
+            assert {key: errors.tobytes() for key, errors in mine.items()} == {
+                key: errors.tobytes() for key, errors in theirs.items()
+            }
+    assert numbers(here) == numbers(there) == numbers(experiment)
 
 
 def test_a_silent_scheduler_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,0 +1,146 @@
+"""Options of every experiment and campaign that is made of tasks: where they run, where results are kept."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeVar
+
+from mastctl.cli import output
+
+if TYPE_CHECKING:
+    from mastctl.experiment.tasks import Kept, Work
+
+Task = TypeVar("Task")
+Result = TypeVar("Result")
+
+
+def add_task_options(parser: argparse.ArgumentParser) -> None:
+    """Add --executor, --workers, --results, --list-tasks and --task."""
+    group = parser.add_argument_group("tasks", "where they run, and how a run goes on (docs/campaigns.md)")
+    group.add_argument(
+        "--executor", default="local", metavar="WHERE",
+        help="local: processes of this machine (default); dask:ADDRESS: a Dask cluster",
+    )  # fmt: skip
+    group.add_argument(
+        "--workers", type=output.at_least(1), metavar="N", help="local processes (default: one a processor)"
+    )
+    group.add_argument(
+        "--results", type=Path, metavar="DIR",
+        help="keep each task's result there, and run none that is there (default: OUT/tasks with --out DIR)",
+    )  # fmt: skip
+    group.add_argument(
+        "--list-tasks", action="store_true", help="only list the tasks: ID, whether it is done, what it is"
+    )
+    group.add_argument(
+        "--task", action="append", metavar="ID",
+        help="only run this task here and keep its result; may be given several times",
+    )  # fmt: skip
+
+
+def results_of(
+    args: argparse.Namespace,
+    what: str,
+    function: Callable[[Task], Result],
+    tasks: Sequence[Task],
+    label: Callable[[Task], str],
+    failure: Callable[[Result], str] = lambda _: "",
+    done: Callable[[Result], None] = lambda _: None,
+) -> list[Result] | None:
+    """Run a command's tasks as its options say, with a progress bar on stderr.
+
+    Parameters
+    ----------
+    what
+        The tasks, for the progress bar.
+    function, tasks, label
+        As `mastctl.experiment.tasks.Work`.
+    failure
+        Why a result is a failure, which is then told as it comes; empty if it is none.
+    done
+        Called with each result as it comes, in any order.
+
+    Returns
+    -------
+    list or None
+        The results in the order of the tasks; None where they were only listed, or some of them run.
+    """
+    from mastctl.cli.experiment_common import run_bar
+    from mastctl.cli.places import check_folder
+    from mastctl.experiment.tasks import Kept, Work
+
+    work = Work(function, tasks, label)
+    folder: Path | None = args.results or _beside(getattr(args, "out", None))
+    if folder is None and args.task:
+        raise output.WrongUse("--task needs --results DIR, where its result is kept")
+    check_folder(folder, "--results")
+    kept = None if folder is None else Kept(folder)
+    as_json = getattr(args, "json", False)
+    if args.list_tasks:
+        _list(work, kept, as_json)
+        return None
+    if args.task:
+        work = _chosen(work, args.task)
+
+    def tell(task: Task, result: Result) -> None:
+        why = failure(result)
+        step("", why and f"{label(task)}: {why}")
+        done(result)
+
+    with run_bar(args, what, len(set(work.ids))) as step:
+        results = work.run(_opened(args), kept, tell)
+    if not args.task:
+        return results
+    _tell_chosen(work, folder, as_json)
+    return None
+
+
+def _beside(out: Any) -> Path | None:
+    """Where results are kept without a word of it: in the report's folder, if there is one."""
+    return None if not isinstance(out, Path) or out.suffix else out / "tasks"
+
+
+def _opened(args: argparse.Namespace) -> Callable[[], AbstractContextManager[Any]]:
+    from mastctl.experiment.executors import open_executor
+
+    if args.task:
+        return partial(open_executor, "local", min(len(args.task), args.workers or 1))
+    return partial(open_executor, args.executor, args.workers)
+
+
+def _list(work: Work[Any, Any], kept: Kept | None, as_json: bool) -> None:
+    rows = [
+        {"id": name, "done": kept is not None and kept.holds(name), "task": work.label(task)}
+        for name, task in zip(work.ids, work.tasks, strict=True)
+    ]
+    if as_json:
+        output.print_json({"tasks": rows})
+        return
+    for row in rows:
+        sys.stdout.write(f"{row['id']}  {'done' if row['done'] else 'to do'}  {row['task']}\n")
+
+
+def _chosen(work: Work[Any, Any], names: Sequence[str]) -> Work[Any, Any]:
+    """The tasks of these names."""
+    from mastctl.experiment.tasks import Work
+
+    for name in names:
+        if name not in work.ids:
+            raise output.WrongUse(
+                f"--task {name} is none of these {len(work.tasks)} tasks; --list-tasks names them, and other "
+                "options or another version of the program give other names"
+            )
+    tasks = [task for name, task in zip(work.ids, work.tasks, strict=True) if name in names]
+    return Work(work.function, tasks, work.label)
+
+
+def _tell_chosen(work: Work[Any, Any], folder: Path | None, as_json: bool) -> None:
+    if as_json:
+        output.print_json({"kept": list(work.ids), "results": str(folder)})
+        return
+    for name, task in zip(work.ids, work.tasks, strict=True):
+        output.tell(f"task {name} ({work.label(task)}) is kept in {folder}")
