@@ -55,6 +55,8 @@ class Daemons:
     def _do_close(self) -> None:
         daemon, self._daemon = self._daemon, None
         if daemon is not None:
+            if daemon.hardware.simulation is not None:
+                daemon.hardware.simulation.faults.clear()  # whatever hangs comes back: nothing is left behind
             daemon.close()
 
     def _do_joints(self) -> tuple[float, float]:

@@ -1,0 +1,165 @@
+"""The plug-in itself: what it costs those who do not use it, what it refuses, and how its process ends."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from calib.camera.cahvor import CameraModel
+from calib.files.mast_file import load_rig
+from drivers.errors import BadOptions
+from drivers.hardware import DeviceSettings
+from mastctl.config import load_config
+from mastctl.packaged import config_folder
+from mastctl.testing.daemons import config_for_a_test
+from mastctl.testing.pictures import resized, with_width
+
+PATIENCE_S = 60.0  # only ends a failing test
+
+HOLDER = """
+import os, sys, threading, time
+from pathlib import Path
+from mastctl.testing.process import RoverProcess
+
+made = []
+maker = threading.Thread(target=lambda: made.append(RoverProcess(Path(sys.argv[1]))))
+maker.start()
+maker.join()  # that the thread has ended is not that the process has
+time.sleep(1.0)
+assert made[0].alive
+if sys.argv[2] == "forked" and os.fork() == 0:
+    print(os.getpid(), flush=True)  # holds the pipes open
+    time.sleep(600)
+print(made[0].pid, flush=True)
+time.sleep(600)
+"""
+
+
+def runs(pid: int) -> bool:
+    try:
+        state = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
+    except OSError:
+        return False
+    return state not in ("Z", "X")
+
+
+def test_pytest_loads_nothing_heavy_at_its_start() -> None:
+    code = "import sys, pytest; before = set(sys.modules); import mastctl.testing.plugin; "
+    code += "print(*(set(sys.modules) - before))"
+    told = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+    loaded = set(told.split())
+    assert loaded == {"mastctl", "mastctl.testing", "mastctl.testing.plugin", "mastctl.testing.rover"}
+
+
+@pytest.fixture(params=["alone", "forked"])
+def holder(
+    request: pytest.FixtureRequest, tmp_path: Path
+) -> Iterator[tuple[subprocess.Popen[str], list[int]]]:
+    """A process that holds a rover's process, and what it told: its id, and that of a fork with its pipes."""
+    command = [sys.executable, "-c", HOLDER, str(tmp_path / "log"), request.param]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as made:
+        assert made.stdout is not None
+        pids = [int(made.stdout.readline()) for _ in range(1 if request.param == "alone" else 2)]
+        yield made, pids
+        made.kill()
+        made.stdout.close()
+    for pid in pids:
+        if runs(pid):
+            os.kill(pid, 9)
+
+
+def test_its_process_ends_when_the_one_that_made_it_is_killed(
+    holder: tuple[subprocess.Popen[str], list[int]],
+) -> None:
+    made, pids = holder
+    serving = [pid for pid in pids if b"mastctl.testing.serve" in Path(f"/proc/{pid}/cmdline").read_bytes()]
+    assert len(serving) == 1
+    made.kill()
+    until_s = time.monotonic() + PATIENCE_S
+    while runs(serving[0]):
+        assert time.monotonic() < until_s
+        time.sleep(0.02)
+
+
+def test_a_configuration_with_a_real_device_is_refused(tmp_path: Path) -> None:
+    text = (config_folder() / "default.yaml").read_text()
+    path = tmp_path / "bench.yaml"
+    path.write_text(text.replace("pan_tilt: {driver: sim}", "pan_tilt: {driver: flir_ptu}"))
+    with pytest.raises(BadOptions, match="pan_tilt has driver 'flir_ptu', expected 'sim'"):
+        config_for_a_test(str(path), None, {}, tmp_path)
+    path.write_text(text.replace("navcam_left: {driver: sim}", "navcam_left: {driver: v4l2}"))
+    with pytest.raises(BadOptions, match="navcam_left has driver 'v4l2'"):
+        config_for_a_test(str(path), None, {}, tmp_path)
+
+
+def test_what_is_not_said_is_quick_and_what_is_said_holds(tmp_path: Path) -> None:
+    def section(path: str | None, **said: object) -> tuple[object, object]:
+        simulation = config_for_a_test(path, None, said, tmp_path).hardware.simulation
+        return simulation["samples"], simulation["speed"]
+
+    assert section(None) == (1, "max")
+    assert section(None, samples=3, speed=10) == (3, 10)
+    assert section(None, wire="dynamixel") == (1, 1), "bytes travel in real time"
+    own = tmp_path / "own.yaml"
+    own.write_text((config_folder() / "default.yaml").read_text().replace("samples: 2", "samples: 4"))
+    assert section(str(own)) == (4, "max")
+    assert config_for_a_test(None, None, {}, tmp_path).listen.port == 0
+
+
+@pytest.mark.parametrize("width_px", [320, 640, 2048])
+def test_a_camera_with_fewer_pixels_sees_the_same(width_px: int) -> None:
+    """A pixel's edges scale about the picture's edge, half a pixel beyond the first centre."""
+    rig = load_rig(config_folder() / "sim" / "rocky8.yaml").rig
+    points_m = np.random.default_rng(3).uniform([3, -2, -2], [9, 2, 1], (200, 3))
+    for name in ("navcam_left", "pancam_right"):
+        before: CameraModel = rig.cameras[name].model
+        after = resized(before, width_px)
+        factor = width_px / before.size_px[0]
+        assert after.size_px == (width_px, round(before.size_px[1] * factor))
+        seen, valid = before.project(points_m)
+        wanted = (seen[valid] + 0.5) * factor - 0.5
+        assert valid.any()
+        np.testing.assert_allclose(after.project(points_m)[0][valid], wanted, atol=1e-9)
+
+
+@pytest.mark.parametrize("width_px", [0, 63, 4097, 320.0, "320", True])
+def test_a_width_that_is_none_is_refused(width_px: object, tmp_path: Path) -> None:
+    with pytest.raises(BadOptions, match="expected a whole number from 64 to 4096"):
+        with_width(load_config(), width_px, tmp_path)  # type: ignore[arg-type]
+
+
+def test_a_true_rig_that_is_not_there_is_named(tmp_path: Path) -> None:
+    config = load_config()
+    hardware = replace(config.hardware, simulation={"rover": "nowhere.yaml"}, pan_tilt=DeviceSettings("sim"))
+    with pytest.raises(BadOptions, match=r"simulation\.rover: .*nowhere\.yaml"):
+        with_width(replace(config, hardware=hardware), 320, tmp_path)
+
+
+REFUSED = {
+    'mark("x")': "takes keywords only, found 'x'",
+    "mark(picture_width_px=5)": "picture_width_px is 5, expected a whole number",
+    "mark(sped=2)": "simulation has no key 'sped'; did you mean 'speed'",
+    "mark(config='nowhere.yaml')": "nowhere.yaml",
+}
+
+
+def test_a_bad_option_fails_its_test_with_a_sentence_and_no_other(tmp_path: Path) -> None:
+    tests = ["import pytest", "mark = pytest.mark.mastctl"]
+    tests += [f"@{mark}\ndef test_{number}(mast_daemon): pass" for number, mark in enumerate(REFUSED)]
+    tests += ["def test_alive(simulated_rover): assert simulated_rover._ask", ""]
+    (tmp_path / "test_them.py").write_text("\n".join(tests))
+    (tmp_path / "pytest.ini").write_text("[pytest]\nmastctl_picture_width_px = 64\nmastctl_seed = 4\n")
+    command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "--strict-markers"]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=300)
+    assert "1 passed, 4 errors" in done.stdout, done.stdout
+    assert "Traceback" not in done.stdout
+    for words in REFUSED.values():
+        assert words in done.stdout
