@@ -130,6 +130,9 @@ class Cameras:
         for camera in cameras:
             frame_checks.check_known(camera, self._cameras)
         deadline_s = self._time.now_s() + timeout_s
+        if (oldest_s := self._history.oldest_s) is None:
+            oldest_s = self._read().time_s
+        exposed_after_s = max(exposed_after_s, oldest_s)  # before that nobody knows where the head stood
         names = tuple(dict.fromkeys(cameras))
         if len(names) < 2:
             frames = self._fetched(dict.fromkeys(names, exposed_after_s), deadline_s)

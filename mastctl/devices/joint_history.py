@@ -100,6 +100,12 @@ class JointHistory:
         """The last good reading; read without a lock."""
         return self._newest
 
+    @property
+    def oldest_s(self) -> float | None:
+        """When the oldest kept reading was measured, None before the first."""
+        with self._lock:
+            return self._readings[0].time_s if self._readings else None
+
     def add(self, reading: Reading) -> Reading:
         """Keep a checked reading and return it with ``moving`` as the class says.
 

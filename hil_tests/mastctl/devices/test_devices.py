@@ -687,6 +687,19 @@ def test_a_camera_of_another_size_than_the_mast_files_is_refused_at_the_start() 
     eventually(lambda: set(threading.enumerate()) <= before, "no thread is left")
 
 
+def test_a_picture_right_after_the_start_is_one_whose_angles_are_known() -> None:
+    hardware = FakeHardware()
+    hardware.fake_cameras["navcam_left"] = Ticking("navcam_left", 1)  # has taken pictures for long already
+    devices = Devices(hardware, LIMITS, DIGEST, SystemClock(), rig())
+    try:
+        begun_s = now()
+        may_be_old_s = begun_s - 1.0
+        frame = devices.frames(["navcam_left"], may_be_old_s, 2.0)["navcam_left"]
+        assert frame.exposure_began_s > begun_s - 0.5
+    finally:
+        devices.close()
+
+
 # The end
 
 
