@@ -1,0 +1,191 @@
+"""What each unkindness of the simulated head and cameras costs in pixels, and what is left after what helps.
+
+    .venv/bin/python -m tools.campaigns.life [--config FILE] [--moves 100] [--minutes 10] [--seed 1] [--json]
+
+Each option of the configuration's head, clocks and temperature is tried alone, on a head that is else the
+preset. Head: moves to random views of the ground; how far the view is from the one that was asked for in the
+middle of the first exposure after the head says that it rests, at the first pointing (less the mean, which a
+calibration takes) and, corrected by what that exposure showed, at the second. Clocks: what stamps taken at
+their word are off by after so many minutes while a head turns at 0.1 rad/s. Temperature: the whole picture,
+at the day's extreme. rms and worst, pixels of Navcam and Pancam. Nothing is rendered: the truth is the
+simulator's own.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib.camera.cahvor import CameraModel
+from calib.files.mast_file import load_rig
+from calib.mast.rig import Rig
+from drivers.clock import ManualClock
+from drivers.sim.camera_clock import CameraClock, ClockSettings
+from drivers.sim.pan_tilt import PRESETS, HeadSettings, SimulatedPanTilt
+from drivers.sim.rover import SimulationSettings, simulation_settings
+from drivers.sim.warmth import TemperatureSettings
+from mastctl.cli.output import at_least, positive_number
+from mastctl.config import load_config
+from mastctl.packaged import config_folder
+from mastctl.pointing.settings import PointingSettings
+from tools.arguments import end
+
+PAIRS = ("navcam", "pancam")
+PERIOD_S, EXPOSURE_S = 0.1, 0.008
+TURNING_RAD_PER_S = 0.1
+OPTIONS: Mapping[str, tuple[str, ...]] = {
+    "none of them": (),
+    "ringing": ("ring_hz", "ring_damping", "ring_gain"),
+    "ringing, with settle_s": ("ring_hz", "ring_damping", "ring_gain", "settle_s"),
+    "encoder harmonics": ("harmonics_rad",),
+    "play under gravity": ("gravity_turnover_rad", "gravity_friction"),
+}
+
+Offs = NDArray[np.float64]
+"""(n, 2): in pan and tilt, radians, or in x and y, pixels."""
+
+
+class Row(NamedTuple):
+    """By pair, rms and worst, px; None where nothing is told."""
+
+    option: str
+    how: str
+    navcam: tuple[float, float] | None
+    pancam: tuple[float, float] | None
+
+
+def main() -> None:
+    """Measure, and print a table or a document."""
+    worst = config_folder() / "worst_day.yaml"
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--config", type=Path, default=worst, metavar="FILE", help="(default worst_day.yaml)")
+    parser.add_argument("--moves", type=at_least(2), default=100, metavar="N", help="moves (default 100)")
+    parser.add_argument("--minutes", type=positive_number, default=10.0, metavar="T", help="(default 10)")
+    parser.add_argument("--seed", type=at_least(0), default=1, metavar="S", help="of the views (default 1)")
+    parser.add_argument("--json", action="store_true", help="one JSON document")
+    args = parser.parse_args()
+    config = load_config(args.config)
+    settings = simulation_settings(config.hardware.simulation, config.hardware.folder)
+    rig = load_rig(settings.rover).rig
+    rows = [
+        *of_the_head(settings.head, rig, args.moves, args.seed),
+        *of_the_clocks(settings, rig, 60 * args.minutes, config.hardware.cameras),
+        *of_the_day(settings.temperature, rig),
+    ]
+    if args.json:
+        print(json.dumps([row._asdict() for row in rows]))
+        return
+    for row in rows:
+        print(f"| {row.option} | {row.how} | {told(row.navcam)} | {told(row.pancam)} |")
+
+
+def told(px: tuple[float, float] | None) -> str:
+    """A cell."""
+    return "" if px is None else "{:.2f}, {:.2f}".format(*px)
+
+
+def of_the_head(head: HeadSettings, rig: Rig, moves: int, seed: int) -> Iterator[Row]:
+    """Each option of the head alone."""
+    random = np.random.default_rng(seed)
+    ranges_m = np.exp(random.uniform(np.log(2.0), np.log(12.0), moves))
+    goals = np.stack([random.uniform(-1, 1, moves), -np.arctan(1.46 / ranges_m)], axis=-1)
+    for option, names in OPTIONS.items():
+        alone = only(head, names)
+        for number, off in enumerate(offs(alone, goals, random), 1):
+            yield Row(option, f"pointing {number}", *(spread(off * px_per_rad(rig, pair)) for pair in PAIRS))
+
+
+def only(head: HeadSettings, names: tuple[str, ...]) -> HeadSettings:
+    """The preset with some of a head's options."""
+    plain = PRESETS[head.name]
+    pan, tilt = ({name: getattr(axis, name) for name in names} for axis in (head.pan, head.tilt))
+    return replace(plain, pan=replace(plain.pan, **pan), tilt=replace(plain.tilt, **tilt))
+
+
+def offs(head: HeadSettings, goals: Offs, random: np.random.Generator) -> tuple[Offs, Offs]:
+    """How far a picture is from the view that was asked for, at the first and at the second pointing."""
+    clock = ManualClock(100.0)
+    device = SimulatedPanTilt(head, clock)
+    dwell_s = PointingSettings().dwell_s if head.pan.settle_s > 0 else 0.0
+    found: tuple[list[Offs], list[Offs]] = ([], [])
+    for goal in goals:
+        off = np.zeros(2)
+        for pointing in found:
+            device.move(*(goal - off))
+            while device.read().moving:
+                clock.advance(0.005)
+            clock.advance(dwell_s + random.uniform(0, PERIOD_S) + EXPOSURE_S)
+            seen = np.array(device.true_joints(clock.now_s() - EXPOSURE_S / 2)) - goal
+            pointing.append(seen)
+            off = off + seen
+            clock.advance(PERIOD_S)
+        clock.advance(20.0)
+    return np.array(found[0]) - np.mean(found[0], axis=0), np.array(found[1])
+
+
+def px_per_rad(rig: Rig, pair: str) -> float:
+    """A pair's left focal length."""
+    model = rig.cameras[rig.stereo[pair][0]].model
+    return float(np.linalg.norm(np.cross(model.A, model.H)))
+
+
+def spread(px: Offs) -> tuple[float, float]:
+    """Rms of one axis, and the worst of either."""
+    return float(np.sqrt((px**2).mean())), float(np.abs(px).max())
+
+
+def of_the_clocks(
+    settings: SimulationSettings, rig: Rig, passed_s: float, cameras: Mapping[str, Any]
+) -> Iterator[Row]:
+    """Stamps at their word, and corrected by the configuration's offset_s."""
+    turning = {pair: TURNING_RAD_PER_S * px_per_rad(rig, pair) for pair in PAIRS}
+    for how, corrected in (("stamps at their word", False), ("with offset_s", True)):
+        cells: dict[str, tuple[float, float]] = {}
+        for pair in PAIRS:
+            late_s = []
+            for name in rig.stereo[pair]:
+                clock = CameraClock(settings.clocks.get(name, ClockSettings()), 0.0)
+                offset_s = cameras[name].offset_s if corrected else 0.0
+                late_s.append(clock.stamp_s(passed_s) + offset_s - passed_s)
+            cells[pair] = spread(np.array(late_s) * turning[pair])
+        yield Row("clocks", how, cells["navcam"], cells["pancam"])
+
+
+def of_the_day(day: TemperatureSettings, rig: Rig) -> Iterator[Row]:
+    """Lenses and mount at the extreme."""
+    warmer_k = day.amplitude_k
+    still = {"focal_ppm_per_k": 0.0, "centre_x_px_per_k": 0.0, "centre_y_px_per_k": 0.0}
+    parts = {
+        "focal length": replace(day, **{**still, "focal_ppm_per_k": day.focal_ppm_per_k}),
+        "image centre": replace(day, focal_ppm_per_k=0.0),
+    }
+    for part, one in parts.items():
+        cells = []
+        for pair in PAIRS:
+            model = rig.cameras[rig.stereo[pair][0]].model
+            cells.append(spread(moved_px(model, one.camera(model, False, warmer_k))))
+        yield Row("temperature", part, *cells)
+    mount = np.array([[day.mount_pan_rad_per_k, day.mount_tilt_rad_per_k]]) * warmer_k
+    yield Row("temperature", "mount", *(spread(mount * px_per_rad(rig, pair)) for pair in PAIRS))
+
+
+def moved_px(model: CameraModel, warm: CameraModel) -> Offs:
+    """By how much far points of the whole picture move."""
+    width, height = model.size_px
+    grid = np.stack(np.meshgrid(np.linspace(0, width - 1, 9), np.linspace(0, height - 1, 7)), axis=-1)
+    rays = model.ray(grid.reshape(-1, 2))
+    far, _ = warm.project(rays.origins_m + 1000.0 * rays.directions)
+    return np.asarray(far - grid.reshape(-1, 2))
+
+
+if __name__ == "__main__":
+    end(main)
