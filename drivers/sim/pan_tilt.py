@@ -137,8 +137,8 @@ class SimulatedPanTilt:
         self._lock = threading.RLock()
         now_s = clock.now_s()
         self._axes = (
-            WireAxis(head.pan, self._faults, number=0, resumes=False, time_s=now_s),
-            WireAxis(head.tilt, self._faults, number=1, resumes=False, time_s=now_s),
+            WireAxis(head.pan, self._faults, number=0, resumes=False, time_s=now_s - head.pan.settle_s),
+            WireAxis(head.tilt, self._faults, number=1, resumes=False, time_s=now_s - head.tilt.settle_s),
         )
         self._closed = False
 

@@ -107,6 +107,19 @@ def test_a_picture_as_soon_as_the_encoder_stands_is_off_and_settling_makes_it_go
     assert np.ptp(settled) * PANCAM_PX < 0.1
 
 
+def test_a_head_says_that_it_moves_while_it_settles_but_not_before_it_was_ever_moved() -> None:
+    clock = ManualClock(5.0)
+    device = SimulatedPanTilt(head_settings({"settle_s": 0.7}), clock)
+    assert not device.read().moving
+    device.move(0.2, 0.0)
+    clock.advance(2.0)
+    device.stop()
+    clock.advance(0.69)
+    assert device.read().moving
+    clock.advance(0.02)
+    assert not device.read().moving
+
+
 def test_the_encoder_does_not_see_the_ringing() -> None:
     device, clock = moved(head_settings({"preset": "ptu_d46_70", "ring_hz": 5.0}), [(0.4, 0.1)])
     readings = set()

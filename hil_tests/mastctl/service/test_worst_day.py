@@ -1,0 +1,69 @@
+"""The packaged rover on its worst day: what a program that trusts too much gets, and what is reached."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from mastctl.config import load_config
+from mastctl.packaged import config_folder
+from mastctl.pointing.requests import PixelTarget, PointRequest
+from mastctl.service.service import Service
+
+AIM_PX = (511.5, 383.5)
+CLICKS = ((300.0, 420.0), (700.0, 500.0), (450.0, 600.0))
+LONG_S = 120.0
+
+
+@contextmanager
+def worst_day(**head: Any) -> Iterator[Service]:
+    """The service on the rover's own clock, with some of the head's options changed."""
+    config = load_config(config_folder() / "worst_day.yaml")
+    asked = config.hardware.simulation
+    simulation = {**asked, "speed": "max", "samples": 1, "head": {**asked["head"], **head}}
+    hardware = replace(config.hardware, simulation=simulation)
+    service = Service.open(replace(config, hardware=hardware, listen=replace(config.listen, port=0)))
+    try:
+        yield service
+    finally:
+        service.close()
+
+
+def pointed(service: Service, pixel_px: tuple[float, float]) -> tuple[dict[str, Any], np.ndarray[Any, Any]]:
+    """A click, pointed at: what was told, and where the clicked thing is in a picture of later, px off."""
+    frame = service.snapshot("navcam_left", fresh=True)
+    rover = service.hardware.simulation
+    assert rover is not None
+    point_m = rover.true_point("navcam_left", frame.sequence, pixel_px)
+    name = service.point(
+        PointRequest(PixelTarget("navcam_left", frame.frame_id, *pixel_px), pointings=2), {}
+    ).id
+    until_s = time.monotonic() + LONG_S
+    while service.operations.get(name).state in ("queued", "running"):
+        assert time.monotonic() < until_s, f"operation {name} still runs"
+        time.sleep(0.002)
+    told = service.operations.get(name).told()
+    assert told["state"] == "done", told.get("error")
+    service.clock.sleep(30.0)  # until nothing rings any more
+    later = service.snapshot("navcam_left", fresh=True)
+    return told, np.asarray(rover.true_pixel("navcam_left", later.sequence, point_m)) - AIM_PX
+
+
+def test_on_the_worst_day_the_second_pointing_lands_and_tells_the_truth() -> None:
+    with worst_day() as service:
+        for pixel_px in CLICKS:
+            told, truly_px = pointed(service, pixel_px)
+            assert np.abs(truly_px).max() < 0.3
+            assert np.abs(truly_px - told["residual_px"]).max() < 0.2
+
+
+def test_who_does_not_let_the_mast_settle_points_beside_and_is_told_another_residual() -> None:
+    with worst_day(settle_s=0.0) as service:
+        found = [pointed(service, pixel_px) for pixel_px in CLICKS]
+    assert max(np.abs(truly_px).max() for _, truly_px in found) > 0.6
+    assert max(np.abs(truly_px - told["residual_px"]).max() for told, truly_px in found) > 0.6
