@@ -28,7 +28,9 @@ class ClockSettings:
     offset_s
         How much later than the others' its first frame is exposed.
     drift_ppm
-        How much too fast its clock runs: it paces its frames and stamps them.
+        How much too fast its clock runs, which paces its frames.
+    own_stamps
+        Whether that clock stamps them too; else the host's does, as the kernel's for V4L2 cameras.
     stamped_late_s
         How much later than the exposure its stamps are; the negative of it is what the camera's ``offset_s``
         in a configuration should be.
@@ -36,6 +38,7 @@ class ClockSettings:
 
     offset_s: float = 0.0
     drift_ppm: float = 0.0
+    own_stamps: bool = True
     stamped_late_s: float = 0.0
 
 
@@ -55,7 +58,8 @@ class CameraClock:
     """Turns true times into stamps and back; both agree at ``start_s`` but for ``stamped_late_s``."""
 
     def __init__(self, settings: ClockSettings, start_s: float) -> None:
-        self._drift = 1e-6 * settings.drift_ppm
+        self._pace = 1 + 1e-6 * settings.drift_ppm
+        self._drift = 1e-6 * settings.drift_ppm if settings.own_stamps else 0.0
         self._late_s = settings.stamped_late_s
         self._start_s = start_s
         self.first_s = start_s + settings.offset_s
@@ -63,7 +67,7 @@ class CameraClock:
 
     def true_period_s(self, period_s: float) -> float:
         """Return how long a period by this clock truly is."""
-        return period_s / (1 + self._drift)
+        return period_s / self._pace
 
     def stamp_s(self, true_s: float) -> float:
         """Return what stands on a frame of a moment."""

@@ -146,14 +146,16 @@ def spread(px: Offs) -> tuple[float, float]:
 def of_the_clocks(
     settings: SimulationSettings, rig: Rig, passed_s: float, cameras: Mapping[str, Any]
 ) -> Iterator[Row]:
-    """Stamps at their word, and corrected by the configuration's offset_s."""
+    """What stamps are off by if the cameras' clocks make them, without and with offset_s; and as it is."""
     turning = {pair: TURNING_RAD_PER_S * px_per_rad(rig, pair) for pair in PAIRS}
-    for how, corrected in (("stamps at their word", False), ("with offset_s", True)):
+    cases = (("own stamps", True, False), ("own stamps, offset_s", True, True), ("offset_s", False, True))
+    for how, by_own, corrected in cases:
         cells: dict[str, tuple[float, float]] = {}
         for pair in PAIRS:
             late_s = []
             for name in rig.stereo[pair]:
-                clock = CameraClock(settings.clocks.get(name, ClockSettings()), 0.0)
+                own = settings.clocks.get(name, ClockSettings())
+                clock = CameraClock(replace(own, own_stamps=True) if by_own else own, 0.0)
                 offset_s = cameras[name].offset_s if corrected else 0.0
                 late_s.append(clock.stamp_s(passed_s) + offset_s - passed_s)
             cells[pair] = spread(np.array(late_s) * turning[pair])

@@ -14,13 +14,14 @@ import pytest
 from calib.rigid import Rigid
 from drivers.camera_offset import corrected
 from drivers.clock import ManualClock
-from drivers.errors import BadOptions, NoFreshFrame
+from drivers.errors import BadFrame, BadOptions, NoFreshFrame
 from drivers.pairing import Pairing, learned
 from drivers.sim.camera_clock import CameraClock, ClockSettings
 from drivers.sim.render import Renderer
 from drivers.sim.rover import SimulatedRover, simulation_settings
 from drivers.sim.scene import Scene
 from drivers.sim.warmth import STEP_K, TemperatureSettings
+from mastctl.devices.frames import checked
 
 pytestmark = pytest.mark.usefixtures("one_scene")
 
@@ -102,6 +103,18 @@ class Began:
     def __init__(self, frame: Any) -> None:
         self.sequence = frame.sequence
         self.exposure_began_s = frame.mid_exposure_s - frame.exposure_s / 2
+
+
+def test_stamps_ahead_of_the_host_are_refused_and_the_hosts_own_are_not(small_rig: Path) -> None:
+    fast = {LEFT: {"drift_ppm": 78}, RIGHT: {"drift_ppm": 78, "own_stamps": False}}
+    device, clock = rover(small_rig, clocks=fast)
+    clock.advance(600.0)
+    asked_s = clock.now_s() - 0.2
+    left, right = (device.cameras[name].next_frame(asked_s, 1.0) for name in (LEFT, RIGHT))
+    assert checked(right, RIGHT, (256, 192), asked_s, clock.now_s()).sequence == right.sequence
+    assert right.mid_exposure_s == device.frame_truth(RIGHT, right.sequence).mid_exposure_s
+    with pytest.raises(BadFrame, match=r"stamped to end 0\.0\d+ s in the future"):
+        checked(left, LEFT, (256, 192), asked_s, left.mid_exposure_s - 78e-6 * 600 + 0.03)
 
 
 @pytest.mark.parametrize("drift_ppm", [-500.0, -37.0, 0.0, 37.0, 500.0])
