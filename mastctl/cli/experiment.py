@@ -16,6 +16,7 @@ from mastctl.cli.experiment_common import (
     tell_report,
 )
 from mastctl.cli.places import check_folder
+from mastctl.cli.tasks import add_task_options, refuse_task_options, results_of
 
 if TYPE_CHECKING:
     from mastctl.client import Client
@@ -24,6 +25,7 @@ if TYPE_CHECKING:
 
 DEFAULT_TARGETS = 10
 DEFAULT_DISTANCES_M = (10.0, 6.0, 2.0)
+HEADS = ("ptu_d46_70", "dynamixel_x", "ph42")
 
 
 def add_commands(subparsers: Any) -> None:
@@ -41,6 +43,14 @@ def add_commands(subparsers: Any) -> None:
         "--distances", type=output.positive_number, nargs="+", default=list(DEFAULT_DISTANCES_M), metavar="M",
         help="ranges in metres (default 10 6 2)",
     )  # fmt: skip
+    pointing.add_argument(
+        "--simulated", action="store_true",
+        help="on the packaged simulated rover, a fresh one for each target, compared with the truth",
+    )  # fmt: skip
+    pointing.add_argument(
+        "--head", choices=HEADS, help="with --simulated: the simulated head (default ptu_d46_70)"
+    )
+    add_task_options(pointing)
     pointing.set_defaults(run=run_pointing)
     from mastctl.cli import experiment_approach, experiment_calibration, experiment_handoff
 
@@ -55,7 +65,7 @@ def add_commands(subparsers: Any) -> None:
         help="a simulated rig of one's own, with its own seed; --seed then chooses views and pixels only",
     )  # fmt: skip
     demo.add_argument(
-        "--head", choices=("ptu_d46_70", "dynamixel_x", "ph42"),
+        "--head", choices=HEADS,
         help="simulated head (default ptu_d46_70; dynamixel_x behind --wire dynamixel)",
     )  # fmt: skip
     demo.add_argument(
@@ -90,12 +100,43 @@ def _add_common(parser: argparse.ArgumentParser, out_help: str) -> None:
 
 
 def run_pointing(args: argparse.Namespace) -> int:
-    """Run the experiment on the daemon that --url or --config names."""
+    """Run the experiment on the daemon that --url or --config names, or on simulated rovers of its own."""
     from mastctl.cli.service import client_of
 
     check_folder(args.out, "--out")
+    if args.simulated:
+        return _run_simulated(args)
+    if args.head is not None:
+        raise output.WrongUse("--head belongs to --simulated; a running daemon has its own head")
+    refuse_task_options(args)
     with client_of(args) as client:
         return _report(args, _run(args, client, tuple(args.distances), None, ()))
+
+
+def _run_simulated(args: argparse.Namespace) -> int:
+    """Run each target on a simulated rover of its own."""
+    from mastctl.cli.experiment_simulated import PointingTask, Rover, joined_pointings, one_pointing
+    from mastctl.cli.service import refuse_daemon_options
+    from mastctl.experiment.pointing_report import PICTURES_PER_DISTANCE
+
+    refuse_daemon_options(args)
+    rover = Rover(args.head or HEADS[0], args.seed)
+    shown = PICTURES_PER_DISTANCE if args.out is not None else 0
+    tasks = [
+        PointingTask(rover, distance_m, index, index < shown)
+        for distance_m in dict.fromkeys(args.distances)
+        for index in range(args.targets)
+    ]
+    parts = results_of(
+        args,
+        "pointing",
+        one_pointing,
+        tasks,
+        lambda task: f"{task.distance_m:g} m, target {task.index}",
+        lambda part: part.records[0].error,
+        found=lambda part: _residuals(part.records[0]),
+    )
+    return 0 if parts is None else _report(args, joined_pointings(parts))
 
 
 def run_demo(args: argparse.Namespace) -> int:

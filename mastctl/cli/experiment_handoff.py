@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import argparse
 import sys
-from contextlib import ExitStack
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -15,8 +13,6 @@ from mastctl.cli import output
 if TYPE_CHECKING:
     from mastctl.client import Client
     from mastctl.experiment.handoff_record import HandoffExperiment, HandoffRecord
-    from mastctl.experiment.known_points import KnownPoints
-    from mastctl.experiment.pointing import ClickTruth
 
 PICTURES_PER_STEP = 4
 TARGETS = {"ground": "textured ground", "corner": "bricks' corners", "face": "middles of bricks' faces"}
@@ -28,6 +24,7 @@ def add_parser(kinds: Any) -> None:
     """Add ``handoff`` to the experiments."""
     from mastctl.cli.experiment_common import add_run_options, at_least_one
     from mastctl.cli.service import add_daemon_options
+    from mastctl.cli.tasks import add_task_options
 
     parser = kinds.add_parser(
         "handoff",
@@ -36,7 +33,7 @@ def add_parser(kinds: Any) -> None:
     add_daemon_options(parser)
     parser.add_argument(
         "--simulated", action="store_true",
-        help="start the packaged simulated rover for it, and compare with the truth",
+        help="on the packaged simulated rover, a fresh one for each target, compared with the truth",
     )  # fmt: skip
     parser.add_argument(
         "--mast-file", type=Path, metavar="MAST.yaml",
@@ -57,6 +54,7 @@ def add_parser(kinds: Any) -> None:
     )  # fmt: skip
     out_help = "folder for report.html, targets.csv, handoffs.jsonl and record.json"
     add_run_options(parser, "chooses views and pixels", out_help)
+    add_task_options(parser)
     parser.set_defaults(run=run)
 
 
@@ -64,49 +62,67 @@ def run(args: argparse.Namespace) -> int:
     """Run the experiment; 1 if no target at all was handed over."""
     from mastctl.cli.places import check_folder
     from mastctl.cli.service import client_of
+    from mastctl.cli.tasks import refuse_task_options
 
     if args.mast_file is not None and not args.simulated:
         raise output.WrongUse("--mast-file belongs to --simulated; a running daemon has its own mast file")
     if args.bricks is not None and not (args.simulated and args.bricks <= MOST_BRICKS):
         raise output.WrongUse(f"--bricks {args.bricks}: 1 to {MOST_BRICKS} are possible, with --simulated")
     check_folder(args.out, "--out")
-    with ExitStack() as stack:
-        if args.simulated:
-            client, truth, points = _simulated(args, stack)
-        else:
-            client, truth, points = stack.enter_context(client_of(args)), None, None
-        experiment = _run(args, client, truth, points)
-    return _tell(args, experiment)
+    if args.simulated:
+        return _run_simulated(args)
+    refuse_task_options(args)
+    with client_of(args) as client:
+        return _tell(args, _run(args, client))
 
 
-def _simulated(args: argparse.Namespace, stack: ExitStack) -> tuple[Client, ClickTruth, KnownPoints | None]:
-    """The packaged simulated rover behind a daemon on a free port, with its bricks if they are asked for."""
-    from mastctl.cli.experiment_common import simulated_daemon
+def _run_simulated(args: argparse.Namespace) -> int:
+    """Run each target on a simulated rover of its own; bricks, all of a step on one."""
+    from calib.files.mast_file import load_rig
+    from mastctl.cli.experiment_simulated import HandoffTask, Rover, joined_handoffs, one_handoff
+    from mastctl.cli.service import refuse_daemon_options
+    from mastctl.cli.tasks import results_of
     from mastctl.config import load_config
-    from mastctl.experiment.demo import SimulationTruth, demo_config
-    from mastctl.experiment.known_points import BrickPoints
+    from mastctl.experiment.handoff import STEPS
 
-    config = demo_config(load_config(None), head="ptu_d46_70", seed=args.seed, bricks=args.bricks or 0)
-    if args.mast_file is not None:
-        config = replace(config, mast_file=args.mast_file)
-    daemon, client = stack.enter_context(simulated_daemon(args, config))
-    rover = daemon.hardware.simulation
-    assert rover is not None  # the packaged configuration is a simulated rover
-    points = BrickPoints(rover) if args.bricks else None
-    return client, SimulationTruth(rover), points
+    refuse_daemon_options(args)
+    stereo = load_rig(args.mast_file or load_config(None).mast_file).rig.stereo
+    sources = [source for source, to, _ in STEPS if {source, to} <= set(stereo)]
+    if not sources:
+        raise output.CommandError(
+            "no_handoff", f"{args.mast_file} has neither pancam and navcam nor navcam and hazcam pairs"
+        )
+    mast_file = None if args.mast_file is None else args.mast_file.read_bytes()
+    rover = Rover("ptu_d46_70", args.seed, args.bricks or 0, mast_file)
+    shown = PICTURES_PER_STEP if args.out is not None else 0
+    if args.bricks:
+        most = args.targets or MOST_POINTS * args.bricks
+        tasks = [HandoffTask(rover, source, 0, args.click_px, most, shown) for source in sources]
+    else:
+        tasks = [
+            HandoffTask(rover, source, index, args.click_px, pictures=int(index < shown))
+            for source in sources
+            for index in range(args.targets or 10)
+        ]
+    parts = results_of(
+        args,
+        "hand-off",
+        one_handoff,
+        tasks,
+        lambda task: f"from {task.source}, " + ("all bricks" if args.bricks else f"target {task.index}"),
+        lambda part: next((record.error for record in part.records if record.error), ""),
+    )
+    return 0 if parts is None else _tell(args, joined_handoffs(parts))
 
 
-def _run(
-    args: argparse.Namespace, client: Client, truth: ClickTruth | None, points: KnownPoints | None
-) -> HandoffExperiment:
-    """Run with a progress bar on stderr, one step a target."""
+def _run(args: argparse.Namespace, client: Client) -> HandoffExperiment:
+    """Run on a running daemon, with a progress bar on stderr, one step a target."""
 
     from mastctl.cli.experiment_common import run_bar
     from mastctl.experiment.handoff import STEPS, run_handoff_experiment
 
-    targets = args.targets or (MOST_POINTS * args.bricks if args.bricks else 10)
-    total = None if args.bricks else targets * len(STEPS)  # how many points show is not known before
-    with run_bar(args, "hand-off", total) as step:
+    targets = args.targets or 10
+    with run_bar(args, "hand-off", targets * len(STEPS)) as step:
 
         def show(record: HandoffRecord) -> None:
             where = f"{record.step}, target {record.index}"
@@ -117,8 +133,6 @@ def _run(
             targets=targets,
             seed=args.seed,
             click_px=args.click_px,
-            truth=truth,
-            points=points,
             on_target=show,
             pictures=PICTURES_PER_STEP if args.out is not None else 0,
         )

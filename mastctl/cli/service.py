@@ -162,6 +162,13 @@ def _snapshot(args: argparse.Namespace) -> int:
     return 0
 
 
+def refuse_daemon_options(args: argparse.Namespace) -> None:
+    """Refuse --url and --config beside --simulated, which asks no running daemon."""
+    for option in ("url", "config"):
+        if getattr(args, option) is not None:
+            raise WrongUse(f"--{option} names a running daemon; --simulated starts rovers of its own")
+
+
 @contextmanager
 def client_of(args: argparse.Namespace) -> Iterator[Client]:
     """A client of the daemon that the options name."""

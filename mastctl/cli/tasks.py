@@ -42,6 +42,23 @@ def add_task_options(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
 
 
+def refuse_task_options(args: argparse.Namespace) -> None:
+    """Refuse the options of tasks for a running daemon: it is one mast, whose targets come one by one."""
+    given = {
+        "--executor": args.executor != "local",
+        "--workers": args.workers is not None,
+        "--results": args.results is not None,
+        "--list-tasks": args.list_tasks,
+        "--task": bool(args.task),
+    }
+    for option, used in given.items():
+        if used:
+            raise output.WrongUse(
+                f"{option} belongs to --simulated, which runs simulated rovers of its own; a running daemon "
+                "is one mast, and its targets come one after another"
+            )
+
+
 def results_of(
     args: argparse.Namespace,
     what: str,
@@ -50,6 +67,7 @@ def results_of(
     label: Callable[[Task], str],
     failure: Callable[[Result], str] = lambda _: "",
     done: Callable[[Result], None] = lambda _: None,
+    found: Callable[[Result], str] = lambda _: "",
 ) -> list[Result] | None:
     """Run a command's tasks as its options say, with a progress bar on stderr.
 
@@ -63,6 +81,8 @@ def results_of(
         Why a result is a failure, which is then told as it comes; empty if it is none.
     done
         Called with each result as it comes, in any order.
+    found
+        What a result is worth a line for, if it is no failure; empty for none.
 
     Returns
     -------
@@ -88,7 +108,8 @@ def results_of(
 
     def tell(task: Task, result: Result) -> None:
         why = failure(result)
-        step("", why and f"{label(task)}: {why}")
+        told = found(result)
+        step("", why and f"{label(task)}: {why}", told and f"{label(task)}: {told}")
         done(result)
 
     with run_bar(args, what, len(set(work.ids))) as step:

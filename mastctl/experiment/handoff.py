@@ -9,7 +9,7 @@ the refined pixel stands in for it.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -51,6 +51,8 @@ def run_handoff_experiment(
     points: KnownPoints | None = None,
     on_target: Callable[[HandoffRecord], None] | None = None,
     pictures: int = 0,
+    first: int = 0,
+    chosen: Sequence[str] | None = None,
 ) -> HandoffExperiment:
     """Run the paper's two hand-offs and return the record.
 
@@ -61,7 +63,7 @@ def run_handoff_experiment(
     targets
         Targets of each step; with ``points``, no more of them than that.
     seed
-        Chooses views, pixels and the noise of clicks.
+        Chooses views, pixels and the noise of clicks; each target has its own draw, whatever came before it.
     click_px
         Sigma of the noise that is added to both clicks, each axis, as a person would make it.
     truth
@@ -73,6 +75,10 @@ def run_handoff_experiment(
     pictures
         How many targets of each step keep their images for the report; with ``points``, all those of so many
         views.
+    first
+        The number of the first target of each step; without ``points``.
+    chosen
+        Only the steps from these pairs.
 
     Raises
     ------
@@ -82,14 +88,14 @@ def run_handoff_experiment(
     clock = RunTime(client)
     status = client.status()
     rig = parse_rig(client.mast_file(), "the daemon's mast file").rig
-    steps = [step for step in STEPS if all(_served(rig, status, pair) for pair in step[:2])]
+    wanted = [step for step in STEPS if chosen is None or step[0] in chosen]
+    steps = [step for step in wanted if all(_served(rig, status, pair) for pair in step[:2])]
     if not steps:
         raise ClientError(
             "no_handoff",
             "the daemon serves neither pancam and navcam nor navcam and hazcam pairs to hand over between",
         )
     calibration = stored_covariance(rig)
-    rng = np.random.default_rng(seed)
     records: list[HandoffRecord] = []
     for source, to, distance_m in steps:
         bench = _Bench(
@@ -98,14 +104,18 @@ def run_handoff_experiment(
             (source, to),
             distance_m,
             status["limits"],
-            rng,
+            seed,
             click_px,
             truth,
             points,
             calibration,
             clock,
         )
-        found = bench.known(points, targets, pictures) if points else bench.chosen(targets, pictures)
+        found = (
+            bench.known(points, targets, pictures)
+            if points
+            else bench.chosen(range(first, first + targets), pictures)
+        )
         for record in found:
             records.append(record)
             if on_target is not None:
@@ -141,7 +151,7 @@ class _Bench:
         pairs: tuple[str, str],
         distance_m: float,
         limits: Mapping[str, Any],
-        rng: np.random.Generator,
+        seed: int,
         click_px: float,
         truth: ClickTruth | None,
         points: KnownPoints | None,
@@ -154,16 +164,25 @@ class _Bench:
         self._rig = rig
         self._source, self._to = (rig.stereo[pair] for pair in pairs)
         self._distance_m = distance_m
-        self._rng = rng
+        self._seed = seed
         self._click_px = click_px
         self._truth = truth
         self._points = points
         self._calibration = calibration
-        self._views = Views(client, rig, self._source, limits, rng, PAN_RANGE_RAD[pairs[0]])
+        self._limits = limits
+        self._pan_range_rad = PAN_RANGE_RAD[pairs[0]]
+        self._draw_for(0)
 
-    def chosen(self, targets: int, pictures: int) -> Iterator[HandoffRecord]:
+    def _draw_for(self, number: int) -> None:
+        """Begin the draw of a target, or of a view of known points."""
+        self._rng = np.random.default_rng([self._seed, round(1000 * self._distance_m), number])
+        self._views = Views(
+            self._client, self._rig, self._source, self._limits, self._rng, self._pan_range_rad
+        )
+
+    def chosen(self, numbers: Sequence[int], pictures: int) -> Iterator[HandoffRecord]:
         """Hand over textured ground at the distance; the first few records keep their pictures."""
-        for index in range(targets):
+        for index in numbers:
             record = self._one_target(index, pictures > 0)
             pictures -= record.source_image is not None
             yield record
@@ -180,9 +199,10 @@ class _Bench:
             if abs(away_m - self._distance_m) <= KNOWN_SLACK * self._distance_m:
                 groups.setdefault(point.group, []).append(point)
         index = 0
-        for group in groups.values():
+        for number, group in groups.items():
             if index == targets:
                 return
+            self._draw_for(number)
             begun_s = self._clock.now_s()
             try:
                 pair = self._views.look_at(np.mean([point.position_m for point in group], axis=0))
@@ -227,6 +247,7 @@ class _Bench:
     def _one_target(self, index: int, with_pictures: bool) -> HandoffRecord:
         """Find one target, hand it over, and return the record of it."""
         begun_s = self._clock.now_s()
+        self._draw_for(index)
         reason = f"no textured target found at {self._distance_m:g} m in {VIEWS_PER_TARGET} views"
         for _ in range(VIEWS_PER_TARGET):
             try:

@@ -55,6 +55,7 @@ def run_pointing_experiment(
     notes: Sequence[str] = (),
     on_target: Callable[[TargetRecord], None] | None = None,
     pictures: int = 0,
+    first: int = 0,
 ) -> PointingExperiment:
     """Run the experiment and return its record.
 
@@ -67,7 +68,8 @@ def run_pointing_experiment(
     distances_m
         Ranges from the camera to the ground where targets are looked for.
     seed
-        Chooses views and pixels; the same seed asks for the same views.
+        Chooses views and pixels; the same seed asks for the same views. Each target has a draw of its own,
+        whatever came before it.
     truth
         Where the click really is in a later frame; only a simulation knows.
     notes
@@ -76,6 +78,8 @@ def run_pointing_experiment(
         Called after each target, failed or not.
     pictures
         How many targets of each distance keep their images in the record, for the report.
+    first
+        The number of the first target at each distance.
 
     Raises
     ------
@@ -87,13 +91,13 @@ def run_pointing_experiment(
     rig = parse_rig(client.mast_file(), "the daemon's mast file").rig
     pair = head_pair(rig, set(status["cameras"]))
     aim_px = rig.cameras[pair[0]].model.image_center_px
-    bench = _Bench(client, rig, pair, status["limits"], np.random.default_rng(seed), truth, clock)
+    bench = _Bench(client, rig, pair, status["limits"], seed, truth, clock)
     records: list[TargetRecord] = []
     summaries = []
     for distance_m in distances_m:
         distance_begun_s = clock.now_s()
         rows: list[TargetRecord] = []
-        for index in range(targets):
+        for index in range(first, first + targets):
             wanted = sum(bool(row.landed_images) for row in rows) < pictures
             record = bench.one_target(distance_m, index, wanted)
             rows.append(record)
@@ -128,7 +132,7 @@ def head_pair(rig: Rig, served: set[str]) -> tuple[str, str]:
 
 
 class _Bench:
-    """The running experiment: the daemon, the rig as the daemon believes it, the dice."""
+    """The running experiment: the daemon, the rig as the daemon believes it, the seed."""
 
     def __init__(
         self,
@@ -136,7 +140,7 @@ class _Bench:
         rig: Rig,
         pair: tuple[str, str],
         limits: Mapping[str, Any],
-        rng: np.random.Generator,
+        seed: int,
         truth: ClickTruth | None,
         clock: RunTime,
     ) -> None:
@@ -144,16 +148,19 @@ class _Bench:
         self._client = client
         self._rig = rig
         self._pair = pair
-        self._views = Views(client, rig, pair, limits, rng, PAN_RANGE_RAD)
+        self._limits = limits
+        self._seed = seed
         self._truth = truth
 
     def one_target(self, distance_m: float, index: int, with_pictures: bool) -> TargetRecord:
         """Find one target at the distance, point at it twice, and return the record of it."""
         begun_s = self._clock.now_s()
+        rng = np.random.default_rng([self._seed, round(1000 * distance_m), index])
+        views = Views(self._client, self._rig, self._pair, self._limits, rng, PAN_RANGE_RAD)
         reason = ""
         for _ in range(VIEWS_PER_TARGET):
             try:
-                target = self._views.find_target(distance_m)
+                target = views.find_target(distance_m)
             except ClientError as error:
                 reason = f"looking for a target: {error}"
                 break

@@ -52,6 +52,10 @@ class OtherProgram(MastctlError):
     exit_code = 2
 
 
+class _Broke(Exception):
+    """What went wrong in a task, in words."""
+
+
 class Work(Generic[Task, Result]):
     """Tasks of one function, which decides by a task's value alone what it comes to.
 
@@ -150,7 +154,7 @@ class Work(Generic[Task, Result]):
             name, first = failed[0]
             raise TaskFailed(
                 f"{len(failed)} of {len(todo)} tasks failed; task {name} ({self.label(todo[name])}): "
-                f"{type(first).__name__}: {first}"
+                f"{first if isinstance(first, _Broke) else repr(first)}"
             ) from first
 
 
@@ -203,7 +207,10 @@ def _one(function: Callable[[Task], Result], task: Task, program: str) -> Result
             f"the worker on {socket.gethostname()} runs another program ({here}) than this one ({program}); "
             "install the same version of everything there"
         )
-    return function(task)
+    try:
+        return function(task)
+    except Exception as error:  # not every error survives the way between processes; its words do
+        raise _Broke(f"{type(error).__name__}: {error}") from error
 
 
 def program_of(function: Callable[..., Any]) -> str:

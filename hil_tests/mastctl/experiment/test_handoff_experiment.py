@@ -254,7 +254,7 @@ def test_an_experiment_without_any_target_says_so(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     nothing = HandoffExperiment({"hardware": "simulated"}, 1, 0.2, (), (), "now", 3.0)
-    monkeypatch.setattr(experiment_handoff, "_run", lambda args, client, truth, points: nothing)
+    monkeypatch.setattr(experiment_handoff, "_run", lambda args, client: nothing)
     out = tmp_path / "report"
     assert main(["experiment", "handoff", "--out", str(out)]) == 1
     told = capsys.readouterr().out.splitlines()
