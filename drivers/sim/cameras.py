@@ -10,7 +10,9 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -21,36 +23,13 @@ from drivers.errors import NoFreshFrame, NoReply
 from drivers.faults import Fault, FaultPanel
 from drivers.interfaces import Frame, FrameTime, Image
 from drivers.sim.camera_clock import CameraClock, ClockSettings
+from drivers.sim.camera_settings import CameraSettings
+from drivers.sim.optics.exposure import AutoExposure, FixedExposure, Shot
+from drivers.sim.optics.readout import Readout
 from drivers.sim.sensor import Noise
 
 RING_FRAMES = 4
 """Finished frames that can still be fetched, as in a capture ring of four buffers."""
-
-
-@dataclass(frozen=True)
-class CameraSettings:
-    """How a simulated camera takes pictures.
-
-    Attributes
-    ----------
-    rate_hz
-        Frames a second.
-    exposure_s, readout_s
-        Exposure time, and the time from its end until the frame can be had.
-    read_noise_dn
-        Standard deviation of the noise in the dark, grey levels of 0..255.
-    shot_noise_dn
-        Standard deviation that light adds at mid grey (128); grows as the root of the grey level.
-    seed
-        Of the noise; with the camera's name and the sequence number it fixes every pixel.
-    """
-
-    rate_hz: float = 10.0
-    exposure_s: float = 0.008
-    readout_s: float = 0.02
-    read_noise_dn: float = 1.0
-    shot_noise_dn: float = 1.7
-    seed: int = 1
 
 
 @dataclass(frozen=True)
@@ -87,8 +66,8 @@ class SimulatedCamera:
     size_px
         (width, height).
     expose
-        ``expose(begin_s, exposure_s)`` gives the noise-free float32 (h, w) picture of an exposure; one that
-        it keeps is read-only.
+        ``expose(begin_s, exposure_s)`` gives the noise-free float32 (h, w) picture of an exposure, whose
+        first row begins then; one that it keeps is read-only.
     taken
         ``taken(sequence, mid_exposure_s)`` is told of every frame that is handed out, before it is.
     clock
@@ -126,9 +105,11 @@ class SimulatedCamera:
         self._epochs = [_Epoch(self._own.first_s, 0, self._own.true_period_s(1 / settings.rate_hz))]
         self._last: Frame | None = None
         self._frozen: tuple[Fault, Image] | None = None
-        self._noise = Noise(settings.read_noise_dn, settings.shot_noise_dn, settings.seed, name)
-        nothing = np.empty((0, 0), np.float32)
-        self._light = (nothing, nothing)  # of the last picture at rest, and its noise
+        noise = Noise(settings.read_noise_dn, settings.shot_noise_dn, settings.seed, name)
+        self._readout = Readout(noise, settings.colour, settings.jpeg_quality)
+        self._rolling_s = (size_px[1] - 1) * settings.row_time_s
+        self._exposure: FixedExposure | AutoExposure
+        self._exposure = FixedExposure(settings.exposure, settings.exposure_s, start_s)
         self._closed = threading.Event()
 
     def next_frame(self, exposed_after_s: float, timeout_s: float) -> Frame:
@@ -213,7 +194,7 @@ class SimulatedCamera:
         """How long after its exposure begins a frame can be had."""
         delayed = self._faults.find(self.name, "delayed", now_s)
         late_s = delayed.number("delay_s") if delayed else 0.0
-        return self._settings.exposure_s + self._settings.readout_s + late_s
+        return self._rolling_s + self._exposure.longest_s + self._settings.readout_s + late_s
 
     def _is_missing(self, sequence: int, epoch: _Epoch) -> bool:
         """Whether a fault keeps this frame from coming at all."""
@@ -230,46 +211,44 @@ class SimulatedCamera:
         """Take the picture, once."""
         with self._lock:
             if self._last is None or self._last.sequence != sequence:
-                begin_s, exposure_s = epoch.begin_s(sequence), self._settings.exposure_s
-                image = self._picture(sequence, epoch)
+                shot = self._shot(sequence, epoch)
+                image = self._picture(sequence, epoch, shot)
                 image.setflags(write=False)
-                stamp_s = self._own.stamp_s(begin_s) + exposure_s / 2
-                self._last = Frame(image, sequence, stamp_s, exposure_s)
-                self._taken(sequence, begin_s + exposure_s / 2)
+                begin_s, all_rows_s = epoch.begin_s(sequence), shot.exposure_s + self._rolling_s
+                stamp_s = self._own.stamp_s(begin_s) + all_rows_s / 2
+                self._last = Frame(image, sequence, stamp_s, all_rows_s)
+                self._taken(sequence, begin_s + all_rows_s / 2)
             return self._last
 
-    def _picture(self, sequence: int, epoch: _Epoch) -> Image:
+    def _shot(self, sequence: int, epoch: _Epoch) -> Shot:
+        """Exposure time and gain of a frame."""
+        return self._exposure.shot(sequence, epoch.begin_s(sequence), epoch.period_s)
+
+    def _picture(self, sequence: int, epoch: _Epoch, shot: Shot) -> Image:
         """The picture of an exposure, as a fault leaves it."""
         begin_s = epoch.begin_s(sequence)
         if fault := self._faults.find(self.name, "frozen", begin_s):
             if self._frozen is None or self._frozen[0] is not fault:
                 before = epoch.after(fault.begin_s) - 1
-                self._frozen = (fault, self._healthy(before, epoch.begin_s(before)))
+                self._frozen = (fault, self._healthy(before, epoch, self._shot(before, epoch)))
             return self._frozen[1].copy()
         if fault := self._faults.find(self.name, "garbage", begin_s):
             generator = np.random.default_rng([int(fault.number("seed")), sequence])
-            return generator.integers(0, 256, self._size_px[::-1], dtype=np.uint8)
+            shape = (*self._size_px[::-1], 3) if self._settings.colour else self._size_px[::-1]
+            return generator.integers(0, 256, shape, dtype=np.uint8)
         if self._faults.find(self.name, "dark", begin_s):
-            return self._noisy(np.zeros(self._size_px[::-1], np.float32), sequence)
-        image = self._healthy(sequence, begin_s)
+            return self._readout.picture(np.zeros(self._size_px[::-1], np.float32), sequence, shot)
+        image = self._healthy(sequence, epoch, shot)
         if fault := self._faults.find(self.name, "wrong", begin_s):
             shift = np.array([[1, 0, fault.number("dx_px")], [0, 1, fault.number("dy_px")]])
             shifted = cv2.warpAffine(image, shift, self._size_px, borderMode=cv2.BORDER_REPLICATE)
             return np.asarray(shifted, dtype=np.uint8)
         return image
 
-    def _healthy(self, sequence: int, begin_s: float) -> Image:
+    def _healthy(self, sequence: int, epoch: _Epoch, shot: Shot) -> Image:
         """The picture without faults."""
-        return self._noisy(self._expose(begin_s, self._settings.exposure_s), sequence)
-
-    def _noisy(self, clean: NDArray[np.float32], sequence: int) -> Image:
-        """Read and shot noise, rounded to grey levels; the same for the same seed, camera and sequence."""
-        light, sigma_dn = self._light
-        if light is not clean:
-            sigma_dn = self._noise.sigma_dn(clean)
-            if not clean.flags.writeable:  # a head at rest gives the same array again and again
-                self._light = (clean, sigma_dn)
-        return self._noise.levels(clean, sigma_dn, sequence)
+        light = self._expose(epoch.begin_s(sequence), shot.exposure_s)
+        return self._readout.picture(light, sequence, shot)
 
     def _instead(self, exposed_after_s: float, timeout_s: float) -> str:
         """What to say when no fresh frame came."""
@@ -286,3 +265,27 @@ class SimulatedCamera:
             return f"{message}; none came at all"
         age_s = exposed_after_s - (self._last.mid_exposure_s - self._last.exposure_s / 2)
         return f"{message}; the last one is frame {self._last.sequence}, exposed {age_s:.3f} s before"
+
+
+class SelfExposedCamera(SimulatedCamera):
+    """One with an automatic exposure, also a ``drivers.interfaces.HoldsExposure``.
+
+    Parameters
+    ----------
+    metered
+        ``metered(time_s)``: a coarse noise-free picture of the moment.
+    others
+        As `SimulatedCamera` takes them.
+    """
+
+    def __init__(self, metered: Callable[[float], NDArray[np.float32]], *others: Any) -> None:
+        super().__init__(*others)
+        settings, start_s = self._settings, self._epochs[0].start_s
+        self._automatic = AutoExposure(
+            settings.exposure, settings.exposure_s, start_s, metered, self._clock.now_s
+        )
+        self._exposure = self._automatic
+
+    def exposure_held(self) -> AbstractContextManager[None]:
+        """Return a context in which the exposure does not change."""
+        return self._automatic.held()

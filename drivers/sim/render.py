@@ -28,7 +28,7 @@ __all__ = ["Renderer", "Stills", "compile_renderer", "is_compiled"]
 
 Float32 = NDArray[np.float32]
 
-TABLES_KEPT = 12
+TABLES_KEPT = 24  # of six cameras: their own, one for motion and one for metering
 STILLS_KEPT = 12
 MAX_SAMPLES = 8
 
@@ -52,7 +52,13 @@ class Renderer:
         self._tables: OrderedDict[tuple[object, ...], RayTable] = OrderedDict()
         self._lock = threading.Lock()
 
-    def image(self, camera: CameraModel, site_from_camera_frame: Rigid, samples: int = 2) -> Float32:
+    def image(
+        self,
+        camera: CameraModel,
+        site_from_camera_frame: Rigid,
+        samples: int = 2,
+        rows: tuple[int, int] | None = None,
+    ) -> Float32:
         """Return the picture that ``camera`` takes of the scene.
 
         Parameters
@@ -64,6 +70,8 @@ class Renderer:
             Where that frame is. C must be above the ground, and within 32 m of the site's origin in x and y.
         samples
             Rays across a pixel, 1 to 8: each pixel is the mean of samples x samples rays.
+        rows
+            [first, last): what is wanted; of the other rows some are 0.
 
         Returns
         -------
@@ -88,9 +96,11 @@ class Renderer:
         height, width = table.rays.shape[:2]
         image = np.zeros((height, width), dtype=np.float32)
         rotation = np.array(site_from_camera_frame.rotation)
-        tiles = table.tile_beams.shape[0] * table.tile_beams.shape[1]
+        across, (first, last) = table.tile_beams.shape[1], rows or (0, height)
+        first, last = across * (first // TILE_PX), across * -(-last // TILE_PX)
         # short pieces, so that a worker with sky takes its share of ground too
-        edges = np.linspace(0, tiles, 8 * self._workers + 1).astype(int) if self._workers > 1 else [0, tiles]
+        parts = 8 * self._workers if self._workers > 1 else 1
+        edges = np.linspace(first, last, parts + 1).astype(int)
 
         def draw(k: int) -> None:
             self._kernels.render_tiles(

@@ -12,7 +12,8 @@ import threading
 from collections import OrderedDict
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -31,8 +32,11 @@ from drivers.faults import FaultPanel, nearest, read_script
 from drivers.interfaces import PanTilt
 from drivers.options import is_whole
 from drivers.sim.camera_clock import ClockSettings, clock_settings
-from drivers.sim.cameras import CameraSettings, SimulatedCamera
+from drivers.sim.camera_settings import CameraSettings, check_cameras
+from drivers.sim.cameras import SelfExposedCamera, SimulatedCamera
 from drivers.sim.kept_scenes import kept_scene
+from drivers.sim.optics.lens import Lens
+from drivers.sim.optics.shutter import Shutter
 from drivers.sim.pan_tilt import HeadSettings, SimulatedPanTilt, head_settings
 from drivers.sim.render import Renderer, Stills, compile_renderer
 from drivers.sim.scene import SceneSettings
@@ -52,6 +56,12 @@ BLUR_STEP_PX = 1.5
 
 BLUR_STEPS = 5
 """...but over no more than so many, of one ray a pixel, which take about as long as one still picture."""
+
+RESTS_RAD = 1e-7
+"""A head that turns less during a picture rests."""
+
+METER_PX = 32
+"""A pixel of what an automatic exposure sees is so many of the camera's along each side."""
 
 
 @dataclass(frozen=True)
@@ -134,15 +144,7 @@ def simulation_settings(section: Mapping[str, Any], folder: Path) -> SimulationS
     if not isinstance(faults, list | tuple):
         raise BadOptions(f"simulation.faults is {faults!r}, expected a list of {{device, word, ...}}")
     camera: CameraSettings = filled(CameraSettings(), section.get("cameras", {}), "simulation.cameras")
-    for f in fields(camera):
-        if getattr(camera, f.name) < 0:
-            raise BadOptions(
-                f"simulation.cameras.{f.name} is {getattr(camera, f.name)!r}, expected 0 or more"
-            )
-    if camera.rate_hz <= 0 or not 0 < camera.exposure_s < 1 / camera.rate_hz:
-        raise BadOptions(
-            f"simulation.cameras: exposure_s {camera.exposure_s:g} does not fit rate_hz {camera.rate_hz:g}"
-        )
+    check_cameras(camera, rows=1)
     scene = section.get("scene", {})
     if isinstance(scene, Mapping) and "seed" not in scene:
         scene = {**scene, "seed": seed}
@@ -217,6 +219,7 @@ class SimulatedRover:
             self.rig: Rig = load_rig(settings.rover).rig
         except BadFile as error:
             raise BadOptions(f"simulation.rover: {error}") from None
+        check_cameras(settings.camera, max(c.model.size_px[1] for c in self.rig.cameras.values()))
         self.settings = settings
         self.site_from_rover = Rigid.identity()
         for name in settings.clocks:
@@ -245,6 +248,12 @@ class SimulatedRover:
             self.pan_tilt, self._head = wired.pan_tilt, wired
         start_s = self._start_s = clock.now_s()
         self._right_eyes = {right for _, right in self.rig.stereo.values()}
+        self._lenses = {
+            name: Lens(settings.camera.lens, camera.model, name, settings.camera.seed, self.scene.cast)
+            for name, camera in self.rig.cameras.items()
+        }
+        self._through_lens: dict[str, tuple[NDArray[np.float32], NDArray[np.float32]]] = {}
+        self._metered_at: dict[str, tuple[Rigid, NDArray[np.float32]]] = {}
         self.cameras: Mapping[str, SimulatedCamera] = MappingProxyType(
             {name: self._camera(name, clock, start_s) for name in self.rig.cameras}
         )
@@ -336,19 +345,41 @@ class SimulatedRover:
         def taken(sequence: int, mid_exposure_s: float) -> None:
             self._remember(name, sequence, mid_exposure_s)
 
-        size_px = self.rig.cameras[name].model.size_px
+        settings, size_px = self.settings.camera, self.rig.cameras[name].model.size_px
         own = self.settings.clocks.get(name, ClockSettings())
-        return SimulatedCamera(
-            name, self.settings.camera, size_px, expose, taken, clock, self.faults, start_s, own
-        )
+        usual = (name, settings, size_px, expose, taken, clock, self.faults, start_s, own)
+        if settings.exposure.auto:
+            return SelfExposedCamera(partial(self._metered, name), *usual)
+        return SimulatedCamera(*usual)
 
     def _exposed(self, name: str, begin_s: float, exposure_s: float) -> NDArray[np.float32]:
-        """Render one exposure: one picture at its middle, or the mean along the head's way through it."""
-        steps = self._blur_steps(name, begin_s, exposure_s)
-        middle_s = begin_s + 0.5 * exposure_s
+        """The light of one exposure on the sensor.
+
+        One picture at its middle if nothing moves, or a smear, or the mean along the head's way through it.
+        """
+        settings = self.settings.camera
+        rolling_s = (self.rig.cameras[name].model.size_px[1] - 1) * settings.row_time_s
+        mid_s = begin_s + 0.5 * (rolling_s + exposure_s)
+        way_rad = self._way_rad(name, begin_s, rolling_s + exposure_s)
+        if way_rad <= RESTS_RAD:
+            return self._at_rest(name, mid_s)
+        if settings.smear or settings.row_time_s:
+            light = self._shutter(name, mid_s).light(begin_s, exposure_s, self.settings.samples)
+        else:
+            light = self._copies(name, begin_s, exposure_s, way_rad)
+        if light is None:
+            return self._at_rest(name, mid_s)
+        return self._lenses[name].through(light, self._pose(name, mid_s))
+
+    def _copies(
+        self, name: str, begin_s: float, exposure_s: float, way_rad: float
+    ) -> NDArray[np.float32] | None:
+        """The mean of a few renderings along the head's way; None if one is enough."""
+        model = self._model(name, begin_s + 0.5 * exposure_s)
+        focal_px = float(np.linalg.norm(np.cross(model.A, model.H)))
+        steps = min(BLUR_STEPS, max(1, math.ceil(way_rad * focal_px / BLUR_STEP_PX)))
         if steps == 1:
-            return self._still(name, middle_s)
-        model = self._model(name, middle_s)
+            return None
         total: NDArray[np.float32] | None = None
         for step in range(steps):
             pose = self._pose(name, begin_s + (step + 0.5) / steps * exposure_s)
@@ -357,6 +388,41 @@ class SimulatedRover:
             total = image if total is None else total + image
         assert total is not None
         return total / np.float32(steps)
+
+    def _shutter(self, name: str, time_s: float) -> Shutter:
+        """The shutter of a camera as it is at a moment."""
+
+        def draw(model: CameraModel, pose: Rigid, samples: int, rows: tuple[int, int]) -> NDArray[np.float32]:
+            with self._drawing(name):
+                return self._renderer.image(model, pose, samples, rows)
+
+        model, row_time_s = self._model(name, time_s), self.settings.camera.row_time_s
+        return Shutter(model, row_time_s, partial(self._pose, name), draw, self.scene.cast)
+
+    def _at_rest(self, name: str, time_s: float) -> NDArray[np.float32]:
+        """The picture of a moment through the lens, read-only; kept while nothing moves."""
+        still = self._still(name, time_s)
+        lens = self._lenses[name]
+        if lens.changes_nothing:
+            return still
+        kept = self._through_lens.get(name)
+        if kept is None or kept[0] is not still:
+            through = lens.through(still, self._pose(name, time_s))
+            through.setflags(write=False)
+            self._through_lens[name] = kept = (still, through)
+        return kept[1]
+
+    def _metered(self, name: str, time_s: float) -> NDArray[np.float32]:
+        """A coarse picture of a moment, as an automatic exposure sees it; kept while nothing moves."""
+        pose, kept = self._pose(name, time_s), self._metered_at.get(name)
+        if kept is None or kept[0] != pose:
+            camera = coarse(self.rig.cameras[name].model)
+            with self._drawing(name):
+                light = self._renderer.image(camera, pose, 1)
+            if not self._lenses[name].changes_nothing:
+                light *= self._lenses[name].transmission.mean()
+            self._metered_at[name] = kept = (pose, light)
+        return kept[1]
 
     def _still(self, name: str, time_s: float) -> NDArray[np.float32]:
         """The picture of a moment, read-only; drawn before, if the camera stood there before."""
@@ -397,19 +463,17 @@ class SimulatedRover:
                 raise NoFreshFrame("it is closed", device=name)
             yield
 
-    def _blur_steps(self, name: str, begin_s: float, exposure_s: float) -> int:
-        """How many renderings an exposure takes: 1 when the camera stands still."""
-        camera = self.rig.cameras[name]
-        if camera.on != "head":
-            return 1
+    def _way_rad(self, name: str, begin_s: float, length_s: float) -> float:
+        """How far a camera turns during a picture."""
+        if self.rig.cameras[name].on != "head":
+            return 0.0
         way_rad = 0.0
         pan, tilt = self.true_joints(begin_s)
         for part in (1 / 3, 2 / 3, 1.0):
-            next_pan, next_tilt = self.true_joints(begin_s + part * exposure_s)
+            next_pan, next_tilt = self.true_joints(begin_s + part * length_s)
             way_rad += math.hypot(next_pan - pan, next_tilt - tilt)
             pan, tilt = next_pan, next_tilt
-        focal_px = float(np.linalg.norm(np.cross(camera.model.A, camera.model.H)))
-        return min(BLUR_STEPS, max(1, math.ceil(way_rad * focal_px / BLUR_STEP_PX))) if way_rad > 1e-7 else 1
+        return way_rad
 
     def _remember(self, name: str, sequence: int, mid_exposure_s: float) -> None:
         """Keep the truth of a frame that is handed out."""
@@ -423,3 +487,15 @@ class SimulatedRover:
             frames[sequence] = truth
             while len(frames) > TRUTH_FRAMES:
                 frames.popitem(last=False)
+
+
+def coarse(camera: CameraModel) -> CameraModel:
+    """Return a camera of ``METER_PX`` times fewer pixels along each side with the same view."""
+    width, height = (max(4, side // METER_PX) for side in camera.size_px)
+    shrunk = [side / few for side, few in zip(camera.size_px, (width, height), strict=True)]
+    # The centre of the top-left pixel is (0, 0), so x = (x' + 0.5) / shrunk - 0.5.
+    h, v = (
+        vector / by + (0.5 / by - 0.5) * camera.A
+        for vector, by in zip((camera.H, camera.V), shrunk, strict=True)
+    )
+    return replace(camera, size_px=(width, height), H=h, V=v)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import fields, replace
+from dataclasses import fields, is_dataclass, replace
 from typing import Any
 
 from drivers.errors import BadOptions
@@ -21,13 +21,16 @@ def filled(defaults: Any, values: Any, key: str) -> Any:
         if name not in known:
             raise BadOptions(f"{key} has no key {name!r}{nearest(str(name), known)}")
         kind = type(known[name])
-        if kind in (int, float):
+        if is_dataclass(known[name]):
+            value = filled(known[name], value, f"{key}.{name}")
+        elif kind in (int, float):
             if not (is_whole(value) if kind is int else is_number(value)):
                 what = "a whole number" if kind is int else "a number"
                 raise BadOptions(f"{key}.{name} is {value!r}, expected {what}")
             value = kind(value)
         elif not isinstance(value, kind):
-            raise BadOptions(f"{key}.{name} is {value!r}, expected {kind.__name__}")
+            what = "true or false" if kind is bool else kind.__name__
+            raise BadOptions(f"{key}.{name} is {value!r}, expected {what}")
         changes[str(name)] = value
     return replace(defaults, **changes)
 

@@ -25,6 +25,7 @@ _FRAME_ID = re.compile(r"(.{1,100})-([0-9]{6,20})-([0-9a-f]{8})-([0-9a-f]{4})", 
 KEPT_FRAMES = 16  # per camera; six cameras of 1024x768 grey are 75 MB
 CLOCK_TOLERANCE_S = 0.005  # what a stamp may lie in the future: rounding, and a driver that estimates
 DARK_GREY = 8  # a picture whose brightest hundredth is below this shows nothing to correlate with
+SATURATED_GREY = 250  # nor does one whose darkest hundredth is above this
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,7 +72,7 @@ def checked(
     Raises
     ------
     BadFrame
-        If it is no frame, of another size, dark, or stamped in the future.
+        If it is no frame, of another size, dark, saturated, or stamped in the future.
     NoFreshFrame
         If its exposure began too early.
     """
@@ -102,10 +103,13 @@ def checked(
     if began_s <= exposed_after_s:
         words = f"the frame that came was exposed {exposed_after_s - began_s:.3f} s before the asked moment"
         raise NoFreshFrame(words, device=camera)
-    brightest = np.percentile(image[::8, ::8], 99)
+    darkest, brightest = np.percentile(image[::8, ::8], (1, 99))
     if brightest < DARK_GREY:
         words = f"the picture is dark: its brightest hundredth is at {brightest:.0f} of 255"
         raise BadFrame(words, device=camera)
+    if darkest >= SATURATED_GREY:
+        words = f"the picture is saturated: its darkest hundredth is at {darkest:.0f} of 255"
+        raise BadFrame(f"{words}; expose it for less time", device=camera)
     if image.flags.writeable or not image.flags.c_contiguous:
         # The driver may use its buffer again; one that hands over a read-only array is spared the copy.
         image = image.copy()

@@ -1,0 +1,201 @@
+"""How long a simulated camera exposes, with what gain, and the loop that sets both from the pictures.
+
+A camera's own automatic exposure sees each frame, asked for or not, and what it decides shows some frames
+later. It is metered here on a coarse picture without noise, so it is a function of where the camera looked.
+"""
+
+from __future__ import annotations
+
+import math
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from drivers.sim.optics.mesh import Float32
+
+FRAMES_KEPT = 64
+"""So many frames are metered at most to catch up with the present."""
+
+MOST_STEP = 4.0
+"""A loop changes by no more than this factor a frame."""
+
+
+@dataclass(frozen=True)
+class ExposureSettings:
+    """The ``exposure`` of every camera of a simulation.
+
+    Attributes
+    ----------
+    reference_s
+        The exposure time that gives the scene its own brightness, at gain 1; grey levels grow with time and
+        gain. 0: they do not.
+    gain
+        Of a fixed exposure.
+    auto
+        Whether the camera sets time and gain itself, from ``exposure_s`` on.
+    target_dn
+        The mean grey level that it is after.
+    share
+        Of the way there, in its logarithm, that a frame's decision goes.
+    lag_frames
+        From the frame that is metered to the first one with what was decided.
+    shortest_s, longest_s
+        Bounds of the time; gain rises where the longest is too short.
+    most_gain
+        Bound of the gain.
+    day_s, night_share
+        Length of a day that the run begins at noon of, and the brightness of midnight over that of noon; 0:
+        it stays noon.
+    """
+
+    reference_s: float = 0.0
+    gain: float = 1.0
+    auto: bool = False
+    target_dn: float = 110.0
+    share: float = 0.5
+    lag_frames: int = 2
+    shortest_s: float = 0.0001
+    longest_s: float = 0.03
+    most_gain: float = 8.0
+    day_s: float = 0.0
+    night_share: float = 0.1
+
+    def daylight(self, passed_s: float) -> float:
+        """Return the brightness of a moment over that of noon."""
+        if not self.day_s:
+            return 1.0
+        wave = 0.5 + 0.5 * math.cos(math.tau * passed_s / self.day_s)
+        return self.night_share + (1.0 - self.night_share) * wave
+
+
+@dataclass(frozen=True)
+class Shot:
+    """Exposure time and gain of a frame; ``factor``: grey levels over the scene's own brightness."""
+
+    exposure_s: float
+    gain: float = 1.0
+    factor: float = 1.0
+
+
+class FixedExposure:
+    """The same for every frame but for daylight."""
+
+    def __init__(self, settings: ExposureSettings, exposure_s: float, start_s: float) -> None:
+        self._settings = settings
+        self._start_s = start_s
+        self.longest_s = exposure_s
+        on = settings.reference_s > 0
+        self._gain = settings.gain if on else 1.0
+        self._factor = exposure_s * settings.gain / settings.reference_s if on else 1.0
+
+    def shot(self, _sequence: int, begin_s: float, _period_s: float) -> Shot:
+        """Return time and gain of the frame whose exposure begins at a moment."""
+        daylight = self._settings.daylight(begin_s - self._start_s)
+        return Shot(self.longest_s, self._gain, self._factor * daylight)
+
+
+@dataclass
+class _Decided:
+    """What the loop decided, by frame: time times gain, seconds."""
+
+    amounts_s: dict[int, float] = field(default_factory=dict)
+    next_frame: int = 0
+
+
+class AutoExposure:
+    """A loop over a camera's frames; safe from any thread.
+
+    Parameters
+    ----------
+    settings
+        What it does.
+    exposure_s
+        Of the first frames.
+    start_s
+        When the simulation began.
+    metered
+        ``metered(time_s)``: a coarse picture of the moment at the scene's own brightness.
+    now_s
+        The simulation's clock.
+    """
+
+    def __init__(
+        self,
+        settings: ExposureSettings,
+        exposure_s: float,
+        start_s: float,
+        metered: Callable[[float], Float32],
+        now_s: Callable[[], float],
+    ) -> None:
+        self._settings = settings
+        self._exposure_s = exposure_s
+        self._start_s = start_s
+        self._metered = metered
+        self._now_s = now_s
+        self.longest_s = settings.longest_s
+        self._decided = _Decided()
+        self._holds: list[tuple[float, float]] = []
+        self._held = 0
+        self._held_since_s = 0.0
+        self._lock = threading.Lock()
+
+    @contextmanager
+    def held(self) -> Iterator[None]:
+        """Keep the exposure of all frames that begin inside the block as it is."""
+        with self._lock:
+            self._held += 1
+            if self._held == 1:
+                self._held_since_s = self._now_s()
+        try:
+            yield
+        finally:
+            with self._lock:
+                self._held -= 1
+                if self._held == 0:
+                    self._holds = [*self._holds[-50:], (self._held_since_s, self._now_s())]
+
+    def shot(self, sequence: int, begin_s: float, period_s: float) -> Shot:
+        """Return time and gain of a frame; those before it are metered first, where they were not yet."""
+        with self._lock:
+            done = self._decided
+            if sequence - done.next_frame > FRAMES_KEPT:
+                last_s = done.amounts_s.get(done.next_frame - 1, self._exposure_s)
+                done.next_frame = sequence - FRAMES_KEPT
+                done.amounts_s = dict.fromkeys(
+                    range(done.next_frame - self._settings.lag_frames, done.next_frame), last_s
+                )
+            while done.next_frame <= sequence:
+                frame = done.next_frame
+                done.amounts_s[frame] = self._amount_s(
+                    frame, begin_s - (sequence - frame) * period_s, period_s
+                )
+                done.amounts_s.pop(frame - 2 * FRAMES_KEPT, None)
+                done.next_frame += 1
+            amount_s = done.amounts_s.get(sequence, self._exposure_s)
+        s = self._settings
+        exposure_s = min(max(amount_s, s.shortest_s), s.longest_s)
+        gain = min(max(1.0, amount_s / exposure_s), s.most_gain)
+        daylight = s.daylight(begin_s - self._start_s)
+        return Shot(exposure_s, gain, exposure_s * gain / s.reference_s * daylight)
+
+    def _amount_s(self, frame: int, begin_s: float, period_s: float) -> float:
+        """Time times gain of a frame."""
+        amounts_s, s = self._decided.amounts_s, self._settings
+        before_s = amounts_s.get(frame - 1, self._exposure_s)
+        seen = frame - s.lag_frames
+        if seen < 0 or self._is_held(begin_s):
+            return before_s
+        seen_s = begin_s - s.lag_frames * period_s
+        seen_with_s = amounts_s.get(seen, before_s)
+        brightness = seen_with_s / s.reference_s * s.daylight(seen_s - self._start_s)
+        mean_dn = float(np.clip(self._metered(seen_s) * brightness, 0.5, 255.0).mean())
+        step: float = min(max((s.target_dn / mean_dn) ** s.share, 1 / MOST_STEP), MOST_STEP)
+        return min(max(seen_with_s * step, s.shortest_s), s.longest_s * s.most_gain)
+
+    def _is_held(self, begin_s: float) -> bool:
+        if self._held and begin_s >= self._held_since_s:
+            return True
+        return any(since_s <= begin_s < until_s for since_s, until_s in self._holds)

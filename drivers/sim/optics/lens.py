@@ -1,0 +1,178 @@
+"""What a lens does to the light on its way: falls off to the corners, throws dust's shadow, focuses once.
+
+Thin lens of focal length f at f-number N, focused at s_f: a point at s makes a disc of diameter
+f² / N * |s - s_f| / (s (s_f - f)) on the sensor. Dust on the sensor's window, a gap before the pixels,
+throws the shadow of a disc in light that comes from all of the lens, a cone of 1 in N.
+"""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+
+import cv2
+import numpy as np
+
+from calib.camera.cahvor import CameraModel
+from calib.rigid import Rigid
+from drivers.sim.optics.mesh import Float32, Float64, between, nodes, pixels_of
+
+MESH_PX = 8
+"""Between pixels whose range is asked for defocus, and whose angle is for falloff."""
+
+LEVEL_PX = 0.5
+"""Blurs by discs of such steps are made, and mixed between."""
+
+MOST_DISC_PX = 12.0
+FAR_M = 1e6
+
+
+@dataclass(frozen=True)
+class LensSettings:
+    """The ``lens`` of every camera of a simulation.
+
+    Attributes
+    ----------
+    falloff
+        Power of the cosine of a ray's angle to the axis by which it is dimmed: 4 by geometry, 0 for none.
+    f_number
+        Focal length over aperture; 0: a pinhole.
+    focus_m
+        Distance of what is sharp, along the axis; 0: infinitely far.
+    pitch_um
+        From pixel to pixel; with a model's focal length in pixels it makes that in metres.
+    dust
+        Specks on the sensor's window.
+    dust_um
+        Their median diameter.
+    dust_gap_um
+        From the window to the pixels.
+    """
+
+    falloff: float = 0.0
+    f_number: float = 0.0
+    focus_m: float = 0.0
+    pitch_um: float = 12.0
+    dust: int = 0
+    dust_um: float = 60.0
+    dust_gap_um: float = 1000.0
+
+
+@dataclass(frozen=True)
+class Lens:
+    """One camera's lens.
+
+    Attributes
+    ----------
+    settings
+        What it is like.
+    camera
+        The model in its mounting frame.
+    name, seed
+        Fix where the dust lies.
+    ranges
+        ``ranges(origins_m, directions)``: how far rays go in the site frame, metres, nan for sky.
+    """
+
+    settings: LensSettings
+    camera: CameraModel
+    name: str
+    seed: int
+    ranges: Callable[[Float64, Float64], Float64]
+
+    @property
+    def changes_nothing(self) -> bool:
+        """Whether it is a pinhole without falloff or dust."""
+        return not (self.settings.falloff or self.settings.f_number or self.settings.dust)
+
+    def through(self, light: Float32, pose: Rigid) -> Float32:
+        """Return the light (h, w) on the sensor, of a scene seen sharply from ``pose``."""
+        if self.changes_nothing:
+            return light
+        if self.settings.f_number:
+            light = defocused(light, self.discs_px(pose))
+        return light * self.transmission
+
+    @property
+    def _focal_px(self) -> float:
+        return float(np.linalg.norm(np.cross(self.camera.A, self.camera.H)))
+
+    def discs_px(self, pose: Rigid) -> Float32:
+        """Return (h, w) the diameter of the disc that a point of each pixel's range makes, pixels."""
+        s = self.settings
+        width, height = self.camera.size_px
+        x_px, y_px = nodes(width, MESH_PX), nodes(height, MESH_PX)
+        rays = self.camera.ray(pixels_of(x_px, y_px))
+        ranges_m = self.ranges(pose.points(rays.origins_m), pose.vectors(rays.directions))
+        depth_m = np.where(np.isfinite(ranges_m), ranges_m * (rays.directions @ self.camera.A), FAR_M)
+        focal_m = self._focal_px * s.pitch_um * 1e-6
+        focus_m = s.focus_m or FAR_M
+        aperture_m = focal_m / s.f_number
+        disc_m = aperture_m * focal_m * np.abs(depth_m - focus_m) / (np.abs(depth_m) * (focus_m - focal_m))
+        disc_px = np.clip(disc_m / (s.pitch_um * 1e-6), 0.0, MOST_DISC_PX).astype(np.float32)
+        return np.asarray(between(y_px, 0, height) @ disc_px @ between(x_px, 0, width).T, dtype=np.float32)
+
+    @cached_property
+    def transmission(self) -> Float32:
+        """(h, w): the share of the light that falloff and dust let through."""
+        width, height = self.camera.size_px
+        x_px, y_px = nodes(width, MESH_PX), nodes(height, MESH_PX)
+        cosine = np.clip(self.camera.ray(pixels_of(x_px, y_px)).directions @ self.camera.A, 0.0, 1.0)
+        kept = np.nan_to_num(cosine**self.settings.falloff).astype(np.float32)
+        share = between(y_px, 0, height) @ kept @ between(x_px, 0, width).T
+        return np.asarray(share * self._dust_shadows(), dtype=np.float32)
+
+    def _dust_shadows(self) -> Float32:
+        s = self.settings
+        width, height = self.camera.size_px
+        share = np.ones((height, width), dtype=np.float32)
+        chance = np.random.default_rng([self.seed, zlib.crc32(self.name.encode()), 1])
+        cone_px = s.dust_gap_um / (s.f_number or 8.0) / s.pitch_um
+        y_px, x_px = np.mgrid[0:height, 0:width]
+        for _ in range(s.dust):
+            at_x, at_y = chance.uniform(0, width), chance.uniform(0, height)
+            speck_px = s.dust_um / s.pitch_um * np.exp(0.5 * chance.standard_normal())
+            away_px = np.hypot(x_px - at_x, y_px - at_y)
+            share *= (1.0 - shadow(away_px, 0.5 * speck_px, 0.5 * cone_px)).astype(np.float32)
+        return share
+
+
+def shadow(away_px: Float64, speck_px: float, cone_px: float) -> Float64:
+    """Return the share of a disc of radius ``cone_px`` that one of radius ``speck_px`` covers."""
+    a, b = speck_px, max(cone_px, 0.5)
+    d = np.clip(away_px, abs(a - b) + 1e-9, a + b)
+    to_a = np.arccos(np.clip((d**2 + a**2 - b**2) / (2 * d * a), -1.0, 1.0))
+    to_b = np.arccos(np.clip((d**2 + b**2 - a**2) / (2 * d * b), -1.0, 1.0))
+    kite = 0.5 * np.sqrt(np.clip((a + b - d) * (d + a - b) * (d - a + b) * (a + b + d), 0.0, None))
+    covered = (a**2 * to_a + b**2 * to_b - kite) / (np.pi * b**2)
+    inside = min(1.0, (a / b) ** 2)
+    return np.where(away_px <= abs(a - b), inside, np.where(away_px >= a + b, 0.0, covered))
+
+
+def disc_kernel(diameter_px: float) -> Float32:
+    """Return the kernel of a uniform disc, each pixel by the share of its area that lies inside."""
+    radius, fine = 0.5 * diameter_px, 16
+    half = int(np.ceil(radius))
+    places = (np.arange((2 * half + 1) * fine) + 0.5) / fine - 0.5 - half
+    inside = (places[:, None] ** 2 + places**2 <= radius**2).astype(np.float64)
+    cells = inside.reshape(2 * half + 1, fine, 2 * half + 1, fine).sum(axis=(1, 3))
+    return np.asarray(cells / cells.sum(), dtype=np.float32)
+
+
+def defocused(light: Float32, discs_px: Float32) -> Float32:
+    """Return a picture (h, w) with each pixel blurred by a disc of its own diameter (h, w)."""
+    levels = discs_px / LEVEL_PX
+    first, last = int(np.floor(levels.min())), int(np.ceil(levels.max()))
+    out: Float32 = np.zeros_like(light)
+    for level in range(first, last + 1):
+        weight = np.clip(1.0 - np.abs(levels - level), 0.0, None)
+        sharp = level * LEVEL_PX < 0.5
+        blurred = (
+            light
+            if sharp
+            else cv2.filter2D(light, -1, disc_kernel(level * LEVEL_PX), borderType=cv2.BORDER_REPLICATE)
+        )
+        out += weight * blurred
+    return out
