@@ -6,8 +6,6 @@ known from the simulated motors, never from the driver. The last case is the dem
 
 from __future__ import annotations
 
-import itertools
-import math
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -18,9 +16,11 @@ from pathlib import Path
 import pytest
 
 from drivers.errors import DriverError, LineLost, NoReply
-from drivers.interfaces import PanTilt, Reading
+from drivers.interfaces import Reading
 from mastctl.client import Client
 from mastctl.config import load_config
+from mastctl.conform.checks import Check
+from mastctl.conform.heads import HEADS, HeadTrial, fastest_seen
 from mastctl.daemon import RunningDaemon
 from mastctl.experiment.demo import SimulationTruth, demo_config
 from mastctl.experiment.pointing import run_pointing_experiment
@@ -42,6 +42,14 @@ def rig(request: pytest.FixtureRequest) -> Iterator[Rig]:
 def wired(request: pytest.FixtureRequest) -> Iterator[Rig]:
     with RIGS[request.param]() as made:
         yield made
+
+
+def trial_of(rig: Rig) -> HeadTrial:
+    """The rig as the checks of heads take one."""
+    return HeadTrial(
+        rig.head, LIMITS_RAD, 1.0, limits_rad=LIMITS_RAD, own_limits=True,
+        count_rad=rig.count_rad, settle_rad=rig.settle_rad, true_rad=rig.true_rad,
+    )  # fmt: skip
 
 
 def eventually(what: str, condition: Callable[[], object]) -> None:
@@ -100,124 +108,24 @@ def true_reading(rig: Rig) -> Reading:
     return reading
 
 
-def test_a_reading_is_measured_now_and_healthy(rig: Rig) -> None:
-    assert isinstance(rig.head, PanTilt)
-    reading = true_reading(rig)
-    assert isinstance(reading.moving, bool)
-    assert tuple(reading.faults) == ()
+@pytest.mark.parametrize("check", HEADS.checks, ids=lambda check: str(check.name))
+def test_every_head_keeps_every_promise(rig: Rig, check: Check[HeadTrial]) -> None:
+    check.ask(trial_of(rig))
 
 
-def test_a_move_returns_at_once_and_ends_at_the_nearest_count(rig: Rig) -> None:
-    for pan, tilt in ((0.3, -0.2), (0.25033, -0.25047), (-0.0007, 0.0004)):
-        rig.head.move(pan, tilt)
-        under_way = rig.head.read()
-        assert under_way.moving
-        assert abs(under_way.pan_rad - pan) > 10 * rig.count_rad or abs(pan) < 0.26
-        reading = settled(rig)
-        assert abs(reading.pan_rad - pan) <= 0.5 * rig.count_rad + rig.settle_rad, "nearest, not truncated"
-        assert abs(reading.tilt_rad - tilt) <= 0.5 * rig.count_rad + rig.settle_rad
-        true_pan, true_tilt = rig.true_rad(time.monotonic())
-        there = pytest.approx((reading.pan_rad, reading.tilt_rad), abs=1e-6 + rig.settle_rad)
-        assert (true_pan, true_tilt) == there
+@pytest.mark.parametrize("asked", [0.3, 50.0])
+def test_no_axis_goes_faster_than_asked_or_than_its_own_bound(rig: Rig, asked: float) -> None:
+    assert rig.fastest_rad_per_s is not None
+    bound = min(asked, rig.fastest_rad_per_s)
+    fastest, unsure = fastest_seen(trial_of(rig), asked)
+    assert fastest <= bound * 1.02 + unsure
+    assert fastest >= min(bound, 1.0) * 0.3, "nor much slower"
 
 
 def test_goals_halfway_between_counts_go_to_either_never_further(rig: Rig) -> None:
     for counts in (10.4, 10.6, -10.4, -10.6):
         rig.head.move(counts * rig.count_rad, 0.0)
         assert settled(rig).pan_rad == pytest.approx(round(counts) * rig.count_rad, abs=rig.settle_rad)
-
-
-def test_under_way_every_reading_is_true_and_times_go_forward(rig: Rig) -> None:
-    rig.head.move(0.5, -0.4)
-    readings = [true_reading(rig)]
-    until_s = time.monotonic() + PATIENCE_S
-    while readings[-1].moving and time.monotonic() < until_s:
-        readings.append(true_reading(rig))
-        assert readings[-1].time_s > readings[-2].time_s
-        if not readings[-1].moving:
-            assert readings[-1].pan_rad == pytest.approx(0.5, abs=rig.count_rad + rig.settle_rad)
-            assert readings[-1].tilt_rad == pytest.approx(-0.4, abs=rig.count_rad + rig.settle_rad)
-    between = [r for r in readings if 0.05 < r.pan_rad < 0.45]
-    assert len(between) > 3, "it was seen on its way"
-
-
-@pytest.mark.parametrize("end", [0, 1])
-def test_goals_at_the_limits_are_taken_and_those_beyond_refused(rig: Rig, end: int) -> None:
-    goal = (LIMITS_RAD[0][end], LIMITS_RAD[1][end])
-    before = rig.true_rad(time.monotonic())
-    for beyond in (
-        (math.nextafter(goal[0], 2 * goal[0]), 0.0),
-        (0.0, math.nextafter(goal[1], 2 * goal[1])),
-        (math.nan, 0.0),
-        (0.0, math.inf),
-        (-math.inf, 0.0),
-    ):
-        with pytest.raises(DriverError, match=r"(pan|tilt) .* rad is outside"):
-            rig.head.move(*beyond)
-    assert rig.true_rad(time.monotonic()) == before
-    rig.head.move(*goal)
-    reading = settled(rig)
-    assert (reading.pan_rad, reading.tilt_rad) == pytest.approx(goal, abs=rig.count_rad + rig.settle_rad)
-
-
-@pytest.mark.parametrize("speed", [0.0, -1.0, math.nan])
-def test_a_speed_that_is_none_is_refused(rig: Rig, speed: float) -> None:
-    with pytest.raises(DriverError, match="not a positive number"):
-        rig.head.move(0.1, 0.1, speed)
-    assert rig.true_rad(time.monotonic()) == (0.0, 0.0)
-
-
-@pytest.mark.parametrize("asked", [0.3, 50.0])
-def test_no_axis_goes_faster_than_asked_or_than_its_own_bound(rig: Rig, asked: float) -> None:
-    if asked > 1.0 and rig.fastest_rad_per_s is None:
-        pytest.skip("the bound of this head's speed is not known")
-    fastest = asked if rig.fastest_rad_per_s is None else min(asked, rig.fastest_rad_per_s)
-    rig.head.move(0.3, -0.2, asked)
-    began_s = time.monotonic()
-    settled(rig)
-    ended_s = time.monotonic()
-    times_s = [began_s + (ended_s - began_s) * i / 12 for i in range(13)]
-    pans = [rig.true_rad(moment)[0] for moment in times_s]
-    step_s = times_s[1] - times_s[0]
-    unsure = 2 * (rig.count_rad + rig.settle_rad) / step_s
-    rates = [abs(b - a) / step_s for a, b in itertools.pairwise(pans)]
-    assert max(rates) <= fastest * 1.02 + unsure
-    assert max(rates) >= min(fastest, 1.0) * 0.3, "nor much slower"
-
-
-def test_a_new_goal_replaces_the_old_one(rig: Rig) -> None:
-    rig.head.move(0.9, 0.3)
-    eventually("motion", lambda: rig.head.read().pan_rad > 0.1)
-    rig.head.move(-0.2, -0.3)
-    furthest = 0.0
-
-    def turned_round() -> bool:
-        nonlocal furthest
-        reading = rig.head.read()
-        furthest = max(furthest, reading.pan_rad)
-        return not reading.moving
-
-    eventually("settling", turned_round)
-    assert furthest < 0.85
-    reading = rig.head.read()
-    assert (reading.pan_rad, reading.tilt_rad) == pytest.approx(
-        (-0.2, -0.3), abs=rig.count_rad + rig.settle_rad
-    )
-
-
-def test_stop_brakes_and_holds(rig: Rig) -> None:
-    rig.head.move(0.9, -0.5, 0.5)
-    eventually("motion", lambda: rig.head.read().pan_rad > 0.1)
-    rig.head.stop()
-    reading = settled(rig)
-    assert reading.pan_rad < 0.85
-    held = rig.true_rad(time.monotonic())
-    for _ in range(20):
-        true_reading(rig)
-        time.sleep(0.005)
-    assert rig.true_rad(time.monotonic()) == pytest.approx(held, abs=rig.count_rad + rig.settle_rad)
-    rig.head.move(0.0, 0.0)
-    assert settled(rig).pan_rad == pytest.approx(0.0, abs=rig.count_rad + rig.settle_rad)
 
 
 def test_what_is_measured_is_told_not_what_was_commanded(rig: Rig) -> None:
@@ -338,27 +246,6 @@ def test_replies_lost_now_and_then_cost_errors_but_no_wrong_angle(rig: Rig) -> N
     assert good > 5
     rig.panel.clear()
     works_again(rig)
-
-
-def test_calls_from_many_threads_at_once_are_all_answered(rig: Rig) -> None:
-    errors: list[BaseException] = []
-
-    def work(number: int) -> None:
-        try:
-            for step in range(5):
-                rig.head.read()
-                if number == 0:
-                    rig.head.move(0.1 * step, 0.0)
-        except BaseException as error:
-            errors.append(error)
-
-    threads = [threading.Thread(target=work, args=(number,)) for number in range(4)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join(PATIENCE_S)
-    assert not errors
-    assert settled(rig).pan_rad == pytest.approx(0.4, abs=rig.count_rad + rig.settle_rad)
 
 
 @pytest.mark.parametrize("name", list(RIGS))

@@ -219,7 +219,7 @@ def test_it_keeps_the_promises_of_the_page(hardware: Hardware) -> None:
 
 def test_options_it_refuses_are_told_in_its_own_words(installed: Path) -> None:
     head = DeviceSettings("bench_rig.head:open_head", {"speed_rad_per_s": -1})
-    with pytest.raises(BadOptions, match="bench head: speed_rad_per_s is -1, expected a positive number"):
+    with pytest.raises(BadOptions, match="bench head: speed_rad_per_s is -1, expected above 0"):
         open_hardware(HardwareSettings(head, {}))
 
 

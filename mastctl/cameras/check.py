@@ -41,7 +41,7 @@ class CameraCheck:
         self._delays_s: list[float] = []
         self._refused = 0
         self._uncertainty_s: float | None = None
-        self._problems: list[str] = []
+        self._problems: list[tuple[str, str]] = []
 
     def run(self, seconds: float) -> dict[str, Any]:
         """Take frames for some seconds and return what was found, as JSON.
@@ -58,9 +58,18 @@ class CameraCheck:
         self._check_abilities()
         return self._told(seconds)
 
-    def _problem(self, words: str) -> None:
-        if words not in self._problems and len(self._problems) < MOST_PROBLEMS:
-            self._problems.append(words)
+    def problems(self, promise: str | None = None) -> list[str]:
+        """Return what was found against a promise, or against any.
+
+        Promises are ``frames`` (each can be true), ``fresh`` (none is from before the asked moment),
+        ``order`` (count and time grow together), ``refusal`` (what cannot come is refused in time) and
+        ``told`` (what the camera says of itself).
+        """
+        return [words for about, words in self._problems if promise in (None, about)]
+
+    def _problem(self, promise: str, words: str) -> None:
+        if words not in self.problems() and len(self._problems) < MOST_PROBLEMS:
+            self._problems.append((promise, words))
 
     def _next(self, thread: DeviceThread, after_s: float, timeout_s: float) -> Any:
         """The driver's answer, within a deadline. Raises DriverError."""
@@ -73,13 +82,16 @@ class CameraCheck:
         until_s = time.monotonic() + seconds
         after_s = self._clock.now_s()
         while time.monotonic() < until_s:
+            came = False
             try:
                 answer = self._next(thread, after_s, FRAME_TIMEOUT_S)
+                came = True
                 now_s = self._clock.now_s()
                 frame = frame_checks.checked(answer, self._name, self._size_px, after_s, now_s)
             except DriverError as error:
                 self._refused += 1
-                self._problem(str(error))
+                old = came and isinstance(error, NoFreshFrame)
+                self._problem("fresh" if old else "frames", str(error))
                 if self._refused >= MOST_PROBLEMS or (thread.faults() and not self._frames):
                     return
                 after_s = self._clock.now_s()
@@ -96,13 +108,13 @@ class CameraCheck:
         words = f"asked for a frame exposed in {NEVER_S:g} s, within {SHORT_S:g} s"
         try:
             self._next(thread, self._clock.now_s() + NEVER_S, SHORT_S)
-            self._problem(f"{words}, it gave one that was exposed before")
+            self._problem("refusal", f"{words}, it gave one that was exposed before")
         except NoFreshFrame:
             took_s = time.monotonic() - began_s
             if took_s > SHORT_S + 1.0:
-                self._problem(f"{words}, it said no only after {took_s:.1f} s")
+                self._problem("refusal", f"{words}, it said no only after {took_s:.1f} s")
         except DriverError as error:
-            self._problem(f"{words}, it raised no NoFreshFrame: {error}")
+            self._problem("refusal", f"{words}, it raised no NoFreshFrame: {error}")
 
     def _check_count(self) -> None:
         """Count and time must grow together."""
@@ -110,8 +122,9 @@ class CameraCheck:
             ahead, later_s = frame.sequence - before.sequence, frame.mid_exposure_s - before.mid_exposure_s
             if ahead <= 0 or later_s <= 0:
                 self._problem(
+                    "order",
                     f"frame {frame.sequence} came after frame {before.sequence}, {later_s:.3f} s later: "
-                    "count and time must grow together"
+                    "count and time must grow together",
                 )
 
     def _check_abilities(self) -> None:
@@ -120,10 +133,14 @@ class CameraCheck:
         if isinstance(camera, KnowsSize) and self._frames:
             height, width = self._frames[-1].image.shape[:2]
             if tuple(camera.size_px) != (width, height):
-                self._problem(f"size_px is {tuple(camera.size_px)}, its pictures have ({width}, {height})")
+                self._problem(
+                    "told", f"size_px is {tuple(camera.size_px)}, its pictures have ({width}, {height})"
+                )
         rate_hz = self._rate_hz()
         if isinstance(camera, Paced) and rate_hz and abs(camera.period_s * rate_hz - 1) > PACE_TOLERANCE:
-            self._problem(f"period_s is {camera.period_s:.4g} s, frames come every {1 / rate_hz:.4g} s")
+            self._problem(
+                "told", f"period_s is {camera.period_s:.4g} s, frames come every {1 / rate_hz:.4g} s"
+            )
 
     def _rate_hz(self) -> float | None:
         if len(self._frames) < 2:
@@ -143,7 +160,7 @@ class CameraCheck:
             "rate_hz": self._rate_hz(),
             "mid_exposure_uncertainty_s": self._uncertainty_s,
             "abilities": [word for word, protocol in abilities if isinstance(camera, protocol)],
-            "problems": self._problems,
+            "problems": self.problems(),
         }
         if frames:
             image = frames[-1].image

@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import argparse
+import json
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mastctl.cli import output
-from mastctl.cli.output import WrongUse, positive_number
+from mastctl.cli.output import WrongUse, at_least, finite_number, positive_number
 
 if TYPE_CHECKING:
+    from drivers.hardware import HardwareSettings
     from mastctl.conform.checks import Check, Outcome
+    from mastctl.conform.heads import Angles
     from mastctl.conform.report import Report
 
 MARKS = {"passed": "ok", "failed": "FAILED", "skipped": "-"}
@@ -24,6 +27,34 @@ def add_commands(subparsers: argparse._SubParsersAction[Any]) -> None:
         "conform", help="check a running daemon against the contract, or a head or camera driver"
     )
     parser.add_argument("url", nargs="?", metavar="URL", help="a running daemon's address")
+    what = parser.add_argument_group("a driver instead of a daemon")
+    what.add_argument("--driver", metavar="NAME", help="package.module:factory, or a driver of this program")
+    what.add_argument(
+        "--options", metavar="JSON", help="its options: a JSON object, or a file that holds one"
+    )
+    what.add_argument("--config", metavar="FILE", help="a configuration that has the head or camera")
+    kind = what.add_mutually_exclusive_group()
+    kind.add_argument("--head", action="store_true", help="it is a pan/tilt head")
+    kind.add_argument(
+        "--camera", nargs="?", const="camera", metavar="NAME", help="it is a camera, of this name"
+    )
+    what.add_argument(
+        "--limits", nargs=4, type=finite_number, metavar=("PAN", "PAN", "TILT", "TILT"),
+        help="the head driver's own lowest and highest angles, radians; they are tried",
+    )  # fmt: skip
+    what.add_argument(
+        "--speed", type=positive_number, default=0.5, metavar="RAD/S", help="of every move (default 0.5)"
+    )
+    what.add_argument(
+        "--size", nargs=2, type=at_least(1), metavar=("W", "H"), help="of the camera's pictures"
+    )
+    what.add_argument(
+        "--seconds",
+        type=positive_number,
+        default=3.0,
+        metavar="S",
+        help="how long frames are taken (default 3)",
+    )
     motion = parser.add_mutually_exclusive_group()
     motion.add_argument(
         "--motion", dest="motion", action="store_true", default=None, help="move the head unasked"
@@ -44,7 +75,12 @@ def add_commands(subparsers: argparse._SubParsersAction[Any]) -> None:
 
 
 def _conform(args: argparse.Namespace) -> int:
-    return _daemon(args)
+    """Check a daemon, or a driver where one is named."""
+    device = args.driver is not None or args.config is not None
+    if device == (args.url is not None) and not args.list:
+        raise WrongUse("the address of a daemon, or --driver, or --config is expected, and one of them only")
+    _check_junit(args.junit)
+    return _driver(args) if device or args.head or args.camera is not None else _daemon(args)
 
 
 def _daemon(args: argparse.Namespace) -> int:
@@ -54,24 +90,115 @@ def _daemon(args: argparse.Namespace) -> int:
     checks = chosen(CHECKS, args.only)
     if args.list:
         return _list(checks, args.json)
-    if args.url is None:
-        raise WrongUse("the address of a running daemon is expected")
-    _check_junit(args.junit)
     with daemon_under_test(args.url, args.reach) as daemon:
-        moves = any(check.moves for check in checks)
-        question = f"the head at {args.url} will be moved by up to {args.reach:g} rad from where it stands"
-        motion = moves and (bool(daemon.began.get("simulated")) or None)
-        allowed = args.motion if args.motion is not None else motion
-        if allowed is None:
-            allowed = _may_move(question)
-        return told(args, check_daemon(daemon, checks, allowed, tell_of(args)))
+        motion = _motion(args, checks, f"the head at {args.url}", bool(daemon.began.get("simulated")))
+        return told(args, check_daemon(daemon, checks, motion, tell_of(args)))
+
+
+def _driver(args: argparse.Namespace) -> int:
+    """Check a head or a camera."""
+    from mastctl.conform import drivers_run
+
+    kind = (
+        "head"
+        if args.head
+        else "camera"
+        if args.camera is not None
+        else drivers_run.kind_of(args.driver or "")
+    )
+    if not kind:
+        raise WrongUse("--head or --camera is expected: the driver's name does not say which it is")
+    checks = chosen(drivers_run.ALL[kind], args.only)
+    if args.list:
+        return _list(checks, args.json)
+    settings, name, limits, size_px = _device(args, kind)
+    if kind == "camera":
+        driver = settings.cameras[name].driver
+        with drivers_run.camera_under_test(settings, name, size_px, args.seconds) as camera:
+            return told(args, drivers_run.check_camera(camera, driver, checks, tell_of(args)))
+    driver = settings.pan_tilt.driver
+    if driver == "replay":
+        raise WrongUse("a replayed head stands at recorded pointings only; there is no motion to check")
+    motion = _motion(args, checks, f"the head of driver {driver}", driver == "sim")
+    with drivers_run.head_under_test(
+        settings, args.reach, args.speed, limits, args.limits is not None
+    ) as head:
+        return told(args, drivers_run.check_head(head, driver, checks, motion, tell_of(args)))
+
+
+def _device(
+    args: argparse.Namespace, kind: str
+) -> tuple[HardwareSettings, str, tuple[Angles, Angles] | None, tuple[int, int] | None]:
+    """What opens the device, its name, its limits and the size of its pictures, as far as they are known."""
+    from mastctl.conform.drivers_run import device_settings
+
+    limits = None if args.limits is None else _limits(args.limits)
+    size_px = None if args.size is None else (int(args.size[0]), int(args.size[1]))
+    if args.config is None:
+        name = (
+            "navcam_left"
+            if args.driver == "sim" and args.camera in (None, "camera")
+            else args.camera or "camera"
+        )
+        return device_settings(args.driver, _options(args.options), kind, name), name, limits, size_px
+    from mastctl.cli.camera_choice import with_cameras
+    from mastctl.config import load_config
+    from mastctl.service.mast_in_use import read_mast
+
+    if args.driver is not None or args.options is not None:
+        raise WrongUse("--driver and --options do not go with --config, which says them")
+    config = load_config(args.config)
+    if kind == "head":
+        own = (config.limits.pan_rad, config.limits.tilt_rad)
+        return config.hardware, "", limits or own, None
+    if args.camera not in config.hardware.cameras:
+        known = ", ".join(config.hardware.cameras) or "none"
+        raise WrongUse(f"{config.path} has no camera {args.camera}; it has {known}")
+    rig = read_mast(config.mast_file, config).stored.rig
+    size_px = size_px or rig.cameras[args.camera].model.size_px
+    return with_cameras(config, [args.camera]), args.camera, None, size_px
+
+
+def _limits(numbers: Sequence[float]) -> tuple[Angles, Angles]:
+    """The ends of both axes. Raises WrongUse."""
+    pan, tilt = (numbers[0], numbers[1]), (numbers[2], numbers[3])
+    for low, high in (pan, tilt):
+        if low >= high:
+            raise WrongUse(f"--limits: {low:g} {high:g} where the lower angle first is expected")
+    return pan, tilt
+
+
+def _options(text: str | None) -> dict[str, Any]:
+    """Read the driver's options: JSON, or a file that holds it. Raises WrongUse."""
+    if text is None:
+        return {}
+    words = "--options"
+    try:
+        if not text.lstrip().startswith("{"):
+            words = f"--options {text}"
+            text = Path(text).read_text(encoding="utf-8")
+        options = json.loads(text)
+    except (OSError, ValueError) as error:
+        raise WrongUse(f"{words}: a JSON object, or a file that holds one, is expected: {error}") from None
+    if not isinstance(options, dict):
+        raise WrongUse(f"{words}: a JSON object is expected")
+    return options
+
+
+def _motion(args: argparse.Namespace, checks: Sequence[Check[Any]], whose: str, simulated: bool) -> bool:
+    """Whether the head may be moved: as the options say, or whoever sits at the terminal."""
+    if args.motion is not None:
+        return bool(args.motion)
+    if simulated or not any(check.moves for check in checks):
+        return True
+    return _may_move(f"{whose} will be moved by up to {args.reach:g} rad from where it stands")
 
 
 def _may_move(question: str) -> bool:
     """Ask whoever sits at the terminal. Raises WrongUse where nobody does."""
     if not (sys.stdin.isatty() and sys.stderr.isatty()):
         raise WrongUse(f"{question}: --motion allows it, --no-motion leaves those checks out")
-    sys.stderr.write(f"{question[0].upper()}{question[1:]}, slowly if its limits are. Move it? [y/N] ")
+    sys.stderr.write(f"{question[0].upper()}{question[1:]}. Move it? [y/N] ")
     sys.stderr.flush()
     return sys.stdin.readline().strip().lower() in ("y", "yes")
 

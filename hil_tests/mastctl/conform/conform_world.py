@@ -25,6 +25,7 @@ from mastctl.config import load_config
 from mastctl.daemon import RunningDaemon
 
 HERE = "hil_tests.mastctl.conform.conform_world"
+PERIOD_S = 0.02
 COUNT_RAD, FASTEST_RAD_PER_S = 1e-4, 2.0
 
 
@@ -38,7 +39,7 @@ def open_head(low_rad: float = -2.0, high_rad: float = 2.0) -> SimulatedPanTilt:
 class NoiseCamera:
     """A free-running camera of 50 Hz that sees noise."""
 
-    period_s, trigger = 0.02, ""
+    period_s, trigger = PERIOD_S, ""
 
     def __init__(self, seed: int = 0) -> None:
         self._random = np.random.default_rng(seed)
@@ -49,14 +50,14 @@ class NoiseCamera:
 
     def next_frame(self, exposed_after_s: float, timeout_s: float) -> Frame:
         now_s = time.monotonic()
-        sequence = int(max(exposed_after_s, now_s) / self.period_s) + 1
-        wait_s = sequence * self.period_s + 0.002 - now_s
+        sequence = int(max(exposed_after_s, now_s) / PERIOD_S) + 1
+        wait_s = sequence * PERIOD_S + 0.002 - now_s
         if self._closed.wait(max(0.0, min(wait_s, timeout_s))):
             raise NoReply("it is closed")
         if wait_s > timeout_s:
             raise NoFreshFrame(f"no frame within {timeout_s:g} s")
         image = self._random.integers(0, 255, SIZE_PX[::-1], dtype=np.uint8)
-        return Frame(image, sequence, sequence * self.period_s + 0.001, 0.002)
+        return Frame(image, sequence, sequence * PERIOD_S + 0.001, 0.002)
 
     def close(self) -> None:
         self._closed.set()

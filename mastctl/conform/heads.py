@@ -1,0 +1,490 @@
+"""What a pan/tilt driver promises (docs/drivers.md), asked of any head."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass, field
+from functools import partial
+from itertools import pairwise
+
+import numpy as np
+
+from drivers.errors import BadReply, DriverError, NoReply
+from drivers.interfaces import PanTilt, Reading
+from mastctl.conform.checks import NotTried, PromiseBroken, Suite, expect
+from mastctl.conform.worker import PATIENCE_S, Worker, beside, ended
+from mastctl.devices.devices import MOVE_TIMEOUT_S, READ_TIMEOUT_S, STOP_TIMEOUT_S
+from mastctl.devices.frames import CLOCK_TOLERANCE_S
+
+HEADS: Suite[HeadTrial] = Suite()
+
+Angles = tuple[float, float]
+LONGER = "a larger --reach or a lower --speed"
+SETTLES_WITHIN_S = 30.0
+HOLDS_S = 0.3
+OUTSIDE_COUNT_RAD = 1e-3
+"""Taken for the count of a head that nobody knows; a 12-bit servo has 1.5e-3."""
+
+
+@dataclass
+class HeadTrial:
+    """A head under test, and what is known of it besides.
+
+    Attributes
+    ----------
+    head
+        The driver's object.
+    box_rad
+        Where it may be moved: lowest and highest pan, lowest and highest tilt.
+    speed_rad_per_s
+        How fast.
+    limits_rad
+        The ends of each axis, where the head is to be sent too; None: it is not.
+    own_limits
+        Whether they are the driver's own, so that it refuses goals beyond them.
+    count_rad
+        One count; None: not known.
+    settle_rad
+        How far from its goal a settled head may stand, beyond the rounding to counts.
+    true_rad
+        Where the axes truly are at a moment of the last minute; None where nobody knows.
+    open_again
+        Opens the same head once more after it was closed; None where that is not to be tried.
+    closed
+        Whether it was closed for good.
+    """
+
+    head: PanTilt
+    box_rad: tuple[Angles, Angles]
+    speed_rad_per_s: float
+    limits_rad: tuple[Angles, Angles] | None = None
+    own_limits: bool = False
+    count_rad: float | None = None
+    settle_rad: float = 0.006
+    true_rad: Callable[[float], Angles] | None = None
+    open_again: Callable[[], PanTilt] | None = None
+    closed: bool = False
+    worker: Worker = field(default_factory=Worker)
+
+    @property
+    def near_rad(self) -> float:
+        """How near to a goal a settled head stands."""
+        return (OUTSIDE_COUNT_RAD if self.count_rad is None else self.count_rad) + self.settle_rad
+
+    def goal(self, pan_part: float, tilt_part: float) -> Angles:
+        """Return angles in the box; parts from -1 (its lower end) to 1."""
+        (a, b), (c, d) = self.box_rad
+        return a + (pan_part + 1) / 2 * (b - a), c + (tilt_part + 1) / 2 * (d - c)
+
+    def read(self) -> Reading:
+        """Read in the head's own thread; the answer is one that can be true."""
+        began_s = time.monotonic()
+        reading = self.worker.call("read()", self.head.read)
+        self.check_reading(reading, began_s, time.monotonic())
+        return reading
+
+    def move(self, goal: Angles, speed_rad_per_s: float | None = None) -> None:
+        """Send the head to a goal."""
+        speed = self.speed_rad_per_s if speed_rad_per_s is None else speed_rad_per_s
+        self.worker.call("move()", lambda: self.head.move(goal[0], goal[1], speed))
+
+    def stop(self) -> None:
+        """Stop, in the head's own thread."""
+        self.worker.call("stop()", self.head.stop)
+
+    def check_reading(self, reading: Reading, began_s: float, ended_s: float) -> None:
+        """Pass a reading of a call that can be true. Raises PromiseBroken."""
+        for name in ("pan_rad", "tilt_rad"):
+            angle = getattr(reading, name, None)
+            expect(
+                isinstance(angle, (int, float)) and math.isfinite(angle) and abs(angle) <= math.tau,
+                f"read(): {name} is {angle!r} where a finite angle within a turn is expected",
+            )
+        moving, stamp_s = getattr(reading, "moving", None), getattr(reading, "time_s", None)
+        expect(isinstance(moving, (bool, np.bool_)), f"read(): moving is {moving!r}, neither true nor false")
+        expect(isinstance(stamp_s, (int, float)) and math.isfinite(stamp_s), f"read(): time_s is {stamp_s!r}")
+        expect(
+            began_s - CLOCK_TOLERANCE_S <= reading.time_s <= ended_s + CLOCK_TOLERANCE_S,
+            f"read(): stamped {reading.time_s - began_s:+.3f} s from the call's begin, "
+            f"and the call took {ended_s - began_s:.3f} s",
+        )
+        if self.true_rad is not None:
+            self._check_truth(reading, began_s, ended_s)
+
+    def _check_truth(self, reading: Reading, began_s: float, ended_s: float) -> None:
+        """Pass a reading that was true at some moment of its call, to a count."""
+        assert self.true_rad is not None and self.count_rad is not None
+        truths = [self.true_rad(float(moment_s)) for moment_s in np.linspace(began_s, ended_s, 21)]
+        for axis, angle in enumerate((reading.pan_rad, reading.tilt_rad)):
+            seen = [truth[axis] for truth in truths]
+            expect(
+                min(seen) - self.count_rad <= angle <= max(seen) + self.count_rad,
+                f"read(): {('pan', 'tilt')[axis]} {angle:.5f} rad, it was {min(seen):.5f} to {max(seen):.5f}",
+            )
+
+    def settled(self) -> Reading:
+        """Read until the head says that it does not move."""
+        until_s = time.monotonic() + SETTLES_WITHIN_S
+        while (reading := self.read()).moving:
+            expect(
+                time.monotonic() < until_s, f"the head still says that it moves after {SETTLES_WITHIN_S:g} s"
+            )
+            time.sleep(0.005)
+        return reading
+
+    def sent(self, goal: Angles) -> Reading:
+        """Send the head somewhere and wait until it has settled there."""
+        self.move(goal)
+        reading = self.settled()
+        self.check_arrived(reading, goal, self.near_rad)
+        return reading
+
+    def check_arrived(self, reading: Reading, goal: Angles, bound_rad: float) -> float:
+        """Return how far from its goal a settled head stands. Raises PromiseBroken beyond the bound."""
+        off_rad = away(reading, goal)
+        words = f"sent to {goal[0]:.5f}, {goal[1]:.5f} rad it settled {off_rad:.5f} rad away"
+        expect(off_rad <= bound_rad, f"{words}, {bound_rad:.1e} is allowed")
+        return off_rad
+
+    def on_its_way(self, goal: Angles, part: float = 0.2) -> Reading:
+        """Send the head off; return a reading after that part of the way. Raises NotTried if missed."""
+        way_rad = away(self.read(), goal)
+        self.move(goal)
+        until_s = time.monotonic() + SETTLES_WITHIN_S
+        while away(reading := self.read(), goal) > (1 - part) * way_rad:
+            expect(
+                time.monotonic() < until_s and (reading.moving or away(reading, goal) <= self.near_rad),
+                f"sent to {goal[0]:.4f}, {goal[1]:.4f} rad the head does not go there",
+            )
+        if away(reading, goal) < 0.3 * way_rad:
+            raise NotTried(
+                "the way was too short to catch the head on it; a larger --reach or a lower --speed helps"
+            )
+        return reading
+
+
+def away(reading: Reading, goal: Angles) -> float:
+    """How far a reading is from angles, the farther axis, radians."""
+    return max(abs(reading.pan_rad - goal[0]), abs(reading.tilt_rad - goal[1]))
+
+
+def at(reading: Reading) -> Angles:
+    """The angles of a reading."""
+    return reading.pan_rad, reading.tilt_rad
+
+
+@HEADS.check("head.reading", "a reading is finite, stamped within its call, and without faults")
+def _reading(trial: HeadTrial) -> str:
+    readings = [trial.read() for _ in range(5)]
+    for before, after in pairwise(readings):
+        expect(after.time_s >= before.time_s, f"the stamps went back by {before.time_s - after.time_s:.4f} s")
+    faults = readings[-1].faults
+    expect(
+        not isinstance(faults, str) and all(isinstance(word, str) for word in faults),
+        f"faults is {faults!r} where a sequence of sentences is expected",
+    )
+    expect(len(faults) == 0, f"the head is not healthy: {'; '.join(faults)}")
+    return f"pan {readings[-1].pan_rad:.4f} rad, tilt {readings[-1].tilt_rad:.4f} rad"
+
+
+@HEADS.check("head.move", "a move returns at once and ends at its goal, at the nearest count", moves=True)
+def _move(trial: HeadTrial) -> str:
+    worst_rad = 0.0
+    for parts in ((0.3, -0.2), (0.25033, -0.25047), (-0.0007, 0.0004), (-0.6, 0.5)):
+        goal = trial.goal(*parts)
+        way_rad = away(trial.settled(), goal)
+        began_s = time.monotonic()
+        trial.move(goal)
+        took_s = time.monotonic() - began_s
+        needs_s = way_rad / trial.speed_rad_per_s
+        expect(took_s < MOVE_TIMEOUT_S, f"move() took {took_s:.2f} s, {MOVE_TIMEOUT_S:g} s are allowed")
+        expect(
+            needs_s < 0.2 or took_s < 0.7 * needs_s,
+            f"move() came back after {took_s:.2f} s, when the way of {way_rad:.3f} rad was gone: not at once",
+        )
+        reading = trial.settled()
+        bound_rad = trial.settle_rad + (0.5 * trial.count_rad if trial.count_rad else OUTSIDE_COUNT_RAD)
+        worst_rad = max(worst_rad, trial.check_arrived(reading, goal, bound_rad))
+    return f"within {worst_rad:.1e} rad"
+
+
+@HEADS.check(
+    "head.under_way",
+    "under way it tells what is measured, says that it moves, and its stamps grow",
+    moves=True,
+)
+def _under_way(trial: HeadTrial) -> str:
+    start = trial.sent(trial.goal(-0.5, -0.5))
+    goal = trial.goal(0.7, 0.6)
+    way_rad = away(start, goal)
+    began_s = time.monotonic()
+    trial.move(goal)
+    readings = [trial.read()]
+    until_s = began_s + SETTLES_WITHIN_S
+    while readings[-1].moving and time.monotonic() < until_s:
+        time.sleep(0.002)
+        readings.append(trial.read())
+    for before, after in pairwise(readings):
+        expect(
+            after.time_s > before.time_s, "two readings one after the other bear one stamp, or an older one"
+        )
+    between = 0
+    for reading in readings:
+        gone_s = reading.time_s - began_s
+        left_rad = away(reading, goal)
+        least_rad = way_rad - 1.1 * trial.speed_rad_per_s * gone_s - 2 * trial.near_rad
+        expect(
+            left_rad >= least_rad,
+            f"{gone_s:.3f} s after the move it says that {left_rad:.3f} of {way_rad:.3f} rad are left, "
+            f"at {trial.speed_rad_per_s:g} rad/s: commanded, not measured?",
+        )
+        expect(
+            reading.moving or left_rad <= trial.near_rad,
+            f"{left_rad:.3f} rad before its goal, {gone_s:.3f} s after the move, it says that it stands",
+        )
+        between += 0.05 * way_rad < left_rad < 0.95 * way_rad
+    if between < 3:
+        raise NotTried(f"only {between} readings came on the way; {LONGER} helps")
+    return f"{between} readings on the way of {way_rad:.3f} rad"
+
+
+@HEADS.check("head.new_goal", "a new goal replaces the old one at once", moves=True)
+def _new_goal(trial: HeadTrial) -> None:
+    trial.sent(trial.goal(-0.9, -0.3))
+    far, back = trial.goal(0.9, 0.3), trial.goal(-0.6, -0.4)
+    trial.on_its_way(far)
+    trial.move(back)
+    nearest_rad = math.inf
+    until_s = time.monotonic() + SETTLES_WITHIN_S
+    while (reading := trial.read()).moving and time.monotonic() < until_s:
+        nearest_rad = min(nearest_rad, abs(reading.pan_rad - far[0]))
+    expect(nearest_rad > trial.near_rad, "sent back on its way, the head went to its old goal first")
+    off_rad = away(reading, back)
+    expect(off_rad <= trial.near_rad, f"it settled {off_rad:.4f} rad from the new goal")
+
+
+@HEADS.check("head.stop", "a stop brakes both axes where they are, and holds", moves=True)
+def _stop(trial: HeadTrial) -> str:
+    trial.sent(trial.goal(-0.9, -0.9))
+    goal = trial.goal(0.9, 0.9)
+    trial.on_its_way(goal)
+    trial.stop()
+    reading = trial.settled()
+    left_rad = away(reading, goal)
+    expect(left_rad > trial.near_rad, "the stop came on the way, and the head went on to its goal")
+    until_s = time.monotonic() + HOLDS_S
+    while time.monotonic() < until_s:
+        later = trial.read()
+        expect(
+            away(later, at(reading)) <= trial.near_rad,
+            f"after the stop it moved on by {away(later, at(reading)):.4f} rad",
+        )
+        time.sleep(0.01)
+    trial.sent(trial.goal(0.0, 0.0))
+    return f"{left_rad:.3f} rad before the goal"
+
+
+@HEADS.check(
+    "head.stop_beside", "a stop comes beside a read and a move under way, and several at once", moves=True
+)
+def _stop_beside(trial: HeadTrial) -> str:
+    goal = trial.goal(0.9, 0.9)
+    trial.sent(trial.goal(-0.9, -0.9))
+    waited_s = _stop_beside_a_move(trial, goal)
+    expect(waited_s < STOP_TIMEOUT_S / 2, f"a stop beside a move waited {waited_s:.2f} s for it")
+    trial.sent(trial.goal(-0.9, -0.9))
+    trial.on_its_way(goal)
+    longest_s = _stops_beside_reads(trial)
+    words = f"a stop beside reads took {longest_s:.2f} s of {STOP_TIMEOUT_S:g} s"
+    expect(longest_s < STOP_TIMEOUT_S, words)
+    left_rad = away(trial.settled(), goal)
+    expect(left_rad > trial.near_rad, "stopped beside reads the head went on to its goal")
+    return f"within {max(longest_s, waited_s):.3f} s"
+
+
+def _stop_beside_a_move(trial: HeadTrial, goal: Angles) -> float:
+    """Stop from another thread while a move goes out; return how long it took."""
+    move = beside(lambda: trial.head.move(*goal, trial.speed_rad_per_s))
+    time.sleep(0.05)
+    began_s = time.monotonic()
+    ended("stop() beside move()", beside(trial.head.stop))
+    took_s = time.monotonic() - began_s
+    with suppress(DriverError):  # a stop may end a move that is just going out
+        ended("move()", move)
+    trial.stop()
+    return took_s
+
+
+def _stops_beside_reads(trial: HeadTrial) -> float:
+    """Stop twice at once, twice over, while two threads read; return how long the longest took."""
+
+    def ask() -> None:
+        for _ in range(8):
+            try:
+                trial.head.read()
+            except (NoReply, BadReply):  # a stop that cuts in may cost an answer: the service asks once more
+                trial.head.read()
+
+    reads = [beside(ask) for _ in range(2)]
+    longest_s = 0.0
+    for _ in range(2):
+        began_s = time.monotonic()
+        for stop in [beside(trial.head.stop) for _ in range(2)]:
+            ended("stop() beside read()", stop)
+        longest_s = max(longest_s, time.monotonic() - began_s)
+    for read in reads:
+        ended("read() beside stop()", read)
+    return longest_s
+
+
+@HEADS.check("head.threads", "calls from several threads at once are all answered", moves=True)
+def _threads(trial: HeadTrial) -> None:
+    goals = [trial.goal(0.1 * step, 0.0) for step in range(5)]
+
+    def work(moves: bool) -> None:
+        for goal in goals:
+            trial.head.read()
+            if moves:
+                trial.head.move(*goal, trial.speed_rad_per_s)
+
+    for call in [beside(partial(work, moves)) for moves in (True, False, False, False)]:
+        try:
+            ended("a call beside others", call, 2 * PATIENCE_S)
+        except DriverError as error:
+            raise PromiseBroken(f"a call beside others failed: {error}") from None
+    off_rad = away(trial.settled(), goals[-1])
+    expect(off_rad <= trial.near_rad, f"it settled {off_rad:.4f} rad from the last goal")
+
+
+@HEADS.check("head.speed", "no axis goes faster than asked", moves=True)
+def _speed(trial: HeadTrial) -> str:
+    asked = 0.5 * trial.speed_rad_per_s
+    fastest, unsure = fastest_seen(trial, asked)
+    expect(
+        fastest <= asked * 1.05 + unsure,
+        f"{fastest:.3f} rad/s were measured where {asked:.3f} rad/s were asked for",
+    )
+    return f"{fastest:.3f} rad/s, asked {asked:.3f}"
+
+
+def fastest_seen(trial: HeadTrial, asked_rad_per_s: float) -> tuple[float, float]:
+    """Send the head across its box; return the fastest that was seen, rad/s, and how unsure that is."""
+    trial.sent(trial.goal(-0.7, -0.7))
+    goal = trial.goal(0.3, 0.3)
+    readings: list[tuple[float, Angles]] = []
+    began_s = time.monotonic()
+    trial.move(goal, asked_rad_per_s)
+    while True:
+        reading = trial.read()
+        readings.append((reading.time_s, at(reading)))
+        if not reading.moving or reading.time_s > began_s + SETTLES_WITHIN_S:
+            break
+    stamps_s = np.array([stamp_s for stamp_s, _ in readings])
+    moments_s = np.linspace(stamps_s[0], stamps_s[-1], 13)
+    step_s = float(moments_s[1] - moments_s[0])
+    if step_s < 0.004:
+        raise NotTried("the way was too short to tell a speed; a larger --reach helps")
+    fastest = 0.0
+    for axis in (0, 1):
+        if trial.true_rad is not None:
+            angles = np.array([trial.true_rad(float(moment_s))[axis] for moment_s in moments_s])
+        else:
+            angles = np.interp(moments_s, stamps_s, [angles[axis] for _, angles in readings])
+        fastest = max(fastest, float(np.abs(np.diff(angles)).max()) / step_s)
+    count_rad = OUTSIDE_COUNT_RAD if trial.count_rad is None else trial.count_rad
+    return fastest, 2 * count_rad / step_s
+
+
+@HEADS.check(
+    "head.limits", "goals at the limits are reached, and those beyond the driver's own refused", moves=True
+)
+def _limits(trial: HeadTrial) -> None:
+    if trial.limits_rad is None:
+        raise NotTried("limits that it may be sent to are not known; --limits tells them")
+    pan, tilt = trial.limits_rad
+    home = trial.sent(trial.goal(0.0, 0.0))
+    for end, far in ((0, -math.inf), (1, math.inf)) if trial.own_limits else ():
+        for beyond in (
+            (math.nextafter(pan[end], far), at(home)[1]),
+            (at(home)[0], math.nextafter(tilt[end], far)),
+        ):
+            _refused(trial, beyond, trial.speed_rad_per_s, "beyond a limit")
+    for end in (0, 1):
+        trial.sent((pan[end], tilt[end]))
+
+
+@HEADS.check(
+    "head.not_a_number", "a goal or speed that is no number, or a speed that is none, is refused", moves=True
+)
+def _not_a_number(trial: HeadTrial) -> None:
+    pan, tilt = trial.goal(0.2, 0.2)
+    for goal in ((math.nan, tilt), (pan, math.nan), (math.inf, tilt), (pan, -math.inf)):
+        _refused(trial, goal, trial.speed_rad_per_s, "that is no number")
+    for speed in (0.0, -1.0, math.nan):
+        _refused(trial, (pan, tilt), speed, "at no speed")
+
+
+def _refused(trial: HeadTrial, goal: Angles, speed_rad_per_s: float, words: str) -> None:
+    """Send the head where it cannot go: a DriverError, and nothing moves."""
+    before = trial.settled()
+    what = f"move({goal[0]!r}, {goal[1]!r}, {speed_rad_per_s!r})"
+    try:
+        trial.move(goal, speed_rad_per_s)
+    except DriverError as error:
+        expect("\n" not in str(error), f"{what}: {str(error)!r} is not one sentence")
+    else:
+        trial.stop()
+        raise PromiseBroken(f"{what}, a goal {words}, was not refused")
+    time.sleep(0.05)
+    after = trial.read()
+    expect(
+        away(after, at(before)) <= trial.near_rad,
+        f"{what} was refused, and the head moved by {away(after, at(before)):.4f} rad",
+    )
+
+
+@HEADS.check(
+    "head.deadlines", "every call ends within half of the time that the service gives it", moves=True
+)
+def _deadlines(trial: HeadTrial) -> str:
+    goal = trial.goal(0.2, -0.1)
+    told = []
+    for name, call, deadline_s in (
+        ("read", trial.read, READ_TIMEOUT_S),
+        ("move", lambda: trial.move(goal), MOVE_TIMEOUT_S),
+        ("read", trial.read, READ_TIMEOUT_S),
+        ("stop", trial.stop, STOP_TIMEOUT_S),
+    ):
+        took_s = []
+        for _ in range(3):
+            began_s = time.monotonic()
+            call()
+            took_s.append(time.monotonic() - began_s)
+        expect(min(took_s) < deadline_s / 2, f"{name}() took {min(took_s):.2f} s of {deadline_s:g} s at best")
+        told.append(f"{name} {1e3 * min(took_s):.1f} ms")
+    return ", ".join(told)
+
+
+@HEADS.check("head.close", "close stops the head, twice does no harm, and then no reading comes", moves=True)
+def _close(trial: HeadTrial) -> str | None:
+    trial.sent(trial.goal(-0.9, -0.9))
+    goal = trial.goal(0.9, 0.9)
+    trial.on_its_way(goal)
+    for words in ("close()", "a second close()"):
+        try:
+            trial.worker.call(words, trial.head.close)
+        except DriverError as error:
+            raise PromiseBroken(f"{words} raised {type(error).__name__}: {error}") from None
+    with suppress(DriverError):
+        trial.worker.call("read() of a closed head", trial.head.read)
+        raise PromiseBroken("a closed head gave a reading")
+    if trial.open_again is None:
+        trial.closed = True
+        return None
+    trial.head = trial.open_again()
+    reading = trial.settled()
+    expect(away(reading, goal) > trial.near_rad, "closed on its way the head went on to its goal")
+    return f"opened again {away(reading, goal):.3f} rad before the goal"

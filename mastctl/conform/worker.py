@@ -1,0 +1,85 @@
+"""A device's own thread, as the service gives it one: its calls go one at a time, each with an end."""
+
+from __future__ import annotations
+
+import queue
+import threading
+from collections.abc import Callable
+from concurrent.futures import Future
+from typing import TypeVar
+
+from drivers.errors import DriverError
+from mastctl.conform.checks import PromiseBroken, SubjectLost
+
+T = TypeVar("T")
+
+PATIENCE_S = 12.0
+
+
+class Worker:
+    """One thread that makes a device's calls."""
+
+    def __init__(self) -> None:
+        self._asked: queue.SimpleQueue[Callable[[], None] | None] = queue.SimpleQueue()
+        threading.Thread(target=self._serve, name="device under test", daemon=True).start()
+
+    def call(self, what: str, function: Callable[[], T], patience_s: float = PATIENCE_S) -> T:
+        """Make a call in the device's thread. Raises as `ended`."""
+        future, run = _task(function)
+        self._asked.put(run)
+        return ended(what, future, patience_s)
+
+    def close(self) -> None:
+        """Let the thread end when its last call is back."""
+        self._asked.put(None)
+
+    def _serve(self) -> None:
+        while (run := self._asked.get()) is not None:
+            run()
+
+
+def beside(function: Callable[[], T]) -> Future[T]:
+    """Make a call in a thread of its own, beside those of the device's thread."""
+    future, run = _task(function)
+    threading.Thread(target=run, name="beside the device under test", daemon=True).start()
+    return future
+
+
+def ended(what: str, future: Future[T], patience_s: float = PATIENCE_S) -> T:
+    """Return what a call returned.
+
+    Raises
+    ------
+    DriverError
+        What the driver raised.
+    PromiseBroken
+        If that was anything else.
+    SubjectLost
+        If the call does not come back.
+    """
+    try:
+        return future.result(patience_s)
+    except DriverError:
+        raise
+    except TimeoutError:
+        if future.done():
+            raise PromiseBroken(f"{what} raised TimeoutError where a DriverError is expected") from None
+        raise SubjectLost(f"{what} has not come back after {patience_s:g} s") from None
+    except BaseException as error:
+        words = " ".join(str(error).split())[:200]
+        raise PromiseBroken(
+            f"{what} raised {type(error).__name__} ({words}) where a DriverError is expected"
+        ) from error
+
+
+def _task(function: Callable[[], T]) -> tuple[Future[T], Callable[[], None]]:
+    """What is waited for, and what to run for it."""
+    future: Future[T] = Future()
+
+    def run() -> None:
+        try:
+            future.set_result(function())
+        except BaseException as error:  # a foreign driver may raise anything; whoever waits is told
+            future.set_exception(error)
+
+    return future, run
