@@ -16,6 +16,7 @@ import pytest
 from drivers.clock import ManualClock, SystemClock
 from drivers.errors import BadOptions, BadReply, DriverError, NoFreshFrame, NoReply
 from drivers.faults import CAMERA_WORDS, HEAD_WORDS, LOG_WORDS, PAN_TILT, WHEN, FaultPanel, read_script
+from drivers.hardware import close_devices
 from drivers.interfaces import Camera, HoldsExposure, KnowsSize, Paced
 from drivers.sim.cameras import CameraSettings, SimulatedCamera
 from drivers.sim.hanging import HangingCamera
@@ -476,6 +477,28 @@ def test_camera_hangs_in_the_call_that_is_named_until_the_fault_is_over(clock: A
             panel.clear()
         assert back.wait(PATIENCE_S), name
         panel.set("cam_left", "hang", call=number)
+
+
+def test_a_camera_that_hangs_in_close_is_left_behind_and_the_others_are_closed(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("drivers.hardware.CLOSING_S", 0.5)
+    monkeypatch.setattr("drivers.hardware.CLOSING_PATIENCE_S", 0.05)
+    closed = threading.Event()
+    bench.panel.set("cam_left", "hang", call=2)
+    hanging = HangingCamera(bench.camera, SIZE, bench.clock, bench.panel)
+    close_devices({"cam_left": hanging, "cam_right": SimpleNamespace(close=closed.set)})
+    assert closed.is_set()
+    assert bench.camera.next_frame(START, 5.0).sequence >= 0, "not closed yet"
+    bench.panel.clear()
+    deadline_s = time.monotonic() + PATIENCE_S
+    while True:
+        try:
+            bench.camera.next_frame(bench.clock.now_s(), 5.0)
+        except NoFreshFrame as error:
+            assert "it is closed" in str(error)
+            break
+        assert time.monotonic() < deadline_s
 
 
 def test_a_hanging_camera_is_one_of_every_kind(bench: Bench) -> None:

@@ -100,8 +100,10 @@ class _Processes:
         return folder
 
     def close(self) -> None:
+        """End the process, if there is one."""
         if self._process is not None:
             self._process.close()
+            self._process = None
 
 
 @pytest.fixture(scope="session")
@@ -120,14 +122,19 @@ def simulated_rover(request: pytest.FixtureRequest, _mast_processes: _Processes)
 
     process = _mast_processes.process()
     request.node.stash[_LOG] = _Log(process.log)
+    url = refusal = ""
     try:
         options = _options(request)
         url = process.open({**options, "folder": str(_mast_processes.folder())})
     except (RoverError, ValueError) as error:
-        pytest.fail(f"no simulated rover for this test: {error}", pytrace=False)
+        refusal = str(error)
+    if refusal:
+        pytest.fail(f"no simulated rover for this test: {refusal}", pytrace=False)
     yield SimulatedRover(process.ask, url)
-    if process.alive:
+    try:
         process.ask("close")
+    except RoverError:  # it has died, or hangs: the next test gets another one
+        _mast_processes.close()
 
 
 @pytest.fixture

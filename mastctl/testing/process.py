@@ -33,7 +33,7 @@ class RoverProcess:
     Parameters
     ----------
     log
-        The file that gets what the daemons say on stderr.
+        The file that gets what the daemons say on stderr; temporary files go beside it.
     workers
         How many such processes share this machine: each takes its part of the processors.
     """
@@ -51,7 +51,7 @@ class RoverProcess:
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 stderr=errors,
-                env={**share, **os.environ},
+                env={**share, **os.environ, "TMPDIR": str(log.parent)},  # killed, it clears nothing away
                 # Ctrl-C is for the tests; the daemon is asked by its fixture, which ends after them.
                 start_new_session=True,
             )

@@ -3,8 +3,13 @@
 from __future__ import annotations
 
 import math
+import os
+import signal
+import time
 import urllib.request
 from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
 
 import pytest
 
@@ -15,6 +20,7 @@ pytestmark = pytest.mark.mastctl(picture_width_px=320, scene={"relief_m": 0.0, "
 
 SetsFault = Callable[..., SetFault]
 
+PATIENCE_S = 60.0  # only ends a failing test
 MIDDLE_PX = (159.5, 119.5)
 SEEN: list[str] = []
 
@@ -29,12 +35,39 @@ def ended(client: Client, pixel: tuple[str, str, float, float]) -> str:
     return str(record["error"]["code"] if record["error"] else record["state"])
 
 
+def points_again(client: Client) -> None:
+    """Stop, which also arms a bus watchdog that has tripped, and point, until that is done."""
+    until_s = time.monotonic() + PATIENCE_S
+    while True:
+        try:
+            client.stop()
+            code = ended(client, clicked(client))
+        except ClientError as error:  # the head still moves, or has just come back
+            code = error.code
+        if code == "done":
+            return
+        assert time.monotonic() < until_s, code
+        time.sleep(0.2)  # a head that was lost is asked again twice a second
+
+
 def code_of_snapshot(client: Client, camera: str) -> str:
     try:
         client.snapshot(camera)
     except ClientError as error:
         return error.code
     return "done"
+
+
+def listening_at(port: int) -> list[int]:
+    """The processes with a socket that listens at a port of this machine."""
+    rows = [line.split() for line in Path("/proc/net/tcp").read_text().splitlines()[1:]]
+    sockets = {f"socket:[{row[9]}]" for row in rows if row[1].endswith(f":{port:04X}") and row[3] == "0A"}
+    found = []
+    for folder in Path("/proc").glob("[0-9]*/fd"):
+        with suppress(OSError):
+            if any(str(one.readlink()) in sockets for one in folder.iterdir()):
+                found.append(int(folder.parent.name))
+    return found
 
 
 def test_the_address_is_that_of_a_daemon(mast_daemon: str) -> None:
@@ -153,6 +186,40 @@ def test_the_daemon_outlives_a_fault_and_points_again_when_it_is_over(
     simulated_rover.advance(5.0)
     assert ended(mast_client, clicked(mast_client)) == "done"
     assert mast_client.status()["faults"] == []
+
+
+@pytest.mark.mastctl(wire="dynamixel")
+def test_one_silent_servo_on_a_bus_ends_a_pointing_and_comes_back(
+    mast_client: Client, fault: SetsFault
+) -> None:
+    mast_client.wait(mast_client.point(pan_rad=0.05, tilt_rad=-0.1))  # the driver moves when it opens
+    pixel = clicked(mast_client)
+    with fault("pan_tilt", "silent", axis=1):
+        assert ended(mast_client, pixel) == "no_reply"
+        assert any(one["device"] == "pan_tilt" for one in mast_client.status()["faults"])
+    points_again(mast_client)
+
+
+@pytest.mark.mastctl(wire="flir_ptu")
+def test_a_unit_that_tells_no_number_ends_a_pointing_and_comes_back(
+    mast_client: Client, fault: SetsFault
+) -> None:
+    mast_client.wait(mast_client.point(pan_rad=0.05, tilt_rad=-0.1))  # the driver moves when it opens
+    pixel = clicked(mast_client)
+    with fault("pan_tilt", "not_a_number", axis=1):
+        assert ended(mast_client, pixel) == "bad_reply"
+    points_again(mast_client)
+
+
+def test_a_process_that_died_is_told_and_the_next_test_gets_another(
+    simulated_rover: SimulatedRover, mast_client: Client
+) -> None:
+    address = int(mast_client.url.rpartition(":")[2])
+    killed = [pid for pid in listening_at(address) if pid != os.getpid()]
+    assert len(killed) == 1
+    os.kill(killed[0], signal.SIGKILL)
+    with pytest.raises(RoverError, match="the daemon's process does not answer: it ended with -9"):
+        simulated_rover.true_joints()
 
 
 @pytest.mark.mastctl(faults=[{"device": "hazcam_left", "word": "hang", "call": 4}])
