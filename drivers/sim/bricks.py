@@ -42,9 +42,15 @@ class Brick:
         return np.array([self.corners_m[list(face)].mean(axis=0) for face in (_TOP, *_SIDES)])
 
 
-def make_brick(x_m: float, y_m: float, turn_rad: float, ground_z_m: Callable[[float, float], float]) -> Brick:
-    """Return a brick whose middle is over (x, y), its long side turned from north to east."""
-    length, width, height = SIZE_M
+def make_brick(
+    x_m: float,
+    y_m: float,
+    turn_rad: float,
+    ground_z_m: Callable[[float, float], float],
+    size_m: tuple[float, float, float] = SIZE_M,
+) -> Brick:
+    """Return a brick (length, width, height) about (x, y), its length turned from north to east."""
+    length, width, height = size_m
     flat = 0.5 * np.array([[length, width], [length, -width], [-length, -width], [-length, width]])
     cos, sin = np.cos(turn_rad), np.sin(turn_rad)
     around = flat @ np.array([[cos, sin], [-sin, cos]]) + [x_m, y_m]
@@ -84,8 +90,9 @@ def meshes(bricks: Sequence[Brick]) -> Any:
     normals = np.repeat(across[:, :, None], 3, axis=2).astype(np.float32)
     tones = np.full(len(bricks), TONE, dtype=np.float32)
     return kernels().Rocks(
-        spheres(corners), *(boxes(corners, 4**level) for level in (3, 2, 1)), corners, normals, tones
-    )
+        spheres(corners), *(boxes(corners, 4**level) for level in (3, 2, 1)), corners, normals, tones,
+        np.full(len(bricks), kernels().NOTHING),
+    )  # fmt: skip
 
 
 def _triangles(brick: Brick) -> Float64:

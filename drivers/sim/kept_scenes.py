@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import scipy
 
-from drivers.sim import bricks, rocks, scene, texture
+from drivers.sim import boards, bricks, placed, rocks, scene, texture
 from drivers.sim.bricks import Brick
 from drivers.sim.compiled import kernels
 from drivers.sim.kept import digest_of, keep_newest, kept_folder
@@ -45,7 +45,7 @@ def kept_scene(settings: SceneSettings) -> Scene:
 
 def folder_of(settings: SceneSettings) -> Path:
     """Return where a scene is kept: under the digest of its settings and of all that makes it."""
-    modules = (bricks, rocks, scene, texture)
+    modules = (boards, bricks, placed, rocks, scene, texture)
     makers = digest_of(Path(str(module.__file__)) for module in modules), kernels().SOURCES
     words = (repr(settings), *makers, np.__version__, scipy.__version__)
     return kept_folder("scenes", hashlib.sha256("\n".join(words).encode()).hexdigest())
@@ -83,7 +83,7 @@ def read(folder: Path, settings: SceneSettings) -> Scene:
     """Return a scene that was written; any of the errors that `kept_scene` knows if it is not whole."""
     facts = json.loads((folder / FACTS).read_text())
     module = kernels()
-    kinds = {"inner": module.Grid, "outer": module.Grid, "rocks": module.Rocks}
+    kinds = {"inner": module.Grid, "outer": module.Grid, "rocks": module.Rocks, "boards": module.Boards}
 
     def part(name: str) -> Any:
         # private pages: a process that writes into one gets a copy of its own

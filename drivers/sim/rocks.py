@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -97,14 +97,22 @@ def make_rocks(count: int, rng: np.random.Generator, ground_z_m: Any) -> Any:
 
     ``ground_z_m(x_m, y_m)`` gives the ground's z in the site frame, metres.
     """
+    return stones_at(places(count, rng), rng, ground_z_m)
+
+
+def stones_at(
+    where: Float64, rng: np.random.Generator, ground_z_m: Any, headings_rad: Sequence[float] | None = None
+) -> Any:
+    """Return ``kernels.Rocks`` at (n, 3) places and diameters; turned by chance if no heading is given."""
     sphere = divided_icosahedron()
-    where = places(count, rng)
     corners = np.empty((len(where), len(sphere), 3, 3))
     normals = np.empty((len(where), len(sphere), 3, 3), dtype=np.float32)
     for k, (x, y, diameter) in enumerate(where):
         stone = sphere * shape(sphere, rng)[..., None]
         stone *= rng.uniform([0.8, 0.65, 0.5], [1.0, 0.95, 0.85])
         turn = rng.uniform(0.0, 2 * np.pi)
+        if headings_rad is not None:
+            turn = headings_rad[k]
         cos, sin = np.cos(turn), np.sin(turn)
         stone = stone @ np.array([[cos, sin, 0.0], [-sin, cos, 0.0], [0.0, 0.0, 1.0]])
         stone *= diameter / (stone[..., :2].max() - stone[..., :2].min())
@@ -114,13 +122,14 @@ def make_rocks(count: int, rng: np.random.Generator, ground_z_m: Any) -> Any:
         normals[k] = corner_normals(corners[k])
     tones = np.exp(rng.normal(0.0, 0.16, len(where))).astype(np.float32)
     return kernels().Rocks(
-        spheres(corners), *(boxes(corners, 4**level) for level in (3, 2, 1)), corners, normals, tones
-    )
+        spheres(corners), *(boxes(corners, 4**level) for level in (3, 2, 1)), corners, normals, tones,
+        np.full(len(where), kernels().NOTHING),
+    )  # fmt: skip
 
 
-def together(first: Any, second: Any) -> Any:
-    """Return the ``kernels.Rocks`` of both."""
-    return kernels().Rocks(*(np.concatenate(parts) for parts in zip(first, second, strict=True)))
+def together(*some: Any) -> Any:
+    """Return the ``kernels.Rocks`` of all."""
+    return kernels().Rocks(*(np.concatenate(parts) for parts in zip(*some, strict=True)))
 
 
 def boxes(corners_m: Float64, run: int) -> Float64:

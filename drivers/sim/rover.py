@@ -38,6 +38,7 @@ from drivers.sim.kept_scenes import kept_scene
 from drivers.sim.optics.lens import Lens
 from drivers.sim.optics.shutter import Shutter
 from drivers.sim.pan_tilt import HeadSettings, SimulatedPanTilt, head_settings
+from drivers.sim.placed import REACH_M, check_clear_of, read_list
 from drivers.sim.render import Renderer, Stills, compile_renderer
 from drivers.sim.scene import SceneSettings
 from drivers.sim.section import filled
@@ -47,9 +48,6 @@ from drivers.simulation_clock import simulation_speed
 
 TRUTH_FRAMES = 512
 """How many frames of each camera ``frame_truth`` remembers."""
-
-REACH_M = 28.0
-"""How far from the middle of the ground the rover may stand, along x and y; only hills from 32 m on."""
 
 BLUR_STEP_PX = 1.5
 """An exposure during which the picture moves is averaged over renderings no further apart than this..."""
@@ -159,13 +157,28 @@ def simulation_settings(section: Mapping[str, Any], folder: Path) -> SimulationS
         head=head,
         camera=replace(camera, seed=seed),
         samples=_whole(section.get("samples", 2), "simulation.samples", 1, 6),
-        scene=filled(SceneSettings(), scene, "simulation.scene"),
+        scene=scene_settings(scene, folder),
         faults=tuple(faults),
         wire=wire,
         speed=simulation_speed(section.get("speed", 1.0)),
         temperature=temperature_settings(section.get("temperature", {})),
         clocks=clock_settings(section.get("clocks", {})),
     )
+
+
+def scene_settings(section: Any, folder: Path) -> SceneSettings:
+    """Return the settings of ``simulation.scene``; files in it start at ``folder``. Raises BadOptions."""
+    plain: Any = section
+    placed: dict[str, Any] = {}
+    if isinstance(section, Mapping):
+        placed = {
+            kind: read_list(kind, section[kind], folder)
+            for kind in ("rocks", "bricks", "boards")
+            if isinstance(section.get(kind), list | tuple)
+        }
+        plain = {key: value for key, value in section.items() if key not in placed}
+    settings: SceneSettings = filled(SceneSettings(), plain, "simulation.scene")
+    return replace(settings, **placed)
 
 
 def _whole(value: Any, key: str, low: int, high: int) -> int:
@@ -229,6 +242,7 @@ class SimulatedRover:
                 )
         self.faults = FaultPanel(clock.now_s, self.rig.cameras)
         self.faults.set_all(settings.faults)
+        check_clear_of(settings.scene.placed, self.rig)
         # Before any camera is asked: a frame's deadline is no time for a compiler.
         compile_renderer()
         self.scene = kept_scene(settings.scene)

@@ -8,7 +8,9 @@ horizon and is level where the two meet.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -16,9 +18,20 @@ from numpy.typing import ArrayLike, NDArray
 
 from calib.rigid import Rigid, rot_x, rot_y, rot_z
 from drivers.errors import BadOptions
-from drivers.sim import bricks, rocks, texture
+from drivers.sim import boards, bricks, rocks, texture
+from drivers.sim.boards import Board
 from drivers.sim.bricks import Brick
 from drivers.sim.compiled import kernels
+from drivers.sim.placed import (
+    Placed,
+    PlacedBoard,
+    PlacedBrick,
+    PlacedRock,
+    check_apart,
+    middle_m,
+    named,
+    radius_m,
+)
 
 Float64 = NDArray[np.float64]
 
@@ -44,17 +57,21 @@ class SceneSettings:
     relief_m
         How far the ground rises and falls about z = 0, metres, 0 to 1; 0 gives flat textured ground.
     rocks
-        How many stones of 0.05-0.6 m lie 1.5-20 m away within 1.5 rad of north, 0 to 500.
+        How many stones of 0.05-0.6 m lie 1.5-20 m away within 1.5 rad of north, 0 to 500; or just these.
     bricks
-        How many bricks stand ahead, by turns 1.8 m and 6 m away, as far as there is room, 0 to 24.
+        How many bricks stand ahead, by turns 1.8 m and 6 m away, as far as there is room, 0 to 24; or just
+        these.
+    boards
+        Boards that stand there. Where one does, or a brick or rock was placed, no scattered one is.
     sun_azimuth_rad, sun_elevation_rad
         Where the sun stands: from north over east, and above the horizon (0.2 to 1.5 rad).
     """
 
     seed: int = 1
     relief_m: float = 0.15
-    rocks: int = 50
-    bricks: int = 0
+    rocks: int | tuple[PlacedRock, ...] = 50
+    bricks: int | tuple[PlacedBrick, ...] = 0
+    boards: tuple[PlacedBoard, ...] = ()
     sun_azimuth_rad: float = -1.95
     sun_elevation_rad: float = 0.70
 
@@ -68,10 +85,16 @@ class SceneSettings:
         )
         for name, low, high in bounds:
             value = getattr(self, name)
-            if not low <= value <= high:
+            if not isinstance(value, tuple) and not low <= value <= high:
                 raise BadOptions(f"scene: {name} {value} is not between {low} and {high}")
         if not math.isfinite(self.sun_azimuth_rad):
             raise BadOptions(f"scene: sun_azimuth_rad {self.sun_azimuth_rad} is not a number of radians")
+        check_apart(self.placed)
+
+    @property
+    def placed(self) -> dict[str, Placed]:
+        """All that was placed, by where it stands in a configuration."""
+        return named(self.rocks, self.bricks, self.boards)
 
 
 class Scene:
@@ -81,6 +104,9 @@ class Scene:
         self.settings = settings
         self.world = world
         self.bricks = bricks
+        self.boards: tuple[Board, ...] = tuple(
+            boards.standing(board, self.ground_z_m) for board in settings.boards
+        )
 
     def cast(self, origins_m: ArrayLike, directions: ArrayLike) -> Float64:
         """Return how far rays go before they meet the ground or a rock.
@@ -142,23 +168,55 @@ def build_scene(settings: SceneSettings | None = None) -> Scene:
     """
     settings = settings or SceneSettings()
     # one stream of numbers for each part: a flat scene keeps the stones and gravel of the rough one
-    relief_rng, hill_rng, rock_rng, gravel_rng, tone_rng, stone_rng, brick_rng = (
-        np.random.default_rng(child) for child in np.random.SeedSequence(settings.seed).spawn(7)
+    relief_rng, hill_rng, rock_rng, gravel_rng, tone_rng, stone_rng, brick_rng, placed_rng = (
+        np.random.default_rng(child) for child in np.random.SeedSequence(settings.seed).spawn(8)
     )
     sun = sun_direction(settings)
     inner = make_grid(inner_relief_m(settings, relief_rng), INNER_CELL_M)
     outer = make_grid(outer_relief_m(settings, hill_rng), OUTER_CELL_M)
-    stones = rocks.make_rocks(settings.rocks, rock_rng, lambda x, y: ground_z_m(inner, x, y))
-    laid = bricks.scattered(
-        settings.bricks, brick_rng, stones.spheres_m, lambda x, y: ground_z_m(inner, x, y)
-    )
+    stones, laid = laid_out(settings, rock_rng, brick_rng, placed_rng, partial(ground_z_m, inner))
+    stood = [boards.standing(board, partial(ground_z_m, inner)) for board in settings.boards]
     if laid:
         stones = rocks.together(stones, bricks.meshes(laid))
+    if stood:
+        stones = rocks.together(stones, boards.meshes(stood))
     tones = ground_tones(inner, sun, tone_rng) * shadows(inner, stones, sun)
     detail = texture.pyramid(texture.gravel(gravel_rng, sun, texture.DETAIL_TEXELS), texture.DETAIL_TEXEL_M)
     stone = texture.pyramid(texture.stone(stone_rng, texture.STONE_TEXELS), texture.STONE_TEXEL_M)
     broad = texture.pyramid(tones, INNER_CELL_M)
-    return Scene(settings, kernels().World(inner, outer, stones, detail, broad, stone, sun), laid)
+    world = kernels().World(inner, outer, stones, detail, broad, stone, boards.faces(stood), sun)
+    return Scene(settings, world, laid)
+
+
+def laid_out(
+    settings: SceneSettings,
+    rock_rng: np.random.Generator,
+    brick_rng: np.random.Generator,
+    placed_rng: np.random.Generator,
+    ground: Callable[[float, float], float],
+) -> tuple[Any, tuple[Brick, ...]]:
+    """Return ``kernels.Rocks`` of the stones, and the bricks; scattered ones keep away from placed things."""
+    placed = settings.placed.values()
+    taken_m = np.array([[*middle_m(thing), 0.0, radius_m(thing)] for thing in placed]).reshape(-1, 4)
+    if isinstance(settings.rocks, tuple):
+        where = np.array([[rock.x_m, rock.y_m, rock.diameter_m] for rock in settings.rocks]).reshape(-1, 3)
+        stones = rocks.stones_at(where, placed_rng, ground, [rock.heading_rad for rock in settings.rocks])
+    else:
+        stones = rocks.make_rocks(settings.rocks, rock_rng, ground)
+        apart = stones.spheres_m[:, None] - taken_m[None]
+        free = (np.hypot(apart[..., 0], apart[..., 1]) > stones.spheres_m[:, None, 3] + taken_m[:, 3]).all(
+            axis=1
+        )
+        stones = type(stones)(*(np.ascontiguousarray(part[free]) for part in stones))
+    if isinstance(settings.bricks, tuple):
+        return stones, tuple(
+            bricks.make_brick(
+                one.x_m, one.y_m, one.heading_rad, ground, (one.length_m, one.width_m, one.height_m)
+            )
+            for one in settings.bricks
+        )
+    taken_m = np.concatenate([stones.spheres_m, taken_m])
+    return stones, bricks.scattered(settings.bricks, brick_rng, taken_m, ground)
 
 
 def tiny_scene() -> Scene:
@@ -167,11 +225,12 @@ def tiny_scene() -> Scene:
     rng = np.random.default_rng(settings.seed)
     sun = sun_direction(settings)
     inner = make_grid(np.zeros((9, 9), dtype=np.float32), INNER_CELLS * INNER_CELL_M / 8)
-    stones = rocks.make_rocks(settings.rocks, rng, lambda x, y: ground_z_m(inner, x, y))
+    stones = rocks.make_rocks(1, rng, partial(ground_z_m, inner))
     broad = texture.pyramid(shadows(inner, stones, sun), inner.cell_m)
     detail = texture.pyramid(texture.gravel(rng, sun, 128), texture.DETAIL_TEXEL_M)
     stone = texture.pyramid(texture.stone(rng, 128), texture.STONE_TEXEL_M)
-    return Scene(settings, kernels().World(inner, inner, stones, detail, broad, stone, sun))
+    world = kernels().World(inner, inner, stones, detail, broad, stone, boards.faces([]), sun)
+    return Scene(settings, world)
 
 
 def sun_direction(settings: SceneSettings) -> Float64:

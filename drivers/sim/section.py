@@ -10,6 +10,8 @@ from drivers.errors import BadOptions
 from drivers.faults import nearest
 from drivers.options import is_number, is_whole
 
+_KINDS = {bool: "true or false", tuple: "a list", str: "text"}
+
 
 def filled(defaults: Any, values: Any, key: str) -> Any:
     """Return a settings dataclass with values replaced by those of a mapping. Raises BadOptions."""
@@ -29,8 +31,7 @@ def filled(defaults: Any, values: Any, key: str) -> Any:
                 raise BadOptions(f"{key}.{name} is {value!r}, expected {what}")
             value = kind(value)
         elif not isinstance(value, kind):
-            what = "true or false" if kind is bool else kind.__name__
-            raise BadOptions(f"{key}.{name} is {value!r}, expected {what}")
+            raise BadOptions(f"{key}.{name} is {value!r}, expected {_KINDS.get(kind, kind.__name__)}")
         changes[str(name)] = value
     return replace(defaults, **changes)
 

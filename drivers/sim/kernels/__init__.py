@@ -10,16 +10,18 @@ from drivers.sim.kernels.gravel import lay_pebbles
 from drivers.sim.kernels.ground import over_ground
 from drivers.sim.kernels.noise import noisy_levels
 from drivers.sim.kernels.tiles import render_tiles
-from drivers.sim.kernels.world import AMBIENT, ONE, PAD, Grid, Rocks, Texture, World
+from drivers.sim.kernels.world import AMBIENT, NOTHING, ONE, PAD, Boards, Grid, Rocks, Texture, World
 
 ENTRIES = (cast_rays, hold_rays, lay_pebbles, noisy_levels, over_ground, render_tiles, shadow_rays)
 
 __all__ = [
     "AMBIENT",
     "ENTRIES",
+    "NOTHING",
     "ONE",
     "PAD",
     "SOURCES",
+    "Boards",
     "Grid",
     "Rocks",
     "Texture",

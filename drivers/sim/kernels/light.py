@@ -6,7 +6,7 @@ import math
 
 from drivers.sim.kernels.compiling import inlined, part
 from drivers.sim.kernels.texture import brightness, stretched_brightness
-from drivers.sim.kernels.world import AMBIENT, Float64, Grid, Rocks, Texture
+from drivers.sim.kernels.world import AMBIENT, Boards, Float64, Grid, Rocks, Texture
 
 GROUND_TONE = 108.0
 ROCK_TONE = 106.0
@@ -137,6 +137,51 @@ def rock_light(
     light = max(float(nx * sun[0] + ny * sun[1] + nz * sun[2]), 0.0)
     above = 0.5 - 0.5 * nz
     tone *= float(rocks.tones[k]) * (AMBIENT * (0.45 + 0.55 * above) + (1.0 - AMBIENT) * light) * 1.45
+    haze = s / (s + HAZE_M)
+    return float(ROCK_TONE * tone * (1.0 - haze) + SKY_HORIZON * haze)
+
+
+@part
+def shows_board(rocks: Rocks, boards: Boards, k: int, t: int, board: int) -> bool:
+    """Whether triangle t of a board's mesh is of the face with the picture."""
+    normals, faces = rocks.normals, boards.faces_m
+    across = 0.0
+    for i in range(3):
+        across += normals[k, t, 0, i] * faces[board, 3, i]
+    return bool(across > 0.9)
+
+
+@part
+def board_light(
+    boards: Boards,
+    board: int,
+    sun: Float64,
+    x: float,
+    y: float,
+    z: float,
+    s: float,
+    dx: float,
+    dy: float,
+    dz: float,
+    pitch: float,
+) -> float:
+    """Brightness of a point of a board's face: its picture in the light of sun and sky, without gloss."""
+    faces = boards.faces_m
+    lx, ly, lz = x - faces[board, 0, 0], y - faces[board, 0, 1], z - faces[board, 0, 2]
+    u = lx * faces[board, 1, 0] + ly * faces[board, 1, 1] + lz * faces[board, 1, 2]
+    v = lx * faces[board, 2, 0] + ly * faces[board, 2, 1] + lz * faces[board, 2, 2]
+    du = dx * faces[board, 1, 0] + dy * faces[board, 1, 1] + dz * faces[board, 1, 2]
+    dv = dx * faces[board, 2, 0] + dy * faces[board, 2, 1] + dz * faces[board, 2, 2]
+    nx, ny, nz = faces[board, 3, 0], faces[board, 3, 1], faces[board, 3, 2]
+    facing = max(-(nx * dx + ny * dy + nz * dz), 0.03)
+    level = 1.0 / math.sqrt(du * du + dv * dv + 1e-12)
+    p = boards.picture[board]
+    picture = Texture(boards.texels, boards.start[p], boards.size[p], boards.levels[p], boards.texel_m[p])
+    short = s * pitch
+    tone = stretched_brightness(picture, u, v, short, short / facing, du * level, dv * level)
+    light = max(nx * sun[0] + ny * sun[1] + nz * sun[2], 0.0)
+    above = 0.5 - 0.5 * nz
+    tone *= (AMBIENT * (0.45 + 0.55 * above) + (1.0 - AMBIENT) * light) * 1.45
     haze = s / (s + HAZE_M)
     return float(ROCK_TONE * tone * (1.0 - haze) + SKY_HORIZON * haze)
 

@@ -9,7 +9,14 @@ import numpy as np
 
 from drivers.sim.kernels.compiling import entry, inlined, part
 from drivers.sim.kernels.ground import clear_distance, cross_from_inside, cross_outer, over_ground
-from drivers.sim.kernels.light import ground_light, hits_light, rock_light, sky_light
+from drivers.sim.kernels.light import (
+    board_light,
+    ground_light,
+    hits_light,
+    rock_light,
+    shows_board,
+    sky_light,
+)
 from drivers.sim.kernels.stones import in_beam, nearest_rock
 from drivers.sim.kernels.sweep import DE, DX, DY, MET_A, MET_B, sweep
 from drivers.sim.kernels.world import (
@@ -20,6 +27,7 @@ from drivers.sim.kernels.world import (
     Int64,
     World,
     borrowed,
+    borrowed_boards,
     borrowed_grid,
     borrowed_rocks,
     borrowed_texture,
@@ -71,6 +79,7 @@ def borrowed_world(world: World) -> World:
         borrowed_texture(world.detail),
         borrowed_texture(world.broad),
         borrowed_texture(world.stone),
+        borrowed_boards(world.boards),
         borrowed(world.sun),
     )
 
@@ -132,6 +141,12 @@ def pixel_light(
             s, rock, triangle, u, v = nearest_rock(world.rocks, near, block.n_near, ox, oy, oz, dx, dy, dz, s)
             if rock != NOTHING:
                 px, py, pz = ox + s * dx, oy + s * dy, oz + s * dz
+                board = world.rocks.boards[rock]
+                if board != NOTHING and shows_board(world.rocks, world.boards, rock, triangle, board):
+                    total += board_light(
+                        world.boards, board, world.sun, px, py, pz, s, dx, dy, dz, block.pitch
+                    )
+                    continue
                 total += rock_light(
                     world.rocks, world.stone, world.sun, rock, triangle, u, v, px, py, pz, s, dx, dy, dz,
                     block.pitch,

@@ -51,7 +51,8 @@ class Rocks(NamedTuple):
 
     Four triangles in a row have one parent, sixteen one grandparent, sixty-four one of the 20 first faces;
     boxes_a (k, 20, 6), boxes_b (k, 80, 6), boxes_c (k, 320, 6) bound those, as (low xyz, high xyz).
-    spheres (k, 4) is (centre, radius); corners_m (k, 1280, 3, 3); normals (k, 1280, 3, 3), at the corners.
+    spheres (k, 4) is (centre, radius); corners_m (k, 1280, 3, 3); normals (k, 1280, 3, 3), at the corners;
+    boards (k,) is the place of a board among ``Boards``, NOTHING for a stone or a brick.
     """
 
     spheres_m: Float64
@@ -61,6 +62,7 @@ class Rocks(NamedTuple):
     corners_m: Float64
     normals: Float32
     tones: Float32
+    boards: Int64
 
 
 class Texture(NamedTuple):
@@ -78,6 +80,23 @@ class Texture(NamedTuple):
     texel_m: float
 
 
+class Boards(NamedTuple):
+    """Flat faces with pictures.
+
+    faces_m (n, 4, 3): the corner where the picture begins, the directions of its x and of its y, and where
+    the face looks to; picture (n,) says which. Pictures are as in ``Texture``, all behind one another in
+    texels; start (p, levels) is counted from the first.
+    """
+
+    faces_m: Float64
+    picture: Int64
+    texels: NDArray[np.uint16]
+    start: Int64
+    size: Int64
+    levels: Int64
+    texel_m: Float64
+
+
 class World(NamedTuple):
     """All that a ray can meet, and the light on it."""
 
@@ -87,6 +106,7 @@ class World(NamedTuple):
     detail: Texture
     broad: Texture
     stone: Texture
+    boards: Boards
     sun: Float64
 
 
@@ -136,6 +156,21 @@ def borrowed_rocks(rocks: Rocks) -> Rocks:
         borrowed(rocks.corners_m),
         borrowed(rocks.normals),
         borrowed(rocks.tones),
+        borrowed(rocks.boards),
+    )
+
+
+@part
+def borrowed_boards(boards: Boards) -> Boards:
+    """The boards without owners."""
+    return Boards(
+        borrowed(boards.faces_m),
+        borrowed(boards.picture),
+        borrowed(boards.texels),
+        borrowed(boards.start),
+        borrowed(boards.size),
+        borrowed(boards.levels),
+        borrowed(boards.texel_m),
     )
 
 
