@@ -217,6 +217,8 @@ class SimulationClock:
                 for row in (self._waiting, self._ready, self._guests):
                     if waiting in row:
                         row.remove(waiting)
+                if waiting.member is not None:  # its turn may have come in the same moment
+                    self._give_up_turn(waiting.member)
             self._known.member = None
             raise
 

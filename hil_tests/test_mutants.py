@@ -9,7 +9,7 @@ import pytest
 
 from tools.mutants.nearest import imports, nearest
 from tools.mutants.sites import sites
-from tools.mutants.trial import run
+from tools.mutants.trial import run, run_change
 
 MODULE = '''"""Words."""
 import logging
@@ -129,6 +129,47 @@ def test_neither_an_endless_loop_nor_a_module_that_cannot_be_imported_is_a_test_
 ) -> None:
     (checkout / "calib" / "code.py").write_text(code)
     assert run(checkout, {"test_code.py": 1.0}, 120.0).outcome == outcome
+
+
+def test_what_a_test_objects_to_once_or_without_the_change_too_is_no_kill(checkout: Path) -> None:
+    (checkout / "test_code.py").write_text(
+        """from pathlib import Path
+
+import pytest
+
+from calib.code import doubled
+
+
+def test_once():
+    ran = Path("ran")
+    before = ran.exists()
+    ran.touch()
+    assert before
+
+
+def test_busy():
+    assert False
+
+
+@pytest.mark.parametrize("a", [2, 3])
+def test_two(a):
+    assert a == 3 or doubled(a) == 4
+"""
+    )
+    file = checkout / "calib" / "code.py"
+    allowed_s = {"test_code.py": 30.0}
+    killed = run_change(file, CODE.replace("* 2", "* 3"), checkout, allowed_s, 120.0)
+    assert (killed.outcome, killed.test) == ("killed", "test_code.py::test_two[2]")
+    assert file.read_text() == CODE
+    (checkout / "ran").unlink()
+    assert run_change(file, CODE.replace("-= 1", "-= 2"), checkout, allowed_s, 120.0).outcome == "passed"
+
+
+def test_tests_that_are_all_skipped_object_to_nothing(checkout: Path) -> None:
+    (checkout / "test_code.py").write_text(
+        "import pytest\n\npytest.skip('there is no camera', allow_module_level=True)\n"
+    )
+    assert run(checkout, {"test_code.py": 30.0}, 120.0).outcome == "passed"
 
 
 def test_the_nearest_tests_of_a_module_are_those_that_import_it(repository: Path) -> None:

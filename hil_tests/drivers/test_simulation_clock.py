@@ -43,6 +43,24 @@ def test_a_day_passes_in_no_time_and_to_the_last_bit() -> None:
     assert time.monotonic() - began_s < LONG_S
 
 
+@pytest.mark.parametrize("speed", [math.inf, 1000.0])
+def test_a_wait_that_is_interrupted_in_the_moment_of_its_turn_keeps_nobody_waiting(
+    speed: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    clock, gone_on = SimulationClock(speed), threading.Event()
+
+    def interrupted(self: threading.Event, timeout: float | None = None) -> bool:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patched:
+        patched.setattr(threading.Event, "wait", interrupted)
+        with pytest.raises(KeyboardInterrupt), clock.at_work():
+            pass
+    thread = clock.thread(gone_on.set, "the next one")
+    thread.start()
+    assert gone_on.wait(LONG_S)
+
+
 def test_time_stands_still_while_a_thread_computes() -> None:
     clock = SimulationClock()
     seen: list[float] = []

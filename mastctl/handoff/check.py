@@ -15,7 +15,7 @@ from typing import Any
 from calib.errors import BadFile
 from calib.handoff.bias import HandoffBias, handoff_bias
 from calib.handoff.matched import MatchedHandoff
-from drivers.clock import Clock
+from drivers.clock import Clock, SystemClock
 from mastctl.devices.faults import StandingFault
 from mastctl.handoff.log import HandoffLog, bias_told, read_log
 
@@ -39,18 +39,23 @@ class HandoffCheck:
         Of the mast file in use.
     clock
         Dates the faults.
+    file_time
+        What the file's slowness is measured by; the machine's own clock by default: a file is real, also
+        beside a simulation whose time goes by faster.
     """
 
-    def __init__(self, path: Path | None, digest: str, clock: Clock) -> None:
+    def __init__(self, path: Path | None, digest: str, clock: Clock, file_time: Clock | None = None) -> None:
         self._path = path
         self._clock = clock
+        self._file_time = file_time or SystemClock()
         self._lock = threading.Lock()
         self._handoffs: deque[MatchedHandoff] = deque(maxlen=KEPT)
         self._digest = digest
         self._judged: tuple[int, tuple[HandoffBias, ...]] = (0, ())  # how many count, what stands out
         self._unread: StandingFault | None = None
         self._unwritten: StandingFault | None = None
-        self._asked_s: float | None = None  # since when the file has not answered
+        # Since when the file has not answered: by the clock, and by the file's time.
+        self._asked_s: tuple[float, float] | None = None
         self._queue: SimpleQueue[MatchedHandoff | None] = SimpleQueue()
         self._thread = threading.Thread(target=self._work, name=NAME, daemon=True)
         if path is not None:
@@ -81,13 +86,13 @@ class HandoffCheck:
         """Return what is wrong with the record's file."""
         faults = [one for one in (self._unread, self._unwritten) if one is not None]
         asked_s = self._asked_s
-        if asked_s is not None and self._clock.now_s() - asked_s > SLOW_S:
+        if asked_s is not None and self._file_time.now_s() - asked_s[1] > SLOW_S:
             faults.append(
                 StandingFault(
                     NAME,
                     "slow",
                     f"{self._path} does not answer; hand-offs wait for it",
-                    asked_s,
+                    asked_s[0],
                     "the file answers",
                 )
             )
@@ -126,7 +131,7 @@ class HandoffCheck:
                 return
 
     def _read(self, path: Path) -> None:
-        self._asked(self._clock.now_s())
+        self._ask()
         try:
             before = read_log(path).handoffs if path.is_file() else ()
         except (BadFile, OSError) as error:
@@ -141,12 +146,12 @@ class HandoffCheck:
             self._handoffs = deque((*before, *self._handoffs), maxlen=KEPT)
             news = self._judge()
         _tell(news)
-        self._asked(None)
+        self._answered()
 
     def _write(self, writer: HandoffLog, waiting: deque[MatchedHandoff]) -> None:
         """Write down what waits, oldest first, as far as it goes."""
         words = ""
-        self._asked(self._clock.now_s())
+        self._ask()
         while waiting and not words:
             try:
                 writer.append(waiting[0])
@@ -156,7 +161,7 @@ class HandoffCheck:
             except ValueError as error:
                 log.error("a hand-off cannot be written down: %s", error)
                 waiting.popleft()
-        self._asked(None)
+        self._answered()
         with self._lock:
             before = self._unwritten
             since_s = self._clock.now_s() if before is None else before.since_s
@@ -168,9 +173,13 @@ class HandoffCheck:
         if words and before is None:
             log.error("%s", words)
 
-    def _asked(self, since_s: float | None) -> None:
+    def _ask(self) -> None:
         with self._lock:
-            self._asked_s = since_s
+            self._asked_s = self._clock.now_s(), self._file_time.now_s()
+
+    def _answered(self) -> None:
+        with self._lock:
+            self._asked_s = None
 
 
 def _tell(news: list[HandoffBias]) -> None:

@@ -38,7 +38,8 @@ def sentence(problem: Mapping[str, Any], model: object) -> str:
         return f"{place}: {value} where an object with keys is expected"
     for start in ("Input should be ", "String should have "):
         if words.startswith(start):
-            return f"{place}: {value} where {words.removeprefix(start)} is expected"
+            expected = words.removeprefix(start).partition(", unable to")[0]
+            return f"{place}: {value} where {expected} is expected"
     return f"{place}: {value}: {words}"
 
 

@@ -3,8 +3,9 @@
     .venv/bin/python -m tools.mutants calib/mast drivers/flir_ptu/head.py --mutants 40 --seed 1
 
 Each mutant is one change in one line of a copy of the checkout. Of the eight test files nearest to the
-module, those that enter the changed function run against it, the quickest first, until the first failure. A
-mutant that no test objects to has survived: either the tests lack something, or the line decides nothing.
+module, those that enter the changed function run against it, the quickest first, until the first failure,
+which counts if the same test fails again with the change and passes without it. A mutant that no test objects
+to has survived: either the tests lack something, or the line decides nothing.
 Survivors are printed with their place, to be looked at one by one.
 
 N mutants are drawn from each place named. Told apart from what a test objected to are those that only took
@@ -35,7 +36,7 @@ from mastctl.cli.output import at_least
 from tools.arguments import end, new_file
 from tools.mutants.nearest import TESTS, imports, nearest
 from tools.mutants.sites import Site, sites
-from tools.mutants.trial import Ended, run, warm
+from tools.mutants.trial import Ended, run, run_change, warm
 
 REPOSITORY = Path(__file__).resolve().parent.parent.parent
 FOLDERS = ("calib", "drivers", "mastctl", "hil_tests", "configs", "tools", "docs")
@@ -96,12 +97,7 @@ def _tried(site: Site, allowed_s: dict[str, float]) -> Tried:
     if not tests:
         return Tried(site, "untested", "", 0.0, tests)
     file = _Own.copy / site.file
-    source = file.read_text()
-    try:
-        file.write_text(site.applied(source))
-        ended = run(_Own.copy, allowed_s, PATIENCE_S)
-    finally:
-        file.write_text(source)
+    ended = run_change(file, site.applied(file.read_text()), _Own.copy, allowed_s, PATIENCE_S)
     return Tried(site, ended.outcome.replace("passed", "survived"), ended.test, ended.cpu_s, tests)
 
 

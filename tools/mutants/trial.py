@@ -13,7 +13,7 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from types import FrameType
@@ -25,6 +25,7 @@ from tools.mutants.nearest import PACKAGES, TESTS
 
 LIBRARIES = ("cv2", "fastapi", "httpx", "hypothesis", "numba", "numpy.testing", "scipy.interpolate")
 LIBRARIES += ("scipy.optimize", "scipy.spatial.transform", "scipy.stats", "uvicorn", "yaml")
+NOTHING_TO_RUN = 5  # pytest's code where every test is skipped or left out: nobody objects
 BROKEN = (2, 3, 4)  # pytest's codes for what ended before a test could judge: a module that fails on import
 STARTS_PROCESSES = ("os.exec", "os.fork", "os.posix_spawn", "os.spawn", "subprocess.Popen")
 
@@ -44,23 +45,59 @@ class Ended(NamedTuple):
     reached: frozenset[tuple[str, int]] | None
 
 
+def run_change(
+    file: Path, changed: str, copy: Path, allowed_s: Mapping[str, float], patience_s: float
+) -> Ended:
+    """Run test files on a changed file until one test objects, and put the file back.
+
+    A test that objects must do so again, and must not without the change: else it failed by chance or by what
+    keeps the machine busy; it is left out, and the others go on.
+    """
+    source = file.read_text()
+    doubtful: list[str] = []
+    cpu_s = 0.0
+    while True:
+        try:
+            file.write_text(changed)
+            ended = run(copy, allowed_s, patience_s, leave_out=doubtful)
+            cpu_s += ended.cpu_s
+            if ended.outcome != "killed":
+                return ended._replace(cpu_s=cpu_s)
+            alone_s = {ended.test: allowed_s.get(ended.test.partition("::")[0], 60.0)}
+            again = run(copy, alone_s, patience_s)
+        finally:
+            file.write_text(source)
+        without = run(copy, alone_s, patience_s)
+        cpu_s += again.cpu_s + without.cpu_s
+        if again.outcome != "passed" and without.outcome == "passed":
+            return ended._replace(cpu_s=cpu_s)
+        doubtful.append(ended.test)
+
+
 def warm() -> None:
     """Import what nearly every test needs, once for all runs."""
     for name in LIBRARIES:
         importlib.import_module(name)
 
 
-def run(copy: Path, allowed_s: Mapping[str, float], patience_s: float, *, watched: bool = False) -> Ended:
-    """Run test files until one test objects.
+def run(
+    copy: Path,
+    allowed_s: Mapping[str, float],
+    patience_s: float,
+    *,
+    watched: bool = False,
+    leave_out: Sequence[str] = (),
+) -> Ended:
+    """Run test files, or single tests, until one test objects.
 
-    ``allowed_s`` names the files in their order with the processor time that a single test of each may take;
-    ``patience_s`` is what the whole may take by the clock on the wall.
+    ``allowed_s`` names them in their order with the processor time that a single test of each may take;
+    ``patience_s`` is what the whole may take by the clock on the wall; the tests in ``leave_out`` do not run.
     """
     said = copy.parent / "said"
     said.write_text("")
     pid = os.fork()
     if pid == 0:
-        _in_the_fork(copy, said, allowed_s, watched)
+        _in_the_fork(copy, said, allowed_s, watched, leave_out)
     until_s = time.monotonic() + patience_s
     ended, status, used = os.wait4(pid, os.WNOHANG)
     while not ended and time.monotonic() < until_s:
@@ -83,12 +120,16 @@ def _judged(said: Path, in_time: bool, status: int, cpu_s: float) -> Ended:
     code = os.waitstatus_to_exitcode(status)
     if not in_time or code == -signal.SIGPROF:
         return Ended("killed by timeout", last, cpu_s, None)
+    if code == NOTHING_TO_RUN:
+        return Ended("passed", "", cpu_s, functions)
     if code in BROKEN or not begun:
         return Ended("broken", last, cpu_s, None)
     return Ended("killed" if code else "passed", last if code else "", cpu_s, functions)
 
 
-def _in_the_fork(copy: Path, said: Path, allowed_s: Mapping[str, float], watched: bool) -> NoReturn:
+def _in_the_fork(
+    copy: Path, said: Path, allowed_s: Mapping[str, float], watched: bool, leave_out: Sequence[str]
+) -> NoReturn:
     """Be the process that runs the tests."""
     code = 4
     try:
@@ -104,7 +145,8 @@ def _in_the_fork(copy: Path, said: Path, allowed_s: Mapping[str, float], watched
         sys.dont_write_bytecode = not watched
         with said.open("a", buffering=1) as file:
             tests = _Watch(copy, file.write, allowed_s, watched)
-            code = pytest.main(["-x", "-q", "-p", "no:cacheprovider", *allowed_s], plugins=[tests])
+            without = [f"--deselect={test}" for test in leave_out]
+            code = pytest.main(["-x", "-q", "-p", "no:cacheprovider", *without, *allowed_s], plugins=[tests])
             tests.tell()
     finally:
         os._exit(code)
@@ -129,7 +171,8 @@ class _Watch:
 
     def pytest_runtest_logstart(self, nodeid: str) -> None:
         self._say(begins=nodeid)
-        signal.setitimer(signal.ITIMER_PROF, self._allowed_s.get(nodeid.partition("::")[0], 60.0))
+        of_its_file_s = self._allowed_s.get(nodeid.partition("::")[0], 60.0)
+        signal.setitimer(signal.ITIMER_PROF, self._allowed_s.get(nodeid, of_its_file_s))
 
     def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
         if report.failed:

@@ -349,6 +349,11 @@ def test_other_refusals_have_the_one_form(
     refused(quiet.request(method, f"{quiet.base_url.copy_with(path='')}{path}"), status, code)
 
 
+def test_a_query_that_is_no_boolean_is_told_in_plain_words(quiet: httpx.Client) -> None:
+    message = refused(quiet.get("/snapshot/navcam_left?fresh=perhaps"), 422, "bad_request")
+    assert message == 'fresh: "perhaps" where a valid boolean is expected'
+
+
 def test_an_unknown_query_key_is_named_with_the_nearest(quiet: httpx.Client) -> None:
     message = refused(quiet.get("/snapshot/navcam_left?frehs=true"), 422, "bad_request")
     assert message == "frehs: unknown key; the nearest known is 'fresh'"
