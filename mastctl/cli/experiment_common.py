@@ -47,7 +47,7 @@ def run_bar(args: argparse.Namespace, what: str, total: int | None) -> Iterator[
     It yields a function that is called after each part with what is done now (empty: as before), why the
     part failed (empty: it did not), and what it found if that is worth a line.
     """
-    with output.progress_bar(args.json) as progress:
+    with output.progress_bar(getattr(args, "json", False)) as progress:  # tools have no --json
         task = progress.add_task(what, total=total)
 
         def step(doing: str, failure: str, found: str = "") -> None:

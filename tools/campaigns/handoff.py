@@ -13,8 +13,6 @@ import argparse
 import csv
 import json
 import math
-import sys
-import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -27,11 +25,13 @@ from calib.files.mast_file import load_rig
 from calib.handoff.by_image import Eye, RefineSettings, refine_handoff
 from calib.handoff.geometric import Handoff, Joints, PredictedPixel, hand_off
 from calib.mast.covariance import RigCovariance, stored_covariance
+from calib.mast.rig import Rig
 from calib.pictures.epipolar import find_partner
 from calib.pictures.patch_verdict import MatchSettings
 from calib.pictures.warp import Plane, warp_patch
 from drivers.sim.render import compile_renderer
 from mastctl.cli.output import at_least
+from mastctl.cli.tasks import add_task_options, results_of
 from mastctl.packaged import config_folder
 from tools.arguments import end, new_file
 from tools.campaigns.handoff_provocations import KINDS, Case, Stage
@@ -39,6 +39,7 @@ from tools.campaigns.handoff_provocations import KINDS, Case, Stage
 WRONG_PX = 4.0
 RIGHT_PX = 1.0
 WANTED = 0.9
+BLOCK = 20
 HALF_PX = 20
 PAD = 120
 JOINT_SIGMA_RAD = 3e-5
@@ -169,6 +170,30 @@ def summarise(kind: str, cases: Sequence[Sequence[Outcome]]) -> Row:
     )
 
 
+@dataclass(frozen=True, eq=False)
+class Block:
+    """Cases of one kind from ``first`` on, up to ``BLOCK``, with a draw of their own."""
+
+    true: Rig
+    believed: Rig
+    seed: int
+    kind: str
+    first: int
+    count: int
+
+
+def run_block(block: Block) -> list[list[Outcome]]:
+    """Hand over the cases of a block: outcomes in each eye."""
+    compile_renderer()
+    calibration = stored_covariance(block.believed) or RigCovariance((), np.zeros((0, 0)))
+    stage = Stage(block.true, block.believed, calibration, block.seed)
+    try:
+        cases = stage.cases(block.kind, block.count, block.first)
+        return [run_case(case, number) for number, case in enumerate(cases, block.first)]
+    finally:
+        stage.close()
+
+
 def main() -> int:
     """Run the campaign; exit 1 if less than nine tenths of the wrong answers are flagged."""
     parser = argparse.ArgumentParser(description="Provoke bad hand-offs and count what the verdicts catch.")
@@ -180,23 +205,28 @@ def main() -> int:
     parser.add_argument("--kind", choices=(*KINDS, "good"), help="only this kind, --cases of it")
     parser.add_argument("--json", action="store_true")
     parser.add_argument("--out", type=new_file, metavar="FILE.csv", help="a line for each case and camera")
+    add_task_options(parser)
     options = parser.parse_args()
-    began = time.monotonic()
     true = load_rig(config_folder() / "sim" / "rocky8.yaml").rig
     believed = load_rig(config_folder() / "masts" / "rocky8_simulated.yaml").rig
-    calibration = stored_covariance(believed) or RigCovariance((), np.zeros((0, 0)))
-    compile_renderer()
     wanted = {kind: math.ceil(options.cases / len(KINDS)) for kind in KINDS}
     wanted["good"] = options.cases // 2 if options.good is None else options.good
     if options.kind:
         wanted = {options.kind: options.cases}
-    stage = Stage(true, believed, calibration, options.seed)
+    blocks = [
+        Block(true, believed, options.seed, kind, first, min(BLOCK, count - first))
+        for kind, count in wanted.items()
+        for first in range(0, count, BLOCK)
+    ]
+    found = results_of(
+        options, "blocks", run_block, blocks,
+        lambda block: f"{block.kind}, {block.count} from {block.first}",
+    )  # fmt: skip
+    if found is None:
+        return 0
     done: dict[str, list[list[Outcome]]] = {kind: [] for kind in wanted}
-    for kind, count in wanted.items():
-        for case in stage.cases(kind, count):
-            done[kind].append(run_case(case, len(done[kind])))
-        print(f"{time.monotonic() - began:.0f} s: {summarise(kind, done[kind])}", file=sys.stderr, flush=True)
-    stage.close()
+    for block, cases in zip(blocks, found, strict=True):
+        done[block.kind] += cases
     rows = [summarise(kind, cases) for kind, cases in done.items()]
     bad = [cases for kind in KINDS for cases in done.get(kind, [])]
     total = summarise("all bad", bad)

@@ -111,10 +111,10 @@ class Stage:
         self._true, self._believed, self._calibration = true, believed, calibration
         self._scenes: dict[SceneSettings, Scene] = {}
 
-    def cases(self, kind: str, count: int) -> Iterator[Case]:
-        """Yield ``count`` cases of a kind, by turns of either step."""
+    def cases(self, kind: str, count: int, first: int = 0) -> Iterator[Case]:
+        """Yield ``count`` cases of a kind, by turns of either step; a draw of its own for each ``first``."""
         self.close()
-        self._rng = np.random.default_rng([self._scene_seed, *kind.encode()])
+        self._rng = np.random.default_rng([self._scene_seed, *kind.encode(), *([first] if first else [])])
         done, look = 0, 0
         while done < count:
             off_px = 0.0 if look % 3 == 2 else OFF_PX

@@ -1,6 +1,6 @@
 """Provoke the check of which view a picture shows: false alarms, missed lies, error and time.
 
-    .venv/bin/python -m tools.campaigns.motion [--moves 30] [--seed 1] [--json]
+    .venv/bin/python -m tools.campaigns.motion [--moves 30] [--walks 1] [--seed 1] [--json]
 
 The simulated rover's head goes from view to view; its pictures come from the true rig, the check believes the
 packaged mast file. Each move is judged by both eyes of Navcam and Pancam: with the honest pictures; with
@@ -35,6 +35,7 @@ from drivers.clock import ManualClock
 from drivers.hardware import DeviceSettings, HardwareSettings
 from drivers.open_hardware import open_hardware
 from mastctl.cli.output import at_least
+from mastctl.cli.tasks import add_task_options, results_of
 from mastctl.packaged import config_folder
 from tools.arguments import end
 
@@ -104,6 +105,43 @@ def is_lie(shown: View, told: Posed, allowed_rad: tuple[float, float]) -> bool:
     return bool((np.abs(np.subtract(shown.true_rad, told.angles_rad)) > allowed_rad).any())
 
 
+@dataclass(frozen=True, eq=False)
+class Walk:
+    """Moves one after another, of a head and a scene drawn by a seed; the mast file that is believed."""
+
+    rig: Rig
+    moves: int
+    seed: int
+    head: str
+
+
+Tallies = dict[str, dict[str, Tally]]
+
+
+def walked(walk: Walk) -> Tallies:
+    """Take the pictures of a walk and judge its moves."""
+    return judged(walk.rig, taken(walk.moves, walk.seed, walk.head))
+
+
+def together(walks: list[Tallies]) -> Tallies:
+    """Add the tallies of walks."""
+    return {
+        pair: {kind: _sum([one[pair][kind] for one in walks]) for kind in kinds}
+        for pair, kinds in walks[0].items()
+    }
+
+
+def _sum(tallies: list[Tally]) -> Tally:
+    total = Tally()
+    for one in tallies:
+        total.verdicts.update(one.verdicts)
+        total.off_rad += one.off_rad
+        total.share_of_allowed += one.share_of_allowed
+        total.look_ms += one.look_ms
+        total.missed += one.missed
+    return total
+
+
 def judged(rig: Rig, views: list[View]) -> dict[str, dict[str, Tally]]:
     """Judge every move by every pair: honest pictures, those of before, those of the next view."""
     tallies = {pair: {kind: Tally() for kind in ("honest", "before", "next")} for pair in PAIRS}
@@ -157,16 +195,25 @@ def main(argv: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--moves", type=at_least(1), default=30, help="moves of the head (default 30)")
-    parser.add_argument("--seed", type=at_least(0), default=1, help="of moves and scene (default 1)")
+    parser.add_argument("--moves", type=at_least(1), default=30, help="moves of a walk (default 30)")
+    parser.add_argument(
+        "--walks", type=at_least(1), default=1, help="walks, each with the next seed (default 1)"
+    )
+    parser.add_argument("--seed", type=at_least(0), default=1, help="of the first walk (default 1)")
     parser.add_argument("--head", choices=("ptu_d46_70", "dynamixel_x", "ph42"), default="ptu_d46_70")
     parser.add_argument("--json", action="store_true", help="print one JSON document on stdout")
+    add_task_options(parser)
     args = parser.parse_args(argv)
     rig = load_rig(config_folder() / "masts" / "rocky8_simulated.yaml").rig
-    views = taken(args.moves, args.seed, args.head)
-    rows = told(judged(rig, views))
+    walks = [Walk(rig, args.moves, args.seed + number, args.head) for number in range(args.walks)]
+    found = results_of(args, "walks", walked, walks, lambda walk: f"seed {walk.seed}, {walk.moves} moves")
+    if found is None:
+        return 0
+    rows = told(together(found))
     if args.json:
-        print(json.dumps({"moves": args.moves, "seed": args.seed, "head": args.head, "rows": rows}))
+        print(
+            json.dumps({"moves": args.moves * args.walks, "seed": args.seed, "head": args.head, "rows": rows})
+        )
         return 0
     for row in rows:
         numbers = [row["rms_mrad"], row["worst_mrad"], row["worst_of_allowed"]]

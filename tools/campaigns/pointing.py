@@ -12,6 +12,7 @@ import argparse
 import time
 from collections import Counter
 from dataclasses import dataclass
+from itertools import chain
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -22,9 +23,11 @@ from calib.mast.pointing import solve
 from calib.mast.rig import Mast
 from calib.mast.solutions import Solution
 from mastctl.cli.output import at_least
+from mastctl.cli.tasks import add_task_options, results_of
 from tools.arguments import end
 
 WORST_PX = 1e-7
+BLOCK = 1000
 SAME_RAD = 1e-5
 """A solution is the generating one within this; two that meet at the edge of reach are good to 1e-6."""
 
@@ -144,6 +147,21 @@ def run_case(case: Case) -> Outcome:
     return Outcome(case, solutions, "", bool(misses.min() <= SAME_RAD), float(errors.max()), seconds)
 
 
+@dataclass(frozen=True)
+class Block:
+    """Cases from ``first`` on, up to ``BLOCK``, with a draw of their own."""
+
+    seed: int
+    first: int
+    count: int
+
+
+def run_block(block: Block) -> list[Outcome]:
+    """Return what becomes of the cases of a block."""
+    rng = np.random.default_rng([block.seed, block.first])
+    return [run_case(random_case(rng, block.first + number)) for number in range(block.count)]
+
+
 def main() -> int:
     """Run the campaign; exit 1 if a solution was lost or one missed its pixel by more than 1e-7."""
     parser = argparse.ArgumentParser(description="Point random masts and print the worst re-projection.")
@@ -151,14 +169,20 @@ def main() -> int:
         "--cases", type=at_least(1), default=10_000, help="number of random masts (default 10000)"
     )
     parser.add_argument("--seed", type=at_least(0), default=1)
+    add_task_options(parser)
     options = parser.parse_args()
-    rng = np.random.default_rng(options.seed)
+    blocks = [
+        Block(options.seed, first, min(BLOCK, options.cases - first))
+        for first in range(0, options.cases, BLOCK)
+    ]
+    found = results_of(options, "thousands", run_block, blocks, lambda block: f"cases from {block.first}")
+    if found is None:
+        return 0
     worst: dict[tuple[str, str], float] = {}
     seconds: dict[str, list[float]] = {"a = k = 0": [], "skew": []}
     counts: Counter[int] = Counter()
     bad = 0
-    for number in range(options.cases):
-        outcome = run_case(random_case(rng, number))
+    for number, outcome in enumerate(chain.from_iterable(found)):
         mast = "skew" if outcome.case.mast.axis_offset_m else "a = k = 0"
         seconds[mast].append(outcome.seconds)
         counts[len(outcome.solutions)] += 1

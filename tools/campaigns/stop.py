@@ -21,8 +21,12 @@ from dataclasses import dataclass
 from drivers.errors import DriverError
 from drivers.sim.wire.dynamixel_bus import DynamixelBus
 from drivers.sim.wire.dynamixel_servo import VOLTAGE
+from mastctl.cli.output import at_least
+from mastctl.cli.tasks import add_task_options, results_of
+from tools.arguments import end
 from tools.campaigns.servo_rigs import ACCELERATION_RAD_PER_S2, Rig, dynamixel_pty
 
+AXES = ("pan", "tilt")
 LONGEST_S = 20.0
 LATEST_S = 0.25
 """How long after the failure the stop comes at most."""
@@ -56,8 +60,20 @@ class Stopped:
     beyond_rad: float
 
 
-def trial(fault: str, axis: int, after_s: float) -> Stopped:
-    """Stop a moving head of which one servo has failed ``after_s`` seconds ago; tell of the other axis."""
+@dataclass(frozen=True)
+class Trial:
+    """One servo, by its axis, that has failed ``after_s`` seconds ago when the stop comes."""
+
+    fault: str
+    axis: int
+    number: int
+    after_s: float
+
+
+def trial(one: Trial) -> Stopped:
+    """Stop a moving head of which one servo has failed; tell of the other axis."""
+    logging.disable(logging.CRITICAL)  # each trial gives a line up, and says so
+    fault, axis, after_s = one.fault, one.axis, one.after_s
     with dynamixel_pty(watchdog_s=0.3, reply_timeout_s=0.05) as rig:
         assert rig.line is not None and isinstance(rig.line.device, DynamixelBus)
         bus, other = rig.line.device, 1 - axis
@@ -104,28 +120,48 @@ def _until(true: Callable[[], bool]) -> None:
         time.sleep(0.002)
 
 
-def main() -> None:
+def main() -> int:
     """Run the campaign and print its table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("--trials", type=int, default=5, metavar="N", help="a fault and axis (default 5)")
-    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument(
+        "--trials", type=at_least(1), default=5, metavar="N", help="a fault and axis (default 5)"
+    )
+    parser.add_argument("--seed", type=at_least(0), default=1)
+    add_task_options(parser)
+    parser.set_defaults(workers=1)  # times are measured: two at once would make each other late
     args = parser.parse_args()
-    logging.disable(logging.CRITICAL)  # each trial gives a line up, and says so
-    draw = random.Random(args.seed)
+    trials = [
+        Trial(fault, axis, number, _after_s(args.seed, fault, axis, number))
+        for fault in FAULTS
+        for axis in range(len(AXES))
+        for number in range(args.trials)
+    ]
+    found = results_of(
+        args, "trials", trial, trials, lambda one: f"{one.fault}, {AXES[one.axis]}, trial {one.number}"
+    )
+    if found is None:
+        return 0
     print(
         "fault          failed  brake ms: median  worst   call ms: worst   beyond a perfect brake mrad: worst"
     )
     for fault in FAULTS:
-        for axis, name in enumerate(("pan", "tilt")):
-            rows = [trial(fault, axis, draw.uniform(0.0, LATEST_S)) for _ in range(args.trials)]
+        for axis, name in enumerate(AXES):
+            rows = [
+                row for one, row in zip(trials, found, strict=True) if (one.fault, one.axis) == (fault, axis)
+            ]
             brakes = sorted(1000 * row.brake_s for row in rows)
             print(
                 f"{fault:<14} {name:<6} {brakes[len(brakes) // 2]:>16.1f} {brakes[-1]:>7.1f}"
                 f" {1000 * max(row.call_s for row in rows):>15.0f}"
                 f" {1000 * max(row.beyond_rad for row in rows):>35.1f}",
-                flush=True,
             )
+    return 0
+
+
+def _after_s(seed: int, fault: str, axis: int, number: int) -> float:
+    """How long after the failure the stop comes, by a draw of the trial's own."""
+    return random.Random(f"{seed}/{fault}/{axis}/{number}").uniform(0.0, LATEST_S)
 
 
 if __name__ == "__main__":
-    main()
+    end(main)
