@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import signal
+import threading
 from pathlib import Path
 
 import pytest
@@ -20,7 +21,7 @@ from hil_tests.mastctl.outside_daemon import (
 )
 from hil_tests.mastctl.service_fakes import Hang, eventually
 from mastctl.client import Client
-from mastctl.queued_output import QueuedHandler, QueuedText, QueuedWriter
+from mastctl.queued_output import QueuedHandler, QueuedText, QueuedWriter, stall_while
 
 
 @pytest.mark.parametrize("full", ["stderr", "stdout", "both"])
@@ -56,6 +57,21 @@ def test_what_does_not_fit_is_dropped_and_counted_and_said_when_it_flows_again()
     QueuedText(writer).write("again\n")
     assert writer.flush(BOUND_S)
     assert b"again" in pipe.drain(b"again")
+
+
+def test_a_stall_that_was_ordered_is_as_a_pipe_that_nobody_reads() -> None:
+    pipe, reads = Pipe(), threading.Event()
+    writer = QueuedWriter(pipe.write, kept=10)
+    stall_while(lambda: not reads.is_set())
+    try:
+        for number in range(100):
+            writer.put(f"word {number}\n")
+        assert not writer.flush(0.1)
+        reads.set()
+        told = pipe.drain(b"dropped").decode()
+    finally:
+        stall_while(lambda: False)
+    assert f"{100 - told.count('word')} messages were dropped" in told and told.count("word") <= 12
 
 
 def test_words_need_no_lock_of_the_handler_in_any_python(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -17,7 +17,7 @@ from drivers.sim.rover import SimulatedRover
 from mastctl.config import Config, Listen, load_config
 from mastctl.daemon import RunningDaemon
 from mastctl.devices.frames import camera_and_sequence
-from mastctl.errors import NotKnown
+from mastctl.errors import NotKnown, NotNow
 from mastctl.testing.pictures import with_width
 from mastctl.tracking.pose import RoverPose
 
@@ -29,11 +29,12 @@ class Daemons:
 
     def __init__(self) -> None:
         self._daemon: RunningDaemon | None = None
+        self._config: Config | None = None  # of the one that runs, or ran last
 
     def do(self, word: str, order: dict[str, Any]) -> Any:
         """Carry out an order and return what there is to say, fit for JSON."""
         action = getattr(self, f"_do_{word}")
-        if word in ("open", "close") or self._daemon is None:
+        if word in ("open", "close", "start") or self._daemon is None:
             return action(**order)
         with self._daemon.service.clock.at_work():
             return action(**order)
@@ -41,7 +42,7 @@ class Daemons:
     @property
     def _rover(self) -> SimulatedRover:
         if self._daemon is None or self._daemon.hardware.simulation is None:
-            raise NotKnown("no_daemon", "no daemon runs for this test any more")
+            raise NotKnown("no_daemon", "the daemon does not run; start_daemon() starts it")
         return self._daemon.hardware.simulation
 
     def _do_open(
@@ -50,7 +51,14 @@ class Daemons:
         self._do_close()
         wanted = config_for_a_test(config, picture_width_px, simulation, Path(folder))
         self._daemon = RunningDaemon(wanted)
+        port = int(self._daemon.url.rpartition(":")[2])
+        self._config = replace(wanted, listen=Listen(port=port))
         return {"url": self._daemon.url}
+
+    def _do_start(self) -> None:
+        if self._daemon is not None or self._config is None:
+            raise NotNow("runs_already", "the daemon runs already; end_daemon() ends it")
+        self._daemon = RunningDaemon(self._config)
 
     def _do_close(self) -> None:
         daemon, self._daemon = self._daemon, None

@@ -124,6 +124,20 @@ class SimulatedRover:
         """
         return float(self._ask("advance", duration_s=float(duration_s)))
 
+    def end_daemon(self) -> None:
+        """End the daemon and the rover with it: nobody answers at the address from now on."""
+        self._ask("close")
+
+    def start_daemon(self) -> None:
+        """Start the daemon that `end_daemon` ended, at the same address, with a rover just switched on.
+
+        Raises
+        ------
+        RoverError
+            If it runs, or the address has been taken meanwhile.
+        """
+        self._ask("start")
+
     def set_fault(self, device: str, word: str, **parameters: float) -> SetFault:
         """Set a fault, in place of one with the same word on the same device.
 

@@ -211,6 +211,25 @@ def test_a_unit_that_tells_no_number_ends_a_pointing_and_comes_back(
     points_again(mast_client)
 
 
+def test_a_daemon_that_ends_and_starts_again_is_found_at_its_address(
+    mast_client: Client, simulated_rover: SimulatedRover
+) -> None:
+    pixel = clicked(mast_client)
+    simulated_rover.end_daemon()
+    with pytest.raises(ClientError) as nobody:
+        mast_client.status()
+    assert nobody.value.code == "no_daemon"
+    with pytest.raises(RoverError, match="the daemon does not run"):
+        simulated_rover.true_joints()
+    simulated_rover.start_daemon()
+    assert mast_client.operations() == []
+    with pytest.raises(ClientError, match="not taken by this run"):
+        mast_client.point(pixel=pixel)
+    assert ended(mast_client, clicked(mast_client)) == "done"
+    with pytest.raises(RoverError, match="runs already"):
+        simulated_rover.start_daemon()
+
+
 def test_a_process_that_died_is_told_and_the_next_test_gets_another(
     simulated_rover: SimulatedRover, mast_client: Client
 ) -> None:
