@@ -194,15 +194,14 @@ class ReplayedCamera:
             ready_s = self._begin_s(wanted) + EXPOSURE_S
             if ready_s <= now_s:
                 return self._frame(wanted)
-            if ready_s > deadline_s:
-                self._clock.sleep(deadline_s - now_s)
+            if ready_s > deadline_s and now_s >= deadline_s:
                 raise NoFreshFrame(
                     f"no frame exposed after {exposed_after_s:.3f} s came within {timeout_s:g} s; "
                     f"the next one ends at {ready_s:.3f} s",
                     device=self._name,
                 )
             # A little longer, so that rounding does not leave the frame a hair unfinished.
-            self._clock.sleep(min(ready_s - now_s + 1e-6, 0.5))
+            self._clock.sleep(min(min(ready_s, deadline_s) - now_s + 1e-6, 0.5))
         raise NoFreshFrame("it is closed", device=self._name)
 
     @property

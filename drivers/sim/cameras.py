@@ -141,10 +141,9 @@ class SimulatedCamera:
                 ready_s = np.inf
             if ready_s <= now_s:
                 return self._frame(sequence, epoch)
-            if ready_s > deadline_s:
-                self._clock.sleep(deadline_s - now_s)
+            if now_s >= deadline_s:
                 break
-            self._clock.sleep(min(ready_s - now_s, 0.5))
+            self._clock.sleep(min(min(ready_s, deadline_s) - now_s, 0.5))
         raise NoFreshFrame(self._instead(exposed_after_s, timeout_s), device=self.name)
 
     @property

@@ -19,6 +19,7 @@ from mastctl.devices import frames as frame_checks
 CAMERAS: Suite[CameraTrial] = Suite()
 
 CLOSES_WITHIN_S = 3.0
+WAITS_S = 6.0  # longer than a close may take, shorter than a call is waited for
 FRAMES_EACH = 5
 
 
@@ -111,7 +112,7 @@ def _threads(trial: CameraTrial) -> None:
 @CAMERAS.check("camera.close", "close ends a call that waits, twice does no harm, and then no frame comes")
 def _close(trial: CameraTrial) -> str | None:
     camera = trial.camera
-    waits = beside(lambda: camera.next_frame(time.monotonic() + 60.0, 30.0))
+    waits = beside(lambda: camera.next_frame(time.monotonic() + 60.0, WAITS_S))
     time.sleep(0.1)
     began_s = time.monotonic()
     for words in ("close()", "a second close()"):

@@ -36,7 +36,7 @@ class Daemon:
 
     def __init__(self, wire: Wire, reach_rad: float) -> None:
         self.wire = wire
-        self._reach_rad = reach_rad
+        self.reach_rad = reach_rad
         self.began = self.status()
 
     def status(self) -> dict[str, Any]:
@@ -77,7 +77,7 @@ class Daemon:
     def _around(self, at_rad: float, ends: tuple[float, float]) -> tuple[float, float]:
         margin = min(0.02, 0.1 * (ends[1] - ends[0]))
         low, high = ends[0] + margin, ends[1] - margin
-        width = min(2 * self._reach_rad, high - low)
+        width = min(2 * self.reach_rad, high - low)
         start = min(max(at_rad - width / 2, low), high - width)
         return start, start + width
 
@@ -172,12 +172,27 @@ class Daemon:
         )
         return record
 
+    @cached_property
+    def _time_waits(self) -> bool:
+        """Whether a simulated rover's time passes only when it is told to."""
+        if self.began.get("hardware") != "simulated":
+            return False
+        answer = self.wire.ask("GET", "/simulation/time")
+        return answer.status == 200 and answer.document().get("speed") == "max"
+
+    def let_pass(self, duration_s: float) -> None:
+        """Let some of the daemon's time pass."""
+        if self._time_waits:
+            self.wire.ask("POST", "/simulation/time", json={"advance_s": duration_s}).document()
+        else:
+            time.sleep(duration_s)
+
     def rest(self, within_s: float = 10.0) -> dict[str, Any]:
         """Wait until nothing moves and nothing runs; return the status."""
         until_s = time.monotonic() + within_s
         while (status := self.status()).get("moving") or status.get("operation") is not None:
             expect(time.monotonic() < until_s, f"the head does not come to rest within {within_s:g} s")
-            time.sleep(POLL_S)
+            self.let_pass(POLL_S)
         return status
 
 

@@ -1,0 +1,41 @@
+"""The packaged simulated rover conforms: its daemon, its head and its cameras."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import pytest
+
+from mastctl.cli.main import main
+from mastctl.config import load_config
+from mastctl.conform.daemon_run import CHECKS, check_daemon, daemon_under_test
+from mastctl.daemon import RunningDaemon
+
+TOO_QUICK = {"times.rate", "motion.speed", "motion.busy"}
+"""Where nothing waits for motion, the head may have arrived before anybody looks."""
+
+
+def test_the_simulated_rover_conforms_and_a_click_lands() -> None:
+    config = load_config(None)
+    hardware = config.hardware
+    simulation = {**hardware.simulation, "samples": 1, "speed": "max"}
+    cameras = {name: camera for name, camera in hardware.cameras.items() if name.startswith("navcam")}
+    hardware = replace(hardware, simulation=simulation, cameras=cameras)
+    listen = replace(config.listen, port=0)
+    with (
+        RunningDaemon(replace(config, hardware=hardware, listen=listen)) as daemon,
+        daemon_under_test(daemon.url, 0.3) as under_test,
+    ):
+        outcomes = check_daemon(under_test, CHECKS, True).outcomes
+    assert [outcome for outcome in outcomes if outcome.state == "failed"] == []
+    assert {outcome.name for outcome in outcomes if outcome.state == "skipped"} <= TOO_QUICK
+
+
+@pytest.mark.parametrize("kind", ["--head", "--camera"])
+def test_a_simulated_device_keeps_its_promises(kind: str, capsys: pytest.CaptureFixture[str]) -> None:
+    words = ["conform", "--driver", "sim", "--options", '{"samples": 1}', kind, "--seconds", "1", "--json"]
+    code = main(words)
+    told = json.loads(capsys.readouterr().out)
+    assert code == 0, [check for check in told["checks"] if check["state"] == "failed"]
+    assert told["passed"] >= 7 and told["may_move"] == ""
