@@ -47,7 +47,8 @@ class RoverProcess:
         share["NUMBA_NUM_THREADS"] = str(max(1, cores // max(1, workers)))
         with log.open("ab") as errors:
             self._process = subprocess.Popen(
-                [sys.executable, "-m", "mastctl.testing.serve", str(os.getpid())],
+                # -P: a folder of the project named as one of ours ("drivers") is not taken for it.
+                [sys.executable, "-P", "-m", "mastctl.testing.serve", str(os.getpid())],
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 stderr=errors,

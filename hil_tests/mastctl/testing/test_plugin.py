@@ -156,8 +156,19 @@ def test_a_bad_option_fails_its_test_with_a_sentence_and_no_other(tmp_path: Path
     tests += [f"@{mark}\ndef test_{number}(mast_daemon): pass" for number, mark in enumerate(REFUSED)]
     tests += ["def test_alive(simulated_rover): assert simulated_rover._ask", ""]
     (tmp_path / "test_them.py").write_text("\n".join(tests))
-    (tmp_path / "pytest.ini").write_text("[pytest]\nmastctl_picture_width_px = 64\nmastctl_seed = 4\n")
-    command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "--strict-markers"]
+    (tmp_path / "calib.py").write_text("raise SystemExit('this is the project's own')\n")
+    (tmp_path / "pytest.ini").write_text("[pytest]\nmastctl_picture_width_px = 64\nmastctl_seed = 1\n")
+    command = [
+        sys.executable,
+        "-m",
+        "pytest",
+        "-q",
+        "-p",
+        "no:cacheprovider",
+        "-W",
+        "error",
+        "--strict-markers",
+    ]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=300)
     assert "1 passed, 4 errors" in done.stdout, done.stdout
     assert "Traceback" not in done.stdout and "During handling" not in done.stdout
