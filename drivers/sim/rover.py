@@ -37,10 +37,11 @@ from drivers.sim.cameras import SelfExposedCamera, SimulatedCamera
 from drivers.sim.kept_scenes import kept_scene
 from drivers.sim.optics.lens import Lens
 from drivers.sim.optics.shutter import Shutter
+from drivers.sim.outside_scene import OutsideRenderer, outside_scene
 from drivers.sim.pan_tilt import HeadSettings, SimulatedPanTilt, head_settings
 from drivers.sim.placed import REACH_M, check_clear_of, read_list
 from drivers.sim.render import Renderer, Stills, compile_renderer
-from drivers.sim.scene import SceneSettings
+from drivers.sim.scene import Scene, SceneSettings
 from drivers.sim.section import filled
 from drivers.sim.warmth import TemperatureSettings, temperature_settings
 from drivers.sim.wired_head import DEFAULT_HEADS, WiredHead, check_head
@@ -177,8 +178,23 @@ def scene_settings(section: Any, folder: Path) -> SceneSettings:
             if isinstance(section.get(kind), list | tuple)
         }
         plain = {key: value for key, value in section.items() if key not in placed}
+        beside = set(section) - {"plugin", "options", "seed"} if "plugin" in section else set()
+        if beside:
+            words = "stands beside plugin, expected nothing: the scene from outside makes all"
+            raise BadOptions(f"simulation.scene.{min(beside, key=str)} {words}")
     settings: SceneSettings = filled(SceneSettings(), plain, "simulation.scene")
+    if settings.options and not settings.plugin:
+        raise BadOptions("simulation.scene.options stand without a plugin, expected that too")
     return replace(settings, **placed)
+
+
+def _made(settings: SceneSettings) -> tuple[Scene, Renderer]:
+    """The scene, and what draws it."""
+    if settings.plugin:
+        outside = outside_scene(settings)
+        return outside, OutsideRenderer(outside)
+    scene = kept_scene(settings)
+    return scene, Renderer(scene)
 
 
 def _whole(value: Any, key: str, low: int, high: int) -> int:
@@ -245,8 +261,7 @@ class SimulatedRover:
         check_clear_of(settings.scene.placed, self.rig)
         # Before any camera is asked: a frame's deadline is no time for a compiler.
         compile_renderer()
-        self.scene = kept_scene(settings.scene)
-        self._renderer = Renderer(self.scene)
+        self.scene, self._renderer = _made(settings.scene)
         self._stills = Stills(self._renderer)
         self._render_lock = threading.Lock()
         self._closed = False

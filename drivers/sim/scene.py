@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
 
@@ -63,6 +63,8 @@ class SceneSettings:
         these.
     boards
         Boards that stand there. Where one does, or a brick or rock was placed, no scattered one is.
+    plugin, options
+        A scene from outside instead, ``package.module:factory``, and what it is made with.
     sun_azimuth_rad, sun_elevation_rad
         Where the sun stands: from north over east, and above the horizon (0.2 to 1.5 rad).
     """
@@ -74,6 +76,8 @@ class SceneSettings:
     boards: tuple[PlacedBoard, ...] = ()
     sun_azimuth_rad: float = -1.95
     sun_elevation_rad: float = 0.70
+    plugin: str = ""
+    options: dict[str, Any] = field(default_factory=dict, hash=False)
 
     def __post_init__(self) -> None:
         bounds = (
