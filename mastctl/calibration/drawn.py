@@ -85,7 +85,10 @@ def boards(calibration: Calibration, board: Board) -> Any:
         free = all(abs(place - other) @ (0.35, 1.0) > NAME_ROOM_M for other in names)
         if purpose != "camera" and free:  # those of a ring stand too close together for names
             names.append(place)
-            plan.annotate(key[1], place, fontsize=7, color="0.25", xytext=(2, 2), textcoords="offset points")
+            name = plan.annotate(
+                key[1], place, fontsize=7, color="0.25", xytext=(2, 2), textcoords="offset points"
+            )
+            name.set_parse_math(False)  # a name with two dollars is no formula
     _eyes(calibration.rig, plan, side)
     plan.set(xlabel="y (right), m", ylabel="x (ahead), m", title="from above", aspect="equal")
     side.set(xlabel="x (ahead), m", ylabel="z (down), m", title="from the right side", aspect="equal")

@@ -281,7 +281,7 @@ class Cameras:
                 self._threads[name].wait(told, until_s)
             except BadFrame:
                 for thread in self._threads.values():
-                    thread.close(0.1)
+                    thread.end()
                 raise
             except DriverError as error:
                 log.warning("%s; the size is seen in its pictures", error)

@@ -195,8 +195,8 @@ class DeviceThread:
             faults[now.what] = self._fault(now.what, NoReply.code, overdue, now.began_s)
         return tuple(faults.values())
 
-    def close(self, timeout_s: float) -> bool:
-        """End the thread; return whether it ended within ``timeout_s`` seconds.
+    def end(self) -> None:
+        """Have the thread end, and wait for nobody.
 
         Waiting calls are refused, except those that go ``first``: they still go out before the end.
         """
@@ -207,6 +207,13 @@ class DeviceThread:
                     asked.future.cancel()
             self._jobs = deque(asked for asked in self._jobs if asked.first)
             self._wake.notify_all()
+
+    def close(self, timeout_s: float) -> bool:
+        """End the thread; return whether it ended within ``timeout_s`` seconds of real time.
+
+        Not for who is at work on the clock: the thread would wait for its turn meanwhile.
+        """
+        self.end()
         self._thread.join(timeout_s)
         if self._thread.is_alive():
             log.warning("%s: the driver hangs; its thread is left behind", self._device)

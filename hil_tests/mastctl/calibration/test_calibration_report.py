@@ -12,10 +12,12 @@ from calib.fit.joint import fit_joint
 from calib.fit.uncertainty import rig_moved_along
 from calib.survey import Survey
 from hil_tests.mastctl.calibration.survey_world import navcam_rig, navcam_survey
+from mastctl.calibration.drawn import boards
 from mastctl.calibration.expected import check_sizes
 from mastctl.calibration.landing import click, handoff_errors_px, pointing_error_px
 from mastctl.calibration.maps import CORNER, change_map, uncertainty_map
 from mastctl.calibration.verdict import judge_calibration
+from mastctl.report import plots
 
 DRAWS = 100
 TURN_RAD = np.array([0.0, 0.0, 0.01])
@@ -104,3 +106,15 @@ def test_the_worst_reason_decides(fitted: tuple[Survey, Calibration]) -> None:
     bad = judge_calibration(survey, replace(calibration, images=tuple(off)))
     assert bad.grade == "bad"
     assert any(r.grade == "bad" and "check images of navcam_left" in r.sentence for r in bad.reasons)
+
+
+def test_a_placement_whose_name_looks_like_a_formula_is_drawn(fitted: tuple[Survey, Calibration]) -> None:
+    survey, calibration = fitted
+    renamed = {
+        (setup, f"$\\{placement}$ <b>"): pose
+        for (setup, placement), pose in calibration.rover_from_board.items()
+    }
+    images = [replace(one, placement=f"$\\{one.placement}$ <b>") for one in calibration.images]
+    drawn = boards(replace(calibration, rover_from_board=renamed, images=tuple(images)), survey.board)
+    assert plots.as_png(drawn).startswith(b"\x89PNG")
+    assert any("$" in text.get_text() for text in drawn.axes[0].texts)

@@ -17,6 +17,7 @@ import pytest
 from drivers.clock import SystemClock
 from drivers.errors import BadFrame, BadReply, DriverError, LineLost, NoFreshFrame, NoReply
 from drivers.interfaces import Frame, FrameTime, Reading
+from drivers.simulation_clock import SimulationClock
 from hil_tests.mastctl.service_fakes import FakeCamera, FakeHardware, Hang, eventually, rig
 from mastctl.devices import cameras as cameras_module
 from mastctl.devices import devices as devices_module
@@ -685,6 +686,17 @@ def test_a_camera_of_another_size_than_the_mast_files_is_refused_at_the_start() 
     ):
         Devices(hardware, LIMITS, DIGEST, SystemClock(), rig())
     eventually(lambda: set(threading.enumerate()) <= before, "no thread is left")
+
+
+def test_a_start_that_is_refused_on_the_simulations_clock_blames_no_driver(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    before, clock, hardware = set(threading.enumerate()), SimulationClock(), FakeHardware()
+    hardware.fake_cameras["navcam_left"] = SizedCamera("navcam_left", 0)
+    with pytest.raises(BadFrame), clock.at_work():
+        Devices(hardware, LIMITS, DIGEST, clock, rig())
+    eventually(lambda: set(threading.enumerate()) <= before, "no thread is left")
+    assert "hangs" not in caplog.text
 
 
 def test_a_picture_right_after_the_start_is_one_whose_angles_are_known() -> None:
