@@ -74,8 +74,6 @@ class CameraClock:
         return true_s + ((true_s - self._start_s) * self._drift + self._late_s)
 
     def true_s(self, stamp_s: float) -> float:
-        """Return the moment that a stamp means, or a nanosecond later where rounding comes into it."""
-        if self._drift == 0 and self._late_s == 0:
-            return stamp_s
+        """Return the moment that a stamp means, and a nanosecond for rounding."""
         since_s = stamp_s - self._late_s - self._start_s
         return stamp_s - (since_s * self._drift / (1 + self._drift) + self._late_s) + _ROUNDING_S

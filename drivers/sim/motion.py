@@ -174,6 +174,13 @@ class Motion:
         """When the last leg is done, seconds."""
         return self.legs[-1].end_s
 
+    @property
+    def stood_since_s(self) -> float:
+        """When it last stops turning; minus infinity if it never turned. Orders to stay do not count."""
+        ends_s = [*(leg.start_s for leg in self.legs[1:]), math.inf]
+        turns = [min(leg.end_s, end_s) for leg, end_s in zip(self.legs, ends_s, strict=True)]
+        return max((t for leg, t in zip(self.legs, turns, strict=True) if t > leg.start_s), default=-math.inf)
+
     def kept(self, time_s: float) -> int:
         """Return the index of the oldest leg that a command at ``time_s`` still remembers."""
         return self.leg_index(time_s - HISTORY_S)

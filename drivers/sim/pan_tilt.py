@@ -137,8 +137,8 @@ class SimulatedPanTilt:
         self._lock = threading.RLock()
         now_s = clock.now_s()
         self._axes = (
-            WireAxis(head.pan, self._faults, number=0, resumes=False, time_s=now_s - head.pan.settle_s),
-            WireAxis(head.tilt, self._faults, number=1, resumes=False, time_s=now_s - head.tilt.settle_s),
+            WireAxis(head.pan, self._faults, number=0, resumes=False, time_s=now_s),
+            WireAxis(head.tilt, self._faults, number=1, resumes=False, time_s=now_s),
         )
         self._closed = False
 
@@ -217,7 +217,7 @@ class SimulatedPanTilt:
         for axis in self._axes:
             count = axis.settings.count_rad
             counts.append(round(axis.angle_rad(now_s) / count) * count)
-        moving = any(axis.under_way(now_s - axis.settings.settle_s) for axis in self._axes)
+        moving = any(axis.under_way(now_s) or axis.settles(now_s) for axis in self._axes)
         stuck = self._faults.find(PAN_TILT, "stuck", now_s)
         if stuck is not None and not self._faults.find(PAN_TILT, "off", now_s):
             seized = all(axis.seized(now_s) for axis in self._axes)

@@ -177,5 +177,7 @@ def _reach(axis: AxisSettings) -> dict[str, Any]:
     """Limits and approach of an axis as the driver's options have them."""
     reach: dict[str, Any] = {"limits_rad": [axis.low_rad + _MARGIN_RAD, axis.high_rad - _MARGIN_RAD]}
     if axis.approach_rad > 0:
-        reach |= {"approach": "positive", "approach_rad": axis.approach_rad}
+        hangs = axis.gravity_friction < 1
+        reach |= {"approach": "gravity" if hangs else "positive", "approach_rad": axis.approach_rad}
+        reach |= {"gravity_turnover_rad": axis.gravity_turnover_rad} if hangs else {}
     return reach

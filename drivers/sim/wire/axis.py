@@ -39,7 +39,7 @@ class WireAxis:
     ----------
     settings
         Encoder, backlash, sag and ringing; its acceleration is what ``halt`` brakes with. Counts, speed and
-        approach are for ``to_count`` only; range and ``settle_s`` are not used here.
+        approach are for ``to_count`` only; the range is not used here.
     faults
         The panel that is asked for faults of ``pan_tilt``; none when left out.
     number
@@ -169,6 +169,12 @@ class WireAxis:
         with self._lock:
             self._follow(time_s)
             return time_s < self._axis.motion.end_s
+
+    def settles(self, time_s: float) -> bool:
+        """Return whether the motor turns or did so within the settings' ``settle_s``."""
+        with self._lock:
+            self._follow(time_s)
+            return time_s < self._axis.motion.stood_since_s + self.settings.settle_s
 
     def end_s(self) -> float:
         """Return when the motor comes to rest, if nothing new happens."""

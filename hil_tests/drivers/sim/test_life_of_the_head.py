@@ -112,12 +112,14 @@ def test_a_head_says_that_it_moves_while_it_settles_but_not_before_it_was_ever_m
     device = SimulatedPanTilt(head_settings({"settle_s": 0.7}), clock)
     assert not device.read().moving
     device.move(0.2, 0.0)
-    clock.advance(2.0)
-    device.stop()
-    clock.advance(0.69)
+    clock.advance(0.25)
+    device.stop()  # a quarter of a second of braking
+    clock.advance(0.93)
     assert device.read().moving
-    clock.advance(0.02)
+    clock.advance(0.04)
     assert not device.read().moving
+    device.stop()
+    assert not device.read().moving, "nothing turned, so nothing rings"
 
 
 def test_the_encoder_does_not_see_the_ringing() -> None:

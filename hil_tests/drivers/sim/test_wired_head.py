@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -36,8 +37,8 @@ WIRES = {
 
 
 @contextmanager
-def wired(rig: Path, head: str) -> Iterator[SimulatedRover]:
-    section = {"rover": rig.name, "seed": 5, "head": head, "wire": WIRES[head][0]}
+def wired(rig: Path, head: str, **options: object) -> Iterator[SimulatedRover]:
+    section = {"rover": rig.name, "seed": 5, "head": {"preset": head, **options}, "wire": WIRES[head][0]}
     sim = DeviceSettings("sim")
     settings = HardwareSettings(sim, {"navcam_left": sim}, section, rig.parent)
     with open_hardware(settings) as hardware:
@@ -105,6 +106,27 @@ def test_faults_of_the_rover_reach_line_and_axes(small_rig: Path, head: str) -> 
         device.pan_tilt.move(0.4, -0.2)
         until(lambda: abs(device.true_joints(time.monotonic())[1] - before[1]) > 0.15)
         assert device.true_joints(time.monotonic())[0] == before[0]
+
+
+@pytest.mark.parametrize("head", ["ph42", "ptu_d46_70"])
+def test_behind_bytes_a_head_reads_wrong_hangs_in_its_play_and_settles_all_the_same(
+    small_rig: Path, head: str
+) -> None:
+    options = {
+        "backlash_rad": 0.004,
+        "approach_rad": 0.01,
+        "ring_hz": 9.0,
+        "ring_damping": 0.2,
+        "settle_s": 1.0,
+    }
+    options |= {"tilt_harmonics_rad": [[0.003, 0.0]], "gravity_turnover_rad": -0.3, "gravity_friction": 0.05}
+    with wired(small_rig, head, **options) as device:
+        for tilt, side in ((-0.6, -1), (0.1, 1), (-0.5, -1)):
+            reading = settled(device, 0.1, tilt)
+            true = device.true_joints(time.monotonic())[1]
+            off = true - reading.tilt_rad
+            expected = 0.003 * math.cos(reading.tilt_rad) + side * 0.002 - 5e-5 * math.cos(true)
+            assert off == pytest.approx(expected, abs=3e-5)
 
 
 def test_a_wire_needs_the_machines_own_clock(small_rig: Path) -> None:
