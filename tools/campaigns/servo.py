@@ -59,9 +59,9 @@ DRIVERS: dict[str, Callable[[], AbstractContextManager[Rig]]] = {
 MIXTURE = "mixture"
 WORDS = (*HEAD_WORDS, MIXTURE)
 LYING = ("wrong", "drifting", "garbage")
-OF_THE_MECHANISM = ("stuck", "slow", "overload", "voltage_dip", "temperature_ramp", *LYING)
+OF_THE_MECHANISM = ("stuck", "silent", "slow", "overload", "voltage_dip", "temperature_ramp", *LYING)
 """Words under which the head is moved once and then watched for some seconds."""
-NEVER_A_FAULT = ("duplicate", "noise", "slow", "misnamed", *LYING)
+NEVER_A_FAULT = ("duplicate", "noise", "slow", "misnamed", "not_a_number", *LYING)
 """Words that a good driver may live through without a word."""
 
 AWAY_PERIOD_S = 0.02  # between calls while the head is away: polled as a service polls it
