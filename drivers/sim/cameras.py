@@ -108,6 +108,8 @@ class SimulatedCamera:
         noise = Noise(settings.read_noise_dn, settings.shot_noise_dn, settings.seed, name)
         self._readout = Readout(noise, settings.colour, settings.jpeg_quality)
         self._rolling_s = (size_px[1] - 1) * settings.row_time_s
+        # the begin of an exposure, told by its middle and length, comes back with another last bit
+        self._rounding_s = 1e-9 if settings.row_time_s or settings.exposure.auto else 0.0
         self._exposure: FixedExposure | AutoExposure
         self._exposure = FixedExposure(settings.exposure, settings.exposure_s, start_s)
         self._closed = threading.Event()
@@ -129,7 +131,7 @@ class SimulatedCamera:
         deadline_s = now_s + max(0.0, timeout_s)
         if self._faults.strikes(self.name, now_s):
             raise NoReply("no answer", device=self.name)
-        after_s = self._own.true_s(exposed_after_s)
+        after_s = self._own.true_s(exposed_after_s) + self._rounding_s
         while not self._closed.is_set():
             now_s = self._clock.now_s()
             sequence, epoch = self._wanted(after_s, now_s)

@@ -131,6 +131,17 @@ def test_a_program_that_compares_pictures_is_fooled_unless_it_holds_the_exposure
     assert differences_dn[True] < 1.0 < 20.0 < differences_dn[False]
 
 
+def test_the_frame_after_a_frame_is_the_next_one_however_its_times_are_rounded() -> None:
+    device, _ = camera(
+        Scene(30.0), row_time_s=1.89e-5, exposure=ExposureSettings(reference_s=0.008, auto=True)
+    )
+    after_s = START
+    for number in range(1, 200):
+        frame = device.next_frame(after_s, 4.0)
+        assert frame.sequence == number and frame.exposure_began_s > after_s
+        after_s = frame.exposure_began_s
+
+
 def test_after_a_hold_the_loop_goes_on() -> None:
     scene = Scene(20.0)
     device, clock = automatic(scene)

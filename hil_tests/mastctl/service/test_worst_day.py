@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -67,3 +68,15 @@ def test_who_does_not_let_the_mast_settle_points_beside_and_is_told_another_resi
         found = [pointed(service, pixel_px) for pixel_px in CLICKS]
     assert max(np.abs(truly_px).max() for _, truly_px in found) > 0.6
     assert max(np.abs(truly_px - told["residual_px"]).max() for told, truly_px in found) > 0.6
+
+
+def test_two_worst_days_of_one_seed_are_the_same_to_the_last_bit() -> None:
+    runs = []
+    for _ in range(2):
+        with worst_day() as service:
+            told, truly_px = pointed(service, CLICKS[0])
+            picture = service.snapshot("navcam_right", fresh=True).image
+        runs.append((json.dumps(told, sort_keys=True), truly_px.tobytes(), picture))
+    assert runs[0][:2] == runs[1][:2]
+    np.testing.assert_array_equal(runs[0][2], runs[1][2])
+    assert runs[0][2].ndim == 3 and runs[0][2].std() > 10.0
