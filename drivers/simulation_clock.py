@@ -21,6 +21,7 @@ from __future__ import annotations
 import math
 import threading
 import time
+import weakref
 from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -31,6 +32,7 @@ from drivers.errors import BadOptions
 from drivers.options import is_number
 
 FASTEST = 1000.0
+STILL_WANTED_S = 1.0  # how often a clock that is paced sees whether anybody has it still, real seconds
 MAX = "max"
 
 
@@ -103,7 +105,9 @@ class SimulationClock:
         self._guests: deque[_Waiting] = deque()  # want to be at work
         self._waiting: list[_Waiting] = []  # in the order in which they began
         if self._paced:
-            threading.Thread(target=self._pace, name="simulation clock", daemon=True).start()
+            threading.Thread(
+                target=_pace, args=(weakref.ref(self), self._central), name="simulation clock", daemon=True
+            ).start()
 
     @property
     def speed(self) -> float:
@@ -282,26 +286,21 @@ class SimulationClock:
             self._now_s = max(self._now_s, first.until_s)
             self._release(first)
 
-    # In a thread of its own
-
-    def _pace(self) -> None:
-        """Let whoever waits for a moment go on when real time has brought it."""
-        with self._central:
-            while True:
-                first = min(self._waiting, key=_until_s, default=None)
-                at_work = self._turn is not None or self._ready or self._guests
-                if at_work or first is None or first.until_s == math.inf:
-                    self._central.wait()
-                    continue
-                gone_s = time.monotonic() - self._went_s
-                left_s = (first.until_s - self._now_s) / self._speed - gone_s
-                if left_s > 0:
-                    self._central.wait(left_s)
-                    continue
-                self._now_s = max(self._now_s, first.until_s)
-                self._went_s = time.monotonic()
-                self._release(first)
-                self._go_on()
+    def brought_s(self) -> float:
+        """Let go on whom real time has brought the moment, and return how long until the next, at most."""
+        while True:
+            first = min(self._waiting, key=_until_s, default=None)
+            at_work = self._turn is not None or self._ready or self._guests
+            if at_work or first is None or first.until_s == math.inf:
+                return STILL_WANTED_S
+            gone_s = time.monotonic() - self._went_s
+            left_s = (first.until_s - self._now_s) / self._speed - gone_s
+            if left_s > 0:
+                return min(left_s, STILL_WANTED_S)
+            self._now_s = max(self._now_s, first.until_s)
+            self._went_s = time.monotonic()
+            self._release(first)
+            self._go_on()
 
 
 class SimulationSignal:
@@ -354,6 +353,15 @@ class _Thread(threading.Thread):
     def run(self) -> None:
         assert self._newcomer is not None
         self._clock.work(self._newcomer, self._work)
+
+
+def _pace(wanted: weakref.ref[SimulationClock], central: threading.Condition) -> None:
+    """Let real time bring the moments of a clock for as long as somebody has it; in a thread of its own."""
+    with central:
+        while (clock := wanted()) is not None:
+            left_s = clock.brought_s()
+            del clock
+            central.wait(left_s)
 
 
 def _until_s(waiting: _Waiting) -> float:

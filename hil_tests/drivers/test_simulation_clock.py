@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import itertools
 import math
 import random
@@ -12,6 +13,7 @@ from dataclasses import replace
 
 import pytest
 
+from drivers import simulation_clock
 from drivers.clock import SystemClock
 from drivers.errors import BadOptions
 from drivers.hardware import DeviceSettings, HardwareSettings
@@ -59,6 +61,18 @@ def test_a_wait_that_is_interrupted_in_the_moment_of_its_turn_keeps_nobody_waiti
     thread = clock.thread(gone_on.set, "the next one")
     thread.start()
     assert gone_on.wait(LONG_S)
+
+
+def test_a_paced_clock_that_nobody_has_any_more_leaves_no_thread(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(simulation_clock, "STILL_WANTED_S", 0.01)
+    before = set(threading.enumerate())
+    clock = SimulationClock(1000.0)
+    clock.sleep(1.0)
+    (pacing,) = set(threading.enumerate()) - before
+    del clock
+    gc.collect()
+    pacing.join(LONG_S)
+    assert not pacing.is_alive()
 
 
 def test_time_stands_still_while_a_thread_computes() -> None:
