@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import scipy
 
-from drivers.sim import boards, bricks, placed, rocks, scene, texture
+from drivers.sim import boards, bricks, placed, rocks, scene, terrain, texture
 from drivers.sim.bricks import Brick
 from drivers.sim.compiled import kernels
 from drivers.sim.kept import digest_of, keep_newest, kept_folder
@@ -45,7 +45,7 @@ def kept_scene(settings: SceneSettings) -> Scene:
 
 def folder_of(settings: SceneSettings) -> Path:
     """Return where a scene is kept: under the digest of its settings and of all that makes it."""
-    modules = (boards, bricks, placed, rocks, scene, texture)
+    modules = (boards, bricks, placed, rocks, scene, terrain, texture)
     makers = digest_of(Path(str(module.__file__)) for module in modules), kernels().SOURCES
     words = (repr(settings), *makers, np.__version__, scipy.__version__)
     return kept_folder("scenes", hashlib.sha256("\n".join(words).encode()).hexdigest())

@@ -43,6 +43,7 @@ from drivers.sim.placed import REACH_M, check_clear_of, read_list
 from drivers.sim.render import Renderer, Stills, compile_renderer
 from drivers.sim.scene import Scene, SceneSettings
 from drivers.sim.section import filled
+from drivers.sim.terrain import read_terrain
 from drivers.sim.warmth import TemperatureSettings, temperature_settings
 from drivers.sim.wired_head import DEFAULT_HEADS, WiredHead, check_head
 from drivers.simulation_clock import simulation_speed
@@ -177,6 +178,8 @@ def scene_settings(section: Any, folder: Path) -> SceneSettings:
             for kind in ("rocks", "bricks", "boards")
             if isinstance(section.get(kind), list | tuple)
         }
+        if "terrain" in section:
+            placed["terrain"] = read_terrain(section["terrain"], folder)
         plain = {key: value for key, value in section.items() if key not in placed}
         beside = set(section) - {"plugin", "options", "seed"} if "plugin" in section else set()
         if beside:
@@ -262,6 +265,8 @@ class SimulatedRover:
         # Before any camera is asked: a frame's deadline is no time for a compiler.
         compile_renderer()
         self.scene, self._renderer = _made(settings.scene)
+        if settings.scene.terrain is not None:
+            self._check_over_ground()
         self._stills = Stills(self._renderer)
         self._render_lock = threading.Lock()
         self._closed = False
@@ -286,6 +291,17 @@ class SimulatedRover:
         self.cameras: Mapping[str, SimulatedCamera] = MappingProxyType(
             {name: self._camera(name, clock, start_s) for name in self.rig.cameras}
         )
+
+    def _check_over_ground(self) -> None:
+        """Refuse a map whose ground rises over a camera."""
+        for name in self.rig.cameras:
+            x_m, y_m, z_m = self.rig.camera_in_rover(name, 0.0, 0.0).C
+            ground_m = self.scene.ground_z_m(float(x_m), float(y_m))
+            if z_m >= ground_m:
+                raise BadOptions(
+                    f"simulation.scene.terrain: the ground at ({x_m:.2f}, {y_m:.2f}) m rises to z "
+                    f"{ground_m:.2f} m, over {name} at {z_m:.2f} m, expected ground below all cameras"
+                )
 
     def true_joints(self, time_s: float) -> tuple[float, float]:
         """Return the mechanical pan and tilt at a moment of the last minute, radians."""

@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from calib.rigid import Rigid, rot_x, rot_y, rot_z
 from drivers.errors import BadOptions
-from drivers.sim import boards, bricks, rocks, texture
+from drivers.sim import boards, bricks, rocks, terrain, texture
 from drivers.sim.boards import Board
 from drivers.sim.bricks import Brick
 from drivers.sim.compiled import kernels
@@ -32,6 +32,7 @@ from drivers.sim.placed import (
     named,
     radius_m,
 )
+from drivers.sim.terrain import OwnTerrain
 
 Float64 = NDArray[np.float64]
 
@@ -63,6 +64,8 @@ class SceneSettings:
         these.
     boards
         Boards that stand there. Where one does, or a brick or rock was placed, no scattered one is.
+    terrain
+        Ground of one's own instead of the relief; the hills beyond stay, where ``relief_m`` is not 0.
     plugin, options
         A scene from outside instead, ``package.module:factory``, and what it is made with.
     sun_azimuth_rad, sun_elevation_rad
@@ -74,6 +77,7 @@ class SceneSettings:
     rocks: int | tuple[PlacedRock, ...] = 50
     bricks: int | tuple[PlacedBrick, ...] = 0
     boards: tuple[PlacedBoard, ...] = ()
+    terrain: OwnTerrain | None = None
     sun_azimuth_rad: float = -1.95
     sun_elevation_rad: float = 0.70
     plugin: str = ""
@@ -184,8 +188,11 @@ def build_scene(settings: SceneSettings | None = None) -> Scene:
         stones = rocks.together(stones, bricks.meshes(laid))
     if stood:
         stones = rocks.together(stones, boards.meshes(stood))
-    tones = ground_tones(inner, sun, tone_rng) * shadows(inner, stones, sun)
-    detail = texture.pyramid(texture.gravel(gravel_rng, sun, texture.DETAIL_TEXELS), texture.DETAIL_TEXEL_M)
+    tones = ground_tones(inner, sun, tone_rng, settings.terrain) * shadows(inner, stones, sun)
+    gravel = texture.gravel(gravel_rng, sun, texture.DETAIL_TEXELS)
+    if settings.terrain is not None and not settings.terrain.gravel:
+        gravel = np.ones_like(gravel)
+    detail = texture.pyramid(gravel, texture.DETAIL_TEXEL_M)
     stone = texture.pyramid(texture.stone(stone_rng, texture.STONE_TEXELS), texture.STONE_TEXEL_M)
     broad = texture.pyramid(tones, INNER_CELL_M)
     world = kernels().World(inner, outer, stones, detail, broad, stone, boards.faces(stood), sun)
@@ -247,17 +254,21 @@ def sun_direction(settings: SceneSettings) -> Float64:
 def inner_relief_m(settings: SceneSettings, rng: np.random.Generator) -> NDArray[np.float32]:
     """Elevations (n + 1, n + 1) [y, x] of the inner grid, nil on its rim and nearly so round the rover."""
     n = INNER_CELLS
+    axis = np.asarray((np.arange(n + 1) - n / 2) * INNER_CELL_M, dtype=np.float64)
+    rim = np.maximum(np.abs(axis)[:, None], np.abs(axis)[None, :])
+    level_at_rim = 1.0 - smooth_step(rim, 28.0, 31.8)
+    if settings.terrain is not None:
+        own: Any = terrain.elevation_m(settings.terrain, axis[None, :], axis[:, None])
+        return np.asarray(own * level_at_rim, dtype=np.float32)
     swells = texture.fractal(n, rng, 1.9, 0.8 / INNER_CELL_M, 12.0 / INNER_CELL_M)
     bumps = texture.fractal(n, rng, 1.7, 2.0, 0.8 / INNER_CELL_M)
     # a peak of three standard deviations comes to relief_m
     relief = settings.relief_m * (0.33 * swells + 0.035 * bumps)
     elevation = np.zeros((n + 1, n + 1), dtype=np.float64)
     elevation[:n, :n] = np.clip(relief, -settings.relief_m, settings.relief_m)
-    axis = (np.arange(n + 1) - n / 2) * INNER_CELL_M
     distance = np.hypot(axis[:, None], axis[None, :])
-    rim = np.maximum(np.abs(axis)[:, None], np.abs(axis)[None, :])
     near = 0.06 + 0.94 * smooth_step(distance, LEVEL_WITHIN_M, ROUGH_BEYOND_M)
-    elevation *= near * (1.0 - smooth_step(rim, 28.0, 31.8))
+    elevation *= near * level_at_rim
     elevation -= elevation[n // 2, n // 2] * (1.0 - smooth_step(distance, LEVEL_WITHIN_M, ROUGH_BEYOND_M))
     return elevation.astype(np.float32)
 
@@ -319,7 +330,9 @@ def ground_z_m(grid: Any, x_m: float, y_m: float) -> float:
     return float(-(h00 + rise))
 
 
-def ground_tones(grid: Any, sun: Float64, rng: np.random.Generator) -> NDArray[np.float32]:
+def ground_tones(
+    grid: Any, sun: Float64, rng: np.random.Generator, own: OwnTerrain | None = None
+) -> NDArray[np.float32]:
     """Relative brightness (n, n) [y, x] of the inner grid's cells: light and dark soil, lit by the sun."""
     module = kernels()
     e = grid.elevation_m.astype(np.float64)
@@ -329,7 +342,11 @@ def ground_tones(grid: Any, sun: Float64, rng: np.random.Generator) -> NDArray[n
     light = module.AMBIENT + (1.0 - module.AMBIENT) * cosine
     level = module.AMBIENT - (1.0 - module.AMBIENT) * sun[2]
     soil = texture.fractal(grid.cells, rng, 0.75, 2.0, 10.0 / grid.cell_m)
-    return np.asarray(np.exp(0.13 * soil) * light / level, dtype=np.float32)
+    soil = np.exp(0.13 * soil)
+    if own is not None:
+        middles = grid.x0_m + (np.arange(grid.cells) + 0.5) * grid.cell_m
+        soil = terrain.soil(own, middles[None, :], middles[:, None], grid.cell_m, soil)
+    return np.asarray(soil * light / level, dtype=np.float32)
 
 
 def shadows(grid: Any, stones: Any, sun: Float64) -> NDArray[np.float32]:
