@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 
 from drivers.open_hardware import HEADS
+from mastctl.cli.main import main
 from mastctl.conform.drivers_run import COUNTS
 from tools.campaigns.servo_rigs import LIMITS_RAD, RIGS
 
@@ -53,6 +54,24 @@ def test_a_head_from_outside_goes_through_the_bench_suite(
     pan_tilt = "{driver: 'bench_rig.head:open_head', options: {speed_rad_per_s: 1.5}}"
     last = bench(repository, configuration(tmp_path, pan_tilt), installed)
     assert "12 passed" in last and "failed" not in last, last
+
+
+@pytest.mark.usefixtures("installed")
+def test_a_camera_from_outside_keeps_its_promises(
+    repository: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    mast_file = repository / "configs" / "masts" / "rocky8_simulated.yaml"
+    options = f"{{mast_file: {mast_file}, name: navcam_left}}"
+    (tmp_path / "rig.yaml").write_text(
+        f"schema: mastctl/config/1\nmast_file: {mast_file}\n"
+        "pan_tilt: {driver: 'bench_rig.head:open_head'}\n"
+        f"cameras: {{navcam_left: {{driver: 'bench_rig.camera:open_camera', options: {options}}}}}\n"
+        "limits: {pan_rad: [-0.4, 0.4], tilt_rad: [-0.3, 0.3], speed_rad_per_s: 0.8}\n"
+    )
+    words = ["--config", str(tmp_path / "rig.yaml"), "--camera", "navcam_left", "--with-head"]
+    code = main(["conform", *words, "--seconds", "1"])
+    told = capsys.readouterr()
+    assert code == 0 and "conforms: 7 passed, 0 failed, 0 skipped" in told.out, told
 
 
 @pytest.fixture(params=["dynamixel_pty", "ptu_pty"])

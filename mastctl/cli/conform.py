@@ -55,6 +55,10 @@ def add_commands(subparsers: argparse._SubParsersAction[Any]) -> None:
         metavar="S",
         help="how long frames are taken (default 3)",
     )
+    what.add_argument(
+        "--with-head", action="store_true",
+        help="with --config: open the head first, for cameras of a simulator that look from it",
+    )  # fmt: skip
     motion = parser.add_mutually_exclusive_group()
     motion.add_argument(
         "--motion", dest="motion", action="store_true", default=None, help="move the head unasked"
@@ -79,6 +83,8 @@ def _conform(args: argparse.Namespace) -> int:
     device = args.driver is not None or args.config is not None
     if device == (args.url is not None) and not args.list:
         raise WrongUse("the address of a daemon, or --driver, or --config is expected, and one of them only")
+    if args.with_head and (args.config is None or args.camera is None):
+        raise WrongUse("--with-head goes with --config and --camera")
     _check_junit(args.junit)
     return _driver(args) if device or args.head or args.camera is not None else _daemon(args)
 
@@ -114,7 +120,7 @@ def _driver(args: argparse.Namespace) -> int:
     settings, name, limits, size_px = _device(args, kind)
     if kind == "camera":
         driver = settings.cameras[name].driver
-        with drivers_run.camera_under_test(settings, name, size_px, args.seconds) as camera:
+        with drivers_run.camera_under_test(settings, name, size_px, args.seconds, args.with_head) as camera:
             return told(args, drivers_run.check_camera(camera, driver, checks, tell_of(args)))
     driver = settings.pan_tilt.driver
     if driver == "replay":

@@ -108,10 +108,12 @@ def box(at_rad: float, ends_rad: Angles, reach_rad: float) -> Angles:
 
 @contextmanager
 def camera_under_test(
-    settings: HardwareSettings, name: str, size_px: tuple[int, int] | None, seconds: float
+    settings: HardwareSettings, name: str, size_px: tuple[int, int] | None, seconds: float, with_head: bool
 ) -> Iterator[CameraTrial]:
-    """Open a camera; leaving closes it."""
+    """Open a camera, after the head if it is one of a simulator that looks from it; leaving closes it."""
     with ExitStack() as stack:
+        if with_head:
+            stack.enter_context(open_hardware(replace(settings, cameras={})))
 
         def opened() -> Camera:
             return stack.enter_context(open_one_camera(settings, name))
