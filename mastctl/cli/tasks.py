@@ -112,8 +112,15 @@ def results_of(
         step("", why and f"{label(task)}: {why}", told and f"{label(task)}: {told}")
         done(result)
 
-    with run_bar(args, what, len(set(work.ids))) as step:
-        results = work.run(_opened(args), kept, tell)
+    try:
+        with run_bar(args, what, len(set(work.ids))) as step:
+            results = work.run(_opened(args), kept, tell)
+    except KeyboardInterrupt:
+        if kept is not None:
+            held = sum(map(kept.holds, set(work.ids)))
+            of = len(set(work.ids))
+            output.tell(f"{held} of {of} tasks are kept in {folder}; the same command goes on with the rest")
+        raise
     if not args.task:
         return results
     _tell_chosen(work, folder, as_json)

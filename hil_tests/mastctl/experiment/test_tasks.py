@@ -245,6 +245,19 @@ def test_tasks_run_one_by_one_give_the_same_document_as_two_workers_and_a_cluste
     assert documents[0] == documents[1] == documents[2]
 
 
+def test_an_interrupted_run_says_what_is_kept_and_how_to_go_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def interrupted(self: Work[Any, Any], executor: Any, kept: Kept, done: Any) -> None:
+        kept.write(self.ids[0], "first", 1)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(Work, "run", interrupted)
+    assert main([*COVERAGE[:-1], "--results", str(tmp_path)]) == 130
+    said = capsys.readouterr().err
+    assert f"1 of 2 tasks are kept in {tmp_path}; the same command goes on" in said
+
+
 def test_an_unknown_task_and_one_without_a_place_are_refused(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
