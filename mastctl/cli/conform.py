@@ -156,6 +156,7 @@ def _device(
     config = load_config(args.config)
     if kind == "head":
         own = (config.limits.pan_rad, config.limits.tilt_rad)
+        args.speed = min(args.speed, config.limits.speed_rad_per_s)
         return config.hardware, "", limits or own, None
     if args.camera not in config.hardware.cameras:
         known = ", ".join(config.hardware.cameras) or "none"

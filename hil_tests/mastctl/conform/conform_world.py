@@ -63,13 +63,18 @@ class NoiseCamera:
         self._closed.set()
 
 
-@contextmanager
-def true_daemon(folder: Path) -> Iterator[str]:
-    """A daemon as it is, on devices from outside that never wait; its address."""
+def configuration(folder: Path) -> Path:
+    """A configuration of devices from outside that never wait."""
     save_rig(rig(), folder / "little.yaml")
     text = CONFIG.format(listen="{port: 0}").replace("{driver: fake}", f"{{driver: '{HERE}:open_head'}}", 1)
     (folder / "daemon.yaml").write_text(text.replace("{driver: fake}", f"{{driver: '{HERE}:NoiseCamera'}}"))
-    with RunningDaemon(load_config(folder / "daemon.yaml")) as daemon:
+    return folder / "daemon.yaml"
+
+
+@contextmanager
+def true_daemon(folder: Path) -> Iterator[str]:
+    """A daemon as it is, on such devices; its address."""
+    with RunningDaemon(load_config(configuration(folder))) as daemon:
         yield daemon.url
 
 

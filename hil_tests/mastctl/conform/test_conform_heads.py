@@ -16,7 +16,7 @@ import pytest
 
 from drivers.errors import DriverError, NoReply
 from drivers.interfaces import Reading
-from hil_tests.mastctl.conform.conform_world import HERE, open_head
+from hil_tests.mastctl.conform.conform_world import HERE, configuration, open_head
 from mastctl.cli.main import main
 from mastctl.conform.checks import run_checks
 from mastctl.conform.drivers_run import check_head
@@ -289,3 +289,11 @@ def test_the_command_checks_a_driver_by_its_name(capsys: pytest.CaptureFixture[s
     ):
         assert main(wrong) == 2
         assert json.loads(capsys.readouterr().out)["error"]["code"] == code
+
+
+def test_a_head_of_a_configuration_is_no_faster_than_its_limits(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    words = ["conform", "--config", str(configuration(tmp_path)), "--head", "--motion", "--json"]
+    assert main([*words, "--speed", "3", "--only", "head.speed"]) == 0
+    assert "asked 0.250" in json.loads(capsys.readouterr().out)["checks"][0]["message"]  # half of the limit
