@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import re
 from collections.abc import Callable, Iterator
-from dataclasses import fields
+from dataclasses import fields, is_dataclass
 from pathlib import Path
 from typing import Any
 
@@ -177,11 +177,20 @@ def test_every_driver_is_where_the_page_says_what_may_be_named(page: str) -> Non
     assert [name for name in (*CAMERAS, *OURS) if f"`{name}`" not in camera] == []
 
 
+def keys_of(settings: Any) -> set[str]:
+    """Names of a settings dataclass; those of one in it by key path."""
+    found = set()
+    for f in fields(settings):
+        value = getattr(settings, f.name)
+        found |= {f"{f.name}.{key}" for key in keys_of(value)} if is_dataclass(value) else {f.name}
+    return found
+
+
 def test_every_key_of_the_simulation_and_of_a_recording_is_on_the_page(page: str) -> None:
     known = {key for key in rover._KEYS if key not in ("cameras", "scene", "temperature")}
     known |= {f"temperature.{f.name}" for f in fields(TemperatureSettings)}
     known |= {f"head.{name}" for name in HEAD_KEYS}
-    known |= {f"cameras.{f.name}" for f in fields(CameraSettings)}
+    known |= {f"cameras.{key}" for key in keys_of(CameraSettings())}
     known |= {f"scene.{f.name}" for f in fields(SceneSettings)}
     assert set(rows(part(page, "Simulation"))) == known
     text = part(page, "Options of `replay`")

@@ -13,6 +13,7 @@ from mastctl.cli import output
 from mastctl.cli.output import WrongUse
 from mastctl.cli.places import check_folder
 
+MOST_BOARDS = 12
 HEADS = ("ptu_d46_70", "dynamixel_x", "ph42")
 _OF_NUMBERS = ("height", "baseline", "focal_px", "view_deg", "size", "name")
 
@@ -41,6 +42,13 @@ def add_parser(kinds: Any) -> None:
     new.add_argument("--name", metavar="NAME", help="of the rig (default new_rig)")
     new.add_argument("--head", choices=HEADS, help="default ptu_d46_70; dynamixel_x behind --wire dynamixel")
     new.add_argument("--wire", choices=("dynamixel", "flir_ptu"), help="drive the head through bytes")
+    new.add_argument(
+        "--boards",
+        type=output.at_least(0),
+        default=0,
+        metavar="N",
+        help="dot boards about, at most 12",
+    )
     new.add_argument("--speed", metavar="1|N|max", help="of the rover's clock (default 1)")
     new.add_argument(
         "--seed", type=output.at_least(0), default=1, metavar="S", help="of all that is drawn (default 1)"
@@ -56,7 +64,7 @@ def run(args: argparse.Namespace) -> int:
     from drivers.sim.pan_tilt import head_settings
     from drivers.sim.wired_head import DEFAULT_HEADS, check_head
     from drivers.simulation_clock import simulation_speed
-    from mastctl.new_rig.folder import check_empty, write_built, write_twin
+    from mastctl.new_rig.folder import boards_about, check_empty, write_built, write_twin
     from mastctl.new_rig.numbers import built_rig
 
     if args.mast_file is not None:
@@ -67,6 +75,10 @@ def run(args: argparse.Namespace) -> int:
     for key in ("head", "wire"):
         if getattr(args, key) is not None:
             simulation[key] = getattr(args, key)
+    if args.boards > MOST_BOARDS:
+        raise WrongUse(f"--boards is {args.boards} where {MOST_BOARDS} at most have room")
+    if args.boards:
+        simulation["scene"] = {"boards": boards_about(args.boards)}
     if args.speed is not None:
         simulation["speed"] = args.speed if args.speed == "max" else _number(args.speed)
         simulation_speed(simulation["speed"])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -42,6 +43,20 @@ class NewRig:
     folder: Path
     believed: Rig
     twin: Twin
+
+
+def boards_about(count: int) -> list[dict[str, float]]:
+    """Return so many dot boards for ``simulation.scene.boards``, by turns 3 and 5 m ahead."""
+    apart_rad = min(0.5, 2.4 / max(count, 1))
+    bearings = [(k - (count - 1) / 2) * apart_rad for k in range(count)]
+    return [
+        {
+            "x_m": round((3.0, 5.0)[k % 2] * math.cos(bearing), 3),
+            "y_m": round((3.0, 5.0)[k % 2] * math.sin(bearing), 3),
+            "raised_m": (0.1, 0.6)[k % 2],
+        }
+        for k, bearing in enumerate(bearings)
+    ]
 
 
 def check_empty(folder: Path, force: bool) -> None:

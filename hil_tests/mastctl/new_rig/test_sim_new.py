@@ -13,6 +13,8 @@ from scipy import stats
 
 from calib.files.mast_file import load_rig, save_rig
 from calib.rigid import tangents
+from drivers.sim.placed import check_clear_of
+from drivers.sim.rover import simulation_settings
 from mastctl.cli.main import main
 from mastctl.config import load_config
 from mastctl.daemon import RunningDaemon
@@ -69,6 +71,15 @@ def test_the_numbers_asked_for_are_those_of_the_rig(tmp_path: Path) -> None:
     assert config.hardware.simulation["head"] == "ph42" and config.hardware.simulation["speed"] == "max"
 
 
+@pytest.mark.parametrize("count", [1, 2, 7, 12])
+def test_boards_stand_about_where_there_is_room(tmp_path: Path, count: int) -> None:
+    made(tmp_path, "--boards", str(count))
+    config = load_config(tmp_path / "config.yaml")
+    scene = simulation_settings(config.hardware.simulation, config.hardware.folder).scene
+    assert len(scene.boards) == count
+    check_clear_of(scene.placed, load_rig(tmp_path / "true_rig.yaml").rig)
+
+
 def test_a_rig_is_never_overwritten_unless_that_is_asked_for(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -97,6 +108,7 @@ def test_a_rig_is_never_overwritten_unless_that_is_asked_for(
         ("--head roof", "invalid choice"),
         ("--head ph42 --wire flir_ptu", "flir_ptu"),
         ("--speed often", "speed"),
+        ("--boards 13", "--boards is 13 where 12 at most have room"),
         ("--seed -1", "'-1' where a whole number"),
         ("--from nowhere.yaml", "nowhere.yaml"),
         ("--from nowhere.yaml --height 2", "--height stands beside --from"),
