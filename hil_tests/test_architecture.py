@@ -36,6 +36,21 @@ def test_every_file_that_the_page_names_is_there(repository: Path) -> None:
         assert any(place.is_file() for place in places), file
 
 
+def test_no_page_links_or_names_a_file_of_the_checkout_that_is_not_there(repository: Path) -> None:
+    pages = [repository / "README.md", *sorted((repository / "docs").rglob("*.md"))]
+    missing, seen = [], 0
+    for one in pages:
+        text = one.read_text()
+        links = [link for link in re.findall(r"\]\(([^)#\s]+)", text) if "://" not in link]
+        named = re.findall(r"`((?:calib|configs|docs|drivers|hil_tests|mastctl|tools)/[\w./-]+\.\w+)`", text)
+        named = [name for name in named if "NAME" not in name]
+        seen += len(links) + len(named)
+        missing += [f"{one.name}: {link}" for link in links if not (one.parent / link).exists()]
+        missing += [f"{one.name}: {name}" for name in named if not (repository / name).exists()]
+    assert seen > 100
+    assert missing == []
+
+
 def test_the_page_lists_every_tool(repository: Path) -> None:
     listed = set()
     for cell in re.findall(r"^\| (`.*?) \|", page(repository).partition("## The tools")[2], re.MULTILINE):
