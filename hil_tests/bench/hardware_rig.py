@@ -11,7 +11,7 @@ from typing import Any
 from drivers.hardware import DeviceSettings
 from mastctl.config import load_config
 from mastctl.conform.drivers_run import head_under_test
-from mastctl.conform.heads import HeadTrial
+from mastctl.conform.head_trial import HeadTrial
 
 CHOSEN: str | None = None
 """The configuration that --hardware names."""

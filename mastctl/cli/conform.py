@@ -15,7 +15,7 @@ from mastctl.cli.output import WrongUse, at_least, finite_number, positive_numbe
 if TYPE_CHECKING:
     from drivers.hardware import HardwareSettings
     from mastctl.conform.checks import Check, Outcome
-    from mastctl.conform.heads import Angles
+    from mastctl.conform.head_trial import Angles
     from mastctl.conform.report import Report
 
 MARKS = {"passed": "ok", "failed": "FAILED", "skipped": "-"}

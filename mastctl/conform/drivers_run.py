@@ -19,7 +19,8 @@ from drivers.open_hardware import HEADS as HEAD_DRIVERS
 from drivers.open_hardware import open_hardware, open_one_camera
 from mastctl.conform.cameras import CAMERAS, CameraTrial
 from mastctl.conform.checks import Check, Outcome, run_checks
-from mastctl.conform.heads import HEADS, Angles, HeadTrial
+from mastctl.conform.head_trial import Angles, HeadTrial
+from mastctl.conform.heads import HEADS
 from mastctl.conform.report import Report
 from mastctl.conform.worker import beside
 
