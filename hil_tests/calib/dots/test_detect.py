@@ -9,6 +9,8 @@ from scipy.spatial.transform import Rotation
 
 import calib.dots.board_grid
 from calib.camera.cahvor import CameraModel
+from calib.dots.board_grid import BoardGrid, best_grid
+from calib.dots.candidates import Candidates, dot_candidates
 from calib.dots.find import DetectionFailure, DotsFound, PredictedBoard, Upright, find_dots
 from calib.rigid import Rigid
 from calib.survey import Board
@@ -109,6 +111,27 @@ def test_boards_that_are_not_square(columns: int) -> None:
     for roll_deg in (0, 95):
         shot = shoot(rng, SIDE, pose(4.0, (25, 45), roll_deg), board)
         check(shot, find_dots(shot.image, board, shot.roughly(rng)), WANTED_PX, 7 * columns)
+
+
+@pytest.mark.parametrize("hidden", ["scattered", "two outer columns"])
+def test_dots_that_are_no_spots_are_filled_in_from_the_grid(hidden: str) -> None:
+    """Spots taken away by hand; the picture still holds the dots."""
+    rng = np.random.default_rng(19)
+    shot = shoot(rng, SIDE, pose(4.0, (20, 45)))
+    true_px = shot.true_px(ROWS, COLUMNS)
+    diameter_px = NAVCAM_PX * BOARD.dot_diameter_m / 4.0
+    spots = dot_candidates(shot.image, diameter_px, (0.2 * diameter_px**2, 1.2 * diameter_px**2))
+    away = np.linalg.norm(spots.middles_px[:, None] - true_px, axis=-1)
+    is_dot, dot = away.min(axis=1) < 2.0, away.argmin(axis=1)
+    taken = COLUMNS[dot] >= 8 if hidden == "two outer columns" else np.isin(dot, [11, 34, 37, 55, 72, 90])
+    kept = ~(is_dot & taken)
+    assert is_dot.sum() == 100 and (is_dot & kept).sum() == (80 if hidden == "two outer columns" else 94)
+    left = Candidates(spots.middles_px[kept], spots.shapes_px[kept])
+    grid, _ = best_grid(shot.image, left, BOARD)
+    assert isinstance(grid, BoardGrid), grid
+    assert len(grid.places) == 100
+    off_px = np.linalg.norm(grid.middles_px[:, None] - true_px, axis=-1).min(axis=1)
+    assert off_px.max() < 0.5
 
 
 def test_without_a_prediction_rows_run_to_the_right() -> None:

@@ -265,6 +265,8 @@ def test_too_few_one_sided_and_contradicting_hand_offs_are_refused_by_name(rig: 
     with pytest.raises(NoCorrection) as caught:
         fit_body_pose(rig, HAZCAMS, elsewhere)
     assert caught.value.code == "too_few"
+    least = hand_offs(true, rig, targets(rng, 8), rng)
+    assert len(fit_body_pose(rig, HAZCAMS, least).used.handoffs) == 8
 
 
 def test_groups_are_the_pairs_and_lone_cameras_of_the_body(rig: Rig) -> None:

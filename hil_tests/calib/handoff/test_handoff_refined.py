@@ -143,6 +143,15 @@ def test_an_eye_may_be_off_by_two_sigma_of_what_camera_models_are_wrong_by(
     assert {one.verdict for one in refined.values()} == {verdict}
 
 
+@pytest.mark.parametrize(("model_px", "verdict"), [(0.29, "accepted"), (0.22, "occluded")])
+def test_without_a_word_an_eye_may_be_off_by_four_sigma(good: Case, model_px: float, verdict: str) -> None:
+    """A search of three sigma allows four: 1 px is 3.5 sigma of 0.29 px and 4.5 sigma of 0.22 px."""
+    refined = rolled(good, 1, 1).refined(RefineSettings(model_px=model_px, worst_chi2=1e3))
+    assert {one.verdict for one in refined.values()} == {verdict}
+    if verdict == "occluded":
+        assert all("of its standard deviations" in one.reason for one in refined.values())
+
+
 @pytest.mark.parametrize(("model_px", "verdict"), [(0.4, "accepted"), (0.3, "occluded")])
 def test_eyes_may_disagree_by_what_camera_models_are_wrong_by(
     good: Case, model_px: float, verdict: str

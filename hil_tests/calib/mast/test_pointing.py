@@ -512,3 +512,18 @@ def test_without_a_word_the_head_is_taken_to_stand_at_zero() -> None:
     assert solve_ray(mast, *ray, above, from_pan_rad=0.3)[0].pan_rad == 0.3
     beside = [4.0 * np.cos(2.0), 4.0 * np.sin(2.0), -1.5]
     assert solve_ray(mast, *ray, beside) == solve_ray(mast, *ray, beside, from_pan_rad=0.0, from_tilt_rad=0.0)
+
+
+def test_without_a_word_the_angles_nearest_to_zero_come_first() -> None:
+    """A camera beside the pan axis sees what is steep above it upright two ways: panned less, tilted less.
+
+    From a head that looks 1 rad up, the way with less pan would be the shorter one.
+    """
+    above = [0.11 * np.cos(2.0), 0.11 * np.sin(2.0), -0.3]
+    panned, tilted = solve(straight_mast(-0.05), pinhole((0.0, 0.1, 0.0)), above)
+    assert max(panned.pan_rad, panned.tilt_rad) < max(tilted.pan_rad, tilted.tilt_rad) < np.pi / 2
+    assert max(panned.pan_rad, panned.tilt_rad - 1.0) > max(tilted.pan_rad, tilted.tilt_rad - 1.0)
+    low, high = Solution(0.0, -0.5, 5.0), Solution(0.0, 0.7, 5.0)
+    assert choose([high, low], (-2.0, 2.0), (-1.0, 1.0)) == low
+    left, right = Solution(-0.5, 0.0, 5.0), Solution(0.7, 0.0, 5.0)
+    assert choose([right, left], (-2.0, 2.0), (-1.0, 1.0)) == left

@@ -8,11 +8,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from scipy import ndimage
 from scipy.stats import chi2
 
 from calib.camera.one_point import OnePoint
 from calib.errors import CalibError
 from calib.handoff.by_image import Eye
+from calib.pictures.distinct import indistinct
 from calib.pictures.epipolar import find_partner
 from calib.pictures.patch_match import match_patch
 from calib.pictures.warp import Plane
@@ -172,6 +174,33 @@ def test_a_target_is_kept_while_the_rover_nears_it_with_wrong_odometry(begun: Tr
     assert renewed >= 1
 
 
+def test_the_picked_target_is_less_certain_than_the_followed_place_by_what_the_keys_handed_on(
+    begun: Track,
+) -> None:
+    """2 cm of drift along the ground, to the right: that variance is added there, and nothing elsewhere."""
+    right = np.array([0.0, 1.0, 0.0])
+    drifted = replace(begun, key=replace(begun.key, drift_m2=0.02**2 * np.outer(right, right)))
+    np.testing.assert_array_equal(begun.target_covariance_m2, begun.covariance_m2)
+    more = drifted.target_covariance_m2 - begun.target_covariance_m2
+    assert right @ more @ right == pytest.approx(4e-4)
+    assert np.trace(more) == pytest.approx(4e-4)
+
+
+def test_a_target_behind_its_key_camera_is_lost_and_says_so(begun: Track) -> None:
+    """The pose jumps so far that the believed place lies behind where the key picture was taken."""
+    behind = replace(begun, position_m=2.0 * begun.key.eye.camera.C - begun.position_m)
+    look = seen_by(behind, eyes(0.0, seed=3))
+    assert look.track.state == "lost"
+    assert "not visible from where its key picture was taken" in look.reason
+
+
+def test_a_correlation_at_the_limit_keeps_the_key_and_one_below_renews_it(begun: Track) -> None:
+    track, both = step(begun, pose(0.0), pose(0.1), np.diag([1e-6] * 3 + [0.003**2] * 3)), eyes(0.1, seed=20)
+    worst = min(one.correlation for one in seen_by(track, both).found.values())
+    assert not seen_by(track, both, TrackSettings(renew_below=worst)).renewed
+    assert seen_by(track, both, TrackSettings(renew_below=float(np.nextafter(worst, 1.0)))).renewed
+
+
 def nearer_by(ratio: float) -> float:
     """How far the rover has to drive for the cameras, 1.2 m up, to be that much nearer to the target."""
     return float(TARGET[0] - np.sqrt((TARGET[0] ** 2 + 1.44) / ratio**2 - 1.44))
@@ -291,6 +320,25 @@ def test_a_plain_surface_cannot_be_followed() -> None:
     plain = eyes(0.0, plane=replace(GROUND, grey=np.full((64, 64), 130.0)))
     with pytest.raises(CalibError, match="too little texture"):
         start_track(plain["left"], plain["right"], np.array([160.0, 120.0]))
+
+
+@pytest.mark.parametrize(("sigma_px", "enough"), [(0.13, True), (0.35, False)])
+def test_texture_is_enough_to_begin_if_noise_moves_it_less_than_a_fifth_of_a_pixel(
+    sigma_px: float, enough: bool
+) -> None:
+    """Between two pictures of 2 grey levels' noise: sqrt(2) 2 / sqrt(l), l of the patch's weighted slopes."""
+    field = random_texture(5, contrast_dn=1.0)[:241, :321] - 120.0
+    x, y, sigma = 160, 120, SIZES.near_px
+    weights = np.exp(-((np.arange(321) - x) ** 2 + (np.arange(241)[:, None] - y) ** 2) / (2.0 * sigma**2))
+    slopes = np.stack([ndimage.gaussian_filter(field, 1.0, order) for order in ((0, 1), (1, 0))])
+    least = np.linalg.eigvalsh(np.einsum("iyx,jyx,yx->ij", slopes, slopes, weights))[0]
+    contrast = np.sqrt(2.0) * 2.0 / (sigma_px * np.sqrt(least))
+    rng = np.random.default_rng(8)
+    image = (120.0 + contrast * field + rng.normal(0.0, 2.0, field.shape)).astype(np.float32)
+    level = Pinhole(np.zeros(3), 0.0, 0.0, 900.0, (321, 241))
+    wall = Plane(np.array([3.0, 0.0, 0.0]), np.array([1.0, 0.0, 0.0]))
+    reason = indistinct(image, level.model, np.array([float(x), float(y)]), wall, SIZES)
+    assert reason == ("" if enough else "the patch has too little texture to hold a position")
 
 
 def test_an_edge_cannot_be_followed() -> None:
