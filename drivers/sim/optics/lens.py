@@ -7,6 +7,7 @@ throws the shadow of a disc in light that comes from all of the lens, a cone of 
 
 from __future__ import annotations
 
+import functools
 import zlib
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -151,14 +152,33 @@ def shadow(away_px: Float64, speck_px: float, cone_px: float) -> Float64:
     return np.where(away_px <= abs(a - b), inside, np.where(away_px >= a + b, 0.0, covered))
 
 
+@functools.cache
 def disc_kernel(diameter_px: float) -> Float32:
-    """Return the kernel of a uniform disc, each pixel by the share of its area that lies inside."""
-    radius, fine = 0.5 * diameter_px, 16
+    """Return the kernel of a uniform disc, each pixel by the share of its area that lies inside.
+
+    Shares of pixels are sums over them, which narrows a small disc to nothing and widens a large one: the
+    disc taken is the one whose kernel has the second moment of the one wanted, diameter² / 16.
+    """
+    low, high = 1.0, diameter_px + 1.0
+    for _ in range(20):
+        middle = 0.5 * (low + high)
+        kernel = disc_shares(middle)
+        places = np.arange(len(kernel)) - len(kernel) // 2
+        if kernel.sum(axis=0) @ places**2 < diameter_px**2 / 16:
+            low = middle
+        else:
+            high = middle
+    return np.asarray(disc_shares(high), dtype=np.float32)
+
+
+def disc_shares(diameter_px: float) -> Float64:
+    """Share of each pixel that lies in a disc around the middle one's centre, of the whole disc."""
+    radius, fine = 0.5 * diameter_px, 32
     half = int(np.ceil(radius))
     places = (np.arange((2 * half + 1) * fine) + 0.5) / fine - 0.5 - half
     inside = (places[:, None] ** 2 + places**2 <= radius**2).astype(np.float64)
     cells = inside.reshape(2 * half + 1, fine, 2 * half + 1, fine).sum(axis=(1, 3))
-    return np.asarray(cells / cells.sum(), dtype=np.float32)
+    return np.asarray(cells / cells.sum())
 
 
 def defocused(light: Float32, discs_px: Float32) -> Float32:
@@ -168,10 +188,9 @@ def defocused(light: Float32, discs_px: Float32) -> Float32:
     out: Float32 = np.zeros_like(light)
     for level in range(first, last + 1):
         weight = np.clip(1.0 - np.abs(levels - level), 0.0, None)
-        sharp = level * LEVEL_PX < 0.5
         blurred = (
             light
-            if sharp
+            if level == 0
             else cv2.filter2D(light, -1, disc_kernel(level * LEVEL_PX), borderType=cv2.BORDER_REPLICATE)
         )
         out += weight * blurred

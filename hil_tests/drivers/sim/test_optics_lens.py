@@ -11,7 +11,7 @@ import pytest
 
 from calib.files.mast_file import load_rig
 from calib.rigid import Rigid
-from drivers.sim.optics.lens import Lens, LensSettings, shadow
+from drivers.sim.optics.lens import Lens, LensSettings, disc_kernel, shadow
 from drivers.sim.render import Renderer
 from drivers.sim.scene import Scene
 
@@ -120,3 +120,11 @@ def test_a_naive_register_holds_on_to_dust_while_the_head_turns(small_rig: Path,
         like = cv2.matchTemplate(later * through, (first * through)[20:-20, 20:-20], cv2.TM_CCOEFF_NORMED)
         places.append(20 - int(np.unravel_index(like.argmax(), like.shape)[1]))
     assert places == [3, 0]
+
+
+@pytest.mark.parametrize("diameter_px", [0.5, 1.0, 2.5, 6.0])
+def test_a_disc_of_any_size_spreads_light_by_its_own_second_moment(diameter_px: float) -> None:
+    kernel = disc_kernel(diameter_px).astype(float)
+    across = np.arange(len(kernel)) - len(kernel) // 2
+    assert kernel.sum() == pytest.approx(1.0, abs=1e-5)
+    assert kernel.sum(axis=0) @ across**2 == pytest.approx(diameter_px**2 / 16, abs=0.01)
