@@ -167,6 +167,17 @@ def test_a_head_that_hardly_moved(good: Survey) -> None:
     assert only(tuple(errors)).severity == "error"
 
 
+def test_only_placements_for_the_mast_count_for_it(good: Survey) -> None:
+    """Four of them, and as many boards for the cameras as there are."""
+    kept = sorted({i.placement for i in good.images if i.purpose == "mast"})[:4]
+    changed = with_images(good, lambda i: i if i.purpose != "mast" or i.placement in kept else None)
+    findings = [f.message for f in check_survey(changed) if f.place == "the mast"]
+    assert [m for m in findings if "of purpose mast" in m] == [
+        "4 placements of purpose mast; 5 to 8 are adequate"
+    ]
+    assert not [f for f in check_survey(good) if "of purpose mast" in f.message]
+
+
 # wrong units
 
 

@@ -507,6 +507,24 @@ def test_a_place_that_may_have_drifted_too_far_is_not_called_tracked(begun: Trac
     np.testing.assert_array_equal(look.track.position_m, far.position_m)
 
 
+def test_what_looks_otherwise_from_nearer_is_told_as_less_certain_than_a_plane() -> None:
+    """Another texture is mixed in, 14 parts in 100 of the correlation: doubly as much relief, and more."""
+    left, near = eyes(0.0)["left"], pinholes(0.9)["left"]
+    plane, pixel = Plane(TARGET, GROUND.normal), pinholes(0.0)["left"].pixel(TARGET)
+    same = picture(near, GROUND, noise_dn=1.5, seed=3)
+    other = picture(near, replace(GROUND, grey=random_texture(77)))
+    larger = []
+    for image in (same, (same + 0.55 * (other - other.mean())).astype(np.float32)):
+        told, flat = (
+            match_patch(left.image, left.camera, pixel, plane, image, near.model, 6.0, sizes)
+            for sizes in (SIZES, replace(SIZES, relief=0.0))
+        )
+        assert told.verdict == flat.verdict == "good", told.reason
+        larger.append(float(told.sigma_px.max() / flat.sigma_px.max()))
+    assert larger[0] < 1.1
+    assert larger[1] > 1.3
+
+
 @pytest.mark.parametrize("near_px", [0.5, 1.5])
 def test_weights_so_narrow_that_one_row_counts_end_in_a_verdict(near_px: float) -> None:
     both, narrow = eyes(0.0), replace(SIZES, near_px=near_px, flat_sigma_px=5.0, worst_sigma_px=50.0)
