@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import copy
+import errno
 import hashlib
 import json
 import os
+import stat
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -339,6 +341,23 @@ def test_a_mast_without_cameras_is_kept_like_any_other(tmp_path: Path) -> None:
     assert dict(rig.cameras) == {} and dict(rig.stereo) == {}
     store.save_rig(rig, again)
     assert store.load_rig(again).rig.mast.translation_m.tolist() == [0.0, 0.0, -1.4]
+
+
+def test_a_first_save_whose_folder_does_not_reach_the_disk_leaves_no_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The refusal comes after the file has its name: what is said not to be saved is not there either."""
+    sync = os.fsync
+
+    def refuse_folders(descriptor: int) -> None:
+        if stat.S_ISDIR(os.fstat(descriptor).st_mode):
+            raise OSError(errno.EIO, "Input/output error")
+        sync(descriptor)
+
+    monkeypatch.setattr(os, "fsync", refuse_folders)
+    with pytest.raises(BadFile, match="cannot be saved: Input/output error"):
+        save_bytes(tmp_path / "rig.yaml", b"one")
+    assert _names(tmp_path) == []
 
 
 def test_a_save_keeps_the_version_before_it_its_permissions_and_a_link(tmp_path: Path) -> None:
