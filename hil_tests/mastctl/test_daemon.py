@@ -242,6 +242,7 @@ def test_a_file_in_the_sockets_place_is_left_alone(monkeypatch: pytest.MonkeyPat
 
 
 def test_a_daemon_leaves_no_thread_behind(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    before = set(threading.enumerate())  # what other tests made hang is theirs
     with fake_daemon(monkeypatch, tmp_path) as (daemon, _):
         before_others = {thread for thread in threading.enumerate() if thread.name.startswith("AnyIO")}
         with Client(daemon.url) as client:
@@ -250,7 +251,8 @@ def test_a_daemon_leaves_no_thread_behind(monkeypatch: pytest.MonkeyPatch, tmp_p
             client.stop()
     ours = ("device", "operation", "stop", "daemon", "closing")
     eventually(
-        lambda: not [t.name for t in threading.enumerate() if t.name.startswith(ours)], "our threads gone"
+        lambda: not [t for t in set(threading.enumerate()) - before if t.name.startswith(ours)],
+        "our threads gone",
     )
     eventually(
         lambda: {t for t in threading.enumerate() if t.name.startswith("AnyIO")} <= before_others,
