@@ -36,9 +36,9 @@ maker.join()  # that the thread has ended is not that the process has
 time.sleep(1.0)
 assert made[0].alive
 if sys.argv[2] == "forked" and os.fork() == 0:
-    print(os.getpid(), flush=True)  # holds the pipes open
+    os.write(1, b"%d\\n" % os.getpid())  # holds the pipes open
     time.sleep(600)
-print(made[0].pid, flush=True)
+os.write(1, b"%d\\n" % made[0].pid)  # whole lines, whoever of the two comes first
 time.sleep(600)
 """
 
@@ -67,13 +67,15 @@ def holder(
     command = [sys.executable, "-c", HOLDER, str(tmp_path / "log"), request.param]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as made:
         assert made.stdout is not None
-        pids = [int(made.stdout.readline()) for _ in range(1 if request.param == "alone" else 2)]
-        yield made, pids
-        made.kill()
-        made.stdout.close()
-    for pid in pids:
-        if runs(pid):
-            os.kill(pid, 9)
+        pids = list[int]()
+        try:
+            for _ in range(1 if request.param == "alone" else 2):
+                pids.append(int(made.stdout.readline()))
+            yield made, pids
+        finally:
+            made.kill()
+            for pid in filter(runs, pids):
+                os.kill(pid, 9)
 
 
 def test_its_process_ends_when_the_one_that_made_it_is_killed(
