@@ -93,6 +93,10 @@ class Stops:
         DriverError, MastctlError
             If the driver refused it.
         """
+        with self._clock.at_work():  # a simulation's second does not pass before the stop is queued
+            self._confirmed(timeout_s)
+
+    def _confirmed(self, timeout_s: float) -> None:
         asked_s = self._clock.now_s()
         try:
             self._send(asked_s, timeout_s)

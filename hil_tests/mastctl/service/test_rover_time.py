@@ -143,3 +143,22 @@ def test_a_speed_for_real_devices_is_refused_before_anything_is_opened(tmp_path:
     with pytest.raises(BadOptions, match="lives in real time"):
         Service.open(replace(config, hardware=hardware))
     assert set(threading.enumerate()) <= before
+
+
+def test_a_stop_has_its_second_however_late_its_thread_gets_the_processor(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    with service_at("max") as service:
+        submit = service.devices._head.submit
+
+        def late(what: str, *given: Any, **options: Any) -> Any:
+            if what == "stop" and client.ident is None:
+                client.start()
+                time.sleep(0.3)
+            return submit(what, *given, **options)
+
+        client = threading.Thread(target=lambda: service.clock.sleep(30.0), daemon=True)  # lets time pass
+        monkeypatch.setattr(service.devices._head, "submit", late)
+        service.stop()
+        client.join(LONG_S)
+        assert service.devices.faults() == ()
