@@ -43,6 +43,10 @@ class BadRequest(_Family):
     """What was asked makes no sense for this rig: asked otherwise it may."""
 
 
+class NotAllowed(_Family):
+    """Who asks may not: somebody else may."""
+
+
 class NotKnown(_Family):
     """Something was named that is not here."""
 

@@ -14,12 +14,22 @@ from starlette.exceptions import HTTPException
 
 from calib.errors import CalibError
 from drivers.errors import BadOptions, DriverError, NoFreshFrame, NoReply
-from mastctl.errors import BadRequest, MastctlError, NoLonger, NotKnown, NotNow, Unable, error_body
+from mastctl.errors import (
+    BadRequest,
+    MastctlError,
+    NoLonger,
+    NotAllowed,
+    NotKnown,
+    NotNow,
+    Unable,
+    error_body,
+)
 from mastctl.web.guard import error_response
 from mastctl.web.sentences import sentence
 
 STATUS_OF_KIND: Mapping[type[Exception], int] = {
     BadRequest: 422,
+    NotAllowed: 403,
     NotKnown: 404,
     NoLonger: 410,
     NotNow: 409,

@@ -15,12 +15,12 @@ import drivers
 import mastctl
 from calib.errors import CalibError
 from drivers.errors import DriverError
-from mastctl.errors import BadRequest, MastctlError, NoLonger, NotKnown, NotNow, Stopped, Unable
+from mastctl.errors import BadRequest, MastctlError, NoLonger, NotAllowed, NotKnown, NotNow, Stopped, Unable
 from mastctl.pointing.results import PointingError
 from mastctl.web.guard import GuardError, error_response
 from mastctl.web.refusals import status_of
 
-FAMILIES = {kind.__name__: kind for kind in (BadRequest, NotKnown, NoLonger, NotNow, Unable)}
+FAMILIES = {kind.__name__: kind for kind in (BadRequest, NotAllowed, NotKnown, NoLonger, NotNow, Unable)}
 PLAIN = {GuardError.__name__, error_response.__name__}  # status first, then the code
 NO_ANSWER = {
     "search_cut_short", "survey_refused", "cannot_tell", "address_in_use",
@@ -121,6 +121,7 @@ def test_no_code_has_two_statuses(documented: dict[str, set[str]]) -> None:
     ("error", "status"),
     [
         (BadRequest("bad_aim", "no"), 422),
+        (NotAllowed("role", "no"), 403),
         (NotKnown("unknown_camera", "no"), 404),
         (NoLonger("frame_too_old", "no"), 410),
         (Stopped("no"), 409),

@@ -1,0 +1,53 @@
+"""Who asks: a name, what it may do, and the way it came."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+from mastctl.errors import NotAllowed
+
+Role = Literal["view", "operate", "admin"]
+
+ROLES: tuple[Role, ...] = ("view", "operate", "admin")
+"""Each may do what those before it may: view only reads, operate drives the rover, admin sets it up."""
+
+ANONYMOUS = "anonymous"
+LONGEST_NAME = 80
+
+
+@dataclass(frozen=True)
+class Caller:
+    """Who asks for something. Equal callers are one party.
+
+    Attributes
+    ----------
+    name
+        As told by the caller, for people and for the record; it proves nothing.
+    role
+        What it may do. On the way that needs no token everybody is ``admin``.
+    via
+        The way it came: ``loopback``, ``unix``, ``token``, ``inside`` (this process itself).
+    """
+
+    name: str = ANONYMOUS
+    role: Role = "admin"
+    via: str = "loopback"
+
+    def may(self, role: Role) -> bool:
+        """Return whether it may do what ``role`` may."""
+        return ROLES.index(self.role) >= ROLES.index(role)
+
+    def check_may(self, role: Role, what: str) -> None:
+        """Pass who may do what ``role`` may. Raises NotAllowed ``role``."""
+        if not self.may(role):
+            raise NotAllowed("role", f"{self.name} may {self.role}; {what} needs the role {role}")
+
+
+def told_name(header: str | None) -> str:
+    """Return what a caller calls itself as one printable line, cut to 80 signs; `ANONYMOUS` for nothing.
+
+    Never refuses: a stop with a strange name is a stop.
+    """
+    signs = (sign if sign.isprintable() else "?" for sign in " ".join((header or "").split()))
+    return "".join(signs)[:LONGEST_NAME].strip() or ANONYMOUS
