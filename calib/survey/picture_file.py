@@ -6,7 +6,6 @@ import zlib
 from pathlib import Path
 
 _PNG = b"\x89PNG\r\n\x1a\n"
-_WITHOUT_LENGTH = {0x01, *range(0xD0, 0xD9)}
 _NO_FRAME = {0xC4, 0xC8, 0xCC}
 
 
@@ -52,8 +51,6 @@ def _jpeg_size_px(head: bytes) -> tuple[int, int] | None:
         marker = head[at + 1]
         if marker == 0xFF:
             at += 1
-        elif marker in _WITHOUT_LENGTH:
-            at += 2
         elif 0xC0 <= marker <= 0xCF and marker not in _NO_FRAME:
             height, width = (int.from_bytes(head[i : i + 2], "big") for i in (at + 5, at + 7))
             return width, height

@@ -60,7 +60,6 @@ FORMATS = MappingProxyType(
 )
 
 _JPEG_BEGIN, _JPEG_END = b"\xff\xd8", b"\xff\xd9"
-_JPEG_PADDING_BYTES = 4096  # some cameras fill up to their packet size with zeros
 
 
 def least_bytes(format: PictureFormat) -> int:
@@ -86,8 +85,8 @@ def wrong_length(format: PictureFormat, data: memoryview) -> str:
         return "" if len(data) in lengths else f"{len(data)} bytes where {lengths[0]} are expected"
     if bytes(data[:2]) != _JPEG_BEGIN:
         return "no JPEG: it does not begin like one"
-    tail = bytes(data[-_JPEG_PADDING_BYTES:]).rstrip(b"\0")
-    return "" if tail.endswith(_JPEG_END) else f"a JPEG cut off after {len(data)} bytes"
+    whole = bytes(data).rstrip(b"\0").endswith(_JPEG_END)  # some cameras fill up with zeros
+    return "" if whole else f"a JPEG cut off after {len(data)} bytes"
 
 
 def grey(format: PictureFormat, raw: NDArray[np.uint8]) -> Image:

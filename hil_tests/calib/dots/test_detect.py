@@ -97,6 +97,16 @@ def test_centres_are_corrected_for_the_shape_of_circles() -> None:
     assert np.sqrt(np.mean(np.sum(errors**2, axis=1))) < 0.01
 
 
+def test_the_residual_is_the_scatter_of_the_dots() -> None:
+    rng = np.random.default_rng(30)
+    shot = shoot(rng, SIDE, pose(6.0, (30, 100), -6), noise_dn=6.0)
+    found = find_dots(shot.image, BOARD, shot.roughly(rng))
+    assert isinstance(found, DotsFound)
+    errors = found.pixels_px - shot.true_px(found.rows, found.columns)
+    # The map of the board takes up some of the scatter: 8 to 14 numbers of 200.
+    assert found.residual_px == pytest.approx(np.sqrt(np.mean(errors**2)), rel=0.15)
+
+
 @pytest.mark.parametrize("roll_deg", [0, 70, 90, 180, 250])
 def test_the_predicted_pose_settles_the_order(roll_deg: float) -> None:
     rng = np.random.default_rng(13)
@@ -155,6 +165,14 @@ def test_an_upright_camera_tells_the_order_of_a_rolled_board(roll_deg: float) ->
     check(shot, find_dots(shot.image, BOARD, Upright(rough, down_in_board)), WANTED_PX)
 
 
+def test_an_upright_camera_tells_the_order_of_a_small_board_before_its_lens() -> None:
+    rng = np.random.default_rng(28)
+    small = Board(10, 10, 0.01, 0.005, {})
+    shot = shoot(rng, SIDE, pose(0.5, (25, 120), 90), small)
+    down_in_board = shot.camera_from_board.rotation.T @ np.array([0.0, 1.0, 0.0])
+    check(shot, find_dots(shot.image, small, Upright(SIDE, down_in_board)), WANTED_PX)
+
+
 def test_a_mirrored_camera_sees_a_mirrored_order() -> None:
     rng = np.random.default_rng(18)
     # through a mirror: x of the image runs to the left
@@ -207,6 +225,17 @@ def test_a_board_cut_by_the_image_says_by_which_edge() -> None:
     shot = shoot(rng, SIDE, pose(4.0, aside_m=(0.9, 0.0)))
     told = reason(find_dots(shot.image, BOARD, PredictedBoard(shot.camera, shot.camera_from_board)))
     assert "right edge" in told and "10 x 10 are expected" in told
+
+
+@pytest.mark.parametrize("roll_deg", [0, 90])
+def test_dots_that_just_stand_inside_the_picture_count_and_cut_ones_do_not(roll_deg: float) -> None:
+    """Seen aslant a dot is 13 px high and 6.5 px wide, whichever way the board is turned."""
+    rng = np.random.default_rng(29)
+    for aside_m, whole in ((0.72, 100), (0.725, 90)):
+        shot = shoot(rng, SIDE, pose(4.0, (60, 90), roll_deg, (aside_m, 0.0)))
+        found = find_dots(shot.image, BOARD, PredictedBoard(shot.camera, shot.camera_from_board))
+        assert isinstance(found, DotsFound)
+        assert len(found.rows) == whole
 
 
 def test_a_covered_outer_row_is_not_guessed() -> None:

@@ -19,7 +19,7 @@ import yaml
 from calib.errors import BadFile
 from calib.files import CameraFile
 from calib.files import mast_file as store
-from calib.files.atomic import previous_path, save_bytes
+from calib.files.atomic import keep_previous, previous_path, save_bytes
 from calib.files.yaml_text import parse_mapping
 
 # The contract's example, written as a person writes it.
@@ -372,6 +372,18 @@ def test_a_save_keeps_the_version_before_it_its_permissions_and_a_link(tmp_path:
     assert previous_path(path).read_bytes() == b"two"
     assert path.stat().st_mode & 0o777 == 0o640
     assert _names(tmp_path) == ["link.yaml", "rig.previous.yaml", "rig.yaml"]
+
+
+def test_versions_that_are_kept_are_counted_from_one(tmp_path: Path) -> None:
+    path = tmp_path / "rig.yaml"
+    assert keep_previous(path) is None
+    save_bytes(path, b"one")
+    for content in (b"two", b"three"):
+        save_bytes(path, content)
+        keep_previous(path)
+    assert (tmp_path / "rig.previous-1.yaml").read_bytes() == b"one"
+    assert (tmp_path / "rig.previous-2.yaml").read_bytes() == b"two"
+    assert _names(tmp_path) == ["rig.previous-1.yaml", "rig.previous-2.yaml", "rig.previous.yaml", "rig.yaml"]
 
 
 def test_saving_where_nothing_can_be_saved_is_refused(tmp_path: Path) -> None:

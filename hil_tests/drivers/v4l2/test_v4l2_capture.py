@@ -29,7 +29,7 @@ from drivers.v4l2.exposures_set import ExposuresSet
 from drivers.v4l2.node import Dequeued, Identity, PictureFormat
 from drivers.v4l2.options import parse_options
 from drivers.v4l2.stamps import StampRule
-from drivers.v4l2.uevents import Uevent, parse
+from drivers.v4l2.uevents import Uevent, UeventSocket, parse
 
 SIZE_PX = (16, 8)
 PATIENCE_S = 20.0  # far longer than anything here takes on a loaded machine
@@ -314,6 +314,30 @@ def test_a_failed_stream_is_opened_again(bench: Bench, camera: V4l2Camera) -> No
     until(lambda: len(bench.streams) == 2)
 
 
+def test_a_stream_is_given_back_its_own_buffers_only(bench: Bench, camera: V4l2Camera) -> None:
+    bench.clock.time_s = 100.01
+    bench.streams[0].frame(2, 100.0)
+    until(lambda: camera.counters.good == 1)
+    bench.streams[0].node.put(StreamFailed("/dev/video7 does not give a frame: Input/output error"))
+    until(lambda: len(bench.streams) == 2)
+    for index in (0, 1):
+        bench.clock.time_s += 0.04
+        bench.streams[1].frame(index, bench.clock.time_s - 0.01)
+        until(lambda wanted=2 + index: camera.counters.good == wanted)
+    until(lambda: bench.streams[1].node.queued)
+    assert bench.streams[1].node.queued == [0]  # and no buffer 2, which it has never filled
+
+
+def test_a_closed_camera_gives_no_frame_though_one_had_come(bench: Bench, camera: V4l2Camera) -> None:
+    bench.clock.time_s = 100.01
+    bench.streams[0].frame(0, 100.0)
+    until(lambda: camera.counters.good == 1)
+    camera.close()
+    with pytest.raises(NoFreshFrame):
+        camera.next_frame(0.0, 0.0)
+    assert camera.capture.newest is None and not camera.capture.recent()  # their memory is unmapped
+
+
 def test_the_count_grows_when_the_drivers_count_begins_again(bench: Bench, camera: V4l2Camera) -> None:
     sequences = []
     for index, count in enumerate((2**32 - 1, 0, 1, 0)):
@@ -478,3 +502,22 @@ def test_uevents_of_video_nodes_are_read_and_others_ignored() -> None:
     assert parse(told) == Uevent("remove", "video1")
     assert parse(told.replace(b"=video4linux", b"=usb")) is None
     assert parse(b"") is None and parse(b"\xff\0\0garbage") is None
+
+
+def test_only_the_kernel_is_believed_that_a_camera_came(monkeypatch: pytest.MonkeyPatch) -> None:
+    told = b"add@/devices/video4linux/%s\0ACTION=add\0SUBSYSTEM=video4linux\0DEVNAME=%s\0"
+    arriving = deque([(told % (b"video1", b"video1"), (4242, 1)), (told % (b"video2", b"video2"), (0, 1))])
+
+    class Netlink:
+        """Datagrams with their sender, a process or 0 for the kernel itself (man 7 netlink)."""
+
+        def __init__(self, *ignored: int) -> None: ...
+        def bind(self, address: object) -> None: ...
+        def close(self) -> None: ...
+        def recvfrom(self, size: int) -> tuple[bytes, tuple[int, int]]:
+            if not arriving:
+                raise BlockingIOError
+            return arriving.popleft()
+
+    monkeypatch.setattr("drivers.v4l2.uevents.socket.socket", Netlink)
+    assert UeventSocket().read() == [Uevent("add", "video2")]
