@@ -322,8 +322,11 @@ class SimulatedRover:
         Raises
         ------
         BadOptions
-            Farther than ``REACH_M`` from the middle of the ground.
+            Farther than ``REACH_M`` from the middle of the ground, or for an angle that is no number.
         """
+        for name, angle in (("heading", heading_rad), ("pitch", pitch_rad), ("roll", roll_rad)):
+            if not math.isfinite(angle):
+                raise BadOptions(f"{name}_rad is {angle}, expected a finite number")
         if not (abs(x_m) <= REACH_M and abs(y_m) <= REACH_M):
             raise BadOptions(
                 f"({x_m:g}, {y_m:g}) m is off the simulated ground, which ends {REACH_M:g} m from its middle"

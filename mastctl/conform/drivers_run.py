@@ -10,7 +10,7 @@ from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
 from typing import Any
 
-from drivers.errors import BadOptions
+from drivers.errors import BadOptions, DriverError
 from drivers.faults import PAN_TILT
 from drivers.hardware import DeviceSettings, HardwareSettings
 from drivers.interfaces import Camera, PanTilt
@@ -18,7 +18,7 @@ from drivers.open_hardware import CAMERAS as CAMERA_DRIVERS
 from drivers.open_hardware import HEADS as HEAD_DRIVERS
 from drivers.open_hardware import open_hardware, open_one_camera
 from mastctl.conform.cameras import CAMERAS, CameraTrial
-from mastctl.conform.checks import Check, Outcome, run_checks
+from mastctl.conform.checks import Check, Outcome, PromiseBroken, SubjectLost, run_checks
 from mastctl.conform.head_trial import Angles, HeadTrial
 from mastctl.conform.heads import HEADS
 from mastctl.conform.report import Report
@@ -88,12 +88,16 @@ def head_under_test(
         if count_rad is not None:
             trial.settle_rad = COUNTS[settings.pan_tilt.driver] * count_rad
         try:
-            first = trial.read()
             ends = limits_rad or ((-math.pi, math.pi), (-math.pi / 2, math.pi / 2))
-            trial.box_rad = (
-                box(first.pan_rad, ends[0], reach_rad),
-                box(first.tilt_rad, ends[1], reach_rad),
-            )
+            try:
+                first = trial.read()
+            except (PromiseBroken, SubjectLost, DriverError) as reason:  # the checks have to tell of it
+                trial.unplaced = str(reason)
+            else:
+                trial.box_rad = (
+                    box(first.pan_rad, ends[0], reach_rad),
+                    box(first.tilt_rad, ends[1], reach_rad),
+                )
             yield trial
         finally:
             trial.worker.close()

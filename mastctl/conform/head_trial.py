@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from drivers.interfaces import PanTilt, Reading
-from mastctl.conform.checks import NotTried, expect
+from mastctl.conform.checks import NotTried, SubjectLost, expect
 from mastctl.conform.worker import Worker
 from mastctl.devices.frames import CLOCK_TOLERANCE_S
 
@@ -47,6 +47,8 @@ class HeadTrial:
         Opens the same head once more after it was closed; None where that is not to be tried.
     closed
         Whether it was closed for good.
+    unplaced
+        Why nobody knows where it stands, and so where it may be moved; empty where that is known.
     """
 
     head: PanTilt
@@ -59,6 +61,7 @@ class HeadTrial:
     true_rad: Callable[[float], Angles] | None = None
     open_again: Callable[[], PanTilt] | None = None
     closed: bool = False
+    unplaced: str = ""
     worker: Worker = field(default_factory=Worker)
 
     @property
@@ -67,7 +70,9 @@ class HeadTrial:
         return (OUTSIDE_COUNT_RAD if self.count_rad is None else self.count_rad) + self.settle_rad
 
     def goal(self, pan_part: float, tilt_part: float) -> Angles:
-        """Return angles in the box; parts from -1 (its lower end) to 1."""
+        """Return angles in the box; parts from -1 (its lower end) to 1. Raises SubjectLost without a box."""
+        if self.unplaced:
+            raise SubjectLost(f"the head is not moved, nobody knows from where: {self.unplaced}")
         (a, b), (c, d) = self.box_rad
         return a + (pan_part + 1) / 2 * (b - a), c + (tilt_part + 1) / 2 * (d - c)
 

@@ -90,8 +90,10 @@ class SimulatedRover:
         """Return the pixel where a point, metres in the true rover frame, lies in a frame.
 
         None where the camera cannot see; whether something stands before the point is not asked. Raises
-        RoverError as `true_point`.
+        RoverError as `true_point`, and for a position that is not three numbers.
         """
+        if len(position_m) != 3:
+            raise RoverError(f"position_m has {len(position_m)} numbers, expected three", "bad_request")
         pixel = self._ask("pixel", frame_id=frame_id, position_m=[float(value) for value in position_m])
         return None if pixel is None else (pixel[0], pixel[1])
 

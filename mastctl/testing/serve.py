@@ -1,7 +1,9 @@
 """The process that a worker's daemons live in: ``python -m mastctl.testing.serve PARENT``.
 
 It takes one JSON order a line on stdin and answers each with one on stdout. It ends when stdin does, and
-when the process PARENT is gone: a copy of that process, forked by a test, may hold stdin open.
+when the process PARENT is gone: a copy of that process, forked by a test, may hold stdin open. A worker of
+pytest-xdist outlives the pytest that made it by many seconds, or by all of a test that sleeps: that pytest is
+looked for too.
 """
 
 from __future__ import annotations
@@ -41,9 +43,19 @@ def main() -> None:
 
 def _watch(parent: int) -> None:
     """End with the process that made this one; the system names another parent when that is gone."""
-    while os.getppid() == parent:
+    controller = _parent_of(parent) if "PYTEST_XDIST_WORKER" in os.environ else None
+    while os.getppid() == parent and (controller is None or _parent_of(parent) == controller):
         time.sleep(PARENT_LOOKED_FOR_S)
     os._exit(1)
+
+
+def _parent_of(pid: int) -> int | None:
+    """Who made a process; None where that cannot be told any more."""
+    try:
+        after_name = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2]
+    except OSError:
+        return None
+    return int(after_name.split()[1])
 
 
 def _serve(orders: IO[bytes], answers: IO[bytes]) -> None:

@@ -254,6 +254,30 @@ def test_a_head_that_hangs_ends_the_checks_and_is_told(monkeypatch: pytest.Monke
     assert [outcome.state for outcome in outcomes] == ["failed"] + ["skipped"] * (len(NAMES) - 1)
 
 
+@pytest.mark.parametrize("answer", [RuntimeError("no"), NoReply("no"), None])
+def test_a_head_that_tells_nothing_true_from_the_start_fails_and_is_never_moved(
+    answer: Exception | None, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    sent: list[Any] = []
+
+    class Tells(Right):
+        def read(self) -> Any:
+            if answer is not None:
+                raise answer
+            return answer
+
+        def move(self, *goal: Any) -> None:
+            sent.append(goal)
+
+    monkeypatch.setattr("hil_tests.mastctl.conform.conform_world.open_head", lambda: Tells())
+    assert main(["conform", "--driver", f"{HERE}:open_head", "--head", "--motion", "--json"]) == 1
+    told = {check["name"]: check for check in json.loads(capsys.readouterr().out)["checks"]}
+    assert told["head.reading"]["state"] == "failed"
+    assert {check["state"] for check in told.values()} == {"failed", "skipped"}
+    assert "nobody knows from where" in told["head.move"]["message"]
+    assert sent == []
+
+
 def test_control_c_stops_the_head() -> None:
     head = Right()
 

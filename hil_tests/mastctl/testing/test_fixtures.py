@@ -154,6 +154,19 @@ def test_the_truth_of_a_frame_that_was_not_taken_is_refused(simulated_rover: Sim
             simulated_rover.true_point(frame_id, 0, 0)
 
 
+def test_places_and_points_that_are_none_are_told(
+    mast_client: Client, simulated_rover: SimulatedRover
+) -> None:
+    before = simulated_rover.true_pose()
+    for place in ((math.nan, 0.0, 0.0), (0.0, 0.0, math.nan), (0.0, 0.0, 0.0, math.inf)):
+        with pytest.raises(RoverError, match=r"expected a finite number|off the simulated ground"):
+            simulated_rover.stand(*place)
+    assert simulated_rover.true_pose() == before
+    frame_id = mast_client.snapshot("navcam_left").frame_id
+    with pytest.raises(RoverError, match="position_m has 2 numbers, expected three"):
+        simulated_rover.true_pixel(frame_id, (1.0, 2.0))
+
+
 @pytest.mark.parametrize(
     ("device", "word", "numbers", "code"),
     [

@@ -91,6 +91,36 @@ def test_its_process_ends_when_the_one_that_made_it_is_killed(
         time.sleep(0.02)
 
 
+XDIST = """
+import os, subprocess, sys
+os.environ["PYTEST_XDIST_WORKER"] = "gw0"
+worker = subprocess.Popen([sys.executable, "-c", sys.argv[1], sys.argv[2], "alone"])  # outlives this one
+os.write(1, b"%d\\n" % worker.pid)
+worker.wait()
+"""
+
+
+def test_its_process_ends_when_the_pytest_of_its_worker_is_killed_and_the_worker_lives_on(
+    tmp_path: Path,
+) -> None:
+    command = [sys.executable, "-c", XDIST, HOLDER, str(tmp_path / "log")]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as made:
+        assert made.stdout is not None
+        worker, serving = (int(made.stdout.readline()) for _ in range(2))
+        try:
+            assert runs(worker) and runs(serving)
+            made.kill()
+            until_s = time.monotonic() + PATIENCE_S
+            while runs(serving):
+                assert time.monotonic() < until_s
+                time.sleep(0.02)
+            assert runs(worker)
+        finally:
+            made.kill()
+            for pid in filter(runs, (worker, serving)):
+                os.kill(pid, 9)
+
+
 def test_a_configuration_with_a_real_device_is_refused(tmp_path: Path) -> None:
     text = (config_folder() / "default.yaml").read_text()
     path = tmp_path / "bench.yaml"
