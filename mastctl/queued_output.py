@@ -42,6 +42,11 @@ class QueuedWriter:
         Where to; not closed.
     kept
         How many messages may wait.
+
+    Attributes
+    ----------
+    own_line
+        Makes a line of what the writer itself has to say.
     """
 
     def __init__(self, descriptor: int, kept: int = KEPT) -> None:
@@ -49,6 +54,7 @@ class QueuedWriter:
         self._kept = kept
         self._queue: SimpleQueue[Message | threading.Event] = SimpleQueue()
         self._dropped = 0
+        self.own_line: Callable[[str], str] = lambda words: f"mastctl: {words}\n"
         # Reentrant, because a signal's handler or a finaliser may say something in the middle of it.
         self._counting = threading.RLock()
         threading.Thread(target=self._work, name="output", daemon=True).start()
@@ -74,7 +80,7 @@ class QueuedWriter:
             dropped, self._dropped = self._dropped, 0
         if not dropped:
             return ""
-        return f"mastctl: {dropped} messages were dropped here while nobody read this output\n"
+        return self.own_line(f"{dropped} messages were dropped here while nobody read this output")
 
     # In the writing thread
 
@@ -93,7 +99,7 @@ class QueuedWriter:
         try:
             text = message if isinstance(message, str) else message()
         except Exception as error:  # a message that cannot be put into words must not end the thread
-            text = f"mastctl: a message could not be put into words: {type(error).__name__}\n"
+            text = self.own_line(f"a message could not be put into words: {type(error).__name__}")
         left = text.encode("utf-8", "backslashreplace")
         while left:
             while any(stalled() for stalled in _stalls):
@@ -145,6 +151,15 @@ class QueuedHandler(logging.Handler):
     def __init__(self, writer: QueuedWriter) -> None:
         super().__init__()
         self._writer = writer
+
+    def setFormatter(self, fmt: logging.Formatter | None) -> None:
+        """Format records, and what the writer itself has to say, by this."""
+        super().setFormatter(fmt)
+        if fmt is not None:
+            about = {"name": "mastctl", "levelno": logging.WARNING, "levelname": "WARNING"}
+            self._writer.own_line = lambda words: (
+                fmt.format(logging.makeLogRecord({**about, "msg": "%s", "args": (words,)})) + "\n"
+            )
 
     def createLock(self) -> None:
         self.lock = None

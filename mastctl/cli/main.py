@@ -22,6 +22,7 @@ from typing import Any, NoReturn
 
 from mastctl import signals
 from mastctl.cli import output
+from mastctl.log_lines import TEXT
 from mastctl.queued_output import QueuedHandler, writer_to
 
 log = logging.getLogger(__name__)
@@ -36,6 +37,7 @@ MODULES: dict[str, tuple[str, ...]] = {
     "mastctl.cli.calibrate": ("calibrate",),
     "mastctl.cli.experiment": ("experiment", "demo"),
     "mastctl.cli.conform": ("conform",),
+    "mastctl.cli.doctor": ("doctor",),
     "mastctl.cli.sim": ("sim",),
     "mastctl.cli.servo": ("servo",),
     "mastctl.cli.ptu": ("ptu",),
@@ -132,9 +134,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _log_to(descriptor: int) -> None:
     """Log through a queue: what a driver or a daemon in this process has to say never waits for a reader."""
     handler = QueuedHandler(writer_to(descriptor))
-    logging.basicConfig(
-        format="%(levelname)s %(name)s: %(message)s", level=logging.WARNING, handlers=[handler]
-    )
+    logging.basicConfig(format=TEXT, level=logging.WARNING, handlers=[handler])
 
 
 def _refused(error: BaseException, as_json: bool) -> int:

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 from mastctl.cli import output
 from mastctl.cli.output import CommandError, WrongUse, finite_number, positive_number
 from mastctl.cli.target import add_target_options, check_done, check_target, option_number, target_of
+from mastctl.queued_output import QueuedHandler
 
 if TYPE_CHECKING:
     from mastctl.client import Client
@@ -28,6 +29,13 @@ def add_commands(subparsers: argparse._SubParsersAction[Any]) -> None:
         "run", help="run the daemon; its address is one line on stdout when it is ready"
     )
     run.add_argument("--config", metavar="FILE", help="configuration (default: the packaged simulated rover)")
+    run.add_argument(
+        "--log-format",
+        choices=("text", "json"),
+        help="of what it says on stderr (default: text, JSON where that goes to journald)",
+    )
+    run.add_argument("-v", "--verbose", action="store_true", help="say what the drivers meet, too")
+    run.add_argument("-q", "--quiet", action="store_true", help="say only what is wrong")
     run.set_defaults(run=_run)
 
     status = subparsers.add_parser("status", help="show what a running daemon knows")
@@ -90,13 +98,24 @@ def _queue_output() -> None:
     signal.signal(signal.SIGTTOU, signal.SIG_IGN)  # a background job may write to its terminal
 
 
+def _set_log(args: argparse.Namespace) -> None:
+    """Set what is logged, and how its lines look."""
+    from mastctl.log_lines import formatter
+
+    for handler in logging.getLogger().handlers:
+        if isinstance(handler, QueuedHandler):
+            handler.setFormatter(formatter(args.log_format))
+    level = logging.WARNING if args.quiet else logging.DEBUG if args.verbose else logging.INFO
+    for name in ("mastctl", "drivers", "calib"):
+        logging.getLogger(name).setLevel(level)
+
+
 def _serve(args: argparse.Namespace) -> None:
     """Run the daemon until it is told to end."""
     from mastctl.config import load_config
     from mastctl.daemon import run
 
-    for name in ("mastctl", "drivers", "calib"):
-        logging.getLogger(name).setLevel(logging.INFO)
+    _set_log(args)
 
     def ready(url: str) -> None:
         if args.json:

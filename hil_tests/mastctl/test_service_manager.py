@@ -1,0 +1,143 @@
+"""What a service manager is told: datagrams as sd_notify(3) has them, to a socket of the test's own."""
+
+from __future__ import annotations
+
+import os
+import socket
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from mastctl.service_manager import Heartbeat, ServiceManager
+
+
+@pytest.fixture
+def manager(tmp_path: Path) -> Iterator[socket.socket]:
+    """The manager's end."""
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as listener:
+        listener.bind(str(tmp_path / "notify"))
+        listener.setblocking(False)
+        yield listener
+
+
+def told(listener: socket.socket) -> list[str]:
+    """Everything that was said so far."""
+    found = []
+    while True:
+        try:
+            found.append(listener.recv(4096).decode())
+        except BlockingIOError:
+            return found
+
+
+def environment(listener: socket.socket, **more: str) -> dict[str, str]:
+    return {"NOTIFY_SOCKET": listener.getsockname(), **more}
+
+
+def test_each_message_is_a_datagram_as_the_protocol_has_it(manager: socket.socket) -> None:
+    service = ServiceManager(environment(manager))
+    service.ready()
+    service.status("moving:\n two  lines")
+    service.alive()
+    service.stopping()
+    assert told(manager) == ["READY=1", "STATUS=moving: two lines", "WATCHDOG=1", "STOPPING=1"]
+
+
+def test_a_reload_carries_the_time_that_the_manager_compares() -> None:
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as listener:
+        listener.bind("")  # the kernel gives an abstract name
+        listener.setblocking(False)
+        name = listener.getsockname().decode().replace("\0", "@", 1)
+        ServiceManager({"NOTIFY_SOCKET": name}).reloading()
+        lines = told(listener)[0].splitlines()
+    assert lines[0] == "RELOADING=1"
+    assert lines[1].startswith("MONOTONIC_USEC=") and lines[1].partition("=")[2].isdecimal()
+
+
+@pytest.mark.parametrize("address", ["", "relative", "/nobody/listens/here"])
+def test_without_a_manager_nothing_happens(address: str) -> None:
+    service = ServiceManager({"NOTIFY_SOCKET": address})
+    service.ready()
+    service.close()
+    service.alive()
+
+
+def test_a_manager_that_reads_nothing_holds_nobody(manager: socket.socket) -> None:
+    service = ServiceManager(environment(manager))
+    for _ in range(5000):  # far more than the socket keeps
+        service.alive()
+    assert 0 < len(told(manager)) < 5000
+
+
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [
+        ({"WATCHDOG_USEC": "10000000"}, 10.0),
+        ({"WATCHDOG_USEC": "10000000", "WATCHDOG_PID": str(os.getpid())}, 10.0),
+        ({"WATCHDOG_USEC": "10000000", "WATCHDOG_PID": "1"}, None),  # another process is watched
+        ({"WATCHDOG_USEC": "0"}, None),
+        ({"WATCHDOG_USEC": "soon"}, None),
+        ({}, None),
+    ],
+)
+def test_only_the_process_that_is_meant_is_watched(words: dict[str, str], expected: float | None) -> None:
+    assert ServiceManager(words).watchdog_s == expected
+
+
+class Loop:
+    """An event loop that comes to what it was given when the test says so."""
+
+    def __init__(self) -> None:
+        self.waiting: list[Callable[[], None]] = []
+        self.ended = False
+
+    def soon(self, function: Callable[[], None]) -> None:
+        if self.ended:
+            raise RuntimeError("Event loop is closed")
+        self.waiting.append(function)
+
+    def run(self) -> None:
+        waiting, self.waiting = self.waiting, []
+        for function in waiting:
+            function()
+
+
+def test_a_sign_of_life_needs_a_turn_of_the_head_and_one_of_the_loop(manager: socket.socket) -> None:
+    now, loop = [0.0], Loop()
+    beat = Heartbeat(ServiceManager(environment(manager, WATCHDOG_USEC="8000000")), loop.soon, lambda: now[0])
+    loop.run()
+    assert told(manager) == []  # the loop alone feeds nobody
+    beat.turn()
+    assert told(manager) == []  # nor does the head alone
+    loop.run()
+    assert told(manager) == ["WATCHDOG=1"]
+    beat.turn()
+    loop.run()
+    assert told(manager) == []  # more often than the manager asks is not told
+    now[0] = 2.1
+    beat.turn()
+    loop.run()
+    assert told(manager) == ["WATCHDOG=1"]
+
+
+def test_a_loop_that_stands_still_is_asked_once_and_not_told_of(manager: socket.socket) -> None:
+    now, loop = [0.0], Loop()
+    beat = Heartbeat(ServiceManager(environment(manager, WATCHDOG_USEC="1000000")), loop.soon, lambda: now[0])
+    for _ in range(1000):
+        now[0] += 0.02
+        beat.turn()
+    assert len(loop.waiting) == 1
+    assert told(manager) == []
+
+
+def test_a_loop_that_has_ended_does_not_hurt_the_head(manager: socket.socket) -> None:
+    loop = Loop()
+    loop.ended = True
+    Heartbeat(ServiceManager(environment(manager, WATCHDOG_USEC="1000000")), loop.soon).turn()
+
+
+def test_who_does_not_watch_is_not_told(manager: socket.socket) -> None:
+    loop = Loop()
+    Heartbeat(ServiceManager(environment(manager)), loop.soon).turn()
+    assert loop.waiting == []

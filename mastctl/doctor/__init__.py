@@ -1,0 +1,1 @@
+"""What a machine lacks for a configuration: permissions, adapters, cameras, clock, disk, mast file."""
