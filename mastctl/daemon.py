@@ -32,6 +32,7 @@ from mastctl.errors import MastctlError
 from mastctl.queued_output import stall_while
 from mastctl.service.service import Service
 from mastctl.service.stop_threads import StopsHang
+from mastctl.service_manager import Heartbeat, ServiceManager
 from mastctl.web.app import create_app
 from mastctl.web.connections import ACCEPTED_AT_ONCE, WAITING_IN_KERNEL, Connection, most_connections, sweep
 from mastctl.web.waiting import Waiting
@@ -207,6 +208,8 @@ async def _serve(
         with contextlib.suppress(RuntimeError):  # the loop has ended already
             loop.call_soon_threadsafe(end)
 
+    manager = ServiceManager() if in_process else ServiceManager({})
+    service.devices.on_turn = Heartbeat(manager, loop.call_soon_threadsafe).turn
     if in_process:
         for number in signals.wanted():
             loop.add_signal_handler(number, end)
@@ -218,9 +221,11 @@ async def _serve(
     listener.listen(WAITING_IN_KERNEL)  # asyncio has one number for this and for how many it takes at once
     sweeping = asyncio.create_task(sweep(server.server_state.connections))
     on_ready(end_from_anywhere)
+    manager.ready()
     asked = asyncio.create_task(ending.wait())
     await asyncio.wait({serving, asked}, return_when=asyncio.FIRST_COMPLETED)
     asked.cancel()
+    manager.stopping()
     try:
         stopped = asyncio.wrap_future(service.stop_threads.submit(service.operations.close))
     except StopsHang:

@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import os
+import signal
 import socket
+import subprocess
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
 
+from hil_tests.mastctl.outside_daemon import BOUND_S, OUTSIDE, daemon_process, write_config
 from mastctl.service_manager import Heartbeat, ServiceManager
 
 
@@ -141,3 +145,52 @@ def test_who_does_not_watch_is_not_told(manager: socket.socket) -> None:
     loop = Loop()
     Heartbeat(ServiceManager(environment(manager)), loop.soon).turn()
     assert loop.waiting == []
+
+
+# The same from a daemon in a process of its own
+
+HEAD_THAT_ENDS_BADLY = OUTSIDE.replace(
+    "    def read(self):\n",
+    '    def read(self):\n        if os.path.exists("hang"):\n            time.sleep(600.0)\n'
+    '        if os.path.exists("fail"):\n            raise OSError("the cable is out")\n',
+)
+
+
+@contextmanager
+def watched_daemon(folder: Path, listener: socket.socket) -> Iterator[subprocess.Popen[str]]:
+    """A daemon that a manager watches, once it has said that it is ready."""
+    listener.settimeout(BOUND_S)
+    environ = environment(listener, WATCHDOG_USEC="800000")
+    with pytest.MonkeyPatch.context() as patch:
+        for name, value in environ.items():
+            patch.setenv(name, value)
+        config = write_config(folder, devices=HEAD_THAT_ENDS_BADLY)
+        with daemon_process(folder, config, stderr=subprocess.DEVNULL) as daemon:
+            while listener.recv(4096) != b"READY=1":
+                pass
+            yield daemon
+
+
+def test_a_daemon_says_that_it_is_ready_that_it_lives_and_that_it_ends(
+    manager: socket.socket, tmp_path: Path
+) -> None:
+    with watched_daemon(tmp_path, manager) as daemon:
+        for _ in range(3):
+            assert manager.recv(4096) == b"WATCHDOG=1"
+        daemon.send_signal(signal.SIGTERM)
+        heard = b""
+        while heard != b"STOPPING=1":
+            heard = manager.recv(4096)
+        assert daemon.wait(BOUND_S) == 0
+
+
+def test_a_head_that_fails_is_alive_and_one_that_hangs_is_not(manager: socket.socket, tmp_path: Path) -> None:
+    with watched_daemon(tmp_path, manager):
+        (tmp_path / "fail").touch()
+        for _ in range(10):
+            assert manager.recv(4096) == b"WATCHDOG=1"
+        (tmp_path / "hang").touch()
+        manager.settimeout(3.0)  # far more than the manager allows
+        with pytest.raises(TimeoutError):
+            for _ in range(100):
+                manager.recv(4096)

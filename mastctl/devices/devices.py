@@ -78,6 +78,11 @@ class Devices:
         How long past its time a camera may take before it counts as hanging, seconds; 3 by default.
     new_run
         As in `mastctl.devices.frames.FrameStore`.
+
+    Attributes
+    ----------
+    on_turn
+        Called in the head's own thread each time it is about to read, whatever comes of that; must not wait.
     """
 
     def __init__(
@@ -90,6 +95,7 @@ class Devices:
         camera_grace_s: float | None = None,
         new_run: Callable[[], str] | None = None,
     ) -> None:
+        self.on_turn: Callable[[], None] = lambda: None
         self._pan_tilt = hardware.pan_tilt
         self._limits = limits
         self._clock = clock
@@ -288,6 +294,7 @@ class Devices:
         return reading
 
     def _poll(self) -> float:
+        self.on_turn()
         return MOVING_PERIOD_S if self._read_once().moving else RESTING_PERIOD_S
 
     def _reported(self) -> Mapping[str, AxisReport]:
