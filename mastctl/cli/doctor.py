@@ -4,13 +4,9 @@ from __future__ import annotations
 
 import argparse
 import sys
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from mastctl.cli import output
-
-if TYPE_CHECKING:
-    from mastctl.config import Config
 
 MARKS = {"good": "✓", "unsure": "?", "bad": "✗"}
 
@@ -30,7 +26,7 @@ def _doctor(args: argparse.Namespace) -> int:
     from mastctl.doctor.examination import examine
 
     found = []
-    for finding in examine(args.config, _state_folder, _asked):
+    for finding in examine(args.config, _asked):
         found.append(finding)
         if args.json:
             continue
@@ -57,7 +53,3 @@ def _asked(url: str) -> dict[str, Any] | None:
             return client.status()
     except ClientError:
         return None
-
-
-def _state_folder(config: Config) -> Path:
-    raise NotImplementedError

@@ -36,6 +36,7 @@ MODULES: dict[str, tuple[str, ...]] = {
     "mastctl.cli.handoff": ("handoff",),
     "mastctl.cli.calibrate": ("calibrate",),
     "mastctl.cli.experiment": ("experiment", "demo"),
+    "mastctl.cli.completion": ("completion",),
     "mastctl.cli.conform": ("conform",),
     "mastctl.cli.doctor": ("doctor",),
     "mastctl.cli.sim": ("sim",),

@@ -21,7 +21,7 @@ Asked = Callable[[str], dict[str, Any] | None]
 
 
 def examine(
-    path: str | None, state_folder: Callable[[Config], Path], asked: Asked, machine: Machine | None = None
+    path: str | None, asked: Asked, machine: Machine | None = None, state_folder: Path | None = None
 ) -> Iterator[Finding]:
     """Look at everything that a configuration needs; nothing is opened that could move.
 
@@ -29,12 +29,12 @@ def examine(
     ----------
     path
         The configuration; None for the packaged one.
-    state_folder
-        Where a daemon of this configuration keeps its state.
     asked
         Asks a daemon that may run already.
     machine
         Where devices and their descriptions lie; this machine by default.
+    state_folder
+        Where a daemon keeps its state.
     """
     machine = machine or Machine()
     try:
@@ -53,7 +53,8 @@ def examine(
         if camera.driver in CAMERAS:
             yield examine_camera(name, camera.options, in_use=status is not None)
     yield from _simulation(config)
-    yield from examine_folder("state folder", state_folder(config))
+    if state_folder is not None:
+        yield from examine_folder("state folder", state_folder)
     yield examine_clock()
     yield examine_descriptors()
 
