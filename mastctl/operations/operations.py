@@ -72,7 +72,7 @@ class Operations:
         self._motion = Motion()
         self._stops: set[object] = set()  # under way
         self._closed = False
-        self._cancelled_because = ""
+        self._cancelled_because: MastctlError = Stopped(STOP_ASKED)
 
     @property
     def motion(self) -> Motion:
@@ -147,7 +147,7 @@ class Operations:
         with self.held():
             running = self._current
             if running is not None:  # what ends from here on, ends by the stop
-                self._cancelled_because = STOP_ASKED
+                self._cancelled_because = Stopped(STOP_ASKED)
                 running[1].set()
             try:
                 self._mover.stop()
@@ -169,6 +169,38 @@ class Operations:
                 if left_s <= 0:
                     return
                 self._ended.wait(left_s)
+
+    def end_within(self, name: str, left_s: float, allowed_s: float) -> None:
+        """Stop the mast and end an operation with ``deadline_passed`` if it runs longer; returns at once.
+
+        A stop that comes before is the last word.
+
+        Parameters
+        ----------
+        left_s
+            How long it may run from now on, seconds.
+        allowed_s
+            Of how long altogether; for the message.
+        """
+        until_s = self._time.now_s() + left_s
+        late = NotNow("deadline_passed", f"operation {name} did not end in the {allowed_s:g} s it was given")
+
+        def watch() -> None:
+            with self._ended:
+                while (current := self._current) is not None and current[0] == name:
+                    wait_s = until_s - self._time.now_s()
+                    if wait_s <= 0.0:
+                        break
+                    self._ended.wait(wait_s, idle=True)
+                else:
+                    return
+            self._end_by(name, late)
+
+        try:
+            self._time.thread(watch, f"deadline of {name}").start()
+        except RuntimeError as error:
+            words = f"operation {name} was ended, since nothing could watch its deadline: {error}"
+            self._end_by(name, Unable("no_thread", words))
 
     def get(self, name: str) -> Operation:
         """Return one record.
@@ -208,6 +240,17 @@ class Operations:
             log.error("operation %s did not end within %.0f s; it is given up", current[0], END_TIMEOUT_S)
             self._end(current[0], "stopped", None, error_body(Stopped(CLOSING)))
 
+    def _end_by(self, name: str, error: MastctlError) -> None:
+        """End an operation with an error and stop the mast, unless it is being stopped already."""
+        with self._lock:
+            current = self._current
+            if current is None or current[0] != name or current[1].is_set():
+                return
+            self._cancelled_because = error
+            current[1].set()
+            self._mover.block_moves(name, str(error))
+        self._stop_unasked(f"when operation {name} was to end")
+
     def _stop_unasked(self, when: str) -> None:
         """Stop the mast where nobody waits for the answer; whatever its driver raises must not go further."""
         try:
@@ -227,7 +270,7 @@ class Operations:
         if self._current is None:
             return None
         name, cancelled, _ = self._current
-        self._cancelled_because = reason
+        self._cancelled_because = Stopped(reason)
         cancelled.set()
         self._mover.block_moves(name, reason)
         return name
@@ -269,10 +312,12 @@ class Operations:
         self._stop_unasked(f"after operation {name}")
         partial = getattr(error, "result", None)
         if cancelled.is_set():
-            self._end(name, "stopped", partial, error_body(Stopped(self._cancelled_because)))
+            error = self._cancelled_because
+        body = error_body(error)
+        if isinstance(error, Stopped) and cancelled.is_set():
+            self._end(name, "stopped", partial, body)
             log.info("operation %s stopped", name)
         else:
-            body = error_body(error)
             self._end(name, "failed", partial, body)
             log.warning("operation %s failed: %s", name, body["message"])
 

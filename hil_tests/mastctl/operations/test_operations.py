@@ -10,6 +10,7 @@ import pytest
 
 from drivers.clock import ManualClock
 from drivers.errors import NoReply
+from drivers.simulation_clock import SimulationClock
 from hil_tests.mastctl.service_fakes import FakePointing, FakeResult, eventually
 from mastctl.errors import NotKnown, NotNow, Stopped, Unable, error_body
 from mastctl.operations.operations import CLOSING, KEPT_OPERATIONS, STOP_ASKED, Operations
@@ -258,3 +259,135 @@ def test_an_error_that_cannot_be_put_into_words_is_told_as_a_defect() -> None:
 
     assert error_body(Wordless("", device="x"))["code"] == "internal"
     assert error_body(NoReply("no\n answer", device="pan_tilt"))["message"] == "pan_tilt: no answer"
+
+
+# Deadlines
+
+
+def test_an_operation_that_runs_beyond_its_time_ends_with_the_mast_stopped(
+    mover: Mover, operations: Operations
+) -> None:
+    name = operations.start({}, until_cancelled).id
+    operations.end_within(name, 0.05, 5.0)
+    record = ended(operations, name)
+    assert record.state == "failed"
+    assert record.error is not None
+    assert record.error["code"] == "deadline_passed"
+    assert "did not end in the 5 s it was given" in record.error["message"]
+    assert ("stop", None) in mover.told
+    eventually(lambda: not mover.blocks, "moves are taken again")
+    operations.start({}, lambda record, cancelled: None)
+
+
+def test_a_deadline_that_is_over_already_ends_the_operation_at_once(operations: Operations) -> None:
+    name = operations.start({}, until_cancelled).id
+    operations.end_within(name, -1.0, 5.0)
+    error = ended(operations, name).error
+    assert error is not None
+    assert error["code"] == "deadline_passed"
+
+
+def test_a_deadline_after_the_end_stops_nothing(mover: Mover, operations: Operations) -> None:
+    name = operations.start({}, lambda record, cancelled: None).id
+    assert ended(operations, name).state == "done"
+    operations.end_within(name, 0.0, 5.0)
+    following = operations.start({}, until_cancelled).id
+    operations.end_within(name, 0.0, 5.0)
+    assert operations.motion.operation == following
+    assert ("stop", None) not in mover.told
+    operations.stop()
+    ended(operations, following)
+
+
+def test_a_stop_before_the_deadline_is_the_last_word(mover: Mover, operations: Operations) -> None:
+    go = threading.Event()
+
+    def slow_to_end(record: Callable[[Any], None], cancelled: threading.Event) -> None:
+        assert cancelled.wait(30.0)
+        assert go.wait(30.0)
+        raise Stopped("cancelled")
+
+    name = operations.start({}, slow_to_end).id
+    operations.stop()
+    before = len(mover.told)
+    operations.end_within(name, 0.0, 5.0)
+    eventually(
+        lambda: not any(one.name == f"deadline of {name}" for one in threading.enumerate()), "the watch's end"
+    )
+    assert len(mover.told) == before
+    go.set()
+    record = ended(operations, name)
+    assert record.state == "stopped"
+    assert record.error == error_body(Stopped(STOP_ASKED))
+
+
+def test_a_stop_after_the_deadline_is_sent_all_the_same(mover: Mover, operations: Operations) -> None:
+    go = threading.Event()
+
+    def slow_to_end(record: Callable[[Any], None], cancelled: threading.Event) -> None:
+        assert cancelled.wait(30.0)
+        assert go.wait(30.0)
+        raise Stopped("cancelled")
+
+    name = operations.start({}, slow_to_end).id
+    operations.end_within(name, 0.0, 5.0)
+    eventually(lambda: ("stop", None) in mover.told, "the deadline's stop")
+    assert operations.motion.stopping
+    stops = mover.told.count(("stop", None))
+    operations.stop()
+    assert mover.told.count(("stop", None)) > stops
+    go.set()
+    assert ended(operations, name).state == "stopped"
+
+
+def test_a_head_that_does_not_confirm_at_the_deadline_still_ends_the_operation(
+    mover: Mover, operations: Operations
+) -> None:
+    def fail(name: str) -> None:
+        raise NoReply("no answer")
+
+    mover.hook = fail
+    name = operations.start({}, until_cancelled).id
+    operations.end_within(name, 0.0, 5.0)
+    error = ended(operations, name).error
+    assert error is not None
+    assert error["code"] == "deadline_passed"
+
+
+def test_where_nothing_can_watch_a_deadline_the_operation_ends(
+    operations: Operations, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    name = operations.start({}, until_cancelled).id
+
+    def none_left(thread: threading.Thread) -> None:
+        raise RuntimeError("can't start new thread")
+
+    monkeypatch.setattr(threading.Thread, "start", none_left)
+    operations.end_within(name, 60.0, 60.0)
+    monkeypatch.undo()
+    error = ended(operations, name).error
+    assert error is not None
+    assert error["code"] == "no_thread"
+
+
+def test_a_deadline_on_the_simulations_clock_takes_no_real_time_and_lets_none_pass_by_itself(
+    mover: Mover,
+) -> None:
+    clock = SimulationClock()
+    operations = Operations(mover, clock)
+
+    def polls(record: Callable[[Any], None], cancelled: threading.Event) -> None:
+        while not cancelled.is_set():
+            clock.sleep(0.5)
+        raise Stopped("cancelled")
+
+    name = operations.start({}, polls).id
+    operations.end_within(name, 600.0, 600.0)
+    error = ended(operations, name).error
+    assert error is not None
+    assert error["code"] == "deadline_passed"
+    assert clock.now_s() == pytest.approx(600.0, abs=2.0)
+    name = operations.start({}, lambda record, cancelled: None).id
+    operations.end_within(name, 600.0, 600.0)
+    ended(operations, name)
+    assert clock.now_s() < 610.0

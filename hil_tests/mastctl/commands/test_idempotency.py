@@ -1,0 +1,211 @@
+"""A command that is sent twice acts once."""
+
+from __future__ import annotations
+
+import threading
+
+import pytest
+
+from drivers.clock import ManualClock
+from drivers.errors import NoReply
+from drivers.simulation_clock import SimulationClock
+from hil_tests.mastctl.service_fakes import eventually
+from mastctl.commands.idempotency import KEPT, KEPT_S, Answers
+from mastctl.errors import BadRequest, NotNow
+
+SAME = {"command": "point", "request": {"pan_rad": 0.1}}
+OTHER = {"command": "point", "request": {"pan_rad": 0.2}}
+
+
+class Acts:
+    """Counts how often something is done."""
+
+    def __init__(self) -> None:
+        self.done = 0
+        self.error: BaseException | None = None
+
+    def __call__(self) -> int:
+        self.done += 1
+        if self.error is not None:
+            raise self.error
+        return self.done
+
+
+@pytest.fixture
+def clock() -> ManualClock:
+    return ManualClock()
+
+
+@pytest.fixture
+def answers(clock: ManualClock) -> Answers[int]:
+    return Answers(clock)
+
+
+def test_the_second_gets_the_firsts_answer_and_nothing_is_done(answers: Answers[int]) -> None:
+    acts = Acts()
+    assert answers.once("bench", "k", SAME, acts) == (1, False)
+    assert answers.once("bench", "k", SAME, acts) == (1, True)
+    assert acts.done == 1
+
+
+def test_one_key_for_two_requests_is_refused(answers: Answers[int]) -> None:
+    acts = Acts()
+    answers.once("bench", "k", SAME, acts)
+    with pytest.raises(BadRequest) as refusal:
+        answers.once("bench", "k", OTHER, acts)
+    assert refusal.value.code == "key_reused"
+    assert acts.done == 1
+
+
+def test_anothers_key_is_another_key(answers: Answers[int]) -> None:
+    acts = Acts()
+    assert answers.once("bench", "1", SAME, acts) == (1, False)
+    assert answers.once("rover", "1", SAME, acts) == (2, False)
+
+
+def test_an_answer_is_kept_ten_minutes(answers: Answers[int], clock: ManualClock) -> None:
+    acts = Acts()
+    answers.once("bench", "k", SAME, acts)
+    clock.advance(KEPT_S - 0.001)
+    assert answers.once("bench", "k", SAME, acts) == (1, True)
+    clock.advance(0.001)
+    assert answers.once("bench", "k", SAME, acts) == (2, False)
+
+
+def test_a_refusal_changed_nothing_so_the_same_key_asks_again(answers: Answers[int]) -> None:
+    acts = Acts()
+    acts.error = NotNow("busy", "another runs")
+    with pytest.raises(NotNow):
+        answers.once("bench", "k", SAME, acts)
+    acts.error = None
+    assert answers.once("bench", "k", SAME, acts) == (2, False)
+
+
+@pytest.mark.parametrize("error", [NoReply("no answer"), ZeroDivisionError()])
+def test_what_failed_may_have_acted_so_it_is_not_done_again(answers: Answers[int], error: Exception) -> None:
+    acts = Acts()
+    acts.error = error
+    for _ in range(2):
+        with pytest.raises(type(error)):
+            answers.once("bench", "k", SAME, acts)
+    assert acts.done == 1
+
+
+@pytest.mark.parametrize("simulated", [False, True])
+def test_many_at_once_act_once_and_get_one_answer_also_on_a_clock_that_takes_turns(simulated: bool) -> None:
+    clock = SimulationClock() if simulated else None
+    answers: Answers[int] = Answers(ManualClock(), clock)
+    acts, inside, go = Acts(), threading.Event(), threading.Event()
+    got: list[tuple[int, bool]] = []
+
+    def slow() -> int:
+        inside.set()
+        if clock is not None:
+            clock.sleep(5.0)  # lets the others have their turns
+        assert go.wait(10.0)
+        return acts()
+
+    def ask() -> None:
+        got.append(answers.once("bench", "k", SAME, slow))
+
+    make = threading.Thread if clock is None else lambda target: clock.thread(target, "asks")
+    threads = [make(target=ask) for _ in range(6)]
+    threads[0].start()
+    assert inside.wait(10.0)
+    for thread in threads[1:]:
+        thread.start()
+    go.set()
+    for thread in threads:
+        thread.join(10.0)
+    assert acts.done == 1
+    assert sorted(got) == [(1, False)] + [(1, True)] * 5
+
+
+def test_the_second_of_two_gets_the_firsts_refusal(answers: Answers[int]) -> None:
+    inside, go, refusals = threading.Event(), threading.Event(), []
+
+    def slow() -> int:
+        inside.set()
+        assert go.wait(10.0)
+        raise NotNow("busy", "another runs")
+
+    def ask() -> None:
+        try:
+            answers.once("bench", "k", SAME, slow)
+        except NotNow as error:
+            refusals.append(error.code)
+
+    first, second = threading.Thread(target=ask), threading.Thread(target=ask)
+    first.start()
+    assert inside.wait(10.0)
+    second.start()
+    with pytest.raises(BadRequest):  # what asks otherwise waits for nobody
+        answers.once("bench", "k", OTHER, slow)
+    go.set()
+    first.join(10.0)
+    second.join(10.0)
+    assert refusals == ["busy", "busy"]
+
+
+def test_who_waits_too_long_for_the_first_is_told(clock: ManualClock) -> None:
+    answers: Answers[int] = Answers(clock)
+    inside, go = threading.Event(), threading.Event()
+
+    def slow() -> int:
+        inside.set()
+        go.wait(10.0)
+        return 1
+
+    first = threading.Thread(target=lambda: answers.once("bench", "k", SAME, slow))
+    first.start()
+    assert inside.wait(10.0)
+    told: list[str] = []
+
+    def ask() -> None:
+        try:
+            answers.once("bench", "k", SAME, slow)
+        except NotNow as error:
+            told.append(error.code)
+
+    second = threading.Thread(target=ask)
+    second.start()
+    with answers._changed:
+        clock.advance(31.0)
+        answers._changed.notify_all()
+    eventually(lambda: told or clock.advance(31.0) or _notify(answers), "the refusal")
+    assert told == ["key_in_use"]
+    go.set()
+    first.join(10.0)
+
+
+def _notify(answers: Answers[int]) -> None:
+    with answers._changed:
+        answers._changed.notify_all()
+
+
+def test_keys_are_bounded_and_those_at_work_are_not_forgotten(answers: Answers[int]) -> None:
+    inside, go = threading.Event(), threading.Event()
+
+    def slow() -> int:
+        inside.set()
+        go.wait(30.0)
+        return -1
+
+    first = threading.Thread(target=lambda: answers.once("bench", "first", SAME, slow))
+    first.start()
+    assert inside.wait(10.0)
+    acts = Acts()
+    for number in range(KEPT + 10):
+        answers.once("bench", str(number), SAME, acts)
+    assert len(answers._kept) == KEPT
+    go.set()
+    first.join(10.0)
+    assert answers.once("bench", "first", SAME, acts) == (-1, True)
+
+
+@pytest.mark.parametrize("key", ["", "a" * 201, "schlüssel", "a\nb"])
+def test_what_is_no_key_is_refused_before_anything_is_done(answers: Answers[int], key: str) -> None:
+    acts = Acts()
+    with pytest.raises(BadRequest, match="Idempotency-Key"):
+        answers.once("bench", key, SAME, acts)
+    assert acts.done == 0

@@ -1,0 +1,289 @@
+"""The one entry: each command passes here, and leaves who, under which lease, what, and with which result.
+
+The order: may this role; was this asked before under the same key; is it too late; does somebody else steer;
+does the state allow it; then the act. What came of it is recorded after it. A stop goes the other way round
+(`Entry.first`): it acts, and everything else follows.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+import threading
+from collections.abc import Callable, Mapping
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from typing import Any, Protocol
+
+from drivers.clock import Clock
+from mastctl.commands.audit import AuditLog
+from mastctl.commands.caller import Caller, Role
+from mastctl.commands.idempotency import Answers
+from mastctl.commands.lease import Leases
+from mastctl.errors import BadRequest, NotNow, error_body
+
+LONGEST_DEADLINE_S = 3600.0
+FOLLOWED = 256  # operations whose end is still recorded with who began them
+
+Answer = dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Command:
+    """A kind of command.
+
+    Attributes
+    ----------
+    name
+        As it stands in the record.
+    role
+        What a caller must be allowed at least.
+    steers
+        Whether it is refused while somebody else steers.
+    """
+
+    name: str
+    role: Role = "operate"
+    steers: bool = False
+
+
+POINT = Command("point", steers=True)
+TRACK = Command("track", steers=True)
+TRACK_LOOK = Command("track.look", steers=True)
+TRACK_STOP = Command("track.stop", steers=True)
+MAST = Command("mast", steers=True)
+MAST_BACK = Command("mast.back", steers=True)
+POSE = Command(
+    "pose"
+)  # a fact about the rover, told by who knows it; the track that looks has its own holder
+STOP = Command("stop", "view")
+LEASE = Command("lease")
+LEASE_RENEW = Command("lease.renew")
+LEASE_RELEASE = Command("lease.release")
+LEASE_TAKE = Command("lease.take")
+SIMULATION_POSE = Command("simulation.pose")  # acts on the world, not on the head
+SIMULATION_TIME = Command("simulation.time")
+SIMULATION_FAULT = Command("simulation.fault")
+SIMULATION_FAULTS_OFF = Command("simulation.faults_off")
+
+
+@dataclass(frozen=True)
+class Asked:
+    """One request for a command.
+
+    Attributes
+    ----------
+    caller
+        Who asks.
+    request
+        What exactly, as JSON.
+    lease
+        The lease's id that came with it.
+    key
+        The idempotency key that came with it.
+    deadline_s
+        How long it is given from ``asked_s`` on, seconds of the daemon's clock; None for the usual time.
+    asked_s
+        When it came, by the daemon's clock.
+    """
+
+    caller: Caller
+    asked_s: float
+    request: Mapping[str, Any] = field(default_factory=dict)
+    lease: str | None = None
+    key: str | None = None
+    deadline_s: float | None = None
+
+    def __post_init__(self) -> None:
+        deadline_s = self.deadline_s
+        if deadline_s is not None and not (
+            math.isfinite(deadline_s) and 0.0 < deadline_s <= LONGEST_DEADLINE_S
+        ):
+            expected = f"more than 0 and at most {LONGEST_DEADLINE_S:g} s is expected"
+            raise BadRequest("bad_request", f"deadline_s: {deadline_s:g} where {expected}")
+
+
+class EndsOperations(Protocol):
+    """What of `mastctl.operations.operations.Operations` ends what is late."""
+
+    def end_within(self, name: str, left_s: float, told_s: float) -> None: ...
+
+
+class States(Protocol):
+    """Who knows whether the state allows a command."""
+
+    def check_allowed(self, command: str) -> None: ...
+
+
+class Entry:
+    """The entry of one daemon; safe to use from any thread.
+
+    Parameters
+    ----------
+    clock
+        What deadlines run on, and what stamps the records: the daemon's.
+    leases, answers, audit
+        Who steers, what was answered to each key, where records go.
+    operations
+        Ends operations at their deadline.
+    states
+        Refuses what does not fit the state; None if nothing does.
+    publish
+        Gets each record, with the number of its command; must return at once.
+    """
+
+    def __init__(
+        self,
+        clock: Clock,
+        leases: Leases,
+        answers: Answers[Answer],
+        audit: AuditLog,
+        operations: EndsOperations,
+        states: States | None = None,
+        publish: Callable[[int, Mapping[str, Any]], None] = lambda number, record: None,
+    ) -> None:
+        self.leases = leases
+        self.audit = audit
+        self._clock = clock
+        self._answers = answers
+        self._operations = operations
+        self._states = states
+        self._publish = publish
+        self._numbers = itertools.count(1)
+        self._matching = threading.Lock()
+        self._began: dict[str, dict[str, Any]] = {}  # operation: who began it, until it has ended
+        self._ended: dict[str, dict[str, Any]] = {}  # operation: how it ended, until it is known who began it
+
+    def run(
+        self, command: Command, asked: Asked, act: Callable[[], Answer], usual_s: float | None = None
+    ) -> Answer:
+        """Carry out a command and return its answer; an operation that it starts is named by ``id`` or
+        ``operation`` there.
+
+        Parameters
+        ----------
+        command
+            Its kind.
+        asked
+            Who asks, and how.
+        act
+            Carries it out.
+        usual_s
+            What an operation is given if nothing else was asked for, seconds.
+
+        Raises
+        ------
+        NotAllowed
+            ``role``.
+        BadRequest
+            ``key_reused``.
+        NotNow
+            ``deadline_passed`` if its time was over before it began; ``leased``, ``lease_over``,
+            ``lease_unknown``; ``key_in_use``; what the state refuses.
+        """
+        again = False
+        try:
+            asked.caller.check_may(command.role, command.name)
+            if asked.key is None:
+                answer = self._act(command, asked, act, usual_s)
+            else:
+                same = {"command": command.name, "request": asked.request}
+                answer, again = self._answers.once(
+                    asked.caller.name, asked.key, same, lambda: self._act(command, asked, act, usual_s)
+                )
+        except BaseException as error:
+            self._record(command, asked, None, error, again)
+            raise
+        self._record(command, asked, answer, None, again)
+        return answer
+
+    def first(self, command: Command, asked: Asked, act: Callable[[], Answer]) -> Answer:
+        """Carry out a stop: it acts before anything is asked, locked or written, and is recorded after."""
+        try:
+            answer = act()
+        except BaseException as error:
+            self._record(command, asked, None, error, begins=False)
+            raise
+        self._record(command, asked, answer, None, begins=False)
+        return answer
+
+    def ended(self, operation: str, state: str, error: Mapping[str, Any] | None) -> None:
+        """Record how an operation ended that a command began."""
+        told = {**self._now(), "ended": operation, "state": state}
+        if error is not None:
+            told |= {"code": error.get("code"), "message": error.get("message")}
+        self._matched(self._ended, operation, told)
+
+    def _act(
+        self, command: Command, asked: Asked, act: Callable[[], Answer], usual_s: float | None
+    ) -> Answer:
+        """Carry it out if nothing stands against it; an operation of it gets its deadline."""
+        if asked.deadline_s is not None and self._left_s(asked, asked.deadline_s) <= 0.0:
+            words = f"the {asked.deadline_s:g} s for {command.name} were over before it could begin"
+            raise NotNow("deadline_passed", words)
+        steering: AbstractContextManager[None] = nullcontext()
+        if command.steers:
+            steering = self.leases.steering(asked.caller, asked.lease)
+        with steering:
+            if self._states is not None:
+                self._states.check_allowed(command.name)
+            answer = act()
+            operation = _operation_of(answer)
+            allowed_s = usual_s if asked.deadline_s is None else asked.deadline_s
+            if operation is not None and allowed_s is not None:
+                self._operations.end_within(operation, self._left_s(asked, allowed_s), allowed_s)
+            return answer
+
+    def _left_s(self, asked: Asked, allowed_s: float) -> float:
+        return asked.asked_s + allowed_s - self._clock.now_s()
+
+    def _record(
+        self,
+        command: Command,
+        asked: Asked,
+        answer: Answer | None,
+        error: BaseException | None,
+        again: bool = False,
+        begins: bool = True,
+    ) -> None:
+        """Record what came of a command; ``begins``: an operation that its answer names is one it began."""
+        caller = asked.caller
+        operation = None if answer is None else _operation_of(answer)
+        who = {"command": command.name, "who": caller.name, "role": caller.role, "via": caller.via}
+        number = next(self._numbers)
+        told = {"number": number, **self._now(), **who, "request": asked.request}
+        if asked.lease is not None:
+            told["lease"] = asked.lease[:8]  # names it, without being it
+        if asked.key is not None:
+            told |= {"key": asked.key[:80], "again": again}
+        if error is None:
+            told |= {"result": "ok", "operation": operation}
+        else:
+            body = error_body(error)
+            told |= {"result": body["code"], "message": body["message"]}
+        self._tell(told)
+        if operation is not None and begins and not again:
+            self._matched(self._began, operation, {"number": number, **who})
+
+    def _matched(self, known: dict[str, dict[str, Any]], operation: str, told: dict[str, Any]) -> None:
+        """Keep who began an operation, or how it ended; record the end when both are known."""
+        with self._matching:
+            known[operation] = told
+            if operation in self._began and operation in self._ended:
+                self._tell({**self._began.pop(operation), **self._ended.pop(operation)})
+            while len(known) > FOLLOWED:
+                del known[next(iter(known))]
+
+    def _tell(self, told: dict[str, Any]) -> None:
+        self.audit.put(told)
+        self._publish(told["number"], told)
+
+    def _now(self) -> dict[str, Any]:
+        return {"time": datetime.now(UTC).isoformat(), "monotonic_s": self._clock.now_s()}
+
+
+def _operation_of(answer: Answer) -> str | None:
+    """The id of the operation that an answer names."""
+    found = answer.get("id", answer.get("operation"))
+    return found if isinstance(found, str) else None

@@ -1,0 +1,125 @@
+"""Answers kept by key, so that a command which is sent twice acts once.
+
+What is kept is what acted, or may have: answers, and failures of a device or of the program. A refusal
+changed nothing and is forgotten, so the same key may ask again.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any, Generic, TypeVar
+
+from drivers.clock import Clock, SystemClock
+from mastctl.errors import BadRequest, MastctlError, NotNow
+
+T = TypeVar("T")
+
+KEPT_S = 600.0
+KEPT = 4096  # keys; the oldest is forgotten before its time for one more
+LONGEST_KEY = 200
+WAIT_S = 30.0  # for the first of two, longer than any command takes that is accepted or refused
+
+
+@dataclass(eq=False)
+class _Kept(Generic[T]):
+    """What became of one key."""
+
+    digest: bytes
+    since_s: float
+    done: bool = False
+    answer: T | None = None
+    error: BaseException | None = None
+
+
+class Answers(Generic[T]):
+    """What was answered to each key; safe to use from any thread.
+
+    Parameters
+    ----------
+    clock
+        By which answers are forgotten.
+    waits_on
+        What the second of two waits on while the first is at work; the service's clock.
+    """
+
+    def __init__(self, clock: Clock, waits_on: Clock | None = None) -> None:
+        self._clock = clock
+        self._changed = (waits_on or SystemClock()).signal()
+        self._kept: dict[tuple[str, str], _Kept[T]] = {}  # oldest first
+
+    def once(self, who: str, key: str, request: Mapping[str, Any], act: Callable[[], T]) -> tuple[T, bool]:
+        """Return what ``act()`` returns, or returned before, and whether it was before.
+
+        Parameters
+        ----------
+        who
+            Whose key it is: another's is another key.
+        key
+            Printable ASCII, up to 200 signs.
+        request
+            What is asked, as JSON: the same whenever the key is.
+
+        Raises
+        ------
+        BadRequest
+            ``key_reused`` if the key came with another request, ``bad_request`` for what is no key.
+        NotNow
+            ``key_in_use`` if the first is still at work after 30 s.
+        """
+        if not (0 < len(key) <= LONGEST_KEY and key.isascii() and key.isprintable()):
+            words = f"Idempotency-Key is '{key[:40]}' where up to {LONGEST_KEY} signs of ASCII are expected"
+            raise BadRequest("bad_request", words)
+        digest = hashlib.sha256(json.dumps(request, sort_keys=True).encode()).digest()
+        with self._changed:
+            known = self._kept.get((who, key))
+            if known is not None and not self._old(known):
+                return self._answered(known, key, digest), True
+            self._make_room()
+            self._kept.pop((who, key), None)  # an old one, so that the order stays
+            mine = self._kept[(who, key)] = _Kept(digest, self._clock.now_s())
+        try:
+            mine.answer = act()
+        except BaseException as error:
+            mine.error = error
+            raise
+        finally:
+            with self._changed:
+                mine.done = True
+                if isinstance(mine.error, MastctlError):
+                    del self._kept[(who, key)]
+                self._changed.notify_all()
+        return mine.answer, False
+
+    def _answered(self, known: _Kept[T], key: str, digest: bytes) -> T:
+        """Return the answer that the first got, or gets; the lock is held."""
+        if known.digest != digest:
+            words = f"Idempotency-Key '{key[:40]}' came before with another request; take a new one"
+            raise BadRequest("key_reused", words)
+        until_s = self._clock.now_s() + WAIT_S
+        while not known.done:
+            left_s = until_s - self._clock.now_s()
+            if left_s <= 0:
+                words = f"the request that came first with Idempotency-Key '{key[:40]}' is still at work"
+                raise NotNow("key_in_use", words)
+            self._changed.wait(left_s, idle=True)
+        if known.error is not None:
+            raise known.error
+        return known.answer  # type: ignore[return-value]
+
+    def _old(self, one: _Kept[T]) -> bool:
+        return one.done and self._clock.now_s() - one.since_s >= KEPT_S
+
+    def _make_room(self) -> None:
+        """Forget what is old, and the oldest of too many; never what is at work. The lock is held."""
+        surplus = len(self._kept) + 1 - KEPT
+        leave: list[tuple[str, str]] = []
+        for key, one in self._kept.items():
+            if self._old(one) or (one.done and surplus > len(leave)):
+                leave.append(key)
+            elif surplus <= len(leave):
+                break
+        for key in leave:
+            del self._kept[key]

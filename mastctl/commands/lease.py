@@ -1,0 +1,262 @@
+"""Who steers: one lease at a time, or without one, whoever started what runs.
+
+A lease runs on the machine's clock, however fast a simulated rover's goes: it bounds how long a client may
+be silent, and clients live in real time. It holds while the time is before its end, not at its end. Its id
+is what proves it, so no answer but the holder's own tells it.
+
+Reading from here (`Leases.control`) takes no lock.
+"""
+
+from __future__ import annotations
+
+import hmac
+import math
+import secrets
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime, timedelta
+from typing import Any, Literal
+
+from drivers.clock import Clock
+from mastctl.commands.caller import Caller
+from mastctl.errors import BadRequest, NotNow
+
+SHORTEST_S, USUAL_S, LONGEST_S = 1.0, 30.0, 3600.0
+REMEMBERED = 64  # ended leases whose end is still told to who comes with them
+
+
+class Leased(NotNow):
+    """Somebody else steers; ``detail`` says who, and for how long."""
+
+    def __init__(self, control: Control, now_s: float) -> None:
+        self.detail = control.told(now_s)
+        super().__init__("leased", f"{control.sentence(now_s)}; wait, or take over with a reason")
+
+
+@dataclass(frozen=True)
+class Lease:
+    """The right to steer until ``until_s``, seconds of the lease's clock."""
+
+    id: str
+    holder: str
+    since_s: float
+    for_s: float
+    until_s: float
+
+
+@dataclass(frozen=True)
+class Control:
+    """Who steers.
+
+    Attributes
+    ----------
+    holder
+        Its name.
+    kind
+        ``lease``, or ``operation``: by what runs, until that has ended.
+    until_s
+        When a lease ends, seconds of its clock; None for an operation.
+    """
+
+    holder: str
+    kind: Literal["lease", "operation"]
+    until_s: float | None = None
+
+    def told(self, now_s: float) -> dict[str, Any]:
+        """Return it as JSON: what is left in seconds, and when that is by the wall clock (UTC)."""
+        left_s = None if self.until_s is None else max(0.0, self.until_s - now_s)
+        until = None if left_s is None else (datetime.now(UTC) + timedelta(seconds=left_s)).isoformat()
+        return {"holder": self.holder, "kind": self.kind, "for_s": left_s, "until": until}
+
+    def sentence(self, now_s: float) -> str:
+        """Return it in plain words."""
+        if self.until_s is None:
+            return f"{self.holder} steers, until what runs has ended"
+        return f"{self.holder} steers, for {max(0.0, self.until_s - now_s):.1f} s more"
+
+
+class Leases:
+    """The lease of one daemon, and who steers without one; safe to use from any thread.
+
+    Parameters
+    ----------
+    clock
+        What leases run on.
+    running
+        Whether an operation or a track runs; called with the lock held, so it must take none.
+    on_change
+        Told who steers after each change, and that a lease has ended by time when somebody asks next.
+    """
+
+    def __init__(
+        self,
+        clock: Clock,
+        running: Callable[[], bool],
+        on_change: Callable[[Control | None], None] = lambda control: None,
+    ) -> None:
+        self._clock = clock
+        self._running = running
+        self._on_change = on_change
+        self._lock = threading.Lock()
+        self._lease: Lease | None = None
+        self._over: dict[str, str] = {}  # id of an ended lease: how it ended
+        self._under_way: dict[object, str] = {}  # commands that are being carried out: their party
+        self._party: str | None = None  # who started what runs
+
+    def control(self) -> Control | None:
+        """Return who steers now, None for nobody."""
+        lease = self._lease
+        if lease is not None and self._clock.now_s() < lease.until_s:
+            return Control(lease.holder, "lease", lease.until_s)
+        under_way = next(iter(tuple(self._under_way.values())), None)
+        party = under_way or (self._party if self._running() else None)
+        return None if party is None else Control(party, "operation")
+
+    def told(self) -> dict[str, Any] | None:
+        """Return who steers as ``GET /status`` tells it."""
+        control = self.control()
+        return None if control is None else control.told(self._clock.now_s())
+
+    def acquire(self, caller: Caller, name: str | None = None, for_s: float = USUAL_S) -> Lease:
+        """Return a new lease if nobody else steers.
+
+        Parameters
+        ----------
+        caller
+            Who asks. What its name has running does not stand against it.
+        name
+            The holder's name, the caller's by default.
+        for_s
+            How long, seconds.
+
+        Raises
+        ------
+        Leased
+            If somebody steers.
+        BadRequest
+            If ``for_s`` is out of bounds.
+        """
+        _check_time(for_s)
+        with self._changing():
+            self._check_free(caller)
+            return self._grant(name or caller.name, for_s)
+
+    def renew(self, lease_id: str, for_s: float | None = None) -> Lease:
+        """Have a lease run for ``for_s`` seconds from now on, by default as long as at first; return it.
+
+        Raises
+        ------
+        NotNow
+            ``lease_over`` with how it ended, ``lease_unknown``.
+        BadRequest
+            If ``for_s`` is out of bounds.
+        """
+        if for_s is not None:
+            _check_time(for_s)
+        with self._changing():
+            lease = self._held_by(lease_id)
+            for_s = lease.for_s if for_s is None else for_s
+            self._lease = replace(lease, for_s=for_s, until_s=self._clock.now_s() + for_s)
+            return self._lease
+
+    def release(self, lease_id: str) -> None:
+        """End a lease. Raises NotNow as `renew`."""
+        with self._changing():
+            self._held_by(lease_id)
+            self._end("it was released")
+
+    def take(self, caller: Caller, reason: str, name: str | None = None, for_s: float = USUAL_S) -> Lease:
+        """Return a new lease, whoever steers; the former holder is told by whom it was taken, and why.
+
+        What runs goes on. Raises BadRequest if ``for_s`` is out of bounds.
+        """
+        _check_time(for_s)
+        with self._changing():
+            self._end(f"{name or caller.name} took over: {reason}")
+            return self._grant(name or caller.name, for_s)
+
+    @contextmanager
+    def steering(self, caller: Caller, lease_id: str | None) -> Iterator[None]:
+        """Let a command that steers be carried out inside the block; waits for nobody.
+
+        Until it has ended, and what it started too, nobody else gets a lease or steers, unless by `take`.
+
+        Raises
+        ------
+        Leased
+            If somebody else steers.
+        NotNow
+            ``lease_over``, ``lease_unknown``, for the lease that came with it.
+        """
+        ticket = object()
+        with self._changing():
+            if lease_id is not None:
+                party = self._held_by(lease_id).holder
+            else:
+                self._check_free(caller)
+                party = caller.name
+            self._under_way[ticket] = party
+        try:
+            yield
+        finally:
+            with self._changing():
+                self._party = party
+                del self._under_way[ticket]
+
+    # With the lock held
+
+    @contextmanager
+    def _changing(self) -> Iterator[None]:
+        """Hold the lock, with a lease that has run out ended; tell a change after it."""
+        changed = False
+        try:
+            with self._lock:
+                before = self._lease
+                if before is not None and self._clock.now_s() >= before.until_s:
+                    self._end(f"its {before.for_s:g} s were over")
+                try:
+                    yield
+                finally:
+                    changed = self._lease is not before
+        finally:
+            if changed:
+                self._on_change(self.control())
+
+    def _check_free(self, caller: Caller) -> None:
+        """Pass unless a lease runs, or somebody of another name steers. Raises Leased."""
+        control = self.control()
+        if control is not None and (control.kind == "lease" or control.holder != caller.name):
+            raise Leased(control, self._clock.now_s())
+
+    def _held_by(self, lease_id: str) -> Lease:
+        """Return the lease that runs, if it is this one."""
+        lease = self._lease
+        if lease is not None and hmac.compare_digest(lease.id.encode(), lease_id.encode()):
+            return lease
+        how = self._over.get(lease_id)
+        if how is None:
+            raise NotNow("lease_unknown", "the lease is not known, or ended long ago; acquire one")
+        raise NotNow("lease_over", f"the lease has ended: {how}; acquire another")
+
+    def _grant(self, holder: str, for_s: float) -> Lease:
+        now_s = self._clock.now_s()
+        self._lease = Lease(secrets.token_hex(16), holder, now_s, for_s, now_s + for_s)
+        return self._lease
+
+    def _end(self, how: str) -> None:
+        if self._lease is None:
+            return
+        self._over[self._lease.id] = how
+        while len(self._over) > REMEMBERED:
+            del self._over[next(iter(self._over))]
+        self._lease = None
+
+
+def _check_time(for_s: float) -> None:
+    """Pass how long a lease may be. Raises BadRequest."""
+    if not (math.isfinite(for_s) and SHORTEST_S <= for_s <= LONGEST_S):
+        raise BadRequest(
+            "bad_request", f"for_s: {for_s:g} where {SHORTEST_S:g} to {LONGEST_S:g} seconds are expected"
+        )
