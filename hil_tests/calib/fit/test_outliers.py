@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+from typing import Any
+
 import numpy as np
 import pytest
 
+from calib.fit.adjustment import Block
 from calib.fit.calibration import Calibration
 from calib.fit.joint import fit_joint
 from calib.fit.paper import fit_paper
+from calib.fit.outliers import judge
 from calib.fit.start_values import SurveyNotFitted
+from calib.fit.terms import ImageTerm
 from calib.mast.rig import Rig
 from calib.survey import Survey
 from drivers.sim_survey.blunders import with_moved_tape, with_wrong_prism
@@ -112,3 +118,30 @@ def test_the_upright_mast_of_the_paper_leaves_nothing_out(navcams: Rig) -> None:
     four = fit_paper(survey_of(navcams, 1), 4)
     assert not four.outliers and not six.outliers
     assert max(four.rms_px["navcam_left"]) > 5 * max(six.rms_px["navcam_left"])
+
+
+@pytest.mark.parametrize("fitted", [True, False])
+@pytest.mark.parametrize(("off_sigmas", "good"), [(4.6, True), (5.2, False)])
+def test_a_dot_that_few_others_check_is_judged_by_what_the_fit_leaves_of_it(
+    fitted: bool, off_sigmas: float, good: bool
+) -> None:
+    """One unknown place under three dots, and twenty dots elsewhere that say nothing about it.
+
+    The third dot is off by b sigmas. Worked by hand, b² 2/3 is chi-square of two whether the place is the mean
+    of all three (a residual of 2/3 b, variance 1 - 1/3) or of the other two (b, variance 1 + 1/2). One dot
+    of 23 in a hundred surveys is beyond 2 ln 2300 = 15.5: 4.6² 2/3 = 14.1 is not, 5.2² 2/3 = 18.0 is.
+    """
+    jacobian = np.zeros((23, 2, 2))
+    jacobian[20:] = np.eye(2)
+    keep = np.ones(23, dtype=bool)
+    keep[22] = fitted
+    residual = np.zeros((23, 2))
+    residual[20:, 0] = [-off_sigmas / 3, -off_sigmas / 3, 2 * off_sigmas / 3] if fitted else [0, 0, off_sigmas]
+    block = Block(residual.ravel(), jacobian.reshape(46, 2), np.arange(2), 2)
+    places, counts = np.zeros((23, 3)), np.arange(23)
+    term = ImageTerm(
+        "one", "left", ("s", "p"), None, 0, 0, counts, counts, places, residual, np.ones(23), keep
+    )
+    problem: Any = SimpleNamespace(images=[term], station=[], image_block=lambda state, whole: block)
+    left = judge(problem, None, np.eye(2) / keep[20:].sum(), [term])  # type: ignore[arg-type]
+    assert left.images[0].keep.tolist() == [True] * 22 + [good]
