@@ -28,12 +28,12 @@ class Counters:
         What was wrong with the last refused frame.
     """
 
-    good: int = 0
-    damaged: int = 0
-    dropped: int = 0
-    late: int = 0
-    reopened: int = 0
-    last_damage: str = ""
+    good: int
+    damaged: int
+    dropped: int
+    late: int
+    reopened: int
+    last_damage: str
 
 
 class Arrived(NamedTuple):

@@ -136,8 +136,7 @@ class Spacing:
     def __init__(self, promised_s: float | None, margin_s: float) -> None:
         self._least_s = promised_s  # the shortest promised or seen: a frame that was lost took no less
         self._margin_s = margin_s
-        self._sequence: int | None = None
-        self._stamp_s = 0.0
+        self._last: tuple[int, float] | None = None
         self._apart_s: float | None = None
 
     def see(self, sequence: int, stamp_s: float) -> tuple[float | None, float | None]:
@@ -146,12 +145,13 @@ class Spacing:
         What lies between two frames that came is this frame's alone, but for what lost ones took at least.
         If there is no room for those, the count is not to be believed.
         """
-        before, between_s = self._sequence, stamp_s - self._stamp_s
-        self._sequence, self._stamp_s = sequence, stamp_s
-        if before is None or between_s <= 0.0:  # stamps that began again tell nothing of what was before
+        before, stamped_s = self._last or (sequence, stamp_s)
+        self._last = sequence, stamp_s
+        between_s, lost = stamp_s - stamped_s, sequence - before - 1
+        if between_s <= 0.0:  # the first, or stamps that began again: nothing is told of what was before
             self._apart_s = None
             return None, None
-        apart_s, lost = between_s, sequence - before - 1
+        apart_s = between_s
         if lost == 0:
             seen_s = max(0.0, between_s - self._margin_s)
             self._least_s = seen_s if self._least_s is None else min(self._least_s, seen_s)

@@ -571,6 +571,14 @@ def test_a_bad_list_of_faults_sets_none(bench: Bench, faults: object) -> None:
     assert bench.panel.active() == ()
 
 
+def test_a_fault_is_over_at_its_end_and_listed_no_longer(bench: Bench) -> None:
+    fault = bench.panel.set(PAN_TILT, "stuck", after_s=0.5, for_s=0.25)
+    bench.clock.advance(fault.end_s - START - 0.125)
+    assert bench.panel.active() == (fault,) and fault.holds(bench.clock.now_s())
+    bench.clock.advance(0.125)
+    assert bench.panel.active() == () and not fault.holds(bench.clock.now_s())
+
+
 @pytest.mark.parametrize(
     ("device", "word"),
     [("cam_left", word) for word in CAMERA_WORDS] + [(PAN_TILT, word) for word in HEAD_WORDS],

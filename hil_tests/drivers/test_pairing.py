@@ -133,6 +133,20 @@ def test_before_anything_is_learned_frames_up_to_half_a_period_apart_are_a_pair(
     assert set(pairing.behind({"left": Shot(1, 1.0, 0), "right": Shot(1, 1.0 - far, 0)})) == {"right"}
 
 
+@pytest.mark.parametrize("usual_s", [(-0.012, -0.003), (-0.012, 0.015), (0.003, 0.015)])
+@pytest.mark.parametrize("asked_s", [7.001, 7.013, 7.019, 7.021, 7.033])
+def test_cameras_are_asked_half_a_period_before_the_next_frames_none_before_the_moment_asked_for(
+    asked_s: float, usual_s: tuple[float, float]
+) -> None:
+    offsets = {name: Offset(PERIOD_S, by_s, began_s=3.0) for name, by_s in zip("bc", usual_s, strict=True)}
+    asked_after_s = Pairing("a", offsets).moments(asked_s)
+    began_s = {"a": 3.0, "b": 3.0 + usual_s[0], "c": 3.0 + usual_s[1]}
+    for name, moment_s in asked_after_s.items():
+        periods = (moment_s - began_s[name]) / PERIOD_S
+        assert periods % 1.0 == pytest.approx(0.5)
+    assert asked_s <= min(asked_after_s.values()) < asked_s + PERIOD_S
+
+
 def test_lost_frames_mix_no_others() -> None:
     gone = set(range(45, 300, 3))
     right = [shot for shot in series(400, 0.004) if shot.sequence not in gone]

@@ -116,16 +116,23 @@ def test_an_eye_that_took_nothing_here_says_so(folder: Path) -> None:
         recording.cameras["navcam_right"].next_frame(clock.now_s(), 1.0)
 
 
-def test_sixteen_bits_become_eight_by_one_scale_for_all_frames(folder: Path) -> None:
+@pytest.mark.parametrize(("low_dn", "high_dn"), [(0, 4080), (800, 2840)])
+def test_sixteen_bits_become_eight_by_one_scale_for_all_frames(
+    folder: Path, low_dn: int, high_dn: int
+) -> None:
     for index in range(3):
         image = np.linspace(1000 * index, 1000 * index + 1000, 48).reshape(6, 8).astype(np.uint16)
         cv2.imwrite(str(folder / f"left{index}.png"), image)
     clock = ManualClock(100.0)
-    recording = opened(folder, clock, grey_range_dn=[0, 4080])
+    recording = opened(folder, clock, grey_range_dn=[low_dn, high_dn])
     recording.pan_tilt.move(0.5, -0.2)
     image = recording.cameras["navcam_left"].next_frame(clock.now_s(), 1.0).image
     assert image.dtype == np.uint8
-    assert (image[0, 0], image[-1, -1]) == (round(1000 / 16), round(2000 / 16))
+    dn_a_level = {0: 16, 800: 8}[low_dn]
+    assert (image[0, 0], image[-1, -1]) == (
+        round((1000 - low_dn) / dn_a_level),
+        round((2000 - low_dn) / dn_a_level),
+    )
     scales = {pointing.frames["navcam_left"].scale for pointing in opened(folder).pointings}
     assert len(scales) == 1
 
@@ -170,8 +177,9 @@ def test_options_that_make_no_recording_are_refused_in_one_line(
 @pytest.mark.parametrize(
     ("line", "words"),
     [
-        ("navcam_left,0.3,0.0", "3 cells where 4"),
-        ("navcam_left,far,0.0,left0.png", "'far' where an angle"),
+        ("navcam_left,0.3,0.0", "row 6: 3 cells where 4"),
+        ("navcam_left,far,0.0,left0.png", "row 6, pan_rad: 'far' where an angle"),
+        ("navcam_left,0.0,far,left0.png", "row 6, tilt_rad: 'far' where an angle"),
         ("navcam_left,nan,0.0,left0.png", "'nan' where an angle"),
         ("navcam_left,7.1,0.0,left0.png", "'7.1' where an angle"),
         (",0.3,0.0,left0.png", "a camera and a file"),

@@ -35,14 +35,14 @@ LENS = CameraModel(
 class TwoLines:
     """A mast as two lines at joint angles zero: pan turns about one, which carries the other, tilt's."""
 
-    def __init__(self, seed: int, skew: bool) -> None:
+    def __init__(self, seed: int, skew: bool, twist_rad: float = 0.3) -> None:
         random = np.random.default_rng(seed)
         self.pan_point = np.array([0.4, 0.05, -1.2]) + random.normal(0, 0.2, 3)
         self.pan_axis = Rotation.from_rotvec(random.normal(0, 0.2, 3)).apply([0.0, 0.0, 1.0])
         across = np.cross(self.pan_axis, random.normal(0, 1, 3))
         across /= np.linalg.norm(across)
         if skew:
-            self.tilt_axis = np.cos(0.3) * across + np.sin(0.3) * self.pan_axis
+            self.tilt_axis = np.cos(twist_rad) * across + np.sin(twist_rad) * self.pan_axis
             self.tilt_point = self.pan_point + random.normal(0, 0.05, 3)
         else:
             self.tilt_axis = across
@@ -81,6 +81,15 @@ def test_six_poses_predict_every_other_pose(seed: int, skew: bool) -> None:
     offset_m, twist_rad = mast.offset_and_twist()
     assert abs(fit.mast.axis_offset_m) == pytest.approx(offset_m, abs=1e-9)
     assert abs(fit.mast.axis_twist_rad) == pytest.approx(twist_rad, abs=1e-9)
+
+
+@pytest.mark.parametrize("twist_rad", [-1.25, -0.8, 0.8, 1.25])
+def test_axes_that_are_far_from_square_are_found(twist_rad: float) -> None:
+    mast = TwoLines(4, skew=True, twist_rad=twist_rad)
+    pan, tilt = mast.angles.T
+    fit = fit_poses([mast.camera(p, t) for p, t in mast.angles], pan, tilt)
+    assert max(np.abs(found.shift_px).max() for found in fit.residuals) < SHIFT_PX
+    assert abs(fit.mast.axis_twist_rad) == pytest.approx(abs(twist_rad), abs=1e-9)
 
 
 def test_six_parameters_show_the_skew_they_cannot_hold() -> None:

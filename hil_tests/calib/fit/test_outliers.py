@@ -11,8 +11,8 @@ import pytest
 from calib.fit.adjustment import Block
 from calib.fit.calibration import Calibration
 from calib.fit.joint import fit_joint
-from calib.fit.paper import fit_paper
 from calib.fit.outliers import judge
+from calib.fit.paper import fit_paper
 from calib.fit.start_values import SurveyNotFitted
 from calib.fit.terms import ImageTerm
 from calib.mast.rig import Rig
@@ -127,8 +127,8 @@ def test_a_dot_that_few_others_check_is_judged_by_what_the_fit_leaves_of_it(
 ) -> None:
     """One unknown place under three dots, and twenty dots elsewhere that say nothing about it.
 
-    The third dot is off by b sigmas. Worked by hand, b² 2/3 is chi-square of two whether the place is the mean
-    of all three (a residual of 2/3 b, variance 1 - 1/3) or of the other two (b, variance 1 + 1/2). One dot
+    The third dot is off by b sigmas. Worked by hand, b² 2/3 is chi-square of two whether the place is the
+    mean of all three (residual 2/3 b, variance 1 - 1/3) or of the other two (b, variance 1 + 1/2). One dot
     of 23 in a hundred surveys is beyond 2 ln 2300 = 15.5: 4.6² 2/3 = 14.1 is not, 5.2² 2/3 = 18.0 is.
     """
     jacobian = np.zeros((23, 2, 2))
@@ -136,7 +136,9 @@ def test_a_dot_that_few_others_check_is_judged_by_what_the_fit_leaves_of_it(
     keep = np.ones(23, dtype=bool)
     keep[22] = fitted
     residual = np.zeros((23, 2))
-    residual[20:, 0] = [-off_sigmas / 3, -off_sigmas / 3, 2 * off_sigmas / 3] if fitted else [0, 0, off_sigmas]
+    residual[20:, 0] = (
+        [-off_sigmas / 3, -off_sigmas / 3, 2 * off_sigmas / 3] if fitted else [0, 0, off_sigmas]
+    )
     block = Block(residual.ravel(), jacobian.reshape(46, 2), np.arange(2), 2)
     places, counts = np.zeros((23, 3)), np.arange(23)
     term = ImageTerm(

@@ -21,7 +21,7 @@ import pytest
 
 from drivers.errors import BadOptions, DriverError, NoFreshFrame
 from drivers.interfaces import Camera
-from drivers.v4l2 import abi, capture, pixels
+from drivers.v4l2 import abi, capture, find, pixels
 from drivers.v4l2.camera import V4l2Camera, open_camera
 from drivers.v4l2.capture import Capture
 from drivers.v4l2.errors import NoCamera, StreamFailed
@@ -359,6 +359,18 @@ def test_nothing_is_left_after_closing(bench: Bench) -> None:
     assert held() == before
 
 
+def test_waits_that_end_leave_nothing(camera: V4l2Camera) -> None:
+    def wait() -> None:
+        with pytest.raises(NoFreshFrame):
+            camera.next_frame(0.0, 0.0001)
+
+    wait()
+    before = held()
+    for _ in range(20):
+        wait()
+    assert held() == before
+
+
 def test_a_camera_that_cannot_be_opened_leaves_nothing(bench: Bench) -> None:
     before = held()
     options = parse_options({"card": "Fake"}, "c")
@@ -463,6 +475,9 @@ def test_a_frame_that_was_given_does_not_change_when_its_buffer_is_filled_again(
         ({"card": "a", "controls": {"gain": 1.5}}, "options.controls is"),
         ({"card": "a", "controls": [1]}, "options.controls is"),
         ({"card": "a", "gain": True}, "options.gain is True, expected a whole number"),
+        ({"card": "a", "gain": 2**31}, "options.gain is 2147483648, expected a whole number"),
+        ({"card": "a", "focus": 2**31}, "options.focus is 2147483648, expected a whole number"),
+        ({"card": "a", "focus": -(2**31) - 1}, "options.focus is -2147483649, expected a whole number"),
         ({"card": "a", "exposure_s": -1}, "options.exposure_s is -1"),
         ({"card": "a", "margin_s": 5}, "options.margin_s is 5"),
         ({"card": "a", "buffers": 1}, "options.buffers is 1, expected a whole number from 3 to 32"),
@@ -486,6 +501,20 @@ def test_bad_options_are_told_in_one_line(options: dict[str, object], message: s
     with pytest.raises(BadOptions, match=message) as caught:
         open_camera(options, name="navcam_left")
     assert str(caught.value).startswith("navcam_left: ") and "\n" not in str(caught.value)
+
+
+def test_a_bare_number_is_refused_with_the_stable_link_that_leads_there_now(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(find, "LINKS", tmp_path)
+    with pytest.raises(BadOptions, match=r"; give a link under /dev/v4l/by-id, or 'card' and 'bus' \("):
+        open_camera({"device": "/dev/video9"}, name="eye")
+    (tmp_path / "by-path").mkdir()
+    link = tmp_path / "by-path" / "usb-0:1"
+    link.symlink_to("/dev/video9")
+    (tmp_path / "by-path" / "usb-0:2").symlink_to("/dev/video8")
+    with pytest.raises(BadOptions, match=rf"; give {link} \("):
+        open_camera({"device": "/dev/video9"}, name="eye")
 
 
 def test_a_rate_of_none_is_left_as_it_is() -> None:
