@@ -9,7 +9,7 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
@@ -55,12 +55,15 @@ class Frame:
         Middle of the exposure, seconds of CLOCK_MONOTONIC.
     exposure_s
         Exposure time, seconds: it began at ``mid_exposure_s - exposure_s / 2``.
+    jpeg
+        The camera's own JPEG that the image was made of; empty where it gave none.
     """
 
     image: Image
     sequence: int
     mid_exposure_s: float
     exposure_s: float
+    jpeg: bytes = field(default=b"", kw_only=True, repr=False)
 
     @property
     def exposure_began_s(self) -> float:

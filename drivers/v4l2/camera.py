@@ -123,13 +123,14 @@ class V4l2Camera:
             if lost := self.capture.lost:
                 raise NoCamera(lost)
             raise NoFreshFrame(self._instead(exposed_after_s, timeout_s, damaged), device=self.name)
-        arrived, image = taken
+        arrived, image, jpeg = taken
         last = self._last
         if last is not None and last.image is image:
             return last
         buffer, window, exposure_s = arrived.buffer, arrived.window, arrived.timing.exposure_s
         self._last = V4l2Frame(
             image=image,
+            jpeg=jpeg,
             sequence=arrived.sequence,
             mid_exposure_s=window.mid_s,
             exposure_s=window.length_s,

@@ -54,6 +54,7 @@ class _Shared:
     newest: Arrived | None = None
     node: Node | None = None  # in whose memory the newest lies
     picture: Image | None = None  # the newest converted, once somebody asked
+    jpeg: bytes = b""  # what it was made of, if that is a JPEG
     recent: deque[Arrived] = field(default_factory=lambda: deque(maxlen=RECENT_FRAMES))  # of this stream
     good: int = 0
     damaged: int = 0
@@ -159,8 +160,9 @@ class Capture:
         with self._shared.lock:
             return list(self._shared.recent)
 
-    def take(self, exposed_after_s: float, timeout_s: float) -> tuple[Arrived, Image] | None:
-        """Return the newest frame, once its exposure began after that moment, and its read-only picture.
+    def take(self, exposed_after_s: float, timeout_s: float) -> tuple[Arrived, Image, bytes] | None:
+        """Return the newest frame, once its exposure began after that moment, and its read-only picture,
+        with the JPEG that it was made of (empty where the camera gives none).
 
         A frame that was there before is given only while its stamp is at most a period and 5 ms old: when the
         computer stood still for longer, a newer one is on its way. None after ``timeout_s``, and at once when
@@ -178,7 +180,7 @@ class Capture:
                         and (newest is not first or self._is_young(newest))
                         and (picture := self._picture(newest)) is not None
                     ):
-                        return newest, picture
+                        return newest, picture, shared.jpeg
                     if shared.closed or shared.lost:
                         return None
                     bell = bell or shared.bells.take()
@@ -205,6 +207,7 @@ class Capture:
             data = np.frombuffer(shared.node.bytes_of(newest.buffer), np.uint8)
             try:
                 shared.picture = self._convert(newest.format, data)
+                shared.jpeg = pixels.jpeg_of(newest.format, data)
                 shared.picture.setflags(write=False)
             except BadFrame as error:
                 shared.newest = None

@@ -89,6 +89,13 @@ def wrong_length(format: PictureFormat, data: memoryview) -> str:
     return "" if whole else f"a JPEG cut off after {len(data)} bytes"
 
 
+def jpeg_of(format: PictureFormat, raw: NDArray[np.uint8]) -> bytes:
+    """Return the JPEG that a picture's bytes are, without what fills them up; empty for other formats."""
+    if FORMATS[format.code].kind != "jpeg":
+        return b""
+    return raw.tobytes().rstrip(b"\0")
+
+
 def grey(format: PictureFormat, raw: NDArray[np.uint8]) -> Image:
     """Return the grey picture, uint8 (h, w), in memory of its own. Raises BadFrame for a broken JPEG.
 

@@ -340,6 +340,7 @@ class Cameras:
             frame_id=frame_id,
             camera=camera,
             image=frame.image,
+            jpeg=frame.jpeg,
             sequence=frame.sequence,
             mid_exposure_s=frame.mid_exposure_s,
             exposure_s=frame.exposure_s,

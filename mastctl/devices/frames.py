@@ -12,7 +12,7 @@ import secrets
 import threading
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -30,9 +30,13 @@ SATURATED_GREY = 250  # nor does one whose darkest hundredth is above this
 
 @dataclass(frozen=True, eq=False)
 class StampedFrame(FrameFacts):
-    """One picture and its facts; the image is uint8 (h, w) or (h, w, 3) BGR, read-only."""
+    """One picture and its facts; the image is uint8 (h, w) or (h, w, 3) BGR, read-only.
+
+    ``jpeg`` is the camera's own that it was made of; empty where there is none.
+    """
 
     image: Image
+    jpeg: bytes = field(default=b"", kw_only=True, repr=False)
 
     @property
     def exposure_began_s(self) -> float:
@@ -114,7 +118,8 @@ def checked(
         # The driver may use its buffer again; one that hands over a read-only array is spared the copy.
         image = image.copy()
         image.setflags(write=False)
-    return Frame(image, sequence, mid_s, exposure_s)
+    jpeg = getattr(answer, "jpeg", b"")
+    return Frame(image, sequence, mid_s, exposure_s, jpeg=jpeg if isinstance(jpeg, bytes) else b"")
 
 
 def random_run() -> str:

@@ -101,6 +101,13 @@ def test_a_jpeg_is_what_another_decoder_makes_of_it() -> None:
     assert np.abs(pixels.grey(picture_format("MJPG"), raw).astype(int) - luma).max() <= JPEG_DN
 
 
+def test_a_jpeg_is_kept_as_it_came_without_what_fills_it_up() -> None:
+    data = smooth_jpeg()
+    raw = np.frombuffer(bytes(data) + b"\0" * 300, np.uint8)
+    assert pixels.jpeg_of(picture_format("MJPG"), raw) == bytes(data)
+    assert pixels.jpeg_of(picture_format("GREY"), raw) == b""
+
+
 def test_a_jpeg_of_another_size_is_refused() -> None:
     raw = np.frombuffer(smooth_jpeg(), np.uint8)
     with pytest.raises(BadFrame, match=r"a JPEG of 32x24 px where \(64, 48\) px were set"):

@@ -1,0 +1,202 @@
+"""What is left of an MCAP file, read from front to end: whole, cut off anywhere, or damaged in the middle.
+
+The library's own readers trust the index at the end of a file, which a killed writer has not written, and
+end at the first record that is cut off. Here every record that is whole counts (https://mcap.dev/spec:
+an opcode, a length, the content), and every chunk whose checksum is right; what is not is counted and
+passed over. Nothing is taken from the index.
+"""
+
+from __future__ import annotations
+
+import io
+import struct
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import BinaryIO
+
+from mcap.data_stream import ReadDataStream
+from mcap.opcode import Opcode
+from mcap.records import Attachment, Channel, Chunk, Header, Message, Metadata, Schema
+from mcap.stream_reader import breakup_chunk
+
+from drivers.errors import DriverError
+
+MAGIC = b"\x89MCAP0\r\n"
+LARGEST_RECORD = 1 << 30
+"""A longer record is damage: a length that nobody wrote."""
+
+_FRAME = struct.Struct("<BQ")
+_END = frozenset((Opcode.DATA_END, Opcode.FOOTER))
+
+
+class BadRecording(DriverError):
+    """A file that is no recording, or cannot be read."""
+
+    code = "bad_recording"
+
+
+@dataclass
+class Found:
+    """What was met while a file was read; it grows as the reading goes on.
+
+    Attributes
+    ----------
+    complete
+        Whether the file was ended by its writer, index and all.
+    damaged
+        Chunks and records that were passed over because they are not what was written.
+    whole_bytes
+        Up to where records are whole; what follows was being written when the writer died.
+    left_over_bytes
+        How much follows there.
+    """
+
+    complete: bool = False
+    damaged: int = 0
+    whole_bytes: int = 0
+    left_over_bytes: int = 0
+    messages: int = 0
+    first_ns: int | None = None
+    last_ns: int | None = None
+    channels: dict[int, Channel] = field(default_factory=dict)
+    schemas: dict[int, Schema] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One message with its channel, and its schema (None where the channel names none)."""
+
+    schema: Schema | None
+    channel: Channel
+    message: Message
+
+
+Item = Header | Attachment | Metadata | Entry
+
+
+def is_mcap(path: Path) -> bool:
+    """Return whether a file begins like an MCAP file; False for one that cannot be read."""
+    try:
+        with path.open("rb") as file:
+            return file.read(len(MAGIC)) == MAGIC
+    except OSError:
+        return False
+
+
+def read_items(path: Path, found: Found | None = None) -> Iterator[Item]:
+    """Yield what a file holds, in its order: header, attachments, metadata, messages.
+
+    Parameters
+    ----------
+    path
+        The file.
+    found
+        Filled while the reading goes on.
+
+    Raises
+    ------
+    BadRecording
+        If it cannot be read, or does not begin like an MCAP file. What is wrong further on is passed over.
+    """
+    told = found if found is not None else Found()
+    try:
+        with path.open("rb") as file:
+            size = file.seek(0, io.SEEK_END)
+            file.seek(0)
+            if file.read(len(MAGIC)) != MAGIC:
+                raise BadRecording(f"{path}: is no MCAP file; a recording of mastctl is expected")
+            yield from _items(file, size, told)
+    except OSError as error:
+        raise BadRecording(f"{path}: cannot be read: {error.strerror or error}") from None
+
+
+def read_messages(path: Path, topics: Sequence[str] | None = None) -> Iterator[Entry]:
+    """Yield the messages of a file, of all topics or of these. Raises BadRecording."""
+    for item in read_items(path):
+        if isinstance(item, Entry) and (topics is None or item.channel.topic in topics):
+            yield item
+
+
+def _items(file: BinaryIO, size: int, told: Found) -> Iterator[Item]:
+    """Walk over the records after the magic."""
+    told.whole_bytes = file.tell()
+    while True:
+        head = file.read(_FRAME.size)
+        if len(head) < _FRAME.size:
+            break
+        opcode, length = _FRAME.unpack(head)
+        if opcode == 0 or length > min(LARGEST_RECORD, size - file.tell()):
+            break
+        content = file.read(length)
+        told.whole_bytes = file.tell()
+        if opcode in _END:
+            told.complete = _ends_whole(file, size)
+            told.whole_bytes = size if told.complete else told.whole_bytes - length - _FRAME.size
+            break
+        yield from _record(opcode, content, told)
+    told.left_over_bytes = size - told.whole_bytes
+
+
+def _ends_whole(file: BinaryIO, size: int) -> bool:
+    """Whether the file ends with the magic, as a finished one does."""
+    file.seek(max(0, size - len(MAGIC)))
+    return file.read(len(MAGIC)) == MAGIC
+
+
+def _record(opcode: int, content: bytes, told: Found) -> Iterator[Item]:
+    """What one record holds; a damaged one holds nothing."""
+    if opcode == Opcode.CHUNK:
+        try:
+            chunk = Chunk.read(_stream(content))
+            if chunk.uncompressed_size > LARGEST_RECORD:
+                raise ValueError("a chunk that claims to be larger than any is")
+            inside = breakup_chunk(chunk, validate_crc=True)
+        except Exception:  # whatever a library says of bytes that are no chunk
+            told.damaged += 1
+            return
+        for inner in inside:
+            yield from _known(inner, told)
+        return
+    read = _READ.get(opcode)
+    if read is None:
+        return
+    try:
+        one = read(content)
+    except Exception:  # as above
+        told.damaged += 1
+        return
+    yield from _known(one, told)
+
+
+def _known(one: object, told: Found) -> Iterator[Item]:
+    """Keep schemas and channels, hand on the rest, each message with its channel."""
+    if isinstance(one, Schema):
+        told.schemas[one.id] = one
+    elif isinstance(one, Channel):
+        told.channels[one.id] = one
+    elif isinstance(one, Message):
+        channel = told.channels.get(one.channel_id)
+        if channel is None:  # its channel was in a damaged chunk
+            told.damaged += 1
+            return
+        told.messages += 1
+        told.first_ns = one.log_time if told.first_ns is None else min(told.first_ns, one.log_time)
+        told.last_ns = one.log_time if told.last_ns is None else max(told.last_ns, one.log_time)
+        yield Entry(told.schemas.get(channel.schema_id), channel, one)
+    elif isinstance(one, Header | Attachment | Metadata):
+        yield one
+
+
+def _stream(content: bytes) -> ReadDataStream:
+    return ReadDataStream(io.BytesIO(content))
+
+
+_READ: dict[int, Callable[[bytes], object]] = {
+    Opcode.HEADER: lambda content: Header.read(_stream(content)),
+    Opcode.SCHEMA: lambda content: Schema.read(_stream(content)),
+    Opcode.CHANNEL: lambda content: Channel.read(_stream(content)),
+    Opcode.MESSAGE: lambda content: Message.read(_stream(content), len(content)),
+    Opcode.ATTACHMENT: lambda content: Attachment.read(_stream(content)),
+    Opcode.METADATA: lambda content: Metadata.read(_stream(content)),
+}

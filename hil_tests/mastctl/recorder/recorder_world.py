@@ -1,0 +1,86 @@
+"""What the recorder's tests share: a mast file, frames, and recordings read by the mcap library alone."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from mcap.reader import make_reader
+
+from calib.files.mast_file import parse_rig
+from drivers.clock import SystemClock
+from drivers.interfaces import Image, Reading
+from mastctl.config import load_config
+from mastctl.devices.frames import StampedFrame
+from mastctl.recorder.recorder import MastTold, Recorder
+from mastctl.recorder.settings import RecordSettings
+from mastctl.recorder.writer import Attached
+
+CONFIG = Attached("config.yaml", b"schema: mastctl/config/1\n")
+
+
+def mast() -> MastTold:
+    path = load_config().mast_file
+    data = path.read_bytes()
+    return MastTold(parse_rig(data, path).rig, Attached(path.name, data))
+
+
+def picture(seed: int = 0, shape: tuple[int, ...] = (24, 32)) -> Image:
+    image = np.random.default_rng(seed).integers(0, 256, shape, np.uint8)
+    image.setflags(write=False)
+    return image
+
+
+def frame(
+    number: int, image: Image | None = None, jpeg: bytes = b"", camera: str = "navcam_left"
+) -> StampedFrame:
+    image = picture(number) if image is None else image
+    facts = (
+        f"{camera}-{number:06d}-aaaaaaaa-bbbb",
+        camera,
+        number,
+        100.0 + number,
+        0.01,
+        0.25,
+        -0.5,
+        False,
+        "ab",
+    )
+    return StampedFrame(*facts, image, jpeg=jpeg)
+
+
+def reading(pan_rad: float, moving: bool = True) -> Reading:
+    return Reading(pan_rad, 0.0, moving, 100.0)
+
+
+def recorder(folder: Path, **settings: Any) -> Recorder:
+    wanted = {"ring_s": 600.0, "free_mb": 0.0} | settings
+    return Recorder(
+        RecordSettings(**wanted), folder, mast(), [CONFIG], {"hardware": "simulated"}, SystemClock()
+    )
+
+
+def until(true: Callable[[], Any], what: str, seconds: float = 20.0) -> None:
+    """Wait for something that another thread does."""
+    end_s = time.monotonic() + seconds
+    while not true():
+        assert time.monotonic() < end_s, what
+        time.sleep(0.01)
+
+
+def files(folder: Path) -> list[Path]:
+    return sorted(folder.rglob("*.mcap"))
+
+
+def messages(path: Path, topic: str | None = None) -> Iterator[tuple[Any, Any, Any]]:
+    """What the library's own reader finds, by the index."""
+    with path.open("rb") as file:
+        yield from make_reader(file, validate_crcs=True).iter_messages(topic)
+
+
+def told(path: Path, topic: str) -> list[Any]:
+    return [json.loads(message.data) for _, _, message in messages(path, topic)]

@@ -1,0 +1,269 @@
+"""The recorder in a daemon's place: bounds, faults, a disk that is slow, full or gone, and a kill."""
+
+from __future__ import annotations
+
+import errno
+import threading
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from drivers.mcap_file import Entry, Found, read_items
+from hil_tests.mastctl.recorder.recorder_world import (
+    files,
+    frame,
+    mast,
+    messages,
+    picture,
+    reading,
+    recorder,
+    told,
+    until,
+)  # fmt: skip
+from mastctl.devices.faults import StandingFault
+from mastctl.errors import NotNow, Unable
+from mastctl.recorder import recorder as module
+from mastctl.recorder.recorder import MastTold
+from mastctl.recorder.shelf import Shelf
+from mastctl.recorder.writer import Attached, RecordFile
+from tools.campaigns.record_kills import MOST_LOST_S, kills
+
+FAULT = StandingFault("pan_tilt", "no_reply", "it does not answer", 1.0, "it answers")
+
+
+def kinds(folder: Path) -> dict[str, list[str]]:
+    found: dict[str, list[str]] = {}
+    for one in Shelf(folder).all():
+        found.setdefault(one.kind, []).append(one.name)
+    return found
+
+
+def test_killed_at_any_moment_at_most_a_second_is_lost_and_the_rest_is_whole(tmp_path: Path) -> None:
+    results = kills(24, 6, 7, tmp_path)
+    assert [one.wrong for one in results if one.wrong] == []
+    assert max(one.lost_s for one in results) <= MOST_LOST_S
+    assert sum(one.recorded for one in results) > 0
+
+
+def test_nothing_is_recorded_without_a_ring_until_a_run_begins(tmp_path: Path) -> None:
+    one = recorder(tmp_path, ring_s=0.0)
+    one.tell("command", "1", {"number": 1})
+    one.tell("state", "machine", {"word": "ready"})
+    assert one.told()["recording"] is False
+    assert one.start_run("my rock")["run"].endswith("-my-rock")
+    one.tell("command", "2", {"number": 2})
+    with pytest.raises(NotNow, match="is recorded already"):
+        one.start_run("another")
+    ended = one.stop_run()
+    one.tell("command", "3", {"number": 3})
+    with pytest.raises(NotNow, match="no run is recorded"):
+        one.stop_run()
+    one.close()
+    (path,) = files(tmp_path)
+    assert str(path) == ended["file"]
+    assert [one["number"] for one in told(path, "/command")] == [2]
+    assert told(path, "/state") == [{"word": "ready"}]  # what was known before the run
+
+
+def test_a_run_takes_the_rings_place_and_gives_it_back(tmp_path: Path) -> None:
+    one = recorder(tmp_path)
+    one.tell("command", "1", {"number": 1})
+    one.start_run("")
+    one.tell("command", "2", {"number": 2})
+    one.stop_run()
+    one.tell("command", "3", {"number": 3})
+    one.close()
+    assert [[n["number"] for n in told(path, "/command")] for path in files(tmp_path)] == [[1], [3], [2]]
+
+
+def test_the_ring_goes_round_within_its_size(tmp_path: Path) -> None:
+    one = recorder(tmp_path, ring_mb=1.0)
+    for number in range(400):
+        one.tell("frame", "navcam_left", frame(number, picture(number, (100, 1000))))
+        until(lambda: not one._queue, "it writes")
+        if files(tmp_path)[-1:] and int(files(tmp_path)[-1].name[:6]) > 12:
+            break
+    one.close()
+    names = [path.name[:6] for path in files(tmp_path)]
+    assert int(names[-1]) > 12 and names[0] != "000001"
+    (ring,) = [entry for entry in Shelf(tmp_path).all() if entry.kind == "ring"]
+    assert ring.size_bytes < 2e6  # the bound, and the newest segment
+
+
+def test_a_fault_keeps_the_ring_once_and_what_comes_after_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(module, "AFTER_FAULT_S", 0.3)
+    one = recorder(tmp_path)
+    one.tell("command", "1", {"number": 1})
+    one.tell("fault", "pan_tilt", (FAULT,))
+    one.tell("command", "2", {"number": 2})
+    until(lambda: "kept" in kinds(tmp_path), "it is kept")
+    one.tell("fault", "pan_tilt", ())
+    one.tell("fault", "pan_tilt", (FAULT,))  # it comes and goes: the disk does not fill with it
+    one.close()
+    (name,) = kinds(tmp_path)["kept"]
+    assert name.endswith("-pan_tilt-no_reply")
+    (kept,) = [path for path in files(tmp_path) if name in str(path)]
+    assert [n["number"] for n in told(kept, "/command")] == [1, 2]
+    assert told(kept, "/fault")[0]["faults"][0]["code"] == "no_reply"
+
+
+def test_what_was_kept_is_bounded_and_the_oldest_goes_first(tmp_path: Path) -> None:
+    shelf = Shelf(tmp_path)
+    shelf.prepare()
+    for why in "abc":
+        shelf.next_segment().write_bytes(b"x" * 400_000)
+        shelf.keep_ring(why, 1.0)
+    assert [name[-1] for name in kinds(tmp_path)["kept"]] == ["b", "c"]
+
+
+def test_a_disk_that_hangs_holds_nobody_and_what_was_dropped_is_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    free, hangs = threading.Event(), threading.Event()
+    flush = RecordFile.flush
+
+    def slow(self: RecordFile) -> None:
+        hangs.set()
+        assert free.wait(60.0)
+        flush(self)
+
+    monkeypatch.setattr(RecordFile, "flush", slow)
+    monkeypatch.setattr(module, "SLOW_S", 0.1)
+    monkeypatch.setattr(module, "QUEUE_BYTES", 5 * picture(0, (100, 100)).nbytes)
+    one = recorder(tmp_path)
+    one.tell("command", "0", {"number": 0})
+    assert hangs.wait(20.0)
+    for number in range(20):
+        one.tell("frame", "navcam_left", frame(number, picture(0, (100, 100))))
+    until(lambda: one.faults(), "it says that the disk does not answer")
+    assert one.faults()[0].code == "slow"
+    assert one.told()["dropped"] == {"frame": 15}
+    free.set()
+    until(lambda: not one.faults(), "the disk answers")
+    one.close()
+    path = files(tmp_path)[-1]
+    assert told(path, "/recorder")[-1]["dropped"] == {"frame": 15}
+    assert len(told(path, "/camera/navcam_left/frame")) == 5
+
+
+def test_a_disk_that_refuses_is_a_fault_and_is_tried_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    full = [True]
+    flush = RecordFile.flush
+
+    def refusing(self: RecordFile) -> None:
+        if full[0]:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        flush(self)
+
+    monkeypatch.setattr(RecordFile, "flush", refusing)
+    monkeypatch.setattr(module, "AGAIN_S", 0.0)
+    one = recorder(tmp_path)
+    one.tell("command", "0", {"number": 0})
+    until(lambda: one.faults(), "it says so")
+    (fault,) = one.faults()
+    assert fault.code == "unwritable" and "No space left on device; nothing is recorded" in fault.message
+    with pytest.raises(Unable, match="cannot be written"):
+        one.start_run("now")
+    full[0] = False
+    one.tell("command", "1", {"number": 1})
+    until(lambda: not one.faults(), "it goes on")
+    one.close()
+    assert [n["number"] for n in told(files(tmp_path)[-1], "/command")] == [1]
+
+
+def test_the_room_of_others_is_left_free_the_ring_giving_way_first(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    left_mb = [5000.0]
+    monkeypatch.setattr(Shelf, "free_bytes", lambda self: int(left_mb[0] * 1e6))
+    monkeypatch.setattr(module, "AGAIN_S", 0.0)
+    one = recorder(tmp_path, free_mb=1000.0)
+    one.start_run("long")
+    one.tell("command", "0", {"number": 0})
+    left_mb[0] = 900.0
+    until(lambda: one.faults(), "it stops before the disk is full")
+    (fault,) = one.faults()
+    assert fault.code == "disk_low" and "900 MB free where 1000 MB are left to others" in fault.message
+    assert one.told()["run"] is None
+    with pytest.raises(Unable, match="900 MB free"):
+        one.start_run("more")
+    left_mb[0] = 1050.0  # a little more is not enough: it would end again at once
+    one.tell("command", "1", {"number": 1})
+    until(lambda: not one._queue, "it is read")
+    assert one.faults()
+    left_mb[0] = 2000.0
+    one.tell("command", "2", {"number": 2})
+    until(lambda: not one.faults(), "it goes on")
+    one.close()
+    assert all(Found is not None and list(read_items(path)) for path in files(tmp_path))
+
+
+def test_a_run_ends_at_its_size_and_says_so(tmp_path: Path) -> None:
+    one = recorder(tmp_path, run_mb=1.0, ring_s=0.0)
+    one.start_run("full")
+    number = 0
+    while one.told()["run"]:
+        number += 1
+        one.tell("frame", "navcam_left", frame(number, picture(number, (300, 1000))))
+        until(lambda: not one._queue, "it writes")
+        assert number < 200
+    until(lambda: one.faults(), "it says so")
+    assert one.faults()[0].code == "run_full"
+    one.close()
+
+
+def test_another_mast_file_is_attached_and_its_cameras_told_when_it_comes(tmp_path: Path) -> None:
+    one = recorder(tmp_path)
+    one.tell("joints", "pan_tilt", reading(0.1))
+    other = Attached("other.yaml", b"another mast file")
+    one.use_mast(MastTold(mast().rig, other))
+    one.tell("joints", "pan_tilt", reading(0.2))
+    one.close()
+    (path,) = files(tmp_path)
+    digests = [one["mast_digest"] for one in told(path, "/camera/navcam_left/cahvor")]
+    assert digests == [mast().file.digest, other.digest]
+    from mcap.reader import make_reader
+
+    with path.open("rb") as file:
+        assert other.data in [bytes(one.data) for one in make_reader(file).iter_attachments()]
+
+
+def test_a_head_at_rest_writes_next_to_nothing(tmp_path: Path) -> None:
+    one = recorder(tmp_path)
+    for _ in range(500):
+        one.tell("joints", "pan_tilt", reading(0.1, moving=False))
+    one.close()
+    (path,) = files(tmp_path)
+    assert len(told(path, "/joints")) == 1
+
+
+def test_an_operations_end_leaves_its_residuals_and_target_once(tmp_path: Path) -> None:
+    pointing = {"residual_px": [0.1, 0.2], "residual_sigma_px": [0.05, 0.05], "frame_id": "f"}
+    record: dict[str, Any] = {"id": "000001-ab", "state": "running", "result": None, "ended_s": None}
+    one = recorder(tmp_path)
+    one.tell("operation", "000001-ab", record)
+    done = record | {"state": "done", "ended_s": 2.0}
+    done["result"] = {"position_m": [1.0, 2.0, 3.0], "range_m": 4.0, "pointings": [pointing, pointing]}
+    one.tell("operation", "000001-ab", done)
+    one.tell("operation", "000001-ab", done)
+    one.close()
+    (path,) = files(tmp_path)
+    assert [row["pointing"] for row in told(path, "/residual")] == [1, 2]
+    assert told(path, "/target") == [
+        {"operation": "000001-ab", "position_m": [1.0, 2.0, 3.0], "range_m": 4.0}
+    ]
+
+
+def test_a_value_that_cannot_be_told_spoils_nothing_else(tmp_path: Path) -> None:
+    one = recorder(tmp_path)
+    one.tell("frame", "navcam_left", "no frame at all")
+    one.tell("command", "1", {"number": 1})
+    one.close()
+    (path,) = files(tmp_path)
+    assert sum(isinstance(item, Entry) for item in read_items(path)) == sum(1 for _ in messages(path))
+    assert told(path, "/command") == [{"number": 1}]

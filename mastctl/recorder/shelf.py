@@ -1,0 +1,167 @@
+"""The folder of recordings: the ring's segments, what was kept at faults, and runs; each within its bound.
+
+    ring/      000001-20261122T120341Z.mcap ...       goes round
+    kept/      20261122T120341Z-pan_tilt-no_reply/    segments of the ring, moved here at a fault
+    runs/      20261122T120341Z-NAME.mcap             begun and ended by command
+
+Segments are moved, not copied: keeping them needs no room and no time, on a full disk either.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import re
+import shutil
+from collections.abc import Iterable
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+
+SUFFIX = ".mcap"
+MB = 1e6
+_NOT_IN_NAMES = re.compile(r"[^A-Za-z0-9_.-]+")
+
+
+@dataclass(frozen=True)
+class Recorded:
+    """One recording on the disk: a run, what was kept at a fault, or the ring."""
+
+    name: str
+    kind: str
+    files: tuple[Path, ...]
+    size_bytes: int
+
+    def told(self) -> dict[str, object]:
+        """Return it as JSON."""
+        return {
+            "name": self.name,
+            "kind": self.kind,
+            "size_mb": self.size_bytes / MB,
+            "files": len(self.files),
+        }
+
+
+class Shelf:
+    """The files of one daemon's recordings; used by the recorder's writing thread, read by any.
+
+    Raises
+    ------
+    OSError
+        From every method, if the disk does not do what is asked.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self._ring, self._kept, self._runs = (folder / name for name in ("ring", "kept", "runs"))
+
+    def prepare(self) -> None:
+        """Make the folders."""
+        for one in (self._ring, self._kept, self._runs):
+            one.mkdir(mode=0o700, parents=True, exist_ok=True)
+
+    def free_bytes(self) -> int:
+        """Return what is free on the disk for this user."""
+        room = os.statvfs(self.folder)
+        return room.f_bavail * room.f_frsize
+
+    def next_segment(self) -> Path:
+        """Return the name of the ring's next file."""
+        numbers = [int(path.name[:6]) for path in _files(self._ring) if path.name[:6].isdigit()]
+        return self._ring / f"{max(numbers, default=0) % 999_999 + 1:06d}-{_stamp()}{SUFFIX}"
+
+    def next_run(self, name: str) -> Path:
+        """Return the file of a run that begins now; its name is not taken."""
+        return _untaken(self._runs, f"{_stamp()}{_worded(name)}", SUFFIX)
+
+    def trim_ring(self, ring_s: float, ring_mb: float) -> None:
+        """Let the oldest segments go: those that ended ``ring_s`` before the newest one did, by the files'
+        times, and what is beyond the ring's size. The newest stays.
+        """
+        segments = [(path, path.stat()) for path in _files(self._ring)]
+        while len(segments) > 1 and (
+            sum(told.st_size for _, told in segments) > ring_mb * MB
+            or segments[0][1].st_mtime < segments[-1][1].st_mtime - ring_s
+        ):
+            segments.pop(0)[0].unlink(missing_ok=True)
+
+    def drop_oldest_segment(self) -> bool:
+        """Let the ring's oldest segment go; False if there is none beside the newest."""
+        segments = _files(self._ring)
+        if len(segments) < 2:
+            return False
+        segments[0].unlink(missing_ok=True)
+        return True
+
+    def keep_ring(self, why: str, kept_mb: float) -> str:
+        """Move the ring's segments to a folder of their own and return its name, empty if there are none;
+        the oldest kept ones go.
+        """
+        if not _files(self._ring):
+            return ""
+        place = _untaken(self._kept, f"{_stamp()}{_worded(why)}", "")
+        place.mkdir(mode=0o700)
+        for path in _files(self._ring):
+            path.rename(place / path.name)
+        kept = [one for one in self.all() if one.kind == "kept"]
+        while len(kept) > 1 and sum(one.size_bytes for one in kept) > kept_mb * MB:
+            shutil.rmtree(self._kept / kept.pop(0).name, ignore_errors=True)
+        return place.name
+
+    def all(self) -> list[Recorded]:
+        """Return every recording, the oldest of each kind first."""
+        found = [_recorded(path.stem, "run", [path]) for path in _files(self._runs)]
+        with contextlib.suppress(FileNotFoundError):
+            folders = sorted(path for path in self._kept.iterdir() if path.is_dir())
+            found += [_recorded(path.name, "kept", _files(path)) for path in folders]
+        if segments := _files(self._ring):
+            found.append(_recorded("ring", "ring", segments))
+        return found
+
+
+def recording_files(path: Path) -> list[Path]:
+    """Return the files of a recording that is named by its file, or by the folder of its segments.
+
+    Raises
+    ------
+    FileNotFoundError
+        If there is nothing.
+    """
+    files = _files(path) if path.is_dir() else [path]
+    if not files or not files[0].exists():
+        raise FileNotFoundError(f"{path}: there is no recording")
+    return files
+
+
+def _files(folder: Path) -> list[Path]:
+    """The recordings in a folder, by name: the order in which they were made."""
+    try:
+        return sorted(path for path in folder.iterdir() if path.suffix == SUFFIX)
+    except FileNotFoundError:
+        return []
+
+
+def _recorded(name: str, kind: str, files: Iterable[Path]) -> Recorded:
+    sizes = {}
+    for path in files:
+        with contextlib.suppress(FileNotFoundError):  # it went round meanwhile
+            sizes[path] = path.stat().st_size
+    return Recorded(name, kind, tuple(sizes), sum(sizes.values()))
+
+
+def _stamp() -> str:
+    return datetime.now(UTC).strftime("%Y%m%dT%H%M%SZ")
+
+
+def _worded(words: str) -> str:
+    """Words as a part of a file's name."""
+    plain = _NOT_IN_NAMES.sub("-", words).strip("-.")[:60]
+    return f"-{plain}" if plain else ""
+
+
+def _untaken(folder: Path, name: str, suffix: str) -> Path:
+    path, number = folder / f"{name}{suffix}", 1
+    while path.exists():
+        number += 1
+        path = folder / f"{name}-{number}{suffix}"
+    return path

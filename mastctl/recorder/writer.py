@@ -1,0 +1,216 @@
+"""One MCAP file that a killed daemon leaves readable: chunks of half a second, each on the disk when written.
+
+The library's writer buffers, does not sync, and writes its index at the end. Here the file is unbuffered,
+mast file and configuration stand at its start with their digests, and every chunk is flushed and synced, so
+that what was recorded up to a second before a power cut is whole (`drivers.mcap_file` reads it).
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from google.protobuf.message import Message
+from mcap.well_known import MessageEncoding, SchemaEncoding
+from mcap.writer import CompressionType, Writer
+
+from mastctl.recorder.schemas import descriptor_set, json_schema
+
+PROFILE = "mastctl/record/1"
+CHUNK_BYTES = 4 << 20
+FLUSH_S = 0.5
+"""A chunk is closed when its first message is this old: half of what may be lost."""
+
+_NS = 1_000_000_000
+
+
+@dataclass(frozen=True)
+class Attached:
+    """A file that travels with a recording."""
+
+    name: str
+    data: bytes
+    media_type: str = "application/yaml"
+
+    @property
+    def digest(self) -> str:
+        """SHA-256 of its bytes, hex."""
+        return hashlib.sha256(self.data).hexdigest()
+
+
+@dataclass(frozen=True)
+class Clocks:
+    """What ties the daemon's clock to the calendar: one pair for a file, so that a clock set back does not
+    show in it.
+    """
+
+    monotonic_s: float
+    unix_ns: int
+
+    def ns(self, time_s: float) -> int:
+        """Return a moment of the daemon's clock as nanoseconds since 1970."""
+        return max(0, self.unix_ns + round((time_s - self.monotonic_s) * 1e9))
+
+
+class RecordFile:
+    """An MCAP file that grows. Not for several threads at once.
+
+    Parameters
+    ----------
+    path
+        Made; it must not exist yet.
+    attached
+        Mast file and configuration, written first.
+    facts
+        Words about the recording: metadata ``mastctl``.
+    clocks
+        Stamps the messages.
+
+    Raises
+    ------
+    OSError
+        From every method, if the file cannot be written. Then it is as a killed daemon leaves it.
+    """
+
+    def __init__(
+        self, path: Path, attached: list[Attached], facts: Mapping[str, str], clocks: Clocks
+    ) -> None:
+        self.path = path
+        self.clocks = clocks
+        self._file = path.open("xb", buffering=0)
+        self._writer = Writer(_Whole(self._file), chunk_size=1 << 40, compression=CompressionType.ZSTD)  # type: ignore[arg-type]
+        self._channels: dict[tuple[str, str], int] = {}
+        self._schemas: dict[str, int] = {}
+        self._counts: dict[int, int] = {}
+        self._open_since_s: float | None = None
+        self._gathered = 0
+        self._size = 0
+        self._attached: set[str] = set()
+        try:
+            self._begin(attached, facts)
+            _sync_folder(path.parent)
+        except BaseException:
+            self._file.close()
+            path.unlink(missing_ok=True)  # there is nothing in it
+            raise
+
+    def _begin(self, attached: list[Attached], facts: Mapping[str, str]) -> None:
+        self._writer.start(PROFILE, "mastctl")
+        digests = {f"sha256 {one.name}": one.digest for one in attached}
+        clocks = {"monotonic_s": repr(self.clocks.monotonic_s), "unix_ns": str(self.clocks.unix_ns)}
+        self._writer.add_metadata("mastctl", {**facts, **clocks, **digests})
+        for one in attached:
+            self.attach(one, self.clocks.unix_ns)
+        self.flush()
+
+    def attach(self, one: Attached, time_ns: int) -> None:
+        """Put a file into the recording, unless the same is in it."""
+        if one.digest in self._attached:
+            return
+        self._attached.add(one.digest)
+        self._writer.flush()  # type: ignore[no-untyped-call]  # what was gathered comes before it
+        self._writer.add_attachment(time_ns, time_ns, one.name, one.media_type, one.data)
+
+    @property
+    def size(self) -> int:
+        """Bytes written, and those of the chunk that is gathered."""
+        return self._size + self._gathered
+
+    @property
+    def size_mb(self) -> float:
+        """`size` in 10⁶ bytes; asked from any thread."""
+        return self._size / 1e6
+
+    def add_json(self, topic: str, kind: str, told: Mapping[str, Any], time_s: float, now_s: float) -> None:
+        """Add one JSON message; ``kind`` names its schema. ``now_s`` is the flush's clock."""
+        data = json.dumps(told, allow_nan=False, separators=(",", ":")).encode()
+        self._add(topic, f"mastctl.{kind}", data, time_s, now_s)
+
+    def add_message(self, topic: str, message: Message, time_s: float, now_s: float) -> None:
+        """Add one of Foxglove's messages."""
+        self._add(topic, message.DESCRIPTOR.full_name, message.SerializeToString(), time_s, now_s)
+
+    def flush_if_due(self, now_s: float) -> bool:
+        """Put the gathered chunk on the disk if it is old enough; return whether it was."""
+        if self._open_since_s is None or now_s - self._open_since_s < FLUSH_S:
+            return False
+        self.flush()
+        return True
+
+    def flush(self) -> None:
+        """Put on the disk what was gathered."""
+        self._open_since_s = None
+        self._gathered = 0
+        self._writer.flush()  # type: ignore[no-untyped-call]
+        os.fdatasync(self._file.fileno())
+        self._size = self._file.tell()
+
+    def finish(self) -> None:
+        """Write the index and close the file."""
+        try:
+            self._writer.finish()  # type: ignore[no-untyped-call]
+            os.fdatasync(self._file.fileno())
+        finally:
+            self._file.close()
+
+    def abandon(self) -> None:
+        """Close the file as it is; a repair makes it whole."""
+        self._file.close()
+
+    def _add(self, topic: str, schema: str, data: bytes, time_s: float, now_s: float) -> None:
+        channel = self._channels.get((topic, schema))
+        if channel is None:
+            channel = self._channel(topic, schema)
+        if self._open_since_s is None:
+            self._open_since_s = now_s
+        number = self._counts[channel] = self._counts.get(channel, 0) + 1
+        time_ns = self.clocks.ns(time_s)
+        self._gathered += len(data)
+        self._writer.add_message(channel, time_ns, data, time_ns, number)
+        if self._gathered > CHUNK_BYTES:
+            self.flush()
+
+    def _channel(self, topic: str, schema: str) -> int:
+        protobuf = schema.startswith("foxglove.")
+        if schema not in self._schemas:
+            kind = schema.removeprefix("mastctl.")
+            data = descriptor_set(schema) if protobuf else json.dumps(json_schema(kind)).encode()
+            encoding = SchemaEncoding.Protobuf if protobuf else SchemaEncoding.JSONSchema
+            self._schemas[schema] = self._writer.register_schema(schema, encoding, data)
+        encoding = MessageEncoding.Protobuf if protobuf else MessageEncoding.JSON
+        channel = self._writer.register_channel(topic, encoding, self._schemas[schema])
+        self._channels[topic, schema] = channel
+        return channel
+
+
+def _sync_folder(folder: Path) -> None:
+    """Have the new file's name on the disk too."""
+    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+class _Whole:
+    """An unbuffered file whose writes are whole or an error: the kernel may take only a part of one."""
+
+    def __init__(self, file: Any) -> None:
+        self._file = file
+
+    def write(self, data: Any) -> int:
+        view = memoryview(data)
+        while view:
+            view = view[self._file.write(view) :]
+        return len(data)
+
+    def tell(self) -> int:
+        return int(self._file.tell())
+
+    def flush(self) -> None:
+        """Nothing is held back."""

@@ -1,0 +1,203 @@
+"""A recorder killed at random moments, many times: what of its recording is lost, and is the rest whole?
+
+    python -m tools.campaigns.record_kills [--kills N] [--at-once N] [--seed S] [--folder DIR]
+
+Each child tells a recorder a numbered message every 5 ms and a picture every 50 ms, and notes in shared
+memory which it told last and when; it gets SIGKILL after 0.1 to 3 s. Then its files must begin with the mast
+file, hold every number from the first to the last without a gap, and after a repair be read whole by the
+mcap library's own reader. Told is how long before its end a child's last message that is on the disk was.
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import json
+import mmap
+import os
+import random
+import shutil
+import signal
+import struct
+import tempfile
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from mcap.reader import make_reader
+from mcap.records import Attachment
+
+from calib.files.mast_file import parse_rig
+from drivers.clock import SystemClock
+from drivers.mcap_file import Entry, Found, read_items
+from mastctl.cli.output import at_least
+from mastctl.devices.frames import StampedFrame
+from mastctl.packaged import default_config
+from mastctl.recorder.recorder import MastTold, Recorder
+from mastctl.recorder.repair import repair
+from mastctl.recorder.settings import RecordSettings
+from mastctl.recorder.writer import Attached
+from tools.arguments import end
+
+MOST_LOST_S = 1.0
+STEP_S = 0.005
+FRAME_EVERY = 10
+PLACE = struct.Struct("<qd")
+
+
+@dataclass(frozen=True)
+class Killed:
+    """What one child left."""
+
+    told: int
+    recorded: int
+    lost_s: float
+    left_over_bytes: int
+    wrong: str = ""
+
+
+def mast_of(config: Path) -> MastTold:
+    """Return the mast file that a configuration names."""
+    from mastctl.config import load_config
+
+    path = load_config(config).mast_file
+    data = path.read_bytes()
+    return MastTold(parse_rig(data, path).rig, Attached(path.name, data))
+
+
+def record_until_killed(folder: Path, mast: MastTold, seed: int, told: mmap.mmap) -> None:
+    """What a child does: tell a recorder numbers and pictures, for ever."""
+    pixels = np.random.default_rng(seed)
+    clock = SystemClock()
+    settings = RecordSettings(ring_s=4.0, free_mb=0.0)  # segments of two thirds of a second
+    recorder = Recorder(settings, folder, mast, [], {}, clock)
+    number, next_s = 0, time.monotonic()
+    while True:
+        number += 1
+        now_s = clock.now_s()
+        recorder.tell("command", str(number), {"number": number, "told_s": time.monotonic()}, now_s)
+        if number % FRAME_EVERY == 0:
+            image = pixels.integers(0, 256, (48, 64), np.uint8)
+            facts = (f"f{number}", "navcam_left", number, now_s, 0.001, 0.0, 0.0, False, mast.file.digest)
+            recorder.tell("frame", "navcam_left", StampedFrame(*facts, image), now_s)
+        PLACE.pack_into(told, 0, number, time.monotonic())
+        next_s += STEP_S
+        time.sleep(max(0.0, next_s - time.monotonic()))
+
+
+def judged(folder: Path, mast: MastTold, told: mmap.mmap, killed_s: float) -> Killed:
+    """Read what a killed child left."""
+    last_told, told_s = PLACE.unpack_from(told, 0)
+    numbers: list[tuple[int, float]] = []
+    wrong, left_over = "", 0
+    for path in sorted(folder.rglob("*.mcap")):
+        found, digests, mine = Found(), [], []
+        for item in read_items(path, found):
+            if isinstance(item, Attachment):
+                digests.append(hashlib.sha256(item.data).hexdigest())
+            elif isinstance(item, Entry) and item.channel.topic == "/command":
+                told_there = json.loads(item.message.data)
+                mine.append((told_there["number"], told_there["told_s"]))
+        left_over += found.left_over_bytes
+        numbers += mine
+        if mine and mast.file.digest not in digests:
+            wrong = f"{path.name}: the mast file is not in it as it was"
+        if found.damaged:
+            wrong = f"{path.name}: {found.damaged} damaged chunks before its end"
+        out = path.with_suffix(".repaired")
+        if repair([path], out).messages != _by_the_library(out):
+            wrong = f"{path.name}: the library reads another count from the repaired file"
+        out.unlink()
+    last = numbers[-1][0] if numbers else 0
+    if [number for number, _ in numbers] != list(range(1, last + 1)):
+        wrong = f"{len(numbers)} messages where 1 to {last} are expected"
+    lost_s = told_s - numbers[-1][1] if numbers else killed_s
+    return Killed(last_told, last, lost_s if last < last_told else 0.0, left_over, wrong)
+
+
+def _by_the_library(path: Path) -> int:
+    with path.open("rb") as file:
+        return sum(1 for _ in make_reader(file, validate_crcs=True).iter_messages())
+
+
+@dataclass
+class Child:
+    """A child at work, and when it gets its signal."""
+
+    pid: int
+    folder: Path
+    told: mmap.mmap
+    began_s: float
+    kill_s: float
+
+
+def begun(folder: Path, mast: MastTold, seed: int, life_s: float) -> Child:
+    """Start a child."""
+    folder.mkdir()
+    told = mmap.mmap(-1, PLACE.size)
+    now_s = time.monotonic()
+    pid = os.fork()
+    if pid == 0:
+        try:
+            record_until_killed(folder, mast, seed, told)
+        finally:
+            os._exit(1)
+    return Child(pid, folder, told, now_s, now_s + life_s)
+
+
+def ended(child: Child, mast: MastTold) -> Killed:
+    """Kill a child and judge what it left."""
+    os.kill(child.pid, signal.SIGKILL)
+    _, status = os.waitpid(child.pid, 0)
+    if not os.WIFSIGNALED(status):
+        return Killed(0, 0, 0.0, 0, "it ended by itself")
+    return judged(child.folder, mast, child.told, time.monotonic() - child.began_s)
+
+
+def kills(count: int, at_once: int, seed: int, folder: Path) -> list[Killed]:
+    """Kill ``count`` children, ``at_once`` at a time, and return what each left."""
+    chance = random.Random(seed)
+    mast = mast_of(default_config())
+    running: list[Child] = []
+    results: list[Killed] = []
+    begins = iter(range(count))
+    while len(results) < count:
+        while len(running) < at_once and (number := next(begins, None)) is not None:
+            running.append(begun(folder / f"{number:04d}", mast, number, chance.uniform(0.1, 3.0)))
+        child = min(running, key=lambda one: one.kill_s)
+        time.sleep(max(0.0, child.kill_s - time.monotonic()))
+        running.remove(child)
+        result = ended(child, mast)
+        results.append(result)
+        if not result.wrong:
+            shutil.rmtree(child.folder)
+    return results
+
+
+def main(words: Sequence[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--kills", type=at_least(1), default=1000, help="how many (default 1000)")
+    parser.add_argument(
+        "--at-once", type=at_least(1), default=4, help="children beside each other (default 4)"
+    )
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--folder", type=Path, help="where recordings lie (default: a temporary folder)")
+    args = parser.parse_args(words)
+    with tempfile.TemporaryDirectory(dir=args.folder) as folder:
+        results = kills(args.kills, args.at_once, args.seed, Path(folder))
+    wrong = [one.wrong for one in results if one.wrong]
+    lost = sorted(one.lost_s for one in results)
+    print(f"kills {len(results)}, messages told {sum(one.told for one in results)}, ", end="")
+    print(f"on the disk {sum(one.recorded for one in results)}")
+    print(f"lost: median {lost[len(lost) // 2]:.3f} s, 99 % {lost[len(lost) * 99 // 100]:.3f} s, ", end="")
+    print(f"most {lost[-1]:.3f} s (allowed {MOST_LOST_S:g} s)")
+    print(f"ends cut off {sum(one.left_over_bytes > 0 for one in results)}, wrong {len(wrong)}")
+    for one in wrong[:10]:
+        print(f"  {one}")
+    return 1 if wrong or lost[-1] > MOST_LOST_S else 0
+
+
+if __name__ == "__main__":
+    end(main)
