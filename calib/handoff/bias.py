@@ -7,7 +7,6 @@ stands out says that the two cameras do not mean the same rover frame (the paper
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -103,17 +102,17 @@ def _mean(source: str, camera: str, off_px: FloatArray, covariance_px2: FloatArr
     information = weights[keep].sum(axis=0)
     mean = np.linalg.solve(information, np.einsum("nij,nj->i", weights[keep], off_px[keep]))
     rest = off_px[keep] - mean
-    freedom = 2.0 * int(keep.sum()) - 2.0
+    freedom = 2.0 * int(keep.sum()) - 2.0  # the better half is always kept, of two offsets both
     chi2 = float(np.einsum("ni,nij,nj->", rest, weights[keep], rest))
-    scale = max(1.0, chi2 / freedom) if freedom else math.inf
-    probability = chance(float(mean @ information @ mean), 2, scale, freedom) if freedom else 1.0
+    scale = max(1.0, chi2 / freedom)
+    probability = chance(float(mean @ information @ mean), 2, scale, freedom)
     return HandoffBias(
         source,
         camera,
         int(keep.sum()),
         int(np.sum(~keep)),
         mean,
-        np.linalg.inv(information) * (scale if freedom else 1.0),
+        np.linalg.inv(information) * scale,
         probability,
         sigmas(probability),
     )

@@ -58,6 +58,15 @@ def test_a_blunder_does_not_make_an_offset() -> None:
     assert bias.left_out == 1 and not bias.significant
 
 
+@pytest.mark.parametrize("apart_px", [0.1, 5.0, 400.0])
+def test_of_two_offsets_both_count_however_far_apart(apart_px: float) -> None:
+    (bias,) = handoff_bias(record(np.array([[0.0, 1.0], [apart_px, 1.0]])))
+    assert bias.handoffs == 2 and bias.left_out == 0
+    assert bias.offset_px == pytest.approx([apart_px / 2, 1.0])
+    # half their distance, or what the matches' sigma says of a mean of two
+    assert np.sqrt(bias.covariance_px2[0, 0]) >= max(0.43 / np.sqrt(2.0), apart_px / np.sqrt(8.0) * 0.99)
+
+
 def test_significance_is_that_of_the_normal_distribution() -> None:
     # Standard tables: 5 % of chi-square with two degrees of freedom, 5 % of F(2, 10); two and three sigma.
     assert chance(5.991, 2) == pytest.approx(0.05, abs=1e-4)

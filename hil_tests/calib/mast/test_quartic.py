@@ -44,6 +44,12 @@ def test_leading_coefficients_may_vanish(tiny: float) -> None:
     )
 
 
+def test_a_root_between_two_level_turns_is_found() -> None:
+    """t³ - 3 t is level at -1 and at 1 exactly, where a search for the root between them begins."""
+    expected = np.sort(np.roots([1.0, 0.0, -3.0, 0.5]).real)
+    np.testing.assert_allclose(roots_between((0.0, 1.0, 0.0, -3.0, 0.5), -3.0, 3.0), expected, atol=NEAR)
+
+
 def test_a_minimum_just_above_zero_counts_only_when_asked() -> None:
     nearly_double = (0.0, 0.0, 1.0, -2.0, 1.0 + 1e-13)
     assert roots_between(nearly_double, -5.0, 5.0) == []

@@ -764,6 +764,20 @@ def test_two_programs_cannot_have_the_same_line(opened: Opener) -> None:
             head.close()
 
 
+def test_a_unit_that_is_refused_leaves_the_line_to_the_next_try() -> None:
+    unit = ScriptedPtu()
+    unit.resolutions["P"] = "92.571428"
+    options = {**OPTIONS, "pan": {**OPTIONS["pan"], "resolution_arcsec": 185.0}}
+    with PtyLine(unit, SystemClock(), wire_time=False) as line:
+        refusals = []  # kept, and with them the heads that came to nothing
+        for _ in range(2):
+            with pytest.raises(WrongDevice) as refused:
+                open_head({**options, "port": line.path})
+            refusals.append(refused)
+        unit.resolutions["P"] = "185.142857"
+        open_head({**options, "port": line.path}).close()
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [

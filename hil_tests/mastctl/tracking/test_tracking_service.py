@@ -194,6 +194,20 @@ def test_a_lost_target_stays_lost_with_its_reason_until_a_look_finds_it(
     assert (track["state"], track["reason"], track["misses"]) == ("tracking", "", 0)
 
 
+def test_how_often_the_picture_that_is_followed_was_exchanged_is_counted(
+    client: Client, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    renewed = iter((True, False, True))
+
+    def renewing(track: Track) -> tuple[Track, Sighting]:
+        after, told = found(track)
+        return after, replace(told, renewed=next(renewed))
+
+    monkeypatch.setattr(ScriptedLooker, "script", staticmethod(renewing))
+    started(client)
+    assert [drive(client, 0.1 * n, 1.0 + n)["renewals"] for n in (1, 2, 3)] == [1, 1, 2]
+
+
 def test_a_pose_that_pictures_contradict_is_told_while_the_target_is_tracked(
     client: Client, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
