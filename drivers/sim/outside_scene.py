@@ -75,6 +75,9 @@ class OutsideScene(Scene):
             )
         if np.isnan(brightness).any():
             raise DriverError(f"{told} returned a brightness that is not a number, expected 0 to 255")
+        if (ranges_m < 0.0).any():
+            least_m = float(np.nanmin(ranges_m))
+            raise DriverError(f"{told} returned the range {least_m:g} m, expected 0 or more, nan for sky")
         return ranges_m, brightness
 
     def cast(self, origins_m: ArrayLike, directions: ArrayLike) -> Float64:

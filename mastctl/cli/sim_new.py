@@ -61,9 +61,10 @@ def run(args: argparse.Namespace) -> int:
     """Write the folder and tell what is in it."""
     import numpy as np
 
+    from drivers.hardware import DeviceSettings, HardwareSettings
+    from drivers.open_hardware import clock_for
     from drivers.sim.pan_tilt import head_settings
     from drivers.sim.wired_head import DEFAULT_HEADS, check_head
-    from drivers.simulation_clock import simulation_speed
     from mastctl.new_rig.folder import boards_about, check_empty, write_built, write_twin
     from mastctl.new_rig.numbers import built_rig
 
@@ -81,7 +82,7 @@ def run(args: argparse.Namespace) -> int:
         simulation["scene"] = {"boards": boards_about(args.boards)}
     if args.speed is not None:
         simulation["speed"] = args.speed if args.speed == "max" else _number(args.speed)
-        simulation_speed(simulation["speed"])
+    clock_for(HardwareSettings(DeviceSettings("sim"), {}, simulation))  # refuses a speed that is none here
     if args.wire is not None:
         check_head(args.wire, head_settings(args.head or DEFAULT_HEADS[args.wire]))
     check_folder(args.folder, "FOLDER")

@@ -30,7 +30,7 @@ class Scene:
     def look(self, origins_m, directions, pitch_rad):
         if self.fault == "raises": raise RuntimeError("no such mesh")
         n = len(origins_m) + (self.fault == "long")
-        return [1.0] * n, [float("nan") if self.fault == "nan" else 90.0] * n
+        return [-2.0 if self.fault == "behind" else 1.0] * n, [float("nan") if self.fault == "nan" else 90.0] * n
 class Blind: pass
 def opened(seed, fault): return Blind() if fault == "blind" else Scene(fault)
 """
@@ -100,6 +100,7 @@ def test_pixels_show_what_their_own_rays_see(outside: Path) -> None:
         ("broken_scene:opened", {"fault": "raises"}, r"failed to look \(RuntimeError: no such mesh\)"),
         ("broken_scene:opened", {"fault": "long"}, r"ranges \(3,\) and brightness \(3,\) for 2 rays"),
         ("broken_scene:opened", {"fault": "nan"}, "a brightness that is not a number"),
+        ("broken_scene:opened", {"fault": "behind"}, "the range -2 m, expected 0 or more, nan for sky"),
     ],
 )
 def test_a_scene_that_fails_is_refused_at_the_start(

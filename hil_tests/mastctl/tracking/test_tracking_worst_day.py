@@ -18,9 +18,12 @@ from mastctl.config import load_config
 from mastctl.daemon import RunningDaemon
 
 
-@pytest.fixture(scope="module")
-def daemon(repository: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunningDaemon]:
-    """The small rover of the kind day with the worst day's head, clocks and temperature; nothing waits."""
+@pytest.fixture(scope="module", params=["head", "head and light"])
+def daemon(
+    request: pytest.FixtureRequest, repository: Path, tmp_path_factory: pytest.TempPathFactory
+) -> Iterator[RunningDaemon]:
+    """The small rover of the kind day with the worst day's head, clocks and temperature, without and with
+    its light; nothing waits."""
     folder = tmp_path_factory.mktemp("worst")
     rig = load_rig(repository / "configs/sim/rocky8.yaml").rig
     cameras = {name: cropped(rig.cameras[name]) for name in rig.stereo["navcam"]}
@@ -31,7 +34,9 @@ def daemon(repository: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterat
     worst = yaml.safe_load((repository / "configs/worst_day.yaml").read_text())
     life = {key: worst["simulation"][key] for key in ("head", "temperature")}
     life["clocks"] = {name: own for name, own in worst["simulation"]["clocks"].items() if name in cameras}
-    config["simulation"] = {**config["simulation"], **life, "speed": "max", "cameras": {"rate_hz": 10}}
+    light = worst["simulation"]["cameras"] if request.param == "head and light" else {}
+    cameras_of_the_day = {"rate_hz": 10, **light}
+    config["simulation"] = {**config["simulation"], **life, "speed": "max", "cameras": cameras_of_the_day}
     config["cameras"]["navcam_right"] = worst["cameras"]["navcam_right"]
     (folder / "rover.yaml").write_text(yaml.safe_dump(config))
     with RunningDaemon(load_config(folder / "rover.yaml")) as made:
