@@ -30,7 +30,8 @@ class Scene:
     def look(self, origins_m, directions, pitch_rad):
         if self.fault == "raises": raise RuntimeError("no such mesh")
         n = len(origins_m) + (self.fault == "long")
-        return [-2.0 if self.fault == "behind" else 1.0] * n, [float("nan") if self.fault == "nan" else 90.0] * n
+        range_m = -2.0 if self.fault == "behind" else 1.0
+        return [range_m] * n, [float("nan") if self.fault == "nan" else 90.0] * n
 class Blind: pass
 def opened(seed, fault): return Blind() if fault == "blind" else Scene(fault)
 """
