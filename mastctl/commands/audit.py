@@ -18,7 +18,7 @@ from queue import Empty, SimpleQueue
 from typing import Any
 
 from drivers.clock import Clock, SystemClock
-from mastctl.devices.faults import StandingFault
+from mastctl.state.faults import StandingFault
 
 log = logging.getLogger(__name__)
 

@@ -24,11 +24,12 @@ from drivers.interfaces import Camera, Frame, FrameTime, KnowsSize, Paced, Readi
 from drivers.pairing import Offset, Pairing, learned
 from mastctl.devices import frames as frame_checks
 from mastctl.devices.exposure_hold import ExposureHold
-from mastctl.devices.faults import FaultWords, StandingFault
+from mastctl.devices.faults import FaultWords
 from mastctl.devices.frames import FrameStore, StampedFrame
 from mastctl.devices.joint_history import JointHistory
 from mastctl.devices.thread import Asked, DeviceThread
 from mastctl.errors import NoLonger
+from mastctl.state.faults import StandingFault
 
 log = logging.getLogger(__name__)
 

@@ -26,13 +26,14 @@ from drivers.interfaces import (
 )
 from mastctl.devices import joint_history
 from mastctl.devices.cameras import Cameras
-from mastctl.devices.faults import FaultWords, StandingFault
+from mastctl.devices.faults import FaultWords
 from mastctl.devices.frames import FrameStore, StampedFrame
 from mastctl.devices.joint_history import JointHistory
 from mastctl.devices.limits import Limits
 from mastctl.devices.stops import Stops
 from mastctl.devices.thread import DeviceThread
 from mastctl.errors import MastctlError, Stopped
+from mastctl.state.faults import StandingFault
 
 log = logging.getLogger(__name__)
 

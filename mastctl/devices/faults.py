@@ -1,27 +1,8 @@
-"""What is wrong with a device or a file at a moment, in plain words, and what takes it back."""
+"""What belongs to the faults of a device's calls."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-
-
-@dataclass(frozen=True)
-class StandingFault:
-    """Something wrong with a device, in plain words.
-
-    Attributes
-    ----------
-    since_s
-        When it began, seconds of CLOCK_MONOTONIC.
-    until
-        What takes it back, in plain words that follow "until".
-    """
-
-    device: str
-    code: str
-    message: str
-    since_s: float
-    until: str
 
 
 @dataclass(frozen=True)

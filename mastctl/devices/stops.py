@@ -11,9 +11,9 @@ from dataclasses import dataclass
 
 from drivers.clock import Clock, SystemClock
 from drivers.errors import DriverError, LineLost, NoReply
-from mastctl.devices.faults import StandingFault
 from mastctl.devices.thread import DeviceThread, log
 from mastctl.errors import MastctlError, Stopped
+from mastctl.state.faults import StandingFault
 
 PATIENCE_S = 0.05  # how long a stop waits for the head's own thread before it goes out beside it
 LATEST_SHARE = 1 / 8  # of the time that a head hangs already: a new stop waits no longer for its own way

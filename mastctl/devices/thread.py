@@ -19,8 +19,9 @@ from typing import Any, Generic, TypeVar
 
 from drivers.clock import Clock, SystemClock
 from drivers.errors import DriverError, LineLost, NoReply
-from mastctl.devices.faults import FaultWords, StandingFault
+from mastctl.devices.faults import FaultWords
 from mastctl.errors import MastctlError
+from mastctl.state.faults import StandingFault
 
 log = logging.getLogger(__name__)
 T = TypeVar("T")

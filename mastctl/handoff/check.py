@@ -16,8 +16,8 @@ from calib.errors import BadFile
 from calib.handoff.bias import HandoffBias, handoff_bias
 from calib.handoff.matched import MatchedHandoff
 from drivers.clock import Clock, SystemClock
-from mastctl.devices.faults import StandingFault
 from mastctl.handoff.log import HandoffLog, bias_told, read_log
+from mastctl.state.faults import StandingFault
 
 log = logging.getLogger(__name__)
 

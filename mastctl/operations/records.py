@@ -7,17 +7,9 @@ from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 from mastctl.as_json import as_json
+from mastctl.state.standing import Residual
 
 OperationState = Literal["queued", "running", "done", "failed", "stopped"]
-
-
-@dataclass(frozen=True)
-class Residual:
-    """The last measured residual, pixels (x, y), with one sigma, and the operation that measured it."""
-
-    residual_px: tuple[float, float]
-    residual_sigma_px: tuple[float, float]
-    operation: str
 
 
 @dataclass(frozen=True)

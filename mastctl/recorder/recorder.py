@@ -23,13 +23,13 @@ from typing import Any, Protocol
 
 from calib.mast.rig import Rig
 from drivers.clock import Clock
-from mastctl.devices.faults import StandingFault
 from mastctl.devices.frames import StampedFrame
 from mastctl.errors import MastctlError, NotNow, Unable
 from mastctl.recorder.entries import Entries
 from mastctl.recorder.settings import RecordSettings
 from mastctl.recorder.shelf import MB, Shelf
 from mastctl.recorder.writer import Attached, Clocks, RecordFile
+from mastctl.state.faults import StandingFault
 
 log = logging.getLogger(__name__)
 

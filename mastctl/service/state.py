@@ -11,10 +11,10 @@ from typing import Any, Literal
 
 from drivers.interfaces import Reading
 from mastctl.as_json import as_json, picked
-from mastctl.devices.faults import StandingFault
 from mastctl.devices.frames import StampedFrame
 from mastctl.devices.limits import Limits
 from mastctl.operations.records import Motion
+from mastctl.state.faults import StandingFault
 from mastctl.tracking.status import TrackStatus
 
 StateWord = Literal["idle", "moving", "pointing", "stopping", "stopped", "fault"]

@@ -14,7 +14,8 @@ from drivers.simulation_clock import SimulationClock
 from hil_tests.mastctl.service_fakes import FakePointing, FakeResult, eventually
 from mastctl.errors import NotKnown, NotNow, Stopped, Unable, error_body
 from mastctl.operations.operations import CLOSING, KEPT_OPERATIONS, STOP_ASKED, Operations
-from mastctl.operations.records import Operation, Residual
+from mastctl.operations.records import Operation
+from mastctl.state.standing import Residual
 
 
 class Mover:

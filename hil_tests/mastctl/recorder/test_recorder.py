@@ -21,12 +21,12 @@ from hil_tests.mastctl.recorder.recorder_world import (
     told,
     until,
 )  # fmt: skip
-from mastctl.devices.faults import StandingFault
 from mastctl.errors import NotNow, Unable
 from mastctl.recorder import recorder as module
 from mastctl.recorder.recorder import MastTold
 from mastctl.recorder.shelf import Shelf
 from mastctl.recorder.writer import Attached, RecordFile
+from mastctl.state.faults import StandingFault
 from tools.campaigns.record_kills import MOST_LOST_S, kills
 
 FAULT = StandingFault("pan_tilt", "no_reply", "it does not answer", 1.0, "it answers")

@@ -8,11 +8,12 @@ import numpy as np
 import pytest
 
 from drivers.interfaces import Reading
-from mastctl.devices.faults import StandingFault
 from mastctl.devices.frames import StampedFrame
 from mastctl.devices.limits import Limits
-from mastctl.operations.records import Motion, Residual
+from mastctl.operations.records import Motion
 from mastctl.service.state import State
+from mastctl.state.faults import StandingFault
+from mastctl.state.standing import Residual
 from mastctl.tracking.status import TrackStatus
 
 REST = State(

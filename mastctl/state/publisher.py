@@ -1,0 +1,258 @@
+"""Each change of state published once, to listeners that get the newest and never hold anybody up.
+
+A subscriber has at most one value of each topic and key waiting for it. One that is slow loses values in
+between, never the newest, and is told how many it lost: `Publisher.publish` neither waits nor queues.
+
+    topic       key                 value
+    state       "machine"           `mastctl.state.standing.Standing`
+    joints      the head's name     `drivers.interfaces.Reading`
+    operation   its id              `mastctl.operations.records.Operation`, with the steps so far
+    track       "track"             `mastctl.tracking.status.TrackStatus`
+    fault       the device's name   tuple of `mastctl.state.faults.StandingFault`, empty when it is healthy
+    frame       the camera's name   facts of its newest frame, without the picture
+    mast        "in_use"            the mast file in use, as `GET /mast` tells it
+    command     its id              the record of a command
+    lease       "lease"             who steers
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import itertools
+import threading
+import time
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from types import TracebackType
+from typing import Any, Literal, Self, TypeVar, get_args
+
+from mastctl.state.in_turn import InTurn
+
+Topic = Literal["state", "joints", "operation", "track", "fault", "frame", "mast", "command", "lease"]
+TOPICS: frozenset[Topic] = frozenset(get_args(Topic))
+
+_Subscription = TypeVar("_Subscription", bound="Subscription")
+
+GONE: Any = object()
+
+
+@dataclass(frozen=True, eq=False)
+class Published:
+    """A value of a topic and key, which is never edited.
+
+    Attributes
+    ----------
+    sequence
+        Grows with each value that is published, whatever its topic.
+    """
+
+    sequence: int
+    topic: Topic
+    key: str
+    value: Any
+
+
+class Subscription:
+    """What one listener has not read yet. A context manager; one thread, or one coroutine, reads it.
+
+    Attributes
+    ----------
+    lost
+        How many values were replaced by newer ones before they were read.
+    """
+
+    def __init__(
+        self, topics: frozenset[Topic], wake: Callable[[], None], end: Callable[[Subscription], None]
+    ) -> None:
+        self.lost = 0
+        self._topics = topics
+        self._wake = wake
+        self._end = end
+        self._lock = threading.Lock()  # held while a mapping is changed or handed over, never for longer
+        self._unread: dict[tuple[Topic, str], Published] = {}
+        self._closed = False
+
+    @property
+    def closed(self) -> bool:
+        """Whether no more will come: it was closed, or its publisher was."""
+        return self._closed
+
+    def close(self) -> None:
+        """Hear no more; who waits is woken."""
+        self._end(self)
+        self._ended()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def _take_unread(self) -> list[Published]:
+        with self._lock:
+            unread, self._unread = self._unread, {}
+        return sorted(unread.values(), key=lambda one: one.sequence)
+
+    def _put(self, one: Published) -> None:
+        if one.topic not in self._topics:
+            return
+        place = one.topic, one.key
+        with self._lock:
+            if place in self._unread:
+                self.lost += 1
+            if one.value is GONE:
+                self._unread.pop(place, None)
+                return
+            self._unread[place] = one
+        self._wake()
+
+    def _ended(self) -> None:
+        self._closed = True
+        self._wake()
+
+
+class ThreadSubscription(Subscription):
+    """A subscription that a thread waits on."""
+
+    def __init__(self, topics: frozenset[Topic], end: Callable[[Subscription], None]) -> None:
+        self._something = threading.Event()
+        super().__init__(topics, self._something.set, end)
+
+    def wait(self, timeout_s: float | None = None) -> list[Published]:
+        """Return what is new since the last call, oldest first; wait for it for ``timeout_s`` real seconds.
+
+        Empty if nothing came in that time, or `closed`. None waits for as long as it takes.
+        """
+        until_s = None if timeout_s is None else time.monotonic() + timeout_s
+        while True:
+            self._something.clear()
+            unread = self._take_unread()
+            left_s = None if until_s is None else until_s - time.monotonic()
+            if unread or self._closed or (left_s is not None and left_s <= 0):
+                return unread
+            self._something.wait(left_s)
+
+
+class LoopSubscription(Subscription):
+    """A subscription that a coroutine waits on, of the event loop on which it was made."""
+
+    def __init__(self, topics: frozenset[Topic], end: Callable[[Subscription], None]) -> None:
+        self._loop = asyncio.get_running_loop()
+        self._something = asyncio.Event()
+        self._woken = False
+        super().__init__(topics, self._wake_loop, end)
+
+    async def wait(self, timeout_s: float | None = None) -> list[Published]:
+        """Return what is new since the last call, oldest first; wait for it for ``timeout_s`` seconds.
+
+        Empty if nothing came in that time, or `closed`. None waits for as long as it takes.
+        """
+        until_s = None if timeout_s is None else self._loop.time() + timeout_s
+        while True:
+            self._something.clear()
+            self._woken = False
+            unread = self._take_unread()
+            left_s = None if until_s is None else until_s - self._loop.time()
+            if unread or self._closed or (left_s is not None and left_s <= 0):
+                return unread
+            with contextlib.suppress(TimeoutError):
+                await asyncio.wait_for(self._something.wait(), left_s)
+
+    def _wake_loop(self) -> None:
+        if self._woken:
+            return
+        self._woken = True
+        with contextlib.suppress(RuntimeError):  # the loop has ended, and with it who would read
+            self._loop.call_soon_threadsafe(self._something.set)
+
+
+class Publisher:
+    """Hands each value to everyone who listens; safe to use from any thread, never blocks."""
+
+    def __init__(self) -> None:
+        self._numbers = itertools.count(1)
+        self._newest: dict[tuple[Topic, str], Published] = {}
+        self._subscriptions: tuple[Subscription, ...] = ()
+        self._closed = False
+        self._turns = InTurn[Callable[[], None]](lambda act: act())
+
+    def publish(self, topic: Topic, key: str, value: Any) -> None:
+        """Tell everyone who listens to a topic the newest value of a key.
+
+        Values reach each listener in the order in which they were published.
+        """
+        self._turns.bring(lambda: self._hand_out(topic, key, value))
+
+    def forget(self, topic: Topic, key: str) -> None:
+        """Hold a key's value no longer, for nobody: it is one of many, and old."""
+        self._turns.bring(lambda: self._hand_out(topic, key, GONE))
+
+    def newest(self, topic: Topic, key: str) -> Any:
+        """Return the newest value of a key, None before the first; takes no lock."""
+        known = self._newest.get((topic, key))
+        return None if known is None else known.value
+
+    def subscribe(self, *topics: Topic, known: bool = True) -> ThreadSubscription:
+        """Return a subscription for a thread; without topics to all of them.
+
+        It begins with the newest value of each key that is known already, unless ``known`` is False.
+        """
+        return self._added(ThreadSubscription(_checked(topics), self._leave), known)
+
+    def subscribe_here(self, *topics: Topic, known: bool = True) -> LoopSubscription:
+        """Return a subscription for a coroutine of the running event loop; else as `subscribe`."""
+        return self._added(LoopSubscription(_checked(topics), self._leave), known)
+
+    @property
+    def listeners(self) -> int:
+        """How many subscriptions there are."""
+        return len(self._subscriptions)
+
+    def close(self) -> None:
+        """End every subscription, and each that is asked for later; publishing goes nowhere from then on."""
+
+        def end() -> None:
+            self._closed = True
+            subscriptions, self._subscriptions = self._subscriptions, ()
+            for one in subscriptions:
+                one._ended()
+
+        self._turns.bring(end)
+
+    def _added(self, subscription: _Subscription, known: bool) -> _Subscription:
+        def add() -> None:
+            if self._closed:
+                subscription._ended()
+                return
+            self._subscriptions = (*self._subscriptions, subscription)
+            if known:
+                for one in self._newest.values():
+                    subscription._put(one)
+
+        self._turns.bring(add)
+        return subscription
+
+    def _leave(self, subscription: Subscription) -> None:
+        def remove() -> None:
+            self._subscriptions = tuple(one for one in self._subscriptions if one is not subscription)
+
+        self._turns.bring(remove)
+
+    def _hand_out(self, topic: Topic, key: str, value: Any) -> None:
+        one = Published(next(self._numbers), topic, key, value)
+        if value is GONE:
+            self._newest.pop((topic, key), None)
+        else:
+            self._newest[topic, key] = one
+        for subscription in self._subscriptions:
+            subscription._put(one)
+
+
+def _checked(topics: Iterable[Topic]) -> frozenset[Topic]:
+    asked = frozenset(topics)
+    if not asked <= TOPICS:
+        raise ValueError(f"{', '.join(sorted(asked - TOPICS))}: there is no such topic")
+    return asked or TOPICS

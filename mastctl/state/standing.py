@@ -1,0 +1,87 @@
+"""What the daemon is doing at one moment: one word, why, and the facts that it rests on."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from mastctl.state.faults import StandingFault
+
+Word = Literal[
+    "starting", "ready", "moving", "tracking", "holding", "stopping", "stopped", "fault", "closing"
+]
+
+
+@dataclass(frozen=True)
+class Residual:
+    """The last measured residual, pixels (x, y), with one sigma, and the operation that measured it."""
+
+    residual_px: tuple[float, float]
+    residual_sigma_px: tuple[float, float]
+    operation: str
+
+
+@dataclass(frozen=True)
+class Latch:
+    """An emergency stop that holds until somebody resets it.
+
+    Attributes
+    ----------
+    name, reason
+        Who asked for it and why, as told.
+    at
+        When, ISO 8601 in UTC: it outlives the clock of this run.
+    """
+
+    name: str
+    reason: str
+    at: str
+
+
+@dataclass(frozen=True)
+class Standing:
+    """What the daemon is doing at one moment; replaced at each change, never edited.
+
+    Attributes
+    ----------
+    word
+        The state in one word (docs/safety.md).
+    reason
+        One sentence that says why; empty where nothing needs to be said.
+    since_s
+        Since when the word is that, seconds of CLOCK_MONOTONIC.
+    sequence
+        Grows by one with each change of anything here.
+    operation, target
+        Id of the running operation, None when none runs; the request that runs, or ran last, as it came.
+    residual
+        The last one measured.
+    track
+        Id of the active track, None without one.
+    head_moves
+        Whether the head's last reading said so.
+    stops
+        How many stops are under way: the head has not confirmed them, or what ran has not been told yet.
+    held
+        What ended the last motion before its goal: a stop, a reset, a fault; empty if nothing did, or an
+        operation or a track has begun since.
+    faults
+        What is wrong with the head.
+    latch
+        The emergency stop that holds, None without one.
+    """
+
+    word: Word = "starting"
+    reason: str = "the head has not been read yet"
+    since_s: float = 0.0
+    sequence: int = 0
+    operation: str | None = None
+    target: Mapping[str, Any] | None = None
+    residual: Residual | None = None
+    track: str | None = None
+    head_moves: bool = False
+    stops: int = 0
+    held: str = ""
+    faults: tuple[StandingFault, ...] = ()
+    latch: Latch | None = None
