@@ -117,6 +117,31 @@ class AxisReport:
         return None if self.left_rad is None else focal_px * math.tan(self.left_rad)
 
 
+@dataclass(frozen=True)
+class AxisMotion:
+    """How an axis moves.
+
+    Attributes
+    ----------
+    acceleration_rad_per_s2
+        With which it speeds up and brakes.
+    beyond_goal_rad
+        How far past a goal it may go on purpose, to come to it from one side.
+    """
+
+    acceleration_rad_per_s2: float
+    beyond_goal_rad: float = 0.0
+
+
+@runtime_checkable
+class StatesMotion(Protocol):
+    """A head that says how its axes move; not every head does."""
+
+    def axis_motion(self) -> Mapping[str, AxisMotion]:
+        """Return ``pan`` and ``tilt``. Asks nobody, never fails."""
+        ...
+
+
 class Reporting(ABC):
     """What a head may be beside a `PanTilt`: one that knows its counts."""
 

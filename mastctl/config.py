@@ -7,6 +7,7 @@ is read (`check_cameras`). Options of drivers are handed through as they stand; 
 from __future__ import annotations
 
 import ipaddress
+import math
 from dataclasses import dataclass, field
 from pathlib import Path
 from urllib.parse import quote
@@ -18,7 +19,9 @@ from calib.files.yaml_text import parse_mapping
 from calib.mast.rig import Rig
 from drivers.camera_offset import MOST_OFFSET_S
 from drivers.hardware import DeviceSettings, HardwareSettings
+from mastctl.devices.keep_out import Box
 from mastctl.devices.limits import Limits
+from mastctl.devices.sun import LEAST_CONE_RAD, SUN, WIDEST_CONE_RAD, Frame, Sun, direction_of
 from mastctl.packaged import default_config
 from mastctl.tracking.choice import HandoffRules, PairBounds
 from mastctl.tracking.settings import TrackingSettings
@@ -30,6 +33,8 @@ DEFAULT_PORT = 8420
 _MAX_BYTES = 1_000_000
 _FULL_TURN_RAD = 6.2832
 _FASTEST_RAD_PER_S = 100.0
+_STEEPEST_RAD_PER_S2 = 1000.0
+_WIDEST_MARGIN_RAD = 0.5
 _LONGEST_SOCKET_PATH = 100  # bytes; the kernel's own bound is 108
 
 
@@ -59,6 +64,7 @@ class Config:
     listen: Listen
     hardware: HardwareSettings
     limits: Limits
+    sun: Sun | None = None
     tracking: TrackingSettings = field(default_factory=TrackingSettings)
 
 
@@ -100,6 +106,7 @@ def parse_config(data: bytes, path: str | Path) -> Config:
             folder=folder,
         ),
         limits=_limits(top),
+        sun=_sun(top),
         tracking=_tracking(top, folder),
     )
 
@@ -175,12 +182,69 @@ def _listen(top: Section, folder: Path) -> Listen:
 
 def _limits(top: Section) -> Limits:
     """Read the soft limits."""
-    section = top.section("limits", ("pan_rad", "tilt_rad", "speed_rad_per_s"))
+    section = _limits_section(top)
+    margin_rad = _number_between(section, "margin_rad", 0.0, 0.0, _WIDEST_MARGIN_RAD)
+    pan_rad, tilt_rad = (_within(section, key, margin_rad) for key in ("pan_rad", "tilt_rad"))
+    keep_out = tuple(_box(section, name) for name in section.mapping("keep_out"))
+    if keep_out and margin_rad == 0.0:
+        words = "is needed beside keep_out, above 0: what the head overshoots, rings and has as backlash"
+        raise section.bad("margin_rad", words)
+    return Limits(
+        pan_rad,
+        tilt_rad,
+        _above_zero(section, "speed_rad_per_s", _FASTEST_RAD_PER_S),
+        margin_rad,
+        _above_zero(section, "acceleration_rad_per_s2", _STEEPEST_RAD_PER_S2)
+        if "acceleration_rad_per_s2" in section
+        else None,
+        keep_out,
+    )
+
+
+def _limits_section(top: Section) -> Section:
+    usual = ("margin_rad", "acceleration_rad_per_s2", "keep_out", "sun")
+    return top.section("limits", ("pan_rad", "tilt_rad", "speed_rad_per_s"), usual)
+
+
+def _within(section: Section, key: str, margin_rad: float) -> tuple[float, float]:
+    """Read an axis's range and leave the margin at both ends."""
+    low, high = _range(section, key)
+    if low + margin_rad >= high - margin_rad:
+        words = f"[{low:g}, {high:g}] leaves nothing between margins of {margin_rad:g} rad"
+        raise section.bad(key, words)
+    return low + margin_rad, high - margin_rad
+
+
+def _box(limits: Section, name: str) -> Box:
+    """Read ``{pan_rad: [lowest, highest], tilt_rad: [lowest, highest]}`` of a keep-out."""
+    place = limits.at(f"keep_out.{name}")
+    if not isinstance(name, str) or not name.isidentifier() or name == SUN:
+        raise limits.bad(f"keep_out.{name}", f"a name of letters, digits and _ is expected, not '{SUN}'")
+    section = Section(limits.path, place, limits.mapping("keep_out")[name], ("pan_rad", "tilt_rad"))
     pan_rad, tilt_rad = _range(section, "pan_rad"), _range(section, "tilt_rad")
-    speed_rad_per_s = section.number("speed_rad_per_s", _FASTEST_RAD_PER_S)
-    if speed_rad_per_s <= 0.0:
-        raise section.bad("speed_rad_per_s", f"{speed_rad_per_s:g} where a number above 0 is expected")
-    return Limits(pan_rad, tilt_rad, speed_rad_per_s)
+    return Box(name, pan_rad, tilt_rad)
+
+
+def _sun(top: Section) -> Sun | None:
+    """Read the direction that no head camera looks into, in the rover or the site frame."""
+    limits = _limits_section(top)
+    if "sun" not in limits:
+        return None
+    section = limits.section("sun", ("azimuth_rad", "elevation_rad", "half_angle_rad"), ("frame",))
+    azimuth_rad = section.number("azimuth_rad", _FULL_TURN_RAD)
+    elevation_rad = section.number("elevation_rad", math.pi / 2)
+    half_angle_rad = _number_between(section, "half_angle_rad", 0.0, LEAST_CONE_RAD, WIDEST_CONE_RAD)
+    frame: Frame = "site"
+    if "frame" in section and section.choice("frame", ("site", "rover")) == "rover":
+        frame = "rover"
+    return Sun(direction_of(azimuth_rad, elevation_rad), frame, half_angle_rad)
+
+
+def _above_zero(section: Section, key: str, most: float) -> float:
+    value = section.number(key, most)
+    if value <= 0.0:
+        raise section.bad(key, f"{value:g} where a number above 0 is expected")
+    return value
 
 
 def _tracking(top: Section, folder: Path) -> TrackingSettings:

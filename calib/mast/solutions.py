@@ -64,7 +64,18 @@ def choose(
     from_pan_rad: float = 0.0,
     from_tilt_rad: float = 0.0,
 ) -> Solution:
-    """Return the solution within the joint limits that comes first: upright, then least motion.
+    """Return the solution within the joint limits that comes first: the first of `ordered`."""
+    return ordered(solutions, pan_limits_rad, tilt_limits_rad, from_pan_rad, from_tilt_rad)[0]
+
+
+def ordered(
+    solutions: Sequence[Solution],
+    pan_limits_rad: tuple[float, float],
+    tilt_limits_rad: tuple[float, float],
+    from_pan_rad: float = 0.0,
+    from_tilt_rad: float = 0.0,
+) -> list[Solution]:
+    """Return the solutions within the joint limits: upright ones first, then by least motion.
 
     A joint that turns past ±π (limits of 20 to 350 degrees, say) is offered each angle a whole turn up and
     down too.
@@ -111,7 +122,7 @@ def choose(
 
     inside = [one for one in turned if excess(one) == (0.0, 0.0)]
     if inside:
-        return min(inside, key=lambda one: order(one, from_pan_rad, from_tilt_rad))
+        return sorted(inside, key=lambda one: order(one, from_pan_rad, from_tilt_rad))
     nearest = min(turned, key=lambda one: max(excess(one)))
     raise Unreachable(
         "outside_limits",

@@ -28,7 +28,7 @@ from drivers.dynamixel.session import Session
 from drivers.dynamixel.settings import DynamixelSettings, dynamixel_settings
 from drivers.dynamixel.watch import GivenUp
 from drivers.errors import DriverError, LineLost, NoReply, OutOfRange
-from drivers.interfaces import AxisReport, Reading, Reporting
+from drivers.interfaces import AxisMotion, AxisReport, Reading, Reporting
 
 log = logging.getLogger(__name__)
 T = TypeVar("T")
@@ -153,6 +153,14 @@ class DynamixelHead(Reporting):
         """Return where each axis was sent and where it stood when it was last read; asks nobody."""
         reports = {axis: motion.report() for axis, motion in zip(AXES, self._motions, strict=True)}
         return {axis: report for axis, report in reports.items() if report is not None}
+
+    def axis_motion(self) -> dict[str, AxisMotion]:
+        """Return how each axis moves: its profile, as the servo rounds it, and its approach."""
+        told = {}
+        for name, axis in zip(AXES, (self.settings.pan, self.settings.tilt), strict=True):
+            counts = axis.acceleration_counts(self.settings.acceleration_rad_per_s2)
+            told[name] = AxisMotion(counts * axis.model.acceleration_unit_rad_per_s2, axis.approach_rad)
+        return told
 
     # In the thread that owns the bus
 

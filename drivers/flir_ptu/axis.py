@@ -48,6 +48,8 @@ class StepAxis:
         The unit's own limits, positions.
     slowest, fastest
         The unit's own bounds of speed, positions a second.
+    acceleration
+        Of the unit, positions a second squared.
     speed
         Set in the unit, None if unknown; ``usual_speed`` is that of moves that name none.
     target
@@ -77,6 +79,7 @@ class StepAxis:
         self.position_rad = resolution_arcsec * ARCSEC_RAD
         self.lowest = self.highest = 0
         self.slowest = self.fastest = 0.0
+        self.acceleration = 0
         self.usual_speed = 0
         self.speed: int | None = None
         self.target: int | None = None

@@ -31,7 +31,7 @@ from drivers.flir_ptu.options import DEVICE, Options, options_from
 from drivers.flir_ptu.position import measure
 from drivers.flir_ptu.ready import checked_version, ready_axes
 from drivers.flir_ptu.supply import SupplyWatch
-from drivers.interfaces import Reading
+from drivers.interfaces import AxisMotion, Reading
 from drivers.serial_line import SerialLine
 
 log = logging.getLogger(__name__)
@@ -277,6 +277,13 @@ class FlirPtu:
             self._count.hit(axis, self._axes)
 
     # The unit
+
+    def axis_motion(self) -> dict[str, AxisMotion]:
+        """Return how each axis moves: the unit's acceleration when it was made ready, and its approach."""
+        return {
+            name: AxisMotion(axis.acceleration * axis.position_rad, axis.options.approach_rad)
+            for name, axis in self._axes.items()
+        }
 
     def _set_speed(self, talk: Conversation, axis: StepAxis, speed: int) -> None:
         """Set an axis's speed unless it is set already."""

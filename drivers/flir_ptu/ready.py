@@ -91,6 +91,7 @@ def ready_axes(
             axis.usual_speed = known[name].usual_speed
         else:
             axis.usual_speed = int(talk.sure(ask.SPEED[name]))
+        axis.acceleration = int(talk.sure(ask.ACCELERATION[name]))
         if options.acceleration_rad_per_s2 is not None:
             _accelerate(talk, axis, options.acceleration_rad_per_s2)
     measure(talk, axes["pan"], axes["tilt"], clock)
@@ -112,8 +113,9 @@ def _limit(talk: Conversation, axes: Mapping[str, StepAxis]) -> None:
 def _accelerate(talk: Conversation, axis: StepAxis, acceleration_rad_per_s2: float) -> None:
     """Set the acceleration, if the unit has another."""
     positions = max(1, round(acceleration_rad_per_s2 / axis.position_rad))
-    if int(talk.sure(ask.ACCELERATION[axis.name])) != positions:
+    if axis.acceleration != positions:
         talk.tell(f"{axis.name[0].upper()}A{positions}", RECOMPUTE_S)
+        axis.acceleration = positions
 
 
 def _try(talk: Conversation, command: str) -> None:

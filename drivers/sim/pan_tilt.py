@@ -11,7 +11,7 @@ from typing import Any, TypeVar
 from drivers.clock import Clock
 from drivers.errors import BadOptions, BadReply, DriverError, NoReply
 from drivers.faults import PAN_TILT, Fault, FaultPanel, nearest
-from drivers.interfaces import Reading
+from drivers.interfaces import AxisMotion, Reading
 from drivers.sim.axis import AxisSettings
 from drivers.sim.head_options import axis_changes, check_together
 from drivers.sim.wire.axis import WireAxis
@@ -197,6 +197,13 @@ class SimulatedPanTilt:
             if not self._closed:
                 self._halt(self._clock.now_s())
             self._closed = True
+
+    def axis_motion(self) -> Mapping[str, AxisMotion]:
+        """Return how each axis moves, by its settings."""
+        axes = {"pan": self.head.pan, "tilt": self.head.tilt}
+        return {
+            name: AxisMotion(axis.acceleration_rad_per_s2, axis.approach_rad) for name, axis in axes.items()
+        }
 
     def true_joints(self, time_s: float) -> tuple[float, float]:
         """Return the mechanical pan and tilt at a moment of the last minute, radians. Never fails."""

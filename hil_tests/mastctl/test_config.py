@@ -230,3 +230,59 @@ def test_the_packaged_configuration_is_the_simulated_rover() -> None:
     assert config.hardware.pan_tilt.driver == "sim"
     assert {device.driver for device in config.hardware.cameras.values()} == {"sim"}
     assert config.mast_file.is_file()
+
+
+def with_limits(**more: Any) -> bytes:
+    return changed("limits", {**GOOD["limits"], **more})
+
+
+BOX = {"pan_rad": [-0.9, 0.9], "tilt_rad": [-1.3, -0.8]}
+
+
+def test_keep_outs_and_a_sun_are_read_and_the_margin_is_left_at_both_ends() -> None:
+    sun = {"azimuth_rad": 0.0, "elevation_rad": 0.5, "half_angle_rad": 0.2, "frame": "rover"}
+    config = parsed(with_limits(margin_rad=0.1, keep_out={"deck": BOX}, sun=sun, acceleration_rad_per_s2=2))
+    assert config.limits.pan_rad == (-2.5, 2.5) and config.limits.margin_rad == 0.1
+    (deck,) = config.limits.keep_out
+    assert (deck.name, deck.pan_rad, deck.tilt_rad) == ("deck", (-0.9, 0.9), (-1.3, -0.8))
+    assert config.limits.acceleration_rad_per_s2 == 2.0
+    assert config.sun is not None and config.sun.frame == "rover" and config.sun.until_s is None
+    assert parsed(yaml.safe_dump(GOOD).encode()).sun is None
+
+
+@pytest.mark.parametrize(
+    ("more", "place", "words"),
+    [
+        ({"margin_rad": 0.6}, "limits.margin_rad", "number from 0 to 0.5"),
+        ({"margin_rad": -0.1}, "limits.margin_rad", "number from 0 to 0.5"),
+        ({"tilt_rad": [0.0, 0.2], "margin_rad": 0.1}, "limits.tilt_rad", "leaves nothing between margins"),
+        ({"acceleration_rad_per_s2": 0}, "limits.acceleration_rad_per_s2", "above 0"),
+        ({"keep_out": {"deck": BOX}}, "limits.margin_rad", "needed beside keep_out"),
+        ({"margin_rad": 0.1, "keep_out": {"deck": {}}}, "limits.keep_out.deck.pan_rad", "missing"),
+        ({"margin_rad": 0.1, "keep_out": {"sun": BOX}}, "limits.keep_out.sun", "not 'sun'"),
+        ({"margin_rad": 0.1, "keep_out": {"a b": BOX}}, "limits.keep_out.a b", "letters"),
+        ({"margin_rad": 0.1, "keep_out": {7: BOX}}, "limits.keep_out.7", "letters"),
+        ({"margin_rad": 0.1, "keep_out": [BOX]}, "limits.keep_out", "mapping"),
+        ({"keep_out": {"deck": {**BOX, "pan": 1}}}, "limits.keep_out.deck.pan", "unknown key"),
+        (
+            {"keep_out": {"deck": {**BOX, "pan_rad": [1, -1]}}},
+            "limits.keep_out.deck.pan_rad",
+            "must be below",
+        ),
+        ({"sun": {"azimuth_rad": 0, "elevation_rad": 0.5}}, "limits.sun.half_angle_rad", "missing"),
+        (
+            {"sun": {"azimuth_rad": 0, "elevation_rad": 2, "half_angle_rad": 0.2}},
+            "limits.sun.elevation_rad",
+            "1.57",
+        ),
+        (
+            {"sun": {"azimuth_rad": 0, "elevation_rad": 1, "half_angle_rad": 0.2, "frame": "mast"}},
+            "limits.sun.frame",
+            "site, rover",
+        ),
+    ],
+)
+def test_limits_that_make_no_sense_are_refused_by_place(more: dict[str, Any], place: str, words: str) -> None:
+    with pytest.raises(BadFile) as refused:
+        parsed(with_limits(**more))
+    assert place in str(refused.value) and words in str(refused.value)

@@ -86,6 +86,7 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> Iterator[set[str]]:
 def general(key: str) -> str:
     """A key with the names of cameras and pairs taken out."""
     key = re.sub(r"^cameras\.\w+", "cameras.NAME", key)
+    key = re.sub(r"^(limits\.keep_out)\.\w+", r"\1.NAME", key)
     return re.sub(r"^(tracking\.handoff\.pairs)\.\w+", r"\1.PAIR", key)
 
 

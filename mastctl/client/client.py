@@ -243,6 +243,38 @@ class Client:
         """Go back to the mast file that was in use before; return which is in use now, and the former one."""
         return self._daemon.json("POST", "/mast/back")
 
+    def sun(self) -> dict[str, Any]:
+        """Return the direction that no head camera looks into: ``sun``, null where none was told."""
+        return self._daemon.json("GET", "/limits/sun")
+
+    def keep_off_sun(
+        self,
+        azimuth_rad: float,
+        elevation_rad: float,
+        half_angle_rad: float,
+        *,
+        frame: Literal["site", "rover"] = "site",
+        valid_s: float | None = None,
+    ) -> dict[str, Any]:
+        """Say where the sun stands: azimuth from north over east (forward over right), elevation up.
+
+        Parameters
+        ----------
+        half_angle_rad
+            How near a head camera's axis may come.
+        valid_s
+            How long that holds, seconds; left out, until another is told.
+        """
+        body: dict[str, Any] = {"azimuth_rad": azimuth_rad, "elevation_rad": elevation_rad}
+        body |= {"half_angle_rad": half_angle_rad, "frame": frame}
+        if valid_s is not None:
+            body["valid_s"] = valid_s
+        return self._daemon.json("POST", "/limits/sun", json=body)
+
+    def forget_sun(self) -> dict[str, Any]:
+        """Keep the head off no sun any more."""
+        return self._daemon.json("DELETE", "/limits/sun")
+
     def true_pose(self) -> dict[str, Any]:
         """Return where a simulated rover truly stands: ``position_m`` and ``quaternion``, site_from_rover."""
         return self._daemon.json("GET", "/simulation/pose")

@@ -26,12 +26,16 @@ from drivers.interfaces import (
 )
 from mastctl.devices import joint_history
 from mastctl.devices.cameras import Cameras
+from mastctl.devices.door import REST_S, Door
 from mastctl.devices.faults import FaultWords
 from mastctl.devices.frames import FrameStore, StampedFrame
 from mastctl.devices.joint_history import JointHistory
+from mastctl.devices.keep_out import Pair
 from mastctl.devices.limits import Limits
 from mastctl.devices.stops import Stops
+from mastctl.devices.sun import Sun
 from mastctl.devices.thread import DeviceThread
+from mastctl.devices.ways import Way
 from mastctl.errors import MastctlError, Stopped
 from mastctl.state.faults import StandingFault
 
@@ -43,7 +47,6 @@ MOVE_TIMEOUT_S = 1.0
 STOP_TIMEOUT_S = 1.0
 MOVING_PERIOD_S = 0.02
 RESTING_PERIOD_S = 0.05
-REST_S = 0.3  # after a move was taken, before a reading that says rest is one of its end
 WORDS = {
     "read": FaultWords("the head is read again"),
     "move": FaultWords("a later move is taken in time", late_is_fault=True),
@@ -67,7 +70,7 @@ class Devices:
     hardware
         The opened drivers; closing them is left to their opener, after `close`.
     limits
-        Soft limits, checked in `move` as the last thing before the driver is called.
+        Limits and keep-outs, checked in `move` as the last thing before the driver is called.
     mast_digest
         SHA-256 (hex) of the mast file in use, part of every frame's facts.
     clock
@@ -79,11 +82,20 @@ class Devices:
         How long past its time a camera may take before it counts as hanging, seconds; 3 by default.
     new_run
         As in `mastctl.devices.frames.FrameStore`.
+    sun
+        What the head cameras must not look into at first.
 
     Attributes
     ----------
     on_turn
         Called in the head's own thread each time it is about to read, whatever comes of that; must not wait.
+    door
+        What judges the moves: ways round the keep-outs are asked there, and the sun is told there.
+
+    Raises
+    ------
+    BadOptions
+        If the head says that it speeds up faster than the limits allow.
     """
 
     def __init__(
@@ -95,10 +107,11 @@ class Devices:
         rig: Rig | None = None,
         camera_grace_s: float | None = None,
         new_run: Callable[[], str] | None = None,
+        sun: Sun | None = None,
     ) -> None:
         self.on_turn: Callable[[], None] = lambda: None
         self._pan_tilt = hardware.pan_tilt
-        self._limits = limits
+        self.door = Door(limits, hardware.pan_tilt, clock, HEAD, rig, sun)
         self._clock = clock
         self._time = deadlines_on(clock)
         self._history = JointHistory()
@@ -169,8 +182,9 @@ class Devices:
 
         Raises
         ------
-        OutsideLimits
-            If an angle or the speed may not be commanded; nothing was sent.
+        OutsideLimits, KeptOut
+            If an angle or the speed may not be commanded, or the head might pass a keep-out on its way;
+            nothing was sent.
         Stopped
             If a stop came first, moves are blocked, or a stop has not come back from the driver yet;
             nothing was sent.
@@ -178,19 +192,30 @@ class Devices:
             If the head does not take the command in 1 s.
         """
         ticket = self._stops.ticket()
+        goal = float(pan_rad), float(tilt_rad)
 
-        def send() -> None:
+        def check_free() -> None:
             with self._gate:
                 if self._blocks:
                     raise Stopped(next(iter(self._blocks.values())))
             self._stops.check(ticket)
-            self._limits.check(pan_rad, tilt_rad)
-            speed = self._limits.speed(speed_rad_per_s)
+
+        def send() -> None:
+            check_free()
+            self.door.limits.check(*goal)
+            speed = self.door.limits.speed(speed_rad_per_s)
+            start = self.door.check_move(goal, self._read_for_move)
+            check_free()  # the head may have been read meanwhile
             self._history.move_sent(self._clock.now_s())
-            self._pan_tilt.move(float(pan_rad), float(tilt_rad), speed)
+            self.door.sent(start, goal, speed)
+            self._pan_tilt.move(*goal, speed)
             self._moved = ticket, self._time.now_s()
 
         self._head.call("move", send, MOVE_TIMEOUT_S)
+
+    def way(self, here: Pair, goal: Pair) -> Way:
+        """Return the moves that lead to a goal (`mastctl.devices.door.Door.way`)."""
+        return self.door.way(here, goal)
 
     def stop(self) -> None:
         """Halt the head at once, whatever hangs (`mastctl.devices.stops`); moves still waiting are never
@@ -242,6 +267,7 @@ class Devices:
     def use_rig(self, rig: Rig, mast_digest: str) -> None:
         """Stamp frames with another mast file from now on, and forget those that were stamped before."""
         self._cameras.use_rig(rig)
+        self.door.use_rig(rig)
         self._store.change_mast(mast_digest)
 
     def faults(self) -> tuple[StandingFault, ...]:
@@ -255,7 +281,7 @@ class Devices:
                 )
                 for word in reading.faults
             ]
-        return (*found, *self._cameras.faults())
+        return (*found, *self.door.faults(reading), *self._cameras.faults())
 
     def close(self) -> None:
         """Stop the head and end the threads; takes some 4 s at most and never raises."""
@@ -273,6 +299,12 @@ class Devices:
         self._cameras.close(until_s)
 
     # In the devices' own threads
+
+    def _read_for_move(self) -> Reading:
+        try:
+            return self._read_once()
+        except (NoReply, BadReply):
+            return self._read_once()  # one answer lost on the line moves nothing and stops nothing
 
     def _read_once(self) -> Reading:
         answer = self._pan_tilt.read()

@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+from mastctl.devices.keep_out import Box
 from mastctl.errors import BadRequest
 
 
@@ -44,19 +45,30 @@ class Limits:
     Attributes
     ----------
     pan_rad, tilt_rad
-        (lowest, highest) joint angle.
+        (lowest, highest) joint angle that may be commanded. A pan that turns more than a turn has its cable's
+        winding bounded by them: angles whole turns apart are different ones.
     speed_rad_per_s
         Fastest joint speed.
+    margin_rad
+        Around every keep-out: no goal lies in it, and no way but that of a head which stands in it already.
+        The ranges above are those inside it.
+    acceleration_rad_per_s2
+        The head's axes speed up and brake with no more; None: whatever they do.
+    keep_out
+        Where the head must not be (`mastctl.devices.keep_out`).
 
     Raises
     ------
     ValueError
-        If a bound is not finite, a range is empty, or the speed is not positive.
+        If a bound is not finite, a range is empty, or speed or acceleration is not positive.
     """
 
     pan_rad: tuple[float, float]
     tilt_rad: tuple[float, float]
     speed_rad_per_s: float
+    margin_rad: float = 0.0
+    acceleration_rad_per_s2: float | None = None
+    keep_out: tuple[Box, ...] = ()
 
     def __post_init__(self) -> None:
         for axis, (low, high) in (("pan_rad", self.pan_rad), ("tilt_rad", self.tilt_rad)):
@@ -66,6 +78,11 @@ class Limits:
                 )
         if not (math.isfinite(self.speed_rad_per_s) and self.speed_rad_per_s > 0.0):
             raise ValueError(f"speed_rad_per_s is {self.speed_rad_per_s} where a number above 0 is expected")
+        acceleration = self.acceleration_rad_per_s2
+        if acceleration is not None and not (math.isfinite(acceleration) and acceleration > 0.0):
+            raise ValueError(f"acceleration_rad_per_s2 is {acceleration} where a number above 0 is expected")
+        if not (math.isfinite(self.margin_rad) and self.margin_rad >= 0.0):
+            raise ValueError(f"margin_rad is {self.margin_rad} where 0 or more is expected")
 
     def check(self, pan_rad: float, tilt_rad: float) -> None:
         """Pass joint angles that may be commanded.
@@ -82,9 +99,11 @@ class Limits:
             if value < low or value > high:
                 bound = low if value < low else high
                 told_value, told_bound = _told_apart(value, bound)
+                unwound = value - math.copysign(math.tau, value)
+                hint = f"; {unwound:.6g} rad points the same way" if low <= unwound <= high else ""
                 raise OutsideLimits(
                     axis, value, bound, "rad",
-                    f"{axis} {told_value} rad is beyond the soft limit {told_bound} rad",
+                    f"{axis} {told_value} rad is beyond the soft limit {told_bound} rad{hint}",
                 )  # fmt: skip
 
     def speed(self, asked_rad_per_s: float | None) -> float:

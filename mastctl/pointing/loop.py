@@ -26,7 +26,7 @@ from calib.camera.stereo import triangulate
 from calib.errors import CalibError
 from calib.mast.pointing import solve
 from calib.mast.rig import Rig
-from calib.mast.solutions import Solution, choose
+from calib.mast.solutions import Solution
 from calib.pictures.patch_verdict import PatchMatch
 from calib.rigid import FloatArray
 from drivers.clock import Clock
@@ -81,7 +81,7 @@ class PointingLoop:
     devices
         Head and cameras.
     limits
-        Soft limits, for the choice among solutions; `devices` checks them again.
+        Limits, for the choice among solutions; `devices` checks them again, and knows what is kept out.
     clock
         The clock that stamps readings and frames.
     settings
@@ -268,7 +268,7 @@ class _Run:
                 from_tilt_rad=here.tilt_rad,
             )
             detail.update(solutions=[_told(one) for one in solutions])
-            best = choose(solutions, self._limits.pan_rad, self._limits.tilt_rad, here.pan_rad, here.tilt_rad)
+            best = self._steps.head.chosen(solutions, (here.pan_rad, here.tilt_rad))
             detail.update(chosen=_told(best))
         self._range_m = best.range_m
         eyes = [name for name in (aim.camera, self._eyes.partner(aim.camera)) if name is not None]

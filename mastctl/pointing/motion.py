@@ -4,12 +4,17 @@ from __future__ import annotations
 
 import math
 import threading
+from collections.abc import Sequence
 from typing import Protocol
 
+from calib.mast.solutions import Solution
 from drivers.clock import Clock
 from drivers.interfaces import Reading
+from mastctl.devices.keep_out import Pair
 from mastctl.devices.limits import Limits
 from mastctl.devices.rest import RestWatch
+from mastctl.devices.ways import Way
+from mastctl.pointing.reached import reached
 from mastctl.pointing.results import PointingError
 from mastctl.pointing.settings import PointingSettings
 
@@ -20,6 +25,7 @@ class HeadLike(Protocol):
     def read(self) -> Reading: ...
     def move(self, pan_rad: float, tilt_rad: float, speed_rad_per_s: float | None = None) -> None: ...
     def stop(self) -> None: ...
+    def way(self, here: Pair, goal: Pair) -> Way: ...
 
 
 class Head:
@@ -80,6 +86,23 @@ class Head:
             + settings.dwell_s
             + settings.margin_s
         )
+
+    def way(self, pan_rad: float, tilt_rad: float) -> tuple[Pair, ...]:
+        """Return where to send the head, one after the other, so that it comes to these angles.
+
+        Raises
+        ------
+        OutsideLimits, KeptOut, NoWay
+            If they may not be commanded, or keep-outs lie around.
+        PointingError, DriverError
+            As for a reading.
+        """
+        here = self.read()
+        return self._head.way((here.pan_rad, here.tilt_rad), (pan_rad, tilt_rad)).goals
+
+    def chosen(self, solutions: Sequence[Solution], here: Pair) -> Solution:
+        """Return the one of several joint angles that is taken from ``here``; raises as `reached`."""
+        return reached(solutions, self._limits, self._head.way, here)
 
     def send(self, pan_rad: float, tilt_rad: float) -> None:
         """Start the move at the speed cap. Raises OutsideLimits, Stopped, DriverError."""

@@ -26,7 +26,7 @@ from mastctl.pointing.motion_seen import MotionSeen
 from mastctl.pointing.one_moment import apart, check_one_moment
 from mastctl.pointing.record import Recorder
 from mastctl.pointing.requests import PixelTarget
-from mastctl.pointing.results import Step
+from mastctl.pointing.results import Step, rounded
 from mastctl.pointing.settings import PointingSettings
 from mastctl.pointing.wanted import clicked_frame
 
@@ -154,16 +154,26 @@ class Steps:
     def go(self, pan_rad: float, tilt_rad: float, camera: str | None = None) -> Reading:
         """Check the limits, move, wait until settled; return the reading there.
 
+        Round a keep-out the head goes by corners, and rests at each; the record names them.
         Where the head knows its counts, the record says what these leave, in pixels of ``camera``.
 
         Raises
         ------
-        OutsideLimits, PointingError, Stopped, DriverError
+        OutsideLimits, KeptOut, NoWay, PointingError, Stopped, DriverError
             If the angles may not be commanded or are not reached.
         """
         with self.step("limits") as detail:
             detail.update(pan_rad=pan_rad, tilt_rad=tilt_rad)
             self._limits.check(pan_rad, tilt_rad)
+            *corners, _ = self.head.way(pan_rad, tilt_rad)
+            if corners:
+                detail.update(corners_rad=[rounded(corner) for corner in corners])
+        for corner in corners:
+            with self.step("corner") as detail:
+                detail.update(pan_rad=corner[0], tilt_rad=corner[1])
+                until_s = self._clock.now_s() + self.head.time_allowed_s(*corner)
+                self.head.send(*corner)
+                self.head.arrived(*corner, until_s)
         with self.step("move") as detail:
             allowed_s = self.head.time_allowed_s(pan_rad, tilt_rad)
             detail.update(pan_rad=pan_rad, tilt_rad=tilt_rad, allowed_s=round(allowed_s, 3))

@@ -83,7 +83,7 @@ class Service:
         grace_s = None if hardware.simulation is None else RENDERING_S
         new_run = _run_names(hardware, clock)
         self.devices = Devices(
-            hardware, config.limits, mast.stored.digest, clock, mast.stored.rig, grace_s, new_run
+            hardware, config.limits, mast.stored.digest, clock, mast.stored.rig, grace_s, new_run, config.sun
         )
         self.operations = Operations(self.devices, clock, new_run())
         self.stop_threads = StopThreads()
@@ -241,7 +241,9 @@ class Service:
             As `mastctl.tracking.tracker.Tracker.take_pose`.
         """
         with self._mast_lock:
-            return self.tracker.take_pose(pose, look)
+            taken = self.tracker.take_pose(pose, look)
+            self.devices.door.rover_stands(pose.site_from_rover.inverse.rotation)
+            return taken
 
     def look_for_target(self) -> Operation:
         """Look for the track's target once more and return the look's first record.
@@ -318,7 +320,7 @@ class Service:
         if isinstance(target, PixelTarget):
             self._check_pixel(target)
         if isinstance(target, AnglesTarget):
-            self.config.limits.check(target.pan_rad, target.tilt_rad)
+            self.devices.door.check_goal(target.pan_rad, target.tilt_rad)
         if request.aim is not None:
             aim_of(request, self._rig)
 

@@ -9,7 +9,7 @@ and (2) looks.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -19,9 +19,12 @@ from calib.errors import CalibError
 from calib.mast.budget import stereo_range_error_m
 from calib.mast.pointing import solve
 from calib.mast.rig import Rig
-from calib.mast.solutions import choose
+from calib.mast.solutions import Solution, choose
 from calib.rigid import FloatArray
+from mastctl.devices.keep_out import KeptOut, NoWay
 from mastctl.devices.limits import Limits
+
+Chosen = Callable[[Sequence[Solution]], Solution]
 
 CENTRING_STEPS = 3
 """Each solves exactly for one eye; the other eye's place follows within a pixel after two."""
@@ -101,6 +104,7 @@ def choose_pairs(
     rules: HandoffRules | None = None,
     limits: Limits | None = None,
     from_rad: tuple[float, float] = (0.0, 0.0),
+    chosen: Chosen | None = None,
 ) -> list[Choice]:
     """Return the pairs that can look at a position, the one that should first.
 
@@ -117,6 +121,8 @@ def choose_pairs(
         Of the head; none by default.
     from_rad
         Pan and tilt of now, for the choice among solutions.
+    chosen
+        Chooses among them in place of ``limits``.
 
     Raises
     ------
@@ -124,13 +130,18 @@ def choose_pairs(
         If no pair has the target well inside both pictures, with the reason for each.
     """
     rules = rules or HandoffRules()
+
+    def within_limits(solutions: Sequence[Solution]) -> Solution:
+        return choose(solutions, limits.pan_rad, limits.tilt_rad, *from_rad) if limits else solutions[0]
+
+    choose_one = chosen or within_limits
     kept: list[tuple[float, Choice]] = []
     broken: list[tuple[float, Choice]] = []
     reasons: list[str] = []
     for name in rig.stereo:
         try:
-            focal_px, choice = _looked_at(rig, name, position_m, rules, limits, from_rad)
-        except CalibError as error:
+            focal_px, choice = _looked_at(rig, name, position_m, rules, choose_one, from_rad)
+        except (CalibError, KeptOut, NoWay) as error:
             reasons.append(f"{name}: {error}")
             continue
         (broken if choice.outside else kept).append((focal_px, choice))
@@ -149,14 +160,14 @@ def _looked_at(
     name: str,
     position_m: FloatArray,
     rules: HandoffRules,
-    limits: Limits | None,
+    chosen: Chosen,
     from_rad: tuple[float, float],
 ) -> tuple[float, Choice]:
     """One pair's focal length and how it would look. Raises CalibError if it cannot."""
     eyes = rig.stereo[name]
     angles = None
     if rig.cameras[eyes[0]].on == "head":
-        angles = _centred(rig, eyes, position_m, limits, from_rad)
+        angles = _centred(rig, eyes, position_m, chosen, from_rad)
     left, right = (rig.camera_in_rover(eye, *(angles or (0.0, 0.0))) for eye in eyes)
     for eye, model in zip(eyes, (left, right), strict=True):
         _check_inside(eye, model, position_m, rules.margin_px)
@@ -182,7 +193,7 @@ def _centred(
     rig: Rig,
     eyes: tuple[str, str],
     position_m: FloatArray,
-    limits: Limits | None,
+    chosen: Chosen,
     from_rad: tuple[float, float],
 ) -> tuple[float, float]:
     """Joint angles that put the target as far from the middle in the one eye as in the other.
@@ -197,7 +208,7 @@ def _centred(
         solutions = solve(
             rig.mast, left, position_m, aim, from_pan_rad=from_rad[0], from_tilt_rad=from_rad[1]
         )
-        best = choose(solutions, limits.pan_rad, limits.tilt_rad, *from_rad) if limits else solutions[0]
+        best = chosen(solutions)
         pan_rad, tilt_rad = best.pan_rad, best.tilt_rad
         in_right, seen = rig.camera_in_rover(eyes[1], pan_rad, tilt_rad).project(position_m)
         if not bool(seen):

@@ -285,12 +285,14 @@ class Looker:
     def _choices(self, position_m: FloatArray) -> list[Choice]:
         with self._steps.step("choose") as detail:
             here = self._steps.head.read()
+            place = here.pan_rad, here.tilt_rad
             found = choose_pairs(
                 self._rig,
                 position_m,
                 self._settings.handoff,
                 self._limits,
-                (here.pan_rad, here.tilt_rad),
+                place,
+                lambda solutions: self._steps.head.chosen(solutions, place),
             )
             detail.update(pairs=[one.pair for one in found], range_m=round(found[0].range_m, 3))
             detail.update(range_error_m=round(found[0].range_error_m, 4), outside=found[0].outside)

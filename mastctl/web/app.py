@@ -15,6 +15,7 @@ from starlette.types import ASGIApp
 from mastctl.service.service import Service
 from mastctl.web import PREFIX
 from mastctl.web.guard import Guard
+from mastctl.web.limits import add_limits
 from mastctl.web.models import ErrorBody
 from mastctl.web.pictures import add_pictures
 from mastctl.web.refusals import add_errors
@@ -37,6 +38,7 @@ def create_app(service: Service, waiting: Waiting | None = None) -> ASGIApp:
     add_errors(app)
     add_pointing(app, service, waiting)
     add_tracking(app, service, waiting)
+    add_limits(app, service, waiting)
     add_pictures(app, service, waiting)
     add_simulation(app, service, waiting)
     return Guard(app, ignores_body=frozenset({f"{PREFIX}/stop", f"{PREFIX}/track/stop"}))

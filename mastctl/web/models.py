@@ -10,6 +10,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 from scipy.spatial.transform import Rotation
 
 from calib.rigid import Rigid
+from mastctl.devices.sun import LEAST_CONE_RAD, WIDEST_CONE_RAD, Sun, direction_of
 from mastctl.pointing.requests import (
     LARGEST_M,
     Aim,
@@ -159,6 +160,40 @@ def _check_covariance(rows: list[list[float]]) -> None:
         raise ValueError("covariance is not symmetric")
     if np.linalg.eigvalsh(correlation)[0] < -1e-6:
         raise ValueError(_NEGATIVE)
+
+
+class SunBody(_Strict):
+    """``POST /limits/sun``: a direction by azimuth and elevation, or as a vector, and the cone around it.
+
+    Azimuth goes from x over y, elevation up; in the site frame x is north and y east, in the rover's forward
+    and right. ``valid_s`` is how long it holds; left out: until another is told.
+    """
+
+    azimuth_rad: Angle | None = None
+    elevation_rad: Annotated[float, Field(ge=-math.pi / 2, le=math.pi / 2)] | None = None
+    direction: Annotated[list[Part], Field(min_length=3, max_length=3)] | None = None
+    frame: Literal["site", "rover"] = "site"
+    half_angle_rad: Annotated[float, Field(ge=LEAST_CONE_RAD, le=WIDEST_CONE_RAD)]
+    valid_s: Annotated[float, Field(gt=0.0, le=1e6)] | None = None
+
+    @model_validator(mode="after")
+    def _one(self) -> Self:
+        angles = (self.azimuth_rad is not None) + (self.elevation_rad is not None)
+        if angles != (0 if self.direction is not None else 2):
+            raise ValueError("azimuth_rad with elevation_rad, or direction, is expected")
+        if self.direction is not None and not math.hypot(*self.direction) > 1e-6:
+            raise ValueError("direction is no direction: its length is 0")
+        return self
+
+    def sun(self, now_s: float) -> Sun:
+        """Return it as the door takes it."""
+        if self.direction is None:
+            assert self.azimuth_rad is not None and self.elevation_rad is not None
+            x, y, z = direction_of(self.azimuth_rad, self.elevation_rad)
+        else:
+            x, y, z = (part / math.hypot(*self.direction) for part in self.direction)
+        until_s = None if self.valid_s is None else now_s + self.valid_s
+        return Sun((x, y, z), self.frame, self.half_angle_rad, until_s)
 
 
 class StandBody(_Strict):

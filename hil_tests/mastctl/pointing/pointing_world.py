@@ -20,7 +20,9 @@ from drivers.clock import ManualClock
 from drivers.interfaces import Reading
 from hil_tests.calib.pictures.textured_planes import Pinhole, TexturedPlane, picture, random_texture
 from mastctl.devices.frames import StampedFrame
+from mastctl.devices.keep_out import Pair
 from mastctl.devices.limits import Limits
+from mastctl.devices.ways import Way, duration_s
 from mastctl.errors import NotKnown
 from mastctl.pointing.loop import PixelTarget, PointingLoop, PointingResult, PointRequest, Step
 
@@ -155,6 +157,9 @@ class World:
         if frame_id not in self._frames:
             raise NotKnown("frame_unknown", f"frame {frame_id} was not taken here")
         return self._frames[frame_id]
+
+    def way(self, here: Pair, goal: Pair) -> Way:
+        return Way((goal,), duration_s(here, (goal,), self.speed_rad_per_s))
 
     def newest_frames(self) -> dict[str, StampedFrame | None]:
         return dict.fromkeys(MOUNTS)

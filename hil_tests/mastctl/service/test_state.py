@@ -92,4 +92,5 @@ def test_what_is_known_is_told() -> None:
         "residual_px": [0.25, -0.5], "residual_sigma_px": [0.1, 0.2], "operation": "2",
     }  # fmt: skip
     assert told["joints"] == {"pan_rad": 0.1, "tilt_rad": -0.2, "measured_s": 99.75, "age_s": 0.25}
-    assert told["limits"] == {"pan_rad": [-2.0, 2.0], "tilt_rad": [-1.0, 1.0], "speed_rad_per_s": 0.5}
+    limits = {"pan_rad": [-2.0, 2.0], "tilt_rad": [-1.0, 1.0], "speed_rad_per_s": 0.5}
+    assert {key: told["limits"][key] for key in limits} == limits

@@ -87,7 +87,9 @@ def test_status_tells_what_the_contract_asks(
     assert status["joints"]["pan_rad"] == 0.5
     assert 0.0 <= status["joints"]["age_s"] < 5.0
     assert status["moving"] is False
-    assert status["limits"] == {"pan_rad": [-2.0, 2.0], "tilt_rad": [-1.0, 1.0], "speed_rad_per_s": 0.5}
+    limits = {"pan_rad": [-2.0, 2.0], "tilt_rad": [-1.0, 1.0], "speed_rad_per_s": 0.5}
+    assert {key: status["limits"][key] for key in limits} == limits
+    assert status["limits"]["keep_out"] == [] and status["limits"]["acceleration_rad_per_s2"] is None
     assert status["target"] is None
     assert status["last_residual"] is None
     assert status["control"] is None
@@ -643,3 +645,33 @@ def test_what_is_not_http_does_no_harm(quiet: httpx.Client) -> None:
         line.sendall(b"\x00\x01\x02 GET\r\n\r\n")
         assert line.recv(4096).startswith(b"HTTP/1.1 400")
     assert quiet.get("/status").status_code == 200
+
+
+# Limits
+
+
+def test_the_sun_is_told_kept_out_and_forgotten(web: httpx.Client) -> None:
+    assert web.get("/limits/sun").json() == {"sun": None}
+    body = {"azimuth_rad": 0.1, "elevation_rad": -0.1, "half_angle_rad": 0.2, "valid_s": 60.0}
+    told = web.post("/limits/sun", json=body).json()["sun"]
+    assert told["holds"] and told["frame"] == "site" and 50.0 < told["left_s"] <= 60.0
+    assert "keep-out sun" in refused(web.post("/point", json=ANGLES), 422, "keep_out")
+    vector = {"direction": [-2.0, 0.0, 0.0], "frame": "rover", "half_angle_rad": 0.2}
+    assert web.post("/limits/sun", json=vector).json()["sun"]["direction"] == [-1.0, 0.0, 0.0]
+    ended(web, web.post("/point", json=ANGLES).json()["id"])
+    assert web.delete("/limits/sun").json() == {"sun": None}
+
+
+@pytest.mark.parametrize(
+    ("body", "words"),
+    [
+        ({"half_angle_rad": 0.2}, "azimuth_rad with elevation_rad, or direction, is expected"),
+        ({"azimuth_rad": 0.1, "half_angle_rad": 0.2}, "azimuth_rad with elevation_rad, or direction"),
+        ({"direction": [0, 0, 0], "half_angle_rad": 0.2}, "its length is 0"),
+        ({"direction": [1, 0, 0], "half_angle_rad": 0.2, "azimuth_rad": 1.0}, "or direction, is expected"),
+        ({"azimuth_rad": 0.1, "elevation_rad": 1.6, "half_angle_rad": 0.2}, "elevation_rad"),
+        ({"direction": [1, 0, 0], "half_angle_rad": 2.0}, "half_angle_rad"),
+    ],
+)
+def test_a_sun_that_is_none_is_refused(web: httpx.Client, body: dict[str, Any], words: str) -> None:
+    assert words in refused(web.post("/limits/sun", json=body), 422, "bad_request")

@@ -1,0 +1,215 @@
+"""The door: limits and keep-outs of the moment, judged from where the head may be when the move goes out."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from drivers.clock import ManualClock, SystemClock
+from drivers.errors import BadOptions, BadReply
+from drivers.interfaces import AxisMotion, Reading
+from drivers.sim.pan_tilt import PRESETS, SimulatedPanTilt
+from hil_tests.mastctl.service_fakes import FakeHardware, FakeHead, rig
+from mastctl.devices.devices import HEAD, Devices
+from mastctl.devices.door import TRAVEL_S, Door
+from mastctl.devices.keep_out import Box, KeptOut, Pair
+from mastctl.devices.limits import Limits
+from mastctl.devices.sun import Sun, direction_of
+
+DECK = Box("deck", (-1.0, 1.0), (-1.2, -0.8))
+LIMITS = Limits((-2.5, 2.5), (-1.2, 0.6), 0.5, margin_rad=0.02, keep_out=(DECK,))
+ACCELERATION = 2.0
+BRAKING_RAD = 0.5**2 / (2 * ACCELERATION)
+
+
+class StatedHead(FakeHead):
+    """A head that says how it moves."""
+
+    beyond_rad = 0.0
+
+    def axis_motion(self) -> Mapping[str, AxisMotion]:
+        return dict.fromkeys(("pan", "tilt"), AxisMotion(ACCELERATION, self.beyond_rad))
+
+
+def door_of(limits: Limits = LIMITS, head: FakeHead | None = None, sun: Sun | None = None) -> Door:
+    return Door(limits, head or StatedHead(), ManualClock(100.0), HEAD, rig(), sun)
+
+
+def at(pan_rad: float, tilt_rad: float, moving: bool = False) -> Reading:
+    return Reading(pan_rad, tilt_rad, moving, 100.0)
+
+
+def lets(door: Door, reading: Reading, goal: Pair) -> bool:
+    try:
+        door.check_move(goal, lambda: reading)
+    except KeptOut:
+        return False
+    return True
+
+
+@pytest.fixture
+def hardware() -> FakeHardware:
+    made = FakeHardware()
+    made.head = StatedHead(tilt_rad=-0.4)
+    return made
+
+
+@pytest.fixture
+def devices(hardware: FakeHardware) -> Iterator[Devices]:
+    made = Devices(hardware, LIMITS, "0" * 64, SystemClock(), rig())
+    yield made
+    made.close()
+
+
+def test_a_move_that_might_pass_a_keep_out_never_reaches_the_driver(
+    devices: Devices, hardware: FakeHardware
+) -> None:
+    devices.move(-1.5, -0.4)
+    devices.move(-1.5, -1.0)
+    with pytest.raises(KeptOut, match=r"between .* the head may pass the keep-out deck"):
+        devices.move(1.5, -1.0)
+    with pytest.raises(KeptOut, match="is in the keep-out deck"):
+        devices.move(0.0, -1.0)
+    moves = [call[1:3] for call in hardware.head.calls if call[0] == "move"]
+    assert moves == [(-1.5, -0.4), (-1.5, -1.0)]
+
+
+def test_the_head_is_measured_again_before_a_move_and_one_lost_answer_is_forgiven(
+    devices: Devices, hardware: FakeHardware
+) -> None:
+    devices.move(-1.5, -0.4)
+    hardware.head.pan_rad = 0.0  # turned by hand
+    with pytest.raises(KeptOut):
+        devices.move(-1.5, -1.0)
+    hardware.head.pan_rad = -1.5
+    lost: list[str] = []
+
+    def once(name: str) -> None:
+        if name == "read" and not lost:
+            lost.append(name)
+            raise BadReply("garbled")
+
+    hardware.head.hook = once
+    devices.move(-1.5, -1.0)
+    assert lost and hardware.head.tilt_rad == -1.0
+
+
+def test_no_head_is_read_for_a_move_where_nothing_is_kept_out() -> None:
+    door = door_of(replace(LIMITS, keep_out=()))
+
+    def read() -> Reading:
+        raise AssertionError("read")
+
+    assert door.check_move((0.0, -1.0), read) is None
+
+
+def test_where_a_moving_head_may_be_counts_its_braking_and_the_command_s_travel() -> None:
+    door = door_of()
+    far = BRAKING_RAD + 0.5 * TRAVEL_S
+    edge = -0.8 + far  # from here it may brake just above the deck
+    assert lets(door, at(0.0, edge + 0.001, moving=True), (0.5, 0.0))
+    assert not lets(door, at(0.0, edge - 0.021, moving=True), (0.5, 0.0)), "it may be in the deck"
+    assert lets(door, at(0.0, edge - 0.021), (0.5, 0.0)), "at rest it stands where it was read"
+
+
+def test_a_moving_head_is_taken_to_stay_in_the_rectangle_that_was_let_through_last() -> None:
+    door = door_of()
+    start = door.check_move((1.5, -0.5), lambda: at(0.0, -0.5))
+    door.sent(start, (1.5, -0.5), 0.5)
+    near_the_deck = at(0.7, -0.76, moving=True)  # lower than the rectangle: it brakes there at most
+    assert not lets(door, near_the_deck, (0.7, -0.78))
+    inside = at(0.7, -0.5, moving=True)
+    assert lets(door, inside, (0.7, -0.78)), "tilt rests: it cannot be on its way down"
+    assert not lets(door, inside, (0.0, -0.79)), "that is the margin"
+
+
+def test_until_a_move_has_had_time_to_begin_a_head_that_says_rest_is_not_believed() -> None:
+    door = door_of()
+    start = door.check_move((1.5, -1.0), lambda: at(1.5, -0.4))
+    door.sent(start, (1.5, -1.0), 0.5)
+    assert not lets(door, at(1.5, -0.4), (0.0, -0.4)), "it may be on its way down beside the deck"
+
+
+def test_an_approach_from_one_side_is_part_of_the_slack() -> None:
+    head = StatedHead()
+    head.beyond_rad = 0.1
+    door = door_of(head=head)
+    assert not lets(door, at(0.0, 0.0), (0.0, -0.75))
+    assert lets(door, at(0.0, 0.0), (0.0, -0.67))
+
+
+def test_a_head_faster_than_the_limit_is_refused_with_the_option_that_would_be_right() -> None:
+    slow = replace(LIMITS, acceleration_rad_per_s2=1.0)
+    words = r"limits.acceleration_rad_per_s2 is 1, and pan speeds up with 2 .* set acceleration_rad_per_s2 of"
+    with pytest.raises(BadOptions, match=words):
+        door_of(slow)
+    door_of(replace(LIMITS, acceleration_rad_per_s2=2.0))
+
+
+def test_a_head_that_does_not_say_how_it_brakes_is_taken_for_a_lazy_one(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    assert door_of(head=FakeHead()).braking_rad(0.5) == pytest.approx(0.5**2 / 2 / 0.4)
+    assert not caplog.records
+    told = door_of(replace(LIMITS, acceleration_rad_per_s2=1.0), FakeHead())
+    assert told.braking_rad(0.5) == pytest.approx(0.125)
+    assert "does not say how fast it speeds up" in caplog.text
+
+
+def test_the_simulated_head_says_how_it_moves() -> None:
+    preset = PRESETS["ph42"]
+    head = SimulatedPanTilt(preset, ManualClock())
+    assert head.axis_motion()["tilt"] == AxisMotion(4.0, preset.tilt.approach_rad)
+
+
+def test_the_sun_is_kept_out_until_its_moment_and_then_missed_aloud() -> None:
+    door = door_of(replace(LIMITS, keep_out=()))
+    door.use_sun(Sun(direction_of(0.5, 0.0), "rover", 0.1, 110.0))
+    with pytest.raises(KeptOut, match="keep-out sun"):
+        door.check_goal(0.5, 0.0)
+    assert [fault.code for fault in door.faults(at(0.5, 0.02))] == ["sun_in_view"]
+    assert door.faults(at(0.5, 0.5)) == ()
+    told = door.told()["sun"]
+    assert (told["left_s"], told["holds"]) == (10.0, True)
+    clock = door._clock
+    assert isinstance(clock, ManualClock)
+    clock.advance(10.5)
+    door.check_goal(0.5, 0.0)
+    assert [fault.code for fault in door.faults(at(0.5, 0.02))] == ["sun_not_known"]
+    door.use_sun(None)
+    assert door.faults(at(0.5, 0.02)) == () and door.told() == {"sun": None}
+
+
+def test_a_sun_of_the_site_turns_with_the_rover() -> None:
+    sun = Sun(direction_of(0.5, 0.0), "site", 0.1)
+    door = door_of(replace(LIMITS, keep_out=()), sun=sun)
+    with pytest.raises(KeptOut):
+        door.check_goal(0.5, 0.0)
+    heading = 0.9  # the rover turned right: what was ahead to the right is now to the left
+    cosine, sine = math.cos(heading), math.sin(heading)
+    door.rover_stands(np.array([[cosine, sine, 0.0], [-sine, cosine, 0.0], [0.0, 0.0, 1.0]]))
+    door.check_goal(0.5, 0.0)
+    with pytest.raises(KeptOut):
+        door.check_goal(0.5 - heading, 0.0)
+
+
+def test_a_head_in_a_keep_out_is_told_as_such() -> None:
+    (fault,) = door_of().faults(at(0.0, -0.9))
+    assert (fault.device, fault.code) == ("deck", "in_keep_out")
+    assert "the head stands in the keep-out deck" in fault.message
+
+
+def test_nearest_slides_along_a_bound_and_stays_where_nothing_is_free() -> None:
+    door = door_of()
+    assert door.nearest(at(0.0, 0.0), (0.2, 0.1)) == (0.2, 0.1)
+    assert door.nearest(at(2.45, 0.0), (2.6, 0.1)) == (2.5, 0.1), "pan stands at its limit"
+    pan, tilt = door.nearest(at(0.0, -0.77), (0.2, -0.9))
+    assert pan == pytest.approx(0.2) and tilt == -0.77, "tilt stands above the deck"
+    boxed = replace(
+        LIMITS, keep_out=(Box("ring", (-2.5, 2.5), (-1.2, -0.1)), Box("lid", (-2.5, 2.5), (0.1, 0.6)))
+    )
+    assert door_of(boxed).nearest(at(0.0, 0.0), (0.0, 0.3)) != (0.0, 0.3)

@@ -1,0 +1,312 @@
+"""The one door's judgement: which moves may go out, with the limits and keep-outs of this moment.
+
+Where a head that moves may be is counted, not guessed. It is within the rectangle of the move that was let
+through last, which is free; and near its reading: as far off as it needs to brake from the fastest speed that
+it was sent with, and as it goes while the command travels. What both allow is where the next move begins.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from calib.mast.rig import Rig
+from calib.rigid import FloatArray
+from drivers.clock import Clock
+from drivers.errors import BadOptions
+from drivers.interfaces import AxisMotion, PanTilt, Reading, StatesMotion
+from mastctl.devices.keep_out import Box, KeepOuts, KeptOut, Pair, Span
+from mastctl.devices.limits import Limits
+from mastctl.devices.sun import SUN, Sun, sun_boxes
+from mastctl.devices.ways import Way, duration_s, plan
+from mastctl.state.faults import StandingFault
+
+log = logging.getLogger(__name__)
+
+REST_S = 0.3  # after a move was taken, before a reading that says rest is one of its end
+TRAVEL_S = 0.1  # from a reading to the moment when the next command acts on the axes
+ASSUMED_RAD_PER_S2 = 0.4  # of a head that does not say how it brakes: the least that a driver can be set to
+ROUNDED = 1.01  # a servo rounds its acceleration up to its own unit
+
+
+@dataclass(frozen=True)
+class _Sent:
+    """The move that was let through last."""
+
+    within: Span | None  # None: nobody knew where it began
+    goal: Pair
+    speed_rad_per_s: float
+    at_s: float
+
+
+class Door:
+    """Limits, keep-outs and the sun; safe from any thread.
+
+    Parameters
+    ----------
+    limits
+        Of the configuration.
+    head
+        May say how its axes move.
+    clock
+        The sun's directions end by it.
+    device
+        The head's name, in errors.
+    rig
+        The mast file's content; without it no sun is kept out.
+    sun
+        Of the configuration.
+
+    Raises
+    ------
+    BadOptions
+        If the head says that it speeds up faster than the limits allow.
+    """
+
+    def __init__(
+        self, limits: Limits, head: PanTilt, clock: Clock, device: str, rig: Rig | None, sun: Sun | None
+    ) -> None:
+        self.limits = limits
+        self._clock = clock
+        stated: Mapping[str, AxisMotion] = head.axis_motion() if isinstance(head, StatesMotion) else {}
+        _check_acceleration(limits, stated, device)
+        assumed = limits.acceleration_rad_per_s2 or ASSUMED_RAD_PER_S2
+        self._braking_rad_per_s2 = min(
+            (axis.acceleration_rad_per_s2 for axis in stated.values()), default=assumed
+        )
+        still = AxisMotion(assumed)
+        self._beyond = tuple(stated.get(axis, still).beyond_goal_rad for axis in ("pan", "tilt"))
+        self._lock = threading.Lock()
+        self._rig = rig
+        self._sun = sun
+        self._rover_from_site = np.eye(3)
+        self._boxes: tuple[KeepOuts | None, KeepOuts | None] = (None, None)  # without the sun, and with it
+        self._sent: _Sent | None = None
+        self._renew()
+
+    @property
+    def sun(self) -> Sun | None:
+        """The direction that is kept out; also one that holds no longer."""
+        return self._sun
+
+    def braking_rad(self, speed_rad_per_s: float) -> float:
+        """Return how far an axis goes while it brakes from a speed."""
+        return speed_rad_per_s**2 / (2.0 * self._braking_rad_per_s2)
+
+    def use_rig(self, rig: Rig) -> None:
+        """Take another mast file's cameras to judge the sun by."""
+        with self._lock:
+            self._rig = rig
+            self._renew()
+
+    def use_sun(self, sun: Sun | None) -> None:
+        """Keep another direction out, or none."""
+        with self._lock:
+            self._sun = sun
+            self._renew()
+
+    def rover_stands(self, rover_from_site: FloatArray) -> None:
+        """Take how the rover stands, (3, 3): a sun told in the site frame turns with it."""
+        with self._lock:
+            self._rover_from_site = rover_from_site
+            self._renew()
+
+    def check_goal(self, pan_rad: float, tilt_rad: float) -> None:
+        """Pass joint angles that may be a goal. Raises OutsideLimits, KeptOut."""
+        self.limits.check(pan_rad, tilt_rad)
+        keep_outs = self._now()
+        if keep_outs is not None:
+            keep_outs.check_goal((pan_rad, tilt_rad))
+
+    def way(self, here: Pair, goal: Pair) -> Way:
+        """Return the moves that lead a head at rest to a goal.
+
+        Raises
+        ------
+        OutsideLimits, KeptOut
+            If the goal may not be commanded.
+        NoWay
+            If nothing leads there.
+        """
+        self.limits.check(*goal)
+        keep_outs, speed = self._now(), self.limits.speed_rad_per_s
+        if keep_outs is None:
+            return Way((goal,), duration_s(here, (goal,), speed))
+        return plan(keep_outs, here, goal, speed)
+
+    def check_move(self, goal: Pair, read: Callable[[], Reading]) -> Span | None:
+        """Pass a move that may go out now; return where it begins, as `sent` takes it.
+
+        Parameters
+        ----------
+        goal
+            (pan, tilt), within the limits.
+        read
+            Measures the head; only asked where there is something to keep out.
+
+        Raises
+        ------
+        KeptOut
+            If the head might pass a keep-out.
+        """
+        keep_outs = self._now()
+        if keep_outs is None:
+            return None
+        start, rests = self._start(read())
+        keep_outs.check_move(start, goal, rests)
+        return start
+
+    def sent(self, start: Span | None, goal: Pair, speed_rad_per_s: float) -> None:
+        """Remember a move that goes out."""
+        before = self._sent
+        if before is not None and start is not None and start.corners[0] != start.corners[1]:
+            speed_rad_per_s = max(speed_rad_per_s, before.speed_rad_per_s)  # it may still be that fast
+        within = None if start is None else Span.around(*start.corners, *self._round(goal).corners)
+        self._sent = _Sent(within, goal, speed_rad_per_s, self._clock.now_s())
+
+    def nearest(self, reading: Reading, goal: Pair, parts: int = 16) -> Pair:
+        """Return how far towards a goal a head under way may be sent: each axis goes as far as it may.
+
+        An axis at a bound stays there while the other goes on. Where not a step is free, the answer is where
+        it was read.
+        """
+        limits = self.limits
+        here = reading.pan_rad, reading.tilt_rad
+        goal = _into(goal[0], limits.pan_rad), _into(goal[1], limits.tilt_rad)
+        keep_outs = self._now()
+        if keep_outs is None:
+            return goal
+        start, rests = self._start(reading)
+
+        def free(place: Pair) -> bool:
+            try:
+                keep_outs.check_move(start, place, rests)
+            except KeptOut:
+                return False
+            return True
+
+        def part(of: Pair) -> Pair | None:
+            for number in range(parts, 0, -1):
+                share = number / parts
+                place = here[0] + share * (of[0] - here[0]), here[1] + share * (of[1] - here[1])
+                if free(place):
+                    return place
+            return None
+
+        ways = [part(goal), part((goal[0], here[1])), part((here[0], goal[1]))]
+        found = [one for one in ways if one is not None]
+        return max(found, key=lambda one: abs(one[0] - here[0]) + abs(one[1] - here[1]), default=here)
+
+    def faults(self, reading: Reading | None) -> tuple[StandingFault, ...]:
+        """Return what stands against the head's place, and a sun that is known no longer."""
+        now_s = self._clock.now_s()
+        found = []
+        sun = self._sun
+        if sun is not None and sun.until_s is not None and not sun.holds(now_s):
+            words = (
+                "the direction of the sun that was told holds no longer, and nothing keeps the cameras off it"
+            )
+            found.append(StandingFault(SUN, "sun_not_known", words, sun.until_s, "another is told, or none"))
+        keep_outs = self._now()
+        if keep_outs is None or reading is None:
+            return tuple(found)
+        names = dict.fromkeys(
+            box.name for box in keep_outs.holding(Span.around((reading.pan_rad, reading.tilt_rad)))
+        )
+        for name in names:
+            words = "a head camera looks into the cone around the sun"
+            code, until = "sun_in_view", "the head is moved out of it, or the sun is told elsewhere"
+            if name != SUN:
+                words, code = f"the head stands in the keep-out {name}", "in_keep_out"
+                until = "it is moved out, the shortest way along one axis"
+            found.append(StandingFault(name, code, words, reading.time_s, until))
+        return tuple(found)
+
+    def told(self) -> dict[str, Any]:
+        """Return the sun as ``GET /limits/sun`` tells it."""
+        sun, now_s = self._sun, self._clock.now_s()
+        if sun is None:
+            return {"sun": None}
+        x, y, z = sun.direction
+        return {
+            "sun": {
+                "direction": [x, y, z],
+                "frame": sun.frame,
+                "half_angle_rad": sun.half_angle_rad,
+                "left_s": None if sun.until_s is None else max(0.0, sun.until_s - now_s),
+                "holds": sun.holds(now_s),
+            }
+        }
+
+    def _start(self, reading: Reading) -> tuple[Span, bool]:
+        """Where the next move begins, and whether the head rests there."""
+        here = Span.around((reading.pan_rad, reading.tilt_rad))
+        sent = self._sent
+        rests = not reading.moving and (sent is None or self._clock.now_s() - sent.at_s > REST_S)
+        if rests:
+            return here, True
+        speed = self.limits.speed_rad_per_s if sent is None else sent.speed_rad_per_s
+        far = self.braking_rad(speed) + speed * TRAVEL_S
+        near = here.grown(far, far)
+        if sent is None:
+            return near, False
+        start = (near if sent.within is None else near.overlap(sent.within)) or near
+        return Span.around(*start.corners, *here.corners, sent.goal), False
+
+    def _round(self, goal: Pair) -> Span:
+        return Span.around(goal).grown(self._beyond[0], self._beyond[1])
+
+    def _now(self) -> KeepOuts | None:
+        """What is kept out at this moment; None for nothing."""
+        sun = self._sun
+        return self._boxes[sun is not None and sun.holds(self._clock.now_s())]
+
+    def _renew(self) -> None:
+        """Make the boxes anew; the lock is held."""
+        limits, sun = self.limits, self._sun
+        slack = limits.margin_rad + self._beyond[0], limits.margin_rad + self._beyond[1]
+        # A copy of each box for every turn that the pan reaches, and for where a hand may have pushed it.
+        reach = limits.pan_rad[0] - np.pi, limits.pan_rad[1] + np.pi
+        made = []
+        plain: list[Box] = [copy for box in limits.keep_out for copy in box.within(reach)]
+        with_sun = list(plain)
+        if sun is not None and self._rig is not None:
+            direction = np.array(sun.direction)
+            in_rover = direction if sun.frame == "rover" else self._rover_from_site @ direction
+            tilts = limits.tilt_rad[0] - slack[1], limits.tilt_rad[1] + slack[1]
+            rows = sun_boxes(self._rig, in_rover, sun.half_angle_rad, tilts)
+            with_sun += [copy for box in rows for copy in box.within(reach)]
+        for boxes in (plain, with_sun):
+            whole = KeepOuts(tuple(boxes), slack, limits.pan_rad, limits.tilt_rad)
+            made.append(whole if boxes else None)
+        self._boxes = made[0], made[1]
+
+
+def _into(value: float, limits: Pair) -> float:
+    return min(max(value, limits[0]), limits[1])
+
+
+def _check_acceleration(limits: Limits, stated: Mapping[str, AxisMotion], device: str) -> None:
+    """Pass a head that speeds up no faster than the limits allow. Raises BadOptions."""
+    most = limits.acceleration_rad_per_s2
+    if most is None:
+        return
+    if not stated:
+        log.warning(
+            "the driver of the head does not say how fast it speeds up: limits.acceleration_rad_per_s2 (%g) "
+            "is only counted with, and cannot be held against it",
+            most,
+        )
+    for name, axis in stated.items():
+        if axis.acceleration_rad_per_s2 > ROUNDED * most:
+            raise BadOptions(
+                f"limits.acceleration_rad_per_s2 is {most:g}, and {name} speeds up with "
+                f"{axis.acceleration_rad_per_s2:.4g} rad/s2; set acceleration_rad_per_s2 of its driver "
+                f"(pan_tilt.options, or simulation.head) to {most:g} or less",
+                device=device,
+            )

@@ -1,0 +1,258 @@
+"""Where the head must not be: boxes in pan and tilt, and whether a move could enter one.
+
+The two axes of a head turn each at its own pace, so between its start and its goal it may be anywhere in the
+rectangle that both span: a move is free if this whole rectangle is. Around each box lies a slack, per axis,
+that no goal is in: what a head may overshoot, and how far it passes a goal on purpose to come back to it from
+one side. A box itself is open: its edge may be touched. Pan angles a whole turn apart show the same place, so
+a box is there once a turn.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+
+from mastctl.errors import BadRequest, NotNow
+
+Pair = tuple[float, float]
+
+TOUCH_RAD = 1e-9  # closer than this is the edge itself
+ASIDE_RAD = 5e-3  # a move along one axis leaves the other where it was read: three counts of a 12-bit servo
+
+
+class KeptOut(BadRequest):
+    """A goal, or every way to it that was asked for, lies in a keep-out.
+
+    Attributes
+    ----------
+    name
+        Of the keep-out.
+    """
+
+    def __init__(self, name: str, message: str) -> None:
+        self.name = name
+        super().__init__("keep_out", message)
+
+    @property
+    def detail(self) -> dict[str, str]:
+        """The same for programs."""
+        return {"keep_out": self.name}
+
+
+class NoWay(NotNow):
+    """From where the head stands the goal cannot be reached without passing a keep-out."""
+
+    def __init__(self, message: str) -> None:
+        super().__init__("no_way", message)
+
+
+@dataclass(frozen=True)
+class Span:
+    """A rectangle in pan and tilt: (lowest, highest) of each, radians."""
+
+    pan_rad: Pair
+    tilt_rad: Pair
+
+    @staticmethod
+    def around(*points: Pair) -> Span:
+        """Return the smallest one that holds these (pan, tilt)."""
+        pans, tilts = zip(*points, strict=True)
+        return Span((min(pans), max(pans)), (min(tilts), max(tilts)))
+
+    @property
+    def corners(self) -> tuple[Pair, Pair]:
+        """The lowest and the highest (pan, tilt)."""
+        return (self.pan_rad[0], self.tilt_rad[0]), (self.pan_rad[1], self.tilt_rad[1])
+
+    def grown(self, pan_rad: float, tilt_rad: float) -> Span:
+        """Return it wider by so much at each end."""
+        (pan_low, tilt_low), (pan_high, tilt_high) = self.corners
+        return Span((pan_low - pan_rad, pan_high + pan_rad), (tilt_low - tilt_rad, tilt_high + tilt_rad))
+
+    def overlap(self, other: Span) -> Span | None:
+        """Return what both hold; None if that is nothing."""
+        pan, tilt = (
+            (max(a[0], b[0]), min(a[1], b[1]))
+            for a, b in ((self.pan_rad, other.pan_rad), (self.tilt_rad, other.tilt_rad))
+        )
+        return Span(pan, tilt) if pan[0] <= pan[1] and tilt[0] <= tilt[1] else None
+
+    def enters(self, open_box: Span) -> bool:
+        """Return whether any of it lies inside another one, whose edge does not count."""
+        return all(
+            mine[0] < theirs[1] - TOUCH_RAD and mine[1] > theirs[0] + TOUCH_RAD
+            for mine, theirs in (
+                (self.pan_rad, open_box.pan_rad),
+                (self.tilt_rad, open_box.tilt_rad),
+            )
+        )
+
+
+@dataclass(frozen=True)
+class Box:
+    """A named keep-out; pan is taken round the circle, so that it may lie anywhere in a turn or past ±π."""
+
+    name: str
+    pan_rad: Pair
+    tilt_rad: Pair
+
+    @property
+    def span(self) -> Span:
+        """Its rectangle, without its slack."""
+        return Span(self.pan_rad, self.tilt_rad)
+
+    def within(self, pan_rad: Pair) -> list[Box]:
+        """Return its copies, whole turns apart, that reach into a range of pan."""
+        low, high = self.pan_rad
+        first, last = math.ceil((pan_rad[0] - high) / math.tau), math.floor((pan_rad[1] - low) / math.tau)
+        turns = [turn * math.tau for turn in range(first, last + 1)]
+        return [Box(self.name, (low + turn, high + turn), self.tilt_rad) for turn in turns]
+
+    def told(self) -> str:
+        """Say which it is and where."""
+        pan, tilt = (f"{low:.4g} to {high:.4g}" for low, high in (self.pan_rad, self.tilt_rad))
+        return f"keep-out {self.name} (pan {pan}, tilt {tilt} rad)"
+
+
+@dataclass(frozen=True)
+class KeepOuts:
+    """All boxes of a moment, with the slack around them.
+
+    Attributes
+    ----------
+    boxes
+        Copies over the whole range of pan included.
+    slack_rad
+        Around each, in pan and in tilt.
+    pan_rad, tilt_rad
+        The joint limits: ways out of a box end within them.
+    """
+
+    boxes: tuple[Box, ...]
+    slack_rad: Pair
+    pan_rad: Pair
+    tilt_rad: Pair
+
+    @cached_property
+    def full(self) -> tuple[Span, ...]:
+        """Every box with its slack."""
+        return tuple(box.span.grown(*self.slack_rad) for box in self.boxes)
+
+    def holding(self, place: Span) -> list[Box]:
+        """Return the boxes that a place reaches into, their slack left aside."""
+        return [box for box in self.boxes if place.enters(box.span)]
+
+    def check_goal(self, goal: Pair) -> None:
+        """Pass a goal that lies in no box and no slack. Raises KeptOut."""
+        point = Span.around(goal)
+        for box, full in zip(self.boxes, self.full, strict=True):
+            if point.enters(full):
+                where = "in" if point.enters(box.span) else "too near to"
+                raise KeptOut(box.name, f"{_told(goal)} is {where} the {box.told()}{self._slack_told()}")
+
+    def near(self, start: Span) -> tuple[Span, ...]:
+        """Return every box with as much of its slack as a start leaves: nearer than it is, nothing may go."""
+        return tuple(
+            box.span.grown(*(share * slack for slack in self.slack_rad))
+            for box, share in ((box, self._share(start, box)) for box in self.boxes)
+        )
+
+    def check_move(self, start: Span, goal: Pair, rests: bool) -> None:
+        """Pass a move from anywhere in ``start`` to a goal.
+
+        A head in the slack of a box may go where that is not nearer. One in a box itself may leave it the
+        shortest way along one axis, from rest.
+
+        Raises
+        ------
+        KeptOut
+            If the goal, or any place that the head may pass, is kept out.
+        """
+        self.check_goal(goal)
+        inside = self.holding(start)
+        if inside:
+            self._check_way_out(start, goal, rests, inside[0])
+            return
+        way = Span.around(*start.corners, goal)
+        for box, near in zip(self.boxes, self.near(start), strict=True):
+            if way.enters(near):
+                raise KeptOut(
+                    box.name,
+                    f"between {_told(_middle(start))} and {_told(goal)} the head may pass the {box.told()}"
+                    f"{self._slack_told()}: each axis goes at its own pace",
+                )
+
+    def way_out(self, here: Pair) -> Pair | None:
+        """Return where the shortest way along one axis leaves the boxes that hold the head; None if none.
+
+        It passes no other keep-out and ends within the joint limits.
+        """
+        names = {box.name for box in self.holding(Span.around(here))}
+        found = []
+        for axis, limits in ((0, self.pan_rad), (1, self.tilt_rad)):
+            for side in (-1, 1):
+                end = self._end_along(here, axis, side, names)
+                if end is not None and limits[0] <= end[axis] <= limits[1]:
+                    found.append((abs(end[axis] - here[axis]), end))
+        return min(found)[1] if found else None
+
+    def _end_along(self, here: Pair, axis: int, side: int, names: set[str]) -> Pair | None:
+        """The first place in one direction that is in no box and no slack; None if another keep-out comes."""
+        end = here
+        for _ in range(2 * len(self.boxes) + 1):
+            point = Span.around(end)
+            held = [full for full in self.full if point.enters(full)]
+            if not held:
+                way = Span.around(here, end)
+                other = [box for box in self.boxes if box.name not in names and way.enters(box.span)]
+                return None if other else end
+            edges = [(full.pan_rad, full.tilt_rad)[axis][side > 0] for full in held]
+            edge = max(edges) if side > 0 else min(edges)
+            end = (edge, end[1]) if axis == 0 else (end[0], edge)
+        return None
+
+    def _check_way_out(self, start: Span, goal: Pair, rests: bool, box: Box) -> None:
+        """Pass a move out of the box that holds the head. Raises KeptOut."""
+        here = _middle(start)
+        words = f"the head stands in the {box.told()}"
+        if not rests:
+            raise KeptOut(box.name, f"{words} and moves; it is led out when it rests")
+        end = self.way_out(here)
+        if end is None:
+            raise KeptOut(box.name, f"{words}, and no way along one axis leads out of it; turn it by hand")
+        axis = 0 if abs(end[0] - here[0]) > abs(end[1] - here[1]) else 1
+        out = end[axis] - here[axis]
+        along = (goal[axis] - end[axis]) * math.copysign(1.0, out) >= -ASIDE_RAD
+        rest = Span.around((goal[0], here[1]) if axis == 0 else (here[0], goal[1]), end)
+        if (
+            not along
+            or abs(goal[1 - axis] - here[1 - axis]) > ASIDE_RAD
+            or any(rest.enters(full) for full in self.full)
+        ):
+            raise KeptOut(box.name, f"{words}; the one move that is taken from there is out, to {_told(end)}")
+
+    def _share(self, start: Span, box: Box) -> float:
+        """How much of a box's slack a start leaves free, 0 to 1; 0 also inside."""
+        share = 0.0
+        pairs = ((start.pan_rad, box.pan_rad), (start.tilt_rad, box.tilt_rad))
+        for (mine, theirs), slack in zip(pairs, self.slack_rad, strict=True):
+            gap = max(theirs[0] - mine[1], mine[0] - theirs[1])
+            if gap >= slack:
+                return 1.0
+            share = max(share, gap / slack if slack > 0.0 else 0.0)
+        return share
+
+    def _slack_told(self) -> str:
+        pan, tilt = self.slack_rad
+        if pan == tilt:
+            return f" with {pan:.3g} rad around it" if pan > 0.0 else ""
+        return f" with {pan:.3g} rad around it in pan and {tilt:.3g} rad in tilt"
+
+
+def _middle(span: Span) -> Pair:
+    return sum(span.pan_rad) / 2, sum(span.tilt_rad) / 2
+
+
+def _told(place: Pair) -> str:
+    return f"pan {place[0]:.4g}, tilt {place[1]:.4g} rad"
