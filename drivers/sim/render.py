@@ -24,7 +24,7 @@ from drivers.sim.rays import BLOCK_PX, TILE_PX, RayTable, ray_table
 from drivers.sim.scene import Scene, tiny_scene
 from drivers.sim.sensor import Noise
 
-__all__ = ["Renderer", "Stills", "compile_renderer", "is_compiled"]
+__all__ = ["Renderer", "Stills", "compile_drawing", "compile_renderer", "is_compiled"]
 
 Float32 = NDArray[np.float32]
 
@@ -95,7 +95,7 @@ class Renderer:
         table = self._table(camera, samples)
         height, width = table.rays.shape[:2]
         image = np.zeros((height, width), dtype=np.float32)
-        rotation = np.array(site_from_camera_frame.rotation)
+        rotation = np.array(site_from_camera_frame.rotation, order="C")  # compiled for this order only
         across, (first, last) = table.tile_beams.shape[1], rows or (0, height)
         first, last = across * (first // TILE_PX), across * -(-last // TILE_PX)
         # short pieces, so that a worker with sky takes its share of ground too
@@ -178,6 +178,26 @@ def camera_key(camera: CameraModel) -> tuple[object, ...]:
     """Return all numbers of a camera model, to the last bit."""
     numbers = (getattr(camera, one.name) for one in fields(camera) if one.init)
     return tuple(n.tobytes() if isinstance(n, np.ndarray) else n for n in numbers)
+
+
+def compile_drawing() -> None:
+    """Compile what draws a picture, or load it: by far the largest part of what `compile_renderer` does."""
+    beams = np.full((1, 1, 6), -1.0)
+    kernels().render_tiles(
+        tiny_scene(lit=False).world,
+        np.empty((BLOCK_PX, BLOCK_PX, 1, 3), dtype=np.float32),
+        np.empty((0, 0, 0, 3), dtype=np.float32),
+        beams,
+        beams,
+        TILE_PX,
+        BLOCK_PX,
+        0,
+        0,
+        np.eye(3),
+        np.zeros(3),
+        np.empty((5, BLOCK_PX * BLOCK_PX)),
+        np.empty((BLOCK_PX, BLOCK_PX), dtype=np.float32),
+    )
 
 
 def compile_renderer() -> None:

@@ -34,6 +34,7 @@ from drivers.options import is_whole
 from drivers.sim.camera_clock import ClockSettings, clock_settings
 from drivers.sim.camera_settings import CameraSettings, check_cameras
 from drivers.sim.cameras import SelfExposedCamera, SimulatedCamera
+from drivers.sim.compile_beside import drawing_compiled_beside
 from drivers.sim.kept_scenes import kept_scene
 from drivers.sim.optics.lens import Lens
 from drivers.sim.optics.shutter import Shutter
@@ -262,9 +263,10 @@ class SimulatedRover:
         self.faults = FaultPanel(clock.now_s, self.rig.cameras)
         self.faults.set_all(settings.faults)
         check_clear_of(settings.scene.placed, self.rig)
+        with drawing_compiled_beside():
+            self.scene, self._renderer = _made(settings.scene)
         # Before any camera is asked: a frame's deadline is no time for a compiler.
         compile_renderer()
-        self.scene, self._renderer = _made(settings.scene)
         if settings.scene.terrain is not None:
             self._check_over_ground()
         self._stills = Stills(self._renderer)

@@ -230,15 +230,19 @@ def laid_out(
     return stones, bricks.scattered(settings.bricks, brick_rng, taken_m, ground)
 
 
-def tiny_scene() -> Scene:
-    """Return a level scene with one rock and next to no texture, made in no time: for compiling only."""
+def tiny_scene(lit: bool = True) -> Scene:
+    """Return a level scene with one rock and next to no texture, made in no time: for compiling only.
+
+    Without light nothing has to be compiled to make it.
+    """
     settings = SceneSettings(relief_m=0.0, rocks=1)
     rng = np.random.default_rng(settings.seed)
     sun = sun_direction(settings)
     inner = make_grid(np.zeros((9, 9), dtype=np.float32), INNER_CELLS * INNER_CELL_M / 8)
     stones = rocks.make_rocks(1, rng, partial(ground_z_m, inner))
-    broad = texture.pyramid(shadows(inner, stones, sun), inner.cell_m)
-    detail = texture.pyramid(texture.gravel(rng, sun, 128), texture.DETAIL_TEXEL_M)
+    even = np.ones((8, 8), dtype=np.float32)
+    broad = texture.pyramid(shadows(inner, stones, sun) if lit else even, inner.cell_m)
+    detail = texture.pyramid(texture.gravel(rng, sun, 128) if lit else even, texture.DETAIL_TEXEL_M)
     stone = texture.pyramid(texture.stone(rng, 128), texture.STONE_TEXEL_M)
     world = kernels().World(inner, inner, stones, detail, broad, stone, boards.faces([]), sun)
     return Scene(settings, world)

@@ -1,0 +1,82 @@
+"""What draws pictures takes most of the compiling: another process does it while this one makes the scene.
+
+    python -m drivers.sim.compile_beside
+
+compiles it into the folder where compiled code is kept. However many of these run at once, as for the workers
+of a test run, it is compiled once: the others wait, and find it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+from drivers.sim.compiled import is_compiled, kernels
+from drivers.sim.render import compile_drawing
+
+PATIENCE_S = 120.0
+"""After so long it is left to this process."""
+
+
+@contextlib.contextmanager
+def drawing_compiled_beside() -> Iterator[None]:
+    """Let another process compile what draws while the block runs, and wait for it at its end.
+
+    Nothing happens where it is compiled already, where there is one processor only, or where nothing can be
+    kept. Whether it went well or not, `drivers.sim.render.compile_renderer` has to follow.
+    """
+    beside = None if is_compiled() else _begun()
+    try:
+        yield
+        if beside is not None:
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                beside.wait(PATIENCE_S)
+    finally:
+        if beside is not None:
+            beside.kill()
+            beside.wait()
+
+
+def _begun() -> subprocess.Popen[bytes] | None:
+    """The process that compiles, if one is of use here."""
+    if len(os.sched_getaffinity(0)) < 2 or not sys.executable:
+        return None
+    folder = _folder()
+    with contextlib.suppress(OSError):
+        folder.mkdir(parents=True, exist_ok=True)
+    if not os.access(folder, os.W_OK):
+        return None
+    command = [sys.executable, "-P", "-m", "drivers.sim.compile_beside"]
+    path = os.pathsep.join(str(Path(place).absolute()) for place in sys.path)
+    try:
+        return subprocess.Popen(
+            command,
+            env={**os.environ, "PYTHONPATH": path},
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+            start_new_session=True,  # Ctrl-C is for the one who waits
+        )
+    except OSError:
+        return None
+
+
+def _folder() -> Path:
+    """Where compiled code is kept."""
+    return Path(kernels().render_tiles.stats.cache_path)
+
+
+def main() -> None:
+    """Compile what draws, if nobody else has."""
+    with (_folder() / "lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)  # goes with the process, however it ends
+        compile_drawing()
+
+
+if __name__ == "__main__":
+    main()

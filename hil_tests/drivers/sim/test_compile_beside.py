@@ -1,0 +1,72 @@
+"""What draws is compiled by a process of its own while the scene is made."""
+
+from __future__ import annotations
+
+import subprocess
+from typing import Any
+
+import numpy as np
+import pytest
+
+from calib.camera.cahvor import CameraModel
+from calib.rigid import Rigid, rot_z
+from drivers.sim import compile_beside
+from drivers.sim.compile_beside import drawing_compiled_beside
+from drivers.sim.compiled import kernels
+from drivers.sim.render import Renderer, compile_drawing, compile_renderer
+from drivers.sim.scene import tiny_scene
+
+
+@pytest.fixture
+def begun(monkeypatch: pytest.MonkeyPatch) -> list[subprocess.Popen[bytes]]:
+    """The processes that are begun, as if nothing were compiled on a machine of two processors."""
+    made: list[subprocess.Popen[bytes]] = []
+    popen = subprocess.Popen
+
+    def kept(*words: Any, **more: Any) -> subprocess.Popen[bytes]:
+        made.append(popen(*words, **more))
+        return made[-1]
+
+    monkeypatch.setattr(compile_beside, "is_compiled", lambda: False)
+    monkeypatch.setattr(compile_beside.os, "sched_getaffinity", lambda pid: {0, 1})
+    monkeypatch.setattr(compile_beside.subprocess, "Popen", kept)
+    return made
+
+
+def test_it_is_compiled_for_the_very_arguments_that_pictures_are_drawn_with() -> None:
+    compile_renderer()
+    compile_drawing()
+    camera = CameraModel("CAHV", (8, 8), C=[0, 0, -1.5], A=[1, 0, 0], H=[3.5, 8, 0], V=[3.5, 0, 8])
+    renderer = Renderer(tiny_scene(), workers=1)
+    renderer.image(camera, Rigid(rot_z(0.3), np.zeros(3)).inverse, samples=2)
+    renderer.close()
+    assert len(kernels().render_tiles.signatures) == 1
+
+
+def test_the_other_process_ends_well_and_is_waited_for(begun: list[subprocess.Popen[bytes]]) -> None:
+    compile_drawing()  # kept now, so that the other one finds it
+    with drawing_compiled_beside():
+        (process,) = begun
+    assert process.returncode == 0
+
+
+def test_the_other_process_is_not_left_behind(begun: list[subprocess.Popen[bytes]]) -> None:
+    with pytest.raises(KeyboardInterrupt), drawing_compiled_beside():
+        raise KeyboardInterrupt
+    (process,) = begun
+    assert process.returncode is not None
+
+
+def test_where_it_cannot_be_begun_or_kept_the_block_goes_on(
+    begun: list[subprocess.Popen[bytes]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(compile_beside.sys, "executable", "/nowhere/python")
+    with drawing_compiled_beside():
+        pass
+    monkeypatch.undo()
+    assert begun == []
+    monkeypatch.setattr(compile_beside, "is_compiled", lambda: False)
+    monkeypatch.setattr(compile_beside.os, "access", lambda folder, mode: False)
+    with drawing_compiled_beside():
+        pass
+    assert begun == []
