@@ -32,6 +32,9 @@ log = logging.getLogger(__name__)
 HEADS = {"dynamixel": "drivers.dynamixel.head", "flir_ptu": "drivers.flir_ptu.head"}
 """Pan/tilt drivers of this repository: the module whose ``open_head(options, clock)`` opens them."""
 
+HALTS = {"dynamixel": "drivers.dynamixel.halt", "flir_ptu": "drivers.flir_ptu.halt"}
+"""The module of each whose ``halt(options)`` stops a head that no daemon drives any more."""
+
 CAMERAS = {"v4l2": "drivers.v4l2.camera"}
 """Camera drivers of this repository: the module whose ``open_camera(options, clock, name)`` opens one."""
 
@@ -101,6 +104,36 @@ def open_hardware(settings: HardwareSettings, clock: Clock | None = None) -> Har
         raise
     pan_tilt = devices.pop(PAN_TILT)
     return Hardware(pan_tilt, devices, opener.kinds, opener.rover)
+
+
+def halt_head(settings: HardwareSettings) -> list[str]:
+    """Stop a head of which no daemon lives: open its line, say stop, and leave it holding.
+
+    Nothing is set up, no other device is opened. A head from outside is opened, stopped and closed.
+
+    Returns
+    -------
+    list of str
+        What was done to each axis, in plain words.
+
+    Raises
+    ------
+    BadOptions
+        If the settings say too little.
+    DriverError
+        If the head did not confirm; it may still move.
+    """
+    device = settings.pan_tilt
+    if device.driver in HALTS:
+        return list(importlib.import_module(HALTS[device.driver]).halt(device.options))
+    if device.driver in OURS:
+        return [f"driver {device.driver!r} has no head that moves without its daemon; nothing to halt"]
+    head = _Opener(settings, SystemClock()).head(device)
+    try:
+        head.stop()
+    finally:
+        head.close()
+    return [f"driver {device.driver!r}: stopped and closed"]
 
 
 @contextmanager

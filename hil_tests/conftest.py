@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import atexit
+import os
+import shutil
 import signal
+import tempfile
 from collections import Counter
 from collections.abc import Generator
 from contextlib import suppress
@@ -24,6 +28,11 @@ with suppress(ValueError):  # not the main thread
     ):
         if signal.getsignal(_number) is signal.SIG_IGN:
             signal.signal(_number, _usual)
+
+# Daemons that tests start keep their state in a folder of these tests, and no two runs share one.
+os.environ["XDG_STATE_HOME"] = tempfile.mkdtemp(prefix="mastctl-tests-")
+os.environ.pop("STATE_DIRECTORY", None)
+atexit.register(shutil.rmtree, os.environ["XDG_STATE_HOME"], ignore_errors=True)
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:

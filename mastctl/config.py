@@ -66,6 +66,7 @@ class Config:
     limits: Limits
     sun: Sun | None = None
     tracking: TrackingSettings = field(default_factory=TrackingSettings)
+    state_folder: Path | None = None
 
 
 def load_config(path: str | Path | None = None) -> Config:
@@ -80,6 +81,13 @@ def load_config(path: str | Path | None = None) -> Config:
     return parse_config(read_bytes(file, _MAX_BYTES), file)
 
 
+def load_head(path: str | Path) -> HardwareSettings:
+    """Read what a configuration says of its head and pass over whatever else it holds. Raises BadFile."""
+    document = parse_mapping(read_bytes(Path(path), _MAX_BYTES), path)
+    top = Section(path, "", document, ("pan_tilt",), tuple(map(str, document)))
+    return HardwareSettings(pan_tilt=_head(top), cameras={}, folder=Path(path).resolve().parent)
+
+
 def parse_config(data: bytes, path: str | Path) -> Config:
     """Read a configuration's bytes; relative paths in it start at the folder of ``path``. Raises BadFile."""
     document = parse_mapping(data, path)
@@ -91,7 +99,7 @@ def parse_config(data: bytes, path: str | Path) -> Config:
         "",
         document,
         ("schema", "mast_file", "pan_tilt", "limits"),
-        ("cameras", "listen", "simulation", "tracking"),
+        ("cameras", "listen", "simulation", "tracking", "state"),
     )
     folder = Path(path).resolve().parent
     cameras = {name: _camera(top, name) for name in top.mapping("cameras")}
@@ -108,6 +116,7 @@ def parse_config(data: bytes, path: str | Path) -> Config:
         limits=_limits(top),
         sun=_sun(top),
         tracking=_tracking(top, folder),
+        state_folder=_state_folder(top, folder),
     )
 
 
@@ -274,6 +283,13 @@ def _tracking(top: Section, folder: Path) -> TrackingSettings:
         named_pairs=named,
         handoff_log=folder / section.text("handoff_log") if "handoff_log" in section else None,
     )
+
+
+def _state_folder(top: Section, folder: Path) -> Path | None:
+    """Read ``{folder: PATH}``; None where the usual place is to be used."""
+    if "state" not in top:
+        return None
+    return folder / top.section("state", ("folder",), ()).text("folder")
 
 
 def _pair_bounds(handoff: Section, name: str) -> PairBounds:

@@ -30,8 +30,9 @@ from mastctl import signals
 from mastctl.config import Config, Listen
 from mastctl.errors import MastctlError
 from mastctl.queued_output import stall_while
+from mastctl.safety.state_folder import StateFolder
+from mastctl.safety.stop_threads import StopsHang
 from mastctl.service.service import Service
-from mastctl.service.stop_threads import StopsHang
 from mastctl.service_manager import Heartbeat, ServiceManager
 from mastctl.web.app import create_app
 from mastctl.web.connections import ACCEPTED_AT_ONCE, WAITING_IN_KERNEL, Connection, most_connections, sweep
@@ -67,13 +68,13 @@ def run(config: Config, on_ready: Callable[[str], None], clock: Clock | None = N
 
     Raises
     ------
-    AddressInUse
-        If the address is taken; the hardware was not touched.
+    AddressInUse, StateInUse
+        If the address is taken, or the state folder; the hardware was not touched.
     BadFile, DriverError
         From opening the service.
     """
     with _listening(config.listen) as (listener, url):
-        service = Service.open(config, clock)
+        service = _opened(config, clock, _state_folder(config), url)
         _let_log_stall(service)
         try:
             asyncio.run(_serve(service, listener, lambda _: on_ready(url), in_process=True))
@@ -101,7 +102,9 @@ class RunningDaemon:
         self._exit = contextlib.ExitStack()
         listener, self.url = self._exit.enter_context(_listening(config.listen))
         try:
-            self.service = Service.open(config, clock)
+            named = config.state_folder
+            folder = None if named is None else StateFolder.of(named, config.path, self.url)
+            self.service = _opened(config, clock, folder, self.url)
         except BaseException:
             self._exit.close()
             raise
@@ -153,6 +156,31 @@ class RunningDaemon:
             self._ended.set()
             self._ready.set()
             self._stop = lambda: None
+
+
+def _state_folder(config: Config) -> StateFolder:
+    """The folder of a daemon's own process; at any free port nobody would find it again."""
+    if config.state_folder is None and config.listen.socket is None and config.listen.port == 0:
+        return StateFolder.temporary()
+    return StateFolder.of(config.state_folder, config.path, config.listen.url)
+
+
+def _opened(config: Config, clock: Clock | None, folder: StateFolder | None, url: str) -> Service:
+    """Open the service and its socket for stops; let go of the folder if that fails."""
+    try:
+        service = Service.open(config, clock, folder)
+    except BaseException:
+        if folder is not None:
+            folder.close()
+        raise
+    try:
+        service.open_stop_socket()
+    except BaseException:
+        service.close()
+        raise
+    socket_path = None if service.stop_socket is None else service.stop_socket.path
+    service.folder.note_daemon(config.path, url, socket_path)
+    return service
 
 
 def _let_log_stall(service: Service) -> None:

@@ -1,8 +1,9 @@
 """Saving a file so that a crash at any moment leaves the old content or the new, never less.
 
-Steps: write the new content beside the file and fsync it; give the old content a second name; rename the
-new one into place; fsync the folder; rename the old one to ``NAME.previous.SUFFIX``. After a crash in between
-the folder may hold a hidden ``.NAME.*.new`` or ``.NAME.*.old`` beside the file; neither is ever read.
+Steps of `save_bytes`: write the new content beside the file and fsync it; give the old content a second name;
+rename the new one into place; fsync the folder; rename the old one to ``NAME.previous.SUFFIX``. After a crash
+in between the folder may hold a hidden ``.NAME.*.new`` or ``.NAME.*.old`` beside the file; neither is ever
+read. `replace_bytes` is the same without a second name, for what a program keeps for itself.
 """
 
 from __future__ import annotations
@@ -72,7 +73,7 @@ def save_bytes(path: str | Path, data: bytes) -> None:
                 _second_name(target, old)
             new.replace(target)
             placed = True
-            _sync_folder(target.parent)
+            sync_folder(target.parent)
             if mode is not None:
                 old.replace(previous_path(target))
         except OSError:
@@ -91,6 +92,35 @@ def save_bytes(path: str | Path, data: bytes) -> None:
         raise BadFile(path, "", f"cannot be saved: {error}") from None
 
 
+def replace_bytes(path: Path, data: bytes, mode: int = 0o600) -> None:
+    """Replace the file's content in one step; when this returns it is on the disk.
+
+    What crashes have left of earlier tries is taken away. One process at a time may do this to a file.
+
+    Raises
+    ------
+    OSError
+        If the file system refuses: the old content is then there, or the new one if only its way to the disk
+        was not confirmed.
+    """
+    new = path.with_name(f".{path.name}.new")
+    try:
+        new.unlink(missing_ok=True)
+        _write(new, data, mode)
+        new.replace(path)
+    except OSError:
+        with contextlib.suppress(OSError):
+            new.unlink(missing_ok=True)
+        raise
+    sync_folder(path.parent)
+
+
+def remove(path: Path) -> None:
+    """Remove a file; when this returns it is gone from the disk. Raises OSError."""
+    path.unlink(missing_ok=True)
+    sync_folder(path.parent)
+
+
 def _mode_of(target: Path) -> int | None:
     """The permissions of the file that is to be replaced; None if there is none yet."""
     try:
@@ -104,12 +134,15 @@ def _mode_of(target: Path) -> int | None:
 
 def _write(new: Path, data: bytes, mode: int | None) -> None:
     descriptor = os.open(new, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o666)
-    with os.fdopen(descriptor, "wb") as file:
+    try:
         if mode is not None:
             os.fchmod(descriptor, mode)
-        file.write(data)
-        file.flush()
+        left = memoryview(data)
+        while left:
+            left = left[os.write(descriptor, left) :]
         os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
 
 
 def _second_name(target: Path, old: Path) -> None:
@@ -129,7 +162,8 @@ def _second_name(target: Path, old: Path) -> None:
             os.close(descriptor)
 
 
-def _sync_folder(folder: Path) -> None:
+def sync_folder(folder: Path) -> None:
+    """Have the names in a folder on the disk. Raises OSError."""
     descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
     try:
         os.fsync(descriptor)

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from calib.errors import BadFile
+from calib.files.atomic import sync_folder
 from calib.files.yaml_text import dump_mapping
 from calib.survey.reader import (
     CLICK_COLUMNS,
@@ -63,9 +64,9 @@ def write_survey(survey: Survey, folder: str | Path, pictures: Iterable[tuple[st
             path.parent.mkdir(parents=True, exist_ok=True)
             _write(path, data)
         _check(new, target)
-        _sync(new)
+        sync_folder(new)
         new.replace(target)
-        _sync(target.parent)
+        sync_folder(target.parent)
     except OSError as error:
         raise BadFile(folder, "", f"cannot be written: {error.strerror or error}") from None
     finally:
@@ -167,11 +168,3 @@ def _write(path: Path, data: bytes) -> None:
         file.write(data)
         file.flush()
         os.fsync(file.fileno())
-
-
-def _sync(folder: Path) -> None:
-    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)

@@ -29,7 +29,8 @@ log = logging.getLogger(__name__)
 
 # Which module brings which command, in the order in which the help shows them.
 MODULES: dict[str, tuple[str, ...]] = {
-    "mastctl.cli.service": ("run", "status", "point", "stop", "snapshot"),
+    "mastctl.cli.service": ("run", "status", "point", "snapshot"),
+    "mastctl.cli.stop": ("stop", "estop", "reset", "halt"),
     "mastctl.cli.track": ("track",),
     "mastctl.cli.camera_files": ("camera",),
     "mastctl.cli.geometry": ("solve", "triangulate", "budget"),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import atexit
 import logging
+import os
 import signal
 import sys
 from collections.abc import Iterator
@@ -24,7 +25,7 @@ SUFFIXES = {".png": "png", ".jpg": "jpeg", ".jpeg": "jpeg"}
 
 
 def add_commands(subparsers: argparse._SubParsersAction[Any]) -> None:
-    """Add run, status, point, stop and snapshot."""
+    """Add run, status, point and snapshot."""
     run = subparsers.add_parser(
         "run", help="run the daemon; its address is one line on stdout when it is ready"
     )
@@ -54,16 +55,13 @@ def add_commands(subparsers: argparse._SubParsersAction[Any]) -> None:
     )
     point.set_defaults(run=_point)
 
-    stop = subparsers.add_parser("stop", help="stop the mast at once")
-    stop.set_defaults(run=_stop)
-
     snapshot = subparsers.add_parser("snapshot", help="take a picture and write it to a file")
     snapshot.add_argument("camera", metavar="CAMERA")
     snapshot.add_argument("--out", required=True, metavar="FILE", help="where to: .png (lossless), .jpg")
     snapshot.add_argument("--frame-id", metavar="ID", help="a frame that the daemon still keeps")
     snapshot.set_defaults(run=_snapshot)
 
-    for client in (status, point, stop, snapshot):
+    for client in (status, point, snapshot):
         add_daemon_options(client)
 
 
@@ -157,14 +155,6 @@ def _point(args: argparse.Namespace) -> int:
     return 0
 
 
-def _stop(args: argparse.Namespace) -> int:
-    with client_of(args) as client:
-        answer = client.stop()
-    operation = answer.get("operation")
-    tell_result(args, answer, f"stopped{f', operation {operation} too' if operation else ''}")
-    return 0
-
-
 def _snapshot(args: argparse.Namespace) -> int:
     out = Path(args.out)
     kind = SUFFIXES.get(out.suffix.lower())
@@ -189,14 +179,24 @@ def refuse_daemon_options(args: argparse.Namespace) -> None:
 
 
 @contextmanager
-def client_of(args: argparse.Namespace) -> Iterator[Client]:
-    """A client of the daemon that the options name."""
-    from mastctl.client import Client
-    from mastctl.config import load_config
+def client_of(args: argparse.Namespace, *, whatever_configured: bool = False) -> Iterator[Client]:
+    """A client of the daemon that the options, or MASTCTL_URL, name.
 
-    url = args.url
+    ``whatever_configured``: where the configuration cannot be read, the usual address is asked.
+    """
+    from calib.errors import BadFile
+    from mastctl.client import Client
+    from mastctl.config import Listen, load_config
+
+    url = args.url or os.environ.get("MASTCTL_URL")
     if url is None:
-        listen = load_config(args.config).listen
+        try:
+            listen = load_config(args.config).listen
+        except BadFile as error:
+            if not whatever_configured:
+                raise
+            listen = Listen()
+            output.tell(f"{error}; asking the usual address {listen.url}")
         if listen.socket is None and listen.port == 0:
             raise WrongUse("the configuration listens at any free port (0); give --url")
         url = listen.url

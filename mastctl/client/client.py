@@ -115,6 +115,16 @@ class Client:
         """Stop the mast and the running operation."""
         return self._daemon.json("POST", "/stop")
 
+    def estop(self, *, reason: str | None = None, name: str | None = None) -> dict[str, Any]:
+        """Stop the mast and let nothing move it until `reset`; ``kept`` says whether a restart would know."""
+        body = {"reason": reason, "name": name}
+        told = {key: value for key, value in body.items() if value is not None}
+        return self._daemon.json("POST", "/estop", json=told)
+
+    def reset(self, *, reason: str, name: str) -> dict[str, Any]:
+        """Release the emergency stop; nothing moves before the next command."""
+        return self._daemon.json("POST", "/reset", json={"reason": reason, "name": name})
+
     def pose(
         self,
         position_m: Sequence[float],

@@ -117,7 +117,7 @@ class Devices:
         self._history = JointHistory()
         self._store = FrameStore(mast_digest, new_run=new_run)
         self._gate = threading.Lock()
-        self._blocks: dict[object, str] = {}  # who lets no move out, and why
+        self._blocks: dict[object, Stopped] = {}  # who lets no move out, and why
         self._closed = False
         self._last_faults: tuple[str, ...] = ()
         # The last move's ticket and when it was taken, until the head was read at rest after it.
@@ -197,7 +197,8 @@ class Devices:
         def check_free() -> None:
             with self._gate:
                 if self._blocks:
-                    raise Stopped(next(iter(self._blocks.values())))
+                    why = next(iter(self._blocks.values()))
+                    raise type(why)(str(why))
             self._stops.check(ticket)
 
         def send() -> None:
@@ -232,10 +233,22 @@ class Devices:
             self._stop_lost = True
             raise
 
-    def block_moves(self, holder: object, reason: str) -> None:
-        """Refuse every further move, with this reason, until the holder (any key) allows them again."""
+    @property
+    def stop_pending(self) -> bool:
+        """Whether a stop has not come back from the driver yet."""
+        return self._stops.pending
+
+    def block_moves(self, holder: object, reason: str | Stopped) -> None:
+        """Refuse every further move until the holder (any key) allows them again.
+
+        ``reason`` are the words, or the refusal itself, which is then told before those of others.
+        """
         with self._gate:
-            self._blocks[holder] = reason
+            others = {other: why for other, why in self._blocks.items() if other is not holder}
+            if isinstance(reason, Stopped):
+                self._blocks = {holder: reason, **others}
+            else:
+                self._blocks = {**others, holder: Stopped(reason)}
 
     def allow_moves(self, holder: object) -> None:
         """Take back what this holder blocked; moves are taken when nobody blocks them."""

@@ -114,6 +114,11 @@ class Stops:
             if self._late_s < asked_s:
                 self._fault = None
 
+    @property
+    def pending(self) -> bool:
+        """Whether a stop is on its way, or inside the driver."""
+        return self._queued_s is not None or bool(self._inside)
+
     def proved(self, ticket: int) -> None:
         """Take back what earlier stops left: the move of a later ticket was taken, and the head rests."""
         with self._changed:

@@ -82,6 +82,12 @@ class Operations:
         return replace(motion, stopping=bool(self._stops) or ending)
 
     @property
+    def stopping(self) -> bool:
+        """Whether a stop is under way, or what it ends has not ended."""
+        current = self._current
+        return bool(self._stops) or (current is not None and current[1].is_set())
+
+    @property
     def closed(self) -> bool:
         """Whether the service is closing or closed."""
         return self._closed
@@ -134,10 +140,11 @@ class Operations:
             self._stops.discard(hold)
             self._mover.allow_moves(hold)
 
-    def stop(self) -> str | None:
+    def stop(self, reason: str = STOP_ASKED) -> str | None:
         """Stop the mast, then the running operation, if any; return its id.
 
-        The head comes first: nothing is asked, written or locked before it was told.
+        The head comes first: nothing is asked, written or locked before it was told. ``reason`` is what the
+        operation's record says.
 
         Raises
         ------
@@ -147,13 +154,13 @@ class Operations:
         with self.held():
             running = self._current
             if running is not None:  # what ends from here on, ends by the stop
-                self._cancelled_because = Stopped(STOP_ASKED)
+                self._cancelled_because = Stopped(reason)
                 running[1].set()
             try:
                 self._mover.stop()
             finally:
                 with self._lock:
-                    name = self._cancel(STOP_ASKED)
+                    name = self._cancel(reason)
                     self._motion = replace(self._motion, stopped=True)
         if name is None and running is not None and self.get(running[0]).state == "stopped":
             name = running[0]

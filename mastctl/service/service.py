@@ -6,8 +6,8 @@ import logging
 import math
 import random
 import threading
-from collections.abc import Callable, Mapping
-from dataclasses import replace
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import asdict, replace
 from functools import partial
 from importlib.metadata import version
 from typing import Any
@@ -16,22 +16,28 @@ import numpy as np
 
 from calib.files.mast_file import StoredRig
 from drivers.clock import Clock
+from drivers.errors import DriverError
 from drivers.hardware import Hardware
 from drivers.open_hardware import clock_for, open_hardware
 from drivers.simulation_clock import SimulationClock
 from mastctl.config import Config
 from mastctl.devices.devices import HEAD, Devices
 from mastctl.devices.frames import StampedFrame, check_known, random_run
-from mastctl.errors import NotNow
+from mastctl.errors import MastctlError, NotNow, Unable
 from mastctl.handoff.check import HandoffCheck
-from mastctl.operations.operations import STOP_ASKED, Operations, busy
+from mastctl.operations.operations import CLOSING, STOP_ASKED, Operations, busy
 from mastctl.operations.records import Operation
 from mastctl.pointing.loop import PointingLoop
 from mastctl.pointing.requests import AnglesTarget, PixelTarget, PointRequest, PositionTarget
 from mastctl.pointing.wanted import aim_of, clicked_frame, wrong_camera
+from mastctl.safety import stop_socket
+from mastctl.safety.latch import Held, Latch
+from mastctl.safety.state_folder import StateFolder
+from mastctl.safety.stop_socket import StopSocket
+from mastctl.safety.stop_threads import StopThreads
 from mastctl.service.mast_in_use import MastInUse, configured, read_mast, read_next
 from mastctl.service.state import State
-from mastctl.service.stop_threads import StopThreads
+from mastctl.state.faults import StandingFault
 from mastctl.tracking.pose import RoverPose
 from mastctl.tracking.status import TrackStatus
 from mastctl.tracking.tracker import Tracker
@@ -43,6 +49,8 @@ SNAPSHOT_AGE_S = 1.0  # a snapshot that need not be fresh may be this old
 SNAPSHOT_TIMEOUT_S = 5.0
 RENDERING_S = 20.0  # six simulated cameras share one renderer, on a machine that may be busy
 HARDWARE_CLOSE_S = 3.0
+KEPT_S = 1.0  # what the disk is given before an emergency stop is answered without it
+STATE = "state"
 ENDS_SOON_S = 0.25  # a stopped operation ends within 20 ms or so; then the next one may follow at once
 
 
@@ -59,6 +67,8 @@ class Service:
         The opened drivers; closed by `close`.
     clock
         The clock that stamps everything.
+    folder
+        Where state is kept, closed by `close`; a temporary one by default.
 
     Attributes
     ----------
@@ -70,9 +80,22 @@ class Service:
         What the track's hand-offs say of the mast file in use.
     stop_threads
         Where the web side calls `stop`: threads that nothing else can keep busy.
+    latch
+        The emergency stop, if one is latched.
+    folder
+        Where state is kept that outlives the daemon.
+    stop_socket
+        The Unix socket for stops alone, once `open_stop_socket` was called.
     """
 
-    def __init__(self, config: Config, mast: MastInUse, hardware: Hardware, clock: Clock) -> None:
+    def __init__(
+        self,
+        config: Config,
+        mast: MastInUse,
+        hardware: Hardware,
+        clock: Clock,
+        folder: StateFolder | None = None,
+    ) -> None:
         self.config = config
         self.mast = mast
         self.former: MastInUse | None = None
@@ -86,6 +109,10 @@ class Service:
             hardware, config.limits, mast.stored.digest, clock, mast.stored.rig, grace_s, new_run, config.sun
         )
         self.operations = Operations(self.devices, clock, new_run())
+        self.folder = folder or StateFolder.temporary()
+        self.latch = Latch(self.folder)
+        if self.latch.held is not None:
+            self.devices.block_moves(self.latch, self.latch.held.refusal())
         self.stop_threads = StopThreads()
         self._rig = configured(mast.stored.rig, config.hardware.cameras)
         self._loop = PointingLoop(self._rig, self.devices, config.limits, clock)
@@ -100,11 +127,14 @@ class Service:
             self.handoffs.add,
         )
         self._version = version("mastctl")
+        self.stop_socket: StopSocket | None = None
+        self._socket_folder: StateFolder | None = None
         self._closing = threading.Lock()
+        self._latch_lock = threading.Lock()
         self._closed = False
 
     @classmethod
-    def open(cls, config: Config, clock: Clock | None = None) -> Service:
+    def open(cls, config: Config, clock: Clock | None = None, folder: StateFolder | None = None) -> Service:
         """Read the mast file, open the hardware, and return the running service.
 
         Raises
@@ -121,7 +151,7 @@ class Service:
         hardware = open_hardware(config.hardware, clock)
         try:
             with clock.at_work():
-                return cls(config, mast, hardware, clock)
+                return cls(config, mast, hardware, clock, folder)
         except BaseException:
             hardware.close()
             raise
@@ -151,7 +181,9 @@ class Service:
             frames=self.devices.newest_frames(),
             motion=self.operations.motion,
             track=self.tracker.status,
-            faults=(*self.devices.faults(), *self.handoffs.faults()),
+            faults=(*self.devices.faults(), *self.handoffs.faults(), *self._state_faults()),
+            estop=self.latch.held,
+            stop_socket=None if self.stop_socket is None else str(self.stop_socket.path),
         )
 
     def track_told(self, status: TrackStatus | None = None) -> dict[str, Any]:
@@ -206,6 +238,7 @@ class Service:
         NotNow
             If the frame is of another mast file, head or rover moved since, or another operation runs.
         """
+        self._refuse_if_latched()
         with self._mast_lock:
             if isinstance(request.target, PositionTarget):
                 request = replace(request, target=self._in_rover(request.target))
@@ -226,6 +259,7 @@ class Service:
         NotKnown, NoLonger, BadRequest, NotNow
             As for `point`; ``busy`` also while a track runs.
         """
+        self._refuse_if_latched()
         with self._mast_lock:
             if isinstance(target, PositionTarget):
                 target = self._in_rover(target)
@@ -253,6 +287,7 @@ class Service:
         NotNow, Unable
             As `mastctl.tracking.tracker.Tracker.look`.
         """
+        self._refuse_if_latched()
         with self._mast_lock:
             return self.tracker.look()
 
@@ -332,19 +367,112 @@ class Service:
         x, y, z = pose.site_from_rover.inverse.points(np.array(target.position_m)).tolist()
         return PositionTarget((x, y, z), "rover")
 
-    def stop(self) -> str | None:
+    def stop(self, reason: str = STOP_ASKED) -> str | None:
         """Stop the mast, then what runs and the track; return the stopped operation's id. Raises DriverError.
 
         Nothing comes before the head: no log, no file, and no lock that is held for longer than a read.
         """
         with self.operations.held():  # until the track has ended too, which would look again
             try:
-                stopped = self.operations.stop()
+                stopped = self.operations.stop(reason)
             finally:
-                self.tracker.stop(STOP_ASKED)
+                self.tracker.stop(reason)
         if stopped is not None:
             self.operations.wait_ended(stopped, ENDS_SOON_S)
         return stopped
+
+    def estop(self, reason: str | None = None, name: str | None = None) -> dict[str, Any]:
+        """Stop the mast, and let nothing move it before `reset`, across restarts too.
+
+        The head first; then what runs and the track end; then it is told whether the disk holds the stop.
+
+        Returns
+        -------
+        dict
+            As ``POST /estop`` tells it: ``latched``, ``kept`` (a restart would find it; else ``message`` says
+            why not), ``operation``, and ``reason``, ``name`` and ``at`` of the stop that is latched.
+
+        Raises
+        ------
+        Unable
+            ``stop_unconfirmed`` if the head did not confirm; the stop is latched all the same.
+        """
+        held = self.latch_estop(reason, name)
+        stopped, unconfirmed = None, None
+        try:
+            stopped = self.stop(f"an emergency stop: {held.reason} ({held.name})")
+        except (DriverError, MastctlError) as error:
+            unconfirmed = error
+        self.latch.head_told()
+        kept = self.latch.kept_within(KEPT_S)
+        why = "" if kept else f"it would not survive a restart of the daemon: {self.latch.not_kept}"
+        if unconfirmed is not None:
+            words = f"the emergency stop is latched, but the head did not confirm it: {unconfirmed}"
+            raise Unable("stop_unconfirmed", f"{words}; {why}" if why else words)
+        told = {"stopped": True, "latched": True, "kept": kept, "operation": stopped, **asdict(held)}
+        return told | ({"message": why} if why else {})
+
+    def latch_estop(self, reason: str | None, name: str | None) -> Held:
+        """Let no move out from now on; the head is told by `estop`. Returns the stop that is latched."""
+        held = self.latch.hold(reason, name)
+        self.devices.block_moves(self.latch, held.refusal())
+        return held
+
+    def stop_told(self) -> dict[str, Any]:
+        """Stop as `stop`; return what ``POST /stop`` tells."""
+        return {"stopped": True, "operation": self.stop()}
+
+    def open_stop_socket(self) -> None:
+        """Listen for stops in the state folder, or a temporary one if its name is too long for a socket's."""
+        try:
+            self.stop_socket = StopSocket(self.folder.path / stop_socket.FILE, self)
+        except MastctlError as error:
+            log.warning("%s", error)
+            self._socket_folder = StateFolder.temporary()
+            self.stop_socket = StopSocket(self._socket_folder.path / stop_socket.FILE, self)
+
+    def reset(self, reason: str, name: str) -> Held:
+        """Release the emergency stop and return it; nothing moves before the next command.
+
+        Raises
+        ------
+        NotNow
+            ``not_estopped`` if none is latched, ``stopping`` while a stop is under way.
+        Unable
+            ``not_saved`` if the state folder goes on to say that it is latched; ``closing``.
+        """
+        if self.operations.closed:
+            raise Unable("closing", CLOSING)
+        if self.operations.stopping or self.devices.stop_pending:
+            raise NotNow("stopping", "the mast is being stopped; an emergency stop is released after that")
+        with self._latch_lock:
+            held = self.latch.release(reason, name)
+            self.devices.allow_moves(self.latch)
+            if self.latch.held is not None:  # another came meanwhile
+                self.devices.block_moves(self.latch, self.latch.held.refusal())
+        return held
+
+    def _refuse_if_latched(self) -> None:
+        """Raises Estopped."""
+        held = self.latch.held
+        if held is not None:
+            raise held.refusal()
+
+    def _state_faults(self) -> Iterator[StandingFault]:
+        """What keeps state from outliving the daemon, where it should."""
+        if self.folder.why_temporary:
+            words = f"nothing outlives this daemon, an emergency stop above all: {self.folder.why_temporary}"
+            yield StandingFault(
+                STATE, "state_not_kept", words, self.started_s, "the daemon has a state folder"
+            )
+        elif self.folder.refused and self.latch.held is None:
+            words = f"an emergency stop would not survive a restart: {self.folder.refused}"
+            yield StandingFault(STATE, "state_not_kept", words, self.started_s, "the daemon is started again")
+        elif self.latch.not_kept and not self.folder.is_temporary:
+            words = f"the emergency stop is held in memory only: {self.latch.not_kept}"
+            yield StandingFault(
+                STATE, "latch_not_kept", words, self.latch.since_s, "the disk takes it, or a reset"
+            )
 
     def close(self) -> None:
         """Stop the mast and let go of everything; bounded, never raises."""
@@ -357,6 +485,12 @@ class Service:
         self.stop_threads.close()
         self.handoffs.close()
         _bounded("closing the hardware", self.hardware.close, HARDWARE_CLOSE_S)
+        if self.stop_socket is not None:
+            self.stop_socket.close()
+        self.latch.close()
+        for folder in (self.folder, self._socket_folder):
+            if folder is not None:
+                folder.close()
 
     def _check_pixel(self, target: PixelTarget) -> None:
         taken_with, in_use = target.mast_digest, self.stored.digest

@@ -6,7 +6,7 @@ The API reads it, and whatever else shows the state later reads the same.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any, Literal
 
 from drivers.interfaces import Reading
@@ -14,9 +14,13 @@ from mastctl.as_json import as_json, picked
 from mastctl.devices.frames import StampedFrame
 from mastctl.devices.limits import Limits
 from mastctl.operations.records import Motion
+from mastctl.safety.latch import Held
 from mastctl.state.faults import StandingFault
 from mastctl.tracking.status import TrackStatus
 
+AS_THEY_ARE = (
+    "hardware", "moving", "limits", "mast", "former_mast", "version", "now_s", "stop_socket",
+)  # fmt: skip
 StateWord = Literal["idle", "moving", "pointing", "stopping", "stopped", "fault"]
 
 
@@ -38,6 +42,10 @@ class State:
         Each configured camera's newest frame.
     track
         The track, and the rover's pose.
+    estop
+        The emergency stop that is latched, None if none is.
+    stop_socket
+        Path of the Unix socket for stops alone.
     """
 
     now_s: float
@@ -52,6 +60,8 @@ class State:
     motion: Motion
     track: TrackStatus
     faults: tuple[StandingFault, ...]
+    estop: Held | None = None
+    stop_socket: str | None = None
 
     @property
     def moving(self) -> bool:
@@ -64,6 +74,8 @@ class State:
             return "fault"
         if self.motion.stopping:
             return "stopping"
+        if self.estop is not None:
+            return "stopped"
         if self.motion.operation is not None:
             return "pointing"
         if self.moving:
@@ -86,6 +98,7 @@ class State:
             "pose": None if track.pose is None else track.pose.told(self.now_s),
             "track": picked(track, "state", "reason", "id"),
             "control": None,
+            "estop": None if self.estop is None else asdict(self.estop),
             "cameras": {
                 name: picked(frame, "frame_id", "sequence", "exposure_s")
                 | {"age_s": None if frame is None else self._age_s(frame.mid_exposure_s)}
@@ -96,7 +109,7 @@ class State:
                 for fault in self.faults
             ],
             "uptime_s": self.now_s - self.started_s,
-            **picked(self, "hardware", "moving", "limits", "mast", "former_mast", "version", "now_s"),
+            **picked(self, *AS_THEY_ARE),
         }
 
     def _age_s(self, time_s: float) -> float:

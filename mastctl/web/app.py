@@ -14,6 +14,7 @@ from starlette.types import ASGIApp
 
 from mastctl.service.service import Service
 from mastctl.web import PREFIX
+from mastctl.web.estop import add_estop
 from mastctl.web.guard import Guard
 from mastctl.web.limits import add_limits
 from mastctl.web.models import ErrorBody
@@ -37,8 +38,13 @@ def create_app(service: Service, waiting: Waiting | None = None) -> ASGIApp:
     )
     add_errors(app)
     add_pointing(app, service, waiting)
+    add_estop(app, service, waiting)
     add_tracking(app, service, waiting)
     add_limits(app, service, waiting)
     add_pictures(app, service, waiting)
     add_simulation(app, service, waiting)
-    return Guard(app, ignores_body=frozenset({f"{PREFIX}/stop", f"{PREFIX}/track/stop"}))
+    return Guard(
+        app,
+        ignores_body=frozenset({f"{PREFIX}/stop", f"{PREFIX}/track/stop"}),
+        reads_body=frozenset({f"{PREFIX}/estop"}),
+    )

@@ -28,7 +28,7 @@ LEAST = 8
 FREE_DESCRIPTORS = 24  # for devices that come back, mast files, and what is accepted before it is counted
 ACCEPTED_AT_ONCE = 4  # connections taken in one turn of the event loop
 WAITING_IN_KERNEL = 128  # connections that the kernel keeps for us meanwhile
-ALWAYS = ("/stop", "/status")  # how a path ends that is served to whoever comes
+ALWAYS = ("/stop", "/estop", "/status")  # how a path ends that is served to whoever comes
 
 
 def most_connections() -> int:

@@ -51,11 +51,19 @@ class Guard:
         What it guards.
     ignores_body
         Paths that must always work: whatever body comes with them is dropped unread.
+    reads_body
+        Paths that must always work and read what they can of their body themselves.
     """
 
-    def __init__(self, app: ASGIApp, ignores_body: frozenset[str] = frozenset()) -> None:
+    def __init__(
+        self,
+        app: ASGIApp,
+        ignores_body: frozenset[str] = frozenset(),
+        reads_body: frozenset[str] = frozenset(),
+    ) -> None:
         self._app = app
         self._ignores_body = ignores_body
+        self._reads_body = reads_body
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["type"] != "http":
@@ -75,11 +83,12 @@ class Guard:
             _check_host(headers)
             if scope["method"] in _UNSAFE:
                 _check_origin(headers)
-                body = b""
-                if scope["path"] not in self._ignores_body:
-                    body = await _body(receive, headers)
-                    _check_json(body, headers)
-                receive = _once(body, receive)
+                if scope["path"] not in self._reads_body:
+                    body = b""
+                    if scope["path"] not in self._ignores_body:
+                        body = await _body(receive, headers)
+                        _check_json(body, headers)
+                    receive = _once(body, receive)
             await self._app(scope, receive, send_marked)
         except GuardError as refusal:
             response = error_response(refusal.status, refusal.code, str(refusal))

@@ -6,7 +6,7 @@ import math
 from typing import Annotated, Any, Literal, Self
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, ConfigDict, Field, StringConstraints, model_validator
 from scipy.spatial.transform import Rotation
 
 from calib.rigid import Rigid
@@ -24,6 +24,7 @@ from mastctl.pointing.requests import (
     PositionTarget,
     Target,
 )
+from mastctl.safety.latch import LONGEST
 from mastctl.tracking.pose import RoverPose
 
 Slope = Annotated[float, Field(ge=-1.0, le=1.0)]
@@ -36,6 +37,23 @@ class _Strict(BaseModel):
     """Unknown keys, wrong types and numbers that are not finite are refused."""
 
     model_config = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False, frozen=True)
+
+
+Words = Annotated[str, StringConstraints(strip_whitespace=True, min_length=1, max_length=LONGEST)]
+
+
+class EstopBody(BaseModel):
+    """``POST /estop``: why and by whom, if they are told."""
+
+    reason: str | None = None
+    name: str | None = None
+
+
+class ResetBody(_Strict):
+    """``POST /reset``: why the emergency stop is released, and by whom."""
+
+    reason: Words
+    name: Words
 
 
 class TrackBody(_Strict):

@@ -24,7 +24,7 @@ STREAM_POLL_S = 0.05  # how late a change may be told
 STREAM_ALIVE_S = 5.0
 
 
-async def _stopped(service: Service, stop: Callable[[], T]) -> T:
+async def stopped(service: Service, stop: Callable[[], T]) -> T:
     """Run a stop in the threads that are there for it. Raises Unable ``stop_pending``, DriverError."""
     try:
         return await asyncio.wait_for(asyncio.wrap_future(service.stop_threads.submit(stop)), STOP_ANSWER_S)
@@ -55,7 +55,7 @@ def add_pointing(app: FastAPI, service: Service, waiting: Waiting) -> None:
 
     @app.post(f"{PREFIX}/stop", summary="Stop the mast and the running operation, at once")
     async def stop() -> dict[str, Any]:
-        return {"stopped": True, "operation": await _stopped(service, service.stop)}
+        return await stopped(service, service.stop_told)
 
 
 def add_tracking(app: FastAPI, service: Service, waiting: Waiting) -> None:
@@ -84,7 +84,7 @@ def add_tracking(app: FastAPI, service: Service, waiting: Waiting) -> None:
 
     @app.post(f"{PREFIX}/track/stop", summary="End the track; the head stops if it moves for it")
     async def stop() -> dict[str, Any]:
-        await _stopped(service, service.stop_track)
+        await stopped(service, service.stop_track)
         return told()
 
     @app.get(

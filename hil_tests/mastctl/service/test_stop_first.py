@@ -24,7 +24,7 @@ from mastctl.operations import operations as operations_module
 from mastctl.operations.operations import Operations
 from mastctl.operations.records import Operation
 from mastctl.pointing.loop import PointingLoop
-from mastctl.service import stop_threads as stop_threads_module
+from mastctl.safety import stop_threads as stop_threads_module
 from mastctl.web import routes as routes_module
 
 

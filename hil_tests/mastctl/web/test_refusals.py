@@ -23,7 +23,7 @@ from mastctl.web.refusals import status_of
 FAMILIES = {kind.__name__: kind for kind in (BadRequest, NotAllowed, NotKnown, NoLonger, NotNow, Unable)}
 PLAIN = {GuardError.__name__, error_response.__name__}  # status first, then the code
 NO_ANSWER = {
-    "search_cut_short", "survey_refused", "cannot_tell", "address_in_use",
+    "search_cut_short", "survey_refused", "cannot_tell", "address_in_use", "state_in_use",
     "no_executor", "task_failed", "other_program", "bad_rig", "in_the_way",
 }  # fmt: skip
 """Of commands that ask no daemon."""

@@ -1,0 +1,442 @@
+"""The emergency stop: latched at once, kept across restarts, released by a reason and a name only."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import threading
+from pathlib import Path
+from typing import Any
+
+import httpx
+import pytest
+
+from calib.errors import BadFile
+from drivers.errors import DriverError
+from hil_tests.mastctl.outside_daemon import BOUND_S, daemon_process, free_port, line, under_way, write_config
+from hil_tests.mastctl.service_fakes import CONFIG, Hang, ScriptedLoop, eventually, fake_daemon
+from mastctl.client import Client, ClientError
+from mastctl.errors import NotNow, Unable
+from mastctl.safety import latch as latch_module
+from mastctl.safety import stop_threads
+from mastctl.safety.latch import FILE, Estopped, Latch
+from mastctl.safety.state_file import StateFile
+from mastctl.safety.state_folder import StateFolder, StateInUse, usual_folder
+from mastctl.service import service as service_module
+
+KEPT = CONFIG + "state: {{folder: state}}\n"
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Any:
+    path = tmp_path / "state"
+    path.mkdir()
+    made = StateFolder(path)
+    yield made
+    made.close()
+
+
+# The latch by itself
+
+
+def test_a_latched_stop_is_found_by_the_next_daemon(folder: StateFolder) -> None:
+    latch = Latch(folder)
+    assert latch.held is None
+    held = latch.hold("sparks at the\nmast", "Ana")
+    latch.head_told()
+    assert latch.kept_within(BOUND_S)
+    assert (held.reason, held.name) == ("sparks at the mast", "Ana")
+    assert Latch(folder).held == held
+
+
+def test_the_disk_waits_for_the_head_but_not_for_long(
+    folder: StateFolder, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(latch_module, "HEAD_FIRST_S", 1e6)
+    latch = Latch(folder)
+    latch.hold(None, None)
+    assert not latch.kept_within(0.05)
+    assert "not confirmed" in latch.not_kept
+    latch.head_told()
+    assert latch.kept_within(BOUND_S)
+    monkeypatch.setattr(latch_module, "HEAD_FIRST_S", 0.05)
+    latch.release("looked", "Ben")
+    latch.hold(None, None)
+    assert latch.kept_within(BOUND_S)  # a head that hangs does not keep the disk
+
+
+@pytest.mark.parametrize("data", [b"", b"{}", b"\0" * 300, b'{"schema": "mastctl/latch/1"}', b"[]"])
+def test_a_latch_file_that_cannot_be_read_means_latched(folder: StateFolder, data: bytes) -> None:
+    (folder.path / FILE).write_bytes(data)
+    latch = Latch(folder)
+    assert latch.held is not None
+    latch.release("looked at it", "Ben")
+    assert Latch(folder).held is None
+
+
+def test_a_latch_file_that_is_a_folder_means_latched_and_a_reset_says_why_it_stays(
+    folder: StateFolder,
+) -> None:
+    (folder.path / FILE).mkdir()
+    latch = Latch(folder)
+    assert latch.held is not None
+    with pytest.raises(Unable, match="stays latched"):
+        latch.release("looked at it", "Ben")
+    assert latch.held is not None
+
+
+def test_a_disk_that_refuses_leaves_it_latched_in_memory_and_says_so_until_it_takes_it(
+    folder: StateFolder, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(latch_module, "AGAIN_S", 0.01)
+    full = threading.Event()
+    full.set()
+    true = StateFile.write
+
+    def write(file: StateFile, document: Any) -> None:
+        if full.is_set():
+            raise BadFile(file.path, "", "cannot be saved: No space left on device")
+        true(file, document)
+
+    monkeypatch.setattr(StateFile, "write", write)
+    latch = Latch(folder)
+    held = latch.hold("smoke", "Ana")
+    latch.head_told()
+    assert not latch.kept_within(BOUND_S)
+    assert latch.held == held
+    assert "No space left" in latch.not_kept
+    full.clear()
+    eventually(lambda: latch.not_kept == "", "the disk takes it")
+    assert Latch(folder).held == held
+
+
+def test_a_reset_on_a_full_disk_takes_the_file_away(
+    folder: StateFolder, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    latch = Latch(folder)
+    latch.hold("smoke", "Ana")
+    latch.head_told()
+    assert latch.kept_within(BOUND_S)
+
+    def write(file: StateFile, document: Any) -> None:
+        raise BadFile(file.path, "", "cannot be saved: No space left on device")
+
+    monkeypatch.setattr(StateFile, "write", write)
+    latch.release("aired", "Ben")
+    assert latch.held is None
+    assert Latch(folder).held is None
+
+
+def test_a_reset_that_the_disk_refuses_leaves_it_latched_here_and_there(
+    folder: StateFolder, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    latch = Latch(folder)
+    latch.hold("smoke", "Ana")
+    latch.head_told()
+    assert latch.kept_within(BOUND_S)
+
+    def refuse(file: StateFile, *ignored: Any) -> None:
+        raise BadFile(file.path, "", "cannot be saved: Read-only file system")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(StateFile, "write", refuse)
+        patch.setattr(StateFile, "remove", refuse)
+        with pytest.raises(Unable, match=r"stays latched.*Read-only"):
+            latch.release("aired", "Ben")
+        assert latch.held is not None
+    assert Latch(folder).held == latch.held
+
+
+def test_a_stop_during_a_reset_wins(folder: StateFolder, monkeypatch: pytest.MonkeyPatch) -> None:
+    latch = Latch(folder)
+    latch.hold("smoke", "Ana")
+    latch.head_told()
+    assert latch.kept_within(BOUND_S)
+    true = StateFile.write
+
+    def write(file: StateFile, document: Any) -> None:
+        monkeypatch.setattr(StateFile, "write", true)
+        true(file, document)
+        latch.hold("more smoke", "Cem")
+
+    monkeypatch.setattr(StateFile, "write", write)
+    with pytest.raises(NotNow, match="another emergency stop"):
+        latch.release("aired", "Ben")
+    assert latch.held is not None
+    eventually(lambda: Latch(folder).held == latch.held, "the disk holds it again")
+
+
+def test_what_was_never_latched_cannot_be_released(folder: StateFolder) -> None:
+    with pytest.raises(NotNow, match="no emergency stop"):
+        Latch(folder).release("a reason", "a name")
+
+
+# The folder
+
+
+def test_a_second_daemon_does_not_get_the_folder(folder: StateFolder) -> None:
+    with pytest.raises(StateInUse, match=r"in use by another daemon.*state\.folder"):
+        StateFolder(folder.path)
+    folder.close()
+    StateFolder(folder.path).close()
+
+
+def test_the_usual_place_is_of_configuration_and_address(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
+    config = tmp_path / "rover.yaml"
+    places = {usual_folder(config, url) for url in ("http://127.0.0.1:1", "http://127.0.0.1:2")}
+    places.add(usual_folder(tmp_path / "other" / "rover.yaml", "http://127.0.0.1:1"))
+    assert len(places) == 3
+    assert all(place.parent == tmp_path / "mastctl" and place.name.startswith("rover-") for place in places)
+    made = StateFolder.of(None, config, "http://127.0.0.1:1")
+    assert made.path in places
+    assert made.path.stat().st_mode & 0o777 == 0o700
+    made.close()
+
+
+def test_systemd_names_the_folder_and_the_configuration_before_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("STATE_DIRECTORY", f"{tmp_path / 'one'}:{tmp_path / 'two'}")
+    for named, expected in ((None, tmp_path / "one"), (tmp_path / "told", tmp_path / "told")):
+        made = StateFolder.of(named, tmp_path / "rover.yaml", "http://127.0.0.1:1")
+        assert made.path == expected
+        made.close()
+
+
+def test_a_usual_place_that_cannot_be_made_is_replaced_and_told_a_named_one_is_insisted_upon(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "file").write_text("")
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "file"))
+    made = StateFolder.of(None, tmp_path / "rover.yaml", "http://127.0.0.1:1")
+    assert made.is_temporary
+    assert "cannot be made" in made.why_temporary
+    made.close()
+    assert not made.path.exists()
+    with pytest.raises(BadFile, match="cannot be made"):
+        StateFolder.of(tmp_path / "file" / "in", tmp_path / "rover.yaml", "http://127.0.0.1:1")
+
+
+# The daemon
+
+
+def test_after_an_emergency_stop_nothing_moves_whatever_way_it_comes(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    with fake_daemon(monkeypatch, tmp_path, config=KEPT) as (daemon, hardware), Client(daemon.url) as client:
+        told = client.estop(reason="sparks", name="Ana")
+        assert (told["stopped"], told["latched"], told["kept"]) == (True, True, True)
+        assert hardware.head.calls.count(("stop",)) == 1
+        status = client.status()
+        assert (status["state"], status["estop"]["name"]) == ("stopped", "Ana")
+        for ask in (
+            lambda: client.point(pan_rad=0.1, tilt_rad=0.1),
+            lambda: client.start_track(position_m=(6.0, 0.0, 0.0)),
+            client.look,
+        ):
+            with pytest.raises(ClientError, match=r"latched \(Ana: sparks\).*mastctl reset") as refused:
+                ask()
+            assert refused.value.code == "estopped"
+        with pytest.raises(Estopped):
+            daemon.service.devices.move(0.1, 0.1)
+        client.stop()  # takes nothing back
+        with pytest.raises(Estopped):
+            daemon.service.devices.move(0.1, 0.1)
+        assert not [call for call in hardware.head.calls if call[0] == "move"]
+        assert client.reset(reason="a loose wire, tied", name="Ben")["released"]["reason"] == "sparks"
+        assert not [call for call in hardware.head.calls if call[0] == "move"]
+        assert client.status()["estop"] is None
+        client.wait(client.point(pan_rad=0.1, tilt_rad=0.1))
+        assert [call for call in hardware.head.calls if call[0] == "move"]
+
+
+def test_an_emergency_stop_ends_the_running_operation(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    with fake_daemon(monkeypatch, tmp_path) as (daemon, _), Client(daemon.url) as client:
+        begun = threading.Event()
+
+        def wait(request: Any, record: Any, cancelled: threading.Event, devices: Any) -> Any:
+            begun.set()
+            assert cancelled.wait(BOUND_S)
+            devices.move(0.1, 0.1)
+
+        monkeypatch.setattr(ScriptedLoop, "script", staticmethod(wait))
+        operation = client.point(pan_rad=0.1, tilt_rad=0.1)
+        assert begun.wait(BOUND_S)
+        assert client.estop(reason="sparks")["operation"] == operation
+        record = client.wait(operation)
+        assert record["state"] == "stopped"
+        assert "sparks" in record["error"]["message"]
+
+
+def test_an_operation_that_slips_in_while_it_is_latched_fails_at_the_gate(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    with fake_daemon(monkeypatch, tmp_path) as (daemon, hardware), Client(daemon.url) as client:
+        monkeypatch.setattr(daemon.service, "_refuse_if_latched", lambda: None)
+        client.estop()
+        record = client.wait(client.point(pan_rad=0.1, tilt_rad=0.1))
+        assert (record["state"], record["error"]["code"]) == ("failed", "estopped")
+        assert not [call for call in hardware.head.calls if call[0] == "move"]
+
+
+@pytest.mark.parametrize(
+    ("body", "kind", "reason"),
+    [
+        (b"", "", "no reason given"),
+        (b"{", "application/json", "no reason given"),
+        (b'{"reason": 3}', "text/plain", "no reason given"),
+        (b'["reason"]', "application/json", "no reason given"),
+        (b'{"reason": "x", "reason": "y", "more": NaN}', "application/json", "y"),
+        (b'{"reason": "' + b"x" * 300 + b'"}', "application/json", "x" * 200),
+        (b"x" * 100_000, "application/json", "no reason given"),
+    ],
+)
+def test_an_emergency_stop_is_never_refused_for_its_words(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, body: bytes, kind: str, reason: str
+) -> None:
+    with fake_daemon(monkeypatch, tmp_path) as (daemon, hardware):
+        headers = {"content-type": kind} if kind else {}
+        answer = httpx.post(f"{daemon.url}/api/v1/estop", content=body, headers=headers, timeout=BOUND_S)
+        assert (answer.status_code, answer.json()["reason"]) == (200, reason)
+        assert ("stop",) in hardware.head.calls
+
+
+@pytest.mark.parametrize(
+    "body",
+    [{}, {"reason": "x"}, {"name": "x"}, {"reason": " ", "name": "x"}, {"reason": "x", "name": "y" * 201}],
+)
+def test_a_reset_needs_a_reason_and_a_name(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, body: dict[str, str]
+) -> None:
+    with fake_daemon(monkeypatch, tmp_path) as (daemon, _), Client(daemon.url) as client:
+        client.estop()
+        answer = httpx.post(f"{daemon.url}/api/v1/reset", json=body, timeout=BOUND_S)
+        assert (answer.status_code, answer.json()["error"]["code"]) == (422, "bad_request")
+        assert daemon.service.latch.held is not None
+
+
+def test_a_reset_waits_for_a_stop_that_is_under_way(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    hang = Hang()
+    with fake_daemon(monkeypatch, tmp_path) as (daemon, hardware), Client(daemon.url) as client:
+        client.estop()
+        with monkeypatch.context() as patch:
+            patch.setattr(hardware.head, "stop", hang)
+            stopping = threading.Thread(target=stop, args=(daemon.url,))
+            stopping.start()
+            eventually(lambda: daemon.service.devices.stop_pending, "the stop")
+            with pytest.raises(ClientError, match="being stopped") as refused:
+                client.reset(reason="x", name="y")
+            assert refused.value.code == "stopping"
+            hang.let_go()
+            stopping.join(BOUND_S)
+        eventually(lambda: not daemon.service.operations.stopping, "the stop's end")
+        client.reset(reason="x", name="y")
+
+
+def stop(url: str) -> None:
+    with contextlib.suppress(ClientError), Client(url) as client:
+        client.stop()
+
+
+def test_a_head_that_does_not_confirm_is_told_and_the_stop_is_latched_all_the_same(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    def refuse() -> None:
+        raise DriverError("the cable is cut")
+
+    with fake_daemon(monkeypatch, tmp_path, config=KEPT) as (daemon, hardware), Client(daemon.url) as client:
+        with monkeypatch.context() as patch:
+            patch.setattr(hardware.head, "stop", refuse)
+            with pytest.raises(ClientError, match=r"latched, but the head did not confirm.*cable") as told:
+                client.estop(name="Ana")
+            assert told.value.code == "stop_unconfirmed"
+        assert client.status()["estop"]["name"] == "Ana"
+        assert (tmp_path / "state" / FILE).exists()
+
+
+def test_stops_that_all_hang_do_not_keep_an_emergency_stop_from_the_gate(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    hang = Hang()
+    monkeypatch.setattr(stop_threads, "OVERDUE_S", 0.05)
+    with fake_daemon(monkeypatch, tmp_path) as (daemon, _), Client(daemon.url) as client:
+        futures = [daemon.service.stop_threads.submit(hang) for _ in range(stop_threads.THREADS)]
+        began = daemon.service.stop_threads._began_s
+        for future in futures:
+            eventually(lambda future=future: future in began, "the stops are under way")
+            began[future] -= 1.0
+        with pytest.raises(ClientError, match="latched, but") as told:
+            client.estop(name="Ana")
+        assert told.value.code == "stop_unconfirmed"
+        with pytest.raises(Estopped):
+            daemon.service.devices.move(0.1, 0.1)
+        hang.let_go()
+
+
+def test_a_disk_that_hangs_holds_the_answer_for_a_bounded_time_and_the_answer_says_so(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    hang = Hang()
+    with fake_daemon(monkeypatch, tmp_path, config=KEPT) as (daemon, hardware), Client(daemon.url) as client:
+        monkeypatch.setattr(StateFile, "write", hang)
+        monkeypatch.setattr(service_module, "KEPT_S", 0.05)
+        told = client.estop()
+        assert (told["latched"], told["kept"]) == (True, False)
+        assert "would not survive" in told["message"]
+        assert ("stop",) in hardware.head.calls
+        (fault,) = client.status()["faults"]
+        assert (fault["device"], fault["code"]) == ("state", "latch_not_kept")
+        monkeypatch.undo()
+        hang.let_go()
+
+
+def test_a_daemon_that_starts_latched_sends_the_head_nothing(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    with fake_daemon(monkeypatch, tmp_path, config=KEPT) as (daemon, _), Client(daemon.url) as client:
+        client.estop(reason="sparks", name="Ana")
+    with fake_daemon(monkeypatch, tmp_path, config=KEPT) as (daemon, hardware), Client(daemon.url) as client:
+        status = client.status()
+        assert (status["state"], status["estop"]["reason"]) == ("stopped", "sparks")
+        with pytest.raises(ClientError, match="latched"):
+            client.point(pan_rad=0.1, tilt_rad=0.1)
+        assert not [call for call in hardware.head.calls if call[0] in ("move", "stop")]
+
+
+# A daemon in a process of its own
+
+
+def test_killed_right_after_the_answer_it_comes_back_latched(tmp_path: Path) -> None:
+    config = write_config(tmp_path, f"{{port: {free_port()}}}")
+    with daemon_process(tmp_path, config) as daemon, Client(line(daemon)) as client:
+        under_way(client)
+        told = client.estop(reason="sparks", name="Ana")
+        os.kill(daemon.pid, 9)
+        assert told["kept"] is True
+    (tmp_path / "head.log").unlink()
+    with daemon_process(tmp_path, config) as daemon, Client(line(daemon)) as client:
+        assert client.status()["estop"]["name"] == "Ana"
+        with pytest.raises(ClientError, match="latched"):
+            client.point(pan_rad=0.1, tilt_rad=0.0)
+        assert not (tmp_path / "head.log").exists()
+        client.reset(reason="looked", name="Ben")
+        os.kill(daemon.pid, 9)
+    with daemon_process(tmp_path, config) as daemon, Client(line(daemon)) as client:
+        assert client.status()["estop"] is None
+
+
+def test_a_second_daemon_of_one_state_folder_does_not_touch_the_head(tmp_path: Path) -> None:
+    config = write_config(tmp_path)
+    config.write_text(config.read_text() + "state: {folder: state}\n")
+    with daemon_process(tmp_path, config) as daemon:
+        line(daemon)
+        with daemon_process(tmp_path, config) as second:
+            _, words = second.communicate(timeout=BOUND_S)
+        assert second.returncode == 1
+        assert "is in use by another daemon" in words.splitlines()[-1]
+        assert "Traceback" not in words

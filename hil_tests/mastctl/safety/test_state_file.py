@@ -1,0 +1,208 @@
+"""State files and mast files: whatever fails, whenever the power goes, the old or the new is there, whole."""
+
+from __future__ import annotations
+
+import errno
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from calib.errors import BadFile
+from calib.files.atomic import previous_path, save_bytes
+from hil_tests.mastctl.safety.crash_states import Cut, Recorder, crash_states
+from mastctl.safety.state_file import StateFile
+from tools.campaigns.state_kills import BadState, kill_writers
+
+SCHEMA = "mastctl/test/1"
+OLD, NEW = {"value": "old" * 40}, {"value": "new" * 700}
+
+
+def state(folder: Path) -> StateFile:
+    return StateFile(folder / "state.json", SCHEMA)
+
+
+def save_state(folder: Path) -> None:
+    state(folder).write(NEW)
+
+
+def state_read(folder: Path) -> Any:
+    return state(folder).read()
+
+
+def save_mast(folder: Path) -> None:
+    save_bytes(folder / "rig.yaml", b"new" * 700)
+
+
+def mast_read(folder: Path) -> Any:
+    path = folder / "rig.yaml"
+    return {"value": path.read_bytes().decode()} if path.exists() else None
+
+
+WRITERS = [(save_state, state_read), (save_mast, mast_read)]
+
+
+def begun(folder: Path, save: Callable[[Path], None]) -> None:
+    """The old content, as another save has left it."""
+    if save is save_state:
+        state(folder).write(OLD)
+    else:
+        (folder / "rig.yaml").write_bytes(OLD["value"].encode())
+
+
+@pytest.mark.parametrize(("save", "read"), WRITERS)
+@pytest.mark.parametrize("error", [errno.EIO, errno.ENOSPC, errno.EROFS])
+def test_a_disk_that_refuses_any_one_call_leaves_the_old_or_the_new(
+    tmp_path: Path, save: Callable[[Path], None], read: Callable[[Path], Any], error: int
+) -> None:
+    refused = 0
+    for number in range(100):
+        folder = tmp_path / str(number)
+        folder.mkdir()
+        begun(folder, save)
+        with Recorder(folder, fail_at=number, error=error).installed() as recorder:
+            try:
+                save(folder)
+            except BadFile as told:
+                refused += 1
+                assert os.strerror(error) in str(told)
+        assert read(folder) in (OLD, NEW), f"call {number} of {recorder.calls}"
+        if ("failed",) not in recorder.calls:
+            break
+    assert refused >= 5
+
+
+@pytest.mark.parametrize(("save", "read"), WRITERS)
+def test_a_process_that_ends_before_any_call_leaves_the_old_or_the_new_and_the_next_save_works(
+    tmp_path: Path, save: Callable[[Path], None], read: Callable[[Path], Any]
+) -> None:
+    cut = 0
+    for number in range(100):
+        folder = tmp_path / str(number)
+        folder.mkdir()
+        begun(folder, save)
+        with Recorder(folder, cut_at=number).installed():
+            try:
+                save(folder)
+            except Cut:
+                cut += 1
+        assert read(folder) in (OLD, NEW)
+        if cut == number:
+            break
+        save(folder)
+        assert read(folder) == NEW
+        if save is save_state:
+            assert [path.name for path in folder.iterdir()] == ["state.json"]
+    assert cut >= 5
+
+
+@pytest.mark.parametrize("old", [OLD, None])
+@pytest.mark.parametrize(("save", "read"), WRITERS)
+def test_after_a_power_cut_at_any_call_the_disk_holds_the_old_or_the_new_and_the_new_once_told(
+    tmp_path: Path, save: Callable[[Path], None], read: Callable[[Path], Any], old: dict[str, str] | None
+) -> None:
+    folder = tmp_path / "recorded"
+    folder.mkdir()
+    if old is not None:
+        begun(folder, save)
+    before = {str(path): path.read_bytes() for path in folder.iterdir()}
+    with Recorder(folder).installed() as recorder:
+        save(folder)
+    states = 0
+    for made, held in crash_states(before, recorder.calls, str(folder)):
+        for path in folder.iterdir():
+            path.unlink()
+        for name, data in held.items():
+            Path(name).write_bytes(data)
+        found = read(folder)
+        assert found in (old, NEW), f"after {made} of {recorder.calls}: {sorted(held)}"
+        if made == len(recorder.calls):
+            assert found == NEW
+        states += 1
+    assert states > 20
+
+
+def test_a_power_cut_between_write_and_sync_is_found_out(tmp_path: Path) -> None:
+    """The judge itself: a careless writer does not pass."""
+    folder = tmp_path / "careless"
+    folder.mkdir()
+    path = folder / "state.json"
+
+    def careless() -> None:
+        descriptor = os.open(folder / "new", os.O_WRONLY | os.O_CREAT)
+        os.write(descriptor, b"new")
+        os.close(descriptor)
+        (folder / "new").replace(path)
+
+    path.write_bytes(b"old")
+    with Recorder(folder).installed() as recorder:
+        careless()
+    found = {
+        held.get(str(path)) for _, held in crash_states({str(path): b"old"}, recorder.calls, str(folder))
+    }
+    assert b"" in found
+
+
+def test_the_version_before_survives_a_power_cut_once_a_save_is_over(tmp_path: Path) -> None:
+    folder = tmp_path / "recorded"
+    folder.mkdir()
+    begun(folder, save_mast)
+    save_mast(folder)
+    assert previous_path(folder / "rig.yaml").read_bytes() == OLD["value"].encode()
+
+
+@pytest.mark.parametrize(
+    ("data", "words"),
+    [
+        (b"", "is no JSON (its 0 bytes"),
+        (b'{"schema": "mastctl/test/1", "val', "is no JSON"),
+        (b"\xff\xfe\x00", "is no JSON"),
+        (b"[1]", "no JSON object"),
+        (b'{"schema": "mastctl/test/2"}', "'mastctl/test/2' where 'mastctl/test/1' is expected"),
+        (b"{}", "None where 'mastctl/test/1' is expected"),
+        (b"[" * 100_000, "is no JSON"),
+        (b" " * (2 << 20), "is larger than"),
+    ],
+)
+def test_what_is_no_state_is_told_in_one_sentence(tmp_path: Path, data: bytes, words: str) -> None:
+    file = state(tmp_path)
+    file.path.write_bytes(data)
+    with pytest.raises(BadFile) as told:
+        file.read()
+    assert words in str(told.value)
+    assert str(file.path) in str(told.value)
+
+
+def test_a_state_file_is_for_its_user_only(tmp_path: Path) -> None:
+    state(tmp_path).write(NEW)
+    assert state(tmp_path).path.stat().st_mode & 0o777 == 0o600
+
+
+def test_what_is_no_json_is_not_written(tmp_path: Path) -> None:
+    state(tmp_path).write(OLD)
+    for bad in (float("nan"), object()):
+        with pytest.raises((ValueError, TypeError)):
+            state(tmp_path).write({"value": bad})
+    assert state(tmp_path).read() == OLD
+
+
+def test_processes_killed_while_they_write_leave_whole_files(tmp_path: Path) -> None:
+    counts = kill_writers(tmp_path, kills=24, seed=1)
+    assert counts["kills"] == 24
+    assert counts["in the middle of a save"] > 0
+
+
+def test_the_campaign_of_kills_sees_a_careless_writer(tmp_path: Path) -> None:
+    with pytest.raises(BadState):
+        kill_writers(tmp_path, kills=200, seed=1, careless=True)
+
+
+def test_the_campaign_of_kills_is_a_command() -> None:
+    command = [sys.executable, "-m", "tools.campaigns.state_kills", "--kills", "3"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert "3 kills" in done.stdout

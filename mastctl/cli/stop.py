@@ -1,0 +1,129 @@
+"""Commands that stop: ``stop``, ``estop``, its ``reset``, and ``halt``, which asks no daemon.
+
+A stop works whatever else does not: with a configuration that cannot be read, and when the web side of the
+daemon does not answer, by its stop socket.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from mastctl.cli.output import CommandError
+from mastctl.cli.service import add_daemon_options, client_of, tell_result
+
+if TYPE_CHECKING:
+    from mastctl.client import Client
+
+
+def add_commands(subparsers: argparse._SubParsersAction[Any]) -> None:
+    """Add stop, estop, reset and halt."""
+    stop = subparsers.add_parser("stop", help="stop the mast at once")
+    stop.set_defaults(run=_stop)
+
+    estop = subparsers.add_parser(
+        "estop", help="stop the mast at once, and let nothing move it until 'mastctl reset'"
+    )
+    estop.add_argument("--reason", metavar="WORDS", help="why, for who comes to reset it")
+    estop.add_argument("--name", metavar="WHO", help="who stops it")
+    estop.set_defaults(run=_estop)
+
+    reset = subparsers.add_parser("reset", help="release an emergency stop; nothing moves by that")
+    reset.add_argument("--reason", required=True, metavar="WORDS", help="why it is safe to move again")
+    reset.add_argument("--name", required=True, metavar="WHO", help="who says so")
+    reset.set_defaults(run=_reset)
+
+    halt = subparsers.add_parser(
+        "halt",
+        help="stop a head whose daemon is dead: opens its servo line, says stop on it, and nothing else",
+    )
+    halt.add_argument("--config", required=True, metavar="FILE", help="the daemon's configuration")
+    halt.set_defaults(run=_halt)
+
+    for client in (stop, estop, reset):
+        add_daemon_options(client)
+
+
+def _stop(args: argparse.Namespace) -> int:
+    answer = _by_any_way(args, "stop", lambda client: client.stop())
+    operation = answer.get("operation")
+    tell_result(args, answer, f"stopped{f', operation {operation} too' if operation else ''}")
+    return 0
+
+
+def _estop(args: argparse.Namespace) -> int:
+    reason, name = (" ".join((words or "").split()) for words in (args.reason, args.name))
+    line = f"estop {name.replace(':', ' ')}: {reason}"
+    answer = _by_any_way(args, line, lambda client: client.estop(reason=reason or None, name=name or None))
+    words = f"stopped and latched ({answer.get('name')}: {answer.get('reason')})"
+    if answer.get("message"):
+        words += f"; {answer['message']}"
+    tell_result(args, answer, f"{words}; 'mastctl reset --reason ... --name ...' releases it")
+    return 0
+
+
+def _reset(args: argparse.Namespace) -> int:
+    with client_of(args, whatever_configured=True) as client:
+        answer = client.reset(reason=args.reason, name=args.name)
+    was = answer["released"]
+    tell_result(args, answer, f"released (it was latched by {was['name']}, {was['at']}: {was['reason']})")
+    return 0
+
+
+def _by_any_way(
+    args: argparse.Namespace, line: str, ask: Callable[[Client], dict[str, Any]]
+) -> dict[str, Any]:
+    """Ask by the stop socket where there is one, else over HTTP."""
+    from mastctl.safety.stop_line import NoAnswer
+    from mastctl.safety.stop_line import ask as ask_socket
+
+    answer: Mapping[str, Any] | None = None
+    failed = ""
+    for path in _sockets(args):
+        try:
+            answer = ask_socket(path, line)
+        except NoAnswer:
+            continue
+        except ValueError as error:
+            failed = str(error)
+    if failed:  # one of them could not; another way would meet the same head
+        raise CommandError("stop_failed", failed)
+    if answer is not None:
+        return dict(answer)
+    with client_of(args, whatever_configured=True) as client:
+        return ask(client)
+
+
+def _sockets(args: argparse.Namespace) -> list[Path]:
+    """The stop sockets of the daemon that is meant."""
+    from calib.errors import BadFile
+    from mastctl.config import load_config
+    from mastctl.packaged import default_config
+    from mastctl.safety.state_folder import usual_folder
+    from mastctl.safety.stop_line import sockets_of
+
+    url = args.url or os.environ.get("MASTCTL_URL")
+    if url is not None:
+        return sockets_of(None, None if args.config is None else Path(args.config), url)
+    config = default_config() if args.config is None else Path(args.config)
+    try:
+        loaded = load_config(config)
+    except BadFile:
+        return sockets_of(None, config, None)
+    if loaded.state_folder is not None:
+        return sockets_of(loaded.state_folder, None, None)
+    return sockets_of(None, config, loaded.listen.url) or sockets_of(
+        usual_folder(config, loaded.listen.url), None, None
+    )
+
+
+def _halt(args: argparse.Namespace) -> int:
+    from drivers.open_hardware import halt_head
+    from mastctl.config import load_head
+
+    said = halt_head(load_head(args.config))
+    tell_result(args, {"halted": True, "said": said}, "; ".join(said))
+    return 0

@@ -1,0 +1,84 @@
+"""Files in which a daemon keeps what must outlive it: one JSON document each, versioned, replaced whole."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from calib.errors import BadFile
+from calib.files.atomic import remove, replace_bytes
+
+MAX_BYTES = 1 << 20
+
+
+@dataclass(frozen=True)
+class StateFile:
+    """One document, of which a crash at any moment leaves the old or the new, whole.
+
+    Attributes
+    ----------
+    path
+        The file; its folder must be there.
+    schema
+        Its kind and version, such as ``mastctl/latch/1``: a file that says another one is refused.
+    """
+
+    path: Path
+    schema: str
+
+    def read(self) -> dict[str, Any] | None:
+        """Return the document without its schema; None if there is no file.
+
+        Raises
+        ------
+        BadFile
+            If there is one that cannot be read, or is something else.
+        """
+        try:
+            with self.path.open("rb") as file:
+                data = file.read(MAX_BYTES + 1)
+        except FileNotFoundError:
+            return None
+        except OSError as error:
+            raise BadFile(self.path, "", f"cannot be read: {error.strerror or error}") from None
+        if len(data) > MAX_BYTES:
+            raise BadFile(self.path, "", f"is larger than {MAX_BYTES} bytes")
+        try:
+            document = json.loads(data)
+        except (ValueError, RecursionError):
+            raise BadFile(
+                self.path, "", f"is no JSON (its {len(data)} bytes are not what was written)"
+            ) from None
+        if not isinstance(document, dict):
+            raise BadFile(self.path, "", f"holds no JSON object where one of {self.schema} is expected")
+        found = document.pop("schema", None)
+        if found != self.schema:
+            raise BadFile(self.path, "schema", f"{found!r} where '{self.schema}' is expected")
+        return document
+
+    def write(self, document: Mapping[str, Any]) -> None:
+        """Put a document in the place of the former one; when this returns it is on the disk.
+
+        Raises
+        ------
+        BadFile
+            If the file system refuses; what is then read is the former document, or the new one if only its
+            way to the disk was not confirmed.
+        ValueError, TypeError
+            If it is no JSON.
+        """
+        text = json.dumps({"schema": self.schema, **document}, indent=1, allow_nan=False)
+        try:
+            replace_bytes(self.path, (text + "\n").encode())
+        except OSError as error:
+            raise BadFile(self.path, "", f"cannot be saved: {error.strerror or error}") from None
+
+    def remove(self) -> None:
+        """Take the file away; when this returns it is gone from the disk too. Raises BadFile."""
+        try:
+            remove(self.path)
+        except OSError as error:
+            raise BadFile(self.path, "", f"cannot be removed: {error.strerror or error}") from None

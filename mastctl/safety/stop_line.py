@@ -1,0 +1,122 @@
+"""Asking a daemon's stop socket, from another process; needs no configuration that can be read."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import socket
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from calib.errors import BadFile
+from mastctl.safety.state_file import StateFile
+from mastctl.safety.state_folder import DAEMON_FILE, DAEMON_SCHEMA, folders_of
+from mastctl.safety.stop_socket import FILE
+
+ANSWER_S = 5.0
+TRIES = 3  # a crowd of others may have pushed us out
+
+
+class NoAnswer(Exception):
+    """Nobody there, or nobody who answers as a daemon does."""
+
+
+def sockets_of(folder: Path | None, config: Path | None, url: str | None) -> list[Path]:
+    """Return the stop sockets of what is known of a daemon; whether somebody listens is not asked.
+
+    Parameters
+    ----------
+    folder
+        Its state folder, if that is known.
+    config
+        Its configuration, which may be broken; None for any.
+    url
+        Its address, if that is known.
+    """
+    if folder is not None:
+        return [path for path, _ in _of(folder)]
+    found = []
+    for place in folders_of(config):
+        for path, told in _of(place):
+            wrong = told and (
+                (config is not None and told.get("config") != str(config.resolve()))
+                or (url is not None and told.get("url") != url)
+            )
+            if not wrong and (told or url is None):
+                found.append(path)
+    return found
+
+
+def ask(path: Path, line: str) -> dict[str, Any]:
+    """Send one line; return what the daemon tells of what it did.
+
+    Raises
+    ------
+    NoAnswer
+        If nobody listens, or no daemon of this program answers.
+    ValueError
+        With the daemon's own sentence, if it could not.
+    """
+    for _ in range(TRIES):
+        answer = _asked(path, line)
+        if answer:
+            break
+    verb, _, rest = answer.partition(" ")
+    if verb == "failed:":
+        raise ValueError(rest)
+    try:
+        told = json.loads(rest)
+    except ValueError:
+        told = None
+    if not isinstance(told, dict) or verb != line.split()[0]:
+        raise NoAnswer(f"what listens at {path} does not answer as a daemon does")
+    return told
+
+
+def _asked(path: Path, line: str) -> str:
+    """One line of answer; empty if the other side has closed without one."""
+    until_s = time.monotonic() + ANSWER_S
+    answer = b""
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as peer:
+        peer.settimeout(ANSWER_S)
+        try:
+            _connect(peer, path, until_s)
+            peer.sendall(f"{line}\n".encode())
+            while not answer.endswith(b"\n"):
+                peer.settimeout(max(0.01, until_s - time.monotonic()))
+                part = peer.recv(4096)
+                if not part:
+                    break
+                answer += part
+        except TimeoutError:
+            raise NoAnswer(f"{path} took the line but did not answer within {ANSWER_S:g} s") from None
+        except (ConnectionResetError, BrokenPipeError):
+            return ""
+        except OSError as error:
+            raise NoAnswer(f"nobody listens at {path}: {error.strerror or error}") from None
+    return answer.decode("utf-8", "replace").strip()
+
+
+def _connect(peer: socket.socket, path: Path, until_s: float) -> None:
+    """Connect, after those who wait for the same. Raises OSError."""
+    while True:
+        try:
+            peer.connect(str(path))
+            return
+        except BlockingIOError:  # the kernel keeps no more of us waiting; they are taken in quickly
+            if time.monotonic() > until_s:
+                raise TimeoutError from None
+            time.sleep(0.001)
+
+
+def _of(folder: Path) -> Iterator[tuple[Path, dict[str, Any]]]:
+    """The socket of a state folder, if there is one, and what is written down of its daemon."""
+    told: dict[str, Any] = {}
+    with contextlib.suppress(BadFile):
+        told = StateFile(folder / DAEMON_FILE, DAEMON_SCHEMA).read() or {}
+    path = Path(str(told.get("stop_socket") or folder / FILE))
+    with contextlib.suppress(OSError):
+        if path.is_socket():
+            yield path, told

@@ -1,0 +1,65 @@
+"""Routes of the emergency stop and its release."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+from dataclasses import asdict
+from typing import Any
+
+from fastapi import FastAPI, Request
+
+from mastctl.errors import Unable
+from mastctl.safety.stop_threads import StopsHang
+from mastctl.service.service import Service
+from mastctl.web import PREFIX
+from mastctl.web.models import EstopBody, ResetBody
+from mastctl.web.routes import stopped
+from mastctl.web.waiting import Waiting
+
+BODY_S = 0.05  # a body comes with its request; who sends it later is stopped without its words
+LARGEST_BODY_BYTES = 4096
+
+
+def add_estop(app: FastAPI, service: Service, waiting: Waiting) -> None:
+    """The emergency stop, which needs no body that makes sense, and the reset, which does."""
+
+    @app.post(
+        f"{PREFIX}/estop",
+        summary="Stop the mast and let nothing move it until it is reset, across restarts too",
+        openapi_extra={
+            "requestBody": {"content": {"application/json": {"schema": EstopBody.model_json_schema()}}}
+        },
+    )
+    async def estop(request: Request) -> dict[str, Any]:
+        told = await _told(request)
+        words = told.get("reason"), told.get("name")
+        try:
+            return await stopped(service, lambda: service.estop(*words))
+        except StopsHang as error:
+            await waiting.run(lambda: service.latch_estop(*words))
+            raise Unable("stop_unconfirmed", f"the emergency stop is latched, but {error}") from None
+
+    @app.post(f"{PREFIX}/reset", summary="Release the emergency stop; nothing moves before the next command")
+    async def reset(body: ResetBody) -> dict[str, Any]:
+        released = await waiting.run(lambda: service.reset(body.reason, body.name))
+        return {"latched": False, "released": asdict(released)}
+
+
+async def _told(request: Request) -> dict[str, str]:
+    """What words the body has, if it comes at once and has any."""
+    data = b""
+    try:
+        async with asyncio.timeout(BODY_S):
+            async for part in request.stream():
+                data += part
+                if len(data) > LARGEST_BODY_BYTES:
+                    return {}
+        found = json.loads(data)
+    except Exception:  # late, broken off, no JSON: a stop is not refused for its words
+        return {}
+    return (
+        {key: value for key, value in found.items() if isinstance(value, str)}
+        if isinstance(found, dict)
+        else {}
+    )
