@@ -21,7 +21,8 @@ def _paths(daemon: Daemon) -> str:
     paths = field(_description(daemon), "paths")
     for method, path in (
         ("get", "/status"), ("post", "/point"), ("get", "/operations"), ("get", "/operations/{operation_id}"),
-        ("post", "/stop"), ("get", "/snapshot/{camera}"), ("get", "/mast"),
+        ("post", "/stop"), ("post", "/estop"), ("post", "/reset"), ("get", "/snapshot/{camera}"),
+        ("get", "/mast"),
     ):  # fmt: skip
         known = [told for told in paths if _same(told, PREFIX + path)]
         expect(known and method in paths[known[0]], f"{method.upper()} {PREFIX}{path} is not described")

@@ -187,6 +187,42 @@ def _after_stop(daemon: Daemon) -> None:
 
 
 @MOTION.check(
+    "motion.estop",
+    "an emergency stop refuses moves until a reset with reason and name, and that moves nothing",
+    moves=True,
+)
+def _estop(daemon: Daemon) -> str:
+    words = {"reason": "a check of this daemon's promises", "name": "mastctl conform"}
+    before = daemon.joints()
+    answer = daemon.wire.ask("POST", "/estop", json=words)
+    expect(answer.status == 200, f"POST /estop: {answer.status} where 200 is expected{answer.why}")
+    told = answer.document()
+    expect(told.get("latched") is True, "POST /estop does not answer that it is latched")
+    try:
+        goal = daemon.goal(0.5, 0.5)
+        moved = daemon.wire.ask("POST", "/point", json={"pan_rad": goal[0], "tilt_rad": goal[1]})
+        expect(
+            (moved.status, moved.refusal[0]) == (409, "estopped"),
+            f"a pointing after it: {moved.status} {moved.refusal[0]} where 409 estopped is expected",
+        )
+        expect(daemon.status().get("state") == "stopped", "after an emergency stop the state is not stopped")
+        for half in ({"reason": words["reason"]}, {"name": words["name"]}):
+            refused = daemon.wire.ask("POST", "/reset", json=half)
+            expect(
+                refused.status == 422,
+                f"a reset with half of its words: {refused.status} where 422 is expected",
+            )
+    finally:
+        released = daemon.wire.ask("POST", "/reset", json=words)
+    expect(released.status == 200, f"POST /reset: {released.status} where 200 is expected{released.why}")
+    daemon.let_pass(10 * POLL_S)
+    now = daemon.joints()
+    moved_rad = max(abs(a - b) for a, b in zip(before, now, strict=True))
+    expect(moved_rad <= ARRIVED_RAD, f"emergency stop and reset moved the head by {moved_rad:.4f} rad")
+    return "kept across a restart" if told.get("kept") else "not kept across a restart"
+
+
+@MOTION.check(
     "times.operations", "an operation's times are in order, and within those of the request", moves=True
 )
 def _operations(daemon: Daemon) -> str:
