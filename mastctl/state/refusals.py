@@ -27,20 +27,20 @@ def refusal_of(now: Standing, need: Need) -> MastctlError | None:
     Returns
     -------
     refusal
-        To be raised: `mastctl.errors.NotNow` ``busy``, ``stopping``, ``latched``, ``moving`` or
-        ``not_latched``; `mastctl.errors.Unable` ``closing``. A fault refuses nothing: a later move may be
+        To be raised: `mastctl.errors.NotNow` ``busy``, ``stopping``, ``estopped``, ``moving`` or
+        ``not_estopped``; `mastctl.errors.Unable` ``closing``. A fault refuses nothing: a later move may be
         what clears it, and the head itself refuses what it cannot do.
     """
     event: Event = "reset" if need == "latch" else "operation_began"
     to = TABLE[now.word].get(event)
     if to == "refused: closing":
         return Unable("closing", CLOSING)
-    if to == "refused: not_latched":
-        return NotNow("not_latched", "no emergency stop is latched; there is nothing to reset")
+    if to == "refused: not_estopped":
+        return NotNow("not_estopped", "no emergency stop is latched; there is nothing to reset")
     if to == "refused: stopping":
         return NotNow("stopping", f"{now.reason}; ask again when that is over")
-    if to == "refused: latched" and need != "rest":
-        return NotNow("latched", now.reason)
+    if to == "refused: estopped" and need != "rest":
+        return NotNow("estopped", now.reason)
     if need == "latch":
         return None
     if now.operation is not None:

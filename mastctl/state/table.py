@@ -28,7 +28,7 @@ Event = Literal[
     "closing",
 ]
 Choice = Literal["what goes on", "after a stop", "after a fault"]
-Refusal = Literal["refused: stopping", "refused: latched", "refused: not_latched", "refused: closing"]
+Refusal = Literal["refused: stopping", "refused: estopped", "refused: not_estopped", "refused: closing"]
 To = Word | Choice | Refusal
 
 WORDS: tuple[Word, ...] = get_args(Word)
@@ -63,7 +63,7 @@ HAPPENS: Mapping[Event, str] = {
 }
 
 _ENDS: Mapping[Event, To] = {"stop_asked": "stopping", "estop_asked": "stopping", "closing": "closing"}
-_NO_LATCH: Mapping[Event, To] = {"reset": "refused: not_latched"}
+_NO_LATCH: Mapping[Event, To] = {"reset": "refused: not_estopped"}
 
 TABLE: Mapping[Word, Mapping[Event, To]] = {
     "starting": {
@@ -113,7 +113,7 @@ TABLE: Mapping[Word, Mapping[Event, To]] = {
         "closing": "closing",
     },
     "stopped": {
-        "operation_began": "refused: latched",
+        "operation_began": "refused: estopped",
         "reset": "after a stop",
         "closing": "closing",
     },

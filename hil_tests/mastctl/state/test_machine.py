@@ -83,14 +83,14 @@ TELL: dict[str, Callable[[Machine], Any]] = {
 # ! and the code of a refusal. Columns as in TELL.
 MUST = """
            began       ended    moves    rests    track    untrack  stop     stopped  estop    reset         fault fine    closing
-starting   moving      starting moving   ready    tracking starting stopping starting stopping !not_latched  fault starting closing
-ready      moving      ready    moving   ready    tracking ready    stopping ready    stopping !not_latched  fault ready    closing
-moving     !busy       ready    moving   moving   tracking moving   stopping moving   stopping !not_latched  fault moving   closing
-tracking   tracking    tracking tracking tracking tracking ready    stopping tracking stopping !not_latched  fault tracking closing
-holding    moving      holding  moving   holding  tracking holding  stopping holding  stopping !not_latched  fault holding  closing
+starting   moving      starting moving   ready    tracking starting stopping starting stopping !not_estopped  fault starting closing
+ready      moving      ready    moving   ready    tracking ready    stopping ready    stopping !not_estopped  fault ready    closing
+moving     !busy       ready    moving   moving   tracking moving   stopping moving   stopping !not_estopped  fault moving   closing
+tracking   tracking    tracking tracking tracking tracking ready    stopping tracking stopping !not_estopped  fault tracking closing
+holding    moving      holding  moving   holding  tracking holding  stopping holding  stopping !not_estopped  fault holding  closing
 stopping   !stopping   stopping stopping stopping stopping stopping stopping holding  stopping !stopping     stopping stopping closing
-stopped    !latched    stopped  stopped  stopped  stopped  stopped  stopped  stopped  stopped  holding       stopped stopped closing
-fault      fault       fault    fault    fault    fault    fault    stopping fault    stopping !not_latched  fault holding  closing
+stopped    !estopped   stopped  stopped  stopped  stopped  stopped  stopped  stopped  stopped  holding       stopped stopped closing
+fault      fault       fault    fault    fault    fault    fault    stopping fault    stopping !not_estopped  fault holding  closing
 closing    !closing    closing  closing  closing  closing  closing  closing  closing  closing  !closing      closing closing closing
 """  # noqa: E501
 ROWS = [line.split() for line in MUST.strip().splitlines()[1:]]
@@ -264,14 +264,14 @@ def test_a_latch_from_before_holds_from_the_first_moment_and_the_first_one_stays
 @pytest.mark.parametrize(
     ("word", "codes"),
     [
-        ("starting", (None, None, None, "not_latched")),
-        ("ready", (None, None, None, "not_latched")),
-        ("moving", ("busy", "busy", "busy", "not_latched")),
-        ("tracking", (None, "busy", None, "not_latched")),
-        ("holding", (None, None, None, "not_latched")),
+        ("starting", (None, None, None, "not_estopped")),
+        ("ready", (None, None, None, "not_estopped")),
+        ("moving", ("busy", "busy", "busy", "not_estopped")),
+        ("tracking", (None, "busy", None, "not_estopped")),
+        ("holding", (None, None, None, "not_estopped")),
         ("stopping", ("stopping", "stopping", "stopping", "stopping")),
-        ("stopped", ("latched", "latched", None, None)),
-        ("fault", (None, None, None, "not_latched")),
+        ("stopped", ("estopped", "estopped", None, None)),
+        ("fault", (None, None, None, "not_estopped")),
         ("closing", ("closing", "closing", "closing", "closing")),
     ],
 )
@@ -416,4 +416,4 @@ def test_whatever_comes_from_many_threads_each_change_is_told_once_and_none_brea
             assert before.operation == now.operation, words
     assert (last.stops, last.operation, last.track) == (0, None, None), storm.words
     assert {one.word for one in told} >= {"stopping", "stopped", "fault"}
-    assert {one.code for one in storm.refused} >= {"stopping", "latched"}
+    assert {one.code for one in storm.refused} >= {"stopping", "estopped"}
