@@ -261,7 +261,8 @@ class _Opener:
                 device=name,
             )
         if self.rover is None:
-            from drivers.sim.rover import SimulatedRover, simulation_settings
+            from drivers.sim.rover import SimulatedRover
+            from drivers.sim.settings import simulation_settings
 
             simulation = simulation_settings(self._settings.simulation, self._settings.folder)
             self.rover = SimulatedRover(simulation, self._clock)

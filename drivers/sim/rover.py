@@ -12,11 +12,9 @@ import threading
 from collections import OrderedDict
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import partial
-from pathlib import Path
 from types import MappingProxyType
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -28,26 +26,22 @@ from calib.mast.rig import Rig
 from calib.rigid import FloatArray, Rigid
 from drivers.clock import Clock
 from drivers.errors import BadOptions, NoFreshFrame
-from drivers.faults import FaultPanel, nearest, read_script
+from drivers.faults import FaultPanel, nearest
 from drivers.interfaces import PanTilt
-from drivers.options import is_whole
-from drivers.sim.camera_clock import ClockSettings, clock_settings
-from drivers.sim.camera_settings import CameraSettings, check_cameras
+from drivers.sim.camera_clock import ClockSettings
+from drivers.sim.camera_settings import check_cameras
 from drivers.sim.cameras import SelfExposedCamera, SimulatedCamera
 from drivers.sim.compile_beside import drawing_compiled_beside
 from drivers.sim.kept_scenes import kept_scene
 from drivers.sim.optics.lens import Lens
 from drivers.sim.optics.shutter import Shutter
 from drivers.sim.outside_scene import OutsideRenderer, outside_scene
-from drivers.sim.pan_tilt import HeadSettings, SimulatedPanTilt, head_settings
-from drivers.sim.placed import REACH_M, check_clear_of, read_list
+from drivers.sim.pan_tilt import SimulatedPanTilt
+from drivers.sim.placed import REACH_M, check_clear_of
 from drivers.sim.render import Renderer, Stills, compile_renderer
 from drivers.sim.scene import Scene, SceneSettings
-from drivers.sim.section import filled
-from drivers.sim.terrain import read_terrain
-from drivers.sim.warmth import TemperatureSettings, temperature_settings
-from drivers.sim.wired_head import DEFAULT_HEADS, WiredHead, check_head
-from drivers.simulation_clock import simulation_speed
+from drivers.sim.settings import SimulationSettings
+from drivers.sim.wired_head import WiredHead
 
 TRUTH_FRAMES = 512
 """How many frames of each camera ``frame_truth`` remembers."""
@@ -65,133 +59,6 @@ METER_PX = 32
 """A pixel of what an automatic exposure sees is so many of the camera's along each side."""
 
 
-@dataclass(frozen=True)
-class SimulationSettings:
-    """The ``simulation`` section of a configuration.
-
-    Attributes
-    ----------
-    rover
-        The true rig, a mast file.
-    head
-        What the head is made of.
-    camera
-        Rate, exposure and noise of every camera; the seed is the simulation's.
-    samples
-        Rays per pixel along each side: 2 is 2x2.
-    scene
-        What is rendered.
-    faults
-        Faults set from the start, as ``FaultPanel.set_all`` reads them.
-    wire
-        None: the head is in memory. ``dynamixel`` or ``flir_ptu``: the real driver turns it through a
-        simulated line.
-    temperature
-        What a day does to lenses and mount.
-    clocks
-        By camera's name: when it exposes and what its stamps are worth; those of no entry are one and true.
-    speed
-        Of the clock that the rover is told to live on (`drivers.open_hardware.clock_for`); infinite: ``max``.
-    """
-
-    rover: Path
-    head: HeadSettings
-    camera: CameraSettings = field(default_factory=CameraSettings)
-    samples: int = 2
-    scene: SceneSettings = field(default_factory=SceneSettings)
-    faults: tuple[Mapping[str, Any], ...] = ()
-    wire: str | None = None
-    speed: float = 1.0
-    temperature: TemperatureSettings = field(default_factory=TemperatureSettings)
-    clocks: Mapping[str, ClockSettings] = field(default_factory=dict)
-
-
-_KEYS = (
-    "rover", "head", "seed", "samples", "scene", "cameras", "temperature", "clocks", "faults", "wire",
-    "speed",
-)  # fmt: skip
-
-
-def simulation_settings(section: Mapping[str, Any], folder: Path) -> SimulationSettings:
-    """Return the settings that a configuration's ``simulation`` section asks for.
-
-    Parameters
-    ----------
-    section
-        Keys ``rover`` (a mast file, relative to ``folder``), ``head`` (a preset, see
-        ``drivers.sim.pan_tilt.head_settings``), ``seed`` (of scene and noise), ``samples``, ``scene``
-        (fields of ``SceneSettings``), ``cameras`` (fields of ``CameraSettings``), ``temperature`` (fields of
-        ``TemperatureSettings``), ``clocks`` (fields of ``ClockSettings`` by camera), ``faults`` (a list, or a
-        script's name), ``wire``, ``speed`` (`drivers.simulation_clock.simulation_speed`). Only ``rover`` is
-        needed.
-    folder
-        Where relative paths start.
-
-    Raises
-    ------
-    BadOptions
-        For an unknown key or a value of the wrong kind, naming the key and the nearest valid one.
-    """
-    for key in section:
-        if key not in _KEYS:
-            raise BadOptions(f"simulation has no key {key!r}{nearest(str(key), _KEYS)}")
-    rover = section.get("rover")
-    if not isinstance(rover, str):
-        raise BadOptions(f"simulation.rover is {rover!r}, expected the file of the true rig")
-    seed = _whole(section.get("seed", 1), "simulation.seed", 0, 2**31 - 1)
-    faults = section.get("faults", [])
-    if isinstance(faults, str):
-        faults = read_script(folder / faults)
-    if not isinstance(faults, list | tuple):
-        raise BadOptions(f"simulation.faults is {faults!r}, expected a list of {{device, word, ...}}")
-    camera: CameraSettings = filled(CameraSettings(), section.get("cameras", {}), "simulation.cameras")
-    check_cameras(camera, rows=1)
-    scene = section.get("scene", {})
-    if isinstance(scene, Mapping) and "seed" not in scene:
-        scene = {**scene, "seed": seed}
-    wire = section.get("wire")
-    if wire is not None and wire not in DEFAULT_HEADS:
-        raise BadOptions(f"simulation.wire is {wire!r}{nearest(str(wire), DEFAULT_HEADS)}")
-    head = head_settings(section.get("head", DEFAULT_HEADS.get(str(wire), "ptu_d46_70")))
-    if wire is not None:
-        check_head(wire, head)
-    return SimulationSettings(
-        rover=folder / rover,
-        head=head,
-        camera=replace(camera, seed=seed),
-        samples=_whole(section.get("samples", 2), "simulation.samples", 1, 6),
-        scene=scene_settings(scene, folder),
-        faults=tuple(faults),
-        wire=wire,
-        speed=simulation_speed(section.get("speed", 1.0)),
-        temperature=temperature_settings(section.get("temperature", {})),
-        clocks=clock_settings(section.get("clocks", {})),
-    )
-
-
-def scene_settings(section: Any, folder: Path) -> SceneSettings:
-    """Return the settings of ``simulation.scene``; files in it start at ``folder``. Raises BadOptions."""
-    plain: Any = section
-    placed: dict[str, Any] = {}
-    if isinstance(section, Mapping):
-        placed = {
-            kind: read_list(kind, section[kind], folder)
-            for kind in ("rocks", "bricks", "boards")
-            if isinstance(section.get(kind), list | tuple)
-        }
-        if "terrain" in section:
-            placed["terrain"] = read_terrain(section["terrain"], folder)
-        plain = {key: value for key, value in section.items() if key not in placed}
-        beside = set(section) - {"plugin", "options", "seed"} if "plugin" in section else set()
-        if beside:
-            words = "stands beside plugin, expected nothing: the scene from outside makes all"
-            raise BadOptions(f"simulation.scene.{min(beside, key=str)} {words}")
-    settings: SceneSettings = filled(SceneSettings(), plain, "simulation.scene")
-    if settings.options and not settings.plugin:
-        raise BadOptions("simulation.scene.options stand without a plugin, expected that too")
-    return replace(settings, **placed)
-
-
 def _made(settings: SceneSettings) -> tuple[Scene, Renderer]:
     """The scene, and what draws it."""
     if settings.plugin:
@@ -199,13 +66,6 @@ def _made(settings: SceneSettings) -> tuple[Scene, Renderer]:
         return outside, OutsideRenderer(outside)
     scene = kept_scene(settings)
     return scene, Renderer(scene)
-
-
-def _whole(value: Any, key: str, low: int, high: int) -> int:
-    """A whole number within bounds."""
-    if not is_whole(value) or not low <= value <= high:
-        raise BadOptions(f"{key} is {value!r}, expected a whole number from {low} to {high}")
-    return value
 
 
 @dataclass(frozen=True, eq=False)

@@ -208,7 +208,7 @@ def test_a_camera_that_fails_to_open_closes_the_head_again(outside: None) -> Non
     [
         ({"rover": None}, r"simulation.rover is None, expected the file of the true rig"),
         ({"rover": "missing.yaml"}, r"simulation.rover: .*missing.yaml"),
-        ({"hed": "ptu_d46_70"}, r"simulation has no key 'hed'; did you mean 'head'"),
+        ({"hed": "ptu_d46_70"}, r"simulation.hed: there is no such option; did you mean 'head'"),
         ({"head": "ptu"}, r"there is no head 'ptu'"),
         ({"seed": -1}, r"simulation.seed is -1, expected a whole number from 0"),
         ({"seed": 1.5}, r"simulation.seed is 1.5"),

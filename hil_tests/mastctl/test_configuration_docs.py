@@ -21,7 +21,7 @@ from drivers.errors import BadOptions
 from drivers.flir_ptu import options as flir_ptu
 from drivers.open_hardware import CAMERAS, HEADS, OURS
 from drivers.replay import OPTIONS as REPLAY_OPTIONS
-from drivers.sim import rover
+from drivers.sim import settings as simulation
 from drivers.sim.cameras import CameraSettings
 from drivers.sim.head_options import HEAD_KEYS
 from drivers.sim.scene import SceneSettings
@@ -150,8 +150,8 @@ def options_known(read: Callable[[dict[str, Any]], Any], options: dict[str, Any]
     return {key for key in known if not key.startswith("tilt.")}
 
 
-def simulated(values: dict[str, Any]) -> rover.SimulationSettings:
-    return rover.simulation_settings(values, Path())
+def simulated(values: dict[str, Any]) -> simulation.SimulationSettings:
+    return simulation.simulation_settings(values, Path())
 
 
 def known_of(driver: str) -> set[str]:
@@ -188,7 +188,7 @@ def keys_of(settings: Any) -> set[str]:
 
 
 def test_every_key_of_the_simulation_and_of_a_recording_is_on_the_page(page: str) -> None:
-    known = {key for key in rover._KEYS if key not in ("cameras", "scene", "temperature")}
+    known = {key for key in simulation.KEYS if key not in ("cameras", "scene", "temperature")}
     known |= {f"temperature.{f.name}" for f in fields(TemperatureSettings)}
     known |= {f"head.{name}" for name in HEAD_KEYS}
     known |= {f"cameras.{key}" for key in keys_of(CameraSettings())}

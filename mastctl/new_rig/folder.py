@@ -110,7 +110,7 @@ def write_twin(file: Path, folder: Path, simulation: Mapping[str, Any], seed: in
 
 def _write(believed: Rig, folder: Path, simulation: Mapping[str, Any], seed: int) -> NewRig:
     """Write the true rig and the configuration, and read all of it as the daemon does."""
-    from drivers.sim.rover import simulation_settings
+    from drivers.sim.settings import simulation_settings
 
     twin = true_twin(believed, np.random.default_rng(seed))
     stated = "" if twin.by == "fit.covariance" else f": {STATED}"

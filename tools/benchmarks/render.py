@@ -38,7 +38,8 @@ def measured(repeats: int) -> dict[str, float]:
     from calib.rigid import Rigid
     from drivers.clock import SystemClock
     from drivers.sim.render import Renderer
-    from drivers.sim.rover import SimulatedRover, simulation_settings
+    from drivers.sim.rover import SimulatedRover
+    from drivers.sim.settings import simulation_settings
 
     clock = SystemClock()
     section = {"rover": "rocky8.yaml", "samples": 1, "cameras": {"rate_hz": 100.0, "readout_s": 0.0}}

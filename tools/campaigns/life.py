@@ -29,7 +29,7 @@ from calib.mast.rig import Rig
 from drivers.clock import ManualClock
 from drivers.sim.camera_clock import CameraClock, ClockSettings
 from drivers.sim.pan_tilt import PRESETS, HeadSettings, SimulatedPanTilt
-from drivers.sim.rover import SimulationSettings, simulation_settings
+from drivers.sim.settings import SimulationSettings, simulation_settings
 from drivers.sim.warmth import TemperatureSettings
 from mastctl.cli.output import at_least, positive_number
 from mastctl.config import load_config

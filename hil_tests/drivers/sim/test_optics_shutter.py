@@ -11,8 +11,9 @@ from drivers.clock import ManualClock
 from drivers.errors import BadOptions
 from drivers.interfaces import Frame
 from drivers.sim.render import Renderer
-from drivers.sim.rover import SimulatedRover, simulation_settings
+from drivers.sim.rover import SimulatedRover
 from drivers.sim.scene import Scene
+from drivers.sim.settings import simulation_settings
 from mastctl.devices.joint_history import JointHistory
 
 pytestmark = pytest.mark.usefixtures("one_scene")

@@ -17,7 +17,7 @@ from calib.camera.cahvor import CameraModel
 from calib.rigid import Rigid, rot_y
 from drivers.errors import BadOptions, DriverError
 from drivers.sim.outside_scene import OutsideRenderer, OutsideScene, outside_scene
-from drivers.sim.rover import scene_settings
+from drivers.sim.settings import scene_settings
 from mastctl.cli.main import main
 from mastctl.config import load_config
 from mastctl.daemon import RunningDaemon

@@ -18,8 +18,8 @@ from drivers.errors import BadOptions
 from drivers.sim.kept_scenes import read, write
 from drivers.sim.placed import check_clear_of
 from drivers.sim.render import Renderer
-from drivers.sim.rover import scene_settings
 from drivers.sim.scene import Scene, build_scene
+from drivers.sim.settings import scene_settings
 
 FOCAL_PX, SIZE_PX = 900.0, (800, 600)
 EYE_M = np.array([0.1, -0.05, -1.2])

@@ -15,8 +15,9 @@ from calib.rigid import Rigid, rot_z
 from drivers.clock import ManualClock
 from drivers.errors import BadOptions, NoFreshFrame
 from drivers.sim.render import Renderer
-from drivers.sim.rover import TRUTH_FRAMES, SimulatedRover, simulation_settings
+from drivers.sim.rover import TRUTH_FRAMES, SimulatedRover
 from drivers.sim.scene import Scene
+from drivers.sim.settings import simulation_settings
 
 pytestmark = pytest.mark.usefixtures("one_scene")
 

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from drivers.errors import BadOptions
-from drivers.sim.rover import scene_settings
 from drivers.sim.scene import Scene, build_scene
+from drivers.sim.settings import scene_settings
 
 ROWS, COLUMNS, STEP_M = 41, 61, 0.25
 PLACE = {"m_per_px": STEP_M, "origin_x_m": 7.0, "origin_y_m": -6.0}

@@ -19,8 +19,9 @@ from drivers.hardware import DeviceSettings, HardwareSettings
 from drivers.interfaces import Reading
 from drivers.open_hardware import open_hardware
 from drivers.sim.render import Renderer
-from drivers.sim.rover import SimulatedRover, simulation_settings
+from drivers.sim.rover import SimulatedRover
 from drivers.sim.scene import Scene
+from drivers.sim.settings import simulation_settings
 
 pytestmark = pytest.mark.usefixtures("one_scene")
 

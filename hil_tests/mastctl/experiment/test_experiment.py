@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from calib.files.mast_file import load_rig
-from drivers.sim.rover import simulation_settings
+from drivers.sim.settings import simulation_settings
 from mastctl.cli.main import main
 from mastctl.client import Client, ClientError
 from mastctl.config import load_config

@@ -14,7 +14,7 @@ from scipy import stats
 from calib.files.mast_file import load_rig, save_rig
 from calib.rigid import tangents
 from drivers.sim.placed import check_clear_of
-from drivers.sim.rover import simulation_settings
+from drivers.sim.settings import simulation_settings
 from mastctl.cli.main import main
 from mastctl.config import load_config
 from mastctl.daemon import RunningDaemon

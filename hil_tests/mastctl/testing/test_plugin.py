@@ -178,7 +178,7 @@ def test_a_true_rig_that_is_not_there_is_named(tmp_path: Path) -> None:
 REFUSED = {
     'mark("x")': "takes keywords only, found 'x'",
     "mark(picture_width_px=5)": "picture_width_px is 5, expected a whole number",
-    "mark(sped=2)": "simulation has no key 'sped'; did you mean 'speed'",
+    "mark(sped=2)": "simulation.sped: there is no such option; did you mean 'speed'",
     "mark(config='nowhere.yaml')": "nowhere.yaml",
 }
 
