@@ -65,11 +65,15 @@ class Found:
 
 @dataclass(frozen=True)
 class Entry:
-    """One message with its channel, and its schema (None where the channel names none)."""
+    """One message with its channel, and its schema (None where the channel names none).
+
+    ``at`` is where in the file the record begins that holds it: what `read_at` wants.
+    """
 
     schema: Schema | None
     channel: Channel
     message: Message
+    at: int
 
 
 Item = Header | Attachment | Metadata | Entry
@@ -118,10 +122,36 @@ def read_messages(path: Path, topics: Sequence[str] | None = None) -> Iterator[E
             yield item
 
 
+def read_at(path: Path, entry: Entry) -> bytes:
+    """Return a message's content again, without reading what stands before it.
+
+    ``entry`` may have lost its own content since it was read. Raises BadRecording.
+    """
+    try:
+        with path.open("rb") as file:
+            file.seek(entry.at)
+            opcode, length = _FRAME.unpack(file.read(_FRAME.size))
+            if length > LARGEST_RECORD:
+                raise ValueError("it has changed")
+            told = Found(channels={entry.channel.id: entry.channel})
+            for one in _record(opcode, file.read(length), told, entry.at):
+                if isinstance(one, Entry) and _same(one.message, entry.message):
+                    return one.message.data
+    except (OSError, ValueError, struct.error) as error:
+        raise BadRecording(f"{path}: cannot be read again: {error}") from None
+    raise BadRecording(f"{path}: has changed since it was read first")
+
+
+def _same(one: Message, other: Message) -> bool:
+    """Whether two are one message of a file."""
+    return (one.channel_id, one.sequence, one.log_time) == (other.channel_id, other.sequence, other.log_time)
+
+
 def _items(file: BinaryIO, size: int, told: Found) -> Iterator[Item]:
     """Walk over the records after the magic."""
     told.whole_bytes = file.tell()
     while True:
+        at = file.tell()
         head = file.read(_FRAME.size)
         if len(head) < _FRAME.size:
             break
@@ -134,7 +164,7 @@ def _items(file: BinaryIO, size: int, told: Found) -> Iterator[Item]:
             told.complete = _ends_whole(file, size)
             told.whole_bytes = size if told.complete else told.whole_bytes - length - _FRAME.size
             break
-        yield from _record(opcode, content, told)
+        yield from _record(opcode, content, told, at)
     told.left_over_bytes = size - told.whole_bytes
 
 
@@ -144,7 +174,7 @@ def _ends_whole(file: BinaryIO, size: int) -> bool:
     return file.read(len(MAGIC)) == MAGIC
 
 
-def _record(opcode: int, content: bytes, told: Found) -> Iterator[Item]:
+def _record(opcode: int, content: bytes, told: Found, at: int) -> Iterator[Item]:
     """What one record holds; a damaged one holds nothing."""
     if opcode == Opcode.CHUNK:
         try:
@@ -156,7 +186,7 @@ def _record(opcode: int, content: bytes, told: Found) -> Iterator[Item]:
             told.damaged += 1
             return
         for inner in inside:
-            yield from _known(inner, told)
+            yield from _known(inner, told, at)
         return
     read = _READ.get(opcode)
     if read is None:
@@ -166,10 +196,10 @@ def _record(opcode: int, content: bytes, told: Found) -> Iterator[Item]:
     except Exception:  # as above
         told.damaged += 1
         return
-    yield from _known(one, told)
+    yield from _known(one, told, at)
 
 
-def _known(one: object, told: Found) -> Iterator[Item]:
+def _known(one: object, told: Found, at: int) -> Iterator[Item]:
     """Keep schemas and channels, hand on the rest, each message with its channel."""
     if isinstance(one, Schema):
         told.schemas[one.id] = one
@@ -183,7 +213,7 @@ def _known(one: object, told: Found) -> Iterator[Item]:
         told.messages += 1
         told.first_ns = one.log_time if told.first_ns is None else min(told.first_ns, one.log_time)
         told.last_ns = one.log_time if told.last_ns is None else max(told.last_ns, one.log_time)
-        yield Entry(told.schemas.get(channel.schema_id), channel, one)
+        yield Entry(told.schemas.get(channel.schema_id), channel, one, at)
     elif isinstance(one, Header | Attachment | Metadata):
         yield one
 

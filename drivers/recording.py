@@ -1,7 +1,8 @@
 """A recording: frames with the joint angles measured when they were taken.
 
-Two forms are read: PDS3 products of one camera (image, and the label's measured mast angles), and a CSV
-beside ordinary image files with the columns ``camera,pan_rad,tilt_rad,file``. Pixels of more than 8 bits
+Other people's pictures are read in two forms: PDS3 products of one camera (image, and the label's measured
+mast angles), and a CSV beside ordinary image files with the columns ``camera,pan_rad,tilt_rad,file``; what
+mastctl itself recorded is `drivers.recorded_frames`'s. Pixels of more than 8 bits
 become 8 by one linear scale for all frames of a camera, never one for each: grey levels stay comparable.
 """
 
@@ -13,6 +14,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Protocol
 
 import cv2
 import numpy as np
@@ -78,13 +80,21 @@ class RecordedFrame:
         return image
 
 
+class HasPicture(Protocol):
+    """A frame as replay needs it."""
+
+    def image(self) -> Image:
+        """Return the picture, uint8 (h, w) or (h, w, 3) BGR, read-only. Raises BadFrame."""
+        ...
+
+
 @dataclass(frozen=True)
 class Pointing:
     """A place where the head stood, and what its cameras took there."""
 
     pan_rad: float
     tilt_rad: float
-    frames: Mapping[str, RecordedFrame]
+    frames: Mapping[str, HasPicture]
 
 
 def read_products(

@@ -25,6 +25,7 @@ from drivers.errors import BadOptions, DriverError, NoFreshFrame
 from drivers.faults import PAN_TILT
 from drivers.interfaces import Camera, Frame, FrameTime, Image, PanTilt, Reading
 from drivers.options import OptionReader
+from drivers.recorded_frames import read_recording
 from drivers.recording import Pointing, read_folder, read_products
 
 TOLERANCE_RAD = 0.002
@@ -33,7 +34,8 @@ TOLERANCE_RAD = 0.002
 PERIOD_S = 0.1
 EXPOSURE_S = 0.001
 
-OPTIONS = ("products", "camera", "frames", "tolerance_rad", "grey_range_dn")
+OPTIONS = ("products", "camera", "frames", "recording", "tolerance_rad", "grey_range_dn")
+SOURCES = ("products", "frames", "recording")
 
 
 class NoRecording(DriverError):
@@ -67,9 +69,10 @@ def open_replay(options: Mapping[str, Any], folder: Path, clock: Clock) -> Repla
     Parameters
     ----------
     options
-        Either ``products`` (a list of PDS3 files, or a pattern like ``opportunity/1N*.IMG``, sorted by
-        name) with ``camera`` (the name that its frames go by), or ``frames`` (a CSV, see
-        `drivers.recording`). ``tolerance_rad``: how far from a recorded pointing a move may ask.
+        One of ``recording`` (an MCAP file that mastctl recorded, or a folder of them), ``products`` (a list
+        of PDS3 files, or a pattern like ``opportunity/1N*.IMG``, sorted by name) with ``camera`` (the name
+        that its frames go by), and ``frames`` (a CSV, see `drivers.recording`). ``tolerance_rad``: how far
+        from a recorded pointing a move may ask.
         ``grey_range_dn``: [low, high], what becomes black and white in frames of more than 8 bits.
     folder
         Where relative paths start.
@@ -82,8 +85,10 @@ def open_replay(options: Mapping[str, Any], folder: Path, clock: Clock) -> Repla
         For unknown or missing options and recordings that cannot be read.
     """
     read = OptionReader(options, OPTIONS, device="replay")
-    if ("products" in options) == ("frames" in options):
-        raise BadOptions("either options.products or options.frames is expected", device="replay")
+    if sum(source in options for source in SOURCES) != 1:
+        raise BadOptions(
+            "one of options.recording, options.products and options.frames is expected", device="replay"
+        )
     tolerance_rad = read.number("tolerance_rad", TOLERANCE_RAD, 1e-9, 1000.0)
     grey_range_dn = None
     if options.get("grey_range_dn") is not None:
@@ -95,9 +100,13 @@ def open_replay(options: Mapping[str, Any], folder: Path, clock: Clock) -> Repla
         if camera is None:
             raise read.refused("camera", " is missing: the name that the products' frames go by")
         pointings = read_products(_files(read, folder), camera, grey_range_dn)
+    elif "camera" in options:
+        raise read.refused("camera", " goes with products; recordings and the table 'frames' name their own")
+    elif "recording" in options:
+        if grey_range_dn is not None:
+            raise read.refused("grey_range_dn", " goes with products and frames; a recording has 8 bits")
+        pointings = read_recording(folder / read.text("recording", "the path of a recording"))
     else:
-        if "camera" in options:
-            raise read.refused("camera", " goes with products; the table 'frames' names its own")
         table = read.text("frames", "the path of a CSV file")
         pointings = read_folder(folder / table, grey_range_dn)
     if not pointings:

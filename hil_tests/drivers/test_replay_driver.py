@@ -149,12 +149,15 @@ def test_a_file_that_is_gone_is_a_bad_frame(folder: Path) -> None:
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        ({}, "either options.products or options.frames"),
-        ({"frames": "frames.csv", "products": "*.IMG"}, "either options.products or options.frames"),
+        ({}, "one of options.recording, options.products and options.frames"),
+        (
+            {"frames": "frames.csv", "products": "*.IMG"},
+            "one of options.recording, options.products and options.frames",
+        ),
         ({"frame": "frames.csv"}, "did you mean 'frames'"),
         ({"frames": 3}, "path of a CSV"),
         ({"frames": "missing.csv"}, "missing.csv"),
-        ({"frames": "frames.csv", "camera": "navcam_left"}, "names its own"),
+        ({"frames": "frames.csv", "camera": "navcam_left"}, "name their own"),
         ({"frames": "frames.csv", "tolerance_rad": 0}, "options.tolerance_rad is 0"),
         ({"frames": "frames.csv", "tolerance_rad": "wide"}, "options.tolerance_rad is 'wide'"),
         ({"frames": "frames.csv", "grey_range_dn": [5, 5]}, "options.grey_range_dn is [5, 5]"),

@@ -40,6 +40,7 @@ MODULES: dict[str, tuple[str, ...]] = {
     "mastctl.cli.completion": ("completion",),
     "mastctl.cli.conform": ("conform",),
     "mastctl.cli.doctor": ("doctor",),
+    "mastctl.cli.record": ("record", "replay"),
     "mastctl.cli.sim": ("sim",),
     "mastctl.cli.servo": ("servo",),
     "mastctl.cli.ptu": ("ptu",),

@@ -20,6 +20,7 @@ from mastctl.queued_output import QueuedHandler
 
 if TYPE_CHECKING:
     from mastctl.client import Client
+    from mastctl.config import Config
 
 SUFFIXES = {".png": "png", ".jpg": "jpeg", ".jpeg": "jpeg"}
 
@@ -74,14 +75,14 @@ def add_daemon_options(parser: argparse.ArgumentParser) -> None:
 def _run(args: argparse.Namespace) -> int:
     from mastctl import signals
 
-    _queue_output()
+    queue_output()
     # Told to end before it is up, it ends: nothing has moved yet. Before the imports, which take a second.
     with suppress(KeyboardInterrupt), signals.raised(signal.SIGINT):
         _serve(args)
     return 0
 
 
-def _queue_output() -> None:
+def queue_output() -> None:
     """Let nothing that the daemon says wait for who reads it, on stderr as on stdout."""
     from mastctl.queued_output import QueuedText, writer_to
 
@@ -111,9 +112,14 @@ def _set_log(args: argparse.Namespace) -> None:
 def _serve(args: argparse.Namespace) -> None:
     """Run the daemon until it is told to end."""
     from mastctl.config import load_config
-    from mastctl.daemon import run
 
     _set_log(args)
+    serve_config(load_config(args.config), args)
+
+
+def serve_config(config: Config, args: argparse.Namespace) -> None:
+    """Run a daemon with a configuration until it is told to end; its address is a line on stdout."""
+    from mastctl.daemon import run
 
     def ready(url: str) -> None:
         if args.json:
@@ -122,7 +128,7 @@ def _serve(args: argparse.Namespace) -> None:
             sys.stdout.write(f"{url}\n")
         sys.stdout.flush()
 
-    run(load_config(args.config), ready)
+    run(config, ready)
 
 
 def _status(args: argparse.Namespace) -> int:

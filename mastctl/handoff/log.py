@@ -28,9 +28,13 @@ from calib.handoff.bias import HandoffBias
 from calib.handoff.by_image import RefinedVerdict
 from calib.handoff.geometric import Joints
 from calib.handoff.matched import Landed, MatchedHandoff
+from drivers.mcap_file import BadRecording, is_mcap, read_messages
 from mastctl.as_json import picked
 
 SCHEMA = "mastctl/handoff/1"
+TOPIC = "/handoff"
+"""Of a recording."""
+
 MAX_BYTES = 1 << 28
 LONGEST_LINE = 1 << 16
 _BEGIN = f'{{"schema": "{SCHEMA}"'.encode()
@@ -148,14 +152,15 @@ def bias_told(bias: HandoffBias) -> dict[str, Any]:
 def read_log(path: str | Path) -> ReadLog:
     """Read a record of hand-offs.
 
-    A last line without its end that is no JSON is what a crash left, and is passed over.
+    A last line without its end that is no JSON is what a crash left, and is passed over. A recording (MCAP)
+    is one too: its topic ``/handoff`` holds the lines.
 
     Raises
     ------
     BadFile
         If the file cannot be read or a line is no hand-off: which line, which key, what is expected.
     """
-    data = read_bytes(path, MAX_BYTES)
+    data = _lines_recorded(Path(path)) if is_mcap(Path(path)) else read_bytes(path, MAX_BYTES)
     lines = data.split(b"\n")
     handoffs = []
     for number, line in enumerate(lines, start=1):
@@ -167,12 +172,20 @@ def read_log(path: str | Path) -> ReadLog:
             if number == len(lines):
                 break
             raise BadFile(path, f"line {number}", f"is no JSON: {error}") from None
-        handoffs.append(_handoff(path, number, value))
+        handoffs.append(handoff_of(path, number, value))
     return ReadLog(Path(path), digest_of(data), tuple(handoffs))
 
 
-def _handoff(path: str | Path, number: int, value: Any) -> MatchedHandoff:
-    """Read one line."""
+def _lines_recorded(path: Path) -> bytes:
+    """The hand-offs of a recording as lines. Raises BadFile."""
+    try:
+        return b"".join(entry.message.data + b"\n" for entry in read_messages(path, (TOPIC,)))
+    except BadRecording as error:
+        raise BadFile(path, "", str(error)) from None
+
+
+def handoff_of(path: str | Path, number: int, value: Any) -> MatchedHandoff:
+    """Return the hand-off that one line tells. Raises BadFile."""
     line = Section(path, f"line {number}", value, _KEYS)
     line.choice("schema", (SCHEMA,))
     time = line.text("time")

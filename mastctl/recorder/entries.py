@@ -127,7 +127,7 @@ class Entries:
             return
         self._frames[frame.camera] = frame.frame_id
         time_s = frame.mid_exposure_s
-        facts = picked(frame, *FACTS)
+        facts = picked(frame, *FACTS) | {"colour": frame.image.ndim == 3}
         file.add_json(f"/camera/{frame.camera}/frame", "frame", facts, time_s, now_s)
         image = messages.picture(frame, file.clocks.ns(time_s))
         file.add_message(f"/camera/{frame.camera}/image", image, time_s, now_s)

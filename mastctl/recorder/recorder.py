@@ -19,7 +19,7 @@ from collections.abc import Callable
 from concurrent.futures import Future
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 from calib.mast.rig import Rig
 from drivers.clock import Clock
@@ -46,12 +46,6 @@ ANSWER_S = 5.0
 CLOSE_S = 3.0
 SMALL_BYTES = 1000
 WAIT_S = 0.25
-
-
-class Listening(Protocol):
-    """What of a subscription is needed: the newest of each key that was published since the last call."""
-
-    def wait(self, timeout_s: float | None = None) -> list[Any]: ...
 
 
 @dataclass(frozen=True)
@@ -157,6 +151,11 @@ class Recorder:
             self._queued_bytes += one.bytes
             self._lock.notify()
 
+    def missed(self, topic: str, count: int) -> None:
+        """Count what never came to be told: newer values took its place."""
+        with self._lock:
+            self._dropped[topic] += count
+
     def use_mast(self, mast: MastTold) -> None:
         """Put another mast file into the recording, for what comes from now on."""
         self.tell("mast_file", "in_use", mast)
@@ -248,7 +247,7 @@ class Recorder:
         while True:
             with self._lock:
                 if not self._queue and not self._acts and not self._closing:
-                    self._lock.wait(WAIT_S)
+                    self._lock.wait(WAIT_S if self._awake else None)
                 batch, self._queue, self._queued_bytes = self._queue, deque(), 0
                 acts, self._acts = self._acts, deque()
                 closing = self._closing
@@ -261,6 +260,11 @@ class Recorder:
             if closing:
                 self._guarded(self._end_file)
                 return
+
+    @property
+    def _awake(self) -> bool:
+        """Whether there is something to look after without being told anything."""
+        return self._now.file is not None or self._now.keep_at_s is not None
 
     def _answer(self, act: Callable[[], Any], answer: Future[Any]) -> None:
         try:

@@ -35,6 +35,7 @@ _PROPERTIES: Mapping[str, Mapping[str, Any]] = {
         "frame_id": _TEXT, "camera": _TEXT, "sequence": {"type": "integer"}, "mid_exposure_s": _SECONDS,
         "exposure_s": _NUMBER, "pan_rad": _ANGLE, "tilt_rad": _ANGLE, "moving": {"type": "boolean"},
         "mast_digest": {"type": "string", "description": "SHA-256 of the mast file in use"},
+        "colour": {"type": "boolean", "description": "whether the daemon used the picture in colour"},
     },
     "cahvor": {
         "camera": _TEXT, "mast_digest": _TEXT,

@@ -119,20 +119,6 @@ class Shelf:
         return found
 
 
-def recording_files(path: Path) -> list[Path]:
-    """Return the files of a recording that is named by its file, or by the folder of its segments.
-
-    Raises
-    ------
-    FileNotFoundError
-        If there is nothing.
-    """
-    files = _files(path) if path.is_dir() else [path]
-    if not files or not files[0].exists():
-        raise FileNotFoundError(f"{path}: there is no recording")
-    return files
-
-
 def _files(folder: Path) -> list[Path]:
     """The recordings in a folder, by name: the order in which they were made."""
     try:

@@ -35,6 +35,7 @@ from drivers.mcap_file import Entry, Found, read_items
 from mastctl.cli.output import at_least
 from mastctl.devices.frames import StampedFrame
 from mastctl.packaged import default_config
+from mastctl.recorder import recorder as recorder_module
 from mastctl.recorder.recorder import MastTold, Recorder
 from mastctl.recorder.repair import repair
 from mastctl.recorder.settings import RecordSettings
@@ -44,7 +45,9 @@ from tools.arguments import end
 MOST_LOST_S = 1.0
 STEP_S = 0.005
 FRAME_EVERY = 10
-PLACE = struct.Struct("<qd")
+PLACE = struct.Struct("<qdd")
+SEGMENTS = 900
+"""Of ten minutes: a new file every two thirds of a second, and none of them old enough to go."""
 
 
 @dataclass(frozen=True)
@@ -71,9 +74,11 @@ def record_until_killed(folder: Path, mast: MastTold, seed: int, told: mmap.mmap
     """What a child does: tell a recorder numbers and pictures, for ever."""
     pixels = np.random.default_rng(seed)
     clock = SystemClock()
-    settings = RecordSettings(ring_s=4.0, free_mb=0.0)  # segments of two thirds of a second
+    recorder_module.SEGMENTS = SEGMENTS
+    settings = RecordSettings(ring_s=600.0, free_mb=0.0)
     recorder = Recorder(settings, folder, mast, [], {}, clock)
-    number, next_s = 0, time.monotonic()
+    number, first_s = 0, time.monotonic()
+    next_s = first_s
     while True:
         number += 1
         now_s = clock.now_s()
@@ -82,14 +87,14 @@ def record_until_killed(folder: Path, mast: MastTold, seed: int, told: mmap.mmap
             image = pixels.integers(0, 256, (48, 64), np.uint8)
             facts = (f"f{number}", "navcam_left", number, now_s, 0.001, 0.0, 0.0, False, mast.file.digest)
             recorder.tell("frame", "navcam_left", StampedFrame(*facts, image), now_s)
-        PLACE.pack_into(told, 0, number, time.monotonic())
+        PLACE.pack_into(told, 0, number, time.monotonic(), first_s)
         next_s += STEP_S
         time.sleep(max(0.0, next_s - time.monotonic()))
 
 
-def judged(folder: Path, mast: MastTold, told: mmap.mmap, killed_s: float) -> Killed:
+def judged(folder: Path, mast: MastTold, told: mmap.mmap) -> Killed:
     """Read what a killed child left."""
-    last_told, told_s = PLACE.unpack_from(told, 0)
+    last_told, told_s, first_s = PLACE.unpack_from(told, 0)
     numbers: list[tuple[int, float]] = []
     wrong, left_over = "", 0
     for path in sorted(folder.rglob("*.mcap")):
@@ -113,7 +118,7 @@ def judged(folder: Path, mast: MastTold, told: mmap.mmap, killed_s: float) -> Ki
     last = numbers[-1][0] if numbers else 0
     if [number for number, _ in numbers] != list(range(1, last + 1)):
         wrong = f"{len(numbers)} messages where 1 to {last} are expected"
-    lost_s = told_s - numbers[-1][1] if numbers else killed_s
+    lost_s = told_s - (numbers[-1][1] if numbers else first_s)
     return Killed(last_told, last, lost_s if last < last_told else 0.0, left_over, wrong)
 
 
@@ -129,7 +134,6 @@ class Child:
     pid: int
     folder: Path
     told: mmap.mmap
-    began_s: float
     kill_s: float
 
 
@@ -144,7 +148,7 @@ def begun(folder: Path, mast: MastTold, seed: int, life_s: float) -> Child:
             record_until_killed(folder, mast, seed, told)
         finally:
             os._exit(1)
-    return Child(pid, folder, told, now_s, now_s + life_s)
+    return Child(pid, folder, told, now_s + life_s)
 
 
 def ended(child: Child, mast: MastTold) -> Killed:
@@ -153,7 +157,7 @@ def ended(child: Child, mast: MastTold) -> Killed:
     _, status = os.waitpid(child.pid, 0)
     if not os.WIFSIGNALED(status):
         return Killed(0, 0, 0.0, 0, "it ended by itself")
-    return judged(child.folder, mast, child.told, time.monotonic() - child.began_s)
+    return judged(child.folder, mast, child.told)
 
 
 def kills(count: int, at_once: int, seed: int, folder: Path) -> list[Killed]:

@@ -1,0 +1,177 @@
+"""What-if beside the truth: the simulator's pointings with a wrong mast file, worked out with the right one,
+against those that the right one really makes.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from calib.files.mast_file import load_rig, save_rig
+from calib.mast.rig import Mast, Rig
+from hil_tests.mastctl.recorder.recorder_world import CONFIG
+from mastctl.cli.main import main
+from mastctl.client import Client
+from mastctl.config import Listen, load_config
+from mastctl.daemon import RunningDaemon
+from mastctl.recorder.recorded import Recording, read_whole
+from mastctl.recorder.recorder import MastTold, Recorder
+from mastctl.recorder.settings import RecordSettings
+from mastctl.recorder.what_if import WouldBe, pointings_with, rms, seen_in
+from mastctl.recorder.writer import Attached
+
+CLICKS_PX = ((300.0, 500.0), (700.0, 600.0), (200.0, 650.0))
+ROUNDED_PX = 1e-3  # the record's pixels have four digits
+
+
+def wrong_mast(right: Rig) -> Rig:
+    """A mast that was put on again a little turned, after its axes were dismounted."""
+    mast = right.mast
+    turned = mast.rotation_rad + np.array([0.0, 0.002, -0.003])
+    return replace(
+        right, mast=Mast(mast.translation_m, turned, mast.axis_offset_m + 0.003, mast.axis_twist_rad + 0.003)
+    )
+
+
+def recorded(mast_file: Path, folder: Path) -> Path:
+    """Point at some pixels with a mast file, and record it; return the recording."""
+    config = load_config()
+    simulation = {**config.hardware.simulation, "speed": "max"}
+    config = replace(
+        config,
+        listen=Listen(port=0),
+        mast_file=mast_file,
+        hardware=replace(config.hardware, simulation=simulation),
+    )
+    stored = load_rig(mast_file)
+    mast = MastTold(stored.rig, Attached(mast_file.name, mast_file.read_bytes()))
+    settings = RecordSettings(ring_s=0.0, free_mb=0.0)
+    attached = [replace(CONFIG, data=Path(config.path).read_bytes())]
+    with RunningDaemon(config) as daemon, Client(daemon.url) as client:
+        clock = daemon.service.clock
+        recorder = Recorder(settings, folder, mast, attached, {"hardware": "simulated"}, clock)
+        recorder.start_run("")
+        for x_px, y_px in CLICKS_PX:
+            client.wait(client.point(pan_rad=0.0, tilt_rad=-0.1))
+            shot = client.snapshot("navcam_left")
+            done = client.point(pixel=("navcam_left", shot.frame_id, x_px, y_px), pointings=2)
+            record = client.wait(done)
+            assert record["state"] == "done", record["error"]
+            for pointing in record["pointings"]:
+                frame = daemon.service.devices.frame_by_id(pointing["frame_id"])
+                recorder.tell("frame", frame.camera, frame)
+            told = daemon.service.operations.get(done)
+            recorder.tell("operation", done, told)
+        file = Path(recorder.stop_run()["file"])
+        recorder.close()
+    return file
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    folder = tmp_path_factory.mktemp("what_if")
+    right = load_rig(load_config().mast_file).rig
+    found = {"right": folder / "right.yaml", "wrong": folder / "wrong.yaml"}
+    save_rig(right, found["right"])
+    save_rig(wrong_mast(right), found["wrong"])
+    return found | {f"{name} run": recorded(path, folder / name) for name, path in found.items()}
+
+
+def would_be(recording: Recording, mast_file: Path) -> list[WouldBe]:
+    facts = {name: frame.facts for name, frame in recording.frames.items()}
+    seen, others = seen_in(recording.operations, facts)
+    assert others == {}
+    return pointings_with(load_rig(mast_file).rig, seen)
+
+
+def test_the_right_mast_file_is_said_to_leave_what_it_really_leaves(files: dict[str, Path]) -> None:
+    said = would_be(read_whole(files["wrong run"]), files["right"])
+    real = would_be(read_whole(files["right run"]), files["right"])
+    first = [one for one in said if one.seen.pointing == 1]
+    assert len(first) == len(CLICKS_PX)
+    before = np.array([one.seen.residual_px for one in first])
+    assert np.abs(before).max() > 0.5  # the wrong file is felt
+    off, sigma = [], []
+    for one, other in zip(said, real, strict=True):
+        assert one.residual_px is not None and one.sigma_px is not None
+        off.append(one.residual_px - other.seen.residual_px)
+        sigma.append(one.sigma_px)
+    in_sigmas = np.abs(np.array(off)) / np.array(sigma)
+    assert in_sigmas.max() < 3.5, in_sigmas
+    assert np.sqrt(np.mean(np.square(in_sigmas))) < 1.6, in_sigmas
+    assert np.array(sigma).max() < 0.15  # and the sigma says something
+
+
+def test_with_its_own_mast_file_the_recorded_residuals_come_out(files: dict[str, Path]) -> None:
+    for one in would_be(read_whole(files["wrong run"]), files["wrong"]):
+        assert one.residual_px is not None
+        assert one.residual_px == pytest.approx(one.seen.residual_px, abs=ROUNDED_PX)
+
+
+def test_the_command_tells_a_table_and_draws_a_page(
+    files: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["replay", str(files["wrong run"]), "--mast", str(files["right"]), "--report", str(tmp_path)]
+    assert main([*words, "--json"]) == 0
+    told: dict[str, Any] = json.loads(capsys.readouterr().out)
+    row = told["rms_px"]["first pointing"]
+    assert np.hypot(*row["would_be"]) < 0.2 * np.hypot(*row["recorded"])
+    assert row["recorded"] == pytest.approx(
+        rms([np.array(one["recorded_px"]) for one in told["pointings"] if one["pointing"] == 1])
+    )
+    assert told["mast"]["name"] == "right.yaml" and told["recorded_mast"]["name"] == "wrong.yaml"
+    assert main(words) == 0
+    shown = capsys.readouterr().out
+    assert "would be rms" in shown and "what_if.html" in shown
+    page = (tmp_path / "what_if.html").read_text()
+    assert page.count("data:image/jpeg") == 2 * len(CLICKS_PX) and page.count("data:image/png") == 1
+
+
+def test_a_mast_file_without_the_cameras_says_which(files: dict[str, Path], tmp_path: Path) -> None:
+    rig = load_rig(files["right"]).rig
+    fewer = replace(
+        rig,
+        cameras={name: one for name, one in rig.cameras.items() if not name.startswith("navcam")},
+        stereo={name: eyes for name, eyes in rig.stereo.items() if name != "navcam"},
+        fit={},
+    )
+    save_rig(fewer, tmp_path / "fewer.yaml")
+    answers = would_be(read_whole(files["wrong run"]), tmp_path / "fewer.yaml")
+    assert {one.error for one in answers} == {"the mast file has no camera navcam_left"}
+
+
+def test_what_cannot_be_worked_out_is_named() -> None:
+    records = {
+        "1": {"state": "done", "request": {"position_m": [1, 2, 3]}, "result": {"pointings": [{}]}},
+        "2": {"state": "failed", "request": {"pixel": {"camera": "a"}}, "error": {"message": "it was flat"}},
+        "3": {"state": "done", "request": {"pixel": {"camera": "a"}}, "result": {"pointings": [{"x": 1}]}},
+    }
+    seen, others = seen_in(records, {})
+    assert seen == []
+    assert others["1"] == "it had no picture in which anything could be measured"
+    assert others["2"] == "it failed: it was flat"
+    assert others["3"].startswith("its record does not tell enough")
+
+
+def test_a_recording_is_served_as_it_was(files: dict[str, Path], tmp_path: Path) -> None:
+    from mastctl.recorder.replayed import replay_files
+
+    recording = read_whole(files["wrong run"])
+    config = load_config(replay_files(recording, tmp_path, {"port": 0}))
+    frames = [frame for frame in recording.frames.values() if not frame.facts["moving"]]
+    with RunningDaemon(config) as daemon, Client(daemon.url) as client:
+        status = client.status()
+        assert status["hardware"] == "replayed"
+        assert status["mast"]["digest"] == load_rig(files["wrong"]).digest
+        for frame in frames[:2]:
+            facts = frame.facts
+            record = client.wait(client.point(pan_rad=facts["pan_rad"], tilt_rad=facts["tilt_rad"]))
+            assert record["state"] == "done", record["error"]
+            taken = daemon.service.snapshot(facts["camera"], True)
+            assert taken.pan_rad == pytest.approx(facts["pan_rad"], abs=2e-5)
+            assert np.array_equal(taken.image, frame.image())

@@ -1,0 +1,297 @@
+"""What if: the pointings and hand-offs of a recording, worked out again with another mast file.
+
+A pointing's record holds the pixels in which the pair saw the target, with the joint angles there; the angles
+that were commanded, and those that were reached; and the pixel in which the target was seen then. With
+another mast file, position and commanded angles come out differently; where the target would have been seen
+at those follows from where it was seen, since the way between the two angles is short and the same mast
+file's. What the servos left of the command is taken as it was. With the recording's own mast file the
+recorded residual comes out again.
+
+The sigma told is that of another run's residual: of the matches, of the range from the pair's matches, and of
+what the servos leave, as scattered over the recording.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from calib.camera.stereo import triangulate
+from calib.errors import CalibError
+from calib.handoff.geometric import hand_off
+from calib.handoff.matched import MatchedHandoff
+from calib.mast.pointing import solve
+from calib.mast.rig import Rig
+from calib.rigid import FloatArray
+
+STEP_PX = 0.01
+STEP_RAD = 1e-6
+LEAST_PX = 0.02
+"""No match is known better than this, whatever it says."""
+
+
+@dataclass(frozen=True, eq=False)
+class Seen:
+    """What a recorded pointing measured: all that is needed to work it out again.
+
+    Attributes
+    ----------
+    operation, pointing, mast_digest
+        Which one, and with which mast file.
+    pair, pair_px, pair_sigma_px, pair_rad
+        The two cameras, (2, 2) pixels of the target in them, their sigma, and (pan, tilt) there.
+    aim_camera, aim_px
+        Where the target was wanted.
+    commanded_rad, measured_rad
+        (pan, tilt) sent and reached.
+    target_px, target_sigma_px
+        (2,) where the new picture showed the target.
+    frame_id
+        The new picture.
+    """
+
+    operation: str
+    pointing: int
+    mast_digest: str
+    pair: tuple[str, str]
+    pair_px: FloatArray
+    pair_sigma_px: FloatArray
+    pair_rad: tuple[float, float]
+    aim_camera: str
+    aim_px: FloatArray
+    commanded_rad: tuple[float, float]
+    measured_rad: tuple[float, float]
+    target_px: FloatArray
+    target_sigma_px: FloatArray
+    frame_id: str
+
+    @property
+    def residual_px(self) -> FloatArray:
+        """(2,) as it was measured."""
+        return self.target_px - self.aim_px
+
+    @property
+    def left_rad(self) -> FloatArray:
+        """(2,) what the servos left of the command."""
+        return np.subtract(self.measured_rad, self.commanded_rad)
+
+
+@dataclass(frozen=True, eq=False)
+class WouldBe:
+    """A pointing with another mast file.
+
+    ``commanded_rad`` and ``range_m`` as it would have had them; ``residual_px`` and ``sigma_px``: what would
+    have been left, and one sigma of it. None, and a sentence in ``error``, where it has no answer.
+    """
+
+    seen: Seen
+    commanded_rad: tuple[float, float] | None = None
+    range_m: float | None = None
+    residual_px: FloatArray | None = None
+    sigma_px: FloatArray | None = None
+    error: str = ""
+
+
+@dataclass(frozen=True, eq=False)
+class HandedAgain:
+    """A hand-off to one camera: found less predicted pixel, as recorded and with another mast file."""
+
+    name: str
+    time: str
+    camera: str
+    recorded_px: FloatArray
+    would_be_px: FloatArray | None
+    sigma_px: FloatArray
+    error: str = ""
+
+
+def seen_in(
+    operations: Mapping[str, Mapping[str, Any]], frames: Mapping[str, Any]
+) -> tuple[list[Seen], dict[str, str]]:
+    """Return the pointings of a recording that can be worked out again, and why the others cannot.
+
+    Parameters
+    ----------
+    operations
+        Records by id.
+    frames
+        Facts of recorded frames by id, for their joint angles and mast file; a record tells what is missing.
+    """
+    found: list[Seen] = []
+    others: dict[str, str] = {}
+    for name, record in operations.items():
+        if "pixel" not in (record.get("request") or {}):
+            if set(record.get("request") or {}) & {"position_m", "pan_rad"}:
+                others[name] = "it had no picture in which anything could be measured"
+            continue
+        try:
+            found += _pointings(name, record, frames)
+        except (KeyError, TypeError, ValueError, IndexError) as error:
+            others[name] = f"its record does not tell enough ({type(error).__name__}: {error})"
+            continue
+        if not any(one.operation == name for one in found):
+            words = (record.get("error") or {}).get("message", "")
+            others[name] = f"it {record.get('state', 'did not end')}: {words}".rstrip(": ")
+    return found, others
+
+
+def _pointings(name: str, record: Mapping[str, Any], frames: Mapping[str, Any]) -> list[Seen]:
+    """The measured pointings of one operation."""
+    clicked = str(record["request"]["pixel"]["camera"])
+    results = (record.get("result") or {}).get("pointings") or []
+    steps: dict[tuple[str, int], Mapping[str, Any]] = {}
+    for step in record.get("steps") or []:
+        if step["state"] == "done":
+            steps[step["name"], int(step["detail"].get("pointing", 1))] = step["detail"]
+    pair_ids = steps["frames", 1]["frame_ids"] if results else []
+    rest = steps["rest", 1] if results else {}
+    found: list[Seen] = []
+    for number, result in enumerate(results, start=1):
+        if result.get("target_px") is None:
+            continue
+        aim_camera = str(result["camera"])
+        if number == 1:
+            pair = clicked, _camera_of(pair_ids[1])
+            pixels = [steps["target", 1]["pixel_px"], steps["stereo", 1]["pixel_px"]]
+            sigmas = [steps["target", 1]["sigma_px"], steps["stereo", 1]["sigma_px"]]
+            where = _joints(frames.get(pair_ids[0]), (rest["pan_rad"], rest["tilt_rad"]))
+        else:
+            before, eyes = steps["measure", number - 1], steps["eyes", number - 1]
+            if len(eyes["confirmed_by"]) != 1:
+                continue  # another pair gave the range; the record of the first pointing says enough
+            pair = aim_camera, str(eyes["confirmed_by"][0])
+            pixels = [before["pixel_px"], eyes[pair[1]]["pixel_px"]]
+            sigmas = [before["sigma_px"], before["sigma_px"]]
+            last = results[number - 2]
+            where = float(last["measured_pan_rad"]), float(last["measured_tilt_rad"])
+        facts = frames.get(result["frame_id"])
+        found.append(
+            Seen(
+                operation=name,
+                pointing=number,
+                mast_digest="" if facts is None else str(facts["mast_digest"]),
+                pair=pair,
+                pair_px=np.array(pixels, dtype=float),
+                pair_sigma_px=np.maximum(np.array(sigmas, dtype=float), LEAST_PX),
+                pair_rad=where,
+                aim_camera=aim_camera,
+                aim_px=np.array(result["aim_px"], dtype=float),
+                commanded_rad=(float(result["commanded_pan_rad"]), float(result["commanded_tilt_rad"])),
+                measured_rad=(float(result["measured_pan_rad"]), float(result["measured_tilt_rad"])),
+                target_px=np.array(result["target_px"], dtype=float),
+                target_sigma_px=np.maximum(np.array(result["residual_sigma_px"], dtype=float), LEAST_PX),
+                frame_id=str(result["frame_id"]),
+            )
+        )
+    return found
+
+
+def pointings_with(rig: Rig, seen: Sequence[Seen]) -> list[WouldBe]:
+    """Return each pointing as it would have been with another mast file."""
+    servo_rad = _servo_scatter(seen)
+    return [_would_be(rig, one, servo_rad) for one in seen]
+
+
+def _would_be(rig: Rig, seen: Seen, servo_rad: FloatArray) -> WouldBe:
+    """One pointing with another mast file."""
+    missing = [name for name in (*seen.pair, seen.aim_camera) if name not in rig.cameras]
+    if missing:
+        return WouldBe(seen, error=f"the mast file has no camera {missing[0]}")
+    try:
+        commanded, range_m, residual = _residual(rig, seen)
+        sigma = _sigma(rig, seen, servo_rad)
+    except CalibError as error:
+        return WouldBe(seen, error=" ".join(str(error).split()))
+    return WouldBe(seen, commanded, range_m, residual, sigma)
+
+
+def _residual(rig: Rig, seen: Seen) -> tuple[tuple[float, float], float, FloatArray]:
+    """Commanded angles, range and residual of a pointing with a mast file. Raises CalibError."""
+    one, other = (rig.camera_in_rover(name, *seen.pair_rad) for name in seen.pair)
+    target = triangulate(one, other, seen.pair_px[0], seen.pair_px[1]).position_m
+    aim = rig.cameras[seen.aim_camera].model
+    solutions = solve(rig.mast, aim, target, seen.aim_px)
+    pan, tilt = seen.commanded_rad
+    chosen = min(solutions, key=lambda s: max(abs(s.pan_rad - pan), abs(s.tilt_rad - tilt)))
+    ray = rig.camera_in_rover(seen.aim_camera, *seen.measured_rad).ray(seen.target_px)
+    range_m = float(np.linalg.norm(target - ray.origins_m))
+    stands = ray.origins_m + range_m * ray.directions
+    left = seen.left_rad
+    there = rig.camera_in_rover(seen.aim_camera, chosen.pan_rad + left[0], chosen.tilt_rad + left[1])
+    pixel, _ = there.project(stands)
+    return (chosen.pan_rad, chosen.tilt_rad), range_m, np.asarray(pixel - seen.aim_px, dtype=float)
+
+
+def _sigma(rig: Rig, seen: Seen, servo_rad: FloatArray) -> FloatArray:
+    """(2,) one sigma of another run's residual, by what each measured number moves it."""
+    _, _, here = _residual(rig, seen)
+
+    def moved(change: Callable[[], Seen], step: float) -> FloatArray:
+        _, _, there = _residual(rig, change())
+        return (there - here) / step
+
+    variance = np.square(seen.target_sigma_px)
+    for eye, axis in np.ndindex(2, 2):
+        pixels = seen.pair_px.copy()
+        pixels[eye, axis] += STEP_PX
+        rate = moved(lambda pixels=pixels: replace(seen, pair_px=pixels), STEP_PX)  # type: ignore[misc]
+        variance = variance + np.square(rate * seen.pair_sigma_px[eye, axis])
+    for joint in range(2):
+        commanded = list(seen.commanded_rad)
+        commanded[joint] -= STEP_RAD
+        rate = moved(lambda c=commanded: replace(seen, commanded_rad=(c[0], c[1])), STEP_RAD)  # type: ignore[misc]
+        variance = variance + 2.0 * np.square(rate * servo_rad[joint])  # this run's, and the other one's
+    return np.sqrt(variance)
+
+
+def _servo_scatter(seen: Sequence[Seen]) -> FloatArray:
+    """(2,) rms of what the servos left of their commands, radians."""
+    left = np.array([one.left_rad for one in seen]).reshape(-1, 2)
+    return np.sqrt(np.mean(np.square(left), axis=0)) if len(left) else np.zeros(2)
+
+
+def handoffs_with(rig: Rig, handoffs: Sequence[MatchedHandoff]) -> list[HandedAgain]:
+    """Return each hand-off that was found, as it would have been predicted with another mast file."""
+    rows: list[HandedAgain] = []
+    for number, one in enumerate(handoffs, start=1):
+        for camera, landed in one.found.items():
+            assert landed.found_px is not None and landed.found_covariance_px2 is not None
+            both = landed.found_covariance_px2 + landed.geometric_covariance_px2
+            sigma = np.sqrt(np.diag(both))
+            row = HandedAgain(
+                str(number), one.time, camera, landed.found_px - landed.geometric_px, None, sigma
+            )
+            try:
+                again = hand_off(
+                    rig, one.pair, [camera], one.joints, *one.clicks_px,
+                    to_joints=one.to_joints, sigma_px=one.sigma_px,
+                ).pixels[camera]  # fmt: skip
+            except (CalibError, KeyError) as error:
+                rows.append(replace(row, error=" ".join(str(error).split()) or "no such camera"))
+                continue
+            assert again is not None
+            rows.append(replace(row, would_be_px=landed.found_px - again.pixel_px))
+    return rows
+
+
+def rms(rows: Sequence[FloatArray]) -> tuple[float, float] | None:
+    """Return the root mean square of columns, None of nothing."""
+    if not rows:
+        return None
+    x, y = np.sqrt(np.mean(np.square(np.array(rows)), axis=0))
+    return float(x), float(y)
+
+
+def _camera_of(frame_id: str) -> str:
+    """The camera in a frame's id: what stands before its count, mast file and run."""
+    return frame_id.rsplit("-", 3)[0]
+
+
+def _joints(facts: Any, otherwise: tuple[float, float]) -> tuple[float, float]:
+    """Joint angles of a recorded frame, or what the step before it read."""
+    if facts is None:
+        return float(otherwise[0]), float(otherwise[1])
+    return float(facts["pan_rad"]), float(facts["tilt_rad"])
