@@ -101,16 +101,11 @@ def pointing_table(what_if: WhatIf) -> Table:
 
 def short_table(what_if: WhatIf) -> Table:
     """Return each pointing as it fits a terminal."""
-    rows = [
-        [
-            one.seen.operation,
-            str(one.seen.pointing),
-            x_y(one.seen.residual_px),
-            x_y(one.residual_px) or one.error,
-            x_y(one.sigma_px),
-        ]
-        for one in what_if.pointings
-    ]
+    rows = []
+    for one in what_if.pointings:
+        would_be = x_y(one.residual_px) or one.error
+        start = one.seen.operation, str(one.seen.pointing), x_y(one.seen.residual_px)
+        rows.append([*start, would_be, x_y(one.sigma_px)])
     return Table(("operation", "pointing", "recorded (px)", "would be (px)", "sigma (px)"), rows)
 
 
