@@ -160,6 +160,26 @@ def test_a_stop_gets_its_own_way_when_an_earlier_one_hangs(devices: Devices, har
     eventually(lambda: len(hardware.head.calls) >= 2, "the first one's return")
 
 
+def test_a_stop_without_a_thread_of_its_own_says_so_and_nothing_stays_of_it(
+    devices: Devices, hardware: FakeHardware, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(thread: threading.Thread) -> None:
+        raise RuntimeError("can't start new thread")
+
+    hangs = Hangs(hardware, "stop", times=1)
+    with pytest.raises(NoReply):
+        devices.stop()
+    with monkeypatch.context() as patch:
+        patch.setattr(threading.Thread, "start", refuse)
+        with pytest.raises(NoReply, match=r"none could be sent beside the call that hangs \(can't start"):
+            devices.stop()
+    hangs.let_go()
+    eventually(lambda: len(hardware.head.calls) >= 2, "both stops' return")
+    devices.stop()
+    assert devices.faults() == ()
+    devices.move(0.1, 0.1)
+
+
 def test_a_stop_is_confirmed_by_an_earlier_one_that_comes_back(
     devices: Devices, hardware: FakeHardware
 ) -> None:

@@ -55,7 +55,8 @@ def looker(world: World, steps: list[Step] | None = None, believed: Rig | None =
 def begun(world: World) -> tuple[Track, np.ndarray]:
     """A track of what a pixel shows, and where that truly is."""
     frame = world.shoot()
-    track, _ = looker(world).begin_at_pixel(PixelTarget("navcam_left", frame.frame_id, *PIXEL))
+    track, seen = looker(world).begin_at_pixel(PixelTarget("navcam_left", frame.frame_id, *PIXEL))
+    assert seen.pair == "navcam" and list(seen.pixels) == ["navcam_left", "navcam_right"]
     return track, world.true_point(frame, *PIXEL)
 
 

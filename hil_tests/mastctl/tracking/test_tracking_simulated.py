@@ -157,6 +157,7 @@ def test_an_approach_over_http_hands_over_and_keeps_its_target(client: Client, d
     assert list(record.found) == ["hazcam_left", "hazcam_right"]
     for landed in record.found.values():
         assert landed.found_px == pytest.approx(landed.geometric_px, abs=1.0), "the mast file is true"
+    assert 0.0 < record.joints.sigma_rad < 4e-4, "a joint's reading is known to less than half a pixel"
 
 
 def test_the_told_pose_moves_the_site_and_not_the_truth(client: Client, daemon: RunningDaemon) -> None:
