@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from calib.camera.cahvor import CameraModel
 from calib.errors import Unreachable
-from calib.mast.pointing import solve, solve_ray
+from calib.mast.pointing import solve, solve_many, solve_ray
 from calib.mast.rig import Mast, Rig, RigCamera
 from calib.mast.solutions import Solution, choose
 from tools.campaigns import pointing as campaign
@@ -510,6 +510,9 @@ def test_without_a_word_the_head_is_taken_to_stand_at_zero() -> None:
     ray = [0.0, 0.0, 0.0], [1.0, 0.0, 0.0]
     assert solve_ray(mast, *ray, above)[0].pan_rad == 0.0
     assert solve_ray(mast, *ray, above, from_pan_rad=0.3)[0].pan_rad == 0.3
+    camera = CameraModel("CAHV", (640, 480), C=[0, 0, 0], A=[1, 0, 0], H=[319.5, 400, 0], V=[239.5, 0, 400])
+    assert solve_many(mast, camera, [above]).at(0) == solve(mast, camera, above)
+    assert solve_many(mast, camera, [above]).at(0)[0].pan_rad == 0.0
     beside = [4.0 * np.cos(2.0), 4.0 * np.sin(2.0), -1.5]
     assert solve_ray(mast, *ray, beside) == solve_ray(mast, *ray, beside, from_pan_rad=0.0, from_tilt_rad=0.0)
 
