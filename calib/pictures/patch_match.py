@@ -75,7 +75,7 @@ def match_patch(
     if cut is None:
         return no_match("border", f"the patch around {_at(target)} is cut by the picture's border", seen)
     template, near_px2 = cut
-    half = min(template.values.shape) // 2
+    half = int(template.half_px.min())
     lacking = texture_lacks(template.values, settings)
     if lacking:
         return no_match("flat", lacking, seen, half_px=half)
@@ -113,7 +113,7 @@ def _surface_term(
     The patch tells where its plane is; the target itself lies off it by ``roughness`` of the patch's half
     extent on the plane, hence 1 / sine of the viewing angle as much along the source's ray.
     """
-    ray, half = source.ray(target), np.array(template.values.shape[::-1]) // 2
+    ray, half = source.ray(target), template.half_px
     if near_px2 is not None:
         half = np.sqrt(3.0 * np.diag(near_px2))  # a box of this half side spreads as much
     sides = template.target_px + half * SIDES
@@ -186,7 +186,7 @@ def _search(
     template: Template, image: Grey, search_px: float, settings: MatchSettings, near_px2: FloatArray | None
 ) -> PatchFound | PatchMatch:
     """Correlate over the window, then refine at the best place."""
-    half, reach = np.array(template.values.shape[::-1]) // 2, int(np.ceil(search_px))
+    half, reach = template.half_px, int(np.ceil(search_px))
     window = template.centre_px - reach - half, template.centre_px + reach + half
     low, high = np.maximum(window[0], 0), np.minimum(window[1], np.array(image.shape[::-1]) - 1)
     if (high - low < 2 * half + 4).any():

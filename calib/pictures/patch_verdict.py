@@ -149,7 +149,7 @@ def judged(
     template: Template, found: PatchFound, surface_px2: FloatArray, settings: MatchSettings
 ) -> PatchMatch:
     """Return the match with its verdict, from correlation, rival and certainty."""
-    refined, half = found.refined, min(template.values.shape) // 2
+    refined, half = found.refined, int(template.half_px.min())
     facts = (refined.correlation, found.second, half)
     least = settings.least_correlation * expected_correlation(template.values, settings)
     if refined.correlation < least:

@@ -139,6 +139,11 @@ class Template:
     target_px: FloatArray
     magnification: float
 
+    @property
+    def half_px(self) -> NDArray[np.intp]:
+        """(2,), whole pixels from the middle to the right and to the lower side."""
+        return np.array(self.values.shape[::-1]) // 2
+
 
 def warp_patch(
     source_image: Grey,

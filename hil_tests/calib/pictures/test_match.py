@@ -275,6 +275,18 @@ def test_a_rough_surface_makes_the_place_less_certain_along_the_parallax_only() 
     assert np.sqrt(sigmas[1][1] ** 2 - sigmas[0][1] ** 2) < 0.01
 
 
+@pytest.mark.parametrize("pixel_px", [(180.0, 20.0), (180.0, SIZE_PX[1] - 21.0)])
+def test_beside_the_border_a_lower_patch_finds_the_place_as_well(pixel_px: tuple[float, float]) -> None:
+    pixel = np.array(pixel_px)
+    point = wall(5).hit(LEFT.position_m, LEFT.rays(pixel))
+    found = match_patch(
+        seen(LEFT, 5), LEFT.model, pixel, Plane(point, wall(5).normal), seen(RIGHT, 5), RIGHT.model, 10, PLANE
+    )
+    assert found.verdict == "good", found.reason
+    assert found.half_px < PLANE.half_px
+    assert np.abs(found.pixel_px - RIGHT.pixel(point)).max() < 0.15
+
+
 def test_what_is_left_unexplained_makes_the_surface_term_larger() -> None:
     """With (1 - correlation / what noise allows) = u, roughness counts 1 + u / relief times."""
     pixel = np.array([180.0, 140.0])
