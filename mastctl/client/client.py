@@ -8,6 +8,7 @@ from typing import Any, Literal
 from urllib.parse import quote
 
 from mastctl.client.connection import ClientError, DaemonHttp
+from mastctl.client.jog import ANSWER_S, Jog
 from mastctl.client.snapshot import Snapshot, read_snapshot
 
 DEFAULT_URL = "http://127.0.0.1:8420"
@@ -252,6 +253,19 @@ class Client:
     def use_former_mast(self) -> dict[str, Any]:
         """Go back to the mast file that was in use before; return which is in use now, and the former one."""
         return self._daemon.json("POST", "/mast/back")
+
+    def jog(self) -> Jog:
+        """Return a context in which the head turns at rates; it sends the heartbeats itself.
+
+        Examples
+        --------
+        ::
+
+            with client.jog() as jog:
+                jog.rates(0.2, 0.0)      # rad/s
+                time.sleep(1.5)
+        """
+        return Jog(lambda: DaemonHttp(self.url, ANSWER_S))
 
     def sun(self) -> dict[str, Any]:
         """Return the direction that no head camera looks into: ``sun``, null where none was told."""

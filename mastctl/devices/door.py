@@ -31,6 +31,7 @@ log = logging.getLogger(__name__)
 REST_S = 0.3  # after a move was taken, before a reading that says rest is one of its end
 TRAVEL_S = 0.1  # from a reading to the moment when the next command acts on the axes
 ASSUMED_RAD_PER_S2 = 0.4  # of a head that does not say how it brakes: the least that a driver can be set to
+PARTS = 16  # in which a goal ahead is tried
 ROUNDED = 1.01  # a servo rounds its acceleration up to its own unit
 
 
@@ -169,11 +170,11 @@ class Door:
         within = None if start is None else Span.around(*start.corners, *self._round(goal).corners)
         self._sent = _Sent(within, goal, speed_rad_per_s, self._clock.now_s())
 
-    def nearest(self, reading: Reading, goal: Pair, parts: int = 16) -> Pair:
+    def nearest(self, reading: Reading, goal: Pair, stay: Pair | None = None) -> Pair:
         """Return how far towards a goal a head under way may be sent: each axis goes as far as it may.
 
-        An axis at a bound stays there while the other goes on. Where not a step is free, the answer is where
-        it was read.
+        An axis at a bound goes to ``stay`` (where it was sent before; by default where it was read) while the
+        other goes on. Where not a step is free, the answer is where the head was read.
         """
         limits = self.limits
         here = reading.pan_rad, reading.tilt_rad
@@ -190,17 +191,18 @@ class Door:
                 return False
             return True
 
-        def part(of: Pair) -> Pair | None:
-            for number in range(parts, 0, -1):
-                share = number / parts
-                place = here[0] + share * (of[0] - here[0]), here[1] + share * (of[1] - here[1])
-                if free(place):
-                    return place
-            return None
+        def part(way: Callable[[float], Pair]) -> Pair | None:
+            return next((place for n in range(PARTS, 0, -1) if free(place := way(n / PARTS))), None)
 
-        ways = [part(goal), part((goal[0], here[1])), part((here[0], goal[1]))]
+        held = stay or here
+        (pan, tilt), (to_pan, to_tilt) = here, goal
+        ways = (
+            part(lambda share: (pan + share * (to_pan - pan), tilt + share * (to_tilt - tilt))),
+            part(lambda share: (pan + share * (to_pan - pan), held[1])),
+            part(lambda share: (held[0], tilt + share * (to_tilt - tilt))),
+        )
         found = [one for one in ways if one is not None]
-        return max(found, key=lambda one: abs(one[0] - here[0]) + abs(one[1] - here[1]), default=here)
+        return max(found, key=lambda one: abs(one[0] - pan) + abs(one[1] - tilt), default=here)
 
     def faults(self, reading: Reading | None) -> tuple[StandingFault, ...]:
         """Return what stands against the head's place, and a sun that is known no longer."""

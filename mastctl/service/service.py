@@ -27,6 +27,7 @@ from mastctl.errors import MastctlError, NotNow, Unable
 from mastctl.handoff.check import HandoffCheck
 from mastctl.operations.operations import CLOSING, STOP_ASKED, Operations, busy
 from mastctl.operations.records import Operation
+from mastctl.pointing.jog import Jogs
 from mastctl.pointing.loop import PointingLoop
 from mastctl.pointing.requests import AnglesTarget, PixelTarget, PointRequest, PositionTarget
 from mastctl.pointing.wanted import aim_of, clicked_frame, wrong_camera
@@ -76,6 +77,8 @@ class Service:
         The mast file in use, and the one before it; replaced as a whole, never edited.
     tracker
         The track, and the rover's pose.
+    jogs
+        Takes the heartbeats of jogs.
     handoffs
         What the track's hand-offs say of the mast file in use.
     stop_threads
@@ -116,6 +119,7 @@ class Service:
         self.stop_threads = StopThreads()
         self._rig = configured(mast.stored.rig, config.hardware.cameras)
         self._loop = PointingLoop(self._rig, self.devices, config.limits, clock)
+        self.jogs = Jogs(self.operations, self.devices, clock)
         self.handoffs = HandoffCheck(config.tracking.handoff_log, mast.stored.digest, clock)
         self.tracker = Tracker(
             self.operations,

@@ -1,4 +1,4 @@
-"""Routes of what the head must not look into."""
+"""Routes of the jog, and of what the head must not look into."""
 
 from __future__ import annotations
 
@@ -8,13 +8,17 @@ from fastapi import FastAPI
 
 from mastctl.service.service import Service
 from mastctl.web import PREFIX
-from mastctl.web.models import SunBody
+from mastctl.web.models import JogBody, SunBody
 from mastctl.web.waiting import Waiting
 
 
 def add_limits(app: FastAPI, service: Service, waiting: Waiting) -> None:
-    """The sun."""
+    """The jog, and the sun."""
     door = service.devices.door
+
+    @app.post(f"{PREFIX}/jog", summary="A heartbeat: turn the head at a rate, for half a second")
+    async def jog(body: JogBody) -> dict[str, Any]:
+        return await waiting.run(lambda: service.jogs.beat(body.beat()))
 
     @app.get(f"{PREFIX}/limits/sun", summary="The direction that no head camera looks into")
     async def sun() -> dict[str, Any]:

@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from calib.rigid import Rigid
 from mastctl.devices.sun import LEAST_CONE_RAD, WIDEST_CONE_RAD, Sun, direction_of
+from mastctl.pointing.jog import Beat
 from mastctl.pointing.requests import (
     LARGEST_M,
     Aim,
@@ -27,6 +28,7 @@ from mastctl.pointing.requests import (
 from mastctl.safety.latch import LONGEST
 from mastctl.tracking.pose import RoverPose
 
+Rate = Annotated[float, Field(ge=-100.0, le=100.0)]
 Slope = Annotated[float, Field(ge=-1.0, le=1.0)]
 Sigma = Annotated[float, Field(ge=0.0, le=LARGEST_M)]
 Part = Annotated[float, Field(ge=-1e9, le=1e9)]
@@ -178,6 +180,23 @@ def _check_covariance(rows: list[list[float]]) -> None:
         raise ValueError("covariance is not symmetric")
     if np.linalg.eigvalsh(correlation)[0] < -1e-6:
         raise ValueError(_NEGATIVE)
+
+
+class JogBody(_Strict):
+    """``POST /jog``: a heartbeat.
+
+    The first one has no ``id``; those that follow have the one that it was answered. With a ``sequence``,
+    which rises from heartbeat to heartbeat, one that was held up on its way is not taken.
+    """
+
+    pan_rad_per_s: Rate
+    tilt_rad_per_s: Rate
+    id: Name | None = None
+    sequence: Annotated[int, Field(ge=0, le=2**53)] | None = None
+
+    def beat(self) -> Beat:
+        """Return it as the jog takes it."""
+        return Beat((self.pan_rad_per_s, self.tilt_rad_per_s), self.sequence, self.id)
 
 
 class SunBody(_Strict):
