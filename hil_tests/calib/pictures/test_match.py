@@ -317,6 +317,21 @@ def test_best_and_second_place_are_compared_before_the_best_is_deformed() -> Non
     assert judged(template, PatchFound(refined, 0.8, 0.4), none, PLANE).verdict == "good"
 
 
+@pytest.mark.parametrize(("contrast_dn", "correlation", "verdict"), [
+    (25.0, 0.72, "good"), (25.0, 0.66, "weak"), (8.0**0.5, 0.37, "good"), (8.0**0.5, 0.33, "weak"),
+])  # fmt: skip
+def test_a_faint_patch_may_correlate_by_as_much_less_as_noise_explains(
+    contrast_dn: float, correlation: float, verdict: str
+) -> None:
+    """Noise of 2 grey levels is half of the variance of a patch of 8: of 0.7, 0.35 is left to ask for."""
+    values = random_texture(6)[:25, :25]
+    values = (120.0 + contrast_dn * (values - values.mean()) / values.std()).astype(np.float32)
+    template = Template(values, np.array([50, 50]), np.array([50.0, 50.0]), 1.0)
+    refined = LeastSquaresMatch(np.array([50.0, 50.0]), 1e-4 * np.eye(2), np.zeros((2, 2)), correlation)
+    judgement = judged(template, PatchFound(refined, 0.8, 0.0), np.zeros((2, 2)), PLANE)
+    assert judgement.verdict == verdict, judgement.reason
+
+
 def test_what_lies_far_from_the_target_does_not_pull_it() -> None:
     """A picture whose outer part is displaced by 1.5 px, as relief displaces it when the view changes."""
     plane, pixel = wall(4), np.array([180.0, 140.0])
