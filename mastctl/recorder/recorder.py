@@ -170,7 +170,7 @@ class Recorder:
             "run": now.run,
             "file": None if file is None else file.path.name,
             "size_mb": 0.0 if file is None else file.size_mb,
-            "dropped": dict(self._dropped),
+            "dropped": self._dropped_so_far(),
             "fault": None if now.words is None else now.words.message,
             "folder": str(self._shelf.folder),
         }
@@ -178,7 +178,10 @@ class Recorder:
     def faults(self) -> tuple[StandingFault, ...]:
         """Return what keeps it from recording."""
         found = [one for one in (self._now.words,) if one is not None]
-        busy = self._busy_since_s
+        busy, file = self._busy_since_s, self._now.file
+        waits_s = 0.0 if file is None else file.disk_waits_s
+        if busy is None and waits_s > SLOW_S:
+            busy = time.monotonic() - waits_s, self._clock.now_s() - waits_s
         if busy is not None and time.monotonic() - busy[0] > SLOW_S:
             words = (
                 f"{self._shelf.folder} does not answer; what happens meanwhile may be missing in the record"
@@ -226,6 +229,10 @@ class Recorder:
         self._thread.join(CLOSE_S)
         if self._thread.is_alive():
             log.error("%s does not answer; the newest second is not written down", self._shelf.folder)
+
+    def _dropped_so_far(self) -> dict[str, int]:
+        with self._lock:
+            return dict(self._dropped)
 
     def _asked(self, act: Callable[[], dict[str, Any]]) -> dict[str, Any]:
         """Have the writing thread do something, and wait for it."""
@@ -308,7 +315,7 @@ class Recorder:
 
     def _write(self, batch: deque[Told]) -> None:
         """Put what was told into the file, if there is one to be written."""
-        dropped = sum(self._dropped.values())
+        dropped = self._dropped_so_far()
         for at, one in enumerate(batch):
             self._notice(one)
             if self._now.file is None and not self._open_ring():
@@ -318,13 +325,14 @@ class Recorder:
             try:
                 self._entries.write(self._now.file, one, time.monotonic())
             except OSError:
-                self._dropped.update(rest.topic for rest in list(batch)[at:])
+                for rest in list(batch)[at:]:
+                    self.missed(rest.topic, 1)
                 raise
             except Exception:  # a value of a kind that nobody expected must not end the recording
-                self._dropped[one.topic] += 1
+                self.missed(one.topic, 1)
                 log.exception("what %s %s tells cannot be recorded", one.topic, one.key)
         if dropped and self._now.file is not None:
-            self._entries.tell_dropped(self._now.file, self._dropped, self._clock.now_s(), time.monotonic())
+            self._entries.tell_dropped(self._now.file, dropped, self._clock.now_s(), time.monotonic())
 
     def _notice(self, one: Told) -> None:
         """See what changes the recording itself: another mast file, a fault."""
@@ -366,7 +374,7 @@ class Recorder:
         elif (
             now_s - now.begun_s > self._ring_s / SEGMENTS or file.size > self.settings.ring_mb * MB / SEGMENTS
         ):
-            self._end_file()
+            self._end_file(wait=False)
             self._shelf.trim_ring(self._ring_s, self.settings.ring_mb)
 
     def _room_is_low(self) -> bool:
@@ -419,11 +427,11 @@ class Recorder:
         self._entries.begin(self._now.file, self._clock.now_s(), time.monotonic())
         return True
 
-    def _end_file(self) -> None:
+    def _end_file(self, *, wait: bool = True) -> None:
         """End the file that is written, if there is one; no run is recorded then."""
         file, self._now.file, self._now.run = self._now.file, None, None
         if file is not None:
-            file.finish()
+            file.finish(wait=wait)
 
     def _start_run(self, name: str) -> dict[str, Any]:
         if self._now.run is not None:
@@ -443,7 +451,5 @@ class Recorder:
             raise NotNow("not_recording", "no run is recorded; 'record start' begins one")
         self._end_file()
         log.info("run %s has ended", run)
-        return {"run": run, "file": str(file.path), "size_mb": file.path.stat().st_size / MB, **self._lost()}
-
-    def _lost(self) -> dict[str, Any]:
-        return {"dropped": dict(self._dropped)}
+        lost = {"dropped": self._dropped_so_far()}
+        return {"run": run, "file": str(file.path), "size_mb": file.path.stat().st_size / MB, **lost}

@@ -24,6 +24,7 @@ PROTOBUF: Mapping[str, type[Message]] = {
 
 _NUMBER = {"type": "number"}
 _TEXT = {"type": "string"}
+_TEXT_OR_NONE = {"type": ["string", "null"]}
 _SECONDS = {"type": "number", "description": "seconds of the daemon's monotonic clock"}
 _ANGLE = {"type": "number", "description": "radians"}
 _PIXEL = {"type": ["array", "null"], "items": {"type": ["number", "null"]}, "description": "x, y in pixels"}
@@ -56,6 +57,32 @@ _PROPERTIES: Mapping[str, Mapping[str, Any]] = {
     "handoff": {
         "schema": _TEXT, "time": _TEXT, "source": {"type": "array"}, "destinations": {"type": "object"},
     },
+    "state": {
+        "word": _TEXT, "reason": _TEXT, "since_s": _SECONDS, "sequence": {"type": "integer"},
+        "operation": _TEXT_OR_NONE, "track": _TEXT_OR_NONE, "target": _ANY, "residual": _ANY, "latch": _ANY,
+    },
+    "fault": {
+        "device": _TEXT,
+        "faults": {
+            "type": "array",
+            "items": {
+                "type": "object",
+                "properties": {
+                    "device": _TEXT, "code": _TEXT, "message": _TEXT, "since_s": _SECONDS, "until": _TEXT,
+                },
+            },
+        },
+    },
+    "command": {
+        "number": {"type": "integer"}, "time": _TEXT, "monotonic_s": _SECONDS, "command": _TEXT, "who": _TEXT,
+        "role": _TEXT, "via": _TEXT, "request": _ANY, "result": _TEXT, "operation": _TEXT_OR_NONE,
+    },
+    "track": {
+        "sequence": {"type": "integer"}, "state": _TEXT, "reason": _TEXT, "id": _TEXT_OR_NONE,
+        "predicted": {"type": "boolean"}, "position_m": _POINT, "looks": {"type": "integer"},
+        "misses": {"type": "integer"},
+    },
+    "mast": {"file": _TEXT, "name": _TEXT, "digest": _TEXT},
     "recorder": {
         "dropped": {"type": "object", "description": "messages that were not written, by topic, so far"},
         "reason": _TEXT,

@@ -1,12 +1,13 @@
-"""One MCAP file that a killed daemon leaves readable: chunks of half a second, each on the disk when written.
+"""One MCAP file that a killed daemon leaves readable: chunks of a quarter of a second, written and synced.
 
 The library's writer buffers, does not sync, and writes its index at the end. Here the file is unbuffered,
-mast file and configuration stand at its start with their digests, and every chunk is flushed and synced, so
-that what was recorded up to a second before a power cut is whole (`drivers.mcap_file` reads it).
+mast file and configuration stand at its start with their digests, and every chunk is written whole at once
+and then synced by a thread that alone waits for the disk (`drivers.mcap_file` reads what is left).
 """
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import json
 import os
@@ -20,11 +21,12 @@ from mcap.well_known import MessageEncoding, SchemaEncoding
 from mcap.writer import CompressionType, Writer
 
 from mastctl.recorder.schemas import descriptor_set, json_schema
+from mastctl.recorder.sync import Sync
 
 PROFILE = "mastctl/record/1"
 CHUNK_BYTES = 4 << 20
-FLUSH_S = 0.5
-"""A chunk is closed when its first message is this old: half of what may be lost."""
+FLUSH_S = 0.25
+"""A chunk is written when its first message is this old: a quarter of what may be lost."""
 
 _NS = 1_000_000_000
 
@@ -88,14 +90,14 @@ class RecordFile:
         self._schemas: dict[str, int] = {}
         self._counts: dict[int, int] = {}
         self._open_since_s: float | None = None
+        self._sync = Sync(os.dup(self._file.fileno()), path.parent)
         self._gathered = 0
         self._size = 0
         self._attached: set[str] = set()
         try:
             self._begin(attached, facts)
-            _sync_folder(path.parent)
         except BaseException:
-            self._file.close()
+            self.abandon()
             path.unlink(missing_ok=True)  # there is nothing in it
             raise
 
@@ -143,24 +145,31 @@ class RecordFile:
         return True
 
     def flush(self) -> None:
-        """Put on the disk what was gathered."""
+        """Write what was gathered, and have it put on the disk."""
         self._open_since_s = None
         self._gathered = 0
         self._writer.flush()  # type: ignore[no-untyped-call]
-        os.fdatasync(self._file.fileno())
+        self._sync.ask()
         self._size = self._file.tell()
 
-    def finish(self) -> None:
-        """Write the index and close the file."""
+    @property
+    def disk_waits_s(self) -> float:
+        """How long the disk has not answered, seconds; asked from any thread."""
+        return self._sync.waits_s
+
+    def finish(self, *, wait: bool = True) -> None:
+        """Write the index and close the file; wait until it is on the disk, or not."""
         try:
             self._writer.finish()  # type: ignore[no-untyped-call]
-            os.fdatasync(self._file.fileno())
         finally:
             self._file.close()
+            self._sync.finish(wait=wait)
 
     def abandon(self) -> None:
         """Close the file as it is; a repair makes it whole."""
         self._file.close()
+        with contextlib.suppress(OSError):
+            self._sync.finish(wait=False)
 
     def _add(self, topic: str, schema: str, data: bytes, time_s: float, now_s: float) -> None:
         channel = self._channels.get((topic, schema))
@@ -186,15 +195,6 @@ class RecordFile:
         channel = self._writer.register_channel(topic, encoding, self._schemas[schema])
         self._channels[topic, schema] = channel
         return channel
-
-
-def _sync_folder(folder: Path) -> None:
-    """Have the new file's name on the disk too."""
-    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
 
 
 class _Whole:
