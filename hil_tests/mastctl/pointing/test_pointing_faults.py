@@ -6,6 +6,7 @@ fault words of its panel, through the service's own devices.
 
 from __future__ import annotations
 
+import re
 import threading
 from collections.abc import Iterator
 from dataclasses import replace
@@ -158,6 +159,18 @@ def test_a_picture_that_is_wrong_after_the_move_is_never_measured_in(
     error = refused(world)
     assert error.code in codes, str(error)
     assert error.step in ("look", "measure", "eyes")
+
+
+@pytest.mark.parametrize("eye", ["navcam_left", "navcam_right"])
+def test_eyes_that_disagree_are_told_by_how_many_pixels(eye: str) -> None:
+    world = World()
+    world.image = lambda camera, number, image: (
+        shifted(image, 0, 4) if camera == eye and world.moves else image
+    )
+    told = re.search(r"the target ([+-]\d+\.\d\d) px across and ([+-]\d+\.\d\d) px", str(refused(world)))
+    assert told
+    assert abs(float(told[1])) == pytest.approx(4.0, abs=0.4)
+    assert abs(float(told[2])) < 0.4
 
 
 @pytest.mark.parametrize("eye", ["navcam_left", "navcam_right"])
