@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from typing import Any, Literal
 from urllib.parse import quote
 
 from mastctl.client.connection import ClientError, DaemonHttp
 from mastctl.client.jog import ANSWER_S, Jog
+from mastctl.client.lease import HeldLease
 from mastctl.client.snapshot import Snapshot, read_snapshot
 
 DEFAULT_URL = "http://127.0.0.1:8420"
@@ -24,6 +26,11 @@ class Client:
         ``http://127.0.0.1:8420``, or ``unix:/path/of/socket``.
     timeout_s
         What each request is given, seconds.
+    name
+        What this program calls itself, for the daemon's record and for who else wants to steer; by default
+        ``program@host:pid``. Clients of one name are one party.
+
+    A command goes out again where the connection breaks, with a key by which the daemon carries it out once.
 
     Raises
     ------
@@ -31,9 +38,74 @@ class Client:
         ``bad_url``, if the address is of neither form. Every method raises it for whatever goes wrong.
     """
 
-    def __init__(self, url: str = DEFAULT_URL, timeout_s: float = 30.0) -> None:
+    def __init__(self, url: str = DEFAULT_URL, timeout_s: float = 30.0, name: str | None = None) -> None:
         self.url = url
-        self._daemon = DaemonHttp(url, timeout_s)
+        self._daemon = DaemonHttp(url, timeout_s, name)
+
+    @contextmanager
+    def lease(
+        self, name: str | None = None, for_s: float = 30.0, take_over: str | None = None
+    ) -> Iterator[HeldLease]:
+        """Steer alone inside the block: a thread renews the lease, and this client's commands carry it.
+
+        Parameters
+        ----------
+        name
+            The holder's, by default this client's.
+        for_s
+            How long it outlives a holder that falls silent, 1 to 3600 s.
+        take_over
+            Why it is taken from whoever steers; None waits for nobody and takes nothing away.
+
+        Yields
+        ------
+        lease
+            Whose ``lost`` says if somebody took over meanwhile.
+
+        Raises
+        ------
+        ClientError
+            ``leased`` if somebody else steers.
+        """
+        granted = self.acquire_lease(name, for_s, take_over)
+        before, held = self._daemon.lease_id, HeldLease(self._daemon, granted, for_s)
+        self._daemon.lease_id = held.id
+        try:
+            yield held
+        finally:
+            self._daemon.lease_id = before
+            held.end()
+
+    def control(self) -> dict[str, Any] | None:
+        """Return who steers, or None: ``holder``, ``kind`` (lease, operation), ``for_s``, ``until``."""
+        found = self._daemon.json("GET", "/lease")["control"]
+        return dict(found) if found else None
+
+    def acquire_lease(
+        self, name: str | None = None, for_s: float = 30.0, take_over: str | None = None
+    ) -> dict[str, Any]:
+        """Acquire or take over a lease that nobody renews; arguments as for `lease`.
+
+        Returns ``lease_id``, ``holder``, ``for_s`` and ``until``; `use_lease` has commands carry it.
+        """
+        body: dict[str, Any] = {"for_s": float(for_s)}
+        if name is not None:
+            body["name"] = name
+        if take_over is not None:
+            return self._daemon.command("POST", "/lease/take", body | {"reason": take_over})
+        return self._daemon.command("POST", "/lease", body)
+
+    def use_lease(self, lease_id: str | None) -> None:
+        """Have each command carry a lease from now on, or none."""
+        self._daemon.lease_id = lease_id
+
+    def renew_lease(self, for_s: float | None = None) -> dict[str, Any]:
+        """Have the lease in use run for ``for_s`` seconds from now on, by default as long as at first."""
+        return self._daemon.command("POST", "/lease/renew", {} if for_s is None else {"for_s": float(for_s)})
+
+    def release_lease(self) -> None:
+        """Release the lease in use."""
+        self._daemon.command("DELETE", "/lease")
 
     def status(self) -> dict[str, Any]:
         """Return what the daemon knows at this moment."""
@@ -49,6 +121,8 @@ class Client:
         tilt_rad: float | None = None,
         aim: tuple[str, float, float] | None = None,
         pointings: int | None = None,
+        deadline_s: float | None = None,
+        idempotency_key: str | None = None,
     ) -> str:
         """Start a pointing operation and return its id.
 
@@ -64,13 +138,20 @@ class Client:
             (camera, x, y): where the target shall come; the daemon's default when left out.
         pointings
             1 (default) or 2.
+        deadline_s
+            How long it is given, seconds of the daemon's clock; then the head is stopped and the operation
+            fails with ``deadline_passed``. By default from the longest way and the speed.
+        idempotency_key
+            The same for each try of one command; a new one by default.
         """
         body = _target(pixel, position_m, frame)
         if aim is not None:
             body["aim"] = dict(zip(("camera", "x_px", "y_px"), aim, strict=True))
         others = {"pan_rad": pan_rad, "tilt_rad": tilt_rad, "pointings": pointings}
         body |= {key: value for key, value in others.items() if value is not None}
-        return str(self._daemon.json("POST", "/point", json=body)["id"])
+        return str(
+            self._daemon.command("POST", "/point", body, key=idempotency_key, deadline_s=deadline_s)["id"]
+        )
 
     def operation(self, operation_id: str) -> dict[str, Any]:
         """Return an operation's record."""
@@ -175,13 +256,18 @@ class Client:
         pixel: tuple[str, str, float, float] | None = None,
         position_m: Sequence[float] | None = None,
         frame: Literal["rover", "site"] | None = None,
+        deadline_s: float | None = None,
+        idempotency_key: str | None = None,
     ) -> str:
         """Start to follow a target and return the operation's id; arguments as for `point`."""
-        return str(self._daemon.json("POST", "/track", json=_target(pixel, position_m, frame))["id"])
+        body = _target(pixel, position_m, frame)
+        answer = self._daemon.command("POST", "/track", body, key=idempotency_key, deadline_s=deadline_s)
+        return str(answer["id"])
 
-    def look(self) -> str:
+    def look(self, *, deadline_s: float | None = None, idempotency_key: str | None = None) -> str:
         """Look for the track's target once more; return the operation's id."""
-        return str(self._daemon.json("POST", "/track/look")["id"])
+        answer = self._daemon.command("POST", "/track/look", key=idempotency_key, deadline_s=deadline_s)
+        return str(answer["id"])
 
     def wait_track(
         self,
@@ -248,11 +334,11 @@ class Client:
 
     def use_mast(self, file: str) -> dict[str, Any]:
         """Use another mast file of the same folder; return which is in use now, and the former one."""
-        return self._daemon.json("POST", "/mast", json={"file": file})
+        return self._daemon.command("POST", "/mast", {"file": file})
 
     def use_former_mast(self) -> dict[str, Any]:
         """Go back to the mast file that was in use before; return which is in use now, and the former one."""
-        return self._daemon.json("POST", "/mast/back")
+        return self._daemon.command("POST", "/mast/back")
 
     def jog(self) -> Jog:
         """Return a context in which the head turns at rates; it sends the heartbeats itself.
@@ -265,7 +351,7 @@ class Client:
                 jog.rates(0.2, 0.0)      # rad/s
                 time.sleep(1.5)
         """
-        return Jog(lambda: DaemonHttp(self.url, ANSWER_S))
+        return Jog(lambda: self._daemon.beside(ANSWER_S))
 
     def sun(self) -> dict[str, Any]:
         """Return the direction that no head camera looks into: ``sun``, null where none was told."""
@@ -309,7 +395,7 @@ class Client:
         """Put a simulated rover somewhere on its ground, truly; return its true pose."""
         body = {"x_m": x_m, "y_m": y_m, "heading_rad": heading_rad}
         body |= {"pitch_rad": pitch_rad, "roll_rad": roll_rad}
-        return self._daemon.json("POST", "/simulation/pose", json=body)
+        return self._daemon.command("POST", "/simulation/pose", body)
 
     def simulation_time(self) -> dict[str, Any]:
         """Return a simulated rover's time: ``now_s``, and ``speed``, a number or ``max``."""
@@ -324,7 +410,7 @@ class Client:
         ClientError
             ``time_passes`` where time passes by itself, ``not_simulated``.
         """
-        return self._daemon.json("POST", "/simulation/time", json={"advance_s": duration_s})
+        return self._daemon.command("POST", "/simulation/time", {"advance_s": duration_s})
 
     def faults(self) -> list[dict[str, Any]]:
         """Return the faults that are switched on in a simulated rover."""
@@ -333,11 +419,12 @@ class Client:
     def set_fault(self, device: str, word: str, **parameters: float) -> list[dict[str, Any]]:
         """Switch a fault of a simulated device on; return all that are on."""
         body = {"device": device, "word": word, "parameters": parameters}
-        return list(self._daemon.json("POST", "/simulation/faults", json=body)["faults"])
+        return list(self._daemon.command("POST", "/simulation/faults", body)["faults"])
 
     def clear_faults(self, device: str | None = None) -> None:
         """Switch the faults of one simulated device off, or all."""
-        self._daemon.json("DELETE", "/simulation/faults", params={} if device is None else {"device": device})
+        params = {} if device is None else {"device": device}
+        self._daemon.command("DELETE", "/simulation/faults", params=params)
 
     def close(self) -> None:
         """Let go of the connection."""

@@ -3,14 +3,21 @@
 from __future__ import annotations
 
 import json
+import os
+import secrets
+import socket
+import sys
+import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 from urllib.parse import unquote, urlsplit
 
 import httpx
 
 PREFIX = "/api/v1"
+AGAIN_S = (0.1, 0.5)  # pauses before a command goes out again on a new connection
 _BAD_INPUT = frozenset({400, 404, 413, 415, 422})
 
 
@@ -36,11 +43,18 @@ class ClientError(Exception):
         super().__init__(message)
 
 
+class Broken(ClientError):
+    """The connection broke: whether the daemon got the request is not known."""
+
+
 class DaemonHttp:
     """A connection to one daemon; parameters and errors as `Client` has them."""
 
-    def __init__(self, url: str, timeout_s: float) -> None:
+    def __init__(self, url: str, timeout_s: float, name: str | None = None) -> None:
         self.url = url
+        self.timeout_s = timeout_s
+        self.name = plain_name(name or program_name())
+        self.lease_id: str | None = None  # goes with whatever is asked
         transport: httpx.HTTPTransport | None = None
         base = url.rstrip("/")
         if url.startswith("unix:"):
@@ -51,13 +65,25 @@ class DaemonHttp:
             if parts.scheme not in ("http", "https") or not parts.hostname or (parts.port or 1) < 1:
                 raise ValueError
             # No proxy of the environment: the daemon is on this machine, or reached by a tunnel to it.
-            self._http = httpx.Client(base_url=base, timeout=timeout_s, trust_env=False, transport=transport)
+            self._http = httpx.Client(
+                base_url=base,
+                timeout=timeout_s,
+                headers={"Mastctl-Client": self.name},
+                trust_env=False,
+                transport=transport,
+            )
         except (ValueError, httpx.InvalidURL):
             raise ClientError(
                 "bad_url",
                 f"'{url}' is no address of a daemon; http://127.0.0.1:8420 or unix:/path is expected",
                 exit_code=2,
             ) from None
+
+    def beside(self, timeout_s: float) -> DaemonHttp:
+        """Return another connection of the same program, under the same lease."""
+        other = DaemonHttp(self.url, timeout_s, self.name)
+        other.lease_id = self.lease_id
+        return other
 
     def json(self, method: str, path: str, **options: Any) -> dict[str, Any]:
         """Ask, and return the answer, which must be a JSON object."""
@@ -70,8 +96,37 @@ class DaemonHttp:
             raise self.bad_answer("the answer is not a JSON object")
         return document
 
+    def command(
+        self,
+        method: str,
+        path: str,
+        body: Mapping[str, Any] | None = None,
+        *,
+        key: str | None = None,
+        deadline_s: float | None = None,
+        **options: Any,
+    ) -> dict[str, Any]:
+        """Have something done once, and return the answer.
+
+        Where the connection breaks it is asked again with the same key, by which the daemon gives the first
+        one's answer and does nothing twice.
+        """
+        headers = {"Idempotency-Key": key or secrets.token_hex(16)}
+        if deadline_s is not None:
+            headers["Deadline-S"] = repr(float(deadline_s))
+        if body is not None:
+            options["json"] = body
+        for pause_s in AGAIN_S:
+            try:
+                return self.json(method, path, headers=headers, **options)
+            except Broken:
+                time.sleep(pause_s)
+        return self.json(method, path, headers=headers, **options)
+
     def ask(self, method: str, path: str, **options: Any) -> httpx.Response:
         """Ask, and return a good answer; everything else is a ClientError."""
+        if self.lease_id is not None:
+            options["headers"] = {"Mastctl-Lease": self.lease_id, **(options.get("headers") or {})}
         answer = self.send(method, PREFIX + path, **options)
         if answer.is_success:
             return answer
@@ -128,4 +183,16 @@ class DaemonHttp:
         except httpx.TimeoutException:
             raise ClientError("timeout", silent) from None
         except httpx.HTTPError as error:
-            raise ClientError("no_daemon", f"the connection to {self.url} broke: {error}") from None
+            raise Broken("no_daemon", f"the connection to {self.url} broke: {error}") from None
+
+
+def program_name() -> str:
+    """Return what this process calls itself where it is told nothing else: ``program@host:pid``."""
+    program = Path(sys.argv[0] if sys.argv else "")
+    name = program.parent.name if program.stem == "__main__" else program.stem
+    return f"{name or 'python'}@{socket.gethostname()}:{os.getpid()}"
+
+
+def plain_name(name: str) -> str:
+    """Return a name as a header can carry it."""
+    return "".join(sign if sign.isascii() and sign.isprintable() else "?" for sign in name).strip() or "?"

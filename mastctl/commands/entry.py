@@ -14,19 +14,19 @@ from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
-from typing import Any, Protocol
+from typing import Any, Literal, Protocol
 
 from drivers.clock import Clock
 from mastctl.commands.audit import AuditLog
 from mastctl.commands.caller import Caller, Role
-from mastctl.commands.idempotency import Answers
+from mastctl.commands.idempotency import Answer, Answers
 from mastctl.commands.lease import Leases
-from mastctl.errors import BadRequest, NotNow, error_body
+from mastctl.errors import BadRequest, MastctlError, NotNow, error_body
 
 LONGEST_DEADLINE_S = 3600.0
 FOLLOWED = 256  # operations whose end is still recorded with who began them
 
-Answer = dict[str, Any]
+Need = Literal["motion", "track", "rest", "latch"]
 
 
 @dataclass(frozen=True)
@@ -41,23 +41,35 @@ class Command:
         What a caller must be allowed at least.
     steers
         Whether it is refused while somebody else steers.
+    need
+        What it needs of the daemon's state; None for nothing.
+    goes_on
+        Whether it is sent again and again to keep its operation going: then only the first is recorded, and
+        what is refused.
     """
 
     name: str
     role: Role = "operate"
     steers: bool = False
+    need: Need | None = None
+    goes_on: bool = False
 
 
-POINT = Command("point", steers=True)
-TRACK = Command("track", steers=True)
-TRACK_LOOK = Command("track.look", steers=True)
+POINT = Command("point", steers=True, need="motion")
+JOG = Command("jog", steers=True, goes_on=True)
+TRACK = Command("track", steers=True, need="track")
+TRACK_LOOK = Command("track.look", steers=True, need="motion")
 TRACK_STOP = Command("track.stop", steers=True)
-MAST = Command("mast", steers=True)
-MAST_BACK = Command("mast.back", steers=True)
+MAST = Command("mast", steers=True, need="rest")
+MAST_BACK = Command("mast.back", steers=True, need="rest")
 POSE = Command(
     "pose"
 )  # a fact about the rover, told by who knows it; the track that looks has its own holder
+SUN = Command("limits.sun")  # a fact too
+SUN_FORGET = Command("limits.sun.forget")
 STOP = Command("stop", "view")
+ESTOP = Command("estop", "view")
+RESET = Command("reset", need="latch")
 LEASE = Command("lease")
 LEASE_RENEW = Command("lease.renew")
 LEASE_RELEASE = Command("lease.release")
@@ -85,11 +97,11 @@ class Asked:
     deadline_s
         How long it is given from ``asked_s`` on, seconds of the daemon's clock; None for the usual time.
     asked_s
-        When it came, by the daemon's clock.
+        When it came, by the daemon's clock; needed for a deadline only.
     """
 
     caller: Caller
-    asked_s: float
+    asked_s: float = 0.0
     request: Mapping[str, Any] = field(default_factory=dict)
     lease: str | None = None
     key: str | None = None
@@ -110,10 +122,10 @@ class EndsOperations(Protocol):
     def end_within(self, name: str, left_s: float, told_s: float) -> None: ...
 
 
-class States(Protocol):
-    """Who knows whether the state allows a command."""
+class KnowsState(Protocol):
+    """What of the daemon's machine says whether the state allows a command."""
 
-    def check_allowed(self, command: str) -> None: ...
+    def refusal(self, need: Need) -> MastctlError | None: ...
 
 
 class Entry:
@@ -127,7 +139,7 @@ class Entry:
         Who steers, what was answered to each key, where records go.
     operations
         Ends operations at their deadline.
-    states
+    machine
         Refuses what does not fit the state; None if nothing does.
     publish
         Gets each record, with the number of its command; must return at once.
@@ -137,10 +149,10 @@ class Entry:
         self,
         clock: Clock,
         leases: Leases,
-        answers: Answers[Answer],
+        answers: Answers,
         audit: AuditLog,
         operations: EndsOperations,
-        states: States | None = None,
+        machine: KnowsState | None = None,
         publish: Callable[[int, Mapping[str, Any]], None] = lambda number, record: None,
     ) -> None:
         self.leases = leases
@@ -148,7 +160,7 @@ class Entry:
         self._clock = clock
         self._answers = answers
         self._operations = operations
-        self._states = states
+        self._machine = machine
         self._publish = publish
         self._numbers = itertools.count(1)
         self._matching = threading.Lock()
@@ -208,6 +220,10 @@ class Entry:
         self._record(command, asked, answer, None, begins=False)
         return answer
 
+    def not_begun(self, command: Command, asked: Asked, error: Exception) -> None:
+        """Record a stop that could not even be tried."""
+        self._record(command, asked, None, error, begins=False)
+
     def ended(self, operation: str, state: str, error: Mapping[str, Any] | None) -> None:
         """Record how an operation ended that a command began."""
         told = {**self._now(), "ended": operation, "state": state}
@@ -226,12 +242,15 @@ class Entry:
         if command.steers:
             steering = self.leases.steering(asked.caller, asked.lease)
         with steering:
-            if self._states is not None:
-                self._states.check_allowed(command.name)
+            refusal = None
+            if self._machine is not None and command.need is not None:
+                refusal = self._machine.refusal(command.need)
+            if refusal is not None:
+                raise refusal
             answer = act()
             operation = _operation_of(answer)
             allowed_s = usual_s if asked.deadline_s is None else asked.deadline_s
-            if operation is not None and allowed_s is not None:
+            if operation is not None and allowed_s is not None and operation not in self._began:
                 self._operations.end_within(operation, self._left_s(asked, allowed_s), allowed_s)
             return answer
 
@@ -250,6 +269,8 @@ class Entry:
         """Record what came of a command; ``begins``: an operation that its answer names is one it began."""
         caller = asked.caller
         operation = None if answer is None else _operation_of(answer)
+        if command.goes_on and error is None and (operation is None or operation in self._began):
+            return
         who = {"command": command.name, "who": caller.name, "role": caller.role, "via": caller.via}
         number = next(self._numbers)
         told = {"number": number, **self._now(), **who, "request": asked.request}

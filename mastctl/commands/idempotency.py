@@ -10,31 +10,31 @@ import hashlib
 import json
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any, Generic, TypeVar
+from typing import Any
 
 from drivers.clock import Clock, SystemClock
 from mastctl.errors import BadRequest, MastctlError, NotNow
 
-T = TypeVar("T")
+Answer = dict[str, Any]
 
 KEPT_S = 600.0
-KEPT = 4096  # keys; the oldest is forgotten before its time for one more
+KEPT, KEPT_BYTES = 4096, 4 << 20  # keys, and their answers; for more, the oldest is forgotten before its time
 LONGEST_KEY = 200
 WAIT_S = 30.0  # for the first of two, longer than any command takes that is accepted or refused
 
 
 @dataclass(eq=False)
-class _Kept(Generic[T]):
+class _Kept:
     """What became of one key."""
 
     digest: bytes
     since_s: float
     done: bool = False
-    answer: T | None = None
+    answer: bytes = b""
     error: BaseException | None = None
 
 
-class Answers(Generic[T]):
+class Answers:
     """What was answered to each key; safe to use from any thread.
 
     Parameters
@@ -48,9 +48,12 @@ class Answers(Generic[T]):
     def __init__(self, clock: Clock, waits_on: Clock | None = None) -> None:
         self._clock = clock
         self._changed = (waits_on or SystemClock()).signal()
-        self._kept: dict[tuple[str, str], _Kept[T]] = {}  # oldest first
+        self._kept: dict[tuple[str, str], _Kept] = {}  # oldest first
+        self._bytes = 0
 
-    def once(self, who: str, key: str, request: Mapping[str, Any], act: Callable[[], T]) -> tuple[T, bool]:
+    def once(
+        self, who: str, key: str, request: Mapping[str, Any], act: Callable[[], Answer]
+    ) -> tuple[Answer, bool]:
         """Return what ``act()`` returns, or returned before, and whether it was before.
 
         Parameters
@@ -77,23 +80,26 @@ class Answers(Generic[T]):
             known = self._kept.get((who, key))
             if known is not None and not self._old(known):
                 return self._answered(known, key, digest), True
+            self._leave((who, key))  # an old one, so that the order stays
             self._make_room()
-            self._kept.pop((who, key), None)  # an old one, so that the order stays
             mine = self._kept[(who, key)] = _Kept(digest, self._clock.now_s())
+        text = b""
         try:
-            mine.answer = act()
+            answer = act()
+            text = json.dumps(answer).encode()
         except BaseException as error:
             mine.error = error
             raise
         finally:
             with self._changed:
-                mine.done = True
+                mine.done, mine.answer = True, text
+                self._bytes += len(text)
                 if isinstance(mine.error, MastctlError):
-                    del self._kept[(who, key)]
+                    self._leave((who, key))
                 self._changed.notify_all()
-        return mine.answer, False
+        return answer, False
 
-    def _answered(self, known: _Kept[T], key: str, digest: bytes) -> T:
+    def _answered(self, known: _Kept, key: str, digest: bytes) -> Answer:
         """Return the answer that the first got, or gets; the lock is held."""
         if known.digest != digest:
             words = f"Idempotency-Key '{key[:40]}' came before with another request; take a new one"
@@ -107,19 +113,26 @@ class Answers(Generic[T]):
             self._changed.wait(left_s, idle=True)
         if known.error is not None:
             raise known.error
-        return known.answer  # type: ignore[return-value]
+        return dict(json.loads(known.answer))
 
-    def _old(self, one: _Kept[T]) -> bool:
+    def _old(self, one: _Kept) -> bool:
         return one.done and self._clock.now_s() - one.since_s >= KEPT_S
 
     def _make_room(self) -> None:
         """Forget what is old, and the oldest of too many; never what is at work. The lock is held."""
-        surplus = len(self._kept) + 1 - KEPT
         leave: list[tuple[str, str]] = []
+        left_bytes = self._bytes
         for key, one in self._kept.items():
-            if self._old(one) or (one.done and surplus > len(leave)):
+            crowded = len(self._kept) - len(leave) >= KEPT or left_bytes > KEPT_BYTES
+            if one.done and (crowded or self._old(one)):
                 leave.append(key)
-            elif surplus <= len(leave):
+                left_bytes -= len(one.answer)
+            elif not crowded:
                 break
         for key in leave:
-            del self._kept[key]
+            self._leave(key)
+
+    def _leave(self, key: tuple[str, str]) -> None:
+        """Forget a key; the lock is held."""
+        one = self._kept.pop(key, None)
+        self._bytes -= 0 if one is None else len(one.answer)

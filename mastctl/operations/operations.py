@@ -57,9 +57,17 @@ class Operations:
         Stamps the records.
     run
         A word in every id, so that an id from before a restart names nothing; a random one by default.
+    on_ended
+        Gets the last record of each operation, in its thread; must return at once.
     """
 
-    def __init__(self, mover: Mover, clock: Clock, run: str | None = None) -> None:
+    def __init__(
+        self,
+        mover: Mover,
+        clock: Clock,
+        run: str | None = None,
+        on_ended: OnEnd = lambda operation: None,
+    ) -> None:
         self._mover = mover
         self._clock = clock
         self._time = deadlines_on(clock)
@@ -68,6 +76,7 @@ class Operations:
         self._records: Mapping[str, Operation] = {}  # oldest first
         self._numbers = itertools.count(1)
         self._run = run or secrets.token_hex(2)
+        self._on_ended = on_ended
         self._current: tuple[str, threading.Event, threading.Thread] | None = None
         self._motion = Motion()
         self._stops: set[object] = set()  # under way
@@ -285,12 +294,13 @@ class Operations:
     def _work(self, name: str, work: Work, cancelled: threading.Event, on_end: OnEnd | None) -> None:
         """Run one operation, then tell who wants to know."""
         self._run_to_end(name, work, cancelled)
-        if on_end is None:
-            return
-        try:
-            on_end(self.get(name))
-        except Exception:  # nothing is left that it could be told to
-            log.exception("what follows upon operation %s met a defect of the program", name)
+        for tell in (self._on_ended, on_end):
+            if tell is None:
+                continue
+            try:
+                tell(self.get(name))
+            except Exception:  # nothing is left that it could be told to
+                log.exception("what follows upon operation %s met a defect of the program", name)
 
     def _run_to_end(self, name: str, work: Work, cancelled: threading.Event) -> None:
         """Run one operation to its end; whatever happens is in its record afterwards."""

@@ -15,11 +15,15 @@ from typing import Any
 import numpy as np
 
 from calib.files.mast_file import StoredRig
-from drivers.clock import Clock
+from drivers.clock import Clock, SystemClock
 from drivers.errors import DriverError
 from drivers.hardware import Hardware
 from drivers.open_hardware import clock_for, open_hardware
 from drivers.simulation_clock import SimulationClock
+from mastctl.commands.audit import AuditLog
+from mastctl.commands.entry import Entry
+from mastctl.commands.idempotency import Answers
+from mastctl.commands.lease import Leases
 from mastctl.config import Config
 from mastctl.devices.devices import HEAD, Devices
 from mastctl.devices.frames import StampedFrame, check_known, random_run
@@ -37,10 +41,11 @@ from mastctl.safety.state_folder import StateFolder
 from mastctl.safety.stop_socket import StopSocket
 from mastctl.safety.stop_threads import StopThreads
 from mastctl.service.mast_in_use import MastInUse, configured, read_mast, read_next
+from mastctl.service.socket_stops import SocketStops
 from mastctl.service.state import State
 from mastctl.state.faults import StandingFault
 from mastctl.tracking.pose import RoverPose
-from mastctl.tracking.status import TrackStatus
+from mastctl.tracking.status import ACTIVE, TrackStatus
 from mastctl.tracking.tracker import Tracker
 
 log = logging.getLogger(__name__)
@@ -52,6 +57,7 @@ RENDERING_S = 20.0  # six simulated cameras share one renderer, on a machine tha
 HARDWARE_CLOSE_S = 3.0
 KEPT_S = 1.0  # what the disk is given before an emergency stop is answered without it
 STATE = "state"
+AUDIT_FILE = "audit.jsonl"
 ENDS_SOON_S = 0.25  # a stopped operation ends within 20 ms or so; then the next one may follow at once
 
 
@@ -81,6 +87,8 @@ class Service:
         Takes the heartbeats of jogs.
     handoffs
         What the track's hand-offs say of the mast file in use.
+    entry, leases, audit
+        Where each command passes, who steers, and what is recorded of it.
     stop_threads
         Where the web side calls `stop`: threads that nothing else can keep busy.
     latch
@@ -111,7 +119,7 @@ class Service:
         self.devices = Devices(
             hardware, config.limits, mast.stored.digest, clock, mast.stored.rig, grace_s, new_run, config.sun
         )
-        self.operations = Operations(self.devices, clock, new_run())
+        self.operations = Operations(self.devices, clock, new_run(), self._ended)
         self.folder = folder or StateFolder.temporary()
         self.latch = Latch(self.folder)
         if self.latch.held is not None:
@@ -130,6 +138,10 @@ class Service:
             config.tracking,
             self.handoffs.add,
         )
+        people_s = SystemClock()  # clients live in real time, whatever a simulated rover's clock does
+        self.leases = Leases(people_s, self._runs)
+        self.audit = AuditLog(self.folder.path / AUDIT_FILE, clock)
+        self.entry = Entry(clock, self.leases, Answers(people_s, clock), self.audit, self.operations)
         self._version = version("mastctl")
         self.stop_socket: StopSocket | None = None
         self._socket_folder: StateFolder | None = None
@@ -185,7 +197,13 @@ class Service:
             frames=self.devices.newest_frames(),
             motion=self.operations.motion,
             track=self.tracker.status,
-            faults=(*self.devices.faults(), *self.handoffs.faults(), *self._state_faults()),
+            faults=(
+                *self.devices.faults(),
+                *self.handoffs.faults(),
+                *self.audit.faults(),
+                *self._state_faults(),
+            ),
+            control=self.leases.told(),
             estop=self.latch.held,
             stop_socket=None if self.stop_socket is None else str(self.stop_socket.path),
         )
@@ -429,11 +447,11 @@ class Service:
     def open_stop_socket(self) -> None:
         """Listen for stops in the state folder, or a temporary one if its name is too long for a socket's."""
         try:
-            self.stop_socket = StopSocket(self.folder.path / stop_socket.FILE, self)
+            self.stop_socket = StopSocket(self.folder.path / stop_socket.FILE, SocketStops(self))
         except MastctlError as error:
             log.warning("%s", error)
             self._socket_folder = StateFolder.temporary()
-            self.stop_socket = StopSocket(self._socket_folder.path / stop_socket.FILE, self)
+            self.stop_socket = StopSocket(self._socket_folder.path / stop_socket.FILE, SocketStops(self))
 
     def reset(self, reason: str, name: str) -> Held:
         """Release the emergency stop and return it; nothing moves before the next command.
@@ -491,10 +509,19 @@ class Service:
         _bounded("closing the hardware", self.hardware.close, HARDWARE_CLOSE_S)
         if self.stop_socket is not None:
             self.stop_socket.close()
+        self.audit.close()
         self.latch.close()
         for folder in (self.folder, self._socket_folder):
             if folder is not None:
                 folder.close()
+
+    def _runs(self) -> bool:
+        """Whether an operation or a track runs; takes no lock."""
+        return self.operations.motion.operation is not None or self.tracker.status.state in ACTIVE
+
+    def _ended(self, operation: Operation) -> None:
+        """Have an operation's end recorded."""
+        self.entry.ended(operation.id, operation.state, operation.error)
 
     def _check_pixel(self, target: PixelTarget) -> None:
         taken_with, in_use = target.mast_digest, self.stored.digest

@@ -46,6 +46,8 @@ class State:
         The emergency stop that is latched, None if none is.
     stop_socket
         Path of the Unix socket for stops alone.
+    control
+        Who steers, as `mastctl.commands.lease.Control.told` tells it; None for nobody.
     """
 
     now_s: float
@@ -62,6 +64,7 @@ class State:
     faults: tuple[StandingFault, ...]
     estop: Held | None = None
     stop_socket: str | None = None
+    control: Mapping[str, Any] | None = None
 
     @property
     def moving(self) -> bool:
@@ -97,7 +100,7 @@ class State:
             "last_residual": as_json(motion.residual),
             "pose": None if track.pose is None else track.pose.told(self.now_s),
             "track": picked(track, "state", "reason", "id"),
-            "control": None,
+            "control": self.control,
             "estop": None if self.estop is None else asdict(self.estop),
             "cameras": {
                 name: picked(frame, "frame_id", "sequence", "exposure_s")

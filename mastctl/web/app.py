@@ -14,8 +14,10 @@ from starlette.types import ASGIApp
 
 from mastctl.service.service import Service
 from mastctl.web import PREFIX
+from mastctl.web.commands import Commands
 from mastctl.web.estop import add_estop
 from mastctl.web.guard import Guard
+from mastctl.web.lease import add_lease
 from mastctl.web.limits import add_limits
 from mastctl.web.models import ErrorBody
 from mastctl.web.pictures import add_pictures
@@ -37,12 +39,14 @@ def create_app(service: Service, waiting: Waiting | None = None) -> ASGIApp:
         redoc_url=None,
     )
     add_errors(app)
-    add_pointing(app, service, waiting)
-    add_estop(app, service, waiting)
-    add_tracking(app, service, waiting)
-    add_limits(app, service, waiting)
-    add_pictures(app, service, waiting)
-    add_simulation(app, service, waiting)
+    commands = Commands(service, waiting)
+    add_pointing(app, service, commands)
+    add_estop(app, service, waiting, commands)
+    add_lease(app, service, commands)
+    add_tracking(app, service, commands)
+    add_limits(app, service, commands)
+    add_pictures(app, service, waiting, commands)
+    add_simulation(app, service, waiting, commands)
     return Guard(
         app,
         ignores_body=frozenset({f"{PREFIX}/stop", f"{PREFIX}/track/stop"}),

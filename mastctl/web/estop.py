@@ -9,19 +9,20 @@ from typing import Any
 
 from fastapi import FastAPI, Request
 
+from mastctl.commands.entry import ESTOP, RESET
 from mastctl.errors import Unable
 from mastctl.safety.stop_threads import StopsHang
 from mastctl.service.service import Service
 from mastctl.web import PREFIX
+from mastctl.web.commands import Commands, Headers
 from mastctl.web.models import EstopBody, ResetBody
-from mastctl.web.routes import stopped
 from mastctl.web.waiting import Waiting
 
 BODY_S = 0.05  # a body comes with its request; who sends it later is stopped without its words
 LARGEST_BODY_BYTES = 4096
 
 
-def add_estop(app: FastAPI, service: Service, waiting: Waiting) -> None:
+def add_estop(app: FastAPI, service: Service, waiting: Waiting, commands: Commands) -> None:
     """The emergency stop, which needs no body that makes sense, and the reset, which does."""
 
     @app.post(
@@ -35,15 +36,19 @@ def add_estop(app: FastAPI, service: Service, waiting: Waiting) -> None:
         told = await _told(request)
         words = told.get("reason"), told.get("name")
         try:
-            return await stopped(service, lambda: service.estop(*words))
+            return await commands.first(
+                ESTOP, request, lambda: service.estop(*words), {"reason": words[0], "name": words[1]}
+            )
         except StopsHang as error:
             await waiting.run(lambda: service.latch_estop(*words))
             raise Unable("stop_unconfirmed", f"the emergency stop is latched, but {error}") from None
 
     @app.post(f"{PREFIX}/reset", summary="Release the emergency stop; nothing moves before the next command")
-    async def reset(body: ResetBody) -> dict[str, Any]:
-        released = await waiting.run(lambda: service.reset(body.reason, body.name))
-        return {"latched": False, "released": asdict(released)}
+    async def reset(body: ResetBody, came: Headers) -> dict[str, Any]:
+        def act() -> dict[str, Any]:
+            return {"latched": False, "released": asdict(service.reset(body.reason, body.name))}
+
+        return await commands.run(RESET, came, body.model_dump(), act)
 
 
 async def _told(request: Request) -> dict[str, str]:

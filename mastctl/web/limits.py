@@ -6,31 +6,40 @@ from typing import Any
 
 from fastapi import FastAPI
 
+from mastctl.commands.entry import JOG, SUN, SUN_FORGET
 from mastctl.service.service import Service
 from mastctl.web import PREFIX
+from mastctl.web.commands import Commands, Headers
 from mastctl.web.models import JogBody, SunBody
-from mastctl.web.waiting import Waiting
 
 
-def add_limits(app: FastAPI, service: Service, waiting: Waiting) -> None:
+def add_limits(app: FastAPI, service: Service, commands: Commands) -> None:
     """The jog, and the sun."""
     door = service.devices.door
 
     @app.post(f"{PREFIX}/jog", summary="A heartbeat: turn the head at a rate, for half a second")
-    async def jog(body: JogBody) -> dict[str, Any]:
-        return await waiting.run(lambda: service.jogs.beat(body.beat()))
+    async def jog(body: JogBody, came: Headers) -> dict[str, Any]:
+        asked = body.model_dump(exclude_none=True)
+        return await commands.run(JOG, came, asked, lambda: service.jogs.beat(body.beat()))
 
     @app.get(f"{PREFIX}/limits/sun", summary="The direction that no head camera looks into")
     async def sun() -> dict[str, Any]:
         return door.told()
 
     @app.post(f"{PREFIX}/limits/sun", summary="Say where the sun stands; the head keeps off it")
-    async def tell(body: SunBody) -> dict[str, Any]:
-        came = body.sun(service.clock.now_s())
-        await waiting.run(lambda: door.use_sun(came))
-        return door.told()
+    async def tell(body: SunBody, came: Headers) -> dict[str, Any]:
+        sun = body.sun(service.clock.now_s())
+
+        def act() -> dict[str, Any]:
+            door.use_sun(sun)
+            return door.told()
+
+        return await commands.run(SUN, came, body.model_dump(exclude_none=True), act)
 
     @app.delete(f"{PREFIX}/limits/sun", summary="Keep the head off no sun any more")
-    async def forget() -> dict[str, Any]:
-        await waiting.run(lambda: door.use_sun(None))
-        return door.told()
+    async def forget(came: Headers) -> dict[str, Any]:
+        def act() -> dict[str, Any]:
+            door.use_sun(None)
+            return door.told()
+
+        return await commands.run(SUN_FORGET, came, {}, act)

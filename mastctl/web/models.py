@@ -10,6 +10,8 @@ from pydantic import BaseModel, ConfigDict, Field, StringConstraints, model_vali
 from scipy.spatial.transform import Rotation
 
 from calib.rigid import Rigid
+from mastctl.commands.entry import LONGEST_DEADLINE_S
+from mastctl.commands.lease import LONGEST_S, SHORTEST_S, USUAL_S
 from mastctl.devices.sun import LEAST_CONE_RAD, WIDEST_CONE_RAD, Sun, direction_of
 from mastctl.pointing.jog import Beat
 from mastctl.pointing.requests import (
@@ -32,6 +34,8 @@ Rate = Annotated[float, Field(ge=-100.0, le=100.0)]
 Slope = Annotated[float, Field(ge=-1.0, le=1.0)]
 Sigma = Annotated[float, Field(ge=0.0, le=LARGEST_M)]
 Part = Annotated[float, Field(ge=-1e9, le=1e9)]
+LeaseS = Annotated[float, Field(ge=SHORTEST_S, le=LONGEST_S)]
+DeadlineS = Annotated[float, Field(gt=0.0, le=LONGEST_DEADLINE_S, allow_inf_nan=False)]
 Place = Annotated[list[Metres], Field(min_length=3, max_length=3)]
 
 
@@ -58,9 +62,29 @@ class ResetBody(_Strict):
     name: Words
 
 
+class LeaseBody(_Strict):
+    """``POST /lease``: how long, and whose it is, if not the caller's."""
+
+    name: Name | None = None
+    for_s: LeaseS = USUAL_S
+
+
+class RenewBody(_Strict):
+    """``POST /lease/renew``: how long from now on; as long as at first when left out."""
+
+    for_s: LeaseS | None = None
+
+
+class TakeBody(LeaseBody):
+    """``POST /lease/take``: why, beside what goes with a lease."""
+
+    reason: Annotated[str, Field(min_length=1, max_length=400, pattern=r"\S")]
+
+
 class TrackBody(_Strict):
     """``POST /track``: exactly one of pixel and position_m."""
 
+    deadline_s: DeadlineS | None = None
     pixel: PixelTarget | None = None
     position_m: Place | None = None
     frame: Literal["rover", "site"] | None = None

@@ -8,17 +8,19 @@ from typing import Annotated, Any
 from fastapi import FastAPI, Query
 from fastapi.responses import Response
 
+from mastctl.commands.entry import MAST, MAST_BACK
 from mastctl.devices.frames import StampedFrame
 from mastctl.frame_facts import headers_of
 from mastctl.report.pictures import encoded
 from mastctl.service.mast_in_use import MastInUse
 from mastctl.service.service import Service
 from mastctl.web import PREFIX
+from mastctl.web.commands import Commands, Headers
 from mastctl.web.models import MastBody, SnapshotQuery
 from mastctl.web.waiting import Waiting
 
 
-def add_pictures(app: FastAPI, service: Service, waiting: Waiting) -> None:
+def add_pictures(app: FastAPI, service: Service, waiting: Waiting, commands: Commands) -> None:
     """Frames with their facts, and the mast file they are to be read by."""
 
     @app.get(
@@ -49,14 +51,14 @@ def add_pictures(app: FastAPI, service: Service, waiting: Waiting) -> None:
         )
 
     @app.post(f"{PREFIX}/mast", summary="Use another mast file, or the former one, from now on")
-    async def load_mast(body: MastBody) -> dict[str, Any]:
+    async def load_mast(body: MastBody, came: Headers) -> dict[str, Any]:
         name = body.file
         work = service.former_mast if name is None else partial(service.load_mast, name)
-        return told(await waiting.run(work))
+        return await commands.run(MAST, came, body.model_dump(exclude_none=True), lambda: told(work()))
 
     @app.post(f"{PREFIX}/mast/back", summary="Go back to the former mast file")
-    async def back() -> dict[str, Any]:
-        return told(await waiting.run(service.former_mast))
+    async def back(came: Headers) -> dict[str, Any]:
+        return await commands.run(MAST_BACK, came, {}, lambda: told(service.former_mast()))
 
     def told(mast: MastInUse) -> dict[str, Any]:
         former = service.former

@@ -4,46 +4,41 @@ from __future__ import annotations
 
 import asyncio
 import json
-from collections.abc import AsyncIterator, Callable
-from functools import partial
-from typing import Any, TypeVar
+from collections.abc import AsyncIterator
+from typing import Any
 
-from fastapi import FastAPI
+from fastapi import FastAPI, Request
 from fastapi.responses import StreamingResponse
 
-from mastctl.errors import Unable
+from mastctl.commands.deadlines import usual_s
+from mastctl.commands.entry import POINT, POSE, STOP, TRACK, TRACK_LOOK, TRACK_STOP
+from mastctl.pointing.requests import AnglesTarget
 from mastctl.service.service import Service
 from mastctl.web import PREFIX
+from mastctl.web.commands import Commands, Headers
 from mastctl.web.models import PointBody, PoseBody, TrackBody
-from mastctl.web.waiting import Waiting
 
-T = TypeVar("T")
-
-STOP_ANSWER_S = 3.0  # the devices give a stop 1 s; beyond this it is told that nothing is known
 STREAM_POLL_S = 0.05  # how late a change may be told
 STREAM_ALIVE_S = 5.0
 
 
-async def stopped(service: Service, stop: Callable[[], T]) -> T:
-    """Run a stop in the threads that are there for it. Raises Unable ``stop_pending``, DriverError."""
-    try:
-        return await asyncio.wait_for(asyncio.wrap_future(service.stop_threads.submit(stop)), STOP_ANSWER_S)
-    except TimeoutError:
-        words = f"the stop did not come back within {STOP_ANSWER_S:g} s; the head may still move"
-        raise Unable("stop_pending", words) from None
-
-
-def add_pointing(app: FastAPI, service: Service, waiting: Waiting) -> None:
+def add_pointing(app: FastAPI, service: Service, commands: Commands) -> None:
     """State, operations and the stop."""
+    limits = service.config.limits
 
     @app.get(f"{PREFIX}/status", summary="What is known at this moment")
     async def status() -> dict[str, Any]:
         return service.state().told(service.head)
 
     @app.post(f"{PREFIX}/point", status_code=202, summary="Point at a pixel, a position, or joint angles")
-    async def point(body: PointBody) -> dict[str, Any]:
-        told = body.model_dump(exclude_none=True)
-        return {"id": (await waiting.run(lambda: service.point(body.request(), told))).id}
+    async def point(body: PointBody, came: Headers) -> dict[str, Any]:
+        told, asked = body.model_dump(exclude_none=True), body.request()
+        looks = 0 if isinstance(asked.target, AnglesTarget) else asked.pointings
+
+        def act() -> dict[str, Any]:
+            return {"id": service.point(asked, told).id}
+
+        return await commands.run(POINT, came, told, act, usual_s(limits, looks))
 
     @app.get(f"{PREFIX}/operations", summary="The newest operations, without their steps")
     async def operations() -> dict[str, Any]:
@@ -54,37 +49,51 @@ def add_pointing(app: FastAPI, service: Service, waiting: Waiting) -> None:
         return service.operations.get(operation_id).told()
 
     @app.post(f"{PREFIX}/stop", summary="Stop the mast and the running operation, at once")
-    async def stop() -> dict[str, Any]:
-        return await stopped(service, service.stop_told)
+    async def stop(request: Request) -> dict[str, Any]:
+        return await commands.first(STOP, request, service.stop_told)
 
 
-def add_tracking(app: FastAPI, service: Service, waiting: Waiting) -> None:
+def add_tracking(app: FastAPI, service: Service, commands: Commands) -> None:
     """The rover's pose, and the track."""
     told = service.track_told
+    allowed_s = usual_s(service.config.limits, 1)
 
     @app.post(f"{PREFIX}/pose", summary="Say where the rover stands; a track is carried over and looked for")
-    async def pose(body: PoseBody) -> dict[str, Any]:
-        came = body.pose(service.clock.now_s())
-        operation = await waiting.run(lambda: service.take_pose(came, body.look))
-        return {"operation": operation, "track": told()}
+    async def pose(body: PoseBody, came: Headers) -> dict[str, Any]:
+        stands = body.pose(service.clock.now_s())
+
+        def act() -> dict[str, Any]:
+            operation = service.take_pose(stands, body.look)
+            return {"operation": operation, "track": told()}
+
+        return await commands.run(POSE, came, body.model_dump(exclude_none=True), act, allowed_s)
 
     @app.get(f"{PREFIX}/track", summary="The track at this moment")
     async def track() -> dict[str, Any]:
         return told()
 
     @app.post(f"{PREFIX}/track", status_code=202, summary="Follow what a pixel shows, or is at a position")
-    async def start(body: TrackBody) -> dict[str, Any]:
+    async def start(body: TrackBody, came: Headers) -> dict[str, Any]:
         asked = body.model_dump(exclude_none=True)
-        work = partial(service.start_track, body.target(), {"track": asked})
-        return {"id": (await waiting.run(work)).id}
+
+        def act() -> dict[str, Any]:
+            return {"id": service.start_track(body.target(), {"track": asked}).id}
+
+        return await commands.run(TRACK, came, asked, act, allowed_s)
 
     @app.post(f"{PREFIX}/track/look", status_code=202, summary="Look for the target once more")
-    async def look() -> dict[str, Any]:
-        return {"id": (await waiting.run(service.look_for_target)).id}
+    async def look(came: Headers) -> dict[str, Any]:
+        return await commands.run(
+            TRACK_LOOK, came, {}, lambda: {"id": service.look_for_target().id}, allowed_s
+        )
 
     @app.post(f"{PREFIX}/track/stop", summary="End the track; the head stops if it moves for it")
-    async def stop() -> dict[str, Any]:
-        await stopped(service, service.stop_track)
+    async def stop(came: Headers) -> dict[str, Any]:
+        def act() -> dict[str, Any]:
+            service.stop_track()
+            return {}
+
+        await commands.run_beside(TRACK_STOP, came, act)
         return told()
 
     @app.get(

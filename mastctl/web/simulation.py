@@ -11,10 +11,17 @@ from drivers.faults import Fault as SetFault
 from drivers.faults import FaultPanel
 from drivers.simulation_clock import MAX, SimulationClock
 from mastctl.as_json import as_json
+from mastctl.commands.entry import (
+    SIMULATION_FAULT,
+    SIMULATION_FAULTS_OFF,
+    SIMULATION_POSE,
+    SIMULATION_TIME,
+)
 from mastctl.errors import NotKnown, NotNow
 from mastctl.service.service import Service
 from mastctl.tracking.pose import RoverPose
 from mastctl.web import PREFIX
+from mastctl.web.commands import Commands, Headers
 from mastctl.web.models import FaultBody, FaultsQuery, StandBody, TimeBody
 from mastctl.web.waiting import Waiting
 
@@ -22,7 +29,7 @@ if TYPE_CHECKING:
     from drivers.sim.rover import SimulatedRover
 
 
-def add_simulation(app: FastAPI, service: Service, waiting: Waiting) -> None:
+def add_simulation(app: FastAPI, service: Service, waiting: Waiting, commands: Commands) -> None:
     """The fault switches of a simulated rover, and where it truly stands."""
 
     def simulated(what: str) -> SimulatedRover:
@@ -44,13 +51,13 @@ def add_simulation(app: FastAPI, service: Service, waiting: Waiting) -> None:
         return await waiting.run(stands)
 
     @app.post(f"{PREFIX}/simulation/pose", summary="Put the simulated rover somewhere on its ground")
-    async def stand(body: StandBody) -> dict[str, Any]:
+    async def stand(body: StandBody, came: Headers) -> dict[str, Any]:
         def put() -> dict[str, Any]:
             rover = simulated("true poses")
             rover.stand(body.x_m, body.y_m, body.heading_rad, body.pitch_rad, body.roll_rad)
             return stands()
 
-        return await waiting.run(put)
+        return await commands.run(SIMULATION_POSE, came, body.model_dump(), put)
 
     def time_now() -> dict[str, Any]:
         simulated("clocks")
@@ -63,7 +70,7 @@ def add_simulation(app: FastAPI, service: Service, waiting: Waiting) -> None:
         return await waiting.run(time_now)
 
     @app.post(f"{PREFIX}/simulation/time", summary="Let time pass where it does not pass by itself")
-    async def advance(body: TimeBody) -> dict[str, Any]:
+    async def advance(body: TimeBody, came: Headers) -> dict[str, Any]:
         def pass_by() -> dict[str, Any]:
             speed = time_now()["speed"]
             if speed != MAX:
@@ -72,7 +79,7 @@ def add_simulation(app: FastAPI, service: Service, waiting: Waiting) -> None:
             service.clock.sleep(body.advance_s)
             return time_now()
 
-        return await waiting.run(pass_by)
+        return await commands.run(SIMULATION_TIME, came, body.model_dump(), pass_by)
 
     def told() -> dict[str, Any]:
         return {"faults": [_fault_told(fault) for fault in panel().active()]}
@@ -82,14 +89,20 @@ def add_simulation(app: FastAPI, service: Service, waiting: Waiting) -> None:
         return await waiting.run(told)
 
     @app.post(f"{PREFIX}/simulation/faults", summary="Switch a fault on")
-    async def set_fault(body: FaultBody) -> dict[str, Any]:
-        await waiting.run(lambda: panel().set(body.device, body.word, **body.parameters))
-        return await waiting.run(told)
+    async def set_fault(body: FaultBody, came: Headers) -> dict[str, Any]:
+        def act() -> dict[str, Any]:
+            panel().set(body.device, body.word, **body.parameters)
+            return told()
+
+        return await commands.run(SIMULATION_FAULT, came, body.model_dump(), act)
 
     @app.delete(f"{PREFIX}/simulation/faults", summary="Switch the faults of one device, or all, off")
-    async def clear_faults(query: Annotated[FaultsQuery, Query()]) -> dict[str, Any]:
-        await waiting.run(lambda: panel().clear(query.device))
-        return await waiting.run(told)
+    async def clear_faults(query: Annotated[FaultsQuery, Query()], came: Headers) -> dict[str, Any]:
+        def act() -> dict[str, Any]:
+            panel().clear(query.device)
+            return told()
+
+        return await commands.run(SIMULATION_FAULTS_OFF, came, query.model_dump(exclude_none=True), act)
 
 
 def _fault_told(fault: SetFault) -> dict[str, Any]:

@@ -14,7 +14,7 @@ from drivers.clock import ManualClock
 from drivers.errors import NoReply
 from mastctl.commands.audit import AuditLog
 from mastctl.commands.caller import Caller
-from mastctl.commands.entry import POINT, POSE, STOP, Answer, Asked, Command, Entry
+from mastctl.commands.entry import JOG, POINT, POSE, STOP, Answer, Asked, Command, Entry
 from mastctl.commands.idempotency import Answers
 from mastctl.commands.lease import Leases
 from mastctl.errors import MastctlError, NotNow
@@ -38,7 +38,7 @@ class World:
         self.entry = Entry(
             self.clock,
             self.leases,
-            Answers[Answer](self.clock),
+            Answers(self.clock),
             self.audit,
             self,
             self,
@@ -49,9 +49,8 @@ class World:
     def end_within(self, name: str, left_s: float, allowed_s: float) -> None:
         self.deadlines.append((name, left_s, allowed_s))
 
-    def check_allowed(self, command: str) -> None:
-        if self.refuses is not None:
-            raise NotNow(self.refuses, f"{command} does not fit")
+    def refusal(self, need: str) -> NotNow | None:
+        return None if self.refuses is None else NotNow(self.refuses, f"{need} does not fit")
 
     def asked(self, caller: Caller = BENCH, **others: Any) -> Asked:
         return Asked(caller, self.clock.now_s(), **others)
@@ -128,11 +127,11 @@ def test_what_fails_is_recorded_with_its_code_and_raised(world: World, error: Ex
 def test_each_refusal_is_recorded_and_nothing_is_done(world: World) -> None:
     entry, asked = world.entry, world.asked
     refused("role", lambda: entry.run(POINT, asked(Caller("page", "view")), world.act))
-    world.leases.acquire(BENCH)
+    lease = world.leases.acquire(BENCH)
     refused("leased", lambda: entry.run(POINT, asked(ROVER), world.act))
     refused("lease_unknown", lambda: entry.run(POINT, asked(ROVER, lease="x"), world.act))
     world.refuses = "stopped"
-    refused("stopped", lambda: entry.run(POSE, asked(ROVER), world.act))
+    refused("stopped", lambda: entry.run(POINT, asked(lease=lease.id), world.act))
     late = asked(ROVER, deadline_s=1.0)
     world.clock.advance(1.0)
     refused("deadline_passed", lambda: entry.run(POSE, late, world.act))
@@ -249,3 +248,15 @@ def test_the_record_of_who_began_what_is_bounded(world: World) -> None:
         world.entry.ended(f"x{number}", "done", None)
     assert len(world.entry._began) == 256
     assert len(world.entry._ended) == 256
+
+
+def test_of_heartbeats_the_first_is_recorded_and_what_is_refused(world: World) -> None:
+    for _ in range(3):
+        world.entry.run(JOG, world.asked(deadline_s=9.0), lambda: {"id": "000001-abcd", "taken": True})
+    world.entry.run(JOG, world.asked(), lambda: {"id": None, "taken": False})
+    world.leases.acquire(BENCH)
+    refused("leased", lambda: world.entry.run(JOG, world.asked(ROVER), dict))
+    world.entry.ended("000001-abcd", "done", None)
+    told = [(line.get("result"), line.get("ended")) for line in world.lines()]
+    assert told == [("ok", None), ("leased", None), (None, "000001-abcd")]
+    assert world.deadlines == [("000001-abcd", 9.0, 9.0)]

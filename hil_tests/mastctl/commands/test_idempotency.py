@@ -10,7 +10,7 @@ from drivers.clock import ManualClock
 from drivers.errors import NoReply
 from drivers.simulation_clock import SimulationClock
 from hil_tests.mastctl.service_fakes import eventually
-from mastctl.commands.idempotency import KEPT, KEPT_S, Answers
+from mastctl.commands.idempotency import KEPT, KEPT_BYTES, KEPT_S, Answer, Answers
 from mastctl.errors import BadRequest, NotNow
 
 SAME = {"command": "point", "request": {"pan_rad": 0.1}}
@@ -24,11 +24,11 @@ class Acts:
         self.done = 0
         self.error: BaseException | None = None
 
-    def __call__(self) -> int:
+    def __call__(self) -> Answer:
         self.done += 1
         if self.error is not None:
             raise self.error
-        return self.done
+        return {"id": self.done}
 
 
 @pytest.fixture
@@ -37,18 +37,18 @@ def clock() -> ManualClock:
 
 
 @pytest.fixture
-def answers(clock: ManualClock) -> Answers[int]:
+def answers(clock: ManualClock) -> Answers:
     return Answers(clock)
 
 
-def test_the_second_gets_the_firsts_answer_and_nothing_is_done(answers: Answers[int]) -> None:
+def test_the_second_gets_the_firsts_answer_and_nothing_is_done(answers: Answers) -> None:
     acts = Acts()
-    assert answers.once("bench", "k", SAME, acts) == (1, False)
-    assert answers.once("bench", "k", SAME, acts) == (1, True)
+    assert answers.once("bench", "k", SAME, acts) == ({"id": 1}, False)
+    assert answers.once("bench", "k", SAME, acts) == ({"id": 1}, True)
     assert acts.done == 1
 
 
-def test_one_key_for_two_requests_is_refused(answers: Answers[int]) -> None:
+def test_one_key_for_two_requests_is_refused(answers: Answers) -> None:
     acts = Acts()
     answers.once("bench", "k", SAME, acts)
     with pytest.raises(BadRequest) as refusal:
@@ -57,32 +57,32 @@ def test_one_key_for_two_requests_is_refused(answers: Answers[int]) -> None:
     assert acts.done == 1
 
 
-def test_anothers_key_is_another_key(answers: Answers[int]) -> None:
+def test_anothers_key_is_another_key(answers: Answers) -> None:
     acts = Acts()
-    assert answers.once("bench", "1", SAME, acts) == (1, False)
-    assert answers.once("rover", "1", SAME, acts) == (2, False)
+    assert answers.once("bench", "1", SAME, acts) == ({"id": 1}, False)
+    assert answers.once("rover", "1", SAME, acts) == ({"id": 2}, False)
 
 
-def test_an_answer_is_kept_ten_minutes(answers: Answers[int], clock: ManualClock) -> None:
+def test_an_answer_is_kept_ten_minutes(answers: Answers, clock: ManualClock) -> None:
     acts = Acts()
     answers.once("bench", "k", SAME, acts)
     clock.advance(KEPT_S - 0.001)
-    assert answers.once("bench", "k", SAME, acts) == (1, True)
+    assert answers.once("bench", "k", SAME, acts) == ({"id": 1}, True)
     clock.advance(0.001)
-    assert answers.once("bench", "k", SAME, acts) == (2, False)
+    assert answers.once("bench", "k", SAME, acts) == ({"id": 2}, False)
 
 
-def test_a_refusal_changed_nothing_so_the_same_key_asks_again(answers: Answers[int]) -> None:
+def test_a_refusal_changed_nothing_so_the_same_key_asks_again(answers: Answers) -> None:
     acts = Acts()
     acts.error = NotNow("busy", "another runs")
     with pytest.raises(NotNow):
         answers.once("bench", "k", SAME, acts)
     acts.error = None
-    assert answers.once("bench", "k", SAME, acts) == (2, False)
+    assert answers.once("bench", "k", SAME, acts) == ({"id": 2}, False)
 
 
 @pytest.mark.parametrize("error", [NoReply("no answer"), ZeroDivisionError()])
-def test_what_failed_may_have_acted_so_it_is_not_done_again(answers: Answers[int], error: Exception) -> None:
+def test_what_failed_may_have_acted_so_it_is_not_done_again(answers: Answers, error: Exception) -> None:
     acts = Acts()
     acts.error = error
     for _ in range(2):
@@ -94,11 +94,11 @@ def test_what_failed_may_have_acted_so_it_is_not_done_again(answers: Answers[int
 @pytest.mark.parametrize("simulated", [False, True])
 def test_many_at_once_act_once_and_get_one_answer_also_on_a_clock_that_takes_turns(simulated: bool) -> None:
     clock = SimulationClock() if simulated else None
-    answers: Answers[int] = Answers(ManualClock(), clock)
+    answers = Answers(ManualClock(), clock)
     acts, inside, go = Acts(), threading.Event(), threading.Event()
-    got: list[tuple[int, bool]] = []
+    got: list[tuple[Answer, bool]] = []
 
-    def slow() -> int:
+    def slow() -> Answer:
         inside.set()
         if clock is not None:
             clock.sleep(5.0)  # lets the others have their turns
@@ -118,13 +118,14 @@ def test_many_at_once_act_once_and_get_one_answer_also_on_a_clock_that_takes_tur
     for thread in threads:
         thread.join(10.0)
     assert acts.done == 1
-    assert sorted(got) == [(1, False)] + [(1, True)] * 5
+    assert sorted(again for _, again in got) == [False] + [True] * 5
+    assert all(answer == {"id": 1} for answer, _ in got)
 
 
-def test_the_second_of_two_gets_the_firsts_refusal(answers: Answers[int]) -> None:
+def test_the_second_of_two_gets_the_firsts_refusal(answers: Answers) -> None:
     inside, go, refusals = threading.Event(), threading.Event(), []
 
-    def slow() -> int:
+    def slow() -> Answer:
         inside.set()
         assert go.wait(10.0)
         raise NotNow("busy", "another runs")
@@ -148,13 +149,13 @@ def test_the_second_of_two_gets_the_firsts_refusal(answers: Answers[int]) -> Non
 
 
 def test_who_waits_too_long_for_the_first_is_told(clock: ManualClock) -> None:
-    answers: Answers[int] = Answers(clock)
+    answers = Answers(clock)
     inside, go = threading.Event(), threading.Event()
 
-    def slow() -> int:
+    def slow() -> Answer:
         inside.set()
         go.wait(10.0)
-        return 1
+        return {"id": 1}
 
     first = threading.Thread(target=lambda: answers.once("bench", "k", SAME, slow))
     first.start()
@@ -178,18 +179,18 @@ def test_who_waits_too_long_for_the_first_is_told(clock: ManualClock) -> None:
     first.join(10.0)
 
 
-def _notify(answers: Answers[int]) -> None:
+def _notify(answers: Answers) -> None:
     with answers._changed:
         answers._changed.notify_all()
 
 
-def test_keys_are_bounded_and_those_at_work_are_not_forgotten(answers: Answers[int]) -> None:
+def test_keys_are_bounded_and_those_at_work_are_not_forgotten(answers: Answers) -> None:
     inside, go = threading.Event(), threading.Event()
 
-    def slow() -> int:
+    def slow() -> Answer:
         inside.set()
         go.wait(30.0)
-        return -1
+        return {"id": -1}
 
     first = threading.Thread(target=lambda: answers.once("bench", "first", SAME, slow))
     first.start()
@@ -200,12 +201,30 @@ def test_keys_are_bounded_and_those_at_work_are_not_forgotten(answers: Answers[i
     assert len(answers._kept) == KEPT
     go.set()
     first.join(10.0)
-    assert answers.once("bench", "first", SAME, acts) == (-1, True)
+    assert answers.once("bench", "first", SAME, acts) == ({"id": -1}, True)
 
 
 @pytest.mark.parametrize("key", ["", "a" * 201, "schlüssel", "a\nb"])
-def test_what_is_no_key_is_refused_before_anything_is_done(answers: Answers[int], key: str) -> None:
+def test_what_is_no_key_is_refused_before_anything_is_done(answers: Answers, key: str) -> None:
     acts = Acts()
     with pytest.raises(BadRequest, match="Idempotency-Key"):
         answers.once("bench", key, SAME, acts)
     assert acts.done == 0
+
+
+def test_answers_are_bounded_in_bytes_too(answers: Answers) -> None:
+    large = {"text": "x" * (KEPT_BYTES // 4)}
+    for number in range(8):
+        answers.once("bench", str(number), SAME, lambda: large)
+    acts = Acts()
+    assert answers.once("bench", "7", SAME, acts)[1]
+    assert not answers.once("bench", "0", SAME, acts)[1]
+    assert answers._bytes <= KEPT_BYTES
+    assert answers._bytes == sum(len(one.answer) for one in answers._kept.values())
+
+
+def test_who_got_an_answer_may_change_it(answers: Answers) -> None:
+    first, _ = answers.once("bench", "k", SAME, lambda: {"track": {"state": "idle"}})
+    first["track"]["state"] = "changed"
+    second, _ = answers.once("bench", "k", SAME, dict)
+    assert second == {"track": {"state": "idle"}}

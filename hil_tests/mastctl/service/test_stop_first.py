@@ -25,7 +25,7 @@ from mastctl.operations.operations import Operations
 from mastctl.operations.records import Operation
 from mastctl.pointing.loop import PointingLoop
 from mastctl.safety import stop_threads as stop_threads_module
-from mastctl.web import routes as routes_module
+from mastctl.web import commands as commands_module
 
 
 def test_the_head_is_told_before_the_track_and_before_any_word(
@@ -118,7 +118,7 @@ def test_a_fifth_stop_is_answered_honestly_while_four_hang(
 ) -> None:
     hang = Hang()
     monkeypatch.setattr(stop_threads_module, "OVERDUE_S", 0.2)
-    monkeypatch.setattr(routes_module, "STOP_ANSWER_S", 0.5)
+    monkeypatch.setattr(commands_module, "STOP_ANSWER_S", 0.5)
     with fake_daemon(monkeypatch, tmp_path) as (daemon, _):
         monkeypatch.setattr(daemon.service, "stop", hang)
         told: list[ClientError] = []

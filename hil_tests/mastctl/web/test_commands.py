@@ -1,0 +1,404 @@
+"""Commands from outside: who steers, once and not twice, until when, and what is left of it."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import socket
+import threading
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+from urllib.parse import urlsplit
+
+import httpx
+import pytest
+
+from hil_tests.mastctl.service_fakes import FakeHardware, ScriptedLoop, eventually, fake_daemon
+from mastctl.client import Client, ClientError
+from mastctl.commands.audit import AuditLog
+from mastctl.daemon import RunningDaemon
+from mastctl.errors import Stopped
+
+ANGLES = {"pan_rad": 0.1, "tilt_rad": -0.1}
+Pair = tuple[RunningDaemon, FakeHardware]
+
+
+@pytest.fixture
+def pair(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[Pair]:
+    with fake_daemon(monkeypatch, tmp_path) as made:
+        yield made
+
+
+@pytest.fixture
+def bench(pair: Pair) -> Iterator[Client]:
+    with Client(pair[0].url, name="bench") as client:
+        yield client
+
+
+@pytest.fixture
+def rover(pair: Pair) -> Iterator[Client]:
+    with Client(pair[0].url, name="rover") as client:
+        yield client
+
+
+@pytest.fixture
+def web(pair: Pair) -> Iterator[httpx.Client]:
+    with httpx.Client(base_url=f"{pair[0].url}/api/v1", trust_env=False, timeout=20.0) as client:
+        yield client
+
+
+def refused(code: str, act: Callable[[], object]) -> ClientError:
+    with pytest.raises(ClientError) as refusal:
+        act()
+    assert refusal.value.code == code
+    return refusal.value
+
+
+def waits(request: Any, record: Callable[[Any], None], cancelled: threading.Event, devices: Any) -> None:
+    """A pointing that goes on until it is ended."""
+    devices.move(0.1, -0.1)
+    assert cancelled.wait(30.0)
+    raise Stopped("cancelled")
+
+
+def moves(hardware: FakeHardware) -> int:
+    return sum(call[0] == "move" for call in hardware.head.calls)
+
+
+# Who steers
+
+
+def test_while_one_program_holds_the_lease_another_is_told_who_and_moves_nothing(
+    bench: Client, rover: Client, pair: Pair
+) -> None:
+    with bench.lease(for_s=60.0):
+        for command in (
+            lambda: rover.point(**ANGLES),
+            lambda: rover.start_track(position_m=(5.0, 0.0, 0.0)),
+            rover.look,
+            rover.stop_track,
+            lambda: rover.use_mast("little.yaml"),
+            rover.use_former_mast,
+            lambda: rover.acquire_lease(),
+        ):
+            error = refused("leased", command)
+            assert error.detail is not None
+            assert (error.detail["holder"], error.detail["kind"]) == ("bench", "lease")
+        assert moves(pair[1]) == 0
+        control = rover.status()["control"]
+        assert (control["holder"], control["kind"]) == ("bench", "lease")
+        assert 50.0 < control["for_s"] <= 60.0
+        assert rover.control() is not None
+        bench.wait(bench.point(**ANGLES))
+    assert rover.status()["control"] is None
+    rover.wait(rover.point(**ANGLES))
+    assert moves(pair[1]) == 2
+
+
+def test_the_holders_name_alone_does_not_steer(bench: Client, pair: Pair) -> None:
+    with bench.lease(), Client(pair[0].url, name="bench") as another:
+        refused("leased", lambda: another.point(**ANGLES))
+
+
+def test_a_stop_and_a_pose_need_no_lease(bench: Client, rover: Client, pair: Pair) -> None:
+    with bench.lease():
+        assert rover.stop()["stopped"]
+        rover.pose([0, 0, 0], [1, 0, 0, 0])
+    assert ("stop",) in pair[1].head.calls
+
+
+def test_without_a_lease_who_started_what_runs_steers_until_it_ends(
+    bench: Client, rover: Client, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(ScriptedLoop, "script", staticmethod(waits))
+    operation = bench.point(**ANGLES)
+    assert refused("leased", lambda: rover.point(**ANGLES)).detail == {
+        "holder": "bench", "kind": "operation", "for_s": None, "until": None,
+    }  # fmt: skip
+    refused("leased", rover.acquire_lease)
+    refused("busy", lambda: bench.point(**ANGLES))
+    rover.stop()
+    bench.wait(operation)
+    eventually(lambda: rover.status()["control"] is None, "nobody steers")
+    rover.acquire_lease()
+
+
+def test_who_takes_over_steers_and_the_former_holder_learns_it_by_itself(
+    bench: Client, rover: Client
+) -> None:
+    with bench.lease(for_s=1.0) as held, rover.lease(take_over="the bench is empty"):
+        error = refused("lease_over", lambda: bench.point(**ANGLES))
+        assert "rover took over: the bench is empty" in str(error)
+        eventually(lambda: held.lost is not None, "the holder's thread learns it")
+        assert held.lost is not None
+        assert held.lost.code == "lease_over"
+        rover.wait(rover.point(**ANGLES))
+    bench.wait(bench.point(**ANGLES))
+
+
+def test_a_held_lease_is_renewed_beyond_its_time_and_released_at_the_end(bench: Client, pair: Pair) -> None:
+    leases = pair[0].service.leases
+    with bench.lease(for_s=1.0) as held:
+        first_s = leases._lease.until_s  # type: ignore[union-attr]
+        eventually(lambda: (leases._lease or held).until_s > first_s + 1.0, "two renewals")  # type: ignore
+        assert held.lost is None
+    assert bench.control() is None
+
+
+def test_two_programs_that_race_for_the_rover_never_steer_at_once(
+    pair: Pair, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    daemon, hardware = pair
+    inside, both, done = list[str](), list[str](), dict[str, int]()
+    turns = 5
+
+    def program(name: str, leased: bool) -> None:
+        with Client(daemon.url, name=name) as client:
+            while done.get(name, 0) < turns:
+                try:
+                    if leased:
+                        with client.lease(for_s=30.0):
+                            inside.append(name)
+                            both.extend(one for one in inside if one != name)
+                            record = client.wait(client.point(**ANGLES))
+                            inside.remove(name)
+                    else:
+                        record = client.wait(client.point(**ANGLES))
+                except ClientError as error:
+                    assert error.code in ("leased", "busy"), error
+                    continue
+                assert record["state"] == "done"
+                done[name] = done.get(name, 0) + 1
+
+    threads = [
+        threading.Thread(target=program, args=(name, name != "plain"))
+        for name in ("first", "second", "plain")
+    ]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join(60.0)
+    assert both == []
+    assert done == {"first": turns, "second": turns, "plain": turns}
+    assert moves(hardware) == 3 * turns
+    records = sorted(daemon.service.operations.all(), key=lambda one: one.created_s)
+    assert all(
+        one.ended_s is not None and one.ended_s <= other.created_s
+        for one, other in itertools.pairwise(records)
+    )
+
+
+def test_a_lease_can_be_shown_taken_and_given_back_by_hand(bench: Client, rover: Client) -> None:
+    granted = bench.acquire_lease(for_s=20.0)
+    assert (granted["holder"], granted["for_s"]) == ("bench", pytest.approx(20.0, abs=5.0))
+    refused("leased", lambda: bench.point(**ANGLES))
+    bench.use_lease(granted["lease_id"])
+    assert bench.renew_lease(60.0)["for_s"] == pytest.approx(60.0, abs=5.0)
+    bench.release_lease()
+    refused("lease_over", bench.release_lease)
+    bench.use_lease("0" * 32)
+    refused("lease_unknown", lambda: bench.point(**ANGLES))
+
+
+@pytest.mark.parametrize(
+    ("path", "body", "words"),
+    [
+        ("/lease", {"for_s": 0.5}, "for_s: 0.5 where"),
+        ("/lease", {"for_s": 3601}, "for_s: 3601 where"),
+        ("/lease", {"fors": 5}, "fors: unknown key"),
+        ("/lease/take", {}, "reason is missing"),
+        ("/lease/take", {"reason": "  "}, "reason:"),
+        ("/lease/renew", {}, "Mastctl-Lease is missing"),
+    ],
+)
+def test_what_is_wrong_with_a_lease_is_one_sentence(
+    web: httpx.Client, path: str, body: dict[str, Any], words: str
+) -> None:
+    answer = web.post(path, json=body)
+    assert answer.status_code == 422
+    assert words in answer.json()["error"]["message"]
+    assert web.get("/lease").json() == {"control": None}
+
+
+# Once and not twice
+
+
+def test_a_command_sent_twice_with_one_key_is_carried_out_once(web: httpx.Client, pair: Pair) -> None:
+    headers = {"Idempotency-Key": "a-key", "Mastctl-Client": "bench"}
+    first = web.post("/point", json=ANGLES, headers=headers)
+    again = web.post("/point", json=ANGLES, headers=headers)
+    assert (first.status_code, first.json()) == (again.status_code, again.json())
+    other = web.post("/point", json={"pan_rad": 0.2, "tilt_rad": 0.0}, headers=headers)
+    assert (other.status_code, other.json()["error"]["code"]) == (422, "key_reused")
+    eventually(lambda: moves(pair[1]) == 1, "the move")
+    assert len(web.get("/operations").json()["operations"]) == 1
+
+
+def test_a_key_is_one_callers(web: httpx.Client) -> None:
+    ids = set()
+    for name in ("bench", "rover"):
+        headers = {"Idempotency-Key": "1", "Mastctl-Client": name}
+        operation = web.post("/point", json=ANGLES, headers=headers).json()["id"]
+        eventually(
+            lambda operation=operation: web.get(f"/operations/{operation}").json()["state"] == "done",  # type: ignore[misc]
+            "its end",
+        )
+        ids.add(operation)
+    assert len(ids) == 2
+
+
+class Dropping:
+    """A way to the daemon on which answers are lost: ``drop`` of them, after the request went through."""
+
+    def __init__(self, url: str, drop: int) -> None:
+        self.drop = drop
+        self._to = urlsplit(url)
+        self._listener = socket.create_server(("127.0.0.1", 0))
+        self.url = f"http://127.0.0.1:{self._listener.getsockname()[1]}"
+        threading.Thread(target=self._work, daemon=True).start()
+
+    def _work(self) -> None:
+        while True:
+            try:
+                came, _ = self._listener.accept()
+            except OSError:
+                return
+            with came, socket.create_connection((self._to.hostname, self._to.port)) as on:  # type: ignore[arg-type]
+                request = b""
+                while b"\r\n\r\n" not in request or not request.endswith(b"}"):
+                    request += came.recv(65536)
+                on.sendall(request.replace(b"keep-alive", b"close"))
+                answer = b""
+                while part := on.recv(65536):
+                    answer += part
+                if self.drop:
+                    self.drop -= 1
+                else:
+                    came.sendall(answer)
+
+    def close(self) -> None:
+        self._listener.close()
+
+
+def test_a_command_whose_answer_is_lost_is_sent_again_and_carried_out_once(pair: Pair) -> None:
+    daemon, hardware = pair
+    way = Dropping(daemon.url, drop=2)
+    with Client(way.url, name="bench") as client:
+        operation = client.point(**ANGLES)
+    way.close()
+    assert way.drop == 0
+    with Client(daemon.url) as client:
+        client.wait(operation)
+    assert [one.id for one in daemon.service.operations.all()] == [operation]
+    assert moves(hardware) == 1
+
+
+def test_a_command_whose_answers_are_all_lost_says_that_the_connection_broke(pair: Pair) -> None:
+    way = Dropping(pair[0].url, drop=3)
+    with Client(way.url) as client:
+        assert "broke" in str(refused("no_daemon", lambda: client.point(**ANGLES)))
+    way.close()
+
+
+# Until when
+
+
+def test_an_operation_beyond_its_deadline_ends_with_the_head_stopped(
+    bench: Client, pair: Pair, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(ScriptedLoop, "script", staticmethod(waits))
+    record = bench.wait(bench.point(**ANGLES, deadline_s=0.1))
+    assert record["state"] == "failed"
+    assert record["error"]["code"] == "deadline_passed"
+    assert ("stop",) in pair[1].head.calls
+    monkeypatch.setattr(ScriptedLoop, "script", staticmethod(ScriptedLoop.good))
+    assert bench.wait(bench.point(**ANGLES))["state"] == "done"
+
+
+def test_the_shorter_of_the_deadlines_of_header_and_body_counts(
+    web: httpx.Client, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(ScriptedLoop, "script", staticmethod(waits))
+    for header, body in (("0.1", 60.0), ("60", 0.1)):
+        answer = web.post("/point", json={**ANGLES, "deadline_s": body}, headers={"Deadline-S": header})
+        operation = answer.json()["id"]
+        eventually(lambda op=operation: web.get(f"/operations/{op}").json()["error"], "the deadline")  # type: ignore[misc]
+        assert web.get(f"/operations/{operation}").json()["error"]["code"] == "deadline_passed"
+
+
+@pytest.mark.parametrize("deadline", ["0", "-1", "3601", "nan", "inf", "soon", ""])
+def test_a_deadline_that_is_none_is_refused_by_a_command_and_nothing_to_a_stop(
+    web: httpx.Client, pair: Pair, deadline: str
+) -> None:
+    answer = web.post("/point", json=ANGLES, headers={"Deadline-S": deadline})
+    assert answer.status_code == 422
+    assert "eadline" in answer.json()["error"]["message"]
+    assert moves(pair[1]) == 0
+    headers = {"Deadline-S": deadline, "Mastctl-Lease": "none", "Idempotency-Key": "\x7f" * 300}
+    assert web.post("/stop", headers=headers).json()["stopped"]
+
+
+# What is left of it
+
+
+def test_each_command_leaves_a_line_and_its_operation_another(
+    bench: Client, rover: Client, pair: Pair, tmp_path: Path
+) -> None:
+    path = tmp_path / "audit.jsonl"
+    entry = pair[0].service.entry
+    entry.audit = AuditLog(path)
+    with bench.lease() as held:
+        operation = bench.point(**ANGLES)
+        bench.wait(operation)
+        refused("leased", lambda: rover.point(**ANGLES))
+        rover.stop()
+
+    def lines() -> list[dict[str, Any]]:
+        assert entry.audit.flush(10.0)
+        return [json.loads(line) for line in path.read_text().splitlines()]
+
+    eventually(lambda: any("ended" in line for line in lines()), "the operation's line")
+    told = [(line["command"], line["who"], line.get("result", line.get("state"))) for line in lines()]
+    assert sorted(told) == sorted(
+        [
+            ("lease", "bench", "ok"),
+            ("point", "bench", "ok"),
+            ("point", "bench", "done"),
+            ("point", "rover", "leased"),
+            ("stop", "rover", "ok"),
+            ("lease.release", "bench", "ok"),
+        ]
+    )
+    point = next(line for line in lines() if line["command"] == "point")
+    assert point["request"] == {**ANGLES, "pointings": 1}
+    assert (point["operation"], point["lease"]) == (operation, held.id[:8])
+    assert held.id not in path.read_text()
+    entry.audit.close()
+
+
+def test_a_stop_is_answered_while_every_lock_of_the_entry_is_held_and_the_disk_hangs(
+    pair: Pair, tmp_path: Path
+) -> None:
+    daemon, hardware = pair
+    service = daemon.service
+    locks = [service.leases._lock, service.entry._matching, service.entry._answers._changed]
+    with Client(daemon.url, timeout_s=10.0) as client:
+        for lock in locks:
+            lock.__enter__()
+        try:
+            assert client.stop()["stopped"]
+        finally:
+            for lock in locks:
+                lock.__exit__(None, None, None)
+    assert ("stop",) in hardware.head.calls
+
+
+def test_what_a_caller_is_called_comes_from_its_header_and_any_header_will_do(
+    web: httpx.Client, pair: Pair
+) -> None:
+    for name in ("bench", "", "é", "a" * 500, "<b>"):
+        web.post("/lease", json={"for_s": 1.0}, headers={"Mastctl-Client": name.encode("latin-1")})  # type: ignore[dict-item]
+        control = web.get("/lease").json()["control"]
+        assert control["holder"] == (name[:80] or "anonymous")
+        pair[0].service.leases._end("the test goes on")

@@ -1,0 +1,73 @@
+"""Routes of the lease: who steers."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from fastapi import FastAPI
+
+from mastctl.commands.caller import told_name
+from mastctl.commands.entry import LEASE, LEASE_RELEASE, LEASE_RENEW, LEASE_TAKE
+from mastctl.commands.lease import Lease
+from mastctl.errors import BadRequest
+from mastctl.service.service import Service
+from mastctl.web import PREFIX
+from mastctl.web.commands import Came, Commands, Headers
+from mastctl.web.models import LeaseBody, RenewBody, TakeBody
+
+
+def add_lease(app: FastAPI, service: Service, commands: Commands) -> None:
+    """Who steers: acquired, renewed, released, taken over."""
+    leases = service.leases
+
+    def granted(lease: Lease) -> dict[str, Any]:
+        told = leases.told_of(lease)
+        return {"lease_id": lease.id, **{key: told[key] for key in ("holder", "for_s", "until")}}
+
+    @app.get(f"{PREFIX}/lease", summary="Who steers")
+    async def control() -> dict[str, Any]:
+        return {"control": leases.told()}
+
+    @app.post(f"{PREFIX}/lease", summary="Acquire the lease, if nobody else steers")
+    async def acquire(body: LeaseBody, came: Headers) -> dict[str, Any]:
+        name = None if body.name is None else told_name(body.name)
+        return await commands.run(
+            LEASE, came, told(body), lambda: granted(leases.acquire(came.caller, name, body.for_s))
+        )
+
+    @app.post(f"{PREFIX}/lease/renew", summary="Have the lease run for its time from now on")
+    async def renew(came: Headers, body: RenewBody | None = None) -> dict[str, Any]:
+        lease_id, for_s = _lease_of(came), None if body is None else body.for_s
+        return await commands.run(
+            LEASE_RENEW, came, {"for_s": for_s}, lambda: granted(leases.renew(lease_id, for_s))
+        )
+
+    @app.delete(f"{PREFIX}/lease", summary="Release the lease")
+    async def release(came: Headers) -> dict[str, Any]:
+        lease_id = _lease_of(came)
+
+        def act() -> dict[str, Any]:
+            leases.release(lease_id)
+            return {"control": leases.told()}
+
+        return await commands.run(LEASE_RELEASE, came, {}, act)
+
+    @app.post(f"{PREFIX}/lease/take", summary="Take over, whoever steers; what runs goes on")
+    async def take(body: TakeBody, came: Headers) -> dict[str, Any]:
+        name = None if body.name is None else told_name(body.name)
+        return await commands.run(
+            LEASE_TAKE,
+            came,
+            told(body),
+            lambda: granted(leases.take(came.caller, body.reason, name, body.for_s)),
+        )
+
+    def told(body: LeaseBody) -> dict[str, Any]:
+        return body.model_dump(exclude_none=True)
+
+
+def _lease_of(came: Came) -> str:
+    """The lease that a request speaks of. Raises BadRequest."""
+    if came.lease is None:
+        raise BadRequest("bad_request", "Mastctl-Lease is missing; the id of the lease is expected")
+    return came.lease
