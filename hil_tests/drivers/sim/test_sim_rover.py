@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from calib.files.mast_file import load_rig
 from calib.rigid import Rigid, rot_z
 from drivers.clock import ManualClock
-from drivers.errors import BadOptions, NoFreshFrame
+from drivers.errors import BadOptions, NoFreshFrame, NoReply
 from drivers.sim.render import Renderer
 from drivers.sim.rover import TRUTH_FRAMES, SimulatedRover
 from drivers.sim.scene import Scene
@@ -159,9 +159,15 @@ def test_cameras_may_be_asked_from_different_threads(small_rig: Path) -> None:
     assert set(found) == set(device.cameras) and len(set(found.values())) == 1
 
 
-def test_a_closed_rover_gives_no_frames(small_rig: Path) -> None:
+def test_a_closed_rover_stops_its_head_and_gives_no_frames(small_rig: Path) -> None:
     device, clock = rover(small_rig)
+    device.pan_tilt.move(1.0, 0.2)
+    clock.advance(0.3)
     device.close()
+    with pytest.raises(NoReply):
+        device.pan_tilt.read()
+    clock.advance(30.0)
+    assert device.true_joints(clock.now_s())[0] < 0.9
     with pytest.raises(NoFreshFrame, match="closed"):
         device.cameras["navcam_left"].next_frame(clock.now_s(), 1.0)
 
