@@ -14,7 +14,7 @@ import pytest
 import drivers
 import mastctl
 from calib.errors import CalibError
-from drivers.errors import DriverError
+from drivers.errors import BadOptions, DriverError, NoFreshFrame, NoReply
 from mastctl.errors import BadRequest, MastctlError, NoLonger, NotAllowed, NotKnown, NotNow, Stopped, Unable
 from mastctl.pointing.results import PointingError
 from mastctl.web.guard import GuardError, error_response
@@ -126,7 +126,11 @@ def test_no_code_has_two_statuses(documented: dict[str, set[str]]) -> None:
         (NoLonger("frame_too_old", "no"), 410),
         (Stopped("no"), 409),
         (Unable("closing", "no"), 503),
+        (MastctlError("no"), 500),
         (CalibError("no"), 422),
+        (BadOptions("no"), 422),
+        (NoReply("no"), 504),
+        (NoFreshFrame("no"), 504),
         (DriverError("no"), 502),
     ],
 )
