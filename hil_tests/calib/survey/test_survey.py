@@ -16,6 +16,7 @@ from hypothesis import strategies as st
 
 from calib.errors import BadFile
 from calib.survey import Survey, read_survey, write_survey
+from calib.survey.picture_file import spoiled_png
 from hil_tests.calib.survey.survey_case import CLICKS, DOTS, FILES, IMAGES, write_files
 
 
@@ -334,3 +335,15 @@ def test_every_file_of_a_survey_is_on_the_disk_before_the_folder_gets_its_name(
     write_survey(survey, target, [("pictures/x.png", b"x")])
     written = {path.name for path in target.rglob("*") if path.is_file()}
     assert {"survey.yaml", "station.csv", "images.csv", "x.png"} <= written <= early
+
+
+def test_a_png_is_whole_to_its_last_byte_or_said_to_be_cut_short() -> None:
+    whole = cv2.imencode(".png", np.arange(64, dtype=np.uint8).reshape(8, 8))[1].tobytes()
+    assert spoiled_png(whole) is None
+    assert spoiled_png(whole + b"more") is None, "what follows the end is nobody's"
+    for length in range(8, len(whole)):
+        assert spoiled_png(whole[:length]) == "it is cut short", length
+    damaged = bytearray(whole)
+    damaged[40] ^= 1
+    assert spoiled_png(bytes(damaged)) == "a part of it is damaged"
+    assert spoiled_png(b"\xff\xd8 a JPEG") is None
