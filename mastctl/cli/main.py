@@ -31,6 +31,7 @@ log = logging.getLogger(__name__)
 MODULES: dict[str, tuple[str, ...]] = {
     "mastctl.cli.service": ("run", "status", "point", "snapshot"),
     "mastctl.cli.stop": ("stop", "estop", "reset", "halt"),
+    "mastctl.cli.lease": ("lease",),
     "mastctl.cli.track": ("track",),
     "mastctl.cli.jog": ("jog",),
     "mastctl.cli.camera_files": ("camera",),

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import argparse
 import atexit
+import getpass
 import logging
 import os
 import signal
+import socket
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -70,6 +72,7 @@ def add_daemon_options(parser: argparse.ArgumentParser) -> None:
     """Add the options that say which daemon is meant; `client_of` reads them."""
     parser.add_argument("--url", help="the daemon's address (default: that of the configuration)")
     parser.add_argument("--config", metavar="FILE", help="the configuration that the daemon runs with")
+    parser.add_argument("--lease", metavar="ID", help="the lease to steer under ('mastctl lease take')")
 
 
 def _run(args: argparse.Namespace) -> int:
@@ -179,7 +182,7 @@ def _snapshot(args: argparse.Namespace) -> int:
 
 def refuse_daemon_options(args: argparse.Namespace) -> None:
     """Refuse --url and --config beside --simulated, which asks no running daemon."""
-    for option in ("url", "config"):
+    for option in ("url", "config", "lease"):
         if getattr(args, option) is not None:
             raise WrongUse(f"--{option} names a running daemon; --simulated starts rovers of its own")
 
@@ -206,8 +209,17 @@ def client_of(args: argparse.Namespace, *, whatever_configured: bool = False) ->
         if listen.socket is None and listen.port == 0:
             raise WrongUse("the configuration listens at any free port (0); give --url")
         url = listen.url
-    with Client(url) as client:
+    with Client(url, name=_person()) as client:
+        client.use_lease(getattr(args, "lease", None))
         yield client
+
+
+def _person() -> str:
+    """Who types: commands of one user of a machine are one party, however many processes they are."""
+    try:
+        return f"{getpass.getuser()}@{socket.gethostname()}"
+    except (OSError, KeyError):  # a user without a name
+        return f"{os.getuid()}@{socket.gethostname()}"
 
 
 def followed(client: Client, operation_id: str, args: argparse.Namespace) -> dict[str, Any]:
@@ -259,6 +271,8 @@ def _show_pointings(record: dict[str, Any]) -> None:
 def _status_rows(status: dict[str, Any]) -> Iterator[tuple[str, str]]:
     """The lines of the status table."""
     yield "state", f"{status['state']} ({status['hardware']})"
+    if status.get("control"):
+        yield "control", steers(status["control"])
     joints = status["joints"]
     if joints is None:
         yield "joints", "not read yet"
@@ -285,6 +299,15 @@ def _status_rows(status: dict[str, Any]) -> Iterator[tuple[str, str]]:
     mast = status["mast"]
     yield "mast file", f"{mast['file']} ({mast['digest'][:8]}...)"
     yield "up", f"{status['uptime_s']:.0f} s, version {status['version']}"
+
+
+def steers(control: dict[str, Any] | None) -> str:
+    """Who steers, in a line."""
+    if control is None:
+        return "nobody steers"
+    left_s = control["for_s"]
+    until = "until what runs has ended" if left_s is None else f"for {left_s:.0f} s more"
+    return f"{control['holder']} steers, {until}"
 
 
 def _fault_lines(status: dict[str, Any]) -> list[str]:

@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from typing import Any, Literal
 from urllib.parse import quote
 
-from mastctl.client.connection import ClientError, DaemonHttp
+from mastctl.client.connection import ClientError, DaemonHttp, plain_name
 from mastctl.client.jog import ANSWER_S, Jog
 from mastctl.client.lease import HeldLease
 from mastctl.client.snapshot import Snapshot, read_snapshot
@@ -97,7 +97,7 @@ class Client:
 
     def use_lease(self, lease_id: str | None) -> None:
         """Have each command carry a lease from now on, or none."""
-        self._daemon.lease_id = lease_id
+        self._daemon.lease_id = None if lease_id is None else plain_name(lease_id)
 
     def renew_lease(self, for_s: float | None = None) -> dict[str, Any]:
         """Have the lease in use run for ``for_s`` seconds from now on, by default as long as at first."""

@@ -1,0 +1,74 @@
+"""The lease on the command line: its id goes from one command to the next."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from hil_tests.mastctl.service_fakes import fake_daemon
+from mastctl.cli.main import main
+from mastctl.client import Client
+from mastctl.daemon import RunningDaemon
+
+Run = Callable[..., tuple[int, str, str]]
+ANGLES = ("--angles", "0.1", "-0.1")
+
+
+@pytest.fixture
+def daemon(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[RunningDaemon]:
+    with fake_daemon(monkeypatch, tmp_path) as (made, _):
+        yield made
+
+
+@pytest.fixture
+def run(daemon: RunningDaemon, capsys: pytest.CaptureFixture[str]) -> Run:
+    def call(*words: str) -> tuple[int, str, str]:
+        capsys.readouterr()
+        code = main([*words, "--url", daemon.url])
+        out, log = capsys.readouterr()
+        return code, out.strip(), log
+
+    return call
+
+
+def test_a_lease_is_taken_used_renewed_shown_and_released(run: Run) -> None:
+    assert run("lease", "show")[1] == "nobody steers"
+    code, lease, _ = run("lease", "take", "--for", "600", "--name", "night shift")
+    assert (code, len(lease)) == (0, 32)
+    assert run("lease", "show")[1].startswith("night shift steers, for ")
+    assert "night shift steers" in run("status")[1]
+    code, out, _ = run("point", *ANGLES, "--json")
+    assert (code, json.loads(out)["error"]["code"]) == (1, "leased")
+    assert run("point", *ANGLES, "--lease", lease, "--json")[0] == 0
+    assert run("lease", "renew", "--lease", lease, "--for", "60")[1] == "night shift steers, for 60 s more"
+    assert run("lease", "release", "--lease", lease)[:2] == (0, "released")
+    code, out, _ = run("lease", "release", "--lease", lease, "--json")
+    assert (code, json.loads(out)["error"]["code"]) == (1, "lease_over")
+
+
+def test_taking_over_needs_a_reason(run: Run, daemon: RunningDaemon) -> None:
+    with Client(daemon.url, name="bench") as client, client.lease():
+        code, out, _ = run("lease", "take", "--json")
+        assert (code, json.loads(out)["error"]["code"]) == (1, "leased")
+        code, lease, _ = run("lease", "take", "--reason", "the bench is empty")
+        assert code == 0
+        assert run("point", *ANGLES, "--lease", lease)[0] == 0
+
+
+def test_commands_of_one_person_are_one_party(run: Run, daemon: RunningDaemon) -> None:
+    started = json.loads(run("point", *ANGLES, "--no-wait", "--json")[1])["id"]
+    with Client(daemon.url) as client:
+        client.wait(started)
+    assert run("point", *ANGLES)[0] == 0
+    assert "@" in daemon.service.leases._party  # type: ignore[operator]
+
+
+@pytest.mark.parametrize("act", ["renew", "release"])
+def test_without_its_id_nothing_becomes_of_a_lease(run: Run, act: str) -> None:
+    code, out, _ = run("lease", act, "--json")
+    assert (code, "--lease is missing" in json.loads(out)["error"]["message"]) == (2, True)
+    code, out, _ = run("lease", act, "--lease", "ä\n", "--json")
+    assert (code, json.loads(out)["error"]["code"]) == (1, "lease_unknown")
