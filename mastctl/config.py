@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import ipaddress
 import math
+import re
 from dataclasses import dataclass, field
 from pathlib import Path
 from urllib.parse import quote
@@ -35,24 +36,56 @@ _FULL_TURN_RAD = 6.2832
 _FASTEST_RAD_PER_S = 100.0
 _STEEPEST_RAD_PER_S2 = 1000.0
 _WIDEST_MARGIN_RAD = 0.5
+_HOST_NAME = re.compile(r"[A-Za-z0-9]([A-Za-z0-9._-]{0,252})|[0-9A-Fa-f:]*:[0-9A-Fa-f:.]*")
 _LONGEST_SOCKET_PATH = 100  # bytes; the kernel's own bound is 108
 
 
 @dataclass(frozen=True)
+class Tls:
+    """The files by which a daemon speaks TLS: a certificate with its chain, and its key, both PEM."""
+
+    certificate: Path
+    key: Path
+
+
+@dataclass(frozen=True)
 class Listen:
-    """Where the daemon listens: a loopback address, or a Unix socket, which then is not None."""
+    """Where the daemon listens, and to which names it answers.
+
+    Attributes
+    ----------
+    host, port
+        An address of this machine; port 0 is any free one.
+    socket
+        A Unix socket instead, if not None.
+    hosts
+        Names that it answers to beside the loopback ones, in lower case.
+    tls
+        None for plain HTTP.
+    """
 
     host: str = DEFAULT_HOST
     port: int = DEFAULT_PORT
     socket: Path | None = None
+    hosts: tuple[str, ...] = ()
+    tls: Tls | None = None
 
     @property
     def url(self) -> str:
-        """The address as clients take it: ``http://127.0.0.1:8420`` or ``unix:/path/of/socket``."""
+        """The address as clients take it: ``http://127.0.0.1:8420`` or ``unix:/path/of/socket``.
+
+        Of a daemon that listens at every address of the machine it is the loopback one.
+        """
         if self.socket is not None:
             return f"unix:{quote(str(self.socket))}"
-        host = f"[{self.host}]" if ":" in self.host else self.host
-        return f"http://{host}:{self.port}"
+        host = {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(self.host, self.host)
+        scheme = "http" if self.tls is None else "https"
+        return f"{scheme}://{f'[{host}]' if ':' in host else host}:{self.port}"
+
+    @property
+    def needs_token(self) -> bool:
+        """Whether others than this machine's users may reach it, by its address or a name it answers to."""
+        return bool(self.hosts) or (self.socket is None and not is_loopback(self.host))
 
 
 @dataclass(frozen=True)
@@ -168,25 +201,60 @@ def _camera(top: Section, name: str) -> DeviceSettings:
     return DeviceSettings(section.text("driver"), section.free("options"), offset_s)
 
 
+def parse_address(text: str) -> Listen:
+    """Read ``HOST:PORT``, ``[HOST]:PORT`` or the path of a Unix socket, which has a slash in it.
+
+    Raises
+    ------
+    ValueError
+        In words that say what is expected.
+    """
+    if "/" in text:
+        if len(text.encode()) > _LONGEST_SOCKET_PATH:
+            raise ValueError(f"'{text[:40]}...' is longer than {_LONGEST_SOCKET_PATH} bytes, a socket's most")
+        return Listen(socket=Path(text).absolute())
+    host, colon, port = text.rpartition(":")
+    if host.startswith("[") and host.endswith("]"):
+        host = host[1:-1]
+    elif ":" in host:
+        colon = ""
+    if not (colon and host and port.isascii() and port.isdecimal() and int(port[:9]) <= 65535):
+        raise ValueError(f"'{text[:80]}' where HOST:PORT (127.0.0.1:8420, [::1]:8420) or a path is expected")
+    return Listen(host, int(port))
+
+
 def _listen(top: Section, folder: Path) -> Listen:
-    """Read ``{host, port}`` or ``{socket: PATH}``; only this machine itself may be listened to."""
+    """Read ``{host, port}`` or ``{socket: PATH}``, with ``hosts`` and ``tls``."""
     if "listen" not in top:
         return Listen()
-    section = top.section("listen", (), ("host", "port", "socket"))
+    section = top.section("listen", (), ("host", "port", "socket", "hosts", "tls"))
+    hosts = _hosts(section)
     if "socket" in section:
-        for other in ("host", "port"):
+        for other in ("host", "port", "tls"):
             if other in section:
                 raise section.bad(other, "stands beside 'socket'; one or the other is expected")
         socket = folder / section.text("socket")
         if len(str(socket).encode()) > _LONGEST_SOCKET_PATH:
             raise section.bad("socket", f"{socket} is longer than {_LONGEST_SOCKET_PATH} bytes")
-        return Listen(socket=socket)
+        return Listen(socket=socket, hosts=hosts)
     host = section.text("host") if "host" in section else DEFAULT_HOST
-    if not is_loopback(host):
-        words = f"'{host}' where a loopback address (127.0.0.1, ::1, localhost) is expected"
-        raise section.bad("host", f"{words}: without authentication the daemon serves this machine only")
     port = section.integer("port", 0, 65535) if "port" in section else DEFAULT_PORT
-    return Listen(host, port)
+    tls = None
+    if "tls" in section:
+        files = section.section("tls", ("certificate", "key"), ())
+        tls = Tls(folder / files.text("certificate"), folder / files.text("key"))
+    return Listen(host, port, hosts=hosts, tls=tls)
+
+
+def _hosts(section: Section) -> tuple[str, ...]:
+    """Read the names to answer to."""
+    named = section.values.get("hosts", [])
+    if not isinstance(named, list) or not all(isinstance(one, str) for one in named):
+        raise section.bad("hosts", "a list of names such as rover.local is expected")
+    for name in named:
+        if not _HOST_NAME.fullmatch(name):
+            raise section.bad("hosts", f"'{name[:60]}' where a name without scheme and port is expected")
+    return tuple(name.lower() for name in named)
 
 
 def _limits(top: Section) -> Limits:

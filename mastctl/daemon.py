@@ -14,19 +14,26 @@ import logging
 import os
 import signal
 import socket
+import ssl
 import threading
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future
+from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
 from typing import Any
 
 import uvicorn
+from starlette.types import ASGIApp
 
+from calib.errors import BadFile
+from calib.files import read_bytes
 from drivers.clock import Clock
 from drivers.faults import LOG
 from drivers.hardware import Hardware
 from mastctl import signals
+from mastctl.access.access import Access
+from mastctl.access.tokens import TokenList
 from mastctl.config import Config, Listen
 from mastctl.errors import MastctlError
 from mastctl.queued_output import stall_while
@@ -35,14 +42,25 @@ from mastctl.safety.stop_threads import StopsHang
 from mastctl.service.service import Service
 from mastctl.service_manager import Heartbeat, ServiceManager
 from mastctl.web.app import create_app
-from mastctl.web.connections import ACCEPTED_AT_ONCE, WAITING_IN_KERNEL, Connection, most_connections, sweep
+from mastctl.web.connections import (
+    ACCEPTED_AT_ONCE,
+    WAITING_IN_KERNEL,
+    Connection,
+    counted,
+    most_connections,
+    sweep,
+)
+from mastctl.web.entrance import Entrance
+from mastctl.web.secure import arriving
 from mastctl.web.waiting import Waiting
+from mastctl.web.whose_page import Names
 
 log = logging.getLogger(__name__)
 
 GRACE_S = 2  # for answers under way, when the daemon ends; what waits for a device is refused at once
 START_TIMEOUT_S = 600.0  # the first start compiles the simulator's kernels
 END_TIMEOUT_S = 20.0
+MOST_PEM_BYTES = 1_000_000
 
 
 class AddressInUse(MastctlError):
@@ -73,11 +91,13 @@ def run(config: Config, on_ready: Callable[[str], None], clock: Clock | None = N
     BadFile, DriverError
         From opening the service.
     """
+    _check_tls(config.listen)
     with _listening(config.listen) as (listener, url):
         service = _opened(config, clock, _state_folder(config), url)
         _let_log_stall(service)
         try:
-            asyncio.run(_serve(service, listener, lambda _: on_ready(url), in_process=True))
+            with _entrance(service, url) as entrance:
+                asyncio.run(_serve(service, listener, lambda _: on_ready(url), entrance, in_process=True))
         finally:
             service.close()
 
@@ -99,6 +119,7 @@ class RunningDaemon:
     """
 
     def __init__(self, config: Config, clock: Clock | None = None) -> None:
+        _check_tls(config.listen)
         self._exit = contextlib.ExitStack()
         listener, self.url = self._exit.enter_context(_listening(config.listen))
         try:
@@ -109,6 +130,11 @@ class RunningDaemon:
             self._exit.close()
             raise
         self._exit.callback(self.service.close)
+        try:
+            self._entrance = self._exit.enter_context(_entrance(self.service, self.url))
+        except BaseException:
+            self._exit.close()
+            raise
         _let_log_stall(self.service)
         self._exit.callback(stall_while, lambda: False)
         self._ready = threading.Event()
@@ -149,7 +175,7 @@ class RunningDaemon:
             self._ready.set()
 
         try:
-            asyncio.run(_serve(self.service, listener, ready, in_process=False))
+            asyncio.run(_serve(self.service, listener, ready, self._entrance, in_process=False))
         except Exception:
             log.exception("the daemon ended")
         finally:
@@ -202,6 +228,7 @@ async def _serve(
     service: Service,
     listener: socket.socket,
     on_ready: Callable[[Callable[[], None]], None],
+    entrance: Entrance,
     *,
     in_process: bool,
 ) -> None:
@@ -211,20 +238,8 @@ async def _serve(
     """
     loop = asyncio.get_running_loop()
     waiting = Waiting(service.clock)
-    server = _Server(
-        uvicorn.Config(
-            create_app(service, waiting),
-            http=type("Connection", (Connection,), {"most": most_connections()}),
-            backlog=ACCEPTED_AT_ONCE,
-            ws="none",
-            lifespan="off",
-            proxy_headers=False,
-            server_header=False,
-            access_log=False,
-            log_config=None,
-            timeout_graceful_shutdown=GRACE_S,
-        )
-    )
+    settings = _settings(service, create_app(service, waiting, entrance))
+    server = _Server(settings)
     ending = asyncio.Event()
 
     def end() -> None:
@@ -269,9 +284,69 @@ async def _serve(
         await loop.run_in_executor(None, service.close)
 
 
+def _settings(service: Service, app: ASGIApp) -> uvicorn.Config:
+    """How uvicorn serves. TLS is made by its options, and spoken by connections that are counted."""
+    kind = type("Connection", (Connection,), {"most": most_connections()})
+    tls = service.config.listen.tls
+    settings = uvicorn.Config(
+        app,
+        http=kind,
+        backlog=ACCEPTED_AT_ONCE,
+        ws="none",
+        lifespan="off",
+        proxy_headers=False,
+        server_header=False,
+        access_log=False,
+        log_config=None,
+        timeout_graceful_shutdown=GRACE_S,
+        ssl_certfile=None if tls is None else tls.certificate,
+        ssl_keyfile=None if tls is None else tls.key,
+    )
+    if tls is not None:
+        settings.load()
+        assert settings.ssl is not None
+        context, settings.ssl = settings.ssl, None
+        settings.http_protocol_class = arriving(kind, context)
+    return settings
+
+
+@contextlib.contextmanager
+def _entrance(service: Service, url: str) -> Iterator[Entrance]:
+    """Say who comes in, by where the daemon listens. Raises BadFile."""
+    listen = service.config.listen
+    names = Names(frozenset(listen.hosts), any_address=listen.needs_token, secure=listen.tls is not None)
+    if not listen.needs_token:
+        yield Entrance(names, None, "loopback" if listen.socket is None else "unix")
+        return
+    tokens = TokenList(service.folder.path)
+    access = Access(tokens)
+    try:
+        log.warning("%s asks everybody for a token, but for a stop; tokens lie in %s", url, tokens.folder)
+        if listen.tls is None and listen.socket is None:
+            log.warning("%s speaks plain HTTP: tokens and pictures can be read on the way (listen.tls)", url)
+        yield Entrance(names, access, "token")
+    finally:
+        access.close()
+
+
+def _check_tls(listen: Listen) -> None:
+    """Pass a certificate and a key that belong together. Raises BadFile."""
+    if listen.tls is None:
+        return
+    for path in (listen.tls.certificate, listen.tls.key):
+        read_bytes(path, MOST_PEM_BYTES)
+    try:
+        ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER).load_cert_chain(
+            listen.tls.certificate, listen.tls.key, password=lambda: b""
+        )
+    except (ssl.SSLError, OSError, ValueError) as error:
+        words = f"it and {listen.tls.certificate} are no key and certificate that belong together ({error})"
+        raise BadFile(listen.tls.key, "", words) from None
+
+
 def _leave(connections: Iterable[Any]) -> None:
     """Leave those who have not read their answers."""
-    for one in list(connections):
+    for one in counted(list(connections)):
         one.leave()
 
 
@@ -292,8 +367,7 @@ def _listening(listen: Listen) -> Iterator[tuple[socket.socket, str]]:
         url = listen.url
     else:
         listener = _tcp_socket(listen)
-        port = listener.getsockname()[1]
-        url = Listen(listen.host, port).url
+        url = replace(listen, port=listener.getsockname()[1]).url
     try:
         yield listener, url
     finally:

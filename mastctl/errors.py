@@ -43,6 +43,18 @@ class BadRequest(_Family):
     """What was asked makes no sense for this rig: asked otherwise it may."""
 
 
+class NotLetIn(_Family):
+    """Who asks has not shown who it is."""
+
+
+class TooMany(_Family):
+    """Somebody asks too often; it may ask again after ``retry_after_s`` seconds."""
+
+    def __init__(self, code: str, message: str, retry_after_s: float = 1.0) -> None:
+        self.retry_after_s = retry_after_s
+        super().__init__(code, message)
+
+
 class NotAllowed(_Family):
     """Who asks may not: somebody else may."""
 

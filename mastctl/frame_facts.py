@@ -54,6 +54,15 @@ def facts_in(headers: Mapping[str, str]) -> dict[str, Any]:
     return {one.name: _READ[str(one.type)](headers[_HEADERS[one.name]]) for one in fields(FrameFacts)}
 
 
+def described_headers() -> dict[str, Any]:
+    """Return how OpenAPI describes these headers."""
+    kinds = {"str": "string", "int": "integer", "float": "number", "bool": "boolean"}
+    return {
+        _HEADERS[one.name]: {"required": True, "schema": {"type": kinds[str(one.type)]}}
+        for one in fields(FrameFacts)
+    }
+
+
 _HEADERS = {one.name: "X-Mastctl-" + one.name.replace("_", "-").title() for one in fields(FrameFacts)}
 _READ: Mapping[str, Callable[[str], Any]] = {
     "str": str,

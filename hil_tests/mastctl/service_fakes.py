@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -172,6 +172,15 @@ class FakePointing:
     residual_sigma_px: Any
     frame_id: str
     note: str = ""
+    commanded_pan_rad: float = 0.1
+    commanded_tilt_rad: float = -0.1
+    measured_pan_rad: float = 0.1
+    measured_tilt_rad: float = -0.1
+    camera: str = "navcam_left"
+    aim_px: Any = None
+    predicted_px: Any = None
+    target_px: Any = None
+    motion_evidence: Mapping[str, Any] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from calib.errors import BadFile
 from hil_tests.mastctl.service_fakes import rig
-from mastctl.config import Config, Listen, check_cameras, load_config, parse_config
+from mastctl.config import Config, Listen, check_cameras, load_config, parse_address, parse_config
 from mastctl.packaged import config_folder, default_config
 from mastctl.tracking.choice import PairBounds
 
@@ -75,6 +75,57 @@ def test_an_absolute_mast_file_stays_where_it_is() -> None:
     assert parsed(changed("mast_file", "/somewhere/mast.yaml")).mast_file == Path("/somewhere/mast.yaml")
 
 
+@pytest.mark.parametrize(
+    ("listen", "needs"),
+    [
+        ({}, False),
+        ({"host": "localhost"}, False),
+        ({"host": "127.0.0.1", "hosts": []}, False),
+        ({"socket": "/run/mast.sock"}, False),
+        ({"host": "0.0.0.0"}, True),
+        ({"host": "::"}, True),
+        ({"host": "192.168.1.5"}, True),
+        ({"host": "rover.example.org"}, True),
+        ({"host": "127.0.0.1", "hosts": ["rover.local"]}, True),
+        ({"socket": "/run/mast.sock", "hosts": ["rover.local"]}, True),
+    ],
+)
+def test_a_token_is_asked_for_where_others_than_this_machine_may_come_in(
+    listen: dict[str, Any], needs: bool
+) -> None:
+    assert parsed(changed("listen", listen)).listen.needs_token is needs
+
+
+def test_names_and_tls_are_read_and_every_address_is_asked_for_on_this_machine() -> None:
+    tls = {"certificate": "a.pem", "key": "/b.key"}
+    listen = parsed(changed("listen", {"host": "0.0.0.0", "hosts": ["Rover.Local"], "tls": tls})).listen
+    assert listen.hosts == ("rover.local",)
+    assert listen.tls is not None and listen.tls.certificate.is_absolute() and str(listen.tls.key) == "/b.key"
+    assert listen.url == "https://127.0.0.1:8420"
+    assert parsed(changed("listen", {"host": "::"})).listen.url == "http://[::1]:8420"
+
+
+@pytest.mark.parametrize(
+    ("text", "url"),
+    [
+        ("127.0.0.1:0", "http://127.0.0.1:0"),
+        ("[::1]:8420", "http://[::1]:8420"),
+        ("rover.local:80", "http://rover.local:80"),
+        ("/run/mast.sock", "unix:/run/mast.sock"),
+    ],
+)
+def test_an_address_is_read_as_a_command_takes_it(text: str, url: str) -> None:
+    assert parse_address(text).url == url
+
+
+@pytest.mark.parametrize(
+    "text", ["", "8420", "host", "host:", ":8420", "::1:8420", "h:70000", "h:-1", "h:8x", "/" * 101]
+)
+def test_what_is_no_address_is_refused_with_what_is_expected(text: str) -> None:
+    with pytest.raises(ValueError, match=r"expected|longer"):
+        parse_address(text)
+
+
 def test_listen_may_be_left_out_or_be_a_socket() -> None:
     assert parsed(changed("listen", ...)).listen.url == "http://127.0.0.1:8420"
     assert (
@@ -113,10 +164,18 @@ BAD: list[tuple[str, Any, str, str]] = [
     ("listen/port", 65536, "listen.port", "65535"),
     ("listen/port", "8420", "listen.port", "integer"),
     ("listen/port", True, "listen.port", "integer"),
-    ("listen/host", "0.0.0.0", "listen.host", "loopback"),
-    ("listen/host", "192.168.1.5", "listen.host", "loopback"),
-    ("listen/host", "::", "listen.host", "loopback"),
-    ("listen/host", "rover.example.org", "listen.host", "loopback"),
+    ("listen/hosts", "rover.local", "listen.hosts", "list of names"),
+    ("listen/hosts", [7], "listen.hosts", "list of names"),
+    ("listen/hosts", ["http://rover"], "listen.hosts", "without scheme"),
+    ("listen/hosts", ["rover:8420"], "listen.hosts", "without scheme"),
+    ("listen/hosts", ["*"], "listen.hosts", "without scheme"),
+    ("listen/tls", {"certificate": "a.pem"}, "listen.tls.key", "missing"),
+    (
+        "listen",
+        {"socket": "/run/x", "tls": {"certificate": "a", "key": "b"}},
+        "listen.tls",
+        "beside 'socket'",
+    ),
     ("listen/socket", "/run/x.sock", "listen.host", "beside 'socket'"),
     ("listen", {"socket": "/" + "x" * 120}, "listen.socket", "longer than"),
     ("simulation", "yes", "simulation", "a mapping is expected"),

@@ -12,6 +12,7 @@ import socket
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -22,7 +23,7 @@ from mastctl.queued_output import QueuedHandler
 
 if TYPE_CHECKING:
     from mastctl.client import Client
-    from mastctl.config import Config
+    from mastctl.config import Config, Listen
 
 SUFFIXES = {".png": "png", ".jpg": "jpeg", ".jpeg": "jpeg"}
 
@@ -40,6 +41,12 @@ def add_commands(subparsers: argparse._SubParsersAction[Any]) -> None:
     )
     run.add_argument("-v", "--verbose", action="store_true", help="say what the drivers meet, too")
     run.add_argument("-q", "--quiet", action="store_true", help="say only what is wrong")
+    run.add_argument(
+        "--listen",
+        type=_address,
+        metavar="ADDRESS",
+        help="HOST:PORT or the path of a Unix socket, instead of the configuration's",
+    )
     run.set_defaults(run=_run)
 
     status = subparsers.add_parser("status", help="show what a running daemon knows")
@@ -73,6 +80,16 @@ def add_daemon_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--url", help="the daemon's address (default: that of the configuration)")
     parser.add_argument("--config", metavar="FILE", help="the configuration that the daemon runs with")
     parser.add_argument("--lease", metavar="ID", help="the lease to steer under ('mastctl lease take')")
+
+
+def _address(text: str) -> Listen:
+    """Read --listen (argparse ``type``)."""
+    from mastctl.config import parse_address
+
+    try:
+        return parse_address(text)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(str(error)) from None
 
 
 def _run(args: argparse.Namespace) -> int:
@@ -117,7 +134,12 @@ def _serve(args: argparse.Namespace) -> None:
     from mastctl.config import load_config
 
     _set_log(args)
-    serve_config(load_config(args.config), args)
+    config = load_config(args.config)
+    if args.listen is not None:
+        address = args.listen
+        listen = replace(config.listen, host=address.host, port=address.port, socket=address.socket)
+        config = replace(config, listen=listen)
+    serve_config(config, args)
 
 
 def serve_config(config: Config, args: argparse.Namespace) -> None:

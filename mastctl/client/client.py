@@ -31,6 +31,10 @@ class Client:
         ``program@host:pid``. Clients of one name are one party.
 
     A command goes out again where the connection breaks, with a key by which the daemon carries it out once.
+    token
+        What a daemon asks for that is reached from other machines; by default that of ``$MASTCTL_TOKEN``.
+        Without TLS it can be read on the way. The certificates that are trusted beside the system's may
+        stand in the file ``$MASTCTL_CA_FILE``.
 
     Raises
     ------
@@ -38,9 +42,15 @@ class Client:
         ``bad_url``, if the address is of neither form. Every method raises it for whatever goes wrong.
     """
 
-    def __init__(self, url: str = DEFAULT_URL, timeout_s: float = 30.0, name: str | None = None) -> None:
+    def __init__(
+        self,
+        url: str = DEFAULT_URL,
+        timeout_s: float = 30.0,
+        name: str | None = None,
+        token: str | None = None,
+    ) -> None:
         self.url = url
-        self._daemon = DaemonHttp(url, timeout_s, name)
+        self._daemon = DaemonHttp(url, timeout_s, name, token)
 
     @contextmanager
     def lease(
@@ -384,6 +394,18 @@ class Client:
     def forget_sun(self) -> dict[str, Any]:
         """Keep the head off no sun any more."""
         return self._daemon.json("DELETE", "/limits/sun")
+
+    def session(self) -> dict[str, Any]:
+        """Return who asks: ``name``, ``role``, ``via``, and whether the daemon asks for a token at all."""
+        return self._daemon.json("GET", "/session")
+
+    def login(self, token: str) -> dict[str, Any]:
+        """Begin a session as a page does: this client then needs its token no longer, for some hours."""
+        return self._daemon.json("POST", "/login", json={"token": token})
+
+    def logout(self) -> None:
+        """End the session that `login` began."""
+        self._daemon.json("POST", "/logout")
 
     def true_pose(self) -> dict[str, Any]:
         """Return where a simulated rover truly stands: ``position_m`` and ``quaternion``, site_from_rover."""

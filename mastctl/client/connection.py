@@ -6,6 +6,7 @@ import json
 import os
 import secrets
 import socket
+import ssl
 import sys
 import time
 from collections.abc import Iterator, Mapping
@@ -43,6 +44,19 @@ class ClientError(Exception):
         super().__init__(message)
 
 
+def _trusted() -> ssl.SSLContext:
+    """Whose certificates are taken: those of the machine, and of ``$MASTCTL_CA_FILE``. Raises ClientError."""
+    context = ssl.create_default_context()
+    ca_file = os.environ.get("MASTCTL_CA_FILE")
+    if ca_file:
+        try:
+            context.load_verify_locations(ca_file)
+        except (OSError, ssl.SSLError) as error:
+            words = f"MASTCTL_CA_FILE: {ca_file}: no certificates can be read ({error})"
+            raise ClientError("bad_url", words, exit_code=2) from None
+    return context
+
+
 class Broken(ClientError):
     """The connection broke: whether the daemon got the request is not known."""
 
@@ -50,11 +64,15 @@ class Broken(ClientError):
 class DaemonHttp:
     """A connection to one daemon; parameters and errors as `Client` has them."""
 
-    def __init__(self, url: str, timeout_s: float, name: str | None = None) -> None:
+    def __init__(self, url: str, timeout_s: float, name: str | None = None, token: str | None = None) -> None:
         self.url = url
+        token = token or os.environ.get("MASTCTL_TOKEN")
+        if token and not (token.isascii() and token.isprintable()):
+            raise ClientError("bad_token", "the token has signs that no token has", exit_code=2)
         self.timeout_s = timeout_s
         self.name = plain_name(name or program_name())
         self.lease_id: str | None = None  # goes with whatever is asked
+        shown = {"Authorization": f"Bearer {token}"} if token else {}
         transport: httpx.HTTPTransport | None = None
         base = url.rstrip("/")
         if url.startswith("unix:"):
@@ -68,9 +86,10 @@ class DaemonHttp:
             self._http = httpx.Client(
                 base_url=base,
                 timeout=timeout_s,
-                headers={"Mastctl-Client": self.name},
+                headers={"Mastctl-Client": self.name, **shown},
                 trust_env=False,
                 transport=transport,
+                verify=_trusted() if parts.scheme == "https" else False,
             )
         except (ValueError, httpx.InvalidURL):
             raise ClientError(

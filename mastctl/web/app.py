@@ -13,23 +13,34 @@ from fastapi import FastAPI
 from starlette.types import ASGIApp
 
 from mastctl.service.service import Service
-from mastctl.web import PREFIX
+from mastctl.web.answers import ErrorBody
 from mastctl.web.commands import Commands
+from mastctl.web.described import describe
+from mastctl.web.entrance import Entrance
 from mastctl.web.estop import add_estop
 from mastctl.web.guard import Guard
 from mastctl.web.lease import add_lease
 from mastctl.web.limits import add_limits
-from mastctl.web.models import ErrorBody
 from mastctl.web.pictures import add_pictures
 from mastctl.web.refusals import add_errors
 from mastctl.web.routes import add_pointing, add_tracking
+from mastctl.web.sessions import add_sessions
 from mastctl.web.simulation import add_simulation
 from mastctl.web.waiting import Waiting
 
 
-def create_app(service: Service, waiting: Waiting | None = None) -> ASGIApp:
-    """Return the ASGI application that serves one service; ``waiting`` tells its requests when it ends."""
+def create_app(service: Service, waiting: Waiting | None = None, entrance: Entrance | None = None) -> ASGIApp:
+    """Return the ASGI application that serves one service.
+
+    Parameters
+    ----------
+    waiting
+        Tells its requests when the daemon ends.
+    entrance
+        What it asks of who comes in; nothing but a loopback name by default.
+    """
     waiting = waiting or Waiting(service.clock)
+    entrance = entrance or Entrance()
     app = FastAPI(
         title="mastctl",
         version=version("mastctl"),
@@ -39,6 +50,7 @@ def create_app(service: Service, waiting: Waiting | None = None) -> ASGIApp:
         redoc_url=None,
     )
     add_errors(app)
+    add_sessions(app, entrance)
     commands = Commands(service, waiting)
     add_pointing(app, service, commands)
     add_estop(app, service, waiting, commands)
@@ -47,8 +59,5 @@ def create_app(service: Service, waiting: Waiting | None = None) -> ASGIApp:
     add_limits(app, service, commands)
     add_pictures(app, service, waiting, commands)
     add_simulation(app, service, waiting, commands)
-    return Guard(
-        app,
-        ignores_body=frozenset({f"{PREFIX}/stop", f"{PREFIX}/track/stop"}),
-        reads_body=frozenset({f"{PREFIX}/estop"}),
-    )
+    describe(app)
+    return Guard(app, entrance)

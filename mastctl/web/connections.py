@@ -10,15 +10,21 @@ must have come whole within some seconds, and a client that takes no bytes for s
 from __future__ import annotations
 
 import asyncio
+import logging
 import resource
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, Protocol, cast
 
+import h11
 from starlette.types import ASGIApp, Receive, Scope, Send
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
-from mastctl.web.guard import error_response
+from mastctl.web import PREFIX
+from mastctl.web.answer import error_response
+
+log = logging.getLogger(__name__)
+log.setLevel(logging.ERROR)
 
 REQUEST_S = 10.0  # for a request to come whole, from the connection's beginning or the answer before
 STALLED_S = 10.0  # for a client that does not read its answer
@@ -28,7 +34,48 @@ LEAST = 8
 FREE_DESCRIPTORS = 24  # for devices that come back, mast files, and what is accepted before it is counted
 ACCEPTED_AT_ONCE = 4  # connections taken in one turn of the event loop
 WAITING_IN_KERNEL = 128  # connections that the kernel keeps for us meanwhile
-ALWAYS = ("/stop", "/estop", "/status")  # how a path ends that is served to whoever comes
+ALWAYS = frozenset(f"{PREFIX}/{name}" for name in ("stop", "estop", "track/stop", "status"))
+"""What is served to whoever comes."""
+
+
+class Counted(Protocol):
+    """What stands among a server's connections."""
+
+    @property
+    def waits(self) -> bool:
+        """Whether no whole request is here."""
+        ...
+
+    @property
+    def waits_since_s(self) -> float:
+        """Since when, by the event loop's time."""
+        ...
+
+    def overdue(self, now_s: float) -> bool:
+        """Whether it takes too long."""
+        ...
+
+    def leave(self) -> None:
+        """Close it at once."""
+        ...
+
+
+def room_for(newcomer: Counted, connections: set[Any], most: int) -> bool:
+    """Close the connection that waits longest for a request if there are too many; False if none waits."""
+    if len(connections) <= most:
+        return True
+    others = [one for one in counted(connections) if one is not newcomer and one.waits]
+    if not others:
+        return False
+    oldest = min(others, key=lambda one: one.waits_since_s)
+    connections.discard(oldest)  # counted no longer, although its closing takes a turn of the loop
+    oldest.leave()
+    return True
+
+
+def counted(connections: Iterable[Any]) -> list[Counted]:
+    """Return those that know how long they wait; uvicorn's WebSockets look after themselves."""
+    return [one for one in connections if hasattr(one, "waits_since_s")]
 
 
 def most_connections() -> int:
@@ -49,15 +96,56 @@ class Connection(H11Protocol):
 
     most = MOST
 
+    def __init__(self, *args: Any, **options: Any) -> None:
+        super().__init__(*args, **options)
+        self.logger = log  # what strangers send is no warning
+        self.waits_since_s = 0.0
+        self._stalled_since_s: float | None = None
+        self._early = b""
+
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         super().connection_made(transport)
-        self._waits_since_s = self.loop.time()
-        self._stalled_since_s: float | None = None
-        if len(self.connections) > self.most and not self._room_made():
+        self.waits_since_s = self.loop.time()
+        if not room_for(self, self.connections, self.most):
             self.app = cast(Any, _Crowded(cast(ASGIApp, self.app)))
+        if self._early:
+            early, self._early = self._early, b""
+            self.data_received(early)
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        if self._made:
+            super().connection_lost(exc)
+
+    def data_received(self, data: bytes) -> None:
+        if self._made:
+            super().data_received(data)
+        else:  # a TLS client that asks in the same breath as it ends its handshake
+            self._early += data
+
+    def send_400_response(self, msg: str) -> None:
+        """Refuse what is no HTTP in the one form of refusals, and close."""
+        if self.conn.our_state not in (h11.IDLE, h11.SEND_RESPONSE):
+            self.leave()  # an answer is half sent
+            return
+        refused = error_response(400, "not_http", "this is no HTTP request, or its headers are too large")
+        headers = [*refused.raw_headers, (b"connection", b"close")]
+        for event in (
+            h11.Response(status_code=400, headers=headers, reason=b"Bad Request"),
+            h11.Data(data=bytes(refused.body)),
+            h11.EndOfMessage(),
+        ):
+            self.transport.write(self.conn.send(event) or b"")
+        if self.cycle is not None:
+            self.cycle.disconnected = True  # nobody hears what it still says
+            self.cycle.message_event.set()
+        self.transport.close()
+
+    @property
+    def _made(self) -> bool:
+        return cast(Any, self.transport) is not None
 
     def on_response_complete(self) -> None:
-        self._waits_since_s = self.loop.time()
+        self.waits_since_s = self.loop.time()
         super().on_response_complete()
 
     def pause_writing(self) -> None:
@@ -78,23 +166,11 @@ class Connection(H11Protocol):
         stalled_s = self._stalled_since_s
         if stalled_s is not None and now_s - stalled_s > STALLED_S:
             return True
-        return self.waits and now_s - self._waits_since_s > REQUEST_S
+        return self.waits and now_s - self.waits_since_s > REQUEST_S
 
     def leave(self) -> None:
         """Close it at once, whatever its client still expects."""
         self.transport.abort()
-
-    def _room_made(self) -> bool:
-        """Close the connection that has waited longest for a request; return whether there was one."""
-        others = [
-            one for one in cast("Iterable[Connection]", self.connections) if one is not self and one.waits
-        ]
-        if not others:
-            return False
-        oldest = min(others, key=lambda one: one._waits_since_s)
-        self.connections.discard(oldest)  # counted no longer, although its closing takes a turn of the loop
-        oldest.leave()
-        return True
 
 
 async def sweep(connections: Iterable[Any]) -> None:
@@ -102,7 +178,7 @@ async def sweep(connections: Iterable[Any]) -> None:
     while True:
         await asyncio.sleep(SWEEP_S)
         now_s = asyncio.get_running_loop().time()
-        for one in list(connections):
+        for one in counted(list(connections)):
             if one.overdue(now_s):
                 one.leave()
 
@@ -114,7 +190,7 @@ class _Crowded:
         self._app = app
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        if scope["path"].endswith(ALWAYS):
+        if scope["path"] in ALWAYS:
             await self._app(scope, receive, send)
             return
         response = error_response(

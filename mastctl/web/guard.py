@@ -1,45 +1,47 @@
-"""What stands before the API: whose page asks, how much it sends, and whether that is JSON at all.
+"""What stands before the API: whose page asks, who comes in, how much it sends, and whether that is JSON.
 
-A daemon on the loopback address is within reach of every web page that this machine's browser opens. Two
-checks keep such pages out: the Host must be a loopback name (a foreign name that resolves to 127.0.0.1 is
-refused), and an unsafe request that a browser says comes from another origin is refused.
+A stop passes nearly all of it: only another site's page is refused one.
 """
 
 from __future__ import annotations
 
-import json
+import asyncio
 import logging
 from collections.abc import Mapping
-from typing import Any, NoReturn
-from urllib.parse import urlsplit
+from typing import Any
+from urllib.parse import parse_qsl
 
-from starlette.responses import JSONResponse
-from starlette.types import ASGIApp, Message, Receive, Scope, Send
+from fastapi import FastAPI
+from starlette.types import Message, Receive, Scope, Send
 
-from mastctl.config import is_loopback
+from mastctl.commands.caller import Caller
+from mastctl.errors import MastctlError
+from mastctl.web import PREFIX
+from mastctl.web.answer import GuardError, error_response, marked
+from mastctl.web.bodies import check_json, once, whole_body
+from mastctl.web.entrance import Entrance, Rate, changes
+from mastctl.web.refusals import told
+from mastctl.web.whose_page import check_site
 
 log = logging.getLogger(__name__)
 
-LARGEST_BODY_BYTES = 65536
-_UNSAFE = frozenset({"POST", "PUT", "PATCH", "DELETE"})
-_HEADERS = [(b"cache-control", b"no-store"), (b"x-content-type-options", b"nosniff")]
+STOPS = frozenset({f"{PREFIX}/stop", f"{PREFIX}/estop"})
+"""What everybody may ask for who reaches the daemon, whatever else the request says."""
+UNREAD = frozenset({f"{PREFIX}/stop", f"{PREFIX}/track/stop"})
+"""Where no body is read; an emergency stop reads what it can of its own."""
+LOGIN, LOGOUT = f"{PREFIX}/login", f"{PREFIX}/logout"
+PAGES = frozenset({"/"})
+LARGEST_HEADERS_BYTES = 16384
+MOST_HEADERS = 100
 
-
-class GuardError(Exception):
-    """A request that does not get as far as the API."""
-
-    def __init__(self, status: int, code: str, message: str) -> None:
-        self.status = status
-        self.code = code
-        super().__init__(message)
-
-
-def error_response(
-    status: int, code: str, message: str, detail: Any = None, headers: Mapping[str, str] | None = None
-) -> JSONResponse:
-    """Return an error as the contract has it."""
-    body = {"error": {"code": code, "message": message, "detail": detail}}
-    return JSONResponse(body, status_code=status, headers=dict(headers or {}))
+_ONCE = frozenset(
+    (
+        *("host", "origin", "authorization", "cookie", "content-type", "content-length", "transfer-encoding"),
+        *("sec-fetch-site", "sec-fetch-mode", "sec-fetch-dest"),
+        *("mastctl-client", "mastctl-lease", "idempotency-key", "deadline-s"),
+    )
+)
+_SECRETS = frozenset({"token", "access_token", "authorization", "api_key", "apikey"})
 
 
 class Guard:
@@ -49,148 +51,160 @@ class Guard:
     ----------
     app
         What it guards.
-    ignores_body
-        Paths that must always work: whatever body comes with them is dropped unread.
-    reads_body
-        Paths that must always work and read what they can of their body themselves.
+    entrance
+        What the daemon asks of who comes in.
     """
 
-    def __init__(
-        self,
-        app: ASGIApp,
-        ignores_body: frozenset[str] = frozenset(),
-        reads_body: frozenset[str] = frozenset(),
-    ) -> None:
+    def __init__(self, app: FastAPI, entrance: Entrance | None = None) -> None:
         self._app = app
-        self._ignores_body = ignores_body
-        self._reads_body = reads_body
+        self._entrance = entrance or Entrance()
+        self._rate = Rate()
+
+    def openapi(self) -> dict[str, Any]:
+        """Return what the API says of itself, as ``/openapi.json`` does."""
+        return self._app.openapi()
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        if scope["type"] != "http":
+        if scope["type"] == "http":
+            await self._http(scope, receive, send)
+        elif scope["type"] == "websocket":
+            await self._websocket(scope, receive, send)
+        else:
             await self._app(scope, receive, send)
-            return
+
+    async def _http(self, scope: Scope, receive: Receive, send: Send) -> None:
         started = False
 
         async def send_marked(message: Message) -> None:
             nonlocal started
             if message["type"] == "http.response.start":
                 started = True
-                message = {**message, "headers": [*message.get("headers", []), *_HEADERS]}
+                message = {**message, "headers": marked(message.get("headers", []))}
             await send(message)
 
         try:
-            headers = _headers(scope)
-            _check_host(headers)
-            if scope["method"] in _UNSAFE:
-                _check_origin(headers)
-                if scope["path"] not in self._reads_body:
+            headers, twice = _headers(scope)
+            if scope["path"] in STOPS and scope["method"] == "POST":
+                self._let_stop(scope, headers)
+                if scope["path"] in UNREAD:
+                    receive = once(b"", receive)
+            else:
+                self._let_in(scope, headers, twice)
+                if changes(scope):
                     body = b""
-                    if scope["path"] not in self._ignores_body:
-                        body = await _body(receive, headers)
-                        _check_json(body, headers)
-                    receive = _once(body, receive)
+                    if scope["path"] not in UNREAD:
+                        body = await whole_body(receive, headers)
+                        check_json(body, headers)
+                    receive = once(body, receive)
             await self._app(scope, receive, send_marked)
-        except GuardError as refusal:
-            response = error_response(refusal.status, refusal.code, str(refusal))
-            await response(scope, receive, send_marked)
+        except (GuardError, MastctlError) as refused:
+            if not started:
+                await told(refused)(scope, receive, send_marked)
         except Exception:  # a defect: the client gets a sentence, the log the rest
             log.exception("%s %s met a defect of the program", scope["method"], scope["path"])
             if not started:
                 message = "the service met a defect of its own; its log says more"
                 await error_response(500, "internal", message)(scope, receive, send_marked)
 
+    async def _websocket(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """As for HTTP; a browser cannot be kept from asking, so what it says of its page is all there is."""
+        try:
+            headers, twice = _headers(scope)
+            self._let_in(scope, headers, twice)
+            self._entrance.names.check_origin(headers)
+            if "cookie" in headers and "authorization" not in headers and self._entrance.access is not None:
+                _check_origin_said(headers)
+        except (GuardError, MastctlError) as refused:
+            await _refuse_websocket(refused, scope, receive, send)
+            return
+        await self._app(scope, receive, send)
 
-def _headers(scope: Scope) -> dict[str, str]:
-    return {name.decode("latin-1").lower(): value.decode("latin-1") for name, value in scope["headers"]}
+    def _let_stop(self, scope: Scope, headers: Mapping[str, str]) -> None:
+        """Pass a stop from anybody but another site's page."""
+        entrance = self._entrance
+        if "origin" in headers:
+            entrance.names.check_host(headers)
+            entrance.names.check_origin(headers)
+        check_site(headers)
+        _hand_on(scope, entrance.stopper(scope, headers))
+
+    def _let_in(self, scope: Scope, headers: Mapping[str, str], twice: set[str]) -> None:
+        """Pass a request, or say why not."""
+        entrance, path = self._entrance, scope["path"]
+        if entrance.access is not None:
+            self._rate.count(scope, asyncio.get_running_loop().time())
+        _check_size(scope)
+        _check_shape(headers, twice)
+        entrance.names.check_host(headers)
+        if changes(scope):
+            entrance.names.check_origin(headers)
+        check_site(headers, page=path in PAGES and not changes(scope))
+        _check_no_secret(scope)
+        if path == LOGIN or path in PAGES:
+            caller = entrance.stranger(headers)
+        else:
+            caller = entrance.caller(scope, headers)
+            if changes(scope) and path != LOGOUT and not caller.may("operate"):
+                words = f"{caller.name} may {caller.role}; {scope['method']} {path[:80]} needs operate"
+                raise GuardError(403, "role", words)
+        _hand_on(scope, caller)
 
 
-def _check_host(headers: Mapping[str, str]) -> None:
-    """Refuse a Host that is no loopback name."""
-    host = headers.get("host", "")
-    try:
-        name = urlsplit(f"//{host}").hostname or ""
-    except ValueError:
-        name = ""
-    if not is_loopback(name):
-        raise GuardError(
-            403, "foreign_host", f"Host is '{host[:80]}' where a loopback name such as 127.0.0.1 is expected"
-        )
+def _headers(scope: Scope) -> tuple[dict[str, str], set[str]]:
+    """The headers, those of one name joined, and which names were there more than once."""
+    found: dict[str, str] = {}
+    twice: set[str] = set()
+    for raw_name, raw_value in scope["headers"]:
+        name, value = raw_name.decode("latin-1").lower(), raw_value.decode("latin-1")
+        if name in found:
+            twice.add(name)
+            value = f"{found[name]}, {value}"
+        found[name] = value
+    return found, twice
 
 
-def _check_origin(headers: Mapping[str, str]) -> None:
-    """Refuse a request that changes something and comes from another site's page."""
-    origin = headers.get("origin")
-    if origin is None:
+def _hand_on(scope: Scope, caller: Caller) -> None:
+    state: dict[str, Any] = scope.setdefault("state", {})
+    state["caller"] = caller
+
+
+def _check_size(scope: Scope) -> None:
+    """Refuse more than anybody needs to say. Raises GuardError ``headers_too_large``."""
+    size = sum(len(name) + len(value) for name, value in scope["headers"])
+    if size > LARGEST_HEADERS_BYTES or len(scope["headers"]) > MOST_HEADERS:
+        words = f"more than {LARGEST_HEADERS_BYTES} bytes or {MOST_HEADERS} lines of headers"
+        raise GuardError(431, "headers_too_large", words, {"Connection": "close"})
+
+
+def _check_shape(headers: Mapping[str, str], twice: set[str]) -> None:
+    """Refuse what two programs in a row may read in two ways. Raises GuardError ``ambiguous``."""
+    doubled = sorted(twice & _ONCE)
+    if doubled:
+        raise _misread(f"the header {doubled[0]} is there twice")
+    if "transfer-encoding" in headers and "content-length" in headers:
+        raise _misread("Transfer-Encoding and Content-Length are both there; one says how long the body is")
+
+
+def _misread(words: str) -> GuardError:
+    return GuardError(400, "ambiguous", words, {"Connection": "close"})
+
+
+def _check_no_secret(scope: Scope) -> None:
+    """Refuse a token in an address: addresses are kept in logs and histories. Raises GuardError."""
+    keys = {key.lower() for key, _ in parse_qsl(scope["query_string"].decode("latin-1"), True)}
+    if keys & _SECRETS:
+        words = "a token goes into the header Authorization, never into an address; take this one back"
+        raise GuardError(400, "token_in_address", words)
+
+
+def _check_origin_said(headers: Mapping[str, str]) -> None:
+    if "origin" not in headers:
+        raise GuardError(403, "foreign_origin", "a page's session says its Origin with a WebSocket")
+
+
+async def _refuse_websocket(refused: Exception, scope: Scope, receive: Receive, send: Send) -> None:
+    """Say why, where the server can; else only that."""
+    if "websocket.http.response" not in scope.get("extensions", {}):
+        await send({"type": "websocket.close", "code": 1008, "reason": ""})
         return
-    try:
-        netloc = urlsplit(origin).netloc
-    except ValueError:
-        netloc = ""
-    if netloc.lower() != headers.get("host", "").lower():
-        raise GuardError(403, "foreign_origin", f"Origin is '{origin[:80]}', which is not this service")
-
-
-async def _body(receive: Receive, headers: Mapping[str, str]) -> bytes:
-    """Read the whole body, which may not be large."""
-    told = headers.get("content-length", "0")
-    if told.isdecimal() and int(told[:20]) > LARGEST_BODY_BYTES:
-        _too_large()
-    parts: list[bytes] = []
-    size = 0
-    while True:
-        message = await receive()
-        if message["type"] == "http.disconnect":
-            raise GuardError(400, "disconnected", "the client left before its request had come whole")
-        part = message.get("body", b"")
-        size += len(part)
-        if size > LARGEST_BODY_BYTES:
-            _too_large()
-        parts.append(part)
-        if not message.get("more_body", False):
-            return b"".join(parts)
-
-
-def _too_large() -> NoReturn:
-    raise GuardError(413, "too_large", f"the body is larger than {LARGEST_BODY_BYTES} bytes")
-
-
-def _check_json(body: bytes, headers: Mapping[str, str]) -> None:
-    """Refuse a body that is not JSON as the standard has it: finite numbers, each key once."""
-    if not body.strip():
-        return
-    kind = headers.get("content-type", "").partition(";")[0].strip().lower()
-    if kind != "application/json":
-        raise GuardError(415, "not_json", f"Content-Type is '{kind[:60]}' where application/json is expected")
-    try:
-        json.loads(body, parse_constant=_no_constant, object_pairs_hook=_no_duplicates)
-    except RecursionError:
-        raise GuardError(400, "not_json", "the body is nested too deeply") from None
-    except ValueError as error:
-        raise GuardError(400, "not_json", f"the body is not JSON: {' '.join(str(error).split())}") from None
-
-
-def _no_constant(word: str) -> NoReturn:
-    raise ValueError(f"{word} where a finite number is expected")
-
-
-def _no_duplicates(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    found: dict[str, Any] = {}
-    for key, value in pairs:
-        if key in found:
-            raise ValueError(f"the key '{key[:60]}' is there twice")
-        found[key] = value
-    return found
-
-
-def _once(body: bytes, receive: Receive) -> Receive:
-    """Give the body that was read already, then whatever comes."""
-    given = False
-
-    async def again() -> Message:
-        nonlocal given
-        if not given:
-            given = True
-            return {"type": "http.request", "body": body, "more_body": False}
-        return await receive()
-
-    return again
+    await told(refused)(scope, receive, send)

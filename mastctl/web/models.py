@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Literal, Self
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, StringConstraints, model_validator
@@ -286,6 +286,12 @@ class MastBody(_Strict):
         return self
 
 
+class LoginBody(_Strict):
+    """``POST /login``: a token."""
+
+    token: Annotated[str, Field(min_length=1, max_length=200)]
+
+
 class FaultBody(_Strict):
     """``POST /simulation/faults``: a fault word for a simulated device, with its parameters."""
 
@@ -317,17 +323,3 @@ class FaultsQuery(BaseModel):
     model_config = ConfigDict(extra="forbid")
 
     device: Name | None = None
-
-
-class ErrorTold(BaseModel):
-    """Why a request was refused: a word for programs, a sentence for people, more where there is more."""
-
-    code: str
-    message: str
-    detail: dict[str, Any] | None = None
-
-
-class ErrorBody(BaseModel):
-    """Every answer that is not a success."""
-
-    error: ErrorTold

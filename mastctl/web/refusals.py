@@ -20,16 +20,20 @@ from mastctl.errors import (
     NoLonger,
     NotAllowed,
     NotKnown,
+    NotLetIn,
     NotNow,
+    TooMany,
     Unable,
     error_body,
 )
-from mastctl.web.guard import error_response
+from mastctl.web.answer import GuardError, error_response
 from mastctl.web.sentences import sentence
 
 STATUS_OF_KIND: Mapping[type[Exception], int] = {
     BadRequest: 422,
+    NotLetIn: 401,
     NotAllowed: 403,
+    TooMany: 429,
     NotKnown: 404,
     NoLonger: 410,
     NotNow: 409,
@@ -48,16 +52,26 @@ def status_of(error: Exception) -> int:
     return next(STATUS_OF_KIND[kind] for kind in type(error).__mro__ if kind in STATUS_OF_KIND)
 
 
+def told(error: Exception) -> JSONResponse:
+    """Return the answer to a request that met an error of these families."""
+    if isinstance(error, GuardError):
+        return error_response(error.status, error.code, str(error), headers=error.headers)
+    body, headers = error_body(error), {}
+    again_s = getattr(error, "retry_after_s", None)
+    if again_s is not None:
+        headers["Retry-After"] = str(math.ceil(again_s))
+    if isinstance(error, NotLetIn):
+        headers["WWW-Authenticate"] = "Bearer"
+    return error_response(status_of(error), body["code"], body["message"], body["detail"], headers)
+
+
 def add_errors(app: FastAPI) -> None:
     """Every refusal in the one form."""
 
     async def ours(request: Request, error: Exception) -> JSONResponse:
-        body = error_body(error)
-        again_s = getattr(error, "retry_after_s", None)
-        headers = None if again_s is None else {"Retry-After": str(math.ceil(again_s))}
-        return error_response(status_of(error), body["code"], body["message"], body["detail"], headers)
+        return told(error)
 
-    for kind in (MastctlError, DriverError, CalibError):
+    for kind in (MastctlError, DriverError, CalibError, GuardError):
         app.add_exception_handler(kind, ours)
 
     @app.exception_handler(RequestValidationError)

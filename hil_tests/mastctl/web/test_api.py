@@ -25,7 +25,7 @@ from hil_tests.mastctl.service_fakes import CONFIG, FakeHardware, Hang, Scripted
 from mastctl.daemon import RunningDaemon
 from mastctl.devices import devices as devices_module
 from mastctl.service import service as service_module
-from mastctl.web.guard import LARGEST_BODY_BYTES
+from mastctl.web.bodies import LARGEST_BODY_BYTES
 
 ANGLES = {"pan_rad": 0.1, "tilt_rad": -0.1}
 

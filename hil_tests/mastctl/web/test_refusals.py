@@ -15,16 +15,28 @@ import drivers
 import mastctl
 from calib.errors import CalibError
 from drivers.errors import BadOptions, DriverError, NoFreshFrame, NoReply
-from mastctl.errors import BadRequest, MastctlError, NoLonger, NotAllowed, NotKnown, NotNow, Stopped, Unable
+from mastctl.errors import (
+    BadRequest,
+    MastctlError,
+    NoLonger,
+    NotAllowed,
+    NotKnown,
+    NotLetIn,
+    NotNow,
+    Stopped,
+    TooMany,
+    Unable,
+)
 from mastctl.pointing.results import PointingError
-from mastctl.web.guard import GuardError, error_response
+from mastctl.web.answer import GuardError, error_response
 from mastctl.web.refusals import status_of
 
-FAMILIES = {kind.__name__: kind for kind in (BadRequest, NotAllowed, NotKnown, NoLonger, NotNow, Unable)}
+KINDS = (BadRequest, NotAllowed, NotKnown, NotLetIn, NoLonger, NotNow, TooMany, Unable)
+FAMILIES = {kind.__name__: kind for kind in KINDS}
 PLAIN = {GuardError.__name__, error_response.__name__}  # status first, then the code
 NO_ANSWER = {
     "search_cut_short", "survey_refused", "cannot_tell", "address_in_use", "state_in_use",
-    "no_executor", "task_failed", "other_program", "bad_rig", "in_the_way",
+    "token_refused", "no_executor", "task_failed", "other_program", "bad_rig", "in_the_way",
 }  # fmt: skip
 """Of commands that ask no daemon."""
 
@@ -121,7 +133,9 @@ def test_no_code_has_two_statuses(documented: dict[str, set[str]]) -> None:
     ("error", "status"),
     [
         (BadRequest("bad_aim", "no"), 422),
+        (NotLetIn("no_token", "no"), 401),
         (NotAllowed("role", "no"), 403),
+        (TooMany("too_many_guesses", "no"), 429),
         (NotKnown("unknown_camera", "no"), 404),
         (NoLonger("frame_too_old", "no"), 410),
         (Stopped("no"), 409),

@@ -1,0 +1,117 @@
+"""Every answer that a daemon gives in a test is asked whether /openapi.json describes it."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from typing import Any
+
+import jsonschema_rs
+import pytest
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+from mastctl import daemon as daemon_module
+from mastctl.web.guard import Guard
+
+
+class Described:
+    """What one application says of itself, and where an answer was another."""
+
+    def __init__(self, document: Mapping[str, Any], complaints: list[str]) -> None:
+        self._document = closed(document)
+        self._complaints = complaints
+        self._validators: dict[str, Any] = {}
+        self._paths = [
+            (re.compile(re.sub(r"\\\{[^}]*\\\}", "[^/]+", re.escape(path))), path, methods)
+            for path, methods in self._document["paths"].items()
+        ]
+
+    def check(self, scope: Scope, status: int, kind: str, body: bytes) -> None:
+        """Take note of an answer that is not as described."""
+        found = next(
+            ((path, known) for form, path, known in self._paths if form.fullmatch(scope["path"])), None
+        )
+        method = scope["method"].lower()
+        if found is None or method not in found[1]:
+            return  # refused before the routes
+        path, known = found
+        where = f"{scope['method']} {path}: {status}"
+        responses = known[method]["responses"]
+        told = responses.get(str(status)) or responses.get(f"{status // 100}XX")
+        if told is None:
+            self._complaints.append(f"{where} is none of the described {', '.join(responses)}")
+            return
+        content = told.get("content", {})
+        if kind not in content:
+            self._complaints.append(f"{where} is {kind}, described are {', '.join(content)}")
+        elif kind == "application/json":
+            validator = self._validator(f"{method} {path} {status}", content[kind]["schema"])
+            self._complaints += [
+                f"{where}, {'/'.join(map(str, error.instance_path))}: {error.message[:200]}"
+                for error in validator.iter_errors(json.loads(body))
+            ]
+        elif kind == "text/event-stream":
+            event = self._validator(f"{path} event", content[kind]["x-event"])
+            for line in body.decode().splitlines():
+                if line.startswith("data:"):
+                    self._complaints += [
+                        f"{where}, event: {error.message[:200]}"
+                        for error in event.iter_errors(json.loads(line.removeprefix("data:")))
+                    ]
+
+    def _validator(self, name: str, schema: Mapping[str, Any]) -> Any:
+        if name not in self._validators:
+            whole = {"$ref": schema["$ref"], "components": self._document["components"]}
+            self._validators[name] = jsonschema_rs.Draft202012Validator(whole)
+        return self._validators[name]
+
+
+def closed(document: Mapping[str, Any]) -> Any:
+    """The document, whose objects have no keys but those that are described."""
+    if isinstance(document, dict):
+        told = {key: closed(value) for key, value in document.items()}
+        if told.get("type") == "object" and "properties" in told:
+            told.setdefault("additionalProperties", False)
+        return told
+    return [closed(one) for one in document] if isinstance(document, list) else document
+
+
+@contextmanager
+def answers_checked() -> Iterator[list[str]]:
+    """Have every daemon of this process checked; yields what was not as described."""
+    complaints: list[str] = []
+    plain: Callable[..., ASGIApp] = daemon_module.create_app
+
+    def create_app(*args: Any, **options: Any) -> ASGIApp:
+        app = plain(*args, **options)
+        assert isinstance(app, Guard)
+        described: list[Described] = []
+
+        async def watched(scope: Scope, receive: Receive, send: Send) -> None:
+            status, kind, body = 0, "", b""
+
+            async def seen(message: Message) -> None:
+                nonlocal status, kind, body
+                await send(message)
+                if message["type"] == "http.response.start":
+                    status = message["status"]
+                    told = dict(message["headers"]).get(b"content-type", b"")
+                    kind = told.decode().partition(";")[0]
+                elif message["type"] == "http.response.body" and not kind.startswith("image/"):
+                    body += message.get("body", b"")
+
+            try:
+                await app(scope, receive, seen)
+            finally:
+                if not described:
+                    described.append(Described(app.openapi(), complaints))
+                if status and scope["type"] == "http":
+                    described[0].check(scope, status, kind, body)
+
+        return watched
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(daemon_module, "create_app", create_app)
+        yield complaints

@@ -1,0 +1,125 @@
+"""Tokens on disk: made once, private, digests only; whatever is damaged is refused by name."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import stat
+import threading
+from pathlib import Path
+
+import pytest
+
+from calib.errors import BadFile
+from mastctl.access.tokens import MOST_TOKENS, TokenList, TokenRefused
+from mastctl.commands.caller import ROLES
+
+
+def mode(path: Path) -> int:
+    return stat.S_IMODE(path.stat().st_mode)
+
+
+@pytest.fixture
+def tokens(tmp_path: Path) -> TokenList:
+    tokens = TokenList(tmp_path)
+    tokens.first_run()
+    return tokens
+
+
+def text_of(tokens: TokenList, role: str) -> str:
+    return tokens.file_of(role).read_text().strip()  # type: ignore[arg-type]
+
+
+def test_the_first_run_makes_one_token_of_256_bits_for_each_role_for_its_user_only(tokens: TokenList) -> None:
+    texts = {role: text_of(tokens, role) for role in ROLES}
+    assert len(set(texts.values())) == 3
+    assert {len(text) for text in texts.values()} == {43}, "32 bytes in base64 without padding"
+    assert {mode(path) for path in tokens.folder.iterdir()} == {0o600}
+    held = {one.role: one.sha256 for one in tokens.read() or ()}
+    assert held == {role: hashlib.sha256(text.encode()).hexdigest() for role, text in texts.items()}
+
+
+def test_the_list_holds_no_token(tokens: TokenList) -> None:
+    made = tokens.new("bench", "operate")
+    kept = "".join(path.read_text() for path in tokens.folder.iterdir())
+    assert made not in kept
+    listed = tokens.path.read_text()
+    assert not any(text_of(tokens, role) in listed for role in ROLES)
+
+
+def test_the_second_run_makes_none(tokens: TokenList) -> None:
+    before = tokens.path.read_bytes()
+    assert tokens.first_run() == TokenList(tokens.folder).read()
+    assert tokens.path.read_bytes() == before
+
+
+def test_a_revoked_token_of_the_first_run_leaves_no_file_and_is_not_made_again(tokens: TokenList) -> None:
+    tokens.revoke("admin")
+    assert not tokens.file_of("admin").exists()
+    assert [one.name for one in tokens.first_run()] == ["view", "operate"]
+
+
+@pytest.mark.parametrize("name", ["", "a b", "a/b", "x" * 41, "admin", "a\nb"])
+def test_a_name_that_is_none_or_is_taken_is_refused(tokens: TokenList, name: str) -> None:
+    with pytest.raises(TokenRefused):
+        tokens.new(name, "view")
+
+
+def test_what_is_not_there_cannot_be_revoked_and_who_is_there_is_said(tokens: TokenList) -> None:
+    with pytest.raises(TokenRefused, match="there are: view, operate, admin"):
+        tokens.revoke("somebody")
+
+
+def test_there_is_a_bound_of_tokens(tokens: TokenList) -> None:
+    entry = json.loads(tokens.path.read_text())["tokens"][0]
+    document = {
+        "schema": "mastctl/tokens/1",
+        "tokens": [{**entry, "name": f"t{i}"} for i in range(MOST_TOKENS)],
+    }
+    tokens.path.write_text(json.dumps(document))
+    with pytest.raises(TokenRefused, match="revoke one first"):
+        tokens.new("more", "view")
+
+
+@pytest.mark.parametrize("name", ["tokens.json", "admin.token"])
+@pytest.mark.parametrize("others", [0o640, 0o604, 0o620])
+def test_what_other_users_may_touch_is_refused_with_what_mends_it(
+    tokens: TokenList, name: str, others: int
+) -> None:
+    (tokens.folder / name).chmod(others)
+    with pytest.raises(BadFile, match="chmod 600"):
+        tokens.read()
+
+
+ENTRY = {"name": "a", "role": "view", "sha256": "0" * 64, "made": "2026-01-01T00:00:00+00:00"}
+
+
+@pytest.mark.parametrize(
+    "held",
+    [
+        "x",
+        [1],
+        [{**ENTRY, "role": "root"}],
+        [{**ENTRY, "sha256": "ü" * 64}],
+        [{**ENTRY, "sha256": "0"}],
+        [{**ENTRY, "name": 7}],
+        [{**ENTRY, "more": "x"}],
+        [ENTRY, ENTRY],
+    ],
+)
+def test_a_damaged_list_is_refused_and_stays_as_it_is(tokens: TokenList, held: object) -> None:
+    tokens.path.write_text(json.dumps({"schema": "mastctl/tokens/1", "tokens": held}))
+    before = tokens.path.read_bytes()
+    for act in (tokens.read, tokens.first_run, lambda: tokens.new("b", "view"), lambda: tokens.revoke("a")):
+        with pytest.raises(BadFile):
+            act()
+    assert tokens.path.read_bytes() == before
+
+
+def test_commands_at_the_same_time_lose_no_token(tokens: TokenList) -> None:
+    threads = [threading.Thread(target=tokens.new, args=(f"t{i}", "view")) for i in range(8)]
+    for one in threads:
+        one.start()
+    for one in threads:
+        one.join()
+    assert {one.name for one in tokens.read() or ()} == {*ROLES, *(f"t{i}" for i in range(8))}

@@ -1,0 +1,1 @@
+"""Who may come in from beyond this machine: tokens, sessions of pages, and what is done about guessing."""

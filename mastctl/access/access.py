@@ -1,0 +1,158 @@
+"""Who a token or a page's session belongs to. In memory there are digests only, compared in constant time."""
+
+from __future__ import annotations
+
+import hmac
+import logging
+import secrets
+import threading
+from collections import OrderedDict
+from dataclasses import dataclass
+
+from calib.errors import BadFile
+from drivers.clock import Clock, SystemClock
+from mastctl.access.guesses import Guesses
+from mastctl.access.tokens import TOKEN_BYTES, Token, TokenList, digest_of
+from mastctl.errors import NotLetIn, TooMany
+
+log = logging.getLogger(__name__)
+
+REREAD_S = 1.0  # how late a new or a revoked token may be known
+SESSION_S = 12 * 3600.0
+MOST_SESSIONS = 200
+
+
+@dataclass(frozen=True)
+class Session:
+    """A page that was let in by a token; it ends with that token, or at ``until_s`` of the clock."""
+
+    token_sha256: str
+    until_s: float
+
+
+class Access:
+    """The tokens of a daemon, read again when they change, and the sessions of pages.
+
+    What is asked of it belongs to one thread, the event loop's, and touches no file; `reread` is the other's.
+
+    Parameters
+    ----------
+    tokens
+        The list; made at the first run.
+    clock
+        For sessions and guesses; the machine's by default.
+
+    Raises
+    ------
+    BadFile
+        If the list cannot be read or made.
+    """
+
+    def __init__(self, tokens: TokenList, clock: Clock | None = None) -> None:
+        self._list = tokens
+        self._clock = clock or SystemClock()
+        self._tokens = tokens.first_run()
+        self._seen = self._stamp()
+        self._guesses = Guesses()
+        self._sessions: OrderedDict[str, Session] = OrderedDict()
+        self._closing = threading.Event()
+        self._thread = threading.Thread(target=self._watch, name="tokens", daemon=True)
+        self._thread.start()
+
+    @property
+    def folder(self) -> str:
+        """Where the tokens lie."""
+        return str(self._list.folder)
+
+    def token_of(self, text: str, address: str) -> Token:
+        """Return whose token a text is.
+
+        Raises
+        ------
+        NotLetIn, TooMany
+            ``wrong_token`` if it is nobody's, ``too_many_guesses`` if ``address`` has tried too many.
+        """
+        now_s = self._clock.now_s()
+        wait_s = self._guesses.wait_s(address, now_s)
+        if wait_s > 0.0:
+            words = f"too many wrong tokens came from {address[:60]}; it is heard again in {wait_s:.0f} s"
+            raise TooMany("too_many_guesses", words, max(1.0, wait_s))
+        digest = digest_of(text)
+        found = self._find(digest)
+        if found is None:
+            if self._guesses.wrong(address, digest, now_s):
+                log.warning("a wrong token came from %s", address[:60])
+            raise NotLetIn("wrong_token", "the token is nobody's; perhaps it was revoked")
+        return found
+
+    def known(self, text: str) -> Token | None:
+        """Return whose token a text is, if it is one; nothing is counted."""
+        return self._find(digest_of(text))
+
+    def log_in(self, text: str, address: str) -> tuple[str, Token, Session]:
+        """Begin a session by a token; return the session's secret. Raises NotLetIn, TooMany as `token_of`."""
+        token = self.token_of(text, address)
+        secret = secrets.token_urlsafe(TOKEN_BYTES)
+        session = Session(token.sha256, self._clock.now_s() + SESSION_S)
+        self._sessions[digest_of(secret)] = session
+        while len(self._sessions) > MOST_SESSIONS:
+            self._sessions.popitem(last=False)
+        return secret, token, session
+
+    def session_of(self, secret: str) -> tuple[Token, float] | None:
+        """Return whose session it is, and the seconds that are left of it; None if it has ended."""
+        digest = digest_of(secret)
+        session = self._sessions.get(digest)
+        if session is None:
+            return None
+        token = self._find(session.token_sha256)
+        left_s = session.until_s - self._clock.now_s()
+        if token is None or left_s <= 0.0:
+            del self._sessions[digest]
+            return None
+        return token, left_s
+
+    def log_out(self, secret: str) -> None:
+        """End a session, if there is one."""
+        self._sessions.pop(digest_of(secret), None)
+
+    def reread(self) -> None:
+        """Take the list as it is now, if it has changed; a damaged one leaves everything as it was."""
+        stamp = self._stamp()
+        if stamp == self._seen:
+            return
+        self._seen = stamp
+        try:
+            tokens = self._list.read()
+        except BadFile as error:
+            log.error("the tokens stay as they were: %s", error)
+            return
+        if tokens is None:
+            log.error("the tokens stay as they were: %s is gone", self._list.path)
+            return
+        self._tokens = tokens
+        log.info("%d tokens: %s", len(tokens), ", ".join(one.name for one in tokens) or "none")
+
+    def close(self) -> None:
+        """Look at the list no longer."""
+        self._closing.set()
+
+    def _find(self, digest: str) -> Token | None:
+        """The token of a digest; as slow for one that is not there as for one that is."""
+        found = None
+        for token in self._tokens:
+            if hmac.compare_digest(token.sha256, digest):
+                found = token
+        return found
+
+    def _watch(self) -> None:
+        while not self._closing.wait(REREAD_S):
+            self.reread()
+
+    def _stamp(self) -> tuple[int, int, int] | None:
+        """What changes when the list does."""
+        try:
+            found = self._list.path.stat()
+        except OSError:
+            return None
+        return found.st_mtime_ns, found.st_size, found.st_ino

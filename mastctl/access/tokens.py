@@ -1,0 +1,227 @@
+"""Tokens: 256 random bits each, with a name and a role; the list of them keeps digests only.
+
+The first run of a daemon that needs tokens makes one for each role, each in a file of its own beside the list
+(``admin.token``), for its user only. What ``mastctl token new`` makes is shown once and kept nowhere.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import hashlib
+import os
+import re
+import secrets
+import stat
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any, get_args
+
+from calib.errors import BadFile
+from calib.files.atomic import remove, replace_bytes
+from mastctl.commands.caller import ROLES, Role
+from mastctl.errors import MastctlError
+from mastctl.safety.state_file import StateFile
+
+TOKEN_BYTES = 32
+LIST_NAME = "tokens.json"
+SCHEMA = "mastctl/tokens/1"
+MOST_TOKENS = 200
+LONGEST_NAME = 40
+
+_OTHERS_MAY = stat.S_IRWXG | stat.S_IRWXO
+
+
+class TokenRefused(MastctlError):
+    """A token cannot be made or revoked under this name."""
+
+    code = "token_refused"
+    exit_code = 2
+
+
+@dataclass(frozen=True)
+class Token:
+    """One token, as it is kept: without itself.
+
+    Attributes
+    ----------
+    name, role
+        Whose it is, and what it allows.
+    sha256
+        Hexadecimal digest of its text.
+    made
+        When it was made, ISO 8601, UTC.
+    """
+
+    name: str
+    role: Role
+    sha256: str
+    made: str
+
+
+def digest_of(token: str) -> str:
+    """Return the digest by which a token is known."""
+    return hashlib.sha256(token.encode("utf-8", "surrogatepass")).hexdigest()
+
+
+class TokenList:
+    """The tokens of one daemon, in its state folder. Each call reads the file anew.
+
+    Parameters
+    ----------
+    folder
+        The state folder.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.path = folder / LIST_NAME
+        self._file = StateFile(self.path, SCHEMA)
+
+    def file_of(self, role: Role) -> Path:
+        """Return where the token lies that the first run made for a role."""
+        return self.folder / f"{role}.token"
+
+    def read(self) -> tuple[Token, ...] | None:
+        """Return the tokens; None before the first run.
+
+        Raises
+        ------
+        BadFile
+            If the list, or a token beside it, is damaged or open to other users of this machine.
+        """
+        for path in (self.path, *(self.file_of(role) for role in ROLES)):
+            _check_private(path)
+        document = self._file.read()
+        if document is None:
+            return None
+        held = document.get("tokens")
+        if not isinstance(held, list) or len(held) > MOST_TOKENS:
+            raise BadFile(self.path, "tokens", f"a list of at most {MOST_TOKENS} tokens is expected")
+        tokens = tuple(_token(self.path, number, one) for number, one in enumerate(held))
+        if len({one.name for one in tokens}) != len(tokens):
+            raise BadFile(self.path, "tokens", "a name is there twice")
+        return tokens
+
+    def first_run(self) -> tuple[Token, ...]:
+        """Return the tokens, after making one for each role if there is no list yet.
+
+        Raises
+        ------
+        BadFile
+            As `read`, or if they cannot be saved.
+        """
+        with self._locked():
+            tokens = self.read()
+            if tokens is not None:
+                return tokens
+            made = []
+            for role in ROLES:
+                text, token = _new(role, role)
+                _save(self.file_of(role), f"{text}\n".encode())
+                made.append(token)
+            self._write(made)
+            return tuple(made)
+
+    def new(self, name: str, role: Role) -> str:
+        """Make a token and return it; it is kept nowhere else.
+
+        Raises
+        ------
+        TokenRefused
+            If the name is none or is taken, or there are too many.
+        BadFile
+            As `first_run`.
+        """
+        if not name or len(name) > LONGEST_NAME or not all(c.isalnum() or c in "._-" for c in name):
+            words = f"'{name[:60]}' where 1 to {LONGEST_NAME} letters, digits, dots, dashes are expected"
+            raise TokenRefused(words)
+        with self._locked():
+            tokens = list(self.read() or ())
+            if any(one.name == name for one in tokens):
+                raise TokenRefused(f"there is a token '{name}' already; revoke it first")
+            if len(tokens) >= MOST_TOKENS:
+                raise TokenRefused(f"there are {MOST_TOKENS} tokens; revoke one first")
+            text, token = _new(name, role)
+            self._write([*tokens, token])
+            return text
+
+    def revoke(self, name: str) -> Token:
+        """Let a token open nothing any more.
+
+        Raises
+        ------
+        TokenRefused
+            If there is none of this name.
+        BadFile
+            As `first_run`.
+        """
+        with self._locked():
+            tokens = self.read() or ()
+            found = next((one for one in tokens if one.name == name), None)
+            if found is None:
+                known = ", ".join(one.name for one in tokens) or "none"
+                raise TokenRefused(f"there is no token '{name[:60]}'; there are: {known}")
+            self._write([one for one in tokens if one is not found])
+            if name in ROLES:
+                remove(self.file_of(found.role))
+            return found
+
+    def _write(self, tokens: Sequence[Token]) -> None:
+        self._file.write({"tokens": [asdict(one) for one in tokens]})
+
+    @contextlib.contextmanager
+    def _locked(self) -> Iterator[None]:
+        """Keep a second command from changing the list meanwhile."""
+        try:
+            lock = os.open(self.folder / "tokens.lock", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+        except OSError as error:
+            raise BadFile(self.folder, "", f"no tokens can be kept here: {error.strerror or error}") from None
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX)
+            yield
+        finally:
+            os.close(lock)
+
+
+def _new(name: str, role: Role) -> tuple[str, Token]:
+    """A token's text, and how it is kept."""
+    text = secrets.token_urlsafe(TOKEN_BYTES)
+    made = datetime.now(UTC).isoformat(timespec="seconds")
+    return text, Token(name, role, digest_of(text), made)
+
+
+def _token(path: Path, number: int, held: Any) -> Token:
+    """One entry of the list. Raises BadFile."""
+    keys = {"name", "role", "sha256", "made"}
+    if not isinstance(held, dict) or set(held) != keys or not all(isinstance(v, str) for v in held.values()):
+        raise BadFile(path, f"tokens[{number}]", f"an object of {', '.join(sorted(keys))} is expected")
+    if held["role"] not in get_args(Role):
+        raise BadFile(path, f"tokens[{number}].role", f"one of {', '.join(ROLES)} is expected")
+    if not re.fullmatch("[0-9a-f]{64}", held["sha256"]):
+        raise BadFile(path, f"tokens[{number}].sha256", "64 hexadecimal digits are expected")
+    return Token(**held)
+
+
+def _check_private(path: Path) -> None:
+    """Pass a file that only its user may touch, or that is not there. Raises BadFile."""
+    try:
+        mode = path.stat().st_mode
+    except FileNotFoundError:
+        return
+    except OSError as error:
+        raise BadFile(path, "", f"cannot be read: {error.strerror or error}") from None
+    if mode & _OTHERS_MAY:
+        words = (
+            f"other users of this machine may touch it (mode {stat.S_IMODE(mode):04o}); 'chmod 600' mends it"
+        )
+        raise BadFile(path, "", words)
+
+
+def _save(path: Path, data: bytes) -> None:
+    try:
+        replace_bytes(path, data, 0o600)
+    except OSError as error:
+        raise BadFile(path, "", f"cannot be saved: {error.strerror or error}") from None

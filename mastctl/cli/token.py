@@ -1,0 +1,81 @@
+"""Commands of the tokens by which others than this machine's users reach a daemon."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from mastctl.cli import output
+
+if TYPE_CHECKING:
+    from mastctl.access.tokens import TokenList
+
+
+def add_commands(subparsers: argparse._SubParsersAction[Any]) -> None:
+    """Add token new, token list and token revoke."""
+    token = subparsers.add_parser("token", help="tokens of a daemon that is reached from other machines")
+    verbs = token.add_subparsers(dest="verb", metavar="VERB", required=True)
+    new = verbs.add_parser("new", help="make a token and print it; it is shown once and kept nowhere")
+    new.add_argument("--name", required=True, help="whose it is; the record of commands names it")
+    new.add_argument("--role", required=True, choices=("view", "operate", "admin"), help="what it allows")
+    new.set_defaults(run=_new)
+    shown = verbs.add_parser("list", help="show names and roles of the tokens")
+    shown.set_defaults(run=_list)
+    revoke = verbs.add_parser("revoke", help="let a token open nothing any more; sessions by it end too")
+    revoke.add_argument("name", metavar="NAME")
+    revoke.set_defaults(run=_revoke)
+    for one in (new, shown, revoke):
+        one.add_argument("--config", metavar="FILE", help="the configuration that the daemon runs with")
+        one.add_argument("--state", metavar="FOLDER", help="the daemon's state folder, wherever it is")
+
+
+def _new(args: argparse.Namespace) -> int:
+    text = _tokens(args).new(args.name, args.role)
+    if args.json:
+        output.print_json({"name": args.name, "role": args.role, "token": text})
+    else:
+        sys.stdout.write(f"{text}\n")
+    return 0
+
+
+def _list(args: argparse.Namespace) -> int:
+    tokens = _tokens(args)
+    held = tokens.read() or ()
+    if args.json:
+        output.print_json(
+            {"tokens": [{k: v for k, v in asdict(one).items() if k != "sha256"} for one in held]}
+        )
+        return 0
+    rows = [(one.name, one.role, one.made) for one in held]
+    output.print_table(f"tokens in {tokens.folder}", ("name", "role", "made"), rows)
+    return 0
+
+
+def _revoke(args: argparse.Namespace) -> int:
+    revoked = _tokens(args).revoke(args.name)
+    if args.json:
+        output.print_json({"revoked": revoked.name, "role": revoked.role})
+    else:
+        sys.stdout.write(output.one_line(f"{revoked.name} ({revoked.role}) opens nothing any more") + "\n")
+    return 0
+
+
+def _tokens(args: argparse.Namespace) -> TokenList:
+    """The list that the options name."""
+    from mastctl.access.tokens import TokenList
+
+    return TokenList(_folder(args))
+
+
+def _folder(args: argparse.Namespace) -> Path:
+    """The state folder of the daemon that the options name."""
+    from mastctl.config import load_config
+    from mastctl.safety.state_folder import usual_folder
+
+    if args.state is not None:
+        return Path(args.state)
+    config = load_config(args.config)
+    return config.state_folder or usual_folder(config.path, config.listen.url)

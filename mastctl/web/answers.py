@@ -1,0 +1,423 @@
+"""What the API answers, as /openapi.json describes it.
+
+The answers are made from the service's own records; these models describe them and cost nothing when one is
+given. That both agree is asked of every answer that the tests get.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from mastctl.commands.caller import Role
+from mastctl.service.state import StateWord
+from mastctl.tracking.status import TrackState
+
+Pixel = Annotated[list[float], Field(min_length=2, max_length=2)]
+Point = Annotated[list[float], Field(min_length=3, max_length=3)]
+MaybePixel = Annotated[list[float | None], Field(min_length=2, max_length=2)]
+"""With null for what could not be measured."""
+Angles = Annotated[list[float], Field(min_length=2, max_length=2)]
+Seconds = Annotated[float, Field(ge=0.0)]
+Count = Annotated[int, Field(ge=0)]
+Json = dict[str, Any]
+
+
+class _Told(BaseModel):
+    """An answer, or a part of one. Every key is always there, unless it says otherwise."""
+
+    model_config = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
+
+
+class Joints(_Told):
+    """The head's joints as last measured, radians; ``measured_s`` of CLOCK_MONOTONIC."""
+
+    pan_rad: float
+    tilt_rad: float
+    measured_s: float
+    age_s: Seconds
+
+
+class BoxTold(_Told):
+    """Where the head must not be: [lowest, highest] of each joint, radians."""
+
+    name: str
+    pan_rad: Angles
+    tilt_rad: Angles
+
+
+class SoftLimits(_Told):
+    """[lowest, highest] of each joint, radians, the fastest speed, rad/s, and where the head must not be."""
+
+    pan_rad: Angles
+    tilt_rad: Angles
+    speed_rad_per_s: float
+    margin_rad: float
+    acceleration_rad_per_s2: float | None
+    keep_out: list[BoxTold]
+
+
+class Sun(_Told):
+    """The direction that no head camera looks into; ``left_s``: how long that holds, null for good."""
+
+    direction: Point
+    frame: Literal["site", "rover"]
+    half_angle_rad: float
+    left_s: Seconds | None
+    holds: bool
+
+
+class SunTold(_Told):
+    """``GET /limits/sun``; null where none was told."""
+
+    sun: Sun | None
+
+
+class LastResidual(_Told):
+    """The last measured residual, with one sigma, and the operation that measured it."""
+
+    residual_px: Pixel
+    residual_sigma_px: Pixel
+    operation: str
+
+
+class MastTold(_Told):
+    """A mast file: its name on disk, the mast's, and the SHA-256 of its bytes."""
+
+    file: str
+    name: str
+    digest: str
+
+
+class CameraTold(_Told):
+    """A camera's newest frame; all null before the first."""
+
+    frame_id: str | None
+    sequence: int | None
+    exposure_s: float | None
+    age_s: Seconds | None
+
+
+class FaultTold(_Told):
+    """What is wrong with a device, in plain words, for how long, and what takes it back."""
+
+    device: str
+    code: str
+    message: str
+    until: str
+    for_s: Seconds
+
+
+class PoseTold(_Told):
+    """Where the rover stands in the site; ``time_s`` by the sender's clock."""
+
+    position_m: Point
+    quaternion: Annotated[list[float], Field(min_length=4, max_length=4)]
+    time_s: float | None
+    age_s: Seconds
+
+
+class TrackWord(_Told):
+    """The track in a word."""
+
+    state: TrackState
+    reason: str
+    id: str | None
+
+
+class ControlTold(_Told):
+    """Who steers, by a lease or by what runs; ``until`` by the wall clock, null for as long as it runs."""
+
+    holder: str
+    kind: Literal["lease", "operation"]
+    for_s: Seconds | None
+    until: str | None
+
+
+class LeaseTold(_Told):
+    """``GET /lease``: who steers; null for nobody."""
+
+    control: ControlTold | None
+
+
+class LeaseGranted(_Told):
+    """A lease that commands carry as ``Mastctl-Lease``."""
+
+    lease_id: str
+    holder: str
+    for_s: Seconds
+    until: str
+
+
+class EstopHeld(_Told):
+    """The emergency stop that is latched: why, by whom, when (ISO 8601, UTC)."""
+
+    reason: str
+    name: str
+    at: str
+
+
+class Status(_Told):
+    """``GET /status``."""
+
+    state: StateWord
+    simulated: bool
+    hardware: str
+    moving: bool
+    joints: Joints | None
+    limits: SoftLimits
+    operation: str | None
+    target: Json | None
+    last_residual: LastResidual | None
+    pose: PoseTold | None
+    track: TrackWord
+    control: ControlTold | None
+    estop: EstopHeld | None
+    stop_socket: str | None
+    cameras: dict[str, CameraTold]
+    faults: list[FaultTold]
+    mast: MastTold
+    former_mast: MastTold | None
+    version: str
+    now_s: float
+    uptime_s: Seconds
+
+
+class StepTold(_Told):
+    """One step of an operation; ``detail`` has units in its names."""
+
+    name: str
+    state: Literal["done", "failed"]
+    started_s: float
+    duration_s: float
+    detail: Json
+
+
+class PointingTold(BaseModel):
+    """One pointing, and what was measured after it in a new picture."""
+
+    commanded_pan_rad: float
+    commanded_tilt_rad: float
+    measured_pan_rad: float
+    measured_tilt_rad: float
+    camera: str
+    frame_id: str
+    aim_px: Pixel | None
+    predicted_px: Pixel | None
+    target_px: Pixel | None
+    residual_px: MaybePixel | None
+    residual_sigma_px: MaybePixel | None
+    note: str
+    motion_evidence: dict[str, Json]
+
+
+class ErrorTold(_Told):
+    """Why something was refused: a word for programs, a sentence for people, more where there is more."""
+
+    code: str
+    message: str
+    detail: Json | None = None
+
+
+class ErrorBody(_Told):
+    """Every answer that is not a success."""
+
+    error: ErrorTold
+
+
+class OperationListed(_Told):
+    """An operation without its steps. Times of CLOCK_MONOTONIC."""
+
+    id: str
+    state: Literal["queued", "running", "done", "failed", "stopped"]
+    request: Json
+    created_s: float
+    started_s: float | None
+    ended_s: float | None
+    error: ErrorTold | None
+    residual_px: MaybePixel | None
+    residual_sigma_px: MaybePixel | None
+    position_m: Point | None
+    range_m: float | None
+    pointings: list[PointingTold]
+
+
+class OperationTold(OperationListed):
+    """``GET /operations/{id}``: the same with its steps."""
+
+    steps: list[StepTold]
+
+
+class Operations(_Told):
+    """``GET /operations``: the newest first."""
+
+    operations: list[OperationListed]
+
+
+class Started(_Told):
+    """What was started: the id of its operation."""
+
+    id: str
+
+
+class StopTold(_Told):
+    """``POST /stop``: the head has confirmed it; the operation that was stopped with it."""
+
+    stopped: Literal[True]
+    operation: str | None
+
+
+class EstopTold(EstopHeld):
+    """``POST /estop``: confirmed. ``kept``: a restart would find it; else ``message`` says why not."""
+
+    stopped: Literal[True]
+    latched: Literal[True]
+    kept: bool
+    operation: str | None
+    message: str | None = None
+
+
+class ResetTold(_Told):
+    """``POST /reset``: the emergency stop that was released."""
+
+    latched: Literal[False]
+    released: EstopHeld
+
+
+class JogTold(_Told):
+    """``POST /jog``: the jog's operation, whether the heartbeat was taken, and what holds an axis."""
+
+    id: str | None
+    taken: bool
+    held: dict[str, str]
+
+
+class EyeTold(_Told):
+    """What one eye told of the target; pixel and sigma are null without a good verdict."""
+
+    frame_id: str
+    verdict: str
+    reason: str
+    x_px: float | None
+    y_px: float | None
+    sigma_px: MaybePixel
+    correlation: float | None
+
+
+class HandoffTold(_Told):
+    """The target went from one pair to another, at a range of the new one."""
+
+    from_pair: str
+    to_pair: str
+    range_m: float
+
+
+class OffsetTold(_Told):
+    """What hand-offs from ``source`` to ``camera`` tell by more than chance: found less predicted."""
+
+    source: str
+    camera: str
+    handoffs: Count
+    left_out: Count
+    offset_px: Pixel
+    sigma_px: Pixel
+    sigmas: float
+    sentence: str
+
+
+class SelfCheck(_Told):
+    """How the mast file in use agrees with the hand-offs."""
+
+    handoffs: Count
+    offsets: list[OffsetTold]
+
+
+class TrackTold(_Told):
+    """``GET /track``, and each event of ``GET /track/stream``."""
+
+    sequence: Count
+    state: TrackState
+    reason: str
+    id: str | None
+    predicted: bool
+    operation: str | None
+    looks: Count
+    misses: Count
+    handoffs: list[HandoffTold]
+    renewals: Count
+    range_m: float | None
+    pair: str | None
+    pixels: dict[str, EyeTold]
+    chi2: float | None
+    renewed: bool
+    pose_doubt: str
+    position_m: Point | None
+    position_in_site_m: Point | None
+    covariance_m2: Annotated[list[Point], Field(min_length=3, max_length=3)] | None
+    pose: PoseTold | None
+    age_s: Seconds
+    self_check: SelfCheck
+
+
+class PoseTaken(_Told):
+    """``POST /pose``: the look that follows, if one does, and the track."""
+
+    operation: str | None
+    track: TrackTold
+
+
+class MastsTold(_Told):
+    """``POST /mast``: the mast file in use, and the one before it."""
+
+    mast: MastTold
+    former_mast: MastTold | None
+
+
+class StandTold(_Told):
+    """Where a simulated rover truly stands."""
+
+    position_m: Point
+    quaternion: Annotated[list[float], Field(min_length=4, max_length=4)]
+
+
+class TimeTold(_Told):
+    """A simulated rover's time, seconds, and its speed, where it has one."""
+
+    now_s: float
+    speed: float | Literal["max"]
+
+
+class FaultSet(_Told):
+    """A fault that is switched on; ``end_s`` is null for one without an end."""
+
+    device: str
+    word: str
+    parameters: dict[str, float]
+    begin_s: float
+    end_s: float | None
+
+
+class FaultsSet(_Told):
+    """The faults that are switched on."""
+
+    faults: list[FaultSet]
+
+
+class SessionTold(_Told):
+    """``GET /session``: who asks, what it may do, and by which way it came.
+
+    ``ends_in_s`` of a page's session; ``needs_token``: whether the daemon asks for one at all.
+    """
+
+    name: str
+    role: Role
+    via: str
+    ends_in_s: Seconds | None
+    needs_token: bool
+
+
+class LoggedOut(_Told):
+    """``POST /logout``."""
+
+    logged_out: Literal[True]

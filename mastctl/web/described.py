@@ -1,0 +1,107 @@
+"""How /openapi.json describes the answers: a model for each route, without a cost when an answer is given."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from fastapi import FastAPI
+from pydantic import BaseModel
+from pydantic.json_schema import models_json_schema
+
+from mastctl.frame_facts import described_headers
+from mastctl.web import PREFIX
+from mastctl.web import answers as told
+
+ANSWERS: Mapping[str, type[BaseModel]] = {
+    "GET /status": told.Status,
+    "POST /point": told.Started,
+    "GET /operations": told.Operations,
+    "GET /operations/{operation_id}": told.OperationTold,
+    "POST /stop": told.StopTold,
+    "POST /estop": told.EstopTold,
+    "POST /reset": told.ResetTold,
+    "POST /pose": told.PoseTaken,
+    "GET /track": told.TrackTold,
+    "POST /track": told.Started,
+    "POST /track/look": told.Started,
+    "POST /track/stop": told.TrackTold,
+    "POST /jog": told.JogTold,
+    "GET /limits/sun": told.SunTold,
+    "POST /limits/sun": told.SunTold,
+    "DELETE /limits/sun": told.SunTold,
+    "GET /lease": told.LeaseTold,
+    "POST /lease": told.LeaseGranted,
+    "POST /lease/renew": told.LeaseGranted,
+    "POST /lease/take": told.LeaseGranted,
+    "DELETE /lease": told.LeaseTold,
+    "POST /mast": told.MastsTold,
+    "POST /mast/back": told.MastsTold,
+    "GET /simulation/pose": told.StandTold,
+    "POST /simulation/pose": told.StandTold,
+    "GET /simulation/time": told.TimeTold,
+    "POST /simulation/time": told.TimeTold,
+    "GET /simulation/faults": told.FaultsSet,
+    "POST /simulation/faults": told.FaultsSet,
+    "DELETE /simulation/faults": told.FaultsSet,
+    "GET /session": told.SessionTold,
+    "POST /login": told.SessionTold,
+    "POST /logout": told.LoggedOut,
+}
+EVENTS: Mapping[str, type[BaseModel]] = {"GET /track/stream": told.TrackTold}
+"""Server-sent events without an end: one line each, ``data:`` and the model's JSON."""
+FILES: Mapping[str, tuple[str, ...]] = {
+    "GET /snapshot/{camera}": ("image/png", "image/jpeg"),
+    "GET /mast": ("application/yaml",),
+}
+PICTURES = ("GET /snapshot/{camera}",)
+_REFERENCE = "#/components/schemas/{model}"
+
+
+def describe(app: FastAPI) -> None:
+    """Let /openapi.json name these models."""
+    made = app.openapi
+
+    def openapi() -> dict[str, Any]:
+        if app.openapi_schema is None:
+            _describe(made())
+        assert app.openapi_schema is not None
+        return app.openapi_schema
+
+    app.openapi = openapi  # type: ignore[method-assign]
+
+
+def _describe(document: dict[str, Any]) -> None:
+    """Put the models, events and files where they are answered."""
+    models = {*ANSWERS.values(), *EVENTS.values()}
+    pairs = sorted(((one, "serialization") for one in models), key=lambda pair: pair[0].__name__)
+    _, schemas = models_json_schema(pairs, ref_template=_REFERENCE)  # type: ignore[arg-type]
+    document["components"]["schemas"].update(schemas["$defs"])
+    for route, success in _successes(document).items():
+        if route in ANSWERS:
+            model = ANSWERS[route]
+            success["description"] = (model.__doc__ or model.__name__).strip().splitlines()[0]
+            success["content"] = {"application/json": {"schema": _reference(model)}}
+        elif route in EVENTS:
+            stream = {"schema": {"type": "string"}, "x-endless": True, "x-event": _reference(EVENTS[route])}
+            success["content"] = {"text/event-stream": stream}
+        elif route in FILES:
+            binary = {"schema": {"type": "string", "format": "binary"}}
+            success["content"] = dict.fromkeys(FILES[route], binary)
+            if route in PICTURES:
+                success["headers"] = described_headers()
+
+
+def _successes(document: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
+    """The good answer of each route."""
+    return {
+        f"{method.upper()} {path.removeprefix(PREFIX)}": told
+        for path, methods in document["paths"].items()
+        for method, operation in methods.items()
+        for status, told in operation["responses"].items()
+        if status.startswith("2")
+    }
+
+
+def _reference(model: type[BaseModel]) -> dict[str, str]:
+    return {"$ref": _REFERENCE.format(model=model.__name__)}

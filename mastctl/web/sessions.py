@@ -1,0 +1,59 @@
+"""Routes of who asks: a page's log-in and log-out, and what a caller may do."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from fastapi import FastAPI, Request, Response
+
+from mastctl.access.access import SESSION_S
+from mastctl.commands.caller import Caller, Role
+from mastctl.errors import NotNow
+from mastctl.web import PREFIX
+from mastctl.web.entrance import Entrance, address_of, cookie_name, credentials
+from mastctl.web.models import LoginBody
+
+
+def add_sessions(app: FastAPI, entrance: Entrance) -> None:
+    """Log-in, log-out, and who one is."""
+    access = entrance.access
+    secure = entrance.names.secure
+
+    @app.get(f"{PREFIX}/session", summary="Who asks, and what it may do")
+    async def session(request: Request) -> dict[str, Any]:
+        caller: Caller = request.scope["state"]["caller"]
+        shown = credentials(request.scope, request.headers)
+        held = None
+        if access is not None and shown.token is None and shown.session is not None:
+            held = access.session_of(shown.session)
+        left_s = None if held is None else held[1]
+        return _told(caller.name, caller.role, caller.via, left_s, access is not None)
+
+    @app.post(f"{PREFIX}/login", summary="Begin a page's session by a token")
+    async def login(body: LoginBody, request: Request, response: Response) -> dict[str, Any]:
+        if access is None:
+            raise NotNow("no_login", "nobody needs a token here: the daemon serves this machine only")
+        secret, token, _ = access.log_in(body.token, address_of(request.scope))
+        response.set_cookie(
+            cookie_name(request.scope),
+            secret,
+            max_age=int(SESSION_S),
+            path="/",
+            secure=secure,
+            httponly=True,
+            samesite="strict",
+        )
+        return _told(token.name, token.role, "token", SESSION_S, True)
+
+    @app.post(f"{PREFIX}/logout", summary="End a page's session")
+    async def logout(request: Request, response: Response) -> dict[str, Any]:
+        shown = credentials(request.scope, request.headers)
+        if access is not None and shown.session is not None:
+            access.log_out(shown.session)
+        name = cookie_name(request.scope)
+        response.delete_cookie(name, path="/", secure=secure, httponly=True, samesite="strict")
+        return {"logged_out": True}
+
+
+def _told(name: str, role: Role, via: str, ends_in_s: float | None, needs_token: bool) -> dict[str, Any]:
+    return {"name": name, "role": role, "via": via, "ends_in_s": ends_in_s, "needs_token": needs_token}
