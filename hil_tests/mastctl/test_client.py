@@ -32,7 +32,7 @@ def client(pair: BOTH) -> Iterator[Client]:
 
 
 def test_a_whole_visit(client: Client, pair: BOTH) -> None:
-    assert client.status()["state"] in ("idle", "fault")
+    assert client.status()["state"] in ("ready", "fault")
     shot = client.snapshot("navcam_left")
     kept = pair[0].service.devices.frame_by_id(shot.frame_id)
     np.testing.assert_array_equal(shot.image, kept.image)

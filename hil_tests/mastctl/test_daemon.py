@@ -124,7 +124,7 @@ def test_a_signal_ends_the_daemon_cleanly_with_the_mast_stopped(
         url = first_line(daemon).removesuffix("\n")
         assert url.startswith("http://127.0.0.1:")
         with Client(url) as client:
-            assert client.status()["state"] == "idle"
+            assert client.status()["state"] == "ready"
             operation = client.point(pan_rad=0.2, tilt_rad=0.1)
             assert client.wait(operation)["state"] == "done"
         daemon.send_signal(number)
@@ -215,7 +215,7 @@ def test_a_unix_socket_serves_its_owner_only_and_goes_with_the_daemon(
         assert daemon.url == f"unix:{tmp_path}/mast%20ctl.sock"
         assert stat.S_IMODE(path.stat().st_mode) == 0o600
         with Client(daemon.url) as client:
-            assert client.status()["state"] in ("idle", "fault")
+            assert client.status()["state"] in ("ready", "fault")
             assert client.snapshot("navcam_left").image.shape == (48, 64)
         with pytest.raises(AddressInUse):
             RunningDaemon(load_config(tmp_path / "daemon.yaml"))

@@ -58,7 +58,7 @@ def test_a_closed_terminal_is_survived_where_nohup_asked_for_it(tmp_path: Path) 
         url = line(daemon)
         daemon.send_signal(signal.SIGHUP)
         with Client(url) as client:
-            assert client.status()["state"] == "idle"
+            assert client.status()["state"] == "ready"
         daemon.send_signal(signal.SIGTERM)
         assert daemon.wait(BOUND_S) == 0
 

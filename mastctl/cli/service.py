@@ -292,7 +292,8 @@ def _show_pointings(record: dict[str, Any]) -> None:
 
 def _status_rows(status: dict[str, Any]) -> Iterator[tuple[str, str]]:
     """The lines of the status table."""
-    yield "state", f"{status['state']} ({status['hardware']})"
+    reason = status.get("reason")
+    yield "state", f"{status['state']} ({status['hardware']})" + (f": {reason}" if reason else "")
     if status.get("control"):
         yield "control", steers(status["control"])
     joints = status["joints"]

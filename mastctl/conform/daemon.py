@@ -20,7 +20,9 @@ ENDED = ("done", "failed", "stopped")
 ARRIVED_RAD = 0.006  # what the service takes for arrived
 POLL_S = 0.02
 OPERATION_S = 60.0
-WORDS_OF_NOW = ("idle", "moving", "pointing", "stopping", "stopped", "fault")
+WORDS_OF_NOW = (
+    "starting", "ready", "moving", "tracking", "holding", "stopping", "stopped", "fault", "closing"
+)  # fmt: skip
 
 
 class Daemon:

@@ -152,7 +152,7 @@ def _stopped_on_the_way(daemon: Daemon, goal: tuple[float, float]) -> str:
     )
     expect(record["state"] == "stopped", f"the operation that was stopped ended {record['state']!r}")
     word = daemon.status().get("state")
-    expect(word == "stopped", f"after the stop the state is {word!r}, not stopped")
+    expect(word == "holding", f"after the stop the state is {word!r}, not holding")
     daemon.let_pass(10 * POLL_S)
     crept_rad = abs(_left(daemon.status(), goal) - rests_rad)
     expect(crept_rad <= ARRIVED_RAD, f"after the stop the head crept by {crept_rad:.4f} rad")

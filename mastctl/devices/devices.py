@@ -27,6 +27,7 @@ from drivers.interfaces import (
 from mastctl.devices import joint_history
 from mastctl.devices.cameras import Cameras
 from mastctl.devices.door import REST_S, Door
+from mastctl.devices.fault_watch import FaultWatch
 from mastctl.devices.faults import FaultWords
 from mastctl.devices.frames import FrameStore, StampedFrame
 from mastctl.devices.joint_history import JointHistory
@@ -38,6 +39,7 @@ from mastctl.devices.thread import DeviceThread
 from mastctl.devices.ways import Way
 from mastctl.errors import MastctlError, Stopped
 from mastctl.state.faults import StandingFault
+from mastctl.state.machine import Machine
 
 log = logging.getLogger(__name__)
 
@@ -84,6 +86,9 @@ class Devices:
         As in `mastctl.devices.frames.FrameStore`.
     sun
         What the head cameras must not look into at first.
+    machine
+        Is told whether the head moves and what is wrong with it; its publisher gets each reading, each
+        frame's facts and each device's faults. One of its own by default.
 
     Attributes
     ----------
@@ -108,18 +113,21 @@ class Devices:
         camera_grace_s: float | None = None,
         new_run: Callable[[], str] | None = None,
         sun: Sun | None = None,
+        machine: Machine | None = None,
     ) -> None:
+        self._machine = machine or Machine(clock)
+        self._publisher = self._machine.publisher
         self.on_turn: Callable[[], None] = lambda: None
         self._pan_tilt = hardware.pan_tilt
         self.door = Door(limits, hardware.pan_tilt, clock, HEAD, rig, sun)
         self._clock = clock
         self._time = deadlines_on(clock)
         self._history = JointHistory()
-        self._store = FrameStore(mast_digest, new_run=new_run)
+        self._store = FrameStore(mast_digest, new_run=new_run, on_new=self._new_frame)
         self._gate = threading.Lock()
         self._blocks: dict[object, Stopped] = {}  # who lets no move out, and why
         self._closed = False
-        self._last_faults: tuple[str, ...] = ()
+        self._reported_s: Mapping[str, float] = {}  # what the head reports about itself, and since when
         # The last move's ticket and when it was taken, until the head was read at rest after it.
         self._moved: tuple[int, float] | None = None
         self._stop_lost = False  # a lost line kept a stop from the head, which was not read at rest since
@@ -134,10 +142,12 @@ class Devices:
             rig,
             camera_grace_s,
         )
+        self._watch = FaultWatch(self._faults, HEAD, self._machine, self._time)
         self._head = DeviceThread(
             HEAD, between=self._poll, between_timeout_s=READ_TIMEOUT_S, words=WORDS, clock=self._time
         )
         self._stops = Stops(self._head, HEAD, lambda: self._pan_tilt.stop(), self._time)
+        self._watch.begin()
 
     # The head
 
@@ -232,6 +242,8 @@ class Devices:
         except LineLost:
             self._stop_lost = True
             raise
+        finally:
+            self._watch.look()
 
     @property
     def stop_pending(self) -> bool:
@@ -285,16 +297,16 @@ class Devices:
 
     def faults(self) -> tuple[StandingFault, ...]:
         """Return what is wrong with any device now, what the head reports about itself included."""
-        found = [*self._head.faults(), *self._stops.faults()]
-        reading = self._history.newest
-        if reading is not None:
-            found += [
-                StandingFault(
-                    HEAD, "device_fault", f"{HEAD}: {word}", reading.time_s, "the head no longer reports it"
-                )
-                for word in reading.faults
-            ]
-        return (*found, *self.door.faults(reading), *self._cameras.faults())
+        self._watch.look()
+        return self._faults()
+
+    def _faults(self) -> tuple[StandingFault, ...]:
+        reported = [
+            StandingFault(HEAD, "device_fault", f"{HEAD}: {word}", since_s, "the head no longer reports it")
+            for word, since_s in self._reported_s.items()
+        ]
+        door = self.door.faults(self._history.newest)
+        return (*self._head.faults(), *self._stops.faults(), *reported, *door, *self._cameras.faults())
 
     def close(self) -> None:
         """Stop the head and end the threads; takes some 4 s at most and never raises."""
@@ -310,6 +322,7 @@ class Devices:
         until_s = self._time.now_s() + 2.0
         self._head.close(max(0.1, until_s - self._time.now_s()))
         self._cameras.close(until_s)
+        self._watch.close()
 
     # In the devices' own threads
 
@@ -326,8 +339,9 @@ class Devices:
             answer, HEAD, self._clock.now_s(), None if newest is None else newest.time_s
         )
         reading = self._history.add(reading)
-        if reading.faults != self._last_faults:
-            self._last_faults = tuple(reading.faults)
+        if set(reading.faults) != set(self._reported_s):
+            before_s = self._reported_s
+            self._reported_s = {word: before_s.get(word, reading.time_s) for word in reading.faults}
             log.warning("%s reports: %s", HEAD, "; ".join(reading.faults) or "healthy again")
         if self._stop_lost and not reading.moving:
             self._stop_lost = False
@@ -337,7 +351,13 @@ class Devices:
             if self._time.now_s() - moved_s > REST_S:
                 self._moved = None
                 self._stops.proved(ticket)
+        self._machine.head_read(reading.moving)
+        self._publisher.publish("joints", HEAD, reading)
+        self._watch.look()
         return reading
+
+    def _new_frame(self, frame: StampedFrame) -> None:
+        self._publisher.publish("frame", frame.camera, frame.facts)
 
     def _poll(self) -> float:
         self.on_turn()

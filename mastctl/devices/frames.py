@@ -12,7 +12,7 @@ import secrets
 import threading
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 
 import numpy as np
 
@@ -37,6 +37,11 @@ class StampedFrame(FrameFacts):
 
     image: Image
     jpeg: bytes = field(default=b"", kw_only=True, repr=False)
+
+    @property
+    def facts(self) -> FrameFacts:
+        """The facts without the picture."""
+        return FrameFacts(**{one.name: getattr(self, one.name) for one in fields(FrameFacts)})
 
     @property
     def exposure_began_s(self) -> float:
@@ -130,7 +135,8 @@ def random_run() -> str:
 class FrameStore:
     """The newest frames of each camera, found again by id. Safe to use from any thread.
 
-    ``new_run`` makes the last part of ids, four hexadecimal digits; `random_run` by default.
+    ``new_run`` makes the last part of ids, four hexadecimal digits; `random_run` by default. ``on_new`` gets
+    each frame that is kept; must return at once.
     """
 
     def __init__(
@@ -138,8 +144,10 @@ class FrameStore:
         mast_digest: str,
         kept: int = KEPT_FRAMES,
         new_run: Callable[[], str] | None = None,
+        on_new: Callable[[StampedFrame], None] = lambda frame: None,
     ) -> None:
         self._digest = mast_digest
+        self._on_new = on_new
         self._new_run = new_run or random_run
         self._runs: dict[str, str] = {}
         self._kept = kept
@@ -185,7 +193,8 @@ class FrameStore:
                     return known
             frames.append(frame)
             self._newest = {**self._newest, frame.camera: frame}
-            return frame
+        self._on_new(frame)
+        return frame
 
     def newest(self, camera: str) -> StampedFrame | None:
         """Return a camera's newest frame, None before the first; takes no lock."""

@@ -3,9 +3,10 @@
 This module does not know how to point. It runs what it is given, keeps the record, and makes sure that a
 stop is the last word: from the moment a stop is asked for until the operation has ended, no move goes out.
 
-What is read from here (`Operations.motion`, `Operations.get`, `Operations.all`) is read without a lock: the
-records are a mapping that is replaced, never edited. The lock is for those that write, and is not held while
-anything else is waited for.
+What is read from here (`Operations.get`, `Operations.all`) is read without a lock: the records are a mapping
+that is replaced, never edited. The lock is for those that write, and is not held while anything else is
+waited for. What runs and what is being stopped is told to the machine (`mastctl.state.machine`), each change
+of a record to its publisher.
 """
 
 from __future__ import annotations
@@ -23,7 +24,9 @@ from calib.errors import CalibError
 from drivers.clock import Clock, deadlines_on
 from drivers.errors import DriverError
 from mastctl.errors import MastctlError, NotKnown, NotNow, Stopped, Unable, error_body
-from mastctl.operations.records import Motion, Operation, OperationState, last_residual
+from mastctl.operations.records import Operation, OperationState, last_residual
+from mastctl.state.machine import Machine
+from mastctl.state.words import CLOSING
 
 log = logging.getLogger(__name__)
 
@@ -31,7 +34,6 @@ KEPT_OPERATIONS = 200
 END_TIMEOUT_S = 5.0  # for a cancelled operation to notice, when the service closes
 
 STOP_ASKED = "a stop was asked for"
-CLOSING = "the service is closing"
 
 
 class Mover(Protocol):
@@ -59,6 +61,8 @@ class Operations:
         A word in every id, so that an id from before a restart names nothing; a random one by default.
     on_ended
         Gets the last record of each operation, in its thread; must return at once.
+    machine
+        Is told what runs, and refuses what may not begin now; one of its own by default.
     """
 
     def __init__(
@@ -67,8 +71,11 @@ class Operations:
         clock: Clock,
         run: str | None = None,
         on_ended: OnEnd = lambda operation: None,
+        machine: Machine | None = None,
     ) -> None:
         self._mover = mover
+        self._machine = machine or Machine(clock)
+        self._publisher = self._machine.publisher
         self._clock = clock
         self._time = deadlines_on(clock)
         self._ended = self._time.signal()
@@ -78,28 +85,13 @@ class Operations:
         self._run = run or secrets.token_hex(2)
         self._on_ended = on_ended
         self._current: tuple[str, threading.Event, threading.Thread] | None = None
-        self._motion = Motion()
-        self._stops: set[object] = set()  # under way
         self._closed = False
         self._cancelled_because: MastctlError = Stopped(STOP_ASKED)
 
     @property
-    def motion(self) -> Motion:
-        """What to show about operations: the running one, its target, the last residual."""
-        motion, current = self._motion, self._current
-        ending = current is not None and current[0] == motion.operation and current[1].is_set()
-        return replace(motion, stopping=bool(self._stops) or ending)
-
-    @property
-    def stopping(self) -> bool:
-        """Whether a stop is under way, or what it ends has not ended."""
-        current = self._current
-        return bool(self._stops) or (current is not None and current[1].is_set())
-
-    @property
-    def closed(self) -> bool:
-        """Whether the service is closing or closed."""
-        return self._closed
+    def running(self) -> str | None:
+        """Id of the running operation, None when none runs."""
+        return self._machine.standing.operation
 
     def start(self, request: Mapping[str, Any], work: Work, on_end: OnEnd | None = None) -> Operation:
         """Start ``work(record_step, cancelled)`` in a thread and return its first record.
@@ -109,18 +101,13 @@ class Operations:
         Raises
         ------
         NotNow
-            ``busy`` if another operation runs, ``stopping`` if the mast is being stopped.
+            ``busy``, ``stopping``, ``latched``: as `mastctl.state.machine.Machine.refusal` of ``motion``.
         Unable
             ``no_thread`` if the machine has none for it (the record says so too), ``closing``.
         """
         with self._lock:
-            if self._closed:
-                raise Unable("closing", CLOSING)
-            if self._stops:
-                raise NotNow("stopping", "the mast is being stopped; ask again when that is over")
-            if self._current is not None:
-                raise busy(self._current[0], stopping=self._current[1].is_set())
             name = f"{next(self._numbers):06d}-{self._run}"
+            self._machine.operation_began(name, request)
             operation = Operation(name, "queued", dict(request), self._clock.now_s())
             cancelled = threading.Event()
             thread = self._clock.thread(
@@ -128,26 +115,25 @@ class Operations:
             )
             self._keep(operation)
             self._current = (name, cancelled, thread)
-            self._motion = replace(self._motion, operation=name, target=dict(request), stopped=False)
         try:
             thread.start()
         except RuntimeError as error:  # no thread to be had: nothing has moved, and the next may have one
-            refusal = Unable("no_thread", f"operation {name} was not started: {error}")
-            self._end(name, "failed", None, error_body(refusal))
-            raise refusal from None
+            unable = Unable("no_thread", f"operation {name} was not started: {error}")
+            self._end(name, "failed", None, error_body(unable))
+            raise unable from None
         return operation
 
     @contextmanager
     def held(self) -> Iterator[None]:
         """Let no operation start and no move go out inside the block; waits for nobody."""
         hold = object()
-        self._stops.add(hold)
+        self._machine.stop_asked()
         self._mover.block_moves(hold, STOP_ASKED)
         try:
             yield
         finally:
-            self._stops.discard(hold)
             self._mover.allow_moves(hold)
+            self._machine.stop_ended()
 
     def stop(self, reason: str = STOP_ASKED) -> str | None:
         """Stop the mast, then the running operation, if any; return its id.
@@ -170,7 +156,6 @@ class Operations:
             finally:
                 with self._lock:
                     name = self._cancel(reason)
-                    self._motion = replace(self._motion, stopped=True)
         if name is None and running is not None and self.get(running[0]).state == "stopped":
             name = running[0]
         log.info("stop%s", f": operation {name}" if name else "")
@@ -244,8 +229,10 @@ class Operations:
         if self._closed:
             return
         self._closed = True
+        self._machine.closing()
         self._mover.block_moves(self, CLOSING)
         self._stop_unasked("as the service closes")
+        self._machine.go_on()
         with self._lock:
             current = self._current
             self._cancel(CLOSING)
@@ -265,7 +252,9 @@ class Operations:
             self._cancelled_because = error
             current[1].set()
             self._mover.block_moves(name, str(error))
+        self._machine.stop_asked()
         self._stop_unasked(f"when operation {name} was to end")
+        self._machine.stop_ended()
 
     def _stop_unasked(self, when: str) -> None:
         """Stop the mast where nobody waits for the answer; whatever its driver raises must not go further."""
@@ -278,8 +267,11 @@ class Operations:
         """Keep a record, and forget the oldest; the lock is held."""
         records = {**self._records, operation.id: operation}
         while len(records) > KEPT_OPERATIONS:
-            del records[next(iter(records))]
+            oldest = next(iter(records))
+            del records[oldest]
+            self._publisher.forget("operation", oldest)
         self._records = records
+        self._publisher.publish("operation", operation.id, operation)
 
     def _cancel(self, reason: str) -> str | None:
         """Tell the running operation to end and let no further move of it out; the lock is held."""
@@ -349,19 +341,11 @@ class Operations:
             if self._current is None or self._current[0] != name:
                 return  # given up before
             self._current = None
-            self._motion = replace(self._motion, operation=None, residual=residual or self._motion.residual)
             self._mover.allow_moves(name)
+            self._machine.operation_ended(name, residual)
             known = self._records.get(name)
             if known is not None:  # last, since it is what clients wait for
                 ended_s = self._clock.now_s()
                 self._keep(replace(known, state=state, result=result, error=error, ended_s=ended_s))
         with self._ended:
             self._ended.notify_all()
-
-
-def busy(operation: str, *, stopping: bool = False) -> NotNow:
-    """Return the refusal of what cannot be done beside a running operation."""
-    what = (
-        "is being stopped; ask again when it has ended" if stopping else "is running; wait for it or stop it"
-    )
-    return NotNow("busy", f"operation {operation} {what}")

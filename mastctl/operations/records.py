@@ -1,4 +1,4 @@
-"""What is known of operations: the record of each, and what they say together. All frozen."""
+"""The record of an operation; frozen."""
 
 from __future__ import annotations
 
@@ -10,31 +10,6 @@ from mastctl.as_json import as_json
 from mastctl.state.standing import Residual
 
 OperationState = Literal["queued", "running", "done", "failed", "stopped"]
-
-
-@dataclass(frozen=True)
-class Motion:
-    """What the operations say about themselves.
-
-    Attributes
-    ----------
-    operation
-        Id of the running operation, None when none runs.
-    target
-        The request that runs, or ran last, as it came; None before the first.
-    residual
-        The last one measured.
-    stopped
-        Whether the last thing that happened was a stop.
-    stopping
-        Whether a stop is under way: the head has not confirmed it, or the operation has not ended yet.
-    """
-
-    operation: str | None = None
-    target: Mapping[str, Any] | None = None
-    residual: Residual | None = None
-    stopped: bool = False
-    stopping: bool = False
 
 
 @dataclass(frozen=True, eq=False)

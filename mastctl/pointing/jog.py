@@ -22,8 +22,9 @@ from drivers.interfaces import Reading
 from mastctl.devices.door import Door
 from mastctl.devices.keep_out import KeptOut, Pair
 from mastctl.errors import NotNow
-from mastctl.operations.operations import Operations, busy
+from mastctl.operations.operations import Operations
 from mastctl.pointing.results import PointingError
+from mastctl.state.refusals import busy
 
 log = logging.getLogger(__name__)
 
@@ -124,7 +125,7 @@ class Jogs:
             return jog.told(name, True)
 
     def _running(self) -> tuple[str, _Jog] | None:
-        if self._jog is not None and self._operations.motion.operation != self._jog[0]:
+        if self._jog is not None and self._operations.running != self._jog[0]:
             self._jog = None
         return self._jog
 

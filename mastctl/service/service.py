@@ -25,11 +25,11 @@ from mastctl.commands.entry import Entry
 from mastctl.commands.idempotency import Answers
 from mastctl.commands.lease import Leases
 from mastctl.config import Config
-from mastctl.devices.devices import HEAD, Devices
+from mastctl.devices.devices import Devices
 from mastctl.devices.frames import StampedFrame, check_known, random_run
 from mastctl.errors import MastctlError, NotNow, Unable
 from mastctl.handoff.check import HandoffCheck
-from mastctl.operations.operations import CLOSING, STOP_ASKED, Operations, busy
+from mastctl.operations.operations import STOP_ASKED, Operations
 from mastctl.operations.records import Operation
 from mastctl.pointing.jog import Jogs
 from mastctl.pointing.loop import PointingLoop
@@ -44,6 +44,8 @@ from mastctl.service.mast_in_use import MastInUse, configured, read_mast, read_n
 from mastctl.service.socket_stops import SocketStops
 from mastctl.service.state import State
 from mastctl.state.faults import StandingFault
+from mastctl.state.machine import Machine
+from mastctl.state.standing import Latched
 from mastctl.tracking.pose import RoverPose
 from mastctl.tracking.status import ACTIVE, TrackStatus
 from mastctl.tracking.tracker import Tracker
@@ -81,6 +83,8 @@ class Service:
     ----------
     mast, former
         The mast file in use, and the one before it; replaced as a whole, never edited.
+    machine
+        What the daemon is doing; its publisher tells every change.
     tracker
         The track, and the rover's pose.
     jogs
@@ -116,12 +120,22 @@ class Service:
         self.started_s = clock.now_s()
         grace_s = None if hardware.simulation is None else RENDERING_S
         new_run = _run_names(hardware, clock)
-        self.devices = Devices(
-            hardware, config.limits, mast.stored.digest, clock, mast.stored.rig, grace_s, new_run, config.sun
-        )
-        self.operations = Operations(self.devices, clock, new_run(), self._ended)
         self.folder = folder or StateFolder.temporary()
         self.latch = Latch(self.folder)
+        self.machine = Machine(clock, latch=_latched(self.latch.held))
+        self.machine.publisher.publish("mast", "in_use", mast.told())
+        self.devices = Devices(
+            hardware,
+            config.limits,
+            mast.stored.digest,
+            clock,
+            mast.stored.rig,
+            grace_s,
+            new_run,
+            config.sun,
+            self.machine,
+        )
+        self.operations = Operations(self.devices, clock, new_run(), self._ended, self.machine)
         if self.latch.held is not None:
             self.devices.block_moves(self.latch, self.latch.held.refusal())
         self.stop_threads = StopThreads()
@@ -137,6 +151,7 @@ class Service:
             clock,
             config.tracking,
             self.handoffs.add,
+            self.machine,
         )
         people_s = SystemClock()  # clients live in real time, whatever a simulated rover's clock does
         self.leases = Leases(people_s, self._runs)
@@ -177,14 +192,15 @@ class Service:
         """The mast file in use, as read."""
         return self.mast.stored
 
-    @property
-    def head(self) -> str:
-        """The name under which the head's faults stand."""
-        return HEAD
-
     def state(self) -> State:
         """Return what is known at this moment."""
         mast, former = self.mast, self.former
+        faults = (
+            *self.devices.faults(),
+            *self.handoffs.faults(),
+            *self.audit.faults(),
+            *self._state_faults(),
+        )  # first: the machine is told of them
         return State(
             now_s=self.clock.now_s(),
             started_s=self.started_s,
@@ -195,16 +211,10 @@ class Service:
             limits=self.config.limits,
             reading=self.devices.last_reading,
             frames=self.devices.newest_frames(),
-            motion=self.operations.motion,
+            standing=self.machine.standing,
             track=self.tracker.status,
-            faults=(
-                *self.devices.faults(),
-                *self.handoffs.faults(),
-                *self.audit.faults(),
-                *self._state_faults(),
-            ),
+            faults=faults,
             control=self.leases.told(),
-            estop=self.latch.held,
             stop_socket=None if self.stop_socket is None else str(self.stop_socket.path),
         )
 
@@ -316,10 +326,10 @@ class Service:
     def stop_track(self) -> None:
         """End the track, and stop the mast if it moves for it. Raises DriverError."""
         running = self.tracker.status.operation
-        if running is not None and self.operations.motion.operation == running:
+        if running is not None and self.machine.standing.operation == running:
             self.operations.stop()  # the head first
         running = self.tracker.stop("the track was stopped")
-        if running is not None and self.operations.motion.operation == running:
+        if running is not None and self.machine.standing.operation == running:
             self.operations.stop()
 
     def load_mast(self, name: str) -> MastInUse:
@@ -353,19 +363,18 @@ class Service:
 
     def _use(self, mast: MastInUse) -> MastInUse:
         """Put a mast file into use while the head rests and nothing runs."""
-        reading = self.devices.read()
+        self.devices.read()  # the machine knows whether the head moves now
         with self._mast_lock:
-            running = self.operations.motion.operation
-            if running is not None:
-                raise busy(running)
-            if reading.moving:
-                raise NotNow("moving", "the head moves; a mast file is changed while it rests")
+            refusal = self.machine.refusal("rest")
+            if refusal is not None:
+                raise refusal
             self.devices.use_rig(mast.stored.rig, mast.stored.digest)
             self._rig = configured(mast.stored.rig, self.config.hardware.cameras)
             self._loop = PointingLoop(self._rig, self.devices, self.config.limits, self.clock)
             self.tracker.use_rig(self._rig, mast.path.name)
             self.handoffs.use_mast(mast.stored.digest)
             self.mast, self.former = mast, self.mast
+            self.machine.publisher.publish("mast", "in_use", mast.told())
         for note in mast.stored.notes:
             log.warning("%s", note)
         log.info("mast file %s (%s) is in use", mast.path.name, mast.stored.digest[:12])
@@ -419,12 +428,13 @@ class Service:
         Unable
             ``stop_unconfirmed`` if the head did not confirm; the stop is latched all the same.
         """
-        held = self.latch_estop(reason, name)
         stopped, unconfirmed = None, None
-        try:
-            stopped = self.stop(f"an emergency stop: {held.reason} ({held.name})")
-        except (DriverError, MastctlError) as error:
-            unconfirmed = error
+        with self.operations.held():
+            held = self.latch_estop(reason, name)
+            try:
+                stopped = self.stop(f"an emergency stop: {held.reason} ({held.name})")
+            except (DriverError, MastctlError) as error:
+                unconfirmed = error
         self.latch.head_told()
         kept = self.latch.kept_within(KEPT_S)
         why = "" if kept else f"it would not survive a restart of the daemon: {self.latch.not_kept}"
@@ -437,6 +447,7 @@ class Service:
     def latch_estop(self, reason: str | None, name: str | None) -> Held:
         """Let no move out from now on; the head is told by `estop`. Returns the stop that is latched."""
         held = self.latch.hold(reason, name)
+        self.machine.estop_asked(Latched(**asdict(held)))
         self.devices.block_moves(self.latch, held.refusal())
         return held
 
@@ -463,15 +474,19 @@ class Service:
         Unable
             ``not_saved`` if the state folder goes on to say that it is latched; ``closing``.
         """
-        if self.operations.closed:
-            raise Unable("closing", CLOSING)
-        if self.operations.stopping or self.devices.stop_pending:
+        refusal = self.machine.refusal("latch")
+        if refusal is not None:
+            raise refusal
+        if self.devices.stop_pending:
             raise NotNow("stopping", "the mast is being stopped; an emergency stop is released after that")
         with self._latch_lock:
             held = self.latch.release(reason, name)
             self.devices.allow_moves(self.latch)
+            self.machine.reset(name, reason)
             if self.latch.held is not None:  # another came meanwhile
-                self.devices.block_moves(self.latch, self.latch.held.refusal())
+                self.machine.stop_asked()
+                self.latch_estop(None, None)
+                self.machine.stop_ended()
         return held
 
     def _refuse_if_latched(self) -> None:
@@ -504,6 +519,7 @@ class Service:
             self._closed = True
         self.operations.close()
         self.devices.close()
+        self.machine.publisher.close()
         self.stop_threads.close()
         self.handoffs.close()
         _bounded("closing the hardware", self.hardware.close, HARDWARE_CLOSE_S)
@@ -517,7 +533,7 @@ class Service:
 
     def _runs(self) -> bool:
         """Whether an operation or a track runs; takes no lock."""
-        return self.operations.motion.operation is not None or self.tracker.status.state in ACTIVE
+        return self.operations.running is not None or self.tracker.status.state in ACTIVE
 
     def _ended(self, operation: Operation) -> None:
         """Have an operation's end recorded."""
@@ -534,6 +550,11 @@ class Service:
         if moved_s is not None and frame.exposure_began_s < moved_s:
             words = f"the rover moved since frame {target.frame_id} was exposed; take another"
             raise NotNow("rover_moved", words)
+
+
+def _latched(held: Held | None) -> Latched | None:
+    """What the machine is told of an emergency stop that was found."""
+    return None if held is None else Latched(**asdict(held))
 
 
 def _bounded(what: str, function: Callable[[], None], timeout_s: float) -> None:

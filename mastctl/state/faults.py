@@ -24,8 +24,10 @@ class StandingFault:
     until: str
 
     def same(self, other: StandingFault) -> bool:
-        """Return whether both are one fault, whose words may tell how long it stands."""
-        return (self.device, self.code, self.since_s) == (other.device, other.code, other.since_s)
+        """Return whether both are one fault at two moments: its words or its time may have gone on."""
+        return (self.device, self.code) == (other.device, other.code) and (
+            self.since_s == other.since_s or self.message == other.message
+        )
 
 
 def same_faults(some: tuple[StandingFault, ...], others: tuple[StandingFault, ...]) -> bool:

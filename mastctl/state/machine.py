@@ -20,7 +20,7 @@ from mastctl.state.faults import StandingFault, same_faults
 from mastctl.state.in_turn import InTurn
 from mastctl.state.publisher import Publisher
 from mastctl.state.refusals import Need, refusal_of
-from mastctl.state.standing import Latch, Residual, Standing
+from mastctl.state.standing import Latched, Residual, Standing
 from mastctl.state.table import CHOICES, TABLE, Event
 from mastctl.state.words import why
 
@@ -47,7 +47,9 @@ class Machine:
         Where everything else that changes is published too.
     """
 
-    def __init__(self, clock: Clock, publisher: Publisher | None = None, latch: Latch | None = None) -> None:
+    def __init__(
+        self, clock: Clock, publisher: Publisher | None = None, latch: Latched | None = None
+    ) -> None:
         self.publisher = publisher or Publisher()
         self._clock = clock
         self._turns = InTurn[_News](self._take)
@@ -56,6 +58,10 @@ class Machine:
             now = replace(now, word="stopped", latch=latch)
         self._standing = replace(now, reason=why(now))
         self.publisher.publish("state", "machine", self._standing)
+
+    def go_on(self) -> None:
+        """Take what was noted, so that whoever listens hears it."""
+        self._turns.go_on()
 
     @property
     def standing(self) -> Standing:
@@ -75,10 +81,13 @@ class Machine:
     def operation_began(self, operation: str, target: Mapping[str, Any]) -> None:
         """Let an operation begin. Raises what `refusal` returns for ``motion``; then nothing has changed."""
         told = dict(target)
-        self._begin(
-            "motion",
-            lambda now: ("operation_began", replace(now, operation=operation, target=told, held="")),
-        )
+        with self._turns.alone():
+            refused = refusal_of(self._standing, "motion")
+            if refused is not None:
+                raise refused
+            self._take(
+                lambda now: ("operation_began", replace(now, operation=operation, target=told, held=""))
+            )
 
     def operation_ended(self, operation: str, residual: Residual | None = None) -> None:
         """Take that an operation ended, and what it measured last; not twice of one."""
@@ -136,7 +145,7 @@ class Machine:
         """Take that a stop is over: the head has confirmed it, or its fault was told before."""
         self._turns.bring(lambda now: ("stop_ended", replace(now, stops=max(0, now.stops - 1))))
 
-    def estop_asked(self, latch: Latch) -> None:
+    def estop_asked(self, latch: Latched) -> None:
         """Note an emergency stop, between `stop_asked` and `stop_ended` of its stop.
 
         From then on nothing may begin. The first one holds if another is latched already.
@@ -146,20 +155,13 @@ class Machine:
         )
 
     def reset(self, name: str, reason: str) -> None:
-        """Release the latch. Raises what `refusal` returns for ``latch``; then nothing has changed."""
+        """Take that the latch was released, of a service that asked `refusal` of ``latch`` before."""
         held = f"reset by {name}: {reason}; the next command starts"
-        self._begin("latch", lambda now: ("reset", replace(now, latch=None, held=held)))
+        self._turns.bring(lambda now: ("reset", replace(now, latch=None, held=held)) if now.latch else None)
 
     def closing(self) -> None:
         """Note that the service is closing: nothing begins any more."""
         self._turns.leave(lambda now: ("closing", now))
-
-    def _begin(self, need: Need, news: _News) -> None:
-        with self._turns.alone():
-            refused = refusal_of(self._standing, need)
-            if refused is not None:
-                raise refused
-            self._take(news)
 
     def _take(self, news: _News) -> None:
         """Take one event: its facts, the word that the table has for it, and tell who listens."""
@@ -169,6 +171,8 @@ class Machine:
             return
         event, now = told
         to = TABLE[before.word].get(event, before.word)
+        if to.startswith("refused: "):  # asked before, and true by now all the same
+            to = before.word
         word = CHOICES[to][0](now) if to in CHOICES else to  # type: ignore[index]
         now = replace(now, word=word)  # type: ignore[arg-type]
         if word != before.word:

@@ -23,7 +23,7 @@ class Residual:
 
 
 @dataclass(frozen=True)
-class Latch:
+class Latched:
     """An emergency stop that holds until somebody resets it.
 
     Attributes
@@ -84,4 +84,4 @@ class Standing:
     stops: int = 0
     held: str = ""
     faults: tuple[StandingFault, ...] = ()
-    latch: Latch | None = None
+    latch: Latched | None = None

@@ -18,7 +18,6 @@ import numpy as np
 
 from calib.handoff.matched import MatchedHandoff
 from calib.mast.rig import Rig
-from calib.tracking.track import Track
 from drivers.clock import Clock
 from mastctl.devices.limits import Limits
 from mastctl.errors import BadRequest, MastctlError, NotNow
@@ -27,8 +26,10 @@ from mastctl.operations.records import Operation
 from mastctl.pointing.requests import PixelTarget, PositionTarget
 from mastctl.pointing.settings import PointingSettings
 from mastctl.pointing.steps import DevicesLike, Steps
+from mastctl.state.machine import Machine
 from mastctl.tracking.carried import Carried
 from mastctl.tracking.look import Looker, Sighting
+from mastctl.tracking.outcomes import Outcome, Turn, looked, moved_on, started
 from mastctl.tracking.pose import (
     RoverPose,
     check_follows,
@@ -36,12 +37,11 @@ from mastctl.tracking.pose import (
     stands,
 )
 from mastctl.tracking.settings import TrackingSettings
-from mastctl.tracking.status import ACTIVE, HandedOver, TrackState, TrackStatus
+from mastctl.tracking.status import ACTIVE, TrackStatus
 
 log = logging.getLogger(__name__)
 
 Told = Mapping[str, Any]
-Outcome = tuple[Track, Sighting]
 
 
 class HoldingDevices(DevicesLike, Protocol):
@@ -65,6 +65,9 @@ class Tracker:
         Which pair looks, how far a pose may lie from the one before.
     on_matched
         Gets each hand-off's record; must return at once.
+    machine
+        Is told when a track begins and ends; its publisher gets each change of the track. One of its own by
+        default.
     """
 
     def __init__(
@@ -76,7 +79,9 @@ class Tracker:
         clock: Clock,
         settings: TrackingSettings | None = None,
         on_matched: Callable[[MatchedHandoff], None] = lambda matched: None,
+        machine: Machine | None = None,
     ) -> None:
+        self._machine = machine or Machine(clock)
         self._operations = operations
         self._devices = devices
         self._rig = rig
@@ -271,23 +276,26 @@ class Tracker:
     def _carry(self, status: TrackStatus, pose: RoverPose) -> TrackStatus:
         """Carry the track over to a pose, or say that the pose jumped."""
         assert self._carried is not None
-        after_jump = self._carried.jumped
         origin_m = self._rig.mast.translation_m
-        self._carried, reason = self._carried.to(pose, origin_m, self._settings.most_step)
-        if reason:
-            return replace(status, state="lost", reason=reason, covariance_m2=None)
-        if after_jump:
-            status = replace(status, reason="not looked for since a pose jumped")
-        track = self._carried.track
-        return replace(
-            status, position_m=track.position_m, covariance_m2=track.target_covariance_m2, stands_at=pose
-        )
+        return self._take(moved_on(status, self._carried, pose, origin_m, self._settings.most_step))
+
+    def _take(self, turn: Turn) -> TrackStatus:
+        """Follow what came of something, have it logged, and return the status to publish."""
+        self._carried = turn.carried
+        self._said += turn.said
+        return turn.status
 
     def _publish(self, status: TrackStatus) -> None:
         before = self._status
         if status.state == "lost" and (before.state, before.reason) != (status.state, status.reason):
             self._say(logging.WARNING, "track %s: %s", status.id, status.reason)
         self._status = replace(status, sequence=before.sequence + 1, changed_s=self._clock.now_s())
+        self._machine.publisher.publish("track", "track", self._status)
+        was, now = before.state in ACTIVE, status.state in ACTIVE
+        if now and not was and status.id is not None:
+            self._machine.track_began(status.id)
+        if was and not now and before.id is not None:
+            self._machine.track_ended(before.id)
 
     # In the operation's thread
 
@@ -309,76 +317,18 @@ class Tracker:
             stood = status.stands_at
             left = any(stood is not None and not stands(motion_between(stood, one)) for one in waiting)
             if status.state == "starting":
-                status = self._started(status, operation, outcome, left)
+                status = self._take(started(status, operation, outcome, left))
             elif left:
                 words = "the rover moved while the pictures were taken, so that they belong to no one pose"
                 status = replace(status, reason=words)
             else:
-                status = self._looked(status, operation, outcome)
+                assert self._carried is not None
+                status = self._take(looked(status, self._carried, operation, outcome))
+                if outcome is not None and outcome[1].matched is not None:
+                    self._on_matched(outcome[1].matched)
             if self._carried is not None:
                 for one in waiting:
                     status = self._carry(status, one)
                 if self._look_again:
                     status = self._looked_for(status)
             self._publish(status)
-
-    def _started(
-        self, status: TrackStatus, operation: Operation, outcome: Outcome | None, left: bool
-    ) -> TrackStatus:
-        if outcome is None or left:
-            reason = "the rover moved while the track's first pictures were taken; start it again"
-            if outcome is None:
-                reason = _why(operation)
-            ended: TrackState = "stopped" if operation.state == "stopped" else "idle"
-            return TrackStatus(state=ended, reason=reason, id=status.id, pose=status.pose)
-        track, seen = outcome
-        self._carried = Carried(track, status.stands_at)
-        self._say(logging.INFO, "track %s begins %.2f m away, by %s", status.id, seen.range_m, seen.pair)
-        return replace(
-            status,
-            state="tracking",
-            position_m=seen.position_m,
-            covariance_m2=seen.covariance_m2,
-            seen=seen,
-            found_by=seen.pair,
-        )
-
-    def _looked(self, status: TrackStatus, operation: Operation, outcome: Outcome | None) -> TrackStatus:
-        carried = self._carried
-        assert carried is not None
-        status = replace(status, looks=status.looks + 1)
-        if outcome is None and operation.state == "stopped":
-            self._carried = None
-            return replace(status, state="stopped", reason=_why(operation))
-        if outcome is None:
-            # Nothing was seen: both eyes must find the target again, as after a look without success.
-            track = replace(carried.track, state="lost", misses=carried.track.misses + 1)
-            self._carried = replace(carried, track=track)
-            return replace(status, state="lost", reason=_why(operation), misses=track.misses)
-        track, seen = outcome
-        self._carried = replace(carried, track=track)
-        if seen.matched is not None:
-            self._on_matched(seen.matched)
-        if seen.pose_doubt and seen.state == "tracked":  # what is lost is logged with its whole reason
-            self._say(logging.WARNING, "track %s: %s", status.id, seen.pose_doubt)
-        status = replace(
-            status,
-            reason="; ".join(filter(None, (seen.reason, seen.pose_doubt))),
-            position_m=seen.position_m,
-            covariance_m2=seen.covariance_m2,
-            seen=seen,
-            misses=track.misses,
-            renewals=status.renewals + seen.renewed,
-        )
-        if seen.state == "lost":
-            return replace(status, state="lost")
-        if seen.pair != status.found_by:
-            self._say(logging.INFO, "track %s: %s hands over to %s", status.id, status.found_by, seen.pair)
-            handed = HandedOver(status.found_by, seen.pair, seen.range_m)
-            status = replace(status, handoffs=(*status.handoffs, handed))
-        return replace(status, state="tracking", predicted=False, found_by=seen.pair)
-
-
-def _why(operation: Operation) -> str:
-    """Why an operation brought nothing, in its own words."""
-    return str((operation.error or {}).get("message", "the operation ended without a result"))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import json
 from collections.abc import AsyncIterator
 from typing import Any
@@ -14,11 +13,11 @@ from mastctl.commands.deadlines import usual_s
 from mastctl.commands.entry import POINT, POSE, STOP, TRACK, TRACK_LOOK, TRACK_STOP
 from mastctl.pointing.requests import AnglesTarget
 from mastctl.service.service import Service
+from mastctl.tracking.status import TrackStatus
 from mastctl.web import PREFIX
 from mastctl.web.commands import Commands, Headers
 from mastctl.web.models import PointBody, PoseBody, TrackBody
 
-STREAM_POLL_S = 0.05  # how late a change may be told
 STREAM_ALIVE_S = 5.0
 
 
@@ -28,7 +27,7 @@ def add_pointing(app: FastAPI, service: Service, commands: Commands) -> None:
 
     @app.get(f"{PREFIX}/status", summary="What is known at this moment")
     async def status() -> dict[str, Any]:
-        return service.state().told(service.head)
+        return service.state().told()
 
     @app.post(f"{PREFIX}/point", status_code=202, summary="Point at a pixel, a position, or joint angles")
     async def point(body: PointBody, came: Headers) -> dict[str, Any]:
@@ -108,14 +107,18 @@ def add_tracking(app: FastAPI, service: Service, commands: Commands) -> None:
 
 async def _track_events(service: Service) -> AsyncIterator[str]:
     """Each change of the track as an event, and a comment now and then to show that somebody is there."""
-    told, quiet_s = -1, 0.0
-    while not service.operations.closed:
+    with service.machine.publisher.subscribe_here("track", "state", known=False) as changes:
         status = service.tracker.status
-        if status.sequence != told:
-            told, quiet_s = status.sequence, 0.0
-            yield f"data: {json.dumps(service.track_told(status), allow_nan=False)}\n\n"
-        elif quiet_s >= STREAM_ALIVE_S:
-            quiet_s = 0.0
-            yield ": alive\n\n"
-        await asyncio.sleep(STREAM_POLL_S)
-        quiet_s += STREAM_POLL_S
+        yield _event(service, status)
+        while service.machine.standing.word != "closing" and not changes.closed:
+            news = await changes.wait(STREAM_ALIVE_S)
+            if not news:
+                yield ": alive\n\n"
+            for one in news:
+                if one.topic == "track" and one.value.sequence > status.sequence:
+                    status = one.value
+                    yield _event(service, status)
+
+
+def _event(service: Service, status: TrackStatus) -> str:
+    return f"data: {json.dumps(service.track_told(status), allow_nan=False)}\n\n"

@@ -373,7 +373,7 @@ def stands_short_of(daemon_url: str, goal_rad: float) -> bool:
         until_s = time.monotonic() + 10
         while (status := client.status())["moving"] or status["operation"]:
             assert time.monotonic() < until_s
-        return bool(status["state"] == "stopped" and abs(status["joints"]["pan_rad"] - goal_rad) > 0.01)
+        return bool(status["state"] == "holding" and abs(status["joints"]["pan_rad"] - goal_rad) > 0.01)
 
 
 def test_a_connection_that_is_lost_while_the_head_moves_ends_with_a_stop(

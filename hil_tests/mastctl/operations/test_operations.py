@@ -13,9 +13,10 @@ from drivers.errors import NoReply
 from drivers.simulation_clock import SimulationClock
 from hil_tests.mastctl.service_fakes import FakePointing, FakeResult, eventually
 from mastctl.errors import NotKnown, NotNow, Stopped, Unable, error_body
-from mastctl.operations.operations import CLOSING, KEPT_OPERATIONS, STOP_ASKED, Operations
+from mastctl.operations.operations import KEPT_OPERATIONS, STOP_ASKED, Operations
 from mastctl.operations.records import Operation
 from mastctl.state.standing import Residual
+from mastctl.state.words import CLOSING
 
 
 class Mover:
@@ -48,6 +49,12 @@ def operations(mover: Mover) -> Operations:
     return Operations(mover, ManualClock(50.0))
 
 
+def word(operations: Operations) -> str:
+    """The state of a machine whose head was read at rest."""
+    operations._machine.head_read(False)
+    return operations._machine.standing.word
+
+
 def ended(operations: Operations, name: str) -> Operation:
     eventually(lambda: operations.get(name).state not in ("queued", "running"), "its end")
     return operations.get(name)
@@ -68,15 +75,15 @@ def test_a_stop_blocks_and_halts_before_it_ends_what_runs(operations: Operations
     name = operations.start({}, until_cancelled).id
     eventually(lambda: operations.get(name).steps, "its step")
     seen: list[Any] = []
-    mover.hook = lambda _: seen.append((dict(mover.blocks).values(), operations.motion.stopping))
+    mover.hook = lambda _: seen.append((dict(mover.blocks).values(), operations._machine.standing.word))
     assert operations.stop() == name
     assert mover.told[:2] == [("block", STOP_ASKED), ("stop", None)]
-    assert [(list(blocks), stopping) for blocks, stopping in seen[:1]] == [([STOP_ASKED], True)]
+    assert [(list(blocks), word) for blocks, word in seen[:1]] == [([STOP_ASKED], "stopping")]
     record = ended(operations, name)
     assert record.state == "stopped" and record.steps == ("it waits",)
     assert record.error is not None and STOP_ASKED in record.error["message"]
     assert mover.blocks == {}, "moves are taken again"
-    assert operations.motion.stopped and not operations.motion.stopping
+    assert word(operations) == "holding"
 
 
 def test_no_move_goes_out_between_a_stop_and_the_end_of_what_it_stopped(
@@ -91,12 +98,12 @@ def test_no_move_goes_out_between_a_stop_and_the_end_of_what_it_stopped(
     name = operations.start({}, slow).id
     operations.stop()
     assert list(mover.blocks.values()) == [STOP_ASKED]
-    assert operations.motion.stopping
+    assert word(operations) == "stopping"
     with pytest.raises(NotNow, match="is being stopped"):
         operations.start({}, slow)
     go.set()
     ended(operations, name)
-    assert mover.blocks == {} and not operations.motion.stopping
+    assert mover.blocks == {} and word(operations) == "holding"
 
 
 def test_a_stop_that_the_head_does_not_confirm_ends_what_runs_all_the_same(
@@ -111,32 +118,35 @@ def test_a_stop_that_the_head_does_not_confirm_ends_what_runs_all_the_same(
     with pytest.raises(NoReply):
         operations.stop()
     assert ended(operations, name).state == "stopped"
-    assert operations.motion.stopped and mover.blocks == {}
+    assert word(operations) == "holding" and mover.blocks == {}
 
 
 def test_nothing_starts_while_a_stop_is_held(operations: Operations, mover: Mover) -> None:
     with operations.held():
-        assert operations.motion.stopping and list(mover.blocks.values()) == [STOP_ASKED]
+        assert word(operations) == "stopping" and list(mover.blocks.values()) == [STOP_ASKED]
         with pytest.raises(NotNow, match="the mast is being stopped") as refused:
             operations.start({}, until_cancelled)
         assert refused.value.code == "stopping"
-    assert not operations.motion.stopping and mover.blocks == {}
+    assert word(operations) == "holding" and mover.blocks == {}
     assert operations.stop() is None, "nothing ran"
     assert operations.all() == []
 
 
 def test_one_operation_runs_at_a_time(operations: Operations) -> None:
     first = operations.start({"pan_rad": 0.1}, until_cancelled)
-    assert (operations.motion.operation, operations.motion.target) == (first.id, {"pan_rad": 0.1})
+    assert (operations.running, operations._machine.standing.target) == (
+        first.id,
+        {"pan_rad": 0.1},
+    )
     with pytest.raises(NotNow, match=f"operation {first.id} is running; wait for it or stop it") as busy:
         operations.start({}, until_cancelled)
     assert busy.value.code == "busy"
     operations.stop()
     ended(operations, first.id)
-    assert operations.motion.operation is None
+    assert operations.running is None
     second = operations.start({}, lambda record, cancelled: None)
     assert second.id != first.id and ended(operations, second.id).state == "done"
-    assert not operations.motion.stopped, "a start ends the word of the stop"
+    assert word(operations) == "ready", "a start ends the word of the stop"
 
 
 def test_what_fails_halts_the_head_and_says_why(operations: Operations, mover: Mover) -> None:
@@ -166,18 +176,18 @@ def test_what_is_done_leaves_the_head_alone_and_its_last_residual_behind(
     assert (told["created_s"], told["started_s"], told["ended_s"]) == (50.0, 50.0, 50.0)
     assert mover.told == []
     residual = Residual((0.25, -0.5), (0.1, 0.2), name)
-    assert operations.motion.residual == residual
+    assert operations._machine.standing.residual == residual
     for later in (pointed(), pointed(None), pointed([None, 1.0]), None):
         again = operations.start({}, lambda record, cancelled, later=later: later).id  # type: ignore[misc]
         assert ended(operations, again).state == "done"
-        assert operations.motion.residual == residual, "the last one measured"
+        assert operations._machine.standing.residual == residual, "the last one measured"
 
 
 def test_who_waits_for_the_end_is_told_when_the_next_may_start(operations: Operations) -> None:
     heard: list[tuple[str, str | None]] = []
 
     def on_end(operation: Operation) -> None:
-        heard.append((operation.state, operations.motion.operation))
+        heard.append((operation.state, operations.running))
         raise ZeroDivisionError
 
     name = operations.start({}, lambda record, cancelled: None, on_end).id
@@ -195,7 +205,7 @@ def test_closing_halts_the_head_and_ends_what_runs_and_nothing_starts_after_it(
     assert record.state == "stopped" and record.error is not None and CLOSING in record.error["message"]
     assert mover.told[:2] == [("block", CLOSING), ("stop", None)]
     assert mover.blocks == {operations: CLOSING}, "for good"
-    assert operations.closed
+    assert word(operations) == "closing"
     with pytest.raises(Unable, match=CLOSING):
         operations.start({}, until_cancelled)
     told = len(mover.told)
@@ -294,7 +304,7 @@ def test_a_deadline_after_the_end_stops_nothing(mover: Mover, operations: Operat
     operations.end_within(name, 0.0, 5.0)
     following = operations.start({}, until_cancelled).id
     operations.end_within(name, 0.0, 5.0)
-    assert operations.motion.operation == following
+    assert operations.running == following
     assert ("stop", None) not in mover.told
     operations.stop()
     ended(operations, following)
@@ -333,7 +343,7 @@ def test_a_stop_after_the_deadline_is_sent_all_the_same(mover: Mover, operations
     name = operations.start({}, slow_to_end).id
     operations.end_within(name, 0.0, 5.0)
     eventually(lambda: ("stop", None) in mover.told, "the deadline's stop")
-    assert operations.motion.stopping
+    assert word(operations) == "stopping"
     stops = mover.told.count(("stop", None))
     operations.stop()
     assert mover.told.count(("stop", None)) > stops

@@ -23,6 +23,7 @@ from mastctl.safety.latch import FILE, Estopped, Latch
 from mastctl.safety.state_file import StateFile
 from mastctl.safety.state_folder import StateFolder, StateInUse, usual_folder
 from mastctl.service import service as service_module
+from mastctl.state import machine as machine_module
 
 KEPT = CONFIG + "state: {{folder: state}}\n"
 
@@ -278,6 +279,7 @@ def test_an_operation_that_slips_in_while_it_is_latched_fails_at_the_gate(
 ) -> None:
     with fake_daemon(monkeypatch, tmp_path) as (daemon, hardware), Client(daemon.url) as client:
         monkeypatch.setattr(daemon.service, "_refuse_if_latched", lambda: None)
+        monkeypatch.setattr(machine_module, "refusal_of", lambda now, need: None)
         client.estop()
         record = client.wait(client.point(pan_rad=0.1, tilt_rad=0.1))
         assert (record["state"], record["error"]["code"]) == ("failed", "estopped")
@@ -334,7 +336,7 @@ def test_a_reset_waits_for_a_stop_that_is_under_way(monkeypatch: pytest.MonkeyPa
             assert refused.value.code == "stopping"
             hang.let_go()
             stopping.join(BOUND_S)
-        eventually(lambda: not daemon.service.operations.stopping, "the stop's end")
+        eventually(lambda: not daemon.service.machine.standing.stops, "the stop's end")
         client.reset(reason="x", name="y")
 
 

@@ -59,7 +59,7 @@ def a_run(seed: int, pause_s: float) -> tuple[str, list[np.ndarray[Any, Any]]]:
             request = PointRequest(PixelTarget("navcam_left", frame.frame_id, u_px, v_px))
             told.append(ended(service, service.point(request, {"pixel": [u_px, v_px]}).id))
             time.sleep(pause_s)
-        told.append(service.state().told(service.head))
+        told.append(service.state().told())
     return json.dumps(told, sort_keys=True), pictures
 
 

@@ -5,15 +5,13 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-import pytest
 
 from drivers.interfaces import Reading
 from mastctl.devices.frames import StampedFrame
 from mastctl.devices.limits import Limits
-from mastctl.operations.records import Motion
 from mastctl.service.state import State
 from mastctl.state.faults import StandingFault
-from mastctl.state.standing import Residual
+from mastctl.state.standing import Latched, Residual, Standing
 from mastctl.tracking.status import TrackStatus
 
 REST = State(
@@ -26,7 +24,7 @@ REST = State(
     limits=Limits((-2.0, 2.0), (-1.0, 1.0), 0.5),
     reading=Reading(0.1, -0.2, False, 99.75),
     frames={"navcam_left": None},
-    motion=Motion(),
+    standing=Standing("ready", "", 90.0),
     track=TrackStatus(),
     faults=(),
 )
@@ -35,27 +33,8 @@ OF_THE_HEAD = StandingFault("head", "no_reply", "the head is silent", 98.5, "it 
 OF_A_CAMERA = replace(OF_THE_HEAD, device="navcam_left")
 
 
-@pytest.mark.parametrize(
-    ("change", "word"),
-    [
-        ({}, "idle"),
-        ({"reading": None}, "fault"),
-        ({"faults": (OF_THE_HEAD,)}, "fault"),
-        ({"faults": (OF_A_CAMERA,)}, "idle"),
-        ({"reading": MOVING}, "moving"),
-        ({"reading": MOVING, "motion": Motion(operation="1")}, "pointing"),
-        ({"reading": MOVING, "motion": Motion(operation="1", stopping=True)}, "stopping"),
-        ({"motion": Motion(stopped=True, stopping=True), "faults": (OF_THE_HEAD,)}, "fault"),
-        ({"reading": MOVING, "motion": Motion(stopped=True)}, "moving"),
-        ({"motion": Motion(stopped=True)}, "stopped"),
-    ],
-)
-def test_the_word_is_that_of_the_gravest_thing(change: dict[str, object], word: str) -> None:
-    assert replace(REST, **change).told("head")["state"] == word  # type: ignore[arg-type]
-
-
 def test_moving_is_what_the_head_said_last() -> None:
-    assert [replace(REST, reading=one).told("head")["moving"] for one in (None, REST.reading, MOVING)] == [
+    assert [replace(REST, reading=one).told()["moving"] for one in (None, REST.reading, MOVING)] == [
         False, False, True,
     ]  # fmt: skip
 
@@ -66,23 +45,29 @@ def test_ages_count_to_the_moment_of_the_snapshot_and_are_never_below_zero() -> 
     )
     state = replace(REST, frames={"navcam_left": frame}, faults=(OF_A_CAMERA,))
     for later_s, ages_s in ((0.0, (0.25, 0.5, 1.5, 60.0)), (-5.0, (0.0, 0.0, 0.0, 55.0))):
-        told = replace(state, now_s=100.0 + later_s).told("head")
+        told = replace(state, now_s=100.0 + later_s).told()
         camera, fault = told["cameras"]["navcam_left"], told["faults"][0]
         assert (told["joints"]["age_s"], camera["age_s"], fault["for_s"], told["uptime_s"]) == ages_s
     assert (camera["frame_id"], camera["sequence"], camera["exposure_s"]) == ("id", 7, 0.01)
 
 
 def test_what_is_not_known_yet_is_null() -> None:
-    told = replace(REST, reading=None).told("head")
+    told = replace(REST, reading=None).told()
     names = ("joints", "operation", "target", "last_residual", "pose", "former_mast")
     assert [told[name] for name in names] == [None] * len(names)
     assert set(told["cameras"]["navcam_left"].values()) == {None}
 
 
 def test_what_is_known_is_told() -> None:
-    motion = Motion("3", {"pan_rad": 0.5}, Residual((0.25, -0.5), (0.1, 0.2), "2"))
-    told = replace(REST, motion=motion, hardware="simulated", former_mast={"file": "b.yaml"}).told("head")
-    assert told["simulated"] and not REST.told("head")["simulated"]
+    residual = Residual((0.25, -0.5), (0.1, 0.2), "2")
+    standing = Standing(
+        "stopped", "why", 97.5, operation="3", target={"pan_rad": 0.5}, residual=residual,
+        latch=Latched("Ana", "a hand", "2026-01-02T03:04:05Z"),
+    )  # fmt: skip
+    told = replace(REST, standing=standing, hardware="simulated", former_mast={"file": "b.yaml"}).told()
+    assert (told["state"], told["reason"], told["state_for_s"]) == ("stopped", "why", 2.5)
+    assert told["estop"] == {"name": "Ana", "reason": "a hand", "at": "2026-01-02T03:04:05Z"}
+    assert told["simulated"] and not REST.told()["simulated"]
     assert (told["operation"], told["target"], told["former_mast"]) == (
         "3",
         {"pan_rad": 0.5},

@@ -25,6 +25,7 @@ from mastctl.operations.operations import Operations
 from mastctl.operations.records import Operation
 from mastctl.pointing.loop import PointingLoop
 from mastctl.safety import stop_threads as stop_threads_module
+from mastctl.tracking import tracker as tracker_module
 from mastctl.web import commands as commands_module
 
 
@@ -105,7 +106,8 @@ def test_a_lock_of_the_bookkeeping_does_not_keep_a_stop_from_the_head(
         service = daemon.service
         for lock in (
             service._mast_lock, service.operations._lock, service.tracker._lock, service.handoffs._lock,
-            service.devices._store._lock,
+            service.devices._store._lock, service.machine._turns._lock,
+            service.machine.publisher._turns._lock,
         ):  # fmt: skip
             hardware.head.calls.clear()
             with lock, contextlib.suppress(ClientError), Client(daemon.url, timeout_s=1.0) as client:
@@ -230,7 +232,7 @@ def test_nothing_starts_and_nothing_moves_while_a_stop_is_under_way(
         assert refused.value.code == "stopping"
         hang.let_go()
         stopping.join()
-        assert client.status()["state"] == "stopped"
+        assert client.status()["state"] == "holding"
         assert client.wait(client.point(pan_rad=0.1, tilt_rad=0.1))["state"] == "done"
 
 
@@ -257,7 +259,7 @@ def test_an_operation_that_ends_while_the_head_is_being_stopped_was_stopped_by_t
 
     def until_it_has_ended() -> None:
         go.set()
-        eventually(lambda: operations.motion.operation is None, "the operation's end", BOUND_S)
+        eventually(lambda: operations.running is None, "the operation's end", BOUND_S)
 
     operations = Operations(ScriptedMover(until_it_has_ended), SystemClock())
     name = operations.start({}, refused).id
@@ -271,7 +273,7 @@ def test_an_operation_that_was_done_before_its_stop_is_not_told_as_stopped() -> 
 
     def until_it_has_ended() -> None:
         go.set()
-        eventually(lambda: operations.motion.operation is None, "the operation's end", BOUND_S)
+        eventually(lambda: operations.running is None, "the operation's end", BOUND_S)
 
     operations = Operations(ScriptedMover(until_it_has_ended), SystemClock())
     name = operations.start({}, lambda record, cancelled: go.wait(BOUND_S)).id
@@ -297,7 +299,7 @@ def test_whoever_sees_a_record_that_has_ended_sees_no_operation_running() -> Non
     def keep_and_look(operation: Operation) -> None:
         keep(operation)
         if operation.ended_s is not None:
-            seen.append(operations.motion.operation)
+            seen.append(operations.running)
 
     operations._keep = keep_and_look  # type: ignore[method-assign]
     operations.start({}, lambda record, cancelled: None)
@@ -326,7 +328,7 @@ def test_a_stop_ends_a_pointing_that_waits_for_a_picture(
         # The picture would be waited for 5 s and more; the hanging camera is still at it.
         eventually(lambda: client.operation(operation)["state"] == "stopped", "the end", within_s=2.5)
         assert client.operation(operation)["error"]["message"] == "a stop was asked for"
-        assert client.status()["state"] == "stopped"
+        assert client.status()["state"] == "holding"
         assert client.wait(client.point(pan_rad=0.1, tilt_rad=0.1))["state"] == "done"
         hang.let_go()
 
@@ -344,14 +346,14 @@ def test_a_stop_that_an_operation_has_not_heeded_yet_is_told_as_stopping(
         monkeypatch.setattr(ScriptedLoop, "script", staticmethod(deaf))
         client.point(pan_rad=0.1, tilt_rad=0.1)
         assert entered.wait(BOUND_S)
-        assert client.status()["state"] == "pointing"
+        assert client.status()["state"] == "moving"
         client.stop()
         assert client.status()["state"] == "stopping"
         with pytest.raises(ClientError, match="is being stopped") as refused:
             client.point(pan_rad=0.1, tilt_rad=0.1)
-        assert refused.value.code == "busy"
+        assert refused.value.code == "stopping"
         leave.set()
-        eventually(lambda: client.status()["state"] == "stopped", "the end")
+        eventually(lambda: client.status()["state"] == "holding", "the end")
 
 
 def test_a_defect_at_the_end_of_a_look_ends_the_track_instead_of_keeping_it_busy(
@@ -361,7 +363,7 @@ def test_a_defect_at_the_end_of_a_look_ends_the_track_instead_of_keeping_it_busy
         raise ValueError("a defect")
 
     with fake_daemon(monkeypatch, tmp_path) as (daemon, _), Client(daemon.url) as client:
-        monkeypatch.setattr(daemon.service.tracker, "_started", fail)
+        monkeypatch.setattr(tracker_module, "started", fail)
         frame_id = client.snapshot("navcam_left").frame_id
         client.start_track(pixel=("navcam_left", frame_id, 30.0, 20.0))
         eventually(lambda: client.track()["state"] == "stopped", "the end of the track")

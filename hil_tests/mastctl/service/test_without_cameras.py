@@ -77,7 +77,7 @@ def outcome(daemon: RunningDaemon, command: str, body: dict[str, object]) -> dic
 
 def test_a_head_without_cameras_is_moved_by_angles(bare: RunningDaemon) -> None:
     status = httpx.get(f"{bare.url}/api/v1/status").json()
-    assert status["state"] == "idle" and not status["cameras"] and status["faults"] == []
+    assert status["state"] == "ready" and not status["cameras"] and status["faults"] == []
     assert outcome(bare, "point", ANGLES) == {}
     assert httpx.get(f"{bare.url}/api/v1/status").json()["joints"]["pan_rad"] == 0.3
 

@@ -19,11 +19,11 @@ from mastctl.errors import MastctlError, NotNow, Unable
 from mastctl.state.faults import StandingFault
 from mastctl.state.machine import Machine
 from mastctl.state.publisher import Publisher, Topic
-from mastctl.state.standing import Latch, Residual, Standing, Word
+from mastctl.state.standing import Latched, Residual, Standing, Word
 from mastctl.state.table import CHOICES, EVENTS, HAPPENS, MEANINGS, TABLE, WORDS, leads_to
 
 BOUND_S = 30.0
-LATCH = Latch("Ana", "a hand in the way", "2026-01-02T03:04:05Z")
+LATCH = Latched("Ana", "a hand in the way", "2026-01-02T03:04:05Z")
 SILENT = StandingFault("pan_tilt", "no_reply", "the head is silent", 3.0, "it answers")
 HOT = StandingFault("pan_tilt", "device_fault", "the tilt motor is hot", 4.0, "it has cooled")
 
@@ -52,6 +52,13 @@ def latched(machine: Machine) -> None:
     machine.stop_ended()
 
 
+def asked_reset(machine: Machine, name: str) -> None:
+    refusal = machine.refusal("latch")
+    if refusal is not None:
+        raise refusal
+    machine.reset(name, "it is gone")
+
+
 # The way into each state, by what is told on it alone.
 INTO: dict[Word, Callable[[Machine], Any]] = {
     "starting": lambda machine: None,
@@ -74,7 +81,7 @@ TELL: dict[str, Callable[[Machine], Any]] = {
     "stop_asked": lambda machine: machine.stop_asked(),
     "stop_ended": lambda machine: machine.stop_ended(),
     "estop_asked": lambda machine: machine.estop_asked(LATCH),
-    "reset": lambda machine: machine.reset("Ana", "it is gone"),
+    "reset": lambda machine: asked_reset(machine, "Ana"),
     "fault_stands": lambda machine: machine.head_faults((HOT,)),
     "fault_cleared": lambda machine: machine.head_faults(()),
     "closing": lambda machine: machine.closing(),
@@ -193,6 +200,8 @@ def test_a_fault_whose_words_only_grow_older_is_told_once() -> None:
     machine.head_faults((replace(SILENT, message="the head has been silent for 2 s"),))
     assert len(heard.standings) == count
     machine.head_faults((replace(SILENT, since_s=9.0),))
+    assert len(heard.standings) == count
+    machine.head_faults((replace(SILENT, message="another", since_s=9.0),))
     assert len(heard.standings) == count + 1
 
 
@@ -251,7 +260,7 @@ def test_a_latch_from_before_holds_from_the_first_moment_and_the_first_one_stays
     machine.head_read(False)
     assert machine.standing.word == "stopped"
     machine.stop_asked()
-    machine.estop_asked(Latch("Ben", "again", ""))
+    machine.estop_asked(Latched("Ben", "again", ""))
     machine.stop_ended()
     assert machine.standing.latch == LATCH
     machine.reset("Ben", "checked")
@@ -344,7 +353,7 @@ class Storm:
             machine.stop_ended()
             if latches or chance.random() < 0.5:
                 try:
-                    machine.reset(name, "again")
+                    asked_reset(machine, name)
                 except MastctlError as refusal:
                     self.refused.append(refusal)
 

@@ -82,7 +82,7 @@ def test_status_tells_what_the_contract_asks(
     eventually(lambda: daemon.service.devices.read().pan_rad == 0.5, "a reading")
     web.get("/snapshot/navcam_left")
     status = web.get("/status").json()
-    assert status["state"] == "idle"
+    assert status["state"] == "ready"
     assert (status["simulated"], status["hardware"]) == (False, "real")
     assert status["joints"]["pan_rad"] == 0.5
     assert 0.0 <= status["joints"]["age_s"] < 5.0
@@ -112,7 +112,7 @@ def test_a_head_that_fails_shows_as_fault_in_plain_words(web: httpx.Client, hard
     assert (fault["device"], fault["code"]) == ("pan_tilt", "no_reply")
     assert fault["message"] == "pan_tilt: no answer on the bus"
     hardware.head.hook = lambda name: None
-    eventually(lambda: web.get("/status").json()["state"] == "idle", "recovery")
+    eventually(lambda: web.get("/status").json()["state"] == "holding", "recovery")
 
 
 # Point
@@ -172,7 +172,7 @@ def test_a_second_operation_is_refused_naming_the_first(
     monkeypatch.setattr(ScriptedLoop, "script", staticmethod(lambda *any: hang()))
     first = web.post("/point", json=ANGLES).json()["id"]
     assert hang.entered.wait(5.0)
-    assert web.get("/status").json()["state"] == "pointing"
+    assert web.get("/status").json()["state"] == "moving"
     assert first in refused(web.post("/point", json=ANGLES), 409, "busy")
     hang.let_go()
     assert ended(web, first)["state"] == "done"
@@ -489,7 +489,7 @@ def test_stop_ends_the_operation_and_lets_no_later_move_out(
     assert record["error"]["code"] == "stopped"
     assert [call[:3] for call in hardware.head.calls if call[0] == "move"] == [("move", 0.1, 0.1)]
     assert hardware.head.calls[-1] == ("stop",)
-    assert web.get("/status").json()["state"] == "stopped"
+    assert web.get("/status").json()["state"] == "holding"
     monkeypatch.setattr(ScriptedLoop, "script", staticmethod(ScriptedLoop.good))
     assert ended(web, web.post("/point", json=ANGLES).json()["id"])["state"] == "done"
 
@@ -589,7 +589,7 @@ def test_a_camera_that_fails_is_a_gateway_error_in_plain_words(
 
     hardware.fake_cameras["navcam_left"].hook = fail
     refused(web.get("/snapshot/navcam_left?fresh=true"), 502, "driver_error")
-    assert web.get("/status").json()["state"] == "idle"
+    assert web.get("/status").json()["state"] == "ready"
     assert web.get("/status").json()["faults"][0]["device"] == "navcam_left"
 
 

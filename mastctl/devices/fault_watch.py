@@ -1,0 +1,81 @@
+"""What is wrong with the devices, told when it changes: also when nothing happens but that time passes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+from drivers.clock import Clock
+from mastctl.state.faults import StandingFault, same_faults
+from mastctl.state.in_turn import InTurn
+from mastctl.state.machine import Machine
+
+ENDS_S = 1.0
+LOOK_S = 0.1  # a call is overdue by the clock alone; so late it may be told
+
+
+class FaultWatch:
+    """Tells the machine what is wrong with the head, and publishes what is wrong with each device.
+
+    Parameters
+    ----------
+    faults
+        Returns what is wrong with any device now; must not wait.
+    head
+        The name under which the head's faults stand.
+    machine
+        Is told of the head's; its publisher gets them all, as ``("fault", device, tuple)``.
+    clock
+        What the looks run on.
+    """
+
+    def __init__(
+        self, faults: Callable[[], Sequence[StandingFault]], head: str, machine: Machine, clock: Clock
+    ) -> None:
+        self._faults = faults
+        self._head = head
+        self._machine = machine
+        self._told: dict[str, tuple[StandingFault, ...]] = {}
+        self._turns = InTurn[None](self._compare)
+        self._changed = clock.signal()
+        self._begun = self._closed = False
+        self._thread = clock.thread(self._work, "faults")
+
+    def begin(self) -> None:
+        """Look from now on: ``faults`` can be asked."""
+        self._begun = True
+        self._thread.start()
+
+    def look(self) -> None:
+        """Tell what has changed; waits for nobody."""
+        if self._begun:
+            self._turns.bring(None)
+
+    def close(self) -> None:
+        """Look once more, and end the thread."""
+        self.look()
+        with self._changed:
+            self._closed = True
+            self._changed.notify_all()
+        self._thread.join(ENDS_S)
+
+    def _work(self) -> None:
+        while True:
+            with self._changed:
+                if not self._closed:
+                    self._changed.wait(LOOK_S, idle=True)
+                if self._closed:
+                    return
+            self.look()
+
+    def _compare(self, _: None) -> None:
+        by_device: dict[str, list[StandingFault]] = {}
+        for fault in self._faults():
+            by_device.setdefault(fault.device, []).append(fault)
+        for device in {*self._told, *by_device}:
+            now = tuple(by_device.get(device, ()))
+            if same_faults(now, self._told.get(device, ())):
+                continue
+            self._told[device] = now
+            self._machine.publisher.publish("fault", device, now)
+            if device == self._head:
+                self._machine.head_faults(now)
