@@ -80,8 +80,10 @@ def arrows() -> Iterator[tuple[Word | None, Word, tuple[Event, ...]]]:
             for to in leads_to(word, event):
                 common[event, to] = common.get((event, to), 0) + (to != word)
     framed = {pair for pair, count in common.items() if count == len(GROUP)}
-    for to in dict.fromkeys(to for _, to in framed):
-        yield None, to, tuple(event for event in EVENTS if (event, to) in framed)
+    for to in WORDS:
+        events = tuple(event for event in EVENTS if (event, to) in framed)
+        if events:
+            yield None, to, events
     for word in WORDS:
         for to in WORDS:
             events = tuple(
