@@ -11,7 +11,7 @@ from typing import Annotated, Any, Literal
 from pydantic import BaseModel, ConfigDict, Field
 
 from mastctl.commands.caller import Role
-from mastctl.service.state import StateWord
+from mastctl.state.standing import Word
 from mastctl.tracking.status import TrackState
 
 Pixel = Annotated[list[float], Field(min_length=2, max_length=2)]
@@ -161,7 +161,9 @@ class EstopHeld(_Told):
 class Status(_Told):
     """``GET /status``."""
 
-    state: StateWord
+    state: Word
+    reason: str
+    state_for_s: Seconds
     simulated: bool
     hardware: str
     moving: bool
