@@ -389,11 +389,11 @@ class Client:
         body |= {"half_angle_rad": half_angle_rad, "frame": frame}
         if valid_s is not None:
             body["valid_s"] = valid_s
-        return self._daemon.json("POST", "/limits/sun", json=body)
+        return self._daemon.command("POST", "/limits/sun", body)
 
     def forget_sun(self) -> dict[str, Any]:
         """Keep the head off no sun any more."""
-        return self._daemon.json("DELETE", "/limits/sun")
+        return self._daemon.command("DELETE", "/limits/sun")
 
     def session(self) -> dict[str, Any]:
         """Return who asks: ``name``, ``role``, ``via``, and whether the daemon asks for a token at all."""

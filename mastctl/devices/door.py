@@ -81,7 +81,8 @@ class Door:
             (axis.acceleration_rad_per_s2 for axis in stated.values()), default=assumed
         )
         still = AxisMotion(assumed)
-        self._beyond = tuple(stated.get(axis, still).beyond_goal_rad for axis in ("pan", "tilt"))
+        pan, tilt = (stated.get(axis, still).beyond_goal_rad for axis in ("pan", "tilt"))
+        self._beyond = pan, tilt
         self._lock = threading.Lock()
         self._rig = rig
         self._sun = sun
@@ -271,7 +272,7 @@ class Door:
     def _renew(self) -> None:
         """Make the boxes anew; the lock is held."""
         limits, sun = self.limits, self._sun
-        slack = limits.margin_rad + self._beyond[0], limits.margin_rad + self._beyond[1]
+        slack = limits.margin_rad + self._beyond[1]
         # A copy of each box for every turn that the pan reaches, and for where a hand may have pushed it.
         reach = limits.pan_rad[0] - np.pi, limits.pan_rad[1] + np.pi
         made = []
@@ -280,11 +281,11 @@ class Door:
         if sun is not None and self._rig is not None:
             direction = np.array(sun.direction)
             in_rover = direction if sun.frame == "rover" else self._rover_from_site @ direction
-            tilts = limits.tilt_rad[0] - slack[1], limits.tilt_rad[1] + slack[1]
+            tilts = limits.tilt_rad[0] - slack, limits.tilt_rad[1] + slack
             rows = sun_boxes(self._rig, in_rover, sun.half_angle_rad, tilts)
             with_sun += [copy for box in rows for copy in box.within(reach)]
         for boxes in (plain, with_sun):
-            whole = KeepOuts(tuple(boxes), slack, limits.pan_rad, limits.tilt_rad)
+            whole = KeepOuts(tuple(boxes), limits.margin_rad, self._beyond, limits.pan_rad, limits.tilt_rad)
             made.append(whole if boxes else None)
         self._boxes = made[0], made[1]
 

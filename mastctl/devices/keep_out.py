@@ -1,10 +1,10 @@
 """Where the head must not be: boxes in pan and tilt, and whether a move could enter one.
 
 The two axes of a head turn each at its own pace, so between its start and its goal it may be anywhere in the
-rectangle that both span: a move is free if this whole rectangle is. Around each box lies a slack, per axis,
-that no goal is in: what a head may overshoot, and how far it passes a goal on purpose to come back to it from
-one side. A box itself is open: its edge may be touched. Pan angles a whole turn apart show the same place, so
-a box is there once a turn.
+rectangle that both span, and beyond its goal by as much as it passes it on purpose to come back to it from
+one side. A move is free if all this keeps the margin of every box: what a head overshoots. A box itself is
+open: its edge may be touched. Pan angles a whole turn apart show the same place, so a box is there once a
+turn.
 """
 
 from __future__ import annotations
@@ -78,6 +78,11 @@ class Span:
         )
         return Span(pan, tilt) if pan[0] <= pan[1] and tilt[0] <= tilt[1] else None
 
+    def gap(self, other: Span) -> float:
+        """Return how far apart two are: the larger of pan's and tilt's distance, negative if they overlap."""
+        pairs = (self.pan_rad, other.pan_rad), (self.tilt_rad, other.tilt_rad)
+        return max(max(theirs[0] - mine[1], mine[0] - theirs[1]) for mine, theirs in pairs)
+
     def enters(self, open_box: Span) -> bool:
         """Return whether any of it lies inside another one, whose edge does not count."""
         return all(
@@ -117,34 +122,42 @@ class Box:
 
 @dataclass(frozen=True)
 class KeepOuts:
-    """All boxes of a moment, with the slack around them.
+    """All boxes of a moment, and the room around them.
 
     Attributes
     ----------
     boxes
         Copies over the whole range of pan included.
-    slack_rad
-        Around each, in pan and in tilt.
+    margin_rad
+        Around each.
+    beyond_rad
+        How far the head may pass a goal on purpose, in pan and in tilt.
     pan_rad, tilt_rad
         The joint limits: ways out of a box end within them.
     """
 
     boxes: tuple[Box, ...]
-    slack_rad: Pair
+    margin_rad: float
+    beyond_rad: Pair
     pan_rad: Pair
     tilt_rad: Pair
 
+    @property
+    def slack_rad(self) -> Pair:
+        """What no goal is nearer than, in pan and in tilt."""
+        return self.margin_rad + self.beyond_rad[0], self.margin_rad + self.beyond_rad[1]
+
     @cached_property
     def full(self) -> tuple[Span, ...]:
-        """Every box with its slack."""
+        """Every box with the room that goals keep."""
         return tuple(box.span.grown(*self.slack_rad) for box in self.boxes)
 
     def holding(self, place: Span) -> list[Box]:
-        """Return the boxes that a place reaches into, their slack left aside."""
+        """Return the boxes that a place reaches into, their margin left aside."""
         return [box for box in self.boxes if place.enters(box.span)]
 
     def check_goal(self, goal: Pair) -> None:
-        """Pass a goal that lies in no box and no slack. Raises KeptOut."""
+        """Pass a goal that lies in no box nor too near to one. Raises KeptOut."""
         point = Span.around(goal)
         for box, full in zip(self.boxes, self.full, strict=True):
             if point.enters(full):
@@ -152,16 +165,18 @@ class KeepOuts:
                 raise KeptOut(box.name, f"{_told(goal)} is {where} the {box.told()}{self._slack_told()}")
 
     def near(self, start: Span) -> tuple[Span, ...]:
-        """Return every box with as much of its slack as a start leaves: nearer than it is, nothing may go."""
-        return tuple(
-            box.span.grown(*(share * slack for slack in self.slack_rad))
-            for box, share in ((box, self._share(start, box)) for box in self.boxes)
-        )
+        """Return every box with as much of its margin as a start leaves: nearer than it is, nothing goes."""
+        rooms = [min(self.margin_rad, max(0.0, start.gap(box.span))) for box in self.boxes]
+        return tuple(box.span.grown(room, room) for box, room in zip(self.boxes, rooms, strict=True))
+
+    def reach(self, start: Span, goal: Pair) -> Span:
+        """Return all that a move from anywhere in ``start`` to a goal may pass."""
+        return Span.around(*start.corners, *Span.around(goal).grown(*self.beyond_rad).corners)
 
     def check_move(self, start: Span, goal: Pair, rests: bool) -> None:
         """Pass a move from anywhere in ``start`` to a goal.
 
-        A head in the slack of a box may go where that is not nearer. One in a box itself may leave it the
+        A head in the margin of a box may go where that is not nearer. One in a box itself may leave it the
         shortest way along one axis, from rest.
 
         Raises
@@ -174,7 +189,7 @@ class KeepOuts:
         if inside:
             self._check_way_out(start, goal, rests, inside[0])
             return
-        way = Span.around(*start.corners, goal)
+        way = self.reach(start, goal)
         for box, near in zip(self.boxes, self.near(start), strict=True):
             if way.enters(near):
                 raise KeptOut(
@@ -198,7 +213,7 @@ class KeepOuts:
         return min(found)[1] if found else None
 
     def _end_along(self, here: Pair, axis: int, side: int, names: set[str]) -> Pair | None:
-        """The first place in one direction that is in no box and no slack; None if another keep-out comes."""
+        """The first place in one direction where a goal may be; None if another keep-out comes before."""
         end = here
         for _ in range(2 * len(self.boxes) + 1):
             point = Span.around(end)
@@ -231,17 +246,6 @@ class KeepOuts:
             or any(rest.enters(full) for full in self.full)
         ):
             raise KeptOut(box.name, f"{words}; the one move that is taken from there is out, to {_told(end)}")
-
-    def _share(self, start: Span, box: Box) -> float:
-        """How much of a box's slack a start leaves free, 0 to 1; 0 also inside."""
-        share = 0.0
-        pairs = ((start.pan_rad, box.pan_rad), (start.tilt_rad, box.tilt_rad))
-        for (mine, theirs), slack in zip(pairs, self.slack_rad, strict=True):
-            gap = max(theirs[0] - mine[1], mine[0] - theirs[1])
-            if gap >= slack:
-                return 1.0
-            share = max(share, gap / slack if slack > 0.0 else 0.0)
-        return share
 
     def _slack_told(self) -> str:
         pan, tilt = self.slack_rad

@@ -1,22 +1,25 @@
 """A way round the keep-outs: moves one after the other, each free over its whole rectangle.
 
 Corners lie where edges of boxes, start and goal cross. Along such lines there is a way if there is one at
-all: any way of free rectangles can be pushed against the edges without entering a box.
+all: any way of free rectangles can be pushed against the edges without entering a box. Corners keep a little
+more room than they must, since a head rests a little off them; where that leaves no way, what they must.
 """
 
 from __future__ import annotations
 
 import heapq
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mastctl.devices.keep_out import KeepOuts, NoWay, Pair, Span
+from mastctl.devices.keep_out import TOUCH_RAD, KeepOuts, NoWay, Pair, Span
 
 CORNER_S = 0.6  # what a corner costs beside the way: braking, dwelling until rest is known, starting again
+OFF_RAD = 6e-3  # how far off a corner a head may rest: as far as an arrival is let pass
 MOST_CORNERS = 100  # of a way; more would be a defect
 
 Flags = NDArray[np.bool_]
@@ -44,7 +47,7 @@ def plan(keep_outs: KeepOuts, here: Pair, goal: Pair, speed_rad_per_s: float) ->
     Parameters
     ----------
     keep_outs
-        Boxes, slack and joint limits.
+        Boxes, the room around them and joint limits.
     here, goal
         (pan, tilt), radians.
     speed_rad_per_s
@@ -67,7 +70,9 @@ def plan(keep_outs: KeepOuts, here: Pair, goal: Pair, speed_rad_per_s: float) ->
             raise NoWay(f"{words}; turn it by hand")
         legs.append(out)
         start = out
-    way = _fastest(_Grid(keep_outs, start, goal), speed_rad_per_s)
+    way = None
+    for more_rad in (OFF_RAD, 0.0):
+        way = way or _fastest(_Grid(keep_outs, start, goal, more_rad), speed_rad_per_s)
     if way is None:
         names = ", ".join(sorted({box.name for box in keep_outs.boxes}))
         raise NoWay(
@@ -90,16 +95,20 @@ def duration_s(here: Pair, goals: tuple[Pair, ...], speed_rad_per_s: float) -> f
 class _Grid:
     """The plane cut along every edge: lines at even, the cells between them at odd numbers."""
 
-    def __init__(self, keep_outs: KeepOuts, start: Pair, goal: Pair) -> None:
-        near = keep_outs.near(Span.around(start))
-        spans = (*keep_outs.full, *near)
+    def __init__(self, keep_outs: KeepOuts, start: Pair, goal: Pair, more_rad: float) -> None:
+        self._keep_outs = keep_outs
+        self._from = Span.around(start)
+        spans = [
+            full.grown(more, more)
+            for full in keep_outs.full
+            for more in [min(more_rad, max(0.0, Span.around(goal).gap(full)))]
+        ]
         self.pans = _lines([s.pan_rad for s in spans], keep_outs.pan_rad, start[0], goal[0])
         self.tilts = _lines([s.tilt_rad for s in spans], keep_outs.tilt_rad, start[1], goal[1])
         self.start = _index(self.pans, start[0]), _index(self.tilts, start[1])
         self.goal = _index(self.pans, goal[0]), _index(self.tilts, goal[1])
-        full = self._taken(keep_outs.full)
+        full = self._taken(spans)
         self._sums = _summed(full)
-        self._sums_at_start = _summed(self._taken(near))
         inside = [
             (lines >= low - 1e-12) & (lines <= high + 1e-12)
             for lines, (low, high) in ((self.pans, keep_outs.pan_rad), (self.tilts, keep_outs.tilt_rad))
@@ -108,7 +117,9 @@ class _Grid:
 
     def reached(self, node: tuple[int, int], first: bool) -> Flags:
         """Which corners one move leads to, as flags over all of them."""
-        sums = self._sums_at_start if first else self._sums
+        if first:
+            return self._reached_at_once() & self.stand
+        sums = self._sums
         bounds = []
         for here, lines in zip(node, (self.pans, self.tilts), strict=True):
             others = np.arange(len(lines))
@@ -118,7 +129,23 @@ class _Grid:
         reached: Flags = (taken == 0) & self.stand
         return reached
 
-    def _taken(self, spans: tuple[Span, ...]) -> Flags:
+    def _reached_at_once(self) -> Flags:
+        """Which corners the first move leads to, judged as the door will."""
+        free = np.ones((len(self.pans), len(self.tilts)), dtype=bool)
+        beyond = self._keep_outs.beyond_rad
+        pan, tilt = (
+            (np.minimum(here[0], lines - past), np.maximum(here[1], lines + past))
+            for here, lines, past in zip(
+                (self._from.pan_rad, self._from.tilt_rad), (self.pans, self.tilts), beyond, strict=True
+            )
+        )
+        for box in self._keep_outs.near(self._from):
+            across = (pan[0] < box.pan_rad[1] - TOUCH_RAD) & (pan[1] > box.pan_rad[0] + TOUCH_RAD)
+            along = (tilt[0] < box.tilt_rad[1] - TOUCH_RAD) & (tilt[1] > box.tilt_rad[0] + TOUCH_RAD)
+            free &= ~(across[:, None] & along[None, :])
+        return free
+
+    def _taken(self, spans: Sequence[Span]) -> Flags:
         """Which lines, cells and crossings lie inside a box."""
         taken = np.zeros((2 * len(self.pans) - 1, 2 * len(self.tilts) - 1), dtype=bool)
         for span in spans:

@@ -11,7 +11,7 @@ import pytest
 from scipy.ndimage import label
 
 from mastctl.devices.keep_out import Box, KeepOuts, KeptOut, NoWay, Pair, Span
-from mastctl.devices.ways import CORNER_S, plan
+from mastctl.devices.ways import CORNER_S, OFF_RAD, plan
 
 PAN, TILT = (-2.5, 2.5), (-1.2, 0.6)
 MARGIN = 0.02
@@ -19,9 +19,11 @@ DECK = Box("deck", (-1.0, 1.0), (-1.2, -0.8))
 ANTENNA = Box("antenna", (1.4, 1.6), (-0.6, 0.2))
 
 
-def kept(*boxes: Box, slack: Pair = (MARGIN, MARGIN), pan: Pair = PAN, tilt: Pair = TILT) -> KeepOuts:
+def kept(
+    *boxes: Box, margin: float = MARGIN, beyond: Pair = (0.0, 0.0), pan: Pair = PAN, tilt: Pair = TILT
+) -> KeepOuts:
     copies = tuple(copy for box in boxes for copy in box.within((pan[0] - math.pi, pan[1] + math.pi)))
-    return KeepOuts(copies, slack, pan, tilt)
+    return KeepOuts(copies, margin, beyond, pan, tilt)
 
 
 def allowed(keep_outs: KeepOuts, start: Pair, goal: Pair, rests: bool = True) -> bool:
@@ -105,7 +107,7 @@ def test_a_plan_leads_round_by_corners_that_the_door_lets_through() -> None:
     way = plan(keep_outs, (-1.5, -1.0), (1.3, -1.0), 0.5)
     assert len(way.goals) == 3
     assert way.goals[-1] == (1.3, -1.0)
-    assert all(goal[1] >= -0.8 + MARGIN - 1e-9 for goal in way.goals[:-1])
+    assert all(goal[1] >= -0.8 + MARGIN + OFF_RAD - 1e-9 for goal in way.goals[:-1])
     assert way.time_s == pytest.approx(
         sum(max(abs(b[0] - a[0]), abs(b[1] - a[1])) for a, b in zip(((-1.5, -1.0), *way.goals), way.goals,
                                                                  strict=False)) / 0.5 + 2 * CORNER_S
@@ -137,7 +139,9 @@ def worlds(seed: int, count: int) -> Iterator[tuple[int, KeepOuts, Pair, Pair]]:
             tilt = rng.uniform(-1.0, 0.4)
             boxes.append(Box(f"low{number}", (pan, pan + 0.1), (-1.5, tilt)))
             boxes.append(Box(f"high{number}", (pan, pan + 0.1), (tilt + gap, 0.9)))
-        keep_outs = kept(*boxes, slack=(rng.uniform(0, 0.05), rng.uniform(0, 0.05)))
+        keep_outs = kept(
+            *boxes, margin=rng.uniform(0, 0.04), beyond=(rng.choice((0.0, 0.03)), rng.choice((0.0, 0.02)))
+        )
         places = [
             place
             for place in ((rng.uniform(*PAN), rng.uniform(*TILT)) for _ in range(60))
@@ -202,3 +206,41 @@ def test_no_way_over_a_fine_grid_of_corners_is_much_faster() -> None:
                     max(abs(b[0] - a[0]), abs(b[1] - a[1])) for a, b in ((start, corner), (corner, goal))
                 ]
                 assert way.time_s <= sum(moves) + CORNER_S + 0.05, f"case {case}"
+
+
+def test_a_head_that_rests_a_little_off_a_corner_may_still_go_on() -> None:
+    """Corners keep more room than they must: a servo rests a count or two beside where it was sent."""
+    rng = random.Random(3)
+    legs = 0
+    for case, keep_outs, start, goal in worlds(5, 120):
+        try:
+            way = plan(keep_outs, start, goal, 1.0)
+        except NoWay:
+            continue
+        if len(way.goals) < 2 or any(
+            box.gap(Span.around(goal)) < OFF_RAD or box.gap(Span.around(start)) < OFF_RAD
+            for box in keep_outs.full
+        ):
+            continue  # beside a box there is no more room than that
+        room = all(
+            not Span.around(corner).grown(OFF_RAD, OFF_RAD).enters(full)
+            for corner in way.goals[:-1]
+            for full in keep_outs.full
+        )
+        if not room:
+            continue  # only the exact corners lead there
+        for corner, following in zip(way.goals, way.goals[1:], strict=False):
+            off = corner[0] + rng.uniform(-OFF_RAD, OFF_RAD), corner[1] + rng.uniform(-OFF_RAD, OFF_RAD)
+            assert allowed(keep_outs, off, following), f"case {case}: {off} to {following}"
+            legs += 1
+    assert legs > 15
+
+
+def test_what_a_head_passes_on_its_approach_is_no_place_that_the_next_goal_may_use() -> None:
+    """A head under way may be beyond its goal; that lets no goal come nearer to a box."""
+    keep_outs = kept(Box("pole", (-0.9, -0.85), (-0.7, -0.5)), beyond=(0.05, 0.05))
+    beside = -0.85 + MARGIN + 0.05
+    moving = keep_outs.reach(Span.around((0.0, -0.9)), (beside, 0.0))
+    keep_outs.check_move(moving, (beside, 0.1), False)
+    with pytest.raises(KeptOut):
+        keep_outs.check_move(moving, (beside - 0.006, 0.1), False)
