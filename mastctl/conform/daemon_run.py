@@ -11,6 +11,7 @@ from typing import Any
 
 from mastctl.client import ClientError
 from mastctl.conform.checks import Check, Outcome, PromiseBroken, SubjectLost, run_checks
+from mastctl.conform.commands import COMMANDS
 from mastctl.conform.daemon import Daemon
 from mastctl.conform.described import DESCRIBED
 from mastctl.conform.motion import MOTION
@@ -24,7 +25,7 @@ from mastctl.errors import NotNow
 log = logging.getLogger(__name__)
 
 CHECKS: Sequence[Check[Daemon]] = (
-    *STATES.checks, *PICTURES.checks, *MOTION.checks, *REFUSALS.checks, *DESCRIBED.checks,
+    *STATES.checks, *PICTURES.checks, *COMMANDS.checks, *MOTION.checks, *REFUSALS.checks, *DESCRIBED.checks,
 )  # fmt: skip
 
 
@@ -104,6 +105,9 @@ def _at_work(status: dict[str, Any]) -> str:
         return f"operation {status['operation']}"
     if status.get("moving"):
         return "the head moves"
+    control = status.get("control")
+    if isinstance(control, dict):
+        return f"{control.get('holder')} steers"
     track = status.get("track")
     following = isinstance(track, dict) and track.get("state") in ("starting", "tracking")
     return "it follows a target" if following else ""
