@@ -2,8 +2,8 @@
 
     python -m drivers.sim.compile_beside
 
-compiles it into the folder where compiled code is kept. However many of these run at once, as for the workers
-of a test run, it is compiled once: the others wait, and find it.
+compiles it into the folder where compiled code is kept, for as long as its stdin is open. However many of
+these run at once, as for the workers of a test run, it is compiled once: the others wait, and find it.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ import fcntl
 import os
 import subprocess
 import sys
+import threading
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -38,6 +39,8 @@ def drawing_compiled_beside() -> Iterator[None]:
                 beside.wait(PATIENCE_S)
     finally:
         if beside is not None:
+            assert beside.stdin is not None
+            beside.stdin.close()
             beside.kill()
             beside.wait()
 
@@ -57,7 +60,7 @@ def _begun() -> subprocess.Popen[bytes] | None:
         return subprocess.Popen(
             command,
             env={**os.environ, "PYTHONPATH": path},
-            stdin=subprocess.DEVNULL,
+            stdin=subprocess.PIPE,  # it ends with whoever holds the other end
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,
             start_new_session=True,  # Ctrl-C is for the one who waits
@@ -71,8 +74,16 @@ def _folder() -> Path:
     return Path(kernels().render_tiles.stats.cache_path)
 
 
+def _ends_with_its_maker() -> None:
+    """End when nobody waits any more."""
+    while os.read(0, 1):
+        pass
+    os._exit(1)
+
+
 def main() -> None:
     """Compile what draws, if nobody else has."""
+    threading.Thread(target=_ends_with_its_maker, daemon=True).start()
     with (_folder() / "lock").open("w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)  # goes with the process, however it ends
         compile_drawing()

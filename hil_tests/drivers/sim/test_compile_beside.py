@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
+import sys
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,6 +18,8 @@ from drivers.sim.compile_beside import drawing_compiled_beside
 from drivers.sim.compiled import kernels
 from drivers.sim.render import Renderer, compile_drawing, compile_renderer
 from drivers.sim.scene import tiny_scene
+
+PATIENCE_S = 60.0  # only ends a failing test
 
 
 @pytest.fixture
@@ -55,6 +60,18 @@ def test_the_other_process_is_not_left_behind(begun: list[subprocess.Popen[bytes
         raise KeyboardInterrupt
     (process,) = begun
     assert process.returncode is not None
+
+
+def test_the_other_process_ends_when_the_one_that_waits_is_killed(tmp_path: Path) -> None:
+    """In an empty folder, where it would compile for many seconds."""
+    with subprocess.Popen(
+        [sys.executable, "-m", "drivers.sim.compile_beside"],
+        stdin=subprocess.PIPE,
+        env={**os.environ, "XDG_CACHE_HOME": str(tmp_path)},
+    ) as process:
+        assert process.stdin is not None
+        process.stdin.close()  # as the end of its maker does
+        assert process.wait(PATIENCE_S) == 1
 
 
 def test_where_it_cannot_be_begun_or_kept_the_block_goes_on(
