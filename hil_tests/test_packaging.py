@@ -111,6 +111,40 @@ def test_installed_wheel_runs_the_demo_from_another_folder(installed: Installed,
     assert page.endswith("</html>\n") and "Every target" in page and 'src="data:image/png;base64,' in page
 
 
+def test_the_installed_command_checks_a_driver_and_a_daemon(installed: Installed, tmp_path: Path) -> None:
+    mastctl, how = installed.program("mastctl"), {"env": installed.environ, "cwd": tmp_path}
+    words = (
+        "conform",
+        "--driver",
+        "sim",
+        "--head",
+        "--only",
+        "head.reading",
+        "--only",
+        "head.move",
+        "--json",
+    )
+    told = json.loads(run(mastctl, *words, timeout_s=DEMO_TIMEOUT_S, **how).stdout)
+    assert told["conforms"] and told["passed"] == 2
+    rig = ("sim", "new", "rig", "--size", "320x240", "--view-deg", "40", "--speed", "max")
+    run(mastctl, *rig, timeout_s=DEMO_TIMEOUT_S, **how)
+    config = tmp_path / "rig" / "config.yaml"
+    config.write_text(config.read_text().replace("port: 8420", "port: 0"))
+    daemon = subprocess.Popen(
+        [mastctl, "run", "--config", config], stdout=subprocess.PIPE, text=True, env=installed.environ
+    )
+    with daemon:
+        try:
+            assert daemon.stdout is not None
+            url = daemon.stdout.readline().strip()
+            words = ("conform", url, "--junit", "report.xml", "--json")
+            told = json.loads(run(mastctl, *words, timeout_s=DEMO_TIMEOUT_S, **how).stdout)
+        finally:
+            daemon.terminate()
+    assert told["conforms"] and told["passed"] > 30 and told["failed"] == 0
+    assert (tmp_path / "report.xml").stat().st_size > 1000
+
+
 FAULT_ROW = re.compile(r"^\| `(\w+)` \| `([^`]+)` \| `?([\w.]+)`? \|$", re.MULTILINE)
 
 FAULT_TABLE = """
