@@ -25,9 +25,9 @@ Json = dict[str, Any]
 
 
 class _Told(BaseModel):
-    """An answer, or a part of one. Every key is always there, unless it says otherwise."""
+    """An answer, or a part of one. Every key is always there unless it has a default; others may come later."""
 
-    model_config = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
+    model_config = ConfigDict(strict=True, allow_inf_nan=False)
 
 
 class Joints(_Told):
@@ -196,7 +196,7 @@ class StepTold(_Told):
     detail: Json
 
 
-class PointingTold(BaseModel):
+class PointingTold(_Told):
     """One pointing, and what was measured after it in a new picture."""
 
     commanded_pan_rad: float

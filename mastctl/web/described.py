@@ -77,6 +77,7 @@ def _describe(document: dict[str, Any]) -> None:
     pairs = sorted(((one, "serialization") for one in models), key=lambda pair: pair[0].__name__)
     _, schemas = models_json_schema(pairs, ref_template=_REFERENCE)  # type: ignore[arg-type]
     document["components"]["schemas"].update(schemas["$defs"])
+    _without_null(document)
     for route, success in _successes(document).items():
         if route in ANSWERS:
             model = ANSWERS[route]
@@ -86,10 +87,26 @@ def _describe(document: dict[str, Any]) -> None:
             stream = {"schema": {"type": "string"}, "x-endless": True, "x-event": _reference(EVENTS[route])}
             success["content"] = {"text/event-stream": stream}
         elif route in FILES:
-            binary = {"schema": {"type": "string", "format": "binary"}}
-            success["content"] = dict.fromkeys(FILES[route], binary)
+            success["content"] = {kind: {"schema": _form(kind)} for kind in FILES[route]}
             if route in PICTURES:
                 success["headers"] = described_headers()
+
+
+def _form(kind: str) -> dict[str, str]:
+    """What a file of a kind holds."""
+    return {"type": "object"} if kind == "application/yaml" else {"type": "string", "format": "binary"}
+
+
+def _without_null(document: Mapping[str, Any]) -> None:
+    """Say of headers and queries that they are there or not: null is no word of an address."""
+    for methods in document["paths"].values():
+        for operation in methods.values():
+            for parameter in operation.get("parameters", ()):
+                schema = parameter["schema"]
+                kinds = [one for one in schema.get("anyOf", ()) if one.get("type") != "null"]
+                if len(kinds) == 1:
+                    del schema["anyOf"]
+                    schema.update(kinds[0])
 
 
 def _successes(document: Mapping[str, Any]) -> dict[str, dict[str, Any]]:

@@ -20,6 +20,7 @@ from mastctl.web.waiting import Waiting
 
 BODY_S = 0.05  # a body comes with its request; who sends it later is stopped without its words
 LARGEST_BODY_BYTES = 4096
+ANY_BODY = {"anyOf": [EstopBody.model_json_schema(), {}]}  # a stop is refused for no body
 
 
 def add_estop(app: FastAPI, service: Service, waiting: Waiting, commands: Commands) -> None:
@@ -29,7 +30,9 @@ def add_estop(app: FastAPI, service: Service, waiting: Waiting, commands: Comman
         f"{PREFIX}/estop",
         summary="Stop the mast and let nothing move it until it is reset, across restarts too",
         openapi_extra={
-            "requestBody": {"content": {"application/json": {"schema": EstopBody.model_json_schema()}}}
+            "requestBody": {
+                "content": {"application/json": {"schema": {"anyOf": [EstopBody.model_json_schema(), {}]}}}
+            }
         },
     )
     async def estop(request: Request) -> dict[str, Any]:

@@ -86,12 +86,24 @@ def add_errors(app: FastAPI) -> None:
             405: ("method_not_allowed", f"{request.method} is not possible at {request.url.path[:120]}"),
         }
         code, message = words.get(error.status_code, ("bad_request", str(error.detail)))
-        return error_response(error.status_code, code, message, headers=error.headers)
+        headers = dict(error.headers or {})
+        if error.status_code == 405:
+            headers["Allow"] = ", ".join(_methods_of(app, request))
+        return error_response(error.status_code, code, message, headers=headers)
 
     @app.exception_handler(Exception)
     async def defect(request: Request, error: Exception) -> JSONResponse:
         body = error_body(error)
         return error_response(500, body["code"], body["message"])
+
+
+def _methods_of(app: FastAPI, request: Request) -> list[str]:
+    """The methods of a path, which may have a route for each."""
+    found = set[str]()
+    for route in app.routes:
+        if isinstance(route, APIRoute) and route.path_regex.match(request.url.path):
+            found |= route.methods or set()
+    return sorted(found)
 
 
 def _read_by(request: Request, problem: Mapping[str, Any]) -> object:

@@ -1,0 +1,40 @@
+"""Every route's answer has a model, and whoever asks everything gets no answer that is not described."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import httpx
+import pytest
+
+from hil_tests.mastctl.service_fakes import fake_daemon
+from mastctl.web import PREFIX
+from mastctl.web.described import ANSWERS, EVENTS, FILES
+from tools.campaigns.fuzz_http import ask
+
+FUZZ_S = 20.0
+
+
+def test_every_route_has_a_model_a_kind_of_file_or_events_and_no_other_is_named(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    with fake_daemon(monkeypatch, tmp_path) as (daemon, _):
+        document = httpx.get(f"{daemon.url}/openapi.json", timeout=30.0).json()
+    routes = {
+        f"{method.upper()} {path.removeprefix(PREFIX)}"
+        for path, methods in document["paths"].items()
+        for method in methods
+    }
+    assert routes == {*ANSWERS, *EVENTS, *FILES}
+    schemas = document["components"]["schemas"]
+    for model in {*ANSWERS.values(), *EVENTS.values()}:
+        assert schemas[model.__name__]["properties"], model.__name__
+        assert "additionalProperties" not in schemas[model.__name__], "clients live with keys that come later"
+
+
+def test_whatever_is_asked_the_answer_is_as_described(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    with fake_daemon(monkeypatch, tmp_path) as (daemon, _):
+        done = ask(daemon.url, FUZZ_S, examples=3)
+    assert done.returncode == 0, capfd.readouterr().out[-6000:]

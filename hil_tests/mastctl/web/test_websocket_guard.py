@@ -1,0 +1,121 @@
+"""The guard before a WebSocket, asked as a server asks it: who comes in is who a page or a token lets in."""
+
+from __future__ import annotations
+
+import asyncio
+from pathlib import Path
+from typing import Any
+
+import pytest
+from fastapi import FastAPI
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from drivers.clock import ManualClock
+from mastctl.access.access import Access
+from mastctl.access.tokens import TokenList
+from mastctl.web.entrance import Entrance
+from mastctl.web.guard import Guard
+from mastctl.web.whose_page import Names
+
+NAME = "rover.test"
+ORIGIN = {"origin": f"http://{NAME}"}
+
+
+class Inside(FastAPI):
+    """What the guard lets through."""
+
+    came: Any = None
+
+    async def __call__(self, scope: Any, receive: Any, send: Any) -> None:
+        self.came = scope["state"]["caller"]
+
+
+@pytest.fixture(scope="module")
+def access(tmp_path_factory: pytest.TempPathFactory) -> Access:
+    made = Access(TokenList(tmp_path_factory.mktemp("tokens")), ManualClock())
+    made.close()
+    return made
+
+
+def asked(access: Access | None, headers: dict[str, str], query: bytes = b"", told: bool = True) -> Any:
+    """Who was let in, or the status of the refusal (403: closed before it was accepted)."""
+    inside, sent = Inside(), list[Any]()
+    told_headers = {"host": NAME, **headers}
+    scope = {
+        "type": "websocket", "path": "/api/v1/events", "query_string": query, "client": ("10.0.0.1", 7),
+        "server": (NAME, 80), "extensions": {"websocket.http.response": {}} if told else {},
+        "headers": [(name.encode(), value.encode("utf-8")) for name, value in told_headers.items()],
+    }  # fmt: skip
+
+    async def receive() -> Any:
+        return {"type": "websocket.connect"}
+
+    async def send(message: Any) -> None:
+        sent.append(message)
+
+    names = Names(frozenset({NAME}), any_address=True)
+    asyncio.run(Guard(inside, Entrance(names, access))(scope, receive, send))
+    if inside.came is not None:
+        assert not sent
+        return inside.came
+    return sent[0].get("status", 403)
+
+
+def bearer(access: Access, role: str = "view") -> dict[str, str]:
+    text = (Path(access.folder) / f"{role}.token").read_text().strip()
+    return {"authorization": f"Bearer {text}"}
+
+
+def session(access: Access) -> dict[str, str]:
+    text = bearer(access)["authorization"].split()[1]
+    return {"cookie": f"mastctl-80={access.log_in(text, '10.0.0.1')[0]}"}
+
+
+def test_a_token_and_a_page_with_its_session_come_in(access: Access) -> None:
+    assert asked(access, bearer(access, "operate")).role == "operate"
+    assert asked(access, {**session(access), **ORIGIN}).name == "view"
+    assert asked(None, {}).role == "admin"
+
+
+def test_nobody_else_does(access: Access) -> None:
+    assert asked(access, {}) == 401
+    assert asked(access, ORIGIN) == 401
+    assert asked(access, session(access)) == 403, "a page says its Origin"
+    assert asked(access, {**bearer(access), "host": "evil.example"}) == 403
+    assert asked(access, bearer(access), query=b"token=x") == 400
+    assert asked(access, {}, told=False) == 403
+    for origin in ("http://evil.example", "null", "", f"http://{NAME}:1"):
+        for shown in (bearer(access), session(access)):
+            assert asked(access, {**shown, "origin": origin}) == 403
+        assert asked(None, {"origin": origin}) == 403
+    for site in ("cross-site", "same-site"):
+        assert asked(access, {**bearer(access), "sec-fetch-site": site}) == 403
+
+
+WORDS = st.text(st.characters(codec="utf-8", exclude_characters="\r\n\0"), max_size=30)
+HEADERS = st.sampled_from(["origin", "authorization", "cookie", "host", "sec-fetch-site", "x-forwarded-for"])
+
+
+TOLD = st.dictionaries(HEADERS, WORDS | st.sampled_from(["Bearer ", "mastctl-80=", NAME]), max_size=5)
+
+
+@settings(max_examples=200, deadline=None)
+@given(TOLD, st.binary(max_size=20))
+def test_no_words_let_anybody_in_without_a_token(headers: dict[str, str], query: bytes) -> None:
+    assert asked(EMPTY, headers, query) in (400, 401, 403, 429, 431)
+
+
+class _Nobody(Access):
+    """An access without any token."""
+
+    def __init__(self) -> None:
+        from collections import OrderedDict
+
+        from mastctl.access.guesses import Guesses
+
+        self._clock, self._tokens = ManualClock(), ()
+        self._guesses, self._sessions = Guesses(), OrderedDict()
+
+
+EMPTY = _Nobody()
