@@ -25,7 +25,7 @@ Json = dict[str, Any]
 
 
 class _Told(BaseModel):
-    """An answer, or a part of one. Every key is always there unless it has a default; others may come later."""
+    """An answer, or a part of one. Each key is there unless it has a default; others may come later."""
 
     model_config = ConfigDict(strict=True, allow_inf_nan=False)
 
