@@ -101,14 +101,19 @@ def read_items(path: Path, found: Found | None = None) -> Iterator[Item]:
     Raises
     ------
     BadRecording
-        If it cannot be read, or does not begin like an MCAP file. What is wrong further on is passed over.
+        If it cannot be read, or does not begin like an MCAP file; an empty one is a recording of nothing.
+        What is wrong further on is passed over.
     """
     told = found if found is not None else Found()
     try:
         with path.open("rb") as file:
             size = file.seek(0, io.SEEK_END)
             file.seek(0)
-            if file.read(len(MAGIC)) != MAGIC:
+            begin = file.read(len(MAGIC))
+            if begin != MAGIC and MAGIC.startswith(begin):  # its writer died before its first record
+                told.left_over_bytes = len(begin)
+                return
+            if begin != MAGIC:
                 raise BadRecording(f"{path}: is no MCAP file; a recording of mastctl is expected")
             yield from _items(file, size, told)
     except OSError as error:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -51,7 +52,7 @@ def calibration(name: str, model: CameraModel, time_ns: int) -> tuple[Message | 
     """Return the nearest ``plumb_bob`` camera (None if there is none) and the camera itself, as JSON."""
     told: dict[str, Any] = {"camera": name, "model": _model_told(model)}
     try:
-        near = nearest_plumb_bob(model)
+        near = _nearest(model)
     except ValueError as error:
         return None, told | {"plumb_bob": {"none": str(error)}}
     width, height = model.size_px
@@ -67,6 +68,12 @@ def calibration(name: str, model: CameraModel, time_ns: int) -> tuple[Message | 
         P=np.hstack([near.matrix_px, np.zeros((3, 1))]).ravel().tolist(),
     )
     return message, told | {"plumb_bob": _near_told(near)}
+
+
+@lru_cache(maxsize=64)
+def _nearest(model: CameraModel) -> PlumbBob:
+    """The fit of a camera, once for all files that begin with it."""
+    return nearest_plumb_bob(model)
 
 
 def transforms(rig: Rig, pan_rad: float, tilt_rad: float, time_ns: int) -> Message:

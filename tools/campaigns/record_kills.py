@@ -151,11 +151,15 @@ def begun(folder: Path, mast: MastTold, seed: int, life_s: float) -> Child:
     return Child(pid, folder, told, now_s + life_s)
 
 
+def killed(child: Child) -> int:
+    """Kill a child, wait for its end and return how that was."""
+    os.kill(child.pid, signal.SIGKILL)
+    return os.waitpid(child.pid, 0)[1]
+
+
 def ended(child: Child, mast: MastTold) -> Killed:
     """Kill a child and judge what it left."""
-    os.kill(child.pid, signal.SIGKILL)
-    _, status = os.waitpid(child.pid, 0)
-    if not os.WIFSIGNALED(status):
+    if not os.WIFSIGNALED(killed(child)):
         return Killed(0, 0, 0.0, 0, "it ended by itself")
     return judged(child.folder, mast, child.told)
 
@@ -167,16 +171,20 @@ def kills(count: int, at_once: int, seed: int, folder: Path) -> list[Killed]:
     running: list[Child] = []
     results: list[Killed] = []
     begins = iter(range(count))
-    while len(results) < count:
-        while len(running) < at_once and (number := next(begins, None)) is not None:
-            running.append(begun(folder / f"{number:04d}", mast, number, chance.uniform(0.1, 3.0)))
-        child = min(running, key=lambda one: one.kill_s)
-        time.sleep(max(0.0, child.kill_s - time.monotonic()))
-        running.remove(child)
-        result = ended(child, mast)
-        results.append(result)
-        if not result.wrong:
-            shutil.rmtree(child.folder)
+    try:
+        while len(results) < count:
+            while len(running) < at_once and (number := next(begins, None)) is not None:
+                running.append(begun(folder / f"{number:04d}", mast, number, chance.uniform(0.1, 3.0)))
+            child = min(running, key=lambda one: one.kill_s)
+            time.sleep(max(0.0, child.kill_s - time.monotonic()))
+            running.remove(child)
+            result = ended(child, mast)
+            results.append(result)
+            if not result.wrong:
+                shutil.rmtree(child.folder)
+    finally:
+        for child in running:
+            killed(child)
     return results
 
 

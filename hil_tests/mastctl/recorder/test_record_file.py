@@ -148,9 +148,9 @@ def test_cut_off_at_any_byte_it_holds_every_chunk_before_and_repair_makes_it_who
     data = whole.read_bytes()
     chance = np.random.default_rng(seed)
     counts = set()
-    for length in sorted({9, *chance.integers(9, len(data), 40).tolist(), len(data) - 1}):
+    for length in sorted({0, 5, 9, *chance.integers(9, len(data), 40).tolist(), len(data) - 1}):
         cut = tmp_path / f"{length}.mcap"
-        cut.write_bytes(data[:length] + b"\0" * int(chance.integers(0, 3)))
+        cut.write_bytes(data[:length] + b"\0" * int(chance.integers(0, 3) if length > 8 else 0))
         found = Found()
         there = numbers(cut, found)
         assert there == list(range(len(there))) and len(there) % 10 == 0, f"seed {seed}, {length} bytes"
