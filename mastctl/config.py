@@ -24,6 +24,7 @@ from mastctl.devices.keep_out import Box
 from mastctl.devices.limits import Limits
 from mastctl.devices.sun import LEAST_CONE_RAD, SUN, WIDEST_CONE_RAD, Frame, Sun, direction_of
 from mastctl.packaged import default_config
+from mastctl.recorder.settings import RecordSettings
 from mastctl.tracking.choice import HandoffRules, PairBounds
 from mastctl.tracking.settings import TrackingSettings
 
@@ -37,6 +38,7 @@ _FASTEST_RAD_PER_S = 100.0
 _STEEPEST_RAD_PER_S2 = 1000.0
 _WIDEST_MARGIN_RAD = 0.5
 _HOST_NAME = re.compile(r"[A-Za-z0-9]([A-Za-z0-9._-]{0,252})|[0-9A-Fa-f:]*:[0-9A-Fa-f:.]*")
+_MOST_MB = 1e7
 _LONGEST_SOCKET_PATH = 100  # bytes; the kernel's own bound is 108
 
 
@@ -90,7 +92,7 @@ class Listen:
 
 @dataclass(frozen=True)
 class Config:
-    """A daemon's configuration; paths are absolute or relative to the working folder."""
+    """A daemon's configuration; paths are absolute or relative to the working folder. ``data``: its bytes."""
 
     path: Path
     mast_file: Path
@@ -99,6 +101,8 @@ class Config:
     limits: Limits
     sun: Sun | None = None
     tracking: TrackingSettings = field(default_factory=TrackingSettings)
+    record: RecordSettings = field(default_factory=RecordSettings)
+    data: bytes = field(default=b"", repr=False)
     state_folder: Path | None = None
 
 
@@ -132,7 +136,7 @@ def parse_config(data: bytes, path: str | Path) -> Config:
         "",
         document,
         ("schema", "mast_file", "pan_tilt", "limits"),
-        ("cameras", "listen", "simulation", "tracking", "state"),
+        ("cameras", "listen", "record", "simulation", "tracking", "state"),
     )
     folder = Path(path).resolve().parent
     cameras = {name: _camera(top, name) for name in top.mapping("cameras")}
@@ -149,6 +153,8 @@ def parse_config(data: bytes, path: str | Path) -> Config:
         limits=_limits(top),
         sun=_sun(top),
         tracking=_tracking(top, folder),
+        record=_record(top, folder),
+        data=data,
         state_folder=_state_folder(top, folder),
     )
 
@@ -358,6 +364,22 @@ def _state_folder(top: Section, folder: Path) -> Path | None:
     if "state" not in top:
         return None
     return folder / top.section("state", ("folder",), ()).text("folder")
+
+
+def _record(top: Section, folder: Path) -> RecordSettings:
+    """Read how much is recorded, and where; what is left out stays as it is."""
+    usual = RecordSettings()
+    if "record" not in top:
+        return usual
+    section = top.section("record", (), ("ring_s", "ring_mb", "kept_mb", "run_mb", "free_mb", "folder"))
+    return RecordSettings(
+        ring_s=_number_between(section, "ring_s", 0.0, 0.0, 86400.0) if "ring_s" in section else None,
+        ring_mb=_number_between(section, "ring_mb", usual.ring_mb, 10.0, _MOST_MB),
+        kept_mb=_number_between(section, "kept_mb", usual.kept_mb, 10.0, _MOST_MB),
+        run_mb=_number_between(section, "run_mb", usual.run_mb, 10.0, _MOST_MB),
+        free_mb=_number_between(section, "free_mb", usual.free_mb, 10.0, _MOST_MB),
+        folder=folder / section.text("folder") if "folder" in section else None,
+    )
 
 
 def _pair_bounds(handoff: Section, name: str) -> PairBounds:

@@ -1,4 +1,4 @@
-"""``mastctl record`` and ``mastctl replay``: recordings looked into, mended, played."""
+"""``mastctl record`` and ``mastctl replay``: recordings begun, ended, listed, looked into, mended, played."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from mastctl.cli import output
 from mastctl.cli.output import WrongUse
-from mastctl.cli.service import queue_output, serve_config, tell_result
+from mastctl.cli.service import add_daemon_options, client_of, queue_output, serve_config, tell_result
 
 if TYPE_CHECKING:
     from mastctl.recorder.recorded import Recording
@@ -18,8 +18,18 @@ if TYPE_CHECKING:
 
 def add_commands(subparsers: argparse._SubParsersAction[Any]) -> None:
     """Add record and replay."""
-    record = subparsers.add_parser("record", help="look into recordings, and mend them")
+    record = subparsers.add_parser("record", help="begin and end a recording, list, look into and mend them")
     acts = record.add_subparsers(dest="act", metavar="ACT", required=True)
+
+    start = acts.add_parser("start", help="have the daemon record until 'record stop'")
+    start.add_argument("name", nargs="?", default="", help="a word for the file's name")
+    start.set_defaults(run=_start)
+    stop = acts.add_parser("stop", help="end the recording that 'record start' began")
+    stop.set_defaults(run=_stop)
+    listed = acts.add_parser("list", help="list the daemon's recordings: runs, what faults kept, the ring")
+    listed.set_defaults(run=_list)
+    for client in (start, stop, listed):
+        add_daemon_options(client)
 
     show = acts.add_parser("show", help="say what a recording holds, whole or not")
     show.add_argument("file", metavar="FILE", type=Path, help="an MCAP file, or a folder of segments")
@@ -41,6 +51,42 @@ def add_commands(subparsers: argparse._SubParsersAction[Any]) -> None:
         "--listen", metavar="HOST:PORT", help="where to serve (default 127.0.0.1:8420; port 0: any)"
     )
     replay.set_defaults(run=_replay)
+
+
+def _start(args: argparse.Namespace) -> int:
+    with client_of(args) as client:
+        told = client.start_recording(args.name)
+    tell_result(args, told, f"recording {told['run']} in {told['folder']}; 'mastctl record stop' ends it")
+    return 0
+
+
+def _stop(args: argparse.Namespace) -> int:
+    with client_of(args) as client:
+        told = client.stop_recording()
+    line = f"{told['file']}: {told['size_mb']:.1f} MB{_dropped(told['dropped'])}"
+    tell_result(args, told, line)
+    return 0
+
+
+def _list(args: argparse.Namespace) -> int:
+    with client_of(args) as client:
+        told = client.recordings()
+    if args.json:
+        output.print_json(told)
+        return 0
+    rows = [
+        (one["kind"], one["name"], f"{one['size_mb']:.1f}", str(one["files"])) for one in told["recordings"]
+    ]
+    now = told["recorder"]
+    notes = [f"now: {now['run'] or now['file'] or 'nothing is recorded'}{_dropped(now['dropped'])}"]
+    notes += [now["fault"]] if now["fault"] else []
+    output.print_table(f"recordings in {now['folder']}", ("kind", "name", "MB", "files"), rows, notes)
+    return 0
+
+
+def _dropped(dropped: dict[str, int]) -> str:
+    count = sum(dropped.values())
+    return f", {count} messages were dropped" if count else ""
 
 
 def _show(args: argparse.Namespace) -> int:

@@ -203,6 +203,18 @@ class Client:
                 raise ClientError("timeout", f"operation {operation_id} has not ended after {timeout_s:g} s")
             time.sleep(POLL_S)
 
+    def recordings(self) -> dict[str, Any]:
+        """Return the daemon's recordings, and what it records now."""
+        return self._daemon.json("GET", "/recordings")
+
+    def start_recording(self, name: str = "") -> dict[str, Any]:
+        """Have the daemon record until `stop_recording`; return what it records then."""
+        return self._daemon.command("POST", "/recordings/start", {"name": name})
+
+    def stop_recording(self) -> dict[str, Any]:
+        """End the recording; return its file on the daemon's machine, its size and what was dropped."""
+        return self._daemon.command("POST", "/recordings/stop")
+
     def stop(self) -> dict[str, Any]:
         """Stop the mast and the running operation."""
         return self._daemon.json("POST", "/stop")

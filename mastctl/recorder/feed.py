@@ -57,7 +57,7 @@ class Feed:
                 return
 
     def _hand_on(self, topic: str, key: str, value: Any) -> None:
-        if topic == "frame":
+        if topic == "frame" and not isinstance(value, StampedFrame):
             try:
                 value = self._frame_by_id(value["frame_id"] if isinstance(value, dict) else value.frame_id)
             except MastctlError:

@@ -98,10 +98,11 @@ def _transform(parent: str, child: str, parent_from_child: Rigid, time_ns: int) 
 
 
 def pointings_told(operation: Mapping[str, Any]) -> Sequence[dict[str, Any]]:
-    """Return each measured pointing of an operation's record, as the topic ``/residual`` has it."""
+    """Return each pointing of an operation's record that measured a residual, as ``/residual`` has it."""
     result = operation.get("result") or {}
     rows = result.get("pointings") or []
-    return [{"operation": operation.get("id"), "pointing": at, **row} for at, row in enumerate(rows, start=1)]
+    told = [{"operation": operation.get("id"), "pointing": at, **row} for at, row in enumerate(rows, start=1)]
+    return [row for row in told if row.get("residual_px") is not None]
 
 
 def target_told(operation: Mapping[str, Any]) -> dict[str, Any] | None:

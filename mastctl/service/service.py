@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from calib.files.mast_file import StoredRig
+from calib.handoff.matched import MatchedHandoff
 from drivers.clock import Clock, SystemClock
 from drivers.errors import DriverError
 from drivers.hardware import Hardware
@@ -41,6 +42,7 @@ from mastctl.safety.state_folder import StateFolder
 from mastctl.safety.stop_socket import StopSocket
 from mastctl.safety.stop_threads import StopThreads
 from mastctl.service.mast_in_use import MastInUse, configured, read_mast, read_next
+from mastctl.service.recording import Recording
 from mastctl.service.socket_stops import SocketStops
 from mastctl.service.state import State
 from mastctl.state.faults import StandingFault
@@ -60,6 +62,7 @@ HARDWARE_CLOSE_S = 3.0
 KEPT_S = 1.0  # what the disk is given before an emergency stop is answered without it
 STATE = "state"
 AUDIT_FILE = "audit.jsonl"
+KEPT_COMMANDS = 100  # newest ones that a new listener still hears
 ENDS_SOON_S = 0.25  # a stopped operation ends within 20 ms or so; then the next one may follow at once
 
 
@@ -95,6 +98,8 @@ class Service:
         Where each command passes, who steers, and what is recorded of it.
     stop_threads
         Where the web side calls `stop`: threads that nothing else can keep busy.
+    recording
+        The recorder, and what it hears.
     latch
         The emergency stop, if one is latched.
     folder
@@ -150,14 +155,31 @@ class Service:
             config.limits,
             clock,
             config.tracking,
-            self.handoffs.add,
+            self._handed_over,
             self.machine,
         )
         people_s = SystemClock()  # clients live in real time, whatever a simulated rover's clock does
         self.leases = Leases(people_s, self._runs)
         self.audit = AuditLog(self.folder.path / AUDIT_FILE, clock)
-        self.entry = Entry(clock, self.leases, Answers(people_s, clock), self.audit, self.operations)
+        self.entry = Entry(
+            clock,
+            self.leases,
+            Answers(people_s, clock),
+            self.audit,
+            self.operations,
+            publish=self._commanded,
+        )
         self._version = version("mastctl")
+        self.recording = Recording(
+            config,
+            mast,
+            hardware.kind,
+            self._version,
+            self.folder.path,
+            self.machine.publisher,
+            self.devices.frame_by_id,
+            clock,
+        )
         self.stop_socket: StopSocket | None = None
         self._socket_folder: StateFolder | None = None
         self._closing = threading.Lock()
@@ -198,6 +220,7 @@ class Service:
         faults = (
             *self.devices.faults(),
             *self.handoffs.faults(),
+            *self.recording.faults(),
             *self.audit.faults(),
             *self._state_faults(),
         )  # first: the machine is told of them
@@ -373,6 +396,7 @@ class Service:
             self._loop = PointingLoop(self._rig, self.devices, self.config.limits, self.clock)
             self.tracker.use_rig(self._rig, mast.path.name)
             self.handoffs.use_mast(mast.stored.digest)
+            self.recording.use_mast(mast)
             self.mast, self.former = mast, self.mast
             self.machine.publisher.publish("mast", "in_use", mast.told())
         for note in mast.stored.notes:
@@ -522,6 +546,7 @@ class Service:
         self.machine.publisher.close()
         self.stop_threads.close()
         self.handoffs.close()
+        self.recording.close()
         _bounded("closing the hardware", self.hardware.close, HARDWARE_CLOSE_S)
         if self.stop_socket is not None:
             self.stop_socket.close()
@@ -538,6 +563,16 @@ class Service:
     def _ended(self, operation: Operation) -> None:
         """Have an operation's end recorded."""
         self.entry.ended(operation.id, operation.state, operation.error)
+
+    def _commanded(self, number: int, record: Mapping[str, Any]) -> None:
+        """Publish a command's record."""
+        self.machine.publisher.publish("command", str(number), record)
+        self.machine.publisher.forget("command", str(number - KEPT_COMMANDS))
+
+    def _handed_over(self, handoff: MatchedHandoff) -> None:
+        """Have a hand-off counted and recorded."""
+        self.handoffs.add(handoff)
+        self.recording.handed_over(handoff)
 
     def _check_pixel(self, target: PixelTarget) -> None:
         taken_with, in_use = target.mast_digest, self.stored.digest

@@ -287,6 +287,44 @@ class ResetTold(_Told):
     released: EstopHeld
 
 
+class RecordingListed(_Told):
+    """A recording on the disk: a run, what a fault kept, or the ring; size in 10⁶ bytes."""
+
+    name: str
+    kind: Literal["run", "kept", "ring"]
+    size_mb: float
+    files: Count
+
+
+class RecorderTold(_Told):
+    """What is recorded now. ``dropped``: messages not written, by topic; ``fault``: what is wrong."""
+
+    recording: bool
+    ring_s: Seconds
+    run: str | None
+    file: str | None
+    size_mb: float
+    dropped: dict[str, Count]
+    fault: str | None
+    folder: str
+
+
+class Recordings(_Told):
+    """``GET /recordings``."""
+
+    recordings: list[RecordingListed]
+    recorder: RecorderTold
+
+
+class RecordingEnded(_Told):
+    """``POST /recordings/stop``: the run, its file on the daemon's machine, what it lacks."""
+
+    run: str
+    file: str
+    size_mb: float
+    dropped: dict[str, Count]
+
+
 class JogTold(_Told):
     """``POST /jog``: the jog's operation, whether the heartbeat was taken, and what holds an axis."""
 

@@ -22,6 +22,7 @@ from mastctl.web.guard import Guard
 from mastctl.web.lease import add_lease
 from mastctl.web.limits import add_limits
 from mastctl.web.pictures import add_pictures
+from mastctl.web.recordings import add_recordings
 from mastctl.web.refusals import add_errors
 from mastctl.web.routes import add_pointing, add_tracking
 from mastctl.web.sessions import add_sessions
@@ -58,6 +59,7 @@ def create_app(service: Service, waiting: Waiting | None = None, entrance: Entra
     add_tracking(app, service, commands)
     add_limits(app, service, commands)
     add_pictures(app, service, waiting, commands)
+    add_recordings(app, service, waiting, commands)
     add_simulation(app, service, waiting, commands)
     describe(app)
     return Guard(app, entrance)

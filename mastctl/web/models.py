@@ -81,6 +81,12 @@ class TakeBody(LeaseBody):
     reason: Annotated[str, Field(min_length=1, max_length=400, pattern=r"\S")]
 
 
+class RecordBody(_Strict):
+    """``POST /recordings/start``: a word for the file's name."""
+
+    name: Annotated[str, Field(max_length=60)] = ""
+
+
 class TrackBody(_Strict):
     """``POST /track``: exactly one of pixel and position_m."""
 

@@ -1,0 +1,96 @@
+"""The recorder of one daemon: what it records, where, and how news and mast files reach it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from calib.handoff.matched import MatchedHandoff
+from drivers.clock import Clock
+from mastctl.config import Config
+from mastctl.devices.frames import StampedFrame
+from mastctl.handoff.log import line_of
+from mastctl.recorder.feed import Feed
+from mastctl.recorder.recorder import MastTold, Recorder
+from mastctl.recorder.writer import Attached
+from mastctl.service.mast_in_use import MastInUse
+from mastctl.state.faults import StandingFault
+from mastctl.state.publisher import Publisher
+
+FOLDER = "records"
+
+
+class Recording:
+    """A recorder that hears what the daemon publishes.
+
+    Parameters
+    ----------
+    config
+        Says how much is recorded, and is attached as it was read.
+    mast
+        The mast file in use.
+    hardware
+        Of which kind it is: of real hardware there is a ring unless the configuration says otherwise.
+    version
+        The program's.
+    state_folder
+        Where recordings lie, if the configuration names no other place.
+    publisher, frame_by_id
+        What is heard, and where the pictures are.
+    clock
+        The daemon's.
+
+    Attributes
+    ----------
+    recorder
+        Begins and ends runs.
+    """
+
+    def __init__(
+        self,
+        config: Config,
+        mast: MastInUse,
+        hardware: str,
+        version: str,
+        state_folder: Path,
+        publisher: Publisher,
+        frame_by_id: Callable[[str], StampedFrame],
+        clock: Clock,
+    ) -> None:
+        settings = replace(config.record, ring_s=config.record.ring_of(hardware))
+        self.recorder = Recorder(
+            settings,
+            config.record.folder or state_folder / FOLDER,
+            _told(mast),
+            [Attached(config.path.name, config.data)],
+            {"hardware": hardware, "version": version},
+            clock,
+        )
+        self._feed = Feed(publisher, self.recorder, frame_by_id)
+
+    def handed_over(self, handoff: MatchedHandoff) -> None:
+        """Record a hand-off, as the record of hand-offs has it."""
+        self.recorder.tell("handoff", handoff.time, line_of(handoff))
+
+    def use_mast(self, mast: MastInUse) -> None:
+        """Attach another mast file, for what comes from now on."""
+        self.recorder.use_mast(_told(mast))
+
+    def faults(self) -> tuple[StandingFault, ...]:
+        """Return what keeps it from recording."""
+        return self.recorder.faults()
+
+    def told(self) -> dict[str, Any]:
+        """Return every recording, and what is recorded now, as ``GET /recordings`` has it. Raises Unable."""
+        return {"recordings": self.recorder.recordings(), "recorder": self.recorder.told()}
+
+    def close(self) -> None:
+        """Hear nothing more and end the file; bounded."""
+        self._feed.close()
+        self.recorder.close()
+
+
+def _told(mast: MastInUse) -> MastTold:
+    return MastTold(mast.stored.rig, Attached(mast.path.name, mast.data))
