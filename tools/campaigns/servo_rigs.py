@@ -170,6 +170,33 @@ def ptu_pty() -> Iterator[Rig]:
 
 
 @contextmanager
+def line_alone(driver: str) -> Iterator[tuple[dict[str, Any], Callable[[float], tuple[float, float]]]]:
+    """Simulated servos on a pseudo terminal that nobody has opened: a driver's options, and the truth.
+
+    Dynamixel servos stop by their watchdog 0.4 s after the last packet.
+    """
+    clock, panel, axes = _axes()
+    device: DynamixelBus | SimulatedPtu
+    if driver == "dynamixel":
+        settings = {"baud_rate": 3, "return_delay_time": 0}
+        device = DynamixelBus(
+            SimulatedServo("xm430_w350", number, axis, settings=settings, time_s=clock.now_s())
+            for number, axis in enumerate(axes, start=1)
+        )
+        ends = [{"id": n, "model": "XM430-W350", "limits_rad": list(LIMITS_RAD[n - 1])} for n in (1, 2)]
+        options: dict[str, Any] = {
+            "baud": 1_000_000, "watchdog_s": 0.4, "reply_timeout_s": 0.1,
+            "acceleration_rad_per_s2": ACCELERATION_RAD_PER_S2,
+        }  # fmt: skip
+    else:
+        device = SimulatedPtu("d46_70", *axes)
+        ends, options = [{"limits_rad": list(limits)} for limits in LIMITS_RAD], {}
+        ends[0]["sign"] = -1
+    with PtyLine(device, clock, panel, wire_time=False) as line:
+        yield {"port": line.path, "pan": ends[0], "tilt": ends[1], **options}, _truth(axes)
+
+
+@contextmanager
 def ptu_tcp() -> Iterator[Rig]:
     """A D48E, whose answers look otherwise, behind a TCP port."""
     with ExitStack() as stack:
