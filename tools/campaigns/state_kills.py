@@ -14,8 +14,6 @@ import json
 import os
 import random
 import signal
-import subprocess
-import sys
 import tempfile
 import time
 from collections import Counter
@@ -28,7 +26,6 @@ from tools.arguments import end
 
 SCHEMA = "mastctl/kills/1"
 LATEST_S = 0.05
-STARTED_S = 60.0
 
 
 class BadState(Exception):
@@ -40,17 +37,17 @@ def document(number: int) -> dict[str, object]:
     return {"number": number, "filling": str(number % 10) * (1 + number * 977 % 60_000)}
 
 
-def write_for_ever(path: Path, first: int, careless: bool) -> None:
-    """Save one document after the other and tell each on stdout; in the process that is killed."""
+def write_for_ever(path: Path, first: int, careless: bool, told: int) -> None:
+    """Save one document after the other and tell each on a descriptor; in the process that is killed."""
     file = StateFile(path, SCHEMA)
     number = first
     while True:
-        os.write(1, f"begun {number}\n".encode())
+        os.write(told, f"begun {number}\n".encode())
         if careless:
             path.write_text(json.dumps({"schema": SCHEMA, **document(number)}))
         else:
             file.write(document(number))
-        os.write(1, f"saved {number}\n".encode())
+        os.write(told, f"saved {number}\n".encode())
         number += 1
 
 
@@ -65,17 +62,9 @@ def kill_writers(folder: Path, kills: int, seed: int, careless: bool = False) ->
     draw = random.Random(seed)
     path, counts, saved = folder / "state.json", Counter[str](), 0
     for kill in range(kills):
-        command = [sys.executable, "-m", "tools.campaigns.state_kills", "--write", str(path), str(saved + 1)]
-        with subprocess.Popen(
-            [*command, *(["--careless"] if careless else [])], stdout=subprocess.PIPE, text=True
-        ) as writer:
-            assert writer.stdout is not None
-            told = writer.stdout.readline()
-            if not told:
-                raise BadState(f"kill {kill}: the writer ended by itself; seed {seed}")
-            time.sleep(draw.uniform(0.0, LATEST_S))
-            writer.send_signal(signal.SIGKILL)
-            words = [told, *writer.stdout.read().splitlines()]
+        words = _killed(path, saved + 1, draw.uniform(0.0, LATEST_S), careless)
+        if not words:
+            raise BadState(f"kill {kill}: the writer ended by itself; seed {seed}")
         begun = max(int(line.split()[1]) for line in words if line.startswith("begun"))
         known = max((int(line.split()[1]) for line in words if line.startswith("saved")), default=saved)
         try:
@@ -92,18 +81,38 @@ def kill_writers(folder: Path, kills: int, seed: int, careless: bool = False) ->
     return counts
 
 
+def _killed(path: Path, first: int, after_s: float, careless: bool) -> list[str]:
+    """Start a writer, kill it a while after its first word, and return what it told; nothing if it failed."""
+    reading, writing = os.pipe()
+    writer = os.fork()
+    if not writer:
+        try:
+            os.close(reading)
+            write_for_ever(path, first, careless, writing)
+        finally:
+            os._exit(1)
+    os.close(writing)
+    with os.fdopen(reading) as stream:
+        words = [stream.readline()]
+        time.sleep(after_s)
+        os.kill(writer, signal.SIGKILL)
+        os.waitpid(writer, 0)
+        return [*words, *stream.read().splitlines()] if words[0] else []
+
+
 def main() -> int:
-    """Run the campaign, or be one of its writers."""
+    """Run the campaign."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--kills", type=at_least(1), default=1000, metavar="N")
     parser.add_argument("--seed", type=at_least(0), default=1)
-    parser.add_argument("--write", nargs=2, metavar=("FILE", "FIRST"), help=argparse.SUPPRESS)
     parser.add_argument("--careless", action="store_true", help=argparse.SUPPRESS)
     args = parser.parse_args()
-    if args.write is not None:
-        write_for_ever(Path(args.write[0]), int(args.write[1]), args.careless)
     with tempfile.TemporaryDirectory() as folder:
-        counts = kill_writers(Path(folder), args.kills, args.seed)
+        try:
+            counts = kill_writers(Path(folder), args.kills, args.seed, args.careless)
+        except BadState as error:
+            print(error)
+            return 1
     print(", ".join(f"{number} {what}" for what, number in counts.items()))
     return 0
 

@@ -16,7 +16,6 @@ from calib.errors import BadFile
 from calib.files.atomic import previous_path, save_bytes
 from hil_tests.mastctl.safety.crash_states import Cut, Recorder, crash_states
 from mastctl.safety.state_file import StateFile
-from tools.campaigns.state_kills import BadState, kill_writers
 
 SCHEMA = "mastctl/test/1"
 OLD, NEW = {"value": "old" * 40}, {"value": "new" * 700}
@@ -190,19 +189,20 @@ def test_what_is_no_json_is_not_written(tmp_path: Path) -> None:
     assert state(tmp_path).read() == OLD
 
 
-def test_processes_killed_while_they_write_leave_whole_files(tmp_path: Path) -> None:
-    counts = kill_writers(tmp_path, kills=24, seed=1)
-    assert counts["kills"] == 24
-    assert counts["in the middle of a save"] > 0
+def kills(*options: str) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "tools.campaigns.state_kills", *options]
+    return subprocess.run(command, capture_output=True, text=True, check=False)
 
 
-def test_the_campaign_of_kills_sees_a_careless_writer(tmp_path: Path) -> None:
-    with pytest.raises(BadState):
-        kill_writers(tmp_path, kills=200, seed=1, careless=True)
+def test_processes_killed_while_they_write_leave_whole_files() -> None:
+    done = kills("--kills", "60")
+    assert done.returncode == 0, done.stdout + done.stderr
+    found = {what: int(number) for number, _, what in (one.partition(" ") for one in done.stdout.split(", "))}
+    assert found["kills"] == 60
+    assert found["in the middle of a save"] > 0
 
 
-def test_the_campaign_of_kills_is_a_command() -> None:
-    command = [sys.executable, "-m", "tools.campaigns.state_kills", "--kills", "3"]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
-    assert "3 kills" in done.stdout
+def test_the_campaign_of_kills_sees_a_careless_writer() -> None:
+    done = kills("--kills", "500", "--careless")
+    assert done.returncode == 1
+    assert "seed 1" in done.stdout
