@@ -14,7 +14,7 @@ from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
-from typing import Any, Literal, Protocol
+from typing import Any, Protocol
 
 from drivers.clock import Clock
 from mastctl.commands.audit import AuditLog
@@ -22,11 +22,10 @@ from mastctl.commands.caller import Caller, Role
 from mastctl.commands.idempotency import Answer, Answers
 from mastctl.commands.lease import Leases
 from mastctl.errors import BadRequest, MastctlError, NotNow, error_body
+from mastctl.state.refusals import Need
 
 LONGEST_DEADLINE_S = 3600.0
 FOLLOWED = 256  # operations whose end is still recorded with who began them
-
-Need = Literal["motion", "track", "rest", "latch"]
 
 
 @dataclass(frozen=True)
@@ -60,8 +59,8 @@ JOG = Command("jog", steers=True, goes_on=True)
 TRACK = Command("track", steers=True, need="track")
 TRACK_LOOK = Command("track.look", steers=True, need="motion")
 TRACK_STOP = Command("track.stop", steers=True)
-MAST = Command("mast", steers=True, need="rest")
-MAST_BACK = Command("mast.back", steers=True, need="rest")
+MAST = Command("mast", steers=True)  # the service asks whether the head rests, after reading it
+MAST_BACK = Command("mast.back", steers=True)
 POSE = Command(
     "pose"
 )  # a fact about the rover, told by who knows it; the track that looks has its own holder

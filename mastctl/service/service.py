@@ -24,7 +24,7 @@ from drivers.simulation_clock import SimulationClock
 from mastctl.commands.audit import AuditLog
 from mastctl.commands.entry import Entry
 from mastctl.commands.idempotency import Answers
-from mastctl.commands.lease import Leases
+from mastctl.commands.lease import Control, Leases
 from mastctl.config import Config
 from mastctl.devices.devices import Devices
 from mastctl.devices.frames import StampedFrame, check_known, random_run
@@ -62,7 +62,7 @@ HARDWARE_CLOSE_S = 3.0
 KEPT_S = 1.0  # what the disk is given before an emergency stop is answered without it
 STATE = "state"
 AUDIT_FILE = "audit.jsonl"
-KEPT_COMMANDS = 100  # newest ones that a new listener still hears
+KEPT_COMMANDS = 100  # the newest ones, which a new listener still hears of
 ENDS_SOON_S = 0.25  # a stopped operation ends within 20 ms or so; then the next one may follow at once
 
 
@@ -159,7 +159,7 @@ class Service:
             self.machine,
         )
         people_s = SystemClock()  # clients live in real time, whatever a simulated rover's clock does
-        self.leases = Leases(people_s, self._runs)
+        self.leases = Leases(people_s, self._runs, self._steered)
         self.audit = AuditLog(self.folder.path / AUDIT_FILE, clock)
         self.entry = Entry(
             clock,
@@ -167,7 +167,8 @@ class Service:
             Answers(people_s, clock),
             self.audit,
             self.operations,
-            publish=self._commanded,
+            self.machine,
+            self._commanded,
         )
         self._version = version("mastctl")
         self.recording = Recording(
@@ -560,14 +561,20 @@ class Service:
         """Whether an operation or a track runs; takes no lock."""
         return self.operations.running is not None or self.tracker.status.state in ACTIVE
 
+    def _steered(self, control: Control | None) -> None:
+        """Publish who holds the lease."""
+        told = None if control is None else asdict(control)
+        self.machine.publisher.publish("lease", "lease", told)
+
+    def _commanded(self, number: int, record: Mapping[str, Any]) -> None:
+        """Publish a command's record, or how what it began has ended."""
+        publisher, end = self.machine.publisher, ".ended" if "ended" in record else ""
+        publisher.publish("command", f"{number}{end}", record)
+        publisher.forget("command", f"{number - KEPT_COMMANDS}{end}")
+
     def _ended(self, operation: Operation) -> None:
         """Have an operation's end recorded."""
         self.entry.ended(operation.id, operation.state, operation.error)
-
-    def _commanded(self, number: int, record: Mapping[str, Any]) -> None:
-        """Publish a command's record."""
-        self.machine.publisher.publish("command", str(number), record)
-        self.machine.publisher.forget("command", str(number - KEPT_COMMANDS))
 
     def _handed_over(self, handoff: MatchedHandoff) -> None:
         """Have a hand-off counted and recorded."""
