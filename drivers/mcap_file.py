@@ -34,6 +34,7 @@ class BadRecording(DriverError):
     """A file that is no recording, or cannot be read."""
 
     code = "bad_recording"
+    exit_code = 2
 
 
 @dataclass

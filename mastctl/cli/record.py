@@ -86,7 +86,7 @@ def _list(args: argparse.Namespace) -> int:
 
 def _dropped(dropped: dict[str, int]) -> str:
     count = sum(dropped.values())
-    return f", {count} messages were dropped" if count else ""
+    return f", {count} values were dropped or overtaken by newer ones" if count else ""
 
 
 def _show(args: argparse.Namespace) -> int:
