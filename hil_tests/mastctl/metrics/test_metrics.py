@@ -1,0 +1,135 @@
+"""What Prometheus reads: parsed by its own library, from news that the test publishes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+from prometheus_client.parser import text_string_to_metric_families
+
+from drivers.interfaces import Reading
+from hil_tests.mastctl.service_fakes import FakePointing, FakeResult, eventually
+from mastctl.metrics.metrics import Metrics
+from mastctl.operations.records import Operation
+from mastctl.state.publisher import Publisher
+
+STATUS: dict[str, Any] = {
+    "state": "ready",
+    "version": "1.2.3",
+    "hardware": "simulated",
+    "uptime_s": 12.5,
+    "mast": {"file": 'ma"st\\.yaml', "digest": "abc", "name": "little"},
+    "joints": {"pan_rad": 0.25, "tilt_rad": -0.125, "age_s": 0.02},
+    "cameras": {"navcam_left": {"age_s": 0.5}, "navcam_right": {"age_s": None}},
+    "faults": [
+        {"device": "navcam_right", "code": "no_reply"},
+        {"device": "navcam_right", "code": "no_reply"},
+    ],
+    "control": {"holder": "a", "kind": "lease", "for_s": 4.0},
+}
+
+DONE = FakeResult((6.0, 1.0, 0.0), 6.2, (FakePointing((0.3, -0.1), (0.1, 0.1), "navcam_left-1"),))
+
+Found = dict[tuple[str, tuple[tuple[str, str], ...]], float]
+Scrape = Callable[[], Found]
+
+
+@pytest.fixture
+def publisher() -> Publisher:
+    return Publisher()
+
+
+def scraped(metrics: Metrics) -> Found:
+    return {
+        (sample.name, tuple(sorted(sample.labels.items()))): sample.value
+        for family in text_string_to_metric_families(metrics.text().decode())
+        for sample in family.samples
+    }
+
+
+def test_the_status_is_told_as_it_is_when_somebody_asks(publisher: Publisher) -> None:
+    status = dict(STATUS)
+    metrics = Metrics(lambda: status, publisher)
+    found = scraped(metrics)
+    assert found["mastctl_state", (("mastctl_state", "ready"),)] == 1.0
+    assert found["mastctl_state", (("mastctl_state", "moving"),)] == 0.0
+    assert found["mastctl_joint_radians", (("axis", "tilt"),)] == -0.125
+    assert found["mastctl_frame_age_seconds", (("camera", "navcam_left"),)] == 0.5
+    assert ("mastctl_frame_age_seconds", (("camera", "navcam_right"),)) not in found
+    assert found["mastctl_fault", (("code", "no_reply"), ("device", "navcam_right"))] == 1.0
+    assert found["mastctl_lease_left_seconds", ()] == 4.0
+    labels = dict(next(labels for name, labels in found if name == "mastctl_info"))
+    assert labels["mast_file"] == 'ma"st\\.yaml'
+    status |= {"state": "moving", "control": None, "joints": None, "faults": []}
+    found = scraped(metrics)
+    assert found["mastctl_state", (("mastctl_state", "ready"),)] == 0.0
+    assert not [
+        name for name, _ in found if name in ("mastctl_joint_radians", "mastctl_fault", "mastctl_lease")
+    ]
+    metrics.close()
+
+
+def operation(name: str, state: str, **more: Any) -> Operation:
+    return Operation(name, state, {}, 0.0, **more)  # type: ignore[arg-type]
+
+
+def test_operations_are_counted_once_when_they_have_ended(publisher: Publisher) -> None:
+    metrics = Metrics(lambda: STATUS, publisher)
+    publisher.publish("operation", "1", operation("1", "running"))
+    publisher.publish(
+        "operation",
+        "1",
+        operation("1", "done", result=DONE, steps=({"name": "move", "duration_s": 0.3},)),
+    )
+    publisher.publish("operation", "2", operation("2", "failed", error={"code": "did_not_arrive"}))
+    failed = "mastctl_operations_total", (("code", "did_not_arrive"), ("state", "failed"))
+    eventually(lambda: failed in scraped(metrics), "the second operation")
+    found = scraped(metrics)
+    assert found["mastctl_operations_total", (("code", ""), ("state", "done"))] == 1.0
+    assert found["mastctl_step_seconds_count", (("step", "move"),)] == 1.0
+    assert found["mastctl_residual_pixels_count", ()] == 2.0
+    metrics.close()
+
+
+def test_frames_that_nobody_got_are_counted_by_the_cameras_own_count(publisher: Publisher) -> None:
+    metrics = Metrics(lambda: STATUS, publisher)
+    taken = "mastctl_frames_total", (("camera", "navcam_left"),)
+    for number, sequence in enumerate((7, 8, 12), 1):
+        publisher.publish("frame", "navcam_left", SimpleNamespace(sequence=sequence))
+        eventually(lambda number=number: scraped(metrics).get(taken) == number, "the frame")
+    assert scraped(metrics)["mastctl_frames_missed_total", (("camera", "navcam_left"),)] == 3.0
+    metrics.close()
+
+
+def test_readings_of_the_head_are_counted_by_the_time_between_them(publisher: Publisher) -> None:
+    metrics = Metrics(lambda: STATUS, publisher)
+    count = "mastctl_reading_interval_seconds_count", ()
+    publisher.publish("joints", "pan_tilt", Reading(0.0, 0.0, False, 10.0))
+    publisher.publish("command", "1", {"command": "point", "result": "ok"})
+    point = "mastctl_commands_total", (("command", "point"), ("result", "ok"))
+    eventually(lambda: point in scraped(metrics), "what was published after it")
+    publisher.publish("joints", "pan_tilt", Reading(0.0, 0.0, False, 10.04))
+    eventually(lambda: scraped(metrics)[count] == 1.0, "the second reading")
+    assert scraped(metrics)["mastctl_reading_interval_seconds_sum", ()] == pytest.approx(0.04)
+    metrics.close()
+
+
+def test_a_record_that_nobody_foresaw_does_not_end_the_counting(publisher: Publisher) -> None:
+    metrics = Metrics(lambda: STATUS, publisher)
+    publisher.publish("frame", "navcam_left", object())
+    publisher.publish("operation", "3", operation("3", "stopped", error={"code": "stopped"}))
+    stopped = "mastctl_operations_total", (("code", "stopped"), ("state", "stopped"))
+    eventually(lambda: stopped in scraped(metrics), "what came after it")
+    metrics.close()
+
+
+def test_two_daemons_in_one_process_count_each_for_itself(publisher: Publisher) -> None:
+    one, other = Metrics(lambda: STATUS, publisher), Metrics(lambda: STATUS, Publisher())
+    publisher.publish("command", "1", {"command": "stop", "result": "ok"})
+    counted = "mastctl_commands_total", (("command", "stop"), ("result", "ok"))
+    eventually(lambda: counted in scraped(one), "the command")
+    assert counted not in scraped(other)
+    one.close()
+    other.close()

@@ -1,0 +1,1 @@
+"""Figures of a running daemon as Prometheus reads them."""

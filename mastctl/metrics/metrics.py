@@ -1,0 +1,183 @@
+"""``GET /metrics``: what a daemon is and has done, in Prometheus' text format.
+
+What is true at the moment is read from the status when somebody asks; what happened is counted as it is
+published, in a thread of its own, so that nothing that happens waits for being counted.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections.abc import Callable, Iterable, Mapping
+from typing import Any, get_args
+
+from prometheus_client import CollectorRegistry, Counter, Histogram, generate_latest
+from prometheus_client.core import GaugeMetricFamily, InfoMetricFamily, Metric, StateSetMetricFamily
+from prometheus_client.process_collector import ProcessCollector
+
+from mastctl.operations.records import Operation
+from mastctl.state.publisher import Published, Publisher
+from mastctl.state.standing import Word
+
+log = logging.getLogger(__name__)
+
+CONTENT_TYPE = "text/plain; version=0.0.4; charset=utf-8"
+
+RESIDUAL_PX = (0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0)
+SIGMAS = (0.5, 1.0, 1.5, 2.0, 3.0, 5.0, 10.0)
+STEP_S = (0.005, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 30.0)
+READING_S = (0.005, 0.01, 0.02, 0.03, 0.05, 0.075, 0.1, 0.2, 0.5, 1.0)
+ENDED = frozenset({"done", "failed", "stopped"})
+
+Status = Callable[[], Mapping[str, Any]]
+
+
+class Metrics:
+    """The figures of one daemon, in a registry of their own.
+
+    Parameters
+    ----------
+    status
+        Returns what ``GET /status`` tells.
+    publisher
+        Whose news are counted.
+    """
+
+    def __init__(self, status: Status, publisher: Publisher) -> None:
+        self._registry = CollectorRegistry()
+        self._registry.register(_Now(status))
+        ProcessCollector(registry=self._registry)
+        self._operations = self._counter("operations", "Operations that have ended.", "state", "code")
+        self._commands = self._counter("commands", "Commands, by what came of them.", "command", "result")
+        self._frames = self._counter("frames", "Frames taken.", "camera")
+        self._missed = self._counter("frames_missed", "Frames that a camera counted, nobody got.", "camera")
+        self._residual = self._histogram("residual_pixels", "Residuals, each axis by itself.", RESIDUAL_PX)
+        self._sigmas = self._histogram("residual_sigmas", "Residuals over their sigma.", SIGMAS)
+        self._step = self._histogram("step_seconds", "Steps of pointings and looks.", STEP_S, "step")
+        self._reading = self._histogram(
+            "reading_interval_seconds", "From one reading of the head to the next.", READING_S
+        )
+        self._last_reading_s: float | None = None
+        self._sequences: dict[str, int] = {}
+        self._news = publisher.subscribe("operation", "command", "frame", "joints", known=False)
+        self._thread = threading.Thread(target=self._count, name="metrics", daemon=True)
+        self._thread.start()
+
+    def text(self) -> bytes:
+        """Return everything in the text format."""
+        return bytes(generate_latest(self._registry))
+
+    def close(self) -> None:
+        """Count no more."""
+        self._news.close()
+
+    def _counter(self, name: str, words: str, *labels: str) -> Counter:
+        return Counter(name, words, labels, namespace="mastctl", registry=self._registry)
+
+    def _histogram(self, name: str, words: str, bounds: tuple[float, ...], *labels: str) -> Histogram:
+        return Histogram(name, words, labels, namespace="mastctl", buckets=bounds, registry=self._registry)
+
+    # In the listener's thread
+
+    def _count(self) -> None:
+        while not self._news.closed:
+            for one in self._news.wait():
+                try:
+                    self._counted(one)
+                except Exception:  # a record that nobody foresaw must not end the counting
+                    log.exception("what was published under %s could not be counted", one.topic)
+
+    def _counted(self, one: Published) -> None:
+        if one.topic == "operation":
+            self._operation(one.value)
+        elif one.topic == "command":
+            self._command(one.value)
+        elif one.topic == "frame":
+            self._frame(one.key, one.value)
+        elif one.topic == "joints":
+            before, self._last_reading_s = self._last_reading_s, one.value.time_s
+            if before is not None:
+                self._reading.observe(one.value.time_s - before)
+
+    def _operation(self, operation: Operation) -> None:
+        if operation.state not in ENDED:
+            return
+        told = operation.told()
+        self._operations.labels(operation.state, (told["error"] or {}).get("code", "")).inc()
+        for step in told["steps"]:
+            if step.get("duration_s") is not None:
+                self._step.labels(str(step["name"])).observe(step["duration_s"])
+        for pointing in told["pointings"]:
+            residual = pointing.get("residual_px") or ()
+            for off, sigma in zip(residual, pointing.get("residual_sigma_px") or (), strict=False):
+                if off is not None and sigma:
+                    self._residual.observe(abs(off))
+                    self._sigmas.observe(abs(off) / sigma)
+
+    def _command(self, record: Mapping[str, Any]) -> None:
+        if "result" in record:  # not the record of its operation's end
+            self._commands.labels(record["command"], record["result"]).inc()
+
+    def _frame(self, camera: str, facts: Any) -> None:
+        before = self._sequences.get(camera)
+        self._sequences[camera] = facts.sequence
+        self._frames.labels(camera).inc()
+        if before is not None and facts.sequence > before + 1:
+            self._missed.labels(camera).inc(facts.sequence - before - 1)
+
+
+class _Now:
+    """What is true at the moment, read when somebody asks."""
+
+    def __init__(self, status: Status) -> None:
+        self._status = status
+
+    def describe(self) -> Iterable[Metric]:
+        """Return nothing: without it the library would ask for a status to find out the names."""
+        return ()
+
+    def collect(self) -> Iterable[Metric]:
+        """Yield the gauges."""
+        status = self._status()
+        mast = status["mast"]
+        yield InfoMetricFamily(
+            "mastctl",
+            "The program and what it drives.",
+            {
+                "version": status["version"], "hardware": status["hardware"],
+                "mast_file": mast["file"], "mast_digest": mast["digest"],
+            },
+        )  # fmt: skip
+        states = StateSetMetricFamily("mastctl_state", "The state in one word.")
+        states.add_metric([], {word: word == status["state"] for word in get_args(Word)})
+        yield states
+        yield GaugeMetricFamily("mastctl_uptime_seconds", "Since the daemon started.", status["uptime_s"])
+        joints = status["joints"]
+        if joints is not None:
+            angle = GaugeMetricFamily("mastctl_joint_radians", "Measured joint angle.", labels=["axis"])
+            angle.add_metric(["pan"], joints["pan_rad"])
+            angle.add_metric(["tilt"], joints["tilt_rad"])
+            yield angle
+            yield GaugeMetricFamily("mastctl_joints_age_seconds", "Since the head was read.", joints["age_s"])
+        age = GaugeMetricFamily("mastctl_frame_age_seconds", "Of the newest frame.", labels=["camera"])
+        for name, camera in status["cameras"].items():
+            if camera["age_s"] is not None:
+                age.add_metric([name], camera["age_s"])
+        yield age
+        faults = GaugeMetricFamily("mastctl_fault", "1 for each fault.", labels=["device", "code"])
+        for device, code in {(fault["device"], fault["code"]) for fault in status["faults"]}:
+            faults.add_metric([device, code], 1.0)
+        yield faults
+        yield from _steering(status.get("control"))
+
+
+def _steering(control: Mapping[str, Any] | None) -> Iterable[Metric]:
+    """Who steers, and for how long."""
+    held = GaugeMetricFamily("mastctl_lease", "1 for the one who steers.", labels=["holder", "kind"])
+    left = GaugeMetricFamily("mastctl_lease_left_seconds", "Until the lease is over.")
+    if control is not None:
+        held.add_metric([str(control.get("holder", "")), str(control.get("kind", ""))], 1.0)
+        if control.get("for_s") is not None:
+            left.add_metric([], float(control["for_s"]))
+    yield held
+    yield left
