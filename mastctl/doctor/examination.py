@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from pathlib import Path
 from typing import Any
 
 from calib.errors import BadFile
@@ -15,14 +14,13 @@ from mastctl.doctor.findings import Finding, Machine
 from mastctl.doctor.host import examine_clock, examine_descriptors, examine_folder
 from mastctl.doctor.mast_file import examine_mast_file
 from mastctl.doctor.serial_lines import examine_port
+from mastctl.safety.state_folder import usual_folder
 
 Asked = Callable[[str], dict[str, Any] | None]
 """Returns the status of the daemon at an address, None if nobody answers there."""
 
 
-def examine(
-    path: str | None, asked: Asked, machine: Machine | None = None, state_folder: Path | None = None
-) -> Iterator[Finding]:
+def examine(path: str | None, asked: Asked, machine: Machine | None = None) -> Iterator[Finding]:
     """Look at everything that a configuration needs; nothing is opened that could move.
 
     Parameters
@@ -33,8 +31,6 @@ def examine(
         Asks a daemon that may run already.
     machine
         Where devices and their descriptions lie; this machine by default.
-    state_folder
-        Where a daemon keeps its state.
     """
     machine = machine or Machine()
     try:
@@ -53,8 +49,9 @@ def examine(
         if camera.driver in CAMERAS:
             yield examine_camera(name, camera.options, in_use=status is not None)
     yield from _simulation(config)
-    if state_folder is not None:
-        yield from examine_folder("state folder", state_folder)
+    yield from examine_folder(
+        "state folder", config.state_folder or usual_folder(config.path, config.listen.url)
+    )
     yield examine_clock()
     yield examine_descriptors()
 

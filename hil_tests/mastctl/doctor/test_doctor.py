@@ -147,7 +147,7 @@ def configured(tmp_path: Path, text: str) -> str:
 def examined(
     path: str | None, tmp_path: Path, machine: Machine, status: dict[str, Any] | None = None
 ) -> dict[str, Finding]:
-    return by_name(list(examine(path, lambda _: status, machine, tmp_path / "state")))
+    return by_name(list(examine(path, lambda _: status, machine)))
 
 
 def test_the_packaged_simulated_rover_lacks_nothing(tmp_path: Path, machine: Machine) -> None:
