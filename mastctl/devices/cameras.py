@@ -242,6 +242,14 @@ class Cameras:
         """Return what is wrong with any camera now."""
         return [fault for thread in self._threads.values() for fault in thread.faults()]
 
+    def errors(self) -> dict[tuple[str, str, str], int]:
+        """Return how often calls have failed since the start: by camera, call, and the error's code."""
+        return {
+            (name, *kind): count
+            for name, thread in self._threads.items()
+            for kind, count in thread.errors().items()
+        }
+
     def close(self, until_s: float) -> None:
         """End the threads; waits until a moment of the deadlines' clock, and for each 0.1 s at least."""
         for thread in self._threads.values():

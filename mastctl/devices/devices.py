@@ -308,6 +308,11 @@ class Devices:
         door = self.door.faults(self._history.newest)
         return (*self._head.faults(), *self._stops.faults(), *reported, *door, *self._cameras.faults())
 
+    def errors(self) -> dict[tuple[str, str, str], int]:
+        """Return how often calls have failed since the start: by device, call, and the error's code."""
+        head = {(HEAD, *kind): count for kind, count in self._head.errors().items()}
+        return head | self._cameras.errors()
+
     def close(self) -> None:
         """Stop the head and end the threads; takes some 4 s at most and never raises."""
         self.block_moves(self, "the service is closing")

@@ -11,7 +11,7 @@ Deadlines and pacing run on a clock that goes on while somebody waits, whatever 
 from __future__ import annotations
 
 import logging
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Mapping
 from concurrent.futures import CancelledError, Future
 from dataclasses import dataclass
@@ -97,6 +97,7 @@ class DeviceThread:
         self._jobs: deque[Asked[Any]] = deque()
         self._closing = False
         self._now: _Now | None = None
+        self._errors: Counter[tuple[str, str]] = Counter()
         self._faults: Mapping[str, StandingFault] = {}  # replaced, never edited: read without a lock
         self._thread = self._clock.thread(self._serve, f"device {device}")
         self._thread.start()
@@ -183,6 +184,11 @@ class DeviceThread:
         """
         deadline_s = self._clock.now_s() + timeout_s
         return self.wait(self.submit(what, function, timeout_s, told=told), deadline_s)
+
+    def errors(self) -> dict[tuple[str, str], int]:
+        """Return how often each call has failed since the start, by its name and the error's code."""
+        with self._wake:
+            return dict(self._errors)
 
     def faults(self) -> tuple[StandingFault, ...]:
         """Return what is wrong at this moment; a call that succeeds takes back its own earlier fault.
@@ -333,6 +339,7 @@ class DeviceThread:
             else:
                 since_s = known.since_s if known else self._clock.now_s()
                 code = getattr(error, "code", DriverError.code)
+                self._errors[what, code] += 1
                 fault = self._fault(what, code, str(error), since_s)
                 self._faults = {**self._faults, what: fault}
         if error is None and known:

@@ -12,7 +12,13 @@ from collections.abc import Callable, Iterable, Mapping
 from typing import Any, get_args
 
 from prometheus_client import CollectorRegistry, Counter, Histogram, generate_latest
-from prometheus_client.core import GaugeMetricFamily, InfoMetricFamily, Metric, StateSetMetricFamily
+from prometheus_client.core import (
+    CounterMetricFamily,
+    GaugeMetricFamily,
+    InfoMetricFamily,
+    Metric,
+    StateSetMetricFamily,
+)
 from prometheus_client.process_collector import ProcessCollector
 
 from mastctl.operations.records import Operation
@@ -30,6 +36,7 @@ READING_S = (0.005, 0.01, 0.02, 0.03, 0.05, 0.075, 0.1, 0.2, 0.5, 1.0)
 ENDED = frozenset({"done", "failed", "stopped"})
 
 Status = Callable[[], Mapping[str, Any]]
+Errors = Callable[[], Mapping[tuple[str, str, str], int]]
 
 
 class Metrics:
@@ -39,13 +46,15 @@ class Metrics:
     ----------
     status
         Returns what ``GET /status`` tells.
+    errors
+        Returns how often calls to devices have failed: by device, call, and the error's code.
     publisher
         Whose news are counted.
     """
 
-    def __init__(self, status: Status, publisher: Publisher) -> None:
+    def __init__(self, status: Status, errors: Errors, publisher: Publisher) -> None:
         self._registry = CollectorRegistry()
-        self._registry.register(_Now(status))
+        self._registry.register(_Now(status, errors))
         ProcessCollector(registry=self._registry)
         self._operations = self._counter("operations", "Operations that have ended.", "state", "code")
         self._commands = self._counter("commands", "Commands, by what came of them.", "command", "result")
@@ -129,8 +138,9 @@ class Metrics:
 class _Now:
     """What is true at the moment, read when somebody asks."""
 
-    def __init__(self, status: Status) -> None:
+    def __init__(self, status: Status, errors: Errors) -> None:
         self._status = status
+        self._errors = errors
 
     def describe(self) -> Iterable[Metric]:
         """Return nothing: without it the library would ask for a status to find out the names."""
@@ -168,6 +178,12 @@ class _Now:
         for device, code in {(fault["device"], fault["code"]) for fault in status["faults"]}:
             faults.add_metric([device, code], 1.0)
         yield faults
+        failed = CounterMetricFamily(
+            "mastctl_device_errors", "Calls to devices that failed.", labels=["device", "call", "code"]
+        )
+        for kind, count in self._errors().items():
+            failed.add_metric(kind, count)
+        yield failed
         yield from _steering(status.get("control"))
 
 

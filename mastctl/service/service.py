@@ -30,6 +30,7 @@ from mastctl.devices.devices import Devices
 from mastctl.devices.frames import StampedFrame, check_known, random_run
 from mastctl.errors import MastctlError, NotNow, Unable
 from mastctl.handoff.check import HandoffCheck
+from mastctl.metrics.metrics import Metrics
 from mastctl.operations.operations import STOP_ASKED, Operations
 from mastctl.operations.records import Operation
 from mastctl.pointing.jog import Jogs
@@ -96,6 +97,8 @@ class Service:
         What the track's hand-offs say of the mast file in use.
     entry, leases, audit
         Where each command passes, who steers, and what is recorded of it.
+    metrics
+        What is counted, for Prometheus.
     stop_threads
         Where the web side calls `stop`: threads that nothing else can keep busy.
     recording
@@ -170,6 +173,7 @@ class Service:
             self.machine,
             self._commanded,
         )
+        self.metrics = Metrics(lambda: self.state().told(), self.devices.errors, self.machine.publisher)
         self._version = version("mastctl")
         self.recording = Recording(
             config,
@@ -545,6 +549,7 @@ class Service:
         self.operations.close()
         self.devices.close()
         self.machine.publisher.close()
+        self.metrics.close()
         self.stop_threads.close()
         self.handoffs.close()
         self.recording.close()

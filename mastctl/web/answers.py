@@ -68,6 +68,20 @@ class Sun(_Told):
     holds: bool
 
 
+class LiveTold(_Told):
+    """``GET /health/live``."""
+
+    live: Literal[True]
+
+
+class ReadyTold(_Told):
+    """``GET /health/ready``: whether commands are carried out, and the state with its reason."""
+
+    ready: bool
+    state: Word
+    reason: str
+
+
 class SunTold(_Told):
     """``GET /limits/sun``; null where none was told."""
 

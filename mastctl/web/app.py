@@ -28,6 +28,7 @@ from mastctl.web.routes import add_pointing, add_tracking
 from mastctl.web.sessions import add_sessions
 from mastctl.web.simulation import add_simulation
 from mastctl.web.waiting import Waiting
+from mastctl.web.watching import add_watching
 
 
 def create_app(service: Service, waiting: Waiting | None = None, entrance: Entrance | None = None) -> ASGIApp:
@@ -61,5 +62,6 @@ def create_app(service: Service, waiting: Waiting | None = None, entrance: Entra
     add_pictures(app, service, waiting, commands)
     add_recordings(app, service, waiting, commands)
     add_simulation(app, service, waiting, commands)
+    add_watching(app, service)
     describe(app)
     return Guard(app, entrance)

@@ -47,6 +47,8 @@ ANSWERS: Mapping[str, type[BaseModel]] = {
     "GET /simulation/faults": told.FaultsSet,
     "POST /simulation/faults": told.FaultsSet,
     "DELETE /simulation/faults": told.FaultsSet,
+    "GET /health/live": told.LiveTold,
+    "GET /health/ready": told.ReadyTold,
     "GET /session": told.SessionTold,
     "POST /login": told.SessionTold,
     "POST /logout": told.LoggedOut,
@@ -56,6 +58,7 @@ EVENTS: Mapping[str, type[BaseModel]] = {"GET /track/stream": told.TrackTold}
 FILES: Mapping[str, tuple[str, ...]] = {
     "GET /snapshot/{camera}": ("image/png", "image/jpeg"),
     "GET /mast": ("application/yaml",),
+    "GET /metrics": ("text/plain",),
 }
 PICTURES = ("GET /snapshot/{camera}",)
 _REFERENCE = "#/components/schemas/{model}"

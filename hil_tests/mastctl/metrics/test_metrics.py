@@ -51,7 +51,7 @@ def scraped(metrics: Metrics) -> Found:
 
 def test_the_status_is_told_as_it_is_when_somebody_asks(publisher: Publisher) -> None:
     status = dict(STATUS)
-    metrics = Metrics(lambda: status, publisher)
+    metrics = Metrics(lambda: status, lambda: {("pan_tilt", "read", "no_reply"): 3}, publisher)
     found = scraped(metrics)
     assert found["mastctl_state", (("mastctl_state", "ready"),)] == 1.0
     assert found["mastctl_state", (("mastctl_state", "moving"),)] == 0.0
@@ -60,6 +60,8 @@ def test_the_status_is_told_as_it_is_when_somebody_asks(publisher: Publisher) ->
     assert ("mastctl_frame_age_seconds", (("camera", "navcam_right"),)) not in found
     assert found["mastctl_fault", (("code", "no_reply"), ("device", "navcam_right"))] == 1.0
     assert found["mastctl_lease_left_seconds", ()] == 4.0
+    failed = (("call", "read"), ("code", "no_reply"), ("device", "pan_tilt"))
+    assert found["mastctl_device_errors_total", failed] == 3.0
     labels = dict(next(labels for name, labels in found if name == "mastctl_info"))
     assert labels["mast_file"] == 'ma"st\\.yaml'
     status |= {"state": "moving", "control": None, "joints": None, "faults": []}
@@ -76,7 +78,7 @@ def operation(name: str, state: str, **more: Any) -> Operation:
 
 
 def test_operations_are_counted_once_when_they_have_ended(publisher: Publisher) -> None:
-    metrics = Metrics(lambda: STATUS, publisher)
+    metrics = Metrics(lambda: STATUS, dict, publisher)
     publisher.publish("operation", "1", operation("1", "running"))
     publisher.publish(
         "operation",
@@ -94,7 +96,7 @@ def test_operations_are_counted_once_when_they_have_ended(publisher: Publisher) 
 
 
 def test_frames_that_nobody_got_are_counted_by_the_cameras_own_count(publisher: Publisher) -> None:
-    metrics = Metrics(lambda: STATUS, publisher)
+    metrics = Metrics(lambda: STATUS, dict, publisher)
     taken = "mastctl_frames_total", (("camera", "navcam_left"),)
     for number, sequence in enumerate((7, 8, 12), 1):
         publisher.publish("frame", "navcam_left", SimpleNamespace(sequence=sequence))
@@ -104,7 +106,7 @@ def test_frames_that_nobody_got_are_counted_by_the_cameras_own_count(publisher: 
 
 
 def test_readings_of_the_head_are_counted_by_the_time_between_them(publisher: Publisher) -> None:
-    metrics = Metrics(lambda: STATUS, publisher)
+    metrics = Metrics(lambda: STATUS, dict, publisher)
     count = "mastctl_reading_interval_seconds_count", ()
     publisher.publish("joints", "pan_tilt", Reading(0.0, 0.0, False, 10.0))
     publisher.publish("command", "1", {"command": "point", "result": "ok"})
@@ -117,7 +119,7 @@ def test_readings_of_the_head_are_counted_by_the_time_between_them(publisher: Pu
 
 
 def test_a_record_that_nobody_foresaw_does_not_end_the_counting(publisher: Publisher) -> None:
-    metrics = Metrics(lambda: STATUS, publisher)
+    metrics = Metrics(lambda: STATUS, dict, publisher)
     publisher.publish("frame", "navcam_left", object())
     publisher.publish("operation", "3", operation("3", "stopped", error={"code": "stopped"}))
     stopped = "mastctl_operations_total", (("code", "stopped"), ("state", "stopped"))
@@ -126,7 +128,7 @@ def test_a_record_that_nobody_foresaw_does_not_end_the_counting(publisher: Publi
 
 
 def test_two_daemons_in_one_process_count_each_for_itself(publisher: Publisher) -> None:
-    one, other = Metrics(lambda: STATUS, publisher), Metrics(lambda: STATUS, Publisher())
+    one, other = Metrics(lambda: STATUS, dict, publisher), Metrics(lambda: STATUS, dict, Publisher())
     publisher.publish("command", "1", {"command": "stop", "result": "ok"})
     counted = "mastctl_commands_total", (("command", "stop"), ("result", "ok"))
     eventually(lambda: counted in scraped(one), "the command")

@@ -1,0 +1,45 @@
+"""Metrics and health of a daemon, asked over HTTP."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import httpx
+import pytest
+from prometheus_client.parser import text_string_to_metric_families
+
+from hil_tests.mastctl.service_fakes import FakeHardware, eventually, fake_daemon
+from mastctl.daemon import RunningDaemon
+
+BOTH = tuple[RunningDaemon, FakeHardware]
+
+
+@pytest.fixture
+def pair(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[BOTH]:
+    with fake_daemon(monkeypatch, tmp_path) as made:
+        yield made
+
+
+def test_metrics_are_read_by_prometheus_own_parser(pair: BOTH) -> None:
+    answer = httpx.get(f"{pair[0].url}/metrics")
+    assert answer.status_code == 200
+    assert answer.headers["content-type"].startswith("text/plain; version=0.0.4")
+    found = {family.name for family in text_string_to_metric_families(answer.text)}
+    assert {"mastctl_info", "mastctl_state", "mastctl_uptime_seconds", "process_open_fds"} <= found
+
+
+def test_a_daemon_whose_head_is_read_is_ready_and_one_that_is_stopped_says_why_not(pair: BOTH) -> None:
+    url = f"{pair[0].url}/api/v1"
+    assert httpx.get(f"{url}/health/live").json() == {"live": True}
+    eventually(lambda: httpx.get(f"{url}/health/ready").status_code == 200, "the first reading")
+    httpx.post(f"{url}/estop", json={"reason": "a dog is near the mast", "name": "Ida"})
+    answer = httpx.get(f"{url}/health/ready")
+    assert answer.status_code == 503
+    assert answer.json()["state"] == "stopped"
+    assert "a dog is near the mast" in answer.json()["reason"]
+
+
+def test_another_sites_page_reads_no_metrics(pair: BOTH) -> None:
+    answer = httpx.get(f"{pair[0].url}/metrics", headers={"Sec-Fetch-Site": "cross-site"})
+    assert answer.status_code == 403

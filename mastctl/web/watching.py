@@ -1,0 +1,36 @@
+"""Routes for who watches a daemon without using it: Prometheus, and what asks whether it is well."""
+
+from __future__ import annotations
+
+from fastapi import FastAPI, Response
+
+from mastctl.metrics.metrics import CONTENT_TYPE
+from mastctl.service.service import Service
+from mastctl.state.standing import Word
+from mastctl.web import PREFIX
+
+WELL: frozenset[Word] = frozenset({"ready", "moving", "tracking", "holding"})
+"""States in which a command is carried out."""
+
+
+def add_watching(app: FastAPI, service: Service) -> None:
+    """Metrics and health."""
+
+    @app.get("/metrics", summary="Figures in the text format of Prometheus", response_class=Response)
+    async def metrics() -> Response:
+        return Response(service.metrics.text(), media_type=CONTENT_TYPE)
+
+    @app.get(f"{PREFIX}/health/live", summary="Whether requests are answered: they are")
+    async def live() -> dict[str, bool]:
+        return {"live": True}
+
+    @app.get(
+        f"{PREFIX}/health/ready",
+        summary="Whether commands are carried out: 200 if they are, else 503 and why not",
+        responses={503: {"description": "Not now"}},
+    )
+    async def ready(response: Response) -> dict[str, str | bool]:
+        now = service.machine.standing
+        well = now.word in WELL
+        response.status_code = 200 if well else 503
+        return {"ready": well, "state": now.word, "reason": now.reason}
