@@ -75,9 +75,9 @@ class LiveTold(_Told):
 
 
 class ReadyTold(_Told):
-    """``GET /health/ready``: whether commands are carried out, and the state with its reason."""
+    """``GET /health/ready`` where commands are carried out: the state with its reason."""
 
-    ready: bool
+    ready: Literal[True]
     state: Word
     reason: str
 

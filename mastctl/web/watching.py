@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from fastapi import FastAPI, Response
 
+from mastctl.errors import Unable
 from mastctl.metrics.metrics import CONTENT_TYPE
 from mastctl.service.service import Service
 from mastctl.state.standing import Word
@@ -27,10 +28,9 @@ def add_watching(app: FastAPI, service: Service) -> None:
     @app.get(
         f"{PREFIX}/health/ready",
         summary="Whether commands are carried out: 200 if they are, else 503 and why not",
-        responses={503: {"description": "Not now"}},
     )
-    async def ready(response: Response) -> dict[str, str | bool]:
+    async def ready() -> dict[str, str | bool]:
         now = service.machine.standing
-        well = now.word in WELL
-        response.status_code = 200 if well else 503
-        return {"ready": well, "state": now.word, "reason": now.reason}
+        if now.word not in WELL:
+            raise Unable("not_ready", f"{now.word}: {now.reason}" if now.reason else now.word)
+        return {"ready": True, "state": now.word, "reason": now.reason}

@@ -36,8 +36,9 @@ def test_a_daemon_whose_head_is_read_is_ready_and_one_that_is_stopped_says_why_n
     httpx.post(f"{url}/estop", json={"reason": "a dog is near the mast", "name": "Ida"})
     answer = httpx.get(f"{url}/health/ready")
     assert answer.status_code == 503
-    assert answer.json()["state"] == "stopped"
-    assert "a dog is near the mast" in answer.json()["reason"]
+    error = answer.json()["error"]
+    assert error["code"] == "not_ready"
+    assert error["message"].startswith("stopped: ") and "a dog is near the mast" in error["message"]
 
 
 def test_another_sites_page_reads_no_metrics(pair: BOTH) -> None:
