@@ -148,7 +148,8 @@ def _arrow(word: Word | None, to: Word, events: Sequence[Event]) -> tuple[str, s
     ahead, aside = ((x2 - x1) / far, (y2 - y1) / far), (-(y2 - y1) / far, (x2 - x1) / far)
     apart = 0 if word is None else 9
     bow = 75 if {word, to} == {"stopped", "fault"} else 0
-    start, stop = (0.0 if word is None else _edge(*ahead)), far - _edge(*ahead)
+    start = 0.0 if word is None else _edge(ahead, (apart * aside[0], apart * aside[1]))
+    stop = far - _edge((-ahead[0], -ahead[1]), (apart * aside[0], apart * aside[1]))
 
     def at(way: float, off: float) -> tuple[float, float]:
         return x1 + way * ahead[0] + off * aside[0], y1 + way * ahead[1] + off * aside[1]
@@ -174,11 +175,12 @@ def _arrow(word: Word | None, to: Word, events: Sequence[Event]) -> tuple[str, s
     )
 
 
-def _edge(ahead_x: float, ahead_y: float) -> float:
-    """How far the edge of a box is from its middle in a direction, px."""
-    width, height = BOX_PX
+def _edge(ahead: tuple[float, float], off: tuple[float, float]) -> float:
+    """How far it is to the edge of a box in a direction, from so far off its middle, px."""
     return min(
-        width / 2 / abs(ahead_x) if ahead_x else math.inf, height / 2 / abs(ahead_y) if ahead_y else math.inf
+        (size / 2 - math.copysign(1.0, way) * beside) / abs(way)
+        for size, way, beside in zip(BOX_PX, ahead, off, strict=True)
+        if way
     )
 
 
