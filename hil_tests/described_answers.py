@@ -87,7 +87,7 @@ def answers_checked() -> Iterator[list[str]]:
     def create_app(*args: Any, **options: Any) -> ASGIApp:
         app = plain(*args, **options)
         assert isinstance(app, Guard)
-        described: list[Described] = []
+        described = Described(app.openapi(), complaints)
 
         async def watched(scope: Scope, receive: Receive, send: Send) -> None:
             status, kind, body = 0, "", b""
@@ -105,10 +105,8 @@ def answers_checked() -> Iterator[list[str]]:
             try:
                 await app(scope, receive, seen)
             finally:
-                if not described:
-                    described.append(Described(app.openapi(), complaints))
                 if status and scope["type"] == "http":
-                    described[0].check(scope, status, kind, body)
+                    described.check(scope, status, kind, body)
 
         return watched
 

@@ -69,7 +69,7 @@ def test_a_stop_before_the_deadline_is_what_is_told(rover: tuple[RunningDaemon, 
     assert client.wait(operation)["error"]["code"] in ("stopped", "did_not_arrive")
     watch = f"deadline of {operation}"
     eventually(lambda: all(one.name != watch for one in threading.enumerate()), "the watch's end")
-    assert daemon.service.operations.motion.operation is None
+    assert daemon.service.operations.running is None
 
 
 def test_a_deadline_is_of_its_own_operation_and_not_of_the_next(

@@ -610,6 +610,13 @@ def test_the_interface_describes_itself(quiet: httpx.Client) -> None:
     assert refusal["schema"]["$ref"].endswith("/ErrorBody")
 
 
+def test_the_description_is_made_before_the_first_request_and_holds_no_stop_up(
+    quiet: httpx.Client, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("fastapi.applications.get_openapi", lambda **facts: pytest.fail("made late"))
+    assert quiet.get(str(quiet.base_url.copy_with(path="/openapi.json"))).status_code == 200
+
+
 @pytest.mark.parametrize(
     "host", ["evil.example", "evil.example:80", "", "127.0.0.1.evil.example", "[::2]", "["]
 )
