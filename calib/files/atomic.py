@@ -3,7 +3,8 @@
 Steps of `save_bytes`: write the new content beside the file and fsync it; give the old content a second name;
 rename the new one into place; fsync the folder; rename the old one to ``NAME.previous.SUFFIX``. After a crash
 in between the folder may hold a hidden ``.NAME.*.new`` or ``.NAME.*.old`` beside the file; neither is ever
-read. `replace_bytes` is the same without a second name, for what a program keeps for itself.
+read. `replace_bytes` is the same without a second name, for what a program keeps for itself. Not so
+`overwrite_bytes`, which is for who cannot wait.
 """
 
 from __future__ import annotations
@@ -115,6 +116,29 @@ def replace_bytes(path: Path, data: bytes, mode: int = 0o600) -> None:
     sync_folder(path.parent)
 
 
+def overwrite_bytes(path: Path, data: bytes) -> None:
+    """Write over what the file holds, blanks after it; when this returns it is on the disk.
+
+    No name and no length changes, so the file system has nothing to note beside the bytes: on ext4 this takes
+    a twentieth of the time of `replace_bytes`, and waits for nobody else's files. A crash meanwhile leaves
+    the old, the new, or parts of both.
+
+    Raises
+    ------
+    OSError
+        If the file system refuses, there is no file, or it is shorter than ``data``.
+    """
+    descriptor = os.open(path, os.O_WRONLY | os.O_CLOEXEC)
+    try:
+        size = os.fstat(descriptor).st_size
+        if len(data) > size:
+            raise OSError(errno.EFBIG, f"has no room for {len(data)} bytes")
+        _write_all(descriptor, data.ljust(size))
+        os.fdatasync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
 def remove(path: Path) -> None:
     """Remove a file; when this returns it is gone from the disk. Raises OSError."""
     path.unlink(missing_ok=True)
@@ -137,12 +161,16 @@ def _write(new: Path, data: bytes, mode: int | None) -> None:
     try:
         if mode is not None:
             os.fchmod(descriptor, mode)
-        left = memoryview(data)
-        while left:
-            left = left[os.write(descriptor, left) :]
+        _write_all(descriptor, data)
         os.fsync(descriptor)
     finally:
         os.close(descriptor)
+
+
+def _write_all(descriptor: int, data: bytes) -> None:
+    left = memoryview(data)
+    while left:
+        left = left[os.write(descriptor, left) :]
 
 
 def _second_name(target: Path, old: Path) -> None:

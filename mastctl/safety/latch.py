@@ -1,11 +1,13 @@
 """The latched emergency stop: held in memory from the first moment, and in the state folder across restarts.
 
-What cannot be read counts as latched. The disk never holds the stop up: a thread of its own writes, after the
-head was told, and tries again for as long as the disk refuses.
+What cannot be read counts as latched: so a stop is written over the file that says that none is, which is
+there from the start, and quick. The disk never holds the stop up: a thread of its own writes, after the head
+was told, and tries again for as long as the disk refuses.
 """
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import threading
 import time
@@ -25,6 +27,7 @@ FILE = "latch.json"
 HEAD_FIRST_S = 0.1  # how long the disk waits for the head to be told, at most
 AGAIN_S = 2.0
 PATIENCE_S = 2.0  # of a reset for a disk that is busy
+ROOM_BYTES = 8192  # for the longest reason and name, however they are written
 LONGEST = 200
 """Characters of a reason or a name that are kept."""
 
@@ -68,7 +71,7 @@ class Latch:
 
     def __init__(self, folder: StateFolder) -> None:
         self._folder = folder
-        self._file = StateFile(folder.path / FILE, SCHEMA)
+        self._file = StateFile(folder.path / FILE, SCHEMA, ROOM_BYTES)
         self._changed = threading.Condition()
         self._disk = threading.Lock()  # for who writes; a disk that hangs holds nobody else
         self.held: Held | None = None
@@ -189,6 +192,10 @@ class Latch:
 
     def _keep(self) -> None:
         """Write what is latched, in a thread of its own."""
+        with self._disk:
+            if self.held is None and not self._folder.is_temporary and not self._file.has_room:
+                with contextlib.suppress(BadFile):  # then a stop is written anew, and tells what is wrong
+                    self._file.write({"latched": False})
         while True:
             with self._changed:
                 while self.held is self._kept or time.monotonic() < self._due_s:
@@ -201,11 +208,19 @@ class Latch:
                 if held is None:
                     continue
                 try:
-                    self._file.write({"latched": True, **asdict(held)})
+                    self._write_held(held)
                     problem = ""
                 except BadFile as error:
                     problem = str(error)
                 self._tried(held, problem)
+
+    def _write_held(self, held: Held) -> None:
+        """Have it on the disk. Raises BadFile."""
+        document = {"latched": True, **asdict(held)}
+        try:
+            self._file.overwrite(document)
+        except BadFile:  # no file with room for it, or one that cannot be written to any more
+            self._file.write(document)
 
     def _tried(self, held: Held, problem: str) -> None:
         """Note how the writing went, and say each change once."""

@@ -1,4 +1,8 @@
-"""Files in which a daemon keeps what must outlive it: one JSON document each, versioned, replaced whole."""
+"""Files in which a daemon keeps what must outlive it: one JSON document each, versioned, replaced whole.
+
+`StateFile.overwrite` is for the one document that has no time for that, and that is taken for written where
+the file cannot be read.
+"""
 
 from __future__ import annotations
 
@@ -9,14 +13,14 @@ from pathlib import Path
 from typing import Any
 
 from calib.errors import BadFile
-from calib.files.atomic import remove, replace_bytes
+from calib.files.atomic import overwrite_bytes, remove, replace_bytes
 
 MAX_BYTES = 1 << 20
 
 
 @dataclass(frozen=True)
 class StateFile:
-    """One document, of which a crash at any moment leaves the old or the new, whole.
+    """One document, of which a crash during `write` leaves the old or the new, whole.
 
     Attributes
     ----------
@@ -24,10 +28,13 @@ class StateFile:
         The file; its folder must be there.
     schema
         Its kind and version, such as ``mastctl/latch/1``: a file that says another one is refused.
+    room
+        How long the file is at least, bytes, filled up with blanks: what `overwrite` may need.
     """
 
     path: Path
     schema: str
+    room: int = 0
 
     def read(self) -> dict[str, Any] | None:
         """Return the document without its schema; None if there is no file.
@@ -70,11 +77,35 @@ class StateFile:
         ValueError, TypeError
             If it is no JSON.
         """
-        text = json.dumps({"schema": self.schema, **document}, indent=1, allow_nan=False)
+        data = self._data(document)
         try:
-            replace_bytes(self.path, (text + "\n").encode())
+            replace_bytes(self.path, data.ljust(self.room))
         except OSError as error:
             raise BadFile(self.path, "", f"cannot be saved: {error.strerror or error}") from None
+
+    def overwrite(self, document: Mapping[str, Any]) -> None:
+        """Write a document over the former one, as quickly as can be; when this returns it is on the disk.
+
+        A crash meanwhile may leave a file that cannot be read: only for what is then taken as this document.
+        Raises as `write`, and BadFile if there is no file with room for it.
+        """
+        data = self._data(document)
+        try:
+            overwrite_bytes(self.path, data)
+        except OSError as error:
+            raise BadFile(self.path, "", f"cannot be overwritten: {error.strerror or error}") from None
+
+    @property
+    def has_room(self) -> bool:
+        """Whether a file is there that can be written over."""
+        try:
+            return self.path.stat().st_size >= self.room
+        except OSError:
+            return False
+
+    def _data(self, document: Mapping[str, Any]) -> bytes:
+        text = json.dumps({"schema": self.schema, **document}, indent=1, allow_nan=False)
+        return f"{text}\n".encode()
 
     def remove(self) -> None:
         """Take the file away; when this returns it is gone from the disk too. Raises BadFile."""

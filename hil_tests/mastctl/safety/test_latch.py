@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import os
+import random
 import threading
 from pathlib import Path
 from typing import Any
@@ -25,6 +27,7 @@ from mastctl.safety.state_folder import StateFolder, StateInUse, usual_folder
 from mastctl.service import service as service_module
 from mastctl.state import machine as machine_module
 
+SECTOR_BYTES = 512
 KEPT = CONFIG + "state: {{folder: state}}\n"
 
 
@@ -165,6 +168,59 @@ def test_a_stop_during_a_reset_wins(folder: StateFolder, monkeypatch: pytest.Mon
         latch.release("aired", "Ben")
     assert latch.held is not None
     eventually(lambda: Latch(folder).held == latch.held, "the disk holds it again")
+
+
+def test_a_stop_is_written_over_the_file_that_is_there_from_the_start(folder: StateFolder) -> None:
+    latch, path = Latch(folder), folder.path / FILE
+    eventually(path.exists, "a file that says that nothing is latched")
+    for _ in range(2):
+        before = path.stat().st_ino
+        latch.hold("smoke " * 100, "\U0001f525" * 500)  # six bytes and twelve a character
+        latch.head_told()
+        assert latch.kept_within(BOUND_S)
+        assert path.stat().st_ino == before
+        assert Latch(folder).held == latch.held
+        latch.release("aired", "Ben")
+        assert path.stat().st_ino != before
+        assert Latch(folder).held is None
+
+
+@pytest.mark.parametrize("reason", ["smoke", "\U0001f525" * 200])
+def test_a_power_cut_while_a_stop_is_written_leaves_what_is_latched_or_cannot_be_read(
+    folder: StateFolder, reason: str
+) -> None:
+    latch, path = Latch(folder), folder.path / FILE
+    latch.hold("sparks", "Ana")
+    latch.release("\U0001f525" * 200, "Ben")
+    old = path.read_bytes()
+    latch.hold(reason, "Cem")
+    latch.head_told()
+    assert latch.kept_within(BOUND_S)
+    new = path.read_bytes()
+    assert len(new) == len(old)
+    parts = [slice(at, at + SECTOR_BYTES) for at in range(0, len(new), SECTOR_BYTES)]
+    chance = random.Random(1)
+    for _ in range(100):
+        mixed = [new[parts[0]], *(chance.choice((old, new))[part] for part in parts[1:])]
+        path.write_bytes(b"".join(mixed))
+        assert Latch(folder).held is not None
+    path.write_bytes(b"".join([old[parts[0]], *(new[part] for part in parts[1:])]))
+    Latch(folder)  # before its first sector nothing was told; it starts
+
+
+def test_a_file_that_cannot_be_written_over_is_written_anew(
+    folder: StateFolder, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(descriptor: int) -> None:
+        raise OSError(errno.EIO, os.strerror(errno.EIO))
+
+    latch = Latch(folder)
+    eventually((folder.path / FILE).exists, "a file that says that nothing is latched")
+    monkeypatch.setattr(os, "fdatasync", refuse)
+    latch.hold("smoke", "Ana")
+    latch.head_told()
+    assert latch.kept_within(BOUND_S)
+    assert Latch(folder).held == latch.held
 
 
 def test_what_was_never_latched_cannot_be_released(folder: StateFolder) -> None:
@@ -385,7 +441,8 @@ def test_a_disk_that_hangs_holds_the_answer_for_a_bounded_time_and_the_answer_sa
 ) -> None:
     hang = Hang()
     with fake_daemon(monkeypatch, tmp_path, config=KEPT) as (daemon, hardware), Client(daemon.url) as client:
-        monkeypatch.setattr(StateFile, "write", hang)
+        for way in ("write", "overwrite"):
+            monkeypatch.setattr(StateFile, way, hang)
         monkeypatch.setattr(service_module, "KEPT_S", 0.05)
         told = client.estop()
         assert (told["latched"], told["kept"]) == (True, False)
