@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import partial
 
 from calib.pictures.patch_verdict import MatchSettings
 from calib.pictures.shown_view import ViewLimits
@@ -56,8 +57,10 @@ class PointingSettings:
     view
         What may lie between the view that joints tell and the one that a picture shows.
     match, small_half_px
-        Of the matching itself; and the half patch that is tried where the usual one fits nowhere, because
-        part of it lies on something nearer or farther.
+        Of the matching itself, whose sigmas allow for rough ground and rocks seen by the other eye
+        (``roughness``, ``relief``: they decide sigmas only, no place and no verdict;
+        `tools.campaigns.match_sigma`); and the half patch that is tried where the usual one fits nowhere,
+        because part of it lies on something nearer or farther.
     """
 
     poll_s: float = 0.02
@@ -81,4 +84,4 @@ class PointingSettings:
     triangulation_sigma_px: float = 0.2
     small_half_px: int = 12
     view: ViewLimits = field(default_factory=ViewLimits)
-    match: MatchSettings = field(default_factory=MatchSettings)
+    match: MatchSettings = field(default_factory=partial(MatchSettings, roughness=0.02, relief=0.01))

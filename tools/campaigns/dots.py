@@ -11,8 +11,8 @@ from __future__ import annotations
 
 import argparse
 import time
-from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from functools import cache
 from pathlib import Path
 
 import cv2
@@ -27,6 +27,7 @@ from drivers.sim.render import Renderer
 from drivers.sim.scene import SceneSettings, build_scene
 from drivers.sim_survey.board import BoardLook, draw_board, half_size_m, photograph
 from mastctl.cli.output import at_least
+from mastctl.cli.tasks import add_task_options, results_of
 from tools.arguments import end
 
 BOARD = Board(10, 10, 0.08, 0.04, {})
@@ -95,19 +96,20 @@ def camera_of(focal_px: float, wrong: float = 0.0) -> CameraModel:
     )
 
 
-class Grounds:
-    """Pictures of gravel with stones as a mast camera sees them, noise-free."""
+@cache
+def ground_renderer(seed: int) -> Renderer:
+    """Return what draws gravel with stones."""
+    return Renderer(build_scene(SceneSettings(seed=seed)), workers=1)
 
-    def __init__(self, seed: int) -> None:
-        self._renderer = Renderer(build_scene(SceneSettings(seed=seed)), workers=1)
 
-    def picture(self, focal_px: float, range_m: float, azimuth_rad: float) -> np.ndarray:
-        """Return what a camera 1.5 m up sees that looks at the ground ``range_m`` away."""
-        down = np.arcsin(min(1.0, 1.5 / range_m))
-        turn = Rotation.from_rotvec([0, 0, azimuth_rad]) * Rotation.from_rotvec([0, -down, 0])
-        axes = turn.as_matrix() @ np.array([[0, 0, 1], [1, 0, 0], [0, 1, 0]])
-        site_from_camera = Rigid(axes, np.array([0.0, 0.0, -1.5]))
-        return self._renderer.image(camera_of(focal_px), site_from_camera)
+@cache
+def ground(seed: int, focal_px: float, range_m: float, azimuth_rad: float) -> np.ndarray:
+    """Return what a camera 1.5 m up sees that looks at the ground ``range_m`` away, noise-free."""
+    down = np.arcsin(min(1.0, 1.5 / range_m))
+    turn = Rotation.from_rotvec([0, 0, azimuth_rad]) * Rotation.from_rotvec([0, -down, 0])
+    axes = turn.as_matrix() @ np.array([[0, 0, 1], [1, 0, 0], [0, 1, 0]])
+    site_from_camera = Rigid(axes, np.array([0.0, 0.0, -1.5]))
+    return ground_renderer(seed).image(camera_of(focal_px), site_from_camera)
 
 
 def random_pose(rng: np.random.Generator, camera: CameraModel, range_m: float, tilt_rad: float) -> Rigid:
@@ -129,11 +131,11 @@ def random_pose(rng: np.random.Generator, camera: CameraModel, range_m: float, t
 
 
 def make_trial(
-    rng: np.random.Generator, ground: np.ndarray, focal_px: float, pose: Rigid, stress: Stress
+    rng: np.random.Generator, behind: np.ndarray, focal_px: float, pose: Rigid, stress: Stress
 ) -> Trial:
     """Return a picture of the board in front of the ground, and a rough prediction of the board's pose."""
     camera = camera_of(focal_px)
-    picture = draw_board(ground, camera, pose, BOARD, stress.look, samples=6)
+    picture = draw_board(behind, camera, pose, BOARD, stress.look, samples=6)
     if stress.gradient:
         angle = rng.uniform(0, 2 * np.pi)
         y, x = np.mgrid[0 : SIZE_PX[1], 0 : SIZE_PX[0]]
@@ -164,25 +166,41 @@ def judge(trial: Trial) -> tuple[Outcome, DotsFound | DetectionFailure]:
     return Outcome(errors, found.sigma_px, "", False, seconds), found
 
 
-def campaign(
-    poses: int, seed: int, stress: Stress, pictures: Path | None = None
-) -> Iterator[tuple[float, float, float, list[Outcome]]]:
-    """Yield (focal length, range, tilt in degrees, outcomes) cell by cell."""
-    grounds = Grounds(seed)
-    for focal_px, range_m in CELLS:
-        views = [grounds.picture(focal_px, range_m, a) for a in (-0.8, 0.0, 0.8)]
-        for tilt_deg in TILTS_DEG:
-            rng = np.random.default_rng([seed, int(focal_px), int(10 * range_m), int(tilt_deg)])
-            outcomes = []
-            for k in range(poses):
-                pose = random_pose(rng, camera_of(focal_px), range_m, np.radians(tilt_deg))
-                trial = make_trial(rng, views[k % len(views)], focal_px, pose, stress)
-                outcome, found = judge(trial)
-                outcomes.append(outcome)
-                if pictures and (k == 0 or outcome.failure or outcome.order_wrong):
-                    name = f"f{focal_px:.0f}_{range_m:g}m_{tilt_deg:g}deg_{k}"
-                    cv2.imwrite(str(pictures / f"{name}.png"), overlay(trial.image, found))
-            yield focal_px, range_m, tilt_deg, outcomes
+@dataclass(frozen=True)
+class Cell:
+    """Boards of one focal length, range and tilt; with ``pictures`` those worth a look are kept."""
+
+    focal_px: float
+    range_m: float
+    tilt_deg: float
+    poses: int
+    seed: int
+    stress: Stress
+    pictures: bool = False
+
+
+@dataclass(frozen=True)
+class Found:
+    """What became of a cell: an outcome a pose, and pictures (PNG) by their names."""
+
+    outcomes: list[Outcome]
+    pictures: dict[str, bytes] = field(default_factory=dict)
+
+
+def run_cell(cell: Cell) -> Found:
+    """Draw a cell's boards and find their dots."""
+    views = [ground(cell.seed, cell.focal_px, cell.range_m, a) for a in (-0.8, 0.0, 0.8)]
+    rng = np.random.default_rng([cell.seed, int(cell.focal_px), int(10 * cell.range_m), int(cell.tilt_deg)])
+    told = Found([])
+    for k in range(cell.poses):
+        pose = random_pose(rng, camera_of(cell.focal_px), cell.range_m, np.radians(cell.tilt_deg))
+        trial = make_trial(rng, views[k % len(views)], cell.focal_px, pose, cell.stress)
+        outcome, found = judge(trial)
+        told.outcomes.append(outcome)
+        if cell.pictures and (k == 0 or outcome.failure or outcome.order_wrong):
+            name = f"f{cell.focal_px:.0f}_{cell.range_m:g}m_{cell.tilt_deg:g}deg_{k}.png"
+            told.pictures[name] = cv2.imencode(".png", overlay(trial.image, found))[1].tobytes()
+    return told
 
 
 def overlay(image: np.ndarray, found: DotsFound | DetectionFailure) -> np.ndarray:
@@ -199,6 +217,25 @@ def overlay(image: np.ndarray, found: DotsFound | DetectionFailure) -> np.ndarra
     return shown
 
 
+def tell(cell: Cell, outcomes: list[Outcome]) -> int:
+    """Print a cell's row and why boards were not found; return how many were not, or in a wrong order."""
+    errors = np.concatenate([o.errors_px for o in outcomes])
+    sigma = np.concatenate([o.sigma_px for o in outcomes])[:, None]
+    failures = [o.failure for o in outcomes if o.failure]
+    wrong = sum(o.order_wrong for o in outcomes)
+    ms = [1e3 * o.seconds for o in outcomes]
+    line = f"{cell.focal_px:6.0f}  {cell.range_m:5.1f}  {cell.tilt_deg:4.0f} |"
+    if len(errors):
+        rms, worst = np.sqrt(np.mean(errors**2)), np.abs(errors).max()
+        line += f" {rms:.4f}  {worst:.4f}  {np.sqrt(np.mean((errors / sigma) ** 2)):9.2f} |"
+    else:
+        line += " " * 27 + "|"
+    print(f"{line} {len(failures):6d}  {wrong:5d} | {np.median(ms):9.0f}  {max(ms):8.0f}")
+    for reason in sorted(set(failures)):
+        print(f"        failed: {reason}")
+    return len(failures) + wrong
+
+
 def main() -> int:
     """Run the campaign and print its table."""
     parser = argparse.ArgumentParser(description="Dots found on rendered boards: error, failures, time.")
@@ -206,30 +243,32 @@ def main() -> int:
     parser.add_argument("--seed", type=at_least(0), default=1)
     parser.add_argument("--stress", choices=sorted(STRESSES), default="none")
     parser.add_argument("--pictures", type=Path, help="folder for pictures with what was found")
+    add_task_options(parser)
     arguments = parser.parse_args()
-    if arguments.pictures:
-        arguments.pictures.mkdir(parents=True, exist_ok=True)
+    stress, pictures = STRESSES[arguments.stress], arguments.pictures
+    cells = [
+        Cell(focal_px, range_m, tilt_deg, arguments.poses, arguments.seed, stress, pictures is not None)
+        for focal_px, range_m in CELLS
+        for tilt_deg in TILTS_DEG
+    ]
+    if pictures:
+        pictures.mkdir(parents=True, exist_ok=True)
+    founds = results_of(
+        arguments,
+        "cells",
+        run_cell,
+        cells,
+        lambda c: f"{c.focal_px:g} px, {c.range_m:g} m, {c.tilt_deg:g} deg",
+    )
+    if founds is None:
+        return 0
     print(f"stress {arguments.stress}, seed {arguments.seed}, {arguments.poses} poses a line; px per axis")
     print("  f px  range  tilt |   rms   worst  rms/sigma | failed  order | median ms  worst ms")
     bad = 0
-    for focal_px, range_m, tilt_deg, outcomes in campaign(
-        arguments.poses, arguments.seed, STRESSES[arguments.stress], arguments.pictures
-    ):
-        errors = np.concatenate([o.errors_px for o in outcomes])
-        sigma = np.concatenate([o.sigma_px for o in outcomes])[:, None]
-        failures = [o.failure for o in outcomes if o.failure]
-        wrong = sum(o.order_wrong for o in outcomes)
-        ms = [1e3 * o.seconds for o in outcomes]
-        bad += len(failures) + wrong
-        line = f"{focal_px:6.0f}  {range_m:5.1f}  {tilt_deg:4.0f} |"
-        if len(errors):
-            rms, worst = np.sqrt(np.mean(errors**2)), np.abs(errors).max()
-            line += f" {rms:.4f}  {worst:.4f}  {np.sqrt(np.mean((errors / sigma) ** 2)):9.2f} |"
-        else:
-            line += " " * 27 + "|"
-        print(f"{line} {len(failures):6d}  {wrong:5d} | {np.median(ms):9.0f}  {max(ms):8.0f}", flush=True)
-        for reason in sorted(set(failures)):
-            print(f"        failed: {reason}")
+    for cell, found in zip(cells, founds, strict=True):
+        bad += tell(cell, found.outcomes)
+        for name, png in found.pictures.items():
+            (pictures / name).write_bytes(png)
     return 1 if bad else 0
 
 

@@ -1,6 +1,6 @@
 """Simulated heads among random keep-outs: does any ever enter one?
 
-    python -m tools.campaigns.keep_out [--cases N] [--minutes M] [--seed S] [--unchecked]
+    python -m tools.campaigns.keep_out [--cases N] [--seed S] [--unchecked]
 
 Each case is a head of its own (axes of unequal speed and acceleration, backlash, sag, ringing, an approach
 from one side or none) among random boxes, with the margin that such a head needs. It is pointed round them,
@@ -14,7 +14,6 @@ from __future__ import annotations
 import argparse
 import math
 import random
-import time
 from collections import Counter
 from dataclasses import dataclass, replace
 
@@ -22,7 +21,8 @@ from drivers.clock import ManualClock
 from drivers.interfaces import Reading
 from drivers.sim.axis import AxisSettings
 from drivers.sim.pan_tilt import PRESETS, HeadSettings, SimulatedPanTilt
-from mastctl.cli.output import at_least, positive_number
+from mastctl.cli.output import at_least
+from mastctl.cli.tasks import add_task_options, results_of
 from mastctl.devices.door import REST_S, Door
 from mastctl.devices.keep_out import Box, KeptOut, NoWay, Pair, Span
 from mastctl.devices.limits import Limits
@@ -47,6 +47,19 @@ class Found:
 def case(seed: str, checked: bool = True, actions: int = ACTIONS) -> Found:
     """Drive one head among its boxes."""
     return _Drive(random.Random(seed), checked).run(actions)
+
+
+@dataclass(frozen=True)
+class Case:
+    """One head and its boxes, drawn by the seed, with the door or past it."""
+
+    seed: str
+    checked: bool
+
+
+def run_case(one: Case) -> Found:
+    """Drive one head of the campaign."""
+    return case(one.seed, one.checked)
 
 
 class _Drive:
@@ -254,27 +267,22 @@ def _into(value: float, limits: Pair) -> float:
 def main() -> int:
     """Run the campaign and print what came of it."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("--cases", type=at_least(1), default=200, metavar="N", help="at most (default 200)")
-    parser.add_argument("--minutes", type=positive_number, metavar="M", help="at most (default: all cases)")
+    parser.add_argument("--cases", type=at_least(1), default=200, metavar="N", help="heads (default 200)")
     parser.add_argument("--seed", type=at_least(0), default=1)
     parser.add_argument("--unchecked", action="store_true", help="send every goal, past the door")
+    add_task_options(parser)
     args = parser.parse_args()
-    until_s = math.inf if args.minutes is None else time.monotonic() + 60.0 * args.minutes
-    counts: Counter[str] = Counter()
-    entered, least_rad, cases = [], math.inf, 0
-    for number in range(args.cases):
-        if time.monotonic() > until_s:
-            break
-        found = case(f"{args.seed}/{number}", checked=not args.unchecked)
-        cases += 1
-        counts += found.counts
-        least_rad = min(least_rad, found.least_rad)
-        if found.deepest_rad > 0.0:
-            entered.append((number, found.deepest_rad))
-    print(f"{cases} heads; {', '.join(f'{name} {count}' for name, count in sorted(counts.items()))}")
+    cases = [Case(f"{args.seed}/{number}", not args.unchecked) for number in range(args.cases)]
+    founds = results_of(args, "heads", run_case, cases, lambda one: f"case {one.seed}")
+    if founds is None:
+        return 0
+    counts = sum((found.counts for found in founds), Counter[str]())
+    least_rad = min(found.least_rad for found in founds)
+    entered = [(c.seed, f.deepest_rad) for c, f in zip(cases, founds, strict=True) if f.deepest_rad > 0.0]
+    print(f"{len(cases)} heads; {', '.join(f'{name} {count}' for name, count in sorted(counts.items()))}")
     print(f"entered a keep-out: {len(entered)}; nearest to an edge: {1000 * least_rad:.2f} mrad outside it")
-    for number, depth in entered[:20]:
-        print(f"  case {args.seed}/{number}: {1000 * depth:.1f} mrad inside")
+    for seed, depth in entered[:20]:
+        print(f"  case {seed}: {1000 * depth:.1f} mrad inside")
     return 1 if entered else 0
 
 

@@ -15,8 +15,8 @@ from __future__ import annotations
 
 import argparse
 import json
-from collections.abc import Iterator, Mapping
-from dataclasses import replace
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -32,6 +32,7 @@ from drivers.sim.pan_tilt import PRESETS, HeadSettings, SimulatedPanTilt
 from drivers.sim.settings import SimulationSettings, simulation_settings
 from drivers.sim.warmth import TemperatureSettings
 from mastctl.cli.output import at_least, positive_number
+from mastctl.cli.tasks import add_task_options, results_of
 from mastctl.config import load_config
 from mastctl.packaged import config_folder
 from mastctl.pointing.settings import PointingSettings
@@ -52,6 +53,16 @@ Offs = NDArray[np.float64]
 """(n, 2): in pan and tilt, radians, or in x and y, pixels."""
 
 
+@dataclass(frozen=True)
+class Head:
+    """A head with one option; all heads are sent to the same views and looked at after the same waits."""
+
+    option: str
+    settings: HeadSettings
+    moves: int
+    seed: int
+
+
 class Row(NamedTuple):
     """By pair, rms and worst, px; None where nothing is told."""
 
@@ -61,7 +72,7 @@ class Row(NamedTuple):
     pancam: tuple[float, float] | None
 
 
-def main() -> None:
+def main() -> int:
     """Measure, and print a table or a document."""
     worst = config_folder() / "worst_day.yaml"
     parser = argparse.ArgumentParser(
@@ -72,20 +83,28 @@ def main() -> None:
     parser.add_argument("--minutes", type=positive_number, default=10.0, metavar="T", help="(default 10)")
     parser.add_argument("--seed", type=at_least(0), default=1, metavar="S", help="of the views (default 1)")
     parser.add_argument("--json", action="store_true", help="one JSON document")
+    add_task_options(parser)
     args = parser.parse_args()
     config = load_config(args.config)
     settings = simulation_settings(config.hardware.simulation, config.hardware.folder)
     rig = load_rig(settings.rover).rig
+    heads = [
+        Head(option, only(settings.head, names), args.moves, args.seed) for option, names in OPTIONS.items()
+    ]
+    found = results_of(args, "heads", offs, heads, lambda head: head.option)
+    if found is None:
+        return 0
     rows = [
-        *of_the_head(settings.head, rig, args.moves, args.seed),
+        *of_the_head(heads, found, rig),
         *of_the_clocks(settings, rig, 60 * args.minutes, config.hardware.cameras),
         *of_the_day(settings.temperature, rig),
     ]
     if args.json:
         print(json.dumps([row._asdict() for row in rows]))
-        return
+        return 0
     for row in rows:
         print(f"| {row.option} | {row.how} | {told(row.navcam)} | {told(row.pancam)} |")
+    return 0
 
 
 def told(px: tuple[float, float] | None) -> str:
@@ -93,15 +112,12 @@ def told(px: tuple[float, float] | None) -> str:
     return "" if px is None else "{:.2f}, {:.2f}".format(*px)
 
 
-def of_the_head(head: HeadSettings, rig: Rig, moves: int, seed: int) -> Iterator[Row]:
+def of_the_head(heads: Sequence[Head], found: Sequence[tuple[Offs, Offs]], rig: Rig) -> Iterator[Row]:
     """Each option of the head alone."""
-    random = np.random.default_rng(seed)
-    ranges_m = np.exp(random.uniform(np.log(2.0), np.log(12.0), moves))
-    goals = np.stack([random.uniform(-1, 1, moves), -np.arctan(1.46 / ranges_m)], axis=-1)
-    for option, names in OPTIONS.items():
-        alone = only(head, names)
-        for number, off in enumerate(offs(alone, goals, random), 1):
-            yield Row(option, f"pointing {number}", *(spread(off * px_per_rad(rig, pair)) for pair in PAIRS))
+    for head, pointings in zip(heads, found, strict=True):
+        for number, off in enumerate(pointings, 1):
+            pixels = (spread(off * px_per_rad(rig, pair)) for pair in PAIRS)
+            yield Row(head.option, f"pointing {number}", *pixels)
 
 
 def only(head: HeadSettings, names: tuple[str, ...]) -> HeadSettings:
@@ -111,11 +127,14 @@ def only(head: HeadSettings, names: tuple[str, ...]) -> HeadSettings:
     return replace(plain, pan=replace(plain.pan, **pan), tilt=replace(plain.tilt, **tilt))
 
 
-def offs(head: HeadSettings, goals: Offs, random: np.random.Generator) -> tuple[Offs, Offs]:
+def offs(head: Head) -> tuple[Offs, Offs]:
     """How far a picture is from the view that was asked for, at the first and at the second pointing."""
+    random = np.random.default_rng(head.seed)
+    ranges_m = np.exp(random.uniform(np.log(2.0), np.log(12.0), head.moves))
+    goals = np.stack([random.uniform(-1, 1, head.moves), -np.arctan(1.46 / ranges_m)], axis=-1)
     clock = ManualClock(100.0)
-    device = SimulatedPanTilt(head, clock)
-    dwell_s = PointingSettings().dwell_s if head.pan.settle_s > 0 else 0.0
+    device = SimulatedPanTilt(head.settings, clock)
+    dwell_s = PointingSettings().dwell_s if head.settings.pan.settle_s > 0 else 0.0
     found: tuple[list[Offs], list[Offs]] = ([], [])
     for goal in goals:
         off = np.zeros(2)

@@ -16,6 +16,7 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -24,6 +25,7 @@ import yaml
 
 from drivers.errors import DriverError
 from mastctl.cli.output import at_least
+from mastctl.cli.tasks import add_task_options, results_of
 from mastctl.config import load_config
 from mastctl.packaged import config_folder
 from tools.arguments import end
@@ -41,6 +43,16 @@ OPTIONS: Mapping[str, tuple[str, ...]] = {
 }
 
 
+@dataclass(frozen=True)
+class Trial:
+    """An option, the section ``cameras`` that is it, and the targets."""
+
+    option: str
+    cameras: Mapping[str, Any]
+    targets: int
+    seed: int
+
+
 class Row(NamedTuple):
     """Rms px (x, y) over all targets; ``failed``: targets without a residual."""
 
@@ -51,7 +63,7 @@ class Row(NamedTuple):
     failed: int
 
 
-def main() -> None:
+def main() -> int:
     """Measure, and print a table or a document."""
     worst = config_folder() / "worst_day.yaml"
     parser = argparse.ArgumentParser(
@@ -61,15 +73,19 @@ def main() -> None:
     parser.add_argument("--targets", type=at_least(1), default=4, metavar="N", help="a distance (default 4)")
     parser.add_argument("--seed", type=at_least(0), default=1, metavar="S", help="of the targets (default 1)")
     parser.add_argument("--json", action="store_true", help="one JSON document")
+    add_task_options(parser)
     args = parser.parse_args()
     cameras = load_config(args.config).hardware.simulation.get("cameras", {})
-    rows = []
-    for option, keys in OPTIONS.items():
-        rows.append(pointed(option, only(cameras, keys), args.targets, args.seed))
-        if not args.json:
-            print(told(rows[-1]), flush=True)
+    trials = [Trial(option, only(cameras, keys), args.targets, args.seed) for option, keys in OPTIONS.items()]
+    rows = results_of(args, "options", pointed, trials, lambda trial: trial.option)
+    if rows is None:
+        return 0
     if args.json:
         print(json.dumps([row._asdict() for row in rows]))
+        return 0
+    for row in rows:
+        print(told(row))
+    return 0
 
 
 def told(row: Row) -> str:
@@ -90,30 +106,37 @@ def only(cameras: Mapping[str, Any], keys: tuple[str, ...]) -> dict[str, Any]:
     return kept
 
 
-def pointed(option: str, cameras: Mapping[str, Any], targets: int, seed: int) -> Row:
+def pointed(trial: Trial) -> Row:
     """The pointing experiment on the packaged rover with such cameras."""
     folder = config_folder()
     config = yaml.safe_load((folder / "default.yaml").read_text())
     config["mast_file"] = str(folder / config["mast_file"])
     config["simulation"]["rover"] = str(folder / config["simulation"]["rover"])
-    config["simulation"]["cameras"] = dict(cameras)
+    config["simulation"]["cameras"] = dict(trial.cameras)
     with tempfile.TemporaryDirectory() as where:
         file = Path(where, "config.yaml")
         file.write_text(yaml.safe_dump(config))
         command = [sys.executable, "-m", "mastctl", "demo", "--config", str(file), "--speed", "max", "--json"]
-        command += ["--targets", str(targets), "--seed", str(seed), "--out", str(Path(where, "out"))]
+        command += [
+            "--targets",
+            str(trial.targets),
+            "--seed",
+            str(trial.seed),
+            "--out",
+            str(Path(where, "out")),
+        ]
         done = subprocess.run(command, capture_output=True, text=True, check=False)
     try:
         distances = json.loads(done.stdout)["distances"]
     except (ValueError, KeyError):
-        raise DriverError(f"the experiment with {option} did not run: {done.stderr[-300:]}") from None
+        raise DriverError(f"the experiment with {trial.option} did not run: {done.stderr[-300:]}") from None
 
     def rms(key: str) -> tuple[float, float]:
         x_px, y_px = np.sqrt(np.mean(np.square([distance[key] for distance in distances]), axis=0))
         return float(x_px), float(y_px)
 
     failed = sum(distance["failed"] for distance in distances)
-    return Row(option, rms("first_rms_px"), rms("second_rms_px"), rms("true_second_rms_px"), failed)
+    return Row(trial.option, rms("first_rms_px"), rms("second_rms_px"), rms("true_second_rms_px"), failed)
 
 
 if __name__ == "__main__":

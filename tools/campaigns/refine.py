@@ -12,7 +12,7 @@ from __future__ import annotations
 import argparse
 import math
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -28,10 +28,44 @@ from calib.mast.rig import Rig
 from calib.rigid import FloatArray, Rigid, moved_rigid
 from mastctl.calibration.landing import handoff_errors_px
 from mastctl.cli.output import at_least, not_negative, positive_number
+from mastctl.cli.tasks import add_task_options, results_of
 from tools.arguments import end
 
 HEAD_HEIGHT_M, ASIDE_RAD = 1.45, 0.35
 HELD_OUT, HELD_OUT_M = 60, (1.5, 4.0)
+BLOCK = 10
+ROWS = [
+    (words, ranges_m, size)
+    for words, ranges_m in (("2 m", (2.0, 2.0)), ("1.5 to 4 m", (1.5, 4.0)))
+    for size in (1.0, 0.0)
+]
+"""Targets of the record in words and metres, and how far the Hazcams are moved, sigmas."""
+
+
+@dataclass(frozen=True)
+class Block:
+    """Cases of one row from ``first`` on, up to ``BLOCK``, with a draw of their own."""
+
+    true: Rig
+    ranges_m: tuple[float, float]
+    size: float
+    first: int
+    count: int
+    handoffs: int
+    click_px: float
+    match_px: float
+    seed: int
+
+
+@dataclass(frozen=True)
+class Case:
+    """One fit: significant or not, directions told, chi-square of six, held-out errors (n, 2) px."""
+
+    significant: bool
+    seen: int
+    chi2: float
+    before_px: FloatArray
+    after_px: FloatArray
 
 
 def targets(
@@ -64,26 +98,23 @@ def targets(
 def handed(
     believed: Rig,
     true: Rig,
-    ranges_m: tuple[float, float],
-    options: argparse.Namespace,
+    block: Block,
     rng: np.random.Generator,
 ) -> list[MatchedHandoff]:
     """Hand-offs of a case, with the errors of clicks and matches."""
     source, to = true.stereo["navcam"], true.stereo["hazcam"]
     made = []
     for _, (_, joints, clicks, found) in zip(
-        range(options.handoffs), targets(true, ranges_m, rng), strict=False
+        range(block.handoffs), targets(true, block.ranges_m, rng), strict=False
     ):
-        noisy = clicks + rng.normal(0.0, options.click_px, (2, 2))
-        done = hand_off(believed, source, to, joints, noisy[0], noisy[1], sigma_px=options.click_px)
-        off = rng.normal(0.0, options.match_px, (2, 2))
+        noisy = clicks + rng.normal(0.0, block.click_px, (2, 2))
+        done = hand_off(believed, source, to, joints, noisy[0], noisy[1], sigma_px=block.click_px)
+        off = rng.normal(0.0, block.match_px, (2, 2))
         refined = {
             name: RefinedPixel("accepted", "", pixel + e, 0.01 * np.eye(2), np.zeros(2))
             for name, pixel, e in zip(to, found, off, strict=True)
         }
-        made.append(
-            matched_handoff("campaign", source, joints, noisy, options.click_px, joints, done, refined)
-        )
+        made.append(matched_handoff("campaign", source, joints, noisy, block.click_px, joints, done, refined))
     return made
 
 
@@ -111,6 +142,35 @@ def moved(true: Rig, step: FloatArray) -> tuple[Rig, FloatArray]:
     return replace(true, cameras={**true.cameras, **cameras}), np.concatenate([step[:3], shift])
 
 
+def run_block(block: Block) -> list[Case]:
+    """Return what the fits of a block come to; the cases of all rows have the same draws."""
+    true, rng = block.true, np.random.default_rng([block.seed, block.first])
+    cases = []
+    for _ in range(block.count):
+        shift_m, turn_rad = (rng.normal(0.0, block.size * s, 3) for s in (PRIOR_SHIFT_M, PRIOR_TURN_RAD))
+        believed, step = moved(true, np.concatenate([turn_rad, shift_m]))
+        fit = fit_body_pose(believed, true.stereo["hazcam"], handed(believed, true, block, rng))
+        off = fit.step - step
+        taken = corrected_rig(believed, fit) if fit.significant else believed
+        held_out = rng.integers(1 << 31)
+        before, after = (errors_px(rig, true, np.random.default_rng(held_out)) for rig in (believed, taken))
+        chi2 = float(off @ np.linalg.solve(fit.covariance, off))
+        cases.append(Case(fit.significant, fit.seen, chi2, before, after))
+    return cases
+
+
+def blocks_of(true: Rig, options: argparse.Namespace) -> list[Block]:
+    """The tasks, row by row."""
+    return [
+        Block(
+            true, ranges_m, size, first, min(BLOCK, options.cases - first),
+            options.handoffs, options.click_px, options.match_px, options.seed,
+        )
+        for _, ranges_m, size in ROWS
+        for first in range(0, options.cases, BLOCK)
+    ]  # fmt: skip
+
+
 def main() -> int:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
@@ -121,39 +181,39 @@ def main() -> int:
     parser.add_argument("--click-px", type=positive_number, default=0.2)
     parser.add_argument("--match-px", type=not_negative, default=0.4, help="what a match is wrong by")
     parser.add_argument("--seed", type=at_least(0), default=1)
+    add_task_options(parser)
     options = parser.parse_args()
     true = load_rig(options.rig).rig
     if lacking := [pair for pair in ("navcam", "hazcam") if pair not in true.stereo]:
         parser.error(f"--rig {options.rig} has no stereo pair '{lacking[0]}'")
+    blocks = blocks_of(true, options)
+    found = results_of(options, "tens of cases", run_block, blocks, label)
+    if found is None:
+        return 0
     print("targets     moved  significant  told  chi2 of 6   before rms, worst px   after rms, worst px")
-    for words, ranges_m in (("2 m", (2.0, 2.0)), ("1.5 to 4 m", (1.5, 4.0))):
-        for size in (1.0, 0.0):
-            rng = np.random.default_rng(options.seed)
-            fits, chi2, before, after = [], [], [], []
-            for _ in range(options.cases):
-                shift_m, turn_rad = (rng.normal(0.0, size * s, 3) for s in (PRIOR_SHIFT_M, PRIOR_TURN_RAD))
-                believed, step = moved(true, np.concatenate([turn_rad, shift_m]))
-                fit = fit_body_pose(
-                    believed, true.stereo["hazcam"], handed(believed, true, ranges_m, options, rng)
-                )
-                off = fit.step - step
-                chi2.append(float(off @ np.linalg.solve(fit.covariance, off)))
-                fits.append(fit)
-                taken = corrected_rig(believed, fit) if fit.significant else believed
-                held_out = rng.integers(1 << 31)
-                before.append(errors_px(believed, true, np.random.default_rng(held_out)))
-                after.append(errors_px(taken, true, np.random.default_rng(held_out)))
-            told = [
-                f"{np.sqrt(np.mean(e**2)):6.2f} {np.linalg.norm(e, axis=-1).max():6.2f}"
-                for e in (np.concatenate(before), np.concatenate(after))
-            ]
-            significant = sum(fit.significant for fit in fits)
-            seen = np.mean([fit.seen for fit in fits])
-            print(
-                f"{words:11s} {'yes' if size else 'no':5s}  {significant:4d} of {options.cases:<4d}  "
-                f"{seen:4.1f}  {np.mean(chi2):9.2f}   {told[0]:>20s}  {told[1]:>20s}"
-            )
+    for words, ranges_m, size in ROWS:
+        row = [
+            case
+            for block, cases in zip(blocks, found, strict=True)
+            if (block.ranges_m, block.size) == (ranges_m, size)
+            for case in cases
+        ]
+        told = [
+            f"{np.sqrt(np.mean(e**2)):6.2f} {np.linalg.norm(e, axis=-1).max():6.2f}"
+            for e in (np.concatenate([c.before_px for c in row]), np.concatenate([c.after_px for c in row]))
+        ]
+        significant, seen = sum(case.significant for case in row), np.mean([case.seen for case in row])
+        print(
+            f"{words:11s} {'yes' if size else 'no':5s}  {significant:4d} of {options.cases:<4d}  "
+            f"{seen:4.1f}  {np.mean([c.chi2 for c in row]):9.2f}   {told[0]:>20s}  {told[1]:>20s}"
+        )
     return 0
+
+
+def label(block: Block) -> str:
+    """A task in words."""
+    targets = next(words for words, ranges_m, _ in ROWS if ranges_m == block.ranges_m)
+    return f"{targets}, {'moved' if block.size else 'not moved'}, cases from {block.first}"
 
 
 if __name__ == "__main__":

@@ -13,6 +13,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache
 
 import cv2
 import numpy as np
@@ -24,6 +25,7 @@ from calib.rigid import FloatArray, Rigid, rot_y, rot_z
 from drivers.sim.render import Renderer
 from drivers.sim.scene import Scene, SceneSettings, build_scene
 from mastctl.cli.output import at_least, positive_number
+from mastctl.cli.tasks import add_task_options, results_of
 from tools.arguments import end
 
 MAST = Mast(np.array([0.3443, -0.0043, -1.4572]), np.array([-0.0088, -0.0181, 0.0027]))
@@ -235,7 +237,52 @@ def body_poses(camera: CameraModel, range_m: float, rng: np.random.Generator) ->
     return Rigid(rot_z(first), np.zeros(3)), Rigid(rot_z(second), np.zeros(3))
 
 
-def main() -> None:
+CAMERAS: dict[str, tuple[CameraModel, Poses]] = {
+    "navcam turned": (NAVCAM, turned_poses),
+    "navcam rolled": (NAVCAM, rolled_poses),
+    "pancam turned": (PANCAM, turned_poses),
+    "pancam rolled": (PANCAM, rolled_poses),
+    "hazcam turned": (HAZCAM, body_poses),
+}
+
+
+@dataclass(frozen=True)
+class Row:
+    """A scene, a camera and how it moves, a range, rays a pixel and side; so many pairs of pictures."""
+
+    scene: str
+    camera: str
+    range_m: float
+    samples: int
+    pairs: int
+    patches: int
+    seed: int
+
+    def __str__(self) -> str:
+        return f"{self.scene:6s} {self.camera} {self.range_m:4.1f} m  {self.samples}x{self.samples}"
+
+
+@cache
+def scene_renderer(scene: str, seed: int) -> Renderer:
+    """Return what draws a scene, ``flat`` or with ``relief`` and rocks."""
+    flat = SceneSettings(seed=seed, relief_m=0.0, rocks=0)
+    return Renderer(build_scene(flat if scene == "flat" else SceneSettings(seed=seed)), workers=1)
+
+
+def run_row(row: Row) -> Errors:
+    """Draw a row's pictures and measure them."""
+    camera, poses = CAMERAS[row.camera]
+    rng = np.random.default_rng([row.seed, int(row.range_m * 10), row.samples])
+    renderer = scene_renderer(row.scene, row.seed)
+    return together(
+        [
+            measure(renderer, camera, poses(camera, row.range_m, rng), row.samples, row.patches, rng)
+            for _ in range(row.pairs)
+        ]
+    )
+
+
+def main() -> int:
     """Print one row for each scene, camera, range and number of samples."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
@@ -245,32 +292,21 @@ def main() -> None:
     parser.add_argument("--samples", type=at_least(1), nargs="+", default=[1, 2, 3])
     parser.add_argument("--ranges", type=positive_number, nargs="+", default=[10.0, 6.0, 2.0])
     parser.add_argument("--seed", type=at_least(0), default=1)
+    add_task_options(parser)
     options = parser.parse_args()
-    rows: list[tuple[str, CameraModel, float, Poses]] = []
-    for range_m in options.ranges:
-        rows += [
-            ("navcam turned", NAVCAM, range_m, turned_poses),
-            ("navcam rolled", NAVCAM, range_m, rolled_poses),
-        ]
-        rows += [
-            ("pancam turned", PANCAM, range_m, turned_poses),
-            ("pancam rolled", PANCAM, range_m, rolled_poses),
-        ]
-    rows.append(("hazcam turned", HAZCAM, 2.0, body_poses))
-    for scene_name, settings in (
-        ("flat", SceneSettings(seed=options.seed, relief_m=0.0, rocks=0)),
-        ("relief", SceneSettings(seed=options.seed)),
-    ):
-        renderer = Renderer(build_scene(settings))
-        for name, camera, range_m, poses in rows:
-            for samples in options.samples:
-                rng = np.random.default_rng([options.seed, int(range_m * 10), samples])
-                found = [
-                    measure(renderer, camera, poses(camera, range_m, rng), samples, options.patches, rng)
-                    for _ in range(options.pairs)
-                ]
-                label = f"{scene_name:6s} {name} {range_m:4.1f} m  {samples}x{samples}"
-                print(f"{label}  {together(found).line()}", flush=True)
+    places = [
+        (camera, range_m) for range_m in options.ranges for camera in CAMERAS if camera != "hazcam turned"
+    ]
+    rows = [
+        Row(scene, camera, range_m, samples, options.pairs, options.patches, options.seed)
+        for scene in ("flat", "relief")
+        for camera, range_m in [*places, ("hazcam turned", 2.0)]
+        for samples in options.samples
+    ]
+    found = results_of(options, "rows", run_row, rows, str)
+    for row, errors in zip(rows, found or [], strict=found is not None):
+        print(f"{row}  {errors.line()}")
+    return 0
 
 
 if __name__ == "__main__":

@@ -1,0 +1,30 @@
+"""The short form of the campaign: what the loop's matches on rough ground are off by, of what they tell."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from calib.files.mast_file import load_rig
+from mastctl.packaged import config_folder
+from tools.campaigns.match_sigma import Look, Row, Rows, run_look, together
+
+TARGETS, SEEDS = 8, (1, 2)
+
+
+def of_sigma(row: Row) -> float:
+    """Rms of error over told sigma along x, where ranges show."""
+    return float(np.sqrt(np.mean((row.error_px / row.sigma_px)[:, 0] ** 2)))
+
+
+def rows_on(relief_m: float) -> Rows:
+    rig = load_rig(config_folder() / "masts" / "rocky8_simulated.yaml").rig
+    return together([run_look(Look(rig, relief_m, seed, 0, TARGETS)) for seed in SEEDS])
+
+
+def test_the_loops_matches_tell_on_rough_ground_what_they_are_off_by_and_lie_where_they_did() -> None:
+    rows = rows_on(0.5)
+    plain, loop = rows["the matcher's own", "other eye"], rows["the loop's", "other eye"]
+    assert len(loop.error_px) > TARGETS
+    np.testing.assert_array_equal(loop.error_px, plain.error_px)
+    assert of_sigma(plain) > 2.0, "where nothing is wrong nothing is shown"
+    assert 0.4 < of_sigma(loop) < 2.0
