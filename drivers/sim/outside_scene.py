@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import logging
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any, Protocol
 
 import numpy as np
@@ -17,6 +21,10 @@ from drivers.sim.scene import Scene, SceneSettings
 Float64 = NDArray[np.float64]
 
 RAYS_AT_ONCE = 200_000
+LONG_S = 5.0
+"""What takes longer at the start is named in the log, again and again."""
+
+_log = logging.getLogger(__name__)
 
 
 class SeenFromOutside(Protocol):
@@ -156,7 +164,8 @@ def outside_scene(settings: SceneSettings) -> OutsideScene:
     name = settings.plugin
     factory = named_factory("scene", name)
     try:
-        made = factory(seed=settings.seed, **settings.options)
+        with _named_if_long(f"scene {name!r} to be made"):
+            made = factory(seed=settings.seed, **settings.options)
     except DriverError:
         raise
     except (Exception, SystemExit) as error:  # a foreign factory may raise anything: one sentence tells it
@@ -168,7 +177,26 @@ def outside_scene(settings: SceneSettings) -> OutsideScene:
     scene = OutsideScene(settings, made)
     ahead = np.array([[1.0, 0.0, 0.3], [1.0, 0.0, -0.3]])
     try:
-        scene.look(np.array([[0.0, 0.0, -1.0]] * 2), ahead / np.linalg.norm(ahead, axis=1)[:, None], 1e-3)
+        with _named_if_long(f"the first look of scene {name!r}, at two rays"):
+            scene.look(np.array([[0.0, 0.0, -1.0]] * 2), ahead / np.linalg.norm(ahead, axis=1)[:, None], 1e-3)
     except DriverError as error:
         raise BadOptions(str(error)) from None
     return scene
+
+
+@contextmanager
+def _named_if_long(what: str) -> Iterator[None]:
+    """Say what is waited for while it takes long: foreign code may hang, and nothing can end it."""
+    over = threading.Event()
+
+    def tell() -> None:
+        waited_s = 0.0
+        while not over.wait(LONG_S):
+            waited_s += LONG_S
+            _log.warning("still waiting for %s, after %.0f s", what, waited_s)
+
+    threading.Thread(target=tell, name="scene from outside", daemon=True).start()
+    try:
+        yield
+    finally:
+        over.set()

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import importlib
 import json
+import logging
 import re
 import sys
+import threading
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -33,7 +36,12 @@ class Scene:
         range_m = -2.0 if self.fault == "behind" else 1.0
         return [range_m] * n, [float("nan") if self.fault == "nan" else 90.0] * n
 class Blind: pass
-def opened(seed, fault): return Blind() if fault == "blind" else Scene(fault)
+class Slow:
+    told = None
+    def look(self, origins_m, directions, pitch_rad):
+        assert Slow.told.wait(60), "nobody was told"
+        return [1.0] * len(origins_m), [90.0] * len(origins_m)
+def opened(seed, fault): return Blind() if fault == "blind" else Slow() if fault == "slow" else Scene(fault)
 """
 
 
@@ -110,6 +118,28 @@ def test_a_scene_that_fails_is_refused_at_the_start(
     with pytest.raises(BadOptions, match=told) as refused:
         made(plugin, **options)
     assert plugin in str(refused.value) and "\n" not in str(refused.value)
+
+
+def test_a_first_look_that_takes_long_is_named_in_the_log_while_it_is_waited_for(
+    outside: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("drivers.sim.outside_scene.LONG_S", 0.01)
+    lines: list[str] = []
+    heard = threading.Event()
+
+    class Listening(logging.Handler):
+        def emit(self, record: logging.LogRecord) -> None:
+            lines.append(record.getMessage())
+            heard.set()
+
+    monkeypatch.setattr(importlib.import_module("broken_scene").Slow, "told", heard)
+    log, handler = logging.getLogger("drivers.sim.outside_scene"), Listening()
+    log.addHandler(handler)
+    try:
+        made("broken_scene:opened", fault="slow")
+    finally:
+        log.removeHandler(handler)
+    assert lines[0].startswith("still waiting for the first look of scene 'broken_scene:opened'")
 
 
 def test_a_scene_that_fails_later_is_a_drivers_error(outside: Path) -> None:

@@ -124,6 +124,18 @@ def test_a_bad_number_gets_one_sentence_and_leaves_nothing(
     assert not (tmp_path / "rig").exists()
 
 
+@pytest.mark.parametrize("name", ["", "  "])
+def test_a_folder_without_a_name_is_refused_and_nothing_is_written(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert main(["sim", "new", name, "--json"]) == 2
+    assert (
+        "the name is empty, a folder is expected" in json.loads(capsys.readouterr().out)["error"]["message"]
+    )
+    assert not list(tmp_path.iterdir())
+
+
 def test_a_twin_believes_the_file_to_the_byte_and_is_drawn_from_its_covariance(
     repository: Path, tmp_path: Path
 ) -> None:
