@@ -92,6 +92,8 @@ class AxisReport:
         Of the gears, as their maker states it; None where nothing is stated.
     current_A, temperature_C, voltage_V
         As the device measures them; None for what it does not.
+    count_rad
+        One count; None where it is not known.
     """
 
     commanded_rad: float | None
@@ -104,6 +106,7 @@ class AxisReport:
     current_A: float | None
     temperature_C: float | None
     voltage_V: float | None
+    count_rad: float | None = None
 
     @property
     def left_rad(self) -> float | None:

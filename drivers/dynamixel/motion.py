@@ -287,6 +287,7 @@ class AxisMotion:
             current_A=None if unit is None else sample.values["present_current"] * unit,
             temperature_C=sample.values["present_temperature"],
             voltage_V=sample.values["present_voltage"] / 10,
+            count_rad=settings.model.count_rad,
         )
 
     def _arrived(self, sample: Sample) -> bool:

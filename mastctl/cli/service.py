@@ -321,6 +321,8 @@ def _status_rows(status: dict[str, Any]) -> Iterator[tuple[str, str]]:
         yield "rover", f"at ({x:.3f}, {y:.3f}, {z:.3f}) m of the site, {status['pose']['age_s']:.1f} s ago"
     mast = status["mast"]
     yield "mast file", f"{mast['file']} ({mast['digest'][:8]}...)"
+    if status.get("calibration"):
+        yield "calibration", status["calibration"]["sentence"]
     yield "up", f"{status['uptime_s']:.0f} s, version {status['version']}"
 
 

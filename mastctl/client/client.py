@@ -121,6 +121,10 @@ class Client:
         """Return what the daemon knows at this moment."""
         return self._daemon.json("GET", "/status")
 
+    def calibration_health(self) -> dict[str, Any]:
+        """Return whether residuals of the last days are as the mast file predicts, with the figures."""
+        return self._daemon.json("GET", "/calibration/health")
+
     def point(
         self,
         *,

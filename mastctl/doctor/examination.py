@@ -66,6 +66,22 @@ def _daemon(config: Config, status: dict[str, Any] | None) -> Iterator[Finding]:
         yield Finding(
             f"fault of {fault['device']}", "bad", fault["message"], f"it lasts until {fault['until']}"
         )
+    yield from _calibration(status.get("calibration"))
+
+
+def _calibration(told: dict[str, Any] | None) -> Iterator[Finding]:
+    """What the residuals of the last days say of the mast file."""
+    if told is None:
+        return
+    what, sentence = "residuals", f"{told['sentence']} ({told['pointings']} pointings)"
+    if told["verdict"] == "drifts":
+        yield Finding(
+            what, "unsure", told["sentence"], "calibrate again; docs/operations.md says where to look"
+        )
+    elif told["verdict"] == "unknown":
+        yield Finding(what, "unsure", sentence, "calibrate again: mastctl calibrate writes it")
+    else:
+        yield Finding(what, "good", sentence)
 
 
 def _head(config: Config, machine: Machine) -> Iterator[Finding]:

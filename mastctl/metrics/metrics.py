@@ -185,6 +185,7 @@ class _Now:
             failed.add_metric(kind, count)
         yield failed
         yield from _steering(status.get("control"))
+        yield from _calibration(status.get("calibration"))
 
 
 def _steering(control: Mapping[str, Any] | None) -> Iterable[Metric]:
@@ -197,3 +198,13 @@ def _steering(control: Mapping[str, Any] | None) -> Iterable[Metric]:
             left.add_metric([], float(control["for_s"]))
     yield held
     yield left
+
+
+def _calibration(told: Mapping[str, Any] | None) -> Iterable[Metric]:
+    """Whether residuals are as the mast file predicts."""
+    if told is not None:
+        drifts = float(told["verdict"] == "drifts")
+        yield GaugeMetricFamily("mastctl_calibration_drifts", "1 if residuals are not as predicted.", drifts)
+        yield GaugeMetricFamily(
+            "mastctl_calibration_pointings", "Of the last days, that are judged.", float(told["pointings"])
+        )

@@ -38,6 +38,8 @@ def counts_told(head: object, tilt_rad: float, model: CameraModel | None) -> dic
             "measured_counts": axis.measured_counts,
             "came_from": axis.side,
         }
+        if axis.count_rad is not None:
+            told[name]["count_rad"] = axis.count_rad
         if axis.left_rad is None:
             continue
         told[name]["left_rad"] = round(axis.left_rad, 7)

@@ -30,6 +30,7 @@ from mastctl.devices.devices import Devices
 from mastctl.devices.frames import StampedFrame, check_known, random_run
 from mastctl.errors import MastctlError, NotNow, Unable
 from mastctl.handoff.check import HandoffCheck
+from mastctl.health.health import CalibrationHealth
 from mastctl.metrics.metrics import Metrics
 from mastctl.operations.operations import STOP_ASKED, Operations
 from mastctl.operations.records import Operation
@@ -95,6 +96,8 @@ class Service:
         Takes the heartbeats of jogs.
     handoffs
         What the track's hand-offs say of the mast file in use.
+    health
+        What the pointings' residuals say of it.
     entry, leases, audit
         Where each command passes, who steers, and what is recorded of it.
     metrics
@@ -151,6 +154,7 @@ class Service:
         self._loop = PointingLoop(self._rig, self.devices, config.limits, clock)
         self.jogs = Jogs(self.operations, self.devices, clock)
         self.handoffs = HandoffCheck(config.tracking.handoff_log, mast.stored.digest, clock)
+        self.health = CalibrationHealth(self.folder.path, mast.stored)
         self.tracker = Tracker(
             self.operations,
             self.devices,
@@ -243,6 +247,7 @@ class Service:
             track=self.tracker.status,
             faults=faults,
             control=self.leases.told(),
+            calibration=self.health.verdict.told(),
             stop_socket=None if self.stop_socket is None else str(self.stop_socket.path),
         )
 
@@ -309,7 +314,7 @@ class Service:
                 with self.devices.exposure_held():
                     return loop.run(request, record, cancelled)
 
-            return self.operations.start(told, run)
+            return self.operations.start(told, run, partial(self.health.ended, self.stored))
 
     def start_track(self, target: PixelTarget | PositionTarget, told: Mapping[str, Any]) -> Operation:
         """Begin to follow what a pixel shows, or what is seen at a position; return the start's record.
@@ -401,6 +406,7 @@ class Service:
             self._loop = PointingLoop(self._rig, self.devices, self.config.limits, self.clock)
             self.tracker.use_rig(self._rig, mast.path.name)
             self.handoffs.use_mast(mast.stored.digest)
+            self.health.use_mast(mast.stored)
             self.recording.use_mast(mast)
             self.mast, self.former = mast, self.mast
             self.machine.publisher.publish("mast", "in_use", mast.told())
@@ -552,6 +558,7 @@ class Service:
         self.metrics.close()
         self.stop_threads.close()
         self.handoffs.close()
+        self.health.close()
         self.recording.close()
         _bounded("closing the hardware", self.hardware.close, HARDWARE_CLOSE_S)
         if self.stop_socket is not None:

@@ -44,6 +44,8 @@ class State:
         The track, and the rover's pose.
     stop_socket
         Path of the Unix socket for stops alone.
+    calibration
+        What pointings say of the mast file (`mastctl.health.verdict.Verdict.told`).
     control
         Who steers, as `mastctl.commands.lease.Control.told` tells it; None for nobody.
     """
@@ -61,6 +63,7 @@ class State:
     track: TrackStatus
     faults: tuple[StandingFault, ...]
     stop_socket: str | None = None
+    calibration: Mapping[str, Any] | None = None
     control: Mapping[str, Any] | None = None
 
     @property
@@ -87,6 +90,7 @@ class State:
             "pose": None if track.pose is None else track.pose.told(self.now_s),
             "track": picked(track, "state", "reason", "id"),
             "control": self.control,
+            "calibration": self.calibration,
             "cameras": {
                 name: picked(frame, "frame_id", "sequence", "exposure_s")
                 | {"age_s": None if frame is None else self._age_s(frame.mid_exposure_s)}

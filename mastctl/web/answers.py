@@ -172,6 +172,59 @@ class EstopHeld(_Told):
     at: str
 
 
+class CalibrationTold(_Told):
+    """Whether residuals are as the mast file predicts; ``since`` (ISO 8601, UTC) where they are not."""
+
+    verdict: Literal["good", "drifts", "few", "unknown"]
+    sentence: str
+    pointings: Count
+    since: str | None
+
+
+class TurnedTold(_Told):
+    """How far a camera seems turned, by the axes of the frame that it is mounted on."""
+
+    turn_rad: Point
+    sigma_rad: Point
+    log10_evidence: float
+
+
+class MeasuredTold(_Told):
+    """A pointing that counts: where, the residual, the part that joints do not explain, its predicted sigma.
+
+    ``time_s`` since 1970 (UTC); ``square``: of ``off_px`` over all that is expected, 2 on average.
+    """
+
+    time_s: float
+    operation: str
+    mast_digest: str
+    source: str
+    partner: str
+    camera: str
+    from_rad: Angles
+    to_rad: Angles
+    position_m: Point
+    range_m: float
+    residual_px: Pixel
+    off_px: Pixel
+    sigma_px: Pixel
+    match_sigma_px: Pixel
+    count_rad: Angles
+    square: float
+
+
+class CalibrationHealthTold(CalibrationTold):
+    """``GET /calibration/health``: the verdict, its figures, and the newest pointings that count."""
+
+    times_expected: float | None
+    log10_evidence: float | None
+    log10_threshold: float
+    false_alarms_per_day: float
+    cameras: dict[str, TurnedTold]
+    not_kept: str | None
+    newest: list[MeasuredTold]
+
+
 class Status(_Told):
     """``GET /status``."""
 
@@ -191,6 +244,7 @@ class Status(_Told):
     control: ControlTold | None
     estop: EstopHeld | None
     stop_socket: str | None
+    calibration: CalibrationTold | None
     cameras: dict[str, CameraTold]
     faults: list[FaultTold]
     mast: MastTold

@@ -14,6 +14,7 @@ from mastctl.web import PREFIX
 from mastctl.web import answers as told
 
 ANSWERS: Mapping[str, type[BaseModel]] = {
+    "GET /calibration/health": told.CalibrationHealthTold,
     "GET /status": told.Status,
     "POST /point": told.Started,
     "GET /operations": told.Operations,

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 from fastapi import FastAPI, Response
 
 from mastctl.errors import Unable
@@ -15,7 +17,7 @@ WELL: frozenset[Word] = frozenset({"ready", "moving", "tracking", "holding"})
 
 
 def add_watching(app: FastAPI, service: Service) -> None:
-    """Metrics and health."""
+    """Metrics, health, and that of the calibration."""
 
     @app.get("/metrics", summary="Figures in the text format of Prometheus", response_class=Response)
     async def metrics() -> Response:
@@ -34,3 +36,10 @@ def add_watching(app: FastAPI, service: Service) -> None:
         if now.word not in WELL:
             raise Unable("not_ready", f"{now.word}: {now.reason}" if now.reason else now.word)
         return {"ready": True, "state": now.word, "reason": now.reason}
+
+    @app.get(
+        f"{PREFIX}/calibration/health",
+        summary="Whether residuals of the last days are as the mast file predicts",
+    )
+    async def calibration() -> dict[str, Any]:
+        return service.health.told()

@@ -1,0 +1,94 @@
+"""Simulated histories of pointings: a true rig sees, a believed one computes; no formula of the judge's."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from calib.camera.stereo import triangulate
+from calib.files.mast_file import StoredRig, load_rig
+from calib.mast.covariance import moved_rig, stored_covariance
+from calib.mast.pointing import solve
+from calib.mast.rig import Rig
+from calib.rigid import Rigid
+from mastctl.health.measured import Measured
+from mastctl.packaged import default_config
+
+DAY_S = 86400.0
+NOON_S = 20_000 * DAY_S + DAY_S / 2
+COUNT_RAD = math.radians(0.003)
+MATCH_PX = 0.05
+
+
+def stored_rig() -> StoredRig:
+    """The packaged mast file, which has a covariance."""
+    return load_rig(Path(default_config()).parent / "masts" / "rocky8_simulated.yaml")
+
+
+def honest(rig: Rig, rng: np.random.Generator) -> Rig:
+    """Return a true rig of which the mast file says just how far it may be off."""
+    known = stored_covariance(rig)
+    assert known is not None
+    step = rng.multivariate_normal(np.zeros(len(known.names)), known.covariance, method="eigh")
+    return moved_rig(rig, known.names, step)
+
+
+def bumped(rig: Rig, camera: str, turn_rad: tuple[float, float, float]) -> Rig:
+    """Return the rig with a camera turned about its own place."""
+    held = rig.cameras[camera]
+    place = held.model.C
+    rotation = Rotation.from_rotvec(turn_rad).as_matrix()
+    model = held.model.moved(Rigid(rotation, place - rotation @ place))
+    return replace(rig, cameras={**rig.cameras, camera: replace(held, model=model)})
+
+
+def pointing(
+    believed: StoredRig,
+    true: Rig,
+    rng: np.random.Generator,
+    time_s: float,
+    camera: str = "pancam_left",
+    source: tuple[str, str] = ("navcam_left", "navcam_right"),
+) -> Measured:
+    """One pointing: seen by a pair from one pose, aimed at with a camera, looked at from another pose."""
+    rig = believed.rig
+    while True:
+        target = np.array([rng.uniform(2.0, 8.0), rng.uniform(-3.0, 3.0), rng.uniform(-0.4, 0.1)])
+        best = solve(rig.mast, rig.cameras[source[0]].model, target.tolist())[0]
+        before = best.pan_rad + rng.uniform(-0.2, 0.2), best.tilt_rad + rng.uniform(-0.1, 0.1)
+        read = _read(before)
+        clicks = [true.camera_in_rover(name, *before).project(target)[0] for name in source]
+        clicks = [click + rng.normal(0.0, MATCH_PX, 2) for click in clicks]
+        eyes = [rig.camera_in_rover(name, *read) for name in source]
+        if not all(eye.holds(click) for eye, click in zip(eyes, clicks, strict=True)):
+            continue
+        point = triangulate(*eyes, *clicks, MATCH_PX)
+        aimed = solve(rig.mast, rig.cameras[camera].model, point.position_m.tolist())[0]
+        after = aimed.pan_rad + rng.uniform(-1e-3, 1e-3), aimed.tilt_rad + rng.uniform(-1e-3, 1e-3)
+        found = true.camera_in_rover(camera, *after).project(target)[0] + rng.normal(0.0, MATCH_PX, 2)
+        off = found - rig.camera_in_rover(camera, *_read(after)).project(point.position_m)[0]
+        return Measured(
+            time_s,
+            "000001-aaaa",
+            believed.digest,
+            *source,
+            camera,
+            read,
+            _read(after),
+            tuple(point.position_m.tolist()),
+            aimed.range_m,
+            tuple((found - rig.cameras[camera].model.image_center_px).tolist()),
+            tuple(off.tolist()),
+            (MATCH_PX, MATCH_PX),
+            (COUNT_RAD, COUNT_RAD),
+        )
+
+
+def _read(angles: tuple[float, float]) -> tuple[float, float]:
+    """What an encoder tells of angles."""
+    pan, tilt = (round(angle / COUNT_RAD) * COUNT_RAD for angle in angles)
+    return pan, tilt

@@ -1,0 +1,129 @@
+"""False alarms and alarms, over simulated days whose truth the judge never sees."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from hil_tests.mastctl.health.histories import DAY_S, NOON_S, bumped, honest, pointing, stored_rig
+from mastctl.health.evidence import Judge, Sums, sums_of
+from mastctl.health.expected import Expected
+from mastctl.health.verdict import verdict_of
+from mastctl.health.windows import LOG_THRESHOLD, Windows
+
+CAMERAS = ("pancam_left", "navcam_left", "navcam_right")
+BUMP_RAD = 2e-3
+DAYS = 3000
+POINTINGS = 12
+
+
+def test_thousands_of_honest_days_raise_no_more_false_alarms_than_stated() -> None:
+    rng = np.random.default_rng(20)
+    root = rng.normal(0.0, 0.5, (4, 4))
+    judge = Judge(root @ root.T, ("a", "b"))
+    alarms, averages = 0, []
+    for _ in range(DAYS):
+        wrong = root @ rng.normal(0.0, 1.0, 4)
+        sums, loudest = None, -math.inf
+        for number in range(POINTINGS):
+            rates = rng.normal(0.0, 1.0, (2, 4))
+            turned = np.zeros((2, 6))
+            turned[:, 3 * (number % 2) : 3 * (number % 2) + 3] = rng.normal(0.0, 1000.0, (2, 3))
+            off = rates @ wrong + rng.normal(0.0, 0.3, 2)
+            one = sums_of(Expected(0.09 * np.eye(2), rates, turned), (off[0], off[1]), 0.0)
+            sums = one if sums is None else sums + one
+            evidence = judge.weigh(sums)
+            loudest = max(loudest, evidence.log_evidence)
+        alarms += loudest >= LOG_THRESHOLD
+        averages.append(evidence.square / (2 * POINTINGS))
+    assert alarms <= 3, f"{alarms} of {DAYS} honest days, seed 20"
+    assert np.mean(averages) == pytest.approx(1.0, abs=0.02)  # the square has its stated mean
+
+
+def test_evidence_is_a_fair_bet_while_the_mast_file_holds() -> None:
+    """Its mean over honest histories is 1: that is what bounds the false alarms."""
+    rng = np.random.default_rng(21)
+    judge = Judge(np.eye(2), ("a",))
+    ratios = []
+    for _ in range(20_000):
+        rates, turned = rng.normal(0.0, 1.0, (2, 2)), rng.normal(0.0, 200.0, (2, 3))
+        off = rates @ rng.normal(0.0, 1.0, 2) + rng.normal(0.0, 1.0, 2)
+        ratios.append(
+            math.exp(
+                judge.weigh(sums_of(Expected(np.eye(2), rates, turned), (off[0], off[1]), 0.0)).log_evidence
+            )
+        )
+    assert np.mean(ratios) == pytest.approx(1.0, abs=5 * np.std(ratios) / math.sqrt(len(ratios)))
+
+
+def test_an_honest_rig_raises_no_alarm_and_its_residuals_are_within_what_is_expected() -> None:
+    stored = stored_rig()
+    for seed in range(25):
+        rng = np.random.default_rng(seed)
+        true, windows = honest(stored.rig, rng), Windows(stored.rig, stored.digest)
+        for number in range(9):
+            windows.add(pointing(stored, true, rng, NOON_S + 60.0 * number, CAMERAS[number % 3]))
+        evidence = windows.evidence()
+        assert evidence is not None
+        assert evidence.log_evidence < LOG_THRESHOLD, f"seed {seed}"
+        assert evidence.times < 1.2, f"seed {seed}"
+
+
+@pytest.mark.parametrize("camera", CAMERAS)
+@pytest.mark.parametrize("axis", [1, 2])
+def test_a_camera_bumped_by_2_mrad_is_named_within_six_pointings(camera: str, axis: int) -> None:
+    stored = stored_rig()
+    rng = np.random.default_rng(7)
+    turn = [0.0, 0.0, 0.0]
+    turn[axis] = BUMP_RAD
+    true = bumped(honest(stored.rig, rng), camera, (turn[0], turn[1], turn[2]))
+    windows = Windows(stored.rig, stored.digest)
+    for number in range(6):
+        windows.add(pointing(stored, true, rng, NOON_S + 60.0 * number, CAMERAS[number % 3]))
+    verdict = verdict_of(windows.evidence(), 6)
+    assert verdict.word == "drifts"
+    assert camera in verdict.sentence
+    assert verdict.turned[camera]["turn_rad"][axis] == pytest.approx(BUMP_RAD, abs=1e-3)
+
+
+def test_a_bump_is_dated_after_days_without_one() -> None:
+    stored = stored_rig()
+    rng = np.random.default_rng(3)
+    before = honest(stored.rig, rng)
+    after = bumped(before, "pancam_left", (0.0, BUMP_RAD, 0.0))
+    windows = Windows(stored.rig, stored.digest)
+    for day in range(-4, 1):
+        for number in range(6):
+            true = before if day < 0 else after
+            windows.add(
+                pointing(stored, true, rng, NOON_S + day * DAY_S + 60.0 * number, CAMERAS[number % 3])
+            )
+        loudest = windows.evidence()
+        assert loudest is not None
+        assert (loudest.log_evidence >= LOG_THRESHOLD) == (day == 0)
+    verdict = verdict_of(windows.evidence(), 30)
+    assert verdict.since is not None and verdict.since.startswith("2024-10-04T12:0")
+    windows.forget(NOON_S + 8 * DAY_S)
+    assert windows.evidence() is None
+
+
+def test_one_false_match_is_no_drift() -> None:
+    stored = stored_rig()
+    rng = np.random.default_rng(5)
+    true, windows = honest(stored.rig, rng), Windows(stored.rig, stored.digest)
+    for number in range(8):
+        one = pointing(stored, true, rng, NOON_S + number)
+        if number == 4:
+            one = type(one)(**{**vars(one), "off_px": (30.0, -20.0)})
+        windows.add(one)
+    evidence = windows.evidence()
+    assert evidence is not None and evidence.log_evidence < LOG_THRESHOLD
+
+
+def test_sums_are_those_of_their_parts() -> None:
+    one = Sums(1, np.eye(2), np.ones(2), 3.0, 5.0)
+    both = one + Sums(2, 2 * np.eye(2), np.zeros(2), 1.0, 4.0)
+    assert (both.count, both.square, both.first_s) == (3, 4.0, 4.0)
+    assert ((both - one).count, (both - one).square) == (2, 1.0)

@@ -1,0 +1,127 @@
+"""Pointings are kept over a restart, bounded, and judged by the mast file in use."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from calib.errors import BadFile
+from hil_tests.mastctl.health.histories import DAY_S, NOON_S, bumped, pointing, stored_rig
+from hil_tests.mastctl.service_fakes import eventually
+from mastctl.health import journal as journal_module
+from mastctl.health.health import CalibrationHealth
+from mastctl.health.journal import FILE, Journal
+from mastctl.health.measured import COARSE_COUNT_RAD, Measured, measured_by, measured_of
+from mastctl.operations.records import Operation
+from mastctl.pointing.results import Pointing, PointingResult, Step
+
+STORED = stored_rig()
+
+
+def history(count: int, turn_rad: float = 0.0) -> list[Measured]:
+    rng = np.random.default_rng(1)
+    true = bumped(STORED.rig, "pancam_left", (0.0, turn_rad, 0.0))
+    return [pointing(STORED, true, rng, NOON_S + 60.0 * number) for number in range(count)]
+
+
+def ended_pointing() -> Operation:
+    step = Step("rest", "done", 0.0, 0.1, {"pan_rad": 0.1, "tilt_rad": -0.2})
+    seen = Step("triangulate", "done", 0.0, 0.1, {"position_m": [3.0, 0.2, 0.1], "range_m": 3.1})
+    counts = {"pan": {"count_rad": 1e-4}}
+    settled = Step("settle", "done", 0.0, 0.1, {"counts": counts})
+    result = Pointing(
+        0.1, -0.2, 0.1, -0.2, "pancam_left", "f", (512.0, 384.0), (513.0, 385.0), (512.5, 385.5), (0.5, 1.5),
+        (0.05, 0.05),
+    )  # fmt: skip
+    request = {"pixel": {"camera": "navcam_right", "frame_id": "f", "x_px": 1.0, "y_px": 2.0}}
+    made = PointingResult((3.0, 0.2, 0.1), 3.0, (result,))
+    return Operation("000001-ab", "done", request, 0.0, 0.0, 1.0, (step, seen, settled), made)
+
+
+def test_a_pointing_tells_what_measured_joints_do_not_explain() -> None:
+    one = measured_by(ended_pointing(), "d", STORED.rig.stereo, NOON_S)
+    assert one is not None
+    assert (one.source, one.partner, one.camera) == ("navcam_right", "navcam_left", "pancam_left")
+    assert (one.residual_px, one.off_px) == ((0.5, 1.5), (-0.5, 0.5))
+    assert one.count_rad == (1e-4, COARSE_COUNT_RAD)
+    assert measured_of(json.loads(json.dumps(one.told()))) == one
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"state": "failed"},
+        {"request": {"pan_rad": 0.1, "tilt_rad": 0.1}},
+        {"result": None},
+        {"steps": ()},
+    ],
+)
+def test_what_has_measured_nothing_is_not_kept(change: dict[str, object]) -> None:
+    assert measured_by(replace(ended_pointing(), **change), "d", STORED.rig.stereo, NOON_S) is None  # type: ignore[arg-type]
+
+
+def test_pointings_outlive_a_restart_and_a_torn_line_costs_one(tmp_path: Path) -> None:
+    for one in history(4):
+        Journal(tmp_path / FILE).add(one, [])
+    with (tmp_path / FILE).open("ab") as file:
+        file.write(b'{"time_s": 1')
+    Journal(tmp_path / FILE).add(history(5)[4], [])
+    assert Journal(tmp_path / FILE).read() == history(5)
+
+
+def test_a_file_that_is_full_is_written_anew_with_what_counts(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(journal_module, "MOST_BYTES", 3000)
+    journal, known = Journal(tmp_path / FILE), history(30)
+    for number, one in enumerate(known):
+        journal.add(one, known[max(0, number - 1) : number + 1])
+        assert (tmp_path / FILE).stat().st_size <= 3000
+    assert journal.read()[-2:] == known[-2:]
+
+
+def test_a_folder_that_is_no_folder_is_told(tmp_path: Path) -> None:
+    (tmp_path / FILE).mkdir()
+    with pytest.raises(BadFile, match="cannot be"):
+        Journal(tmp_path / FILE).read()
+    health = CalibrationHealth(tmp_path, STORED, lambda: NOON_S)
+    health.ended(STORED, ended_pointing())
+    eventually(lambda: health.told()["not_kept"], "the file is told")
+    health.close()
+
+
+def test_a_drift_is_told_after_a_restart_and_ends_with_another_mast_file(tmp_path: Path) -> None:
+    for one in history(6, 2e-3):
+        Journal(tmp_path / FILE).add(one, [])
+    health = CalibrationHealth(tmp_path, STORED, lambda: NOON_S + 600.0)
+    eventually(lambda: health.verdict.word == "drifts", "it drifts")
+    told = health.told()
+    assert "pancam_left" in told["sentence"] and "mrad" in told["sentence"]
+    assert len(told["newest"]) == told["pointings"] == 6
+    health.use_mast(replace(STORED, digest="0" * 64))
+    assert health.verdict.word == "few"
+    health.use_mast(STORED)
+    eventually(lambda: health.verdict.word == "drifts", "it drifts")
+    health.close()
+
+
+def test_pointings_of_last_month_do_not_count(tmp_path: Path) -> None:
+    for one in history(6, 2e-3):
+        Journal(tmp_path / FILE).add(one, [])
+    health = CalibrationHealth(tmp_path, STORED, lambda: NOON_S + 30 * DAY_S)
+    health.close()
+    assert (health.verdict.word, health.verdict.pointings) == ("few", 0)
+
+
+def test_a_mast_file_that_does_not_say_how_sure_it_is_is_not_judged_by(tmp_path: Path) -> None:
+    unsure = replace(STORED, rig=replace(STORED.rig, fit={}))
+    health = CalibrationHealth(tmp_path, unsure, lambda: NOON_S)
+    health.ended(unsure, ended_pointing())
+    health.close()
+    assert health.verdict.word == "unknown"
+    assert "fit.covariance" in health.verdict.sentence
+    assert len(Journal(tmp_path / FILE).read()) == 1

@@ -1,0 +1,1 @@
+"""Whether pointings still come out as the mast file predicts."""

@@ -1,0 +1,175 @@
+"""How strongly pointings speak against the mast file, judged as often as one likes.
+
+The residuals of n pointings are expected to be Gaussian about zero with the covariance S = R + J C Jᵀ: R
+differs from pointing to pointing, C is the mast file's own covariance, whose error all of them share. Against
+that stand: one camera was turned by some angle, of which nothing is known but its usual size; or everything
+is some times as wrong as expected. The ratio of the likelihoods, averaged over all of these, has the mean 1
+while the mast file holds, and is a martingale as pointings come in: the chance that it *ever* reaches k is at
+most 1/k (Ville's inequality; Ramdas et al., "Game-theoretic statistics and safe anytime-valid inference",
+2023). So it may be looked at after each pointing, and the false alarms do not add up.
+
+The pointings enter by sums only (`Sums`), which add up over time.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from calib.rigid import FloatArray
+from mastctl.health.expected import Expected
+
+TURN_RAD = 2e-3
+"""Usual size of a bump, about each axis."""
+TIMES = (1.5, 2.0, 4.0)
+"""As how many times as wrong everything may be taken."""
+
+
+@dataclass(frozen=True, eq=False)
+class Sums:
+    """What some pointings say together: n, HᵀR⁻¹H, HᵀR⁻¹r, rᵀR⁻¹r, with H the rates, then the turns.
+
+    ``first_s``: when the first of them was.
+    """
+
+    count: int
+    normal: FloatArray
+    right: FloatArray
+    square: float
+    first_s: float
+
+    def __add__(self, other: Sums) -> Sums:
+        return Sums(
+            self.count + other.count,
+            self.normal + other.normal,
+            self.right + other.right,
+            self.square + other.square,
+            min(self.first_s, other.first_s),
+        )
+
+    def __sub__(self, other: Sums) -> Sums:
+        return Sums(
+            self.count - other.count,
+            self.normal - other.normal,
+            self.right - other.right,
+            self.square - other.square,
+            self.first_s,
+        )
+
+
+@dataclass(frozen=True)
+class Turned:
+    """How far a camera seems turned: by its axes and in all, radians, with one sigma; and the evidence."""
+
+    turn_rad: tuple[float, float, float]
+    sigma_rad: tuple[float, float, float]
+    size_rad: float
+    size_sigma_rad: float
+    log_evidence: float
+
+
+@dataclass(frozen=True, eq=False)
+class Evidence:
+    """What some pointings say against the mast file.
+
+    Attributes
+    ----------
+    count, since_s
+        How many pointings, and when the first one was.
+    square
+        Of all residuals over their covariance: about twice the count while the mast file holds.
+    log_evidence
+        Natural logarithm of the averaged ratio.
+    log_wider
+        Of the part that says that everything is some times as wrong.
+    turned
+        By camera.
+    """
+
+    count: int
+    since_s: float
+    square: float
+    log_evidence: float
+    log_wider: float
+    turned: dict[str, Turned]
+
+    @property
+    def times(self) -> float:
+        """As how many times as wrong as expected everything is, rms."""
+        return math.sqrt(max(self.square, 0.0) / (2 * self.count)) if self.count else 0.0
+
+
+def sums_of(one: Expected, off_px: tuple[float, float], time_s: float) -> Sums:
+    """Return what a single pointing says."""
+    whole = np.concatenate([one.rates, one.turned], axis=1)
+    weight = np.linalg.inv(one.noise_px2)
+    off = np.array(off_px)
+    return Sums(1, whole.T @ weight @ whole, whole.T @ weight @ off, float(off @ weight @ off), time_s)
+
+
+class Judge:
+    """Weighs sums of pointings against one mast file.
+
+    Parameters
+    ----------
+    covariance
+        (p, p) of the mast file's parameters.
+    cameras
+        (c,) whose turns the sums tell.
+    """
+
+    def __init__(self, covariance: FloatArray, cameras: tuple[str, ...]) -> None:
+        values, vectors = np.linalg.eigh(covariance)
+        kept = values > 1e-15 * max(float(values.max(initial=0.0)), 1e-300)
+        self._cameras = cameras
+        self._root = vectors[:, kept] * np.sqrt(values[kept])  # covariance = root rootᵀ
+        self._size = len(covariance)
+
+    def square(self, sums: Sums) -> float:
+        """Return the residuals' square over their covariance."""
+        return self._reduced(sums)[1]
+
+    def weigh(self, sums: Sums) -> Evidence:
+        """Return what pointings say."""
+        normal, square, right = self._reduced(sums)
+        turned = {}
+        for number, camera in enumerate(self._cameras):
+            part = slice(3 * number, 3 * number + 3)
+            turned[camera] = _turned(normal[part, part], right[part])
+        wider = [-2 * sums.count * math.log(times) + 0.5 * square * (1.0 - times**-2) for times in TIMES]
+        log_wider = _log_mean(wider)
+        log_evidence = _log_mean([log_wider, *(one.log_evidence for one in turned.values())])
+        return Evidence(sums.count, sums.first_s, square, log_evidence, log_wider, turned)
+
+    def _reduced(self, sums: Sums) -> tuple[FloatArray, float, FloatArray]:
+        """Take out what the mast file's own covariance explains: turns' normal matrix, square, right side."""
+        p, root = self._size, self._root
+        inner = np.eye(root.shape[1]) + root.T @ sums.normal[:p, :p] @ root
+        across = root.T @ np.concatenate([sums.right[:p, None], sums.normal[:p, p:]], axis=1)
+        solved = np.linalg.solve(inner, across)
+        square = sums.square - float(across[:, 0] @ solved[:, 0])
+        right = sums.right[p:] - across[:, 1:].T @ solved[:, 0]
+        normal = sums.normal[p:, p:] - across[:, 1:].T @ solved[:, 1:]
+        return normal, square, right
+
+
+def _turned(normal: FloatArray, right: FloatArray) -> Turned:
+    """The likeliest turn of usual size, and the ratio of the likelihoods of any and none."""
+    inner = normal + np.eye(3) / TURN_RAD**2
+    covariance = np.linalg.inv(inner)
+    turn = covariance @ right
+    log_evidence = 0.5 * float(right @ turn) - 0.5 * float(np.linalg.slogdet(inner * TURN_RAD**2)[1])
+    sigma = np.sqrt(np.diag(covariance))
+    x, y, z = turn.tolist()
+    sx, sy, sz = sigma.tolist()
+    size = math.hypot(x, y, z)
+    along = turn / max(size, 1e-12)
+    return Turned((x, y, z), (sx, sy, sz), size, math.sqrt(float(along @ covariance @ along)), log_evidence)
+
+
+def _log_mean(logs: list[float]) -> float:
+    """Logarithm of the mean of numbers that are given by their logarithms."""
+    top = max(logs)
+    return top + math.log(sum(math.exp(one - top) for one in logs) / len(logs))
