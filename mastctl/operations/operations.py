@@ -32,6 +32,7 @@ log = logging.getLogger(__name__)
 
 KEPT_OPERATIONS = 200
 END_TIMEOUT_S = 5.0  # for a cancelled operation to notice, when the service closes
+ENDS_SOON_S = 0.25  # a stopped operation ends within 20 ms or so; who comes next waits for that
 
 STOP_ASKED = "a stop was asked for"
 
@@ -96,7 +97,7 @@ class Operations:
     def start(self, request: Mapping[str, Any], work: Work, on_end: OnEnd | None = None) -> Operation:
         """Start ``work(record_step, cancelled)`` in a thread and return its first record.
 
-        ``on_end`` gets the last record, in the same thread, when the next operation may be started already.
+        A stopped operation that has not ended yet is waited for, `ENDS_SOON_S` at most. ``on_end`` gets the last record, in the same thread, when the next operation may be started already.
 
         Raises
         ------
@@ -105,6 +106,7 @@ class Operations:
         Unable
             ``no_thread`` if the machine has none for it (the record says so too), ``closing``.
         """
+        self.let_stopped_end()
         with self._lock:
             name = f"{next(self._numbers):06d}-{self._run}"
             self._machine.operation_began(name, request)
@@ -160,6 +162,15 @@ class Operations:
             name = running[0]
         log.info("stop%s", f": operation {name}" if name else "")
         return name
+
+    def let_stopped_end(self) -> None:
+        """Wait for an operation that is being ended, `ENDS_SOON_S` at most; return at once if there is none.
+
+        The stop itself is answered as soon as the head has confirmed it.
+        """
+        current = self._current
+        if current is not None and current[1].is_set():
+            self.wait_ended(current[0], ENDS_SOON_S)
 
     def wait_ended(self, name: str, timeout_s: float) -> None:
         """Wait until an operation has ended, ``timeout_s`` seconds at most."""
@@ -340,12 +351,12 @@ class Operations:
         with self._lock:
             if self._current is None or self._current[0] != name:
                 return  # given up before
-            self._current = None
             self._mover.allow_moves(name)
             self._machine.operation_ended(name, residual)
             known = self._records.get(name)
             if known is not None:  # last, since it is what clients wait for
                 ended_s = self._clock.now_s()
                 self._keep(replace(known, state=state, result=result, error=error, ended_s=ended_s))
+            self._current = None  # whoever waits for the end finds it told
         with self._ended:
             self._ended.notify_all()

@@ -49,6 +49,7 @@ from mastctl.service.socket_stops import SocketStops
 from mastctl.service.state import State
 from mastctl.state.faults import StandingFault
 from mastctl.state.machine import Machine
+from mastctl.state.refusals import Need
 from mastctl.state.standing import Latched
 from mastctl.tracking.pose import RoverPose
 from mastctl.tracking.status import ACTIVE, TrackStatus
@@ -65,7 +66,6 @@ KEPT_S = 1.0  # what the disk is given before an emergency stop is answered with
 STATE = "state"
 AUDIT_FILE = "audit.jsonl"
 KEPT_COMMANDS = 100  # the newest ones, which a new listener still hears of
-ENDS_SOON_S = 0.25  # a stopped operation ends within 20 ms or so; then the next one may follow at once
 
 
 class Service:
@@ -148,7 +148,7 @@ class Service:
         )
         self.operations = Operations(self.devices, clock, new_run(), self._ended, self.machine)
         if self.latch.held is not None:
-            self.devices.block_moves(self.latch, self.latch.held.refusal())
+            self.devices.block_moves(self.latch.held, self.latch.held.refusal())
         self.stop_threads = StopThreads()
         self._rig = configured(mast.stored.rig, config.hardware.cameras)
         self._loop = PointingLoop(self._rig, self.devices, config.limits, clock)
@@ -174,7 +174,7 @@ class Service:
             Answers(people_s, clock),
             self.audit,
             self.operations,
-            self.machine,
+            self,
             self._commanded,
         )
         self.metrics = Metrics(lambda: self.state().told(), self.devices.errors, self.machine.publisher)
@@ -398,7 +398,7 @@ class Service:
         """Put a mast file into use while the head rests and nothing runs."""
         self.devices.read()  # the machine knows whether the head moves now
         with self._mast_lock:
-            refusal = self.machine.refusal("rest")
+            refusal = self.refusal("rest")
             if refusal is not None:
                 raise refusal
             self.devices.use_rig(mast.stored.rig, mast.stored.digest)
@@ -443,8 +443,6 @@ class Service:
                 stopped = self.operations.stop(reason)
             finally:
                 self.tracker.stop(reason)
-        if stopped is not None:
-            self.operations.wait_ended(stopped, ENDS_SOON_S)
         return stopped
 
     def estop(self, reason: str | None = None, name: str | None = None) -> dict[str, Any]:
@@ -481,14 +479,26 @@ class Service:
 
     def latch_estop(self, reason: str | None, name: str | None) -> Held:
         """Let no move out from now on; the head is told by `estop`. Returns the stop that is latched."""
-        held = self.latch.hold(reason, name)
-        self.machine.estop_asked(Latched(**asdict(held)))
-        self.devices.block_moves(self.latch, held.refusal())
+        self.machine.stop_asked()
+        try:
+            held = self.latch.hold(reason, name)
+            self.machine.estop_asked(Latched(**asdict(held)))
+            self.devices.block_moves(held, held.refusal())
+        finally:
+            self.machine.stop_ended()
         return held
 
     def stop_told(self) -> dict[str, Any]:
         """Stop as `stop`; return what ``POST /stop`` tells."""
         return {"stopped": True, "operation": self.stop()}
+
+    def refusal(self, need: Need) -> MastctlError | None:
+        """Return why a command may not be carried out now, as `mastctl.state.machine.Machine.refusal`.
+
+        What a stop has ended may end first.
+        """
+        self.operations.let_stopped_end()
+        return self.machine.refusal(need)
 
     def open_stop_socket(self) -> None:
         """Listen for stops in the state folder, or a temporary one if its name is too long for a socket's."""
@@ -509,19 +519,15 @@ class Service:
         Unable
             ``not_saved`` if the state folder goes on to say that it is latched; ``closing``.
         """
-        refusal = self.machine.refusal("latch")
+        refusal = self.refusal("latch")
         if refusal is not None:
             raise refusal
         if self.devices.stop_pending:
             raise NotNow("stopping", "the mast is being stopped; an emergency stop is released after that")
         with self._latch_lock:
             held = self.latch.release(reason, name)
-            self.devices.allow_moves(self.latch)
-            self.machine.reset(name, reason)
-            if self.latch.held is not None:  # another came meanwhile
-                self.machine.stop_asked()
-                self.latch_estop(None, None)
-                self.machine.stop_ended()
+            self.devices.allow_moves(held)  # and not what another one blocks that came meanwhile
+            self.machine.reset(name, reason, lambda: _latched(self.latch.held))
         return held
 
     def _refuse_if_latched(self) -> None:

@@ -154,10 +154,15 @@ class Machine:
             lambda now: ("estop_asked", replace(now, latch=now.latch or latch, held=AFTER_A_STOP))
         )
 
-    def reset(self, name: str, reason: str) -> None:
-        """Take that the latch was released, of a service that asked `refusal` of ``latch`` before."""
+    def reset(self, name: str, reason: str, latched: Callable[[], Latched | None] = lambda: None) -> None:
+        """Take that the latch was released, of a service that asked `refusal` of ``latch`` before.
+
+        ``latched`` tells what is latched then: another emergency stop may have come since. It must not wait.
+        """
         held = f"reset by {name}: {reason}; the next command starts"
-        self._turns.bring(lambda now: ("reset", replace(now, latch=None, held=held)) if now.latch else None)
+        self._turns.bring(
+            lambda now: ("reset", replace(now, latch=latched(), held=held)) if now.latch else None
+        )
 
     def closing(self) -> None:
         """Note that the service is closing: nothing begins any more."""

@@ -21,7 +21,7 @@ from mastctl.client import Client, ClientError
 from mastctl.errors import NotNow, Unable
 from mastctl.safety import latch as latch_module
 from mastctl.safety import stop_threads
-from mastctl.safety.latch import FILE, Estopped, Latch
+from mastctl.safety.latch import FILE, Estopped, Held, Latch
 from mastctl.safety.state_file import StateFile
 from mastctl.safety.state_folder import StateFolder, StateInUse, usual_folder
 from mastctl.service import service as service_module
@@ -394,6 +394,64 @@ def test_a_reset_waits_for_a_stop_that_is_under_way(monkeypatch: pytest.MonkeyPa
             stopping.join(BOUND_S)
         eventually(lambda: not daemon.service.machine.standing.stops, "the stop's end")
         client.reset(reason="x", name="y")
+
+
+def test_a_stop_in_the_middle_of_a_reset_leaves_nothing_latched_and_the_next_command_starts(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    with fake_daemon(monkeypatch, tmp_path, config=KEPT) as (daemon, hardware), Client(daemon.url) as client:
+        service = daemon.service
+        client.estop(reason="sparks", name="Ana")
+        true = service.latch.release
+
+        def release(reason: str, name: str) -> Held:
+            held = true(reason, name)
+            service.machine.stop_asked()
+            return held
+
+        monkeypatch.setattr(service.latch, "release", release)
+        client.reset(reason="looked", name="Ben")
+        assert (service.machine.standing.word, service.machine.standing.latch) == ("stopping", None)
+        service.machine.stop_ended()
+        assert client.status()["state"] == "holding"
+        with pytest.raises(ClientError) as refused:
+            client.reset(reason="looked", name="Ben")
+        assert refused.value.code == "not_estopped"
+        client.wait(client.point(pan_rad=0.1, tilt_rad=0.1))
+        assert [call for call in hardware.head.calls if call[0] == "move"]
+
+
+def test_an_emergency_stop_in_the_middle_of_a_reset_is_latched_everywhere(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    with fake_daemon(monkeypatch, tmp_path, config=KEPT) as (daemon, _), Client(daemon.url) as client:
+        service = daemon.service
+        client.estop(reason="sparks", name="Ana")
+        true = service.latch.release
+
+        def release(reason: str, name: str) -> Held:
+            held = true(reason, name)
+            service.latch_estop("smoke", "Cem")
+            return held
+
+        with monkeypatch.context() as patch:
+            patch.setattr(service.latch, "release", release)
+            client.reset(reason="looked", name="Ben")
+        status = client.status()
+        assert (status["state"], status["estop"]["name"]) == ("stopped", "Cem")
+        with pytest.raises(Estopped, match="smoke"):
+            service.devices.move(0.1, 0.1)
+        assert client.reset(reason="looked", name="Ben")["released"]["name"] == "Cem"
+        client.wait(client.point(pan_rad=0.1, tilt_rad=0.1))
+
+
+def test_what_is_latched_where_no_stop_could_be_sent_can_be_reset(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    with fake_daemon(monkeypatch, tmp_path, config=KEPT) as (daemon, _), Client(daemon.url) as client:
+        daemon.service.latch_estop("smoke", "Ana")
+        assert client.status()["state"] == "stopped"
+        assert client.reset(reason="looked", name="Ben")["released"]["name"] == "Ana"
 
 
 def stop(url: str) -> None:
