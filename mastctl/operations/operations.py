@@ -97,7 +97,8 @@ class Operations:
     def start(self, request: Mapping[str, Any], work: Work, on_end: OnEnd | None = None) -> Operation:
         """Start ``work(record_step, cancelled)`` in a thread and return its first record.
 
-        A stopped operation that has not ended yet is waited for, `ENDS_SOON_S` at most. ``on_end`` gets the last record, in the same thread, when the next operation may be started already.
+        A stopped operation that has not ended yet is waited for, `ENDS_SOON_S` at most. ``on_end`` gets the
+        last record, in the same thread, when the next operation may be started already.
 
         Raises
         ------

@@ -218,7 +218,13 @@ def test_a_stop_does_not_wait_for_the_operation_but_the_next_start_does(
 ) -> None:
     monkeypatch.setattr("mastctl.operations.operations.ENDS_SOON_S", 30.0)
     go = threading.Event()
-    first = operations.start({}, lambda record, cancelled: go.wait(30.0)).id
+
+    def ends_late(record: Any, cancelled: threading.Event) -> None:
+        assert go.wait(30.0)
+        assert cancelled.is_set()
+        raise Stopped("it noticed")
+
+    first = operations.start({}, ends_late).id
     assert operations.stop() == first
     assert operations.get(first).state == "running"
     seen: list[str] = []
