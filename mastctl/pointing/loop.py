@@ -192,13 +192,15 @@ class _Run:
             partnered = self._steps.unless_stopped(self._eyes.stereo, now, found.pixel_px, other)
             detail.update(match_facts(partnered.match), across_px=round(partnered.across_px, 3))
         assert partnered.plane is not None
-        self._triangulate(now, found.pixel_px, other, partnered.match.pixel_px)
+        self._triangulate(now, found.pixel_px, other, partnered.match)
         return Clicked(found.view, found.clicked_px, partnered.plane)
 
-    def _triangulate(self, one: View, one_px: FloatArray, other: View, other_px: FloatArray) -> None:
+    def _triangulate(self, one: View, one_px: FloatArray, other: View, seen: PatchMatch) -> None:
         with self._steps.step("triangulate") as detail:
-            sigma_px = self._settings.triangulation_sigma_px
-            point = triangulate(one.camera, other.camera, one_px, other_px, sigma_px)
+            # the match is of one pixel of the two that are taken as equally sure
+            match_px = float(seen.sigma_px.max()) / math.sqrt(2.0)
+            sigma_px = math.hypot(self._settings.triangulation_sigma_px, match_px)
+            point = triangulate(one.camera, other.camera, one_px, seen.pixel_px, sigma_px)
             self._position_m = point.position_m
             detail.update(
                 position_m=rounded(point.position_m, 5),
@@ -220,7 +222,7 @@ class _Run:
                 seen = self._steps.unless_stopped(self._eyes.look_for, clicked, now)
                 detail.update(match_facts(seen), predicted_px=rounded(seen.predicted_px))
                 detail.update(residual_px=rounded(seen.pixel_px - aim_px))
-            confirmed: list[tuple[View, FloatArray]] = [(now, seen.pixel_px)]
+            confirmed: list[tuple[View, PatchMatch]] = [(now, seen)]
             with self._steps.step("eyes") as detail:
                 detail.update(confirmed_by=list(companions))
                 if views:
@@ -230,12 +232,12 @@ class _Run:
                     found, detail[name] = self._steps.unless_stopped(
                         self._eyes.agree, clicked, now, seen, other, same_pair
                     )
-                    confirmed.append((other, found.pixel_px))
+                    confirmed.append((other, found))
             self._done(self._pointing(commanded, now, aim_px, seen))
             if number < pointings:
                 self._again(confirmed)
 
-    def _again(self, confirmed: Sequence[tuple[View, FloatArray]]) -> None:
+    def _again(self, confirmed: Sequence[tuple[View, PatchMatch]]) -> None:
         """Measure the position again in the new pictures, by the aiming eye and its partner.
 
         Where another pair stood in for the partner it gives the range only; the direction stays the aiming
@@ -245,12 +247,12 @@ class _Run:
             with self._steps.step("triangulate"):
                 words = "a second pointing needs two eyes of a pair that see the target after the first one"
                 raise PointingError("no_stereo", words)
-        (one, one_px), (other, other_px) = confirmed[-2:]
-        self._triangulate(one, one_px, other, other_px)
+        (one, own), (other, seen) = confirmed[-2:]
+        self._triangulate(one, own.pixel_px, other, seen)
         if len(confirmed) > 2:
             assert self._position_m is not None
-            aiming, seen_px = confirmed[0]
-            ray = aiming.camera.ray(seen_px)
+            aiming, first = confirmed[0]
+            ray = aiming.camera.ray(first.pixel_px)
             range_m = float((self._position_m - ray.origins_m) @ ray.directions)
             self._position_m = ray.origins_m + range_m * ray.directions
 

@@ -53,7 +53,8 @@ class PointingSettings:
         Largest offset across the epipolar line, and along it after the move (same pair only), that is still
         put down to calibration: the paper's mast fit leaves 1.1 px rms.
     triangulation_sigma_px
-        Of a pixel for the position's covariance: matching and calibration together.
+        Of a pixel for the position's covariance: noise and calibration. What the match in the other eye
+        tells is added, so that a position on rough ground is told as less sure.
     view
         What may lie between the view that joints tell and the one that a picture shows.
     match, small_half_px

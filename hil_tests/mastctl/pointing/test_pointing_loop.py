@@ -9,6 +9,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
+from calib.pictures.patch_verdict import MatchSettings
 from hil_tests.mastctl.pointing.pointing_world import LIMITS, SIZE_PX, World, click, rig, run
 from mastctl.as_json import as_json
 from mastctl.pointing.loop import (
@@ -21,6 +22,7 @@ from mastctl.pointing.loop import (
     PositionTarget,
     Step,
 )
+from mastctl.pointing.settings import PointingSettings
 
 MIDDLE_PX = ((SIZE_PX[0] - 1) / 2, (SIZE_PX[1] - 1) / 2)
 MEASURED_PX = 0.1  # the measured residual against the true one
@@ -50,6 +52,26 @@ def test_a_clicked_pixel_lands_on_the_aim_and_the_residual_is_the_true_one(
         assert np.abs(truth).max() < 0.5
         assert np.abs(np.array(pointing.residual_px) - truth).max() < MEASURED_PX
         assert max(pointing.residual_sigma_px) < MEASURED_PX
+
+
+def test_a_position_is_told_as_sure_as_the_pixels_and_the_match_it_comes_from() -> None:
+    """Of range, by hand: the disparity's sigma (two pixels of 0.2 px, and the match) times r² / (f b)."""
+    told_m = {}
+    for roughness in (0.0, 0.3):
+        world = World()
+        frame = world.shoot()
+        settings = PointingSettings(match=MatchSettings(roughness=roughness))
+        steps: list[Step] = []
+        loop = PointingLoop(rig(), world, LIMITS, world.clock, settings)
+        loop.run(click(frame, 150.0, 120.0), steps.append, threading.Event())
+        stereo, place = (
+            next(s.detail for s in steps if s.name == name) for name in ("stereo", "triangulate")
+        )
+        disparity_px = np.sqrt(2 * 0.2**2 + max(stereo["sigma_px"]) ** 2)
+        expected_m = disparity_px * place["range_m"] ** 2 / (645.0 * 0.2)
+        told_m[roughness] = np.linalg.norm(place["sigma_m"])
+        assert told_m[roughness] == pytest.approx(expected_m, rel=0.05)
+    assert told_m[0.3] > 2.0 * told_m[0.0]
 
 
 def test_a_wrong_mast_file_shows_as_a_residual_and_not_as_nothing() -> None:
