@@ -163,10 +163,18 @@ class StopSocket:
             except BlockingIOError:
                 return None
             except OSError as error:
-                self._starved = error.errno in (errno.EMFILE, errno.ENFILE)
-                if not self._starved or not self._spares:
+                if error.errno not in (errno.EMFILE, errno.ENFILE) or not self._somebody_waits():
+                    return None  # the kernel looks for a descriptor first, and then for somebody
+                self._starved = True
+                if not self._spares:
                     return None
                 os.close(self._spares.pop())
+
+    def _somebody_waits(self) -> bool:
+        """Whether somebody wants to be let in; needs no descriptor."""
+        waiting = select.poll()
+        waiting.register(self._listener, select.POLLIN)
+        return bool(waiting.poll(0))
 
     def _hear(self, number: int) -> None:
         """Take what a peer says; a whole line is carried out."""

@@ -244,7 +244,7 @@ def test_a_daemon_whose_event_loop_is_blocked_takes_a_stop_here(
 ) -> None:
     hang = Hang()
     with fake_daemon(monkeypatch, tmp_path) as (daemon, hardware):
-        path = Path(str(daemon.service.state().told(daemon.service.head)["stop_socket"]))
+        path = Path(str(daemon.service.state().told()["stop_socket"]))
         true = type(daemon.service).state
 
         def state(service: Any) -> Any:  # GET /status, on the loop
