@@ -51,7 +51,9 @@ from mastctl.web.connections import (
     sweep,
 )
 from mastctl.web.entrance import Entrance
+from mastctl.web.events import Streams
 from mastctl.web.secure import arriving
+from mastctl.web.sockets import LARGEST_BYTES, PING_S, Socket
 from mastctl.web.waiting import Waiting
 from mastctl.web.whose_page import Names
 
@@ -238,7 +240,9 @@ async def _serve(
     """
     loop = asyncio.get_running_loop()
     waiting = Waiting(service.clock)
-    settings = _settings(service, create_app(service, waiting, entrance))
+    most = most_connections()
+    streams = Streams(service.machine.publisher, most // 2)
+    settings = _settings(service, create_app(service, waiting, entrance, streams), most)
     server = _Server(settings)
     ending = asyncio.Event()
 
@@ -276,6 +280,7 @@ async def _serve(
     waiting.end()
     log.info("ending: the mast is stopped first")
     await stopped
+    streams.end()
     server.should_exit = True
     loop.call_later(GRACE_S - 0.5, _leave, server.server_state.connections)  # before uvicorn's own impatience
     await serving
@@ -284,15 +289,19 @@ async def _serve(
         await loop.run_in_executor(None, service.close)
 
 
-def _settings(service: Service, app: ASGIApp) -> uvicorn.Config:
+def _settings(service: Service, app: ASGIApp, most: int) -> uvicorn.Config:
     """How uvicorn serves. TLS is made by its options, and spoken by connections that are counted."""
-    kind = type("Connection", (Connection,), {"most": most_connections()})
+    kind = type("Connection", (Connection,), {"most": most})
     tls = service.config.listen.tls
     settings = uvicorn.Config(
         app,
         http=kind,
         backlog=ACCEPTED_AT_ONCE,
-        ws="none",
+        ws=Socket,
+        ws_max_size=LARGEST_BYTES,
+        ws_ping_interval=PING_S,
+        ws_ping_timeout=PING_S,
+        ws_per_message_deflate=False,
         lifespan="off",
         proxy_headers=False,
         server_header=False,

@@ -318,6 +318,15 @@ class Client:
         """Yield the track as it is, and again at each change, until the daemon ends."""
         yield from self._daemon.events("/track/stream")
 
+    def events(self, *topics: str, keys: Sequence[str] = ()) -> Iterator[dict[str, Any]]:
+        """Yield each change of some topics (all without any) and keys, beginning with what is known, until
+        the daemon ends: ``topic``, ``key``, ``sequence``, ``lost``, ``value``.
+        """
+        query: dict[str, Any] = {"key": list(keys)} if keys else {}
+        if topics:
+            query["topics"] = ",".join(topics)
+        yield from self._daemon.events("/events", query)
+
     def stop_track(self) -> dict[str, Any]:
         """End the track; return it as it is then."""
         return self._daemon.json("POST", "/track/stop")

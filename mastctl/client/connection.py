@@ -167,11 +167,11 @@ class DaemonHttp:
                     "bad_request", f"the request cannot be sent: {error}", exit_code=2
                 ) from None
 
-    def events(self, path: str) -> Iterator[dict[str, Any]]:
+    def events(self, path: str, query: Mapping[str, Any] | None = None) -> Iterator[dict[str, Any]]:
         """Yield what a stream of the daemon tells, until the daemon ends."""
         with (
             self._failures(f"the daemon at {self.url} fell silent"),
-            self._http.stream("GET", PREFIX + path) as answer,
+            self._http.stream("GET", PREFIX + path, params=query) as answer,
         ):
             if not answer.is_success:
                 raise self.bad_answer(f"the stream says {answer.status_code}")

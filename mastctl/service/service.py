@@ -165,6 +165,7 @@ class Service:
             self._handed_over,
             self.machine,
         )
+        self.machine.publisher.publish("track", "track", self.tracker.status)
         people_s = SystemClock()  # clients live in real time, whatever a simulated rover's clock does
         self.leases = Leases(people_s, self._runs, self._steered)
         self.audit = AuditLog(self.folder.path / AUDIT_FILE, clock)

@@ -73,20 +73,11 @@ class State:
 
     def told(self) -> dict[str, Any]:
         """Return the snapshot as ``GET /status`` tells it: JSON, ages instead of times."""
-        reading, now, track = self.reading, self.standing, self.track
+        reading, track = self.reading, self.track
         return {
-            "state": now.word,
-            "reason": now.reason,
-            "state_for_s": self._age_s(now.since_s),
-            "estop": as_json(now.latch),
+            **standing_told(self.standing, self.now_s),
             "simulated": self.hardware == "simulated",
-            "joints": None
-            if reading is None
-            else picked(reading, "pan_rad", "tilt_rad")
-            | {"measured_s": reading.time_s, "age_s": self._age_s(reading.time_s)},
-            "operation": now.operation,
-            "target": as_json(now.target),
-            "last_residual": as_json(now.residual),
+            "joints": None if reading is None else joints_told(reading, self.now_s),
             "pose": None if track.pose is None else track.pose.told(self.now_s),
             "track": picked(track, "state", "reason", "id"),
             "control": self.control,
@@ -96,13 +87,35 @@ class State:
                 | {"age_s": None if frame is None else self._age_s(frame.mid_exposure_s)}
                 for name, frame in self.frames.items()
             },
-            "faults": [
-                picked(fault, "device", "code", "message", "until") | {"for_s": self._age_s(fault.since_s)}
-                for fault in self.faults
-            ],
+            "faults": [fault_told(fault, self.now_s) for fault in self.faults],
             "uptime_s": self.now_s - self.started_s,
             **picked(self, *AS_THEY_ARE),
         }
 
     def _age_s(self, time_s: float) -> float:
         return max(0.0, self.now_s - time_s)
+
+
+def standing_told(now: Standing, now_s: float) -> dict[str, Any]:
+    """Return what the daemon is doing as ``GET /status`` tells it."""
+    return {
+        "state": now.word,
+        "reason": now.reason,
+        "state_for_s": max(0.0, now_s - now.since_s),
+        "estop": as_json(now.latch),
+        "operation": now.operation,
+        "target": as_json(now.target),
+        "last_residual": as_json(now.residual),
+    }
+
+
+def joints_told(reading: Reading, now_s: float) -> dict[str, Any]:
+    """Return a reading of the head as ``GET /status`` tells it."""
+    age_s = max(0.0, now_s - reading.time_s)
+    return picked(reading, "pan_rad", "tilt_rad") | {"measured_s": reading.time_s, "age_s": age_s}
+
+
+def fault_told(fault: StandingFault, now_s: float) -> dict[str, Any]:
+    """Return what is wrong with a device as ``GET /status`` tells it."""
+    for_s = max(0.0, now_s - fault.since_s)
+    return picked(fault, "device", "code", "message", "until") | {"for_s": for_s}

@@ -63,10 +63,15 @@ class Subscription:
     """
 
     def __init__(
-        self, topics: frozenset[Topic], wake: Callable[[], None], end: Callable[[Subscription], None]
+        self,
+        topics: frozenset[Topic],
+        keys: frozenset[str] | None,
+        wake: Callable[[], None],
+        end: Callable[[Subscription], None],
     ) -> None:
         self.lost = 0
         self._topics = topics
+        self._keys = keys
         self._wake = wake
         self._end = end
         self._lock = threading.Lock()  # held while a mapping is changed or handed over, never for longer
@@ -97,7 +102,7 @@ class Subscription:
         return sorted(unread.values(), key=lambda one: one.sequence)
 
     def _put(self, one: Published) -> None:
-        if one.topic not in self._topics:
+        if one.topic not in self._topics or (self._keys is not None and one.key not in self._keys):
             return
         place = one.topic, one.key
         with self._lock:
@@ -119,7 +124,7 @@ class ThreadSubscription(Subscription):
 
     def __init__(self, topics: frozenset[Topic], end: Callable[[Subscription], None]) -> None:
         self._something = threading.Event()
-        super().__init__(topics, self._something.set, end)
+        super().__init__(topics, None, self._something.set, end)
 
     def wait(self, timeout_s: float | None = None) -> list[Published]:
         """Return what is new since the last call, oldest first; wait for it for ``timeout_s`` real seconds.
@@ -139,11 +144,13 @@ class ThreadSubscription(Subscription):
 class LoopSubscription(Subscription):
     """A subscription that a coroutine waits on, of the event loop on which it was made."""
 
-    def __init__(self, topics: frozenset[Topic], end: Callable[[Subscription], None]) -> None:
+    def __init__(
+        self, topics: frozenset[Topic], keys: frozenset[str] | None, end: Callable[[Subscription], None]
+    ) -> None:
         self._loop = asyncio.get_running_loop()
         self._something = asyncio.Event()
         self._woken = False
-        super().__init__(topics, self._wake_loop, end)
+        super().__init__(topics, keys, self._wake_loop, end)
 
     async def wait(self, timeout_s: float | None = None) -> list[Published]:
         """Return what is new since the last call, oldest first; wait for it for ``timeout_s`` seconds.
@@ -202,9 +209,13 @@ class Publisher:
         """
         return self._added(ThreadSubscription(_checked(topics), self._leave), known)
 
-    def subscribe_here(self, *topics: Topic, known: bool = True) -> LoopSubscription:
-        """Return a subscription for a coroutine of the running event loop; else as `subscribe`."""
-        return self._added(LoopSubscription(_checked(topics), self._leave), known)
+    def subscribe_here(
+        self, *topics: Topic, known: bool = True, keys: frozenset[str] | None = None
+    ) -> LoopSubscription:
+        """Return a subscription for a coroutine of the running event loop, to some keys only if they are
+        given; else as `subscribe`.
+        """
+        return self._added(LoopSubscription(_checked(topics), keys, self._leave), known)
 
     @property
     def listeners(self) -> int:

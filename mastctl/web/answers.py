@@ -225,24 +225,29 @@ class CalibrationHealthTold(CalibrationTold):
     newest: list[MeasuredTold]
 
 
-class Status(_Told):
-    """``GET /status``."""
+class StandingTold(_Told):
+    """What the daemon is doing: the state's word, why, for how long, and what it rests on."""
 
     state: Word
     reason: str
     state_for_s: Seconds
+    operation: str | None
+    target: Json | None
+    last_residual: LastResidual | None
+    estop: EstopHeld | None
+
+
+class Status(StandingTold):
+    """``GET /status``."""
+
     simulated: bool
     hardware: str
     moving: bool
     joints: Joints | None
     limits: SoftLimits
-    operation: str | None
-    target: Json | None
-    last_residual: LastResidual | None
     pose: PoseTold | None
     track: TrackWord
     control: ControlTold | None
-    estop: EstopHeld | None
     stop_socket: str | None
     calibration: CalibrationTold | None
     cameras: dict[str, CameraTold]

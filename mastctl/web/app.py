@@ -18,6 +18,7 @@ from mastctl.web.commands import Commands
 from mastctl.web.described import describe
 from mastctl.web.entrance import Entrance
 from mastctl.web.estop import add_estop
+from mastctl.web.events import Streams, add_events
 from mastctl.web.guard import Guard
 from mastctl.web.lease import add_lease
 from mastctl.web.limits import add_limits
@@ -31,7 +32,12 @@ from mastctl.web.waiting import Waiting
 from mastctl.web.watching import add_watching
 
 
-def create_app(service: Service, waiting: Waiting | None = None, entrance: Entrance | None = None) -> ASGIApp:
+def create_app(
+    service: Service,
+    waiting: Waiting | None = None,
+    entrance: Entrance | None = None,
+    streams: Streams | None = None,
+) -> ASGIApp:
     """Return the ASGI application that serves one service.
 
     Parameters
@@ -40,6 +46,8 @@ def create_app(service: Service, waiting: Waiting | None = None, entrance: Entra
         Tells its requests when the daemon ends.
     entrance
         What it asks of who comes in; nothing but a loopback name by default.
+    streams
+        Ends who listens to events when the daemon ends.
     """
     waiting = waiting or Waiting(service.clock)
     entrance = entrance or Entrance()
@@ -63,5 +71,6 @@ def create_app(service: Service, waiting: Waiting | None = None, entrance: Entra
     add_recordings(app, service, waiting, commands)
     add_simulation(app, service, waiting, commands)
     add_watching(app, service)
+    add_events(app, service, streams or Streams(service.machine.publisher))
     describe(app)
     return Guard(app, entrance)

@@ -36,6 +36,8 @@ ACCEPTED_AT_ONCE = 4  # connections taken in one turn of the event loop
 WAITING_IN_KERNEL = 128  # connections that the kernel keeps for us meanwhile
 ALWAYS = frozenset(f"{PREFIX}/{name}" for name in ("stop", "estop", "track/stop", "status"))
 """What is served to whoever comes."""
+EVENTS = f"{PREFIX}/events"
+"""Where a connection may become a WebSocket."""
 
 
 class Counted(Protocol):
@@ -74,7 +76,7 @@ def room_for(newcomer: Counted, connections: set[Any], most: int) -> bool:
 
 
 def counted(connections: Iterable[Any]) -> list[Counted]:
-    """Return those that know how long they wait; uvicorn's WebSockets look after themselves."""
+    """Return those that know how long they wait."""
     return [one for one in connections if hasattr(one, "waits_since_s")]
 
 
@@ -139,6 +141,12 @@ class Connection(H11Protocol):
             self.cycle.disconnected = True  # nobody hears what it still says
             self.cycle.message_event.set()
         self.transport.close()
+
+    def _should_upgrade(self) -> bool:
+        """Whether this becomes a WebSocket: at the one address that has one, and if there is room for it."""
+        crowded = isinstance(self.app, _Crowded)
+        listens = self.scope["path"] == EVENTS and self.scope["method"] == "GET"
+        return listens and not crowded and super()._should_upgrade()
 
     @property
     def _made(self) -> bool:

@@ -12,6 +12,7 @@ from pydantic.json_schema import models_json_schema
 from mastctl.frame_facts import described_headers
 from mastctl.web import PREFIX
 from mastctl.web import answers as told
+from mastctl.web.event_answers import Event
 
 ANSWERS: Mapping[str, type[BaseModel]] = {
     "GET /calibration/health": told.CalibrationHealthTold,
@@ -54,7 +55,7 @@ ANSWERS: Mapping[str, type[BaseModel]] = {
     "POST /login": told.SessionTold,
     "POST /logout": told.LoggedOut,
 }
-EVENTS: Mapping[str, type[BaseModel]] = {"GET /track/stream": told.TrackTold}
+EVENTS: Mapping[str, type[BaseModel]] = {"GET /events": Event, "GET /track/stream": told.TrackTold}
 """Server-sent events without an end: one line each, ``data:`` and the model's JSON."""
 FILES: Mapping[str, tuple[str, ...]] = {
     "GET /snapshot/{camera}": ("image/png", "image/jpeg"),

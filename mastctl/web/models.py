@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Annotated, Literal, Self
+from typing import Annotated, Literal, Self, cast
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, StringConstraints, model_validator
@@ -28,6 +28,7 @@ from mastctl.pointing.requests import (
     Target,
 )
 from mastctl.safety.latch import LONGEST
+from mastctl.state.publisher import TOPICS, Topic
 from mastctl.tracking.pose import RoverPose
 
 Rate = Annotated[float, Field(ge=-100.0, le=100.0)]
@@ -36,6 +37,7 @@ Sigma = Annotated[float, Field(ge=0.0, le=LARGEST_M)]
 Part = Annotated[float, Field(ge=-1e9, le=1e9)]
 LeaseS = Annotated[float, Field(ge=SHORTEST_S, le=LONGEST_S)]
 DeadlineS = Annotated[float, Field(gt=0.0, le=LONGEST_DEADLINE_S, allow_inf_nan=False)]
+MOST_KEYS = 16
 Place = Annotated[list[Metres], Field(min_length=3, max_length=3)]
 
 
@@ -321,6 +323,33 @@ class SnapshotQuery(BaseModel):
     format: Literal["png", "jpeg"] = "png"
     fresh: bool = False
     frame_id: Name | None = None
+
+
+class EventsQuery(BaseModel):
+    """``GET /events``: ``topics`` with commas between, all of them when left out; ``key``: of these only."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    topics: Annotated[str, Field(max_length=200)] | None = None
+    key: Annotated[list[Name], Field(max_length=MOST_KEYS)] | None = None
+
+    @model_validator(mode="after")
+    def _known(self) -> Self:
+        unknown = [name for name in self.names if name not in TOPICS]
+        if unknown:
+            words = f"topics: {unknown[0]!r} where some of {', '.join(sorted(TOPICS))} are expected"
+            raise ValueError(words)
+        return self
+
+    @property
+    def names(self) -> tuple[Topic, ...]:
+        """The topics, none for all."""
+        return tuple(cast(Topic, name.strip()) for name in (self.topics or "").split(",") if name.strip())
+
+    @property
+    def keys(self) -> frozenset[str] | None:
+        """The keys, None for all."""
+        return None if self.key is None else frozenset(self.key)
 
 
 class FaultsQuery(BaseModel):

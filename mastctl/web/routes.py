@@ -2,23 +2,17 @@
 
 from __future__ import annotations
 
-import json
-from collections.abc import AsyncIterator
 from typing import Any
 
 from fastapi import FastAPI, Request
-from fastapi.responses import StreamingResponse
 
 from mastctl.commands.deadlines import usual_s
 from mastctl.commands.entry import POINT, POSE, STOP, TRACK, TRACK_LOOK, TRACK_STOP
 from mastctl.pointing.requests import AnglesTarget
 from mastctl.service.service import Service
-from mastctl.tracking.status import TrackStatus
 from mastctl.web import PREFIX
 from mastctl.web.commands import Commands, Headers
 from mastctl.web.models import PointBody, PoseBody, TrackBody
-
-STREAM_ALIVE_S = 5.0
 
 
 def add_pointing(app: FastAPI, service: Service, commands: Commands) -> None:
@@ -94,31 +88,3 @@ def add_tracking(app: FastAPI, service: Service, commands: Commands) -> None:
 
         await commands.run_beside(TRACK_STOP, came, act)
         return told()
-
-    @app.get(
-        f"{PREFIX}/track/stream",
-        summary="The track as server-sent events: now, and at each change",
-        response_class=StreamingResponse,
-        responses={200: {"content": {"text/event-stream": {}}}},
-    )
-    async def stream() -> StreamingResponse:
-        return StreamingResponse(_track_events(service), media_type="text/event-stream")
-
-
-async def _track_events(service: Service) -> AsyncIterator[str]:
-    """Each change of the track as an event, and a comment now and then to show that somebody is there."""
-    with service.machine.publisher.subscribe_here("track", "state", known=False) as changes:
-        status = service.tracker.status
-        yield _event(service, status)
-        while service.machine.standing.word != "closing" and not changes.closed:
-            news = await changes.wait(STREAM_ALIVE_S)
-            if not news:
-                yield ": alive\n\n"
-            for one in news:
-                if one.topic == "track" and one.value.sequence > status.sequence:
-                    status = one.value
-                    yield _event(service, status)
-
-
-def _event(service: Service, status: TrackStatus) -> str:
-    return f"data: {json.dumps(service.track_told(status), allow_nan=False)}\n\n"

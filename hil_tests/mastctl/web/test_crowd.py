@@ -26,6 +26,7 @@ from hil_tests.mastctl.service_fakes import Hang, eventually, fake_daemon
 from mastctl import daemon as daemon_module
 from mastctl.client import Client, ClientError
 from mastctl.web import connections as connections_module
+from mastctl.web.events import Streams
 
 
 def in_threads(count: int, ask: Callable[[], Any]) -> list[threading.Thread]:
@@ -141,6 +142,7 @@ def test_when_every_connection_is_at_work_stop_and_status_are_still_served(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     monkeypatch.setattr(daemon_module, "most_connections", lambda: 8)
+    monkeypatch.setattr(daemon_module, "Streams", lambda publisher, most: Streams(publisher, 8))
     with fake_daemon(monkeypatch, tmp_path) as (daemon, hardware), contextlib.ExitStack() as open_ones:
         host, port = daemon.url.removeprefix("http://").split(":")
 
@@ -156,6 +158,23 @@ def test_when_every_connection_is_at_work_stop_and_status_are_still_served(
         assert b"200 OK" in get(connection(), "/status")
         assert b"200 OK" in get(connection(), "/stop", "POST")
         assert ("stop",) in hardware.head.calls
+
+
+def test_streams_leave_half_of_the_connections_to_others(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr(daemon_module, "most_connections", lambda: 8)
+    with fake_daemon(monkeypatch, tmp_path) as (daemon, _), contextlib.ExitStack() as open_ones:
+        host, port = daemon.url.removeprefix("http://").split(":")
+        answers = []
+        for number in range(6):
+            one = open_ones.enter_context(socket.create_connection((host, int(port)), timeout=BOUND_S))
+            answers.append(get(one, "/events" if number % 2 else "/track/stream"))
+        assert all(b"200 OK" in answer for answer in answers[:4])
+        for refused in answers[4:]:
+            assert b"503" in refused and b"retry-after" in refused
+        one = open_ones.enter_context(socket.create_connection((host, int(port)), timeout=BOUND_S))
+        assert b"200 OK" in get(one, "/operations")
 
 
 @pytest.mark.parametrize(

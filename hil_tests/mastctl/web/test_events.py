@@ -1,0 +1,328 @@
+"""The event stream: begins with what is known, tells each change, holds nobody, ends with the daemon."""
+
+from __future__ import annotations
+
+import json
+import socket
+import threading
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import httpx
+import jsonschema_rs
+import pytest
+from websockets.exceptions import ConnectionClosed, InvalidStatus
+from websockets.sync.client import ClientConnection, connect
+
+from hil_tests.described_answers import closed
+from hil_tests.mastctl.service_fakes import FakeHardware, ScriptedLoop, eventually, fake_daemon
+from hil_tests.mastctl.web.network import NAME, Network, network_daemon
+from mastctl.daemon import RunningDaemon
+from mastctl.state.publisher import TOPICS
+from mastctl.web import events as events_module
+from mastctl.web import sockets as sockets_module
+from tools.campaigns import fuzz_websocket
+
+BOTH = tuple[RunningDaemon, FakeHardware]
+BOUND_S = 20.0
+
+
+@pytest.fixture
+def pair(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[BOTH]:
+    with fake_daemon(monkeypatch, tmp_path) as made:
+        yield made
+
+
+@contextmanager
+def listening(url: str, query: str = "", **headers: str) -> Iterator[Iterator[dict[str, Any]]]:
+    """The server-sent events of a daemon."""
+    with (
+        httpx.Client(trust_env=False, timeout=BOUND_S) as http,
+        http.stream("GET", f"{url}/api/v1/events{query}", headers=headers) as answer,
+    ):
+        assert answer.status_code == 200, answer.read()
+        assert answer.headers["content-type"].startswith("text/event-stream")
+        lines = answer.iter_lines()
+        yield (json.loads(line.removeprefix("data: ")) for line in lines if line.startswith("data: "))
+
+
+def socket_of(url: str, query: str = "", **options: Any) -> connect:
+    """A WebSocket of a daemon."""
+    address = f"ws{url.removeprefix('http')}/api/v1/events{query}"
+    return connect(address, open_timeout=BOUND_S, close_timeout=2.0, proxy=None, **options)
+
+
+def until(events: Iterator[dict[str, Any]], holds: Any) -> dict[str, Any]:
+    """The first event of which something holds."""
+    return next(event for event in events if holds(event))
+
+
+def heard(line: ClientConnection) -> Iterator[dict[str, Any]]:
+    while True:
+        yield json.loads(line.recv(timeout=BOUND_S))
+
+
+def test_it_begins_with_what_is_known_and_then_tells_each_change(pair: BOTH) -> None:
+    daemon, _ = pair
+    with listening(daemon.url, "?topics=state,mast,track,operation,command") as events:
+        first = {event["topic"]: event for event in (next(events) for _ in range(3))}
+        assert set(first) == {"state", "mast", "track"}
+        assert first["mast"]["value"]["digest"] == daemon.service.stored.digest
+        with httpx.Client(base_url=f"{daemon.url}/api/v1", trust_env=False) as http:
+            begun = http.post("/point", json={"pan_rad": 0.1, "tilt_rad": 0.0}).json()["id"]
+        ended = until(events, lambda e: e["topic"] == "operation" and e["value"]["state"] == "done")
+        assert ended["key"] == ended["value"]["id"] == begun
+        assert [step["name"] for step in ended["value"]["steps"]] == ["look", "measure"]
+
+
+def test_each_topic_is_told_by_the_model_that_openapi_describes(pair: BOTH) -> None:
+    daemon, _ = pair
+    with httpx.Client(base_url=daemon.url, trust_env=False) as http:
+        document = closed(http.get("/openapi.json").json())
+        described = document["paths"]["/api/v1/events"]["get"]["responses"]["200"]["content"]
+        event = described["text/event-stream"]["x-event"]
+        validator = jsonschema_rs.Draft202012Validator({**event, "components": document["components"]})
+        http.post("/api/v1/point", json={"pan_rad": 0.1, "tilt_rad": 0.0}, headers={"Mastctl-Client": "a"})
+        http.post("/api/v1/lease", json={"for_s": 5.0}, headers={"Mastctl-Client": "a"})
+        http.get("/api/v1/snapshot/navcam_left")
+    daemon.service.machine.publisher.publish("fault", "a device", ())
+    seen: set[str] = set()
+    with socket_of(daemon.url) as line:
+        for _ in range(200):
+            one = json.loads(line.recv(timeout=BOUND_S))
+            validator.validate(one)
+            seen.add(one["topic"])
+            if seen == TOPICS:
+                break
+    assert seen == TOPICS
+
+
+def test_the_key_of_a_command_is_told_to_nobody_else(pair: BOTH) -> None:
+    daemon, _ = pair
+    with httpx.Client(base_url=f"{daemon.url}/api/v1", trust_env=False) as http:
+        http.post("/lease", json={}, headers={"Idempotency-Key": "very-own", "Mastctl-Client": "a"})
+    with listening(daemon.url, "?topics=command,lease") as events:
+        told = next(events), next(events)
+    assert {one["topic"] for one in told} == {"command", "lease"}
+    assert "very-own" not in json.dumps(told)
+
+
+def test_topics_and_keys_are_chosen(pair: BOTH) -> None:
+    daemon, _ = pair
+    publisher = daemon.service.machine.publisher
+    with socket_of(daemon.url, "?topics=fault&key=b") as line:
+        eventually(lambda: publisher.listeners > 0, "somebody listens")
+        for device in ("a", "b"):
+            publisher.publish("fault", device, ())
+        told = json.loads(line.recv(timeout=BOUND_S))
+    assert (told["topic"], told["key"], told["value"], told["lost"]) == ("fault", "b", [], 0)
+
+
+@pytest.mark.parametrize("query", ["?topics=state,weather", "?topic=state", "?key=" + "&key=".join("a" * 17)])
+def test_what_is_no_topic_is_refused_in_a_sentence_both_ways(pair: BOTH, query: str) -> None:
+    daemon, _ = pair
+    answer = httpx.get(f"{daemon.url}/api/v1/events{query}", trust_env=False)
+    assert answer.status_code == 422
+    with pytest.raises(InvalidStatus) as refused, socket_of(daemon.url, query):
+        pass
+    assert refused.value.response.status_code == 422
+    told = json.loads(refused.value.response.body or b"")["error"]
+    assert told["code"] == answer.json()["error"]["code"] == "bad_request"
+    if "weather" in query:
+        assert told["message"] == answer.json()["error"]["message"]
+        assert "'weather'" in told["message"] and "operation" in told["message"]
+
+
+def test_a_slow_reader_gets_the_newest_and_is_told_what_it_lost(pair: BOTH) -> None:
+    daemon, _ = pair
+    publisher = daemon.service.machine.publisher
+    with listening(daemon.url, "?topics=command") as events:
+        eventually(lambda: publisher.listeners > 0, "somebody listens")
+        record = {"number": 1, "time": "", "monotonic_s": 0.0, "command": "x", "who": "x", "role": "admin"}
+        words = "long " * 2000  # soon more than a connection holds
+        for number in range(3000):
+            publisher.publish("command", "1", {**record, "number": number, "via": "test", "message": words})
+        last = until(events, lambda e: e["value"]["number"] == 2999)
+    assert last["lost"] > 1000
+
+
+def test_a_listener_that_stalls_holds_nobody(pair: BOTH) -> None:
+    daemon, _ = pair
+    publisher = daemon.service.machine.publisher
+    with socket_of(daemon.url, "?topics=fault") as stalled, listening(daemon.url, "?topics=fault") as events:
+        eventually(lambda: publisher.listeners >= 2, "both listen")
+        stalled.socket.settimeout(None)
+        for _ in range(2000):
+            publisher.publish("fault", "x" * 5000, ())
+        publisher.publish("fault", "last", ())
+        assert until(events, lambda e: e["key"] == "last")
+        with httpx.Client(base_url=f"{daemon.url}/api/v1", trust_env=False) as http:
+            assert http.post("/stop").status_code == 200
+
+
+def test_it_ends_with_the_daemon_after_its_last_words(pair: BOTH, monkeypatch: pytest.MonkeyPatch) -> None:
+    daemon, _ = pair
+    monkeypatch.setattr(
+        ScriptedLoop,
+        "script",
+        staticmethod(lambda request, record, cancelled, devices: cancelled.wait(BOUND_S)),
+    )
+    with httpx.Client(base_url=f"{daemon.url}/api/v1", trust_env=False) as http:
+        http.post("/point", json={"pan_rad": 0.1, "tilt_rad": 0.0})
+    with (
+        listening(daemon.url, "?topics=operation") as events,
+        socket_of(daemon.url, "?topics=operation") as line,
+    ):
+        assert next(events)["value"]["state"] in ("queued", "running")
+        ending = threading.Thread(target=daemon.close)
+        ending.start()
+        assert [one["value"]["state"] for one in events][-1] in ("stopped", "done")
+        told = []
+        with pytest.raises(ConnectionClosed) as ended:
+            told += [one["value"]["state"] for one in heard(line)]
+        assert ended.value.rcvd is not None and ended.value.rcvd.code == 1001
+        ending.join(BOUND_S)
+    assert not ending.is_alive()
+
+
+def test_not_everybody_may_listen_at_once(pair: BOTH, monkeypatch: pytest.MonkeyPatch) -> None:
+    daemon, _ = pair
+    streams = events_module.Streams(daemon.service.machine.publisher, 0)
+    with pytest.raises(events_module.Unable, match="0 listen to events already"), streams.listening((), None):
+        pass
+
+
+def test_streams_of_one_daemon_are_counted_and_their_places_come_free(pair: BOTH) -> None:
+    daemon, _ = pair
+    publisher = daemon.service.machine.publisher
+    before = publisher.listeners
+    for _ in range(3):
+        with listening(daemon.url, "?topics=state") as events, socket_of(daemon.url, "?topics=state") as line:
+            next(events), line.recv(timeout=BOUND_S)
+            assert publisher.listeners == before + 2
+        eventually(lambda: publisher.listeners == before, "nobody listens any more")
+
+
+# Who may listen
+
+
+@pytest.fixture(scope="module")
+def net(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Network]:
+    with pytest.MonkeyPatch.context() as patch, network_daemon(patch, tmp_path_factory.mktemp("net")) as made:
+        yield made
+
+
+def refusal(net: Network, query: str = "", **headers: str) -> tuple[int, str]:
+    """What a WebSocket is refused with."""
+    told = {"Host": f"{NAME}:{net.port}", **headers}
+    request = "".join(f"{name}: {value}\r\n" for name, value in told.items())
+    answer = net.raw(
+        f"GET /api/v1/events{query} HTTP/1.1\r\n{request}Upgrade: websocket\r\nConnection: Upgrade\r\n"
+        "Sec-WebSocket-Version: 13\r\nSec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\n\r\n"
+    )
+    head, _, body = answer.partition(b"\r\n\r\n")
+    return int(head.split()[1]), json.loads(body)["error"]["code"]
+
+
+def bearer(net: Network) -> str:
+    return f"Bearer {net.token('view')}"
+
+
+def test_a_websocket_asks_for_a_token_as_every_request_does(net: Network) -> None:
+    assert refusal(net) == (401, "no_token")
+    assert refusal(net, Authorization="Bearer wrong") == (401, "wrong_token")
+    assert refusal(net, f"?token={net.token('view')}") == (400, "token_in_address")
+    with socket_of(net.url, additional_headers={"Authorization": bearer(net)}) as line:
+        assert json.loads(line.recv(timeout=BOUND_S))["sequence"] > 0
+
+
+def test_another_sites_page_opens_no_websocket(net: Network) -> None:
+    for origin in ("http://evil.example", "null", f"http://{NAME}:1", "http://"):
+        assert refusal(net, Authorization=bearer(net), Origin=origin) == (403, "foreign_origin"), origin
+    told = {"Authorization": bearer(net), "Sec-Fetch-Site": "cross-site"}
+    assert refusal(net, **told) == (403, "foreign_origin")
+    assert refusal(net, Authorization=bearer(net), Host="evil.example") == (403, "foreign_host")
+
+
+def test_a_pages_session_opens_one_only_from_its_own_page(net: Network) -> None:
+    token = {"token": net.token("view")}
+    answer = net.ask("POST", "/login", json=token, headers={"Origin": net.origin})
+    cookie = answer.headers["set-cookie"].partition(";")[0]
+    assert refusal(net, Cookie=cookie) == (403, "foreign_origin")
+    assert refusal(net, Cookie=cookie, Origin="http://evil.example") == (403, "foreign_origin")
+    own = {"Cookie": cookie, "Host": f"{NAME}:{net.port}"}
+    request = "".join(f"{name}: {value}\r\n" for name, value in own.items())
+    with socket.create_connection(("127.0.0.1", net.port), timeout=BOUND_S) as line:
+        line.sendall(
+            f"GET /api/v1/events HTTP/1.1\r\n{request}Origin: {net.origin}\r\nUpgrade: websocket\r\n"
+            "Connection: Upgrade\r\nSec-WebSocket-Version: 13\r\n"
+            "Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\n\r\n".encode()
+        )
+        assert b" 101 " in line.recv(4096)
+
+
+def test_a_websocket_anywhere_else_is_a_plain_request(net: Network) -> None:
+    told = f"Host: {NAME}\r\nAuthorization: {bearer(net)}\r\n"
+    told += "Upgrade: websocket\r\nConnection: Upgrade, close\r\n"
+    for path in ("/api/v1/status", "/api/v1/nothing"):
+        answer = net.raw(f"GET {path} HTTP/1.1\r\n{told}\r\n")
+        assert answer.startswith((b"HTTP/1.1 200", b"HTTP/1.1 404")), answer[:100]
+    answer = net.raw(f"POST /api/v1/events HTTP/1.1\r\n{told}Content-Type: application/json\r\n\r\n")
+    assert answer.startswith((b"HTTP/1.1 405", b"HTTP/1.1 403"))
+
+
+# What a WebSocket may be sent
+
+
+def test_nothing_that_is_sent_into_a_websocket_harms_the_daemon(
+    pair: BOTH, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    daemon, _ = pair
+    monkeypatch.setattr(fuzz_websocket, "ATTACK_S", 0.5)
+    publisher = daemon.service.machine.publisher
+    before = publisher.listeners
+    with ThreadPoolExecutor(4) as pool:
+        done = fuzz_websocket.campaign(daemon.url, 0, 4 * len(fuzz_websocket.ATTACKS), pool)
+    assert set(done.values()) == {4}
+    eventually(lambda: publisher.listeners == before, "every attacker is forgotten")
+    assert [record.getMessage() for record in caplog.records if record.levelname == "ERROR"] == []
+
+
+@pytest.mark.parametrize(
+    ("sent", "code"),
+    [
+        (fuzz_websocket.frame(1, b"hello"), 1003),
+        (fuzz_websocket.frame(2, b"", last=False), 1003),
+        (fuzz_websocket.frame(9, b"") * 100, 1008),
+        (fuzz_websocket.frame(1, b"", told_bytes=1 << 40), 1009),
+        (fuzz_websocket.frame(1, b"hello", masked=False), 1002),
+        (b"\xff" * 20, 1002),
+    ],
+)
+def test_what_a_client_sends_ends_its_websocket_and_says_why(pair: BOTH, sent: bytes, code: int) -> None:
+    daemon, _ = pair
+    with socket.create_connection(("127.0.0.1", int(daemon.url.rpartition(":")[2])), timeout=BOUND_S) as line:
+        fuzz_websocket.opened(line, "/api/v1/events?topics=lease")
+        line.sendall(sent)
+        got = b"".join(iter(lambda: line.recv(65536), b""))
+    assert got.rpartition(b"\x88")[2][1:3] == code.to_bytes(2, "big"), got
+
+
+def test_a_websocket_whose_client_does_not_read_is_left(pair: BOTH, monkeypatch: pytest.MonkeyPatch) -> None:
+    daemon, _ = pair
+    monkeypatch.setattr(sockets_module, "STALLED_S", 0.2)
+    publisher = daemon.service.machine.publisher
+    with socket.create_connection(("127.0.0.1", int(daemon.url.rpartition(":")[2])), timeout=BOUND_S) as line:
+        line.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+        fuzz_websocket.opened(line)
+        eventually(lambda: publisher.listeners > 0, "it listens")
+        before = publisher.listeners
+
+        def left() -> bool:
+            publisher.publish("fault", "x" * 200000, ())
+            return publisher.listeners < before
+
+        eventually(left, "it is left", within_s=BOUND_S)

@@ -1,0 +1,206 @@
+"""The event stream: each change, pushed as it comes, as server-sent events or through a WebSocket.
+
+A listener begins with what is known and then gets the newest of each topic and key. One that reads slowly
+loses values in between and is told how many; nobody waits for it. WebSockets only tell: what a client sends
+into one ends it (`mastctl.web.sockets`).
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+from collections.abc import AsyncIterator, Callable, Iterator, Mapping
+from contextlib import contextmanager
+from typing import Annotated, Any
+
+from fastapi import FastAPI, Query, WebSocket
+from fastapi.responses import StreamingResponse
+from pydantic import ValidationError
+from starlette.types import Receive, Scope, Send
+from starlette.websockets import WebSocketDisconnect
+
+from mastctl.as_json import as_json
+from mastctl.errors import MastctlError, Unable
+from mastctl.service.service import Service
+from mastctl.service.state import fault_told, joints_told, standing_told
+from mastctl.state.publisher import LoopSubscription, Published, Publisher, Topic
+from mastctl.web import PREFIX
+from mastctl.web.answer import error_response
+from mastctl.web.connections import EVENTS
+from mastctl.web.models import EventsQuery
+from mastctl.web.refusals import told as refused
+from mastctl.web.sentences import sentence
+
+ALIVE_S = 2.0  # between signs of life where nothing changes
+MOST = 100
+GOING_AWAY = 1001  # RFC 6455, 7.4.1
+FULL_S = 1.0
+
+Telling = Callable[[Published, int], str]
+
+
+class Streams:
+    """Who listens to one daemon; used on its event loop only.
+
+    Parameters
+    ----------
+    publisher
+        What is listened to.
+    most
+        How many may listen at once, so that they leave connections for everybody else.
+    """
+
+    def __init__(self, publisher: Publisher, most: int = MOST) -> None:
+        self._publisher = publisher
+        self._most = most
+        self._open: set[LoopSubscription] = set()
+        self._ended = False
+
+    @contextmanager
+    def listening(self, topics: tuple[Topic, ...], keys: frozenset[str] | None) -> Iterator[LoopSubscription]:
+        """Listen inside the block to topics, all of them if none is named, of some keys or of every one.
+
+        Raises
+        ------
+        Unable
+            ``too_many`` listen already, ``closing``.
+        """
+        if self._ended:
+            raise Unable("closing", "the daemon ends; nothing more will be told")
+        if len(self._open) >= self._most:
+            words = f"{self._most} listen to events already, and no more may; ask again later"
+            raise Unable("too_many", words, FULL_S)
+        with self._publisher.subscribe_here(*topics, keys=keys) as news:
+            self._open.add(news)
+            try:
+                yield news
+            finally:
+                self._open.discard(news)
+
+    def end(self) -> None:
+        """Let every stream tell what it has not told yet, and end."""
+        self._ended = True
+        for news in tuple(self._open):
+            news.close()
+
+
+def add_events(app: FastAPI, service: Service, streams: Streams) -> None:
+    """The event stream, and the track's own."""
+
+    def tell(one: Published, lost: int) -> str:
+        event = {"topic": one.topic, "key": one.key, "sequence": one.sequence, "lost": lost}
+        return json.dumps(event | {"value": value_told(service, one)}, allow_nan=False)
+
+    def tell_track(one: Published, lost: int) -> str:
+        return json.dumps(service.track_told(one.value), allow_nan=False)
+
+    @app.get(
+        EVENTS,
+        summary="Each change as server-sent events, or through a WebSocket at the same address",
+        response_class=StreamingResponse,
+        responses={200: {"content": {"text/event-stream": {}}}},
+    )
+    async def events(query: Annotated[EventsQuery, Query()]) -> StreamingResponse:
+        return _Lines(streams, query.names, query.keys, tell)
+
+    @app.get(
+        f"{PREFIX}/track/stream",
+        summary="The track as server-sent events: now, and at each change",
+        response_class=StreamingResponse,
+        responses={200: {"content": {"text/event-stream": {}}}},
+    )
+    async def track() -> StreamingResponse:
+        return _Lines(streams, ("track",), None, tell_track)
+
+    @app.websocket(EVENTS)
+    async def socket(line: WebSocket) -> None:
+        try:
+            query = _asked(line)
+            with streams.listening(query.names, query.keys) as news:
+                await _tell(line, news, tell)
+        except ValidationError as error:
+            words = sentence({**error.errors()[0], "loc": ("query", *error.errors()[0]["loc"])}, EventsQuery)
+            await line.send_denial_response(error_response(422, "bad_request", words))
+        except MastctlError as error:
+            await line.send_denial_response(refused(error))
+
+
+def _asked(line: WebSocket) -> EventsQuery:
+    """The query of a WebSocket, read as that of the route. Raises ValidationError."""
+    query = line.query_params
+    told: dict[str, Any] = {name: query[name] for name in query if name != "key"}
+    return EventsQuery.model_validate(told | ({"key": query.getlist("key")} if "key" in query else {}))
+
+
+class _Lines(StreamingResponse):
+    """Events as server-sent ones, until the daemon or the client ends."""
+
+    def __init__(
+        self, streams: Streams, topics: tuple[Topic, ...], keys: frozenset[str] | None, tell: Telling
+    ) -> None:
+        super().__init__(self._lines(), media_type="text/event-stream")
+        self._listening = streams.listening(topics, keys)
+        self._tell = tell
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        with self._listening as self._news:
+            await super().__call__(scope, receive, send)
+
+    async def _lines(self) -> AsyncIterator[str]:
+        news = self._news
+        while True:
+            found = await news.wait(ALIVE_S)
+            for one in found:
+                yield f"id: {one.sequence}\ndata: {self._tell(one, news.lost)}\n\n"
+            if not found:
+                if news.closed:
+                    return
+                yield ": alive\n\n"
+
+
+async def _tell(line: WebSocket, news: LoopSubscription, tell: Telling) -> None:
+    """Tell through a WebSocket until the daemon or the client ends."""
+    await line.accept()
+    gone = asyncio.ensure_future(line.receive())  # a client's only message is its end
+    gone.add_done_callback(lambda _: news.close())
+    try:
+        while found := await news.wait():
+            for one in found:
+                await line.send_text(tell(one, news.lost))
+        if not gone.done():
+            await line.close(GOING_AWAY)
+    except WebSocketDisconnect:
+        pass
+    finally:
+        gone.cancel()
+
+
+def value_told(service: Service, one: Published) -> Any:
+    """Return a published value as JSON, as the routes tell the same."""
+    return _TOLD[one.topic](service, one.value, service.clock.now_s())
+
+
+def _state(service: Service, value: Any, now_s: float) -> Any:
+    return standing_told(value, now_s) | {"track": value.track, "moving": value.head_moves}
+
+
+def _frame(service: Service, value: Any, now_s: float) -> Any:
+    return as_json(value) | {"age_s": max(0.0, now_s - value.mid_exposure_s)}
+
+
+def _command(service: Service, value: Any, now_s: float) -> Any:
+    """Without the key: by it others would get the answer, and a lease with it."""
+    return {name: told for name, told in value.items() if name != "key"}
+
+
+_TOLD: Mapping[Topic, Callable[[Service, Any, float], Any]] = {
+    "state": _state,
+    "joints": lambda service, value, now_s: joints_told(value, now_s) | {"moving": value.moving},
+    "operation": lambda service, value, now_s: value.told(),
+    "track": lambda service, value, now_s: service.track_told(value),
+    "fault": lambda service, value, now_s: [fault_told(one, now_s) for one in value],
+    "frame": _frame,
+    "mast": lambda service, value, now_s: value,
+    "command": _command,
+    "lease": lambda service, value, now_s: {"control": service.leases.told()},
+}

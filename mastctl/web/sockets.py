@@ -1,0 +1,101 @@
+"""WebSockets that only tell: whatever a client sends into one, and however it reads, costs nobody anything.
+
+uvicorn's protocol answers pings without waiting for its client to read, keeps what is sent to it, and bounds
+neither. Here a message from the client ends the connection with its first frame, pings are answered only
+while their answers are read, and a client that takes no bytes for some seconds is left.
+"""
+
+from __future__ import annotations
+
+import logging
+from typing import Any
+
+from uvicorn.protocols.utils import ClientDisconnected
+from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIOProtocol
+from websockets.frames import Frame
+
+log = logging.getLogger(__name__)
+log.setLevel(logging.ERROR)
+
+LARGEST_BYTES = 1024  # of what a client sends; it has nothing to say
+PING_S = 20.0
+STALLED_S = 10.0
+MOST_PINGS = 20  # of a client in a second
+UNSUPPORTED, BROKEN_RULES = 1003, 1008  # RFC 6455, 7.4.1
+
+
+class Socket(WebSocketsSansIOProtocol):
+    """One WebSocket, which knows for how long its client has not read."""
+
+    waits = False
+    waits_since_s = 0.0
+
+    def __init__(self, *args: Any, **options: Any) -> None:
+        super().__init__(*args, **options)
+        self.logger = self.conn.logger = log  # what strangers send is no warning
+        self._stalled_since_s: float | None = None
+        self._pings, self._second = 0, 0
+
+    def overdue(self, now_s: float) -> bool:
+        """Whether its client has not read for too long."""
+        if self._stalled_since_s is None and self.transport.is_closing():
+            self._stalled_since_s = now_s  # its last words are waiting to be read
+        return self._stalled_since_s is not None and now_s - self._stalled_since_s > STALLED_S
+
+    def leave(self) -> None:
+        """Close it at once, whatever its client still expects."""
+        self.transport.abort()
+
+    def pause_writing(self) -> None:
+        super().pause_writing()
+        self._stalled_since_s = self.loop.time()
+        self.transport.pause_reading()
+
+    def resume_writing(self) -> None:
+        super().resume_writing()
+        self._stalled_since_s = None
+        self.transport.resume_reading()
+
+    async def send(self, message: Any) -> None:
+        """Send; raises ClientDisconnected also where the connection is ending already."""
+        await self.writable.wait()
+        if self.handshake_complete and self.close_sent:
+            raise ClientDisconnected
+        await super().send(message)
+
+    def handle_text(self, event: Frame) -> None:
+        self._end(UNSUPPORTED, "this WebSocket tells and takes nothing")
+
+    handle_bytes = handle_cont = handle_text
+
+    def handle_ping(self) -> None:
+        if self._often():
+            super().handle_ping()
+
+    def handle_pong(self, event: Frame) -> None:
+        if self._often():
+            super().handle_pong(event)
+
+    def handle_parser_exception(self) -> None:
+        if self.conn.close_sent is None:  # no WebSocket was begun
+            self.leave()
+        else:
+            super().handle_parser_exception()
+
+    def _often(self) -> bool:
+        """Count a ping or a pong; False if there are too many, and the connection ends."""
+        second = int(self.loop.time())
+        self._pings = self._pings + 1 if second == self._second else 1
+        self._second = second
+        if self._pings > MOST_PINGS:
+            self._end(BROKEN_RULES, f"more than {MOST_PINGS} pings in a second")
+        return self._pings <= MOST_PINGS
+
+    def _end(self, code: int, words: str) -> None:
+        if self.close_sent:
+            return
+        self.close_sent = True
+        self.conn.send_close(code, words)
+        self.transport.write(b"".join(self.conn.data_to_send()))
+        self.queue.put_nowait({"type": "websocket.disconnect", "code": code, "reason": words})
+        self.transport.close()
