@@ -14,7 +14,7 @@ The pointings enter by sums only (`Sums`), which add up over time.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -25,6 +25,8 @@ TURN_RAD = 2e-3
 """Usual size of a bump, about each axis."""
 TIMES = (1.5, 2.0, 4.0)
 """As how many times as wrong everything may be taken."""
+FAR = 3.0
+"""A turn accounts for residuals if it leaves no more than so many sigma of them, rms."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,8 +80,8 @@ class Evidence:
     ----------
     count, since_s
         How many pointings, and when the first one was.
-    square
-        Of all residuals over their covariance: about twice the count while the mast file holds.
+    times
+        As how many times as wrong as expected everything confirmed is, rms.
     log_evidence
         Natural logarithm of the averaged ratio.
     log_wider
@@ -90,15 +92,10 @@ class Evidence:
 
     count: int
     since_s: float
-    square: float
+    times: float
     log_evidence: float
     log_wider: float
     turned: dict[str, Turned]
-
-    @property
-    def times(self) -> float:
-        """As how many times as wrong as expected everything is, rms."""
-        return math.sqrt(max(self.square, 0.0) / (2 * self.count)) if self.count else 0.0
 
 
 def sums_of(one: Expected, off_px: tuple[float, float], time_s: float) -> Sums:
@@ -131,17 +128,32 @@ class Judge:
         """Return the residuals' square over their covariance."""
         return self._reduced(sums)[1]
 
-    def weigh(self, sums: Sums) -> Evidence:
-        """Return what pointings say."""
+    def weigh(self, sums: Sums, confirmed: Sums | None = None) -> Evidence:
+        """Return what pointings say.
+
+        Parameters
+        ----------
+        sums
+            All of them.
+        confirmed
+            Those of them that are no false matches for sure, all by default: only they can say that
+            everything is wider. A turn has to account for all.
+        """
         normal, square, right = self._reduced(sums)
-        turned = {}
+        count, first_s, turned = sums.count, sums.first_s, {}
         for number, camera in enumerate(self._cameras):
             part = slice(3 * number, 3 * number + 3)
-            turned[camera] = _turned(normal[part, part], right[part])
+            one = _turned(normal[part, part], right[part])
+            left = square - float(right[part] @ one.turn_rad)
+            accounts = left <= FAR**2 * 2 * sums.count
+            turned[camera] = one if accounts else replace(one, log_evidence=min(0.0, one.log_evidence))
+        if confirmed is not None:
+            sums, square = confirmed, self.square(confirmed)
         wider = [-2 * sums.count * math.log(times) + 0.5 * square * (1.0 - times**-2) for times in TIMES]
         log_wider = _log_mean(wider)
         log_evidence = _log_mean([log_wider, *(one.log_evidence for one in turned.values())])
-        return Evidence(sums.count, sums.first_s, square, log_evidence, log_wider, turned)
+        times = math.sqrt(max(square, 0.0) / max(2 * sums.count, 1))
+        return Evidence(count, first_s, times, log_evidence, log_wider, turned)
 
     def _reduced(self, sums: Sums) -> tuple[FloatArray, float, FloatArray]:
         """Take out what the mast file's own covariance explains: turns' normal matrix, square, right side."""

@@ -55,7 +55,7 @@ class CalibrationHealth:
 
     def ended(self, mast: StoredRig, operation: Operation) -> None:
         """Keep what a pointing measured, if it did; ``mast`` was in use when it began."""
-        one = measured_by(operation, mast.digest, mast.rig.stereo, self._wall_s())
+        one = measured_by(operation, mast, self._wall_s())
         if one is not None:
             self._queue.put(one)
 

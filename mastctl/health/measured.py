@@ -12,7 +12,10 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields
 from typing import Any
 
+from calib.files.mast_file import StoredRig
 from mastctl.operations.records import Operation
+
+DISAGREE = "eyes_disagree"
 
 COARSE_COUNT_RAD = math.tau / 4096
 """What a head that does not know its counts is taken to have: those of a 12-bit servo, the coarsest."""
@@ -31,6 +34,8 @@ class Measured:
         When, seconds of the wall clock since 1970 (UTC).
     operation, mast_digest
         Which one, and the mast file in use.
+    confirmed
+        Whether the other eyes confirmed what the aimed camera sees.
     source, partner, camera
         The pair that gave the position, the clicked eye first, and the camera that was aimed and looked.
     from_rad, to_rad
@@ -45,6 +50,7 @@ class Measured:
 
     time_s: float
     operation: str
+    confirmed: bool
     mast_digest: str
     source: str
     partner: str
@@ -77,54 +83,58 @@ def measured_of(told: Mapping[str, Any]) -> Measured:
     for key in ("operation", "mast_digest", "source", "partner", "camera"):
         if not isinstance(values[key], str):
             raise ValueError(f"{key} is no text")
+    if not isinstance(values["confirmed"], bool):
+        raise ValueError("confirmed is neither true nor false")
     if min(values["match_sigma_px"]) <= 0.0 or min(values["count_rad"]) < 0.0:
         raise ValueError("a sigma is not above 0")
     return Measured(**values)
 
 
-def measured_by(
-    operation: Operation, mast_digest: str, stereo: Mapping[str, tuple[str, str]], time_s: float
-) -> Measured | None:
-    """Return what a finished pointing has measured; None if it was none, or measured nothing.
+def measured_by(operation: Operation, mast: StoredRig, time_s: float) -> Measured | None:
+    """Return what a pointing that has ended measured; None if it was none, or measured nothing.
 
-    Of two pointings at one target the first counts: the second starts from what the first has seen.
+    One that failed because another eye did not confirm what it measured counts too: that is what a bumped
+    camera looks like. Of two pointings at one target the first counts; the second starts from what the first
+    has seen.
     """
     pixel = operation.request.get("pixel")
-    result = operation.result
-    if operation.state != "done" or not isinstance(pixel, Mapping) or not getattr(result, "pointings", ()):
+    confirmed = operation.state == "done"
+    if not isinstance(pixel, Mapping) or not (confirmed or (operation.error or {}).get("code") == DISAGREE):
         return None
-    first = result.pointings[0]
-    if first.residual_px is None or first.residual_sigma_px is None or first.predicted_px is None:
-        return None
-    source = str(pixel.get("camera"))
-    partners = [a if source == b else b for a, b in stereo.values() if source in (a, b)]
+    source, rig = str(pixel.get("camera")), mast.rig
+    partners = [a if source == b else b for a, b in rig.stereo.values() if source in (a, b)]
     steps = {step.name: step.detail for step in reversed(operation.steps)}  # the first of each name
-    rest, seen, solved = (steps.get(name, {}) for name in ("rest", "triangulate", "solve"))
-    if not partners or "position_m" not in seen or "pan_rad" not in rest:
-        return None
-    counts = steps.get("settle", {}).get("counts", {})
-    told = {
-        "time_s": time_s,
-        "operation": operation.id,
-        "mast_digest": mast_digest,
-        "source": source,
-        "partner": partners[0],
-        "camera": first.camera,
-        "from_rad": (rest["pan_rad"], rest["tilt_rad"]),
-        "to_rad": (first.measured_pan_rad, first.measured_tilt_rad),
-        "position_m": tuple(seen["position_m"]),
-        "range_m": solved.get("chosen", {}).get("range_m", seen["range_m"]),
-        "residual_px": first.residual_px,
-        "off_px": tuple(a - b for a, b in zip(first.target_px, first.predicted_px, strict=True)),
-        "match_sigma_px": first.residual_sigma_px,
-        "count_rad": tuple(
-            counts.get(axis, {}).get("count_rad", COARSE_COUNT_RAD) for axis in ("pan", "tilt")
-        ),
-    }
     try:
-        return measured_of(told)
-    except ValueError:  # a number that could not be measured
+        rest, seen, settled, found = (steps[name] for name in ("rest", "triangulate", "settle", "measure"))
+        to_rad = settled["pan_rad"], settled["tilt_rad"]
+        view = rig.camera_in_rover(found["camera"], *to_rad)
+        predicted = view.project(seen["position_m"])[0].tolist()
+        counts = settled.get("counts", {})
+        return measured_of(
+            {
+                "time_s": time_s,
+                "operation": operation.id,
+                "confirmed": confirmed,
+                "mast_digest": mast.digest,
+                "source": source,
+                "partner": partners[0],
+                "camera": found["camera"],
+                "from_rad": (rest["pan_rad"], rest["tilt_rad"]),
+                "to_rad": to_rad,
+                "position_m": seen["position_m"],
+                "range_m": math.dist(seen["position_m"], view.C.tolist()),
+                "residual_px": found["residual_px"],
+                "off_px": tuple(a - b for a, b in zip(found["pixel_px"], predicted, strict=True)),
+                "match_sigma_px": found["sigma_px"],
+                "count_rad": tuple(_count_rad(counts, axis) for axis in ("pan", "tilt")),
+            }
+        )
+    except (LookupError, TypeError, ValueError):  # it did not come so far, or could not measure a number
         return None
+
+
+def _count_rad(counts: Mapping[str, Mapping[str, Any]], axis: str) -> float:
+    return float(counts.get(axis, {}).get("count_rad", COARSE_COUNT_RAD))
 
 
 def _numbers(values: object, key: str, size: int) -> tuple[float, ...]:

@@ -12,7 +12,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import reduce
-from operator import add
+from operator import add, sub
 
 import numpy as np
 
@@ -117,7 +117,10 @@ class Windows:
             if sums.count < FEWEST:
                 continue
             worst = max((one for span in window for one in self._spans[span]), key=lambda one: one.square)
-            now = self._judge.weigh(sums - _sums(worst))
+            doubtful = [one for span in window for one in self._spans[span] if not one.measured.confirmed]
+            kept = sums - _sums(worst)
+            without = (_sums(one) for one in doubtful if one is not worst)
+            now = self._judge.weigh(kept, reduce(sub, without, kept))
             if found is None or now.log_evidence > found.log_evidence:
                 found = now
         return found

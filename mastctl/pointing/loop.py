@@ -220,7 +220,7 @@ class _Run:
             now = views.pop(aim.camera)
             with self._steps.step("measure") as detail:
                 seen = self._steps.unless_stopped(self._eyes.look_for, clicked, now)
-                detail.update(match_facts(seen), predicted_px=rounded(seen.predicted_px))
+                detail.update(camera=aim.camera, **match_facts(seen), predicted_px=rounded(seen.predicted_px))
                 detail.update(residual_px=rounded(seen.pixel_px - aim_px))
             confirmed: list[tuple[View, PatchMatch]] = [(now, seen)]
             with self._steps.step("eyes") as detail:

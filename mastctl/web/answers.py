@@ -197,6 +197,7 @@ class MeasuredTold(_Told):
 
     time_s: float
     operation: str
+    confirmed: bool
     mast_digest: str
     source: str
     partner: str

@@ -74,6 +74,7 @@ def pointing(
         return Measured(
             time_s,
             "000001-aaaa",
+            True,
             believed.digest,
             *source,
             camera,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -37,7 +38,7 @@ def test_thousands_of_honest_days_raise_no_more_false_alarms_than_stated() -> No
             evidence = judge.weigh(sums)
             loudest = max(loudest, evidence.log_evidence)
         alarms += loudest >= LOG_THRESHOLD
-        averages.append(evidence.square / (2 * POINTINGS))
+        averages.append(evidence.times**2)
     assert alarms <= 3, f"{alarms} of {DAYS} honest days, seed 20"
     assert np.mean(averages) == pytest.approx(1.0, abs=0.02)  # the square has its stated mean
 
@@ -116,10 +117,25 @@ def test_one_false_match_is_no_drift() -> None:
     for number in range(8):
         one = pointing(stored, true, rng, NOON_S + number)
         if number == 4:
-            one = type(one)(**{**vars(one), "off_px": (30.0, -20.0)})
+            one = replace(one, off_px=(30.0, -20.0))
         windows.add(one)
     evidence = windows.evidence()
     assert evidence is not None and evidence.log_evidence < LOG_THRESHOLD
+
+
+def test_false_matches_that_other_eyes_did_not_confirm_are_no_drift_and_a_bump_is_one() -> None:
+    stored = stored_rig()
+    for what, turn_rad, expected in (("false", 0.0, "good"), ("bump", BUMP_RAD, "drifts")):
+        rng = np.random.default_rng(6)
+        true = bumped(honest(stored.rig, rng), "pancam_left", (0.0, turn_rad, 0.0))
+        windows = Windows(stored.rig, stored.digest)
+        for number in range(12):
+            one = pointing(stored, true, rng, NOON_S + number)
+            if number % 2:
+                off = tuple(rng.uniform(-48.0, 48.0, 2)) if what == "false" else one.off_px
+                one = replace(one, confirmed=False, off_px=off)
+            windows.add(one)
+        assert verdict_of(windows.evidence(), 12).word == expected, what
 
 
 def test_sums_are_those_of_their_parts() -> None:

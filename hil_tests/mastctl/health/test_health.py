@@ -17,7 +17,7 @@ from mastctl.health.health import CalibrationHealth
 from mastctl.health.journal import FILE, Journal
 from mastctl.health.measured import COARSE_COUNT_RAD, Measured, measured_by, measured_of
 from mastctl.operations.records import Operation
-from mastctl.pointing.results import Pointing, PointingResult, Step
+from mastctl.pointing.results import Step
 
 STORED = stored_rig()
 
@@ -29,39 +29,50 @@ def history(count: int, turn_rad: float = 0.0) -> list[Measured]:
 
 
 def ended_pointing() -> Operation:
-    step = Step("rest", "done", 0.0, 0.1, {"pan_rad": 0.1, "tilt_rad": -0.2})
-    seen = Step("triangulate", "done", 0.0, 0.1, {"position_m": [3.0, 0.2, 0.1], "range_m": 3.1})
-    counts = {"pan": {"count_rad": 1e-4}}
-    settled = Step("settle", "done", 0.0, 0.1, {"counts": counts})
-    result = Pointing(
-        0.1, -0.2, 0.1, -0.2, "pancam_left", "f", (512.0, 384.0), (513.0, 385.0), (512.5, 385.5), (0.5, 1.5),
-        (0.05, 0.05),
-    )  # fmt: skip
+    at = {"pan_rad": 0.1, "tilt_rad": -0.2}
+    predicted = STORED.rig.camera_in_rover("pancam_left", 0.1, -0.2).project((3.0, 0.2, -1.0))[0]
+    details = {
+        "rest": at,
+        "triangulate": {"position_m": [3.0, 0.2, -1.0], "range_m": 3.1},
+        "settle": at | {"counts": {"pan": {"count_rad": 1e-4}}},
+        "measure": {
+            "camera": "pancam_left",
+            "pixel_px": [float(predicted[0]) - 0.5, float(predicted[1]) + 0.5],
+            "sigma_px": [0.05, 0.06],
+            "residual_px": [0.5, 1.5],
+        },
+    }
+    steps = tuple(Step(name, "done", 0.0, 0.1, detail) for name, detail in details.items())
     request = {"pixel": {"camera": "navcam_right", "frame_id": "f", "x_px": 1.0, "y_px": 2.0}}
-    made = PointingResult((3.0, 0.2, 0.1), 3.0, (result,))
-    return Operation("000001-ab", "done", request, 0.0, 0.0, 1.0, (step, seen, settled), made)
+    return Operation("000001-ab", "done", request, 0.0, 0.0, 1.0, steps)
 
 
 def test_a_pointing_tells_what_measured_joints_do_not_explain() -> None:
-    one = measured_by(ended_pointing(), "d", STORED.rig.stereo, NOON_S)
+    one = measured_by(ended_pointing(), STORED, NOON_S)
     assert one is not None
     assert (one.source, one.partner, one.camera) == ("navcam_right", "navcam_left", "pancam_left")
-    assert (one.residual_px, one.off_px) == ((0.5, 1.5), (-0.5, 0.5))
+    assert one.residual_px == (0.5, 1.5)
+    assert one.off_px == pytest.approx((-0.5, 0.5))
     assert one.count_rad == (1e-4, COARSE_COUNT_RAD)
     assert measured_of(json.loads(json.dumps(one.told()))) == one
+
+
+def test_what_other_eyes_did_not_confirm_counts_as_such() -> None:
+    one = measured_by(replace(ended_pointing(), state="failed", error={"code": "eyes_disagree"}), STORED, 0.0)
+    assert one is not None and not one.confirmed
 
 
 @pytest.mark.parametrize(
     "change",
     [
-        {"state": "failed"},
+        {"state": "failed", "error": {"code": "stopped"}},
         {"request": {"pan_rad": 0.1, "tilt_rad": 0.1}},
-        {"result": None},
         {"steps": ()},
+        {"steps": ended_pointing().steps[:2]},
     ],
 )
 def test_what_has_measured_nothing_is_not_kept(change: dict[str, object]) -> None:
-    assert measured_by(replace(ended_pointing(), **change), "d", STORED.rig.stereo, NOON_S) is None  # type: ignore[arg-type]
+    assert measured_by(replace(ended_pointing(), **change), STORED, NOON_S) is None  # type: ignore[arg-type]
 
 
 def test_pointings_outlive_a_restart_and_a_torn_line_costs_one(tmp_path: Path) -> None:
