@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 from urllib.parse import quote
 
 from mastctl.client.connection import ClientError, DaemonHttp, plain_name
+from mastctl.client.following import followed
 from mastctl.client.jog import ANSWER_S, Jog
 from mastctl.client.lease import HeldLease
-from mastctl.client.snapshot import Snapshot, read_snapshot
+
+if TYPE_CHECKING:
+    from mastctl.client.snapshot import Snapshot
 
 DEFAULT_URL = "http://127.0.0.1:8420"
-POLL_S = 0.05
+ENDED = ("done", "failed", "stopped")
 
 
 class Client:
@@ -193,19 +195,45 @@ class Client:
         ClientError
             ``timeout``, if it has not ended in time; it goes on.
         """
-        until_s = time.monotonic() + timeout_s
         told = 0
-        while True:
-            record = self.operation(operation_id)
+        query = {"topics": "operation", "key": operation_id}
+        for record in followed(self._daemon, query, lambda: self.operation(operation_id), timeout_s):
             for step in record["steps"][told:]:
                 told += 1
                 if on_step is not None:
                     on_step(step)
-            if record["state"] in ("done", "failed", "stopped"):
+            if record["state"] in ENDED:
                 return record
-            if time.monotonic() > until_s:
-                raise ClientError("timeout", f"operation {operation_id} has not ended after {timeout_s:g} s")
-            time.sleep(POLL_S)
+        raise ClientError("timeout", f"operation {operation_id} has not ended after {timeout_s:g} s")
+
+    def wait_state(
+        self,
+        *states: str,
+        timeout_s: float = 60.0,
+        on_change: Callable[[dict[str, Any]], None] | None = None,
+    ) -> dict[str, Any]:
+        """Wait until the daemon's state is one of some words; return ``state``, ``reason`` and what goes with
+        them in the status.
+
+        Parameters
+        ----------
+        on_change
+            Called with the same at the beginning and at each change.
+
+        Raises
+        ------
+        ClientError
+            ``timeout``, if it was none of them in time.
+        """
+        word = ""
+        for told in followed(self._daemon, {"topics": "state"}, self.status, timeout_s):
+            word = told["state"]
+            if on_change is not None:
+                on_change(told)
+            if word in states:
+                return told
+        wanted = " or ".join(states)
+        raise ClientError("timeout", f"the state is {word} and not {wanted} after {timeout_s:g} s")
 
     def recordings(self) -> dict[str, Any]:
         """Return the daemon's recordings, and what it records now."""
@@ -307,12 +335,10 @@ class Client:
         """
         if operation_id is not None:
             self.wait(operation_id, timeout_s, on_step)
-        until_s = time.monotonic() + timeout_s
-        while (track := self.track())["operation"] == operation_id is not None:
-            if time.monotonic() > until_s:
-                raise ClientError("timeout", f"the track did not take up operation {operation_id}")
-            time.sleep(POLL_S)
-        return track
+        for track in followed(self._daemon, {"topics": "track"}, self.track, timeout_s):
+            if operation_id is None or track["operation"] != operation_id:
+                return track
+        raise ClientError("timeout", f"the track did not take up operation {operation_id}")
 
     def watch_track(self) -> Iterator[dict[str, Any]]:
         """Yield the track as it is, and again at each change, until the daemon ends."""
@@ -352,6 +378,8 @@ class Client:
         format
             ``png`` is lossless.
         """
+        from mastctl.client.snapshot import read_snapshot  # the image library, only where there is an image
+
         query: dict[str, str] = {"format": format}
         if frame_id is None:
             query["fresh"] = "true" if fresh else "false"

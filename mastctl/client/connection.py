@@ -149,13 +149,17 @@ class DaemonHttp:
         answer = self.send(method, PREFIX + path, **options)
         if answer.is_success:
             return answer
+        raise self.refused(answer)
+
+    def refused(self, answer: httpx.Response) -> ClientError:
+        """Return what an answer says that is not a good one."""
         try:
             told = answer.json()["error"]
             code, message, detail = str(told["code"]), str(told["message"]), told.get("detail")
         except (ValueError, LookupError, TypeError, AttributeError):
-            raise self.bad_answer(f"it says {answer.status_code}, not in the way of this program") from None
+            return self.bad_answer(f"it says {answer.status_code}, not in the way of this program")
         exit_code = 2 if answer.status_code in _BAD_INPUT else 1
-        raise ClientError(code, message, detail if isinstance(detail, dict) else None, exit_code)
+        return ClientError(code, message, detail if isinstance(detail, dict) else None, exit_code)
 
     def send(self, method: str, path: str, **options: Any) -> httpx.Response:
         """Ask for a path of the whole address, and return the answer whatever it is."""
@@ -167,21 +171,36 @@ class DaemonHttp:
                     "bad_request", f"the request cannot be sent: {error}", exit_code=2
                 ) from None
 
-    def events(self, path: str, query: Mapping[str, Any] | None = None) -> Iterator[dict[str, Any]]:
-        """Yield what a stream of the daemon tells, until the daemon ends."""
+    def heard(
+        self, path: str, query: Mapping[str, Any] | None = None, silent_s: float | None = None
+    ) -> Iterator[dict[str, Any] | None]:
+        """Yield what a stream of the daemon tells, and None for each sign of life, until the daemon ends.
+
+        ``timeout`` is raised if it is silent for ``silent_s`` seconds, those of each request by default.
+        """
+        headers = {} if self.lease_id is None else {"Mastctl-Lease": self.lease_id}
         with (
             self._failures(f"the daemon at {self.url} fell silent"),
-            self._http.stream("GET", PREFIX + path, params=query) as answer,
+            self._http.stream(
+                "GET", PREFIX + path, params=query, headers=headers, timeout=silent_s or self.timeout_s
+            ) as answer,
         ):
             if not answer.is_success:
-                raise self.bad_answer(f"the stream says {answer.status_code}")
+                answer.read()
+                raise self.refused(answer)
             for line in answer.iter_lines():
-                if line.startswith("data:"):
+                if line.startswith(":"):
+                    yield None
+                elif line.startswith("data:"):
                     try:
                         event = json.loads(line.removeprefix("data:"))
                     except ValueError:
                         raise self.bad_answer("an event of the stream is not JSON") from None
                     yield event
+
+    def events(self, path: str, query: Mapping[str, Any] | None = None) -> Iterator[dict[str, Any]]:
+        """Yield what a stream of the daemon tells, until the daemon ends."""
+        yield from (event for event in self.heard(path, query) if event is not None)
 
     def close(self) -> None:
         """Let go of the connection."""

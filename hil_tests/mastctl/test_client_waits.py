@@ -1,0 +1,182 @@
+"""Waits of the client: by events, nothing missed, whatever becomes of stream and daemon."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from hil_tests.mastctl.service_fakes import FakeHardware, FakeStep, ScriptedLoop, eventually, fake_daemon
+from mastctl.client import Client, ClientError
+from mastctl.client import connection as connection_module
+from mastctl.daemon import RunningDaemon
+from mastctl.web import events as events_module
+
+BOTH = tuple[RunningDaemon, FakeHardware]
+BOUND_S = 20.0
+
+
+@pytest.fixture
+def pair(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[BOTH]:
+    with fake_daemon(monkeypatch, tmp_path) as made:
+        yield made
+
+
+@pytest.fixture
+def client(pair: BOTH) -> Iterator[Client]:
+    with Client(pair[0].url) as made:
+        yield made
+
+
+@pytest.fixture
+def go(monkeypatch: pytest.MonkeyPatch) -> threading.Event:
+    """Operations that end when this is set, with a step before."""
+    let = threading.Event()
+
+    def script(request: Any, record: Any, cancelled: threading.Event, devices: Any) -> Any:
+        record(FakeStep("look", "done", 0.0, 0.01, {}))
+        while not let.wait(0.01) and not cancelled.is_set():
+            pass
+        return ScriptedLoop.good(request, record, cancelled, devices)
+
+    monkeypatch.setattr(ScriptedLoop, "script", staticmethod(script))
+    return let
+
+
+def asked(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """Paths of the requests that this process's clients send."""
+    paths: list[str] = []
+    plain = connection_module.DaemonHttp.send
+
+    def send(self: Any, method: str, path: str, **options: Any) -> Any:
+        paths.append(f"{method} {path}")
+        return plain(self, method, path, **options)
+
+    monkeypatch.setattr(connection_module.DaemonHttp, "send", send)
+    return paths
+
+
+def test_a_wait_asks_once_and_then_listens(
+    client: Client, go: threading.Event, pair: BOTH, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    operation = client.point(pan_rad=0.0, tilt_rad=0.0)
+    paths, steps = asked(monkeypatch), []
+    publisher = pair[0].service.machine.publisher
+    before = publisher.listeners
+
+    def on_step(step: dict[str, Any]) -> None:
+        steps.append(step["name"])
+
+    with ThreadPoolExecutor(1) as pool:
+        waiting = pool.submit(client.wait, operation, BOUND_S, on_step)
+        eventually(lambda: publisher.listeners > before and steps == ["look"], "it listens")
+        go.set()
+        assert waiting.result(BOUND_S)["state"] == "done"
+    assert steps == ["look", "look", "measure"]
+    assert paths == [f"GET /api/v1/operations/{operation}"]
+
+
+def test_an_end_between_the_question_and_the_subscription_is_not_missed(
+    client: Client, go: threading.Event, pair: BOTH, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    operation = client.point(pan_rad=0.0, tilt_rad=0.0)
+    operations, heard = pair[0].service.operations, connection_module.DaemonHttp.heard
+
+    def after_the_end(self: Any, *args: Any) -> Any:
+        go.set()
+        eventually(lambda: operations.get(operation).state == "done", "it has ended")
+        return heard(self, *args)
+
+    monkeypatch.setattr(connection_module.DaemonHttp, "heard", after_the_end)
+    assert client.wait(operation, timeout_s=BOUND_S)["state"] == "done"
+
+
+def test_two_wait_at_once(client: Client, go: threading.Event, pair: BOTH) -> None:
+    operation = client.point(pan_rad=0.0, tilt_rad=0.0)
+    with Client(pair[0].url) as other, ThreadPoolExecutor(2) as pool:
+        waiting = [pool.submit(one.wait, operation, BOUND_S) for one in (client, other)]
+        go.set()
+        assert [one.result(BOUND_S)["state"] for one in waiting] == ["done", "done"]
+
+
+def test_a_daemon_that_ends_during_a_wait_is_one_plain_sentence(
+    client: Client, go: threading.Event, pair: BOTH
+) -> None:
+    operation = client.point(pan_rad=0.0, tilt_rad=0.0)
+    publisher = pair[0].service.machine.publisher
+    before = publisher.listeners
+    with ThreadPoolExecutor(1) as pool:
+        waiting = pool.submit(client.wait, operation, BOUND_S)
+        eventually(lambda: publisher.listeners > before, "it listens")
+        pair[0].close()
+        try:
+            assert waiting.result(BOUND_S)["state"] == "stopped"  # its last word came in time
+        except ClientError as error:
+            assert error.code == "no_daemon" and "Traceback" not in str(error)
+    with pytest.raises(ClientError, match="no daemon answers at") as refused:
+        client.wait(operation, timeout_s=BOUND_S)
+    assert refused.value.code == "no_daemon"
+
+
+def test_a_stream_that_breaks_is_begun_again(
+    client: Client, go: threading.Event, pair: BOTH, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    operation = client.point(pan_rad=0.0, tilt_rad=0.0)
+    heard, broken = connection_module.DaemonHttp.heard, []
+
+    def breaking(self: Any, *args: Any) -> Any:
+        for event in heard(self, *args):
+            yield event
+            if len(broken) < 2:
+                broken.append(event)
+                raise connection_module.Broken("no_daemon", "the connection broke")
+            go.set()
+
+    monkeypatch.setattr(connection_module.DaemonHttp, "heard", breaking)
+    assert client.wait(operation, timeout_s=BOUND_S)["state"] == "done"
+    assert len(broken) == 2
+
+
+def test_without_a_stream_left_the_daemon_is_asked(
+    client: Client, go: threading.Event, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(events_module.Streams, "listening", full)
+    operation = client.point(pan_rad=0.0, tilt_rad=0.0)
+    threading.Timer(0.3, go.set).start()
+    assert client.wait(operation, timeout_s=BOUND_S)["state"] == "done"
+
+
+def full(self: Any, topics: Any, keys: Any) -> Any:
+    raise events_module.Unable("too_many", "no more may listen", 1.0)
+
+
+def test_an_unknown_operation_is_said_at_once(client: Client) -> None:
+    with pytest.raises(ClientError) as refused:
+        client.wait("000001-none", timeout_s=BOUND_S)
+    assert refused.value.code == "operation_unknown"
+
+
+def test_a_state_is_waited_for(client: Client, go: threading.Event) -> None:
+    words: list[str] = []
+    client.point(pan_rad=0.0, tilt_rad=0.0)
+    client.wait_state("moving", timeout_s=BOUND_S)
+    go.set()
+    told = client.wait_state("ready", timeout_s=BOUND_S, on_change=lambda one: words.append(one["state"]))
+    assert told["state"] == words[-1] == "ready"
+    with pytest.raises(ClientError, match=r"the state is ready and not stopped after 0\.2 s"):
+        client.wait_state("stopped", timeout_s=0.2)
+
+
+def test_importing_the_client_loads_no_image_library() -> None:
+    program = "import sys, mastctl.client; print([n for n in ('cv2', 'numpy', 'scipy') if n in sys.modules])"
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
+    program = "import sys; from mastctl.client import Snapshot; print('cv2' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "True"

@@ -1,0 +1,73 @@
+"""Waiting on a daemon's event stream: a value as it is and at each change, also if the stream breaks."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any
+
+from mastctl.client.connection import Broken, ClientError, DaemonHttp
+
+AGAIN_S = (0.1, 0.5, 1.0)  # pauses before a stream that broke is begun again
+SILENT_S = 10.0  # the daemon shows every 2 s that it is there
+LAST_S = 3.0  # of a wait: then it ends to the moment, and not with the next sign of life
+PASSING = ("no_daemon", "timeout", "closing")
+ASK_S = 0.25  # between questions to a daemon that has no stream left
+
+
+def followed(
+    daemon: DaemonHttp,
+    query: Mapping[str, Any],
+    ask: Callable[[], dict[str, Any]],
+    timeout_s: float,
+) -> Iterator[dict[str, Any]]:
+    """Yield a value as it is, then at each change, for some seconds.
+
+    The value is asked for before each stream, and each stream begins with what is known, so that no end of
+    anything is missed. A stream that breaks is begun again; where the daemon has none left, it is asked.
+
+    Parameters
+    ----------
+    query
+        Which events, of one topic and key.
+    ask
+        Returns the value by a request of its own.
+
+    Raises
+    ------
+    ClientError
+        What ``ask`` raises: ``no_daemon`` if the daemon is gone, ``operation_unknown`` if it is another one.
+    """
+    until_s = time.monotonic() + timeout_s
+    pauses: list[float] = []  # a daemon that does not answer at the beginning is told at once
+    while True:
+        try:
+            yield ask()
+            pauses = pauses or list(AGAIN_S)  # it answers
+            for value in _stream(daemon, query, until_s):
+                pauses = list(AGAIN_S)
+                yield value
+        except ClientError as error:
+            if error.code == "too_many":
+                pauses = [ASK_S, *AGAIN_S]
+            elif not (isinstance(error, Broken) or error.code in PASSING):
+                raise
+            if not pauses:
+                raise
+            time.sleep(max(0.0, min(pauses.pop(0), until_s - time.monotonic())))
+        if time.monotonic() >= until_s:
+            return
+
+
+def _stream(daemon: DaemonHttp, query: Mapping[str, Any], until_s: float) -> Iterator[dict[str, Any]]:
+    """Yield a stream's values until it ends, or a time, or some seconds before it."""
+    left_s = until_s - time.monotonic()
+    if left_s <= 0:
+        return
+    last = left_s <= LAST_S
+    for event in daemon.heard("/events", query, min(left_s, SILENT_S)):
+        if event is not None:
+            yield event["value"]
+        left_s = until_s - time.monotonic()
+        if left_s <= (0.0 if last else LAST_S):
+            return
