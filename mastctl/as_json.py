@@ -24,9 +24,10 @@ def as_json(value: Any) -> Any:
         return as_json(value.item())
     if isinstance(value, float):
         return value if math.isfinite(value) else None
-    if value is None or isinstance(value, (str, int, bool)):
+    if value is None or isinstance(value, (int, bool)):
         return value
-    return str(value)
+    text = str(value)  # a file's name may hold what no JSON can
+    return text if text.isascii() else text.encode("utf-8", "replace").decode()
 
 
 def picked(value: object, *names: str) -> dict[str, Any]:

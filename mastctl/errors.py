@@ -16,6 +16,8 @@ from mastctl.as_json import as_json
 
 log = logging.getLogger(__name__)
 
+LONGEST_MESSAGE = 2000
+
 
 class MastctlError(Exception):
     """Base of every error that the service raises on purpose."""
@@ -86,6 +88,18 @@ class Stopped(NotNow):
         super().__init__("stopped", message)
 
 
+def one_line(text: object, longest: int) -> str:
+    """Return what was said outside as one printable line, cut to ``longest`` signs; never raises.
+
+    What a terminal obeys or JSON cannot hold becomes ``?``. What has no words is an empty line.
+    """
+    try:
+        words = " ".join(str(text).split())
+    except BaseException:  # an exception of a driver from outside may raise where it is to say what it is
+        return ""
+    return "".join(sign if sign.isprintable() else "?" for sign in words[:longest])
+
+
 def error_body(error: BaseException) -> dict[str, Any]:
     """Return an error as programs read it: code, one plain sentence, more detail or null; never raises."""
     try:
@@ -94,7 +108,7 @@ def error_body(error: BaseException) -> dict[str, Any]:
             detail = getattr(error, "detail", None)
             return {
                 "code": code if isinstance(code, str) else MastctlError.code,
-                "message": " ".join(str(error).split()),
+                "message": one_line(str(error), LONGEST_MESSAGE),
                 "detail": as_json(detail) if isinstance(detail, Mapping) else None,
             }
     except Exception:  # a driver from outside raised what cannot even be put into words

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-from mastctl.errors import NotAllowed
+from mastctl.errors import NotAllowed, one_line
 
 Role = Literal["view", "operate", "admin"]
 
@@ -49,5 +49,4 @@ def told_name(header: str | None) -> str:
 
     Never refuses: a stop with a strange name is a stop.
     """
-    signs = (sign if sign.isprintable() else "?" for sign in " ".join((header or "").split()))
-    return "".join(signs)[:LONGEST_NAME].strip() or ANONYMOUS
+    return one_line(header or "", LONGEST_NAME).strip() or ANONYMOUS

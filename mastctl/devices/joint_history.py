@@ -6,18 +6,22 @@ import bisect
 import math
 import threading
 from collections import deque
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
+from itertools import islice
 
 import numpy as np
 
 from drivers.errors import BadReply
 from drivers.interfaces import Reading
 from mastctl.devices.rest import DITHER_S, dithers
+from mastctl.errors import one_line
 
 KEPT_READINGS = 3000  # one minute at 50 Hz
 OLDEST_READING_S = 1.0  # a reading stamped further back is not a present measurement
 CLOCK_TOLERANCE_S = 0.005  # what a stamp may lie in the future by rounding
 LARGEST_GAP_S = 1.0  # between the readings around an exposure; beyond it the angles are a guess
+MOST_FAULTS, LONGEST_FAULT = 20, 200  # words that a head may say of itself at once, and their signs
 STILL_RAD = 3e-3  # between neighbours; two counts of a 12-bit servo
 
 
@@ -75,11 +79,17 @@ def checked(answer: object, device: str, now_s: float, newest_s: float | None) -
     if newest_s is not None and time_s < newest_s:
         words = f"the reading's time goes back by {newest_s - time_s:.3f} s"
         raise BadReply(words, device=device)
-    words_given = getattr(answer, "faults", ()) or ()
-    faults = (
-        (words_given,) if isinstance(words_given, str) else tuple(str(word)[:200] for word in words_given)
-    )
+    faults = _faults(getattr(answer, "faults", ()) or (), device)
     return Reading(numbers["pan_rad"], numbers["tilt_rad"], bool(moving), time_s, faults)
+
+
+def _faults(given: object, device: str) -> tuple[str, ...]:
+    """What the head says is wrong with it, each as one line, as many as anybody reads. Raises BadReply."""
+    if isinstance(given, str):
+        given = (given,)
+    if not isinstance(given, Iterable):
+        raise BadReply(f"faults is {one_line(given, 40)} where words are expected", device=device)
+    return tuple(one_line(word, LONGEST_FAULT) for word in islice(given, MOST_FAULTS))
 
 
 class JointHistory:

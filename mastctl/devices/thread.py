@@ -20,11 +20,13 @@ from typing import Any, Generic, TypeVar
 from drivers.clock import Clock, SystemClock
 from drivers.errors import DriverError, LineLost, NoReply
 from mastctl.devices.faults import FaultWords
-from mastctl.errors import MastctlError
+from mastctl.errors import MastctlError, one_line
 from mastctl.state.faults import StandingFault
 
 log = logging.getLogger(__name__)
 T = TypeVar("T")
+
+LONGEST_WORDS, LONGEST_CODE = 400, 60  # of what a driver says went wrong
 
 
 @dataclass(eq=False)
@@ -230,10 +232,11 @@ class DeviceThread:
         """Return what a driver raised as an error of the service's own kind, with the device's name."""
         if isinstance(error, MastctlError):
             return error
-        if isinstance(error, DriverError):
-            return error if error.device == self._device else _named(error, self._device)
+        words = one_line(error, LONGEST_WORDS)
+        if isinstance(error, DriverError) and words:
+            said_well = getattr(error, "device", None) == self._device and words == str(error)
+            return error if said_well else _named(error, words, self._device)
         log.debug("%s: %s raised", self._device, what, exc_info=error)
-        words = " ".join(str(error).split())[:200]
         return DriverError(
             f"the driver failed in {what}: {type(error).__name__}{': ' + words if words else ''}",
             device=self._device,
@@ -348,10 +351,12 @@ class DeviceThread:
             log.warning("%s", error)
 
 
-def _named(fault: DriverError, device: str) -> DriverError:
-    """Return the same error with the device's name in front, if its class can be made so."""
+def _named(fault: DriverError, words: str, device: str) -> DriverError:
+    """Return the same error in these words after the device's name, if its class can be made so."""
+    words = words.removeprefix(f"{device}: ")
     try:
-        named = type(fault)(str(fault), device=device, detail=fault.detail)
-    except TypeError:
-        return fault
-    return named
+        return type(fault)(words, device=device, detail=fault.detail)
+    except Exception:  # a class from outside may want other parameters
+        named = DriverError(words, device=device)
+        named.code = one_line(fault.code, LONGEST_CODE) or DriverError.code
+        return named

@@ -16,7 +16,7 @@ from datetime import UTC, datetime
 from typing import Any
 
 from calib.errors import BadFile
-from mastctl.errors import NotNow, Stopped, Unable
+from mastctl.errors import NotNow, Stopped, Unable, one_line
 from mastctl.safety.state_file import StateFile
 from mastctl.safety.state_folder import StateFolder
 
@@ -154,11 +154,12 @@ class Latch:
             held, asked = self.held, self._asked
             if held is None:
                 raise NotNow("not_estopped", "no emergency stop is latched")
-            if self._kept is not None:
+            with self._changed:  # before the disk changes: from here on nobody is told that it holds a stop
+                kept, self._kept = self._kept, None
+            if kept is not None:
                 released = {"by": _told(name, ""), "reason": _told(reason, ""), "at": _now()}
                 self._write_released({"latched": False, **asdict(held), "released": released})
             with self._changed:
-                self._kept = None
                 self._changed.notify_all()
                 if asked != self._asked:
                     raise NotNow("stopping", "another emergency stop came during the reset; it is latched")
@@ -185,7 +186,6 @@ class Latch:
                 self._file.remove()  # a full disk still takes this
             except BadFile:
                 with self._changed:  # what the disk says is not known: the thread writes it again
-                    self._kept = None
                     self._changed.notify_all()
                 words = f"the emergency stop stays latched, since its release cannot be kept: {error}"
                 raise Unable("not_saved", words) from None
@@ -242,8 +242,8 @@ def _now() -> str:
 
 def _told(text: str | None, otherwise: str) -> str:
     """One line of bounded length."""
-    return " ".join((text or "").split())[:LONGEST] or otherwise
+    return one_line(text or "", LONGEST) or otherwise
 
 
 def _text(value: object) -> str:
-    return value if isinstance(value, str) else "not told"
+    return one_line(value, LONGEST) if isinstance(value, str) else "not told"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from typing import Any
 
 from fastapi import FastAPI
@@ -38,9 +39,8 @@ def add_lease(app: FastAPI, service: Service, commands: Commands) -> None:
     @app.post(f"{PREFIX}/lease/renew", summary="Have the lease run for its time from now on")
     async def renew(came: Headers, body: RenewBody | None = None) -> dict[str, Any]:
         lease_id, for_s = _lease_of(came), None if body is None else body.for_s
-        return await commands.run(
-            LEASE_RENEW, came, {"for_s": for_s}, lambda: granted(leases.renew(lease_id, for_s))
-        )
+        asked = {"for_s": for_s, **_which(lease_id)}
+        return await commands.run(LEASE_RENEW, came, asked, lambda: granted(leases.renew(lease_id, for_s)))
 
     @app.delete(f"{PREFIX}/lease", summary="Release the lease")
     async def release(came: Headers) -> dict[str, Any]:
@@ -50,7 +50,7 @@ def add_lease(app: FastAPI, service: Service, commands: Commands) -> None:
             leases.release(lease_id)
             return {"control": leases.told()}
 
-        return await commands.run(LEASE_RELEASE, came, {}, act)
+        return await commands.run(LEASE_RELEASE, came, _which(lease_id), act)
 
     @app.post(f"{PREFIX}/lease/take", summary="Take over, whoever steers; what runs goes on")
     async def take(body: TakeBody, came: Headers) -> dict[str, Any]:
@@ -64,6 +64,12 @@ def add_lease(app: FastAPI, service: Service, commands: Commands) -> None:
 
     def told(body: LeaseBody) -> dict[str, Any]:
         return body.model_dump(exclude_none=True)
+
+
+def _which(lease_id: str) -> dict[str, str]:
+    """What tells a lease from another in the record, without being it: a key that came with one is not good
+    for the next."""
+    return {"of": hashlib.sha256(lease_id.encode()).hexdigest()[:16]}
 
 
 def _lease_of(came: Came) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import logging
 import math
 import threading
@@ -21,6 +22,7 @@ from drivers.simulation_clock import SimulationClock
 from hil_tests.mastctl.service_fakes import FakeCamera, FakeHardware, Hang, eventually, rig
 from mastctl.devices import cameras as cameras_module
 from mastctl.devices import devices as devices_module
+from mastctl.devices import joint_history
 from mastctl.devices.devices import Devices
 from mastctl.devices.frames import KEPT_FRAMES, StampedFrame
 from mastctl.devices.joint_history import JointHistory
@@ -146,8 +148,33 @@ class Absurd(BaseException):
     """Not even an Exception."""
 
 
+class Speechless(Exception):
+    """It raises where it is to say what it is."""
+
+    def __str__(self) -> str:
+        raise RuntimeError("no words")
+
+
+class SpeechlessDriver(Speechless, DriverError):
+    """The same, of the drivers' own kind."""
+
+
+class Peculiar(DriverError):
+    """One whose making wants something else."""
+
+    code = "peculiar"
+
+    def __init__(self, number: int) -> None:
+        super().__init__(f"number {number}\nof \ud800")
+
+
 @pytest.mark.parametrize(
-    "error", [ValueError("what\nnow"), SystemExit(3), Absurd(), StopIteration(), MemoryError()]
+    "error",
+    [
+        *(ValueError("what\nnow"), SystemExit(3), Absurd(), StopIteration(), MemoryError()),
+        *(ValueError("\ud800 \x1b[2J"), NoReply("NoReply \ud800")),
+        *(Speechless(), SpeechlessDriver("SpeechlessDriver")),
+    ],
 )
 def test_whatever_a_driver_raises_comes_as_one_typed_line(
     devices: Devices, hardware: FakeHardware, error: BaseException
@@ -159,9 +186,41 @@ def test_whatever_a_driver_raises_comes_as_one_typed_line(
     for call in (devices.read, lambda: devices.move(0.1, 0.1), devices.stop):
         with pytest.raises(DriverError, match=type(error).__name__) as refused:
             call()
-        assert "\n" not in str(refused.value)
+        assert str(refused.value).isprintable()
+    assert all(fault.message.isprintable() for fault in devices.faults())
     hardware.head.hook = lambda name: None
     assert devices.read().pan_rad == 0.0
+
+
+def test_an_error_that_cannot_be_made_anew_keeps_its_code(devices: Devices, hardware: FakeHardware) -> None:
+    def raise_it(name: str) -> None:
+        raise Peculiar(7)
+
+    hardware.head.hook = raise_it
+    with pytest.raises(DriverError, match=r"^pan_tilt: number 7 of \?$") as refused:
+        devices.stop()
+    assert refused.value.code == "peculiar"
+
+
+@pytest.mark.parametrize(
+    ("said", "told"),
+    [
+        (("hot \ud800", "cold\n\x1b[2J"), ("hot ?", "cold ?[2J")),
+        ("x" * 1000, ("x" * 200,)),
+        ((str(n) for n in itertools.count()), tuple(map(str, range(20)))),
+    ],
+)
+def test_what_a_head_says_of_itself_is_told_in_lines_that_anybody_can_read(
+    said: Any, told: tuple[str, ...]
+) -> None:
+    answer = SimpleNamespace(pan_rad=0.0, tilt_rad=0.0, moving=False, time_s=now(), faults=said)
+    assert joint_history.checked(answer, "pan_tilt", now(), None).faults == told
+
+
+def test_faults_that_are_no_words_are_a_bad_reply() -> None:
+    answer = SimpleNamespace(pan_rad=0.0, tilt_rad=0.0, moving=False, time_s=now(), faults=5)
+    with pytest.raises(BadReply, match="faults is 5 where words are expected"):
+        joint_history.checked(answer, "pan_tilt", now(), None)
 
 
 @impatient

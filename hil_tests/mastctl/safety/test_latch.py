@@ -223,6 +223,50 @@ def test_a_file_that_cannot_be_written_over_is_written_anew(
     assert Latch(folder).held == latch.held
 
 
+def test_nobody_is_told_that_the_disk_holds_a_stop_while_a_reset_writes_there(
+    folder: StateFolder, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    latch = Latch(folder)
+    latch.hold("smoke", "Ana")
+    latch.head_told()
+    assert latch.kept_within(BOUND_S)
+    told = []
+    true = StateFile.write
+
+    def write(file: StateFile, document: Any) -> None:
+        monkeypatch.setattr(StateFile, "write", true)
+        true(file, document)
+        latch.hold("more smoke", "Cem")  # a restart at this moment would find nothing latched
+        told.append((latch.survives, latch.kept_within(0.02)))
+
+    monkeypatch.setattr(StateFile, "write", write)
+    with pytest.raises(NotNow, match="another emergency stop"):
+        latch.release("aired", "Ben")
+    assert told == [(False, False)]
+    assert latch.kept_within(BOUND_S)
+    assert Latch(folder).held == latch.held
+
+
+@pytest.mark.parametrize("words", ["a \ud800 b", "a \x1b[2J b", "a \0 b"])
+def test_words_that_no_terminal_and_no_answer_can_hold_are_kept_without_them(
+    folder: StateFolder, words: str
+) -> None:
+    latch = Latch(folder)
+    latch.hold(words, words)
+    latch.head_told()
+    assert latch.kept_within(BOUND_S)
+    found = Latch(folder).held
+    assert found is not None
+    assert found.reason == found.name == latch.release(words, words).reason
+    assert found.reason.startswith("a ?")
+    StateFile(folder.path / FILE, latch_module.SCHEMA).write(
+        {"latched": True, "reason": words, "name": words}
+    )
+    by_hand = Latch(folder).held
+    assert by_hand is not None
+    assert by_hand.reason.startswith("a ?")
+
+
 def test_what_was_never_latched_cannot_be_released(folder: StateFolder) -> None:
     with pytest.raises(NotNow, match="no emergency stop"):
         Latch(folder).release("a reason", "a name")
@@ -350,6 +394,7 @@ def test_an_operation_that_slips_in_while_it_is_latched_fails_at_the_gate(
         (b'{"reason": 3}', "text/plain", "no reason given"),
         (b'["reason"]', "application/json", "no reason given"),
         (b'{"reason": "x", "reason": "y", "more": NaN}', "application/json", "y"),
+        (b'{"reason": "a \\ud800 b"}', "application/json", "a ? b"),
         (b'{"reason": "' + b"x" * 300 + b'"}', "application/json", "x" * 200),
         (b"x" * 100_000, "application/json", "no reason given"),
     ],
@@ -361,6 +406,8 @@ def test_an_emergency_stop_is_never_refused_for_its_words(
         headers = {"content-type": kind} if kind else {}
         answer = httpx.post(f"{daemon.url}/api/v1/estop", content=body, headers=headers, timeout=BOUND_S)
         assert (answer.status_code, answer.json()["reason"]) == (200, reason)
+        status = httpx.get(f"{daemon.url}/api/v1/status", timeout=BOUND_S)
+        assert status.json()["estop"]["reason"] == reason
         assert ("stop",) in hardware.head.calls
 
 

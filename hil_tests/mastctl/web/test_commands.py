@@ -225,6 +225,24 @@ def test_what_is_wrong_with_a_lease_is_one_sentence(
 # Once and not twice
 
 
+def test_a_key_that_released_one_lease_does_not_tell_that_the_next_one_is_released(web: httpx.Client) -> None:
+    def acquired() -> dict[str, str]:
+        lease = web.post("/lease", json={}, headers={"Mastctl-Client": "bench"}).json()["lease_id"]
+        return {"Idempotency-Key": "a-key", "Mastctl-Client": "bench", "Mastctl-Lease": lease}
+
+    for send in (
+        lambda headers: web.request("DELETE", "/lease", headers=headers),
+        lambda headers: web.post("/lease/renew", headers={**headers, "Idempotency-Key": "another"}),
+    ):
+        first = acquired()
+        assert send(first).status_code == 200
+        web.request("DELETE", "/lease", headers={"Mastctl-Lease": first["Mastctl-Lease"]})
+        second = acquired()
+        assert send(second).json()["error"]["code"] == "key_reused"
+        assert web.get("/lease").json()["control"]["holder"] == "bench"
+        web.request("DELETE", "/lease", headers={"Mastctl-Lease": second["Mastctl-Lease"]})
+
+
 def test_a_command_sent_twice_with_one_key_is_carried_out_once(web: httpx.Client, pair: Pair) -> None:
     headers = {"Idempotency-Key": "a-key", "Mastctl-Client": "bench"}
     first = web.post("/point", json=ANGLES, headers=headers)
