@@ -16,7 +16,7 @@ from datetime import UTC, datetime
 from typing import Any
 
 from calib.errors import BadFile
-from mastctl.errors import NotNow, Stopped, Unable, one_line
+from mastctl.errors import NotNow, Stopped, Unable, latched_words, one_line
 from mastctl.safety.state_file import StateFile
 from mastctl.safety.state_folder import StateFolder
 
@@ -49,8 +49,7 @@ class Held:
 
     def refusal(self) -> Estopped:
         """Return what a move is refused with."""
-        words = f"an emergency stop is latched ({self.name}: {self.reason})"
-        return Estopped(f"{words}; 'mastctl reset' with a reason and a name releases it")
+        return Estopped(latched_words(self.name, self.reason))
 
 
 class Latch:
