@@ -23,6 +23,7 @@ from drivers.hardware import DeviceSettings, HardwareSettings
 from mastctl.devices.keep_out import Box
 from mastctl.devices.limits import Limits
 from mastctl.devices.sun import LEAST_CONE_RAD, SUN, WIDEST_CONE_RAD, Frame, Sun, direction_of
+from mastctl.live.settings import LiveSettings
 from mastctl.packaged import default_config
 from mastctl.recorder.settings import RecordSettings
 from mastctl.tracking.choice import HandoffRules, PairBounds
@@ -102,6 +103,7 @@ class Config:
     sun: Sun | None = None
     tracking: TrackingSettings = field(default_factory=TrackingSettings)
     record: RecordSettings = field(default_factory=RecordSettings)
+    live: LiveSettings | None = None
     data: bytes = field(default=b"", repr=False)
     state_folder: Path | None = None
 
@@ -136,7 +138,7 @@ def parse_config(data: bytes, path: str | Path) -> Config:
         "",
         document,
         ("schema", "mast_file", "pan_tilt", "limits"),
-        ("cameras", "listen", "record", "simulation", "tracking", "state"),
+        ("cameras", "foxglove", "listen", "record", "simulation", "tracking", "state"),
     )
     folder = Path(path).resolve().parent
     cameras = {name: _camera(top, name) for name in top.mapping("cameras")}
@@ -154,6 +156,7 @@ def parse_config(data: bytes, path: str | Path) -> Config:
         sun=_sun(top),
         tracking=_tracking(top, folder),
         record=_record(top, folder),
+        live=_live(top),
         data=data,
         state_folder=_state_folder(top, folder),
     )
@@ -364,6 +367,19 @@ def _state_folder(top: Section, folder: Path) -> Path | None:
     if "state" not in top:
         return None
     return folder / top.section("state", ("folder",), ()).text("folder")
+
+
+def _live(top: Section) -> LiveSettings | None:
+    """Read ``{port: PORT}`` of the live view; without it there is none."""
+    if "foxglove" not in top:
+        return None
+    usual = LiveSettings()
+    section = top.section("foxglove", (), ("host", "port"))
+    host = section.text("host") if "host" in section else usual.host
+    if not is_loopback(host):
+        words = f"'{host[:60]}' where a loopback address is expected: the live view asks nobody who they are"
+        raise section.bad("host", words)
+    return LiveSettings(host, section.integer("port", 0, 65535) if "port" in section else usual.port)
 
 
 def _record(top: Section, folder: Path) -> RecordSettings:

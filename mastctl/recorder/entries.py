@@ -1,16 +1,18 @@
-"""Which messages become of what the daemon publishes, and what a file begins with."""
+"""Which messages become of what the daemon publishes, and what a file or a live view begins with."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from typing import Any, Protocol
 
+from google.protobuf.message import Message
+
 from calib.mast.rig import Rig
 from drivers.interfaces import Reading
 from mastctl.as_json import as_json, picked
 from mastctl.devices.frames import StampedFrame
 from mastctl.recorder import messages
-from mastctl.recorder.writer import RecordFile
+from mastctl.recorder.writer import Clocks
 
 SAME_RAD = 1e-6
 REST_S = 10.0
@@ -35,6 +37,17 @@ class ToldLike(Protocol):
     def time_s(self) -> float: ...
 
 
+class Sink(Protocol):
+    """Where messages go: a recording, or a live view."""
+
+    clocks: Clocks
+
+    def add_json(
+        self, topic: str, kind: str, told: Mapping[str, Any], time_s: float, now_s: float
+    ) -> None: ...
+    def add_message(self, topic: str, message: Message, time_s: float, now_s: float) -> None: ...
+
+
 class Entries:
     """Writes what was published into a file, and remembers what the next file must begin with."""
 
@@ -55,7 +68,7 @@ class Entries:
         """Stand by another mast file from now on."""
         self._rig, self._digest = rig, digest
 
-    def begin(self, file: RecordFile, time_s: float, now_s: float) -> None:
+    def begin(self, file: Sink, time_s: float, now_s: float) -> None:
         """Write what was known before the file was: cameras, frames, the newest of the sticky topics."""
         self._frames.clear()
         self._joints_told_s = float("-inf")
@@ -65,7 +78,7 @@ class Entries:
         for one in list(self._newest.values()):
             self._write_json(file, one, now_s)
 
-    def tell_cameras(self, file: RecordFile, time_s: float, now_s: float) -> None:
+    def tell_cameras(self, file: Sink, time_s: float, now_s: float) -> None:
         """Write every camera's calibration."""
         time_ns = file.clocks.ns(time_s)
         for name, camera in self._rig.cameras.items():
@@ -84,7 +97,7 @@ class Entries:
         elif one.topic in self.STICKY:
             self._newest.pop((one.topic, one.key), None)
 
-    def write(self, file: RecordFile, one: ToldLike, now_s: float) -> None:
+    def write(self, file: Sink, one: ToldLike, now_s: float) -> None:
         """Write one thing that was published. Raises OSError."""
         self.remember(one)
         if one.topic == "joints":
@@ -96,7 +109,7 @@ class Entries:
         if one.topic == "operation":
             self._write_outcome(file, one, now_s)
 
-    def tell_dropped(self, file: RecordFile, dropped: Mapping[str, int], time_s: float, now_s: float) -> None:
+    def tell_dropped(self, file: Sink, dropped: Mapping[str, int], time_s: float, now_s: float) -> None:
         """Write how much was not written, if it is more than before."""
         count = sum(dropped.values())
         if count > self._told_dropped:
@@ -104,7 +117,7 @@ class Entries:
             told = {"dropped": dict(dropped), "reason": "the disk was slower than what came"}
             file.add_json("/recorder", "recorder", told, time_s, now_s)
 
-    def _write_joints(self, file: RecordFile, reading: Reading, time_s: float, now_s: float) -> None:
+    def _write_joints(self, file: Sink, reading: Reading, time_s: float, now_s: float) -> None:
         before, self._joints = self._joints, reading
         still = (
             before is not None
@@ -122,7 +135,7 @@ class Entries:
         tree = messages.transforms(self._rig, reading.pan_rad, reading.tilt_rad, time_ns)
         file.add_message("/tf", tree, reading.time_s, now_s)
 
-    def _write_frame(self, file: RecordFile, frame: StampedFrame, now_s: float) -> None:
+    def _write_frame(self, file: Sink, frame: StampedFrame, now_s: float) -> None:
         if self._frames.get(frame.camera) == frame.frame_id:
             return
         self._frames[frame.camera] = frame.frame_id
@@ -132,10 +145,10 @@ class Entries:
         image = messages.picture(frame, file.clocks.ns(time_s))
         file.add_message(f"/camera/{frame.camera}/image", image, time_s, now_s)
 
-    def _write_json(self, file: RecordFile, one: ToldLike, now_s: float) -> None:
+    def _write_json(self, file: Sink, one: ToldLike, now_s: float) -> None:
         file.add_json(f"/{one.topic}", one.topic, _told(one), one.time_s, now_s)
 
-    def _write_outcome(self, file: RecordFile, one: ToldLike, now_s: float) -> None:
+    def _write_outcome(self, file: Sink, one: ToldLike, now_s: float) -> None:
         """What an operation that ended found: its target and its residuals, once."""
         told = _told(one)
         if told.get("ended_s") is None or one.key in self._ended:
@@ -146,6 +159,8 @@ class Entries:
         target = messages.target_told(told)
         if target is not None:
             file.add_json("/target", "target", target, one.time_s, now_s)
+            scene = messages.target_scene(target["position_m"], file.clocks.ns(one.time_s))
+            file.add_message("/target/scene", scene, one.time_s, now_s)
 
 
 def _told(one: ToldLike) -> dict[str, Any]:

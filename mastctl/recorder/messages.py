@@ -12,6 +12,7 @@ from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
 from foxglove_schemas_protobuf.FrameTransform_pb2 import FrameTransform
 from foxglove_schemas_protobuf.FrameTransforms_pb2 import FrameTransforms
 from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
+from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 from google.protobuf.message import Message
 from google.protobuf.timestamp_pb2 import Timestamp
 from scipy.spatial.transform import Rotation
@@ -22,6 +23,9 @@ from calib.mast.rig import Rig
 from calib.rigid import Rigid
 from mastctl.as_json import as_json
 from mastctl.devices.frames import StampedFrame
+
+TARGET_M = 0.1
+TARGET_COLOUR = (0.9, 0.2, 0.1, 0.8)
 
 
 def picture(frame: StampedFrame, time_ns: int) -> Message:
@@ -112,6 +116,18 @@ def target_told(operation: Mapping[str, Any]) -> dict[str, Any] | None:
         return None
     told = {name: result.get(name) for name in ("position_m", "range_m")}
     return {"operation": operation.get("id"), **told}
+
+
+def target_scene(position_m: Sequence[float], time_ns: int) -> Message:
+    """Return a target as viewers draw it: a ball at its place in the rover frame."""
+    scene = SceneUpdate()
+    entity = scene.entities.add(timestamp=_stamp(time_ns), frame_id="rover", id="target")
+    ball = entity.spheres.add()
+    ball.pose.position.x, ball.pose.position.y, ball.pose.position.z = position_m
+    ball.pose.orientation.w = 1.0
+    ball.size.x = ball.size.y = ball.size.z = TARGET_M
+    ball.color.r, ball.color.g, ball.color.b, ball.color.a = TARGET_COLOUR
+    return scene
 
 
 def _model_told(model: CameraModel) -> dict[str, Any]:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
+from dataclasses import dataclass
 from functools import cache
 from typing import Any
 
@@ -10,15 +12,18 @@ from foxglove_schemas_protobuf.CameraCalibration_pb2 import CameraCalibration
 from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
 from foxglove_schemas_protobuf.FrameTransforms_pb2 import FrameTransforms
 from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
+from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 from google.protobuf.descriptor import FileDescriptor
 from google.protobuf.descriptor_pb2 import FileDescriptorSet
 from google.protobuf.message import Message
+from mcap.well_known import MessageEncoding, SchemaEncoding
 
 PROTOBUF: Mapping[str, type[Message]] = {
     "foxglove.CompressedImage": CompressedImage,
     "foxglove.RawImage": RawImage,
     "foxglove.CameraCalibration": CameraCalibration,
     "foxglove.FrameTransforms": FrameTransforms,
+    "foxglove.SceneUpdate": SceneUpdate,
 }
 """The messages that Foxglove, Lichtblick and Rerun draw."""
 
@@ -88,6 +93,28 @@ _PROPERTIES: Mapping[str, Mapping[str, Any]] = {
         "reason": _TEXT,
     },
 }  # fmt: skip
+
+
+OWN_TOPICS = tuple(topic for topic in _PROPERTIES if topic not in ("frame", "cahvor", "handoff", "recorder"))
+"""Topics of JSON that are named as their schemas are, and that the daemon publishes."""
+
+
+@dataclass(frozen=True)
+class Described:
+    """How a channel is announced: the encoding of its messages, and that of its schema, ``data``."""
+
+    message: str
+    schema: str
+    data: bytes
+
+
+@cache
+def described(schema: str) -> Described:
+    """Return how a channel is announced; ``schema`` is ``foxglove.MESSAGE`` or ``mastctl.TOPIC``."""
+    if schema.startswith("foxglove."):
+        return Described(MessageEncoding.Protobuf, SchemaEncoding.Protobuf, descriptor_set(schema))
+    data = json.dumps(json_schema(schema.removeprefix("mastctl."))).encode()
+    return Described(MessageEncoding.JSON, SchemaEncoding.JSONSchema, data)
 
 
 def json_schema(topic: str) -> dict[str, Any]:

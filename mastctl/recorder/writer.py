@@ -17,10 +17,9 @@ from pathlib import Path
 from typing import Any
 
 from google.protobuf.message import Message
-from mcap.well_known import MessageEncoding, SchemaEncoding
 from mcap.writer import CompressionType, Writer
 
-from mastctl.recorder.schemas import descriptor_set, json_schema
+from mastctl.recorder.schemas import described
 from mastctl.recorder.sync import Sync
 
 PROFILE = "mastctl/record/1"
@@ -185,14 +184,10 @@ class RecordFile:
             self.flush()
 
     def _channel(self, topic: str, schema: str) -> int:
-        protobuf = schema.startswith("foxglove.")
+        known = described(schema)
         if schema not in self._schemas:
-            kind = schema.removeprefix("mastctl.")
-            data = descriptor_set(schema) if protobuf else json.dumps(json_schema(kind)).encode()
-            encoding = SchemaEncoding.Protobuf if protobuf else SchemaEncoding.JSONSchema
-            self._schemas[schema] = self._writer.register_schema(schema, encoding, data)
-        encoding = MessageEncoding.Protobuf if protobuf else MessageEncoding.JSON
-        channel = self._writer.register_channel(topic, encoding, self._schemas[schema])
+            self._schemas[schema] = self._writer.register_schema(schema, known.schema, known.data)
+        channel = self._writer.register_channel(topic, known.message, self._schemas[schema])
         self._channels[topic, schema] = channel
         return channel
 

@@ -31,6 +31,8 @@ from mastctl.devices.frames import StampedFrame, check_known, random_run
 from mastctl.errors import MastctlError, NotNow, Unable
 from mastctl.handoff.check import HandoffCheck
 from mastctl.health.health import CalibrationHealth
+from mastctl.live.settings import LiveSettings
+from mastctl.live.view import LiveView, check_installed
 from mastctl.metrics.metrics import Metrics
 from mastctl.operations.operations import STOP_ASKED, Operations
 from mastctl.operations.records import Operation
@@ -106,6 +108,8 @@ class Service:
         Where the web side calls `stop`: threads that nothing else can keep busy.
     recording
         The recorder, and what it hears.
+    live
+        What Foxglove shows, if the configuration asks for it.
     latch
         The emergency stop, if one is latched.
     folder
@@ -190,6 +194,7 @@ class Service:
             self.devices.frame_by_id,
             clock,
         )
+        self.live = None if config.live is None else self._live_view(config.live)
         self.stop_socket: StopSocket | None = None
         self._socket_folder: StateFolder | None = None
         self._closing = threading.Lock()
@@ -206,11 +211,15 @@ class Service:
             If the mast file cannot be used, or lacks a configured camera.
         DriverError
             If a driver refuses its options or cannot reach its device.
+        Unable
+            ``no_foxglove`` if a live view is asked for, and what shows it is not installed.
         """
         clock = clock or clock_for(config.hardware)
         mast = read_mast(config.mast_file, config)
         for note in mast.stored.notes:
             log.warning("%s", note)
+        if config.live is not None:
+            check_installed()
         hardware = open_hardware(config.hardware, clock)
         try:
             with clock.at_work():
@@ -231,6 +240,7 @@ class Service:
             *self.devices.faults(),
             *self.handoffs.faults(),
             *self.recording.faults(),
+            *(() if self.live is None else self.live.faults()),
             *self.audit.faults(),
             *self._state_faults(),
         )  # first: the machine is told of them
@@ -409,6 +419,8 @@ class Service:
             self.handoffs.use_mast(mast.stored.digest)
             self.health.use_mast(mast.stored)
             self.recording.use_mast(mast)
+            if self.live is not None:
+                self.live.use_mast(mast.stored.rig, mast.stored.digest)
             self.mast, self.former = mast, self.mast
             self.machine.publisher.publish("mast", "in_use", mast.told())
         for note in mast.stored.notes:
@@ -567,6 +579,8 @@ class Service:
         self.handoffs.close()
         self.health.close()
         self.recording.close()
+        if self.live is not None:
+            self.live.close()
         _bounded("closing the hardware", self.hardware.close, HARDWARE_CLOSE_S)
         if self.stop_socket is not None:
             self.stop_socket.close()
@@ -575,6 +589,12 @@ class Service:
         for folder in (self.folder, self._socket_folder):
             if folder is not None:
                 folder.close()
+
+    def _live_view(self, settings: LiveSettings) -> LiveView:
+        stored, names = self.stored, tuple(self.hardware.cameras)
+        return LiveView(
+            settings, stored.rig, stored.digest, names, self.machine.publisher, self.devices, self.clock
+        )
 
     def _runs(self) -> bool:
         """Whether an operation or a track runs; takes no lock."""
