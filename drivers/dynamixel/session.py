@@ -111,6 +111,8 @@ class Session:
             self._watch.look_soon()  # the servos may have stopped by themselves meanwhile
         for axis in self.pair.axes:
             axis.go_on()
+        if all(axis.motion.settled(now_s) for axis in self.pair.axes):
+            self.poll_due_s = now_s + self._head.resting_poll_s
 
     def read(self) -> Reading:
         """Return what both servos measure now; raises as `look`."""

@@ -17,6 +17,7 @@ Rest = Literal["hold", "torque_off"]
 OnHardwareError = Literal["report", "reboot"]
 
 STANDS_WITHIN_S = 0.5  # after this process has died: the last poll's age, the watchdog, and braking
+RESTING_POLL_S = 0.1  # of servos that stand: an idle computer stays idle
 USUAL_WATCHDOG_S, SHORTEST_WATCHDOG_S = 0.3, 0.1
 WATCHDOG_STEP_S = 0.02
 LEAST_SLACK_COUNTS = 3
@@ -118,7 +119,7 @@ class DynamixelSettings:
         After this silence the servos stop by themselves; 0 switches that off. Left out: 0.3 s, or as much
         less as it takes to stand 0.5 s after the last poll, braking included.
     poll_hz
-        How often the servos are read when nobody asks.
+        How often the servos are read when nobody asks, while they move.
     reply_timeout_s
         What a reply may take beyond its time on the wire; a lost one must not trip the watchdog.
     settle_s
@@ -147,6 +148,14 @@ class DynamixelSettings:
     def watchdog_counts(self) -> int:
         """The watchdog register's value, rounded down; 0 for off."""
         return _watchdog_counts(self.watchdog_s)
+
+    @property
+    def resting_poll_s(self) -> float:
+        """How often servos that stand are read, seconds; a lost reply must not trip the watchdog."""
+        if not self.watchdog_counts:
+            return max(1 / self.poll_hz, RESTING_POLL_S)
+        silence_s = self.watchdog_counts * WATCHDOG_STEP_S - self.reply_timeout_s - QUIET_S
+        return max(1 / self.poll_hz, min(RESTING_POLL_S, silence_s / 2))
 
     @property
     def silence_s(self) -> float:

@@ -12,12 +12,14 @@ import os
 import signal
 import threading
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from drivers.dynamixel.head import open_head
+from drivers.dynamixel.port import QUIET_S
 from drivers.dynamixel.servo import Servo
 from drivers.errors import (
     DriverError,
@@ -321,6 +323,17 @@ def test_the_watchdog_is_fed_while_nobody_calls() -> None:
         until(lambda: len(it.ear.heard) > before + 60, "a second of polls")
         assert it.servos[0].table["bus_watchdog"] == 20
         assert head.read().faults == ()
+
+
+def test_servos_that_stand_are_read_seldom_and_often_enough_for_their_watchdog() -> None:
+    with opened() as (it, head):
+        settled(head)
+        before, began_s = len(it.ear.heard), time.monotonic()
+        until(lambda: len(it.ear.heard) > before + 40, "two seconds of polls")
+        assert time.monotonic() - began_s > 1.0  # a busy machine only makes it longer
+        for reply_timeout_s in (0.01, 0.05, 0.2):
+            patient = replace(head.settings, watchdog_s=0.3, reply_timeout_s=reply_timeout_s)
+            assert patient.resting_poll_s + reply_timeout_s + QUIET_S < 0.3  # one reply may be lost
 
 
 def test_fast_reads_are_used_only_after_they_proved_themselves() -> None:

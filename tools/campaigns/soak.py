@@ -1,0 +1,109 @@
+"""Let a daemon live among bad clients, faults and work for a while, and see whether it stays the same.
+
+    python -m tools.campaigns.soak [--minutes N] [--head memory|dynamixel|ptu] [--seed S]
+
+The daemon is a process of its own on a simulated rover, recorder on. Two clients look at pictures. One
+steers: it points at angles, pixels and places, tracks while the rover drives, jogs under a lease, stops and
+latches, changes mast files. One tries to steer beside it. Faults come at random by their words; clients
+stall, are killed (SIGKILL) and send rubbish. Now and then all of them rest, faults are taken back, and the
+daemon is weighed. What it did is drawn from the seed; when it happened is the machine's affair. Wanted, after
+the first rest (the warm-up):
+
+- no growth of memory beyond 20 MB, none of threads, none of descriptors;
+- every operation ends within its deadline, or 5 s after it, and one that fails says why;
+- no answer of 500 and above, and no fault in the status, which no fault that was set explains;
+- the head never reads beyond its limits, but for faults that make it read wrongly.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import tempfile
+import time
+from pathlib import Path
+
+from mastctl.cli.output import at_least, positive_number
+from tools.arguments import end
+from tools.campaigns.soak_clients import Crowd
+from tools.campaigns.soak_ledger import Ledger
+from tools.living_daemon import HEADS, Vitals, simulated, started, vitals
+
+CAMERAS = ("navcam_left", "navcam_right", "hazcam_left", "hazcam_right")
+MOST_GROWTH_MB = 20.0
+WARM_UP = 0.25  # of the whole
+RESTS = 4  # after the warm-up
+SETTLE_S = 14.0  # idle threads of the web's pool end after 10 s
+WEIGH_S = 4.0
+
+
+def main() -> int:
+    """Run it, print the tables; 1 if something was not as wanted."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument(
+        "--minutes", type=positive_number, default=20.0, metavar="N", help="how long (default 20)"
+    )
+    parser.add_argument("--head", choices=HEADS, default="memory", help="default memory")
+    parser.add_argument("--seed", type=at_least(0), default=1, metavar="S", help="of all draws (default 1)")
+    args = parser.parse_args()
+    with tempfile.TemporaryDirectory() as folder:
+        wrong = soak(Path(folder), args.head, 60.0 * args.minutes, args.seed)
+    return 1 if wrong else 0
+
+
+def soak(folder: Path, head: str, duration_s: float, seed: int, settle_s: float = SETTLE_S) -> list[str]:
+    """Run a daemon among all clients for so long; print what happened and return what was not as wanted."""
+    config = simulated(folder, head, CAMERAS, {"record": {"ring_s": 60, "ring_mb": 100, "kept_mb": 200}})
+    ledger = Ledger()
+    print(f"head {head}, seed {seed}, load {os.getloadavg()[0]:.1f}")
+    print(" after min   memory MB   threads   descriptors   load   answers   operations", flush=True)
+    weighed: list[Vitals] = []
+    with started(config) as (daemon, port), Crowd(port, seed, ledger) as crowd:
+        began_s = time.monotonic()
+        shares = [WARM_UP + (1.0 - WARM_UP) * rest / RESTS for rest in range(RESTS + 1)]
+        for share in shares:
+            crowd.work(max(1.0, began_s + share * duration_s - time.monotonic()))
+            crowd.rest(settle_s)
+            weighed.append(_weigh(daemon.pid))
+            now = weighed[-1]
+            print(
+                f"{(time.monotonic() - began_s) / 60:10.1f} {now.rss_mb:11.1f} {now.threads:9d}"
+                f" {now.descriptors:13d} {os.getloadavg()[0]:6.1f} {ledger.answered:9d}"
+                f" {ledger.operated:12d}",
+                flush=True,
+            )
+        ledger.check(daemon.poll() is None, "the daemon has ended by itself")
+    if "Traceback" in (said := (folder / "daemon.log").read_text()):
+        ledger.check(False, f"the daemon's log has a traceback: {said[said.index('Traceback') :][:1500]}")
+    _judge(weighed[0], weighed[-1], ledger)
+    print(ledger.tables())
+    return ledger.wrong
+
+
+def _weigh(pid: int) -> Vitals:
+    """The lightest of some seconds: a thread or a file may just be on its way out."""
+    weighed = []
+    until_s = time.monotonic() + WEIGH_S
+    while time.monotonic() < until_s:
+        weighed.append(vitals(pid))
+        time.sleep(0.2)
+    return min(weighed, key=lambda one: (one.threads + one.descriptors, one.rss_mb))
+
+
+def _judge(first: Vitals, last: Vitals, ledger: Ledger) -> None:
+    """Compare the daemon at its last rest with what it was at its first."""
+    grown_mb = last.rss_mb - first.rss_mb
+    ledger.check(grown_mb <= MOST_GROWTH_MB, f"memory grew by {grown_mb:.1f} MB, {MOST_GROWTH_MB:g} allowed")
+    more = last.threads - first.threads
+    ledger.check(more <= 0, f"{more} threads more than after the warm-up")
+    opened = {
+        kind: count - first.open_files.get(kind, 0)
+        for kind, count in last.open_files.items()
+        if count > first.open_files.get(kind, 0)
+    }
+    more = last.descriptors - first.descriptors
+    ledger.check(more <= 0, f"{more} descriptors more than after the warm-up: {opened}")
+
+
+if __name__ == "__main__":
+    end(main)

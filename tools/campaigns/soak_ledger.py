@@ -1,0 +1,170 @@
+"""What happened in a soak, and what of it nothing explains; safe from any thread."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import Counter
+from typing import Any
+
+AFTER_S = 10.0
+"""So long after its end a fault explains what is seen: a call under way, a line that comes back."""
+
+LIES = {"wrong", "garbage", "drifting", "not_a_number", "misnamed", "swapped", "late"}
+"""Words by which the head reads what is not so."""
+
+OF_THE_SCENE = {
+    "target_flat", "target_ambiguous", "target_border", "target_not_found", "target_moving", "eyes_disagree",
+    "not_trackable", "not_in_view", "outside_image", "outside_limits", "keep_out", "no_way", "no_stereo",
+    "blind_cone", "too_near", "not_one_point", "out_of_reach", "unreachable", "behind", "frame_too_old",
+    "frame_moving", "rover_moved", "other_mast_file", "no_track",
+}  # fmt: skip
+"""Ends of an operation that a place in the scene, drawn at random, explains."""
+
+OF_A_STOP = {"stopped", "estopped", "stopping", "jog_ended"}
+
+OF_LOAD = {"too_many", "too_many_requests"}
+"""Refusals that a client is told to come back after."""
+
+SHOWN = 12
+
+
+class Ledger:
+    """Counts, faults that were set with their times, and what was not as wanted.
+
+    Attributes
+    ----------
+    answered, operated
+        How many answers and ended operations there were.
+    wrong
+        One sentence for each thing that was not as wanted.
+    """
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._faults: list[tuple[str, str, float, float]] = []
+        self._answers = Counter[tuple[str, str]]()
+        self._ends = Counter[tuple[str, str]]()
+        self._acts = Counter[str]()
+        self._words = Counter[str]()
+        self._seen = Counter[str]()
+        self._stops_ms: list[float] = []
+        self._longest_over_s = 0.0
+        self.wrong: list[str] = []
+
+    @property
+    def answered(self) -> int:
+        """All answers so far."""
+        return sum(self._answers.values())
+
+    @property
+    def operated(self) -> int:
+        """All ended operations so far."""
+        return sum(self._ends.values())
+
+    def check(self, good: bool, otherwise: str) -> None:
+        """Note a sentence if something is not good."""
+        if not good:
+            with self._lock:
+                self.wrong.append(otherwise)
+
+    def act(self, what: str) -> None:
+        """Count something that a client did."""
+        with self._lock:
+            self._acts[what] += 1
+
+    def fault_set(self, device: str, word: str, begin_s: float, end_s: float) -> None:
+        """Note a fault that was set, with its times (CLOCK_MONOTONIC)."""
+        with self._lock:
+            self._words[f"{device} {word}"] += 1
+            self._faults.append((device, word, begin_s, end_s))
+
+    def faults_taken_back(self) -> None:
+        """Note that no fault is set any more."""
+        now_s = time.monotonic()
+        with self._lock:
+            self._faults = [(*one[:3], min(one[3], now_s)) for one in self._faults]
+
+    def explained(
+        self, since_s: float, until_s: float, words: set[str] | None = None, device: str = ""
+    ) -> bool:
+        """Whether a fault, if given of this device or one of these words, held then or shortly before."""
+        with self._lock:
+            return any(
+                begin_s <= until_s
+                and since_s <= end_s + AFTER_S
+                and (words is None or word in words)
+                and device in ("", on)
+                for on, word, begin_s, end_s in self._faults
+            )
+
+    def answer(self, who: str, asked: str, status: int, code: str, since_s: float, says: str) -> None:
+        """Note an answer; from 500 on a fault or a full queue must explain it."""
+        kind = str(status) if status < 400 else f"{status} {code}"
+        with self._lock:
+            self._answers[who, kind] += 1
+        if status >= 500 and code not in OF_LOAD:
+            good = code != "internal" and self.explained(since_s, time.monotonic())
+            self.check(good, f"{who}: {asked}: {status} {says[:200]}")
+
+    def stop_answered(self, took_s: float) -> None:
+        """Note how long a stop's answer took."""
+        with self._lock:
+            self._stops_ms.append(1e3 * took_s)
+
+    def operation_ended(self, what: str, record: dict[str, Any], deadline_s: float) -> None:
+        """Note an operation's end: in time, and with a reason that something explains."""
+        state = str(record["state"])
+        error = record.get("error") or {}
+        code = str(error.get("code", ""))
+        took_s = record["ended_s"] - record["created_s"]
+        with self._lock:
+            self._ends[what, f"{state} {code}".strip()] += 1
+            self._longest_over_s = max(self._longest_over_s, took_s - deadline_s)
+        self.check(took_s <= deadline_s + 5.0, f"{what}: {took_s:.1f} s, {deadline_s:g} s were given")
+        self.check(state != "failed" or bool(error.get("message")), f"{what}: failed and says not why")
+        if state == "failed" and code not in OF_THE_SCENE | OF_A_STOP:
+            good = self.explained(record["created_s"], record["ended_s"])
+            self.check(good, f"{what}: {code}: {str(error.get('message'))[:200]}, and no fault was set")
+
+    def status(self, told: dict[str, Any], asked_s: float) -> None:
+        """Look at a status: faults that nothing explains, joints beyond the limits."""
+        now_s = time.monotonic()
+        for fault in told["faults"]:
+            with self._lock:
+                self._seen[f"{fault['device']} {fault['code']}"] += 1
+            good = self.explained(asked_s, now_s, device=fault["device"])
+            self.check(good, f"the status tells a fault, and none was set: {fault['message'][:200]}")
+        joints, limits = told["joints"], told["limits"]
+        if joints is None or self.explained(asked_s, now_s, LIES):
+            return
+        for axis in ("pan_rad", "tilt_rad"):
+            low, high = limits[axis]
+            good = low - 0.01 <= joints[axis] <= high + 0.01
+            self.check(good, f"{axis} reads {joints[axis]:.4f}, the limits are {low:g} to {high:g}")
+
+    def tables(self) -> str:
+        """Return everything as text, the verdict last."""
+        lines = ["", "faults set: " + _counted(self._words), "faults told: " + _counted(self._seen)]
+        lines += ["done: " + _counted(self._acts), "", "operations"]
+        lines += [f"  {what:<10} {end:<32} {count:6d}" for (what, end), count in sorted(self._ends.items())]
+        lines += ["answers"]
+        lines += [f"  {who:<10} {end:<32} {count:6d}" for (who, end), count in sorted(self._answers.items())]
+        if self._stops_ms:
+            ordered = sorted(self._stops_ms)
+            lines.append(
+                f"stops answered: {len(ordered)}, median {ordered[len(ordered) // 2]:.1f} ms,"
+                f" longest {ordered[-1]:.1f} ms"
+            )
+        if self._longest_over_s > 0.0:
+            lines.append(f"operations ended at most {self._longest_over_s:.2f} s after their deadline")
+        different = list(dict.fromkeys(self.wrong))
+        lines += ["", f"not as wanted: {len(self.wrong)}" if self.wrong else "all as wanted"]
+        lines += [f"  {sentence}" for sentence in different[:SHOWN]]
+        if len(different) > SHOWN:
+            lines.append(f"  and {len(different) - SHOWN} more")
+        return "\n".join(lines)
+
+
+def _counted(counts: Counter[str]) -> str:
+    return ", ".join(f"{name} {count}" for name, count in sorted(counts.items())) or "none"
