@@ -22,6 +22,7 @@ from typing import Any, NoReturn
 
 from mastctl import signals
 from mastctl.cli import output
+from mastctl.cli.examples import EXAMPLES
 from mastctl.log_lines import TEXT
 from mastctl.queued_output import QueuedHandler, writer_to
 
@@ -35,6 +36,8 @@ MODULES: dict[str, tuple[str, ...]] = {
     "mastctl.cli.token": ("token",),
     "mastctl.cli.track": ("track",),
     "mastctl.cli.jog": ("jog",),
+    "mastctl.cli.operations": ("operations", "events"),
+    "mastctl.cli.mast": ("mast", "fault"),
     "mastctl.cli.camera_files": ("camera",),
     "mastctl.cli.geometry": ("solve", "triangulate", "budget"),
     "mastctl.cli.handoff": ("handoff",),
@@ -60,6 +63,10 @@ class _Commands(argparse._SubParsersAction):  # type: ignore[type-arg]
         words = str(options.get("help", ""))
         options.setdefault("description", f"{words[:1].upper()}{words[1:]}." if words else None)
         parser: argparse.ArgumentParser = super().add_parser(name, **options)
+        example = EXAMPLES.get(parser.prog)
+        if example is not None:
+            said = f"{parser.epilog} " if parser.epilog else ""
+            parser.epilog = f"{said}example: {example}".replace("%", "%%")
         return parser
 
 
@@ -101,6 +108,8 @@ def build_parser(argv: Sequence[str]) -> Parser:
     parser = Parser(
         prog="mastctl",
         description="Rover mast controller: camera geometry, exact pointing, the pointing service.",
+        epilog="--url, the address of a running daemon, may stand before a command too; by default it is "
+        "$MASTCTL_URL, else that of the configuration.",
     )
     parser.add_argument("--version", action=_Version)
     subparsers = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
@@ -174,6 +183,7 @@ def _give_up_stdout() -> None:
 def _run(words: Sequence[str]) -> int:
     """Parse and run; --help and --version end here with their own code."""
     try:
+        words = _url_last(words)
         _check_command(words)
         parser = build_parser(words)
         args = parser.parse_args(words)
@@ -181,6 +191,18 @@ def _run(words: Sequence[str]) -> int:
         return int(done.code or 0)
     args.json = getattr(args, "json", False)
     return int(args.run(args))
+
+
+def _url_last(words: Sequence[str]) -> list[str]:
+    """Put a --url that stands before the command after it. Raises WrongUse if there is one already."""
+    first = next((at for at, word in enumerate(words) if word == "--url" or word.startswith("--url=")), None)
+    if first is None or any(not word.startswith("-") for word in words[:first]):
+        return list(words)
+    size = 2 if words[first] == "--url" else 1
+    url, others = words[first : first + size], [*words[:first], *words[first + size :]]
+    if any(word == "--url" or word.startswith("--url=") for word in others):
+        raise output.WrongUse("--url is there twice; one address is expected")
+    return [*others, *url]
 
 
 def _check_command(words: Sequence[str]) -> None:

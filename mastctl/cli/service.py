@@ -182,7 +182,7 @@ def _point(args: argparse.Namespace) -> int:
     if args.json:
         output.print_json(record)
     else:
-        _show_pointings(record)
+        show_pointings(record)
     return 0
 
 
@@ -266,7 +266,7 @@ def followed(client: Client, operation_id: str, args: argparse.Namespace) -> dic
         raise
 
 
-def _show_pointings(record: dict[str, Any]) -> None:
+def show_pointings(record: dict[str, Any]) -> None:
     """A table of what was measured, and in which pictures."""
     rows, notes = [], []
     for number, pointing in enumerate(record["pointings"], 1):

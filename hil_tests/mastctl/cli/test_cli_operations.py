@@ -1,0 +1,121 @@
+"""Operations, events, mast file and faults on the command line; --url on either side; an example each."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import shlex
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from calib.files.mast_file import save_rig
+from hil_tests.mastctl.service_fakes import FakeHardware, fake_daemon, rig
+from mastctl.cli.examples import EXAMPLES
+from mastctl.cli.main import build_parser, main
+from mastctl.client import Client
+from mastctl.daemon import RunningDaemon
+
+BOTH = tuple[RunningDaemon, FakeHardware]
+
+
+@pytest.fixture
+def pair(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[BOTH]:
+    with fake_daemon(monkeypatch, tmp_path) as made:
+        yield made
+
+
+@pytest.fixture
+def operation(pair: BOTH) -> str:
+    with Client(pair[0].url) as client:
+        found = client.point(pan_rad=0.25, tilt_rad=-0.5)
+        client.wait(found)
+    return found
+
+
+def said(capsys: pytest.CaptureFixture[str], *words: str) -> str:
+    assert main(words) == 0, capsys.readouterr().err
+    return capsys.readouterr().out
+
+
+def test_operations_are_listed_shown_and_watched(
+    pair: BOTH, operation: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    url = pair[0].url
+    table = said(capsys, "operations", "list", "--url", url)
+    assert operation in table and "pan 0.25" in table and "+0.250, -0.500" in table
+    shown = said(capsys, "operations", "show", operation, "--url", url)
+    assert "✓ look" in shown and "✓ measure" in shown and "done after measure" in shown
+    assert (
+        json.loads(said(capsys, "operations", "watch", operation, "--url", url, "--json"))["id"] == operation
+    )
+    line = said(capsys, "operations", "watch", "--count", "1", "--url", url)
+    assert line == f"operation {operation}: point at pan 0.25, tilt -0.5 rad, done after measure\n"
+    assert main(["operations", "show", "nothing", "--url", url]) == 2
+    assert "operation nothing is not known" in capsys.readouterr().err
+
+
+def test_events_are_a_line_each(pair: BOTH, operation: str, capsys: pytest.CaptureFixture[str]) -> None:
+    url = pair[0].url
+    assert said(capsys, "events", "state", "--count", "1", "--url", url) == "state machine: ready\n"
+    told = said(capsys, "events", "operation", "mast", "--count", "2", "--url", url, "--json").splitlines()
+    assert {json.loads(line)["topic"] for line in told} == {"operation", "mast"}
+    assert main(["events", "weather", "--url", url]) == 2
+    assert "'weather' where some of" in capsys.readouterr().err
+
+
+def test_the_mast_file_is_shown_replaced_and_put_back(
+    pair: BOTH, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    url = ("--url", pair[0].url)
+    save_rig(rig(), tmp_path / "other.yaml")
+    shown = said(capsys, "mast", "show", "--out", str(tmp_path / "copy"), *url)
+    assert shown.startswith("little.yaml (little")
+    assert (tmp_path / "copy").read_bytes() == (tmp_path / "little.yaml").read_bytes()
+    assert said(capsys, "mast", "use", "other.yaml", *url).startswith("other.yaml (little")
+    assert ", before other.yaml" in said(capsys, "mast", "back", *url)
+    assert main(["mast", "use", "none.yaml", *url]) == 2
+
+
+def test_faults_of_what_is_not_simulated_are_refused(pair: BOTH, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["fault", "list", "--url", pair[0].url]) == 2
+    assert "simulated rover only" in capsys.readouterr().err
+    assert main(["fault", "set", "navcam_left", "noise", "sigma", "--url", pair[0].url]) == 2
+    assert "'sigma' where NAME=VALUE" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("before", [["--url", "{}"], ["--url={}"], ["--json", "--url", "{}"]])
+def test_the_address_may_stand_before_the_command(
+    pair: BOTH, capsys: pytest.CaptureFixture[str], before: list[str]
+) -> None:
+    words = [word.format(pair[0].url) for word in before]
+    assert "control" in said(capsys, *words, "lease", "show", "--json")
+    assert main([*words, "status", "--url", "http://127.0.0.1:1"]) == 2
+    assert "--url is there twice" in capsys.readouterr().err + capsys.readouterr().out or "--json" in words
+
+
+def test_the_environment_names_the_daemon(
+    pair: BOTH, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("MASTCTL_URL", pair[0].url)
+    assert json.loads(said(capsys, "mast", "show", "--json"))["mast"]["file"] == "little.yaml"
+
+
+def leaves(parser: argparse.ArgumentParser) -> Iterator[argparse.ArgumentParser]:
+    inner: list[Any] = [one for one in parser._actions if isinstance(one, argparse._SubParsersAction)]
+    if not inner:
+        yield parser
+    for one in inner:
+        for below in one.choices.values():
+            yield from leaves(below)
+
+
+def test_the_help_of_each_command_shows_an_example_that_it_takes() -> None:
+    parser = build_parser([])
+    known = {leaf.prog: leaf for leaf in leaves(parser)}
+    assert set(EXAMPLES) == set(known)
+    for prog, example in EXAMPLES.items():
+        assert example in " ".join(known[prog].format_help().split()), prog
+        assert "run" in parser.parse_args(shlex.split(example)[1:]), example
