@@ -365,7 +365,7 @@ def _suspend(service: Service) -> None:
     def then(stopped: Future[str | None]) -> None:
         os.kill(os.getpid(), signal.SIGSTOP)
 
-    service.stop_threads.submit(service.stop).add_done_callback(then)
+    service.stop_threads.submit(service.stopping.stop).add_done_callback(then)
 
 
 @contextlib.contextmanager

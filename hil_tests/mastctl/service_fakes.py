@@ -21,6 +21,7 @@ from drivers.interfaces import Camera, Frame, PanTilt, Reading
 from mastctl.config import load_config
 from mastctl.daemon import RunningDaemon
 from mastctl.service import service as service_module
+from mastctl.service import steering as steering_module
 
 SIZE_PX = (64, 48)
 
@@ -227,7 +228,7 @@ def fake_daemon(
     save_rig(rig(), folder / "little.yaml")
     (folder / "daemon.yaml").write_text((config or CONFIG).format(listen=listen))
     monkeypatch.setattr(service_module, "open_hardware", lambda settings, clock: hardware)
-    monkeypatch.setattr(service_module, "PointingLoop", loop)
+    monkeypatch.setattr(steering_module, "PointingLoop", loop)
     monkeypatch.setattr(ScriptedLoop, "script", staticmethod(ScriptedLoop.good), raising=False)
     with RunningDaemon(load_config(folder / "daemon.yaml")) as daemon:
         yield daemon, hardware

@@ -10,6 +10,7 @@ from __future__ import annotations
 import itertools
 import math
 import threading
+from collections import deque
 from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field
@@ -22,10 +23,12 @@ from mastctl.commands.caller import Caller, Role
 from mastctl.commands.idempotency import Answer, Answers
 from mastctl.commands.lease import Leases
 from mastctl.errors import BadRequest, MastctlError, NotNow, error_body
+from mastctl.state.publisher import Publisher
 from mastctl.state.refusals import Need
 
 LONGEST_DEADLINE_S = 3600.0
 FOLLOWED = 256  # operations whose end is still recorded with who began them
+PUBLISHED = 256  # records that who begins to listen still hears of
 
 
 @dataclass(frozen=True)
@@ -142,8 +145,8 @@ class Entry:
         Ends operations at their deadline.
     machine
         Refuses what does not fit the state; None if nothing does.
-    publish
-        Gets each record, with the number of its command; must return at once.
+    publisher
+        Gets each record, the newest 256 to be had later; one of its own by default.
     """
 
     def __init__(
@@ -154,7 +157,7 @@ class Entry:
         audit: AuditLog,
         operations: EndsOperations,
         machine: KnowsState | None = None,
-        publish: Callable[[int, Mapping[str, Any]], None] = lambda number, record: None,
+        publisher: Publisher | None = None,
     ) -> None:
         self.leases = leases
         self.audit = audit
@@ -162,7 +165,8 @@ class Entry:
         self._answers = answers
         self._operations = operations
         self._machine = machine
-        self._publish = publish
+        self._publisher = publisher or Publisher()
+        self._published: deque[str] = deque()  # keys, oldest first
         self._numbers = itertools.count(1)
         self._matching = threading.Lock()
         self._began: dict[str, dict[str, Any]] = {}  # operation: who began it, until it has ended
@@ -299,7 +303,11 @@ class Entry:
 
     def _tell(self, told: dict[str, Any]) -> None:
         self.audit.put(told)
-        self._publish(told["number"], told)
+        key = f"{told['number']}.end" if "ended" in told else f"{told['number']}"
+        self._publisher.publish("command", key, told)
+        self._published.append(key)
+        while len(self._published) > PUBLISHED:
+            self._publisher.forget("command", self._published.popleft())
 
     def _now(self) -> dict[str, Any]:
         return {"time": datetime.now(UTC).isoformat(), "monotonic_s": self._clock.now_s()}

@@ -96,6 +96,8 @@ class Devices:
         Called in the head's own thread each time it is about to read, whatever comes of that; must not wait.
     door
         What judges the moves: ways round the keep-outs are asked there, and the sun is told there.
+    fault_watch
+        Tells each change of what is wrong; what the daemon knows of its own files is told there too.
 
     Raises
     ------
@@ -142,12 +144,12 @@ class Devices:
             rig,
             camera_grace_s,
         )
-        self._watch = FaultWatch(self._faults, HEAD, self._machine, self._time)
+        self.fault_watch = FaultWatch(self._faults, HEAD, self._machine, self._time)
         self._head = DeviceThread(
             HEAD, between=self._poll, between_timeout_s=READ_TIMEOUT_S, words=WORDS, clock=self._time
         )
         self._stops = Stops(self._head, HEAD, lambda: self._pan_tilt.stop(), self._time)
-        self._watch.begin()
+        self.fault_watch.begin()
 
     # The head
 
@@ -243,7 +245,7 @@ class Devices:
             self._stop_lost = True
             raise
         finally:
-            self._watch.look()
+            self.fault_watch.look()
 
     @property
     def stop_pending(self) -> bool:
@@ -297,7 +299,7 @@ class Devices:
 
     def faults(self) -> tuple[StandingFault, ...]:
         """Return what is wrong with any device now, what the head reports about itself included."""
-        self._watch.look()
+        self.fault_watch.look()
         return self._faults()
 
     def _faults(self) -> tuple[StandingFault, ...]:
@@ -327,7 +329,7 @@ class Devices:
         until_s = self._time.now_s() + 2.0
         self._head.close(max(0.1, until_s - self._time.now_s()))
         self._cameras.close(until_s)
-        self._watch.close()
+        self.fault_watch.close()
 
     # In the devices' own threads
 
@@ -358,7 +360,7 @@ class Devices:
                 self._stops.proved(ticket)
         self._machine.head_read(reading.moving)
         self._publisher.publish("joints", HEAD, reading)
-        self._watch.look()
+        self.fault_watch.look()
         return reading
 
     def _new_frame(self, frame: StampedFrame) -> None:

@@ -89,6 +89,7 @@ class Door:
         self._rover_from_site = np.eye(3)
         self._boxes: tuple[KeepOuts | None, KeepOuts | None] = (None, None)  # without the sun, and with it
         self._sent: _Sent | None = None
+        self._inside_s: Mapping[str, float] = {}  # where the head stands and should not, and since when
         self._renew()
 
     @property
@@ -216,18 +217,19 @@ class Door:
             )
             found.append(StandingFault(SUN, "sun_not_known", words, sun.until_s, "another is told, or none"))
         keep_outs = self._now()
-        if keep_outs is None or reading is None:
+        if reading is None:
             return tuple(found)
-        names = dict.fromkeys(
-            box.name for box in keep_outs.holding(Span.around((reading.pan_rad, reading.tilt_rad)))
-        )
-        for name in names:
+        here = Span.around((reading.pan_rad, reading.tilt_rad))
+        holding = () if keep_outs is None else keep_outs.holding(here)
+        before_s = self._inside_s
+        self._inside_s = {box.name: before_s.get(box.name, reading.time_s) for box in holding}
+        for name, since_s in self._inside_s.items():
             words = "a head camera looks into the cone around the sun"
             code, until = "sun_in_view", "the head is moved out of it, or the sun is told elsewhere"
             if name != SUN:
                 words, code = f"the head stands in the keep-out {name}", "in_keep_out"
                 until = "it is moved out, the shortest way along one axis"
-            found.append(StandingFault(name, code, words, reading.time_s, until))
+            found.append(StandingFault(name, code, words, since_s, until))
         return tuple(found)
 
     def told(self) -> dict[str, Any]:

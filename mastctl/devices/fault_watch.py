@@ -1,4 +1,5 @@
-"""What is wrong with the devices, told when it changes: also when nothing happens but that time passes."""
+"""What is wrong with the devices and the daemon's own files, told when it changes: also when nothing happens
+but that time passes."""
 
 from __future__ import annotations
 
@@ -14,12 +15,12 @@ LOOK_S = 0.1  # a call is overdue by the clock alone; so late it may be told
 
 
 class FaultWatch:
-    """Tells the machine what is wrong with the head, and publishes what is wrong with each device.
+    """Tells the machine what is wrong with the head, and publishes what is wrong with each device or file.
 
     Parameters
     ----------
     faults
-        Returns what is wrong with any device now; must not wait.
+        Returns what is wrong with any device now; must not wait, nor may what `also` is given.
     head
         The name under which the head's faults stand.
     machine
@@ -31,7 +32,7 @@ class FaultWatch:
     def __init__(
         self, faults: Callable[[], Sequence[StandingFault]], head: str, machine: Machine, clock: Clock
     ) -> None:
-        self._faults = faults
+        self._sources: tuple[Callable[[], Sequence[StandingFault]], ...] = (faults,)
         self._head = head
         self._machine = machine
         self._told: dict[str, tuple[StandingFault, ...]] = {}
@@ -39,6 +40,15 @@ class FaultWatch:
         self._changed = clock.signal()
         self._begun = self._closed = False
         self._thread = clock.thread(self._work, "faults")
+
+    def also(self, faults: Callable[[], Sequence[StandingFault]]) -> None:
+        """Look at what else may be wrong from now on: the daemon's own files."""
+        self._sources = (*self._sources, faults)
+
+    def now(self) -> tuple[StandingFault, ...]:
+        """Return all that is wrong now, and tell what has changed."""
+        self.look()
+        return tuple(fault for faults in self._sources for fault in faults())
 
     def begin(self) -> None:
         """Look from now on: ``faults`` can be asked."""
@@ -69,7 +79,7 @@ class FaultWatch:
 
     def _compare(self, _: None) -> None:
         by_device: dict[str, list[StandingFault]] = {}
-        for fault in self._faults():
+        for fault in (one for faults in self._sources for one in faults()):
             by_device.setdefault(fault.device, []).append(fault)
         for device in {*self._told, *by_device}:
             now = tuple(by_device.get(device, ()))

@@ -26,6 +26,7 @@ from drivers.errors import DriverError
 from mastctl.errors import MastctlError, NotKnown, NotNow, Stopped, Unable, error_body
 from mastctl.operations.records import Operation, OperationState, last_residual
 from mastctl.state.machine import Machine
+from mastctl.state.refusals import Need
 from mastctl.state.words import CLOSING
 
 log = logging.getLogger(__name__)
@@ -163,6 +164,14 @@ class Operations:
             name = running[0]
         log.info("stop%s", f": operation {name}" if name else "")
         return name
+
+    def refusal(self, need: Need) -> MastctlError | None:
+        """Return why a command may not be carried out now, as `mastctl.state.machine.Machine.refusal`.
+
+        What a stop has ended may end first (`let_stopped_end`).
+        """
+        self.let_stopped_end()
+        return self._machine.refusal(need)
 
     def let_stopped_end(self) -> None:
         """Wait for an operation that is being ended, `ENDS_SOON_S` at most; return at once if there is none.

@@ -342,7 +342,7 @@ class Recorder:
             if self._now.file is not None:
                 self._now.file.attach(one.value.file, self._now.file.clocks.ns(one.time_s))
                 self._entries.tell_cameras(self._now.file, one.time_s, time.monotonic())
-        if one.topic != "fault":
+        if one.topic != "fault" or one.key == NAME:  # a disk that is full is not told to keep more
             return
         now_s = time.monotonic()
         standing = {(one.key, fault.code) for fault in one.value}

@@ -11,14 +11,15 @@ import contextlib
 import logging
 import threading
 import time
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from datetime import UTC, datetime
 from typing import Any
 
 from calib.errors import BadFile
-from mastctl.errors import NotNow, Stopped, Unable, latched_words, one_line
+from mastctl.errors import NotNow, Stopped, Unable, one_line
 from mastctl.safety.state_file import StateFile
 from mastctl.safety.state_folder import StateFolder
+from mastctl.state.standing import Latched
 
 log = logging.getLogger(__name__)
 
@@ -37,19 +38,6 @@ class Estopped(Stopped):
 
     def __init__(self, message: str) -> None:
         NotNow.__init__(self, "estopped", message)
-
-
-@dataclass(frozen=True)
-class Held:
-    """An emergency stop: why, by whom, and when (ISO 8601, UTC, by the machine's clock then)."""
-
-    reason: str
-    name: str
-    at: str
-
-    def refusal(self) -> Estopped:
-        """Return what a move is refused with."""
-        return Estopped(latched_words(self.name, self.reason))
 
 
 class Latch:
@@ -73,8 +61,8 @@ class Latch:
         self._file = StateFile(folder.path / FILE, SCHEMA, ROOM_BYTES)
         self._changed = threading.Condition()
         self._disk = threading.Lock()  # for who writes; a disk that hangs holds nobody else
-        self.held: Held | None = None
-        self._kept: Held | None = None  # what a restart would find latched
+        self.held: Latched | None = None
+        self._kept: Latched | None = None  # what a restart would find latched
         self._problem = ""
         self._asked = 0
         self.since_s = time.monotonic()
@@ -83,15 +71,15 @@ class Latch:
         try:
             document = self._file.read()
             if document is not None and document.get("latched") is not False:
-                self.held = Held(*(_text(document.get(key)) for key in ("reason", "name", "at")))
+                self.held = Latched(*(_text(document.get(key)) for key in ("name", "reason", "at")))
         except BadFile as error:
-            self.held = Held(f"whether one was latched cannot be read: {error}", "mastctl", _now())
+            self.held = Latched("mastctl", f"whether one was latched cannot be read: {error}", _now())
         self._kept = self.held
         if self.held is not None:
-            log.warning("%s", self.held.refusal())
+            log.warning("%s", self.held.sentence)
         threading.Thread(target=self._keep, name="latch", daemon=True).start()
 
-    def hold(self, reason: str | None, name: str | None) -> Held:
+    def hold(self, reason: str | None, name: str | None) -> Latched:
         """Latch in memory, at once; a stop that is latched already stays as it is. Returns the one held.
 
         The disk is written to when `head_told` is called, or a moment later.
@@ -99,7 +87,7 @@ class Latch:
         with self._changed:
             self._asked += 1
             if self.held is None:
-                self.held = Held(_told(reason, "no reason given"), _told(name, "anonymous"), _now())
+                self.held = Latched(_told(name, "anonymous"), _told(reason, "no reason given"), _now())
                 self.since_s = time.monotonic()
                 self._due_s = self.since_s + HEAD_FIRST_S
                 self._changed.notify_all()
@@ -136,7 +124,7 @@ class Latch:
             return self._folder.why_temporary or "this daemon keeps its state in a temporary folder"
         return self._problem or "the disk has not confirmed it yet"
 
-    def release(self, reason: str, name: str) -> Held:
+    def release(self, reason: str, name: str) -> Latched:
         """Release it on the disk, then in memory; return what was latched.
 
         Raises
@@ -213,7 +201,7 @@ class Latch:
                     problem = str(error)
                 self._tried(held, problem)
 
-    def _write_held(self, held: Held) -> None:
+    def _write_held(self, held: Latched) -> None:
         """Have it on the disk. Raises BadFile."""
         document = {"latched": True, **asdict(held)}
         try:
@@ -221,7 +209,7 @@ class Latch:
         except BadFile:  # no file with room for it, or one that cannot be written to any more
             self._file.write(document)
 
-    def _tried(self, held: Held, problem: str) -> None:
+    def _tried(self, held: Latched, problem: str) -> None:
         """Note how the writing went, and say each change once."""
         if problem and problem != self._problem:
             log.error("the emergency stop would not survive a restart: %s", problem)

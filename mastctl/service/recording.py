@@ -31,10 +31,9 @@ class Recording:
         Says how much is recorded, and is attached as it was read.
     mast
         The mast file in use.
-    hardware
-        Of which kind it is: of real hardware there is a ring unless the configuration says otherwise.
-    version
-        The program's.
+    facts
+        ``hardware``, of which kind it is (of real hardware there is a ring unless the configuration says
+        otherwise), and ``version``, the program's.
     state_folder
         Where recordings lie, if the configuration names no other place.
     publisher, frame_by_id
@@ -52,20 +51,19 @@ class Recording:
         self,
         config: Config,
         mast: MastInUse,
-        hardware: str,
-        version: str,
+        facts: dict[str, str],
         state_folder: Path,
         publisher: Publisher,
         frame_by_id: Callable[[str], StampedFrame],
         clock: Clock,
     ) -> None:
-        settings = replace(config.record, ring_s=config.record.ring_of(hardware))
+        settings = replace(config.record, ring_s=config.record.ring_of(facts["hardware"]))
         self.recorder = Recorder(
             settings,
             config.record.folder or state_folder / FOLDER,
             _told(mast),
             [Attached(config.path.name, config.data)],
-            {"hardware": hardware, "version": version},
+            facts,
             clock,
         )
         self._feed = Feed(publisher, self.recorder, frame_by_id)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, Protocol
+from typing import Any
 
 from mastctl.commands.caller import Caller
 from mastctl.commands.entry import ESTOP, STOP, Asked, Entry
@@ -11,27 +11,30 @@ from mastctl.safety.stop_socket import Stops
 VIA = "stop socket"
 
 
-class Recorded(Stops, Protocol):
-    """A service whose stops are recorded."""
-
-    entry: Entry
-
-
 class SocketStops:
-    """The stops of a service, from whoever connects to its socket."""
+    """Stops from whoever connects to a daemon's socket.
 
-    def __init__(self, service: Recorded) -> None:
-        self._service = service
+    Parameters
+    ----------
+    stops
+        Carries them out.
+    entry
+        Records them.
+    """
+
+    def __init__(self, stops: Stops, entry: Entry) -> None:
+        self._stops = stops
+        self._entry = entry
 
     def stop_told(self) -> dict[str, Any]:
         """Stop the mast; return what is to be told."""
-        return self._service.entry.first(STOP, Asked(Caller(role="view", via=VIA)), self._service.stop_told)
+        return self._entry.first(STOP, Asked(Caller(role="view", via=VIA)), self._stops.stop_told)
 
     def estop(self, reason: str | None, name: str | None) -> dict[str, Any]:
         """Stop it and latch; return what is to be told."""
         asked = Asked(Caller(role="view", via=VIA), request={"reason": reason, "name": name})
-        return self._service.entry.first(ESTOP, asked, lambda: self._service.estop(reason, name))
+        return self._entry.first(ESTOP, asked, lambda: self._stops.estop(reason, name))
 
     def latch_estop(self, reason: str | None, name: str | None) -> object:
         """Let no move out from now on, at once."""
-        return self._service.latch_estop(reason, name)
+        return self._stops.latch_estop(reason, name)

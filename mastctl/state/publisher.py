@@ -8,10 +8,10 @@ between, never the newest, and is told how many it lost: `Publisher.publish` nei
     joints      the head's name     `drivers.interfaces.Reading`
     operation   its id              `mastctl.operations.records.Operation`, with the steps so far
     track       "track"             `mastctl.tracking.status.TrackStatus`
-    fault       the device's name   tuple of `mastctl.state.faults.StandingFault`, empty when it is healthy
+    fault       of a device, file   tuple of `mastctl.state.faults.StandingFault`, empty when it is healthy
     frame       the camera's name   facts of its newest frame, without the picture
     mast        "in_use"            the mast file in use, as `GET /mast` tells it
-    command     its id              the record of a command
+    command     its number          the record of a command; under NUMBER.end how what it began has ended
     lease       "lease"             who steers
 """
 

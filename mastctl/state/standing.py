@@ -38,6 +38,12 @@ class Latched:
     reason: str
     at: str
 
+    @property
+    def sentence(self) -> str:
+        """What is told to whoever wants the head to move."""
+        words = f"an emergency stop is latched ({self.name}: {self.reason})"
+        return f"{words}; 'mastctl reset' with a reason and a name releases it"
+
 
 @dataclass(frozen=True)
 class Standing:

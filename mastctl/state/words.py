@@ -22,8 +22,7 @@ def why(now: Standing) -> str:
         case "stopping":
             return _why_stopping(now)
         case "stopped" if now.latch is not None:
-            words = f"emergency stop by {now.latch.name}: {now.latch.reason}; nothing moves until a reset"
-            return "; ".join([words, *(_told(fault) for fault in now.faults[:1])])
+            return "; ".join([now.latch.sentence, *(_told(fault) for fault in now.faults[:1])])
         case "fault" if now.faults:
             more = len(now.faults) - 1
             return _told(now.faults[0]) + (f" (and {more} more)" if more else "")

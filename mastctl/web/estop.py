@@ -40,16 +40,16 @@ def add_estop(app: FastAPI, service: Service, waiting: Waiting, commands: Comman
         words = told.get("reason"), told.get("name")
         try:
             return await commands.first(
-                ESTOP, request, lambda: service.estop(*words), {"reason": words[0], "name": words[1]}
+                ESTOP, request, lambda: service.stopping.estop(*words), {"reason": words[0], "name": words[1]}
             )
         except StopsHang as error:
-            await waiting.run(lambda: service.latch_estop(*words))
+            await waiting.run(lambda: service.stopping.latch_estop(*words))
             raise Unable("stop_unconfirmed", f"the emergency stop is latched, but {error}") from None
 
     @app.post(f"{PREFIX}/reset", summary="Release the emergency stop; nothing moves before the next command")
     async def reset(body: ResetBody, came: Headers) -> dict[str, Any]:
         def act() -> dict[str, Any]:
-            return {"latched": False, "released": asdict(service.reset(body.reason, body.name))}
+            return {"latched": False, "released": asdict(service.stopping.reset(body.reason, body.name))}
 
         return await commands.run(RESET, came, body.model_dump(), act)
 

@@ -43,7 +43,7 @@ def add_pictures(app: FastAPI, service: Service, waiting: Waiting, commands: Com
 
     @app.get(f"{PREFIX}/mast", summary="The mast file in use, byte for byte", response_class=Response)
     async def mast() -> Response:
-        in_use = service.mast
+        in_use = service.masts.in_use
         return Response(
             in_use.data,
             media_type="application/yaml",
@@ -53,13 +53,13 @@ def add_pictures(app: FastAPI, service: Service, waiting: Waiting, commands: Com
     @app.post(f"{PREFIX}/mast", summary="Use another mast file, or the former one, from now on")
     async def load_mast(body: MastBody, came: Headers) -> dict[str, Any]:
         name = body.file
-        work = service.former_mast if name is None else partial(service.load_mast, name)
+        work = service.masts.back if name is None else partial(service.masts.load, name)
         return await commands.run(MAST, came, body.model_dump(exclude_none=True), lambda: told(work()))
 
     @app.post(f"{PREFIX}/mast/back", summary="Go back to the former mast file")
     async def back(came: Headers) -> dict[str, Any]:
-        return await commands.run(MAST_BACK, came, {}, lambda: told(service.former_mast()))
+        return await commands.run(MAST_BACK, came, {}, lambda: told(service.masts.back()))
 
     def told(mast: MastInUse) -> dict[str, Any]:
-        former = service.former
+        former = service.masts.former
         return {"mast": mast.told(), "former_mast": None if former is None else former.told()}

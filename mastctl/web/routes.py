@@ -29,7 +29,7 @@ def add_pointing(app: FastAPI, service: Service, commands: Commands) -> None:
         looks = 0 if isinstance(asked.target, AnglesTarget) else asked.pointings
 
         def act() -> dict[str, Any]:
-            return {"id": service.point(asked, told).id}
+            return {"id": service.steering.point(asked, told).id}
 
         return await commands.run(POINT, came, told, act, usual_s(limits, looks))
 
@@ -43,7 +43,7 @@ def add_pointing(app: FastAPI, service: Service, commands: Commands) -> None:
 
     @app.post(f"{PREFIX}/stop", summary="Stop the mast and the running operation, at once")
     async def stop(request: Request) -> dict[str, Any]:
-        return await commands.first(STOP, request, service.stop_told)
+        return await commands.first(STOP, request, service.stopping.stop_told)
 
 
 def add_tracking(app: FastAPI, service: Service, commands: Commands) -> None:
@@ -56,7 +56,7 @@ def add_tracking(app: FastAPI, service: Service, commands: Commands) -> None:
         stands = body.pose(service.clock.now_s())
 
         def act() -> dict[str, Any]:
-            operation = service.take_pose(stands, body.look)
+            operation = service.steering.take_pose(stands, body.look)
             return {"operation": operation, "track": told()}
 
         return await commands.run(POSE, came, body.model_dump(exclude_none=True), act, allowed_s)
@@ -70,20 +70,18 @@ def add_tracking(app: FastAPI, service: Service, commands: Commands) -> None:
         asked = body.model_dump(exclude_none=True)
 
         def act() -> dict[str, Any]:
-            return {"id": service.start_track(body.target(), {"track": asked}).id}
+            return {"id": service.steering.start_track(body.target(), {"track": asked}).id}
 
         return await commands.run(TRACK, came, asked, act, allowed_s)
 
     @app.post(f"{PREFIX}/track/look", status_code=202, summary="Look for the target once more")
     async def look(came: Headers) -> dict[str, Any]:
-        return await commands.run(
-            TRACK_LOOK, came, {}, lambda: {"id": service.look_for_target().id}, allowed_s
-        )
+        return await commands.run(TRACK_LOOK, came, {}, lambda: {"id": service.steering.look().id}, allowed_s)
 
     @app.post(f"{PREFIX}/track/stop", summary="End the track; the head stops if it moves for it")
     async def stop(came: Headers) -> dict[str, Any]:
         def act() -> dict[str, Any]:
-            service.stop_track()
+            service.stopping.stop_track()
             return {}
 
         await commands.run_beside(TRACK_STOP, came, act)

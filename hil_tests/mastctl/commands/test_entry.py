@@ -18,6 +18,7 @@ from mastctl.commands.entry import JOG, POINT, POSE, STOP, Answer, Asked, Comman
 from mastctl.commands.idempotency import Answers
 from mastctl.commands.lease import Leases
 from mastctl.errors import MastctlError, NotNow
+from mastctl.state.publisher import Publisher
 
 BENCH = Caller("bench")
 ROVER = Caller("rover")
@@ -34,7 +35,7 @@ class World:
         self.audit = AuditLog(path)
         self.deadlines: list[tuple[str, float, float]] = []
         self.refuses: str | None = None
-        self.published: list[dict[str, Any]] = []
+        self.publisher = Publisher()
         self.entry = Entry(
             self.clock,
             self.leases,
@@ -42,9 +43,15 @@ class World:
             self.audit,
             self,
             self,
-            lambda number, record: self.published.append(dict(record)),
+            self.publisher,
         )
         self.acts = 0
+
+    @property
+    def published(self) -> list[Any]:
+        """What who begins to listen now still hears of."""
+        with self.publisher.subscribe("command") as heard:
+            return heard.wait(0.0)
 
     def end_within(self, name: str, left_s: float, allowed_s: float) -> None:
         self.deadlines.append((name, left_s, allowed_s))
@@ -90,7 +97,7 @@ def test_a_record_says_who_under_which_lease_what_when_and_with_which_result(wor
         "result": "ok", "operation": "000001-abcd",
     }  # fmt: skip
     assert lease.id not in world.path.read_text()
-    assert [one["number"] for one in world.published] == [1]
+    assert [(one.key, one.value["number"]) for one in world.published] == [("1", 1)]
 
 
 def test_an_operations_end_is_a_line_of_its_own(world: World) -> None:
@@ -248,6 +255,15 @@ def test_the_record_of_who_began_what_is_bounded(world: World) -> None:
         world.entry.ended(f"x{number}", "done", None)
     assert len(world.entry._began) == 256
     assert len(world.entry._ended) == 256
+
+
+def test_the_newest_256_records_stay_to_be_heard_of_whenever_what_they_began_ended(world: World) -> None:
+    world.entry.run(POINT, world.asked(), world.act)
+    world.entry.ended("000001-abcd", "done", None)
+    assert [one.key for one in world.published] == ["1", "1.end"]
+    for _ in range(300):
+        world.entry.run(POSE, world.asked(), dict)
+    assert [one.key for one in world.published] == [str(number) for number in range(46, 302)]
 
 
 def test_of_heartbeats_the_first_is_recorded_and_what_is_refused(world: World) -> None:

@@ -203,6 +203,19 @@ def test_a_head_in_a_keep_out_is_told_as_such() -> None:
     assert "the head stands in the keep-out deck" in fault.message
 
 
+def test_a_head_in_a_keep_out_is_told_since_it_was_first_read_there() -> None:
+    door = door_of()
+    clear, inside = at(0.0, 0.0), at(0.0, -0.9)
+
+    def since(time_s: float, reading: Reading) -> list[float]:
+        return [fault.since_s for fault in door.faults(replace(reading, time_s=time_s))]
+
+    assert since(1.0, clear) == []
+    assert since(2.0, inside) == since(3.0, inside) == since(9.0, inside) == [2.0]
+    assert since(10.0, clear) == []
+    assert since(11.0, inside) == [11.0]
+
+
 def test_nearest_slides_along_a_bound_and_stays_where_nothing_is_free() -> None:
     door = door_of()
     assert door.nearest(at(0.0, 0.0), (0.2, 0.1)) == (0.2, 0.1)

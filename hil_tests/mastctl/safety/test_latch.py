@@ -24,7 +24,7 @@ from mastctl.safety import stop_threads
 from mastctl.safety.latch import FILE, Estopped, Held, Latch
 from mastctl.safety.state_file import StateFile
 from mastctl.safety.state_folder import StateFolder, StateInUse, usual_folder
-from mastctl.service import service as service_module
+from mastctl.service import stopping as stopping_module
 from mastctl.state import machine as machine_module
 
 SECTOR_BYTES = 512
@@ -378,7 +378,6 @@ def test_an_operation_that_slips_in_while_it_is_latched_fails_at_the_gate(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     with fake_daemon(monkeypatch, tmp_path) as (daemon, hardware), Client(daemon.url) as client:
-        monkeypatch.setattr(daemon.service, "_refuse_if_latched", lambda: None)
         monkeypatch.setattr(machine_module, "refusal_of", lambda now, need: None)
         client.estop()
         record = client.wait(client.point(pan_rad=0.1, tilt_rad=0.1))
@@ -548,7 +547,7 @@ def test_a_disk_that_hangs_holds_the_answer_for_a_bounded_time_and_the_answer_sa
     with fake_daemon(monkeypatch, tmp_path, config=KEPT) as (daemon, hardware), Client(daemon.url) as client:
         for way in ("write", "overwrite"):
             monkeypatch.setattr(StateFile, way, hang)
-        monkeypatch.setattr(service_module, "KEPT_S", 0.05)
+        monkeypatch.setattr(stopping_module, "KEPT_S", 0.05)
         told = client.estop()
         assert (told["latched"], told["kept"]) == (True, False)
         assert "would not survive" in told["message"]

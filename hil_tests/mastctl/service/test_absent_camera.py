@@ -145,7 +145,7 @@ def test_the_service_starts_with_a_camera_absent_and_the_others_serve(bench: Ben
             service.snapshot("navcam_left", fresh=True)
         assert len(told(service, "navcam_left")) == 1, "one thing wrong is told once"
         assert service.snapshot("navcam_right", fresh=True).camera == "navcam_right"
-        done = service.point(PointRequest(AnglesTarget(0.1, 0.0)), {})
+        done = service.steering.point(PointRequest(AnglesTarget(0.1, 0.0)), {})
         eventually(lambda: service.operations.get(done.id).state != "running", "the pointing's end")
         assert service.operations.get(done.id).state == "done"
 
@@ -222,7 +222,9 @@ def test_a_pixel_is_refused_while_the_other_eye_is_absent(bench: Bench, tmp_path
     with serving(tmp_path) as service:
         frame = service.snapshot("navcam_left", fresh=True)
         moves = [call for call in bench.heads[0].calls if call[0] == "move"]
-        done = service.point(PointRequest(PixelTarget("navcam_left", frame.frame_id, 30.0, 20.0)), {})
+        done = service.steering.point(
+            PointRequest(PixelTarget("navcam_left", frame.frame_id, 30.0, 20.0)), {}
+        )
         eventually(lambda: service.operations.get(done.id).state != "running", "the pointing's end")
         record = service.operations.get(done.id)
         assert record.state == "failed"
@@ -321,11 +323,11 @@ def test_another_mast_file_is_taken_while_a_camera_is_absent_or_has_another_size
     away = bench.before_eye["navcam_left"] = Away(NoReply("no answer"))
     with serving(tmp_path) as service:
         save_rig(rig(), tmp_path / "other.yaml")
-        service.load_mast("other.yaml")
+        service.masts.load("other.yaml")
         bench.kind = SmallEyeThatSaysSo
         away.come()
         eventually(lambda: "16x12 px" in "".join(told(service, "navcam_left")), "the fault")
-        service.load_mast("little.yaml")
+        service.masts.load("little.yaml")
         assert "16x12 px" in "".join(told(service, "navcam_left"))
         assert service.snapshot("navcam_right", fresh=True).camera == "navcam_right"
 
@@ -338,6 +340,6 @@ def test_a_stop_is_not_kept_by_a_camera_that_is_absent_or_blocks(
     with serving(tmp_path) as service:
         calls = bench.heads[0].calls
         before = calls.count(("stop",))
-        service.stop()
+        service.stopping.stop()
         assert calls.count(("stop",)) > before
         hang.let_go()

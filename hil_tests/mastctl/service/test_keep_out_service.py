@@ -31,7 +31,7 @@ def service() -> Iterator[Service]:
 
 
 def pointed(service: Service, pan_rad: float, tilt_rad: float) -> dict[str, Any]:
-    name = service.point(PointRequest(AnglesTarget(pan_rad, tilt_rad)), {}).id
+    name = service.steering.point(PointRequest(AnglesTarget(pan_rad, tilt_rad)), {}).id
     until_s = time.monotonic() + LONG_S
     while service.operations.get(name).state in ("queued", "running"):
         assert time.monotonic() < until_s
@@ -57,7 +57,7 @@ def test_what_cannot_be_reached_is_said_with_the_keep_outs_names(service: Servic
     assert record["state"] == "failed" and record["error"]["code"] == "no_way"
     assert "(deck, wall) within the limits" in record["error"]["message"]
     with pytest.raises(KeptOut, match="keep-out deck"):
-        service.point(PointRequest(AnglesTarget(0.0, -0.5)), {})
+        service.steering.point(PointRequest(AnglesTarget(0.0, -0.5)), {})
 
 
 def test_a_head_in_a_keep_out_is_a_fault_and_a_pointing_leads_it_out_first(service: Service) -> None:

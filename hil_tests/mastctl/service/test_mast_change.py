@@ -20,7 +20,7 @@ from drivers.errors import NoReply
 from hil_tests.mastctl.service_fakes import FakeHardware, ScriptedLoop, eventually, fake_daemon, rig
 from mastctl.daemon import RunningDaemon
 from mastctl.errors import Stopped
-from mastctl.service import service as service_module
+from mastctl.service import steering as steering_module
 from mastctl.service.mast_in_use import configured
 
 
@@ -112,7 +112,7 @@ def test_the_loop_points_by_the_new_mast_file(
             rigs.append(used.name)
             super().__init__(used, *rest, **more)
 
-    monkeypatch.setattr(service_module, "PointingLoop", Loop)
+    monkeypatch.setattr(steering_module, "PointingLoop", Loop)
     web.post("/mast", json={"file": "better.yaml"})
     assert rigs == ["better"]
 

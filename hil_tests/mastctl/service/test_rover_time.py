@@ -57,7 +57,7 @@ def a_run(seed: int, pause_s: float) -> tuple[str, list[np.ndarray[Any, Any]]]:
             frame = service.snapshot("navcam_left", fresh=True)
             pictures.append(frame.image)
             request = PointRequest(PixelTarget("navcam_left", frame.frame_id, u_px, v_px))
-            told.append(ended(service, service.point(request, {"pixel": [u_px, v_px]}).id))
+            told.append(ended(service, service.steering.point(request, {"pixel": [u_px, v_px]}).id))
             time.sleep(pause_s)
         told.append(service.state().told())
     return json.dumps(told, sort_keys=True), pictures
@@ -74,7 +74,7 @@ def test_two_runs_of_one_seed_are_the_same_to_the_last_bit_and_another_seed_is_a
 def test_the_head_takes_its_time_on_the_rovers_clock_only() -> None:
     with service_at("max") as service:
         began_s = service.clock.now_s()
-        told = ended(service, service.point(PointRequest(AnglesTarget(2.0, -0.5)), {}).id)
+        told = ended(service, service.steering.point(PointRequest(AnglesTarget(2.0, -0.5)), {}).id)
         assert told["state"] == "done"
         took_s = told["ended_s"] - told["started_s"]
         assert took_s > 2.0  # 2 rad at 1 rad/s
@@ -96,8 +96,8 @@ def test_a_deadline_is_one_of_the_rovers_time() -> None:
 
 def test_a_stop_overtakes_a_move_that_nobody_waits_for() -> None:
     with service_at("max") as service:
-        moving = service.point(PointRequest(AnglesTarget(2.5, 0.0)), {}).id
-        service.stop()
+        moving = service.steering.point(PointRequest(AnglesTarget(2.5, 0.0)), {}).id
+        service.stopping.stop()
         told = ended(service, moving)
         assert told["state"] in ("stopped", "done")
         if told["state"] == "stopped":
@@ -108,7 +108,7 @@ def test_a_stop_overtakes_a_move_that_nobody_waits_for() -> None:
 def test_ten_times_as_fast_is_not_faster_than_that() -> None:
     with service_at(10) as service:
         began_s = time.monotonic()
-        told = ended(service, service.point(PointRequest(AnglesTarget(1.0, 0.0)), {}).id)
+        told = ended(service, service.steering.point(PointRequest(AnglesTarget(1.0, 0.0)), {}).id)
         assert told["state"] == "done"
         took_s = told["ended_s"] - told["started_s"]
         assert took_s > 1.0
@@ -159,6 +159,6 @@ def test_a_stop_has_its_second_however_late_its_thread_gets_the_processor(
 
         client = threading.Thread(target=lambda: service.clock.sleep(30.0), daemon=True)  # lets time pass
         monkeypatch.setattr(service.devices._head, "submit", late)
-        service.stop()
+        service.stopping.stop()
         client.join(LONG_S)
         assert service.devices.faults() == ()

@@ -80,7 +80,7 @@ def test_no_lock_that_somebody_holds_keeps_the_event_loop(
         client.snapshot("navcam_left")
         found = dict(locks_of(daemon.service, set()))
         found["FaultPanel._lock"] = hardware.simulation.faults._lock
-        for one in ("Service._mast_lock", "Operations._lock", "Tracker._lock", "FrameStore._lock"):
+        for one in ("Masts._lock", "Operations._lock", "Tracker._lock", "FrameStore._lock"):
             assert one in found
         for place, lock in found.items():
             with lock, httpx.Client(base_url=f"{daemon.url}/api/v1", timeout=0.3) as hasty:
@@ -105,7 +105,7 @@ def test_a_lock_of_the_bookkeeping_does_not_keep_a_stop_from_the_head(
     with fake_daemon(monkeypatch, tmp_path) as (daemon, hardware):
         service = daemon.service
         for lock in (
-            service._mast_lock, service.operations._lock, service.tracker._lock, service.handoffs._lock,
+            service.masts._lock, service.operations._lock, service.tracker._lock, service.handoffs._lock,
             service.devices._store._lock, service.machine._turns._lock,
             service.machine.publisher._turns._lock,
         ):  # fmt: skip
@@ -122,7 +122,7 @@ def test_a_fifth_stop_is_answered_honestly_while_four_hang(
     monkeypatch.setattr(stop_threads_module, "OVERDUE_S", 0.2)
     monkeypatch.setattr(commands_module, "STOP_ANSWER_S", 0.5)
     with fake_daemon(monkeypatch, tmp_path) as (daemon, _):
-        monkeypatch.setattr(daemon.service, "stop", hang)
+        monkeypatch.setattr(daemon.service.stopping, "stop", hang)
         told: list[ClientError] = []
 
         def stop() -> None:

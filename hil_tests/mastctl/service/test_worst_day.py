@@ -41,7 +41,7 @@ def pointed(service: Service, pixel_px: tuple[float, float]) -> tuple[dict[str, 
     rover = service.hardware.simulation
     assert rover is not None
     point_m = rover.true_point("navcam_left", frame.sequence, pixel_px)
-    name = service.point(
+    name = service.steering.point(
         PointRequest(PixelTarget("navcam_left", frame.frame_id, *pixel_px), pointings=2), {}
     ).id
     until_s = time.monotonic() + LONG_S

@@ -424,5 +424,5 @@ def test_whatever_comes_from_many_threads_each_change_is_told_once_and_none_brea
         if before.word in ("stopping", "stopped") and now.operation is not None:
             assert before.operation == now.operation, words
     assert (last.stops, last.operation, last.track) == (0, None, None), storm.words
-    assert {one.word for one in told} >= {"stopping", "stopped", "fault"}
+    assert {one.word for one in told} >= {"stopping", "stopped"} and any(one.faults for one in told)
     assert {one.code for one in storm.refused} >= {"stopping", "estopped"}

@@ -24,7 +24,7 @@ from drivers.faults import FaultPanel
 from hil_tests.mastctl.service_fakes import CONFIG, FakeHardware, Hang, ScriptedLoop, eventually, fake_daemon
 from mastctl.daemon import RunningDaemon
 from mastctl.devices import devices as devices_module
-from mastctl.service import service as service_module
+from mastctl.service import steering as steering_module
 from mastctl.web.bodies import LARGEST_BODY_BYTES
 
 ANGLES = {"pan_rad": 0.1, "tilt_rad": -0.1}
@@ -449,7 +449,7 @@ def test_a_click_is_refused_by_name_if_its_frame_does_not_serve(
     refused(click(x_px=63.6), 422, "outside_image")
     refused(click(y_px=-0.6), 422, "outside_image")
     with monkeypatch.context() as patch:
-        patch.setattr(service_module, "CLICK_AGE_S", 0.0)
+        patch.setattr(steering_module, "CLICK_AGE_S", 0.0)
         refused(click(), 410, "frame_too_old")
     assert click(x_px=63.5, mast_digest=daemon.service.stored.digest).status_code == 202
 

@@ -27,7 +27,7 @@ def held(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Network]:
 
 @pytest.fixture
 def net(held: Network) -> Network:
-    held.daemon.service.stop()
+    held.daemon.service.stopping.stop()
     held.hardware.head.calls.clear()
     return held
 

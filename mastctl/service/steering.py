@@ -1,0 +1,167 @@
+"""Requests to point and to follow: judged against the mast file in use, then begun."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from calib.mast.rig import Rig
+from drivers.clock import Clock
+from mastctl.devices.devices import Devices
+from mastctl.errors import NotNow
+from mastctl.health.health import CalibrationHealth
+from mastctl.operations.operations import Operations
+from mastctl.operations.records import Operation
+from mastctl.pointing.loop import PointingLoop
+from mastctl.pointing.requests import AnglesTarget, PixelTarget, PointRequest, PositionTarget
+from mastctl.pointing.wanted import aim_of, clicked_frame
+from mastctl.service.masts import Masts
+from mastctl.tracking.pose import RoverPose
+from mastctl.tracking.tracker import Tracker
+
+CLICK_AGE_S = 300.0  # a person may look at a picture for minutes before clicking; the sun moves meanwhile
+
+
+class Steering:
+    """Where the head is sent, and what it follows; safe to use from any thread.
+
+    Parameters
+    ----------
+    masts
+        The mast file in use, which stays the same while a request is judged and begun.
+    rig
+        Its part that this daemon can see with.
+    devices, clock
+        The head and the cameras, and what stamps them.
+    operations, tracker
+        What runs, and what is followed.
+    health
+        Is told of each pointing's end.
+    """
+
+    def __init__(
+        self,
+        masts: Masts,
+        rig: Rig,
+        devices: Devices,
+        clock: Clock,
+        operations: Operations,
+        tracker: Tracker,
+        health: CalibrationHealth,
+    ) -> None:
+        self._masts = masts
+        self._devices = devices
+        self._clock = clock
+        self._operations = operations
+        self._tracker = tracker
+        self._health = health
+        self.use_rig(rig)
+
+    def use_rig(self, rig: Rig) -> None:
+        """Point by another mast file from now on."""
+        self._rig = rig
+        self._loop = PointingLoop(rig, self._devices, self._devices.door.limits, self._clock)
+
+    def point(self, request: PointRequest, told: Mapping[str, Any]) -> Operation:
+        """Start a pointing operation and return its first record.
+
+        Parameters
+        ----------
+        request
+            What to point at.
+        told
+            The request as it came, for the record.
+
+        Raises
+        ------
+        NotKnown, NoLonger, BadRequest
+            If camera, frame, pixel or joint angles do not fit this rig.
+        NotNow
+            If the frame is of another mast file, head or rover moved since, or what
+            `mastctl.operations.operations.Operations.start` says stands against it.
+        """
+        with self._masts.unchanged() as mast:
+            if isinstance(request.target, PositionTarget):
+                request = replace(request, target=self._in_rover(request.target))
+            self._check(request)
+            loop = self._loop
+
+            def run(record: Callable[[Any], None], cancelled: threading.Event) -> Any:
+                with self._devices.exposure_held():
+                    return loop.run(request, record, cancelled)
+
+            return self._operations.start(told, run, partial(self._health.ended, mast.stored))
+
+    def start_track(self, target: PixelTarget | PositionTarget, told: Mapping[str, Any]) -> Operation:
+        """Begin to follow what a pixel shows, or what is seen at a position; return the start's record.
+
+        Raises
+        ------
+        NotKnown, NoLonger, BadRequest, NotNow
+            As for `point`; ``busy`` also while a track runs.
+        """
+        with self._masts.unchanged():
+            if isinstance(target, PositionTarget):
+                target = self._in_rover(target)
+            self._check(PointRequest(target))
+            return self._tracker.start(target, told)
+
+    def look(self) -> Operation:
+        """Look for the track's target once more and return the look's first record.
+
+        Raises
+        ------
+        NotNow, Unable
+            As `mastctl.tracking.tracker.Tracker.look`.
+        """
+        with self._masts.unchanged():
+            return self._tracker.look()
+
+    def take_pose(self, pose: RoverPose, look: bool) -> str | None:
+        """Take where the rover stands; return the id of the look that follows, if one does.
+
+        Raises
+        ------
+        BadRequest, NotNow
+            As `mastctl.tracking.tracker.Tracker.take_pose`.
+        """
+        with self._masts.unchanged():
+            taken = self._tracker.take_pose(pose, look)
+            self._devices.door.rover_stands(pose.site_from_rover.inverse.rotation)
+            return taken
+
+    def _check(self, request: PointRequest) -> None:
+        """Refuse a request that does not fit the mast file in use; see `point`."""
+        target = request.target
+        if isinstance(target, PixelTarget):
+            self._check_pixel(target)
+        if isinstance(target, AnglesTarget):
+            self._devices.door.check_goal(target.pan_rad, target.tilt_rad)
+        if request.aim is not None:
+            aim_of(request, self._rig)
+
+    def _check_pixel(self, target: PixelTarget) -> None:
+        stored = self._masts.in_use.stored
+        taken_with, in_use = target.mast_digest, stored.digest
+        if taken_with not in (None, in_use):
+            words = f"the pixel was taken with mast file {taken_with:.8}..., the one in use is {in_use:.8}..."
+            raise NotNow("other_mast_file", words)
+        find = partial(self._devices.frame_by_id, max_age_s=CLICK_AGE_S)
+        frame = clicked_frame(target, self._rig, find, stored.rig)
+        moved_s = self._tracker.moved_s
+        if moved_s is not None and frame.exposure_began_s < moved_s:
+            words = f"the rover moved since frame {target.frame_id} was exposed; take another"
+            raise NotNow("rover_moved", words)
+
+    def _in_rover(self, target: PositionTarget) -> PositionTarget:
+        """A position in the rover frame of now; before the first pose that is the site frame."""
+        pose = self._tracker.pose
+        if target.frame != "site" or pose is None:
+            return target
+        x, y, z = pose.site_from_rover.inverse.points(np.array(target.position_m)).tolist()
+        return PositionTarget((x, y, z), "rover")

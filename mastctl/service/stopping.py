@@ -1,0 +1,161 @@
+"""The stop, the emergency stop, and the reset: the head first, everything else after it.
+
+Nothing comes before the head: no log, no file, and no lock that is held for longer than a read.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+from dataclasses import asdict
+from typing import Any
+
+from drivers.errors import DriverError
+from mastctl.devices.devices import Devices
+from mastctl.errors import MastctlError, NotNow, Unable
+from mastctl.operations.operations import STOP_ASKED, Operations
+from mastctl.safety.latch import Estopped, Latch
+from mastctl.safety.state_folder import StateFolder
+from mastctl.state.faults import StandingFault
+from mastctl.state.machine import Machine
+from mastctl.state.standing import Latched
+from mastctl.tracking.tracker import Tracker
+
+KEPT_S = 1.0  # what the disk is given before an emergency stop is answered without it
+STATE = "state"
+
+
+class Stopping:
+    """What ends every motion of one daemon; safe to use from any thread.
+
+    Parameters
+    ----------
+    devices, operations, tracker
+        What is stopped, in this order.
+    machine
+        Is told.
+    latch
+        What outlives the daemon of an emergency stop. One that is found latched holds from the start.
+    """
+
+    def __init__(
+        self, devices: Devices, operations: Operations, tracker: Tracker, machine: Machine, latch: Latch
+    ) -> None:
+        self._devices = devices
+        self._operations = operations
+        self._tracker = tracker
+        self._machine = machine
+        self._latch = latch
+        self._resetting = threading.Lock()
+        if latch.held is not None:
+            devices.block_moves(latch.held, Estopped(latch.held.sentence))
+
+    def stop(self, reason: str = STOP_ASKED) -> str | None:
+        """Stop the mast, then what runs and the track; return the stopped operation's id.
+
+        Raises DriverError.
+        """
+        with self._operations.held():  # until the track has ended too, which would look again
+            try:
+                stopped = self._operations.stop(reason)
+            finally:
+                self._tracker.stop(reason)
+        return stopped
+
+    def stop_told(self) -> dict[str, Any]:
+        """Stop as `stop`; return what ``POST /stop`` tells."""
+        return {"stopped": True, "operation": self.stop()}
+
+    def stop_track(self) -> None:
+        """End the track, and stop the mast if it moves for it. Raises DriverError."""
+        running = self._tracker.status.operation
+        if running is not None and self._operations.running == running:
+            self._operations.stop()  # the head first
+        running = self._tracker.stop("the track was stopped")
+        if running is not None and self._operations.running == running:
+            self._operations.stop()
+
+    def estop(self, reason: str | None = None, name: str | None = None) -> dict[str, Any]:
+        """Stop the mast, and let nothing move it before `reset`, across restarts too.
+
+        The head first; then what runs and the track end; then it is told whether the disk holds the stop.
+
+        Returns
+        -------
+        dict
+            As ``POST /estop`` tells it: ``latched``, ``kept`` (a restart would find it; else ``message`` says
+            why not), ``operation``, and ``reason``, ``name`` and ``at`` of the stop that is latched.
+
+        Raises
+        ------
+        Unable
+            ``stop_unconfirmed`` if the head did not confirm; the stop is latched all the same.
+        """
+        stopped, unconfirmed = None, None
+        with self._operations.held():
+            held = self.latch_estop(reason, name)
+            try:
+                stopped = self.stop(f"an emergency stop: {held.reason} ({held.name})")
+            except (DriverError, MastctlError) as error:
+                unconfirmed = error
+        self._latch.head_told()
+        kept = self._latch.kept_within(KEPT_S)
+        why = "" if kept else f"it would not survive a restart of the daemon: {self._latch.not_kept}"
+        if unconfirmed is not None:
+            words = f"the emergency stop is latched, but the head did not confirm it: {unconfirmed}"
+            raise Unable("stop_unconfirmed", f"{words}; {why}" if why else words)
+        told = {"stopped": True, "latched": True, "kept": kept, "operation": stopped, **asdict(held)}
+        return told | ({"message": why} if why else {})
+
+    def latch_estop(self, reason: str | None, name: str | None) -> Latched:
+        """Let no move out from now on; the head is told by `estop`. Returns the stop that is latched."""
+        self._machine.stop_asked()
+        try:
+            held = self._latch.hold(reason, name)
+            self._machine.estop_asked(held)
+            self._devices.block_moves(held, Estopped(held.sentence))
+        finally:
+            self._machine.stop_ended()
+        return held
+
+    def reset(self, reason: str, name: str) -> Latched:
+        """Release the emergency stop and return it; nothing moves before the next command.
+
+        Raises
+        ------
+        NotNow
+            ``not_estopped`` if none is latched, ``stopping`` while a stop is under way.
+        Unable
+            ``not_saved`` if the state folder goes on to say that it is latched; ``closing``.
+        """
+        refusal = self._operations.refusal("latch")
+        if refusal is not None:
+            raise refusal
+        if self._devices.stop_pending:
+            raise NotNow("stopping", "the mast is being stopped; an emergency stop is released after that")
+        with self._resetting:
+            held = self._latch.release(reason, name)
+            self._devices.allow_moves(held)  # and not what another one blocks that came meanwhile
+            self._machine.reset(name, reason, lambda: self._latch.held)
+        return held
+
+
+def state_faults(folder: StateFolder, latch: Latch, started_s: float) -> Iterator[StandingFault]:
+    """Yield what keeps state from outliving the daemon, where it should.
+
+    Parameters
+    ----------
+    folder, latch
+        Where state is kept, and the emergency stop.
+    started_s
+        When the daemon started.
+    """
+    if folder.why_temporary:
+        words = f"nothing outlives this daemon, an emergency stop above all: {folder.why_temporary}"
+        yield StandingFault(STATE, "state_not_kept", words, started_s, "the daemon has a state folder")
+    elif folder.refused and latch.held is None:
+        words = f"an emergency stop would not survive a restart: {folder.refused}"
+        yield StandingFault(STATE, "state_not_kept", words, started_s, "the daemon is started again")
+    elif latch.not_kept and not folder.is_temporary:
+        words = f"the emergency stop is held in memory only: {latch.not_kept}"
+        yield StandingFault(STATE, "latch_not_kept", words, latch.since_s, "the disk takes it, or a reset")
