@@ -137,7 +137,9 @@ class Service:
         self.leases = Leases(people_s, self._runs, self._steered)
         self.audit = AuditLog(self.folder.path / AUDIT_FILE, clock)
         answers = Answers(people_s, clock)
-        self.entry = Entry(clock, self.leases, answers, self.audit, self.operations, self.operations, publisher)
+        self.entry = Entry(
+            clock, self.leases, answers, self.audit, self.operations, self.operations, publisher
+        )
         self.metrics = Metrics(lambda: self.state().told(), self.devices.errors, publisher)
         self.devices.fault_watch.also(self._own_faults)
         self.stop_socket: StopSocket | None = None
