@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 
 import pytest
 
+from calib.errors import BadFile
 from hil_tests.mastctl.service_fakes import eventually, fake_daemon
 from mastctl.client import Client
+from mastctl.safety.state_file import StateFile
 from mastctl.state.faults import StandingFault
 
 FULL = StandingFault("a file", "full", "the disk is full", 1.0, "it is not")
@@ -43,11 +44,12 @@ state: {{folder: state}}
     with fake_daemon(monkeypatch, tmp_path, config=config) as (daemon, _), Client(daemon.url) as client:
         publisher = daemon.service.machine.publisher
 
-        def refuse(*ignored: object) -> None:
-            raise OSError(28, os.strerror(28))
+        def refuse(file: StateFile, document: object) -> None:
+            raise BadFile(file.path, "", "cannot be saved: No space left on device")
 
         with monkeypatch.context() as patch:
-            patch.setattr("os.fsync", refuse)
+            for way in ("write", "overwrite"):
+                patch.setattr(StateFile, way, refuse)
             assert client.estop(reason="smoke")["kept"] is False
             eventually(
                 lambda: [one.code for one in publisher.newest("fault", "state") or ()] == ["latch_not_kept"],
