@@ -477,7 +477,7 @@ def test_an_emergency_stop_in_the_middle_of_a_reset_is_latched_everywhere(
 
         def release(reason: str, name: str) -> Held:
             held = true(reason, name)
-            service.latch_estop("smoke", "Cem")
+            service.stopping.latch_estop("smoke", "Cem")
             return held
 
         with monkeypatch.context() as patch:
@@ -495,7 +495,7 @@ def test_what_is_latched_where_no_stop_could_be_sent_can_be_reset(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     with fake_daemon(monkeypatch, tmp_path, config=KEPT) as (daemon, _), Client(daemon.url) as client:
-        daemon.service.latch_estop("smoke", "Ana")
+        daemon.service.stopping.latch_estop("smoke", "Ana")
         assert client.status()["state"] == "stopped"
         assert client.reset(reason="looked", name="Ben")["released"]["name"] == "Ana"
 
