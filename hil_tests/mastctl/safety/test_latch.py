@@ -21,7 +21,7 @@ from mastctl.client import Client, ClientError
 from mastctl.errors import NotNow, Unable
 from mastctl.safety import latch as latch_module
 from mastctl.safety import stop_threads
-from mastctl.safety.latch import FILE, Estopped, Held, Latch
+from mastctl.safety.latch import FILE, Estopped, Latch
 from mastctl.safety.state_file import StateFile
 from mastctl.safety.state_folder import StateFolder, StateInUse, usual_folder
 from mastctl.service import stopping as stopping_module
@@ -450,7 +450,7 @@ def test_a_stop_in_the_middle_of_a_reset_leaves_nothing_latched_and_the_next_com
         client.estop(reason="sparks", name="Ana")
         true = service.latch.release
 
-        def release(reason: str, name: str) -> Held:
+        def release(reason: str, name: str) -> Latched:
             held = true(reason, name)
             service.machine.stop_asked()
             return held
@@ -475,7 +475,7 @@ def test_an_emergency_stop_in_the_middle_of_a_reset_is_latched_everywhere(
         client.estop(reason="sparks", name="Ana")
         true = service.latch.release
 
-        def release(reason: str, name: str) -> Held:
+        def release(reason: str, name: str) -> Latched:
             held = true(reason, name)
             service.stopping.latch_estop("smoke", "Cem")
             return held
