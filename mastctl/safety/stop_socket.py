@@ -79,8 +79,6 @@ class StopSocket:
         self._peers: dict[int, _Peer] = {}
         self._poll = select.poll()
         self._poll.register(self._listener, select.POLLIN)
-        self._at_the_door = select.poll()
-        self._at_the_door.register(self._listener, select.POLLIN)
         self._threads = StopThreads(THREADS)
         self._ended = threading.Event()
         threading.Thread(target=self._work, name="stop socket", daemon=True).start()
@@ -137,8 +135,6 @@ class StopSocket:
 
     def _took(self) -> bool:
         """Let one peer in, and hear what it has said already; return whether there was one."""
-        if not self._at_the_door.poll(0):
-            return False  # asked first: without descriptors the kernel refuses also when nobody waits
         silent = [number for number, peer in self._peers.items() if peer.asked_s is None]
         if len(silent) >= SILENT_PEERS:
             self._leave(silent.pop(0))

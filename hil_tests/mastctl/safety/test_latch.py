@@ -26,6 +26,7 @@ from mastctl.safety.state_file import StateFile
 from mastctl.safety.state_folder import StateFolder, StateInUse, usual_folder
 from mastctl.service import stopping as stopping_module
 from mastctl.state import machine as machine_module
+from mastctl.state.standing import Latched
 
 SECTOR_BYTES = 512
 KEPT = CONFIG + "state: {{folder: state}}\n"
