@@ -120,16 +120,11 @@ class Asked:
             raise BadRequest("bad_request", f"deadline_s: {deadline_s:g} where {expected}")
 
 
-class EndsOperations(Protocol):
-    """What of `mastctl.operations.operations.Operations` ends what is late."""
-
-    def end_within(self, name: str, left_s: float, told_s: float) -> None: ...
-
-
-class KnowsState(Protocol):
-    """What of the daemon's machine says whether the state allows a command."""
+class JudgesAndEnds(Protocol):
+    """What of `mastctl.operations.operations.Operations` refuses what does not fit, and ends what is late."""
 
     def refusal(self, need: Need) -> MastctlError | None: ...
+    def end_within(self, name: str, left_s: float, told_s: float) -> None: ...
 
 
 class Entry:
@@ -142,9 +137,7 @@ class Entry:
     leases, answers, audit
         Who steers, what was answered to each key, where records go.
     operations
-        Ends operations at their deadline.
-    machine
-        Refuses what does not fit the state; None if nothing does.
+        Refuses what does not fit the state, and ends operations at their deadline.
     publisher
         Gets each record, the newest 256 to be had later; one of its own by default.
     """
@@ -155,8 +148,7 @@ class Entry:
         leases: Leases,
         answers: Answers,
         audit: AuditLog,
-        operations: EndsOperations,
-        machine: KnowsState | None = None,
+        operations: JudgesAndEnds,
         publisher: Publisher | None = None,
     ) -> None:
         self.leases = leases
@@ -164,7 +156,6 @@ class Entry:
         self._clock = clock
         self._answers = answers
         self._operations = operations
-        self._machine = machine
         self._publisher = publisher or Publisher()
         self._published: deque[str] = deque()  # keys, oldest first
         self._numbers = itertools.count(1)
@@ -247,9 +238,7 @@ class Entry:
         if command.steers:
             steering = self.leases.steering(asked.caller, asked.lease)
         with steering:
-            refusal = None
-            if self._machine is not None and command.need is not None:
-                refusal = self._machine.refusal(command.need)
+            refusal = None if command.need is None else self._operations.refusal(command.need)
             if refusal is not None:
                 raise refusal
             answer = act()

@@ -121,6 +121,7 @@ class Service:
         publisher = self.machine.publisher
         self.health = CalibrationHealth(self.folder.path, mast.stored)
         self._open_head(mast)
+        publisher.publish("track", "track", self.tracker.status)
         self.stop_threads = StopThreads()
         self.handoffs = HandoffCheck(config.tracking.handoff_log, mast.stored.digest, clock)
         self.recording = Recording(
@@ -132,14 +133,11 @@ class Service:
             self.devices.frame_by_id,
             clock,
         )
-        self.machine.publisher.publish("track", "track", self.tracker.status)
         people_s = SystemClock()  # clients live in real time, whatever a simulated rover's clock does
         self.leases = Leases(people_s, self._runs, self._steered)
         self.audit = AuditLog(self.folder.path / AUDIT_FILE, clock)
         answers = Answers(people_s, clock)
-        self.entry = Entry(
-            clock, self.leases, answers, self.audit, self.operations, self.operations, publisher
-        )
+        self.entry = Entry(clock, self.leases, answers, self.audit, self.operations, publisher)
         self.metrics = Metrics(lambda: self.state().told(), self.devices.errors, publisher)
         self.devices.fault_watch.also(self._own_faults)
         self.stop_socket: StopSocket | None = None

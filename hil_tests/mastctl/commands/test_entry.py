@@ -42,7 +42,6 @@ class World:
             Answers(self.clock),
             self.audit,
             self,
-            self,
             self.publisher,
         )
         self.acts = 0
