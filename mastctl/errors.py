@@ -88,12 +88,6 @@ class Stopped(NotNow):
         super().__init__("stopped", message)
 
 
-def latched_words(name: str, reason: str) -> str:
-    """Return what a move is refused with while an emergency stop is latched, and what would be right."""
-    words = f"an emergency stop is latched ({name}: {reason})"
-    return f"{words}; 'mastctl reset' with a reason and a name releases it"
-
-
 def one_line(text: object, longest: int) -> str:
     """Return what was said outside as one printable line, cut to ``longest`` signs; never raises.
 
