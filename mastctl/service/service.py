@@ -26,6 +26,8 @@ from mastctl.devices.frames import StampedFrame, check_known
 from mastctl.errors import MastctlError
 from mastctl.handoff.check import HandoffCheck
 from mastctl.health.health import CalibrationHealth
+from mastctl.live.settings import LiveSettings
+from mastctl.live.view import LiveView, check_installed
 from mastctl.metrics.metrics import Metrics
 from mastctl.operations.operations import Operations
 from mastctl.operations.records import Operation
@@ -94,6 +96,8 @@ class Service:
         What is counted, for Prometheus.
     recording
         The recorder, and what it hears.
+    live
+        What Foxglove shows, if the configuration asks for it.
     stop_threads
         Where the web side stops: threads that nothing else can keep busy.
     folder, latch
@@ -133,6 +137,7 @@ class Service:
             self.devices.frame_by_id,
             clock,
         )
+        self.live = None if config.live is None else self._live_view(config.live)
         people_s = SystemClock()  # clients live in real time, whatever a simulated rover's clock does
         self.leases = Leases(people_s, self._runs, self._steered)
         self.audit = AuditLog(self.folder.path / AUDIT_FILE, clock)
@@ -189,11 +194,15 @@ class Service:
             If the mast file cannot be used, or lacks a configured camera.
         DriverError
             If a driver refuses its options or cannot reach its device.
+        Unable
+            ``no_foxglove`` if a live view is asked for, and what shows it is not installed.
         """
         clock = clock or clock_for(config.hardware)
         mast = read_mast(config.mast_file, config)
         for note in mast.stored.notes:
             log.warning("%s", note)
+        if config.live is not None:
+            check_installed()
         hardware = open_hardware(config.hardware, clock)
         try:
             with clock.at_work():
@@ -288,6 +297,8 @@ class Service:
         self.handoffs.close()
         self.health.close()
         self.recording.close()
+        if self.live is not None:
+            self.live.close()
         bounded("closing the hardware", self.hardware.close, HARDWARE_CLOSE_S)
         if self.stop_socket is not None:
             self.stop_socket.close()
@@ -304,6 +315,7 @@ class Service:
         return (
             *self.handoffs.faults(),
             *self.recording.faults(),
+            *(() if self.live is None else self.live.faults()),
             *self.audit.faults(),
             *state_faults(self.folder, self.latch, self.started_s),
         )
@@ -318,6 +330,14 @@ class Service:
         self.handoffs.use_mast(stored.digest)
         self.health.use_mast(stored)
         self.recording.use_mast(mast)
+        if self.live is not None:
+            self.live.use_mast(stored.rig, stored.digest)
+
+    def _live_view(self, settings: LiveSettings) -> LiveView:
+        stored, names = self.stored, tuple(self.hardware.cameras)
+        return LiveView(
+            settings, stored.rig, stored.digest, names, self.machine.publisher, self.devices, self.clock
+        )
 
     def _runs(self) -> bool:
         """Whether an operation or a track runs; takes no lock."""
