@@ -33,6 +33,7 @@ MODULES: dict[str, tuple[str, ...]] = {
     "mastctl.cli.service": ("run", "status", "point", "snapshot"),
     "mastctl.cli.stop": ("stop", "estop", "reset", "halt"),
     "mastctl.cli.lease": ("lease",),
+    "mastctl.cli.reload": ("reload",),
     "mastctl.cli.token": ("token",),
     "mastctl.cli.track": ("track",),
     "mastctl.cli.jog": ("jog",),

@@ -74,14 +74,10 @@ class Door:
     ) -> None:
         self.limits = limits
         self._clock = clock
-        stated: Mapping[str, AxisMotion] = head.axis_motion() if isinstance(head, StatesMotion) else {}
-        _check_acceleration(limits, stated, device)
-        assumed = limits.acceleration_rad_per_s2 or ASSUMED_RAD_PER_S2
-        self._braking_rad_per_s2 = min(
-            (axis.acceleration_rad_per_s2 for axis in stated.values()), default=assumed
-        )
-        still = AxisMotion(assumed)
-        pan, tilt = (stated.get(axis, still).beyond_goal_rad for axis in ("pan", "tilt"))
+        self._device = device
+        self._stated: Mapping[str, AxisMotion] = head.axis_motion() if isinstance(head, StatesMotion) else {}
+        still = AxisMotion(ASSUMED_RAD_PER_S2)
+        pan, tilt = (self._stated.get(axis, still).beyond_goal_rad for axis in ("pan", "tilt"))
         self._beyond = pan, tilt
         self._lock = threading.Lock()
         self._rig = rig
@@ -90,7 +86,7 @@ class Door:
         self._boxes: tuple[KeepOuts | None, KeepOuts | None] = (None, None)  # without the sun, and with it
         self._sent: _Sent | None = None
         self._inside_s: Mapping[str, float] = {}  # where the head stands and should not, and since when
-        self._renew()
+        self.use_limits(limits)
 
     @property
     def sun(self) -> Sun | None:
@@ -100,6 +96,23 @@ class Door:
     def braking_rad(self, speed_rad_per_s: float) -> float:
         """Return how far an axis goes while it brakes from a speed."""
         return speed_rad_per_s**2 / (2.0 * self._braking_rad_per_s2)
+
+    def use_limits(self, limits: Limits) -> None:
+        """Let moves go out within other limits and keep-outs; a head that stands outside may go back in.
+
+        Raises
+        ------
+        BadOptions
+            If the head says that it speeds up faster than the limits allow; nothing has changed.
+        """
+        _check_acceleration(limits, self._stated, self._device)
+        assumed = limits.acceleration_rad_per_s2 or ASSUMED_RAD_PER_S2
+        with self._lock:
+            self.limits = limits
+            self._braking_rad_per_s2 = min(
+                (axis.acceleration_rad_per_s2 for axis in self._stated.values()), default=assumed
+            )
+            self._renew()
 
     def use_rig(self, rig: Rig) -> None:
         """Take another mast file's cameras to judge the sun by."""

@@ -160,6 +160,11 @@ class Recorder:
         """Put another mast file into the recording, for what comes from now on."""
         self.tell("mast_file", "in_use", mast)
 
+    def use_settings(self, settings: RecordSettings, others: list[Attached]) -> None:
+        """Keep as much as this, in the same folder; attach something else from the next file on."""
+        with self._lock:
+            self.settings, self._ring_s, self._others = settings, settings.ring_s or 0.0, others
+
     def told(self) -> dict[str, Any]:
         """Return what is recorded now, as JSON: the run's name, sizes in 10⁶ bytes, what was dropped."""
         now = self._now

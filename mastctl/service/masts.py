@@ -93,16 +93,32 @@ class Masts:
             raise NotNow("no_former_mast", "no other mast file was in use since the daemon started")
         return self._use(former)
 
-    def _use(self, mast: MastInUse) -> MastInUse:
+    @contextmanager
+    def resting(self) -> Iterator[Callable[[MastInUse], None]]:
+        """Let nothing start inside the block, which begins with a head that rests and nothing that runs.
+
+        What it gets puts another mast file into use. Raises NotNow ``busy``, ``moving``; DriverError.
+        """
         self._devices.read()  # the machine knows whether it moves now
         with self._lock:
             refusal = self._operations.refusal("rest")
             if refusal is not None:
                 raise refusal
-            self._follow(mast)
-            self.in_use, self.former = mast, self.in_use
-            self._publisher.publish("mast", "in_use", mast.told())
+            yield self._put
+
+    def use_config(self, config: Config) -> None:
+        """Read further mast files for another configuration, inside `resting`."""
+        self._config = config
+
+    def _use(self, mast: MastInUse) -> MastInUse:
+        with self.resting() as put:
+            put(mast)
+        return mast
+
+    def _put(self, mast: MastInUse) -> None:
+        self._follow(mast)
+        self.in_use, self.former = mast, self.in_use
+        self._publisher.publish("mast", "in_use", mast.told())
         for note in mast.stored.notes:
             log.warning("%s", note)
         log.info("mast file %s (%s) is in use", mast.path.name, mast.stored.digest[:12])
-        return mast

@@ -66,6 +66,7 @@ class Recording:
             facts,
             clock,
         )
+        self._hardware = facts["hardware"]
         self._feed = Feed(publisher, self.recorder, frame_by_id)
 
     def handed_over(self, handoff: MatchedHandoff) -> None:
@@ -75,6 +76,11 @@ class Recording:
     def use_mast(self, mast: MastInUse) -> None:
         """Attach another mast file, for what comes from now on."""
         self.recorder.use_mast(_told(mast))
+
+    def use_config(self, config: Config) -> None:
+        """Keep as much as another configuration says, and attach that, from the next file on."""
+        settings = replace(config.record, ring_s=config.record.ring_of(self._hardware))
+        self.recorder.use_settings(settings, [Attached(config.path.name, config.data)])
 
     def faults(self) -> tuple[StandingFault, ...]:
         """Return what keeps it from recording."""

@@ -46,6 +46,7 @@ from mastctl.service.socket_stops import SocketStops
 from mastctl.service.state import State
 from mastctl.service.steering import Steering
 from mastctl.service.stopping import Stopping, state_faults
+from mastctl.service_manager import ServiceManager
 from mastctl.state.faults import StandingFault
 from mastctl.state.machine import Machine
 from mastctl.tracking.status import ACTIVE, TrackStatus
@@ -102,6 +103,10 @@ class Service:
         Where the web side stops: threads that nothing else can keep busy.
     folder, latch
         Where state is kept that outlives the daemon; the emergency stop, if one is latched.
+    manager
+        What started this process, and hears when the configuration is read again; nobody by default.
+    reloading
+        Held while the configuration is read again.
     stop_socket
         The Unix socket for stops alone, once `open_stop_socket` was called.
     """
@@ -147,6 +152,8 @@ class Service:
         self.devices.fault_watch.also(self._own_faults)
         self.stop_socket: StopSocket | None = None
         self._socket_folder: StateFolder | None = None
+        self.reloading = threading.Lock()
+        self.manager = ServiceManager({})
         self._closing = threading.Lock()
         self._closed = False
 
@@ -319,6 +326,23 @@ class Service:
             *self.audit.faults(),
             *state_faults(self.folder, self.latch, self.started_s),
         )
+
+    def use_config(self, config: Config) -> None:
+        """Use another configuration of the same devices while nothing runs; the limits first.
+
+        Raises
+        ------
+        BadOptions
+            If the head does not keep its limits; nothing has changed.
+        """
+        self.devices.door.use_limits(config.limits)
+        if config.sun != self.config.sun:
+            self.devices.door.use_sun(config.sun)
+        self.config = config
+        self.steering.use_rig(configured(self.stored.rig, config.hardware.cameras))
+        self.tracker.use_settings(config.limits, config.tracking)
+        self.recording.use_config(config)
+        self.masts.use_config(config)
 
     def _use_mast(self, mast: MastInUse) -> None:
         """Have every part use another mast file."""

@@ -222,6 +222,11 @@ class Tracker:
         with self._held():
             self._rig = rig
 
+    def use_settings(self, limits: Limits, settings: TrackingSettings) -> None:
+        """Look within other limits and by other rules from now on."""
+        with self._held():
+            self._limits, self._settings = limits, settings
+
     @contextmanager
     def _held(self) -> Iterator[None]:
         """Hold the lock; what was said meanwhile is logged after it, since whoever writes a log may block."""

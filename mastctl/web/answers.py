@@ -488,6 +488,22 @@ class MastsTold(_Told):
     former_mast: MastTold | None
 
 
+class ChangeTold(_Told):
+    """What two configurations say differently: the key, and what was and is there; null for nothing."""
+
+    key: str
+    before: Any
+    after: Any
+
+
+class ReloadTold(_Told):
+    """``POST /reload``: what changed, the mast file in use, and sentences that say what to know of it."""
+
+    changed: list[ChangeTold]
+    mast: MastTold
+    notes: list[str]
+
+
 class StandTold(_Told):
     """Where a simulated rover truly stands."""
 

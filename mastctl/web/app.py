@@ -25,6 +25,7 @@ from mastctl.web.limits import add_limits
 from mastctl.web.pictures import add_pictures
 from mastctl.web.recordings import add_recordings
 from mastctl.web.refusals import add_errors
+from mastctl.web.reload import add_reload
 from mastctl.web.routes import add_pointing, add_tracking
 from mastctl.web.sessions import add_sessions
 from mastctl.web.simulation import add_simulation
@@ -69,6 +70,7 @@ def create_app(
     add_limits(app, service, commands)
     add_pictures(app, service, waiting, commands)
     add_recordings(app, service, waiting, commands)
+    add_reload(app, service, commands)
     add_simulation(app, service, waiting, commands)
     add_watching(app, service)
     add_events(app, service, streams or Streams(service.machine.publisher))

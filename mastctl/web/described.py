@@ -40,6 +40,7 @@ ANSWERS: Mapping[str, type[BaseModel]] = {
     "POST /lease/renew": told.LeaseGranted,
     "POST /lease/take": told.LeaseGranted,
     "DELETE /lease": told.LeaseTold,
+    "POST /reload": told.ReloadTold,
     "POST /mast": told.MastsTold,
     "POST /mast/back": told.MastsTold,
     "GET /simulation/pose": told.StandTold,

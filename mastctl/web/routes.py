@@ -17,7 +17,6 @@ from mastctl.web.models import PointBody, PoseBody, TrackBody
 
 def add_pointing(app: FastAPI, service: Service, commands: Commands) -> None:
     """State, operations and the stop."""
-    limits = service.config.limits
 
     @app.get(f"{PREFIX}/status", summary="What is known at this moment")
     async def status() -> dict[str, Any]:
@@ -31,7 +30,7 @@ def add_pointing(app: FastAPI, service: Service, commands: Commands) -> None:
         def act() -> dict[str, Any]:
             return {"id": service.steering.point(asked, told).id}
 
-        return await commands.run(POINT, came, told, act, usual_s(limits, looks))
+        return await commands.run(POINT, came, told, act, usual_s(service.config.limits, looks))
 
     @app.get(f"{PREFIX}/operations", summary="The newest operations, without their steps")
     async def operations() -> dict[str, Any]:
@@ -49,7 +48,9 @@ def add_pointing(app: FastAPI, service: Service, commands: Commands) -> None:
 def add_tracking(app: FastAPI, service: Service, commands: Commands) -> None:
     """The rover's pose, and the track."""
     told = service.track_told
-    allowed_s = usual_s(service.config.limits, 1)
+
+    def allowed_s() -> float:
+        return usual_s(service.config.limits, 1)
 
     @app.post(f"{PREFIX}/pose", summary="Say where the rover stands; a track is carried over and looked for")
     async def pose(body: PoseBody, came: Headers) -> dict[str, Any]:
@@ -59,7 +60,7 @@ def add_tracking(app: FastAPI, service: Service, commands: Commands) -> None:
             operation = service.steering.take_pose(stands, body.look)
             return {"operation": operation, "track": told()}
 
-        return await commands.run(POSE, came, body.model_dump(exclude_none=True), act, allowed_s)
+        return await commands.run(POSE, came, body.model_dump(exclude_none=True), act, allowed_s())
 
     @app.get(f"{PREFIX}/track", summary="The track at this moment")
     async def track() -> dict[str, Any]:
@@ -72,11 +73,13 @@ def add_tracking(app: FastAPI, service: Service, commands: Commands) -> None:
         def act() -> dict[str, Any]:
             return {"id": service.steering.start_track(body.target(), {"track": asked}).id}
 
-        return await commands.run(TRACK, came, asked, act, allowed_s)
+        return await commands.run(TRACK, came, asked, act, allowed_s())
 
     @app.post(f"{PREFIX}/track/look", status_code=202, summary="Look for the target once more")
     async def look(came: Headers) -> dict[str, Any]:
-        return await commands.run(TRACK_LOOK, came, {}, lambda: {"id": service.steering.look().id}, allowed_s)
+        return await commands.run(
+            TRACK_LOOK, came, {}, lambda: {"id": service.steering.look().id}, allowed_s()
+        )
 
     @app.post(f"{PREFIX}/track/stop", summary="End the track; the head stops if it moves for it")
     async def stop(came: Headers) -> dict[str, Any]:

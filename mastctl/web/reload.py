@@ -1,0 +1,26 @@
+"""The route by which the configuration is read again."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from fastapi import FastAPI
+
+from mastctl.commands.entry import RELOAD
+from mastctl.service.reload import reload
+from mastctl.service.service import Service
+from mastctl.web import PREFIX
+from mastctl.web.commands import Commands, Headers
+
+
+def add_reload(app: FastAPI, service: Service, commands: Commands) -> None:
+    """``POST /reload``."""
+
+    @app.post(
+        f"{PREFIX}/reload", summary="Read the configuration again: all of it comes into use, or nothing"
+    )
+    async def read_again(came: Headers) -> dict[str, Any]:
+        def act() -> dict[str, Any]:
+            return reload(service)
+
+        return await commands.run(RELOAD, came, {}, act)
