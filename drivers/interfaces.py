@@ -145,6 +145,19 @@ class StatesMotion(Protocol):
         ...
 
 
+@runtime_checkable
+class StopsBeside(Protocol):
+    """A head whose ``stop`` is confirmed sooner beside a call under way than after it; not every head's is.
+
+    Attributes
+    ----------
+    stops_beside
+        True: then a stop does not wait for the call.
+    """
+
+    stops_beside: bool
+
+
 class Reporting(ABC):
     """What a head may be beside a `PanTilt`: one that knows its counts."""
 

@@ -15,6 +15,7 @@ import os
 import signal
 import socket
 import ssl
+import sys
 import threading
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future
@@ -60,6 +61,7 @@ from mastctl.web.whose_page import Names
 log = logging.getLogger(__name__)
 
 GRACE_S = 2  # for answers under way, when the daemon ends; what waits for a device is refused at once
+SWITCH_S = 0.0005  # a stop goes through five threads and may wait so long for each; 5 ms by default
 START_TIMEOUT_S = 600.0  # the first start compiles the simulator's kernels
 END_TIMEOUT_S = 20.0
 MOST_PEM_BYTES = 1_000_000
@@ -94,6 +96,7 @@ def run(config: Config, on_ready: Callable[[str], None], clock: Clock | None = N
         From opening the service.
     """
     _check_tls(config.listen)
+    sys.setswitchinterval(SWITCH_S)
     with _listening(config.listen) as (listener, url):
         service = _opened(config, clock, _state_folder(config), url)
         _let_log_stall(service)

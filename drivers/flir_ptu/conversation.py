@@ -15,6 +15,7 @@ One that stays terse or without such an echo is understood too; it is listened t
 
 from __future__ import annotations
 
+import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterator
@@ -22,7 +23,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import TypeVar
 
-from drivers.errors import BadReply, NoReply, Refused
+from drivers.errors import BadReply, DriverError, NoReply, Refused
 from drivers.flir_ptu.replies import Answer, LineSplitter, answer_of, hits_of, number_of, without_hits
 from drivers.serial_line import SerialLine
 
@@ -36,6 +37,11 @@ LONGEST_DRAIN_S = 0.4
 PATIENT_TRIES = 3
 STEP_TRIES = 3
 AGREEING_TRIES = 5
+ORDER_S = 0.01  # how long a shout waits for another thread's write
+
+
+class Interrupted(DriverError):
+    """Something was shouted meanwhile; the command was not sent, and its caller gives way."""
 
 
 @dataclass(frozen=True)
@@ -84,6 +90,11 @@ class Conversation:
         The head's name in errors.
     on_hit
         Told the axis, ``pan`` or ``tilt``, whenever a limit hit comes that nobody asked for.
+
+    Attributes
+    ----------
+    gives_way
+        Whether nothing is asked any more when something was shouted.
     """
 
     def __init__(self, line: SerialLine, device: str, on_hit: Callable[[str], None]) -> None:
@@ -97,6 +108,9 @@ class Conversation:
         self._tries = 1
         self._turn = 0
         self._last_written = ""
+        self._order = threading.Lock()  # nothing is asked between a shout and its answer
+        self._shouts = 0  # whose answers are still to come
+        self.gives_way = True
         self._answered = b""  # the last line that was taken for an answer
         self.byte_s = line.byte_s
         self.reply_s = REPLY_S + REPLY_BYTES * line.byte_s
@@ -196,11 +210,50 @@ class Conversation:
             raise Refused(f"refuses R: {answer.text or 'without words'}", device=self._device)
 
     def shout(self, command: str) -> None:
-        """Send a command beside whatever is under way, from any thread; its answer upsets the other exchange.
+        """Send a command beside a call under way, from any thread.
 
-        Raises LineLost.
+        That call gets its answer, and `Interrupted` with its next question; then `shouted` takes this one's.
+
+        Raises
+        ------
+        LineLost
+            If the line is gone.
         """
-        self._line.write(f"{command} ".encode())
+        ordered = self._order.acquire(timeout=ORDER_S)
+        try:
+            self._shouts += 1
+            self._line.write(f"{command} ".encode())
+        finally:
+            if ordered:
+                self._order.release()
+
+    def shouted(self, command: str) -> bool:
+        """Take the answer of what was shouted; return whether it was a good one, and nothing else came.
+
+        A unit answers in order, and echoes letter by letter which question it answers: so both sides are in
+        step still. If anything is otherwise, or nothing was shouted, `tell` says what is to be done.
+
+        Raises
+        ------
+        LineLost
+            If the line is gone.
+        """
+        if not (self._shouts and self._in_step and self._manners.exact):
+            return False
+        self._in_step = False
+        while self._shouts:
+            self._answered, self._last_written = b"", command  # two stops have the same answer
+            try:
+                answer = self._next_answer(command, time.monotonic() + self.reply_s, skip=False)
+            except (NoReply, BadReply):
+                return False
+            if not (answer.good and answer.exact):
+                return False
+            with self._order:
+                self._shouts -= 1
+        self._answered = b""
+        self._in_step = True
+        return True
 
     def close(self) -> None:
         """Close the line."""
@@ -228,6 +281,7 @@ class Conversation:
         """The same, one time; on any error the two sides are out of step."""
         if not self._in_step:
             raise BadReply("is out of step with this program", device=self._device)
+        self._give_way(command)
         self._in_step = False
         for line in self._splitter.feed(self._line.read(0.0)):
             self._note_hits(line)
@@ -238,8 +292,10 @@ class Conversation:
         if without_hits(begun):
             raise BadReply(f"was in the middle of saying {_shown(begun)}", device=self._device)
         self._lines.clear()
-        written = self._written(command)
-        self._line.write(f"{written} ".encode())
+        with self._order:
+            self._give_way(command)
+            written = self._written(command)
+            self._line.write(f"{written} ".encode())
         answer = self._next_answer(written, time.monotonic() + patience_s, skip=False)
         if self._manners.echo and not answer.echo:
             raise BadReply(f"answered {command} without its echo", device=self._device)
@@ -249,6 +305,12 @@ class Conversation:
         if not answer.good:
             raise Refused(f"refuses {command}: {answer.text or 'without words'}", device=self._device)
         return answer.text
+
+    def _give_way(self, command: str) -> None:
+        """Raise Interrupted if something was shouted; who makes a unit ready goes through with it."""
+        if self._shouts and self.gives_way and self._tries == 1:
+            self._in_step = True
+            raise Interrupted(f"a stop came before {command} was sent", device=self._device)
 
     def _speaks_twice(self, line: bytes) -> bool:
         """Whether a line that nobody asked for puts the last answer in doubt: it may be the true one."""
@@ -344,6 +406,7 @@ class Conversation:
         """Throw away what comes until nothing has come for a while; limit hits are noted."""
         self._in_step = False
         self._answered = b""
+        self._shouts = 0
         unknown = self._manners.exact is None
         quiet_s = QUIET_S if unknown or self._manners.exact else max(QUIET_S, self.reply_s)
         until_s = time.monotonic() + quiet_s + LONGEST_DRAIN_S

@@ -25,7 +25,7 @@ from drivers.clock import Clock, SystemClock
 from drivers.errors import BadReply, DriverError, HardwareFault, LineLost, NoReply, OutOfRange
 from drivers.flir_ptu import conversation as ask
 from drivers.flir_ptu.axis import StepAxis
-from drivers.flir_ptu.conversation import Conversation
+from drivers.flir_ptu.conversation import Conversation, Interrupted
 from drivers.flir_ptu.count import StepCount
 from drivers.flir_ptu.options import DEVICE, Options, options_from
 from drivers.flir_ptu.position import measure
@@ -37,7 +37,8 @@ from drivers.serial_line import SerialLine
 log = logging.getLogger(__name__)
 
 SILENT_CALLS = 5  # calls without an answer, after which the line is opened anew
-STOP_PATIENCE_S = 0.02  # how long a stop waits for a call that is under way before it goes out beside it
+STOP_OVER_S = 1.0  # how long a reading waits for the stop that it gave way to
+READ_TRIES = 3  # of a reading that stops come into
 
 
 def open_head(options: Mapping[str, Any], clock: Clock | None = None) -> FlirPtu:
@@ -69,13 +70,19 @@ class FlirPtu:
     ----------
     version
         What the unit says about itself.
+    stops_beside
+        A stop is confirmed sooner beside a call under way than after it.
     """
+
+    stops_beside = True
 
     def __init__(self, options: Options, clock: Clock) -> None:
         self._options = options
         self._clock = clock
         self._lock = threading.RLock()
         self._stop_asked = threading.Event()
+        self._stop_over = threading.Event()
+        self._stop_over.set()
         self._count = StepCount()
         self._supply = SupplyWatch(options)
         self._absence = Absence()
@@ -88,7 +95,7 @@ class FlirPtu:
         self._connect()
 
     def read(self) -> Reading:
-        """Return where the axes are.
+        """Return where the axes are. A stop that comes meanwhile goes first.
 
         Raises
         ------
@@ -99,6 +106,13 @@ class FlirPtu:
         WrongDevice
             If what answers after that does not fit the options any more.
         """
+        for _ in range(READ_TRIES - 1):
+            with suppress(Interrupted):
+                return self._read()
+            self._stop_over.wait(STOP_OVER_S)
+        return self._read()
+
+    def _read(self) -> Reading:
         with self._talking() as talk:
             pan, tilt = self._axes["pan"], self._axes["tilt"]
             time_s = measure(talk, pan, tilt, self._clock)
@@ -156,8 +170,9 @@ class FlirPtu:
         """Halt both axes; they hold where they come to rest, and no second leg of a move follows.
 
         If another call is under way, anything has to be asked first, or bytes came that nobody asked for, the
-        halt goes out at once, and again in order. A line that is away is tried at once: a unit has no
-        watchdog that silence would trip.
+        halt goes out at once. A call under way gets the answer that it waits for, and then gives way; where
+        anything else comes, the halt goes out again in order. A line that is away is tried at once: a unit
+        has no watchdog that silence would trip.
 
         Raises
         ------
@@ -165,7 +180,8 @@ class FlirPtu:
             If the unit did not confirm.
         """
         self._stop_asked.set()
-        free = self._lock.acquire(timeout=STOP_PATIENCE_S)
+        self._stop_over.clear()
+        free = self._lock.acquire(blocking=False)
         try:
             self._forget_legs()
             in_order = free and self._talk is not None and self._talk.is_in_step and not self._count.doubted
@@ -179,6 +195,7 @@ class FlirPtu:
         finally:
             self._forget_legs()  # those of a move that was under way beside it, whatever the unit has said
             self._stop_asked.clear()
+            self._stop_over.set()
             if free:
                 self._lock.release()
 
@@ -198,12 +215,13 @@ class FlirPtu:
     # The line
 
     @contextmanager
-    def _talking(self) -> Iterator[Conversation]:
+    def _talking(self, gives_way: bool = True) -> Iterator[Conversation]:
         """The conversation in step, for one caller at a time; a line that turns out dead is closed."""
         with self._lock:
             if self._closed:
                 raise NoReply("it is closed", device=DEVICE)
             talk = self._talk or self._connect()
+            talk.gives_way = gives_way
             try:
                 if self._count.doubted:
                     self._check(talk, talk.in_step())
@@ -293,8 +311,9 @@ class FlirPtu:
             axis.speed = speed
 
     def _halt(self, talk: Conversation) -> None:
-        """Halt both axes."""
-        talk.tell("H")
+        """Halt both axes; a halt that was sent beside another call needs its answer only."""
+        if not talk.shouted("H"):
+            talk.tell("H")
         self._count.halt_owed = False
         for axis in self._axes.values():
             axis.stopped(self._clock.now_s())
@@ -308,7 +327,7 @@ class FlirPtu:
 
     def _halt_in_order(self) -> None:
         """Halt both axes in a conversation that is in step."""
-        with self._talking() as talk:
+        with self._talking(gives_way=False) as talk:
             self._halt(talk)
 
     def _forget_legs(self) -> None:

@@ -23,6 +23,7 @@ from drivers.interfaces import (
     PanTilt,
     Reading,
     Reporting,
+    StopsBeside,
 )
 from mastctl.devices import joint_history
 from mastctl.devices.cameras import Cameras
@@ -33,7 +34,7 @@ from mastctl.devices.frames import FrameStore, StampedFrame
 from mastctl.devices.joint_history import JointHistory
 from mastctl.devices.keep_out import Pair
 from mastctl.devices.limits import Limits
-from mastctl.devices.stops import Stops
+from mastctl.devices.stops import AT_ONCE_S, PATIENCE_S, Stops
 from mastctl.devices.sun import Sun
 from mastctl.devices.thread import DeviceThread
 from mastctl.devices.ways import Way
@@ -148,7 +149,8 @@ class Devices:
         self._head = DeviceThread(
             HEAD, between=self._poll, between_timeout_s=READ_TIMEOUT_S, words=WORDS, clock=self._time
         )
-        self._stops = Stops(self._head, HEAD, lambda: self._pan_tilt.stop(), self._time)
+        patience_s = AT_ONCE_S if _stops_beside(self._pan_tilt) else PATIENCE_S
+        self._stops = Stops(self._head, HEAD, lambda: self._pan_tilt.stop(), self._time, patience_s)
         self.fault_watch.begin()
 
     # The head
@@ -378,3 +380,7 @@ class Devices:
                 words = f"report returned {type(axis).__name__} where an AxisReport is expected"
                 raise BadReply(words, device=HEAD)
         return told
+
+
+def _stops_beside(head: object) -> bool:
+    return isinstance(head, StopsBeside) and head.stops_beside is True

@@ -16,6 +16,7 @@ from mastctl.errors import MastctlError, Stopped
 from mastctl.state.faults import StandingFault
 
 PATIENCE_S = 0.05  # how long a stop waits for the head's own thread before it goes out beside it
+AT_ONCE_S = 0.002  # the same for a driver that is at its best beside a call under way
 LATEST_SHARE = 1 / 8  # of the time that a head hangs already: a new stop waits no longer for its own way
 MAY_MOVE = "the head may still move"
 UNTIL = "a stop is confirmed, or a later move is taken and the head then rests"
@@ -48,11 +49,19 @@ class Stops:
         The driver's stop.
     clock
         What deadlines run on; the machine's own by default.
+    patience_s
+        How long a stop waits for the head's own thread before it goes out beside it, seconds.
     """
 
     def __init__(
-        self, thread: DeviceThread, device: str, stop: Callable[[], None], clock: Clock | None = None
+        self,
+        thread: DeviceThread,
+        device: str,
+        stop: Callable[[], None],
+        clock: Clock | None = None,
+        patience_s: float = PATIENCE_S,
     ) -> None:
+        self._patience_s = patience_s
         self._clock = clock or SystemClock()
         self._thread = thread
         self._device = device
@@ -166,7 +175,7 @@ class Stops:
                 again_s = deadline_s
                 if self._queued_s is not None and not beside:
                     began_s = [one.began_s for one in self._inside]
-                    at_s = max(asked_s + PATIENCE_S, room_s(began_s, timeout_s))
+                    at_s = max(asked_s + self._patience_s, room_s(began_s, timeout_s))
                     beside = now_s >= at_s
                     if beside:
                         alone = self._go_beside(asked_s, timeout_s)

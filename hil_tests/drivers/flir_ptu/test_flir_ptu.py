@@ -656,6 +656,58 @@ def test_a_stop_goes_out_while_the_unit_still_owes_another_call_its_answer(opene
     assert under_way[0]
 
 
+@pytest.mark.parametrize("stops", [1, 3])
+def test_a_stop_into_a_question_that_is_answered_keeps_both_sides_in_step(opened: Opener, stops: int) -> None:
+    head, unit = opened()
+    asked, halted = threading.Event(), threading.Event()
+
+    def late(command: str) -> bytes:
+        asked.set()
+        assert halted.wait(10.0)
+        return b"* Current Pan position is 0"
+
+    readings: list[Any] = []
+    reading = threading.Thread(target=lambda: readings.append(head.read()))
+    unit.answers["PP"] = late
+    talk = head._talk
+    assert talk is not None
+    talk.reply_s = 10.0
+    unit.heard.clear()
+    reading.start()
+    assert asked.wait(10.0)
+    threads = [threading.Thread(target=head.stop) for _ in range(stops)]
+    for thread in threads:
+        thread.start()
+    until(lambda: talk._shouts == stops, "all of them are sent")
+    del unit.answers["PP"]
+    halted.set()
+    for thread in (*threads, reading):
+        thread.join(10.0)
+    assert len(readings) == 1, "and the reading is made after the stop"
+    assert unit.heard[: 2 + stops] == ["TP", "PP"] + ["H"] * stops
+    assert not [command for command in unit.heard if command in ("PR", "TR")], "nobody asks for the step"
+    assert talk.is_in_step
+
+
+def test_a_move_that_a_stop_comes_into_is_not_started(opened: Opener) -> None:
+    head, unit = opened()
+    assert head._talk is not None
+    stopping = threading.Thread(target=head.stop)
+
+    def slaved(command: str) -> bytes:
+        stopping.start()
+        until(lambda: head._talk is not None and head._talk._shouts == 1, "the stop")
+        return b"*"
+
+    unit.answers["S"] = slaved
+    unit.heard.clear()
+    with pytest.raises(DriverError, match="a stop came before PP"):
+        head.move(0.5, 0.2)
+    stopping.join(10.0)
+    assert "I" not in unit.heard
+    assert not head.read().moving
+
+
 def test_a_stop_goes_out_before_a_unit_that_is_in_doubt_is_checked(opened: Opener) -> None:
     head, unit = opened()
     rested(head)
