@@ -245,6 +245,22 @@ class Door:
             found.append(StandingFault(name, code, words, since_s, until))
         return tuple(found)
 
+    def in_the_way(self, reading: Reading | None) -> str | None:
+        """Return the keep-out that a head under way may enter, by name; None if there is none.
+
+        For a keep-out that came after the move was let through. A head that is in it and goes out is let go.
+        """
+        keep_outs, sent = self._now(), self._sent
+        if keep_outs is None or sent is None or reading is None:
+            return None
+        start, rests = self._start(reading)
+        if rests:
+            return None
+        held = {box.name for box in keep_outs.holding(Span.around((reading.pan_rad, reading.tilt_rad)))}
+        ends_in = keep_outs.holding(self._round(sent.goal))
+        passes = (box for box in keep_outs.holding(start) if box.name not in held)
+        return next((box.name for box in (*ends_in, *passes)), None)
+
     def told(self) -> dict[str, Any]:
         """Return the sun as ``GET /limits/sun`` tells it."""
         sun, now_s = self._sun, self._clock.now_s()

@@ -32,6 +32,7 @@ def add_limits(app: FastAPI, service: Service, commands: Commands) -> None:
 
         def act() -> dict[str, Any]:
             door.use_sun(sun)
+            stop_before_keep_outs(service)
             return door.told()
 
         return await commands.run(SUN, came, body.model_dump(exclude_none=True), act)
@@ -43,3 +44,10 @@ def add_limits(app: FastAPI, service: Service, commands: Commands) -> None:
             return door.told()
 
         return await commands.run(SUN_FORGET, came, {}, act)
+
+
+def stop_before_keep_outs(service: Service) -> None:
+    """Stop a head that is under way into what has come to be kept out. Raises DriverError."""
+    name = service.devices.door.in_the_way(service.devices.last_reading)
+    if name is not None:
+        service.operations.stop(f"the keep-out {name} came to lie in the head's way")

@@ -12,6 +12,7 @@ from mastctl.pointing.requests import AnglesTarget
 from mastctl.service.service import Service
 from mastctl.web import PREFIX
 from mastctl.web.commands import Commands, Headers
+from mastctl.web.limits import stop_before_keep_outs
 from mastctl.web.models import PointBody, PoseBody, TrackBody
 
 
@@ -58,6 +59,7 @@ def add_tracking(app: FastAPI, service: Service, commands: Commands) -> None:
 
         def act() -> dict[str, Any]:
             operation = service.steering.take_pose(stands, body.look)
+            stop_before_keep_outs(service)  # a sun of the site frame turns with the rover
             return {"operation": operation, "track": told()}
 
         return await commands.run(POSE, came, body.model_dump(exclude_none=True), act, allowed_s())

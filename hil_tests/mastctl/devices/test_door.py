@@ -184,6 +184,25 @@ def test_the_sun_is_kept_out_until_its_moment_and_then_missed_aloud() -> None:
     assert door.faults(at(0.5, 0.02)) == () and door.told() == {"sun": None}
 
 
+def test_a_sun_that_is_told_in_the_way_of_a_head_is_found_there_but_not_behind_it() -> None:
+    door = door_of(replace(LIMITS, keep_out=()))
+    door.use_sun(Sun(direction_of(2.4, 0.5), "rover", 0.1))  # somewhere else
+    start = door.check_move((1.0, 0.0), lambda: at(-1.0, 0.0))
+    door.sent(start, (1.0, 0.0), 0.5)
+    assert door.in_the_way(at(-0.8, 0.0, moving=True)) is None
+    door.use_sun(Sun(direction_of(0.0, 0.0), "rover", 0.1))
+    assert door.in_the_way(at(-0.8, 0.0, moving=True)) == "sun"
+    assert door.in_the_way(at(0.0, 0.0, moving=True)) is None  # it looks there and goes out
+    assert door.in_the_way(at(0.8, 0.0, moving=True)) is None  # it has passed
+    door.use_sun(Sun(direction_of(1.0, 0.0), "rover", 0.1))
+    assert door.in_the_way(at(0.95, 0.0, moving=True)) == "sun"  # it would come to rest there
+    clock = door._clock
+    assert isinstance(clock, ManualClock)
+    clock.advance(1.0)
+    assert door.in_the_way(at(1.0, 0.0)) is None  # it rests; nothing is to be stopped
+    assert door.in_the_way(None) is None
+
+
 def test_a_sun_of_the_site_turns_with_the_rover() -> None:
     sun = Sun(direction_of(0.5, 0.0), "site", 0.1)
     door = door_of(replace(LIMITS, keep_out=()), sun=sun)

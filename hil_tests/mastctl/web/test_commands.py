@@ -225,6 +225,29 @@ def test_what_is_wrong_with_a_lease_is_one_sentence(
 # Once and not twice
 
 
+@pytest.mark.parametrize(
+    ("path", "body"),
+    [
+        ("/limits/sun", {"direction": [1, 0, 0], "frame": "rover", "half_angle_rad": 0.1}),
+        ("/pose", {"position_m": [0, 0, 0], "quaternion": [1, 0, 0, 0]}),
+    ],
+)
+def test_a_head_under_way_into_what_comes_to_be_kept_out_is_stopped(
+    web: httpx.Client, pair: Pair, monkeypatch: pytest.MonkeyPatch, path: str, body: dict[str, Any]
+) -> None:
+    monkeypatch.setattr(ScriptedLoop, "script", staticmethod(waits))
+    name = web.post("/point", json=ANGLES).json()["id"]
+    eventually(lambda: web.get(f"/operations/{name}").json()["state"] == "running", "it runs")
+    assert web.post(path, json=body).status_code == 200
+    assert web.get(f"/operations/{name}").json()["state"] == "running"
+    door = pair[0].service.devices.door
+    monkeypatch.setattr(door, "in_the_way", lambda reading: "sun")
+    assert web.post(path, json=body).status_code == 200
+    eventually(lambda: web.get(f"/operations/{name}").json()["state"] == "stopped", "it is stopped")
+    assert "keep-out sun" in web.get(f"/operations/{name}").json()["error"]["message"]
+    assert ("stop",) in pair[1].head.calls
+
+
 def test_a_key_that_released_one_lease_does_not_tell_that_the_next_one_is_released(web: httpx.Client) -> None:
     def acquired() -> dict[str, str]:
         lease = web.post("/lease", json={}, headers={"Mastctl-Client": "bench"}).json()["lease_id"]
