@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import threading
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -109,6 +110,17 @@ def test_a_fault_keeps_the_ring_once_and_what_comes_after_it(
     (kept,) = [path for path in files(tmp_path) if name in str(path)]
     assert [n["number"] for n in told(kept, "/command")] == [1, 2]
     assert told(kept, "/fault")[0]["faults"][0]["code"] == "no_reply"
+
+
+def test_the_recorders_own_fault_keeps_nothing_on_a_disk_that_may_be_full(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(module, "AFTER_FAULT_S", 0.0)
+    one = recorder(tmp_path)
+    one.tell("fault", module.NAME, (replace(FAULT, device=module.NAME),))
+    one.close()
+    assert "kept" not in kinds(tmp_path)
+    assert [told(path, "/fault")[0]["device"] for path in files(tmp_path)] == [module.NAME]
 
 
 def test_what_was_kept_is_bounded_and_the_oldest_goes_first(tmp_path: Path) -> None:
