@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+from mastctl.client.async_client import AsyncClient
 from mastctl.client.client import DEFAULT_URL, Client
 from mastctl.client.connection import ClientError
 
 if TYPE_CHECKING:
     from mastctl.client.snapshot import Snapshot
 
-__all__ = ["DEFAULT_URL", "Client", "ClientError", "Snapshot"]
+__all__ = ["DEFAULT_URL", "AsyncClient", "Client", "ClientError", "Snapshot"]
 
 
 def __getattr__(name: str) -> Any:

@@ -9,13 +9,15 @@ import socket
 import ssl
 import sys
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 from urllib.parse import unquote, urlsplit
 
 import httpx
+
+T = TypeVar("T")
 
 PREFIX = "/api/v1"
 AGAIN_S = (0.1, 0.5)  # pauses before a command goes out again on a new connection
@@ -61,31 +63,43 @@ class Broken(ClientError):
     """The connection broke: whether the daemon got the request is not known."""
 
 
-class DaemonHttp:
-    """A connection to one daemon; parameters and errors as `Client` has them."""
+class Connection:
+    """A connection to one daemon, by whichever transport; parameters and errors as `Client` has them."""
 
     def __init__(self, url: str, timeout_s: float, name: str | None = None, token: str | None = None) -> None:
         self.url = url
-        token = token or os.environ.get("MASTCTL_TOKEN")
-        if token and not (token.isascii() and token.isprintable()):
+        self._token = token or os.environ.get("MASTCTL_TOKEN")
+        if self._token and not (self._token.isascii() and self._token.isprintable()):
             raise ClientError("bad_token", "the token has signs that no token has", exit_code=2)
         self.timeout_s = timeout_s
         self.name = plain_name(name or program_name())
         self.lease_id: str | None = None  # goes with whatever is asked
-        shown = {"Authorization": f"Bearer {token}"} if token else {}
-        transport: httpx.HTTPTransport | None = None
-        base = url.rstrip("/")
-        if url.startswith("unix:"):
-            transport = httpx.HTTPTransport(uds=unquote(url.removeprefix("unix:").removeprefix("//")))
-            base = "http://localhost"
+
+    def beside(self, timeout_s: float) -> DaemonHttp:
+        """Return another connection of the same program, under the same lease."""
+        other = DaemonHttp(self.url, timeout_s, self.name, self._token)
+        other.lease_id = self.lease_id
+        return other
+
+    @property
+    def _socket(self) -> str | None:
+        """Path of the daemon's Unix socket, if it has one."""
+        if not self.url.startswith("unix:"):
+            return None
+        return unquote(self.url.removeprefix("unix:").removeprefix("//"))
+
+    def _made(self, kind: Callable[..., T], transport: object) -> T:
+        """Make the client of httpx. Raises ClientError ``bad_url``."""
+        base = "http://localhost" if self._socket is not None else self.url.rstrip("/")
+        shown = {"Authorization": f"Bearer {self._token}"} if self._token else {}
         try:
             parts = urlsplit(base)
             if parts.scheme not in ("http", "https") or not parts.hostname or (parts.port or 1) < 1:
                 raise ValueError
             # No proxy of the environment: the daemon is on this machine, or reached by a tunnel to it.
-            self._http = httpx.Client(
+            return kind(
                 base_url=base,
-                timeout=timeout_s,
+                timeout=self.timeout_s,
                 headers={"Mastctl-Client": self.name, **shown},
                 trust_env=False,
                 transport=transport,
@@ -94,19 +108,41 @@ class DaemonHttp:
         except (ValueError, httpx.InvalidURL):
             raise ClientError(
                 "bad_url",
-                f"'{url}' is no address of a daemon; http://127.0.0.1:8420 or unix:/path is expected",
+                f"'{self.url}' is no address of a daemon; http://127.0.0.1:8420 or unix:/path is expected",
                 exit_code=2,
             ) from None
 
-    def beside(self, timeout_s: float) -> DaemonHttp:
-        """Return another connection of the same program, under the same lease."""
-        other = DaemonHttp(self.url, timeout_s, self.name)
-        other.lease_id = self.lease_id
-        return other
+    def refused(self, answer: httpx.Response) -> ClientError:
+        """Return what an answer says that is not a good one."""
+        try:
+            told = answer.json()["error"]
+            code, message, detail = str(told["code"]), str(told["message"]), told.get("detail")
+        except (ValueError, LookupError, TypeError, AttributeError):
+            return self.bad_answer(f"it says {answer.status_code}, not in the way of this program")
+        exit_code = 2 if answer.status_code in _BAD_INPUT else 1
+        return ClientError(code, message, detail if isinstance(detail, dict) else None, exit_code)
 
-    def json(self, method: str, path: str, **options: Any) -> dict[str, Any]:
-        """Ask, and return the answer, which must be a JSON object."""
-        answer = self.ask(method, path, **options)
+    def bad_answer(self, reason: str) -> ClientError:
+        """Return the error of an answer that no daemon of this program gives."""
+        return ClientError("bad_answer", f"what answers at {self.url} is no mastctl daemon: {reason}")
+
+    @contextmanager
+    def _failures(self, silent: str) -> Iterator[None]:
+        """What a connection may meet, as ClientError."""
+        try:
+            yield
+        except ValueError as error:  # numbers that JSON does not have
+            raise ClientError("bad_request", f"the request cannot be sent: {error}", exit_code=2) from None
+        except (httpx.ConnectError, httpx.ConnectTimeout):
+            words = f"no daemon answers at {self.url}; 'mastctl run' starts one"
+            raise ClientError("no_daemon", words) from None
+        except httpx.TimeoutException:
+            raise ClientError("timeout", silent) from None
+        except httpx.HTTPError as error:
+            raise Broken("no_daemon", f"the connection to {self.url} broke: {error}") from None
+
+    def _document(self, answer: httpx.Response) -> dict[str, Any]:
+        """Return what an answer holds, which must be a JSON object."""
         try:
             document = answer.json()
         except ValueError:
@@ -114,6 +150,34 @@ class DaemonHttp:
         if not isinstance(document, dict):
             raise self.bad_answer("the answer is not a JSON object")
         return document
+
+    def _leased(self, options: dict[str, Any]) -> dict[str, Any]:
+        """Return a request's options with the lease in its headers."""
+        if self.lease_id is None:
+            return options
+        return options | {"headers": {"Mastctl-Lease": self.lease_id, **(options.get("headers") or {})}}
+
+    def _event(self, line: str) -> dict[str, Any] | None:
+        """Return what a line of a stream tells, None for a sign of life."""
+        if line.startswith(":"):
+            return None
+        try:
+            return dict(json.loads(line.removeprefix("data:")))
+        except (ValueError, TypeError):
+            raise self.bad_answer("an event of the stream is not JSON") from None
+
+
+class DaemonHttp(Connection):
+    """A connection whose questions are waited for; parameters and errors as `Client` has them."""
+
+    def __init__(self, url: str, timeout_s: float, name: str | None = None, token: str | None = None) -> None:
+        super().__init__(url, timeout_s, name, token)
+        transport = None if self._socket is None else httpx.HTTPTransport(uds=self._socket)
+        self._http = self._made(httpx.Client, transport)
+
+    def json(self, method: str, path: str, **options: Any) -> dict[str, Any]:
+        """Ask, and return the answer, which must be a JSON object."""
+        return self._document(self.ask(method, path, **options))
 
     def command(
         self,
@@ -130,9 +194,7 @@ class DaemonHttp:
         Where the connection breaks it is asked again with the same key, by which the daemon gives the first
         one's answer and does nothing twice.
         """
-        headers = {"Idempotency-Key": key or secrets.token_hex(16)}
-        if deadline_s is not None:
-            headers["Deadline-S"] = repr(float(deadline_s))
+        headers = _headers_of(key, deadline_s)
         if body is not None:
             options["json"] = body
         for pause_s in AGAIN_S:
@@ -144,32 +206,15 @@ class DaemonHttp:
 
     def ask(self, method: str, path: str, **options: Any) -> httpx.Response:
         """Ask, and return a good answer; everything else is a ClientError."""
-        if self.lease_id is not None:
-            options["headers"] = {"Mastctl-Lease": self.lease_id, **(options.get("headers") or {})}
-        answer = self.send(method, PREFIX + path, **options)
+        answer = self.send(method, PREFIX + path, **self._leased(options))
         if answer.is_success:
             return answer
         raise self.refused(answer)
 
-    def refused(self, answer: httpx.Response) -> ClientError:
-        """Return what an answer says that is not a good one."""
-        try:
-            told = answer.json()["error"]
-            code, message, detail = str(told["code"]), str(told["message"]), told.get("detail")
-        except (ValueError, LookupError, TypeError, AttributeError):
-            return self.bad_answer(f"it says {answer.status_code}, not in the way of this program")
-        exit_code = 2 if answer.status_code in _BAD_INPUT else 1
-        return ClientError(code, message, detail if isinstance(detail, dict) else None, exit_code)
-
     def send(self, method: str, path: str, **options: Any) -> httpx.Response:
         """Ask for a path of the whole address, and return the answer whatever it is."""
         with self._failures(f"the daemon at {self.url} took the request but did not answer"):
-            try:
-                return self._http.request(method, path, **options)
-            except ValueError as error:
-                raise ClientError(
-                    "bad_request", f"the request cannot be sent: {error}", exit_code=2
-                ) from None
+            return self._http.request(method, path, **options)
 
     def heard(
         self, path: str, query: Mapping[str, Any] | None = None, silent_s: float | None = None
@@ -178,25 +223,18 @@ class DaemonHttp:
 
         ``timeout`` is raised if it is silent for ``silent_s`` seconds, those of each request by default.
         """
-        headers = {} if self.lease_id is None else {"Mastctl-Lease": self.lease_id}
         with (
             self._failures(f"the daemon at {self.url} fell silent"),
             self._http.stream(
-                "GET", PREFIX + path, params=query, headers=headers, timeout=silent_s or self.timeout_s
+                "GET", PREFIX + path, params=query, timeout=silent_s or self.timeout_s
             ) as answer,
         ):
             if not answer.is_success:
                 answer.read()
                 raise self.refused(answer)
             for line in answer.iter_lines():
-                if line.startswith(":"):
-                    yield None
-                elif line.startswith("data:"):
-                    try:
-                        event = json.loads(line.removeprefix("data:"))
-                    except ValueError:
-                        raise self.bad_answer("an event of the stream is not JSON") from None
-                    yield event
+                if line.startswith((":", "data:")):
+                    yield self._event(line)
 
     def events(self, path: str, query: Mapping[str, Any] | None = None) -> Iterator[dict[str, Any]]:
         """Yield what a stream of the daemon tells, until the daemon ends."""
@@ -206,22 +244,13 @@ class DaemonHttp:
         """Let go of the connection."""
         self._http.close()
 
-    def bad_answer(self, reason: str) -> ClientError:
-        """Return the error of an answer that no daemon of this program gives."""
-        return ClientError("bad_answer", f"what answers at {self.url} is no mastctl daemon: {reason}")
 
-    @contextmanager
-    def _failures(self, silent: str) -> Iterator[None]:
-        """What a connection may meet, as ClientError."""
-        try:
-            yield
-        except (httpx.ConnectError, httpx.ConnectTimeout):
-            words = f"no daemon answers at {self.url}; 'mastctl run' starts one"
-            raise ClientError("no_daemon", words) from None
-        except httpx.TimeoutException:
-            raise ClientError("timeout", silent) from None
-        except httpx.HTTPError as error:
-            raise Broken("no_daemon", f"the connection to {self.url} broke: {error}") from None
+def _headers_of(key: str | None, deadline_s: float | None) -> dict[str, str]:
+    """The headers of a command: its key, a new one by default, and its deadline."""
+    headers = {"Idempotency-Key": key or secrets.token_hex(16)}
+    if deadline_s is not None:
+        headers["Deadline-S"] = repr(float(deadline_s))
+    return headers
 
 
 def program_name() -> str:

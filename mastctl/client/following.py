@@ -1,4 +1,4 @@
-"""Waiting on a daemon's event stream: a value as it is and at each change, also if the stream breaks."""
+"""Waiting on events of a daemon: a value as it is, then at each change, also if the stream breaks."""
 
 from __future__ import annotations
 

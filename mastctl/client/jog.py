@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import threading
 import time
 from collections.abc import Callable
@@ -76,6 +77,12 @@ class Jog:
         self._daemon.close()
         if kind is None:
             self.check()
+
+    async def __aenter__(self) -> Jog:
+        return self.__enter__()
+
+    async def __aexit__(self, kind: type[BaseException] | None, *ignored: object) -> None:
+        await asyncio.to_thread(self.__exit__, kind)
 
     def _work(self) -> None:
         while True:

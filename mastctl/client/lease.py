@@ -7,7 +7,7 @@ import threading
 import time
 from typing import Any
 
-from mastctl.client.connection import Broken, ClientError, DaemonHttp
+from mastctl.client.connection import Broken, ClientError, Connection
 
 RENEWALS = 3  # within a lease's time, so that one may be lost
 LEAST_TIMEOUT_S = 0.5
@@ -24,7 +24,7 @@ class HeldLease:
         Why the lease is no longer held, None while it is; the next command is refused with the same reason.
     """
 
-    def __init__(self, daemon: DaemonHttp, granted: dict[str, Any], for_s: float) -> None:
+    def __init__(self, daemon: Connection, granted: dict[str, Any], for_s: float) -> None:
         self.id = str(granted["lease_id"])
         self.holder = str(granted["holder"])
         self.lost: ClientError | None = None

@@ -1,0 +1,537 @@
+# Made by tools/async_client.py; what is to be changed is changed in its source.
+"""Asyncio: A small client of a running daemon: what the command line and the experiments use."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import AsyncIterator, Callable, Sequence
+from contextlib import asynccontextmanager
+from typing import TYPE_CHECKING, Any, Literal
+from urllib.parse import quote
+
+from mastctl.client.async_connection import AsyncDaemonHttp
+from mastctl.client.async_following import async_followed
+from mastctl.client.connection import ClientError, plain_name
+from mastctl.client.jog import ANSWER_S, Jog
+from mastctl.client.lease import HeldLease
+
+if TYPE_CHECKING:
+    from mastctl.client.snapshot import Snapshot
+DEFAULT_URL = "http://127.0.0.1:8420"
+ENDED = ("done", "failed", "stopped")
+
+
+class AsyncClient:
+    """A connection to one daemon. A context manager; usable from one thread at a time.
+
+    Parameters
+    ----------
+    url
+        ``http://127.0.0.1:8420``, or ``unix:/path/of/socket``.
+    timeout_s
+        What each request is given, seconds.
+    name
+        What this program calls itself, for the daemon's record and for who else wants to steer; by default
+        ``program@host:pid``. Clients of one name are one party.
+
+    A command goes out again where the connection breaks, with a key by which the daemon carries it out once.
+    token
+        What a daemon asks for that is reached from other machines; by default that of ``$MASTCTL_TOKEN``.
+        Without TLS it can be read on the way. The certificates that are trusted beside the system's may
+        stand in the file ``$MASTCTL_CA_FILE``.
+
+    Raises
+    ------
+    ClientError
+        ``bad_url``, if the address is of neither form. Every method raises it for whatever goes wrong.
+    """
+
+    def __init__(
+        self,
+        url: str = DEFAULT_URL,
+        timeout_s: float = 30.0,
+        name: str | None = None,
+        token: str | None = None,
+    ) -> None:
+        self.url = url
+        self._daemon = AsyncDaemonHttp(url, timeout_s, name, token)
+
+    @asynccontextmanager
+    async def lease(
+        self, name: str | None = None, for_s: float = 30.0, take_over: str | None = None
+    ) -> AsyncIterator[HeldLease]:
+        """Steer alone inside the block: a thread renews the lease, and this client's commands carry it.
+
+        Parameters
+        ----------
+        name
+            The holder's, by default this client's.
+        for_s
+            How long it outlives a holder that falls silent, 1 to 3600 s.
+        take_over
+            Why it is taken from whoever steers; None waits for nobody and takes nothing away.
+
+        Yields
+        ------
+        lease
+            Whose ``lost`` says if somebody took over meanwhile.
+
+        Raises
+        ------
+        ClientError
+            ``leased`` if somebody else steers.
+        """
+        granted = await self.acquire_lease(name, for_s, take_over)
+        before, held = (self._daemon.lease_id, HeldLease(self._daemon, granted, for_s))
+        self._daemon.lease_id = held.id
+        try:
+            yield held
+        finally:
+            self._daemon.lease_id = before
+            await asyncio.to_thread(held.end)
+
+    async def control(self) -> dict[str, Any] | None:
+        """Return who steers, or None: ``holder``, ``kind`` (lease, operation), ``for_s``, ``until``."""
+        found = (await self._daemon.json("GET", "/lease"))["control"]
+        return dict(found) if found else None
+
+    async def acquire_lease(
+        self, name: str | None = None, for_s: float = 30.0, take_over: str | None = None
+    ) -> dict[str, Any]:
+        """Acquire or take over a lease that nobody renews; arguments as for `lease`.
+
+        Returns ``lease_id``, ``holder``, ``for_s`` and ``until``; `use_lease` has commands carry it.
+        """
+        body: dict[str, Any] = {"for_s": float(for_s)}
+        if name is not None:
+            body["name"] = name
+        if take_over is not None:
+            return await self._daemon.command("POST", "/lease/take", body | {"reason": take_over})
+        return await self._daemon.command("POST", "/lease", body)
+
+    def use_lease(self, lease_id: str | None) -> None:
+        """Have each command carry a lease from now on, or none."""
+        self._daemon.lease_id = None if lease_id is None else plain_name(lease_id)
+
+    async def renew_lease(self, for_s: float | None = None) -> dict[str, Any]:
+        """Have the lease in use run for ``for_s`` seconds from now on, by default as long as at first."""
+        return await self._daemon.command(
+            "POST", "/lease/renew", {} if for_s is None else {"for_s": float(for_s)}
+        )
+
+    async def release_lease(self) -> None:
+        """Release the lease in use."""
+        await self._daemon.command("DELETE", "/lease")
+
+    async def status(self) -> dict[str, Any]:
+        """Return what the daemon knows at this moment."""
+        return await self._daemon.json("GET", "/status")
+
+    async def calibration_health(self) -> dict[str, Any]:
+        """Return whether residuals of the last days are as the mast file predicts, with the figures."""
+        return await self._daemon.json("GET", "/calibration/health")
+
+    async def point(
+        self,
+        *,
+        pixel: tuple[str, str, float, float] | None = None,
+        position_m: Sequence[float] | None = None,
+        frame: Literal["rover", "site"] | None = None,
+        pan_rad: float | None = None,
+        tilt_rad: float | None = None,
+        aim: tuple[str, float, float] | None = None,
+        pointings: int | None = None,
+        deadline_s: float | None = None,
+        idempotency_key: str | None = None,
+    ) -> str:
+        """Start a pointing operation and return its id.
+
+        Parameters
+        ----------
+        pixel
+            (camera, frame id, x, y), pixels; or
+        position_m, frame
+            a point, metres, in the ``rover`` (default) or ``site`` frame; or
+        pan_rad, tilt_rad
+            joint angles.
+        aim
+            (camera, x, y): where the target shall come; the daemon's default when left out.
+        pointings
+            1 (default) or 2.
+        deadline_s
+            How long it is given, seconds of the daemon's clock; then the head is stopped and the operation
+            fails with ``deadline_passed``. By default from the longest way and the speed.
+        idempotency_key
+            The same for each try of one command; a new one by default.
+        """
+        body = _target(pixel, position_m, frame)
+        if aim is not None:
+            body["aim"] = dict(zip(("camera", "x_px", "y_px"), aim, strict=True))
+        others = {"pan_rad": pan_rad, "tilt_rad": tilt_rad, "pointings": pointings}
+        body |= {key: value for key, value in others.items() if value is not None}
+        return str(
+            (await self._daemon.command("POST", "/point", body, key=idempotency_key, deadline_s=deadline_s))[
+                "id"
+            ]
+        )
+
+    async def operation(self, operation_id: str) -> dict[str, Any]:
+        """Return an operation's record."""
+        return await self._daemon.json("GET", f"/operations/{quote(operation_id, safe='')}")
+
+    async def operations(self) -> list[dict[str, Any]]:
+        """Return the newest operations, newest first, without their steps."""
+        return list((await self._daemon.json("GET", "/operations"))["operations"])
+
+    async def wait(
+        self,
+        operation_id: str,
+        timeout_s: float = 60.0,
+        on_step: Callable[[dict[str, Any]], None] | None = None,
+    ) -> dict[str, Any]:
+        """Wait until an operation has ended (done, failed or stopped) and return its record.
+
+        Parameters
+        ----------
+        on_step
+            Called with each step as it comes.
+
+        Raises
+        ------
+        ClientError
+            ``timeout``, if it has not ended in time; it goes on.
+        """
+        told = 0
+        query = {"topics": "operation", "key": operation_id}
+        async for record in async_followed(
+            self._daemon, query, lambda: self.operation(operation_id), timeout_s
+        ):
+            for step in record["steps"][told:]:
+                told += 1
+                if on_step is not None:
+                    on_step(step)
+            if record["state"] in ENDED:
+                return record
+        raise ClientError("timeout", f"operation {operation_id} has not ended after {timeout_s:g} s")
+
+    async def wait_state(
+        self, *states: str, timeout_s: float = 60.0, on_change: Callable[[dict[str, Any]], None] | None = None
+    ) -> dict[str, Any]:
+        """Wait until the daemon's state is one of some words; return ``state``, ``reason`` and what goes with
+        them in the status.
+
+        Parameters
+        ----------
+        on_change
+            Called with the same at the beginning and at each change.
+
+        Raises
+        ------
+        ClientError
+            ``timeout``, if it was none of them in time.
+        """
+        word = ""
+        async for told in async_followed(self._daemon, {"topics": "state"}, self.status, timeout_s):
+            word = told["state"]
+            if on_change is not None:
+                on_change(told)
+            if word in states:
+                return told
+        wanted = " or ".join(states)
+        raise ClientError("timeout", f"the state is {word} and not {wanted} after {timeout_s:g} s")
+
+    async def recordings(self) -> dict[str, Any]:
+        """Return the daemon's recordings, and what it records now."""
+        return await self._daemon.json("GET", "/recordings")
+
+    async def start_recording(self, name: str = "") -> dict[str, Any]:
+        """Have the daemon record until `stop_recording`; return what it records then."""
+        return await self._daemon.command("POST", "/recordings/start", {"name": name})
+
+    async def stop_recording(self) -> dict[str, Any]:
+        """End the recording; return its file on the daemon's machine, its size and what was dropped."""
+        return await self._daemon.command("POST", "/recordings/stop")
+
+    async def stop(self) -> dict[str, Any]:
+        """Stop the mast and the running operation."""
+        return await self._daemon.json("POST", "/stop")
+
+    async def estop(self, *, reason: str | None = None, name: str | None = None) -> dict[str, Any]:
+        """Stop the mast and let nothing move it until `reset`; ``kept`` says whether a restart would know."""
+        body = {"reason": reason, "name": name}
+        told = {key: value for key, value in body.items() if value is not None}
+        return await self._daemon.json("POST", "/estop", json=told)
+
+    async def reset(self, *, reason: str, name: str) -> dict[str, Any]:
+        """Release the emergency stop; nothing moves before the next command."""
+        return await self._daemon.json("POST", "/reset", json={"reason": reason, "name": name})
+
+    async def pose(
+        self,
+        position_m: Sequence[float],
+        quaternion: Sequence[float],
+        *,
+        covariance: Sequence[Sequence[float]] | None = None,
+        sigma: tuple[float, float] | None = None,
+        time_s: float | None = None,
+        look: bool = True,
+    ) -> dict[str, Any]:
+        """Say where the rover stands; return the track as it is then, and the ``operation`` of a look.
+
+        Parameters
+        ----------
+        position_m, quaternion
+            site_from_rover: (x, y, z), metres, and (w, x, y, z).
+        covariance
+            6 rows of 6 of the motion since the pose before, along the rover's axes of this pose: x, y, z in
+            metres, then the turns about them in radians; or
+        sigma
+            (metres, radians): one sigma of each axis of its translation and of its rotation.
+        time_s
+            By the sender's clock.
+        look
+            Whether a track's target shall be looked for.
+        """
+        body: dict[str, Any] = {
+            "position_m": [float(value) for value in position_m],
+            "quaternion": [float(value) for value in quaternion],
+            "look": look,
+        }
+        if covariance is not None:
+            body["covariance"] = [[float(value) for value in row] for row in covariance]
+        if sigma is not None:
+            body["sigma"] = {"position_m": sigma[0], "rotation_rad": sigma[1]}
+        if time_s is not None:
+            body["time_s"] = time_s
+        return await self._daemon.json("POST", "/pose", json=body)
+
+    async def track(self) -> dict[str, Any]:
+        """Return the track as it is."""
+        return await self._daemon.json("GET", "/track")
+
+    async def start_track(
+        self,
+        *,
+        pixel: tuple[str, str, float, float] | None = None,
+        position_m: Sequence[float] | None = None,
+        frame: Literal["rover", "site"] | None = None,
+        deadline_s: float | None = None,
+        idempotency_key: str | None = None,
+    ) -> str:
+        """Start to follow a target and return the operation's id; arguments as for `point`."""
+        body = _target(pixel, position_m, frame)
+        answer = await self._daemon.command(
+            "POST", "/track", body, key=idempotency_key, deadline_s=deadline_s
+        )
+        return str(answer["id"])
+
+    async def look(self, *, deadline_s: float | None = None, idempotency_key: str | None = None) -> str:
+        """Look for the track's target once more; return the operation's id."""
+        answer = await self._daemon.command("POST", "/track/look", key=idempotency_key, deadline_s=deadline_s)
+        return str(answer["id"])
+
+    async def wait_track(
+        self,
+        operation_id: str | None,
+        timeout_s: float = 60.0,
+        on_step: Callable[[dict[str, Any]], None] | None = None,
+    ) -> dict[str, Any]:
+        """Wait until a start or a look of the track has ended; return the track after it.
+
+        ``None`` for the operation returns the track as it is. Raises ClientError as `wait`.
+        """
+        if operation_id is not None:
+            await self.wait(operation_id, timeout_s, on_step)
+        async for track in async_followed(self._daemon, {"topics": "track"}, self.track, timeout_s):
+            if operation_id is None or track["operation"] != operation_id:
+                return track
+        raise ClientError("timeout", f"the track did not take up operation {operation_id}")
+
+    async def watch_track(self) -> AsyncIterator[dict[str, Any]]:
+        """Yield the track as it is, and again at each change, until the daemon ends."""
+        async for event in self._daemon.events("/track/stream"):
+            yield event
+
+    async def events(self, *topics: str, keys: Sequence[str] = ()) -> AsyncIterator[dict[str, Any]]:
+        """Yield each change of some topics (all without any) and keys, beginning with what is known, until
+        the daemon ends: ``topic``, ``key``, ``sequence``, ``lost``, ``value``.
+        """
+        query: dict[str, Any] = {"key": list(keys)} if keys else {}
+        if topics:
+            query["topics"] = ",".join(topics)
+        async for event in self._daemon.events("/events", query):
+            yield event
+
+    async def stop_track(self) -> dict[str, Any]:
+        """End the track; return it as it is then."""
+        return await self._daemon.json("POST", "/track/stop")
+
+    async def snapshot(
+        self,
+        camera: str,
+        *,
+        fresh: bool = True,
+        frame_id: str | None = None,
+        format: Literal["png", "jpeg"] = "png",
+    ) -> Snapshot:
+        """Return a picture with its facts.
+
+        Parameters
+        ----------
+        camera
+            The camera's name.
+        fresh
+            Whether it must be exposed after the daemon got the request; else it is at most a second old.
+        frame_id
+            A frame that the daemon still keeps, instead of a new one.
+        format
+            ``png`` is lossless.
+        """
+        from mastctl.client.snapshot import read_snapshot
+
+        query: dict[str, str] = {"format": format}
+        if frame_id is None:
+            query["fresh"] = "true" if fresh else "false"
+        else:
+            query["frame_id"] = frame_id
+        answer = await self._daemon.ask("GET", f"/snapshot/{quote(camera, safe='')}", params=query)
+        try:
+            return read_snapshot(answer.content, answer.headers)
+        except ValueError as reason:
+            raise self._daemon.bad_answer(str(reason)) from None
+
+    async def mast_file(self) -> bytes:
+        """Return the mast file that the daemon uses, byte for byte."""
+        return bytes((await self._daemon.ask("GET", "/mast")).content)
+
+    async def use_mast(self, file: str) -> dict[str, Any]:
+        """Use another mast file of the same folder; return which is in use now, and the former one."""
+        return await self._daemon.command("POST", "/mast", {"file": file})
+
+    async def use_former_mast(self) -> dict[str, Any]:
+        """Go back to the mast file that was in use before; return which is in use now, and the former one."""
+        return await self._daemon.command("POST", "/mast/back")
+
+    def jog(self) -> Jog:
+        """Return a context in which the head turns at rates; it sends the heartbeats itself.
+
+        Examples
+        --------
+        ::
+
+            with client.jog() as jog:
+                jog.rates(0.2, 0.0)      # rad/s
+                time.sleep(1.5)
+        """
+        return Jog(lambda: self._daemon.beside(ANSWER_S))
+
+    async def sun(self) -> dict[str, Any]:
+        """Return the direction that no head camera looks into: ``sun``, null where none was told."""
+        return await self._daemon.json("GET", "/limits/sun")
+
+    async def keep_off_sun(
+        self,
+        azimuth_rad: float,
+        elevation_rad: float,
+        half_angle_rad: float,
+        *,
+        frame: Literal["site", "rover"] = "site",
+        valid_s: float | None = None,
+    ) -> dict[str, Any]:
+        """Say where the sun stands: azimuth from north over east (forward over right), elevation up.
+
+        Parameters
+        ----------
+        half_angle_rad
+            How near a head camera's axis may come.
+        valid_s
+            How long that holds, seconds; left out, until another is told.
+        """
+        body: dict[str, Any] = {"azimuth_rad": azimuth_rad, "elevation_rad": elevation_rad}
+        body |= {"half_angle_rad": half_angle_rad, "frame": frame}
+        if valid_s is not None:
+            body["valid_s"] = valid_s
+        return await self._daemon.command("POST", "/limits/sun", body)
+
+    async def forget_sun(self) -> dict[str, Any]:
+        """Keep the head off no sun any more."""
+        return await self._daemon.command("DELETE", "/limits/sun")
+
+    async def session(self) -> dict[str, Any]:
+        """Return who asks: ``name``, ``role``, ``via``, and whether the daemon asks for a token at all."""
+        return await self._daemon.json("GET", "/session")
+
+    async def login(self, token: str) -> dict[str, Any]:
+        """Begin a session as a page does: this client then needs its token no longer, for some hours."""
+        return await self._daemon.json("POST", "/login", json={"token": token})
+
+    async def logout(self) -> None:
+        """End the session that `login` began."""
+        await self._daemon.json("POST", "/logout")
+
+    async def true_pose(self) -> dict[str, Any]:
+        """Return where a simulated rover truly stands: ``position_m`` and ``quaternion``, site_from_rover."""
+        return await self._daemon.json("GET", "/simulation/pose")
+
+    async def stand(
+        self, x_m: float, y_m: float, heading_rad: float, pitch_rad: float = 0.0, roll_rad: float = 0.0
+    ) -> dict[str, Any]:
+        """Put a simulated rover somewhere on its ground, truly; return its true pose."""
+        body = {"x_m": x_m, "y_m": y_m, "heading_rad": heading_rad}
+        body |= {"pitch_rad": pitch_rad, "roll_rad": roll_rad}
+        return await self._daemon.command("POST", "/simulation/pose", body)
+
+    async def simulation_time(self) -> dict[str, Any]:
+        """Return a simulated rover's time: ``now_s``, and ``speed``, a number or ``max``."""
+        return await self._daemon.json("GET", "/simulation/time")
+
+    async def advance(self, duration_s: float) -> dict[str, Any]:
+        """Let time pass for a simulated rover whose ``simulation.speed`` is ``max``; return it as
+        `simulation_time` does.
+
+        Raises
+        ------
+        ClientError
+            ``time_passes`` where time passes by itself, ``not_simulated``.
+        """
+        return await self._daemon.command("POST", "/simulation/time", {"advance_s": duration_s})
+
+    async def faults(self) -> list[dict[str, Any]]:
+        """Return the faults that are switched on in a simulated rover."""
+        return list((await self._daemon.json("GET", "/simulation/faults"))["faults"])
+
+    async def set_fault(self, device: str, word: str, **parameters: float) -> list[dict[str, Any]]:
+        """Switch a fault of a simulated device on; return all that are on."""
+        body = {"device": device, "word": word, "parameters": parameters}
+        return list((await self._daemon.command("POST", "/simulation/faults", body))["faults"])
+
+    async def clear_faults(self, device: str | None = None) -> None:
+        """Switch the faults of one simulated device off, or all."""
+        params = {} if device is None else {"device": device}
+        await self._daemon.command("DELETE", "/simulation/faults", params=params)
+
+    async def close(self) -> None:
+        """Let go of the connection."""
+        await self._daemon.close()
+
+    async def __aenter__(self) -> AsyncClient:
+        return self
+
+    async def __aexit__(self, *ignored: object) -> None:
+        await self.close()
+
+
+def _target(
+    pixel: tuple[str, str, float, float] | None,
+    position_m: Sequence[float] | None,
+    frame: Literal["rover", "site"] | None,
+) -> dict[str, Any]:
+    """What a request says of its target: a pixel of a frame, or a point; what was not given is left out."""
+    body: dict[str, Any] = {}
+    if pixel is not None:
+        body["pixel"] = dict(zip(("camera", "frame_id", "x_px", "y_px"), pixel, strict=True))
+    if position_m is not None:
+        body["position_m"] = [float(value) for value in position_m]
+    if frame is not None:
+        body["frame"] = frame
+    return body
