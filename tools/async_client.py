@@ -8,10 +8,13 @@ committed; a test asks whether it still comes of its source.
 
 from __future__ import annotations
 
+import argparse
 import ast
 import subprocess
 import sys
 from pathlib import Path
+
+from tools.arguments import end
 
 FOLDER = Path(__file__).resolve().parent.parent / "mastctl" / "client"
 FILES = {"client.py": "async_client.py", "following.py": "async_following.py"}
@@ -128,9 +131,11 @@ def _tidy(text: str) -> str:
 
 def main() -> None:
     """Write the files."""
+    words = "Write the client for asyncio from the one that waits for its answers."
+    argparse.ArgumentParser(description=words).parse_args()
     for source, target in FILES.items():
         (FOLDER / target).write_text(written((FOLDER / source).read_text()))
 
 
 if __name__ == "__main__":
-    main()
+    end(main)

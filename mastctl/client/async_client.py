@@ -127,6 +127,14 @@ class AsyncClient:
         """Return what the daemon knows at this moment."""
         return await self._daemon.json("GET", "/status")
 
+    async def reload(self) -> dict[str, Any]:
+        """Have the daemon read its configuration again; return ``changed``, ``mast`` and ``notes``.
+
+        All of what it says comes into use while the head rests, or nothing (``restart_needed``,
+        ``bad_config``, ``bad_mast_file``, ``busy``, ``moving``).
+        """
+        return await self._daemon.command("POST", "/reload")
+
     async def calibration_health(self) -> dict[str, Any]:
         """Return whether residuals of the last days are as the mast file predicts, with the figures."""
         return await self._daemon.json("GET", "/calibration/health")

@@ -1,5 +1,5 @@
 # Made by tools/async_client.py; what is to be changed is changed in its source.
-"""Asyncio: Waiting on events of a daemon: a value as it is, then at each change, also if the stream breaks."""
+"""Asyncio: Waiting on a daemon's events: a value as it is, then at each change, also if the stream breaks."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Waiting on events of a daemon: a value as it is, then at each change, also if the stream breaks."""
+"""Waiting on a daemon's events: a value as it is, then at each change, also if the stream breaks."""
 
 from __future__ import annotations
 
