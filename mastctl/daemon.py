@@ -73,7 +73,13 @@ class AddressInUse(MastctlError):
     code = "address_in_use"
 
 
-def run(config: Config, on_ready: Callable[[str], None], clock: Clock | None = None) -> None:
+def run(
+    config: Config,
+    on_ready: Callable[[str], None],
+    clock: Clock | None = None,
+    *,
+    draws_ahead: bool = False,
+) -> None:
     """Run a daemon in the main thread until a signal ends it; returns after the mast was stopped.
 
     The signals are those of `mastctl.signals.wanted`. A second one has nobody waited for; SIGTSTP (Ctrl-Z)
@@ -87,6 +93,8 @@ def run(config: Config, on_ready: Callable[[str], None], clock: Clock | None = N
         Called once with the address when requests are answered.
     clock
         The service's clock; CLOCK_MONOTONIC by default.
+    draws_ahead
+        Whether a simulated rover draws its cameras' first pictures as soon as requests are answered.
 
     Raises
     ------
@@ -102,7 +110,13 @@ def run(config: Config, on_ready: Callable[[str], None], clock: Clock | None = N
         _let_log_stall(service)
         try:
             with _entrance(service, url) as entrance:
-                asyncio.run(_serve(service, listener, lambda _: on_ready(url), entrance, in_process=True))
+
+                def ready(_: Callable[[], None]) -> None:
+                    on_ready(url)
+                    if draws_ahead:
+                        _draw_ahead(service)
+
+                asyncio.run(_serve(service, listener, ready, entrance, in_process=True))
         finally:
             service.close()
 
@@ -212,6 +226,13 @@ def _opened(config: Config, clock: Clock | None, folder: StateFolder | None, url
     socket_path = None if service.stop_socket is None else service.stop_socket.path
     service.folder.note_daemon(config.path, url, socket_path)
     return service
+
+
+def _draw_ahead(service: Service) -> None:
+    """Have a simulated rover draw what its cameras see where it stands, beside everything else."""
+    rover, now_s = service.hardware.simulation, service.clock.now_s()
+    if rover is not None:
+        threading.Thread(target=rover.draw_ahead, args=(now_s,), name="first pictures", daemon=True).start()
 
 
 def _let_log_stall(service: Service) -> None:

@@ -11,7 +11,7 @@ import math
 import threading
 from collections import OrderedDict
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from types import MappingProxyType
@@ -52,6 +52,7 @@ BLUR_STEP_PX = 1.5
 BLUR_STEPS = 5
 """...but over no more than so many, of one ray a pixel, which take about as long as one still picture."""
 
+GIVES_WAY_S = 0.05  # between two pictures that nobody has asked for yet
 RESTS_RAD = 1e-7
 """A head that turns less during a picture rests."""
 
@@ -131,6 +132,7 @@ class SimulatedRover:
             self._check_over_ground()
         self._stills = Stills(self._renderer)
         self._render_lock = threading.Lock()
+        self._closing = threading.Event()
         self._closed = False
         self._truth_lock = threading.Lock()
         self._truth: dict[str, OrderedDict[int, FrameTruth]] = {n: OrderedDict() for n in self.rig.cameras}
@@ -237,8 +239,21 @@ class SimulatedRover:
         pixels, _ = model.project(np.asarray(point_in_rover_m, dtype=np.float64).reshape(3))
         return pixels
 
+    def draw_ahead(self, time_s: float) -> None:
+        """Draw what each camera sees at a moment, so that its first picture is there when it is asked for.
+
+        What is asked for meanwhile waits for one picture at most. Ends early when the rover is closed.
+        """
+        for name in self.cameras:
+            # Where a lock is let go and taken at once, whoever waits for it would go on waiting.
+            if self._closing.wait(GIVES_WAY_S):
+                return
+            with suppress(NoFreshFrame):
+                self._at_rest(name, time_s)
+
     def close(self) -> None:
         """Stop the head and let waiting camera calls end."""
+        self._closing.set()
         self._head.close()
         for camera in self.cameras.values():
             camera.close()

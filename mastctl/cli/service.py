@@ -153,7 +153,7 @@ def serve_config(config: Config, args: argparse.Namespace) -> None:
             sys.stdout.write(f"{url}\n")
         sys.stdout.flush()
 
-    run(config, ready)
+    run(config, ready, draws_ahead=True)
 
 
 def _status(args: argparse.Namespace) -> int:

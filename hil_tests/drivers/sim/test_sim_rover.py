@@ -265,3 +265,15 @@ def test_a_fault_shows_at_rest_and_is_gone_when_cleared(small_rig: Path, word: s
     clock.advance(0.5)
     after = clean(device, clock)
     assert np.abs(after.astype(float) - before).mean() < 3.0 and (after != faulty[1]).any()
+
+
+def test_pictures_drawn_ahead_are_those_that_are_asked_for_and_a_closed_rover_draws_none(
+    small_rig: Path,
+) -> None:
+    device, clock = rover(small_rig)
+    device.draw_ahead(clock.now_s())
+    drawn = {name: device._at_rest(name, clock.now_s()) for name in device.cameras}
+    device.draw_ahead(clock.now_s())
+    assert all(device._at_rest(name, clock.now_s()) is image for name, image in drawn.items())
+    device.close()
+    device.draw_ahead(clock.now_s())  # ends at once, and raises nothing
