@@ -13,6 +13,7 @@ from typing import Any
 from uvicorn.protocols.utils import ClientDisconnected
 from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIOProtocol
 from websockets.frames import Frame
+from websockets.protocol import State
 
 log = logging.getLogger(__name__)
 log.setLevel(logging.ERROR)
@@ -92,7 +93,7 @@ class Socket(WebSocketsSansIOProtocol):
         return self._pings <= MOST_PINGS
 
     def _end(self, code: int, words: str) -> None:
-        if self.close_sent:
+        if self.close_sent or self.conn.state is not State.OPEN:  # it ends already
             return
         self.close_sent = True
         self.conn.send_close(code, words)

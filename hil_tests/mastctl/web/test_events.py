@@ -300,6 +300,7 @@ def test_nothing_that_is_sent_into_a_websocket_harms_the_daemon(
         (fuzz_websocket.frame(1, b"", told_bytes=1 << 40), 1009),
         (fuzz_websocket.frame(1, b"hello", masked=False), 1002),
         (b"\xff" * 20, 1002),
+        (fuzz_websocket.frame(8, b"\x03\xe8") + fuzz_websocket.frame(2, b"more") * 3, 1000),
     ],
 )
 def test_what_a_client_sends_ends_its_websocket_and_says_why(pair: BOTH, sent: bytes, code: int) -> None:
