@@ -454,11 +454,12 @@ def _vanish(client: Client) -> None:
 
 
 def _rubbish(client: Client) -> None:
-    """Send what is no request, and go."""
+    """Send what is no request, or a stop from nowhere, and go."""
+    since_s = time.monotonic()
     with contextlib.suppress(OSError), socket.create_connection(("127.0.0.1", client.port), 2.0) as there:
         there.sendall(client.draw.choice(RUBBISH))
         first = there.recv(4096).partition(b"\r\n")[0].decode("latin-1")
-        good = not first.startswith("HTTP/1.1 5") or first.startswith("HTTP/1.1 503")
+        good = not first.startswith("HTTP/1.1 5") or client.ledger.explained(since_s, time.monotonic())
         client.ledger.check(good, f"rubbish was answered by {first}")
     client.ledger.act("rubbish")
     time.sleep(client.draw.uniform(0.2, 3.0))
