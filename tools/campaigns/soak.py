@@ -51,7 +51,9 @@ def main() -> int:
     return 1 if wrong else 0
 
 
-def soak(folder: Path, head: str, duration_s: float, seed: int, settle_s: float = SETTLE_S) -> list[str]:
+def soak(
+    folder: Path, head: str, duration_s: float, seed: int, settle_s: float = SETTLE_S, rests: int = RESTS
+) -> list[str]:
     """Run a daemon among all clients for so long; print what happened and return what was not as wanted."""
     config = simulated(folder, head, CAMERAS, {"record": {"ring_s": 60, "ring_mb": 100, "kept_mb": 200}})
     ledger = Ledger()
@@ -60,7 +62,7 @@ def soak(folder: Path, head: str, duration_s: float, seed: int, settle_s: float 
     weighed: list[Vitals] = []
     with started(config) as (daemon, port), Crowd(port, seed, ledger) as crowd:
         began_s = time.monotonic()
-        shares = [WARM_UP + (1.0 - WARM_UP) * rest / RESTS for rest in range(RESTS + 1)]
+        shares = [WARM_UP + (1.0 - WARM_UP) * rest / rests for rest in range(rests + 1)]
         for share in shares:
             crowd.work(max(1.0, began_s + share * duration_s - time.monotonic()))
             crowd.rest(settle_s)
