@@ -17,7 +17,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, Protocol
 
-from drivers.clock import Clock
+from drivers.clock import Clock, SystemClock
 from drivers.interfaces import Reading
 from mastctl.devices.door import Door
 from mastctl.devices.keep_out import KeptOut, Pair
@@ -29,6 +29,7 @@ from mastctl.state.refusals import busy
 log = logging.getLogger(__name__)
 
 PATIENCE_S = 0.5  # how long a heartbeat is good for
+GONE_S = 30.0  # of the machine's own time: a client that is not heard of where a simulation's time stands
 TICK_S = 0.1  # between goals
 AHEAD_S = 0.25  # of motion that a goal lies ahead, beside the braking: two ticks and what a slow line takes
 AXES = ("pan", "tilt")
@@ -84,12 +85,17 @@ class Jogs:
         The head.
     clock
         What heartbeats are good by.
+    people
+        What clients live by, whatever the clock of a simulated rover does; the machine's own by default.
     """
 
-    def __init__(self, operations: Operations, devices: JogDevices, clock: Clock) -> None:
+    def __init__(
+        self, operations: Operations, devices: JogDevices, clock: Clock, people: Clock | None = None
+    ) -> None:
         self._operations = operations
         self._devices = devices
         self._clock = clock
+        self._people = people or SystemClock()
         self._lock = threading.Lock()
         self._jog: tuple[str, _Jog] | None = None
 
@@ -117,11 +123,12 @@ class Jogs:
                 return running[1].take(beat, running[0])
             if beat.rates_rad_per_s == (0.0, 0.0):
                 return {"id": None, "taken": False, "held": {}}
-            jog = _Jog(self._devices, self._clock, beat)
+            jog = _Jog(self._devices, self._clock, self._people, beat)
             pan, tilt = beat.rates_rad_per_s
             asked = {"jog": {"pan_rad_per_s": pan, "tilt_rad_per_s": tilt}}
             name = self._operations.start(asked, jog.run).id
             self._jog = name, jog
+            threading.Thread(target=jog.watch, name="jog's client", daemon=True).start()
             return jog.told(name, True)
 
     def _running(self) -> tuple[str, _Jog] | None:
@@ -133,9 +140,14 @@ class Jogs:
 class _Jog:
     """One jog."""
 
-    def __init__(self, devices: JogDevices, clock: Clock, first: Beat) -> None:
+    def __init__(self, devices: JogDevices, clock: Clock, people: Clock, first: Beat) -> None:
         self._devices = devices
         self._clock = clock
+        self._people = people
+        self._heard_s = people.now_s()
+        self._gone = False
+        self._over = people.signal()
+        self._is_over = False
         self._changed = clock.signal()
         self._beat = first
         self._came_s = clock.now_s()
@@ -147,8 +159,23 @@ class _Jog:
         """Whether its heartbeats are numbered."""
         return self._beat.sequence is not None
 
+    def watch(self) -> None:
+        """End the jog when nothing is heard of its client for `GONE_S`; where time stands, only this does."""
+        with self._over:
+            while not self._is_over:
+                left_s = self._heard_s + GONE_S - self._people.now_s()
+                if left_s <= 0.0:
+                    break
+                self._over.wait(left_s)
+            else:
+                return
+        with self._clock.at_work(), self._changed:
+            self._gone = True
+            self._changed.notify_all()
+
     def take(self, beat: Beat, name: str) -> dict[str, Any]:
         """Take a heartbeat, unless a later one came before it."""
+        self._heard_s = self._people.now_s()
         with self._changed:
             last = self._beat.sequence
             if last is not None and (beat.sequence is None or beat.sequence <= last):
@@ -172,6 +199,14 @@ class _Jog:
         MastctlError, DriverError
             If the head fails; whoever runs this stops it then.
         """
+        try:
+            return self._run(cancelled)
+        finally:
+            with self._over:
+                self._is_over = True
+                self._over.notify_all()
+
+    def _run(self, cancelled: threading.Event) -> JogEnd:
         seen_s = self._clock.now_s()
         while True:
             if cancelled.is_set():
@@ -181,6 +216,8 @@ class _Jog:
             late_s = max(now_s - self._came_s, now_s - seen_s)
             if self._beat.rates_rad_per_s == (0.0, 0.0):
                 return self._end("its client let go", reading)
+            if self._gone:
+                return self._end(f"nothing was heard of its client for {GONE_S:g} s", reading)
             if late_s > PATIENCE_S:
                 held_up = now_s - seen_s > PATIENCE_S
                 why = "the daemon was held up" if held_up else "no heartbeat came"
@@ -190,7 +227,7 @@ class _Jog:
                 raise PointingError("head_fault", f"the head reports: {'; '.join(reading.faults)}")
             self._step(reading)
             with self._changed:
-                if self._beat.rates_rad_per_s != (0.0, 0.0):
+                if self._beat.rates_rad_per_s != (0.0, 0.0) and not self._gone:
                     self._changed.wait(TICK_S, idle=True)
 
     def _end(self, why: str, reading: Reading) -> JogEnd:

@@ -272,3 +272,19 @@ def test_limits_hold_whatever_rates_come(rig: Rig) -> None:
         for _, (pan, tilt) in rig.head.moves:
             assert -1.0 <= pan <= 1.0 and -1.2 <= tilt <= 0.6
             assert not (abs(pan) < 0.52 and tilt < -0.78)
+
+
+def test_where_time_stands_a_client_that_is_gone_does_not_keep_the_head_for_ever(
+    rig: Rig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("mastctl.pointing.jog.GONE_S", 0.2)
+    name = rig.jogs.beat(Beat((RATE, 0.0)))["id"]
+    ended = threading.Event()
+    for _ in range(600):  # of the machine's time: the rig's stands
+        if rig.operations.running is None:
+            break
+        ended.wait(0.05)
+    operation = rig.operations.get(name)
+    assert operation.state == "done"
+    assert "nothing was heard of its client" in operation.result.ended_because
+    assert rig.head.stops >= 1
