@@ -134,6 +134,7 @@ class Latch:
         Unable
             ``not_saved`` if the disk goes on to say that one is: a restart would be latched again.
         """
+        name, reason = _told(name, ""), _told(reason, "")
         if not self._disk.acquire(timeout=PATIENCE_S):
             words = "the disk has not taken the emergency stop yet; a reset follows it"
             raise Unable("not_saved", words, PATIENCE_S)
@@ -144,7 +145,7 @@ class Latch:
             with self._changed:  # before the disk changes: from here on nobody is told that it holds a stop
                 kept, self._kept = self._kept, None
             if kept is not None:
-                released = {"by": _told(name, ""), "reason": _told(reason, ""), "at": _now()}
+                released = {"by": name, "reason": reason, "at": _now()}
                 self._write_released({"latched": False, **asdict(held), "released": released})
             with self._changed:
                 self._changed.notify_all()

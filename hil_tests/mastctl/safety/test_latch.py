@@ -250,7 +250,7 @@ def test_nobody_is_told_that_the_disk_holds_a_stop_while_a_reset_writes_there(
 
 @pytest.mark.parametrize("words", ["a \ud800 b", "a \x1b[2J b", "a \0 b"])
 def test_words_that_no_terminal_and_no_answer_can_hold_are_kept_without_them(
-    folder: StateFolder, words: str
+    folder: StateFolder, words: str, caplog: pytest.LogCaptureFixture
 ) -> None:
     latch = Latch(folder)
     latch.hold(words, words)
@@ -266,6 +266,7 @@ def test_words_that_no_terminal_and_no_answer_can_hold_are_kept_without_them(
     by_hand = Latch(folder).held
     assert by_hand is not None
     assert by_hand.reason.startswith("a ?")
+    assert not [line for line in caplog.messages if words in line]
 
 
 def test_what_was_never_latched_cannot_be_released(folder: StateFolder) -> None:
