@@ -33,6 +33,7 @@ operations watch 000012-9f3a
 mast show --out now.yaml
 mast use rocky8-refined.yaml
 mast back
+reload
 fault list
 fault set navcam_left noise sigma=8
 fault clear navcam_left
