@@ -43,6 +43,8 @@ ORDER_S = 0.01  # how long a shout waits for another thread's write
 class Interrupted(DriverError):
     """Something was shouted meanwhile; the command was not sent, and its caller gives way."""
 
+    code = "interrupted"
+
 
 @dataclass(frozen=True)
 class Query:

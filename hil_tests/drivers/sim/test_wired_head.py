@@ -89,7 +89,7 @@ def test_pictures_are_taken_from_where_the_bytes_sent_the_axes(
             errors.append(float(np.sqrt(np.mean((clean - frame.image) ** 2))))
         renderer.close()
         assert errors[0] < NOISE_DN < 4 * NOISE_DN < errors[1]
-    assert threading.active_count() == threads
+    assert threading.active_count() <= threads  # those of other tests may have ended meanwhile
     assert sum(1 for _ in Path("/proc/self/fd").iterdir()) == descriptors
 
 

@@ -262,6 +262,7 @@ def test_with_a_full_log_pipe_stops_of_both_kinds_come_through_both_doors(bench:
         assert client.stop()["stopped"] is True
         bench.stopped_on_the_way()
         assert client.estop(name="Ana")["kept"] is True
+        eventually(lambda: client.status()["state"] == "stopped", "the stop's end", BOUND_S)
         client.reset(reason="looked", name="Ben")
         assert ask(bench.folder / "state" / "stop.sock", "estop Cem: smoke")["kept"] is True
         assert client.status()["estop"]["name"] == "Cem"
