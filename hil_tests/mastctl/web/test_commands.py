@@ -228,7 +228,7 @@ def test_what_is_wrong_with_a_lease_is_one_sentence(
 @pytest.mark.parametrize(
     ("path", "body"),
     [
-        ("/limits/sun", {"direction": [1, 0, 0], "frame": "rover", "half_angle_rad": 0.1}),
+        ("/limits/sun", {"direction": [-1, 0, 0], "frame": "rover", "half_angle_rad": 0.1}),
         ("/pose", {"position_m": [0, 0, 0], "quaternion": [1, 0, 0, 0]}),
     ],
 )
