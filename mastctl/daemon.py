@@ -294,6 +294,7 @@ async def _serve(
     sweeping = asyncio.create_task(sweep(server.server_state.connections))
     on_ready(end_from_anywhere)
     manager.ready()
+    telling = asyncio.create_task(_tell_state(service, manager))
     asked = asyncio.create_task(ending.wait())
     await asyncio.wait({serving, asked}, return_when=asyncio.FIRST_COMPLETED)
     asked.cancel()
@@ -309,9 +310,19 @@ async def _serve(
     server.should_exit = True
     loop.call_later(GRACE_S - 0.5, _leave, server.server_state.connections)  # before uvicorn's own impatience
     await serving
-    sweeping.cancel()
+    for task in (sweeping, telling):
+        task.cancel()
     if in_process:
         await loop.run_in_executor(None, service.close)
+
+
+async def _tell_state(service: Service, manager: ServiceManager) -> None:
+    """Tell who started this process each change of the state, in words."""
+    with service.machine.publisher.subscribe_here("state") as changes:
+        while not changes.closed:
+            for change in await changes.wait():
+                now = change.value
+                manager.status(f"{now.word}: {now.reason}" if now.reason else now.word)
 
 
 def _settings(service: Service, app: ASGIApp, most: int) -> uvicorn.Config:

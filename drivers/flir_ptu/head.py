@@ -38,7 +38,7 @@ log = logging.getLogger(__name__)
 
 SILENT_CALLS = 5  # calls without an answer, after which the line is opened anew
 STOP_OVER_S = 1.0  # how long a reading waits for the stop that it gave way to
-READ_TRIES = 3  # of a reading that stops come into
+GIVING_WAY_S = 2.0  # how long a reading begins anew where one stop comes after another
 
 
 def open_head(options: Mapping[str, Any], clock: Clock | None = None) -> FlirPtu:
@@ -106,11 +106,14 @@ class FlirPtu:
         WrongDevice
             If what answers after that does not fit the options any more.
         """
-        for _ in range(READ_TRIES - 1):
-            with suppress(Interrupted):
+        until = time.monotonic() + GIVING_WAY_S
+        while True:
+            try:
                 return self._read()
+            except Interrupted:  # several stops may come into one reading
+                if time.monotonic() > until:
+                    raise
             self._stop_over.wait(STOP_OVER_S)
-        return self._read()
 
     def _read(self) -> Reading:
         with self._talking() as talk:

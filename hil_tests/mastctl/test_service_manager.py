@@ -171,24 +171,41 @@ def watched_daemon(folder: Path, listener: socket.socket) -> Iterator[subprocess
             yield daemon
 
 
+def heard(listener: socket.socket, begins: str) -> str:
+    """The next message that begins so."""
+    while True:
+        message = listener.recv(4096).decode()
+        if message.startswith(begins):
+            return message
+
+
 def test_a_daemon_says_that_it_is_ready_that_it_lives_and_that_it_ends(
     manager: socket.socket, tmp_path: Path
 ) -> None:
     with watched_daemon(tmp_path, manager) as daemon:
         for _ in range(3):
-            assert manager.recv(4096) == b"WATCHDOG=1"
+            heard(manager, "WATCHDOG=1")
         daemon.send_signal(signal.SIGTERM)
-        heard = b""
-        while heard != b"STOPPING=1":
-            heard = manager.recv(4096)
+        heard(manager, "STOPPING=1")
         assert daemon.wait(BOUND_S) == 0
+
+
+def test_each_state_is_told_in_words_and_a_fault_with_its_reason(
+    manager: socket.socket, tmp_path: Path
+) -> None:
+    with watched_daemon(tmp_path, manager):
+        heard(manager, "STATUS=ready")
+        (tmp_path / "fail").touch()
+        assert "the cable is out" in heard(manager, "STATUS=fault: ")
+        (tmp_path / "fail").unlink()
+        heard(manager, "STATUS=holding: ")
 
 
 def test_a_head_that_fails_is_alive_and_one_that_hangs_is_not(manager: socket.socket, tmp_path: Path) -> None:
     with watched_daemon(tmp_path, manager):
         (tmp_path / "fail").touch()
         for _ in range(10):
-            assert manager.recv(4096) == b"WATCHDOG=1"
+            heard(manager, "WATCHDOG=1")
         (tmp_path / "hang").touch()
         manager.settimeout(3.0)  # far more than the manager allows
         with pytest.raises(TimeoutError):
