@@ -689,6 +689,28 @@ def test_a_stop_into_a_question_that_is_answered_keeps_both_sides_in_step(opened
     assert talk.is_in_step
 
 
+def test_a_reading_that_stop_after_stop_comes_into_is_made_after_the_last(opened: Opener) -> None:
+    head, unit = opened()
+    rested(head)
+    talk = head._talk
+    assert talk is not None
+    talk.reply_s = 10.0
+    stops: list[threading.Thread] = []
+
+    def interrupted(command: str) -> bytes:
+        if len(stops) < 5:
+            stops.append(threading.Thread(target=head.stop))
+            stops[-1].start()
+            until(lambda: talk._shouts == 1, "the stop is sent")
+        return b"* Current Tilt position is 0"
+
+    unit.answers["TP"] = interrupted
+    head.read()
+    for stop in stops:
+        stop.join(10.0)
+    assert len(stops) == 5
+
+
 def test_a_move_that_a_stop_comes_into_is_not_started(opened: Opener) -> None:
     head, unit = opened()
     assert head._talk is not None
