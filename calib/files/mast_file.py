@@ -19,6 +19,7 @@ from calib.files import LARGEST_IMAGE_PX, CameraFile, build_model, digest_of, re
 from calib.files.atomic import save_bytes
 from calib.files.strict import Section
 from calib.files.yaml_text import MAX_BYTES, dump_mapping, kind_of, parse_mapping
+from calib.mast.joints import MOST_HARMONICS, AxisJoint, Joints
 from calib.mast.rig import Mast, Rig, RigCamera
 
 MAST_SCHEMA = "mastctl/mast/1"
@@ -56,7 +57,8 @@ def parse_rig(data: bytes, path: str | Path) -> StoredRig:
     """Read a mast file's bytes; ``path`` is for messages only. Raises BadFile as ``load_rig``."""
     document = parse_mapping(data, path)
     _check_schema(document, path, MAST_SCHEMA)
-    top = Section(path, "", document, ("schema", "name", "mast", "cameras"), ("stereo", "fit", "provenance"))
+    optional = ("stereo", "joints", "fit", "provenance")
+    top = Section(path, "", document, ("schema", "name", "mast", "cameras"), optional)
     mast = top.section("mast", ("translation_m", "rotation_rad"), ("axis_offset_m", "axis_twist_rad"))
     cameras: dict[str, RigCamera] = {}
     notes: tuple[str, ...] = ()
@@ -81,6 +83,7 @@ def parse_rig(data: bytes, path: str | Path) -> StoredRig:
         stereo=read_stereo(top, cameras),
         fit=top.free("fit"),
         provenance=top.free("provenance"),
+        joints=_joints(top.section("joints", (), ("pan", "tilt"))) if "joints" in top else Joints(),
     )
     return StoredRig(rig, digest_of(data), Path(path), notes)
 
@@ -107,6 +110,7 @@ def save_rig(rig: Rig, path: str | Path) -> StoredRig:
             name: {"on": camera.on, **_model_keys(camera.model)} for name, camera in rig.cameras.items()
         },
         "stereo": rig.stereo,
+        **({} if rig.joints == Joints() else {"joints": _joint_keys(rig.joints)}),
         "fit": rig.fit,
         "provenance": rig.provenance,
     }
@@ -206,6 +210,33 @@ def _model_keys(model: CameraModel) -> dict[str, Any]:
     if model.kind == "CAHVORE":
         keys.update(type=int(model.cahvore_type), linearity=float(model.linearity))
     return keys
+
+
+def _joints(section: Section) -> Joints:
+    """Read what the joints' readings are wrong by; an axis that is not there reads true."""
+    axes: dict[str, AxisJoint] = {}
+    for axis in section.values:
+        one = section.section(axis, (), ("harmonics_rad", "backlash_rad"))
+        pairs = one.pairs("harmonics_rad", MOST_HARMONICS) if "harmonics_rad" in one else ()
+        backlash = one.number("backlash_rad") if "backlash_rad" in one else 0.0
+        if backlash < 0.0:
+            raise one.bad("backlash_rad", f"{backlash:g} where a width of 0 rad or more is expected")
+        try:
+            axes[axis] = AxisJoint(pairs, backlash)
+        except ValueError as error:
+            raise section.bad(axis, str(error)) from None
+    return Joints(**axes)
+
+
+def _joint_keys(joints: Joints) -> dict[str, Any]:
+    """Return both joints' keys in the contract's order."""
+    return {
+        name: {
+            "harmonics_rad": [[float(part) for part in pair] for pair in axis.harmonics_rad],
+            "backlash_rad": float(axis.backlash_rad),
+        }
+        for name, axis in (("pan", joints.pan), ("tilt", joints.tilt))
+    }
 
 
 def read_stereo(top: Section, cameras: Mapping[str, object]) -> dict[str, tuple[str, str]]:

@@ -107,6 +107,19 @@ class Section:
         items = self._list(key, count, "numbers")
         return np.array([self._number(f"{key}[{i}]", item, limit) for i, item in enumerate(items)])
 
+    def pairs(self, key: str, most: int, limit: float = 1e9) -> tuple[tuple[float, float], ...]:
+        """Return a value that must be a list of at most ``most`` pairs of finite numbers."""
+        value = self.values[key]
+        if not isinstance(value, list) or len(value) > most:
+            raise self.bad(key, f"{kind_of(value)} where a list of up to {most} pairs of numbers is expected")
+        found = []
+        for i, pair in enumerate(value):
+            if not isinstance(pair, list) or len(pair) != 2:
+                raise self.bad(f"{key}[{i}]", f"{kind_of(pair)} where a pair of numbers is expected")
+            one, other = (self._number(f"{key}[{i}][{j}]", part, limit) for j, part in enumerate(pair))
+            found.append((one, other))
+        return tuple(found)
+
     def covariance(self, key: str, count: int, limit: float = 1e9) -> FloatArray:
         """Return a value that must be ``count`` lists of as many numbers, and a covariance."""
         rows = Section(self.path, self.place, {}, (), ())

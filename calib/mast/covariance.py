@@ -1,7 +1,8 @@
 """The covariance that a mast file carries, and a rig moved along it.
 
 A calibration leaves ``fit.parameters`` and ``fit.covariance`` in the mast file (docs/calibration.md). The
-parameters are ``mast.KEY.x`` and ``cameras.NAME.C.x``, as `calib.camera.parameters` orders a camera's step.
+parameters are ``mast.KEY.x``, ``joints.pan.c1`` (`calib.mast.joints`) and ``cameras.NAME.C.x``, as
+`calib.camera.parameters` orders a camera's step.
 """
 
 from __future__ import annotations
@@ -14,6 +15,8 @@ import numpy as np
 from calib.camera.parameters import parameter_names, stepped
 from calib.errors import CalibError
 from calib.mast.gimbal import MAST_NAMES, mast_of, numbers_of
+from calib.mast.joints import JOINTS_NAMES, joints_of
+from calib.mast.joints import numbers_of as joint_numbers_of
 from calib.mast.rig import Rig
 from calib.rigid import FloatArray, ReadOnlyArrays, frozen_array
 
@@ -43,9 +46,9 @@ class RigCovariance(ReadOnlyArrays):
             raise ValueError("a covariance with a negative variance is none")
 
     def of(self, cameras: Sequence[str]) -> RigCovariance:
-        """Return the part of the mast and of some cameras."""
+        """Return the part of the mast, of the joints and of some cameras."""
         wanted = tuple(f"cameras.{name}." for name in cameras)
-        kept = [i for i, name in enumerate(self.names) if name.startswith(("mast.", *wanted))]
+        kept = [i for i, name in enumerate(self.names) if name.startswith(("mast.", "joints.", *wanted))]
         return RigCovariance(tuple(self.names[i] for i in kept), self.covariance[np.ix_(kept, kept)])
 
 
@@ -61,6 +64,7 @@ def stored_covariance(rig: Rig) -> RigCovariance | None:
         return None
     known = {
         *_MAST,
+        *JOINTS_NAMES,
         *(f"cameras.{n}.{p}" for n, c in rig.cameras.items() for p in parameter_names(c.model.kind)),
     }
     names = rig.fit["parameters"]
@@ -99,10 +103,13 @@ def moved_rig(rig: Rig, names: Sequence[str], step: FloatArray) -> Rig:
     """Return the rig with the named parameters moved by ``step`` (p,), in the names' units."""
     at = dict(zip(names, step.tolist(), strict=True))
     numbers = numbers_of(rig.mast) + np.array([at.get(name, 0.0) for name in _MAST])
+    joints = rig.joints
+    if any(at.get(name, 0.0) for name in JOINTS_NAMES):
+        joints = joints_of(joint_numbers_of(joints) + np.array([at.get(name, 0.0) for name in JOINTS_NAMES]))
     cameras = dict(rig.cameras)
     for name, camera in rig.cameras.items():
         mine = [f"cameras.{name}.{part}" for part in parameter_names(camera.model.kind)]
         if any(at.get(part, 0.0) for part in mine):
             model = stepped(camera.model, np.array([at.get(part, 0.0) for part in mine]))
             cameras[name] = replace(camera, model=model)
-    return replace(rig, mast=mast_of(numbers), cameras=cameras)
+    return replace(rig, mast=mast_of(numbers), joints=joints, cameras=cameras)

@@ -2,7 +2,7 @@
 
 rover_from_head(pan, tilt) = Trans(t) Rot(x,θx) Rot(y,θy) Rot(z,θz) · Rot(z,pan) · Trans(a,0,0) Rot(x,k) ·
 Rot(y,tilt) (paper eqs. (6)-(8); a and k make it any two revolute axes). Positive pan turns right, positive
-tilt looks up.
+tilt looks up. Angles are true ones, not what an encoder reads (`calib.mast.joints`).
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from typing import Any, Literal
 import numpy as np
 
 from calib.camera.cahvor import CameraModel
+from calib.mast.joints import Joints
 from calib.rigid import FloatArray, ReadOnlyArrays, Rigid, finite_float, frozen_array, rot_x, rot_y, rot_z
 
 
@@ -64,7 +65,7 @@ class Mast(ReadOnlyArrays):
         )
 
     def rover_from_head(self, pan_rad: float, tilt_rad: float) -> Rigid:
-        """Return the head frame in the rover frame at the given joint angles, radians."""
+        """Return the head frame in the rover frame at true joint angles, radians."""
         return self.rover_from_mast @ self.mast_from_head(pan_rad, tilt_rad)
 
 
@@ -80,8 +81,8 @@ class RigCamera:
 class Rig:
     """A mast with its cameras: what a mast file holds.
 
-    ``stereo`` maps a pair name to its (left, right) camera names. ``fit`` and ``provenance`` are carried
-    through unread.
+    ``stereo`` maps a pair name to its (left, right) camera names. ``joints`` is what the head's readings are
+    wrong by: all else here speaks of true angles. ``fit`` and ``provenance`` are carried through unread.
     """
 
     name: str
@@ -90,6 +91,7 @@ class Rig:
     stereo: Mapping[str, tuple[str, str]] = field(default_factory=dict)
     fit: Mapping[str, Any] = field(default_factory=dict)
     provenance: Mapping[str, Any] = field(default_factory=dict)
+    joints: Joints = field(default_factory=Joints)
 
     def __post_init__(self) -> None:
         for name in ("cameras", "stereo", "fit", "provenance"):
@@ -98,10 +100,10 @@ class Rig:
     def __reduce__(self) -> tuple[Any, ...]:
         """Travel between processes: read-only views cannot be pickled."""
         views = (self.cameras, self.stereo, self.fit, self.provenance)
-        return Rig, (self.name, self.mast, *map(dict, views))
+        return Rig, (self.name, self.mast, *map(dict, views), self.joints)
 
     def camera_in_rover(self, name: str, pan_rad: float, tilt_rad: float) -> CameraModel:
-        """Return camera ``name`` in the rover frame at the given joint angles; body cameras ignore them.
+        """Return camera ``name`` in the rover frame at true joint angles; body cameras ignore them.
 
         Raises
         ------

@@ -7,6 +7,7 @@ import errno
 import hashlib
 import json
 import os
+import pickle
 import stat
 from collections.abc import Callable
 from pathlib import Path
@@ -21,6 +22,7 @@ from calib.files import CameraFile
 from calib.files import mast_file as store
 from calib.files.atomic import keep_previous, previous_path, save_bytes
 from calib.files.yaml_text import parse_mapping
+from calib.mast.covariance import moved_rig, stored_covariance
 
 # The contract's example, written as a person writes it.
 MAST_TEXT = """\
@@ -468,3 +470,42 @@ def test_an_error_at_any_step_of_a_save_leaves_the_folder_as_it_was(tmp_path: Pa
                 expected = {"rig.yaml": b"new", "rig.previous.yaml": b"old"}
         assert {file.name: file.read_bytes() for file in folder.iterdir()} == expected, f"error at call {at}"
     assert refused == calls - 1
+
+
+def test_joints_are_read_as_the_contract_writes_them_and_written_the_same(tmp_path: Path) -> None:
+    assert store.parse_rig(MAST_TEXT.encode(), "rig.yaml").rig.joints.reads_true
+    text = MAST_TEXT + (
+        "joints:\n  pan: {harmonics_rad: [[5e-3, -3e-3], [1e-3, 2e-3]], backlash_rad: 4e-3}\n"
+        "  tilt: {harmonics_rad: []}\n"
+        "fit: {parameters: [joints.pan.c1, joints.pan.backlash_rad], covariance: [[1e-8, 0], [0, 1e-9]]}\n"
+    )
+    rig = store.parse_rig(text.encode(), "rig.yaml").rig
+    assert rig.joints.pan.harmonics_rad == ((0.005, -0.003), (0.001, 0.002))
+    assert rig.joints.pan.backlash_rad == 0.004 and rig.joints.tilt.reads_true
+    known = stored_covariance(rig)
+    assert known is not None and known.of([]).names == ("joints.pan.c1", "joints.pan.backlash_rad")
+    moved = moved_rig(rig, known.names, np.array([1e-4, 2e-4])).joints.pan
+    assert moved.harmonics_rad == ((0.0051, -0.003), (0.001, 0.002)) and moved.backlash_rad == 0.0042
+    again = store.save_rig(rig, tmp_path / "again.yaml").rig
+    assert again.joints == rig.joints and pickle.loads(pickle.dumps(again)).joints == rig.joints
+    plain = store.save_rig(store.parse_rig(MAST_TEXT.encode(), "").rig, tmp_path / "plain.yaml")
+    assert "joints" not in plain.path.read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize(
+    ("joints", "words"),
+    [
+        ({"pan": {"harmonics_rad": [[0.3, 0.0]]}}, "joints.pan: harmonics_rad change the angle by up to 0.3"),
+        ({"pan": {"harmonics_rad": [[0.1]]}}, r"joints.pan.harmonics_rad\[0\]: .*a pair of numbers"),
+        ({"pan": {"harmonics_rad": [[0.0, "x"]]}}, r"harmonics_rad\[0\]\[1\]: .*a number is expected"),
+        ({"pan": {"harmonics_rad": [[0.0, 0.0], [0.0, 0.0], [0.0, 0.0]]}}, "up to 2 pairs"),
+        ({"tilt": {"backlash_rad": -1e-3}}, "joints.tilt.backlash_rad: -0.001 where"),
+        ({"tilt": {"backlash_rad": 0.5}}, "joints.tilt: backlash_rad is 0.5 rad where at most 0.2"),
+        ({"roll": {}}, "joints.roll: unknown key"),
+        ([1], "joints: .*a mapping"),
+        ({"pan": None}, "joints.pan: .*a mapping"),
+    ],
+)
+def test_joints_that_make_no_sense_are_refused_by_key(joints: Any, words: str) -> None:
+    with pytest.raises(BadFile, match=words):
+        store.parse_rig(_bytes(_mast() | {"joints": joints}), "rig.yaml")

@@ -1,0 +1,194 @@
+"""What a joint's reading is wrong by, and back: the map between read and true angles.
+
+true = u + Σ (c_i cos(i u) + s_i sin(i u)), where u is the angle read, less half the backlash if the axis came
+to rest from smaller angles, plus half of it if from larger ones. The first harmonic is an encoder's disc or
+magnet off its centre (an arm's sag looks the same in tilt), the second one that is oval.
+
+The kinematics (`calib.mast.rig`) speak of true angles, a head of read ones.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import Any, TypeVar
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from calib.rigid import FloatArray, finite_float
+
+MOST_HARMONICS = 2
+STEEPEST = 0.25
+"""Σ i |(c_i, s_i)| of an axis at most: Newton's steps from the identity then come home from any angle."""
+LARGEST_BACKLASH_RAD = 0.2
+_ROUNDING_RAD = 1e-15
+_STEPS = 60  # four do for tens of milliradians
+
+AXIS_NAMES = ("c1", "s1", "c2", "s2", "backlash_rad")
+JOINTS_NAMES = tuple(f"joints.{axis}.{name}" for axis in ("pan", "tilt") for name in AXIS_NAMES)
+"""The ten numbers of both joints, in the order of `numbers_of`."""
+
+Pair = tuple[float, float]
+Approach = tuple[int, int]
+"""From which side pan and tilt came to rest: +1 from smaller read angles, -1 from larger, 0 not known."""
+UNKNOWN: Approach = (0, 0)
+
+_Angle = TypeVar("_Angle", float, FloatArray)
+
+
+@dataclass(frozen=True)
+class AxisJoint:
+    """One joint's errors; the default reads true.
+
+    Attributes
+    ----------
+    harmonics_rad
+        (c_i, s_i) of the first and second harmonic over a turn; may be shorter.
+    backlash_rad
+        Full width of the play between encoder and load. An estimate of one that is none may be negative; a
+        mast file holds none such.
+
+    Raises
+    ------
+    ValueError
+        For more than two harmonics, numbers that are not finite, harmonics so large that two readings could
+        mean one angle, or a backlash above 0.2 rad.
+    """
+
+    harmonics_rad: tuple[Pair, ...] = ()
+    backlash_rad: float = 0.0
+
+    def __post_init__(self) -> None:
+        if len(self.harmonics_rad) > MOST_HARMONICS:
+            count = len(self.harmonics_rad)
+            raise ValueError(f"harmonics_rad has {count} pairs where {MOST_HARMONICS} at most are expected")
+        if any(len(pair) != 2 for pair in self.harmonics_rad):
+            raise ValueError("harmonics_rad holds something else than pairs [c, s]")
+        clean = tuple(
+            (finite_float("harmonics_rad", c), finite_float("harmonics_rad", s))
+            for c, s in self.harmonics_rad
+        )
+        object.__setattr__(self, "harmonics_rad", clean)
+        steepest = sum(i * math.hypot(c, s) for i, (c, s) in enumerate(clean, 1))
+        if steepest > STEEPEST:
+            raise ValueError(
+                f"harmonics_rad change the angle by up to {steepest:.3g} rad in a radian where at most "
+                f"{STEEPEST:g} is expected"
+            )
+        backlash = finite_float("backlash_rad", self.backlash_rad)
+        if not abs(backlash) <= LARGEST_BACKLASH_RAD:
+            raise ValueError(
+                f"backlash_rad is {backlash:g} rad where at most {LARGEST_BACKLASH_RAD:g} is expected"
+            )
+        object.__setattr__(self, "backlash_rad", backlash)
+
+    @property
+    def reads_true(self) -> bool:
+        """Whether read and true angles are the same."""
+        return self.backlash_rad == 0.0 and not any(any(pair) for pair in self.harmonics_rad)
+
+    def true_rad(self, read_rad: _Angle, approach: int | FloatArray = 0) -> _Angle:
+        """Return the true angle of a reading, or of an array (...) of them.
+
+        ``approach`` is +1 from smaller read angles, -1 from larger, 0 if not known: the middle.
+        """
+        return self._true(self._taken_up(read_rad, approach))
+
+    def read_rad(self, true_rad: _Angle, approach: int | FloatArray = 0) -> _Angle:
+        """Return the reading of a true angle (or of an array of them), exact to rounding."""
+        slack: Any = 0.5 * approach * self.backlash_rad
+        at = true_rad
+        for _ in range(_STEPS):
+            step = (self._true(at) - true_rad) / self._slope(at)
+            at = at - step
+            if np.max(np.abs(step), initial=0.0) <= _ROUNDING_RAD * (1.0 + np.max(np.abs(at), initial=0.0)):
+                break
+        found: _Angle = at + slack
+        return found
+
+    def slope(self, read_rad: _Angle, approach: int | FloatArray = 0) -> _Angle:
+        """Return by how much the true angle grows with the reading, radians in a radian."""
+        return self._slope(self._taken_up(read_rad, approach))
+
+    def rates(self, read_rad: ArrayLike, approach: ArrayLike = 0) -> FloatArray:
+        """Return (..., 5): how the true angle changes with the numbers `AXIS_NAMES`, the reading held.
+
+        ``read_rad`` and ``approach`` are (...), broadcast against each other.
+        """
+        side = np.asarray(approach, dtype=np.float64)
+        at = np.asarray(read_rad, dtype=np.float64) - 0.5 * side * self.backlash_rad
+        slack = -0.5 * side * self._slope(at)
+        return np.stack([np.cos(at), np.sin(at), np.cos(2.0 * at), np.sin(2.0 * at), slack], axis=-1)
+
+    def _taken_up(self, read_rad: _Angle, approach: int | FloatArray) -> _Angle:
+        """The reading without the play."""
+        slack: Any = 0.5 * approach * self.backlash_rad
+        taken_up: _Angle = read_rad - slack
+        return taken_up
+
+    def _true(self, at_rad: _Angle) -> _Angle:
+        true = at_rad
+        for i, (c, s) in enumerate(self.harmonics_rad, 1):
+            true = true + c * _cos(i * at_rad) + s * _sin(i * at_rad)
+        return true
+
+    def _slope(self, at_rad: _Angle) -> _Angle:
+        slope = 1.0 + 0.0 * at_rad
+        for i, (c, s) in enumerate(self.harmonics_rad, 1):
+            slope = slope + i * (s * _cos(i * at_rad) - c * _sin(i * at_rad))
+        return slope
+
+
+@dataclass(frozen=True)
+class Joints:
+    """The errors of both joints; the default reads true."""
+
+    pan: AxisJoint = field(default_factory=AxisJoint)
+    tilt: AxisJoint = field(default_factory=AxisJoint)
+
+    @property
+    def reads_true(self) -> bool:
+        """Whether read and true angles are the same in both."""
+        return self.pan.reads_true and self.tilt.reads_true
+
+    def true_rad(self, read_rad: Pair, approach: Approach = UNKNOWN) -> Pair:
+        """Return true (pan, tilt) of a reading."""
+        return self.pan.true_rad(read_rad[0], approach[0]), self.tilt.true_rad(read_rad[1], approach[1])
+
+    def read_rad(self, true_rad: Pair, approach: Approach = UNKNOWN) -> Pair:
+        """Return what (pan, tilt) read where they truly are."""
+        return self.pan.read_rad(true_rad[0], approach[0]), self.tilt.read_rad(true_rad[1], approach[1])
+
+
+def numbers_of(joints: Joints) -> FloatArray:
+    """Return the ten numbers (10,) of both joints, in the order of `JOINTS_NAMES`."""
+    numbers = []
+    for axis in (joints.pan, joints.tilt):
+        pairs = (*axis.harmonics_rad, (0.0, 0.0), (0.0, 0.0))[:MOST_HARMONICS]
+        numbers += [*(part for pair in pairs for part in pair), axis.backlash_rad]
+    return np.array(numbers)
+
+
+def joints_of(numbers: FloatArray) -> Joints:
+    """Return the joints of ten numbers in the order of `JOINTS_NAMES`. Raises ValueError as `AxisJoint`."""
+    pan, tilt = (
+        AxisJoint(_without_zeros(((c1, s1), (c2, s2))), backlash)
+        for c1, s1, c2, s2, backlash in np.asarray(numbers, dtype=np.float64).reshape(2, 5).tolist()
+    )
+    return Joints(pan, tilt)
+
+
+def _without_zeros(pairs: tuple[Pair, ...]) -> tuple[Pair, ...]:
+    """Leave out harmonics at the end that are nothing."""
+    while pairs and pairs[-1] == (0.0, 0.0):
+        pairs = pairs[:-1]
+    return pairs
+
+
+def _cos(at_rad: _Angle) -> _Angle:
+    return math.cos(at_rad) if isinstance(at_rad, float) else np.cos(at_rad)
+
+
+def _sin(at_rad: _Angle) -> _Angle:
+    return math.sin(at_rad) if isinstance(at_rad, float) else np.sin(at_rad)
