@@ -3,6 +3,7 @@
 ``records`` holds the dataclasses, ``reader`` and ``writer`` go between them and the folder.
 """
 
+from calib.survey.bench_writer import BenchFolder
 from calib.survey.reader import read_survey
 from calib.survey.records import (
     Board,
@@ -18,6 +19,7 @@ from calib.survey.records import (
 from calib.survey.writer import write_survey
 
 __all__ = [
+    "BenchFolder",
     "Board",
     "Click",
     "Dots",

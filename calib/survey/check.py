@@ -13,6 +13,7 @@ import numpy as np
 from calib.files.strict import nearest
 from calib.rigid import FloatArray, Rigid
 from calib.survey import Finding, Survey, SurveyCamera, SurveyImage
+from calib.survey.bench_check import bench_findings
 from calib.survey.doubts import dot_doubts, grid_doubts, station_doubts, unit_doubts
 from calib.survey.joint_doubts import joint_doubts
 from calib.survey.mixups import Placement, eyes_in_rover_m, mixups, rover_from_boards
@@ -52,6 +53,13 @@ def check_survey(
         Whether cameras will be fitted to images of purpose camera alone, as the paper does.
     """
     purposes = ("camera",) if only_camera_images else ("camera", "mast")
+    if survey.boards:
+        return tuple(
+            sorted(
+                [*bench_findings(survey), *_angles(survey, pan_limits_rad, tilt_limits_rad)],
+                key=lambda finding: finding.severity,
+            )
+        )
     findings = [*_missing(survey), *_set_ups(survey), *_placements(survey)]
     angles = list(_angles(survey, pan_limits_rad, tilt_limits_rad))
     units = list(unit_doubts(survey))

@@ -3,19 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from calib.boards import AnyBoard, Corners
 from calib.camera.cahvor import Kind
 from calib.rigid import FloatArray
 
 IntArray = NDArray[np.int64]
 StationKind = Literal["prism", "tape", "check"]
 Purpose = Literal["camera", "mast", "check"]
+Approach = Literal[-1, 0, 1]
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,6 +45,10 @@ class Board:
         x = (np.asarray(columns, dtype=np.float64) - (self.columns - 1) / 2) * self.spacing_m
         y = (np.asarray(rows, dtype=np.float64) - (self.rows - 1) / 2) * self.spacing_m
         return np.stack([x, y, np.zeros_like(x)], axis=-1)
+
+
+NO_BOARD = Board(0, 0, 0.0, 0.0, {})
+"""The surveyed board of a bench: none."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,7 +89,8 @@ class SurveyImage:
 
     ``file`` is relative to the survey's folder, ``Path()`` where there is no picture but only dots.
     ``placement`` is empty for a check image without a board. ``row`` is the line of the file, the header
-    being line 1.
+    being line 1. Of a bench: ``board`` names what it shows, and an approach is +1 where the joint came to
+    rest from smaller angles, -1 from larger ones, 0 where that is not known.
     """
 
     name: str
@@ -95,6 +102,9 @@ class SurveyImage:
     tilt_rad: float | None
     file: Path
     row: int
+    board: str = ""
+    pan_approach: Approach = 0
+    tilt_approach: Approach = 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,19 +128,26 @@ class Click:
 
 @dataclass(frozen=True)
 class Sigma:
-    """Standard deviations of the measurements, one axis each."""
+    """Standard deviations of the measurements, one axis each.
+
+    A bench has ``corner_px``, of corners whose own sigma corners.csv does not tell, and ``joint_rad``;
+    station and dots are 0 there.
+    """
 
     station_m: float
     dot_px: float
     joint_rad: float = 0.0
     prism_cad_m: float = 0.0
+    corner_px: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
 class Survey:
     """Everything that was measured.
 
-    ``dots`` maps an image's name to its dots; ``digest`` identifies the folder's contents.
+    ``dots`` maps an image's name to its dots; ``digest`` identifies the folder's contents. A bench, which has
+    no station, has ``boards`` by name, whose poses are unknown (one for each set-up, placement and board),
+    and ``corners`` by an image's name; ``board``, prisms, station, dots and clicks are then empty.
     """
 
     folder: Path
@@ -144,6 +161,8 @@ class Survey:
     dots: Mapping[str, Dots]
     clicks: tuple[Click, ...] = ()
     digest: str = ""
+    boards: Mapping[str, AnyBoard] = field(default_factory=dict)
+    corners: Mapping[str, Corners] = field(default_factory=dict)
 
     def measured(self, kind: StationKind) -> dict[tuple[str, str], dict[str, FloatArray]]:
         """Return set-up and placement ('' for prisms) to the points (3,) of a kind measured there, metres."""

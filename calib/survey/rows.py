@@ -65,13 +65,20 @@ class Row:
         return [self.number(column, limit) for column in columns]
 
 
-def rows_of(data: bytes, path: Path, columns: Sequence[str]) -> Iterator[Row]:
+def rows_of(
+    data: bytes, path: Path, columns: Sequence[str], may_be_there: Sequence[str] | None = None
+) -> Iterator[Row]:
     """Yield the rows of a CSV file's bytes; blanks around a cell do not count.
+
+    Parameters
+    ----------
+    columns
+        Exactly these in this order; or, with ``may_be_there``, these and any of those, in any order.
 
     Raises
     ------
     BadFile
-        For what is no UTF-8 CSV with exactly these columns, and for a row of another length.
+        For what is no UTF-8 CSV with such columns, and for a row of another length.
     """
     try:
         text = data.decode("utf-8-sig")
@@ -82,7 +89,11 @@ def rows_of(data: bytes, path: Path, columns: Sequence[str]) -> Iterator[Row]:
     blank_line = 0
     count = 0
     try:
-        check_header(next(lines, []), path, columns)
+        header = next(lines, [])
+        if may_be_there is not None:
+            columns = _header(header, path, columns, may_be_there)
+        else:
+            check_header(header, path, columns)
         for cells in lines:
             line = lines.line_num
             if not cells:
@@ -98,3 +109,22 @@ def rows_of(data: bytes, path: Path, columns: Sequence[str]) -> Iterator[Row]:
             yield Row(path, line, dict(zip(columns, map(str.strip, cells), strict=True)))
     except csv.Error as error:
         raise BadFile(path, f"line {lines.line_num}", f"is not CSV: {error}") from None
+
+
+def _header(
+    cells: Sequence[str], path: Path, columns: Sequence[str], may_be_there: Sequence[str]
+) -> Sequence[str]:
+    """The columns that a header names, all known, each once, none missing that must be there."""
+    found = [cell.strip() for cell in cells]
+    if not set(found) & set(columns):  # separated by something else, or no header
+        check_header(found, path, columns)
+    known = [*columns, *may_be_there]
+    for name in found:
+        if name not in known:
+            raise BadFile(path, "line 1", f"'{name[:40]}' is no column; {nearest(name, known)}")
+        if found.count(name) > 1:
+            raise BadFile(path, "line 1", f"column {name} is there twice")
+    for name in columns:
+        if name not in found:
+            raise BadFile(path, "line 1", f"there is no column {name}; expected '{','.join(columns)}'")
+    return found

@@ -71,6 +71,13 @@ def sigma_of(section: Section) -> Sigma:
     return Sigma(_positive(section, "station_m"), _positive(section, "dot_px"), **optional)
 
 
+def bench_sigma_of(section: Section) -> Sigma:
+    joint_rad = section.number("joint_rad", 10.0) if "joint_rad" in section else 0.0
+    if joint_rad < 0:
+        raise section.bad("joint_rad", f"{joint_rad:g} where 0 or more is expected")
+    return Sigma(0.0, 0.0, joint_rad, corner_px=_positive(section, "corner_px"))
+
+
 def cameras_of(top: Section) -> dict[str, SurveyCamera]:
     cameras: dict[str, SurveyCamera] = {}
     for name in top.mapping("cameras"):

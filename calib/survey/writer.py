@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import csv
-import io
 import os
 import secrets
 import shutil
@@ -15,14 +13,9 @@ from typing import Any
 from calib.errors import BadFile
 from calib.files.atomic import sync_folder
 from calib.files.yaml_text import dump_mapping
-from calib.survey.reader import (
-    CLICK_COLUMNS,
-    DOT_COLUMNS,
-    IMAGE_COLUMNS,
-    SCHEMA,
-    STATION_COLUMNS,
-    read_survey,
-)
+from calib.survey.bench_writer import bench_files, camera_document, file_cell, joint_cells, table
+from calib.survey.folder import SCHEMA
+from calib.survey.reader import CLICK_COLUMNS, DOT_COLUMNS, IMAGE_COLUMNS, STATION_COLUMNS, read_survey
 from calib.survey.records import Survey
 
 
@@ -85,11 +78,21 @@ def _check(new: Path, target: Path) -> None:
 
 def _files(survey: Survey) -> list[tuple[str, bytes]]:
     """Return the text files' names and bytes."""
+    if survey.boards:
+        return bench_files(survey)
     station: list[Sequence[Any]] = [
         (p.setup, p.kind, p.placement, p.point, *_floats(p.position_m)) for p in survey.station
     ]
     images: list[Sequence[Any]] = [
-        (i.name, i.camera, i.setup, i.placement, i.purpose, *_joints(i.pan_rad, i.tilt_rad), _file(i.file))
+        (
+            i.name,
+            i.camera,
+            i.setup,
+            i.placement,
+            i.purpose,
+            *joint_cells(i.pan_rad, i.tilt_rad),
+            file_cell(i.file),
+        )
         for i in survey.images
     ]
     dots: list[Sequence[Any]] = [
@@ -100,28 +103,18 @@ def _files(survey: Survey) -> list[tuple[str, bytes]]:
     clicks: list[Sequence[Any]] = [(c.image, c.point, *_floats(c.pixel_px)) for c in survey.clicks]
     files = [
         ("survey.yaml", dump_mapping(_document(survey))),
-        ("station.csv", _table(STATION_COLUMNS, station)),
-        ("images.csv", _table(IMAGE_COLUMNS, images)),
+        ("station.csv", table(STATION_COLUMNS, station)),
+        ("images.csv", table(IMAGE_COLUMNS, images)),
     ]
     if dots:
-        files.append(("dots.csv", _table(DOT_COLUMNS, dots)))
+        files.append(("dots.csv", table(DOT_COLUMNS, dots)))
     if clicks:
-        files.append(("clicks.csv", _table(CLICK_COLUMNS, clicks)))
+        files.append(("clicks.csv", table(CLICK_COLUMNS, clicks)))
     return files
 
 
 def _document(survey: Survey) -> dict[str, Any]:
     board, sigma = survey.board, survey.sigma
-    cameras: dict[str, dict[str, Any]] = {}
-    for name, camera in survey.cameras.items():
-        cameras[name] = {
-            "on": camera.on,
-            "size_px": list(camera.size_px),
-            "model": camera.kind,
-            "focal_px": float(camera.focal_px),
-        }
-        if camera.rough_C_m is not None and camera.rough_A is not None:
-            cameras[name]["rough"] = {"C": camera.rough_C_m, "A": camera.rough_A}
     return {
         "schema": SCHEMA,
         "board": {
@@ -138,29 +131,13 @@ def _document(survey: Survey) -> dict[str, Any]:
             "joint_rad": sigma.joint_rad,
             "prism_cad_m": sigma.prism_cad_m,
         },
-        "cameras": cameras,
+        "cameras": {name: camera_document(camera) for name, camera in survey.cameras.items()},
         "stereo": survey.stereo,
     }
 
 
 def _floats(values: Iterable[Any]) -> list[str]:
     return [repr(float(value)) for value in values]
-
-
-def _joints(pan_rad: float | None, tilt_rad: float | None) -> list[str]:
-    return ["" if angle is None else repr(float(angle)) for angle in (pan_rad, tilt_rad)]
-
-
-def _file(path: Path) -> str:
-    return "" if path == Path() else path.as_posix()
-
-
-def _table(columns: Sequence[str], rows: Iterable[Sequence[Any]]) -> bytes:
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(columns)
-    writer.writerows(rows)
-    return text.getvalue().encode()
 
 
 def _write(path: Path, data: bytes) -> None:
