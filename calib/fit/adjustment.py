@@ -24,7 +24,7 @@ import numpy as np
 from calib.camera.cahvor import CameraModel
 from calib.camera.parameters import parameter_names, parameter_part, predict, stepped
 from calib.fit.least_squares import Normal
-from calib.fit.terms import ImageTerm, StationTerm
+from calib.fit.terms import DRAWING, JOINTS, ImageTerm, StationTerm, widened_images
 from calib.fit.usual_lens import lens_knowledge
 from calib.mast.gimbal import MAST_FREE, MAST_NAMES, gimbal, gimbal_rates, mast_of
 from calib.mast.rig import Mast
@@ -131,6 +131,15 @@ class Adjustment:
     def with_terms(self, images: Sequence[ImageTerm], station: Sequence[StationTerm]) -> Adjustment:
         """Return the same problem with other terms of the same unknowns."""
         return self._copy(images=tuple(images), station=tuple(station))
+
+    def with_sigmas(self, factors: Mapping[str, float]) -> Adjustment:
+        """Return the same problem with sigmas times ``factors``, by kind (``calib.fit.components``)."""
+        return self._copy(
+            images=widened_images(self.images, factors),
+            station=tuple(replace(p, sigma_m=p.sigma_m * factors.get(p.kind, 1.0)) for p in self.station),
+            joint_rad=self.joint_rad * factors.get(JOINTS, 1.0),
+            prism_cad_m=self.prism_cad_m * factors.get(DRAWING, 1.0),
+        )
 
     def _copy(self, **changed: object) -> Adjustment:
         other = object.__new__(type(self))

@@ -8,6 +8,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from calib.fit.components import Component
 from calib.mast.rig import Rig
 from calib.rigid import FloatArray, Rigid
 
@@ -134,9 +135,12 @@ class Calibration:
     notes
         What else a person should know, a sentence each.
     chi2, degrees_of_freedom
-        Weighted sum of squares of the residuals, and what it is expected to be.
+        Sum of squares of the residuals in stated sigmas, and what it is expected to be.
     chi2_probability
         The chance of a larger ``chi2`` were all sigmas right; nan where the method does not weigh by them.
+    components
+        How large the errors of each kind of measurement are, against its stated sigma; empty where the method
+        does not weigh by them.
     images, station
         What remains of every measurement.
     rover_from_station, rover_from_board
@@ -169,6 +173,11 @@ class Calibration:
     rover_from_board: Mapping[tuple[str, str], Rigid]
     prisms_in_rover_m: Mapping[str, FloatArray]
     seconds: float
+    components: tuple[Component, ...] = ()
+
+    def widened(self, kind: str) -> float:
+        """Return by how much the fit takes a kind of measurement for worse than stated; 1 if it does not."""
+        return next((c.weighed for c in self.components if c.kind == kind), 1.0)
 
     def part(self, prefix: str) -> np.ndarray:
         """Return where the parameters that begin with ``prefix`` are, as indices."""

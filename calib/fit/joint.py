@@ -2,24 +2,27 @@
 
 From a start (``calib.fit.start_values``) the fit goes on with pulls bounded (Huber), so that blunders can be
 told by the tests of ``calib.fit.outliers``; then plain least squares without them. A fit that ends far above
-the noise is refused.
+the noise is refused. Where residuals show that a kind of measurement is worse than stated, the fit is done
+again with the sigma that they show (``calib.fit.components``), and so is its covariance.
 """
 
 from __future__ import annotations
 
 import time
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.stats import chi2
 
 from calib.fit.adjustment import HUBER, MAST, Adjustment, Estimate
 from calib.fit.calibration import Calibration
-from calib.fit.least_squares import Minimum, covariance_of, minimise
+from calib.fit.components import Component, variance_components, wider_sigmas
+from calib.fit.least_squares import Minimum, Normal, covariance_of, minimise
 from calib.fit.outliers import FALSE_ALARMS, judge, name_outliers
 from calib.fit.residuals import check_rms, image_residuals, rms_by_camera, station_residuals
 from calib.fit.start_values import Start, SurveyNotFitted, start_values
-from calib.fit.terms import ImageTerm, StationTerm, with_kept
+from calib.fit.terms import ImageTerm, StationTerm, widened_images, with_kept
 from calib.fit.uncertainty import open_directions, sigma_by_key
 from calib.fit.usual_lens import lens_notes
 from calib.mast.rig import Rig, RigCamera
@@ -29,8 +32,15 @@ from calib.survey import Survey
 ROUNDS = 40
 """Times that measurements are judged and the fit done again, at most."""
 
-WRONG_MINIMUM = 3.0
-"""A fit is refused if the typical dot is this many times farther off than its sigma says."""
+WEIGHINGS = 6
+"""Times that sigmas are widened and the fit done again, at most; three mostly do."""
+
+WEIGHED = 0.02
+"""Sigmas are good enough when the next ones differ by less than this part."""
+
+WRONG_MINIMUM = 6.0
+"""A fit is refused if the typical dot is this many times farther off than its sigma says: stated sigmas are
+wrong by two or three, wrong minima by a hundred."""
 
 MANY = 0.15
 """More than this part of the tapes left out (and more than three) are no blunders: the model fails."""
@@ -55,11 +65,50 @@ def fit_joint(survey: Survey, mast_parameters: int = 6) -> Calibration:
     began = time.perf_counter()
     from_here = start_values(survey, mast_parameters)
     problem = joint_problem(survey, from_here, mast_parameters)
-    problem, fit = without_blunders(problem, from_here)
-    covariance = covariance_of(fit.normal.matrix, problem.weak)
+    problem, fit = without_blunders(problem, from_here.estimate, from_here.images)
     _refuse_wrong_minimum(problem, fit.state)
     _refuse_unsettled(fit)
-    return _calibration(survey, mast_parameters, from_here, problem, fit, covariance, began)
+    weighed = weigh(problem, fit, from_here.images)
+    _refuse_unsettled(weighed.fit)
+    return _calibration(survey, mast_parameters, from_here, (problem, fit), weighed, began)
+
+
+@dataclass(frozen=True, eq=False)
+class Weighed:
+    """A fit with sigmas as large as residuals show them.
+
+    ``images`` are all that were fitted, with every dot and these sigmas.
+    """
+
+    problem: Adjustment
+    fit: Minimum[Estimate]
+    covariance: FloatArray
+    images: tuple[ImageTerm, ...]
+    components: tuple[Component, ...]
+
+
+def weigh(problem: Adjustment, fit: Minimum[Estimate], images: Sequence[ImageTerm]) -> Weighed:
+    """Return the fit with the sigma widened of each kind of measurement that is worse than stated.
+
+    Parameters
+    ----------
+    problem, fit
+        Fitted with the stated sigmas, blunders left out.
+    images
+        All that were fitted, with every dot.
+    """
+    weighed: dict[str, float] = {}
+    for count in range(WEIGHINGS + 1):
+        covariance = covariance_of(fit.normal.matrix, problem.weak)
+        components = variance_components(problem.blocks(fit.state), covariance, weighed)
+        wanted = wider_sigmas(components)
+        change = {kind: factor / weighed.get(kind, 1.0) for kind, factor in wanted.items()}
+        if count == WEIGHINGS or all(abs(ratio - 1.0) < WEIGHED for ratio in change.values()):
+            break
+        weighed |= wanted
+        images = widened_images(images, change)
+        problem, fit = without_blunders(problem.with_sigmas(change), fit.state, images, bounded=False)
+    return Weighed(problem, fit, covariance, tuple(images), components)
 
 
 def joint_problem(survey: Survey, from_here: Start, mast_parameters: int) -> Adjustment:
@@ -80,18 +129,23 @@ def joint_problem(survey: Survey, from_here: Start, mast_parameters: int) -> Adj
     return problem.with_terms(with_kept(problem.images, unseen), problem.station)
 
 
-def without_blunders(problem: Adjustment, from_here: Start) -> tuple[Adjustment, Minimum[Estimate]]:
-    """Fit, judge, and fit again until nothing fails; the last fit is plain least squares."""
-    fit = minimise(problem, from_here.estimate, weak=problem.weak, gain=1e-7)
-    _refuse_lost(fit)
-    for huber in (HUBER, None):
+def without_blunders(
+    problem: Adjustment, start: Estimate, all_images: Sequence[ImageTerm], *, bounded: bool = True
+) -> tuple[Adjustment, Minimum[Estimate]]:
+    """Fit, judge, and fit again until nothing fails; the last fit is plain least squares.
+
+    ``bounded`` begins with pulls bounded: for a start that blunders may have moved.
+    """
+    fit = Minimum(start, Normal(np.inf, np.zeros((0, 0)), np.zeros(0)), False, 0)
+    if bounded:
+        fit = minimise(problem, start, weak=problem.weak, gain=1e-7)
+        _refuse_lost(fit)
+    for huber in (HUBER, None) if bounded else (None,):
         problem = problem.with_huber(huber)
         fit = minimise(problem, fit.state, weak=problem.weak, gain=1e-7 if huber else 1e-11)
         kept = {_kept(problem.images, problem.station)}
         for _ in range(ROUNDS):
-            verdict = judge(
-                problem, fit.state, covariance_of(fit.normal.matrix, problem.weak), from_here.images
-            )
+            verdict = judge(problem, fit.state, covariance_of(fit.normal.matrix, problem.weak), all_images)
             pattern = _kept(verdict.images, verdict.station)
             if pattern in kept:  # nothing new, or a measurement on its limit that comes and goes
                 break
@@ -154,26 +208,26 @@ def _calibration(
     survey: Survey,
     mast_parameters: int,
     from_here: Start,
-    problem: Adjustment,
-    fit: Minimum[Estimate],
-    covariance: FloatArray,
+    as_stated: tuple[Adjustment, Minimum[Estimate]],
+    weighed: Weighed,
     began: float,
 ) -> Calibration:
-    """Put together what the fit says."""
-    state = fit.state
+    """Put together what the fit says, with the stated sigmas and with those that were found."""
+    problem, state, covariance = weighed.problem, weighed.fit.state, weighed.covariance
     size = problem.parts[MAST].stop
     names = problem.names[:size]
-    chi_square, freedom = goodness(problem, state, covariance)
-    probability = float(chi2.sf(chi_square, freedom)) if freedom > 0 else float("nan")
     notes = list(from_here.notes)
     mine = covariance[:size, :size]
-    if probability < 0.001:
+    chi_square, freedom = goodness(problem, state, covariance)
+    if freedom > 0 and chi2.sf(chi_square, freedom) < 0.001:
         notes.append(
-            f"the residuals are {np.sqrt(chi_square / freedom):.2f} times what the stated sigmas allow "
+            f"the residuals are {np.sqrt(chi_square / freedom):.2f} times what their sigmas allow "
             f"(chi-square {chi_square:.0f} for {freedom:.0f}); uncertainties are scaled up by as much"
         )
         mine = mine * chi_square / freedom
-    notes += _prism_notes(problem, state, mast_parameters)
+    stated, first = as_stated
+    notes += _prism_notes(stated, first.state, mast_parameters)
+    chi_square, freedom = goodness(stated, first.state, covariance_of(first.normal.matrix, stated.weak))
     rig = rig_of(survey, state)
     order = mast_first(names)
     names = [names[i] for i in order]
@@ -191,15 +245,16 @@ def _calibration(
         sigma=sigma,
         rms_px=rms_by_camera(images),
         check_rms_px=check_rms(survey, state, images),
-        outliers=name_outliers(problem, state, covariance, from_here.images),
+        outliers=name_outliers(problem, state, covariance, weighed.images),
         false_alarms=3 * FALSE_ALARMS,
         degenerate=open_directions(problem, problem.names[:size], covariance[:size, :size]),
         notes=tuple(notes),
         chi2=chi_square,
         degrees_of_freedom=freedom,
-        chi2_probability=probability,
+        chi2_probability=float(chi2.sf(chi_square, freedom)) if freedom > 0 else float("nan"),
         images=images,
         station=station_residuals(problem, state),
+        components=weighed.components,
         rover_from_station=state.rover_from_station,
         rover_from_board=state.rover_from_board,
         prisms_in_rover_m=state.prisms_in_rover_m,

@@ -10,6 +10,9 @@ import numpy as np
 from calib.rigid import FloatArray, Rigid
 from calib.survey import Survey
 
+JOINTS, TAPES, PRISMS, DRAWING, DOTS_OF = "joint readings", "tapes", "prisms", "drawing", "dots of "
+"""Kinds of measurements, each with a sigma of its own."""
+
 
 @dataclass(frozen=True, eq=False)
 class ImageTerm:
@@ -28,6 +31,11 @@ class ImageTerm:
     sigma_px: FloatArray
     keep: np.ndarray
 
+    @property
+    def kind(self) -> str:
+        """Which measurements have the same sigma."""
+        return DOTS_OF + self.camera
+
 
 @dataclass(frozen=True, eq=False)
 class StationTerm:
@@ -40,6 +48,11 @@ class StationTerm:
     in_board_m: FloatArray
     sigma_m: float
     keep: bool = True
+
+    @property
+    def kind(self) -> str:
+        """Which measurements have the same sigma."""
+        return PRISMS if self.board is None else TAPES
 
     @property
     def name(self) -> str:
@@ -110,3 +123,8 @@ def station_terms(survey: Survey, boards: Mapping[tuple[str, str], Rigid]) -> tu
 def with_kept(images: Sequence[ImageTerm], left_out: frozenset[str] | set[str]) -> tuple[ImageTerm, ...]:
     """Return the terms with whole images left out by name."""
     return tuple(replace(t, keep=np.zeros_like(t.keep)) if t.name in left_out else t for t in images)
+
+
+def widened_images(images: Sequence[ImageTerm], factors: Mapping[str, float]) -> tuple[ImageTerm, ...]:
+    """Return the terms with sigmas times ``factors``, by kind."""
+    return tuple(replace(t, sigma_px=t.sigma_px * factors.get(t.kind, 1.0)) for t in images)

@@ -1,13 +1,16 @@
-"""What residuals of check images a survey's own noise explains: dots and tapes by their sigmas."""
+"""What residuals of check images a survey's own noise explains: dots and tapes by their sigmas, as the
+fit takes them."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 from scipy.stats import chi2
 
 from calib.fit.calibration import Calibration, ImageResiduals
+from calib.fit.terms import DOTS_OF, PRISMS, TAPES
 from calib.fit.uncertainty import pixel_covariance
 from calib.rigid import rigid_rates
 from calib.survey import Survey
@@ -35,7 +38,8 @@ def check_sizes(survey: Survey, calibration: Calibration) -> dict[str, CheckSize
     all (Satterthwaite's degrees of freedom).
     """
     try:
-        setups, boards = rover_from_station(survey), station_from_board(survey)
+        setups = rover_from_station(_with_station(survey, calibration.widened(PRISMS)))
+        boards = station_from_board(_with_station(survey, calibration.widened(TAPES)))
     except NotAligned:
         return {}
     squares: dict[str, list[tuple[float, float]]] = {}
@@ -56,6 +60,11 @@ def check_sizes(survey: Survey, calibration: Calibration) -> dict[str, CheckSize
     return sizes
 
 
+def _with_station(survey: Survey, factor: float) -> Survey:
+    """The survey with the station's sigma as the fit takes it."""
+    return replace(survey, sigma=replace(survey.sigma, station_m=factor * survey.sigma.station_m))
+
+
 def _expected_px2(
     survey: Survey, calibration: Calibration, image: ImageResiduals, setup: Alignment, board: Alignment
 ) -> float:
@@ -74,5 +83,6 @@ def _expected_px2(
     in_rover = rigid_rates(rates, points, setup.b_from_a.translation_m)
     common = np.einsum("nip,pq,niq->ni", in_rover, setup.covariance, in_rover)
     _, by_fit = pixel_covariance(calibration, image.camera, pan, tilt, points)
+    dots = calibration.widened(DOTS_OF + image.camera)
     relative = np.maximum(np.einsum("nii->ni", by_fit) - common, 0.0)
-    return float(np.nanmean(by_board + relative + image.sigma_px[:, None] ** 2))
+    return float(np.nanmean(by_board + relative + (dots * image.sigma_px[:, None]) ** 2))

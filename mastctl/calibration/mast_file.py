@@ -15,6 +15,7 @@ from calib.files.yaml_text import plain
 from calib.fit.calibration import Calibration
 from calib.mast.rig import Rig
 from calib.survey import Survey
+from mastctl.calibration.stated import components_told
 
 DIGITS = 9
 """Significant digits of the covariance: enough that it stays positive definite."""
@@ -35,6 +36,7 @@ def with_fit(calibration: Calibration, survey: Survey, verdict: Mapping[str, Any
         "sigma": plain(calibration.sigma),
         "chi2": _finite(calibration.chi2),
         "degrees_of_freedom": _finite(calibration.degrees_of_freedom),
+        "sigmas_found": components_told(survey, calibration),
         "outliers": [outlier.name for outlier in calibration.outliers],
         "degenerate": [direction.sentence for direction in calibration.degenerate],
         "verdict": dict(verdict),

@@ -15,6 +15,7 @@ from calib.fit.calibration import HELD_FIXED, Calibration
 from calib.survey import Survey
 from mastctl.calibration import drawn
 from mastctl.calibration.maps import change_map, uncertainty_map
+from mastctl.calibration.stated import component_table
 from mastctl.calibration.verdict import POINTING_RANGE_M, Verdict
 from mastctl.report import pages, plots
 from mastctl.report.figures import Figure
@@ -114,6 +115,7 @@ def _page(told: Told) -> str:
         reasons=[(pages.Badge(one.grade, one.grade), one.sentence) for one in verdict.reasons],
         mast=mast_table(calibration),
         cameras=camera_table(calibration),
+        measurements=component_table(survey, calibration),
         notes=calibration.notes,
         held_fixed=HELD_FIXED,
         warnings=told.warnings,

@@ -15,6 +15,7 @@ from calib.fit.uncertainty import pointing_covariance
 from calib.survey import Survey
 from mastctl.calibration.exchanged import exchanged_boards
 from mastctl.calibration.expected import RARELY, check_sizes
+from mastctl.calibration.stated import wrong_sentence
 
 Grade = Literal["good", "care", "bad"]
 
@@ -42,6 +43,9 @@ ODD_IMAGE = 6.0
 """An image this many times farther off than others of its camera and purpose; good surveys reach 3.4."""
 
 FEW_IMAGES = 4
+
+HOPELESS = 5.0
+"""Measurements that scatter so many times their stated sigma are not what they are taken for."""
 
 
 @dataclass(frozen=True)
@@ -123,9 +127,19 @@ def _noise(survey: Survey, calibration: Calibration) -> list[Reason]:
         f"chi-square is {calibration.chi2:.0f} for {calibration.degrees_of_freedom:.0f} degrees of freedom: "
         f"the residuals are {factor:.2f} times what the stated sigmas make them"
     )
-    if calibration.chi2_probability < RARELY:
-        return [Reason("bad" if factor > 2.0 else "care", words)]
-    return [Reason("good", words)]
+    wrong = [c for c in calibration.components if c.wrong]
+    unexplained: Grade = "bad" if factor > 2.0 and not wrong else "care"
+    reasons = [Reason(unexplained if calibration.chi2_probability < RARELY else "good", words)]
+    for component in wrong:
+        grade: Grade = "bad" if component.factor > HOPELESS else "care"
+        reasons.append(Reason(grade, wrong_sentence(survey.sigma, component)))
+    told = [c for c in calibration.components if np.isfinite(c.factor)]
+    if told and not wrong:
+        most = max(told, key=lambda c: c.factor)
+        words = f"each kind of measurement scatters no more than stated, most of all {most.kind}: "
+        words += f"{most.factor:.2f} ± {most.factor_sigma:.2f} times their sigma"
+        reasons.append(Reason("good", words))
+    return reasons
 
 
 def _odd_images(calibration: Calibration) -> list[Reason]:

@@ -167,6 +167,7 @@ def _document(done: Calibrated, in_use: StoredRig | None, page: Path | None) -> 
     from calib.fit.calibration import HELD_FIXED
     from mastctl.calibration.mast_file import as_lists, mast_keys
     from mastctl.calibration.report import change_summary
+    from mastctl.calibration.stated import components_told
 
     fit = done.calibration
     sigma = plain(fit.sigma)
@@ -188,6 +189,7 @@ def _document(done: Calibrated, in_use: StoredRig | None, page: Path | None) -> 
         "chi2": _finite(fit.chi2),
         "degrees_of_freedom": _finite(fit.degrees_of_freedom),
         "chi2_probability": _finite(fit.chi2_probability),
+        "sigmas_found": components_told(done.survey, fit),
         "outliers": [
             {"kind": o.kind, "name": o.name, "sentence": o.sentence, "size": _finite(o.size)}
             for o in fit.outliers
@@ -218,12 +220,15 @@ def _finite(number: float) -> float | None:
 def _show(done: Calibrated, in_use: StoredRig | None, page: Path | None) -> None:
     """Tables for people."""
     from mastctl.calibration.report import camera_table, change_summary, mast_table
+    from mastctl.calibration.stated import component_table
 
     fit = done.calibration
     output.print_table(
         f"Mast ({fit.method}, {fit.mast_parameters} parameters, {fit.seconds:.1f} s)", *mast_table(fit)
     )
     output.print_table("Cameras", *camera_table(fit), fit.notes)
+    if (components := component_table(done.survey, fit)) is not None:
+        output.print_table("Measurements", *components)
     if fit.outliers:
         shown = [[outlier.name, _off(outlier)] for outlier in fit.outliers[:OUTLIERS_SHOWN]]
         more = len(fit.outliers) - len(shown)
