@@ -41,7 +41,14 @@ LAST_STEPS = 500
 """Steps at most of the last fit, which must settle: a narrow field hardly tells the lens, and took 170."""
 
 GROSS = 6.0
-"""An image is another board's if its rms is this many times the typical image's (and above its noise)."""
+"""An image is another board's if its typical residual is this many times the typical image's (and above its
+noise)."""
+
+STRAY = 3.0
+"""A point so many times farther off than an image may be is left out by itself."""
+
+MEDIAN_OF_TWO = 2 * np.log(2.0)
+"""Median of chi-square with two degrees of freedom."""
 
 
 class CameraNotFitted(CalibError):
@@ -141,14 +148,23 @@ def fit_camera(
 
 
 def _typical(fit: CameraFit, images: np.ndarray) -> float:
-    """Median over images of the rms residual, pixels."""
-    return float(np.median(_image_rms(fit.residuals_px, images)))
+    """Median over images of the typical residual, pixels."""
+    return float(np.median(_image_sizes(fit.residuals_px, images)))
 
 
-def _image_rms(residuals_px: FloatArray, images: np.ndarray) -> FloatArray:
-    """Rms residual of each image, infinite where a point has no pixel."""
-    square = np.nan_to_num((residuals_px**2).mean(axis=1), nan=np.inf)
-    return np.asarray(np.sqrt(np.bincount(images, square) / np.bincount(images)))
+def _image_sizes(residuals_px: FloatArray, images: np.ndarray) -> FloatArray:
+    """Residual of each image's typical point, per coordinate; infinite where most have no pixel.
+
+    By the median: an image in which some points are found elsewhere is judged by the others.
+    """
+    count = int(images.max()) + 1
+    return np.array([typical_px(residuals_px[images == i]) for i in range(count)])
+
+
+def typical_px(residuals_px: FloatArray) -> float:
+    """Return the sigma of a coordinate that the median length of residuals (n, 2) tells, pixels."""
+    square = np.nan_to_num((residuals_px**2).sum(axis=1), nan=np.inf)
+    return float(np.sqrt(np.median(square) / MEDIAN_OF_TWO)) if len(square) else float("inf")
 
 
 def _starts(
@@ -180,7 +196,7 @@ def _starts(
                 if model is None:
                     continue
                 seen, _ = model.project(points_m[probe])
-                score = float(np.median(_image_rms(seen - pixels_px[probe], images[probe])))
+                score = float(np.median(_image_sizes(seen - pixels_px[probe], images[probe])))
                 if score < best_score:
                     best, best_score = model, score
             if best is not None:
@@ -303,22 +319,21 @@ def _fit_from(
         problem = FixedPoints(points_m[used], pixels_px[used], np.maximum(weighted, sigma_px))
         model = minimise(problem, model, weak=weak, steps=rounds, gain=1e-6).state
     seen, valid = model.project(points_m)
-    rms = _image_rms(seen - pixels_px, images)
-    limit_px = GROSS * max(float(np.median(rms)), expected_px)
-    good = rms < limit_px
-    used = valid & good[images]
-    if used.sum() < 8 or len(np.unique(images[used])) < 2:
-        return None
-    found = minimise(
-        FixedPoints(points_m[used], pixels_px[used], np.full(int(used.sum()), sigma_px)),
-        model,
-        weak=weak,
-        steps=LAST_STEPS,
-    )
-    if not found.settled:
-        return None
-    model = found.state
-    seen, _ = model.project(points_m)
+    sizes = _image_sizes(seen - pixels_px, images)
+    limit_px = GROSS * max(float(np.median(sizes)), expected_px)
+    good = sizes < limit_px
+    for _ in range(2):  # a point that only an unfinished lens puts elsewhere comes back
+        used = valid & good[images] & (np.linalg.norm(seen - pixels_px, axis=1) < STRAY * limit_px)
+        if used.sum() < 8 or len(np.unique(images[used])) < 2:
+            return None
+        problem = FixedPoints(points_m[used], pixels_px[used], np.full(int(used.sum()), sigma_px))
+        found = minimise(problem, model, weak=weak, steps=LAST_STEPS)
+        if not found.settled:
+            return None
+        model = found.state
+        seen, valid = model.project(points_m)
+        if used.sum() == (valid & good[images]).sum():
+            break
     residuals = seen - pixels_px
     freedom = max(2 * int(used.sum()) - len(weak), 1)
     unit_weight = float(np.sum((residuals[used] / sigma_px) ** 2)) / freedom

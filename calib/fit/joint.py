@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.stats import chi2
@@ -113,8 +113,9 @@ def weigh(problem: Adjustment, fit: Minimum[Estimate], images: Sequence[ImageTer
 
 def joint_problem(survey: Survey, from_here: Start, mast_parameters: int) -> Adjustment:
     """Return the least-squares problem of a survey, without images that disagree with the start."""
+    images = [replace(t, keep=from_here.kept.get(t.name, t.keep)) for t in from_here.images]
     problem = Adjustment(
-        with_kept(from_here.images, from_here.doubtful),
+        with_kept(images, from_here.doubtful),
         from_here.station,
         from_here.estimate,
         mast_parameters=mast_parameters if from_here.reference_rad else 0,
@@ -245,7 +246,7 @@ def _calibration(
         sigma=sigma,
         rms_px=rms_by_camera(images),
         check_rms_px=check_rms(survey, state, images),
-        outliers=name_outliers(problem, state, covariance, weighed.images),
+        outliers=(*name_outliers(problem, state, covariance, weighed.images), *from_here.stray_checks),
         false_alarms=3 * FALSE_ALARMS,
         degenerate=open_directions(problem, problem.names[:size], covariance[:size, :size]),
         notes=tuple(notes),

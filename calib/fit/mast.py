@@ -14,6 +14,7 @@ import numpy as np
 
 from calib.camera.cahvor import CameraModel
 from calib.errors import CalibError
+from calib.fit.camera import typical_px
 from calib.fit.least_squares import Normal, minimise
 from calib.mast.gimbal import MAST_FREE, gimbal, gimbal_rates
 from calib.rigid import FloatArray
@@ -28,7 +29,7 @@ LAST_STEPS = 100
 """Steps at most of the last fit, which must settle."""
 
 GROSS = 6.0
-"""An image is left out if its rms is this many times the typical image's and the expected one."""
+"""An image is left out if its typical residual is this many times that of most images and the expectation."""
 
 
 class MastNotFitted(CalibError):
@@ -198,7 +199,7 @@ def _fit_from(
         mast = minimise(
             _Images(seen, free, _cauchy(seen, mast, expected_px)), mast, weak=weak, steps=steps
         ).state
-    rms = np.array([_rms(mast_residual(view, mast)) for view in views])
+    rms = np.array([typical_px(mast_residual(view, mast)) for view in views])
     typical = float(np.median(rms))
     limit_px = GROSS * max(typical, expected_px)
     good = (rms <= limit_px) | keep_all
@@ -228,13 +229,9 @@ def _thinned(view: MastView) -> MastView:
     )
 
 
-def _rms(residual_px: FloatArray) -> float:
-    return float(np.sqrt(np.nan_to_num((residual_px**2).mean(), nan=np.inf)))
-
-
 def _cauchy(views: Sequence[MastView], mast: FloatArray, expected_px: float) -> list[FloatArray]:
     """Sigmas that take the pull from images far from the typical one."""
-    rms = np.array([_rms(mast_residual(view, mast)) for view in views])
+    rms = np.array([typical_px(mast_residual(view, mast)) for view in views])
     typical = max(float(np.median(rms)), expected_px)
     if not np.isfinite(typical):
         return [np.ones(len(view.points_m)) for view in views]

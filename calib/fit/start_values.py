@@ -23,6 +23,7 @@ from calib.fit.calibration import Outlier
 from calib.fit.camera import CameraFit, CameraNotFitted, fit_camera
 from calib.fit.mast import MastNotFitted, MastView, fit_mast
 from calib.fit.station_poses import station_poses
+from calib.fit.stray_dots import without_stray_dots
 from calib.fit.terms import ImageTerm, StationTerm, image_terms, station_terms
 from calib.mast.gimbal import MAST_NAMES, mast_of
 from calib.rigid import FloatArray, Rigid
@@ -44,7 +45,9 @@ class Start:
     ``reference_rad`` holds, for each head camera, the joint setting at which it was calibrated, and
     ``in_rover`` the cameras there, in the rover frame. ``limits_px`` holds, for each camera, how far off (rms
     of the distances) the dots of an image may be that takes part. ``bent`` are placements whose tapes do not
-    fit the board, ``blunders`` prisms and tapes that the poses were found without.
+    fit the board, ``blunders`` prisms and tapes that the poses were found without. ``kept`` holds, for images
+    with stray dots, which of their dots the start was made with; ``stray_checks`` are those of check images,
+    which lose them for good.
     """
 
     images: tuple[ImageTerm, ...]
@@ -59,6 +62,8 @@ class Start:
     bent: frozenset[tuple[str, str]]
     blunders: tuple[Outlier, ...]
     notes: tuple[str, ...]
+    kept: Mapping[str, np.ndarray]
+    stray_checks: tuple[Outlier, ...]
 
 
 def start_values(survey: Survey, mast_parameters: int, *, only_camera_images: bool = False) -> Start:
@@ -71,6 +76,8 @@ def start_values(survey: Survey, mast_parameters: int, *, only_camera_images: bo
     SurveyNotFitted
         If a set-up, a camera or the mast cannot be started; the sentence says what is missing.
     """
+    every = survey
+    survey, strays = without_stray_dots(survey)
     try:
         station = station_poses(survey)
     except NotAligned as error:
@@ -103,6 +110,7 @@ def start_values(survey: Survey, mast_parameters: int, *, only_camera_images: bo
         if name in reference:
             model = model.moved(mast_of(mast).rover_from_head(*reference[name]).inverse)
         cameras[name] = model
+    images, kept = _with_strays(every, images, strays, rover_from_board)
     images = [t for t in images if t.camera in cameras]
     estimate = Estimate(
         cameras,
@@ -125,7 +133,28 @@ def start_values(survey: Survey, mast_parameters: int, *, only_camera_images: bo
         bent,
         station.blunders,
         tuple(notes),
+        kept,
+        tuple(o for o in strays if any(o.name.startswith(f"image {t.name} dot ") for t in checks)),
     )
+
+
+def _with_strays(
+    survey: Survey,
+    images: Sequence[ImageTerm],
+    strays: Sequence[Outlier],
+    boards: Mapping[tuple[str, str], Rigid],
+) -> tuple[list[ImageTerm], dict[str, np.ndarray]]:
+    """The terms with the dots that the start was made without, and which dots it was made with."""
+    if not strays:
+        return list(images), {}
+    whole = {t.name: t for t in image_terms(survey, boards, [])[0]}
+    kept = {}
+    for term in images:
+        if len(whole[term.name].rows) > len(term.rows):
+            with_these = set(zip(term.rows.tolist(), term.columns.tolist(), strict=True))
+            places = zip(whole[term.name].rows.tolist(), whole[term.name].columns.tolist(), strict=True)
+            kept[term.name] = np.array([place in with_these for place in places])
+    return [whole[term.name] for term in images], kept
 
 
 def at_setting(image: ImageTerm, setting_rad: tuple[float, float], joint_rad: float) -> bool:

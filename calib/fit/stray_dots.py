@@ -3,7 +3,8 @@
 Over one board, pixels are a smooth function of the place on it, whatever the lens and the board's pose: a
 polynomial of the fourth degree is good to some hundredths of a pixel. What is left of a dot is its own
 noise, and its square in sigmas chi-square with two degrees of freedom. This is the test for fits that
-take boards as exact: there the station's error moves all dots of an image, and would hide a wrong one.
+take boards as exact: there the station's error moves all dots of an image, and would hide a wrong one. Every
+start does (``calib.fit.start_values``).
 """
 
 from __future__ import annotations
@@ -38,14 +39,14 @@ PULL = 2.5
 def without_stray_dots(survey: Survey) -> tuple[Survey, tuple[Outlier, ...]]:
     """Return the survey without dots that disagree with the rest of their image, and these.
 
-    Check images are left as they are. Where the typical dot is farther off than its stated sigma, the limit
-    is wider by as much.
+    Check images are tested as well: nothing is fitted here but a polynomial. Where the typical dot is farther
+    off than its stated sigma, the limit is wider by as much.
     """
     tested = {}
     for image in survey.images:
         dots = survey.dots.get(image.name)
         degree = 0 if dots is None else next((d for n, d in DEGREES if len(dots.rows) >= n), 0)
-        if image.purpose != "check" and dots is not None and degree:
+        if dots is not None and degree:
             tested[image.name] = _test(survey, dots, degree)
     if not tested:
         return survey, ()
@@ -79,6 +80,8 @@ def _test(survey: Survey, dots: Dots, degree: int) -> tuple[FloatArray, FloatArr
         size = off_px / sigma
         size = size / max(1.0, float(np.median(size)))
         weight = np.minimum(1.0, PULL / np.maximum(size, PULL)) ** 2 / sigma**2
+        if not (size > PULL).any():
+            break
     root = np.sqrt(weight)[:, None]
     share = np.linalg.norm(np.linalg.qr(root * terms)[0], axis=1) ** 2
     # A dot alone in its corner bends the polynomial to itself: judge it by what that leaves.

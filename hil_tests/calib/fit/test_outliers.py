@@ -17,7 +17,7 @@ from calib.fit.start_values import SurveyNotFitted
 from calib.fit.terms import ImageTerm
 from calib.mast.rig import Rig
 from calib.survey import Survey
-from drivers.sim_survey.blunders import with_moved_tape, with_wrong_prism
+from drivers.sim_survey.blunders import with_moved_tape, with_outlier_dots, with_wrong_prism
 from hil_tests.calib.fit.small_surveys import survey_of, with_shifted_dots, with_swapped_dots
 
 SEED = 6
@@ -77,6 +77,25 @@ def test_wrong_dots_are_named(survey: Survey, good: Calibration) -> None:
     fit = fit_joint(with_shifted_dots(wrong, other, (0.0, 300.0), 50))
     assert names(fit) == {f"image {one} dot (row 1, column 7)", f"image {other} dot (row 5, column 0)"}
     assert_unharmed(fit, good)
+
+
+@pytest.mark.parametrize("seed", [1, 4])
+def test_a_start_lives_through_dots_far_off_everywhere_and_a_tape_5_cm_aside(
+    true_rig: Rig, seed: int
+) -> None:
+    """One dot in a hundred of every image, those of check images too, and a tape that bends its board."""
+    rng = np.random.default_rng(seed)
+    survey, wrong = survey_of(true_rig, seed), set[str]()
+    for image in survey.images:
+        survey, places = with_outlier_dots(survey, image.name, 1, rng.uniform(20.0, 60.0), rng)
+        wrong |= {f"image {image.name} dot (row {r}, column {c})" for r, c in places}
+    survey = with_moved_tape(survey, "tilted-back", "hazcam-3m-2", "b", (0.03, 0.0, 0.04))
+    fit = fit_joint(survey)
+    assert names(fit) >= wrong | {"tape b of placement hazcam-3m-2 (set-up tilted-back)"}
+    assert len(fit.outliers) <= len(wrong) + 2
+    truth = np.array([*true_rig.mast.translation_m, *true_rig.mast.rotation_rad])
+    off = np.abs(fit.estimate[:6] - truth) / np.sqrt(np.diag(fit.covariance)[:6])
+    assert off.max() < SIGMAS_OFF
 
 
 @pytest.mark.parametrize("shift_px", [3.0, 8.0, 150.0])

@@ -50,12 +50,17 @@ def test_wrong_dots_are_named_and_taken_out(good: Survey, camera: str, distance_
     assert not left & set(places)
 
 
-def test_a_shifted_image_and_check_images_are_not_its_matter(good: Survey) -> None:
+def test_a_shifted_image_is_not_its_matter(good: Survey) -> None:
     shifted = {n: replace(d, pixels_px=d.pixels_px + 3.0) for n, d in good.dots.items()}
     assert without_stray_dots(replace(good, dots=shifted))[1] == ()
+
+
+def test_check_images_lose_theirs_too(good: Survey) -> None:
     check = next(i.name for i in good.images if i.purpose == "check")
-    spoiled, _ = with_outlier_dots(good, check, 2, 20.0, np.random.default_rng(2))
-    assert without_stray_dots(spoiled)[1] == ()
+    spoiled, places = with_outlier_dots(good, check, 2, 20.0, np.random.default_rng(2))
+    assert {s.name for s in without_stray_dots(spoiled)[1]} == {
+        f"image {check} dot (row {r}, column {c})" for r, c in places
+    }
 
 
 def test_few_dots_are_left_alone(good: Survey) -> None:
