@@ -5,13 +5,15 @@ from __future__ import annotations
 import subprocess
 import sys
 import threading
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from hil_tests.mastctl.outside_daemon import daemon_process, line, under_way, write_config
 from hil_tests.mastctl.service_fakes import FakeHardware, FakeStep, ScriptedLoop, eventually, fake_daemon
 from mastctl.client import Client, ClientError
 from mastctl.client import connection as connection_module
@@ -122,6 +124,43 @@ def test_a_daemon_that_ends_during_a_wait_is_one_plain_sentence(
     with pytest.raises(ClientError, match="no daemon answers at") as refused:
         client.wait(operation, timeout_s=BOUND_S)
     assert refused.value.code == "no_daemon"
+
+
+@pytest.mark.parametrize("way", ["operation", "state", "track"])
+def test_a_daemon_that_is_killed_while_a_client_listens_is_one_plain_sentence(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, way: str
+) -> None:
+    heard, listens = connection_module.DaemonHttp.heard, threading.Event()
+
+    def noted(self: Any, *args: Any) -> Any:
+        for event in heard(self, *args):
+            listens.set()
+            yield event
+
+    monkeypatch.setattr(connection_module.DaemonHttp, "heard", noted)
+    waits: dict[str, Callable[[Client, str], Any]] = {
+        "operation": lambda client, name: client.wait(name, BOUND_S),
+        "state": lambda client, name: client.wait_state("stopped", timeout_s=BOUND_S),
+        "track": lambda client, name: client.wait_track(name, BOUND_S),
+    }
+    with (
+        daemon_process(tmp_path, write_config(tmp_path)) as daemon,
+        Client(line(daemon)) as client,
+        Client(client.url) as waiter,
+        ThreadPoolExecutor(1) as pool,
+    ):
+        under_way(client)
+        operation = client.status()["operation"]
+        waiting = pool.submit(waits[way], waiter, operation)
+        assert listens.wait(BOUND_S)
+        daemon.kill()
+        began_s = time.monotonic()
+        with pytest.raises(ClientError) as told:
+            waiting.result(BOUND_S)
+        assert time.monotonic() - began_s < BOUND_S / 2, "it does not wait for its whole time"
+    assert told.value.code == "no_daemon"
+    assert "\n" not in str(told.value)
+    assert "no daemon answers at" in str(told.value)
 
 
 def test_a_stream_that_breaks_is_begun_again(

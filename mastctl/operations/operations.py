@@ -98,8 +98,8 @@ class Operations:
     def start(self, request: Mapping[str, Any], work: Work, on_end: OnEnd | None = None) -> Operation:
         """Start ``work(record_step, cancelled)`` in a thread and return its first record.
 
-        A stopped operation that has not ended yet is waited for, `ENDS_SOON_S` at most. ``on_end`` gets the
-        last record, in the same thread, when the next operation may be started already.
+        ``on_end`` gets the last record, in the same thread, when the next operation may be started already.
+        Waits for nobody: `let_stopped_end` does, before any lock is taken.
 
         Raises
         ------
@@ -108,7 +108,6 @@ class Operations:
         Unable
             ``no_thread`` if the machine has none for it (the record says so too), ``closing``.
         """
-        self.let_stopped_end()
         with self._lock:
             name = f"{next(self._numbers):06d}-{self._run}"
             self._machine.operation_began(name, request)

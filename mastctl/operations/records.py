@@ -27,7 +27,7 @@ class Operation:
     error: Mapping[str, Any] | None = None
 
     def told(self, *, steps: bool = True) -> dict[str, Any]:
-        """Return the record as JSON; the last pointing's residual stands in front too."""
+        """Return the record as JSON; in front the last pointing's residual too, or why a jog ended."""
         told: dict[str, Any] = as_json(self if steps else replace(self, steps=()))
         made = told.pop("result")
         result = made if isinstance(made, dict) else {}
@@ -35,13 +35,18 @@ class Operation:
         last = pointings[-1] if pointings else {}
         if not steps:
             del told["steps"]
-        return told | {
-            "residual_px": last.get("residual_px"),
-            "residual_sigma_px": last.get("residual_sigma_px"),
-            "position_m": result.get("position_m"),
-            "range_m": result.get("range_m"),
-            "pointings": pointings,
-        }
+        ended = {"ended_because": result["ended_because"]} if "ended_because" in result else {}
+        return (
+            told
+            | ended
+            | {
+                "residual_px": last.get("residual_px"),
+                "residual_sigma_px": last.get("residual_sigma_px"),
+                "position_m": result.get("position_m"),
+                "range_m": result.get("range_m"),
+                "pointings": pointings,
+            }
+        )
 
 
 def last_residual(result: Any, name: str) -> Residual | None:

@@ -14,6 +14,7 @@ import logging
 import math
 import threading
 from collections.abc import Callable, Mapping
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -87,11 +88,19 @@ class Jogs:
         What heartbeats are good by.
     people
         What clients live by, whatever the clock of a simulated rover does; the machine's own by default.
+    undisturbed
+        A context in which a jog begins, for what needs a head that rests: it changes before or after.
     """
 
     def __init__(
-        self, operations: Operations, devices: JogDevices, clock: Clock, people: Clock | None = None
+        self,
+        operations: Operations,
+        devices: JogDevices,
+        clock: Clock,
+        people: Clock | None = None,
+        undisturbed: Callable[[], AbstractContextManager[object]] = nullcontext,
     ) -> None:
+        self._undisturbed = undisturbed
         self._operations = operations
         self._devices = devices
         self._clock = clock
@@ -108,6 +117,8 @@ class Jogs:
             ``jog_ended`` if it names a jog that does not run; ``busy`` if an operation runs, or a jog that
             counts its heartbeats and is not named; else as `Operations.start`.
         """
+        if beat.jog is None:
+            self._operations.let_stopped_end()
         with self._lock:
             running = self._running()
             if beat.jog is not None:
@@ -126,7 +137,8 @@ class Jogs:
             jog = _Jog(self._devices, self._clock, self._people, beat)
             pan, tilt = beat.rates_rad_per_s
             asked = {"jog": {"pan_rad_per_s": pan, "tilt_rad_per_s": tilt}}
-            name = self._operations.start(asked, jog.run).id
+            with self._undisturbed():
+                name = self._operations.start(asked, jog.run).id
             self._jog = name, jog
             threading.Thread(target=jog.watch, name="jog's client", daemon=True).start()
             return jog.told(name, True)

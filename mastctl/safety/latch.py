@@ -11,6 +11,7 @@ import contextlib
 import logging
 import threading
 import time
+from collections.abc import Callable, Mapping
 from dataclasses import asdict
 from datetime import UTC, datetime
 from typing import Any
@@ -70,11 +71,12 @@ class Latch:
         self._ended = False
         try:
             document = self._file.read()
-            if document is not None and document.get("latched") is not False:
+            if document is not None and _latched(document):
                 self.held = Latched(*(_text(document.get(key)) for key in ("name", "reason", "at")))
         except BadFile as error:
             self.held = Latched("mastctl", f"whether one was latched cannot be read: {error}", _now())
         self._kept = self.held
+        self._on_disk = self.held is not None  # whether a restart may find one, this one or another
         if self.held is not None:
             log.warning("%s", self.held.sentence)
         threading.Thread(target=self._keep, name="latch", daemon=True).start()
@@ -143,8 +145,8 @@ class Latch:
             if held is None:
                 raise NotNow("not_estopped", "no emergency stop is latched")
             with self._changed:  # before the disk changes: from here on nobody is told that it holds a stop
-                kept, self._kept = self._kept, None
-            if kept is not None:
+                self._kept = None
+            if self._on_disk:
                 released = {"by": name, "reason": reason, "at": _now()}
                 self._write_released({"latched": False, **asdict(held), "released": released})
             with self._changed:
@@ -167,16 +169,24 @@ class Latch:
 
     def _write_released(self, document: dict[str, Any]) -> None:
         """Say on the disk that nothing is latched. Raises Unable."""
-        try:
-            self._file.write(document)
-        except BadFile as error:
+        ways: tuple[Callable[[], None], ...] = (
+            lambda: self._file.write(document),
+            lambda: self._file.overwrite(document),  # a full disk still takes this, and the room stays
+            self._file.remove,  # and this one that cannot be written to
+        )
+        refused = ""
+        for way in ways:
             try:
-                self._file.remove()  # a full disk still takes this
-            except BadFile:
-                with self._changed:  # what the disk says is not known: the thread writes it again
-                    self._changed.notify_all()
-                words = f"the emergency stop stays latched, since its release cannot be kept: {error}"
-                raise Unable("not_saved", words) from None
+                way()
+            except BadFile as error:
+                refused = refused or str(error)
+            else:
+                self._on_disk = False
+                return
+        with self._changed:  # what the disk says is not known: the thread writes it again
+            self._changed.notify_all()
+        words = f"the emergency stop stays latched, since its release cannot be kept: {refused}"
+        raise Unable("not_saved", words)
 
     def _keep(self) -> None:
         """Write what is latched, in a thread of its own."""
@@ -206,9 +216,22 @@ class Latch:
         """Have it on the disk. Raises BadFile."""
         document = {"latched": True, **asdict(held)}
         try:
-            self._file.overwrite(document)
-        except BadFile:  # no file with room for it, or one that cannot be written to any more
-            self._file.write(document)
+            try:
+                self._file.overwrite(document)
+            except BadFile:  # no file with room for it, or one that cannot be written to any more
+                self._file.write(document)
+        except BadFile:
+            self._on_disk = self._on_disk or self._says_latched()
+            raise
+        self._on_disk = True
+
+    def _says_latched(self) -> bool:
+        """Whether a restart would take the file for a latched stop."""
+        try:
+            document = self._file.read()
+        except BadFile:
+            return True
+        return document is not None and _latched(document)
 
     def _tried(self, held: Latched, problem: str) -> None:
         """Note how the writing went, and say each change once."""
@@ -222,6 +245,10 @@ class Latch:
             self._changed.notify_all()
             if problem and self._ended:
                 self._kept = held  # nothing more can be done
+
+
+def _latched(document: Mapping[str, Any]) -> bool:
+    return document.get("latched") is not False
 
 
 def _now() -> str:

@@ -12,7 +12,7 @@ from mastctl.devices.devices import Devices
 from mastctl.errors import NotNow
 from mastctl.operations.operations import Operations
 from mastctl.service.mast_in_use import MastInUse, read_next
-from mastctl.state.publisher import Publisher
+from mastctl.state.machine import Machine
 
 log = logging.getLogger(__name__)
 
@@ -27,9 +27,9 @@ class Masts:
     first
         The one that the configuration names.
     devices, operations
-        Say whether the head rests.
-    publisher
-        Tells which is in use.
+        Ask the head whether it rests, and let what was stopped end before.
+    machine
+        Says whether anything runs; its publisher tells which is in use.
     follow
         Has everything use another one from now on.
 
@@ -45,7 +45,7 @@ class Masts:
         first: MastInUse,
         devices: Devices,
         operations: Operations,
-        publisher: Publisher,
+        machine: Machine,
         follow: Callable[[MastInUse], None],
     ) -> None:
         self.in_use = first
@@ -53,10 +53,10 @@ class Masts:
         self._config = config
         self._devices = devices
         self._operations = operations
-        self._publisher = publisher
+        self._machine = machine
         self._follow = follow
         self._lock = threading.Lock()
-        publisher.publish("mast", "in_use", first.told())
+        machine.publisher.publish("mast", "in_use", first.told())
 
     @contextmanager
     def unchanged(self) -> Iterator[MastInUse]:
@@ -99,9 +99,10 @@ class Masts:
 
         What it gets puts another mast file into use. Raises NotNow ``busy``, ``moving``; DriverError.
         """
+        self._operations.let_stopped_end()
         self._devices.read()  # the machine knows whether it moves now
         with self._lock:
-            refusal = self._operations.refusal("rest")
+            refusal = self._machine.refusal("rest")
             if refusal is not None:
                 raise refusal
             yield self._put
@@ -118,7 +119,7 @@ class Masts:
     def _put(self, mast: MastInUse) -> None:
         self._follow(mast)
         self.in_use, self.former = mast, self.in_use
-        self._publisher.publish("mast", "in_use", mast.told())
+        self._machine.publisher.publish("mast", "in_use", mast.told())
         for note in mast.stored.notes:
             log.warning("%s", note)
         log.info("mast file %s (%s) is in use", mast.path.name, mast.stored.digest[:12])

@@ -185,11 +185,11 @@ class Service:
             machine,
         )
         self.stopping = Stopping(self.devices, self.operations, self.tracker, machine, self.latch)
-        self.masts = Masts(config, mast, self.devices, self.operations, machine.publisher, self._use_mast)
+        self.masts = Masts(config, mast, self.devices, self.operations, machine, self._use_mast)
         self.steering = Steering(
             self.masts, rig, self.devices, clock, self.operations, self.tracker, self.health
         )
-        self.jogs = Jogs(self.operations, self.devices, clock)
+        self.jogs = Jogs(self.operations, self.devices, clock, undisturbed=self.masts.unchanged)
 
     @classmethod
     def open(cls, config: Config, clock: Clock | None = None, folder: StateFolder | None = None) -> Service:

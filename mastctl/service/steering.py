@@ -130,10 +130,14 @@ class Steering:
         BadRequest, NotNow
             As `mastctl.tracking.tracker.Tracker.take_pose`.
         """
+        if look:
+            self._operations.let_stopped_end()
         with self._masts.unchanged():
-            taken = self._tracker.take_pose(pose, look)
-            self._devices.door.rover_stands(pose.site_from_rover.inverse.rotation)
-            return taken
+            return self._tracker.take_pose(pose, look, self._stands)
+
+    def _stands(self, pose: RoverPose) -> None:
+        """Have the sun of the site frame kept out by a pose."""
+        self._devices.door.rover_stands(pose.site_from_rover.inverse.rotation)
 
     def _check(self, request: PointRequest) -> None:
         """Refuse a request that does not fit the mast file in use; see `point`."""

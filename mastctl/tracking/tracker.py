@@ -139,8 +139,19 @@ class Tracker:
             )
             return operation
 
-    def take_pose(self, pose: RoverPose, look: bool) -> str | None:
+    def take_pose(
+        self, pose: RoverPose, look: bool, stands_at: Callable[[RoverPose], None] = lambda pose: None
+    ) -> str | None:
         """Take where the rover stands now; carry the track over and look for its target.
+
+        Parameters
+        ----------
+        pose
+            Where it stands.
+        look
+            Whether its target is looked for from there.
+        stands_at
+            Gets a pose that is not refused, before anything is looked for from it; must return at once.
 
         Returns
         -------
@@ -169,6 +180,7 @@ class Tracker:
                     "covariance (6 rows of 6) or sigma of the motion since the pose before is missing; while "
                     "a track runs it says where to look",
                 )
+            stands_at(pose)
             if before is not None and not stands(motion_between(before, pose)):
                 self._moved_s = pose.received_s
             status = replace(self._status, pose=pose)

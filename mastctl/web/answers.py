@@ -303,7 +303,7 @@ class ErrorBody(_Told):
 
 
 class OperationListed(_Told):
-    """An operation without its steps. Times of CLOCK_MONOTONIC."""
+    """An operation without its steps; ``ended_because`` of a jog. Times of CLOCK_MONOTONIC."""
 
     id: str
     state: Literal["queued", "running", "done", "failed", "stopped"]
@@ -317,6 +317,7 @@ class OperationListed(_Told):
     position_m: Point | None
     range_m: float | None
     pointings: list[PointingTold]
+    ended_because: str | None = None
 
 
 class OperationTold(OperationListed):

@@ -213,7 +213,7 @@ def test_closing_halts_the_head_and_ends_what_runs_and_nothing_starts_after_it(
     assert len(mover.told) == told, "the devices may be closed by then"
 
 
-def test_a_stop_does_not_wait_for_the_operation_but_the_next_start_does(
+def test_a_stop_does_not_wait_for_the_operation_but_the_next_command_does(
     operations: Operations, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("mastctl.operations.operations.ENDS_SOON_S", 30.0)
@@ -227,27 +227,30 @@ def test_a_stop_does_not_wait_for_the_operation_but_the_next_start_does(
     first = operations.start({}, ends_late).id
     assert operations.stop() == first
     assert operations.get(first).state == "running"
-    seen: list[str] = []
-    waits = threading.Thread(target=lambda: seen.append(operations.start({}, until_cancelled).id))
+    seen: list[Any] = []
+    waits = threading.Thread(target=lambda: seen.append(operations.refusal("motion")))
     waits.start()
     assert operations.running == first
     go.set()
     waits.join(30.0)
-    assert operations.running == seen[0] != first
+    assert seen == [None]
+    assert operations.running is None
     assert operations.get(first).state == "stopped"
     operations.close()
 
 
-def test_a_start_after_a_stop_waits_for_a_bounded_time(
+def test_a_command_after_a_stop_waits_for_a_bounded_time(
     operations: Operations, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("mastctl.operations.operations.ENDS_SOON_S", 0.05)
     go = threading.Event()
     operations.start({}, lambda record, cancelled: go.wait(30.0))
     operations.stop()
-    with pytest.raises(NotNow) as refused:
+    refused = operations.refusal("motion")
+    assert refused is not None
+    assert refused.code == "stopping"
+    with pytest.raises(NotNow, match="stop"):
         operations.start({}, until_cancelled)
-    assert refused.value.code == "stopping"
     go.set()
 
 

@@ -288,3 +288,52 @@ def test_where_time_stands_a_client_that_is_gone_does_not_keep_the_head_for_ever
     assert operation.state == "done"
     assert "nothing was heard of its client" in operation.result.ended_because
     assert rig.head.stops >= 1
+
+
+def test_two_clients_that_begin_while_what_was_stopped_still_ends_do_not_make_time_stand_still(
+    rig: Rig,
+) -> None:
+    """A simulation's time passes while all wait on its clock: nobody may keep a lock meanwhile."""
+
+    def slow_to_end(record: Any, cancelled: threading.Event) -> None:
+        while not cancelled.is_set():
+            rig.clock.sleep(0.05)
+        rig.clock.sleep(2.0)
+
+    refused: list[str] = []
+
+    def begin() -> None:
+        with rig.clock.at_work():
+            try:
+                rig.jogs.beat(Beat((RATE, 0.0), sequence=1))
+            except NotNow as error:
+                refused.append(error.code)
+
+    with rig.clock.at_work():
+        rig.operations.start({}, slow_to_end)
+        rig.clock.sleep(0.2)
+        rig.operations.stop()
+        clients = [threading.Thread(target=begin, daemon=True) for _ in range(2)]
+        for client in clients:
+            client.start()
+    for client in clients:
+        client.join(10.0)
+    assert refused == ["stopping", "stopping"]
+
+
+def test_a_jog_begins_before_or_after_what_needs_a_head_that_rests(rig: Rig) -> None:
+    changing = threading.Lock()
+    jogs = Jogs(rig.operations, rig.devices, rig.clock, undisturbed=lambda: changing)
+    begun = threading.Event()
+
+    def begin() -> None:
+        jogs.beat(Beat((RATE, 0.0)))
+        begun.set()
+
+    with changing:
+        client = threading.Thread(target=begin, daemon=True)
+        client.start()
+        assert not begun.wait(0.2)
+        assert rig.operations.running is None
+    assert begun.wait(10.0)
+    assert rig.operations.running is not None

@@ -23,6 +23,7 @@ from calib.files.mast_file import save_rig
 from hil_tests.mastctl.outside_daemon import BOUND_S, Pipe, daemon_process, free_port, line
 from hil_tests.mastctl.service_fakes import eventually, rig
 from mastctl.client import Client, ClientError
+from mastctl.client.jog import Jog
 from mastctl.safety.stop_line import ask
 from tools.campaigns.servo_rigs import line_alone
 
@@ -30,6 +31,8 @@ GOAL_RAD = 0.95
 SPEED_RAD_PER_S = 0.05  # the way takes 19 s: a stop on a busy machine still comes before its end
 STANDS_S = 0.3
 SAME_RAD = 1e-4
+COUNTS_RAD = 5e-3  # three of the coarser servo's
+JOG_GOES_ON_S = 0.35  # docs/limits.md: a goal 0.25 s ahead, ten of them a second
 
 DRIVERS = ["dynamixel", "flir_ptu"]
 
@@ -107,6 +110,35 @@ def test_killed_under_way_the_watchdog_or_halt_stops_the_head(bench: Bench) -> N
     again = bench.halt()  # a head that stands is left standing
     assert again.returncode == 0, again.stderr
     bench.stopped_on_the_way()
+
+
+def test_killed_during_a_jog_the_head_goes_no_further_than_the_goal_ahead_whatever_its_driver(
+    bench: Bench,
+) -> None:
+    with daemon_process(bench.folder, bench.config) as daemon, Client(line(daemon)) as client:
+        with pytest.raises(ClientError) as gone, client.jog() as jog:
+            jog.rates(SPEED_RAD_PER_S, 0.0)
+            eventually(lambda: bench.pan_rad > 0.02, "the jog", BOUND_S)
+            daemon.kill()
+            daemon.wait(BOUND_S)
+            killed_at_rad = bench.pan_rad
+            eventually(bench.stands, "the head stands", BOUND_S)
+            stood_at_rad = bench.pan_rad
+            eventually(lambda: not_taken(jog), "a heartbeat is missed", BOUND_S)
+        assert gone.value.code == "no_daemon"
+    assert 0.0 <= stood_at_rad - killed_at_rad <= SPEED_RAD_PER_S * JOG_GOES_ON_S + COUNTS_RAD
+    done = bench.halt()
+    assert done.returncode == 0, done.stderr
+    assert abs(bench.pan_rad - stood_at_rad) < COUNTS_RAD
+
+
+def not_taken(jog: Jog) -> bool:
+    """Whether a heartbeat was refused."""
+    try:
+        jog.check()
+    except ClientError:
+        return True
+    return False
 
 
 def test_halt_stops_servos_that_move_without_a_watchdog(tmp_path: Path) -> None:

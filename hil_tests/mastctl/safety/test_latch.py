@@ -115,41 +115,95 @@ def test_a_disk_that_refuses_leaves_it_latched_in_memory_and_says_so_until_it_ta
     assert Latch(folder).held == held
 
 
-def test_a_reset_on_a_full_disk_takes_the_file_away(
+def refuse(file: StateFile, *ignored: Any) -> None:
+    raise BadFile(file.path, "", "cannot be saved: No space left on device")
+
+
+def test_a_reset_on_a_full_disk_leaves_the_file_its_room_for_the_next_stop(
     folder: StateFolder, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     latch = Latch(folder)
     latch.hold("smoke", "Ana")
     latch.head_told()
     assert latch.kept_within(BOUND_S)
+    monkeypatch.setattr(StateFile, "write", refuse)
+    latch.release("aired", "Ben")
+    assert latch.held is None
+    assert Latch(folder).held is None
+    held = latch.hold("sparks", "Cem")
+    latch.head_told()
+    assert latch.kept_within(BOUND_S)
+    assert Latch(folder).held == held
 
-    def write(file: StateFile, document: Any) -> None:
-        raise BadFile(file.path, "", "cannot be saved: No space left on device")
 
-    monkeypatch.setattr(StateFile, "write", write)
+def test_a_reset_takes_a_file_away_that_cannot_be_written(
+    folder: StateFolder, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    latch = Latch(folder)
+    latch.hold("smoke", "Ana")
+    latch.head_told()
+    assert latch.kept_within(BOUND_S)
+    monkeypatch.setattr(StateFile, "write", refuse)
+    monkeypatch.setattr(StateFile, "overwrite", refuse)
     latch.release("aired", "Ben")
     assert latch.held is None
     assert Latch(folder).held is None
 
 
-def test_a_reset_that_the_disk_refuses_leaves_it_latched_here_and_there(
+def test_a_reset_that_the_disk_refuses_leaves_it_latched_here_and_there_however_often_it_is_asked(
     folder: StateFolder, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     latch = Latch(folder)
     latch.hold("smoke", "Ana")
     latch.head_told()
     assert latch.kept_within(BOUND_S)
-
-    def refuse(file: StateFile, *ignored: Any) -> None:
-        raise BadFile(file.path, "", "cannot be saved: Read-only file system")
-
     with monkeypatch.context() as patch:
-        patch.setattr(StateFile, "write", refuse)
-        patch.setattr(StateFile, "remove", refuse)
-        with pytest.raises(Unable, match=r"stays latched.*Read-only"):
-            latch.release("aired", "Ben")
-        assert latch.held is not None
+        for way in ("write", "overwrite", "remove"):
+            patch.setattr(StateFile, way, refuse)
+        for _ in range(3):
+            with pytest.raises(Unable, match=r"stays latched.*No space"):
+                latch.release("aired", "Ben")
+            assert latch.held is not None
     assert Latch(folder).held == latch.held
+    latch.release("aired", "Ben")
+    assert Latch(folder).held is None
+
+
+def test_a_stop_that_no_disk_ever_took_is_reset_on_that_disk_too(
+    folder: StateFolder, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    latch = Latch(folder)
+    eventually((folder.path / FILE).exists, "a file that says that nothing is latched")
+    for way in ("write", "overwrite", "remove"):
+        monkeypatch.setattr(StateFile, way, refuse)
+    latch.hold("smoke", "Ana")
+    latch.head_told()
+    assert not latch.kept_within(BOUND_S)
+    latch.release("aired", "Ben")
+    assert latch.held is None
+    assert Latch(folder).held is None
+
+
+def test_a_stop_that_the_disk_took_in_part_is_no_release_until_the_disk_says_so(
+    folder: StateFolder, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def torn(file: StateFile, *ignored: Any) -> None:
+        file.path.write_bytes(b"{")
+        refuse(file)
+
+    latch = Latch(folder)
+    eventually((folder.path / FILE).exists, "a file that says that nothing is latched")
+    with monkeypatch.context() as patch:
+        patch.setattr(StateFile, "overwrite", torn)
+        for way in ("write", "remove"):
+            patch.setattr(StateFile, way, refuse)
+        latch.hold("smoke", "Ana")
+        latch.head_told()
+        assert not latch.kept_within(BOUND_S)
+        with pytest.raises(Unable, match="stays latched"):
+            latch.release("aired", "Ben")
+    assert latch.held is not None
+    assert Latch(folder).held is not None
 
 
 def test_a_stop_during_a_reset_wins(folder: StateFolder, monkeypatch: pytest.MonkeyPatch) -> None:

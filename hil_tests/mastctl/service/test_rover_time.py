@@ -129,6 +129,20 @@ def test_clients_see_times_that_agree_and_let_time_pass() -> None:
         assert status["joints"]["age_s"] <= 0.06
 
 
+def test_a_wait_ends_with_the_operation_and_its_own_time_is_that_of_who_waits() -> None:
+    with RunningDaemon(configured("max")) as daemon, Client(daemon.url) as client:
+        record = client.wait(client.point(pan_rad=2.0, tilt_rad=-0.5), LONG_S)
+        assert record["state"] == "done"
+        assert record["ended_s"] - record["started_s"] > 2.0
+        assert client.wait_state("ready", timeout_s=LONG_S)["state"] == "ready"
+        jog = client._daemon.json("POST", "/jog", json={"pan_rad_per_s": 0.2, "tilt_rad_per_s": 0.0})["id"]
+        with pytest.raises(ClientError, match=r"has not ended after 0\.3 s") as refused:
+            client.wait(jog, timeout_s=0.3)  # the rover's time stands: no heartbeat is missed
+        assert refused.value.code == "timeout"
+        client.advance(1.0)
+        assert "no heartbeat came" in client.wait(jog, LONG_S)["ended_because"]
+
+
 def test_time_that_passes_by_itself_is_not_turned_on() -> None:
     with RunningDaemon(configured(1)) as daemon, Client(daemon.url) as client:
         with pytest.raises(ClientError, match="passes by itself") as refused:

@@ -171,6 +171,30 @@ def test_a_full_covariance_is_taken_in_its_own_order(client: Client) -> None:
     )
 
 
+def test_what_keeps_the_head_off_the_sun_knows_a_pose_before_the_look_from_it_begins(
+    daemon: RunningDaemon, client: Client, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    started(client)
+    told: list[str] = []
+    door, operations = daemon.service.devices.door, daemon.service.operations
+    stands, start = door.rover_stands, operations.start
+
+    def rover_stands(rover_from_site: Any) -> None:
+        told.append("stands")
+        stands(rover_from_site)
+
+    def begin(*work: Any) -> Any:
+        told.append("look")
+        return start(*work)
+
+    monkeypatch.setattr(door, "rover_stands", rover_stands)
+    monkeypatch.setattr(operations, "start", begin)
+    drive(client, 0.5, 2.0)
+    assert told == ["stands", "look"]
+    refusal(lambda: drive(client, 1.0, 1.5), "pose_runs_backwards")
+    assert told == ["stands", "look"], "a refused pose turns no sun"
+
+
 def test_without_a_look_a_pose_only_carries_the_track_over(client: Client) -> None:
     started(client)
     track = drive(client, 0.5, 2.0, look=False)

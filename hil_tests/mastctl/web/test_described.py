@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import httpx
 import pytest
 
-from hil_tests.mastctl.service_fakes import fake_daemon
+from hil_tests.mastctl.service_fakes import eventually, fake_daemon
+from mastctl.client import Client
 from mastctl.web import PREFIX
 from mastctl.web.described import ANSWERS, EVENTS, FILES
-from tools.campaigns.fuzz_http import ask
+from tools.campaigns.fuzz_http import UNASKED, ask, taken_back
 
 FUZZ_S = 20.0
 
@@ -31,6 +33,21 @@ def test_every_route_has_a_model_a_kind_of_file_or_events_and_no_other_is_named(
         told = schemas[model.__name__]
         assert told.get("properties") or told["oneOf"], model.__name__
         assert "additionalProperties" not in schemas[model.__name__], "clients live with keys that come later"
+
+
+def test_three_routes_are_not_asked_and_what_has_the_others_refused_is_taken_back(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    unasked = {route.partition(" ")[2] for route in (*ANSWERS, *EVENTS, *FILES)}
+    unasked = {path for path in unasked if re.search(UNASKED, PREFIX + path)}
+    assert unasked == {"/events", "/track/stream", "/health/ready"}
+    with fake_daemon(monkeypatch, tmp_path) as (daemon, _), Client(daemon.url) as client:
+        client.estop()
+        client.acquire_lease("somebody", 3600.0)
+        with taken_back(daemon.url):
+            eventually(lambda: client.control() is None, "the lease is released")
+            eventually(lambda: client.status()["estop"] is None, "the stop is reset")
+            client.wait(client.point(pan_rad=0.1, tilt_rad=0.1))
 
 
 def test_whatever_is_asked_the_answer_is_as_described(
