@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from typing import Literal, get_args
 
@@ -26,6 +27,12 @@ def last_turn(approach: Approach, goal_rad: float, gravity_turnover_rad: float) 
     if approach == "gravity":
         return 1 if goal_rad < gravity_turnover_rad else -1
     return {"none": 0, "positive": 1, "negative": -1}[approach]
+
+
+def rising_below_rad(approach: Approach, gravity_turnover_rad: float) -> float | None:
+    """Return what `drivers.interfaces.AxisMotion` says of an approach."""
+    known = {"none": None, "positive": math.inf, "negative": -math.inf, "gravity": gravity_turnover_rad}
+    return known[approach]
 
 
 def legs_to(

@@ -130,10 +130,23 @@ class AxisMotion:
         With which it speeds up and brakes.
     beyond_goal_rad
         How far past a goal it may go on purpose, to come to it from one side.
+    rising_below_rad
+        To a goal below this angle it comes turning positive, to one above it negative, whichever way it came;
+        infinite for a head that always turns the same way at last. None: it comes the shortest way.
+    count_rad
+        One count of its encoder, or one step; None where it is not known.
     """
 
     acceleration_rad_per_s2: float
     beyond_goal_rad: float = 0.0
+    rising_below_rad: float | None = None
+    count_rad: float | None = None
+
+    def turn_to(self, goal_rad: float) -> int:
+        """Return 1 if it comes to a goal from smaller angles by itself, -1 from larger, 0 for neither."""
+        if self.rising_below_rad is None:
+            return 0
+        return 1 if goal_rad < self.rising_below_rad else -1
 
 
 @runtime_checkable

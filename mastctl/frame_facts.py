@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from typing import Any
 
 
@@ -19,11 +19,16 @@ class FrameFacts:
     mid_exposure_s, exposure_s
         Middle of the exposure, seconds of CLOCK_MONOTONIC, and its length, seconds.
     pan_rad, tilt_rad
-        Joint angles at mid-exposure, radians, interpolated from the measured ones around it.
+        Joint angles at mid-exposure, radians, interpolated from the measured ones around it: as read.
     moving
         Whether the head moved, or was told to, at any time of the exposure.
     mast_digest
         SHA-256 (hex) of the mast file in use.
+    true_pan_rad, true_tilt_rad
+        Where the axes truly stood by its ``joints``: what a camera's place follows from.
+    pan_approach, tilt_approach
+        From which side each axis had come: 1 from smaller readings, -1 from larger, 0 not known, between
+        them where it had not gone through all of its play.
     """
 
     frame_id: str
@@ -35,6 +40,15 @@ class FrameFacts:
     tilt_rad: float
     moving: bool
     mast_digest: str
+    true_pan_rad: float = field(kw_only=True)
+    true_tilt_rad: float = field(kw_only=True)
+    pan_approach: float = field(kw_only=True, default=0.0)
+    tilt_approach: float = field(kw_only=True, default=0.0)
+
+    @property
+    def true_rad(self) -> tuple[float, float]:
+        """True (pan, tilt)."""
+        return self.true_pan_rad, self.true_tilt_rad
 
 
 def headers_of(facts: FrameFacts) -> dict[str, str]:

@@ -19,6 +19,7 @@ from calib.camera.cahvor import CameraModel
 from calib.camera.stereo import Triangulation
 from calib.errors import NoHandoff
 from calib.mast.covariance import RigCovariance
+from calib.mast.joints import UNKNOWN, Approach
 from calib.mast.ray_gap import RayGap, clicked_point
 from calib.mast.rig import Rig
 from calib.mast.rig_rates import JOINT_NAMES, click_rates, pixel_rates
@@ -27,11 +28,15 @@ from calib.rigid import FloatArray, finite_float
 
 @dataclass(frozen=True, eq=False)
 class Joints:
-    """Measured joint angles, and the sigma of each reading; radians. ValueError if they are none."""
+    """Measured true joint angles, and the sigma of each reading; radians. ValueError if they are none.
+
+    ``approach``: from which side the axes came (`calib.mast.joints`); the backlash's sigma counts by it.
+    """
 
     pan_rad: float
     tilt_rad: float
     sigma_rad: float = 0.0
+    approach: Approach = UNKNOWN
 
     def __post_init__(self) -> None:
         for name in ("pan_rad", "tilt_rad", "sigma_rad"):
@@ -219,14 +224,15 @@ def _other_covariance(
     width = calibrated + 2 * len(readings)
     then = [*range(calibrated), width - 2, width - 1]  # the destination's reading is the last
     rates = np.zeros((3 + 2 * len(to), width))
-    clicked = click_rates(rig, names, pair, joints.pan_rad, joints.tilt_rad, seen.position_m)
+    clicked = click_rates(rig, names, pair, joints.pan_rad, joints.tilt_rad, seen.position_m, joints.approach)
     rates[:3, : calibrated + 2] = seen.rates_m_per_px @ clicked
     at, point = readings[-1], seen.position_m[None]
     for row, name in enumerate(to):
         part = slice(3 + 2 * row, 5 + 2 * row)
         model = rig.camera_in_rover(name, at.pan_rad, at.tilt_rad)
         rates[part] = model.project_jacobian(seen.position_m)[1] @ rates[:3]
-        rates[part, then] += pixel_rates(rig, names, name, at.pan_rad, at.tilt_rad, point)[1][0]
+        seen_by = pixel_rates(rig, names, name, at.pan_rad, at.tilt_rad, point, at.approach)
+        rates[part, then] += seen_by[1][0]
     turned = np.repeat([reading.sigma_rad for reading in readings], 2) * rates[:, calibrated:]
     by_rig = rates[:, :calibrated]
     return np.asarray(by_rig @ known.covariance @ by_rig.T + turned @ turned.T)

@@ -30,9 +30,9 @@ JOINTS_NAMES = tuple(f"joints.{axis}.{name}" for axis in ("pan", "tilt") for nam
 """The ten numbers of both joints, in the order of `numbers_of`."""
 
 Pair = tuple[float, float]
-Approach = tuple[int, int]
+Approach = tuple[float, float]
 """From which side pan and tilt came to rest: +1 from smaller read angles, -1 from larger, 0 not known."""
-UNKNOWN: Approach = (0, 0)
+UNKNOWN: Approach = (0.0, 0.0)
 
 _Angle = TypeVar("_Angle", float, FloatArray)
 
@@ -88,14 +88,15 @@ class AxisJoint:
         """Whether read and true angles are the same."""
         return self.backlash_rad == 0.0 and not any(any(pair) for pair in self.harmonics_rad)
 
-    def true_rad(self, read_rad: _Angle, approach: int | FloatArray = 0) -> _Angle:
+    def true_rad(self, read_rad: _Angle, approach: float | FloatArray = 0.0) -> _Angle:
         """Return the true angle of a reading, or of an array (...) of them.
 
-        ``approach`` is +1 from smaller read angles, -1 from larger, 0 if not known: the middle.
+        ``approach`` is +1 from smaller read angles, -1 from larger, 0 if not known: the middle; in between
+        where the load lies between the flanks.
         """
         return self._true(self._taken_up(read_rad, approach))
 
-    def read_rad(self, true_rad: _Angle, approach: int | FloatArray = 0) -> _Angle:
+    def read_rad(self, true_rad: _Angle, approach: float | FloatArray = 0.0) -> _Angle:
         """Return the reading of a true angle (or of an array of them), exact to rounding."""
         slack: Any = 0.5 * approach * self.backlash_rad
         at = true_rad
@@ -107,7 +108,23 @@ class AxisJoint:
         found: _Angle = at + slack
         return found
 
-    def slope(self, read_rad: _Angle, approach: int | FloatArray = 0) -> _Angle:
+    def goal_rad(self, true_rad: float, read_rad: float, approach: float = 0.0, turn: int = 0) -> float:
+        """Return the reading to send an axis to that stands at a reading, so that it comes to a true angle.
+
+        Parameters
+        ----------
+        true_rad
+            The true angle wanted.
+        read_rad, approach
+            Where it stands, and from which side it came there.
+        turn
+            1 or -1 for a head that comes to this goal from smaller or from larger angles by itself.
+        """
+        wanted, stands = self.read_rad(true_rad), self._taken_up(read_rad, approach)
+        turn = turn or (wanted > stands) - (wanted < stands)
+        return wanted + 0.5 * turn * self.backlash_rad if turn else read_rad
+
+    def slope(self, read_rad: _Angle, approach: float | FloatArray = 0.0) -> _Angle:
         """Return by how much the true angle grows with the reading, radians in a radian."""
         return self._slope(self._taken_up(read_rad, approach))
 
@@ -121,7 +138,7 @@ class AxisJoint:
         slack = -0.5 * side * self._slope(at)
         return np.stack([np.cos(at), np.sin(at), np.cos(2.0 * at), np.sin(2.0 * at), slack], axis=-1)
 
-    def _taken_up(self, read_rad: _Angle, approach: int | FloatArray) -> _Angle:
+    def _taken_up(self, read_rad: _Angle, approach: float | FloatArray) -> _Angle:
         """The reading without the play."""
         slack: Any = 0.5 * approach * self.backlash_rad
         taken_up: _Angle = read_rad - slack

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -74,6 +74,7 @@ def ordered(
     tilt_limits_rad: tuple[float, float],
     from_pan_rad: float = 0.0,
     from_tilt_rad: float = 0.0,
+    read: Callable[[Solution], tuple[float, float]] | None = None,
 ) -> list[Solution]:
     """Return the solutions within the joint limits: upright ones first, then by least motion.
 
@@ -88,6 +89,9 @@ def ordered(
         (lowest, highest) of each joint, both included.
     from_pan_rad, from_tilt_rad
         Where the head is now.
+    read
+        What the head reads at a solution's true angles: limits, and where it is now, are then readings too.
+        By default joints read true.
 
     Raises
     ------
@@ -117,21 +121,25 @@ def ordered(
         for tilt_turn in (0.0, math.tau, -math.tau)
     ]
 
+    def angles(one: Solution) -> tuple[float, float]:
+        return (one.pan_rad, one.tilt_rad) if read is None else read(one)
+
     def excess(one: Solution) -> tuple[float, float]:
-        return _beyond(one.pan_rad, pan_limits_rad), _beyond(one.tilt_rad, tilt_limits_rad)
+        pan_rad, tilt_rad = angles(one)
+        return _beyond(pan_rad, pan_limits_rad), _beyond(tilt_rad, tilt_limits_rad)
 
     inside = [one for one in turned if excess(one) == (0.0, 0.0)]
     if inside:
         return sorted(inside, key=lambda one: order(one, from_pan_rad, from_tilt_rad))
-    nearest = min(turned, key=lambda one: max(excess(one)))
+    pan_rad, tilt_rad = angles(min(turned, key=lambda one: max(excess(one))))
     raise Unreachable(
         "outside_limits",
         " and ".join(
             f"{joint} {angle:.6g} rad is {_beyond(angle, limits):.3g} rad beyond the limit "
             f"{limits[0] if angle < limits[0] else limits[1]:.6g} rad"
             for joint, angle, limits in (
-                ("pan", nearest.pan_rad, pan_limits_rad),
-                ("tilt", nearest.tilt_rad, tilt_limits_rad),
+                ("pan", pan_rad, pan_limits_rad),
+                ("tilt", tilt_rad, tilt_limits_rad),
             )
             if _beyond(angle, limits) > 0.0
         ),

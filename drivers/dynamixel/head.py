@@ -20,6 +20,7 @@ from contextlib import suppress
 from typing import Any, TypeVar
 
 from drivers.absence import Absence
+from drivers.approach import rising_below_rad
 from drivers.clock import Clock, SystemClock
 from drivers.dynamixel.bus import Bus
 from drivers.dynamixel.hardware_errors import Reboots
@@ -159,7 +160,12 @@ class DynamixelHead(Reporting):
         told = {}
         for name, axis in zip(AXES, (self.settings.pan, self.settings.tilt), strict=True):
             counts = axis.acceleration_counts(self.settings.acceleration_rad_per_s2)
-            told[name] = AxisMotion(counts * axis.model.acceleration_unit_rad_per_s2, axis.approach_rad)
+            told[name] = AxisMotion(
+                counts * axis.model.acceleration_unit_rad_per_s2,
+                axis.approach_rad,
+                rising_below_rad(axis.approach, axis.gravity_turnover_rad),
+                axis.model.count_rad,
+            )
         return told
 
     # In the thread that owns the bus

@@ -21,6 +21,7 @@ from contextlib import contextmanager, suppress
 from typing import Any
 
 from drivers.absence import Absence
+from drivers.approach import rising_below_rad
 from drivers.clock import Clock, SystemClock
 from drivers.errors import BadReply, DriverError, HardwareFault, LineLost, NoReply, OutOfRange
 from drivers.flir_ptu import conversation as ask
@@ -302,7 +303,12 @@ class FlirPtu:
     def axis_motion(self) -> dict[str, AxisMotion]:
         """Return how each axis moves: the unit's acceleration when it was made ready, and its approach."""
         return {
-            name: AxisMotion(axis.acceleration * axis.position_rad, axis.options.approach_rad)
+            name: AxisMotion(
+                axis.acceleration * axis.position_rad,
+                axis.options.approach_rad,
+                rising_below_rad(axis.options.approach, axis.options.gravity_turnover_rad),
+                axis.position_rad,
+            )
             for name, axis in self._axes.items()
         }
 

@@ -199,10 +199,16 @@ class SimulatedPanTilt:
             self._closed = True
 
     def axis_motion(self) -> Mapping[str, AxisMotion]:
-        """Return how each axis moves, by its settings."""
+        """Return how each axis moves, by its settings; with an approach it rises to every goal."""
         axes = {"pan": self.head.pan, "tilt": self.head.tilt}
         return {
-            name: AxisMotion(axis.acceleration_rad_per_s2, axis.approach_rad) for name, axis in axes.items()
+            name: AxisMotion(
+                axis.acceleration_rad_per_s2,
+                axis.approach_rad,
+                math.inf if axis.approach_rad > 0 else None,
+                axis.count_rad,
+            )
+            for name, axis in axes.items()
         }
 
     def true_joints(self, time_s: float) -> tuple[float, float]:

@@ -177,6 +177,8 @@ class FakePointing:
     commanded_tilt_rad: float = -0.1
     measured_pan_rad: float = 0.1
     measured_tilt_rad: float = -0.1
+    true_pan_rad: float = 0.1
+    true_tilt_rad: float = -0.1
     camera: str = "navcam_left"
     aim_px: Any = None
     predicted_px: Any = None

@@ -9,7 +9,19 @@ import pytest
 from mastctl.frame_facts import FrameFacts, facts_in, headers_of
 
 FACTS = FrameFacts(
-    "navcam_left-000007-d1-ab", "navcam_left", 7, 12345.1 + 1e-11, 1 / 3, -1e-17, 0.1, True, "d1" * 32
+    "navcam_left-000007-d1-ab",
+    "navcam_left",
+    7,
+    12345.1 + 1e-11,
+    1 / 3,
+    -1e-17,
+    0.1,
+    True,
+    "d1" * 32,
+    true_pan_rad=-2e-17,
+    true_tilt_rad=0.1 + 1e-9,
+    pan_approach=-1.0,
+    tilt_approach=1 / 3,
 )
 
 

@@ -245,7 +245,7 @@ class Sweep:
     def _choose(self, name: str, start: Reading, plan: SweepPlan) -> Patches:
         """Take a camera's picture at rest and choose what to follow in it."""
         frame = self._cameras[name].next_frame(time.monotonic(), FRAME_TIMEOUT_S)
-        joints_rad = (start.pan_rad, start.tilt_rad)
+        joints_rad = self._rig.joints.true_rad((start.pan_rad, start.tilt_rad))
         return choose_patches(frame.image, self._rig, name, joints_rad, plan.amplitude_rad)
 
     def _watch(self, name: str, start: Reading, plan: SweepPlan) -> None:

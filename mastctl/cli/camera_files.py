@@ -47,8 +47,12 @@ def _add_camera_options(parser: argparse.ArgumentParser) -> None:
     """Add the options that choose a camera model."""
     parser.add_argument("file", type=Path, metavar="FILE", help="mast or camera file, .cahvor, PDS3 label")
     parser.add_argument("--camera", metavar="NAME", help="which camera, where FILE holds several")
-    parser.add_argument("--pan", type=finite_number, metavar="RAD", help="joint angle, for a head camera")
-    parser.add_argument("--tilt", type=finite_number, metavar="RAD", help="joint angle, for a head camera")
+    parser.add_argument(
+        "--pan", type=finite_number, metavar="RAD", help="true joint angle, for a head camera"
+    )
+    parser.add_argument(
+        "--tilt", type=finite_number, metavar="RAD", help="true joint angle, for a head camera"
+    )
 
 
 def camera_project(args: argparse.Namespace) -> int:

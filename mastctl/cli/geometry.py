@@ -14,7 +14,7 @@ from mastctl.cli.output import finite_number, positive_number
 
 def add_commands(subparsers: Any) -> None:
     """Add the commands of this module to the parser's commands."""
-    solve = subparsers.add_parser("solve", help="the joint angles that bring a target onto a pixel")
+    solve = subparsers.add_parser("solve", help="the true joint angles that bring a target onto a pixel")
     solve.add_argument("mast", type=Path, metavar="MAST.yaml")
     solve.add_argument("--camera", required=True, metavar="NAME", help="a camera on the head")
     solve.add_argument(
@@ -34,8 +34,8 @@ def add_commands(subparsers: Any) -> None:
     triangulate.add_argument(
         "--pair", required=True, metavar="NAME", help="a pair of the file's stereo section"
     )
-    triangulate.add_argument("--pan", type=finite_number, metavar="RAD")
-    triangulate.add_argument("--tilt", type=finite_number, metavar="RAD")
+    triangulate.add_argument("--pan", type=finite_number, metavar="RAD", help="true joint angle")
+    triangulate.add_argument("--tilt", type=finite_number, metavar="RAD", help="true joint angle")
     for side in ("--left", "--right"):
         triangulate.add_argument(side, required=True, nargs=2, type=finite_number, metavar=("U", "V"))
     triangulate.add_argument("--sigma-px", type=positive_number, default=0.2, metavar="PX")

@@ -25,8 +25,8 @@ def add_commands(subparsers: Any) -> None:
     handoff.add_argument("mast", type=Path, metavar="MAST.yaml")
     handoff.add_argument("--from", dest="source", required=True, metavar="PAIR", help="the pair that sees it")
     handoff.add_argument("--to", required=True, metavar="PAIR", help="a pair, or one camera")
-    handoff.add_argument("--pan", type=finite_number, metavar="RAD")
-    handoff.add_argument("--tilt", type=finite_number, metavar="RAD")
+    handoff.add_argument("--pan", type=finite_number, metavar="RAD", help="true joint angle")
+    handoff.add_argument("--tilt", type=finite_number, metavar="RAD", help="true joint angle")
     for side in ("--left", "--right"):
         handoff.add_argument(side, required=True, nargs=2, type=finite_number, metavar=("U", "V"))
     handoff.add_argument("--to-pan", type=finite_number, metavar="RAD", help="default: as --pan")

@@ -357,6 +357,10 @@ class Cameras:
             tilt_rad=joints.tilt_rad,
             moving=joints.moving,
             mast_digest=mast_digest,
+            true_pan_rad=joints.true_rad[0],
+            true_tilt_rad=joints.true_rad[1],
+            pan_approach=joints.approach[0],
+            tilt_approach=joints.approach[1],
         )
         with self._stamping[camera]:
             self._check_alive(stamped)

@@ -14,6 +14,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from typing import Protocol
 
+from calib.mast.joints import AxisJoint, Joints
 from calib.mast.rig import Rig
 from drivers.clock import Clock, deadlines_on
 from drivers.errors import BadReply, DriverError, LineLost, NoReply
@@ -21,7 +22,6 @@ from drivers.interfaces import (
     AxisReport,
     Camera,
     PanTilt,
-    Reading,
     Reporting,
     StopsBeside,
 )
@@ -31,7 +31,7 @@ from mastctl.devices.door import REST_S, Door
 from mastctl.devices.fault_watch import FaultWatch
 from mastctl.devices.faults import FaultWords
 from mastctl.devices.frames import FrameStore, StampedFrame
-from mastctl.devices.joint_history import JointHistory
+from mastctl.devices.joint_history import HeadReading, JointHistory
 from mastctl.devices.keep_out import Pair
 from mastctl.devices.limits import Limits
 from mastctl.devices.stops import AT_ONCE_S, PATIENCE_S, Stops
@@ -125,7 +125,8 @@ class Devices:
         self.door = Door(limits, hardware.pan_tilt, clock, HEAD, rig, sun)
         self._clock = clock
         self._time = deadlines_on(clock)
-        self._history = JointHistory()
+        self._joints = Joints() if rig is None else rig.joints
+        self._history = JointHistory(self._joints)
         self._store = FrameStore(mast_digest, new_run=new_run, on_new=self._new_frame)
         self._gate = threading.Lock()
         self._blocks: dict[object, Stopped] = {}  # who lets no move out, and why
@@ -156,11 +157,11 @@ class Devices:
     # The head
 
     @property
-    def last_reading(self) -> Reading | None:
+    def last_reading(self) -> HeadReading | None:
         """The last good reading of the head, None before the first; its age is the clock minus its time_s."""
         return self._history.newest
 
-    def read(self) -> Reading:
+    def read(self) -> HeadReading:
         """Return the joint state measured now; what was not answered properly is asked for once more.
 
         Raises
@@ -191,8 +192,38 @@ class Devices:
         """
         return self._head.call("report", self._reported, READ_TIMEOUT_S, told=False)
 
+    def goal(self, true_rad: Pair, here: HeadReading, corners: Sequence[Pair] = ()) -> Pair:
+        """Return the readings to send the head to, so that it comes to true angles.
+
+        By the mast file's joints. The side from which each axis will come follows from where it stands, and
+        from whether the head comes to its goals from one side by itself.
+
+        Parameters
+        ----------
+        true_rad
+            (pan, tilt) wanted.
+        here
+            Where the head rests.
+        corners
+            Readings that it goes by on its way.
+        """
+        pan, tilt = (
+            joint.goal_rad(wanted, *_after(joint, read, came, [corner[axis] for corner in corners]), turn)
+            for axis, (joint, wanted, read, came, turn) in enumerate(
+                zip(
+                    (self._joints.pan, self._joints.tilt),
+                    true_rad,
+                    (here.pan_rad, here.tilt_rad),
+                    here.approach,
+                    self.door.turns_to(true_rad),
+                    strict=True,
+                )
+            )
+        )
+        return pan, tilt
+
     def move(self, pan_rad: float, tilt_rad: float, speed_rad_per_s: float | None = None) -> None:
-        """Start the head towards the angles, radians, and return; at most at the speed cap.
+        """Start the head towards angles that it is to read, radians, and return; at most at the speed cap.
 
         Raises
         ------
@@ -296,6 +327,8 @@ class Devices:
     def use_rig(self, rig: Rig, mast_digest: str) -> None:
         """Stamp frames with another mast file from now on, and forget those that were stamped before."""
         self._cameras.use_rig(rig)
+        self._joints = rig.joints
+        self._history.use_joints(rig.joints)
         self.door.use_rig(rig)
         self._store.change_mast(mast_digest)
 
@@ -335,19 +368,19 @@ class Devices:
 
     # In the devices' own threads
 
-    def _read_for_move(self) -> Reading:
+    def _read_for_move(self) -> HeadReading:
         try:
             return self._read_once()
         except (NoReply, BadReply):
             return self._read_once()  # one answer lost on the line moves nothing and stops nothing
 
-    def _read_once(self) -> Reading:
+    def _read_once(self) -> HeadReading:
         answer = self._pan_tilt.read()
         newest = self._history.newest
-        reading = joint_history.checked(
+        checked = joint_history.checked(
             answer, HEAD, self._clock.now_s(), None if newest is None else newest.time_s
         )
-        reading = self._history.add(reading)
+        reading = self._history.add(checked)
         if set(reading.faults) != set(self._reported_s):
             before_s = self._reported_s
             self._reported_s = {word: before_s.get(word, reading.time_s) for word in reading.faults}
@@ -380,6 +413,15 @@ class Devices:
                 words = f"report returned {type(axis).__name__} where an AxisReport is expected"
                 raise BadReply(words, device=HEAD)
         return told
+
+
+def _after(joint: AxisJoint, read_rad: float, approach: float, corners_rad: Sequence[float]) -> Pair:
+    """Where an axis stands, and from which side it came, when it has gone by some readings."""
+    half_rad = 0.5 * joint.backlash_rad
+    load = read_rad - approach * half_rad
+    for read_rad in corners_rad:
+        load = min(max(load, read_rad - half_rad), read_rad + half_rad)
+    return read_rad, (read_rad - load) / half_rad if half_rad else 0.0
 
 
 def _stops_beside(head: object) -> bool:

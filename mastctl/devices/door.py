@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from calib.mast.joints import AxisJoint
 from calib.mast.rig import Rig
 from calib.rigid import FloatArray
 from drivers.clock import Clock
@@ -87,6 +88,14 @@ class Door:
         self._sent: _Sent | None = None
         self._inside_s: Mapping[str, float] = {}  # where the head stands and should not, and since when
         self.use_limits(limits)
+
+    def turns_to(self, goal: Pair) -> tuple[int, int]:
+        """Return from which side pan and tilt come to a goal by themselves: 1, -1, 0 for the shortest way."""
+        pan, tilt = (
+            self._stated[axis].turn_to(to) if axis in self._stated else 0
+            for axis, to in zip(("pan", "tilt"), goal, strict=True)
+        )
+        return pan, tilt
 
     @property
     def sun(self) -> Sun | None:
@@ -313,7 +322,12 @@ class Door:
             direction = np.array(sun.direction)
             in_rover = direction if sun.frame == "rover" else self._rover_from_site @ direction
             tilts = limits.tilt_rad[0] - slack, limits.tilt_rad[1] + slack
-            rows = sun_boxes(self._rig, in_rover, sun.half_angle_rad, tilts)
+            joints = self._rig.joints
+            true_tilts = joints.tilt.true_rad(tilts[0], 1.0), joints.tilt.true_rad(tilts[1], -1.0)
+            rows = [
+                Box(box.name, _as_read(joints.pan, box.pan_rad), _as_read(joints.tilt, box.tilt_rad))
+                for box in sun_boxes(self._rig, in_rover, sun.half_angle_rad, true_tilts)
+            ]
             with_sun += [copy for box in rows for copy in box.within(reach)]
         for boxes in (plain, with_sun):
             whole = KeepOuts(tuple(boxes), limits.margin_rad, self._beyond, limits.pan_rad, limits.tilt_rad)
@@ -323,6 +337,11 @@ class Door:
 
 def _into(value: float, limits: Pair) -> float:
     return min(max(value, limits[0]), limits[1])
+
+
+def _as_read(joint: AxisJoint, true_rad: Pair) -> Pair:
+    """What an axis may read within an interval of true angles, from whichever side it came."""
+    return joint.read_rad(true_rad[0], -1.0), joint.read_rad(true_rad[1], 1.0)
 
 
 def _check_acceleration(limits: Limits, stated: Mapping[str, AxisMotion], device: str) -> None:

@@ -1,4 +1,9 @@
-"""What the head measured lately: checked readings, from which a frame's joint angles are told."""
+"""What the head measured lately: checked readings, from which a frame's joint angles are told.
+
+Here read angles become true ones, once: by the mast file's ``joints`` (`calib.mast.joints`), and by the side
+from which each axis came, which the readings tell. Behind gears with play b the load stands between the
+reading less b/2 and the reading plus b/2, and stays where it is until one of the two takes it along.
+"""
 
 from __future__ import annotations
 
@@ -7,11 +12,12 @@ import math
 import threading
 from collections import deque
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field
 from itertools import islice
 
 import numpy as np
 
+from calib.mast.joints import Approach, Joints, Pair
 from drivers.errors import BadReply
 from drivers.interfaces import Reading
 from mastctl.devices.rest import DITHER_S, dithers
@@ -23,15 +29,39 @@ CLOCK_TOLERANCE_S = 0.005  # what a stamp may lie in the future by rounding
 LARGEST_GAP_S = 1.0  # between the readings around an exposure; beyond it the angles are a guess
 MOST_FAULTS, LONGEST_FAULT = 20, 200  # words that a head may say of itself at once, and their signs
 STILL_RAD = 3e-3  # between neighbours; two counts of a 12-bit servo
+USUAL_PLAY_RAD = 6e-3  # of hobby servos' gears; by it the side is told where the mast file states no backlash
+
+Span = tuple[float, float]
 
 
 @dataclass(frozen=True)
 class JointsAtExposure:
-    """Joint angles at mid-exposure, radians, and whether the head moved during the exposure."""
+    """Joint angles at mid-exposure as read, radians, the true ones, from which side each axis came, and
+    whether the head moved during the exposure.
+    """
 
     pan_rad: float
     tilt_rad: float
     moving: bool
+    true_rad: Pair
+    approach: Approach
+
+
+@dataclass(frozen=True)
+class HeadReading(Reading):
+    """A reading of the head, and where it truly stands.
+
+    Attributes
+    ----------
+    true_rad
+        (pan, tilt) by the mast file's joints.
+    approach
+        For pan and tilt, from which side the axis came: 1 from smaller readings, -1 from larger, 0 not known,
+        between them where it has not gone through all of its play since it turned round.
+    """
+
+    true_rad: Pair = field(kw_only=True)
+    approach: Approach = field(kw_only=True, default=(0.0, 0.0))
 
 
 def checked(answer: object, device: str, now_s: float, newest_s: float | None) -> Reading:
@@ -97,16 +127,20 @@ class JointHistory:
 
     A head that says now and then that it moves, although its readings are those of a head at rest
     (`mastctl.devices.rest.dithers`) and no move was sent for a second, is taken to rest.
+
+    ``joints`` are the mast file's: what readings are wrong by.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, joints: Joints | None = None) -> None:
+        self._joints = joints or Joints()
         self._readings: deque[Reading] = deque(maxlen=KEPT_READINGS)  # as the driver gave them
-        self._newest: Reading | None = None  # with what is true of its motion
+        self._loads: deque[tuple[Span, Span]] = deque(maxlen=KEPT_READINGS)  # and where the loads may be then
+        self._newest: HeadReading | None = None  # with what is true of its motion
         self._moves_s: deque[float] = deque(maxlen=200)
         self._lock = threading.Lock()
 
     @property
-    def newest(self) -> Reading | None:
+    def newest(self) -> HeadReading | None:
         """The last good reading; read without a lock."""
         return self._newest
 
@@ -116,7 +150,15 @@ class JointHistory:
         with self._lock:
             return self._readings[0].time_s if self._readings else None
 
-    def add(self, reading: Reading) -> Reading:
+    def use_joints(self, joints: Joints) -> None:
+        """Take another mast file's joints, for the readings that are kept too."""
+        with self._lock:
+            self._joints = joints
+            self._loads.clear()
+            for reading in self._readings:
+                self._follow(reading)
+
+    def add(self, reading: Reading) -> HeadReading:
         """Keep a checked reading and return it with ``moving`` as the class says.
 
         One of the same time replaces the last.
@@ -124,9 +166,20 @@ class JointHistory:
         with self._lock:
             if self._readings and reading.time_s <= self._readings[-1].time_s:
                 self._readings.pop()
+                self._loads.pop()
             self._readings.append(reading)
-            rests = reading.moving and self._dithers(reading.time_s)
-            self._newest = replace(reading, moving=False) if rests else reading
+            self._follow(reading)
+            moving = reading.moving and not self._dithers(reading.time_s)
+            read = reading.pan_rad, reading.tilt_rad
+            approach = self._approach(read, _middles(self._loads[-1]))
+            self._newest = HeadReading(
+                *read,
+                moving,
+                reading.time_s,
+                reading.faults,
+                true_rad=self._joints.true_rad(read, approach),
+                approach=approach,
+            )
             return self._newest
 
     def move_sent(self, time_s: float) -> None:
@@ -151,6 +204,7 @@ class JointHistory:
             first = bisect.bisect_right(times_s, began_s) - 1
             last = bisect.bisect_left(times_s, ended_s)
             around = [self._readings[i] for i in range(max(first, 0), min(last + 1, len(times_s)))]
+            loads = [_middles(self._loads[i]) for i in range(max(first, 0), min(last + 1, len(times_s)))]
             moves_s = list(self._moves_s)
             rests = bool(around) and self._dithers(around[-1].time_s)
         if first < 0 or last >= len(times_s):
@@ -169,9 +223,35 @@ class JointHistory:
             or max(tilts) - min(tilts) > STILL_RAD
         )
         moving = (seems and not rests) or any(stamps_s[0] <= sent_s <= stamps_s[-1] for sent_s in moves_s)
-        return JointsAtExposure(
-            float(np.interp(mid_s, stamps_s, pans)), float(np.interp(mid_s, stamps_s, tilts)), moving
+        read = float(np.interp(mid_s, stamps_s, pans)), float(np.interp(mid_s, stamps_s, tilts))
+        pan_load, tilt_load = (float(np.interp(mid_s, stamps_s, load)) for load in zip(*loads, strict=True))
+        with self._lock:
+            approach = self._approach(read, (pan_load, tilt_load))
+            return JointsAtExposure(*read, moving, self._joints.true_rad(read, approach), approach)
+
+    def _plays_rad(self) -> Pair:
+        return (
+            self._joints.pan.backlash_rad or USUAL_PLAY_RAD,
+            self._joints.tilt.backlash_rad or USUAL_PLAY_RAD,
         )
+
+    def _follow(self, reading: Reading) -> None:
+        """Tell where the loads may be once the head stands at a reading; the lock is held."""
+        pan, tilt = (
+            _taken_along(self._loads[-1][axis] if self._loads else None, at, play)
+            for axis, (at, play) in enumerate(
+                zip((reading.pan_rad, reading.tilt_rad), self._plays_rad(), strict=True)
+            )
+        )
+        self._loads.append((pan, tilt))
+
+    def _approach(self, read: Pair, loads: Pair) -> Approach:
+        """From which side each axis came, by where its load stands; the lock is held."""
+        pan, tilt = (
+            min(max((at - load) / (play / 2), -1.0), 1.0)
+            for at, load, play in zip(read, loads, self._plays_rad(), strict=True)
+        )
+        return round(pan, 6), round(tilt, 6)
 
     def _dithers(self, until_s: float) -> bool:
         """Whether the readings up to a moment are those of a head that dithers at rest; the lock is held."""
@@ -188,3 +268,14 @@ class JointHistory:
             if reading.time_s <= until_s:
                 window.append(reading)
         return bool(window) and dithers(window[::-1], for_s=for_s)
+
+
+def _taken_along(load: Span | None, read_rad: float, play_rad: float) -> Span:
+    """The lowest and the highest place of a load behind its play; None: nobody knows where it was before."""
+    low, high = read_rad - play_rad / 2, read_rad + play_rad / 2
+    return (low, high) if load is None else (min(max(load[0], low), high), min(max(load[1], low), high))
+
+
+def _middles(loads: tuple[Span, Span]) -> Pair:
+    pan, tilt = (0.5 * (low + high) for low, high in loads)
+    return pan, tilt

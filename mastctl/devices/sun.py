@@ -73,7 +73,7 @@ def sun_boxes(rig: Rig, in_rover: FloatArray, half_angle_rad: float, tilt_rad: P
     half_angle_rad
         Of the cone.
     tilt_rad
-        The range of tilt that is wanted.
+        The range of true tilt that is wanted; the boxes are of true angles too.
     """
     sun = rig.mast.rover_from_mast.rotation.T @ in_rover
     axes = {tuple(camera.model.A.tolist()) for camera in rig.cameras.values() if camera.on == "head"}

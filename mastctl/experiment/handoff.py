@@ -240,7 +240,7 @@ class _Bench:
         left, right = seen[:2]
         if left is None or right is None or None in seen:
             return None
-        model = self._rig.camera_in_rover(self._source[0], pair[0].pan_rad, pair[0].tilt_rad)
+        model = self._rig.camera_in_rover(self._source[0], *pair[0].true_rad)
         range_m = float(np.linalg.norm(point.position_m - model.C))
         return Target(pair[0], *left, range_m, pair[1], right, point.kind, point.position_m)
 
@@ -283,9 +283,9 @@ class _Bench:
         """Hand a target over; raises NoHandoff where no destination camera sees it."""
         exact = np.array([(target.x_px, target.y_px), target.right_px])
         clicks = exact + self._rng.normal(0.0, self._click_px, (2, 2))
-        joints = Joints(target.shot.pan_rad, target.shot.tilt_rad, JOINT_SIGMA_RAD)
+        joints = Joints(*target.shot.true_rad, JOINT_SIGMA_RAD)
         there = next(iter(shots.values()))
-        to_joints = Joints(there.pan_rad, there.tilt_rad, JOINT_SIGMA_RAD)
+        to_joints = Joints(*there.true_rad, JOINT_SIGMA_RAD)
         sigma_px = max(self._click_px, 0.05)
         done = hand_off(
             self._rig,
@@ -328,7 +328,7 @@ class _Bench:
         )
 
     def _eye(self, shot: Snapshot) -> Eye:
-        model = self._rig.camera_in_rover(shot.camera, shot.pan_rad, shot.tilt_rad)
+        model = self._rig.camera_in_rover(shot.camera, *shot.true_rad)
         return Eye(grey(shot.image), model)
 
     def _true(self, target: Target, shot: Snapshot) -> tuple[float, float] | None:

@@ -12,7 +12,7 @@ import numpy as np
 from calib.errors import Unreachable
 from calib.mast import pointing
 from calib.mast.rig import Rig
-from calib.mast.solutions import choose
+from calib.mast.solutions import Solution, choose
 from calib.rigid import FloatArray
 from mastctl.client import Client, ClientError, Snapshot
 from mastctl.experiment.targets import Target, choose_target
@@ -54,7 +54,7 @@ class Views:
         pair = self.look_at(self._ground_ahead(distance_m))
         if pair is None:
             return None
-        models = tuple(self._rig.camera_in_rover(shot.camera, shot.pan_rad, shot.tilt_rad) for shot in pair)
+        models = tuple(self._rig.camera_in_rover(shot.camera, *shot.true_rad) for shot in pair)
         return choose_target(*pair, models[0], models[1], distance_m, self._rng)
 
     def look_at(self, point_m: FloatArray) -> tuple[Snapshot, Snapshot] | None:
@@ -67,7 +67,12 @@ class Views:
         """
         try:
             solutions = pointing.solve(self._rig.mast, self._rig.cameras[self._pair[0]].model, point_m)
-            angles = choose(solutions, self._pan_limits_rad, self._tilt_limits_rad)
+            joints = self._rig.joints
+            angles = choose(
+                [Solution(*joints.read_rad((one.pan_rad, one.tilt_rad)), one.range_m) for one in solutions],
+                self._pan_limits_rad,
+                self._tilt_limits_rad,
+            )
         except Unreachable:
             return None
         operation = pointed(self._client, pan_rad=angles.pan_rad, tilt_rad=angles.tilt_rad)

@@ -39,7 +39,7 @@ class Measured:
     source, partner, camera
         The pair that gave the position, the clicked eye first, and the camera that was aimed and looked.
     from_rad, to_rad
-        (pan, tilt) as read when the pair looked, and at the new picture's mid-exposure.
+        True (pan, tilt) when the pair looked, and when the new picture was taken.
     position_m, range_m
         The target in the rover frame, and its range from the aimed camera.
     residual_px, off_px, match_sigma_px
@@ -106,7 +106,7 @@ def measured_by(operation: Operation, mast: StoredRig, time_s: float) -> Measure
     steps = {step.name: step.detail for step in reversed(operation.steps)}  # the first of each name
     try:
         rest, seen, settled, found = (steps[name] for name in ("rest", "triangulate", "settle", "measure"))
-        to_rad = settled["pan_rad"], settled["tilt_rad"]
+        to_rad = settled["true_pan_rad"], settled["true_tilt_rad"]
         view = rig.camera_in_rover(found["camera"], *to_rad)
         predicted = view.project(seen["position_m"])[0].tolist()
         counts = settled.get("counts", {})
@@ -119,7 +119,7 @@ def measured_by(operation: Operation, mast: StoredRig, time_s: float) -> Measure
                 "source": source,
                 "partner": partners[0],
                 "camera": found["camera"],
-                "from_rad": (rest["pan_rad"], rest["tilt_rad"]),
+                "from_rad": (rest["true_pan_rad"], rest["true_tilt_rad"]),
                 "to_rad": to_rad,
                 "position_m": seen["position_m"],
                 "range_m": math.dist(seen["position_m"], view.C.tolist()),

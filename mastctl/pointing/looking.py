@@ -19,8 +19,8 @@ from calib.pictures.patch_match import match_patch
 from calib.pictures.patch_verdict import MatchSettings, PatchMatch
 from calib.pictures.warp import Grey, Plane, carry, facing_plane, grey
 from calib.rigid import FloatArray
-from drivers.interfaces import Reading
 from mastctl.devices.frames import StampedFrame
+from mastctl.devices.joint_history import HeadReading
 from mastctl.pointing.results import PointingError, rounded
 from mastctl.pointing.settings import PointingSettings
 
@@ -54,7 +54,7 @@ class Clicked:
 
 
 class Eyes:
-    """The cameras during one request; all geometry by the mast file and measured joint angles."""
+    """The cameras during one request; all geometry by the mast file and the true joint angles measured."""
 
     def __init__(self, cameras: CamerasLike, rig: Rig, settings: PointingSettings) -> None:
         self._cameras = cameras
@@ -69,7 +69,7 @@ class Eyes:
         return None
 
     def companions(
-        self, aiming: str, clicked: str, position_m: FloatArray, resting: Reading
+        self, aiming: str, clicked: str, position_m: FloatArray, resting: HeadReading
     ) -> tuple[str, ...]:
         """Return the eyes that can confirm what the aiming one will see: its partner where that sees it too.
 
@@ -86,7 +86,7 @@ class Eyes:
         return ()
 
     def new(
-        self, names: Sequence[str], after_s: float, resting: Reading, timeout_s: float | None = None
+        self, names: Sequence[str], after_s: float, resting: HeadReading, timeout_s: float | None = None
     ) -> dict[str, View]:
         """Return frames exposed after a moment, by a head that rests where it was read.
 
@@ -254,11 +254,11 @@ class Eyes:
             )
         return confirmed, detail
 
-    def _sees(self, name: str, position_m: FloatArray, resting: Reading) -> bool:
+    def _sees(self, name: str, position_m: FloatArray, resting: HeadReading) -> bool:
         """Tell whether a configured camera has a position well inside its picture."""
         if name not in self._cameras.newest_frames():
             return False
-        camera = self._rig.camera_in_rover(name, resting.pan_rad, resting.tilt_rad)
+        camera = self._rig.camera_in_rover(name, *resting.true_rad)
         place, valid = camera.project(position_m)
         return bool(valid) and camera.holds(place, 2.0 * self._settings.match.half_px)
 
@@ -268,9 +268,9 @@ class Eyes:
         return usual, replace(usual, half_px=self._settings.small_half_px)
 
     def view(self, frame: StampedFrame) -> View:
-        if not (math.isfinite(frame.pan_rad) and math.isfinite(frame.tilt_rad)):
+        if not all(map(math.isfinite, (frame.pan_rad, frame.tilt_rad, *frame.true_rad))):
             raise PointingError("bad_reading", f"frame {frame.frame_id} has no finite joint angles")
-        camera = self._rig.camera_in_rover(frame.camera, frame.pan_rad, frame.tilt_rad)
+        camera = self._rig.camera_in_rover(frame.camera, *frame.true_rad)
         return View(frame, grey(frame.image), camera)
 
 

@@ -31,7 +31,7 @@ from calib.pictures.patch_verdict import PatchMatch
 from calib.rigid import FloatArray
 from drivers.clock import Clock
 from drivers.errors import DriverError
-from drivers.interfaces import Reading
+from mastctl.devices.joint_history import HeadReading
 from mastctl.devices.limits import Limits
 from mastctl.errors import MastctlError
 from mastctl.pointing.looking import Clicked, View, match_facts
@@ -256,8 +256,10 @@ class _Run:
             range_m = float((self._position_m - ray.origins_m) @ ray.directions)
             self._position_m = ray.origins_m + range_m * ray.directions
 
-    def _solve_and_go(self, aim: Aim, aim_px: FloatArray, resting: Reading | None) -> tuple[Pair, Reading]:
-        """Solve for the present position, move, settle; return the commanded angles and the arrival."""
+    def _solve_and_go(
+        self, aim: Aim, aim_px: FloatArray, resting: HeadReading | None
+    ) -> tuple[Pair, HeadReading]:
+        """Solve for the present position, move, settle; return the commanded readings and the arrival."""
         assert self._position_m is not None
         here = resting or self._steps.head.read()
         with self._steps.step("solve") as detail:
@@ -266,16 +268,16 @@ class _Run:
                 self._rig.cameras[aim.camera].model,
                 self._position_m,
                 aim_px,
-                from_pan_rad=here.pan_rad,
-                from_tilt_rad=here.tilt_rad,
+                from_pan_rad=here.true_rad[0],
+                from_tilt_rad=here.true_rad[1],
             )
             detail.update(solutions=[_told(one) for one in solutions])
-            best = self._steps.head.chosen(solutions, (here.pan_rad, here.tilt_rad))
+            best = self._steps.head.chosen(solutions, here)
             detail.update(chosen=_told(best))
         self._range_m = best.range_m
         eyes = [name for name in (aim.camera, self._eyes.partner(aim.camera)) if name is not None]
         self._steps.before(eyes, (best.pan_rad, best.tilt_rad), needed=(aim.camera,))
-        return (best.pan_rad, best.tilt_rad), self._steps.go(best.pan_rad, best.tilt_rad, aim.camera)
+        return self._steps.go_to_true(best.pan_rad, best.tilt_rad, aim.camera)
 
     def _pointing(self, commanded: Pair, now: View, aim_px: FloatArray, seen: PatchMatch | None) -> Pointing:
         """Put together what one pointing did."""
@@ -286,6 +288,8 @@ class _Run:
             commanded_tilt_rad=commanded[1],
             measured_pan_rad=now.frame.pan_rad,
             measured_tilt_rad=now.frame.tilt_rad,
+            true_pan_rad=now.frame.true_pan_rad,
+            true_tilt_rad=now.frame.true_tilt_rad,
             camera=now.frame.camera,
             frame_id=now.frame.frame_id,
             aim_px=pair(aim_px),
@@ -321,13 +325,15 @@ def _told(solution: Solution) -> dict[str, float]:
     }
 
 
-def _without_picture(target: AnglesTarget, settled: Reading) -> Pointing:
+def _without_picture(target: AnglesTarget, settled: HeadReading) -> Pointing:
     """Return the pointing of joint angles: where the head rests, and nothing measured."""
     return Pointing(
         commanded_pan_rad=target.pan_rad,
         commanded_tilt_rad=target.tilt_rad,
         measured_pan_rad=settled.pan_rad,
         measured_tilt_rad=settled.tilt_rad,
+        true_pan_rad=settled.true_rad[0],
+        true_tilt_rad=settled.true_rad[1],
         camera="",
         frame_id="",
         aim_px=None,

@@ -9,7 +9,7 @@ from typing import Protocol
 
 from calib.mast.solutions import Solution
 from drivers.clock import Clock
-from drivers.interfaces import Reading
+from mastctl.devices.joint_history import HeadReading
 from mastctl.devices.keep_out import Pair
 from mastctl.devices.limits import Limits
 from mastctl.devices.rest import RestWatch
@@ -22,7 +22,8 @@ from mastctl.pointing.settings import PointingSettings
 class HeadLike(Protocol):
     """What of `mastctl.devices.devices.Devices` moves the head."""
 
-    def read(self) -> Reading: ...
+    def read(self) -> HeadReading: ...
+    def goal(self, true_rad: Pair, here: HeadReading, corners: Sequence[Pair] = ()) -> Pair: ...
     def move(self, pan_rad: float, tilt_rad: float, speed_rad_per_s: float | None = None) -> None: ...
     def stop(self) -> None: ...
     def way(self, here: Pair, goal: Pair) -> Way: ...
@@ -50,7 +51,7 @@ class Head:
         self._clock = clock
         self._settings = settings
         self._cancelled = cancelled
-        self._last: Reading | None = None
+        self._last: HeadReading | None = None
         self._goal: tuple[float, float] | None = None
 
     def check_not_stopped(self) -> None:
@@ -58,7 +59,7 @@ class Head:
         if self._cancelled.is_set():
             raise PointingError("stopped", "the operation was stopped")
 
-    def resting(self) -> Reading:
+    def resting(self) -> HeadReading:
         """Return the reading of a head that rests now.
 
         Raises
@@ -100,9 +101,17 @@ class Head:
         here = self.read()
         return self._head.way((here.pan_rad, here.tilt_rad), (pan_rad, tilt_rad)).goals
 
-    def chosen(self, solutions: Sequence[Solution], here: Pair) -> Solution:
-        """Return the one of several joint angles that is taken from ``here``; raises as `reached`."""
-        return reached(solutions, self._limits, self._head.way, here)
+    def chosen(self, solutions: Sequence[Solution], here: HeadReading) -> Solution:
+        """Return the one of several true joint angles that is taken from ``here``; raises as `reached`."""
+
+        def read(one: Solution) -> Pair:
+            return self.goal((one.pan_rad, one.tilt_rad), here)
+
+        return reached(solutions, self._limits, self._head.way, (here.pan_rad, here.tilt_rad), read)
+
+    def goal(self, true_rad: Pair, here: HeadReading, corners: Sequence[Pair] = ()) -> Pair:
+        """Return the readings to send the head to, so that it comes to true angles."""
+        return self._head.goal(true_rad, here, corners)
 
     def send(self, pan_rad: float, tilt_rad: float) -> None:
         """Start the move at the speed cap. Raises OutsideLimits, Stopped, DriverError."""
@@ -110,7 +119,7 @@ class Head:
         self._goal = (pan_rad, tilt_rad)
         self._head.move(pan_rad, tilt_rad)
 
-    def arrived(self, pan_rad: float, tilt_rad: float, deadline_s: float) -> Reading:
+    def arrived(self, pan_rad: float, tilt_rad: float, deadline_s: float) -> HeadReading:
         """Wait until the head rests at these angles and return the reading.
 
         Raises
@@ -138,7 +147,7 @@ class Head:
             words = f"at its deadline the head still moves, {where}: {watch.seen()}"
             raise PointingError("did_not_settle", words)
 
-    def read(self) -> Reading:
+    def read(self) -> HeadReading:
         """Return a reading that can be true.
 
         Raises
@@ -176,7 +185,7 @@ class Head:
         self._last = reading
         return reading
 
-    def _rests(self, watch: RestWatch, deadline_s: float) -> tuple[bool, Reading]:
+    def _rests(self, watch: RestWatch, deadline_s: float) -> tuple[bool, HeadReading]:
         """Read until the head rests (True) or the deadline passes; return the last reading."""
         while True:
             self.check_not_stopped()

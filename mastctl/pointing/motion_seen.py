@@ -108,7 +108,7 @@ def as_told(shown: ShownView) -> dict[str, Any]:
 
 
 def _posed(view: View) -> Posed:
-    return Posed(view.image, view.frame.pan_rad, view.frame.tilt_rad)
+    return Posed(view.image, *view.frame.true_rad)
 
 
 def _rounded(values: Sequence[float] | FloatArray) -> list[float]:

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from calib.rigid import FloatArray
-from drivers.interfaces import Reading
+from mastctl.devices.joint_history import HeadReading
 from mastctl.pointing.looking import Eyes, View
 from mastctl.pointing.results import PointingError
 from mastctl.pointing.settings import PointingSettings
@@ -20,7 +20,7 @@ def check_one_moment(
     view: View,
     pixel_px: FloatArray,
     others: Sequence[View],
-    resting: Reading,
+    resting: HeadReading,
 ) -> dict[str, Any]:
     """Check that the thing at a pixel moves by less than half a pixel between the exposures of several eyes.
 

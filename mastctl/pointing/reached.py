@@ -11,7 +11,11 @@ from mastctl.devices.ways import Way
 
 
 def reached(
-    solutions: Sequence[Solution], limits: Limits, way: Callable[[Pair, Pair], Way], here: Pair
+    solutions: Sequence[Solution],
+    limits: Limits,
+    way: Callable[[Pair, Pair], Way],
+    here: Pair,
+    read: Callable[[Solution], Pair],
 ) -> Solution:
     """Return the solution to take: upright ones first, then the one that is reached soonest.
 
@@ -22,9 +26,11 @@ def reached(
     limits
         Of the joints: an angle is taken whole turns away too, where a cable lets the pan turn so far.
     way
-        Plans the moves from one pose to another.
+        Plans the moves from one pose to another, in readings.
     here
-        Where the head rests.
+        Where the head rests, as read.
+    read
+        The readings to send the head to, so that it comes to a solution's true angles.
 
     Raises
     ------
@@ -35,9 +41,9 @@ def reached(
     """
     found: list[tuple[bool, float, Solution]] = []
     refused: KeptOut | NoWay | None = None
-    for one in ordered(solutions, limits.pan_rad, limits.tilt_rad, *here):
+    for one in ordered(solutions, limits.pan_rad, limits.tilt_rad, *here, read):
         try:
-            time_s = way(here, (one.pan_rad, one.tilt_rad)).time_s
+            time_s = way(here, read(one)).time_s
         except (KeptOut, NoWay) as error:
             refused = refused or error
         else:

@@ -35,7 +35,10 @@ class Pointing:
     Attributes
     ----------
     commanded_pan_rad, commanded_tilt_rad, measured_pan_rad, measured_tilt_rad
-        Joint angles that were sent, and those measured at the new picture's mid-exposure.
+        Joint angles that were sent, and those measured at the new picture's mid-exposure: as the head reads
+        them.
+    true_pan_rad, true_tilt_rad
+        Where it truly stood then, by the mast file's joints.
     camera, frame_id
         The new picture: exposed after the head had settled.
     aim_px
@@ -56,6 +59,8 @@ class Pointing:
     commanded_tilt_rad: float
     measured_pan_rad: float
     measured_tilt_rad: float
+    true_pan_rad: float
+    true_tilt_rad: float
     camera: str
     frame_id: str
     aim_px: Pair | None

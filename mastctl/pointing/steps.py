@@ -15,7 +15,8 @@ from calib.mast.rig import Rig
 from calib.rigid import FloatArray
 from drivers.clock import Clock, deadlines_on
 from drivers.errors import DriverError
-from drivers.interfaces import Reading
+from mastctl.devices.joint_history import HeadReading
+from mastctl.devices.keep_out import Pair
 from mastctl.devices.limits import Limits
 from mastctl.errors import NotNow
 from mastctl.pointing.abandoned import result_unless
@@ -59,7 +60,7 @@ class FoundAgain:
     now: View
     other: View
     pixel_px: FloatArray
-    resting: Reading
+    resting: HeadReading
 
 
 class Steps:
@@ -117,11 +118,11 @@ class Steps:
         work_of = partial(work, *args, **options)
         return result_unless(self.head.check_not_stopped, work_of, deadlines_on(self._clock))
 
-    def rest(self) -> Reading:
+    def rest(self) -> HeadReading:
         """Return the reading of a head that rests. Raises PointingError, DriverError."""
         with self.step("rest") as detail:
             resting = self.head.resting()
-            detail.update(pan_rad=resting.pan_rad, tilt_rad=resting.tilt_rad)
+            detail.update(**_stands(resting))
         return resting
 
     def clicked(self, target: PixelTarget) -> FoundAgain:
@@ -151,8 +152,17 @@ class Steps:
             detail.update(match_facts(again))
         return FoundAgain(view, pixel, now, other, again.pixel_px, resting)
 
-    def go(self, pan_rad: float, tilt_rad: float, camera: str | None = None) -> Reading:
-        """Check the limits, move, wait until settled; return the reading there.
+    def go_to_true(self, pan_rad: float, tilt_rad: float, camera: str) -> tuple[Pair, HeadReading]:
+        """Go to true angles, as `go` does; return the readings that were commanded, and the arrival."""
+        here = self.head.read()
+        goal = self.head.goal((pan_rad, tilt_rad), here)
+        *corners, _ = self.head.way(*goal)
+        if corners:  # from there an axis may come from the other side
+            goal = self.head.goal((pan_rad, tilt_rad), here, corners)
+        return goal, self.go(*goal, camera)
+
+    def go(self, pan_rad: float, tilt_rad: float, camera: str | None = None) -> HeadReading:
+        """Check the limits, move until the head reads the angles, wait until settled; return the reading.
 
         Round a keep-out the head goes by corners, and rests at each; the record names them.
         Where the head knows its counts, the record says what these leave, in pixels of ``camera``.
@@ -181,7 +191,7 @@ class Steps:
             self.head.send(pan_rad, tilt_rad)
         with self.step("settle") as detail:
             settled = self.head.arrived(pan_rad, tilt_rad, begun_s + allowed_s)
-            detail.update(pan_rad=settled.pan_rad, tilt_rad=settled.tilt_rad)
+            detail.update(**_stands(settled))
             model = None if camera is None else self._rig.cameras[camera].model
             detail.update(counts_told(self._devices, settled.tilt_rad, model))
         return settled
@@ -195,7 +205,8 @@ class Steps:
     ) -> None:
         """Take pictures to compare with after a move, where there are none yet and they will tell something.
 
-        A camera that gives none is left out, and named in the record, unless it is ``needed``.
+        ``goal_rad`` are the true angles that it leads to. A camera that gives none is left out, and named in
+        the record, unless it is ``needed``.
 
         Raises
         ------
@@ -205,7 +216,7 @@ class Steps:
         configured = self._devices.newest_frames()
         here = self.head.read()
         lacking = self._motion_seen.lacking(
-            [name for name in cameras if name in configured], (here.pan_rad, here.tilt_rad), goal_rad
+            [name for name in cameras if name in configured], here.true_rad, goal_rad
         )
         if not lacking:
             return
@@ -225,7 +236,7 @@ class Steps:
             if missing:
                 detail.update(missing=missing)
 
-    def look(self, cameras: Sequence[str], settled: Reading) -> dict[str, View]:
+    def look(self, cameras: Sequence[str], settled: HeadReading) -> dict[str, View]:
         """Take new pictures, exposed after the head had settled, that moved as the head did.
 
         Raises
@@ -242,9 +253,20 @@ class Steps:
         return views
 
     def one_moment(
-        self, view: View, pixel_px: FloatArray, others: Sequence[View], resting: Reading
+        self, view: View, pixel_px: FloatArray, others: Sequence[View], resting: HeadReading
     ) -> dict[str, Any]:
         """Check that pictures of several eyes serve one measurement, as `check_one_moment` says."""
         return self.unless_stopped(
             check_one_moment, self.eyes, self._settings, view, pixel_px, others, resting
         )
+
+
+def _stands(reading: HeadReading) -> dict[str, float]:
+    """Where the head stands, for a step's detail: as read, and truly."""
+    true_pan_rad, true_tilt_rad = reading.true_rad
+    return {
+        "pan_rad": reading.pan_rad,
+        "tilt_rad": reading.tilt_rad,
+        "true_pan_rad": true_pan_rad,
+        "true_tilt_rad": true_tilt_rad,
+    }

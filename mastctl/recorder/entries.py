@@ -8,9 +8,9 @@ from typing import Any, Protocol
 from google.protobuf.message import Message
 
 from calib.mast.rig import Rig
-from drivers.interfaces import Reading
 from mastctl.as_json import as_json, picked
 from mastctl.devices.frames import StampedFrame
+from mastctl.devices.joint_history import HeadReading
 from mastctl.recorder import messages
 from mastctl.recorder.writer import Clocks
 
@@ -20,7 +20,7 @@ REST_S = 10.0
 
 FACTS = (
     "frame_id", "camera", "sequence", "mid_exposure_s", "exposure_s", "pan_rad", "tilt_rad", "moving",
-    "mast_digest",
+    "mast_digest", "true_pan_rad", "true_tilt_rad", "pan_approach", "tilt_approach",
 )  # fmt: skip
 
 
@@ -58,7 +58,7 @@ class Entries:
         self._rig = rig
         self._digest = digest
         self._newest: dict[tuple[str, str], ToldLike] = {}
-        self._joints: Reading | None = None
+        self._joints: HeadReading | None = None
         self._joints_told_s = float("-inf")
         self._told_dropped = 0
         self._frames: dict[str, str] = {}
@@ -117,7 +117,7 @@ class Entries:
             told = {"dropped": dict(dropped), "reason": "the disk was slower than what came"}
             file.add_json("/recorder", "recorder", told, time_s, now_s)
 
-    def _write_joints(self, file: Sink, reading: Reading, time_s: float, now_s: float) -> None:
+    def _write_joints(self, file: Sink, reading: HeadReading, time_s: float, now_s: float) -> None:
         before, self._joints = self._joints, reading
         still = (
             before is not None
@@ -129,10 +129,15 @@ class Entries:
         if still and now_s - self._joints_told_s < REST_S:
             return
         self._joints_told_s = now_s
-        told = picked(reading, "pan_rad", "tilt_rad", "moving", "time_s")
+        told = picked(reading, "pan_rad", "tilt_rad", "moving", "time_s") | {
+            "true_pan_rad": reading.true_rad[0],
+            "true_tilt_rad": reading.true_rad[1],
+            "pan_approach": reading.approach[0],
+            "tilt_approach": reading.approach[1],
+        }
         file.add_json("/joints", "joints", told, reading.time_s, now_s)
         time_ns = file.clocks.ns(reading.time_s)
-        tree = messages.transforms(self._rig, reading.pan_rad, reading.tilt_rad, time_ns)
+        tree = messages.transforms(self._rig, *reading.true_rad, time_ns)
         file.add_message("/tf", tree, reading.time_s, now_s)
 
     def _write_frame(self, file: Sink, frame: StampedFrame, now_s: float) -> None:

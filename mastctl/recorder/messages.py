@@ -81,7 +81,9 @@ def _nearest(model: CameraModel) -> PlumbBob:
 
 
 def transforms(rig: Rig, pan_rad: float, tilt_rad: float, time_ns: int) -> Message:
-    """Return where mast, head and cameras stand: rover <- mast <- head <- cameras, and those on the body."""
+    """Return where mast, head and cameras stand at true joint angles: rover <- mast <- head <- cameras, and
+    those on the body.
+    """
     mast = rig.mast
     known: list[tuple[str, str, Rigid]] = [
         ("rover", "mast", mast.rover_from_mast),

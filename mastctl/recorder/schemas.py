@@ -32,6 +32,10 @@ _TEXT = {"type": "string"}
 _TEXT_OR_NONE = {"type": ["string", "null"]}
 _SECONDS = {"type": "number", "description": "seconds of the daemon's monotonic clock"}
 _ANGLE = {"type": "number", "description": "radians"}
+_SIDE = {"type": "number", "description": "1 from smaller readings, -1 from larger, 0 not known"}
+_TRULY = {
+    "true_pan_rad": _ANGLE, "true_tilt_rad": _ANGLE, "pan_approach": _SIDE, "tilt_approach": _SIDE,
+}  # fmt: skip
 _PIXEL = {"type": ["array", "null"], "items": {"type": ["number", "null"]}, "description": "x, y in pixels"}
 _POINT = {"type": ["array", "null"], "items": _NUMBER, "description": "x, y, z in metres, rover frame"}
 _ANY = {"type": ["object", "null"]}
@@ -41,6 +45,7 @@ _PROPERTIES: Mapping[str, Mapping[str, Any]] = {
         "frame_id": _TEXT, "camera": _TEXT, "sequence": {"type": "integer"}, "mid_exposure_s": _SECONDS,
         "exposure_s": _NUMBER, "pan_rad": _ANGLE, "tilt_rad": _ANGLE, "moving": {"type": "boolean"},
         "mast_digest": {"type": "string", "description": "SHA-256 of the mast file in use"},
+        **_TRULY,
         "colour": {"type": "boolean", "description": "whether the daemon used the picture in colour"},
     },
     "cahvor": {
@@ -48,12 +53,15 @@ _PROPERTIES: Mapping[str, Mapping[str, Any]] = {
         "model": {"type": "object", "description": "the camera in its frame, as a mast file holds it"},
         "plumb_bob": {"type": "object", "description": "how far the nearest plumb_bob is from it, pixels"},
     },
-    "joints": {"pan_rad": _ANGLE, "tilt_rad": _ANGLE, "moving": {"type": "boolean"}, "time_s": _SECONDS},
+    "joints": {
+        "pan_rad": _ANGLE, "tilt_rad": _ANGLE, "moving": {"type": "boolean"}, "time_s": _SECONDS, **_TRULY,
+    },
     "target": {"operation": _TEXT, "position_m": _POINT, "range_m": {"type": ["number", "null"]}},
     "residual": {
         "operation": _TEXT, "pointing": {"type": "integer"}, "camera": _TEXT, "frame_id": _TEXT,
         "aim_px": _PIXEL, "target_px": _PIXEL, "residual_px": _PIXEL, "residual_sigma_px": _PIXEL,
         "measured_pan_rad": _ANGLE, "measured_tilt_rad": _ANGLE,
+        "true_pan_rad": _ANGLE, "true_tilt_rad": _ANGLE,
     },
     "operation": {
         "id": _TEXT, "state": _TEXT, "request": _ANY, "created_s": _SECONDS,

@@ -23,6 +23,7 @@ from calib.camera.stereo import triangulate
 from calib.errors import CalibError
 from calib.handoff.geometric import hand_off
 from calib.handoff.matched import MatchedHandoff
+from calib.mast.joints import UNKNOWN, Approach
 from calib.mast.pointing import solve
 from calib.mast.rig import Rig
 from calib.rigid import FloatArray
@@ -42,11 +43,13 @@ class Seen:
     operation, pointing, mast_digest
         Which one, and with which mast file.
     pair, pair_px, pair_sigma_px, pair_rad
-        The two cameras, (2, 2) pixels of the target in them, their sigma, and (pan, tilt) there.
+        The two cameras, (2, 2) pixels of the target in them, their sigma, and (pan, tilt) read there.
+    pair_approach, measured_approach
+        From which side pan and tilt had come there, and to the new picture.
     aim_camera, aim_px
         Where the target was wanted.
     commanded_rad, measured_rad
-        (pan, tilt) sent and reached.
+        (pan, tilt) sent and reached, as the head reads them.
     target_px, target_sigma_px
         (2,) where the new picture showed the target.
     frame_id
@@ -67,6 +70,8 @@ class Seen:
     target_px: FloatArray
     target_sigma_px: FloatArray
     frame_id: str
+    pair_approach: Approach = UNKNOWN
+    measured_approach: Approach = UNKNOWN
 
     @property
     def residual_px(self) -> FloatArray:
@@ -157,7 +162,7 @@ def _pointings(name: str, record: Mapping[str, Any], frames: Mapping[str, Any]) 
             pair = clicked, _camera_of(pair_ids[1])
             pixels = [steps["target", 1]["pixel_px"], steps["stereo", 1]["pixel_px"]]
             sigmas = [steps["target", 1]["sigma_px"], steps["stereo", 1]["sigma_px"]]
-            where = _joints(frames.get(pair_ids[0]), (rest["pan_rad"], rest["tilt_rad"]))
+            pair_facts, otherwise = frames.get(pair_ids[0]), (rest["pan_rad"], rest["tilt_rad"])
         else:
             before, eyes = steps["measure", number - 1], steps["eyes", number - 1]
             if len(eyes["confirmed_by"]) != 1:
@@ -166,7 +171,9 @@ def _pointings(name: str, record: Mapping[str, Any], frames: Mapping[str, Any]) 
             pixels = [before["pixel_px"], eyes[pair[1]]["pixel_px"]]
             sigmas = [before["sigma_px"], before["sigma_px"]]
             last = results[number - 2]
-            where = float(last["measured_pan_rad"]), float(last["measured_tilt_rad"])
+            pair_facts = frames.get(last["frame_id"])
+            otherwise = last["measured_pan_rad"], last["measured_tilt_rad"]
+        where, pair_approach = _joints(pair_facts, otherwise)
         facts = frames.get(result["frame_id"])
         found.append(
             Seen(
@@ -184,6 +191,8 @@ def _pointings(name: str, record: Mapping[str, Any], frames: Mapping[str, Any]) 
                 target_px=np.array(result["target_px"], dtype=float),
                 target_sigma_px=np.maximum(np.array(result["residual_sigma_px"], dtype=float), LEAST_PX),
                 frame_id=str(result["frame_id"]),
+                pair_approach=pair_approach,
+                measured_approach=_joints(facts, (0.0, 0.0))[1],
             )
         )
     return found
@@ -210,19 +219,22 @@ def _would_be(rig: Rig, seen: Seen, servo_rad: FloatArray) -> WouldBe:
 
 def _residual(rig: Rig, seen: Seen) -> tuple[tuple[float, float], float, FloatArray]:
     """Commanded angles, range and residual of a pointing with a mast file. Raises CalibError."""
-    one, other = (rig.camera_in_rover(name, *seen.pair_rad) for name in seen.pair)
+    joints, came = rig.joints, seen.measured_approach
+    at = joints.true_rad(seen.pair_rad, seen.pair_approach)
+    one, other = (rig.camera_in_rover(name, *at) for name in seen.pair)
     target = triangulate(one, other, seen.pair_px[0], seen.pair_px[1]).position_m
     aim = rig.cameras[seen.aim_camera].model
     solutions = solve(rig.mast, aim, target, seen.aim_px)
     pan, tilt = seen.commanded_rad
     chosen = min(solutions, key=lambda s: max(abs(s.pan_rad - pan), abs(s.tilt_rad - tilt)))
-    ray = rig.camera_in_rover(seen.aim_camera, *seen.measured_rad).ray(seen.target_px)
+    ray = rig.camera_in_rover(seen.aim_camera, *joints.true_rad(seen.measured_rad, came)).ray(seen.target_px)
     range_m = float(np.linalg.norm(target - ray.origins_m))
     stands = ray.origins_m + range_m * ray.directions
-    left = seen.left_rad
-    there = rig.camera_in_rover(seen.aim_camera, chosen.pan_rad + left[0], chosen.tilt_rad + left[1])
+    commanded = joints.read_rad((chosen.pan_rad, chosen.tilt_rad), came)
+    reached = commanded[0] + float(seen.left_rad[0]), commanded[1] + float(seen.left_rad[1])
+    there = rig.camera_in_rover(seen.aim_camera, *joints.true_rad(reached, came))
     pixel, _ = there.project(stands)
-    return (chosen.pan_rad, chosen.tilt_rad), range_m, np.asarray(pixel - seen.aim_px, dtype=float)
+    return commanded, range_m, np.asarray(pixel - seen.aim_px, dtype=float)
 
 
 def _sigma(rig: Rig, seen: Seen, servo_rad: FloatArray) -> FloatArray:
@@ -290,8 +302,9 @@ def _camera_of(frame_id: str) -> str:
     return frame_id.rsplit("-", 3)[0]
 
 
-def _joints(facts: Any, otherwise: tuple[float, float]) -> tuple[float, float]:
-    """Joint angles of a recorded frame, or what the step before it read."""
+def _joints(facts: Any, otherwise: tuple[float, float]) -> tuple[tuple[float, float], Approach]:
+    """Joint angles of a recorded frame as read, or what the step before it read, and from which side."""
     if facts is None:
-        return float(otherwise[0]), float(otherwise[1])
-    return float(facts["pan_rad"]), float(facts["tilt_rad"])
+        return (float(otherwise[0]), float(otherwise[1])), UNKNOWN
+    approach = float(facts.get("pan_approach", 0.0)), float(facts.get("tilt_approach", 0.0))
+    return (float(facts["pan_rad"]), float(facts["tilt_rad"])), approach

@@ -9,9 +9,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from drivers.interfaces import Reading
 from mastctl.as_json import as_json, picked
 from mastctl.devices.frames import StampedFrame
+from mastctl.devices.joint_history import HeadReading
 from mastctl.devices.limits import Limits
 from mastctl.state.faults import StandingFault
 from mastctl.state.standing import Standing
@@ -57,7 +57,7 @@ class State:
     mast: Mapping[str, Any]
     former_mast: Mapping[str, Any] | None
     limits: Limits
-    reading: Reading | None
+    reading: HeadReading | None
     frames: Mapping[str, StampedFrame | None]
     standing: Standing
     track: TrackStatus
@@ -109,10 +109,18 @@ def standing_told(now: Standing, now_s: float) -> dict[str, Any]:
     }
 
 
-def joints_told(reading: Reading, now_s: float) -> dict[str, Any]:
+def joints_told(reading: HeadReading, now_s: float) -> dict[str, Any]:
     """Return a reading of the head as ``GET /status`` tells it."""
     age_s = max(0.0, now_s - reading.time_s)
-    return picked(reading, "pan_rad", "tilt_rad") | {"measured_s": reading.time_s, "age_s": age_s}
+    return {
+        **picked(reading, "pan_rad", "tilt_rad"),
+        "true_pan_rad": reading.true_rad[0],
+        "true_tilt_rad": reading.true_rad[1],
+        "pan_approach": reading.approach[0],
+        "tilt_approach": reading.approach[1],
+        "measured_s": reading.time_s,
+        "age_s": age_s,
+    }
 
 
 def fault_told(fault: StandingFault, now_s: float) -> dict[str, Any]:

@@ -80,8 +80,8 @@ class Choice:
     pair
         Its name.
     pan_rad, tilt_rad
-        Joint angles that bring the target midway between the two pictures' middles; None for a pair on the
-        body, which looks wherever the head is.
+        True joint angles that bring the target midway between the two pictures' middles; None for a pair on
+        the body, which looks wherever the head is.
     range_m
         From the middle between the pair's cameras.
     range_error_m
@@ -120,7 +120,7 @@ def choose_pairs(
     limits
         Of the head; none by default.
     from_rad
-        Pan and tilt of now, for the choice among solutions.
+        True pan and tilt of now, for the choice among solutions.
     chosen
         Chooses among them in place of ``limits``.
 

@@ -27,7 +27,7 @@ from calib.tracking.look import Look, seen_by
 from calib.tracking.start import start_track
 from calib.tracking.track import Track
 from drivers.errors import DriverError
-from drivers.interfaces import Reading
+from mastctl.devices.joint_history import HeadReading
 from mastctl.devices.limits import Limits
 from mastctl.errors import MastctlError
 from mastctl.pointing.looking import View
@@ -108,7 +108,7 @@ class _Taken:
     """The pictures of one pair: new ones by camera, left first, and why an eye has none."""
 
     choice: Choice
-    settled: Reading
+    settled: HeadReading
     views: Mapping[str, View]
     missing: Mapping[str, str]
 
@@ -263,7 +263,9 @@ class Looker:
                 detail.update(pose_doubt=seen.pose_doubt)
         return _Sight(look.track, seen, taken, look.found)
 
-    def _told(self, choice: Choice, look: Look, pixels: Mapping[str, EyePixel], settled: Reading) -> Sighting:
+    def _told(
+        self, choice: Choice, look: Look, pixels: Mapping[str, EyePixel], settled: HeadReading
+    ) -> Sighting:
         track, reason = look.track, look.reason
         gone = [one.reason for one in pixels.values() if one.verdict == "no_frame"]
         if track.state == "lost" and gone:
@@ -285,28 +287,29 @@ class Looker:
     def _choices(self, position_m: FloatArray) -> list[Choice]:
         with self._steps.step("choose") as detail:
             here = self._steps.head.read()
-            place = here.pan_rad, here.tilt_rad
             found = choose_pairs(
                 self._rig,
                 position_m,
                 self._settings.handoff,
                 self._limits,
-                place,
-                lambda solutions: self._steps.head.chosen(solutions, place),
+                here.true_rad,
+                lambda solutions: self._steps.head.chosen(solutions, here),
             )
             detail.update(pairs=[one.pair for one in found], range_m=round(found[0].range_m, 3))
             detail.update(range_error_m=round(found[0].range_error_m, 4), outside=found[0].outside)
         return found
 
-    def _pointed(self, choice: Choice) -> Reading:
+    def _pointed(self, choice: Choice) -> HeadReading:
         """Bring the target into the middle; a pair on the body only needs a head at rest."""
         if choice.pan_rad is None or choice.tilt_rad is None:
             return self._steps.rest()
         eyes = self._rig.stereo[choice.pair]
         self._steps.before(eyes, (choice.pan_rad, choice.tilt_rad), timeout_s=BEFORE_TIMEOUT_S)
-        return self._steps.go(choice.pan_rad, choice.tilt_rad, eyes[0])
+        return self._steps.go_to_true(choice.pan_rad, choice.tilt_rad, eyes[0])[1]
 
-    def _pictures(self, eyes: tuple[str, str], settled: Reading) -> tuple[dict[str, View], dict[str, str]]:
+    def _pictures(
+        self, eyes: tuple[str, str], settled: HeadReading
+    ) -> tuple[dict[str, View], dict[str, str]]:
         """New pictures, left first, and why an eye has none. Raises PointingError, the head's DriverError."""
         missing: dict[str, str] = {}
         while len(missing) < len(eyes):
@@ -320,7 +323,7 @@ class Looker:
                 missing[error.device] = " ".join(str(error).split())
         return {}, missing
 
-    def _started(self, one: View, other: View, pixel_px: FloatArray, resting: Reading) -> Track:
+    def _started(self, one: View, other: View, pixel_px: FloatArray, resting: HeadReading) -> Track:
         with self._steps.step("start") as detail:
             detail.update(self._steps.one_moment(one, pixel_px, [other], resting))
             try:
@@ -350,11 +353,8 @@ class Looker:
             },
         )
 
-    def _range_m(self, pair: str, position_m: FloatArray, settled: Reading) -> float:
-        left, right = (
-            self._rig.camera_in_rover(eye, settled.pan_rad, settled.tilt_rad)
-            for eye in self._rig.stereo[pair]
-        )
+    def _range_m(self, pair: str, position_m: FloatArray, settled: HeadReading) -> float:
+        left, right = (self._rig.camera_in_rover(eye, *settled.true_rad) for eye in self._rig.stereo[pair])
         return float(np.linalg.norm(position_m - (left.C + right.C) / 2))
 
 

@@ -67,7 +67,8 @@ def record_of(
 
 
 def _joints(view: View) -> Joints:
-    return Joints(view.frame.pan_rad, view.frame.tilt_rad, JOINT_SIGMA_RAD)
+    frame = view.frame
+    return Joints(*frame.true_rad, JOINT_SIGMA_RAD, (frame.pan_approach, frame.tilt_approach))
 
 
 def _eye(view: View) -> Eye:

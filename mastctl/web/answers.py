@@ -31,10 +31,18 @@ class _Told(BaseModel):
 
 
 class Joints(_Told):
-    """The head's joints as last measured, radians; ``measured_s`` of CLOCK_MONOTONIC."""
+    """The head's joints as last measured, radians; ``measured_s`` of CLOCK_MONOTONIC.
+
+    ``true_...`` by the mast file's ``joints``; ``..._approach``: from which side an axis came, 1 from smaller
+    readings, -1 from larger, 0 not known.
+    """
 
     pan_rad: float
     tilt_rad: float
+    true_pan_rad: float
+    true_tilt_rad: float
+    pan_approach: float
+    tilt_approach: float
     measured_s: float
     age_s: Seconds
 
@@ -277,6 +285,8 @@ class PointingTold(_Told):
     commanded_tilt_rad: float
     measured_pan_rad: float
     measured_tilt_rad: float
+    true_pan_rad: float
+    true_tilt_rad: float
     camera: str
     frame_id: str
     aim_px: Pixel | None

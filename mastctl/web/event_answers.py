@@ -47,6 +47,10 @@ class FrameTold(_Told):
     tilt_rad: float
     moving: bool
     mast_digest: str
+    true_pan_rad: float
+    true_tilt_rad: float
+    pan_approach: float
+    tilt_approach: float
     age_s: Seconds
 
 

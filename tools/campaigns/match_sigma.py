@@ -96,7 +96,8 @@ class Taken:
             image = photograph(picture, BLUR_PX, NOISE_DN, rng)
             facts = (f"{name}-{number}", name, number, 0.0, 0.0, pan_rad, tilt_rad, False, "")
             camera = look.rig.camera_in_rover(name, pan_rad, tilt_rad)
-            self.views[name] = View(StampedFrame(*facts, image=image), grey(image), camera)
+            frame = StampedFrame(*facts, image=image, true_pan_rad=pan_rad, true_tilt_rad=tilt_rad)
+            self.views[name] = View(frame, grey(image), camera)
 
 
 def run_look(look: Look) -> Rows:

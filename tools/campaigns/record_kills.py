@@ -86,7 +86,12 @@ def record_until_killed(folder: Path, mast: MastTold, seed: int, told: mmap.mmap
         if number % FRAME_EVERY == 0:
             image = pixels.integers(0, 256, (48, 64), np.uint8)
             facts = (f"f{number}", "navcam_left", number, now_s, 0.001, 0.0, 0.0, False, mast.file.digest)
-            recorder.tell("frame", "navcam_left", StampedFrame(*facts, image), now_s)
+            recorder.tell(
+                "frame",
+                "navcam_left",
+                StampedFrame(*facts, image, true_pan_rad=0.0, true_tilt_rad=0.0),
+                now_s,
+            )
         PLACE.pack_into(told, 0, number, time.monotonic(), first_s)
         next_s += STEP_S
         time.sleep(max(0.0, next_s - time.monotonic()))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,7 +11,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import approx_fprime, brentq
 
+from calib.mast.covariance import moved_rig
 from calib.mast.joints import JOINTS_NAMES, AxisJoint, Joints, joints_of, numbers_of
+from calib.mast.rig import Rig
+from calib.mast.rig_rates import pixel_rates
 
 INVERSE_RAD = 1e-12
 RATE = 1e-6
@@ -102,3 +106,26 @@ def test_what_cannot_be_led_back_is_refused(
 ) -> None:
     with pytest.raises(ValueError, match=words):
         AxisJoint(harmonics, backlash)
+
+
+def test_pixels_move_with_the_joints_numbers_as_differences_say(true_rig: Rig) -> None:
+    joints = Joints(AxisJoint(((0.005, -0.003), (0.001, 0.002)), 0.004), AxisJoint(((0.0, 0.002),), 0.003))
+    rig, read, approach = replace(true_rig, joints=joints), (0.4, -0.3), (1.0, -1.0)
+    names = ("mast.rotation_rad.x", *JOINTS_NAMES, "tilt_rad")
+    at = joints.true_rad(read, approach)
+    point = rig.mast.rover_from_head(*at).points(np.array([[4.0, 0.3, 0.2]]))
+
+    def seen(rig: Rig) -> np.ndarray:
+        camera = rig.camera_in_rover("navcam_left", *rig.joints.true_rad(read, approach))
+        return np.asarray(camera.project(point)[0][0])
+
+    _, rates = pixel_rates(rig, names, "navcam_left", *at, point, approach)
+    step = 1e-6
+    for name in names[:-1]:
+        up, down = (moved_rig(rig, (name,), np.array([sign * step])) for sign in (1.0, -1.0))
+        by_difference = (seen(up) - seen(down)) / (2 * step)
+        np.testing.assert_allclose(rates[0, :, names.index(name)], by_difference, atol=2e-3, err_msg=name)
+    turned = [
+        rig.camera_in_rover("navcam_left", at[0], at[1] + d).project(point)[0][0] for d in (step, -step)
+    ]
+    np.testing.assert_allclose(rates[0, :, -1], (turned[0] - turned[1]) / (2 * step), atol=2e-3)

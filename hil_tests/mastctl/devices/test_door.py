@@ -163,7 +163,9 @@ def test_a_head_that_does_not_say_how_it_brakes_is_taken_for_a_lazy_one(
 def test_the_simulated_head_says_how_it_moves() -> None:
     preset = PRESETS["ph42"]
     head = SimulatedPanTilt(preset, ManualClock())
-    assert head.axis_motion()["tilt"] == AxisMotion(4.0, preset.tilt.approach_rad)
+    count_rad = 2 * math.pi / 607500  # the PH42's manual
+    rises = AxisMotion(4.0, preset.tilt.approach_rad, math.inf, count_rad)
+    assert head.axis_motion()["tilt"] == rises and rises.turn_to(3.0) == 1
 
 
 def test_the_sun_is_kept_out_until_its_moment_and_then_missed_aloud() -> None:

@@ -29,7 +29,7 @@ def history(count: int, turn_rad: float = 0.0) -> list[Measured]:
 
 
 def ended_pointing() -> Operation:
-    at = {"pan_rad": 0.1, "tilt_rad": -0.2}
+    at = {"pan_rad": 0.103, "tilt_rad": -0.198, "true_pan_rad": 0.1, "true_tilt_rad": -0.2}
     predicted = STORED.rig.camera_in_rover("pancam_left", 0.1, -0.2).project((3.0, 0.2, -1.0))[0]
     details = {
         "rest": at,

@@ -20,6 +20,7 @@ from drivers.clock import ManualClock
 from drivers.interfaces import Reading
 from hil_tests.calib.pictures.textured_planes import Pinhole, TexturedPlane, picture, random_texture
 from mastctl.devices.frames import StampedFrame
+from mastctl.devices.joint_history import HeadReading
 from mastctl.devices.keep_out import Pair
 from mastctl.devices.limits import Limits
 from mastctl.devices.ways import Way, duration_s
@@ -129,11 +130,16 @@ class World:
         (pan, tilt), _ = self.joints(time_s)
         return pan + self._slip[0], tilt + self._slip[1]
 
-    def read(self) -> Reading:
+    def read(self) -> HeadReading:
         self.on_read()
         now_s = self.clock.now_s()
         (pan, tilt), moving = self.joints(now_s)
-        return self.reading(Reading(pan, tilt, moving, now_s))
+        told = self.reading(Reading(pan, tilt, moving, now_s))
+        true_rad = told.pan_rad, told.tilt_rad
+        return HeadReading(*true_rad, told.moving, told.time_s, told.faults, true_rad=true_rad)
+
+    def goal(self, true_rad: Pair, here: HeadReading, corners: Sequence[Pair] = ()) -> Pair:
+        return true_rad  # joints that read true
 
     def move(self, pan_rad: float, tilt_rad: float, speed_rad_per_s: float | None = None) -> None:
         LIMITS.check(pan_rad, tilt_rad)
@@ -188,7 +194,18 @@ class World:
         frame_id = f"{name}-{self._count:06d}"
         self._truth[frame_id] = self.true_joints(now_s)
         self._frames[frame_id] = StampedFrame(
-            frame_id, name, self._count, now_s, 0.002, pan, tilt, moving, self.digest, shown
+            frame_id,
+            name,
+            self._count,
+            now_s,
+            0.002,
+            pan,
+            tilt,
+            moving,
+            self.digest,
+            shown,
+            true_pan_rad=pan,
+            true_tilt_rad=tilt,
         )
         return self._frames[frame_id]
 

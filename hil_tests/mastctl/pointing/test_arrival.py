@@ -11,6 +11,7 @@ import pytest
 
 from drivers.clock import ManualClock
 from drivers.interfaces import Reading
+from mastctl.devices.joint_history import HeadReading
 from mastctl.devices.limits import Limits
 from mastctl.pointing.motion import Head
 from mastctl.pointing.results import PointingError
@@ -32,9 +33,11 @@ class Turning:
         self.moves: list[tuple[float, float]] = []
         self.stamp: Callable[[Reading], Reading] = lambda reading: reading
 
-    def read(self) -> Reading:
+    def read(self) -> HeadReading:
         pan_rad, tilt_rad, moving = self.at(self.clock.now_s())
-        return self.stamp(Reading(pan_rad, tilt_rad, moving, self.clock.now_s()))
+        told = self.stamp(Reading(pan_rad, tilt_rad, moving, self.clock.now_s()))
+        true_rad = told.pan_rad, told.tilt_rad
+        return HeadReading(*true_rad, told.moving, told.time_s, told.faults, true_rad=true_rad)
 
     def move(self, pan_rad: float, tilt_rad: float, speed_rad_per_s: float | None = None) -> None:
         self.moves.append((pan_rad, tilt_rad))

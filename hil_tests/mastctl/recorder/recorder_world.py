@@ -13,9 +13,10 @@ from mcap.reader import make_reader
 
 from calib.files.mast_file import parse_rig
 from drivers.clock import SystemClock
-from drivers.interfaces import Image, Reading
+from drivers.interfaces import Image
 from mastctl.config import load_config
 from mastctl.devices.frames import StampedFrame
+from mastctl.devices.joint_history import HeadReading
 from mastctl.recorder.recorder import MastTold, Recorder
 from mastctl.recorder.settings import RecordSettings
 from mastctl.recorder.writer import Attached
@@ -50,11 +51,11 @@ def frame(
         False,
         "ab",
     )
-    return StampedFrame(*facts, image, jpeg=jpeg)
+    return StampedFrame(*facts, image, jpeg=jpeg, true_pan_rad=0.25, true_tilt_rad=-0.5)
 
 
-def reading(pan_rad: float, moving: bool = True) -> Reading:
-    return Reading(pan_rad, 0.0, moving, 100.0)
+def reading(pan_rad: float, moving: bool = True) -> HeadReading:
+    return HeadReading(pan_rad, 0.0, moving, 100.0, true_rad=(pan_rad, 0.0))
 
 
 def recorder(folder: Path, **settings: Any) -> Recorder:

@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from drivers.interfaces import Reading
 from mastctl.devices.frames import StampedFrame
+from mastctl.devices.joint_history import HeadReading
 from mastctl.devices.limits import Limits
 from mastctl.service.state import State
 from mastctl.state.faults import StandingFault
@@ -22,13 +22,13 @@ REST = State(
     mast={"file": "a.yaml"},
     former_mast=None,
     limits=Limits((-2.0, 2.0), (-1.0, 1.0), 0.5),
-    reading=Reading(0.1, -0.2, False, 99.75),
+    reading=HeadReading(0.1, -0.2, False, 99.75, true_rad=(0.103, -0.198), approach=(1.0, 0.0)),
     frames={"navcam_left": None},
     standing=Standing("ready", "", 90.0),
     track=TrackStatus(),
     faults=(),
 )
-MOVING = Reading(0.1, -0.2, True, 99.75)
+MOVING = HeadReading(0.1, -0.2, True, 99.75, true_rad=(0.1, -0.2))
 OF_THE_HEAD = StandingFault("head", "no_reply", "the head is silent", 98.5, "it answers")
 OF_A_CAMERA = replace(OF_THE_HEAD, device="navcam_left")
 
@@ -41,7 +41,18 @@ def test_moving_is_what_the_head_said_last() -> None:
 
 def test_ages_count_to_the_moment_of_the_snapshot_and_are_never_below_zero() -> None:
     frame = StampedFrame(
-        "id", "navcam_left", 7, 99.5, 0.01, 0.0, 0.0, False, "digest", np.zeros((2, 2), np.uint8)
+        "id",
+        "navcam_left",
+        7,
+        99.5,
+        0.01,
+        0.0,
+        0.0,
+        False,
+        "digest",
+        np.zeros((2, 2), np.uint8),
+        true_pan_rad=0.0,
+        true_tilt_rad=0.0,
     )
     state = replace(REST, frames={"navcam_left": frame}, faults=(OF_A_CAMERA,))
     for later_s, ages_s in ((0.0, (0.25, 0.5, 1.5, 60.0)), (-5.0, (0.0, 0.0, 0.0, 55.0))):
@@ -76,6 +87,9 @@ def test_what_is_known_is_told() -> None:
     assert told["last_residual"] == {
         "residual_px": [0.25, -0.5], "residual_sigma_px": [0.1, 0.2], "operation": "2",
     }  # fmt: skip
-    assert told["joints"] == {"pan_rad": 0.1, "tilt_rad": -0.2, "measured_s": 99.75, "age_s": 0.25}
+    assert told["joints"] == {
+        "pan_rad": 0.1, "tilt_rad": -0.2, "true_pan_rad": 0.103, "true_tilt_rad": -0.198,
+        "pan_approach": 1.0, "tilt_approach": 0.0, "measured_s": 99.75, "age_s": 0.25,
+    }  # fmt: skip
     limits = {"pan_rad": [-2.0, 2.0], "tilt_rad": [-1.0, 1.0], "speed_rad_per_s": 0.5}
     assert {key: told["limits"][key] for key in limits} == limits
