@@ -74,8 +74,8 @@ class Asynchronous(ast.NodeTransformer):
     def visit_Subscript(self, node: ast.Subscript) -> ast.AST:
         self.generic_visit(node)
         text = ast.unparse(node)
-        if text == "Callable[[], dict[str, Any]]":
-            return ast.parse("Callable[[], Awaitable[dict[str, Any]]]", mode="eval").body
+        if text == "Callable[[], T]":
+            return ast.parse("Callable[[], Awaitable[T]]", mode="eval").body
         return node
 
     def visit_For(self, node: ast.For) -> ast.AST:
@@ -117,10 +117,10 @@ def written(source: str) -> str:
     awaitable = "from collections.abc import Awaitable\n" if "Awaitable" in rest else ""
     made = f"{head}from __future__ import annotations\nimport asyncio\n{awaitable}{rest}"
     made = made.replace('"""', '"""Asyncio: ', 1)
-    return _tidy(f"# Made by tools/async_client.py; what is to be changed is changed in its source.\n{made}")
+    return tidy(f"# Made by tools/async_client.py; what is to be changed is changed in its source.\n{made}")
 
 
-def _tidy(text: str) -> str:
+def tidy(text: str) -> str:
     """The same in the project's form."""
     ruff = str(Path(sys.executable).with_name("ruff"))
     for words in (["check", "--fix", "-q", "--exit-zero", "--line-length", "110"], ["format", "-q"]):

@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import argparse
 import sys
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from mastctl.cli import output
+
+if TYPE_CHECKING:
+    from mastctl.client.answers import Status
 
 MARKS = {"good": "✓", "unsure": "?", "bad": "✗"}
 
@@ -44,7 +47,7 @@ def _doctor(args: argparse.Namespace) -> int:
     return 1 if bad else 0
 
 
-def _asked(url: str) -> dict[str, Any] | None:
+def _asked(url: str) -> Status | None:
     """The status of a daemon, if one answers."""
     from mastctl.client import Client, ClientError
 

@@ -36,8 +36,8 @@ def _jog(args: argparse.Namespace) -> int:
                 time.sleep(LOOK_S)
                 jog.check()
                 held = jog.held
-        joints = client.status()["joints"] or {}
-    where = {"pan_rad": joints.get("pan_rad"), "tilt_rad": joints.get("tilt_rad")}
+        joints = client.status()["joints"]
+    where = {name: None if joints is None else joints[name] for name in ("pan_rad", "tilt_rad")}
     words = (
         f"let go at pan {where['pan_rad']:+.4f}, tilt {where['tilt_rad']:+.4f} rad" if joints else "let go"
     )

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from mastctl.cli import output
 from mastctl.cli.output import WrongUse, finite_number
 from mastctl.cli.places import check_file
 from mastctl.cli.service import add_daemon_options, client_of, tell_result
+
+if TYPE_CHECKING:
+    from mastctl.client.answers import FaultSet, MastsTold
 
 
 def add_commands(subparsers: argparse._SubParsersAction[Any]) -> None:
@@ -61,7 +64,7 @@ def _back(args: argparse.Namespace) -> int:
         return _tell(args, client.use_former_mast())
 
 
-def _tell(args: argparse.Namespace, masts: dict[str, Any]) -> int:
+def _tell(args: argparse.Namespace, masts: MastsTold) -> int:
     now, former = masts["mast"], masts["former_mast"]
     words = f"{now['file']} ({now['name']}, {now['digest'][:8]}...)"
     if former is not None:
@@ -98,7 +101,7 @@ def _parameter(words: str) -> tuple[str, float]:
     raise WrongUse(f"'{words}' where NAME=VALUE with a finite number is expected, such as sigma=8")
 
 
-def _tell_faults(args: argparse.Namespace, faults: list[dict[str, Any]]) -> int:
+def _tell_faults(args: argparse.Namespace, faults: list[FaultSet]) -> int:
     if args.json:
         output.print_json({"faults": faults})
         return 0
@@ -107,5 +110,5 @@ def _tell_faults(args: argparse.Namespace, faults: list[dict[str, Any]]) -> int:
     return 0
 
 
-def _parameters(fault: dict[str, Any]) -> list[str]:
+def _parameters(fault: FaultSet) -> list[str]:
     return [f"{name}={value:g}" for name, value in fault["parameters"].items()]

@@ -5,12 +5,15 @@ from __future__ import annotations
 import argparse
 import json
 import sys
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from mastctl.cli import output
 from mastctl.cli.output import CommandError, at_least, one_line, positive_number
 from mastctl.cli.service import add_daemon_options, client_of, followed, show_pointings, tell_result
 from mastctl.cli.track import track_line
+
+if TYPE_CHECKING:
+    from mastctl.client.answers import Event, OperationListed, OperationTold
 
 
 def add_commands(subparsers: argparse._SubParsersAction[Any]) -> None:
@@ -88,24 +91,24 @@ def _lines(args: argparse.Namespace, topics: list[str], keys: list[str]) -> int:
     return 0
 
 
-def _line(event: dict[str, Any]) -> str:
+def _line(event: Event) -> str:
     """What an event says, in a line."""
-    topic, value = event["topic"], event["value"]
-    if topic == "state":
-        return ", ".join(filter(None, (value["state"], value["reason"])))
-    if topic == "operation":
-        return f"{_asked(value)}, {_progress(value)}"
-    if topic == "track":
-        return track_line(value)
-    if topic == "fault":
-        return "; ".join(fault["message"] for fault in value) or "nothing"
-    if topic == "joints":
-        moving = ", moving" if value["moving"] else ""
-        return f"pan {value['pan_rad']:+.6f}, tilt {value['tilt_rad']:+.6f} rad{moving}"
-    return json.dumps(value)
+    if event["topic"] == "state":
+        return ", ".join(filter(None, (event["value"]["state"], event["value"]["reason"])))
+    if event["topic"] == "operation":
+        return f"{_asked(event['value'])}, {_progress(event['value'])}"
+    if event["topic"] == "track":
+        return track_line(event["value"])
+    if event["topic"] == "fault":
+        return "; ".join(fault["message"] for fault in event["value"]) or "nothing"
+    if event["topic"] == "joints":
+        head = event["value"]
+        moving = ", moving" if head["moving"] else ""
+        return f"pan {head['pan_rad']:+.6f}, tilt {head['tilt_rad']:+.6f} rad{moving}"
+    return json.dumps(event["value"])
 
 
-def _progress(record: dict[str, Any]) -> str:
+def _progress(record: OperationTold) -> str:
     """How far an operation is, in words."""
     if record["error"]:
         return f"{record['state']}: {record['error']['message']}"
@@ -113,7 +116,7 @@ def _progress(record: dict[str, Any]) -> str:
     return f"{record['state']} after {steps[-1]['name']}" if steps else str(record["state"])
 
 
-def _tell(args: argparse.Namespace, record: dict[str, Any]) -> None:
+def _tell(args: argparse.Namespace, record: OperationTold) -> None:
     if args.json:
         output.print_json(record)
         return
@@ -125,11 +128,12 @@ def _tell(args: argparse.Namespace, record: dict[str, Any]) -> None:
     sys.stdout.write(one_line(f"{record['id']}: {_asked(record)}, {_progress(record)}") + "\n")
 
 
-def _asked(record: dict[str, Any]) -> str:
+def _asked(record: OperationListed) -> str:
     """What an operation was asked for, in words."""
     request = record["request"]
     kind = next((name for name in ("track", "jog", "look") if name in request), "point")
-    asked = request.get(kind) if isinstance(request.get(kind), dict) else request
+    found = request.get(kind)
+    asked = found if isinstance(found, dict) else request
     if asked.get("pixel"):
         pixel = asked["pixel"]
         return f"{kind} at {pixel['camera']} ({pixel['x_px']:g}, {pixel['y_px']:g})"
@@ -141,11 +145,11 @@ def _asked(record: dict[str, Any]) -> str:
     return kind
 
 
-def _seconds(record: dict[str, Any]) -> str:
+def _seconds(record: OperationListed) -> str:
     begun, ended = record["started_s"], record["ended_s"]
     return "-" if begun is None or ended is None else f"{ended - begun:.2f}"
 
 
-def _residual(record: dict[str, Any]) -> str:
+def _residual(record: OperationListed) -> str:
     residual = record["residual_px"]
     return "-" if not residual or None in residual else f"{residual[0]:+.3f}, {residual[1]:+.3f}"

@@ -10,7 +10,7 @@ import os
 import signal
 import socket
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
@@ -23,6 +23,7 @@ from mastctl.queued_output import QueuedHandler
 
 if TYPE_CHECKING:
     from mastctl.client import Client
+    from mastctl.client.answers import ControlTold, LeaseGranted, OperationTold, Status, StepTold
     from mastctl.config import Config, Listen
 
 SUFFIXES = {".png": "png", ".jpg": "jpeg", ".jpeg": "jpeg"}
@@ -244,7 +245,7 @@ def _person() -> str:
         return f"{os.getuid()}@{socket.gethostname()}"
 
 
-def followed(client: Client, operation_id: str, args: argparse.Namespace) -> dict[str, Any]:
+def followed(client: Client, operation_id: str, args: argparse.Namespace) -> OperationTold:
     """Wait for an operation, showing its steps to a person."""
     if args.json:
         return client.wait(operation_id, args.timeout)
@@ -253,7 +254,7 @@ def followed(client: Client, operation_id: str, args: argparse.Namespace) -> dic
 
     console = Console(stderr=True)
 
-    def show(step: dict[str, Any]) -> None:
+    def show(step: StepTold) -> None:
         mark = "✓" if step.get("state") == "done" else "✗"
         line = f"  {mark} {step.get('name')} ({step.get('duration_s') or 0.0:.2f} s)"
         console.print(Text(output.one_line(line)))
@@ -266,7 +267,7 @@ def followed(client: Client, operation_id: str, args: argparse.Namespace) -> dic
         raise
 
 
-def show_pointings(record: dict[str, Any]) -> None:
+def show_pointings(record: OperationTold) -> None:
     """A table of what was measured, and in which pictures."""
     rows, notes = [], []
     for number, pointing in enumerate(record["pointings"], 1):
@@ -280,17 +281,18 @@ def show_pointings(record: dict[str, Any]) -> None:
         told = [f"looked at in frame {pointing['frame_id']}"] if pointing.get("frame_id") else []
         told += [pointing["note"]] if pointing.get("note") else []
         notes.append(f"pointing {number}: {'; '.join(told)}")
-    if record.get("position_m"):
-        x, y, z = record["position_m"]
+    position_m = record["position_m"]
+    if position_m is not None:
+        x, y, z = position_m
         notes.append(f"target at ({x:.3f}, {y:.3f}, {z:.3f}) m in the rover frame")
-    if record.get("range_m") is not None:
+    if record["range_m"] is not None:
         notes.append(f"range {record['range_m']:.3f} m")
     output.print_table(
         f"operation {record['id']}", ("pointing", "residual x, px", "residual y, px"), rows, notes
     )
 
 
-def _status_rows(status: dict[str, Any]) -> Iterator[tuple[str, str]]:
+def _status_rows(status: Status) -> Iterator[tuple[str, str]]:
     """The lines of the status table."""
     reason = status.get("reason")
     yield "state", f"{status['state']} ({status['hardware']})" + (f": {reason}" if reason else "")
@@ -304,8 +306,7 @@ def _status_rows(status: dict[str, Any]) -> Iterator[tuple[str, str]]:
         yield "tilt", f"{joints['tilt_rad']:+.6f} rad"
         yield "measured", f"{joints['age_s']:.3f} s ago{', moving' if status['moving'] else ''}"
     limits = status["limits"]
-    for axis in ("pan", "tilt"):
-        low, high = limits[f"{axis}_rad"]
+    for axis, (low, high) in (("pan", limits["pan_rad"]), ("tilt", limits["tilt_rad"])):
         yield f"{axis} limits", f"{low:+.4f} to {high:+.4f} rad"
     residual = status["last_residual"]
     if residual is not None:
@@ -321,12 +322,13 @@ def _status_rows(status: dict[str, Any]) -> Iterator[tuple[str, str]]:
         yield "rover", f"at ({x:.3f}, {y:.3f}, {z:.3f}) m of the site, {status['pose']['age_s']:.1f} s ago"
     mast = status["mast"]
     yield "mast file", f"{mast['file']} ({mast['digest'][:8]}...)"
-    if status.get("calibration"):
-        yield "calibration", status["calibration"]["sentence"]
+    calibration = status["calibration"]
+    if calibration is not None:
+        yield "calibration", calibration["sentence"]
     yield "up", f"{status['uptime_s']:.0f} s, version {status['version']}"
 
 
-def steers(control: dict[str, Any] | None) -> str:
+def steers(control: ControlTold | LeaseGranted | None) -> str:
     """Who steers, in a line."""
     if control is None:
         return "nobody steers"
@@ -335,7 +337,7 @@ def steers(control: dict[str, Any] | None) -> str:
     return f"{control['holder']} steers, {until}"
 
 
-def _fault_lines(status: dict[str, Any]) -> list[str]:
+def _fault_lines(status: Status) -> list[str]:
     return [
         f"fault: {fault['message']} (for {fault['for_s']:.0f} s, until {fault['until']})"
         for fault in status["faults"]
@@ -349,7 +351,7 @@ def _camera_pixel(words: list[str] | None) -> tuple[str, float, float] | None:
     return words[0], option_number("--aim", words[1]), option_number("--aim", words[2])
 
 
-def tell_result(args: argparse.Namespace, document: dict[str, Any], line: str) -> None:
+def tell_result(args: argparse.Namespace, document: Mapping[str, Any], line: str) -> None:
     """One JSON document for programs, or one line for people, on stdout."""
     if args.json:
         output.print_json(document)

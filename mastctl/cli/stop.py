@@ -74,8 +74,8 @@ def _reset(args: argparse.Namespace) -> int:
 
 
 def _by_any_way(
-    args: argparse.Namespace, line: str, ask: Callable[[Client], dict[str, Any]]
-) -> dict[str, Any]:
+    args: argparse.Namespace, line: str, ask: Callable[[Client], Mapping[str, Any]]
+) -> Mapping[str, Any]:
     """Ask by the stop socket where there is one, else over HTTP."""
     from mastctl.safety.stop_line import NoAnswer
     from mastctl.safety.stop_line import ask as ask_socket
@@ -92,7 +92,7 @@ def _by_any_way(
     if failed:  # one of them could not; another way would meet the same head
         raise CommandError("stop_failed", failed)
     if answer is not None:
-        return dict(answer)
+        return answer
     with client_of(args, whatever_configured=True) as client:
         return ask(client)
 

@@ -9,6 +9,7 @@ from mastctl.cli.output import CommandError, WrongUse, finite_number
 
 if TYPE_CHECKING:
     from mastctl.client import Client
+    from mastctl.client.answers import OperationTold
 
 
 def add_target_options(
@@ -56,16 +57,13 @@ def target_of(args: argparse.Namespace, client: Client) -> dict[str, Any]:
     return {} if args.position is None else {"position_m": args.position, "frame": args.frame}
 
 
-def check_done(record: dict[str, Any]) -> None:
+def check_done(record: OperationTold) -> None:
     """Pass an ended operation that did what it was asked. Raises CommandError with the operation's words."""
     if record["state"] == "done":
         return
-    error = record.get("error") or {}
-    raise CommandError(
-        str(error.get("code", record["state"])),
-        str(error.get("message", f"operation {record['id']} ended as {record['state']}")),
-        detail={"operation": record},
-    )
+    words = f"operation {record['id']} ended as {record['state']}"
+    error = record["error"] or {"code": record["state"], "message": words}
+    raise CommandError(error["code"], error["message"], detail={"operation": record})
 
 
 def option_number(option: str, word: str) -> float:

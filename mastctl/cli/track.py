@@ -13,6 +13,7 @@ from mastctl.cli.target import add_target_options, check_done, check_target, tar
 
 if TYPE_CHECKING:
     from mastctl.client import Client
+    from mastctl.client.answers import TrackTold
 
 
 def add_commands(subparsers: argparse._SubParsersAction[Any]) -> None:
@@ -124,14 +125,14 @@ def _after_look(args: argparse.Namespace, client: Client, operation_id: str | No
     return _show(args, client.wait_track(operation_id, args.timeout))
 
 
-def _show(args: argparse.Namespace, track: dict[str, Any]) -> int:
+def _show(args: argparse.Namespace, track: TrackTold) -> int:
     tell_result(args, track, track_line(track))
     return 0
 
 
-def track_line(track: dict[str, Any]) -> str:
+def track_line(track: TrackTold) -> str:
     """Return a track in one line."""
-    words = [track["state"]]
+    words: list[str] = [track["state"]]
     if track["pair"]:
         words.append(f"by {track['pair']}")
         if not track["predicted"]:

@@ -6,7 +6,7 @@ from __future__ import annotations
 import asyncio
 from collections.abc import AsyncIterator, Callable, Sequence
 from contextlib import asynccontextmanager
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, cast
 from urllib.parse import quote
 
 from mastctl.client.async_connection import AsyncDaemonHttp
@@ -16,6 +16,32 @@ from mastctl.client.jog import ANSWER_S, Jog
 from mastctl.client.lease import HeldLease
 
 if TYPE_CHECKING:
+    from mastctl.client.answers import (
+        CalibrationHealthTold,
+        ControlTold,
+        EstopTold,
+        Event,
+        FaultSet,
+        LeaseGranted,
+        MastsTold,
+        OperationListed,
+        OperationTold,
+        PoseTaken,
+        RecorderTold,
+        RecordingEnded,
+        Recordings,
+        ReloadTold,
+        ResetTold,
+        SessionTold,
+        StandTold,
+        StateTold,
+        Status,
+        StepTold,
+        StopTold,
+        SunTold,
+        TimeTold,
+        TrackTold,
+    )
     from mastctl.client.snapshot import Snapshot
 DEFAULT_URL = "http://127.0.0.1:8420"
 ENDED = ("done", "failed", "stopped")
@@ -90,14 +116,14 @@ class AsyncClient:
             self._daemon.lease_id = before
             await asyncio.to_thread(held.end)
 
-    async def control(self) -> dict[str, Any] | None:
+    async def control(self) -> ControlTold | None:
         """Return who steers, or None: ``holder``, ``kind`` (lease, operation), ``for_s``, ``until``."""
         found = (await self._daemon.json("GET", "/lease"))["control"]
-        return dict(found) if found else None
+        return cast("ControlTold | None", found)
 
     async def acquire_lease(
         self, name: str | None = None, for_s: float = 30.0, take_over: str | None = None
-    ) -> dict[str, Any]:
+    ) -> LeaseGranted:
         """Acquire or take over a lease that nobody renews; arguments as for `lease`.
 
         Returns ``lease_id``, ``holder``, ``for_s`` and ``until``; `use_lease` has commands carry it.
@@ -106,38 +132,44 @@ class AsyncClient:
         if name is not None:
             body["name"] = name
         if take_over is not None:
-            return await self._daemon.command("POST", "/lease/take", body | {"reason": take_over})
-        return await self._daemon.command("POST", "/lease", body)
+            return cast(
+                "LeaseGranted",
+                await self._daemon.command("POST", "/lease/take", body | {"reason": take_over}),
+            )
+        return cast("LeaseGranted", await self._daemon.command("POST", "/lease", body))
 
     def use_lease(self, lease_id: str | None) -> None:
         """Have each command carry a lease from now on, or none."""
         self._daemon.lease_id = None if lease_id is None else plain_name(lease_id)
 
-    async def renew_lease(self, for_s: float | None = None) -> dict[str, Any]:
+    async def renew_lease(self, for_s: float | None = None) -> LeaseGranted:
         """Have the lease in use run for ``for_s`` seconds from now on, by default as long as at first."""
-        return await self._daemon.command(
-            "POST", "/lease/renew", {} if for_s is None else {"for_s": float(for_s)}
+        return cast(
+            "LeaseGranted",
+            await self._daemon.command(
+                "POST", "/lease/renew", {} if for_s is None else {"for_s": float(for_s)}
+            ),
         )
 
     async def release_lease(self) -> None:
         """Release the lease in use."""
         await self._daemon.command("DELETE", "/lease")
 
-    async def status(self) -> dict[str, Any]:
+    async def status(self) -> Status:
         """Return what the daemon knows at this moment."""
-        return await self._daemon.json("GET", "/status")
+        return cast("Status", await self._daemon.json("GET", "/status"))
 
-    async def reload(self) -> dict[str, Any]:
+    async def reload(self) -> ReloadTold:
         """Have the daemon read its configuration again; return ``changed``, ``mast`` and ``notes``.
 
         All of what it says comes into use while the head rests, or nothing (``restart_needed``,
         ``bad_config``, ``bad_mast_file``, ``busy``, ``moving``).
         """
-        return await self._daemon.command("POST", "/reload")
+        return cast("ReloadTold", await self._daemon.command("POST", "/reload"))
 
-    async def calibration_health(self) -> dict[str, Any]:
+    async def calibration_health(self) -> CalibrationHealthTold:
         """Return whether residuals of the last days are as the mast file predicts, with the figures."""
-        return await self._daemon.json("GET", "/calibration/health")
+        return cast("CalibrationHealthTold", await self._daemon.json("GET", "/calibration/health"))
 
     async def point(
         self,
@@ -183,20 +215,19 @@ class AsyncClient:
             ]
         )
 
-    async def operation(self, operation_id: str) -> dict[str, Any]:
+    async def operation(self, operation_id: str) -> OperationTold:
         """Return an operation's record."""
-        return await self._daemon.json("GET", f"/operations/{quote(operation_id, safe='')}")
+        return cast(
+            "OperationTold", await self._daemon.json("GET", f"/operations/{quote(operation_id, safe='')}")
+        )
 
-    async def operations(self) -> list[dict[str, Any]]:
+    async def operations(self) -> list[OperationListed]:
         """Return the newest operations, newest first, without their steps."""
-        return list((await self._daemon.json("GET", "/operations"))["operations"])
+        return cast("list[OperationListed]", (await self._daemon.json("GET", "/operations"))["operations"])
 
     async def wait(
-        self,
-        operation_id: str,
-        timeout_s: float = 60.0,
-        on_step: Callable[[dict[str, Any]], None] | None = None,
-    ) -> dict[str, Any]:
+        self, operation_id: str, timeout_s: float = 60.0, on_step: Callable[[StepTold], None] | None = None
+    ) -> OperationTold:
         """Wait until an operation has ended (done, failed or stopped) and return its record.
 
         Parameters
@@ -223,8 +254,11 @@ class AsyncClient:
         raise ClientError("timeout", f"operation {operation_id} has not ended after {timeout_s:g} s")
 
     async def wait_state(
-        self, *states: str, timeout_s: float = 60.0, on_change: Callable[[dict[str, Any]], None] | None = None
-    ) -> dict[str, Any]:
+        self,
+        *states: str,
+        timeout_s: float = 60.0,
+        on_change: Callable[[Status | StateTold], None] | None = None,
+    ) -> Status | StateTold:
         """Wait until the daemon's state is one of some words; return ``state``, ``reason`` and what goes with
         them in the status.
 
@@ -248,31 +282,33 @@ class AsyncClient:
         wanted = " or ".join(states)
         raise ClientError("timeout", f"the state is {word} and not {wanted} after {timeout_s:g} s")
 
-    async def recordings(self) -> dict[str, Any]:
+    async def recordings(self) -> Recordings:
         """Return the daemon's recordings, and what it records now."""
-        return await self._daemon.json("GET", "/recordings")
+        return cast("Recordings", await self._daemon.json("GET", "/recordings"))
 
-    async def start_recording(self, name: str = "") -> dict[str, Any]:
+    async def start_recording(self, name: str = "") -> RecorderTold:
         """Have the daemon record until `stop_recording`; return what it records then."""
-        return await self._daemon.command("POST", "/recordings/start", {"name": name})
+        return cast("RecorderTold", await self._daemon.command("POST", "/recordings/start", {"name": name}))
 
-    async def stop_recording(self) -> dict[str, Any]:
+    async def stop_recording(self) -> RecordingEnded:
         """End the recording; return its file on the daemon's machine, its size and what was dropped."""
-        return await self._daemon.command("POST", "/recordings/stop")
+        return cast("RecordingEnded", await self._daemon.command("POST", "/recordings/stop"))
 
-    async def stop(self) -> dict[str, Any]:
+    async def stop(self) -> StopTold:
         """Stop the mast and the running operation."""
-        return await self._daemon.json("POST", "/stop")
+        return cast("StopTold", await self._daemon.json("POST", "/stop"))
 
-    async def estop(self, *, reason: str | None = None, name: str | None = None) -> dict[str, Any]:
+    async def estop(self, *, reason: str | None = None, name: str | None = None) -> EstopTold:
         """Stop the mast and let nothing move it until `reset`; ``kept`` says whether a restart would know."""
         body = {"reason": reason, "name": name}
         told = {key: value for key, value in body.items() if value is not None}
-        return await self._daemon.json("POST", "/estop", json=told)
+        return cast("EstopTold", await self._daemon.json("POST", "/estop", json=told))
 
-    async def reset(self, *, reason: str, name: str) -> dict[str, Any]:
+    async def reset(self, *, reason: str, name: str) -> ResetTold:
         """Release the emergency stop; nothing moves before the next command."""
-        return await self._daemon.json("POST", "/reset", json={"reason": reason, "name": name})
+        return cast(
+            "ResetTold", await self._daemon.json("POST", "/reset", json={"reason": reason, "name": name})
+        )
 
     async def pose(
         self,
@@ -283,7 +319,7 @@ class AsyncClient:
         sigma: tuple[float, float] | None = None,
         time_s: float | None = None,
         look: bool = True,
-    ) -> dict[str, Any]:
+    ) -> PoseTaken:
         """Say where the rover stands; return the track as it is then, and the ``operation`` of a look.
 
         Parameters
@@ -311,11 +347,11 @@ class AsyncClient:
             body["sigma"] = {"position_m": sigma[0], "rotation_rad": sigma[1]}
         if time_s is not None:
             body["time_s"] = time_s
-        return await self._daemon.json("POST", "/pose", json=body)
+        return cast("PoseTaken", await self._daemon.json("POST", "/pose", json=body))
 
-    async def track(self) -> dict[str, Any]:
+    async def track(self) -> TrackTold:
         """Return the track as it is."""
-        return await self._daemon.json("GET", "/track")
+        return cast("TrackTold", await self._daemon.json("GET", "/track"))
 
     async def start_track(
         self,
@@ -342,8 +378,8 @@ class AsyncClient:
         self,
         operation_id: str | None,
         timeout_s: float = 60.0,
-        on_step: Callable[[dict[str, Any]], None] | None = None,
-    ) -> dict[str, Any]:
+        on_step: Callable[[StepTold], None] | None = None,
+    ) -> TrackTold:
         """Wait until a start or a look of the track has ended; return the track after it.
 
         ``None`` for the operation returns the track as it is. Raises ClientError as `wait`.
@@ -355,12 +391,12 @@ class AsyncClient:
                 return track
         raise ClientError("timeout", f"the track did not take up operation {operation_id}")
 
-    async def watch_track(self) -> AsyncIterator[dict[str, Any]]:
+    async def watch_track(self) -> AsyncIterator[TrackTold]:
         """Yield the track as it is, and again at each change, until the daemon ends."""
-        async for event in self._daemon.events("/track/stream"):
-            yield event
+        async for track in self._daemon.events("/track/stream"):
+            yield cast("TrackTold", track)
 
-    async def events(self, *topics: str, keys: Sequence[str] = ()) -> AsyncIterator[dict[str, Any]]:
+    async def events(self, *topics: str, keys: Sequence[str] = ()) -> AsyncIterator[Event]:
         """Yield each change of some topics (all without any) and keys, beginning with what is known, until
         the daemon ends: ``topic``, ``key``, ``sequence``, ``lost``, ``value``.
         """
@@ -368,11 +404,11 @@ class AsyncClient:
         if topics:
             query["topics"] = ",".join(topics)
         async for event in self._daemon.events("/events", query):
-            yield event
+            yield cast("Event", event)
 
-    async def stop_track(self) -> dict[str, Any]:
+    async def stop_track(self) -> TrackTold:
         """End the track; return it as it is then."""
-        return await self._daemon.json("POST", "/track/stop")
+        return cast("TrackTold", await self._daemon.json("POST", "/track/stop"))
 
     async def snapshot(
         self,
@@ -412,13 +448,13 @@ class AsyncClient:
         """Return the mast file that the daemon uses, byte for byte."""
         return bytes((await self._daemon.ask("GET", "/mast")).content)
 
-    async def use_mast(self, file: str) -> dict[str, Any]:
+    async def use_mast(self, file: str) -> MastsTold:
         """Use another mast file of the same folder; return which is in use now, and the former one."""
-        return await self._daemon.command("POST", "/mast", {"file": file})
+        return cast("MastsTold", await self._daemon.command("POST", "/mast", {"file": file}))
 
-    async def use_former_mast(self) -> dict[str, Any]:
+    async def use_former_mast(self) -> MastsTold:
         """Go back to the mast file that was in use before; return which is in use now, and the former one."""
-        return await self._daemon.command("POST", "/mast/back")
+        return cast("MastsTold", await self._daemon.command("POST", "/mast/back"))
 
     def jog(self) -> Jog:
         """Return a context in which the head turns at rates; it sends the heartbeats itself.
@@ -433,9 +469,9 @@ class AsyncClient:
         """
         return Jog(lambda: self._daemon.beside(ANSWER_S))
 
-    async def sun(self) -> dict[str, Any]:
+    async def sun(self) -> SunTold:
         """Return the direction that no head camera looks into: ``sun``, null where none was told."""
-        return await self._daemon.json("GET", "/limits/sun")
+        return cast("SunTold", await self._daemon.json("GET", "/limits/sun"))
 
     async def keep_off_sun(
         self,
@@ -445,7 +481,7 @@ class AsyncClient:
         *,
         frame: Literal["site", "rover"] = "site",
         valid_s: float | None = None,
-    ) -> dict[str, Any]:
+    ) -> SunTold:
         """Say where the sun stands: azimuth from north over east (forward over right), elevation up.
 
         Parameters
@@ -459,41 +495,41 @@ class AsyncClient:
         body |= {"half_angle_rad": half_angle_rad, "frame": frame}
         if valid_s is not None:
             body["valid_s"] = valid_s
-        return await self._daemon.command("POST", "/limits/sun", body)
+        return cast("SunTold", await self._daemon.command("POST", "/limits/sun", body))
 
-    async def forget_sun(self) -> dict[str, Any]:
+    async def forget_sun(self) -> SunTold:
         """Keep the head off no sun any more."""
-        return await self._daemon.command("DELETE", "/limits/sun")
+        return cast("SunTold", await self._daemon.command("DELETE", "/limits/sun"))
 
-    async def session(self) -> dict[str, Any]:
+    async def session(self) -> SessionTold:
         """Return who asks: ``name``, ``role``, ``via``, and whether the daemon asks for a token at all."""
-        return await self._daemon.json("GET", "/session")
+        return cast("SessionTold", await self._daemon.json("GET", "/session"))
 
-    async def login(self, token: str) -> dict[str, Any]:
+    async def login(self, token: str) -> SessionTold:
         """Begin a session as a page does: this client then needs its token no longer, for some hours."""
-        return await self._daemon.json("POST", "/login", json={"token": token})
+        return cast("SessionTold", await self._daemon.json("POST", "/login", json={"token": token}))
 
     async def logout(self) -> None:
         """End the session that `login` began."""
         await self._daemon.json("POST", "/logout")
 
-    async def true_pose(self) -> dict[str, Any]:
+    async def true_pose(self) -> StandTold:
         """Return where a simulated rover truly stands: ``position_m`` and ``quaternion``, site_from_rover."""
-        return await self._daemon.json("GET", "/simulation/pose")
+        return cast("StandTold", await self._daemon.json("GET", "/simulation/pose"))
 
     async def stand(
         self, x_m: float, y_m: float, heading_rad: float, pitch_rad: float = 0.0, roll_rad: float = 0.0
-    ) -> dict[str, Any]:
+    ) -> StandTold:
         """Put a simulated rover somewhere on its ground, truly; return its true pose."""
         body = {"x_m": x_m, "y_m": y_m, "heading_rad": heading_rad}
         body |= {"pitch_rad": pitch_rad, "roll_rad": roll_rad}
-        return await self._daemon.command("POST", "/simulation/pose", body)
+        return cast("StandTold", await self._daemon.command("POST", "/simulation/pose", body))
 
-    async def simulation_time(self) -> dict[str, Any]:
+    async def simulation_time(self) -> TimeTold:
         """Return a simulated rover's time: ``now_s``, and ``speed``, a number or ``max``."""
-        return await self._daemon.json("GET", "/simulation/time")
+        return cast("TimeTold", await self._daemon.json("GET", "/simulation/time"))
 
-    async def advance(self, duration_s: float) -> dict[str, Any]:
+    async def advance(self, duration_s: float) -> TimeTold:
         """Let time pass for a simulated rover whose ``simulation.speed`` is ``max``; return it as
         `simulation_time` does.
 
@@ -502,16 +538,20 @@ class AsyncClient:
         ClientError
             ``time_passes`` where time passes by itself, ``not_simulated``.
         """
-        return await self._daemon.command("POST", "/simulation/time", {"advance_s": duration_s})
+        return cast(
+            "TimeTold", await self._daemon.command("POST", "/simulation/time", {"advance_s": duration_s})
+        )
 
-    async def faults(self) -> list[dict[str, Any]]:
+    async def faults(self) -> list[FaultSet]:
         """Return the faults that are switched on in a simulated rover."""
-        return list((await self._daemon.json("GET", "/simulation/faults"))["faults"])
+        return cast("list[FaultSet]", (await self._daemon.json("GET", "/simulation/faults"))["faults"])
 
-    async def set_fault(self, device: str, word: str, **parameters: float) -> list[dict[str, Any]]:
+    async def set_fault(self, device: str, word: str, **parameters: float) -> list[FaultSet]:
         """Switch a fault of a simulated device on; return all that are on."""
         body = {"device": device, "word": word, "parameters": parameters}
-        return list((await self._daemon.command("POST", "/simulation/faults", body))["faults"])
+        return cast(
+            "list[FaultSet]", (await self._daemon.command("POST", "/simulation/faults", body))["faults"]
+        )
 
     async def clear_faults(self, device: str | None = None) -> None:
         """Switch the faults of one simulated device off, or all."""

@@ -6,11 +6,12 @@ from __future__ import annotations
 import asyncio
 import time
 from collections.abc import AsyncIterator, Awaitable, Callable, Mapping
-from typing import Any
+from typing import Any, TypeVar, cast
 
 from mastctl.client.async_connection import AsyncDaemonHttp
 from mastctl.client.connection import Broken, ClientError
 
+T = TypeVar("T")
 AGAIN_S = (0.1, 0.5, 1.0)
 SILENT_S = 10.0
 LAST_S = 3.0
@@ -19,11 +20,8 @@ ASK_S = 0.25
 
 
 async def async_followed(
-    daemon: AsyncDaemonHttp,
-    query: Mapping[str, Any],
-    ask: Callable[[], Awaitable[dict[str, Any]]],
-    timeout_s: float,
-) -> AsyncIterator[dict[str, Any]]:
+    daemon: AsyncDaemonHttp, query: Mapping[str, Any], ask: Callable[[], Awaitable[T]], timeout_s: float
+) -> AsyncIterator[T]:
     """Yield a value as it is, then at each change, for some seconds.
 
     The value is asked for before each stream, and each stream begins with what is known, so that no end of
@@ -49,7 +47,7 @@ async def async_followed(
             pauses = pauses or list(AGAIN_S)
             async for value in _stream(daemon, query, until_s):
                 pauses = list(AGAIN_S)
-                yield value
+                yield cast(T, value)
         except ClientError as error:
             if error.code == "too_many":
                 pauses = [ASK_S, *AGAIN_S]

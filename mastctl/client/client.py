@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, cast
 from urllib.parse import quote
 
 from mastctl.client.connection import ClientError, DaemonHttp, plain_name
@@ -13,6 +13,32 @@ from mastctl.client.jog import ANSWER_S, Jog
 from mastctl.client.lease import HeldLease
 
 if TYPE_CHECKING:
+    from mastctl.client.answers import (
+        CalibrationHealthTold,
+        ControlTold,
+        EstopTold,
+        Event,
+        FaultSet,
+        LeaseGranted,
+        MastsTold,
+        OperationListed,
+        OperationTold,
+        PoseTaken,
+        RecorderTold,
+        RecordingEnded,
+        Recordings,
+        ReloadTold,
+        ResetTold,
+        SessionTold,
+        StandTold,
+        StateTold,
+        Status,
+        StepTold,
+        StopTold,
+        SunTold,
+        TimeTold,
+        TrackTold,
+    )
     from mastctl.client.snapshot import Snapshot
 
 DEFAULT_URL = "http://127.0.0.1:8420"
@@ -88,14 +114,14 @@ class Client:
             self._daemon.lease_id = before
             held.end()
 
-    def control(self) -> dict[str, Any] | None:
+    def control(self) -> ControlTold | None:
         """Return who steers, or None: ``holder``, ``kind`` (lease, operation), ``for_s``, ``until``."""
         found = self._daemon.json("GET", "/lease")["control"]
-        return dict(found) if found else None
+        return cast("ControlTold | None", found)
 
     def acquire_lease(
         self, name: str | None = None, for_s: float = 30.0, take_over: str | None = None
-    ) -> dict[str, Any]:
+    ) -> LeaseGranted:
         """Acquire or take over a lease that nobody renews; arguments as for `lease`.
 
         Returns ``lease_id``, ``holder``, ``for_s`` and ``until``; `use_lease` has commands carry it.
@@ -104,36 +130,41 @@ class Client:
         if name is not None:
             body["name"] = name
         if take_over is not None:
-            return self._daemon.command("POST", "/lease/take", body | {"reason": take_over})
-        return self._daemon.command("POST", "/lease", body)
+            return cast(
+                "LeaseGranted", self._daemon.command("POST", "/lease/take", body | {"reason": take_over})
+            )
+        return cast("LeaseGranted", self._daemon.command("POST", "/lease", body))
 
     def use_lease(self, lease_id: str | None) -> None:
         """Have each command carry a lease from now on, or none."""
         self._daemon.lease_id = None if lease_id is None else plain_name(lease_id)
 
-    def renew_lease(self, for_s: float | None = None) -> dict[str, Any]:
+    def renew_lease(self, for_s: float | None = None) -> LeaseGranted:
         """Have the lease in use run for ``for_s`` seconds from now on, by default as long as at first."""
-        return self._daemon.command("POST", "/lease/renew", {} if for_s is None else {"for_s": float(for_s)})
+        return cast(
+            "LeaseGranted",
+            self._daemon.command("POST", "/lease/renew", {} if for_s is None else {"for_s": float(for_s)}),
+        )
 
     def release_lease(self) -> None:
         """Release the lease in use."""
         self._daemon.command("DELETE", "/lease")
 
-    def status(self) -> dict[str, Any]:
+    def status(self) -> Status:
         """Return what the daemon knows at this moment."""
-        return self._daemon.json("GET", "/status")
+        return cast("Status", self._daemon.json("GET", "/status"))
 
-    def reload(self) -> dict[str, Any]:
+    def reload(self) -> ReloadTold:
         """Have the daemon read its configuration again; return ``changed``, ``mast`` and ``notes``.
 
         All of what it says comes into use while the head rests, or nothing (``restart_needed``,
         ``bad_config``, ``bad_mast_file``, ``busy``, ``moving``).
         """
-        return self._daemon.command("POST", "/reload")
+        return cast("ReloadTold", self._daemon.command("POST", "/reload"))
 
-    def calibration_health(self) -> dict[str, Any]:
+    def calibration_health(self) -> CalibrationHealthTold:
         """Return whether residuals of the last days are as the mast file predicts, with the figures."""
-        return self._daemon.json("GET", "/calibration/health")
+        return cast("CalibrationHealthTold", self._daemon.json("GET", "/calibration/health"))
 
     def point(
         self,
@@ -177,20 +208,20 @@ class Client:
             self._daemon.command("POST", "/point", body, key=idempotency_key, deadline_s=deadline_s)["id"]
         )
 
-    def operation(self, operation_id: str) -> dict[str, Any]:
+    def operation(self, operation_id: str) -> OperationTold:
         """Return an operation's record."""
-        return self._daemon.json("GET", f"/operations/{quote(operation_id, safe='')}")
+        return cast("OperationTold", self._daemon.json("GET", f"/operations/{quote(operation_id, safe='')}"))
 
-    def operations(self) -> list[dict[str, Any]]:
+    def operations(self) -> list[OperationListed]:
         """Return the newest operations, newest first, without their steps."""
-        return list(self._daemon.json("GET", "/operations")["operations"])
+        return cast("list[OperationListed]", self._daemon.json("GET", "/operations")["operations"])
 
     def wait(
         self,
         operation_id: str,
         timeout_s: float = 60.0,
-        on_step: Callable[[dict[str, Any]], None] | None = None,
-    ) -> dict[str, Any]:
+        on_step: Callable[[StepTold], None] | None = None,
+    ) -> OperationTold:
         """Wait until an operation has ended (done, failed or stopped) and return its record.
 
         Parameters
@@ -218,8 +249,8 @@ class Client:
         self,
         *states: str,
         timeout_s: float = 60.0,
-        on_change: Callable[[dict[str, Any]], None] | None = None,
-    ) -> dict[str, Any]:
+        on_change: Callable[[Status | StateTold], None] | None = None,
+    ) -> Status | StateTold:
         """Wait until the daemon's state is one of some words; return ``state``, ``reason`` and what goes with
         them in the status.
 
@@ -243,31 +274,31 @@ class Client:
         wanted = " or ".join(states)
         raise ClientError("timeout", f"the state is {word} and not {wanted} after {timeout_s:g} s")
 
-    def recordings(self) -> dict[str, Any]:
+    def recordings(self) -> Recordings:
         """Return the daemon's recordings, and what it records now."""
-        return self._daemon.json("GET", "/recordings")
+        return cast("Recordings", self._daemon.json("GET", "/recordings"))
 
-    def start_recording(self, name: str = "") -> dict[str, Any]:
+    def start_recording(self, name: str = "") -> RecorderTold:
         """Have the daemon record until `stop_recording`; return what it records then."""
-        return self._daemon.command("POST", "/recordings/start", {"name": name})
+        return cast("RecorderTold", self._daemon.command("POST", "/recordings/start", {"name": name}))
 
-    def stop_recording(self) -> dict[str, Any]:
+    def stop_recording(self) -> RecordingEnded:
         """End the recording; return its file on the daemon's machine, its size and what was dropped."""
-        return self._daemon.command("POST", "/recordings/stop")
+        return cast("RecordingEnded", self._daemon.command("POST", "/recordings/stop"))
 
-    def stop(self) -> dict[str, Any]:
+    def stop(self) -> StopTold:
         """Stop the mast and the running operation."""
-        return self._daemon.json("POST", "/stop")
+        return cast("StopTold", self._daemon.json("POST", "/stop"))
 
-    def estop(self, *, reason: str | None = None, name: str | None = None) -> dict[str, Any]:
+    def estop(self, *, reason: str | None = None, name: str | None = None) -> EstopTold:
         """Stop the mast and let nothing move it until `reset`; ``kept`` says whether a restart would know."""
         body = {"reason": reason, "name": name}
         told = {key: value for key, value in body.items() if value is not None}
-        return self._daemon.json("POST", "/estop", json=told)
+        return cast("EstopTold", self._daemon.json("POST", "/estop", json=told))
 
-    def reset(self, *, reason: str, name: str) -> dict[str, Any]:
+    def reset(self, *, reason: str, name: str) -> ResetTold:
         """Release the emergency stop; nothing moves before the next command."""
-        return self._daemon.json("POST", "/reset", json={"reason": reason, "name": name})
+        return cast("ResetTold", self._daemon.json("POST", "/reset", json={"reason": reason, "name": name}))
 
     def pose(
         self,
@@ -278,7 +309,7 @@ class Client:
         sigma: tuple[float, float] | None = None,
         time_s: float | None = None,
         look: bool = True,
-    ) -> dict[str, Any]:
+    ) -> PoseTaken:
         """Say where the rover stands; return the track as it is then, and the ``operation`` of a look.
 
         Parameters
@@ -306,11 +337,11 @@ class Client:
             body["sigma"] = {"position_m": sigma[0], "rotation_rad": sigma[1]}
         if time_s is not None:
             body["time_s"] = time_s
-        return self._daemon.json("POST", "/pose", json=body)
+        return cast("PoseTaken", self._daemon.json("POST", "/pose", json=body))
 
-    def track(self) -> dict[str, Any]:
+    def track(self) -> TrackTold:
         """Return the track as it is."""
-        return self._daemon.json("GET", "/track")
+        return cast("TrackTold", self._daemon.json("GET", "/track"))
 
     def start_track(
         self,
@@ -335,8 +366,8 @@ class Client:
         self,
         operation_id: str | None,
         timeout_s: float = 60.0,
-        on_step: Callable[[dict[str, Any]], None] | None = None,
-    ) -> dict[str, Any]:
+        on_step: Callable[[StepTold], None] | None = None,
+    ) -> TrackTold:
         """Wait until a start or a look of the track has ended; return the track after it.
 
         ``None`` for the operation returns the track as it is. Raises ClientError as `wait`.
@@ -348,22 +379,24 @@ class Client:
                 return track
         raise ClientError("timeout", f"the track did not take up operation {operation_id}")
 
-    def watch_track(self) -> Iterator[dict[str, Any]]:
+    def watch_track(self) -> Iterator[TrackTold]:
         """Yield the track as it is, and again at each change, until the daemon ends."""
-        yield from self._daemon.events("/track/stream")
+        for track in self._daemon.events("/track/stream"):
+            yield cast("TrackTold", track)
 
-    def events(self, *topics: str, keys: Sequence[str] = ()) -> Iterator[dict[str, Any]]:
+    def events(self, *topics: str, keys: Sequence[str] = ()) -> Iterator[Event]:
         """Yield each change of some topics (all without any) and keys, beginning with what is known, until
         the daemon ends: ``topic``, ``key``, ``sequence``, ``lost``, ``value``.
         """
         query: dict[str, Any] = {"key": list(keys)} if keys else {}
         if topics:
             query["topics"] = ",".join(topics)
-        yield from self._daemon.events("/events", query)
+        for event in self._daemon.events("/events", query):
+            yield cast("Event", event)
 
-    def stop_track(self) -> dict[str, Any]:
+    def stop_track(self) -> TrackTold:
         """End the track; return it as it is then."""
-        return self._daemon.json("POST", "/track/stop")
+        return cast("TrackTold", self._daemon.json("POST", "/track/stop"))
 
     def snapshot(
         self,
@@ -403,13 +436,13 @@ class Client:
         """Return the mast file that the daemon uses, byte for byte."""
         return bytes(self._daemon.ask("GET", "/mast").content)
 
-    def use_mast(self, file: str) -> dict[str, Any]:
+    def use_mast(self, file: str) -> MastsTold:
         """Use another mast file of the same folder; return which is in use now, and the former one."""
-        return self._daemon.command("POST", "/mast", {"file": file})
+        return cast("MastsTold", self._daemon.command("POST", "/mast", {"file": file}))
 
-    def use_former_mast(self) -> dict[str, Any]:
+    def use_former_mast(self) -> MastsTold:
         """Go back to the mast file that was in use before; return which is in use now, and the former one."""
-        return self._daemon.command("POST", "/mast/back")
+        return cast("MastsTold", self._daemon.command("POST", "/mast/back"))
 
     def jog(self) -> Jog:
         """Return a context in which the head turns at rates; it sends the heartbeats itself.
@@ -424,9 +457,9 @@ class Client:
         """
         return Jog(lambda: self._daemon.beside(ANSWER_S))
 
-    def sun(self) -> dict[str, Any]:
+    def sun(self) -> SunTold:
         """Return the direction that no head camera looks into: ``sun``, null where none was told."""
-        return self._daemon.json("GET", "/limits/sun")
+        return cast("SunTold", self._daemon.json("GET", "/limits/sun"))
 
     def keep_off_sun(
         self,
@@ -436,7 +469,7 @@ class Client:
         *,
         frame: Literal["site", "rover"] = "site",
         valid_s: float | None = None,
-    ) -> dict[str, Any]:
+    ) -> SunTold:
         """Say where the sun stands: azimuth from north over east (forward over right), elevation up.
 
         Parameters
@@ -450,41 +483,41 @@ class Client:
         body |= {"half_angle_rad": half_angle_rad, "frame": frame}
         if valid_s is not None:
             body["valid_s"] = valid_s
-        return self._daemon.command("POST", "/limits/sun", body)
+        return cast("SunTold", self._daemon.command("POST", "/limits/sun", body))
 
-    def forget_sun(self) -> dict[str, Any]:
+    def forget_sun(self) -> SunTold:
         """Keep the head off no sun any more."""
-        return self._daemon.command("DELETE", "/limits/sun")
+        return cast("SunTold", self._daemon.command("DELETE", "/limits/sun"))
 
-    def session(self) -> dict[str, Any]:
+    def session(self) -> SessionTold:
         """Return who asks: ``name``, ``role``, ``via``, and whether the daemon asks for a token at all."""
-        return self._daemon.json("GET", "/session")
+        return cast("SessionTold", self._daemon.json("GET", "/session"))
 
-    def login(self, token: str) -> dict[str, Any]:
+    def login(self, token: str) -> SessionTold:
         """Begin a session as a page does: this client then needs its token no longer, for some hours."""
-        return self._daemon.json("POST", "/login", json={"token": token})
+        return cast("SessionTold", self._daemon.json("POST", "/login", json={"token": token}))
 
     def logout(self) -> None:
         """End the session that `login` began."""
         self._daemon.json("POST", "/logout")
 
-    def true_pose(self) -> dict[str, Any]:
+    def true_pose(self) -> StandTold:
         """Return where a simulated rover truly stands: ``position_m`` and ``quaternion``, site_from_rover."""
-        return self._daemon.json("GET", "/simulation/pose")
+        return cast("StandTold", self._daemon.json("GET", "/simulation/pose"))
 
     def stand(
         self, x_m: float, y_m: float, heading_rad: float, pitch_rad: float = 0.0, roll_rad: float = 0.0
-    ) -> dict[str, Any]:
+    ) -> StandTold:
         """Put a simulated rover somewhere on its ground, truly; return its true pose."""
         body = {"x_m": x_m, "y_m": y_m, "heading_rad": heading_rad}
         body |= {"pitch_rad": pitch_rad, "roll_rad": roll_rad}
-        return self._daemon.command("POST", "/simulation/pose", body)
+        return cast("StandTold", self._daemon.command("POST", "/simulation/pose", body))
 
-    def simulation_time(self) -> dict[str, Any]:
+    def simulation_time(self) -> TimeTold:
         """Return a simulated rover's time: ``now_s``, and ``speed``, a number or ``max``."""
-        return self._daemon.json("GET", "/simulation/time")
+        return cast("TimeTold", self._daemon.json("GET", "/simulation/time"))
 
-    def advance(self, duration_s: float) -> dict[str, Any]:
+    def advance(self, duration_s: float) -> TimeTold:
         """Let time pass for a simulated rover whose ``simulation.speed`` is ``max``; return it as
         `simulation_time` does.
 
@@ -493,16 +526,16 @@ class Client:
         ClientError
             ``time_passes`` where time passes by itself, ``not_simulated``.
         """
-        return self._daemon.command("POST", "/simulation/time", {"advance_s": duration_s})
+        return cast("TimeTold", self._daemon.command("POST", "/simulation/time", {"advance_s": duration_s}))
 
-    def faults(self) -> list[dict[str, Any]]:
+    def faults(self) -> list[FaultSet]:
         """Return the faults that are switched on in a simulated rover."""
-        return list(self._daemon.json("GET", "/simulation/faults")["faults"])
+        return cast("list[FaultSet]", self._daemon.json("GET", "/simulation/faults")["faults"])
 
-    def set_fault(self, device: str, word: str, **parameters: float) -> list[dict[str, Any]]:
+    def set_fault(self, device: str, word: str, **parameters: float) -> list[FaultSet]:
         """Switch a fault of a simulated device on; return all that are on."""
         body = {"device": device, "word": word, "parameters": parameters}
-        return list(self._daemon.command("POST", "/simulation/faults", body)["faults"])
+        return cast("list[FaultSet]", self._daemon.command("POST", "/simulation/faults", body)["faults"])
 
     def clear_faults(self, device: str | None = None) -> None:
         """Switch the faults of one simulated device off, or all."""

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator, Mapping
-from typing import Any
+from typing import Any, TypeVar, cast
 
 from mastctl.client.connection import Broken, ClientError, DaemonHttp
+
+T = TypeVar("T")
 
 AGAIN_S = (0.1, 0.5, 1.0)  # pauses before a stream that broke is begun again
 SILENT_S = 10.0  # the daemon shows every 2 s that it is there
@@ -18,9 +20,9 @@ ASK_S = 0.25  # between questions to a daemon that has no stream left
 def followed(
     daemon: DaemonHttp,
     query: Mapping[str, Any],
-    ask: Callable[[], dict[str, Any]],
+    ask: Callable[[], T],
     timeout_s: float,
-) -> Iterator[dict[str, Any]]:
+) -> Iterator[T]:
     """Yield a value as it is, then at each change, for some seconds.
 
     The value is asked for before each stream, and each stream begins with what is known, so that no end of
@@ -46,7 +48,7 @@ def followed(
             pauses = pauses or list(AGAIN_S)  # it answers
             for value in _stream(daemon, query, until_s):
                 pauses = list(AGAIN_S)
-                yield value
+                yield cast(T, value)
         except ClientError as error:
             if error.code == "too_many":
                 pauses = [ASK_S, *AGAIN_S]

@@ -1,4 +1,4 @@
-"""Turning the head at a rate: the heartbeats that keep it going, sent from a thread of their own."""
+"""Turning the head at a rate: the heartbeats that keep it going, from a thread also under asyncio."""
 
 from __future__ import annotations
 

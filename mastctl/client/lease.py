@@ -1,13 +1,16 @@
-"""A lease that a client holds: renewed in time by a thread, released at the end."""
+"""A lease that a client holds: renewed in time by a thread, under asyncio too, released at the end."""
 
 from __future__ import annotations
 
 import contextlib
 import threading
 import time
-from typing import Any
+from typing import TYPE_CHECKING
 
 from mastctl.client.connection import Broken, ClientError, Connection
+
+if TYPE_CHECKING:
+    from mastctl.client.answers import LeaseGranted
 
 RENEWALS = 3  # within a lease's time, so that one may be lost
 LEAST_TIMEOUT_S = 0.5
@@ -24,7 +27,7 @@ class HeldLease:
         Why the lease is no longer held, None while it is; the next command is refused with the same reason.
     """
 
-    def __init__(self, daemon: Connection, granted: dict[str, Any], for_s: float) -> None:
+    def __init__(self, daemon: Connection, granted: LeaseGranted, for_s: float) -> None:
         self.id = str(granted["lease_id"])
         self.holder = str(granted["holder"])
         self.lost: ClientError | None = None

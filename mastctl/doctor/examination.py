@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 from calib.errors import BadFile
@@ -16,7 +16,7 @@ from mastctl.doctor.mast_file import examine_mast_file
 from mastctl.doctor.serial_lines import examine_port
 from mastctl.safety.state_folder import usual_folder
 
-Asked = Callable[[str], dict[str, Any] | None]
+Asked = Callable[[str], Mapping[str, Any] | None]
 """Returns the status of the daemon at an address, None if nobody answers there."""
 
 
@@ -56,7 +56,7 @@ def examine(path: str | None, asked: Asked, machine: Machine | None = None) -> I
     yield examine_descriptors()
 
 
-def _daemon(config: Config, status: dict[str, Any] | None) -> Iterator[Finding]:
+def _daemon(config: Config, status: Mapping[str, Any] | None) -> Iterator[Finding]:
     """What a daemon that runs already says is wrong."""
     if status is None:
         yield Finding("daemon", "good", f"none runs at {config.listen.url}")
@@ -69,7 +69,7 @@ def _daemon(config: Config, status: dict[str, Any] | None) -> Iterator[Finding]:
     yield from _calibration(status.get("calibration"))
 
 
-def _calibration(told: dict[str, Any] | None) -> Iterator[Finding]:
+def _calibration(told: Mapping[str, Any] | None) -> Iterator[Finding]:
     """What the residuals of the last days say of the mast file."""
     if told is None:
         return

@@ -186,16 +186,17 @@ class _Bench:
         self, target: Target, distance_m: float, index: int, begun_s: float, with_pictures: bool
     ) -> TargetRecord:
         """Ask the daemon for two pointings and write down what it measured."""
-        error, operation = "", {}
+        error, operation = "", None
         try:
             pixel = (target.shot.camera, target.shot.frame_id, target.x_px, target.y_px)
             operation = pointed(self._client, pixel=pixel, pointings=2)
             if operation["state"] != "done":
-                told = operation.get("error") or {}
-                error = f"{told.get('code', operation['state'])}: {told.get('message', 'stopped')}"
+                told = operation["error"] or {"code": operation["state"], "message": "stopped"}
+                error = f"{told['code']}: {told['message']}"
         except ClientError as refusal:
             error = f"{refusal.code}: {refusal}"
-        landings = tuple(self._landing(target, entry) for entry in operation.get("pointings") or ())
+        entries = operation["pointings"] if operation is not None else []
+        landings = tuple(self._landing(target, entry) for entry in entries)
         images: tuple[Image, ...] = ()
         if with_pictures:
             images = tuple(
@@ -214,7 +215,7 @@ class _Bench:
             landings=landings,
             error=error,
             seconds=self._clock.since_s(begun_s),
-            operation=operation,
+            operation=operation or {},
             clicked_image=target.shot.image if with_pictures else None,
             landed_images=images,
         )

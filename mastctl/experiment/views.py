@@ -15,6 +15,7 @@ from calib.mast.rig import Rig
 from calib.mast.solutions import Solution, choose
 from calib.rigid import FloatArray
 from mastctl.client import Client, ClientError, Snapshot
+from mastctl.client.answers import OperationTold
 from mastctl.experiment.targets import Target, choose_target
 
 # A view that offers no usable target is left for another; after this many in a row the distance is given up.
@@ -77,10 +78,8 @@ class Views:
             return None
         operation = pointed(self._client, pan_rad=angles.pan_rad, tilt_rad=angles.tilt_rad)
         if operation["state"] != "done":
-            error = operation.get("error") or {}
-            raise ClientError(
-                str(error.get("code", operation["state"])), str(error.get("message", "the move was stopped"))
-            )
+            error = operation["error"] or {"code": operation["state"], "message": "the move was stopped"}
+            raise ClientError(error["code"], error["message"])
         return self._client.snapshot(self._pair[0]), self._client.snapshot(self._pair[1])
 
     def _ground_ahead(self, distance_m: float) -> FloatArray:
@@ -98,7 +97,7 @@ class Views:
         )
 
 
-def pointed(client: Client, **request: Any) -> dict[str, Any]:
+def pointed(client: Client, **request: Any) -> OperationTold:
     """Have the daemon point as `Client.point` says; return the ended operation's record.
 
     Raises

@@ -76,12 +76,17 @@ def describe(app: FastAPI) -> None:
     _describe(app.openapi())
 
 
-def _describe(document: dict[str, Any]) -> None:
-    """Put the models, events and files where they are answered."""
+def answer_schemas() -> dict[str, Any]:
+    """Return the JSON schema of each model of an answer, by its name."""
     models = {*ANSWERS.values(), *EVENTS.values()}
     pairs = sorted(((one, "serialization") for one in models), key=lambda pair: pair[0].__name__)
     _, schemas = models_json_schema(pairs, ref_template=_REFERENCE)  # type: ignore[arg-type]
-    document["components"]["schemas"].update(schemas["$defs"])
+    return dict(schemas["$defs"])
+
+
+def _describe(document: dict[str, Any]) -> None:
+    """Put the models, events and files where they are answered."""
+    document["components"]["schemas"].update(answer_schemas())
     _without_null(document)
     for route, success in _successes(document).items():
         if route in ANSWERS:
