@@ -195,6 +195,10 @@ class FrameTold(TypedDict):
     tilt_rad: float
     moving: bool
     mast_digest: str
+    true_pan_rad: float
+    true_tilt_rad: float
+    pan_approach: float
+    tilt_approach: float
     age_s: float
 
 
@@ -211,6 +215,10 @@ class HeadTold(TypedDict):
 
     pan_rad: float
     tilt_rad: float
+    true_pan_rad: float
+    true_tilt_rad: float
+    pan_approach: float
+    tilt_approach: float
     measured_s: float
     age_s: float
     moving: bool
@@ -225,10 +233,18 @@ class JogTold(TypedDict):
 
 
 class Joints(TypedDict):
-    """The head's joints as last measured, radians; ``measured_s`` of CLOCK_MONOTONIC."""
+    """The head's joints as last measured, radians; ``measured_s`` of CLOCK_MONOTONIC.
+
+    ``true_...`` by the mast file's ``joints``; ``..._approach``: from which side an axis came, 1 from smaller
+    readings, -1 from larger, 0 not known.
+    """
 
     pan_rad: float
     tilt_rad: float
+    true_pan_rad: float
+    true_tilt_rad: float
+    pan_approach: float
+    tilt_approach: float
     measured_s: float
     age_s: float
 
@@ -411,6 +427,8 @@ class PointingTold(TypedDict):
     commanded_tilt_rad: float
     measured_pan_rad: float
     measured_tilt_rad: float
+    true_pan_rad: float
+    true_tilt_rad: float
     camera: str
     frame_id: str
     aim_px: list[float] | None
