@@ -78,9 +78,17 @@ def rot_z(angle_rad: float) -> FloatArray:
 
 def tangents(axis: FloatArray) -> FloatArray:
     """Return two unit vectors (2, 3) that make right-handed axes with a unit vector (3,), the third."""
-    across = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))])
-    across /= math.sqrt(float(across @ across))
-    return np.array([across, np.cross(axis, across)])
+    x, y, z = axis.tolist()  # as np.cross, in a tenth of the time
+    least = (abs(x), abs(y), abs(z))
+    if least[0] <= least[1] and least[0] <= least[2]:
+        p, q, r = 0.0, z, -y
+    elif least[1] <= least[2]:
+        p, q, r = -z, 0.0, x
+    else:
+        p, q, r = y, -x, 0.0
+    size = math.sqrt(p * p + q * q + r * r)
+    p, q, r = p / size, q / size, r / size
+    return np.array([[p, q, r], [y * r - z * q, z * p - x * r, x * q - y * p]])
 
 
 NO_ROTATION = 1e-6
@@ -191,12 +199,16 @@ def moved_rigid(pose: Rigid, step: FloatArray) -> Rigid:
 _NEXT, _LAST = [1, 2, 0], [2, 0, 1]
 
 
+def crossed(one: FloatArray, other: FloatArray) -> FloatArray:
+    """Return the cross products (..., 3) of vectors (..., 3): as np.cross, in half the time."""
+    return np.asarray(one[..., _NEXT] * other[..., _LAST] - one[..., _LAST] * other[..., _NEXT])
+
+
 def rigid_rates(per_point: FloatArray, points_m: FloatArray, origin_m: FloatArray) -> FloatArray:
     """Return (n, m, 6): rates of something per point (n, m, 3) for a turn about ``origin_m`` and a shift.
 
     With ``np.eye(3)[None]`` for ``per_point`` they are those of the points (n, 3) themselves.
     """
     arm = (points_m - origin_m)[:, None, :]
-    # As np.cross, in half the time.
-    moment = arm[..., _NEXT] * per_point[..., _LAST] - arm[..., _LAST] * per_point[..., _NEXT]
+    moment = crossed(arm, per_point)
     return np.concatenate([moment, np.broadcast_to(per_point, moment.shape)], axis=2)

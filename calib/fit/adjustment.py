@@ -6,6 +6,10 @@ so the prisms' places on the rover and the joint angles of every head attitude. 
 prisms and tapes (station), prisms from CAD and joint angles; each residual is divided by its sigma. The
 prisms' CAD positions define the rover frame.
 
+A bench has no station: its boards' poses are unknown, or one of them is held; the rover frame is the mast's
+own or hangs on what is held; and the joints' errors (``calib.mast.joints``) and the boards' bows may be
+unknowns too. What joints and boards are usually like holds such an unknown where pictures hardly show it.
+
 A residual of the station is taken in the rover frame: turning it does not change its size, since the
 station's sigma is the same for each axis. Rigid unknowns move by a turn (3, a rotation vector
 about the moved frame's own origin, applied from the left) and a shift (3, metres).
@@ -17,7 +21,8 @@ dense block that is summed into the normal equations at once; these (some 300 un
 from __future__ import annotations
 
 from collections.abc import Hashable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -27,20 +32,33 @@ from calib.fit.least_squares import Normal
 from calib.fit.terms import DRAWING, JOINTS, ImageTerm, StationTerm, widened_images
 from calib.fit.usual_lens import lens_knowledge
 from calib.mast.gimbal import MAST_FREE, MAST_NAMES, gimbal, gimbal_rates, mast_of
+from calib.mast.joints import JOINTS_NAMES, Joints, joints_of
 from calib.mast.rig import Mast
 from calib.rigid import FloatArray, Rigid, moved_rigid, rigid_rates
 
 HUBER = 3.0
 """Length of a residual, in sigmas, from which its pull no longer grows while blunders are looked for."""
 
+USUAL_JOINT_RAD = 0.03
+"""What a joint's harmonics and backlash are like, one sigma, radians; hobby servos have some 10 mrad."""
+
+USUAL_BOW_M = 0.005
+"""How far a board's edges are usually from flat, one sigma, metres."""
+
+KNOWN_BEFOREHAND = "usual "
+"""How the names begin of blocks that are no measurements but what lenses, joints and boards are like."""
+
 Key = Hashable
 MAST: Key = ("mast",)
+JOINT_ERRORS: Key = ("joints",)
 
 
 @dataclass(frozen=True, eq=False)
 class Estimate:
     """A state of the fit. ``mast`` holds the eight numbers of ``MAST_NAMES``, ``joints_rad`` (k, 2) what is
-    added to the readings of each head attitude."""
+    added to the readings of each head attitude, ``joint_errors`` (10,) the numbers of
+    ``calib.mast.joints.JOINTS_NAMES``, ``bows_m`` by board (2,) how far the middles of its sides, right and
+    left, top and bottom, lie behind its centre, metres."""
 
     cameras: Mapping[str, CameraModel]
     mast: FloatArray
@@ -48,11 +66,18 @@ class Estimate:
     rover_from_board: Mapping[tuple[str, str], Rigid]
     prisms_in_rover_m: Mapping[str, FloatArray]
     joints_rad: FloatArray
+    joint_errors: FloatArray = field(default_factory=lambda: np.zeros(len(JOINTS_NAMES)))
+    bows_m: Mapping[str, FloatArray] = field(default_factory=dict)
 
     @property
     def as_mast(self) -> Mast:
         """The mast of ``calib.mast.rig``."""
         return mast_of(self.mast)
+
+    @cached_property
+    def as_joints(self) -> Joints:
+        """The joints of ``calib.mast.joints``; ValueError if their errors are too large to be any."""
+        return joints_of(self.joint_errors)
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,7 +104,13 @@ class Adjustment:
     joint_rad
         Sigma of a joint reading (0: exact).
     mast_parameters
-        4, 6 or 8; 0 leaves the mast as it is.
+        4, 6 or 8; 0 leaves the mast as it is. Or which of its eight numbers move.
+    joint_errors
+        Which of ``calib.mast.joints.JOINTS_NAMES`` move.
+    bowed
+        Boards whose bow is unknown, by the first part of their images' ``board``.
+    held
+        Boards that stay where the start has them.
     start
         The state to start from; it settles which unknowns there are.
     huber
@@ -92,26 +123,37 @@ class Adjustment:
         station: Sequence[StationTerm],
         start: Estimate,
         *,
-        mast_parameters: int,
-        prisms_cad_m: Mapping[str, FloatArray],
+        mast_parameters: int | Sequence[int],
+        prisms_cad_m: Mapping[str, FloatArray] | None = None,
         prism_cad_m: float = 0.0,
         joint_rad: float = 0.0,
+        joint_errors: Sequence[int] = (),
+        bowed: Sequence[str] = (),
+        held: Sequence[tuple[str, str]] = (),
         huber: float | None = None,
     ) -> None:
         self.images, self.station = tuple(images), tuple(station)
-        self.prisms_cad_m, self.prism_cad_m = prisms_cad_m, prism_cad_m
+        self.prisms_cad_m, self.prism_cad_m = prisms_cad_m or {}, prism_cad_m
         self.joint_rad, self.huber = joint_rad, huber
-        self.mast_free = np.array(MAST_FREE.get(mast_parameters, ()), dtype=int)
+        if isinstance(mast_parameters, int):
+            mast_parameters = MAST_FREE.get(mast_parameters, ())
+        self.mast_free = np.array(mast_parameters, dtype=int)
+        self.joint_errors = np.array(joint_errors, dtype=int)
+        self.bowed, self.held = tuple(bowed), frozenset(held)
         self.parts: dict[Key, slice] = {}
         self.names: list[str] = []
         for name, model in start.cameras.items():
             self._add(("camera", name), [f"cameras.{name}.{p}" for p in parameter_names(model.kind)])
         self._add(MAST, [f"mast.{MAST_NAMES[i]}" for i in self.mast_free])
+        self._add(JOINT_ERRORS, [JOINTS_NAMES[i] for i in self.joint_errors])
+        for board in self.bowed:
+            self._add(("bow", board), [f"board {board}.bow_m.{a}" for a in "xy"])
         rigid = [*(f"turn_rad.{a}" for a in "xyz"), *(f"shift_m.{a}" for a in "xyz")]
         for setup in start.rover_from_station:
             self._add(("setup", setup), [f"set-up {setup}.{p}" for p in rigid])
-        for board in start.rover_from_board:
-            self._add(("board", board), [f"placement {board[0]}/{board[1]}.{p}" for p in rigid])
+        for pose in start.rover_from_board:
+            if pose not in self.held:
+                self._add(("board", pose), [f"placement {pose[0]}/{pose[1]}.{p}" for p in rigid])
         if prism_cad_m > 0:
             for prism in start.prisms_in_rover_m:
                 self._add(("prism", prism), [f"prism {prism}.{a}" for a in "xyz"])
@@ -154,6 +196,9 @@ class Adjustment:
             for letter in "HV":
                 part[parameter_part(model.kind, letter)] = float(np.linalg.norm(model.H))
             sigma[self.parts["camera", name]] = part
+        sigma[self.parts[JOINT_ERRORS]] = 1e3  # these have their own knowledge beforehand
+        for board in self.bowed:
+            sigma[self.parts["bow", board]] = 1e3
         return np.asarray(sigma**-2.0)
 
     def stepped(self, state: Estimate, step: FloatArray) -> Estimate:
@@ -162,12 +207,14 @@ class Adjustment:
             raise ValueError("the step is not finite")
         mast = state.mast.copy()
         mast[self.mast_free] += step[self.parts[MAST]]
+        errors = state.joint_errors.copy()
+        errors[self.joint_errors] += step[self.parts[JOINT_ERRORS]]
         prisms, joints = state.prisms_in_rover_m, state.joints_rad
         if self.prism_cad_m > 0:
             prisms = {name: p + step[self.parts["prism", name]] for name, p in prisms.items()}
         if self.joint_rad > 0 and len(joints):
             joints = joints + np.array([step[self.parts["attitude", i]] for i in range(len(joints))])
-        return replace(
+        moved = replace(
             state,
             cameras={n: stepped(m, step[self.parts["camera", n]]) for n, m in state.cameras.items()},
             mast=mast,
@@ -175,11 +222,19 @@ class Adjustment:
                 n: moved_rigid(p, step[self.parts["setup", n]]) for n, p in state.rover_from_station.items()
             },
             rover_from_board={
-                n: moved_rigid(p, step[self.parts["board", n]]) for n, p in state.rover_from_board.items()
+                n: p if n in self.held else moved_rigid(p, step[self.parts["board", n]])
+                for n, p in state.rover_from_board.items()
             },
             prisms_in_rover_m=prisms,
             joints_rad=joints,
+            joint_errors=errors,
+            bows_m={
+                n: b + step[self.parts["bow", n]] if n in self.bowed else b for n, b in state.bows_m.items()
+            },
         )
+        if len(self.joint_errors):
+            _ = moved.as_joints
+        return moved
 
     def cost(self, state: Estimate) -> float:
         """Return the weighted sum of squares (pulls bounded if asked); infinite where a dot has no pixel."""
@@ -238,45 +293,73 @@ class Adjustment:
             yield block.residual, 1
 
     def joints(self, state: Estimate, image: ImageTerm) -> tuple[float, float]:
-        """The joint angles of an image as the state has them."""
-        if image.attitude is None or not len(state.joints_rad):
-            return image.pan_rad, image.tilt_rad
-        pan, tilt = state.joints_rad[image.attitude]
-        return image.pan_rad + float(pan), image.tilt_rad + float(tilt)
+        """The true joint angles of an image as the state has them."""
+        return self.angles(state, image)[0]
+
+    def angles(
+        self, state: Estimate, image: ImageTerm
+    ) -> tuple[tuple[float, float], FloatArray, tuple[float, float]]:
+        """True pan and tilt of an image, their rates (2, 5) to their joint's numbers, and to its reading."""
+        pan, tilt = image.pan_rad, image.tilt_rad
+        if image.attitude is not None and image.attitude >= 0 and len(state.joints_rad):
+            off = state.joints_rad[image.attitude]
+            pan, tilt = pan + float(off[0]), tilt + float(off[1])
+        if image.attitude is None or (not state.joint_errors.any() and not len(self.joint_errors)):
+            return (pan, tilt), np.zeros((2, 5)), (1.0, 1.0)
+        joints, (from_pan, from_tilt) = state.as_joints, image.approach
+        return (
+            joints.true_rad((pan, tilt), image.approach),
+            np.stack([joints.pan.rates(pan, from_pan), joints.tilt.rates(tilt, from_tilt)]),
+            (joints.pan.slope(pan, from_pan), joints.tilt.slope(tilt, from_tilt)),
+        )
 
     def image_residual(self, state: Estimate, image: ImageTerm) -> FloatArray:
         """Predicted less measured pixels of the dots that count, in sigmas, (2n,)."""
         keep = image.keep
-        points = state.rover_from_board[image.board].points(image.in_board_m[keep])
+        pixels, _ = state.cameras[image.camera].project(self.in_camera(state, image)[keep])
+        return np.asarray(((pixels - image.pixels_px[keep]) / image.sigma_px[keep, None]).ravel())
+
+    def in_camera(self, state: Estimate, image: ImageTerm) -> FloatArray:
+        """All the points (n, 3) of an image in its camera's frame, metres, as the state has them."""
+        points = state.rover_from_board[image.board].points(bowed_points(state, image))
         if image.attitude is not None:
             head = gimbal(state.mast, *self.joints(state, image))
             points = (points - head.translation_m) @ head.rotation
-        pixels, _ = state.cameras[image.camera].project(points)
-        return np.asarray(((pixels - image.pixels_px[keep]) / image.sigma_px[keep, None]).ravel())
+        return np.asarray(points)
 
     def image_block(self, state: Estimate, image: ImageTerm) -> Block:
         """The dots of an image."""
         keep = image.keep
         board = state.rover_from_board[image.board]
-        points = board.points(image.in_board_m[keep])
+        points = board.points(bowed_points(state, image)[keep])
         parts, columns = [], [self.at(("camera", image.camera))]
         if image.attitude is None:
             seen = predict(state.cameras[image.camera], points)
             in_rover = seen.d_points
             parts.append(seen.d_step)
         else:
-            head = gimbal(state.mast, *self.joints(state, image))
+            true_rad, per_number, slopes = self.angles(state, image)
+            head = gimbal(state.mast, *true_rad)
             seen = predict(state.cameras[image.camera], (points - head.translation_m) @ head.rotation)
             in_rover = seen.d_points @ head.rotation.T
             parts.append(seen.d_step)
-            wanted = list(self.mast_free)
+            rates = -gimbal_rates(in_rover, points, head, np.array([*self.mast_free, 8, 9], dtype=int))
+            parts.append(rates[..., :-2])
             columns.append(self.at(MAST))
+            if len(self.joint_errors):
+                per_joint = rates[..., -2:, None] * per_number
+                parts.append(per_joint.reshape(*rates.shape[:2], -1)[..., self.joint_errors])
+                columns.append(self.at(JOINT_ERRORS))
             if self.joint_rad > 0:
-                wanted += [8, 9]
+                parts.append(rates[..., -2:] * np.array(slopes))
                 columns.append(self.at(("attitude", image.attitude)))
-            parts.append(-gimbal_rates(in_rover, points, head, np.array(wanted, dtype=int)))
-        parts.append(rigid_rates(in_rover, points, board.translation_m))
-        columns.append(self.at(("board", image.board)))
+        if image.board[0] in self.bowed:
+            behind = (in_rover @ board.rotation[:, 2])[..., None]
+            parts.append(behind * image.bend[keep][:, None, :])
+            columns.append(self.at(("bow", image.board[0])))
+        if image.board not in self.held:
+            parts.append(rigid_rates(in_rover, points, board.translation_m))
+            columns.append(self.at(("board", image.board)))
         sigma = image.sigma_px[keep]
         residual = (seen.pixels_px - image.pixels_px[keep]) / sigma[:, None]
         jacobian = np.concatenate(parts, axis=2) / sigma[:, None, None]
@@ -312,7 +395,23 @@ class Adjustment:
         for name, model in state.cameras.items():
             if "O" in model.kind:
                 residual, jacobian = lens_knowledge(model)
-                yield f"lens {name}", Block(residual, jacobian, self.at(("camera", name)), width=1)
+                yield (
+                    f"{KNOWN_BEFOREHAND}lens {name}",
+                    Block(residual, jacobian, self.at(("camera", name)), width=1),
+                )
+        if len(self.joint_errors):
+            size = len(self.joint_errors)
+            usual = state.joint_errors[self.joint_errors] / USUAL_JOINT_RAD
+            yield (
+                f"{KNOWN_BEFOREHAND}joints",
+                Block(usual, np.eye(size) / USUAL_JOINT_RAD, self.at(JOINT_ERRORS), 1),
+            )
+        for board in self.bowed:
+            bow = state.bows_m[board] / USUAL_BOW_M
+            yield (
+                f"{KNOWN_BEFOREHAND}board {board}",
+                Block(bow, np.eye(2) / USUAL_BOW_M, self.at(("bow", board)), width=1),
+            )
         if self.prism_cad_m > 0:
             for name, place in self.prisms_cad_m.items():
                 residual = (state.prisms_in_rover_m[name] - place) / self.prism_cad_m
@@ -332,3 +431,13 @@ class Adjustment:
         """Return the indices of an unknown's numbers."""
         part = self.parts[key]
         return np.arange(part.start, part.stop)
+
+
+def bowed_points(state: Estimate, image: ImageTerm) -> FloatArray:
+    """Return the points (n, 3) of an image's board, metres, bent as the state has it."""
+    bow = state.bows_m.get(image.board[0])
+    if bow is None or not bow.any():
+        return image.in_board_m
+    bent = image.in_board_m.copy()
+    bent[:, 2] += image.bend @ bow
+    return bent

@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.stats import chi2
 
-from calib.fit.adjustment import HUBER, MAST, Adjustment, Estimate
+from calib.fit.adjustment import HUBER, KNOWN_BEFOREHAND, MAST, Adjustment, Estimate
 from calib.fit.calibration import Calibration
 from calib.fit.components import Component, variance_components, wider_sigmas
 from calib.fit.least_squares import Minimum, Normal, covariance_of, minimise
@@ -286,7 +286,7 @@ def goodness(problem: Adjustment, state: Estimate, covariance: FloatArray) -> tu
     """
     total, count, paid = 0.0, 0, 0.0
     for what, block in problem.blocks(state):
-        if isinstance(what, str) and what.startswith("lens "):
+        if isinstance(what, str) and what.startswith(KNOWN_BEFOREHAND):
             continue
         total += float(block.residual @ block.residual)
         count += len(block.residual)

@@ -32,6 +32,9 @@ BAD_IMAGE = 0.25
 REDUNDANT = 0.02
 """Directions of a residual with less than this part of the noise left in them cannot be tested."""
 
+TELL_APART = 8
+"""With more images of a board than this, the rest says which of two is wrong."""
+
 BOARD_STEPS = 4
 """Gauss-Newton steps of a board's pose: it starts within millimetres."""
 
@@ -125,7 +128,7 @@ def name_outliers(
             found.append(Outlier("image", f"image {term.name}", float(statistic.sum()), limit, size))
             continue
         for row in np.flatnonzero(~term.keep):
-            name = f"image {term.name} dot (row {term.rows[row]}, column {term.columns[row]})"
+            name = f"image {term.name} {term.part(int(row))}"
             size = float(np.linalg.norm(residual[row]))
             found.append(Outlier("dot", name, float(statistic[row]), limits.dot, size))
     for point, judged in zip(problem.station, points, strict=True):
@@ -215,7 +218,7 @@ def _culprit(problem: Adjustment, state: Estimate, suspect: int) -> int:
     """
     board = problem.images[suspect].board
     together = [i for i, t in enumerate(problem.images) if t.board == board and t.keep.any()]
-    if len(together) < 2:
+    if not 2 <= len(together) <= TELL_APART or board in problem.held:
         return suspect
     misfits = {i: _board_misfit(problem, state, board, [j for j in together if j != i]) for i in together}
     best = min(misfits, key=lambda i: misfits[i])

@@ -17,7 +17,7 @@ import numpy as np
 
 from calib.camera.cahvor import CameraModel
 from calib.camera.parameters import parameter_names, parameter_part, predict, stepped
-from calib.fit.adjustment import MAST, Adjustment, Estimate
+from calib.fit.adjustment import KNOWN_BEFOREHAND, MAST, Adjustment, Estimate
 from calib.fit.least_squares import covariance_of
 from calib.fit.terms import ImageTerm
 from calib.fit.usual_lens import lens_knowledge
@@ -86,7 +86,7 @@ class TwoSteps:
             block = problem.station_block(self.state, point)
             matrix[np.ix_(block.columns, block.columns)] += block.jacobian.T @ block.jacobian
         for name, block in problem.known(self.state):
-            if not name.startswith("lens "):
+            if not name.startswith(KNOWN_BEFOREHAND):
                 matrix[np.ix_(block.columns, block.columns)] += block.jacobian.T @ block.jacobian
         return covariance_of(matrix[np.ix_(s, s)])
 

@@ -30,7 +30,7 @@ def image_residuals(
     for term in (*all_images, *checks):
         image = by_name[term.name]
         keep = used.get(term.name)
-        residual = residual_px(problem, state, term, fitted=keep is not None)
+        residual = residual_px(problem, state, term)
         centre, facing = _seen_from(problem, state, term)
         found.append(
             ImageResiduals(
@@ -54,15 +54,9 @@ def image_residuals(
     return tuple(found)
 
 
-def residual_px(problem: Adjustment, state: Estimate, term: ImageTerm, *, fitted: bool) -> FloatArray:
+def residual_px(problem: Adjustment, state: Estimate, term: ImageTerm) -> FloatArray:
     """Return predicted less measured pixels (n, 2) of every dot of an image."""
-    model = state.cameras[term.camera]
-    points = state.rover_from_board[term.board].points(term.in_board_m)
-    if term.attitude is not None:
-        angles = problem.joints(state, term) if fitted else (term.pan_rad, term.tilt_rad)
-        head = gimbal(state.mast, *angles)
-        points = (points - head.translation_m) @ head.rotation
-    pixels, _ = model.project(points)
+    pixels, _ = state.cameras[term.camera].project(problem.in_camera(state, term))
     return np.asarray(pixels - term.pixels_px)
 
 
@@ -71,7 +65,7 @@ def _seen_from(problem: Adjustment, state: Estimate, term: ImageTerm) -> tuple[F
     board = state.rover_from_board[term.board]
     centre = state.cameras[term.camera].C
     if term.attitude is not None:
-        head = gimbal(state.mast, term.pan_rad, term.tilt_rad)
+        head = gimbal(state.mast, *problem.joints(state, term))
         centre = head.rotation @ centre + head.translation_m
     return board.translation_m - centre, board.rotation[:, 2]
 

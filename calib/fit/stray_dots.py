@@ -25,6 +25,12 @@ FALSE_ALARMS = 0.01
 DEGREES = ((60, 4), (30, 3))
 """Fewest dots for a polynomial of that degree; with fewer than the last nothing is tested."""
 
+FEWER = ((16, 2),)
+"""The same for corners of a partly seen board, where only gross errors are looked for."""
+
+GROSS = 100.0
+"""A statistic beyond so many times the typical one's is gross: ten sigma."""
+
 POLYNOMIAL_PX = 0.08
 """What a polynomial of the fourth degree may miss, at the corners of a near board in a wide lens."""
 
@@ -68,15 +74,38 @@ def without_stray_dots(survey: Survey) -> tuple[Survey, tuple[Outlier, ...]]:
 
 def _test(survey: Survey, dots: Dots, degree: int) -> tuple[FloatArray, FloatArray]:
     """The statistic of each dot (n,), and how far it is (n,), pixels, from where the others say."""
-    x, y, _ = survey.board.dots_in_board_m(dots.rows, dots.columns).T / survey.board.spacing_m / 5
+    sigma = np.full(len(dots.rows), survey.sigma.dot_px) if dots.sigma_px is None else dots.sigma_px
+    places = survey.board.dots_in_board_m(dots.rows, dots.columns)[:, :2] / survey.board.spacing_m / 5
+    return _off_polynomial(places, dots.pixels_px, np.hypot(sigma, POLYNOMIAL_PX), degree)
+
+
+def stray_points(places_m: FloatArray, pixels_px: FloatArray, sigma_px: FloatArray) -> np.ndarray:
+    """Return which points (n,) of one image are grossly off where the rest of a flat board says.
+
+    None where there are too few to tell. ``places_m`` (n, 2) on the board; it may be partly seen.
+    """
+    degree = next((d for n, d in (*DEGREES, *FEWER) if len(places_m) >= n), 0)
+    if not degree:
+        return np.zeros(len(places_m), dtype=bool)
+    middle = places_m.mean(axis=0)
+    scale = max(float(np.abs(places_m - middle).max()), 1e-9)
+    sigma = np.hypot(sigma_px, POLYNOMIAL_PX)
+    statistic, _ = _off_polynomial((places_m - middle) / scale, pixels_px, sigma, degree)
+    typical = max(1.0, float(np.median(statistic) / chi2.median(2)))
+    return np.asarray(statistic > GROSS * typical)
+
+
+def _off_polynomial(
+    places: FloatArray, pixels_px: FloatArray, sigma: FloatArray, degree: int
+) -> tuple[FloatArray, FloatArray]:
+    """The statistic of each point (n,) against a polynomial of the others, and how far it is off, pixels."""
+    x, y = places.T
     terms = np.stack([x**i * y**j for i in range(degree + 1) for j in range(degree + 1 - i)], axis=1)
-    sigma = np.full(len(x), survey.sigma.dot_px) if dots.sigma_px is None else dots.sigma_px
-    sigma = np.hypot(sigma, POLYNOMIAL_PX)
     weight = 1 / sigma**2
     for _ in range(STEPS):
         root = np.sqrt(weight)[:, None]
-        numbers = np.linalg.lstsq(root * terms, root * dots.pixels_px, rcond=None)[0]
-        off_px = np.linalg.norm(terms @ numbers - dots.pixels_px, axis=1)
+        numbers = np.linalg.lstsq(root * terms, root * pixels_px, rcond=None)[0]
+        off_px = np.linalg.norm(terms @ numbers - pixels_px, axis=1)
         size = off_px / sigma
         size = size / max(1.0, float(np.median(size)))
         weight = np.minimum(1.0, PULL / np.maximum(size, PULL)) ** 2 / sigma**2

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -16,7 +16,14 @@ JOINTS, TAPES, PRISMS, DRAWING, DOTS_OF = "joint readings", "tapes", "prisms", "
 
 @dataclass(frozen=True, eq=False)
 class ImageTerm:
-    """The dots of one image: board points (n, 3), pixels (n, 2), their sigma (n,), and which count (n,)."""
+    """The dots or corners of one image: board points (n, 3), pixels (n, 2), their sigma (n,), and which count
+    (n,).
+
+    ``board`` is set-up and placement, of a bench board and placement; ``attitude`` the index of the head's
+    standstill, None for a body camera and -1 where it is not fitted. ``approach`` says from where pan and
+    tilt came to rest (+1: from smaller readings, -1: from larger, 0: not known). ``bend`` (n, 2) is what a
+    bow of one moves each point by, back from the board; ``ids`` (n,) are a bench's corners.
+    """
 
     name: str
     camera: str
@@ -30,6 +37,15 @@ class ImageTerm:
     pixels_px: FloatArray
     sigma_px: FloatArray
     keep: np.ndarray
+    approach: tuple[int, int] = (0, 0)
+    bend: FloatArray = field(default_factory=lambda: np.zeros((0, 2)))
+    ids: np.ndarray | None = None
+
+    def part(self, index: int) -> str:
+        """One of the dots or corners as a person says it."""
+        if self.ids is not None:
+            return f"corner {self.ids[index]}"
+        return f"dot (row {self.rows[index]}, column {self.columns[index]})"
 
     @property
     def kind(self) -> str:

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from calib.mast.rig import Mast
-from calib.rigid import FloatArray, rot_x, rot_y, rot_z
+from calib.rigid import FloatArray, crossed, rot_x, rot_y, rot_z
 
 MAST_NAMES = (
     *(f"translation_m.{axis}" for axis in "xyz"),
@@ -66,8 +66,8 @@ def gimbal_rates(per_point: FloatArray, points_m: FloatArray, head: Gimbal, want
 
     ``wanted`` (k,) picks from a gimbal's ten numbers.
     """
-    about_mast = np.cross((points_m - head.mast_origin_m)[:, None, :], per_point)
-    about_head = np.cross((points_m - head.translation_m)[:, None, :], per_point)
+    about_mast = crossed((points_m - head.mast_origin_m)[:, None, :], per_point)
+    about_head = crossed((points_m - head.translation_m)[:, None, :], per_point)
     columns = []
     for index in wanted:
         kind = about_head if index in _ABOUT_HEAD else about_mast if index in _ABOUT_MAST else per_point

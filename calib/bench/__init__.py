@@ -1,1 +1,0 @@
-"""What a picture of a board would tell: the choice of poses and placements of a bench calibration."""

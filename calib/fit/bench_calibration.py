@@ -1,0 +1,124 @@
+"""What the fit of a bench gives: the rig, how sure it is, which terms it needed, what was fixed by choice."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from calib.fit.calibration import Degenerate, ImageResiduals, Outlier
+from calib.fit.components import Component
+from calib.mast.covariance import RigCovariance
+from calib.mast.rig import Rig
+from calib.rigid import FloatArray, Rigid
+
+
+@dataclass(frozen=True, eq=False)
+class TermGain:
+    """A part of the model that enters only if the pictures ask for it.
+
+    Attributes
+    ----------
+    name
+        ``pan harmonic 1``, ``tilt backlash``, ``axis offset``, ``bow of b1``.
+    entered
+        Whether it is part of the model.
+    parameters, values
+        Its numbers' names (k,) and what the fit with it says they are (k,), in the names' units.
+    sigma
+        (k,) of these.
+    chi2
+        By how much the weighted sum of squares is lower with it than without it.
+    chance
+        Of so large a gain were it nothing.
+    moves_px
+        Rms over all corners of what it moves pixels by; nan where it did not enter.
+    """
+
+    name: str
+    entered: bool
+    parameters: tuple[str, ...]
+    values: FloatArray
+    sigma: FloatArray
+    chi2: float
+    chance: float
+    moves_px: float
+
+    @property
+    def sentence(self) -> str:
+        """The term in words."""
+        size = float(np.linalg.norm(self.values))
+        spread = float(np.sqrt(np.mean(self.sigma**2)))
+        milli = "mm" if self.parameters[0].endswith("_m") or ".bow_m" in self.parameters[0] else "mrad"
+        told = f"{self.name}: {1e3 * size:.2f} ± {1e3 * spread:.2f} {milli}"
+        if not self.entered:
+            return f"{told}, not significant (chi-square {self.chi2:.1f}): left out"
+        return f"{told}, moves pixels by {self.moves_px:.2f} px rms, lowers chi-square by {self.chi2:.0f}"
+
+
+@dataclass(frozen=True, eq=False)
+class BenchCalibration:
+    """A rig fitted to pictures of boards that stood anywhere.
+
+    Attributes
+    ----------
+    rig
+        Cameras, mast and joints; ``rig.fit`` and ``rig.provenance`` are empty.
+    parameter_names, covariance
+        (p,) and (p, p) of the mast's, the joints' and the cameras' parameters that were fitted
+        (``calib.mast.covariance``); what was held is exact.
+    unknowns
+        The same with boards' poses and bows beside them: ``placement b1/p2.turn_rad.x`` and
+        ``board b1.bow_m.x``. Angles of single standstills are taken into account and not among them.
+    terms
+        Every term that could have entered.
+    rms_px, check_rms_px
+        Camera to (x, y) rms of the corners that were fitted, and of those of check images.
+    images
+        What remains of every image.
+    outliers
+        What was left out, each with its reason.
+    degenerate
+        What the pictures leave open.
+    gauges, notes
+        What pictures cannot know and how it was fixed; what else a person should know. Sentences.
+    chi2, degrees_of_freedom, chi2_probability
+        Weighted sum of squares, what it is expected to be, and the chance of a larger one, by stated sigmas.
+    components
+        How large errors were against what was stated; the covariance is by what they were.
+    joint_rad
+        What one joint reading is off by, besides its joint's errors.
+    rover_from_board, bows_m
+        Poses by board and placement; by board its bow (across, down), metres.
+    seconds
+        How long it took.
+    """
+
+    rig: Rig
+    parameter_names: tuple[str, ...]
+    covariance: FloatArray
+    unknowns: RigCovariance
+    sigma: Mapping[str, Any]
+    terms: tuple[TermGain, ...]
+    rms_px: Mapping[str, tuple[float, float]]
+    check_rms_px: Mapping[str, tuple[float, float]]
+    images: tuple[ImageResiduals, ...]
+    outliers: tuple[Outlier, ...]
+    false_alarms: float
+    degenerate: tuple[Degenerate, ...]
+    gauges: tuple[str, ...]
+    notes: tuple[str, ...]
+    chi2: float
+    degrees_of_freedom: float
+    chi2_probability: float
+    components: tuple[Component, ...]
+    joint_rad: float
+    rover_from_board: Mapping[tuple[str, str], Rigid]
+    bows_m: Mapping[str, FloatArray]
+    seconds: float
+
+    def part(self, prefix: str) -> np.ndarray:
+        """Return where the parameters that begin with ``prefix`` are, as indices."""
+        return np.array([i for i, n in enumerate(self.parameter_names) if n.startswith(prefix)], dtype=int)

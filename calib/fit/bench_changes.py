@@ -1,0 +1,267 @@
+"""What changed while a bench's pictures were taken: a board, a joint, a camera, from some picture on.
+
+For every picture after which something may have changed, the fit is asked what it would gain if it had: the
+board of the placement stood elsewhere from there on (six numbers), pan or tilt read otherwise (one), a camera
+had another focal length (one) or looked elsewhere in the head (three). Near the fit the problem is linear, so
+that the gains follow from sums over pictures and no further fit is made (score tests). Of changes that
+explain the same, that with the fewest numbers is told. A pan that slips between two placements is seen by
+nothing and does no harm.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from calib.camera.cahvor import CameraModel
+from calib.fit.adjustment import Adjustment, Estimate
+from calib.fit.significance import chance
+from calib.fit.terms import ImageTerm
+from calib.rigid import FloatArray, Rigid, moved_rigid
+
+UNLIKELY = 1e-7
+"""A change is told if so large a gain, were it none, had less than this chance over all that were tried."""
+
+AS_GOOD = 0.98
+"""A change with fewer numbers is preferred if it gains this part of the best one's."""
+
+LEAST_PART = 0.01
+"""A board or camera that moved explains at least this part of the weighted sum of squares: less is the
+model's."""
+
+SIDE = 3
+"""Pictures at least on either side of a change, at different standstills."""
+
+UNSEEN = 1e-5
+"""A direction of a change is not looked at if the other unknowns take up all but this part of it."""
+
+LARGEST = 0.5
+"""Radians, or part of the focal length: what is larger is no slip, knock or other focus."""
+
+STEP = 1e-6
+
+
+@dataclass(frozen=True, eq=False)
+class Change:
+    """Something that changed between two pictures.
+
+    Attributes
+    ----------
+    what
+        ``board``, ``pan``, ``tilt``, ``focus`` or ``knock``.
+    board, camera
+        Whose, where it is one's.
+    before, after
+        Names of the pictures between which it changed.
+    step
+        What it changed by, about: turn and shift of the board (6), radians (1) of a joint, a part of the
+        focal length (1), turn of the camera (3).
+    chi2
+        What it explains of the weighted sum of squares.
+    """
+
+    what: str
+    board: tuple[str, str] | None
+    camera: str
+    before: str
+    after: str
+    step: FloatArray
+    chi2: float
+
+    @property
+    def sentence(self) -> str:
+        """The change in words, and what to do."""
+        between = f"between pictures {self.before} and {self.after}"
+        if self.board is not None:
+            turn, shift = np.linalg.norm(self.step[:3]), np.linalg.norm(self.step[3:])
+            return (
+                f"board {self.board[0]} moved during placement {self.board[1]}, {between}, by about "
+                f"{1e3 * shift:.1f} mm and {1e3 * turn:.1f} mrad"
+            )
+        size = float(np.linalg.norm(self.step))
+        if self.what in ("pan", "tilt"):
+            return (
+                f"{self.what} slipped by about {1e3 * size:.1f} mrad {between}: the head no longer points "
+                "where it read before; tighten what holds it on its axis and take the pictures again"
+            )
+        if self.what == "focus":
+            return (
+                f"camera {self.camera} was refocused {between}: its focal length changed by about "
+                f"{100 * size:.2f} %; fix the lens and take the pictures again"
+            )
+        return (
+            f"camera {self.camera} was knocked {between}: it turned by about {1e3 * size:.1f} mrad in its "
+            "mount; fasten it and take the pictures again"
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class _Rows:
+    """One image's weighted residuals (m,), Jacobian (m, k) on columns (k,), and rates (m, e) by what may
+    change."""
+
+    image: ImageTerm
+    residual: FloatArray
+    jacobian: FloatArray
+    columns: np.ndarray
+    rates: dict[str, FloatArray]
+
+
+def find_change(
+    problem: Adjustment, state: Estimate, covariance: FloatArray, chi2: float, freedom: float
+) -> Change | None:
+    """Return the change that explains most, or None if none is significant.
+
+    Parameters
+    ----------
+    problem, state, covariance
+        A fit with pulls bounded, and the inverse of its normal equations.
+    chi2, freedom
+        Its (bounded) sum of squares, and degrees of freedom.
+    """
+    rows = [_rows(problem, state, image) for image in problem.images if image.keep.any()]
+    found: list[Change] = []
+    count = 0
+    for what, board, camera, mine in _subjects(rows, problem):
+        changes = _tried(what, board, camera, mine, covariance)
+        count += len(changes)
+        found += changes
+    if not found:
+        return None
+    most = max(change.chi2 for change in found)
+    as_good = [c for c in found if c.chi2 >= AS_GOOD * most]
+    best = min(as_good, key=lambda c: (len(c.step), -c.chi2))
+    scale = max((chi2 - best.chi2) / max(freedom, 1.0), 0.1)
+    if chance(best.chi2, len(best.step), scale, max(freedom, 1.0)) * count > UNLIKELY:
+        return None
+    if len(best.step) > 1 and best.chi2 < LEAST_PART * chi2:
+        return None
+    return best
+
+
+def _subjects(
+    rows: Sequence[_Rows], problem: Adjustment
+) -> Iterator[tuple[str, tuple[str, str] | None, str, list[_Rows]]]:
+    """What may have changed: its name, board, camera, and the images that would show it."""
+    for board in dict.fromkeys(r.image.board for r in rows):
+        if board not in problem.held:
+            yield "board", board, "", [r for r in rows if r.image.board == board]
+    on_head = [r for r in rows if r.image.attitude is not None]
+    for axis in ("pan", "tilt"):
+        yield axis, None, "", on_head
+    for camera in dict.fromkeys(r.image.camera for r in rows):
+        mine = [r for r in rows if r.image.camera == camera]
+        for what in ("focus", "knock"):
+            yield what, None, camera, mine
+
+
+def _tried(
+    what: str,
+    board: tuple[str, str] | None,
+    camera: str,
+    rows: Sequence[_Rows],
+    covariance: FloatArray,
+) -> list[Change]:
+    """The gain of every picture from which something may have changed."""
+    size = rows[0].rates[what].shape[1]
+    found = []
+    own, pull = np.zeros((size, size)), np.zeros(size)
+    shared = np.zeros((size, len(covariance)))
+    for index in range(len(rows) - 1, 0, -1):
+        row, before = rows[index], rows[index - 1]
+        rates = row.rates[what]
+        own += rates.T @ rates
+        pull += rates.T @ row.residual
+        shared[:, row.columns] += rates.T @ row.jacobian
+        if _same_standstill(before.image, row.image):
+            continue
+        if min(_standstills(rows[:index]), _standstills(rows[index:])) < SIDE:
+            continue
+        left = own - shared @ covariance @ shared.T
+        gain, step = _gain(left, own, pull)
+        if what != "board" and np.linalg.norm(step) > LARGEST:
+            continue
+        found.append(Change(what, board, camera, before.image.name, row.image.name, step, gain))
+    return found
+
+
+def _gain(left: FloatArray, own: FloatArray, pull: FloatArray) -> tuple[float, FloatArray]:
+    """What numbers explain, and their values, without the directions that the other unknowns take up."""
+    scale = 1.0 / np.sqrt(np.maximum(np.diag(own), 1e-300))
+    if not np.isfinite(left).all() or not np.isfinite(pull).all():
+        return 0.0, np.zeros(len(pull))
+    values, vectors = np.linalg.eigh(left * np.outer(scale, scale))
+    seen = values > UNSEEN
+    along = vectors.T @ (scale * pull)
+    gain = float(np.sum(along[seen] ** 2 / values[seen]))
+    step = -scale * (vectors[:, seen] @ (along[seen] / values[seen]))
+    return gain, np.asarray(step)
+
+
+def _same_standstill(one: ImageTerm, other: ImageTerm) -> bool:
+    if one.attitude is None or other.attitude is None:
+        return False
+    return one.attitude == other.attitude
+
+
+def _standstills(rows: Sequence[_Rows]) -> int:
+    return len({r.image.name if r.image.attitude is None else r.image.attitude for r in rows})
+
+
+def _rows(problem: Adjustment, state: Estimate, image: ImageTerm) -> _Rows:
+    """One image as the fit weighs it."""
+    block = problem.image_block(state, image)
+    weight = np.ones(len(block.residual))
+    if problem.huber is not None:
+        length = np.linalg.norm(block.residual.reshape(-1, 2), axis=1)
+        weight = np.repeat(np.sqrt(np.minimum(1.0, problem.huber / np.maximum(length, 1e-300))), 2)
+    rates: dict[str, FloatArray] = {}
+    if image.board not in problem.held:
+        rates["board"] = block.jacobian[:, -6:]  # a board's pose comes last
+    if image.attitude is not None:
+        for axis in ("pan", "tilt"):
+            key = f"{axis}_rad"
+            moved = replace(image, **{key: getattr(image, key) + STEP})
+            rates[axis] = _difference(problem, state, state, moved, block.residual)[:, None]
+    camera = state.cameras[image.camera]
+    rates["focus"] = _difference(
+        problem, state, _with(state, image, zoomed(camera, STEP)), image, block.residual
+    )[:, None]
+    turned = [
+        _difference(problem, state, _with(state, image, _turned(camera, STEP * axis)), image, block.residual)
+        for axis in np.eye(3)
+    ]
+    rates["knock"] = np.stack(turned, axis=1)
+    return _Rows(
+        image,
+        weight * block.residual,
+        weight[:, None] * block.jacobian,
+        block.columns,
+        {what: weight[:, None] * rate for what, rate in rates.items()},
+    )
+
+
+def _difference(
+    problem: Adjustment, state: Estimate, moved: Estimate, image: ImageTerm, residual: FloatArray
+) -> FloatArray:
+    """How residuals change with something that was moved by a small step."""
+    return np.asarray((problem.image_residual(moved, image) - residual) / STEP)
+
+
+def _with(state: Estimate, image: ImageTerm, camera: CameraModel) -> Estimate:
+    return replace(state, cameras={**state.cameras, image.camera: camera})
+
+
+def zoomed(camera: CameraModel, part: float) -> CameraModel:
+    """Return the camera with a focal length larger by a part of it."""
+    axis = camera.A
+    h, v = camera.H @ axis * axis, camera.V @ axis * axis
+    return replace(camera, H=h + (1 + part) * (camera.H - h), V=v + (1 + part) * (camera.V - v))
+
+
+def _turned(camera: CameraModel, turn: FloatArray) -> CameraModel:
+    """The camera turned about C."""
+    pose = moved_rigid(Rigid.identity(), np.concatenate([turn, np.zeros(3)]))
+    return camera.moved(Rigid(pose.rotation, camera.C - pose.rotation @ camera.C))

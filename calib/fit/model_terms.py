@@ -1,0 +1,128 @@
+"""Which terms a bench's model needs: joints' harmonics and backlash, skew axes, boards' bows.
+
+All of them are fitted together once. Near that fit the problem is linear, so that what dropping some of them
+costs, and what it does to the others, follows from the covariance (a Wald test of nested models): no further
+fit is needed until the choice is made. The least significant goes first, until all that are left are.
+
+The two harmonics of a joint enter together: over the part of a turn that a head sees boards in, one can do
+most of the other's work, and a fit with the wrong one alone would be sure of numbers that are not so.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from calib.fit.significance import THREE_SIGMAS, chance
+from calib.mast.joints import JOINTS_NAMES
+from calib.rigid import FloatArray
+
+JOINT_TERMS = {
+    f"{axis} {word}": tuple(f"joints.{axis}.{number}" for number in numbers)
+    for axis in ("pan", "tilt")
+    for word, numbers in (
+        ("harmonic 1", ("c1", "s1")),
+        ("harmonic 2", ("c2", "s2")),
+        ("backlash", ("backlash_rad",)),
+    )
+}
+AXIS_TERMS = {"axis offset": ("mast.axis_offset_m",), "axis twist": ("mast.axis_twist_rad",)}
+
+
+def candidate_terms(boards: Sequence[str]) -> dict[str, tuple[str, ...]]:
+    """Return the terms that a model of some boards may have, by name, as their parameters' names."""
+    bows = {f"bow of {board}": tuple(f"board {board}.bow_m.{a}" for a in "xy") for board in boards}
+    return {**JOINT_TERMS, **AXIS_TERMS, **bows}
+
+
+def entering_together(terms: Sequence[str]) -> list[tuple[str, ...]]:
+    """Return the terms in groups of which all enter or none."""
+    groups: dict[str, list[str]] = {}
+    for term in terms:
+        groups.setdefault(
+            term.split(" harmonic")[0] + " harmonics" if "harmonic" in term else term, []
+        ).append(term)
+    return [tuple(group) for group in groups.values()]
+
+
+@dataclass(frozen=True)
+class Tested:
+    """A term beside those that were chosen: what it gains, and the chance of that were it nothing; a first
+    harmonic before the second one, a second one beyond the first."""
+
+    chi2: float
+    chance: float
+    values: FloatArray
+    sigma: FloatArray
+
+
+def choose_terms(
+    terms: Mapping[str, tuple[str, ...]],
+    names: Sequence[str],
+    values: Mapping[str, float],
+    covariance: FloatArray,
+    scale: float,
+    freedom: float,
+    enters: float = THREE_SIGMAS,
+) -> tuple[tuple[str, ...], dict[str, Tested]]:
+    """Return the terms that are needed, and how each one does beside these.
+
+    Parameters
+    ----------
+    terms
+        Names to parameters; of those that were fitted.
+    names, covariance
+        Of the whole fit, stated sigmas taken as they are.
+    values
+        Of the terms' parameters at the fit.
+    scale, freedom
+        The fit's chi-square over its degrees of freedom, and these.
+    enters
+        A group enters if so large a gain, were it nothing, had at most this chance.
+    """
+    at = {name: i for i, name in enumerate(names)}
+    places = {term: [at[name] for name in parameters] for term, parameters in terms.items()}
+    everything = [i for place in places.values() for i in place]
+    of_terms = {i: k for k, i in enumerate(everything)}
+    x = np.array([values[names[i]] for i in everything])
+    c = covariance[np.ix_(everything, everything)]
+
+    def told(group: Sequence[str], beside: Sequence[str]) -> Tested:
+        """The test of a group in the model of itself and some other terms."""
+        mine = [of_terms[i] for term in group for i in places[term]]
+        rest = [term for term in places if term not in group and term not in beside]
+        gone = [of_terms[i] for term in rest for i in places[term]]
+        here, spread = x[mine], c[np.ix_(mine, mine)]
+        if gone:
+            pull = c[np.ix_(mine, gone)] @ np.linalg.inv(c[np.ix_(gone, gone)])
+            here, spread = here - pull @ x[gone], spread - pull @ c[np.ix_(gone, mine)]
+        gain = float(here @ np.linalg.solve(spread, here))
+        # Play is a width: what comes out negative is none.
+        negative = group[0].endswith("backlash") and here[0] <= 0.0
+        likely = 1.0 if negative else chance(gain, len(mine), scale, freedom)
+        return Tested(gain, likely, here, np.sqrt(np.maximum(np.diag(spread), 0.0)))
+
+    kept = entering_together(list(terms))
+    while kept:
+        beside = [term for group in kept for term in group]
+        tests = {group: told(group, beside) for group in kept}
+        worst = max(tests, key=lambda group: (tests[group].chance, -tests[group].chi2))
+        if tests[worst].chance <= enters:
+            break
+        kept.remove(worst)
+    chosen = tuple(term for term in terms if any(term in group for group in kept))
+    found = {}
+    for term in places:
+        found[term] = told((term,), chosen)
+        if term.endswith("harmonic 1"):  # what it gains alone, before the second one
+            alone = told((term,), [other for other in chosen if other != term.replace("1", "2")])
+            found[term] = replace(found[term], chi2=alone.chi2, chance=alone.chance)
+    return chosen, found
+
+
+def joint_numbers(chosen: Sequence[str]) -> list[int]:
+    """Return which of the ten numbers of ``calib.mast.joints.JOINTS_NAMES`` some terms have."""
+    wanted = [name for term in chosen for name in JOINT_TERMS.get(term, ())]
+    return sorted(JOINTS_NAMES.index(name) for name in wanted)

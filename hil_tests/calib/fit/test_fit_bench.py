@@ -1,0 +1,178 @@
+"""A bench fitted from pictures alone: pixels by OpenCV, poses by SciPy, joints by the simulator's gears."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from calib.fit.bench import BenchOptions, fit_bench
+from calib.fit.bench_calibration import BenchCalibration
+from calib.fit.bench_start import BenchNotFitted
+from calib.fit.uncertainty import pixel_covariance
+from calib.mast.rig import Mast
+from calib.rigid import Rigid
+from drivers.sim_survey.bench import NAVCAMS, BenchCamera, BenchPlan, Mishap, Placement, simulate_bench
+
+SERVO = {
+    "pan_harmonics": ((0.004, 0.0045), (0.001, -0.0017)),
+    "tilt_harmonics": ((0.003, -0.0052), (0.0015, 0.0013)),
+    "backlash_rad": 0.004,
+    "count_rad": 2 * np.pi / 4096,
+}
+"""Harmonics of 6 and 2 mrad, and a servo's counts."""
+
+IN_SIGMAS = 4.5
+"""How far anything of a test may be off."""
+
+
+def errors_in_sigmas(plan: BenchPlan, fit: BenchCalibration, camera: str) -> np.ndarray:
+    """Predicted less true pixels of points before the head, in sigmas."""
+    off = []
+    true = plan.cameras[camera]
+    for reading in ((0.05, -0.4), (-0.8, -0.15), (0.7, 0.0)):
+        angles = plan.rig.joints.true_rad(reading)
+        model = plan.rig.camera_in_rover(camera, *angles)
+        rays = model.ray(np.array([[200.0, 200.0], [512.0, 384.0], [800.0, 500.0]]))
+        points = rays.origins_m + 1.5 * rays.directions
+        truth = true.pixels(plan.mast.rover_from_head(*angles).inverse.points(points))
+        assert true.on == "head"
+        predicted, covariance = pixel_covariance(fit, camera, *fit.rig.joints.true_rad(reading), points)
+        off.append((predicted - truth) / np.sqrt(np.einsum("nii->ni", covariance)))
+    return np.array(off)
+
+
+def test_a_head_without_errors_is_found_from_rough_focal_lengths_alone() -> None:
+    plan = BenchPlan(attitudes=10)
+    fit = fit_bench(simulate_bench(3, plan))
+    assert not [t.name for t in fit.terms if t.entered]
+    assert fit.chi2_probability > 1e-3
+    for name, truth in plan.cameras.items():
+        assert np.abs(errors_in_sigmas(plan, fit, name)).max() < IN_SIGMAS
+        assert fit.rms_px[name] == pytest.approx((0.1, 0.1), rel=0.1)
+        assert fit.check_rms_px[name] == pytest.approx((0.1, 0.1), rel=0.2)
+        off = fit.rig.cameras[name].model.C - np.array(truth.place_m)
+        assert np.abs(off / np.array(fit.sigma["cameras"][name]["C"])).max() < IN_SIGMAS
+
+
+def test_harmonics_backlash_and_bow_enter_and_say_what_they_gain() -> None:
+    plan = BenchPlan(attitudes=16, bow_m=(0.002, -0.001), **SERVO)
+    fit = fit_bench(simulate_bench(1, plan))
+    entered = {t.name: t for t in fit.terms if t.entered}
+    assert {"pan harmonic 1", "pan backlash", "tilt harmonic 1", "tilt backlash", "bow of b1"} <= set(entered)
+    assert not {"axis offset", "axis twist"} & set(entered)
+    for axis in ("pan", "tilt"):
+        width = entered[f"{axis} backlash"]
+        assert abs(width.values[0] - 0.004) < IN_SIGMAS * width.sigma[0]
+        assert width.chi2 > 100 and width.chance < 1e-6
+        assert "lowers chi-square" in width.sentence
+    bow = entered["bow of b1"]
+    assert np.abs((bow.values - plan.bow_m) / bow.sigma).max() < IN_SIGMAS
+    # What matters of a joint is by how much the angle between two readings is off.
+    for axis, low, high in (("pan", -0.9, -0.7), ("pan", 0.6, 0.9), ("tilt", -0.6, -0.3), ("tilt", 0.0, 0.2)):
+        joint, true = getattr(fit.rig.joints, axis), getattr(plan.rig.joints, axis)
+        readings = np.array([low, high])
+        part = fit.part(f"joints.{axis}.")
+        rates = np.diff(joint.rates(readings, 1), axis=0)[0]
+        sigma = np.sqrt(rates @ fit.covariance[np.ix_(part, part)] @ rates)
+        assert sigma < 4e-4
+        off = np.diff(joint.true_rad(readings, 1)) - np.diff(true.true_rad(readings, 1))
+        assert abs(off[0]) < IN_SIGMAS * sigma
+
+
+def test_skew_axes_enter_when_they_are_there() -> None:
+    skew = Mast(np.zeros(3), np.zeros(3), 0.012, 0.006)
+    fit = fit_bench(simulate_bench(2, BenchPlan(attitudes=10, mast=skew)))
+    entered = {t.name: t for t in fit.terms if t.entered}
+    assert set(entered) >= {"axis offset", "axis twist"}
+    assert entered["axis offset"].values[0] == pytest.approx(0.012, abs=2e-4)
+    assert entered["axis twist"].values[0] == pytest.approx(0.006, abs=2e-4)
+
+
+def test_one_camera_is_enough() -> None:
+    plan = BenchPlan(cameras={"eye": BenchCamera(turn_rad=(0.01, -0.02, 0.01))}, attitudes=12)
+    fit = fit_bench(simulate_bench(4, plan))
+    assert fit.rig.stereo == {}
+    assert np.abs(errors_in_sigmas(plan, fit, "eye")).max() < IN_SIGMAS
+
+
+def test_a_body_camera_hangs_on_boards_that_head_cameras_see() -> None:
+    body = BenchCamera(
+        on="rover", size_px=(640, 480), focal_px=(420.0, 421.0), centre_px=(322.0, 238.0), lens=(-0.05, 0.01),
+        place_m=(0.2, 0.05, 0.6), turn_rad=(0.0, 0.15, 0.0),
+    )  # fmt: skip
+    plan = BenchPlan(
+        cameras={**NAVCAMS, "hazcam": body},
+        placements=(Placement(1.2, 0.0, -0.3), Placement(1.6, -0.2, -0.25, (0.3, 0.3, 0.0))),
+        attitudes=10,
+    )
+    fit = fit_bench(simulate_bench(5, plan))
+    off = fit.rig.cameras["hazcam"].model.C - np.array(body.place_m)
+    assert np.abs(off / np.array(fit.sigma["cameras"]["hazcam"]["C"])).max() < IN_SIGMAS
+    assert np.linalg.norm(off) < 0.003
+
+
+def test_gross_corners_and_a_picture_of_something_else_are_left_out_and_named() -> None:
+    plan = BenchPlan(attitudes=10, gross=0.015)
+    survey = simulate_bench(6, plan)
+    bad = survey.images[7].name
+    corners = dict(survey.corners)
+    rng = np.random.default_rng(1)
+    corners[bad] = replace(corners[bad], pixels_px=rng.uniform(50, 700, corners[bad].pixels_px.shape))
+    fit = fit_bench(replace(survey, corners=corners))
+    assert f"image {bad}" in {o.name for o in fit.outliers}
+    assert sum(o.kind == "dot" for o in fit.outliers) > 30
+    assert all(" corner " in o.name for o in fit.outliers if o.kind == "dot")
+    for name in plan.cameras:
+        assert np.abs(errors_in_sigmas(plan, fit, name)).max() < IN_SIGMAS
+
+
+@pytest.mark.parametrize(
+    ("mishap", "words"),
+    [
+        (Mishap("pan", 7, 0.02), "pan slipped by about"),
+        (Mishap("tilt", 14, 0.004), "tilt slipped by about 4.0 mrad"),
+        (Mishap("focus", 16, 0.01), "camera navcam_left was refocused"),
+        (Mishap("knock", 16, 0.004), "camera navcam_left was knocked"),
+        (Mishap("twin", 0, 0.4), "two boards have the same ids"),
+    ],
+)
+def test_what_changed_half_way_is_named_and_not_averaged(mishap: Mishap, words: str) -> None:
+    survey = simulate_bench(2, BenchPlan(attitudes=10, gross=0.005, mishaps=(mishap,)))
+    with pytest.raises(BenchNotFitted, match=words):
+        fit_bench(survey)
+
+
+@pytest.mark.parametrize("size_m", [0.05, 0.5])
+def test_a_board_that_moved_counts_as_two_placements_and_is_named(size_m: float) -> None:
+    plan = BenchPlan(attitudes=10, mishaps=(Mishap("board", 6, size_m),))
+    fit = fit_bench(simulate_bench(2, plan))
+    assert len(fit.rover_from_board) == 4
+    assert any("board b1 moved during placement p1" in note for note in fit.notes)
+    assert fit.chi2_probability > 1e-3
+    for name in plan.cameras:
+        assert np.abs(errors_in_sigmas(plan, fit, name)).max() < IN_SIGMAS
+
+
+def test_a_joint_that_hardly_moves_is_named() -> None:
+    survey = simulate_bench(1, BenchPlan(attitudes=8, reach_rad=(0.3, 0.01)))
+    with pytest.raises(BenchNotFitted, match=r"tilt moves by 1.* at most while camera navcam_.* sees one"):
+        fit_bench(survey)
+
+
+def test_too_few_pictures_say_what_is_missing() -> None:
+    survey = simulate_bench(1, BenchPlan(attitudes=3, checks=0, placements=(Placement(1.5),)))
+    with pytest.raises(BenchNotFitted, match="3 head positions where 4 at least"):
+        fit_bench(survey)
+
+
+def test_a_board_at_a_known_place_carries_the_rover_frame() -> None:
+    plan = BenchPlan(attitudes=10)
+    rover_from_mast = Rigid(np.eye(3), np.array([0.3, 0.0, -1.4]))
+    known = rover_from_mast @ plan.placements[0].mast_from_board
+    fit = fit_bench(simulate_bench(3, plan), BenchOptions(rover_from_board=(("b1", "p1"), known)))
+    sigma = np.array(fit.sigma["mast"]["translation_m"])
+    assert (sigma > 0).all()
+    assert np.abs((fit.rig.mast.translation_m - rover_from_mast.translation_m) / sigma).max() < IN_SIGMAS
+    assert "placement p1 of board b1, whose pose was stated" in fit.gauges[0]
