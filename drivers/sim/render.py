@@ -12,6 +12,7 @@ import threading
 from collections import OrderedDict
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import fields
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -136,6 +137,22 @@ class Renderer:
             return self._tables[key]
 
 
+class DrawsPictures(Protocol):
+    """What pictures are drawn with: a scene's `Renderer`, or one with more in it."""
+
+    def image(
+        self,
+        camera: CameraModel,
+        site_from_camera_frame: Rigid,
+        samples: int = 2,
+        rows: tuple[int, int] | None = None,
+    ) -> Float32:
+        """Return a picture."""
+
+    def close(self) -> None:
+        """Let go of what it has."""
+
+
 class Stills:
     """Pictures of poses seen lately, so that a camera at rest before a scene that stands is drawn once.
 
@@ -144,7 +161,7 @@ class Stills:
     camera sees (light, dust, exposure, temperature) comes after this, or joins the key. Safe from any thread.
     """
 
-    def __init__(self, renderer: Renderer) -> None:
+    def __init__(self, renderer: DrawsPictures) -> None:
         self._renderer = renderer
         self._lock = threading.Lock()
         self._images: OrderedDict[tuple[object, ...], Float32] = OrderedDict()

@@ -19,6 +19,8 @@ from types import MappingProxyType
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from calib.boards import AnyBoard
+from calib.boards.kinds import FLAT
 from calib.camera.cahvor import CameraModel
 from calib.errors import BadFile
 from calib.files.mast_file import load_rig
@@ -28,6 +30,7 @@ from drivers.clock import Clock
 from drivers.errors import BadOptions, NoFreshFrame
 from drivers.faults import FaultPanel, nearest
 from drivers.interfaces import PanTilt
+from drivers.sim.bench_boards import BenchBoard, BenchBoards, checked, facing
 from drivers.sim.camera_clock import ClockSettings
 from drivers.sim.camera_settings import check_cameras
 from drivers.sim.cameras import SelfExposedCamera, SimulatedCamera
@@ -125,7 +128,8 @@ class SimulatedRover:
         self.faults.set_all(settings.faults)
         check_clear_of(settings.scene.placed, self.rig)
         with drawing_compiled_beside():
-            self.scene, self._renderer = _made(settings.scene)
+            self.scene, renderer = _made(settings.scene)
+        self._renderer = BenchBoards(renderer)
         # Before any camera is asked: a frame's deadline is no time for a compiler.
         compile_renderer()
         if settings.scene.terrain is not None:
@@ -147,7 +151,7 @@ class SimulatedRover:
         start_s = self._start_s = clock.now_s()
         self._right_eyes = {right for _, right in self.rig.stereo.values()}
         self._lenses = {
-            name: Lens(settings.camera.lens, camera.model, name, settings.camera.seed, self.scene.cast)
+            name: Lens(settings.camera.lens, camera.model, name, settings.camera.seed, self._cast)
             for name, camera in self.rig.cameras.items()
         }
         self._through_lens: dict[str, tuple[NDArray[np.float32], NDArray[np.float32]]] = {}
@@ -198,6 +202,73 @@ class SimulatedRover:
         self.site_from_rover = self.scene.standing(x_m, y_m, heading_rad, pitch_rad, roll_rad)
         return self.site_from_rover
 
+    @property
+    def boards(self) -> Mapping[str, BenchBoard]:
+        """The boards that are held up before the rover, by name."""
+        return self._renderer.boards
+
+    def put_board(
+        self,
+        name: str,
+        board: AnyBoard | None,
+        position_m: ArrayLike,
+        *,
+        turned_rad: ArrayLike = (0.0, 0.0, 0.0),
+        rotation: FloatArray | None = None,
+        bow_m: tuple[float, float] | None = None,
+    ) -> BenchBoard:
+        """Have a board stand somewhere from the next picture on, and return it.
+
+        Parameters
+        ----------
+        board
+            What is printed on it; None for the board of this name that is there already.
+        position_m
+            (3,) of its middle, in the rover frame as the rover stands now.
+        turned_rad
+            How it is turned about its x, y and z after facing the mast upright (`bench_boards.facing`).
+        rotation
+            (3, 3) rover_from_board instead of that.
+        bow_m
+            How far its middle stands out (across, down); None: as before, flat at first.
+
+        Raises
+        ------
+        BadOptions
+            For a board that is not there and was not given, a place off the ground, or too much of a bow.
+        """
+        before = self.boards.get(name)
+        if board is None and before is None:
+            raise BadOptions(f"there is no board {name!r} yet, so what is printed on it is expected too")
+        rover_from_board = (
+            facing(self.rig.mast.translation_m, position_m, turned_rad)
+            if rotation is None
+            else Rigid(rotation, np.asarray(position_m, dtype=np.float64))
+        )
+        bow = bow_m if bow_m is not None else before.bow_m if before else FLAT
+        printed = board if board is not None else before.board if before else None
+        assert printed is not None
+        stands = checked(name, BenchBoard(printed, self.site_from_rover @ rover_from_board, bow), self.boards)
+        self._renderer.put(name, stands)
+        self._look_again()
+        return stands
+
+    def take_board(self, name: str) -> None:
+        """Take a board away. Raises BadOptions if there is none of this name."""
+        if name not in self.boards:
+            raise BadOptions(f"there is no board {name!r}{nearest(name, self.boards)}")
+        self._renderer.put(name, None)
+        self._look_again()
+
+    def _look_again(self) -> None:
+        """Forget pictures of what stood there before."""
+        self._stills = Stills(self._renderer)
+        self._metered_at.clear()
+
+    def _cast(self, origins_m: ArrayLike, directions: ArrayLike) -> FloatArray:
+        """How far rays of the site frame go, boards included."""
+        return self._renderer.cast(origins_m, directions, self.scene.cast(origins_m, directions))
+
     def frame_truth(self, camera: str, sequence: int) -> FrameTruth:
         """Return where a camera was when a frame was taken.
 
@@ -222,7 +293,7 @@ class SimulatedRover:
         if not rays.valid[0]:
             return None
         site_from_rover = truth.site_from_rover
-        ranges_m = self.scene.cast(
+        ranges_m = self._cast(
             site_from_rover.points(rays.origins_m), site_from_rover.vectors(rays.directions)
         )
         if not np.isfinite(ranges_m[0]):
@@ -322,7 +393,7 @@ class SimulatedRover:
                 return self._renderer.image(model, pose, samples, rows)
 
         model, row_time_s = self._model(name, time_s), self.settings.camera.row_time_s
-        return Shutter(model, row_time_s, partial(self._pose, name), draw, self.scene.cast)
+        return Shutter(model, row_time_s, partial(self._pose, name), draw, self._cast)
 
     def _at_rest(self, name: str, time_s: float) -> NDArray[np.float32]:
         """The picture of a moment through the lens, read-only; kept while nothing moves."""

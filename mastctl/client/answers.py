@@ -6,6 +6,21 @@ from __future__ import annotations
 from typing import Any, Literal, NotRequired, TypedDict
 
 
+class BoardStands(TypedDict):
+    """A board before a simulated rover: what it is, and rover_from_board."""
+
+    board: dict[str, Any]
+    position_m: list[float]
+    quaternion: list[float]
+    bow_m: list[float]
+
+
+class BoardsTold(TypedDict):
+    """The boards before a simulated rover, by name."""
+
+    boards: dict[str, BoardStands]
+
+
 class BoxTold(TypedDict):
     """Where the head must not be: [lowest, highest] of each joint, radians."""
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any, Literal, cast
 from urllib.parse import quote
@@ -14,6 +14,8 @@ from mastctl.client.lease import HeldLease
 
 if TYPE_CHECKING:
     from mastctl.client.answers import (
+        BoardStands,
+        BoardsTold,
         CalibrationHealthTold,
         ControlTold,
         EstopTold,
@@ -512,6 +514,56 @@ class Client:
         body = {"x_m": x_m, "y_m": y_m, "heading_rad": heading_rad}
         body |= {"pitch_rad": pitch_rad, "roll_rad": roll_rad}
         return cast("StandTold", self._daemon.command("POST", "/simulation/pose", body))
+
+    def boards(self) -> dict[str, BoardStands]:
+        """Return the boards held up before a simulated rover, by name: ``board``, ``position_m``,
+        ``quaternion`` (rover_from_board), ``bow_m``.
+        """
+        return cast("BoardsTold", self._daemon.json("GET", "/simulation/boards"))["boards"]
+
+    def put_board(
+        self,
+        name: str,
+        position_m: Sequence[float],
+        board: Mapping[str, Any] | None = None,
+        turned_rad: Sequence[float] | None = None,
+        quaternion: Sequence[float] | None = None,
+        bow_m: Sequence[float] | None = None,
+    ) -> BoardStands:
+        """Hold a board up before a simulated rover, or move it; frames exposed from now on show it there.
+
+        Parameters
+        ----------
+        position_m
+            (3,) of its middle in the rover frame as the rover truly stands.
+        board
+            What its BOARD.yaml holds; left out, the board of this name is moved that is there already.
+        turned_rad
+            How it is turned about its own x, y and z after facing the mast upright: the upper edge nearer,
+            the right edge nearer, clockwise.
+        quaternion
+            rover_from_board (w, x, y, z) instead of that.
+        bow_m
+            How far its middle stands out, across and down; left out: as before, flat at first.
+
+        Raises
+        ------
+        ClientError
+            ``not_simulated``, ``bad_options``, ``bad_board``.
+        """
+        body: dict[str, Any] = {"position_m": [float(value) for value in position_m]}
+        if board is not None:
+            body["board"] = dict(board)
+        for key, values in (("turned_rad", turned_rad), ("quaternion", quaternion), ("bow_m", bow_m)):
+            if values is not None:
+                body[key] = [float(value) for value in values]
+        return cast(
+            "BoardStands", self._daemon.command("POST", f"/simulation/boards/{quote(name, safe='')}", body)
+        )
+
+    def take_board(self, name: str) -> None:
+        """Take a board away from a simulated rover."""
+        self._daemon.command("DELETE", f"/simulation/boards/{quote(name, safe='')}")
 
     def simulation_time(self) -> TimeTold:
         """Return a simulated rover's time: ``now_s``, and ``speed``, a number or ``max``."""

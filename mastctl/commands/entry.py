@@ -81,6 +81,8 @@ LEASE_RELEASE = Command("lease.release")
 LEASE_TAKE = Command("lease.take")
 SIMULATION_POSE = Command("simulation.pose")  # acts on the world, not on the head
 SIMULATION_TIME = Command("simulation.time")
+SIMULATION_BOARD = Command("simulation.board")
+SIMULATION_BOARD_GONE = Command("simulation.board_gone")
 SIMULATION_FAULT = Command("simulation.fault")
 SIMULATION_FAULTS_OFF = Command("simulation.faults_off")
 

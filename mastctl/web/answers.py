@@ -522,6 +522,21 @@ class StandTold(_Told):
     quaternion: Annotated[list[float], Field(min_length=4, max_length=4)]
 
 
+class BoardStands(_Told):
+    """A board before a simulated rover: what it is, and rover_from_board."""
+
+    board: dict[str, Any]
+    position_m: Point
+    quaternion: Annotated[list[float], Field(min_length=4, max_length=4)]
+    bow_m: Annotated[list[float], Field(min_length=2, max_length=2)]
+
+
+class BoardsTold(_Told):
+    """The boards before a simulated rover, by name."""
+
+    boards: dict[str, BoardStands]
+
+
 class TimeTold(_Told):
     """A simulated rover's time, seconds, and its speed, where it has one."""
 

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import math
-from typing import Annotated, Literal, Self, cast
+from typing import Annotated, Any, Literal, Self, cast
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, StringConstraints, model_validator
 from scipy.spatial.transform import Rotation
 
@@ -273,6 +274,37 @@ class StandBody(_Strict):
     heading_rad: Angle
     pitch_rad: Slope = 0.0
     roll_rad: Slope = 0.0
+
+
+class BoardBody(_Strict):
+    """``POST /simulation/boards/{name}``: where a board is held up before a simulated rover.
+
+    ``board`` holds what a BOARD.yaml does (its ``schema`` may be left out); without it a board of this name
+    is moved that is there already. The place is in the rover frame as the rover stands now. Without
+    ``quaternion`` (w, x, y, z; rover_from_board) it faces the mast upright and is then turned about its own
+    x, y and z.
+    """
+
+    position_m: Place
+    board: dict[str, Any] | None = None
+    turned_rad: Annotated[list[Angle], Field(min_length=3, max_length=3)] | None = None
+    quaternion: Annotated[list[Part], Field(min_length=4, max_length=4)] | None = None
+    bow_m: Annotated[list[Metres], Field(min_length=2, max_length=2)] | None = None
+
+    @model_validator(mode="after")
+    def _one_turn(self) -> BoardBody:
+        if self.turned_rad is not None and self.quaternion is not None:
+            raise ValueError("quaternion and turned_rad are both there, one of them is expected")
+        if self.quaternion is not None and float(np.linalg.norm(self.quaternion)) < 1e-6:
+            raise ValueError(f"quaternion: {self.quaternion} where one that is not zero is expected")
+        return self
+
+    @property
+    def rotation(self) -> NDArray[np.float64] | None:
+        """rover_from_board, (3, 3), where a quaternion tells it."""
+        if self.quaternion is None:
+            return None
+        return np.asarray(Rotation.from_quat(self.quaternion, scalar_first=True).as_matrix())
 
 
 class TimeBody(_Strict):

@@ -5,28 +5,36 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING, Annotated, Any
 
-from fastapi import FastAPI, Query
+from fastapi import FastAPI, Path, Query
+from scipy.spatial.transform import Rotation
 
+from calib.boards.board_file import board_of, document_of
+from calib.errors import BadFile
 from drivers.faults import Fault as SetFault
 from drivers.faults import FaultPanel
 from drivers.simulation_clock import MAX, SimulationClock
 from mastctl.as_json import as_json
 from mastctl.commands.entry import (
+    SIMULATION_BOARD,
+    SIMULATION_BOARD_GONE,
     SIMULATION_FAULT,
     SIMULATION_FAULTS_OFF,
     SIMULATION_POSE,
     SIMULATION_TIME,
 )
-from mastctl.errors import NotKnown, NotNow
+from mastctl.errors import BadRequest, NotKnown, NotNow
 from mastctl.service.service import Service
 from mastctl.tracking.pose import RoverPose
 from mastctl.web import PREFIX
 from mastctl.web.commands import Commands, Headers
-from mastctl.web.models import FaultBody, FaultsQuery, StandBody, TimeBody
+from mastctl.web.models import BoardBody, FaultBody, FaultsQuery, StandBody, TimeBody
 from mastctl.web.waiting import Waiting
 
 if TYPE_CHECKING:
+    from drivers.sim.bench_boards import BenchBoard
     from drivers.sim.rover import SimulatedRover
+
+BoardName = Annotated[str, Path(pattern="^[A-Za-z0-9][A-Za-z0-9_-]{0,39}$")]
 
 
 def add_simulation(app: FastAPI, service: Service, waiting: Waiting, commands: Commands) -> None:
@@ -58,6 +66,53 @@ def add_simulation(app: FastAPI, service: Service, waiting: Waiting, commands: C
             return stands()
 
         return await commands.run(SIMULATION_POSE, came, body.model_dump(), put)
+
+    def board_told(stands: BenchBoard) -> dict[str, Any]:
+        pose = simulated("boards").site_from_rover.inverse @ stands.site_from_board
+        return {
+            "board": document_of(stands.board),
+            "position_m": pose.translation_m.tolist(),
+            "quaternion": Rotation.from_matrix(pose.rotation).as_quat(scalar_first=True).tolist(),
+            "bow_m": list(stands.bow_m),
+        }
+
+    def boards_told() -> dict[str, Any]:
+        return {"boards": {name: board_told(one) for name, one in simulated("boards").boards.items()}}
+
+    @app.get(f"{PREFIX}/simulation/boards", summary="The boards held up before the simulated rover")
+    async def boards() -> dict[str, Any]:
+        return await waiting.run(boards_told)
+
+    @app.post(f"{PREFIX}/simulation/boards/{{name}}", summary="Hold up a board, or move it")
+    async def put_board(name: BoardName, body: BoardBody, came: Headers) -> dict[str, Any]:
+        def put() -> dict[str, Any]:
+            rover = simulated("boards")
+            printed = None
+            if body.board is not None:
+                document = {key: value for key, value in body.board.items() if key != "schema"}
+                try:
+                    printed = board_of(name, "board", document)
+                except BadFile as error:
+                    raise BadRequest("bad_board", f"{error.place}: {error.reason}") from None
+            stands = rover.put_board(
+                name,
+                printed,
+                body.position_m,
+                turned_rad=body.turned_rad or (0.0, 0.0, 0.0),
+                rotation=body.rotation,
+                bow_m=(body.bow_m[0], body.bow_m[1]) if body.bow_m is not None else None,
+            )
+            return board_told(stands)
+
+        return await commands.run(SIMULATION_BOARD, came, {"name": name, **body.model_dump()}, put)
+
+    @app.delete(f"{PREFIX}/simulation/boards/{{name}}", summary="Take a board away from the simulated rover")
+    async def take_board(name: BoardName, came: Headers) -> dict[str, Any]:
+        def take() -> dict[str, Any]:
+            simulated("boards").take_board(name)
+            return boards_told()
+
+        return await commands.run(SIMULATION_BOARD_GONE, came, {"name": name}, take)
 
     def time_now() -> dict[str, Any]:
         simulated("clocks")

@@ -343,6 +343,8 @@ def test_any_json_gets_a_sentence_or_an_operation(quiet: httpx.Client, body: Any
         ("GET", "/api/v1/snapshot/navcam_left?frame_id=navcam_left-000009-x-y", 404, "frame_unknown"),
         ("GET", "/api/v1/simulation/faults", 404, "not_simulated"),
         ("DELETE", "/api/v1/simulation/faults", 404, "not_simulated"),
+        ("GET", "/api/v1/simulation/boards", 404, "not_simulated"),
+        ("DELETE", "/api/v1/simulation/boards/b1", 404, "not_simulated"),
     ],
 )
 def test_other_refusals_have_the_one_form(
