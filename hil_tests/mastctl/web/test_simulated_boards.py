@@ -52,7 +52,7 @@ BAD = {
     "too large a marker": (
         "x",
         {"board": {**BOARD, "marker_m": 0.1}},
-        "bad_file",
+        "bad_board",
         "board.marker_m: 0.1 where less",
     ),
     "far off": ("x", {"board": BOARD, "position_m": [100.0, 0, 0]}, "bad_options", "within 28 m"),
