@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from calib.camera.cahvor import CameraModel, Kind
+from calib.camera.opencv_camera import OpencvCamera
 from calib.errors import BadFile
 
 #: A shift of a pixel by the normalisation of A and O is told from this size on.
@@ -42,6 +43,9 @@ class CameraFile:
         Sentences for the user: what was changed on reading, what was not read.
     path, digest
         Where it was read and the SHA-256 of the bytes read; None and empty for one made in the program.
+    as_read
+        The camera as a file of OpenCV's families has it, in ``frame``; ``model`` is then the nearest to it,
+        and a note says how near. None where ``model`` is what the file holds.
     """
 
     model: CameraModel
@@ -51,6 +55,7 @@ class CameraFile:
     notes: tuple[str, ...] = ()
     path: Path | None = None
     digest: str = ""
+    as_read: OpencvCamera | None = None
 
     def __post_init__(self) -> None:
         for name in ("fit", "provenance"):

@@ -1,13 +1,28 @@
-"""One camera out of a file of any known format: told by content, written by suffix."""
+"""One camera out of a file of any known format, told by content; written as one, and what that costs."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+
+from calib.camera.cahvor import CameraModel
+from calib.camera.opencv_camera import LensKind, OpencvCamera
+from calib.camera.twin import GOOD_PX, Camera, TwinError, nearest_opencv, nearest_square, twin_error
 from calib.errors import BadFile
 from calib.files import CameraFile, read_bytes
-from calib.files.cahvor_text import looks_like_cahvor, parse_cahvor, save_cahvor
+from calib.files.atomic import save_bytes
+from calib.files.cahvor_text import internal_parameters, looks_like_cahvor, parse_cahvor, save_cahvor
+from calib.files.camera_info import (
+    format_camera_info,
+    looks_like_camera_info,
+    parse_camera_info,
+    without_last_mark,
+)
+from calib.files.colmap import format_colmap, looks_like_colmap, parse_colmap
+from calib.files.kalibr import format_kalibr, looks_like_kalibr, parse_kalibr
 from calib.files.mast_file import (
     CAMERA_SCHEMA,
     MAST_SCHEMA,
@@ -15,16 +30,62 @@ from calib.files.mast_file import (
     parse_camera,
     parse_rig,
     save_camera,
-    schema_of,
 )
+from calib.files.mrcal_model import format_mrcal, looks_like_mrcal, parse_mrcal, refuse_mirrored
+from calib.files.opencv_yaml import format_opencv, looks_like_opencv, parse_opencv
+from calib.files.other_lens import error_words
 from calib.files.pds3 import load_pds3_camera, looks_like_pds3
 from calib.files.pds3_image import MAX_FILE_BYTES
+from calib.files.yaml_text import parse_mapping
 
-KNOWN_FORMATS = "a mast file, a camera file, a .cahvor file or a PDS3 label"
+KNOWN_FORMATS = (
+    "a mast file, a camera file, a .cahvor file, a PDS3 label, OpenCV's or ROS's YAML, Kalibr's camchain, "
+    "mrcal's .cameramodel or COLMAP's cameras.txt"
+)
+
+LIMIT_PX = 0.25
+"""A conversion that moves a pixel by more than this is refused unless the caller sets another limit."""
+
+_BY_SUFFIX = {
+    ".cahvor": "cahvor",
+    ".cameramodel": "mrcal",
+    ".txt": "colmap",
+    ".yaml": "mastctl",
+    ".yml": "mastctl",
+}
+FORMATS = ("mastctl", "cahvor", "opencv", "ros", "kalibr", "mrcal", "colmap")
+
+_PINHOLE: LensKind = "pinhole"
+LENSES: dict[str, tuple[LensKind, tuple[int, ...]]] = {
+    "radtan": (_PINHOLE, (4,)),
+    "plumb_bob": (_PINHOLE, (5, 4)),
+    "rational_polynomial": (_PINHOLE, (8,)),
+    "equidistant": ("equidistant", (4,)),
+}
+"""The lenses that can be asked for: family, and how many coefficients files give it (the first fitted)."""
+
+_OFFERED: dict[str, tuple[str, ...]] = {
+    "opencv": ("plumb_bob", "rational_polynomial", "equidistant"),
+    "ros": ("plumb_bob", "rational_polynomial", "equidistant"),
+    "kalibr": ("radtan", "equidistant"),
+    "mrcal": ("cahvor", "plumb_bob", "rational_polynomial"),
+    "colmap": ("radtan", "rational_polynomial", "equidistant"),
+}
+"""Each format's lenses, the plainest first."""
+
+_NO_POSE = {"ros": "a camera_info", "colmap": "a cameras.txt"}
 
 
-def load_any(path: str | Path) -> StoredRig | CameraFile:
-    """Read a mast file, or the one camera of a camera file, .cahvor file or PDS3 label.
+@dataclass(frozen=True)
+class CameraFiles:
+    """Several cameras of one file, by name."""
+
+    cameras: Mapping[str, CameraFile]
+    path: Path
+
+
+def load_any(path: str | Path) -> StoredRig | CameraFile | CameraFiles:
+    """Read a mast file, or the camera (or cameras) of a file of any other known format.
 
     The content tells the format. Where it tells nothing the suffix says which format's refusal helps most.
 
@@ -37,37 +98,270 @@ def load_any(path: str | Path) -> StoredRig | CameraFile:
     suffix = Path(path).suffix.lower()
     if looks_like_pds3(data) or suffix in (".lbl", ".img"):
         return load_pds3_camera(path)
-    schema = schema_of(data)
+    if looks_like_mrcal(data) or suffix == ".cameramodel":
+        return parse_mrcal(data, path)
+    document = _document(data)
+    schema = document.get("schema")
     if schema == CAMERA_SCHEMA:
         return parse_camera(data, path)
-    if schema == MAST_SCHEMA or suffix in (".yaml", ".yml"):
+    if schema == MAST_SCHEMA:
+        return parse_rig(data, path)
+    if looks_like_kalibr(document):
+        return _one_or_all(parse_kalibr(data, path), path)
+    if looks_like_camera_info(document):
+        return parse_camera_info(data, path)
+    if looks_like_opencv(data) or "camera_matrix" in document:
+        return parse_opencv(data, path)
+    if suffix in (".yaml", ".yml"):
         return parse_rig(data, path)
     if suffix == ".cahvor" or looks_like_cahvor(data):
         return parse_cahvor(data, path)
+    if looks_like_colmap(data):
+        return _one_or_all(parse_colmap(data, path), path)
     raise BadFile(path, "", f"is not {KNOWN_FORMATS}")
+
+
+def _document(data: bytes) -> dict[str, object]:
+    """The keys of a YAML file, none if the bytes are no YAML of ours or ROS's or Kalibr's."""
+    try:
+        return parse_mapping(without_last_mark(data.removeprefix(b"%YAML:1.0")), "")
+    except BadFile:
+        return {}
+
+
+def _one_or_all(cameras: Mapping[str, CameraFile], path: str | Path) -> CameraFile | CameraFiles:
+    return next(iter(cameras.values())) if len(cameras) == 1 else CameraFiles(cameras, Path(path))
 
 
 @dataclass(frozen=True)
 class Conversion:
-    """What a conversion wrote: where, in which format, and what the format could not hold."""
+    """What a conversion wrote.
+
+    Attributes
+    ----------
+    path, format
+        Where, and in which format.
+    lost
+        A sentence each: what the format could not hold.
+    lens
+        The lens of the format that was taken for each camera; empty where the format holds the model itself.
+    errors
+        How far each camera as written is from what it was made of; exact ones too.
+    """
 
     path: Path
     format: str
     lost: tuple[str, ...]
+    lens: tuple[str, ...] = ()
+    errors: tuple[TwinError, ...] = ()
+
+    @property
+    def worst_px(self) -> float:
+        """The largest of the errors; 0 where nothing was fitted."""
+        return max((error.worst_px for error in self.errors), default=0.0)
 
 
-def save_any(camera: CameraFile, path: str | Path) -> Conversion:
-    """Save a camera as .yaml (a camera file) or .cahvor, whichever the suffix says.
+def format_of(path: str | Path) -> str:
+    """Return the format that a name asks for: by its suffix, or by the word before it (``left.ros.yaml``).
 
     Raises
     ------
     BadFile
-        If the suffix is another, or the file cannot be saved.
+        If the suffix is none of a known format.
     """
-    suffix = Path(path).suffix.lower()
-    if suffix in (".yaml", ".yml"):
-        save_camera(camera, path)
-        return Conversion(Path(path), CAMERA_SCHEMA, ())
-    if suffix == ".cahvor":
-        return Conversion(Path(path), "cahvor", save_cahvor(camera, path))
-    raise BadFile(path, "", f"suffix '{suffix}' where .yaml or .cahvor is expected")
+    suffixes = [suffix.lower() for suffix in Path(path).suffixes]
+    if len(suffixes) > 1 and suffixes[-2][1:] in FORMATS:
+        return suffixes[-2][1:]
+    suffix = suffixes[-1] if suffixes else ""
+    if suffix not in _BY_SUFFIX:
+        raise BadFile(path, "", f"suffix '{suffix}' where {', '.join(_BY_SUFFIX)} is expected")
+    return _BY_SUFFIX[suffix]
+
+
+def save_any(
+    camera: CameraFile | Mapping[str, CameraFile],
+    path: str | Path,
+    format: str = "",
+    lens: str = "",
+    limit_px: float = LIMIT_PX,
+) -> Conversion:
+    """Save a camera in the format named, else in the one that the file's name asks for (``format_of``).
+
+    Parameters
+    ----------
+    camera
+        One camera, or several by name for a format that holds several: ``kalibr``, ``colmap``.
+    path
+        The file.
+    format
+        One of ``FORMATS``; '' takes what the name asks for.
+    lens
+        The lens to take where the format has several (``radtan``, ``plumb_bob``, ``rational_polynomial``,
+        ``equidistant``, ``cahvor``); '' takes the plainest that comes near enough, else the one that comes
+        nearest.
+    limit_px
+        The largest distance between a pixel of the camera and of what is written, anywhere in the image.
+
+    Raises
+    ------
+    BadFile
+        If the format or lens is unknown or cannot hold this, a pixel would move by more than ``limit_px``,
+        or the file cannot be saved; then nothing has changed.
+    """
+    cameras = {"camera": camera} if isinstance(camera, CameraFile) else dict(camera)
+    to = format or format_of(path)
+    if to not in FORMATS:
+        raise BadFile(path, "", f"format '{to[:20]}' where one of {', '.join(FORMATS)} is expected")
+    if len(cameras) != 1 and to not in ("kalibr", "colmap"):
+        raise BadFile(
+            path, "", f"{len(cameras)} cameras where one is expected; kalibr and colmap hold several"
+        )
+    if len({one.frame for one in cameras.values()}) > 1 and to == "kalibr":
+        raise BadFile(path, "", "the cameras are in several frames; a camchain places them in one")
+    if to in ("mastctl", "cahvor"):
+        if lens:
+            raise BadFile(path, "", f"'{to}' holds the camera's own model; leave the lens out")
+        (only,) = cameras.values()
+        errors = _reading_error(only, path, limit_px)
+        if to == "cahvor":
+            return Conversion(Path(path), "cahvor", save_cahvor(only, path), (), errors)
+        save_camera(only, path)
+        return Conversion(Path(path), CAMERA_SCHEMA, (), (), errors)
+    return _save_twins(cameras, path, to, lens, limit_px)
+
+
+def _reading_error(camera: CameraFile, path: str | Path, limit_px: float) -> tuple[TwinError, ...]:
+    """What reading a camera of another family cost; nothing where the model is what was read."""
+    if camera.as_read is None:
+        return ()
+    error = twin_error(camera.as_read, camera.model)
+    _hold(error, limit_px, f"as {camera.model.kind}", "", path)
+    return (error,)
+
+
+def _hold(error: TwinError, limit_px: float, what: str, why: str, path: str | Path) -> None:
+    if not error.worst_px <= limit_px:
+        far = "does not see all of the image" if np.isinf(error.worst_px) else f"is {error_words(error)}"
+        raise BadFile(path, "", f"{what} {far}; the limit is {limit_px:g} px{why}")
+
+
+def _save_twins(
+    cameras: Mapping[str, CameraFile], path: str | Path, to: str, lens: str, limit_px: float
+) -> Conversion:
+    """Write the nearest cameras that a format of other lenses holds."""
+    offered = _OFFERED[to]
+    if lens and lens not in offered:
+        raise BadFile(path, "", f"lens '{lens[:20]}' where one of {', '.join(offered)} is expected for {to}")
+    found: dict[str, tuple[str, Camera, TwinError]] = {}
+    for name, camera in cameras.items():
+        refuse_mirrored(camera.model, path)
+        found[name] = _nearest(camera, (lens,) if lens else offered, path)
+        taken, _, error = found[name]
+        _hold(error, limit_px, f"'{name}' as {taken}", _why(camera.model), path)
+    frame = next(iter(cameras.values())).frame
+    twins = {name: twin for name, (_, twin, _) in found.items()}
+    first = next(iter(twins.values()))
+    opencv = {name: twin for name, twin in twins.items() if isinstance(twin, OpencvCamera)}
+    match to:
+        case "kalibr":
+            data = format_kalibr(opencv, frame)
+        case "colmap":
+            data = format_colmap(opencv)
+        case "ros":
+            ((name, (taken, _, _)),) = found.items()
+            data = format_camera_info(opencv[name], taken, name)
+        case "mrcal":
+            assert isinstance(first, CameraModel | OpencvCamera)
+            data = format_mrcal(first, frame)
+        case _:
+            (only,) = opencv.values()
+            data = format_opencv(only, frame)
+    save_bytes(path, data)
+    lost = list(_lost(cameras, twins, to, frame))
+    return Conversion(
+        Path(path),
+        to,
+        tuple(lost),
+        tuple(t for t, _, _ in found.values()),
+        tuple(e for _, _, e in found.values()),
+    )
+
+
+def _nearest(camera: CameraFile, lenses: tuple[str, ...], path: str | Path) -> tuple[str, Camera, TwinError]:
+    """Lens, twin and error: the plainest lens that is good enough, else the nearest of them."""
+    original: Camera = camera.as_read or camera.model
+    near = camera.model.lens.moving
+    best: tuple[str, Camera, TwinError] | None = None
+    problem = ""
+    for name in lenses:
+        try:
+            with np.errstate(all="ignore"):
+                twin = _twin(camera, name)
+                error = twin_error(original, twin, near)
+        except (ValueError, np.linalg.LinAlgError) as reason:
+            problem = str(reason)
+            continue
+        if best is None or error.worst_px < 0.5 * best[2].worst_px:
+            best = name, twin, error
+        if error.worst_px <= GOOD_PX:
+            break
+    if best is None:
+        raise BadFile(path, "", f"the camera has no twin in this format: {problem}")
+    return best
+
+
+def _twin(camera: CameraFile, lens: str) -> Camera:
+    """The camera itself where the lens holds it, else the nearest one."""
+    if lens == "cahvor":
+        return camera.model if _is_square(camera.model) else nearest_square(camera.model)
+    family, counts = LENSES[lens]
+    was = camera.as_read
+    if was is not None and was.lens == family:
+        used = np.flatnonzero(was.distortion).tolist()
+        kept = was.distortion[: used[-1] + 1] if used else np.zeros(0)
+        count = next((count for count in sorted(counts) if count >= len(kept)), None)
+        if count is not None:
+            told = np.concatenate([kept, np.zeros(count - len(kept))])
+            return OpencvCamera(family, was.size_px, was.focal_px, was.center_px, told, was.frame_from_camera)
+    return nearest_opencv(camera.model, family, [True] * counts[0])
+
+
+def _is_square(model: CameraModel) -> bool:
+    """Whether H and V are at right angles as far as numbers can say."""
+    return abs(internal_parameters(model)["Theta"] + np.pi / 2) < 1e-12
+
+
+def _why(model: CameraModel) -> str:
+    """What of a camera other families have no place for, as the end of a sentence."""
+    off_rad = internal_parameters(model)["Theta"] + np.pi / 2
+    reasons = []
+    if abs(off_rad) > 1e-5:
+        reasons.append(f"H and V are {1e3 * off_rad:.2g} mrad off a right angle")
+    if model.lens.moving:
+        reasons.append("the entrance point moves")
+    if (beside := float(np.arccos(min(1.0, float(model.A @ model.O))))) > 1e-5:
+        reasons.append(f"O is {1e3 * beside:.2g} mrad beside A")
+    return f" ({', '.join(reasons)})" if reasons else ""
+
+
+def _lost(
+    cameras: Mapping[str, CameraFile], twins: Mapping[str, Camera], to: str, frame: str
+) -> tuple[str, ...]:
+    """What a format of other lenses cannot hold, a sentence each."""
+    lost = []
+    if to in _NO_POSE:
+        for name, twin in twins.items():
+            assert isinstance(twin, OpencvCamera)
+            pose = twin.frame_from_camera
+            rows = ", ".join(f"[{', '.join(f'{value:.9g}' for value in row)}]" for row in pose.rotation)
+            where = ", ".join(f"{value:.9g}" for value in pose.translation_m)
+            lost.append(
+                f"{_NO_POSE[to]} cannot hold where '{name}' is: in '{frame}' at [{where}] m, its x, y, z the "
+                f"columns of [{rows}]"
+            )
+    elif to in ("mrcal", "kalibr"):
+        lost.append(f"the pose is in the frame '{frame}', whose name is only a comment of the file")
+    for key in ("fit", "provenance"):
+        if any(getattr(camera, key) for camera in cameras.values()):
+            lost.append(f"'{to}' cannot hold '{key}'")
+    return tuple(lost)

@@ -8,11 +8,19 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mastctl.cli import cameras, output
-from mastctl.cli.mast_files import camera_name, need_joints, tell_notes
-from mastctl.cli.output import finite_number
+from mastctl.cli.mast_files import camera_name, nearest_of, need_joints, tell_notes
+from mastctl.cli.output import finite_number, positive_number
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from calib.camera.cahvor import CameraModel
+    from calib.files import CameraFile
+    from calib.files.any_camera import CameraFiles, Conversion
+    from calib.files.mast_file import StoredRig
+
+
+_SOURCES = "mast or camera file, .cahvor, PDS3 label, OpenCV's, ROS's, Kalibr's, mrcal's or COLMAP's"
 
 
 def add_commands(subparsers: Any) -> None:
@@ -33,11 +41,41 @@ def add_commands(subparsers: Any) -> None:
     ray.set_defaults(run=camera_ray)
 
     convert = actions.add_parser(
-        "convert", help="write a camera as .yaml or .cahvor; says what the target format cannot hold"
+        "convert",
+        help="write a camera in another format; says what that cannot hold, and the worst error in px",
     )
-    convert.add_argument("source", type=Path, metavar="IN", help="mast or camera file, .cahvor, PDS3 label")
-    convert.add_argument("target", type=Path, metavar="OUT", help="a .yaml or .cahvor file")
-    convert.add_argument("--camera", metavar="NAME", help="which camera, where IN holds several")
+    convert.add_argument("source", type=Path, metavar="IN", help=_SOURCES)
+    convert.add_argument(
+        "target",
+        type=Path,
+        metavar="OUT",
+        help="x.yaml (a camera file), x.cahvor, x.cameramodel, x.txt (COLMAP), "
+        "x.opencv.yaml, x.ros.yaml, x.kalibr.yaml",
+    )
+    convert.add_argument(
+        "--camera",
+        metavar="NAME",
+        action="append",
+        help="which camera, where IN holds several; again for each camera of a Kalibr or COLMAP file",
+    )
+    convert.add_argument(
+        "--to",
+        choices=("mastctl", "cahvor", "opencv", "ros", "kalibr", "mrcal", "colmap"),
+        default="",
+        help="the format, where the name of OUT does not say it",
+    )
+    convert.add_argument(
+        "--lens",
+        choices=("cahvor", "radtan", "plumb_bob", "rational_polynomial", "equidistant"),
+        default="",
+        help="the lens of OUT (default: the plainest of its format that comes near enough)",
+    )
+    convert.add_argument(
+        "--limit-px",
+        type=positive_number,
+        metavar="PX",
+        help="refuse if a pixel anywhere in the image moves by more (default 0.25)",
+    )
     convert.set_defaults(run=camera_convert)
 
     cameras.add_actions(actions)
@@ -45,7 +83,7 @@ def add_commands(subparsers: Any) -> None:
 
 def _add_camera_options(parser: argparse.ArgumentParser) -> None:
     """Add the options that choose a camera model."""
-    parser.add_argument("file", type=Path, metavar="FILE", help="mast or camera file, .cahvor, PDS3 label")
+    parser.add_argument("file", type=Path, metavar="FILE", help=_SOURCES)
     parser.add_argument("--camera", metavar="NAME", help="which camera, where FILE holds several")
     parser.add_argument(
         "--pan", type=finite_number, metavar="RAD", help="true joint angle, for a head camera"
@@ -80,56 +118,90 @@ def camera_ray(args: argparse.Namespace) -> int:
 
 def camera_convert(args: argparse.Namespace) -> int:
     """Write a camera of a file in another format, and say what that format cannot hold."""
-    from calib.files import CameraFile
-    from calib.files.any_camera import load_any, save_any
+    from calib.files.any_camera import LIMIT_PX, load_any, save_any
+    from calib.files.mast_file import StoredRig
 
     source = load_any(args.source)
-    if not isinstance(source, CameraFile):
-        if args.target.exists() and args.target.samefile(args.source):
-            words = "one camera would take the place of the mast and all its cameras"
-            raise output.WrongUse(f"OUT is the mast file {args.source} itself: {words}; give another file")
-        camera = source.rig.cameras[camera_name(source, args.camera)]
-        provenance = {"mast_file_sha256": source.digest, **source.rig.provenance}
-        left_out = ("the mast file's 'fit' is left out",) if source.rig.fit else ()
-        source = CameraFile(camera.model, camera.on, {}, provenance, source.notes + left_out)
-    else:
-        _refuse_name(args)
-    done = save_any(source, args.target)
+    if isinstance(source, StoredRig) and args.target.exists() and args.target.samefile(args.source):
+        words = "one camera would take the place of the mast and all its cameras"
+        raise output.WrongUse(f"OUT is the mast file {args.source} itself: {words}; give another file")
+    names = args.camera or [None]
+    if len(set(names)) < len(names):
+        raise output.WrongUse("--camera names one camera twice")
+    cameras = dict(_camera_of(source, name) for name in names)
+    limit_px = LIMIT_PX if args.limit_px is None else args.limit_px
+    done = save_any(cameras, args.target, args.to, args.lens, limit_px)
+    notes = list(dict.fromkeys(note for camera in cameras.values() for note in camera.notes))
+    (frame,) = {camera.frame for camera in cameras.values()}
     if args.json:
-        output.print_json(
-            {
-                "out": str(done.path),
-                "format": done.format,
-                "frame": source.frame,
-                "lost": list(done.lost),
-                "notes": list(source.notes),
-            }
-        )
+        told: dict[str, Any] = {"out": str(done.path), "format": done.format, "frame": frame}
+        told |= {"lost": list(done.lost), "notes": notes}
+        if done.errors:
+            told["cameras"] = _errors_told(cameras, done)
+        output.print_json(told)
         return 0
-    sys.stdout.write(output.one_line(f"{done.path}: {done.format}, frame '{source.frame}'") + "\n")
-    for sentence in (*source.notes, *done.lost):
+    sys.stdout.write(output.one_line(f"{done.path}: {done.format}, frame '{frame}'") + "\n")
+    for name, error in _errors_told(cameras, done).items():
+        words = f", {error['lens']}" if error["lens"] else ""
+        told_px = f"worst {error['worst_px']:.2g} px, {error['rms_px']:.2g} px rms over the image"
+        sys.stdout.write(output.one_line(f"{name}{words}: {told_px}") + "\n")
+    for sentence in (*notes, *done.lost):
         sys.stdout.write(output.one_line(sentence) + "\n")
     return 0
 
 
+def _errors_told(cameras: Mapping[str, CameraFile], done: Conversion) -> dict[str, dict[str, Any]]:
+    """Lens and error in px of each camera that was not written as it is."""
+    lenses = done.lens or ("",) * len(done.errors)
+    return {
+        name: {"lens": lens, "worst_px": error.worst_px, "rms_px": error.rms_px}
+        for name, lens, error in zip(cameras, lenses, done.errors, strict=False)
+    }
+
+
+def _camera_of(source: StoredRig | CameraFile | CameraFiles, name: str | None) -> tuple[str, CameraFile]:
+    """Return the camera that is meant, and its name. Raises WrongUse."""
+    from calib.files import CameraFile
+    from calib.files.any_camera import CameraFiles
+
+    if isinstance(source, CameraFile):
+        _refuse_name(name)
+        return "camera", source
+    if isinstance(source, CameraFiles):
+        cameras = source.cameras
+        if name is None:
+            raise output.WrongUse(
+                f"{source.path} holds several cameras; --camera with one of {', '.join(cameras)}"
+            )
+        if name not in cameras:
+            raise output.WrongUse(f"no camera '{name}' in {source.path}; {nearest_of(name, cameras)}")
+        return name, cameras[name]
+    name = camera_name(source, name)
+    camera = source.rig.cameras[name]
+    provenance = {"mast_file_sha256": source.digest, **source.rig.provenance}
+    left_out = ("the mast file's 'fit' is left out",) if source.rig.fit else ()
+    return name, CameraFile(camera.model, camera.on, {}, provenance, source.notes + left_out)
+
+
 def _chosen_model(args: argparse.Namespace) -> CameraModel:
     """Return the camera of --camera at --pan and --tilt in the rover frame, or a single camera as it is."""
-    from calib.files import CameraFile
     from calib.files.any_camera import load_any
+    from calib.files.mast_file import StoredRig
 
     source = load_any(args.file)
-    tell_notes(source.notes)
-    if isinstance(source, CameraFile):
-        _refuse_name(args)
+    if not isinstance(source, StoredRig):
+        _, camera = _camera_of(source, args.camera)
+        tell_notes(camera.notes)
         if args.pan is not None or args.tilt is not None:
             raise output.WrongUse(f"{args.file} has no mast; leave --pan and --tilt out")
-        return source.model
+        return camera.model
+    tell_notes(source.notes)
     name = camera_name(source, args.camera)
     need_joints(source.rig, name, args)
     return source.rig.camera_in_rover(name, args.pan or 0.0, args.tilt or 0.0)
 
 
-def _refuse_name(args: argparse.Namespace) -> None:
+def _refuse_name(name: str | None) -> None:
     """Refuse --camera where the file holds one camera without a name."""
-    if args.camera is not None:
+    if name is not None:
         raise output.WrongUse("the file holds one camera without a name; leave --camera out")

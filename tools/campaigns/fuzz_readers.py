@@ -19,7 +19,7 @@ import signal
 import tempfile
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -29,8 +29,13 @@ import numpy as np
 from calib.errors import BadFile
 from calib.files import CameraFile
 from calib.files.cahvor_text import format_cahvor, parse_cahvor
+from calib.files.camera_info import parse_camera_info
+from calib.files.colmap import parse_colmap
+from calib.files.kalibr import parse_kalibr
 from calib.files.mast_file import StoredRig, parse_camera, parse_rig
+from calib.files.mrcal_model import parse_mrcal
 from calib.files.odl import parse_label
+from calib.files.opencv_yaml import parse_opencv
 from calib.files.pds3 import load_pds3_camera, read_product
 from calib.files.tables import parse_table
 from mastctl.cli.main import main as mastctl
@@ -98,6 +103,59 @@ GROUP = GEOMETRIC_CAMERA_MODEL
 END_GROUP = GEOMETRIC_CAMERA_MODEL
 END
 """
+_OPENCV = b"""%YAML:1.0
+---
+image_width: 64
+image_height: 48
+camera_matrix: !!opencv-matrix
+   rows: 3
+   cols: 3
+   dt: d
+   data: [ 60., 0., 31.9, 0., 60.1, 24.1, 0., 0., 1. ]
+distortion_coefficients: !!opencv-matrix
+   rows: 1
+   cols: 5
+   dt: d
+   data: [ -3.1e-01, 1.2e-01, 1.e-03, -7.e-04, 2.e-02 ]
+"""
+_INFO = b"""image_width: 64
+image_height: 48
+camera_name: left
+camera_matrix: {rows: 3, cols: 3, data: [60, 0, 31.9, 0, 60.1, 24.1, 0, 0, 1]}
+distortion_model: rational_polynomial
+distortion_coefficients: {rows: 1, cols: 8, data: [0.4, 0.05, 0.001, -0.0007, 0.002, 0.75, 0.1, 0.005]}
+rectification_matrix: {rows: 3, cols: 3, data: [1, 0, 0, 0, 1, 0, 0, 0, 1]}
+"""
+_CHAIN = b"""cam0:
+  camera_model: pinhole
+  intrinsics: [46.1, 46.2, 36.7, 24.6]
+  distortion_model: radtan
+  distortion_coeffs: [-0.277, 0.067, 0.0009, 0.0001]
+  resolution: [75, 48]
+cam1:
+  camera_model: pinhole
+  intrinsics: [45.0, 45.5, 37.3, 25.3]
+  distortion_model: equidistant
+  distortion_coeffs: [-0.03, 0.012, -0.004, 0.0006]
+  resolution: [75, 48]
+  T_cn_cnm1:
+  - [0, 0, 1, -0.11]
+  - [0, 1, 0, 0.002]
+  - [-1, 0, 0, 0.003]
+  - [0, 0, 0, 1]
+"""
+_MRCAL = b"""# generated
+{ 'lensmodel':  'LENSMODEL_CAHVORE_linearity=0.37',
+  'intrinsics': [ 122.5, 122.25, 51.25, 38.5, 0.0087, -0.0042, 0.0, -0.11, 0.05, 0.01, 0.0, 0.0,],
+  'extrinsics': [ 0.1, 0.2, -0.3, 1, 2, 3,],
+  'imagersize': [ 102, 76,],
+  'optimization_inputs': b'P)h>@6aWA{K2;]}#',
+}
+"""
+_COLMAP = b"""# cameras
+1 SIMPLE_RADIAL 64 48 60 32 24.5 -0.1
+7 OPENCV_FISHEYE 64 48 60 60.1 32 24 -0.03 0.01 1e-3 0
+"""
 
 #: One valid file of each kind.
 VALID: dict[str, bytes] = {
@@ -105,6 +163,11 @@ VALID: dict[str, bytes] = {
     "camera.yaml": b"schema: mastctl/camera/1\nframe: bench\n" + _CAMERA,
     "camera.cahvor": _CAHVOR,
     "product.img": _LABEL.ljust(19 * 64) + bytes(range(24)),
+    "camera.opencv.yaml": _OPENCV,
+    "camera.ros.yaml": _INFO,
+    "chain.kalibr.yaml": _CHAIN,
+    "camera.cameramodel": _MRCAL,
+    "cameras.txt": _COLMAP,
     "points.csv": b"x_m,y_m,z_m\n10,1,-2\n-1,0,0\nnan,0,0\n,,\n1e300,-1e-300,0\n",
     "pixels.csv": b"x_px,y_px\n320,240\n-1e9,0\ninf,0\n",
 }
@@ -198,6 +261,11 @@ def _use_rig(stored: StoredRig) -> None:
         _use_model(CameraFile(stored.rig.camera_in_rover(name, 0.3, -0.2), "rover"))
 
 
+def _use_all(cameras: Mapping[str, CameraFile]) -> None:
+    for camera in cameras.values():
+        _use_model(camera)
+
+
 def _product(data: bytes, path: str) -> None:
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / path
@@ -213,6 +281,11 @@ READERS: dict[str, tuple[str, Callable[[bytes], Any]]] = {
     "cahvor": ("camera.cahvor", lambda data: _use_model(parse_cahvor(data, "f"))),
     "label": ("product.img", lambda data: parse_label(data.decode("latin-1"), "f")),
     "product": ("product.img", lambda data: _product(data, "product.img")),
+    "opencv": ("camera.opencv.yaml", lambda data: _use_model(parse_opencv(data, "f"))),
+    "ros": ("camera.ros.yaml", lambda data: _use_model(parse_camera_info(data, "f"))),
+    "kalibr": ("chain.kalibr.yaml", lambda data: _use_all(parse_kalibr(data, "f"))),
+    "mrcal": ("camera.cameramodel", lambda data: _use_model(parse_mrcal(data, "f"))),
+    "colmap": ("cameras.txt", lambda data: _use_all(parse_colmap(data, "f"))),
     "points": ("points.csv", lambda data: parse_table(data, "f", ("x_m", "y_m", "z_m"))),
     "pixels": ("pixels.csv", lambda data: parse_table(data, "f", ("x_px", "y_px"))),
 }
@@ -227,6 +300,11 @@ COMMANDS: list[tuple[str, str]] = [
     ("camera convert product.img out.yaml", "product.img"),
     ("camera convert camera.cahvor out.cahvor", "camera.cahvor"),
     ("camera convert mast.yaml out.cahvor --camera eye_right", "mast.yaml"),
+    ("camera convert camera.opencv.yaml out.ros.yaml", "camera.opencv.yaml"),
+    ("camera convert camera.ros.yaml out.cameramodel --limit-px 5", "camera.ros.yaml"),
+    ("camera convert chain.kalibr.yaml out.yaml --camera cam1", "chain.kalibr.yaml"),
+    ("camera convert camera.cameramodel out.kalibr.yaml --limit-px 9", "camera.cameramodel"),
+    ("camera convert cameras.txt out.opencv.yaml --camera 7", "cameras.txt"),
     ("solve mast.yaml --camera eye_left --target 5 -1 0.5", "mast.yaml"),
     ("triangulate mast.yaml --pair eye --pan 0 --tilt 0 --left 300 240 --right 280 240", "mast.yaml"),
 ]
@@ -251,8 +329,13 @@ def check_command(words: str, file: str, data: bytes, folder: Path) -> str:
     for out in folder.glob("out*"):
         out.unlink()
     before = {path.name: path.read_bytes() for path in folder.iterdir()}
-    stdout, stderr = io.StringIO(), io.StringIO()
-    with contextlib.chdir(folder), contextlib.redirect_stdout(stdout), contextlib.redirect_stderr(stderr):
+    stdout = io.StringIO()
+    with (
+        open(os.devnull, "w") as stderr,  # noqa: PTH123  a real file: the log goes to its descriptor
+        contextlib.chdir(folder),
+        contextlib.redirect_stdout(stdout),
+        contextlib.redirect_stderr(stderr),
+    ):
         code = mastctl([*words.split(), "--json"])
     after = {path.name: path.read_bytes() for path in folder.iterdir()}
     if code == 0:

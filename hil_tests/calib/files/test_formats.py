@@ -382,7 +382,7 @@ def test_a_file_of_no_known_format_is_refused(tmp_path: Path, name: str, data: b
 
 def test_saving_by_another_suffix_is_refused(tmp_path: Path) -> None:
     camera = store.parse_camera(CAMERA_TEXT.encode(), "x")
-    with pytest.raises(BadFile, match=r"\.yaml or \.cahvor"):
+    with pytest.raises(BadFile, match=r"suffix '\.lbl' where \.cahvor"):
         save_any(camera, tmp_path / "a.lbl")
     assert not list(tmp_path.iterdir())
 
