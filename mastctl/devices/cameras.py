@@ -102,7 +102,7 @@ class Cameras:
             self._check_sizes()
 
     def frames(
-        self, cameras: Sequence[str], exposed_after_s: float, timeout_s: float
+        self, cameras: Sequence[str], exposed_after_s: float, timeout_s: float, told: bool = True
     ) -> dict[str, StampedFrame]:
         """Return one frame of each camera, asked for in parallel, with its facts.
 
@@ -118,6 +118,8 @@ class Cameras:
             Only frames whose exposure began after this moment count, seconds of CLOCK_MONOTONIC.
         timeout_s
             What each camera is given, seconds; the call itself ends at most the grace and 1 s later.
+        told
+            Whether the frame is told of, and recorded; False for one that is only watched.
 
         Raises
         ------
@@ -137,7 +139,7 @@ class Cameras:
         names = tuple(dict.fromkeys(cameras))
         if len(names) < 2:
             frames = self._fetched(dict.fromkeys(names, exposed_after_s), deadline_s)
-            return {name: self._stamped(name, frame) for name, frame in frames.items()}
+            return {name: self._stamped(name, frame, told) for name, frame in frames.items()}
         used_s = max(self._paired_s.get(name, -math.inf) for name in names)
         pairing = Pairing(names[0], self._offsets(names, deadline_s))
         frames = self._fetched(pairing.moments(max(exposed_after_s, used_s)), deadline_s)
@@ -147,7 +149,7 @@ class Cameras:
                 raise NoFreshFrame(words, device=min(after_s))
             frames |= self._fetched(after_s, deadline_s)
         self._paired_s |= {name: frame.exposure_began_s for name, frame in frames.items()}
-        return self._together({name: self._stamped(name, frame) for name, frame in frames.items()})
+        return self._together({name: self._stamped(name, frame, told) for name, frame in frames.items()})
 
     def _offsets(self, names: Sequence[str], deadline_s: float) -> dict[str, Offset]:
         """What is known of each camera's times beside the first one's."""
@@ -181,8 +183,12 @@ class Cameras:
             for camera, told in asked.items()
         }
 
-    def _stamped(self, camera: str, frame: Frame | StampedFrame) -> StampedFrame:
-        return frame if isinstance(frame, StampedFrame) else self._stamp(camera, frame)
+    def _stamped(self, camera: str, frame: Frame | StampedFrame, told: bool) -> StampedFrame:
+        if not isinstance(frame, StampedFrame):
+            return self._stamp(camera, frame, told)
+        if told:
+            self._store.tell(frame)  # until now it was only watched
+        return frame
 
     def _together(self, frames: dict[str, StampedFrame]) -> dict[str, StampedFrame]:
         """Frames that serve one measurement: if the head moved between two exposures, it moved in all."""
@@ -211,6 +217,14 @@ class Cameras:
                 "frame_too_old", f"frame {frame_id} is {age_s:.0f} s old, at most {max_age_s:.0f} s is taken"
             )
         return frame
+
+    def hold(self, frame: StampedFrame, by: str, kept: int) -> None:
+        """Keep a frame for who looks at it, as `mastctl.devices.frames.FrameStore.hold`."""
+        self._store.hold(frame, by, kept)
+
+    def let_go(self, by: str) -> None:
+        """Hold nothing more for somebody."""
+        self._store.let_go(by)
 
     def newest_frames(self) -> dict[str, StampedFrame | None]:
         """Return each configured camera's newest frame, None where there is none yet; asks no camera."""
@@ -334,7 +348,7 @@ class Cameras:
 
     # In the caller's thread
 
-    def _stamp(self, camera: str, frame: Frame) -> StampedFrame:
+    def _stamp(self, camera: str, frame: Frame, told: bool) -> StampedFrame:
         """Give a frame its joint angles and id, and keep it."""
         began_s = frame.mid_exposure_s - frame.exposure_s / 2
         ended_s = frame.mid_exposure_s + frame.exposure_s / 2
@@ -364,7 +378,7 @@ class Cameras:
         )
         with self._stamping[camera]:
             self._check_alive(stamped)
-            return self._store.add(stamped)
+            return self._store.add(stamped, told)
 
     def _check_alive(self, frame: StampedFrame) -> None:
         """Refuse a head camera's picture that did not change at all while the head moved."""

@@ -30,7 +30,7 @@ from mastctl.devices.cameras import Cameras
 from mastctl.devices.door import REST_S, Door
 from mastctl.devices.fault_watch import FaultWatch
 from mastctl.devices.faults import FaultWords
-from mastctl.devices.frames import FrameStore, StampedFrame
+from mastctl.devices.frames import ASKED, KEPT_FRAMES, FrameStore, StampedFrame
 from mastctl.devices.joint_history import HeadReading, JointHistory
 from mastctl.devices.keep_out import Pair
 from mastctl.devices.limits import Limits
@@ -305,14 +305,22 @@ class Devices:
     # The cameras
 
     def frames(
-        self, cameras: Sequence[str], exposed_after_s: float, timeout_s: float
+        self, cameras: Sequence[str], exposed_after_s: float, timeout_s: float, told: bool = True
     ) -> dict[str, StampedFrame]:
         """Return one frame of each camera, with its facts; see `mastctl.devices.cameras.Cameras.frames`."""
-        return self._cameras.frames(cameras, exposed_after_s, timeout_s)
+        return self._cameras.frames(cameras, exposed_after_s, timeout_s, told)
 
     def frame_by_id(self, frame_id: str, max_age_s: float | None = None) -> StampedFrame:
         """Return a frame that is still kept. Raises NotKnown, NoLonger, NotNow."""
         return self._cameras.frame_by_id(frame_id, max_age_s)
+
+    def hold(self, frame: StampedFrame, by: str = ASKED, kept: int = KEPT_FRAMES) -> None:
+        """Keep a frame for who looks at it, as `mastctl.devices.frames.FrameStore.hold`."""
+        self._cameras.hold(frame, by, kept)
+
+    def let_go(self, by: str) -> None:
+        """Hold nothing more for somebody."""
+        self._cameras.let_go(by)
 
     def newest_frames(self) -> dict[str, StampedFrame | None]:
         """Return each configured camera's newest frame, None where there is none yet; asks no camera."""

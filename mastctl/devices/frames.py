@@ -23,6 +23,8 @@ from mastctl.frame_facts import FrameFacts
 
 _FRAME_ID = re.compile(r"(.{1,100})-([0-9]{6,20})-([0-9a-f]{8})-([0-9a-f]{4})", re.ASCII)
 KEPT_FRAMES = 16  # per camera; six cameras of 1024x768 grey are 75 MB
+ASKED = "asked"  # who was given a frame by name: a snapshot, a click
+MOST_TOLD = 1024  # more than are kept of all cameras
 CLOCK_TOLERANCE_S = 0.005  # what a stamp may lie in the future: rounding, and a driver that estimates
 DARK_GREY = 8  # a picture whose brightest hundredth is below this shows nothing to correlate with
 SATURATED_GREY = 250  # nor does one whose darkest hundredth is above this
@@ -136,7 +138,7 @@ class FrameStore:
     """The newest frames of each camera, found again by id. Safe to use from any thread.
 
     ``new_run`` makes the last part of ids, four hexadecimal digits; `random_run` by default. ``on_new`` gets
-    each frame that is kept; must return at once.
+    each frame that is told of, once; must return at once.
     """
 
     def __init__(
@@ -152,7 +154,9 @@ class FrameStore:
         self._runs: dict[str, str] = {}
         self._kept = kept
         self._frames: dict[str, deque[StampedFrame]] = {}
+        self._held: dict[tuple[str, str], deque[StampedFrame]] = {}
         self._newest: Mapping[str, StampedFrame] = {}  # replaced, never edited
+        self._told: deque[str] = deque(maxlen=MOST_TOLD)
         self._lock = threading.Lock()
 
     def name(self, camera: str, sequence: int) -> tuple[str, str]:
@@ -172,6 +176,7 @@ class FrameStore:
         with self._lock:
             self._digest = mast_digest
             self._frames.clear()
+            self._held.clear()
             self._newest = {}
             self._runs.clear()
 
@@ -179,11 +184,29 @@ class FrameStore:
         """Forget a camera's frames, because its count went back: one number must not name two pictures."""
         with self._lock:
             self._frames.pop(camera, None)
+            self._held = {place: held for place, held in self._held.items() if place[1] != camera}
             self._newest = {name: frame for name, frame in self._newest.items() if name != camera}
             self._runs[camera] = self._new_run()
 
-    def add(self, frame: StampedFrame) -> StampedFrame:
-        """Keep a frame and return it; if a frame of that id is kept already, that one is returned."""
+    def add(self, frame: StampedFrame, told: bool = True) -> StampedFrame:
+        """Keep a frame and return it; if a frame of that id is kept already, that one is returned.
+
+        It is told of unless ``told`` is False: a picture that is only watched need not be recorded.
+        """
+        kept = self._kept_one(frame)
+        if told:
+            self.tell(kept)
+        return kept
+
+    def tell(self, frame: StampedFrame) -> None:
+        """Tell of a frame, unless it was told of."""
+        with self._lock:
+            if frame.frame_id in self._told or frame.mast_digest != self._digest:
+                return
+            self._told.append(frame.frame_id)
+        self._on_new(frame)
+
+    def _kept_one(self, frame: StampedFrame) -> StampedFrame:
         with self._lock:
             if frame.mast_digest != self._digest:  # the mast file changed while it was on its way
                 return frame
@@ -193,12 +216,38 @@ class FrameStore:
                     return known
             frames.append(frame)
             self._newest = {**self._newest, frame.camera: frame}
-        self._on_new(frame)
         return frame
 
     def newest(self, camera: str) -> StampedFrame | None:
         """Return a camera's newest frame, None before the first; takes no lock."""
         return self._newest.get(camera)
+
+    def hold(self, frame: StampedFrame, by: str = ASKED, kept: int = KEPT_FRAMES) -> None:
+        """Keep a frame that somebody looks at, however many come after it: it may be clicked yet.
+
+        Parameters
+        ----------
+        frame
+            One of this store.
+        by
+            Who looks; each keeps the newest it held of every camera.
+        kept
+            How many of a camera.
+        """
+        with self._lock:
+            if frame.mast_digest != self._digest:
+                return
+            held = self._held.setdefault((by, frame.camera), deque(maxlen=kept))
+            if frame in held:
+                held.remove(frame)
+            held.append(frame)
+        if by == ASKED:
+            self.tell(frame)
+
+    def let_go(self, by: str) -> None:
+        """Hold nothing more for somebody."""
+        with self._lock:
+            self._held = {place: held for place, held in self._held.items() if place[0] != by}
 
     def by_id(self, frame_id: str) -> StampedFrame:
         """Return a frame by its id.
@@ -210,7 +259,7 @@ class FrameStore:
             was taken with another mast file, ``frame_unknown`` otherwise.
         """
         with self._lock:
-            for frames in self._frames.values():
+            for frames in (*self._frames.values(), *self._held.values()):
                 for frame in frames:
                     if frame.frame_id == frame_id:
                         return frame

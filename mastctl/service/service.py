@@ -26,6 +26,7 @@ from mastctl.devices.frames import StampedFrame, check_known
 from mastctl.errors import MastctlError
 from mastctl.handoff.check import HandoffCheck
 from mastctl.health.health import CalibrationHealth
+from mastctl.live.pictures import WatchedCameras
 from mastctl.live.settings import LiveSettings
 from mastctl.live.view import LiveView, check_installed
 from mastctl.metrics.metrics import Metrics
@@ -99,6 +100,8 @@ class Service:
         The recorder, and what it hears.
     live
         What Foxglove shows, if the configuration asks for it.
+    watched
+        Pictures for who watches cameras by a page.
     stop_threads
         Where the web side stops: threads that nothing else can keep busy.
     folder, latch
@@ -143,6 +146,7 @@ class Service:
             clock,
         )
         self.live = None if config.live is None else self._live_view(config.live)
+        self.watched = WatchedCameras(self.devices, clock)
         people_s = SystemClock()  # clients live in real time, whatever a simulated rover's clock does
         self.leases = Leases(people_s, self._runs, self._steered)
         self.audit = AuditLog(self.folder.path / AUDIT_FILE, clock)
@@ -260,7 +264,9 @@ class Service:
         """
         now_s = self.clock.now_s()
         after_s = now_s if fresh else now_s - SNAPSHOT_AGE_S
-        return self.devices.frames([camera], after_s, SNAPSHOT_TIMEOUT_S)[camera]
+        frame = self.devices.frames([camera], after_s, SNAPSHOT_TIMEOUT_S)[camera]
+        self.devices.hold(frame)  # it may be clicked yet, also while somebody watches the camera live
+        return frame
 
     def check_camera(self, camera: str) -> None:
         """Pass a configured camera's name. Raises NotKnown."""
@@ -304,6 +310,7 @@ class Service:
         self.handoffs.close()
         self.health.close()
         self.recording.close()
+        self.watched.close()
         if self.live is not None:
             self.live.close()
         bounded("closing the hardware", self.hardware.close, HARDWARE_CLOSE_S)

@@ -157,6 +157,7 @@ class Steering:
             raise NotNow("other_mast_file", words)
         find = partial(self._devices.frame_by_id, max_age_s=CLICK_AGE_S)
         frame = clicked_frame(target, self._rig, find, stored.rig)
+        self._devices.hold(frame)  # until it has been found again, however many pictures somebody watches
         moved_s = self._tracker.moved_s
         if moved_s is not None and frame.exposure_began_s < moved_s:
             words = f"the rover moved since frame {target.frame_id} was exposed; take another"

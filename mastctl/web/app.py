@@ -20,6 +20,7 @@ from mastctl.web.entrance import Entrance
 from mastctl.web.estop import add_estop
 from mastctl.web.events import Streams, add_events
 from mastctl.web.guard import Guard
+from mastctl.web.images import add_images
 from mastctl.web.lease import add_lease
 from mastctl.web.limits import add_limits
 from mastctl.web.pictures import add_pictures
@@ -73,6 +74,8 @@ def create_app(
     add_reload(app, service, commands)
     add_simulation(app, service, waiting, commands)
     add_watching(app, service)
-    add_events(app, service, streams or Streams(service.machine.publisher))
+    streams = streams or Streams(service.machine.publisher)
+    add_events(app, service, streams)
+    add_images(app, service, streams)
     describe(app)
     return Guard(app, entrance)

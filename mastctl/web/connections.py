@@ -37,6 +37,8 @@ WAITING_IN_KERNEL = 128  # connections that the kernel keeps for us meanwhile
 ALWAYS = frozenset(f"{PREFIX}/{name}" for name in ("stop", "estop", "track/stop", "status"))
 """What is served to whoever comes."""
 EVENTS = f"{PREFIX}/events"
+IMAGES = f"{PREFIX}/images"
+SOCKETS = frozenset({EVENTS, IMAGES})
 """Where a connection may become a WebSocket."""
 
 
@@ -143,9 +145,9 @@ class Connection(H11Protocol):
         self.transport.close()
 
     def _should_upgrade(self) -> bool:
-        """Whether this becomes a WebSocket: at the one address that has one, and if there is room for it."""
+        """Whether this becomes a WebSocket: at an address that has one, and if there is room for it."""
         crowded = isinstance(self.app, _Crowded)
-        listens = self.scope["path"] == EVENTS and self.scope["method"] == "GET"
+        listens = self.scope["path"] in SOCKETS and self.scope["method"] == "GET"
         return listens and not crowded and super()._should_upgrade()
 
     @property

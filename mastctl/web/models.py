@@ -384,6 +384,14 @@ class EventsQuery(BaseModel):
         return None if self.key is None else frozenset(self.key)
 
 
+class ImagesQuery(BaseModel):
+    """``GET /images``, a WebSocket: of which cameras."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    camera: Annotated[list[Name], Field(min_length=1, max_length=MOST_KEYS)]
+
+
 class FaultsQuery(BaseModel):
     """``DELETE /simulation/faults``; without a device all faults are taken back."""
 

@@ -1,8 +1,9 @@
-"""WebSockets that only tell: whatever a client sends into one, and however it reads, costs nobody anything.
+"""WebSockets that tell: whatever a client sends into one, and however it reads, costs nobody anything.
 
 uvicorn's protocol answers pings without waiting for its client to read, keeps what is sent to it, and bounds
 neither. Here a message from the client ends the connection with its first frame, pings are answered only
-while their answers are read, and a client that takes no bytes for some seconds is left.
+while their answers are read, and a client that takes no bytes for some seconds is left. Where pictures are
+told, a client says by short words which of them it has shown.
 """
 
 from __future__ import annotations
@@ -15,6 +16,8 @@ from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIO
 from websockets.frames import Frame
 from websockets.protocol import State
 
+from mastctl.web.connections import IMAGES
+
 log = logging.getLogger(__name__)
 log.setLevel(logging.ERROR)
 
@@ -22,6 +25,8 @@ LARGEST_BYTES = 1024  # of what a client sends; it has nothing to say
 PING_S = 20.0
 STALLED_S = 10.0
 MOST_PINGS = 20  # of a client in a second
+LONGEST_WORD = 100  # a camera's name
+MOST_WORDS = 400  # in a second: what six cameras at 30 frames/s need, twice
 UNSUPPORTED, BROKEN_RULES = 1003, 1008  # RFC 6455, 7.4.1
 
 
@@ -35,7 +40,7 @@ class Socket(WebSocketsSansIOProtocol):
         super().__init__(*args, **options)
         self.logger = self.conn.logger = log  # what strangers send is no warning
         self._stalled_since_s: float | None = None
-        self._pings, self._second = 0, 0
+        self._pings, self._words, self._second = 0, 0, 0
 
     def overdue(self, now_s: float) -> bool:
         """Whether its client has not read for too long."""
@@ -65,9 +70,17 @@ class Socket(WebSocketsSansIOProtocol):
         await super().send(message)
 
     def handle_text(self, event: Frame) -> None:
+        if self.scope["path"] != IMAGES:
+            self._not_taken(event)
+        elif not event.fin or len(event.data) > LONGEST_WORD or not bytes(event.data).isascii():
+            self._end(UNSUPPORTED, "the name of a camera whose picture was shown is taken here")
+        elif self._seldom():
+            super().handle_text(event)
+
+    def _not_taken(self, event: Frame) -> None:
         self._end(UNSUPPORTED, "this WebSocket tells and takes nothing")
 
-    handle_bytes = handle_cont = handle_text
+    handle_bytes = handle_cont = _not_taken
 
     def handle_ping(self) -> None:
         if self._often():
@@ -85,12 +98,25 @@ class Socket(WebSocketsSansIOProtocol):
 
     def _often(self) -> bool:
         """Count a ping or a pong; False if there are too many, and the connection ends."""
-        second = int(self.loop.time())
-        self._pings = self._pings + 1 if second == self._second else 1
-        self._second = second
+        self._count()
+        self._pings += 1
         if self._pings > MOST_PINGS:
             self._end(BROKEN_RULES, f"more than {MOST_PINGS} pings in a second")
         return self._pings <= MOST_PINGS
+
+    def _seldom(self) -> bool:
+        """Count a word; False if there are too many, and the connection ends."""
+        self._count()
+        self._words += 1
+        if self._words > MOST_WORDS:
+            self._end(BROKEN_RULES, f"more than {MOST_WORDS} messages in a second")
+        return self._words <= MOST_WORDS
+
+    def _count(self) -> None:
+        """Begin to count anew with each second."""
+        second = int(self.loop.time())
+        if second != self._second:
+            self._second, self._pings, self._words = second, 0, 0
 
     def _end(self, code: int, words: str) -> None:
         if self.close_sent or self.conn.state is not State.OPEN:  # it ends already

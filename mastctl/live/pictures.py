@@ -1,0 +1,209 @@
+"""Cameras that somebody watches: each asked for its newest picture once for all who are ready for one.
+
+Nothing is queued. Who watches says for each camera when it is ready for another picture, and is given the
+newest when there is one; one that was not fetched yet is replaced. A camera that nobody is ready for is not
+asked.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from itertools import count
+from typing import Protocol
+
+from drivers.clock import Clock
+from drivers.errors import DriverError
+from mastctl.devices.frames import StampedFrame
+from mastctl.errors import MastctlError
+from mastctl.report.pictures import encoded
+
+log = logging.getLogger(__name__)
+
+JPEG_QUALITY = 80  # 110 kB of 1024x768 gravel; a pixel's own grey is off by 2 of 255
+APART_S = 0.045  # least time between two pictures: more than 15 a second from cameras of 15, 20, 30 or 60
+NEW_S = 0.05  # a picture that was exposed this long ago is still new
+TIMEOUT_S = 1.0
+FAILING_S = 0.5  # how long a camera is left alone that gave none
+HELD = 4  # pictures of a camera that each watcher may click though newer ones came
+AHEAD = 2  # pictures on their way to a watcher: one being shown, one being sent
+
+
+class CamerasLike(Protocol):
+    """Who takes pictures, and keeps those that are looked at."""
+
+    def frames(
+        self, cameras: Sequence[str], exposed_after_s: float, timeout_s: float, told: bool
+    ) -> dict[str, StampedFrame]: ...
+    def hold(self, frame: StampedFrame, by: str, kept: int) -> None: ...
+    def let_go(self, by: str) -> None: ...
+
+
+@dataclass(frozen=True, eq=False)
+class Picture:
+    """A frame and its JPEG."""
+
+    frame: StampedFrame
+    jpeg: bytes
+
+
+class WatchedCameras:
+    """Pictures of cameras for as long as somebody watches them; safe to use from any thread.
+
+    Parameters
+    ----------
+    cameras, clock
+        The daemon's.
+    """
+
+    def __init__(self, cameras: CamerasLike, clock: Clock) -> None:
+        self._cameras = cameras
+        self._clock = clock
+        self._changed = threading.Condition()
+        self._watchers: set[Watcher] = set()
+        self._at_work: set[str] = set()
+        self._closed = False
+        self._numbers = count(1)
+
+    def watch(self, cameras: Sequence[str], wake: Callable[[], None]) -> Watcher:
+        """Begin to watch some cameras. Whoever does ends it by `Watcher.end`.
+
+        Parameters
+        ----------
+        cameras
+            Names of configured cameras.
+        wake
+            Called from another thread when a picture is there; must return at once.
+        """
+        watcher = Watcher(self, f"watcher {next(self._numbers)}", cameras, wake)
+        with self._changed:
+            self._watchers.add(watcher)
+            for camera in watcher.cameras:
+                if camera not in self._at_work and not self._closed:
+                    self._at_work.add(camera)
+                    name = f"pictures of {camera}"
+                    threading.Thread(target=self._work, args=(camera,), name=name, daemon=True).start()
+        return watcher
+
+    def close(self) -> None:
+        """Ask no camera any more."""
+        with self._changed:
+            self._closed = True
+            self._watchers.clear()
+            self._changed.notify_all()
+
+    # What watchers call
+
+    def stir(self) -> None:
+        """Somebody is ready for another picture."""
+        with self._changed:
+            self._changed.notify_all()
+
+    def leave(self, watcher: Watcher) -> None:
+        """Somebody watches no longer."""
+        with self._changed:
+            self._watchers.discard(watcher)
+            self._changed.notify_all()
+        self._cameras.let_go(watcher.name)
+
+    # In a camera's own thread, which ends when nobody watches
+
+    def _work(self, camera: str) -> None:
+        made: Picture | None = None
+        failing = False
+        while self._wanted(camera, FAILING_S if failing else 0.0):
+            try:
+                after_s = self._clock.now_s() - NEW_S
+                if made is not None:
+                    after_s = max(after_s, made.frame.exposure_began_s + APART_S)
+                frame = self._cameras.frames([camera], after_s, TIMEOUT_S, told=False)[camera]
+                made, failing = (
+                    Picture(frame, frame.jpeg or encoded(frame.image, "jpeg", JPEG_QUALITY)),
+                    False,
+                )
+            except (DriverError, MastctlError) as error:  # its fault tells more
+                log.debug("no picture of %s for who watches it: %s", camera, error)
+                made, failing = None, True
+            except Exception:  # a defect must not end the thread
+                log.exception("pictures of %s met a defect of the program", camera)
+                made, failing = None, True
+            else:
+                for watcher in self._ready(camera):
+                    self._cameras.hold(frame, watcher.name, HELD)
+                    watcher.put(made)
+
+    def _wanted(self, camera: str, pause_s: float) -> bool:
+        """Wait until somebody is ready for a picture; False if nobody watches any more."""
+        with self._changed:
+            if pause_s:
+                self._changed.wait_for(lambda: not self._watch(camera), pause_s)
+            self._changed.wait_for(
+                lambda: not self._watch(camera) or any(one.ready(camera) for one in self._watchers)
+            )
+            if self._watch(camera):
+                return True
+            self._at_work.discard(camera)
+            return False
+
+    def _watch(self, camera: str) -> bool:
+        return not self._closed and any(camera in one.cameras for one in self._watchers)
+
+    def _ready(self, camera: str) -> list[Watcher]:
+        with self._changed:
+            return [one for one in self._watchers if one.ready(camera)]
+
+
+class Watcher:
+    """Somebody who watches; made by `WatchedCameras.watch`.
+
+    Attributes
+    ----------
+    name
+        Nobody else's.
+    cameras
+        What is watched.
+    """
+
+    def __init__(
+        self, owner: WatchedCameras, name: str, cameras: Sequence[str], wake: Callable[[], None]
+    ) -> None:
+        self.name = name
+        self.cameras = frozenset(cameras)
+        self._owner = owner
+        self._wake = wake
+        self._lock = threading.Lock()
+        self._room = dict.fromkeys(self.cameras, AHEAD)
+        self._pictures: dict[str, Picture] = {}
+
+    def shown(self, camera: str) -> None:
+        """A picture of a camera was shown: there is room for another. What is not watched counts nothing."""
+        with self._lock:
+            if camera not in self._room:
+                return
+            self._room[camera] = min(AHEAD, self._room[camera] + 1)
+        self._owner.stir()
+
+    def ready(self, camera: str) -> bool:
+        """Whether a picture of a camera would be taken."""
+        return self._room.get(camera, 0) > 0 or camera in self._pictures
+
+    def put(self, picture: Picture) -> None:
+        """Leave a picture to be taken, in the place of one that was not."""
+        camera = picture.frame.camera
+        with self._lock:
+            if camera not in self._pictures:
+                self._room[camera] -= 1
+            self._pictures[camera] = picture
+        self._wake()
+
+    def take(self) -> list[Picture]:
+        """Return what is there, the newest of each camera."""
+        with self._lock:
+            pictures, self._pictures = self._pictures, {}
+        return list(pictures.values())
+
+    def end(self) -> None:
+        """Watch no longer."""
+        self._owner.leave(self)

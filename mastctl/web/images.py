@@ -1,0 +1,108 @@
+"""Live pictures through one WebSocket: the newest of each camera, at the pace at which they are shown.
+
+A message is 4 bytes (the length of what follows, little-endian), the picture's facts as JSON, and the
+picture as JPEG. Who shows one sends the camera's name back, and is sent another one then: at most two of a
+camera are on their way, and none waits.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+from typing import Any
+
+from fastapi import FastAPI, WebSocket
+from pydantic import ValidationError
+from starlette.websockets import WebSocketDisconnect
+
+from mastctl.as_json import as_json
+from mastctl.errors import MastctlError
+from mastctl.live.pictures import Picture, Watcher
+from mastctl.service.service import Service
+from mastctl.web.answer import error_response
+from mastctl.web.connections import IMAGES
+from mastctl.web.events import GOING_AWAY, Streams
+from mastctl.web.models import ImagesQuery
+from mastctl.web.refusals import told as refused
+from mastctl.web.sentences import sentence
+
+
+def add_images(app: FastAPI, service: Service, streams: Streams) -> None:
+    """The WebSocket of live pictures."""
+
+    @app.websocket(IMAGES)
+    async def socket(line: WebSocket) -> None:
+        try:
+            cameras = _asked(line).camera
+            for camera in cameras:
+                service.check_camera(camera)
+            with streams.listening((), frozenset()) as ending:  # counted as a listener, and ended as one
+                await line.accept()
+                await _Line(service, line, cameras).run(asyncio.ensure_future(ending.wait()))
+        except ValidationError as error:
+            words = sentence({**error.errors()[0], "loc": ("query", *error.errors()[0]["loc"])}, ImagesQuery)
+            await line.send_denial_response(error_response(422, "bad_request", words))
+        except MastctlError as error:
+            await line.send_denial_response(refused(error))
+
+
+def _asked(line: WebSocket) -> ImagesQuery:
+    """The query of a WebSocket. Raises ValidationError."""
+    query = line.query_params
+    told: dict[str, Any] = {name: query[name] for name in query if name != "camera"}
+    return ImagesQuery.model_validate(
+        told | ({"camera": query.getlist("camera")} if "camera" in query else {})
+    )
+
+
+class _Line:
+    """One WebSocket of pictures, until the daemon or the client ends."""
+
+    def __init__(self, service: Service, line: WebSocket, cameras: list[str]) -> None:
+        self._service = service
+        self._line = line
+        self._there = asyncio.Event()
+        self._loop = asyncio.get_running_loop()
+        self._watcher: Watcher = service.watched.watch(cameras, self._wake)
+
+    async def run(self, ending: asyncio.Future[Any]) -> None:
+        """Send pictures until ``ending`` is done."""
+        jobs = {ending, asyncio.ensure_future(self._hear()), asyncio.ensure_future(self._tell())}
+        try:
+            await asyncio.wait(jobs, return_when=asyncio.FIRST_COMPLETED)
+            if ending.done():
+                with contextlib.suppress(WebSocketDisconnect, RuntimeError):
+                    await self._line.close(GOING_AWAY)
+        finally:
+            for job in jobs:
+                job.cancel()
+            await asyncio.gather(*jobs, return_exceptions=True)
+            self._watcher.end()
+
+    async def _hear(self) -> None:
+        """Hear which pictures were shown."""
+        with contextlib.suppress(WebSocketDisconnect):
+            while True:
+                self._watcher.shown(await self._line.receive_text())
+
+    async def _tell(self) -> None:
+        """Send what is there."""
+        with contextlib.suppress(WebSocketDisconnect):
+            while True:
+                await self._there.wait()
+                self._there.clear()
+                for picture in self._watcher.take():
+                    await self._line.send_bytes(self._message(picture))
+
+    def _message(self, picture: Picture) -> bytes:
+        frame = picture.frame
+        height, width = frame.image.shape[:2]
+        age_s = max(0.0, self._service.clock.now_s() - frame.mid_exposure_s)
+        facts = as_json(frame.facts) | {"size_px": [width, height], "age_s": age_s}
+        head = json.dumps(facts, allow_nan=False).encode()
+        return b"".join((len(head).to_bytes(4, "little"), head, picture.jpeg))
+
+    def _wake(self) -> None:
+        with contextlib.suppress(RuntimeError):  # the loop has ended
+            self._loop.call_soon_threadsafe(self._there.set)

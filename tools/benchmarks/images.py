@@ -1,0 +1,71 @@
+"""Live pictures of a simulated pair of 1024x768 at rest: frames a second, their age, the daemon's load.
+
+.venv/bin/python -m tools.benchmarks.images [--seconds 10] [--rate 30]
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+import yaml
+from websockets.sync.client import connect
+
+from tools.arguments import end
+from tools.living_daemon import Asker, simulated, started, vitals, written
+
+PAIR = ("navcam_left", "navcam_right")
+
+
+def main() -> int:
+    """Watch, and print a line for each camera and one for the daemon."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("--seconds", type=float, default=10.0)
+    parser.add_argument("--rate", type=float, default=30.0, help="of the cameras, Hz")
+    asked = parser.parse_args()
+    with tempfile.TemporaryDirectory() as folder:
+        config = simulated(Path(folder), "memory", PAIR)
+        document = yaml.safe_load(config.read_text())
+        document["simulation"]["cameras"] = {"rate_hz": asked.rate}
+        written(Path(folder), document)
+        with started(config) as (daemon, port), Asker(port, "benchmark") as asker:
+            for name in PAIR:
+                asker.ask("GET", f"/snapshot/{name}?fresh=true")
+            watch(daemon.pid, port, asked.seconds)
+    return 0
+
+
+def watch(pid: int, port: int, seconds: float) -> None:
+    """Take pictures for some time, each acknowledged when it is here."""
+    ages_s: dict[str, list[float]] = {name: [] for name in PAIR}
+    sizes: list[int] = []
+    query = "&".join(f"camera={name}" for name in PAIR)
+    with connect(f"ws://127.0.0.1:{port}/api/v1/images?{query}", proxy=None, max_size=None) as line:
+        line.recv()
+        line.send(PAIR[0])
+        before, began_s = vitals(pid).cpu_s, time.monotonic()
+        while time.monotonic() - began_s < seconds:
+            message = line.recv(timeout=10.0)
+            assert isinstance(message, bytes)
+            length = int.from_bytes(message[:4], "little")
+            facts = json.loads(message[4 : 4 + length])
+            ages_s[facts["camera"]].append(time.monotonic() - facts["mid_exposure_s"])
+            sizes.append(len(message))
+            line.send(facts["camera"])
+        took_s = time.monotonic() - began_s
+        used = (vitals(pid).cpu_s - before) / took_s
+    for name, ages in ages_s.items():
+        told = np.array(ages) * 1e3
+        print(
+            f"{name}: {len(ages) / took_s:.1f} frames/s, glass to client median {np.median(told):.0f} ms, "
+            f"99 % {np.percentile(told, 99):.0f} ms"
+        )
+    print(f"daemon: {100 * used:.0f} % of a core, {np.mean(sizes) / 1e3:.0f} kB a picture")
+
+
+if __name__ == "__main__":
+    end(main)
