@@ -6,6 +6,14 @@ from __future__ import annotations
 from typing import Any, Literal, NotRequired, TypedDict
 
 
+class AimTold(TypedDict):
+    """Where a target would come."""
+
+    camera: str
+    x_px: float
+    y_px: float
+
+
 class BoardStands(TypedDict):
     """A board before a simulated rover: what it is, and rover_from_board."""
 
@@ -471,6 +479,28 @@ class PoseTold(TypedDict):
     age_s: float
 
 
+class PreviewTold(TypedDict):
+    """``POST /point/preview``: what a clicked pixel shows, before anything moves."""
+
+    camera: str
+    frame_id: str
+    pixel_px: list[float]
+    other_camera: str
+    other_frame_id: str
+    other_pixel_px: list[float]
+    other_sigma_px: list[float]
+    correlation: float
+    second: float
+    across_px: float
+    position_m: list[float]
+    sigma_m: list[float]
+    range_m: float
+    range_sigma_m: float
+    aim: AimTold
+    goal_rad: list[float] | None
+    refused: RefusedTold | None
+
+
 class ReadyTold(TypedDict):
     """``GET /health/ready`` where commands are carried out: the state with its reason."""
 
@@ -517,6 +547,13 @@ class Recordings(TypedDict):
 
     recordings: list[RecordingListed]
     recorder: RecorderTold
+
+
+class RefusedTold(TypedDict):
+    """Why the head would not be sent."""
+
+    code: str
+    message: str
 
 
 class ReloadTold(TypedDict):

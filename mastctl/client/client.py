@@ -26,6 +26,7 @@ if TYPE_CHECKING:
         OperationListed,
         OperationTold,
         PoseTaken,
+        PreviewTold,
         RecorderTold,
         RecordingEnded,
         Recordings,
@@ -209,6 +210,19 @@ class Client:
         return str(
             self._daemon.command("POST", "/point", body, key=idempotency_key, deadline_s=deadline_s)["id"]
         )
+
+    def preview(
+        self, pixel: tuple[str, str, float, float], *, aim: tuple[str, float, float] | None = None
+    ) -> PreviewTold:
+        """Return what a pixel (camera, frame id, x, y) shows and where `point` would send the head.
+
+        Nothing moves. ``position_m`` with ``sigma_m``, ``range_m``, the match in the other eye, ``goal_rad``,
+        and ``refused`` where the head would not be sent.
+        """
+        body = _target(pixel, None, None)
+        if aim is not None:
+            body["aim"] = dict(zip(("camera", "x_px", "y_px"), aim, strict=True))
+        return cast("PreviewTold", self._daemon.json("POST", "/point/preview", json=body))
 
     def operation(self, operation_id: str) -> OperationTold:
         """Return an operation's record."""

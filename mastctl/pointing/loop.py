@@ -19,14 +19,16 @@ import logging
 import math
 import threading
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
 
-from calib.camera.stereo import triangulate
+from calib.camera.stereo import Triangulation, triangulate
 from calib.errors import CalibError
 from calib.mast.pointing import solve
 from calib.mast.rig import Rig
 from calib.mast.solutions import Solution
+from calib.pictures.epipolar import StereoMatch
 from calib.pictures.patch_verdict import PatchMatch
 from calib.rigid import FloatArray
 from drivers.clock import Clock
@@ -41,13 +43,14 @@ from mastctl.pointing.results import (
     Pointing,
     PointingError,
     PointingResult,
+    Preview,
     Step,
     pair,
     rounded,
     triple,
 )
 from mastctl.pointing.settings import PointingSettings
-from mastctl.pointing.steps import DevicesLike, Steps
+from mastctl.pointing.steps import DevicesLike, FoundAgain, Steps
 from mastctl.pointing.wanted import aim_of
 
 __all__ = [
@@ -125,6 +128,28 @@ class PointingLoop:
         steps = Steps(self._rig, self._devices, self._limits, self._clock, self._settings, record, cancelled)
         return _Run(steps, self._rig, self._devices, self._limits, self._settings).all(request)
 
+    def preview(self, request: PointRequest, cancelled: threading.Event) -> Preview:
+        """Return what a pixel request would point at and where the head would go; nothing moves.
+
+        Parameters
+        ----------
+        request
+            With a pixel of a named frame.
+        cancelled
+            Ends it.
+
+        Raises
+        ------
+        MastctlError, DriverError, CalibError
+            If what was clicked is not found, or has no range.
+        """
+        steps = Steps(self._rig, self._devices, self._limits, self._clock, self._settings, _forget, cancelled)
+        return _Run(steps, self._rig, self._devices, self._limits, self._settings).preview(request)
+
+
+def _forget(step: Step) -> None:
+    """Of a preview no record is kept."""
+
 
 class _Run:
     """One request."""
@@ -139,6 +164,7 @@ class _Run:
         self._limits = limits
         self._settings = settings
         self._position_m: FloatArray | None = None
+        self._point: Triangulation | None = None
         self._range_m: float | None = None
         self._pointings: list[Pointing] = []
 
@@ -176,6 +202,46 @@ class _Run:
             return
         self._point_at(self._see(target), aim, aim_px, request.pointings)
 
+    def preview(self, request: PointRequest) -> Preview:
+        """See what was clicked, and where the head would go; nothing moves."""
+        assert isinstance(request.target, PixelTarget)
+        aim = aim_of(request, self._rig)
+        found, partnered = self._seen(request.target)
+        assert self._point is not None
+        point, now = self._point, found.now
+        along = point.position_m - now.camera.ray(found.pixel_px).origins_m
+        along /= np.linalg.norm(along)
+        goal, refused = None, None
+        try:
+            here = self._steps.head.read()
+            best = self._chosen(aim, np.array([aim.x_px, aim.y_px]), here, {})
+            goal = self._steps.head.goal((best.pan_rad, best.tilt_rad), here)
+            self._limits.check(*goal)
+            self._steps.head.way(*goal)
+        except (MastctlError, CalibError) as error:
+            refused = {
+                "code": getattr(error, "code", "failed"), "message": " ".join(str(error).split())
+            }  # fmt: skip
+        return Preview(
+            camera=now.frame.camera,
+            frame_id=now.frame.frame_id,
+            pixel_px=pair(found.pixel_px),
+            other_camera=found.other.frame.camera,
+            other_frame_id=found.other.frame.frame_id,
+            other_pixel_px=pair(partnered.match.pixel_px),
+            other_sigma_px=pair(partnered.match.sigma_px),
+            correlation=float(partnered.match.correlation),
+            second=float(partnered.match.second),
+            across_px=float(partnered.across_px),
+            position_m=triple(point.position_m),
+            sigma_m=triple(np.sqrt(np.diag(point.covariance_m2))),
+            range_m=float(point.ranges_m[0]),
+            range_sigma_m=math.sqrt(float(along @ point.covariance_m2 @ along)),
+            aim=aim,
+            goal_rad=goal,
+            refused=refused,
+        )
+
     # Steps
 
     def _done(self, pointing: Pointing) -> None:
@@ -185,15 +251,20 @@ class _Run:
 
     def _see(self, target: PixelTarget) -> Clicked:
         """From the clicked pixel to a position in the rover frame."""
+        found, partnered = self._seen(target)
+        assert partnered.plane is not None
+        return Clicked(found.view, found.clicked_px, partnered.plane)
+
+    def _seen(self, target: PixelTarget) -> tuple[FoundAgain, StereoMatch]:
+        """Find the clicked thing in a fresh pair, and its position."""
         found = self._steps.clicked(target)
         now, other = found.now, found.other
         with self._steps.step("stereo") as detail:
             detail.update(self._steps.one_moment(now, found.pixel_px, [other], found.resting))
             partnered = self._steps.unless_stopped(self._eyes.stereo, now, found.pixel_px, other)
             detail.update(match_facts(partnered.match), across_px=round(partnered.across_px, 3))
-        assert partnered.plane is not None
         self._triangulate(now, found.pixel_px, other, partnered.match)
-        return Clicked(found.view, found.clicked_px, partnered.plane)
+        return found, partnered
 
     def _triangulate(self, one: View, one_px: FloatArray, other: View, seen: PatchMatch) -> None:
         with self._steps.step("triangulate") as detail:
@@ -201,7 +272,7 @@ class _Run:
             match_px = float(seen.sigma_px.max()) / math.sqrt(2.0)
             sigma_px = math.hypot(self._settings.triangulation_sigma_px, match_px)
             point = triangulate(one.camera, other.camera, one_px, seen.pixel_px, sigma_px)
-            self._position_m = point.position_m
+            self._position_m, self._point = point.position_m, point
             detail.update(
                 position_m=rounded(point.position_m, 5),
                 sigma_m=rounded(np.sqrt(np.diag(point.covariance_m2)), 5),
@@ -263,21 +334,24 @@ class _Run:
         assert self._position_m is not None
         here = resting or self._steps.head.read()
         with self._steps.step("solve") as detail:
-            solutions = solve(
-                self._rig.mast,
-                self._rig.cameras[aim.camera].model,
-                self._position_m,
-                aim_px,
-                from_pan_rad=here.true_rad[0],
-                from_tilt_rad=here.true_rad[1],
-            )
-            detail.update(solutions=[_told(one) for one in solutions])
-            best = self._steps.head.chosen(solutions, here)
-            detail.update(chosen=_told(best))
+            best = self._chosen(aim, aim_px, here, detail)
         self._range_m = best.range_m
         eyes = [name for name in (aim.camera, self._eyes.partner(aim.camera)) if name is not None]
         self._steps.before(eyes, (best.pan_rad, best.tilt_rad), needed=(aim.camera,))
         return self._steps.go_to_true(best.pan_rad, best.tilt_rad, aim.camera)
+
+    def _chosen(self, aim: Aim, aim_px: FloatArray, here: HeadReading, detail: dict[str, Any]) -> Solution:
+        """Solve for the present position; return the solution that is taken from ``here``."""
+        assert self._position_m is not None
+        model = self._rig.cameras[aim.camera].model
+        pan_rad, tilt_rad = here.true_rad
+        solutions = solve(
+            self._rig.mast, model, self._position_m, aim_px, from_pan_rad=pan_rad, from_tilt_rad=tilt_rad
+        )
+        detail.update(solutions=[_told(one) for one in solutions])
+        best = self._steps.head.chosen(solutions, here)
+        detail.update(chosen=_told(best))
+        return best
 
     def _pointing(self, commanded: Pair, now: View, aim_px: FloatArray, seen: PatchMatch | None) -> Pointing:
         """Put together what one pointing did."""

@@ -10,6 +10,7 @@ import numpy as np
 
 from calib.rigid import FloatArray
 from mastctl.errors import MastctlError
+from mastctl.pointing.requests import Aim
 
 Pair = tuple[float, float]
 
@@ -70,6 +71,51 @@ class Pointing:
     residual_sigma_px: Pair | None
     note: str = ""
     motion_evidence: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Preview:
+    """What a clicked pixel shows, before anything moves.
+
+    Attributes
+    ----------
+    camera, frame_id, pixel_px
+        A fresh frame of the clicked camera, and where (x, y) it shows what was clicked.
+    other_camera, other_frame_id, other_pixel_px, other_sigma_px
+        The same in the other eye of its pair, with one sigma of the match.
+    correlation, second
+        Of the best match in the other eye, and of the next best.
+    across_px
+        How far the match lies off the epipolar line.
+    position_m, sigma_m
+        The point in the rover frame, and one sigma along each axis (the clicks', not the mast file's).
+    range_m, range_sigma_m
+        Its distance from the clicked camera, and one sigma along it.
+    aim
+        Where it would come.
+    goal_rad
+        Pan and tilt that the head would be sent to; None where nothing leads there.
+    refused
+        ``code`` and ``message`` where the head would not be sent.
+    """
+
+    camera: str
+    frame_id: str
+    pixel_px: Pair
+    other_camera: str
+    other_frame_id: str
+    other_pixel_px: Pair
+    other_sigma_px: Pair
+    correlation: float
+    second: float
+    across_px: float
+    position_m: tuple[float, float, float]
+    sigma_m: tuple[float, float, float]
+    range_m: float
+    range_sigma_m: float
+    aim: Aim
+    goal_rad: Pair | None
+    refused: Mapping[str, str] | None
 
 
 @dataclass(frozen=True, eq=False)

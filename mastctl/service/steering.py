@@ -19,6 +19,7 @@ from mastctl.operations.operations import Operations
 from mastctl.operations.records import Operation
 from mastctl.pointing.loop import PointingLoop
 from mastctl.pointing.requests import AnglesTarget, PixelTarget, PointRequest, PositionTarget
+from mastctl.pointing.results import Preview
 from mastctl.pointing.wanted import aim_of, clicked_frame
 from mastctl.service.masts import Masts
 from mastctl.tracking.pose import RoverPose
@@ -96,6 +97,21 @@ class Steering:
                     return loop.run(request, record, cancelled)
 
             return self._operations.start(told, run, partial(self._health.ended, mast.stored))
+
+    def preview(self, request: PointRequest, cancelled: threading.Event) -> Preview:
+        """Return what a pixel of a named frame shows and where the head would go; nothing moves.
+
+        Raises
+        ------
+        NotKnown, NoLonger, BadRequest, NotNow
+            As `point`.
+        MastctlError, DriverError, CalibError
+            As `mastctl.pointing.loop.PointingLoop.preview`.
+        """
+        with self._masts.unchanged():
+            self._check(request)
+            loop = self._loop
+        return loop.preview(request, cancelled)
 
     def start_track(self, target: PixelTarget | PositionTarget, told: Mapping[str, Any]) -> Operation:
         """Begin to follow what a pixel shows, or what is seen at a position; return the start's record.

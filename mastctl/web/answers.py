@@ -348,6 +348,43 @@ class Started(_Told):
     id: str
 
 
+class AimTold(_Told):
+    """Where a target would come."""
+
+    camera: str
+    x_px: float
+    y_px: float
+
+
+class RefusedTold(_Told):
+    """Why the head would not be sent."""
+
+    code: str
+    message: str
+
+
+class PreviewTold(_Told):
+    """``POST /point/preview``: what a clicked pixel shows, before anything moves."""
+
+    camera: str
+    frame_id: str
+    pixel_px: Pixel
+    other_camera: str
+    other_frame_id: str
+    other_pixel_px: Pixel
+    other_sigma_px: Pixel
+    correlation: float
+    second: float
+    across_px: float
+    position_m: Point
+    sigma_m: Point
+    range_m: float
+    range_sigma_m: float
+    aim: AimTold
+    goal_rad: Angles | None
+    refused: RefusedTold | None
+
+
 class StopTold(_Told):
     """``POST /stop``: the head has confirmed it; the operation that was stopped with it."""
 

@@ -64,7 +64,7 @@ def create_app(
     add_errors(app)
     add_sessions(app, entrance)
     commands = Commands(service, waiting)
-    add_pointing(app, service, commands)
+    add_pointing(app, service, waiting, commands)
     add_estop(app, service, waiting, commands)
     add_lease(app, service, commands)
     add_tracking(app, service, commands)

@@ -18,6 +18,7 @@ ANSWERS: Mapping[str, type[BaseModel]] = {
     "GET /calibration/health": told.CalibrationHealthTold,
     "GET /status": told.Status,
     "POST /point": told.Started,
+    "POST /point/preview": told.PreviewTold,
     "GET /operations": told.Operations,
     "GET /operations/{operation_id}": told.OperationTold,
     "POST /stop": told.StopTold,

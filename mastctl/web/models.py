@@ -150,6 +150,13 @@ class PointBody(TrackBody):
         return PointRequest(target, self.aim, self.pointings)
 
 
+class PreviewBody(_Strict):
+    """``POST /point/preview``: a pixel of a named frame, and where it would come."""
+
+    pixel: PixelTarget
+    aim: Aim | None = None
+
+
 class SigmaBody(_Strict):
     """One sigma of each axis of a motion: of its translation, metres, and of its rotation, radians."""
 

@@ -2,21 +2,26 @@
 
 from __future__ import annotations
 
+import threading
 from typing import Any
 
 from fastapi import FastAPI, Request
 
+from mastctl.as_json import as_json
 from mastctl.commands.deadlines import usual_s
 from mastctl.commands.entry import POINT, POSE, STOP, TRACK, TRACK_LOOK, TRACK_STOP
-from mastctl.pointing.requests import AnglesTarget
+from mastctl.errors import BadRequest, NotNow
+from mastctl.pointing.requests import AnglesTarget, PointRequest
+from mastctl.pointing.results import PointingError
 from mastctl.service.service import Service
 from mastctl.web import PREFIX
 from mastctl.web.commands import Commands, Headers
 from mastctl.web.limits import stop_before_keep_outs
-from mastctl.web.models import PointBody, PoseBody, TrackBody
+from mastctl.web.models import PointBody, PoseBody, PreviewBody, TrackBody
+from mastctl.web.waiting import Waiting
 
 
-def add_pointing(app: FastAPI, service: Service, commands: Commands) -> None:
+def add_pointing(app: FastAPI, service: Service, waiting: Waiting, commands: Commands) -> None:
     """State, operations and the stop."""
 
     @app.get(f"{PREFIX}/status", summary="What is known at this moment")
@@ -32,6 +37,23 @@ def add_pointing(app: FastAPI, service: Service, commands: Commands) -> None:
             return {"id": service.steering.point(asked, told).id}
 
         return await commands.run(POINT, came, told, act, usual_s(service.config.limits, looks))
+
+    @app.post(f"{PREFIX}/point/preview", summary="What a pixel shows, before anything moves")
+    async def preview(body: PreviewBody) -> dict[str, Any]:
+        asked = PointRequest(body.pixel, body.aim)
+        service.check_camera(body.pixel.camera)
+        cancelled = threading.Event()
+        try:
+            seen = await waiting.picture(
+                body.pixel.camera, lambda: as_json(service.steering.preview(asked, cancelled))
+            )
+        except PointingError as error:
+            kind = NotNow if error.code in ("head_moving", "stopped") else BadRequest
+            raise kind(error.code, str(error)) from None
+        finally:
+            cancelled.set()
+        told: dict[str, Any] = seen
+        return told
 
     @app.get(f"{PREFIX}/operations", summary="The newest operations, without their steps")
     async def operations() -> dict[str, Any]:

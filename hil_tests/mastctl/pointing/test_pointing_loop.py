@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import threading
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -22,6 +23,7 @@ from mastctl.pointing.loop import (
     PositionTarget,
     Step,
 )
+from mastctl.pointing.results import Preview
 from mastctl.pointing.settings import PointingSettings
 
 MIDDLE_PX = ((SIZE_PX[0] - 1) / 2, (SIZE_PX[1] - 1) / 2)
@@ -265,3 +267,37 @@ def test_a_failure_after_the_first_pointing_keeps_its_result() -> None:
     assert refusal.value.result is not None
     assert len(refusal.value.result.pointings) == 1
     assert refusal.value.result.pointings[0].residual_px is not None
+
+
+def preview(world: World, request: PointRequest) -> Preview:
+    loop = PointingLoop(rig(), world, LIMITS, world.clock, PointingSettings())
+    return loop.preview(request, threading.Event())
+
+
+def test_a_preview_tells_what_a_pointing_then_finds_and_nothing_moves() -> None:
+    world, pixel = World(), (150.0, 120.0)
+    frame = world.shoot()
+    point = world.true_point(frame, *pixel)
+    told = preview(world, click(frame, *pixel))
+    assert (world.moves, world.stops) == ([], 0)
+    assert told.other_camera == "navcam_right" and told.refused is None
+    assert np.abs(np.array(told.pixel_px) - pixel).max() < 0.2
+    off_m = np.array(told.position_m) - point
+    assert (np.abs(off_m) < 4 * np.array(told.sigma_m) + 1e-3).all()
+    assert told.range_sigma_m <= np.linalg.norm(told.sigma_m) + 1e-12
+    result, _ = run(world, click(frame, *pixel))
+    assert told.goal_rad == pytest.approx(
+        (result.pointings[0].commanded_pan_rad, result.pointings[0].commanded_tilt_rad), abs=2e-3
+    )
+
+
+def test_a_preview_of_what_the_head_cannot_reach_still_tells_where_it_is() -> None:
+    world = World()
+    frame = world.shoot()
+    loop = PointingLoop(
+        rig(), world, replace(LIMITS, tilt_rad=(-0.001, 0.001)), world.clock, PointingSettings()
+    )
+    told = loop.preview(click(frame, 150.0, 60.0), threading.Event())
+    assert told.range_m > 0.5
+    assert told.refused is not None and told.refused["code"] == "outside_limits", told.refused
+    assert (world.moves, world.stops) == ([], 0)
