@@ -26,7 +26,7 @@ _SOURCES = "mast or camera file, .cahvor, PDS3 label, OpenCV's, ROS's, Kalibr's,
 def add_commands(subparsers: Any) -> None:
     """Add ``camera`` with all its actions."""
     camera = subparsers.add_parser(
-        "camera", help="camera files (project, ray, convert), cameras (list, check, grab, focus)"
+        "camera", help="camera files (project, ray, convert, maps), cameras (list, check, grab, focus)"
     )
     actions = camera.add_subparsers(dest="action", metavar="ACTION", required=True)
 
@@ -78,6 +78,9 @@ def add_commands(subparsers: Any) -> None:
     )
     convert.set_defaults(run=camera_convert)
 
+    from mastctl.cli import camera_maps  # it takes a camera as the actions here do
+
+    camera_maps.add_action(actions)
     cameras.add_actions(actions)
 
 
@@ -157,6 +160,15 @@ def _errors_told(cameras: Mapping[str, CameraFile], done: Conversion) -> dict[st
         name: {"lens": lens, "worst_px": error.worst_px, "rms_px": error.rms_px}
         for name, lens, error in zip(cameras, lenses, done.errors, strict=False)
     }
+
+
+def chosen_camera(path: Path, name: str | None) -> tuple[str, CameraFile]:
+    """Return the camera of a file that is meant, and its name, notes told. Raises WrongUse and BadFile."""
+    from calib.files.any_camera import load_any
+
+    found, camera = _camera_of(load_any(path), name)
+    tell_notes(camera.notes)
+    return found, camera
 
 
 def _camera_of(source: StoredRig | CameraFile | CameraFiles, name: str | None) -> tuple[str, CameraFile]:

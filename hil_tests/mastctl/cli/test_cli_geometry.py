@@ -123,7 +123,7 @@ def test_rays_lead_back_to_their_pixels_bit_for_bit_through_csv(
 def test_solve_puts_the_target_on_the_pixel(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     run = Run("solve mast.yaml --camera eye_left --target -3 2.5 -3.5 --pixel 100 -50.5 --json", capsys)
     assert (run.code, run.err) == (0, "")
-    solutions = run.json["solutions"]
+    solutions = json.loads(run.out)["solutions"]
     assert len(solutions) == 2
     Path("p.csv").write_text("x_m,y_m,z_m\n-3,2.5,-3.5\n")
     for solution in solutions:
@@ -151,8 +151,8 @@ def test_an_unreachable_target_is_a_failure_with_its_own_code(
 ) -> None:
     run = Run("solve mast.yaml --camera eye_left --target 1 2 -3.05 --json", capsys)
     assert run.code == 1
-    assert run.json["error"]["code"] == "unreachable"
-    assert run.json["error"]["message"]
+    assert json.loads(run.out)["error"]["code"] == "unreachable"
+    assert json.loads(run.out)["error"]["message"]
     plain = Run("solve mast.yaml --camera eye_left --target 1 2 -3.05", capsys)
     assert (plain.code, plain.out) == (1, "")
     assert plain.err.count("\n") == 1
@@ -164,20 +164,22 @@ def test_triangulate_finds_the_point_and_how_well(folder: Path, capsys: pytest.C
     run = Run(f"{words} --json", capsys)
     assert run.code == 0
     assert set(run.json) == {"position_m", "covariance_m2", "ray_gap_m"}
-    np.testing.assert_allclose(run.json["position_m"], [11, 2, -3], rtol=0, atol=1e-9)
-    assert run.json["ray_gap_m"] == pytest.approx(0, abs=1e-12)
+    np.testing.assert_allclose(json.loads(run.out)["position_m"], [11, 2, -3], rtol=0, atol=1e-9)
+    assert json.loads(run.out)["ray_gap_m"] == pytest.approx(0, abs=1e-12)
     # Range error by the paper's eq. (1): R^2/(f b) times the disparity's sigma, 0.2 px times the root of 2.
     expected = 100 / (1000 * 0.2) * 0.2 * math.sqrt(2)
-    assert math.sqrt(run.json["covariance_m2"][0][0]) == pytest.approx(expected, rel=1e-3)
+    assert math.sqrt(json.loads(run.out)["covariance_m2"][0][0]) == pytest.approx(expected, rel=1e-3)
     twice = Run(f"{words} --json --sigma-px 0.4", capsys).json
-    assert twice["covariance_m2"][0][0] == pytest.approx(4 * run.json["covariance_m2"][0][0], rel=1e-9)
+    assert twice["covariance_m2"][0][0] == pytest.approx(
+        4 * json.loads(run.out)["covariance_m2"][0][0], rel=1e-9
+    )
     assert "11.000000" in Run(words, capsys).out
 
 
 def test_rays_that_do_not_meet_are_a_failure(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     words = "triangulate mast.yaml --pair eye --pan 0 --tilt 0 --left 310 240 --right 330 240 --json"
     run = Run(words, capsys)
-    assert (run.code, run.json["error"]["code"]) == (1, "behind_camera")
+    assert (run.code, json.loads(run.out)["error"]["code"]) == (1, "behind_camera")
 
 
 def test_pixels_of_two_things_are_a_failure_that_says_by_how_much(
@@ -187,9 +189,9 @@ def test_pixels_of_two_things_are_a_failure_that_says_by_how_much(
     # its errors, so that 1 px is taken: with clicks of 0.2 px a row is good to the root of 2 (1 + 0.04).
     words = "triangulate mast.yaml --pair eye --pan 0 --tilt 0 --left 330 240 --right 310 270 --json"
     run = Run(words, capsys)
-    assert (run.code, run.json["error"]["code"]) == (1, "not_one_point")
-    assert "30.0 px off the epipolar line" in run.json["error"]["message"]
-    assert f"{30 / math.sqrt(2 * 1.04):.1f} sigma" in run.json["error"]["message"]
+    assert (run.code, json.loads(run.out)["error"]["code"]) == (1, "not_one_point")
+    assert "30.0 px off the epipolar line" in json.loads(run.out)["error"]["message"]
+    assert f"{30 / math.sqrt(2 * 1.04):.1f} sigma" in json.loads(run.out)["error"]["message"]
     assert Run(words.replace("310 270", "310 243"), capsys).code == 0
     assert Run(f"{words} --sigma-px 10", capsys).code == 0
 
@@ -202,19 +204,19 @@ def test_budget_is_the_papers_table_1(folder: Path, capsys: pytest.CaptureFixtur
         "navcam": (38.8, 43.6, 3.9),
         "hazcam": (202.17, 203.16, 10.11),
     }
-    for camera in run.json["cameras"]:
+    for camera in json.loads(run.out)["cameras"]:
         found = [camera[key] for key in ("stereo_cm", "untracked_cm", "tracked_cm")]
         np.testing.assert_allclose(found, printed[camera["name"]], rtol=0, atol=0.06)
-    assert [camera["name"] for camera in run.json["cameras"]] == list(printed)
+    assert [camera["name"] for camera in json.loads(run.out)["cameras"]] == list(printed)
     assert "202.17" in Run("budget", capsys).out
 
 
 def test_convert_says_what_the_target_cannot_hold(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     run = Run("camera convert mast.yaml eye.cahvor --camera eye_left --json", capsys)
     assert run.code == 0
-    assert (run.json["format"], run.json["frame"]) == ("cahvor", "head")
-    assert any("name of the frame ('head')" in sentence for sentence in run.json["lost"])
-    assert any("'fit' is left out" in sentence for sentence in run.json["notes"])
+    assert (json.loads(run.out)["format"], run.json["frame"]) == ("cahvor", "head")
+    assert any("name of the frame ('head')" in sentence for sentence in json.loads(run.out)["lost"])
+    assert any("'fit' is left out" in sentence for sentence in json.loads(run.out)["notes"])
     plain = Run("camera convert eye.cahvor eye.yaml", capsys)
     assert plain.out.splitlines() == ["eye.yaml: mastctl/camera/1, frame 'unknown'"]
     assert yaml.safe_load(Path("eye.yaml").read_text())["C"] == [0.0, -0.1, 0.0]
@@ -319,7 +321,7 @@ def test_notes_go_to_stderr_and_stdout_stays_json(folder: Path, capsys: pytest.C
     Path("long.yaml").write_text(MAST.replace("A: [1, 0, 0]", "A: [1.001, 0, 0]"))
     run = Run("solve long.yaml --camera eye_left --target 5 2 -3 --json", capsys)
     assert run.code == 0
-    assert run.json["solutions"]
+    assert json.loads(run.out)["solutions"]
     assert "cameras.eye_left: |A| = 1.001" in run.err
 
 
@@ -331,7 +333,7 @@ def test_a_defect_is_told_in_one_line(
 
     monkeypatch.setattr("calib.mast.budget.target_approach_budget", defect)
     run = Run("budget --json", capsys)
-    assert (run.code, run.json["error"]["code"]) == (1, "internal")
+    assert (run.code, json.loads(run.out)["error"]["code"]) == (1, "internal")
 
 
 def test_every_command_helps(capsys: pytest.CaptureFixture[str]) -> None:
@@ -391,3 +393,24 @@ def test_the_module_runs_as_the_command_does(folder: Path) -> None:
     done = _process(folder, "budget", "--json")
     assert (done.returncode, done.stderr) == (0, "")
     assert len(json.loads(done.stdout)["cameras"]) == 3
+
+
+def test_maps_are_written_for_a_camera_and_for_a_pair(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = Run("camera maps mast.yaml --camera eye_left --out eye.npz --json", capsys)
+    assert run.code == 0
+    assert json.loads(run.out)["frame"] == "head"
+    held = np.load("eye.npz")
+    assert held["map_x"].dtype == np.float32
+    assert held["map_x"].shape == (481, 641)
+    assert 0.9 < json.loads(run.out)["shown"]["eye_left"] <= 1.0
+    run = Run("camera maps mast.yaml --pair eye --out pair.npz", capsys)
+    assert run.code == 0
+    assert {"left_map_x", "right_map_y", "Q", "left_K"} <= set(np.load("pair.npz"))
+
+
+@pytest.mark.parametrize("words", ["--camera eye_left --out a.txt", "--pair yes --out a.npz", "--out a.npz"])
+def test_maps_of_nothing_are_refused(words: str, folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert Run(f"camera maps mast.yaml {words}", capsys).code == 2
+    assert not Path("a.npz").exists()
