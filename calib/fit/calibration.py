@@ -9,6 +9,8 @@ from typing import Any, Literal
 import numpy as np
 
 from calib.fit.components import Component
+from calib.fit.left_out_boards import LeftOutBoard
+from calib.fit.wider import WiderModel
 from calib.mast.rig import Rig
 from calib.rigid import FloatArray, Rigid
 
@@ -141,6 +143,9 @@ class Calibration:
     components
         How large the errors of each kind of measurement are, against its stated sigma; empty where the method
         does not weigh by them.
+    wider, left_out_boards
+        What further numbers would gain, the likeliest first, and what the rest says of each board; empty
+        where the method does not weigh by sigmas.
     images, station
         What remains of every measurement.
     rover_from_station, rover_from_board
@@ -174,6 +179,8 @@ class Calibration:
     prisms_in_rover_m: Mapping[str, FloatArray]
     seconds: float
     components: tuple[Component, ...] = ()
+    wider: tuple[WiderModel, ...] = ()
+    left_out_boards: tuple[LeftOutBoard, ...] = ()
 
     def widened(self, kind: str) -> float:
         """Return by how much the fit takes a kind of measurement for worse than stated; 1 if it does not."""

@@ -19,12 +19,14 @@ from calib.fit.adjustment import HUBER, KNOWN_BEFOREHAND, MAST, Adjustment, Esti
 from calib.fit.calibration import Calibration
 from calib.fit.components import Component, variance_components, wider_sigmas
 from calib.fit.least_squares import Minimum, Normal, covariance_of, minimise
+from calib.fit.left_out_boards import left_out_boards
 from calib.fit.outliers import FALSE_ALARMS, judge, name_outliers
 from calib.fit.residuals import check_rms, image_residuals, rms_by_camera, station_residuals
 from calib.fit.start_values import Start, SurveyNotFitted, start_values
 from calib.fit.terms import ImageTerm, StationTerm, widened_images, with_kept
 from calib.fit.uncertainty import open_directions, sigma_by_key
 from calib.fit.usual_lens import lens_notes
+from calib.fit.wider import WiderModel, explaining, wider_models
 from calib.mast.rig import Rig, RigCamera
 from calib.rigid import FloatArray
 from calib.survey import Survey
@@ -77,7 +79,8 @@ def fit_joint(survey: Survey, mast_parameters: int = 6) -> Calibration:
 class Weighed:
     """A fit with sigmas as large as residuals show them.
 
-    ``images`` are all that were fitted, with every dot and these sigmas.
+    ``images`` are all that were fitted, with every dot and these sigmas; ``excess`` is by how much the
+    squared residuals of the kinds that were widened were larger in the first fit than stated sigmas allow.
     """
 
     problem: Adjustment
@@ -85,6 +88,7 @@ class Weighed:
     covariance: FloatArray
     images: tuple[ImageTerm, ...]
     components: tuple[Component, ...]
+    excess: float
 
 
 def weigh(problem: Adjustment, fit: Minimum[Estimate], images: Sequence[ImageTerm]) -> Weighed:
@@ -98,9 +102,11 @@ def weigh(problem: Adjustment, fit: Minimum[Estimate], images: Sequence[ImageTer
         All that were fitted, with every dot.
     """
     weighed: dict[str, float] = {}
+    first: tuple[Component, ...] = ()
     for count in range(WEIGHINGS + 1):
         covariance = covariance_of(fit.normal.matrix, problem.weak)
         components = variance_components(problem.blocks(fit.state), covariance, weighed)
+        first = first or components
         wanted = wider_sigmas(components)
         change = {kind: factor / weighed.get(kind, 1.0) for kind, factor in wanted.items()}
         if count == WEIGHINGS or all(abs(ratio - 1.0) < WEIGHED for ratio in change.values()):
@@ -108,7 +114,9 @@ def weigh(problem: Adjustment, fit: Minimum[Estimate], images: Sequence[ImageTer
         weighed |= wanted
         images = widened_images(images, change)
         problem, fit = without_blunders(problem.with_sigmas(change), fit.state, images, bounded=False)
-    return Weighed(problem, fit, covariance, tuple(images), components)
+    wrong = {c.kind for c in components if c.wrong}
+    excess = sum((c.factor**2 - 1) * c.redundancy for c in first if c.kind in wrong)
+    return Weighed(problem, fit, covariance, tuple(images), components, excess)
 
 
 def joint_problem(survey: Survey, from_here: Start, mast_parameters: int) -> Adjustment:
@@ -256,11 +264,25 @@ def _calibration(
         images=images,
         station=station_residuals(problem, state),
         components=weighed.components,
+        wider=_wider(stated, first, weighed),
+        left_out_boards=left_out_boards(problem, weighed.fit, covariance),
         rover_from_station=state.rover_from_station,
         rover_from_board=state.rover_from_board,
         prisms_in_rover_m=state.prisms_in_rover_m,
         seconds=time.perf_counter() - began,
     )
+
+
+def _wider(stated: Adjustment, first: Minimum[Estimate], weighed: Weighed) -> tuple[WiderModel, ...]:
+    """Wider models beside the fit, those first that explain why sigmas had to be widened."""
+    found = wider_models(weighed.problem, weighed.fit.state, weighed.covariance, weighed.fit.normal.gradient)
+    if not any(component.wrong for component in weighed.components):
+        return found
+    covariance = covariance_of(first.normal.matrix, stated.weak)
+    tried = wider_models(stated, first.state, covariance, first.normal.gradient)
+    causes = explaining(tried, weighed.excess)
+    named = {model.name for model in causes}
+    return (*causes, *(model for model in found if model.name not in named))
 
 
 def _prism_notes(problem: Adjustment, state: Estimate, mast_parameters: int) -> list[str]:

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.spatial.transform import Rotation
 
-from calib.survey import Dots, StationPoint, Survey
+from calib.rigid import FloatArray, Rigid
+from calib.survey import Dots, StationPoint, Survey, SurveyImage
 from calib.survey.records import StationKind
+from drivers.sim_survey.plan import SurveyTruth
 
 
 def with_moved_tape(survey: Survey, setup: str, placement: str, tape: str, shift_m: ArrayLike) -> Survey:
@@ -72,6 +75,113 @@ def with_outlier_dots(
     changed: Mapping[str, Dots] = {**survey.dots, image: replace(dots, pixels_px=pixels)}
     places = tuple((int(dots.rows[i]), int(dots.columns[i])) for i in chosen)
     return replace(survey, dots=changed), places
+
+
+def with_slipped_joint(survey: Survey, joint: str, first: str, slip_rad: float) -> Survey:
+    """Return the survey with a joint (``pan`` or ``tilt``) read ``slip_rad`` too high from an image on.
+
+    Raises
+    ------
+    KeyError
+        If the survey has no such image.
+    """
+    later = _from(survey, first)
+    return _read_otherwise(survey, joint, lambda image, angle: angle + slip_rad * (image.name in later))
+
+
+def with_encoder_errors(survey: Survey, joint: str, first_rad: complex, second_rad: complex) -> Survey:
+    """Return the survey with a joint's readings off by two waves around the turn.
+
+    A magnet off centre: the reading is the angle plus the real part of ``first_rad`` times e to the minus i
+    angle, and of ``second_rad`` with twice the angle.
+    """
+
+    def read(_: SurveyImage, angle: float) -> float:
+        return angle + float((first_rad * np.exp(-1j * angle) + second_rad * np.exp(-2j * angle)).real)
+
+    return _read_otherwise(survey, joint, read)
+
+
+def with_changed_focus(survey: Survey, camera: str, first: str, times: float) -> Survey:
+    """Return the survey with a camera's picture ``times`` as large from one of its images on.
+
+    Raises
+    ------
+    KeyError
+        If the survey has no such image.
+    """
+    middle = (np.array(survey.cameras[camera].size_px) - 1) / 2
+    later = _from(survey, first)
+    changed = {
+        image.name: replace(
+            survey.dots[image.name],
+            pixels_px=middle + times * (survey.dots[image.name].pixels_px - middle),
+        )
+        for image in survey.images
+        if image.camera == camera and image.name in later
+    }
+    return replace(survey, dots={**survey.dots, **changed})
+
+
+def with_moved_board(
+    survey: Survey, truth: SurveyTruth, images: tuple[str, ...], shift_m: ArrayLike, turn_rad: ArrayLike
+) -> Survey:
+    """Return the survey with some images taken of a board that had moved by (3,) and (3,), board frame.
+
+    Raises
+    ------
+    KeyError
+        If an image has no dots.
+    """
+    turn, shift = (np.asarray(v, dtype=np.float64) for v in (turn_rad, shift_m))
+    move = Rigid(Rotation.from_rotvec(turn).as_matrix(), shift)
+    dots = dict(survey.dots)
+    for name in images:
+        places = survey.board.dots_in_board_m(dots[name].rows, dots[name].columns)
+        dots[name] = _seen_elsewhere(survey, truth, name, places, move.points(places))
+    return replace(survey, dots=dots)
+
+
+def with_bowed_board(survey: Survey, truth: SurveyTruth, bow_m: float) -> Survey:
+    """Return the survey with a board bent about its y axis, its edges ``bow_m`` behind its middle."""
+    half_m = (survey.board.columns - 1) / 2 * survey.board.spacing_m
+    dots = dict(survey.dots)
+    for name, seen in survey.dots.items():
+        places = survey.board.dots_in_board_m(seen.rows, seen.columns)
+        bent = places + np.outer(bow_m * (places[:, 0] / half_m) ** 2, [0.0, 0.0, 1.0])
+        dots[name] = _seen_elsewhere(survey, truth, name, places, bent)
+    return replace(survey, dots=dots)
+
+
+def _from(survey: Survey, first: str) -> set[str]:
+    """The names of an image and those after it."""
+    names = [image.name for image in survey.images]
+    if first not in names:
+        raise KeyError(f"no image {first}")
+    return set(names[names.index(first) :])
+
+
+def _read_otherwise(survey: Survey, joint: str, read: Callable[[SurveyImage, float], float]) -> Survey:
+    """The survey with other readings of a joint."""
+
+    def again(image: SurveyImage) -> SurveyImage:
+        if image.pan_rad is None or image.tilt_rad is None:
+            return image
+        if joint == "pan":
+            return replace(image, pan_rad=read(image, image.pan_rad))
+        return replace(image, tilt_rad=read(image, image.tilt_rad))
+
+    return replace(survey, images=tuple(map(again, survey.images)))
+
+
+def _seen_elsewhere(
+    survey: Survey, truth: SurveyTruth, image: str, was_m: FloatArray, is_m: FloatArray
+) -> Dots:
+    """An image's dots with their noise, had they been at other places (n, 3) of the board frame."""
+    camera, camera_from_board = truth.camera_from_board(survey, image)
+    before, after = (camera.project(camera_from_board.points(places))[0] for places in (was_m, is_m))
+    dots = survey.dots[image]
+    return replace(dots, pixels_px=dots.pixels_px + after - before)
 
 
 def _moved(survey: Survey, key: tuple[str, StationKind, str, str], shift_m: ArrayLike) -> Survey:

@@ -16,6 +16,7 @@ from calib.survey import Survey
 from mastctl.calibration import drawn
 from mastctl.calibration.maps import change_map, uncertainty_map
 from mastctl.calibration.stated import component_table
+from mastctl.calibration.tested import board_table, wider_table
 from mastctl.calibration.verdict import POINTING_RANGE_M, Verdict
 from mastctl.report import pages, plots
 from mastctl.report.figures import Figure
@@ -116,6 +117,8 @@ def _page(told: Told) -> str:
         mast=mast_table(calibration),
         cameras=camera_table(calibration),
         measurements=component_table(survey, calibration),
+        wider=wider_table(calibration),
+        boards=board_table(calibration),
         notes=calibration.notes,
         held_fixed=HELD_FIXED,
         warnings=told.warnings,

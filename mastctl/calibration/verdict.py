@@ -16,6 +16,7 @@ from calib.survey import Survey
 from mastctl.calibration.exchanged import exchanged_boards
 from mastctl.calibration.expected import RARELY, check_sizes
 from mastctl.calibration.stated import wrong_sentence
+from mastctl.calibration.tested import cross_validation_px
 
 Grade = Literal["good", "care", "bad"]
 
@@ -95,6 +96,8 @@ def judge_calibration(
     """
     reasons = [
         *_noise(survey, calibration),
+        *_wider(calibration),
+        *_by_the_others(calibration),
         *_odd_images(calibration),
         *_checks(survey, calibration),
         *_open(calibration),
@@ -139,6 +142,52 @@ def _noise(survey: Survey, calibration: Calibration) -> list[Reason]:
         words = f"each kind of measurement scatters no more than stated, most of all {most.kind}: "
         words += f"{most.factor:.2f} ± {most.factor_sigma:.2f} times their sigma"
         reasons.append(Reason("good", words))
+    return reasons
+
+
+def _wider(calibration: Calibration) -> list[Reason]:
+    """Whether the residuals ask for a wider model than the one that was fitted."""
+    if not calibration.wider:
+        return []
+    asked = [model for model in calibration.wider if model.significant]
+    if not asked:
+        first = min(calibration.wider, key=lambda model: model.chance)
+        words = (
+            f"no wider model out of {len(calibration.wider)} would gain more than chance makes likely; most "
+        )
+        words += f"does {first.name}, {first.gain:.1f} in chi-square with {first.numbers} numbers"
+        return [Reason("good", words)]
+    first, *others = asked
+    grade: Grade = "bad" if first.size_px > POINTING_GOOD_PX else "care"
+    words = f"{first.numbers} more numbers would gain {first.gain:.0f} in chi-square: {first.sentence}"
+    reasons = [Reason(grade, words)]
+    if others:
+        names = _some([f"{model.name} ({model.gain:.0f} with {model.numbers})" for model in others])
+        reasons.append(Reason("care", f"what else would gain, perhaps by the same cause: {names}"))
+    return reasons
+
+
+def _by_the_others(calibration: Calibration) -> list[Reason]:
+    """Whether each board is where the others say, and pulls the mast no farther than it may."""
+    boards = calibration.left_out_boards
+    if not boards:
+        return []
+    odd = [one for one in boards if one.least_chance * len(boards) < RARELY]
+    reasons = []
+    for one in odd:
+        words = (
+            f"placement {one.board[1]} (set-up {one.board[0]}) contradicts the others: without it the mast "
+        )
+        words += f"would be elsewhere by {one.mast_sigmas:.1f} of its sigmas"
+        if np.isfinite(one.predicted_px):
+            words += f", and its dots are {one.predicted_px:.2f} px rms off what they say"
+        reasons.append(Reason("care", words))
+    fitted, predicted = cross_validation_px(calibration)
+    if not odd and np.isfinite(predicted):
+        words = (
+            f"each of {len(boards)} boards is where the others say: {predicted:.3f} px rms by the others, "
+        )
+        reasons.append(Reason("good", f"{words}{fitted:.3f} px with it"))
     return reasons
 
 

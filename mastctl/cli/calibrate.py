@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from mastctl.calibration.run import Calibrated
 
 OUTLIERS_SHOWN = 20
+TESTS_SHOWN = 4
 SURVEY_FILES = ("survey.yaml", "station.csv", "images.csv", "dots.csv", "clicks.csv")
 
 
@@ -168,6 +169,7 @@ def _document(done: Calibrated, in_use: StoredRig | None, page: Path | None) -> 
     from mastctl.calibration.mast_file import as_lists, mast_keys
     from mastctl.calibration.report import change_summary
     from mastctl.calibration.stated import components_told
+    from mastctl.calibration.tested import cross_validation_told, wider_told
 
     fit = done.calibration
     sigma = plain(fit.sigma)
@@ -190,6 +192,8 @@ def _document(done: Calibrated, in_use: StoredRig | None, page: Path | None) -> 
         "degrees_of_freedom": _finite(fit.degrees_of_freedom),
         "chi2_probability": _finite(fit.chi2_probability),
         "sigmas_found": components_told(done.survey, fit),
+        "wider_models": wider_told(fit),
+        "cross_validation": cross_validation_told(fit),
         "outliers": [
             {"kind": o.kind, "name": o.name, "sentence": o.sentence, "size": _finite(o.size)}
             for o in fit.outliers
@@ -221,6 +225,7 @@ def _show(done: Calibrated, in_use: StoredRig | None, page: Path | None) -> None
     """Tables for people."""
     from mastctl.calibration.report import camera_table, change_summary, mast_table
     from mastctl.calibration.stated import component_table
+    from mastctl.calibration.tested import board_table, wider_table
 
     fit = done.calibration
     output.print_table(
@@ -229,6 +234,10 @@ def _show(done: Calibrated, in_use: StoredRig | None, page: Path | None) -> None
     output.print_table("Cameras", *camera_table(fit), fit.notes)
     if (components := component_table(done.survey, fit)) is not None:
         output.print_table("Measurements", *components)
+    if (wider := wider_table(fit, TESTS_SHOWN)) is not None:
+        output.print_table("Wider models, the likeliest first", *wider)
+    if (boards := board_table(fit, TESTS_SHOWN)) is not None:
+        output.print_table("Boards by the others, the least likely first", *boards)
     if fit.outliers:
         shown = [[outlier.name, _off(outlier)] for outlier in fit.outliers[:OUTLIERS_SHOWN]]
         more = len(fit.outliers) - len(shown)
