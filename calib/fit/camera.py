@@ -20,6 +20,7 @@ from calib.camera.cahvor import CameraModel, Kind
 from calib.camera.parameters import parameter_names, parameter_part, predict, stepped
 from calib.errors import CalibError
 from calib.fit.least_squares import Normal, covariance_of, minimise
+from calib.fit.significance import typical_px
 from calib.fit.usual_lens import lens_knowledge
 from calib.rigid import FloatArray
 
@@ -46,9 +47,6 @@ noise)."""
 
 STRAY = 3.0
 """A point so many times farther off than an image may be is left out by itself."""
-
-MEDIAN_OF_TWO = 2 * np.log(2.0)
-"""Median of chi-square with two degrees of freedom."""
 
 
 class CameraNotFitted(CalibError):
@@ -159,12 +157,6 @@ def _image_sizes(residuals_px: FloatArray, images: np.ndarray) -> FloatArray:
     """
     count = int(images.max()) + 1
     return np.array([typical_px(residuals_px[images == i]) for i in range(count)])
-
-
-def typical_px(residuals_px: FloatArray) -> float:
-    """Return the sigma of a coordinate that the median length of residuals (n, 2) tells, pixels."""
-    square = np.nan_to_num((residuals_px**2).sum(axis=1), nan=np.inf)
-    return float(np.sqrt(np.median(square) / MEDIAN_OF_TWO)) if len(square) else float("inf")
 
 
 def _starts(

@@ -14,8 +14,8 @@ import numpy as np
 
 from calib.camera.cahvor import CameraModel
 from calib.errors import CalibError
-from calib.fit.camera import typical_px
 from calib.fit.least_squares import Normal, minimise
+from calib.fit.significance import typical_px
 from calib.mast.gimbal import MAST_FREE, gimbal, gimbal_rates
 from calib.rigid import FloatArray
 

@@ -1,16 +1,22 @@
-"""How unlikely a misfit is by chance, as a probability and in sigmas."""
+"""How large misfits are, and how unlikely by chance: as a probability and in sigmas."""
 
 from __future__ import annotations
 
 import math
 
+import numpy as np
 from scipy.special import chdtrc, fdtrc, ndtri
+
+from calib.rigid import FloatArray
 
 MOST_SIGMAS = 37.0
 """Beyond this the probability is no number that a computer holds."""
 
 THREE_SIGMAS = 0.0027
 """The chance that a normal error is beyond three sigma, either side."""
+
+MEDIAN_OF_TWO = 2 * np.log(2.0)
+"""Median of chi-square with two degrees of freedom."""
 
 
 def chance(chi2: float, freedom: int, scale: float = 1.0, scale_freedom: float = math.inf) -> float:
@@ -37,3 +43,9 @@ def sigmas(probability: float) -> float:
     if probability <= 0.0:
         return MOST_SIGMAS
     return min(float(-ndtri(min(probability, 1.0) / 2)), MOST_SIGMAS)
+
+
+def typical_px(residuals_px: FloatArray) -> float:
+    """Return the sigma of a coordinate that the median length of residuals (n, 2) tells, pixels."""
+    square = np.nan_to_num((residuals_px**2).sum(axis=1), nan=np.inf)
+    return float(np.sqrt(np.median(square) / MEDIAN_OF_TWO)) if len(square) else float("inf")
