@@ -323,7 +323,8 @@ class _Fit:
             chosen, tests = self.choose(candidates, problem, fit)
             start = without_terms(fit.state, set(candidates) - set(chosen))
             if set(chosen) != set(candidates):
-                problem, fit = self.settled(chosen, start)
+                fewer = self.problem(chosen, start).with_terms(problem.images, ()).with_huber(None)
+                problem, fit = without_blunders(fewer, start, self.terms.images, bounded=False)
         else:
             candidates = chosen = tuple(self.options.terms)
             problem, fit = self.settled(chosen, self.look_for_changes(chosen))

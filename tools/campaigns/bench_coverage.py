@@ -1,0 +1,285 @@
+"""Fit many simulated benches and count how often stated intervals hold the truth, and how well the rig
+points.
+
+    .venv/bin/python -m tools.campaigns.bench_coverage --benches 200 --seed 1
+    .venv/bin/python -m tools.campaigns.bench_coverage --benches 200 --seed 1 --head servo
+
+Benches are simulated (`drivers.sim_survey.bench`): a Navcam pair, an A2 board at three placements, corners
+with 0.1 px noise and some of them wrong. ``--head ptu`` reads true but for counts of 0.05 mrad; ``--head
+servo`` has 4096 counts a turn, harmonics of 6 and 2 mrad and 4 mrad of backlash. Prints, over the benches,
+how often the 95 % interval of each parameter and of predicted pixels (points at 2 to 10 m, three directions,
+both cameras, at what the joints read) holds the truth; and how far first pointings land from targets at 10, 6
+and 2 m that were clicked without noise, with the fitted file, with a file fitted without joints' errors, and
+with the truth for a file: what counts alone allow.
+
+Errors of one bench go together, so a pooled rate scatters far more than so many independent intervals would:
+behind ± stands its standard error, from the scatter of whole benches.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from calib.camera.cahvor import CameraModel
+from calib.camera.stereo import triangulate
+from calib.errors import CalibError
+from calib.fit.bench import BenchOptions, fit_bench
+from calib.fit.bench_calibration import BenchCalibration
+from calib.mast.gimbal import numbers_of
+from calib.mast.joints import JOINTS_NAMES
+from calib.mast.joints import numbers_of as joint_numbers
+from calib.mast.pointing import solve
+from calib.mast.rig import Rig
+from calib.mast.rig_rates import pixel_rates
+from calib.rigid import tangents
+from drivers.sim_survey.bench import BenchPlan, Placement, simulate_bench
+from mastctl.cli.output import at_least
+from mastctl.cli.tasks import add_task_options, results_of
+from tools.arguments import end
+
+LEVEL, Z = 0.95, 1.959964
+LOWEST = 88.0
+DIRECTIONS_RAD = ((-0.7, -0.3), (0.1, -0.4), (0.8, 0.0))
+"""What the joints read where pixels are predicted: within what the placements cover."""
+PLACES = ((0.5, 0.5), (0.2, 0.7))
+RANGES_M = (2.0, 6.0, 10.0)
+TARGETS = 12
+"""Pointings at each range."""
+
+PLACEMENTS = (
+    Placement(0.9, 0.1, -0.45, (0.5, 0.1, 0.1)),
+    Placement(1.7, -0.9, -0.1, (-0.3, 0.5, 0.0)),
+    Placement(2.6, 0.8, 0.05, (0.2, -0.4, 0.05)),
+)
+HEADS = {
+    "ptu": BenchPlan(placements=PLACEMENTS, gross=0.005, count_rad=5e-5),
+    "servo": BenchPlan(
+        placements=PLACEMENTS,
+        gross=0.005,
+        count_rad=2 * np.pi / 4096,
+        pan_harmonics=((0.004, 0.0045), (0.001, -0.0017)),
+        tilt_harmonics=((0.003, -0.0052), (0.0015, 0.0013)),
+        backlash_rad=0.004,
+        bow_m=(0.001, -0.0005),
+    ),
+}
+
+
+class BenchTask(NamedTuple):
+    """One bench."""
+
+    plan: BenchPlan
+    seed: int
+
+
+class Score(NamedTuple):
+    """Errors over sigmas, of parameters by name and of pixels; how far pointings land (3 files, ranges,
+    targets, 2), px; what entered; chi-square's probability and quotient; seconds."""
+
+    parameters: dict[str, float]
+    pixels: np.ndarray
+    landed_px: np.ndarray
+    entered: tuple[str, ...]
+    probability: float
+    reduced: float
+    seconds: float
+
+
+def score(task: BenchTask) -> Score | str:
+    """Return how far one bench's fit is from the truth, or why there is none."""
+    survey = simulate_bench(task.seed, task.plan)
+    try:
+        fit = fit_bench(survey)
+        entered = tuple(t.name for t in fit.terms if t.entered)
+        without = [t for t in entered if not t.startswith(("pan ", "tilt "))]
+        plain = fit_bench(survey, BenchOptions(terms=without)) if len(without) < len(entered) else fit
+    except CalibError as refused:
+        return f"seed {task.seed}: {refused}"
+    true = task.plan.rig
+    landed = [pointings(true, rig, task.plan.count_rad, task.seed) for rig in (fit.rig, plain.rig, true)]
+    return Score(
+        parameter_errors(true, fit),
+        np.concatenate([pixel_errors(true, name, fit) for name in true.cameras]),
+        np.array(landed),
+        entered,
+        fit.chi2_probability,
+        fit.chi2 / fit.degrees_of_freedom,
+        fit.seconds,
+    )
+
+
+def parameter_errors(true: Rig, fit: BenchCalibration) -> dict[str, float]:
+    """Return the errors of all fitted parameters of the rig, in sigmas."""
+    values = truths(true, fit.rig)
+    sigma = np.sqrt(np.diag(fit.covariance))
+    return {n: values[n] / s for n, s in zip(fit.parameter_names, sigma, strict=True)}
+
+
+def truths(true: Rig, found: Rig) -> dict[str, float]:
+    """Return how far every parameter of a rig is from the truth, by its name."""
+    mast = numbers_of(found.mast) - numbers_of(true.mast)
+    joints = joint_numbers(found.joints) - joint_numbers(true.joints)
+    off = dict(zip(("mast.axis_offset_m", "mast.axis_twist_rad"), mast[6:].tolist(), strict=True))
+    off |= dict(zip(JOINTS_NAMES, joints.tolist(), strict=True))
+    for name, camera in found.cameras.items():
+        off |= {
+            f"cameras.{name}.{k}": v for k, v in camera_off(camera.model, true.cameras[name].model).items()
+        }
+    return off
+
+
+def camera_off(found: CameraModel, true: CameraModel) -> dict[str, float]:
+    """Return how far a camera's parameters are from the truth."""
+    off: dict[str, float] = {}
+    for letter in "CHV":
+        off |= dict(
+            zip((f"{letter}.{a}" for a in "xyz"), getattr(found, letter) - getattr(true, letter), strict=True)
+        )
+    for letter in "AO":
+        along = -tangents(getattr(found, letter)) @ getattr(true, letter)
+        off |= {f"{letter}.1": along[0], f"{letter}.2": along[1]}
+    off |= {f"R.{i}": found.R[i] - true.R[i] for i in (1, 2)}
+    return {key: float(value) for key, value in off.items()}
+
+
+def pixel_errors(true: Rig, name: str, fit: BenchCalibration) -> np.ndarray:
+    """Return predicted less true pixels of points seen at some readings, in sigmas."""
+    errors = []
+    for reading in DIRECTIONS_RAD:
+        for approach in ((1, 1), (-1, -1)):
+            model = true.camera_in_rover(name, *true.joints.true_rad(reading, approach))
+            rays = model.ray(np.array(PLACES) * model.size_px)
+            for range_m in RANGES_M:
+                points = rays.origins_m + range_m * rays.directions
+                angles = fit.rig.joints.true_rad(reading, approach)
+                predicted, rates = pixel_rates(fit.rig, fit.parameter_names, name, *angles, points, approach)
+                covariance = np.einsum("nip,pq,njq->nij", rates, fit.covariance, rates)
+                errors.append(
+                    (predicted - model.project(points)[0]) / np.sqrt(np.einsum("nii->ni", covariance))
+                )
+    return np.concatenate(errors).ravel()
+
+
+def pointings(true: Rig, believed: Rig, count_rad: float, seed: int) -> np.ndarray:
+    """Return how far targets land from the image centre (ranges, targets, 2), px.
+
+    A target is clicked exactly in both pictures at whole counts; the believed rig ranges it and says what the
+    joints should read; the head goes to the nearest counts, its axes anywhere within these.
+    """
+    rng = np.random.default_rng([seed, 7])
+    left, right = true.stereo["navcam"]
+    aim = (np.array(true.cameras[left].model.size_px) - 1) / 2
+    out = []
+    for range_m in sorted(RANGES_M, reverse=True):
+        for _ in range(TARGETS):
+            reading = counted(rng.uniform((-0.9, -0.4), (0.9, 0.1)), count_rad)
+            at = within(true, reading, (1, 1), count_rad, rng)
+            model = true.camera_in_rover(left, *at)
+            ray = model.ray(rng.uniform(0.2, 0.8, 2) * model.size_px)
+            target = ray.origins_m + range_m * ray.directions
+            clicks = [true.camera_in_rover(name, *at).project(target)[0] for name in (left, right)]
+            angles = believed.joints.true_rad(reading, (1, 1))
+            seen = [believed.camera_in_rover(name, *angles) for name in (left, right)]
+            found = triangulate(*seen, *clicks)
+            goal = solve(
+                believed.mast, believed.cameras[left].model, found.position_m, aim,
+                from_pan_rad=angles[0], from_tilt_rad=angles[1],
+            )[0]  # fmt: skip
+            wanted = (goal.pan_rad, goal.tilt_rad)
+            sides = (1 if wanted[0] >= angles[0] else -1, 1 if wanted[1] >= angles[1] else -1)
+            command = counted(np.array(believed.joints.read_rad(wanted, sides)), count_rad)
+            landed = true.camera_in_rover(left, *within(true, command, sides, count_rad, rng))
+            out.append(landed.project(target)[0] - aim)
+    return np.array(out).reshape(len(RANGES_M), TARGETS, 2)
+
+
+def counted(reading: np.ndarray, count_rad: float) -> tuple[float, float]:
+    """Return a reading in whole counts."""
+    pan, tilt = (np.round(reading / count_rad) * count_rad).tolist()
+    return pan, tilt
+
+
+def within(
+    true: Rig,
+    reading: tuple[float, float],
+    approach: Sequence[int],
+    count_rad: float,
+    rng: np.random.Generator,
+) -> tuple[float, float]:
+    """Return true angles where the joints read some counts."""
+    pan, tilt = np.array(reading) + count_rad * rng.uniform(-0.5, 0.5, 2)
+    return true.joints.true_rad((float(pan), float(tilt)), (approach[0], approach[1]))
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--benches", type=at_least(1), default=100)
+    parser.add_argument("--seed", type=at_least(0), default=1, help="of the first bench; the others follow")
+    parser.add_argument("--head", choices=sorted(HEADS), default="ptu")
+    parser.add_argument("--attitudes", type=at_least(4), default=20, help="head positions per placement")
+    add_task_options(parser)
+    options = parser.parse_args()
+    plan = replace(HEADS[options.head], attitudes=options.attitudes, checks=0)
+    seeds = range(options.seed, options.seed + options.benches)
+    began = time.monotonic()
+    tasks = [BenchTask(plan, seed) for seed in seeds]
+    found = results_of(options, "benches", score, tasks, lambda task: f"seed {task.seed}")
+    if found is None:
+        return 0
+    scores = [one for one in found if isinstance(one, Score)]
+    refused = [one for one in found if isinstance(one, str)]
+    if scores:
+        report(scores)
+    print("\n".join([f"benches refused: {len(refused)}", *refused]))
+    print(
+        f"{options.benches} benches from seed {options.seed}, {options.head}, {options.attitudes} attitudes: "
+        f"{time.monotonic() - began:.0f} s"
+    )
+    return 0
+
+
+def report(scores: Sequence[Score]) -> None:
+    """Print the tables."""
+    names = list(dict.fromkeys(name for s in scores for name in s.parameters))
+    print(f"{100 * LEVEL:g} % intervals hold the truth in, %            rms error in sigmas, benches")
+    for name in names:
+        errors = np.array([s.parameters[name] for s in scores if name in s.parameters])
+        held = 100 * np.mean(np.abs(errors) < Z)
+        mark = "  <--" if held < LOWEST else ""
+        print(f"  {name:36s} {held:5.1f}      {np.sqrt(np.mean(errors**2)):.2f}  {len(errors)}{mark}")
+    each = [100 * np.mean(np.abs(list(s.parameters.values())) < Z) for s in scores]
+    pixels = [100 * np.mean(np.abs(s.pixels) < Z) for s in scores]
+    for what, rates in (("pooled over parameters", each), ("pooled over pixels", pixels)):
+        error = np.std(rates, ddof=1) / np.sqrt(len(rates)) if len(rates) > 1 else np.nan
+        print(f"  {what:36s} {np.mean(rates):5.1f} ± {error:.1f}")
+    print(
+        "first pointing, rms px an axis, exact clicks:   "
+        + "".join(f"{r:8g} m" for r in sorted(RANGES_M)[::-1])
+    )
+    landed = np.array([s.landed_px for s in scores])
+    rms = np.sqrt(np.mean(landed**2, axis=(0, 3, 4)))
+    for label, row in zip(("the fitted file", "without joints' errors", "counts alone"), rms, strict=True):
+        print(f"  {label:44s}" + "".join(f"{value:10.3f}" for value in row))
+    whole = np.sqrt(np.mean(landed**2, axis=(0, 2, 3, 4)))
+    over = whole / whole[2]
+    print(
+        f"  in all {whole[0]:.3f}, {whole[1]:.3f}, {whole[2]:.3f}: {over[0]:.2f}, {over[1]:.2f} times counts alone"
+    )
+    terms = dict.fromkeys(t for s in scores for t in s.entered)
+    counts = {t: sum(t in s.entered for s in scores) for t in terms}
+    print("terms that entered: " + (", ".join(f"{t} {n}" for t, n in counts.items()) or "none"))
+    reduced = np.array([s.reduced for s in scores])
+    print(f"chi-square over its degrees of freedom: mean {reduced.mean():.4f}, sd {reduced.std():.4f}")
+    print(f"fit: {np.mean([s.seconds for s in scores]):.2f} s on average")
+
+
+if __name__ == "__main__":
+    end(main)
