@@ -27,20 +27,20 @@ from functools import cached_property
 import numpy as np
 
 from calib.camera.cahvor import CameraModel
-from calib.camera.parameters import parameter_names, parameter_part, predict, stepped
+from calib.camera.parameters import Prediction, parameter_names, parameter_part, predict, stepped
 from calib.fit.least_squares import Normal
 from calib.fit.terms import DRAWING, JOINTS, ImageTerm, StationTerm, widened_images
 from calib.fit.usual_lens import lens_knowledge
-from calib.mast.gimbal import MAST_FREE, MAST_NAMES, gimbal, gimbal_rates, mast_of
-from calib.mast.joints import JOINTS_NAMES, Joints, joints_of
+from calib.mast.gimbal import MAST_FREE, MAST_NAMES, Gimbal, gimbal, gimbal_rates, mast_of
+from calib.mast.joints import JOINTS_NAMES, AxisJoint, Joints, joints_of
 from calib.mast.rig import Mast
 from calib.rigid import FloatArray, Rigid, moved_rigid, rigid_rates
 
 HUBER = 3.0
 """Length of a residual, in sigmas, from which its pull no longer grows while blunders are looked for."""
 
-USUAL_JOINT_RAD = 0.03
-"""What a joint's harmonics and backlash are like, one sigma, radians; hobby servos have some 10 mrad."""
+USUAL_JOINT_RAD = 0.01
+"""What a joint's harmonics and backlash are like, one sigma, radians; hobby servos have 6 to 9 mrad."""
 
 USUAL_BOW_M = 0.005
 """How far a board's edges are usually from flat, one sigma, metres."""
@@ -274,44 +274,47 @@ class Adjustment:
 
     def blocks(self, state: Estimate) -> Iterator[tuple[ImageTerm | StationTerm | str, Block]]:
         """Yield every group that counts, residuals and Jacobian; a name for what is known beforehand."""
-        for image in self.images:
-            if image.keep.any():
-                yield image, self.image_block(state, image)
+        for _, images in self._by_camera():
+            yield from zip(images, self.image_blocks(state, images), strict=True)
         for point in self.station:
             if point.keep:
                 yield point, self.station_block(state, point)
         yield from self.known(state)
 
+    def _by_camera(self) -> Iterator[tuple[str, list[ImageTerm]]]:
+        """The images that count, by camera: one call for the points of many is far quicker."""
+        for name in dict.fromkeys(t.camera for t in self.images):
+            yield name, [t for t in self.images if t.camera == name and t.keep.any()]
+
     def _residuals(self, state: Estimate) -> Iterator[tuple[FloatArray, int]]:
-        for image in self.images:
-            if image.keep.any():
-                yield self.image_residual(state, image), 2
+        for name, images in self._by_camera():
+            if not images:
+                continue
+            pixels, _ = state.cameras[name].project(
+                np.concatenate([self.in_camera(state, t)[t.keep] for t in images])
+            )
+            measured = np.concatenate([t.pixels_px[t.keep] for t in images])
+            sigma = np.concatenate([t.sigma_px[t.keep] for t in images])
+            yield ((pixels - measured) / sigma[:, None]).ravel(), 2
         for point in self.station:
             if point.keep:
                 yield self.station_residual(state, point), 3
         for _, block in self.known(state):
             yield block.residual, 1
 
+    def reading(self, state: Estimate, image: ImageTerm) -> tuple[float, float]:
+        """What the joints would have read of an image without noise, as the state has it."""
+        if image.attitude is None or image.attitude < 0 or not len(state.joints_rad):
+            return image.pan_rad, image.tilt_rad
+        pan, tilt = state.joints_rad[image.attitude]
+        return image.pan_rad + float(pan), image.tilt_rad + float(tilt)
+
     def joints(self, state: Estimate, image: ImageTerm) -> tuple[float, float]:
         """The true joint angles of an image as the state has them."""
-        return self.angles(state, image)[0]
-
-    def angles(
-        self, state: Estimate, image: ImageTerm
-    ) -> tuple[tuple[float, float], FloatArray, tuple[float, float]]:
-        """True pan and tilt of an image, their rates (2, 5) to their joint's numbers, and to its reading."""
-        pan, tilt = image.pan_rad, image.tilt_rad
-        if image.attitude is not None and image.attitude >= 0 and len(state.joints_rad):
-            off = state.joints_rad[image.attitude]
-            pan, tilt = pan + float(off[0]), tilt + float(off[1])
-        if image.attitude is None or (not state.joint_errors.any() and not len(self.joint_errors)):
-            return (pan, tilt), np.zeros((2, 5)), (1.0, 1.0)
-        joints, (from_pan, from_tilt) = state.as_joints, image.approach
-        return (
-            joints.true_rad((pan, tilt), image.approach),
-            np.stack([joints.pan.rates(pan, from_pan), joints.tilt.rates(tilt, from_tilt)]),
-            (joints.pan.slope(pan, from_pan), joints.tilt.slope(tilt, from_tilt)),
-        )
+        reading = self.reading(state, image)
+        if image.attitude is None or not state.joint_errors.any():
+            return reading
+        return state.as_joints.true_rad(reading, image.approach)
 
     def image_residual(self, state: Estimate, image: ImageTerm) -> FloatArray:
         """Predicted less measured pixels of the dots that count, in sigmas, (2n,)."""
@@ -327,31 +330,58 @@ class Adjustment:
             points = (points - head.translation_m) @ head.rotation
         return np.asarray(points)
 
+    def _axes(self, state: Estimate) -> tuple[AxisJoint, AxisJoint]:
+        """Both joints as the state has them."""
+        return state.as_joints.pan, state.as_joints.tilt
+
     def image_block(self, state: Estimate, image: ImageTerm) -> Block:
         """The dots of an image."""
+        return next(self.image_blocks(state, [image]))
+
+    def image_blocks(self, state: Estimate, images: Sequence[ImageTerm]) -> Iterator[Block]:
+        """The dots of some images of one camera."""
+        if not images:
+            return
+        points, heads = [], []
+        for image in images:
+            board = state.rover_from_board[image.board]
+            points.append(board.points(bowed_points(state, image)[image.keep]))
+            heads.append(None if image.attitude is None else gimbal(state.mast, *self.joints(state, image)))
+        in_camera = [
+            p if head is None else (p - head.translation_m) @ head.rotation
+            for p, head in zip(points, heads, strict=True)
+        ]
+        every = predict(state.cameras[images[0].camera], np.concatenate(in_camera))
+        first = 0
+        for image, there, head in zip(images, points, heads, strict=True):
+            mine = slice(first, first + len(there))
+            first += len(there)
+            yield self._block(state, image, there, head, Prediction(*(array[mine] for array in every)))
+
+    def _block(
+        self, state: Estimate, image: ImageTerm, points: FloatArray, head: Gimbal | None, seen: Prediction
+    ) -> Block:
+        """One image whose points (n, 3) of the rover frame are seen so."""
         keep = image.keep
         board = state.rover_from_board[image.board]
-        points = board.points(bowed_points(state, image)[keep])
-        parts, columns = [], [self.at(("camera", image.camera))]
-        if image.attitude is None:
-            seen = predict(state.cameras[image.camera], points)
-            in_rover = seen.d_points
-            parts.append(seen.d_step)
-        else:
-            true_rad, per_number, slopes = self.angles(state, image)
-            head = gimbal(state.mast, *true_rad)
-            seen = predict(state.cameras[image.camera], (points - head.translation_m) @ head.rotation)
-            in_rover = seen.d_points @ head.rotation.T
-            parts.append(seen.d_step)
-            rates = -gimbal_rates(in_rover, points, head, np.array([*self.mast_free, 8, 9], dtype=int))
-            parts.append(rates[..., :-2])
+        parts, columns = [seen.d_step], [self.at(("camera", image.camera))]
+        in_rover = seen.d_points
+        if head is not None:
+            in_rover = in_rover @ head.rotation.T
+            turned = self.joint_rad > 0 or len(self.joint_errors) > 0
+            wanted = np.array([*self.mast_free, *((8, 9) if turned else ())], dtype=int)
+            rates = -gimbal_rates(in_rover, points, head, wanted)
+            parts.append(rates[..., : len(self.mast_free)])
             columns.append(self.at(MAST))
+            both = list(zip(self._axes(state), self.reading(state, image), image.approach, strict=True))
             if len(self.joint_errors):
+                per_number = np.stack([joint.rates(read, side) for joint, read, side in both])
                 per_joint = rates[..., -2:, None] * per_number
                 parts.append(per_joint.reshape(*rates.shape[:2], -1)[..., self.joint_errors])
                 columns.append(self.at(JOINT_ERRORS))
             if self.joint_rad > 0:
-                parts.append(rates[..., -2:] * np.array(slopes))
+                slopes = np.array([joint.slope(read, side) for joint, read, side in both])
+                parts.append(rates[..., -2:] * slopes)
                 columns.append(self.at(("attitude", image.attitude)))
         if image.board[0] in self.bowed:
             behind = (in_rover @ board.rotation[:, 2])[..., None]

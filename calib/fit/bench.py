@@ -178,31 +178,31 @@ class _Fit:
         )
         self._split(board, after)
 
-    def look_for_changes(self, chosen: Sequence[str]) -> Estimate:
-        """Return a fit of all terms with pulls bounded; a board that moved counts as two placements.
+    def look_for_changes(self, chosen: Sequence[str]) -> tuple[Adjustment, Estimate]:
+        """Return the problem with some terms, lone wrong corners left out, and its fit.
+
+        A board that moved counts as two placements.
 
         Raises
         ------
         BenchNotFitted
             If a joint slipped, or a camera changed: nothing says which of its two states is the one to come.
         """
-        state = self.start
-        for _ in range(CHANGES):
+        strays = {n: s for view in self.views.values() for n, s in view.strays.items()}
+        for left in range(CHANGES, -1, -1):
             problem = self.seen(chosen, self.start)
-            strays = {n: s for view in self.views.values() for n, s in view.strays.items()}
             problem = problem.with_terms(
                 [replace(t, keep=t.keep & ~strays[t.name]) for t in problem.images], ()
             )
             fit = minimise(problem, self.start, weak=problem.weak, gain=1e-4)
             problem = _without_lone_strays(problem, fit.state).with_huber(SCAN_HUBER)
             fit = minimise(problem, fit.state, weak=problem.weak, gain=1e-6)
-            state = fit.state
-            if not np.isfinite(fit.normal.cost):
+            if not np.isfinite(fit.normal.cost) or not left:
                 break
             covariance = covariance_of(fit.normal.matrix, problem.weak)
             freedom = sum(2 * int(t.keep.sum()) for t in problem.images) - len(problem.names)
-            change = find_change(problem, state, covariance, fit.normal.cost, freedom)
-            self._refuse_slip(state)
+            change = find_change(problem, fit.state, covariance, fit.normal.cost, freedom)
+            self._refuse_slip(fit.state)
             if change is None:
                 break
             if change.board is None:
@@ -210,7 +210,7 @@ class _Fit:
             self.notes.append(f"{change.sentence}; from there on it counts as another placement")
             self._split(change.board, change.after)
             self.begin()
-        return state
+        return problem.with_huber(HUBER), fit.state
 
     def _refuse_slip(self, state: Estimate) -> None:
         """Raise if a board that seems to have moved turned about the pan axis: then it was pan that
@@ -316,18 +316,18 @@ class _Fit:
 
     def calibration(self, began: float) -> BenchCalibration:
         """Fit everything, choose, fit again, and put together what it says."""
+        told = chosen = tuple(self.options.terms or ())
         tests: dict[str, Tested] = {}
-        if self.options.terms is None:
-            candidates = self.candidates()
-            problem, fit = self.settled(candidates, self.look_for_changes(candidates))
-            chosen, tests = self.choose(candidates, problem, fit)
-            start = without_terms(fit.state, set(candidates) - set(chosen))
-            if set(chosen) != set(candidates):
-                fewer = self.problem(chosen, start).with_terms(problem.images, ()).with_huber(None)
-                problem, fit = without_blunders(fewer, start, self.terms.images, bounded=False)
-        else:
-            candidates = chosen = tuple(self.options.terms)
-            problem, fit = self.settled(chosen, self.look_for_changes(chosen))
+        every = self.candidates()
+        problem, start = self.look_for_changes(every)
+        choose = self.options.terms is None
+        if choose:
+            problem, fit = without_blunders(problem, start, self.terms.images)
+            start, told = fit.state, every
+            chosen, tests = self.choose(every, problem, fit)
+        start = without_terms(start, set(every) - set(chosen))
+        last = self.problem(chosen, start).with_terms(problem.images, ())
+        problem, fit = without_blunders(last, start, self.terms.images, bounded=not choose)
         _refuse_far(problem, fit.state)
         weighed = weigh(problem, fit, self.terms.images)
         if not weighed.fit.settled:
@@ -336,11 +336,7 @@ class _Fit:
                 "values, so that neither they nor their sigmas are good; take more pictures, at more pan "
                 "and tilt angles and distances"
             )
-        return self._told((problem, fit), weighed, candidates, chosen, tests, began)
-
-    def settled(self, chosen: Sequence[str], start: Estimate) -> tuple[Adjustment, Minimum[Estimate]]:
-        """The fit with some terms, without blunders."""
-        return without_blunders(self.seen(chosen, start), start, self.terms.images)
+        return self._told((problem, fit), weighed, told, chosen, tests, began)
 
     def seen(self, chosen: Sequence[str], start: Estimate) -> Adjustment:
         """The problem without images whose corners have no pixel at the start."""
@@ -432,14 +428,16 @@ class _Fit:
         """Every term with what it gains."""
         every = candidate_terms(self.boards)
         _, now = self.choose(chosen, problem, Minimum(state, problem.with_huber(None).normal(state), True, 0))
+        moves = _moves_px(problem, state, {term: every[term] for term in chosen})
         found = []
         for term in candidates:
-            entered = term in chosen
-            test = now[term] if entered else tests[term]
-            moves = _moves_px(problem, state, every[term]) if entered else float("nan")
+            test = now[term] if term in chosen else tests[term]
             found.append(
-                TermGain(term, entered, every[term], test.values, test.sigma, test.chi2, test.chance, moves)
-            )
+                TermGain(
+                    term, term in chosen, every[term], test.values, test.sigma, test.chi2, test.chance,
+                    moves.get(term, float("nan")),
+                )
+            )  # fmt: skip
         return tuple(found)
 
     def _gauges(self, chosen: Sequence[str]) -> tuple[str, ...]:
@@ -513,21 +511,21 @@ def _values(state: Estimate) -> dict[str, float]:
     return values
 
 
-def _moves_px(problem: Adjustment, state: Estimate, parameters: Sequence[str]) -> float:
-    """Rms over all corners of what some parameters' values move pixels by, all else held."""
+def _moves_px(problem: Adjustment, state: Estimate, terms: Mapping[str, Sequence[str]]) -> dict[str, float]:
+    """Rms over all corners of what each term's values move pixels by, all else held."""
     values = _values(state)
-    at = {problem.names.index(name): values[name] for name in parameters}
-    total, count = 0.0, 0
-    for image in problem.images:
-        if not image.keep.any():
+    at = {term: {problem.names.index(n): values[n] for n in names} for term, names in terms.items()}
+    total, count = dict.fromkeys(terms, 0.0), 0
+    for image, block in problem.blocks(state):
+        if not isinstance(image, ImageTerm):
             continue
-        block = problem.image_block(state, image)
-        moved = sum(
-            (block.jacobian[:, k] * at[i] for k, i in enumerate(block.columns.tolist()) if i in at),
-            np.zeros(len(block.residual)),
-        ) * np.repeat(image.sigma_px[image.keep], 2)
-        total, count = total + float(moved @ moved), count + len(moved)
-    return float(np.sqrt(total / max(count, 1)))
+        sigma = np.repeat(image.sigma_px[image.keep], 2)
+        columns = block.columns.tolist()
+        for term, mine in at.items():
+            step = np.array([mine.get(i, 0.0) for i in columns])
+            total[term] += float(np.sum((sigma * (block.jacobian @ step)) ** 2))
+        count += len(sigma)
+    return {term: float(np.sqrt(square / max(count, 1))) for term, square in total.items()}
 
 
 def _checked(images: Sequence[ImageResiduals], checks: Sequence[ImageTerm]) -> list[ImageResiduals]:
