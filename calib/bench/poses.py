@@ -131,11 +131,7 @@ def next_shot(
         Attitudes (pan, tilt), radians, that are no use, as where the board was not found.
     """
     here = [shot for shot in shots if shot.placement == placement]
-    elsewhere = known.information(shot for shot in shots if shot.placement != placement)
-    size = len(known.names)
-    base = np.zeros((size + 6, size + 6))
-    base[:size, :size] = elsewhere
-    base += sum((known.of_shot(shot) for shot in here), np.zeros_like(base))
+    base = with_board(known, shots, placement)
 
     def judged(shot: Shot) -> Choice:
         return Choice(shot, aim.rms_px(covariance_of(without_board(base + known.of_shot(shot)))))
@@ -149,6 +145,14 @@ def next_shot(
         sides.append((-shot.pan_approach, -shot.tilt_approach))
         choices += [judged(replace(shot, pan_approach=pan, tilt_approach=tilt)) for pan, tilt in sides]
     return min(choices, key=lambda one: one.expected_px, default=None)
+
+
+def with_board(known: Knowledge, shots: Sequence[Shot], placement: str) -> FloatArray:
+    """Return what shots tell of the rig and of one placement's board: information (p + 6, p + 6)."""
+    size = len(known.names)
+    told = np.zeros((size + 6, size + 6))
+    told[:size, :size] = known.information(shot for shot in shots if shot.placement != placement)
+    return sum((known.of_shot(shot) for shot in shots if shot.placement == placement), told)
 
 
 def candidates(

@@ -51,6 +51,7 @@ triangulate mast.yaml --pair navcam --pan 0.3 --tilt -0.2 --left 300 420 --right
 budget
 handoff mast.yaml --from navcam --to hazcam --pan 0.3 --tilt -0.2 --left 300 420 --right 271 420
 calibrate survey --out mast.yaml --report report
+calibrate bench --config rig.yaml --board board.yaml --out mast.yaml --report report
 experiment pointing --targets 20 --out pointing
 experiment handoff --simulated --targets 20 --out handoff
 experiment approach --runs 5 --out approach
@@ -85,7 +86,8 @@ _GROUPS = frozenset(
 
 def _command_of(line: str) -> str:
     words = line.split()
-    return " ".join(words[:2] if words[0] in _GROUPS else words[:1])
+    two = words[0] in _GROUPS or words[:2] == ["calibrate", "bench"]
+    return " ".join(words[:2] if two else words[:1])
 
 
 EXAMPLES: Mapping[str, str] = {

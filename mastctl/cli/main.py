@@ -43,6 +43,7 @@ MODULES: dict[str, tuple[str, ...]] = {
     "mastctl.cli.geometry": ("solve", "triangulate", "budget"),
     "mastctl.cli.handoff": ("handoff",),
     "mastctl.cli.calibrate": ("calibrate",),
+    "mastctl.cli.calibrate_bench": ("calibrate bench",),
     "mastctl.cli.experiment": ("experiment", "demo"),
     "mastctl.cli.completion": ("completion",),
     "mastctl.cli.conform": ("conform",),
@@ -184,7 +185,7 @@ def _give_up_stdout() -> None:
 def _run(words: Sequence[str]) -> int:
     """Parse and run; --help and --version end here with their own code."""
     try:
-        words = _url_last(words)
+        words = _as_one_word(_url_last(words))
         _check_command(words)
         parser = build_parser(words)
         args = parser.parse_args(words)
@@ -192,6 +193,15 @@ def _run(words: Sequence[str]) -> int:
         return int(done.code or 0)
     args.json = getattr(args, "json", False)
     return int(args.run(args))
+
+
+def _as_one_word(words: Sequence[str]) -> list[str]:
+    """Join a command of two words whose first is one too; a survey named as the second is ``./bench``."""
+    two = [command.split(" ") for commands in MODULES.values() for command in commands if " " in command]
+    first = next((at for at, word in enumerate(words) if not word.startswith("-")), len(words))
+    if list(words[first : first + 2]) in two:
+        return [*words[:first], " ".join(words[first : first + 2]), *words[first + 2 :]]
+    return list(words)
 
 
 def _url_last(words: Sequence[str]) -> list[str]:

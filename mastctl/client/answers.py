@@ -14,6 +14,13 @@ class AimTold(TypedDict):
     y_px: float
 
 
+class AxisTold(TypedDict):
+    """How an axis of the head moves; ``count_rad`` null where nobody knows."""
+
+    count_rad: float | None
+    one_sided: bool
+
+
 class BoardStands(TypedDict):
     """A board before a simulated rover: what it is, and rover_from_board."""
 
@@ -657,6 +664,7 @@ class Status(TypedDict):
     hardware: str
     moving: bool
     joints: Joints | None
+    axes: dict[str, AxisTold]
     limits: SoftLimits
     pose: PoseTold | None
     track: TrackWord

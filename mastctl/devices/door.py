@@ -98,6 +98,11 @@ class Door:
         return pan, tilt
 
     @property
+    def axes(self) -> Mapping[str, AxisMotion]:
+        """How the axes move, where the head says it."""
+        return self._stated
+
+    @property
     def sun(self) -> Sun | None:
         """The direction that is kept out; also one that holds no longer."""
         return self._sun

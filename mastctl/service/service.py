@@ -239,6 +239,7 @@ class Service:
             mast=mast.told(),
             former_mast=None if former is None else former.told(),
             limits=self.config.limits,
+            axes=self.devices.door.axes,
             reading=self.devices.last_reading,
             frames=self.devices.newest_frames(),
             standing=self.machine.standing,

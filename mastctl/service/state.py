@@ -9,6 +9,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from drivers.interfaces import AxisMotion
 from mastctl.as_json import as_json, picked
 from mastctl.devices.frames import StampedFrame
 from mastctl.devices.joint_history import HeadReading
@@ -34,6 +35,8 @@ class State:
         ``real``, ``simulated``, ``replayed`` or ``mixed``.
     mast, former_mast
         File, name and digest of the mast file in use and of the one before it.
+    axes
+        How the head's axes move, where it says so.
     reading
         The last good reading of the head, None before the first.
     frames
@@ -57,6 +60,7 @@ class State:
     mast: Mapping[str, Any]
     former_mast: Mapping[str, Any] | None
     limits: Limits
+    axes: Mapping[str, AxisMotion]
     reading: HeadReading | None
     frames: Mapping[str, StampedFrame | None]
     standing: Standing
@@ -82,6 +86,10 @@ class State:
             "track": picked(track, "state", "reason", "id"),
             "control": self.control,
             "calibration": self.calibration,
+            "axes": {
+                name: {"count_rad": axis.count_rad, "one_sided": axis.rising_below_rad is not None}
+                for name, axis in self.axes.items()
+            },
             "cameras": {
                 name: picked(frame, "frame_id", "sequence", "exposure_s")
                 | {"age_s": None if frame is None else self._age_s(frame.mid_exposure_s)}

@@ -246,6 +246,13 @@ class StandingTold(_Told):
     estop: EstopHeld | None
 
 
+class AxisTold(_Told):
+    """How an axis of the head moves; ``count_rad`` null where nobody knows."""
+
+    count_rad: float | None
+    one_sided: bool
+
+
 class Status(StandingTold):
     """``GET /status``."""
 
@@ -253,6 +260,7 @@ class Status(StandingTold):
     hardware: str
     moving: bool
     joints: Joints | None
+    axes: dict[str, AxisTold]
     limits: SoftLimits
     pose: PoseTold | None
     track: TrackWord

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
 
+from drivers.interfaces import AxisMotion
 from mastctl.devices.frames import StampedFrame
 from mastctl.devices.joint_history import HeadReading
 from mastctl.devices.limits import Limits
@@ -22,6 +24,7 @@ REST = State(
     mast={"file": "a.yaml"},
     former_mast=None,
     limits=Limits((-2.0, 2.0), (-1.0, 1.0), 0.5),
+    axes={"pan": AxisMotion(1.0, 0.1, math.inf, 5e-5), "tilt": AxisMotion(1.0)},
     reading=HeadReading(0.1, -0.2, False, 99.75, true_rad=(0.103, -0.198), approach=(1.0, 0.0)),
     frames={"navcam_left": None},
     standing=Standing("ready", "", 90.0),

@@ -1,0 +1,58 @@
+"""A bench of corners, with its folder and who places the board, for the tests of runs."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from calib.boards import Charuco
+from calib.files.mast_file import load_rig
+from calib.mast.rig import Rig
+from calib.survey import Sigma
+from mastctl.bench.eyes import Head
+from mastctl.bench.fitting import fit_in_rover
+from mastctl.bench.folder import Kept, survey_cameras
+from mastctl.bench.run import BenchRun, Wanted
+from tools.simulated.bench import CornerBench, SelfPlacing, TrueAxis
+
+BOARD = Charuco(10, 7, 0.055, 0.042)
+PAIR = ("navcam_left", "navcam_right")
+PTU_COUNT_RAD = 5.6e-5
+
+
+def rigs(repository: Path) -> tuple[Rig, Rig]:
+    """What is so, and what is believed: the packaged bench's."""
+    whole = load_rig(repository / "configs/sim/rocky8.yaml").rig
+    true = replace(
+        whole, cameras={name: whole.cameras[name] for name in PAIR}, stereo={"navcam": PAIR}, provenance={}
+    )
+    return true, load_rig(repository / "configs/masts/bench_drawing.yaml").rig
+
+
+def corner_bench(repository: Path, seed: int = 1, one_sided: bool = True, **axis: object) -> CornerBench:
+    """A PTU's counts; ``axis`` is of both joints."""
+    true, believed = rigs(repository)
+    head = Head(believed, (-2.6, 2.6), (-1.2, 0.5), one_sided, PTU_COUNT_RAD)
+    pan, tilt = (
+        TrueAxis(PTU_COUNT_RAD, one_sided=one_sided, **axis)
+        for _ in range(2)  # type: ignore[arg-type]
+    )
+    return CornerBench(head, true, BOARD, np.random.default_rng(seed), pan, tilt)
+
+
+def kept_in(folder: Path, bench: CornerBench) -> Kept:
+    """The run's folder."""
+    rig = bench.head.rig
+    sizes = {name: camera.model.size_px for name, camera in rig.cameras.items()}
+    sigma = Sigma(0.0, 0.0, joint_rad=PTU_COUNT_RAD / 12**0.5, corner_px=bench.noise_px)
+    return Kept(folder, {"board": BOARD}, sigma, survey_cameras(rig, sizes), rig.stereo)
+
+
+def run_of(bench: CornerBench, folder: Path, wanted: Wanted | None = None) -> tuple[BenchRun, SelfPlacing]:
+    """A run, and who places the board for it."""
+    teller = SelfPlacing(bench)
+    fit = fit_in_rover(bench.head.rig.mast.rover_from_mast)
+    run = BenchRun(bench, kept_in(folder, bench), "board", BOARD, teller, fit, wanted or Wanted())
+    return run, teller

@@ -1,0 +1,145 @@
+"""A whole bench on corners: from a drawing to a rig that points, killed on the way, disturbed on the way."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from bench_world import corner_bench, run_of
+
+from calib.bench.knowledge import Knowledge
+from calib.bench.workspace import Workspace, pointing
+from calib.errors import CalibError
+from calib.rigid import Rigid
+from calib.survey import read_survey
+from mastctl.bench.eyes import Look
+from mastctl.bench.folder import looks_of
+from mastctl.bench.run import BoardLost, Wanted
+from mastctl.bench.search import BoardNotFound
+from tools.simulated.bench import CornerBench
+
+
+def test_a_bench_ends_by_itself_with_what_was_wanted_met_on_paper_and_kept(
+    repository: Path, tmp_path: Path
+) -> None:
+    bench = corner_bench(repository)
+    run, teller = run_of(bench, tmp_path / "bench")
+    fitted = run.run()
+    assert run.predicted_px() <= 0.2 and run.pictures() <= 60 and bench.seconds < 240.0
+    survey = read_survey(tmp_path / "bench")
+    looks = list(looks_of(survey))
+    assert 2 <= len({placement for placement, _, _ in looks}) <= 4
+    assert not any(check for _, check, _ in looks)
+    checked = run.check()
+    assert len(checked.pointings) >= 3
+    x, y = checked.pointing_rms_px or (9.0, 9.0)
+    assert max(x, y) < 0.3
+    assert checked.pointing_promised_px == pytest.approx(0.15, abs=0.12)
+    assert any(check for _, check, _ in looks_of(read_survey(tmp_path / "bench")))
+    for name, true in bench.true_rig.cameras.items():
+        np.testing.assert_allclose(fitted.rig.cameras[name].model.H, true.model.H, atol=8.0)
+    assert any("p2" in line for line in teller.told)
+
+
+class Dying(RuntimeError):
+    """Stands for a kill between two looks."""
+
+
+class Mortal:
+    """Eyes that die after some looks."""
+
+    def __init__(self, bench: CornerBench, looks: int) -> None:
+        self.bench, self.left, self.head = bench, looks, bench.head
+
+    def look(self, pan_rad: float, tilt_rad: float, approach: tuple[int, int] = (0, 0)) -> Look:
+        if not self.left:
+            raise Dying
+        self.left -= 1
+        return self.bench.look(pan_rad, tilt_rad, approach)
+
+
+def test_a_run_that_died_goes_on_at_the_same_placement_without_asking_again(
+    repository: Path, tmp_path: Path
+) -> None:
+    bench = corner_bench(repository, seed=2)
+    run, _ = run_of(bench, tmp_path / "bench")
+    run._eyes = Mortal(bench, 5)  # type: ignore[assignment]  # dies in the middle of the first placement
+    with pytest.raises(Dying):
+        run.run()
+    before = list(looks_of(read_survey(tmp_path / "bench")))
+    again, second = run_of(bench, tmp_path / "bench")
+    again.run()
+    after = list(looks_of(read_survey(tmp_path / "bench")))
+    assert len(before) == 5 and [p for p, _, _ in after][:5] == [p for p, _, _ in before]
+    assert any("stands as it stood" in line for line in second.told)
+    assert not any(line.startswith("p1: straight ahead") for line in second.told)
+    assert again.predicted_px() <= 0.2
+
+
+def test_a_board_that_moved_while_the_run_was_dead_begins_another_placement(
+    repository: Path, tmp_path: Path
+) -> None:
+    bench = corner_bench(repository, seed=3)
+    run, _ = run_of(bench, tmp_path / "bench")
+    run._eyes = Mortal(bench, 5)  # type: ignore[assignment]
+    with pytest.raises(Dying):
+        run.run()
+    assert bench.rover_from_board is not None
+    aside = bench.rover_from_board.translation_m + np.array([0.0, 0.02, 0.0])
+    bench.rover_from_board = Rigid(bench.rover_from_board.rotation, aside)
+    again, second = run_of(bench, tmp_path / "bench")
+    again.run()
+    assert any("does not stand any more" in line for line in second.told)
+    assert {p for p, _, _ in looks_of(read_survey(tmp_path / "bench"))} >= {"p1", "p2"}
+
+
+def test_a_board_that_is_nowhere_is_told_in_one_sentence(repository: Path, tmp_path: Path) -> None:
+    bench = corner_bench(repository)
+    run, teller = run_of(bench, tmp_path / "bench")
+    teller.place = lambda *_: None  # type: ignore[method-assign]  # nobody places it
+    with pytest.raises(BoardNotFound, match=r"was not found in .* looks all over the head's limits"):
+        run.run()
+    assert not read_survey(tmp_path / "bench").images
+
+
+def test_a_board_that_is_taken_away_ends_the_run_and_loses_nothing(repository: Path, tmp_path: Path) -> None:
+    bench = corner_bench(repository)
+    run, _ = run_of(bench, tmp_path / "bench")
+    looked = bench.look
+    taken = 0
+
+    def look(pan_rad: float, tilt_rad: float, approach: tuple[int, int] = (0, 0)) -> Look:
+        nonlocal taken
+        taken += 1
+        if taken == 6:
+            bench.rover_from_board = None
+        return looked(pan_rad, tilt_rad, approach)
+
+    bench.look = look  # type: ignore[method-assign]
+    with pytest.raises(BoardLost, match="put it back or place it anew"):
+        run.run()
+    assert len(list(looks_of(read_survey(tmp_path / "bench")))) == 5
+
+
+def test_play_and_harmonics_are_found_where_the_head_has_them(repository: Path, tmp_path: Path) -> None:
+    bench = corner_bench(
+        repository, one_sided=False, harmonics_rad=((0.0, 0.006), (0.002, 0.0)), backlash_rad=0.004
+    )
+    run, _ = run_of(bench, tmp_path / "bench", Wanted(pointing_px=0.3))
+    joints = run.run().rig.joints
+    assert joints.pan.backlash_rad == pytest.approx(0.004, abs=4e-4)
+    known = Knowledge(run.known.rig, {})
+    assert pointing(known, Workspace(("navcam_left", "navcam_right"), (-0.5, 0.5), (-0.4, 0.1)))
+    read = np.linspace(-0.8, 0.8, 9)
+    true = read + 0.006 * np.sin(read) + 0.002 * np.cos(2 * read)
+    off = np.asarray(joints.pan.true_rad(read)) - true
+    assert np.ptp(off) < 1.5e-3  # an offset is no error of the joint: zero is a choice
+
+
+def test_a_folder_of_another_board_is_refused(repository: Path, tmp_path: Path) -> None:
+    bench = corner_bench(repository)
+    run_of(bench, tmp_path / "bench")
+    bench.noise_px = 0.11
+    with pytest.raises(CalibError, match="other boards, sigmas or cameras"):
+        run_of(bench, tmp_path / "bench")

@@ -1,0 +1,1 @@
+"""The bench calibration that drives the head: it finds a board, chooses poses, asks for placements."""

@@ -1,0 +1,224 @@
+"""The head and cameras of a daemon, as a bench looks through them."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from calib.boards import Corners
+from calib.errors import CalibError
+from calib.files.mast_file import parse_rig
+from calib.mast.rig import Rig
+from drivers.interfaces import Image
+from mastctl.bench.eyes import Head, Look, Seen
+from mastctl.client import Client, ClientError, Snapshot
+from mastctl.errors import MastctlError
+
+FindCorners = Callable[[Image], Corners]
+
+TURN_TIMEOUT_S = 90.0
+PATIENCE_S = 30.0
+"""How long a camera or a head that fails is waited for: a cable is put back, a driver opens it again."""
+
+AGAIN_S = 1.0
+COME_FROM_RAD = 0.06
+"""How far beside an attitude the head goes first to come to it from the other side: more than any play."""
+
+SIDE = 0.9
+"""An approach of less than this has not gone through all of the play, and counts as unknown."""
+
+DARK_DN, BRIGHT_DN = 12.0, 245.0
+"""Mean grey level at which a picture without a board is said to be too dark, or too bright."""
+
+LASTING = frozenset(
+    {
+        "leased", "lease_lost", "not_held", "estopped", "stopping", "no_daemon", "forbidden", "no_token",
+        "bad_token", "bad_url", "busy", "closing",
+    }
+)  # fmt: skip
+"""What waiting does not mend: somebody has to do something."""
+
+
+class Interrupted(MastctlError):
+    """The bench cannot go on just now; nothing is lost."""
+
+    code = "interrupted"
+
+
+class NotThere(MastctlError):
+    """An attitude that the daemon does not turn to, such as one in a keep-out."""
+
+    code = "not_there"
+
+
+class DaemonEyes:
+    """Looks through a daemon; see `mastctl.bench.eyes.Eyes`.
+
+    Parameters
+    ----------
+    client
+        Of the daemon, which should hold the lease.
+    cameras
+        Which of its cameras take pictures.
+    find
+        Finds the board's corners in a picture; a CalibError says why there are none.
+    """
+
+    def __init__(self, client: Client, cameras: Sequence[str], find: FindCorners) -> None:
+        self._client, self._cameras, self._find = client, tuple(cameras), find
+        self._pool = ThreadPoolExecutor(2, "bench-corners")
+        status = client.status()
+        self._rig = served_rig(parse_rig(client.mast_file(), "the daemon's mast file").rig, cameras)
+        axes = status["axes"]
+        limits = status["limits"]
+        self._head = Head(
+            self._rig,
+            (float(limits["pan_rad"][0]), float(limits["pan_rad"][1])),
+            (float(limits["tilt_rad"][0]), float(limits["tilt_rad"][1])),
+            one_sided=bool(axes) and all(axis["one_sided"] for axis in axes.values()),
+            count_rad=max((float(axis["count_rad"] or 0.0) for axis in axes.values()), default=0.0),
+        )
+
+    @property
+    def head(self) -> Head:
+        """What is known of it."""
+        return self._head
+
+    def look(self, pan_rad: float, tilt_rad: float, approach: tuple[int, int] = (0, 0)) -> Look:
+        """See `mastctl.bench.eyes.Eyes`.
+
+        Raises
+        ------
+        Interrupted
+            If somebody else steers, a stop was pressed, the daemon is gone, or head or cameras fail for
+            longer than a cable takes to be put back.
+        NotThere
+            If the daemon does not turn there.
+        """
+        begun = time.monotonic()
+        while True:
+            try:
+                return self._look(pan_rad, tilt_rad, approach)
+            except ClientError as error:
+                if error.code in ("outside_limits", "keep_out", "sun", "unreachable", "no_way"):
+                    raise NotThere(str(error)) from None
+                if error.code in LASTING or time.monotonic() - begun > PATIENCE_S:
+                    raise Interrupted(f"{_sentence(error)}") from None
+                time.sleep(AGAIN_S)
+
+    def pictures(self) -> Mapping[str, Snapshot]:
+        """Return a new picture of each camera; of those that give one."""
+        shots: dict[str, Snapshot] = {}
+        failure: ClientError | None = None
+        for camera in self._cameras:
+            try:
+                shots[camera] = self._client.snapshot(camera)
+            except ClientError as error:
+                failure = error
+                if error.code in LASTING:
+                    raise
+        if not shots and failure is not None:
+            raise failure
+        return shots
+
+    def _look(self, pan_rad: float, tilt_rad: float, approach: tuple[int, int]) -> Look:
+        begun_s = self._now_s()
+        self._turn(pan_rad, tilt_rad, approach)
+        shots = self.pictures()
+        seconds = self._now_s() - begun_s
+        if any(shot.moving for shot in shots.values()):
+            raise ClientError("moving", "the head moved while the pictures were taken")
+        found = dict(zip(shots, self._pool.map(self._seen, shots.values()), strict=True))
+        seen = [found[name] if name in found else _missing(name, shots) for name in self._cameras]
+        one = next(iter(shots.values()))
+        return Look(tuple(seen), _side(one, "pan_approach"), _side(one, "tilt_approach"), seconds)
+
+    def _turn(self, pan_rad: float, tilt_rad: float, approach: tuple[int, int]) -> None:
+        """Go to readings, by way of ones beside them where an axis would come from the other side."""
+        if any(approach) and not self._head.one_sided:
+            joints: Mapping[str, Any] = self._client.status()["joints"] or {}
+            here = float(joints.get("pan_rad", pan_rad)), float(joints.get("tilt_rad", tilt_rad))
+            beside = [
+                _beside(wanted, now, side, limits)
+                for wanted, now, side, limits in zip(
+                    (pan_rad, tilt_rad), here, approach,
+                    (self._head.pan_limits_rad, self._head.tilt_limits_rad), strict=True,
+                )
+            ]  # fmt: skip
+            if any(a != b for a, b in zip(beside, (pan_rad, tilt_rad), strict=True)):
+                self._go(beside[0], beside[1])
+        self._go(pan_rad, tilt_rad)
+
+    def _go(self, pan_rad: float, tilt_rad: float) -> None:
+        """Have the daemon turn to readings; it is told true angles."""
+        true_rad = self._rig.joints.true_rad((pan_rad, tilt_rad))
+        operation = self._client.wait(
+            self._client.point(pan_rad=true_rad[0], tilt_rad=true_rad[1]), timeout_s=TURN_TIMEOUT_S
+        )
+        if operation["state"] == "stopped":
+            raise Interrupted("somebody pressed stop, and the head stands still")
+        if operation["state"] != "done":
+            told: Mapping[str, Any] = operation.get("error") or {}
+            raise ClientError(str(told.get("code", "failed")), str(told.get("message", "the move failed")))
+
+    def _seen(self, shot: Snapshot) -> Seen:
+        pan_rad, tilt_rad = shot.pan_rad, shot.tilt_rad
+        try:
+            corners = self._find(shot.image)
+        except CalibError as reason:
+            return Seen(shot.camera, pan_rad, tilt_rad, None, _why(shot.image, str(reason)), shot.data)
+        if not len(corners):
+            return Seen(shot.camera, pan_rad, tilt_rad, None, _why(shot.image, "no corners"), shot.data)
+        return Seen(shot.camera, pan_rad, tilt_rad, corners, "", shot.data)
+
+    def _now_s(self) -> float:
+        return float(self._client.status()["now_s"])
+
+
+def served_rig(rig: Rig, cameras: Sequence[str]) -> Rig:
+    """Return the rig with these cameras only, and without what a former fit left."""
+    pairs = {name: pair for name, pair in rig.stereo.items() if all(one in cameras for one in pair)}
+    return replace(
+        rig, cameras={name: rig.cameras[name] for name in cameras}, stereo=pairs, fit={}, provenance={}
+    )
+
+
+def _beside(wanted: float, now: float, side: int, limits: tuple[float, float]) -> float:
+    """Where to go first to come from a side; where it is wanted if it comes from there anyway."""
+    if not side or (wanted - now) * side >= COME_FROM_RAD:
+        return wanted
+    return min(max(wanted - side * COME_FROM_RAD, limits[0]), limits[1])
+
+
+def _side(shot: Snapshot, name: str) -> int:
+    told = float(getattr(shot, name, 0.0))
+    return 1 if told > SIDE else -1 if told < -SIDE else 0
+
+
+def _missing(camera: str, shots: Mapping[str, Snapshot]) -> Seen:
+    one = next(iter(shots.values()))
+    return Seen(camera, one.pan_rad, one.tilt_rad, None, f"camera {camera} gave no picture")
+
+
+def _why(image: Any, reason: str) -> str:
+    """Why a picture shows no board: its light, if that is to blame."""
+    mean = float(np.mean(image))
+    if mean < DARK_DN:
+        return f"too dark, mean grey level {mean:.0f} of 255"
+    if mean > BRIGHT_DN:
+        return f"too bright, mean grey level {mean:.0f} of 255"
+    return reason
+
+
+def _sentence(error: ClientError) -> str:
+    """What a daemon said, as what somebody has to do about it."""
+    if error.code == "leased":
+        return f"somebody else steers the head: {error}"
+    if error.code == "estopped":
+        return f"the emergency stop is latched ('mastctl reset' releases it): {error}"
+    return str(error)

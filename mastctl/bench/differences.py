@@ -1,0 +1,107 @@
+"""How far a new rig is from the former one, the motion that the difference implies taken out."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from calib.camera.cahvor import CameraModel
+from calib.camera.parameters import predict
+from calib.mast.rig import Rig
+from calib.rigid import FloatArray, Rigid, moved_rigid, rigid_rates
+
+GRID = (13, 10)
+RANGES_M = (2.0, 20.0)
+STEPS = 20
+
+
+@dataclass(frozen=True, eq=False)
+class Difference:
+    """One camera against its former model, both in the frame that they are mounted on.
+
+    Attributes
+    ----------
+    camera, size_px
+        Which, and its picture's size.
+    pixels_px
+        (n, 2) where it is compared.
+    whole_px, lens_px
+        (n, 2) new less former pixel of what the former saw there, far away: in all, and with the motion out.
+    turned_rad, shifted_m
+        (3,) the motion that makes the former camera project as the new one does, as well as one can.
+    """
+
+    camera: str
+    size_px: tuple[int, int]
+    pixels_px: FloatArray
+    whole_px: FloatArray
+    lens_px: FloatArray
+    turned_rad: FloatArray
+    shifted_m: FloatArray
+
+    @property
+    def rms_px(self) -> float:
+        """Rms length of what the lens differs by."""
+        return float(np.sqrt(np.nanmean(np.sum(self.lens_px**2, axis=1))))
+
+    @property
+    def sentence(self) -> str:
+        """The motion in words."""
+        turn, shift = 1e3 * self.turned_rad, 1e3 * self.shifted_m
+        return (
+            f"{self.camera}: turned by {turn[0]:+.2f}, {turn[1]:+.2f}, {turn[2]:+.2f} mrad about x, y, z "
+            f"and shifted by {shift[0]:+.1f}, {shift[1]:+.1f}, {shift[2]:+.1f} mm; "
+            f"its lens differs by {self.rms_px:.2f} px rms"
+        )
+
+
+def rig_differences(new: Rig, former: Rig) -> Iterator[Difference]:
+    """Yield the difference of each camera that both rigs have, of the same size and mount."""
+    for name, camera in new.cameras.items():
+        old = former.cameras.get(name)
+        if old is not None and old.on == camera.on and old.model.size_px == camera.model.size_px:
+            yield camera_difference(name, camera.model, old.model)
+
+
+def camera_difference(name: str, new: CameraModel, former: CameraModel) -> Difference:
+    """Return how far a camera is from its former model."""
+    width, height = former.size_px
+    x, y = np.meshgrid(
+        (np.arange(GRID[0]) + 0.5) * width / GRID[0] - 0.5,
+        (np.arange(GRID[1]) + 0.5) * height / GRID[1] - 0.5,
+    )
+    pixels = np.stack([x.ravel(), y.ravel()], axis=-1)
+    rays = former.ray(pixels)
+    points = np.concatenate([rays.origins_m + range_m * rays.directions for range_m in RANGES_M])
+    wanted = np.concatenate([pixels] * len(RANGES_M))
+    moved = Rigid.identity()
+    for _ in range(STEPS):
+        here = moved.points(points)
+        seen = predict(new, here)
+        off = (seen.pixels_px - wanted).ravel()
+        rates = rigid_rates(seen.d_points, here, moved.translation_m).reshape(-1, 6)
+        good = np.isfinite(off) & np.isfinite(rates).all(axis=1)
+        step = -np.linalg.lstsq(rates[good], off[good], rcond=None)[0]
+        moved = moved_rigid(moved, step)
+        if np.linalg.norm(step) < 1e-12:
+            break
+    far = points[-len(pixels) :]
+    whole = np.where(*_seen(new, far)) - pixels
+    lens = np.where(*_seen(new, moved.points(far))) - pixels
+    motion = moved.inverse  # points moved into the camera's place: the camera moved the other way
+    return Difference(
+        name, former.size_px, pixels, whole, lens, -_rotvec(moved.rotation), motion.translation_m
+    )
+
+
+def _seen(model: CameraModel, points: FloatArray) -> tuple[FloatArray, FloatArray, float]:
+    pixels, valid = model.project(points)
+    return valid[:, None], pixels, np.nan
+
+
+def _rotvec(rotation: FloatArray) -> FloatArray:
+    from scipy.spatial.transform import Rotation
+
+    return np.asarray(Rotation.from_matrix(rotation).as_rotvec())

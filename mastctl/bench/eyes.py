@@ -1,0 +1,103 @@
+"""What a bench needs of a head with cameras: to look somewhere, and to say what it saw there."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+from calib.boards import Corners
+from calib.mast.rig import Rig
+
+
+@dataclass(frozen=True, eq=False)
+class Seen:
+    """One camera's picture of a look.
+
+    Attributes
+    ----------
+    camera
+        Its name.
+    pan_rad, tilt_rad
+        What the joints read at mid-exposure, radians.
+    corners
+        Of the board, or None.
+    why
+        Why there are none, in words.
+    data
+        The picture's file, PNG; empty where only corners are simulated.
+    """
+
+    camera: str
+    pan_rad: float
+    tilt_rad: float
+    corners: Corners | None
+    why: str = ""
+    data: bytes = b""
+
+
+@dataclass(frozen=True, eq=False)
+class Look:
+    """All cameras' pictures at one attitude, from which side each joint came (1, -1, 0 unknown), and how long
+    it took, seconds of the rover's clock."""
+
+    seen: tuple[Seen, ...]
+    pan_approach: int
+    tilt_approach: int
+    seconds: float
+
+    @property
+    def pan_rad(self) -> float:
+        """What pan read, the cameras' mean."""
+        return sum(one.pan_rad for one in self.seen) / len(self.seen)
+
+    @property
+    def tilt_rad(self) -> float:
+        """What tilt read, the cameras' mean."""
+        return sum(one.tilt_rad for one in self.seen) / len(self.seen)
+
+    @property
+    def found(self) -> tuple[Seen, ...]:
+        """The pictures that show the board."""
+        return tuple(one for one in self.seen if one.corners is not None)
+
+
+@dataclass(frozen=True, eq=False)
+class Head:
+    """What is known of a head before it is calibrated.
+
+    Attributes
+    ----------
+    rig
+        The mast file in use: rough is enough.
+    pan_limits_rad, tilt_limits_rad
+        Within which it may turn.
+    one_sided
+        Whether it approaches every goal from one side by itself.
+    count_rad
+        What one count of its encoders is, the coarser of both; 0 where nobody knows.
+    """
+
+    rig: Rig
+    pan_limits_rad: tuple[float, float]
+    tilt_limits_rad: tuple[float, float]
+    one_sided: bool = False
+    count_rad: float = 0.0
+
+
+class Eyes(Protocol):
+    """A head with cameras in front of a board."""
+
+    @property
+    def head(self) -> Head:
+        """What is known of it."""
+        ...
+
+    def look(self, pan_rad: float, tilt_rad: float, approach: tuple[int, int] = (0, 0)) -> Look:
+        """Turn to joint readings, radians, from the sides asked for (0: any), and take all cameras at rest.
+
+        Raises
+        ------
+        MastctlError
+            If the head does not get there, or no camera gives a picture.
+        """
+        ...

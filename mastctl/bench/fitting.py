@@ -1,0 +1,54 @@
+"""What a run wants of a fit: a rig, where the boards are, and how well it all agrees."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from calib.fit.bench import BenchOptions, fit_bench
+from calib.fit.bench_calibration import BenchCalibration
+from calib.mast.rig import Rig
+from calib.rigid import Rigid
+from calib.survey import Survey
+
+
+@dataclass(frozen=True, eq=False)
+class Fitted:
+    """A survey's fit.
+
+    Attributes
+    ----------
+    rig
+        Cameras, mast and joints.
+    boards
+        Placement to rover_from_board.
+    corner_rms_px
+        Rms per axis of the fitted corners.
+    calibration
+        All of what the fit tells; None of a stand-in.
+    """
+
+    rig: Rig
+    boards: Mapping[str, Rigid]
+    corner_rms_px: float
+    calibration: BenchCalibration | None
+
+
+FitSurvey = Callable[[Survey], Fitted]
+
+
+def fit_in_rover(rover_from_mast: Rigid) -> FitSurvey:
+    """Return the fit of a bench whose mast stands in the rover frame as a drawing has it.
+
+    Where the mast frame is in the rover frame no board of unknown place can tell.
+    """
+
+    def fit(survey: Survey) -> Fitted:
+        done = fit_bench(survey, BenchOptions(rover_from_mast=rover_from_mast))
+        boards = {placement: pose for (_, placement), pose in done.rover_from_board.items()}
+        rms = float(np.sqrt(np.mean(np.square(list(done.rms_px.values())))))
+        return Fitted(done.rig, boards, rms, done)
+
+    return fit

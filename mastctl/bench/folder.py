@@ -1,0 +1,166 @@
+"""A run on disk: the survey's folder, which holds all that was seen, and a journal of what was done."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any, cast
+
+from calib.boards import AnyBoard
+from calib.errors import BadFile
+from calib.mast.rig import Rig
+from calib.survey import Sigma, Survey, SurveyCamera, SurveyImage
+from calib.survey.bench_writer import BenchFolder
+from calib.survey.records import Approach
+from mastctl.bench.eyes import Look, Seen
+
+JOURNAL = "bench.jsonl"
+
+
+class Kept:
+    """The folder of one run; whatever it was told is on the disk when a call returns.
+
+    Parameters
+    ----------
+    path
+        A new folder, or that of a run with the same board and cameras, which goes on.
+    boards
+        The board by its name.
+    sigma
+        Of a corner, pixels, and of a joint's reading, radians.
+    cameras, stereo
+        As of a survey.
+
+    Raises
+    ------
+    BadFile
+        If the folder holds something else.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        boards: Mapping[str, AnyBoard],
+        sigma: Sigma,
+        cameras: Mapping[str, SurveyCamera],
+        stereo: Mapping[str, tuple[str, str]],
+    ) -> None:
+        self.path, self.sigma_px = path, sigma.corner_px
+        self._folder = BenchFolder(path, boards, sigma, cameras, stereo)
+        self._cameras = cameras
+        self._journal = path / JOURNAL
+        self.notes = _read_notes(self._journal)
+        self._numbers: dict[str, int] = {}
+        for image in self._folder.survey().images:
+            number = int(_of_look(image).rsplit("-", 1)[1])
+            self._numbers[image.placement] = max(number, self._numbers.get(image.placement, 0))
+
+    def survey(self) -> Survey:
+        """Return all that was seen."""
+        return self._folder.survey()
+
+    def note(self, **told: Any) -> None:
+        """Write a line into the journal."""
+        line = json.dumps(told, allow_nan=False)
+        try:
+            with self._journal.open("ab") as file:
+                if file.tell() and not _ends_a_line(self._journal):
+                    file.write(b"\n")  # a line that a kill cut short
+                file.write(line.encode() + b"\n")
+                file.flush()
+                os.fsync(file.fileno())
+        except OSError as error:
+            raise BadFile(self._journal, "", f"cannot be written: {error.strerror or error}") from None
+        self.notes.append(told)
+
+    def add(self, placement: str, board: str, look: Look, check: bool) -> None:
+        """Keep the pictures of a look that show the board."""
+        number = self._numbers.get(placement, 0) + 1
+        for one in look.found:
+            name = f"{placement}-{number:03d}-{one.camera}"
+            on_head = self._cameras[one.camera].on == "head"
+            sides = (look.pan_approach, look.tilt_approach) if on_head else (0, 0)
+            image = SurveyImage(
+                name=name,
+                camera=one.camera,
+                setup="",
+                placement=placement,
+                purpose="check" if check else "mast" if on_head else "camera",
+                pan_rad=look.pan_rad if on_head else None,  # at rest: one reading for all cameras
+                tilt_rad=look.tilt_rad if on_head else None,
+                file=Path("images") / f"{name}.png" if one.data else Path(),
+                row=0,
+                board=board,
+                pan_approach=cast(Approach, sides[0]),
+                tilt_approach=cast(Approach, sides[1]),
+            )
+            self._folder.append(image, one.corners, one.data or None)
+        self._numbers[placement] = number
+        self.note(event="look", placement=placement, number=number, seconds=round(look.seconds, 3))
+
+    def seconds(self) -> float:
+        """Return how long all looks took, seconds of the rover's clock."""
+        return sum(float(note.get("seconds", 0.0)) for note in self.notes)
+
+
+def survey_cameras(rig: Rig, names: Mapping[str, tuple[int, int]]) -> dict[str, SurveyCamera]:
+    """Return what a survey says of a rig's cameras beforehand; ``names`` gives their pictures' sizes."""
+    import numpy as np
+
+    cameras = {}
+    for name, size_px in names.items():
+        held = rig.cameras[name]
+        model = held.model
+        focal_px = float(np.linalg.norm(np.cross(model.A, model.H)))
+        kind = "CAHVOR" if model.kind == "CAHV" else model.kind
+        cameras[name] = SurveyCamera(name, held.on, size_px, cast(Any, kind), round(focal_px, 1))
+    return cameras
+
+
+def looks_of(survey: Survey) -> Iterator[tuple[str, bool, Look]]:
+    """Yield what a folder shows, look by look: placement, whether it is a check's, the look."""
+    groups: dict[str, list[SurveyImage]] = {}
+    for image in survey.images:
+        groups.setdefault(_of_look(image), []).append(image)
+    for images in groups.values():
+        seen = tuple(
+            Seen(i.camera, i.pan_rad or 0.0, i.tilt_rad or 0.0, survey.corners.get(i.name), "no corners kept")
+            for i in images
+            if i.name in survey.corners
+        )
+        if seen:
+            head = next((i for i in images if i.pan_rad is not None), images[0])
+            look = Look(seen, head.pan_approach, head.tilt_approach, 0.0)
+            yield images[0].placement, images[0].purpose == "check", look
+
+
+def _of_look(image: SurveyImage) -> str:
+    """The name of an image without its camera's."""
+    return image.name.removesuffix(f"-{image.camera}")
+
+
+def _ends_a_line(path: Path) -> bool:
+    with path.open("rb") as file:
+        file.seek(-1, os.SEEK_END)
+        return file.read(1) == b"\n"
+
+
+def _read_notes(path: Path) -> list[dict[str, Any]]:
+    """The journal's lines; one that a kill cut short is passed over."""
+    notes: list[dict[str, Any]] = []
+    try:
+        lines = path.read_bytes().splitlines()
+    except FileNotFoundError:
+        return notes
+    except OSError as error:
+        raise BadFile(path, "", f"cannot be read: {error.strerror or error}") from None
+    for line in lines:
+        try:
+            note = json.loads(line)
+        except ValueError:
+            continue
+        if isinstance(note, dict):
+            notes.append(note)
+    return notes

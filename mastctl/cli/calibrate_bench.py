@@ -1,0 +1,223 @@
+"""``mastctl calibrate bench``: a mast file from pictures of a board, the head driven for them."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from mastctl.cli import output
+from mastctl.cli.output import CommandError, WrongUse
+from mastctl.cli.places import check_file, check_folder
+
+if TYPE_CHECKING:
+    from mastctl.bench.run import BenchRun
+    from mastctl.bench.teller import Teller
+    from mastctl.client import Client
+
+COMMAND = "calibrate bench"
+
+
+def add_commands(subparsers: Any) -> None:
+    """Add ``calibrate bench``."""
+    parser = subparsers.add_parser(
+        COMMAND,
+        help="fit cameras, axes and joints to pictures of a board that stands anywhere; drives the head",
+        description="Turns the head to look for a board, chooses each next pose by what it would tell, asks "
+        "for two to four placements of the board, and ends by itself when the wanted pointing error is met "
+        "(docs/bench.md). Everything seen is kept in a folder: a run that ended goes on with the same "
+        "command. With FOLDER such a folder is fitted again, and nothing moves.",
+    )
+    parser.add_argument(
+        "folder", nargs="?", type=Path, metavar="FOLDER", help="a bench's folder to fit again"
+    )
+    parser.add_argument(
+        "--config", metavar="RIG.yaml", help="the head's configuration (default: packaged bench)"
+    )
+    parser.add_argument("--url", help="a running daemon, instead of one that is started")
+    parser.add_argument("--board", type=Path, metavar="BOARD.yaml", help="the board ('mastctl board make')")
+    parser.add_argument("--out", type=Path, required=True, metavar="MAST.yaml", help="the mast file to write")
+    parser.add_argument("--report", type=Path, metavar="DIR", help="folder for bench.html")
+    parser.add_argument(
+        "--survey",
+        type=Path,
+        metavar="DIR",
+        help="folder for what is seen (default: MAST.bench beside --out)",
+    )
+    parser.add_argument(
+        "--pictures", type=output.at_least(12), default=60, metavar="N",
+        help="of each camera, at most (default 60)",
+    )  # fmt: skip
+    parser.add_argument(
+        "--wanted-px", type=output.positive_number, default=0.2, metavar="PX",
+        help="what the calibration may leave of a first pointing, rms an axis (default 0.2)",
+    )  # fmt: skip
+    parser.add_argument(
+        "--cameras", nargs="+", metavar="NAME", help="which cameras (default: all that the daemon has)"
+    )
+    parser.add_argument(
+        "--placements", type=Path, metavar="FILE",
+        help="of a simulated bench: where the board stands in turn (default: where it is asked for)",
+    )  # fmt: skip
+    parser.set_defaults(run=run)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Drive the head, or fit a folder again."""
+    check_file(args.out, "--out")
+    check_folder(args.report, "--report")
+    if args.folder is not None:
+        for option in ("config", "url", "board", "survey", "cameras", "placements"):
+            if getattr(args, option) is not None:
+                raise WrongUse(f"--{option} drives a head; with FOLDER nothing is driven")
+        return _again(args)
+    if args.board is None:
+        raise WrongUse("--board is missing; the BOARD.yaml that 'mastctl board make' wrote is expected")
+    return _drive(args)
+
+
+def survey_folder(out: Path) -> Path:
+    """Return where a run keeps what it sees if nobody says where."""
+    return out.with_name(f"{out.stem}.bench")
+
+
+def _again(args: argparse.Namespace) -> int:
+    from calib.survey import read_survey
+    from mastctl.bench.result import save_bench
+
+    survey = read_survey(args.folder)
+    if not survey.boards:
+        raise CommandError(
+            "no_bench",
+            f"{args.folder} is a survey with a station; 'mastctl calibrate {args.folder}' fits it",
+            2,
+        )
+    with output.waiting(args.json, f"fitting {len(survey.images)} images"):
+        done = save_bench(survey, args.out, args.report)
+    _tell(args, done.told(), done.lines())
+    return 0
+
+
+def _drive(args: argparse.Namespace) -> int:
+    from calib.boards import load_board
+    from mastctl.bench.daemon_eyes import Interrupted
+    from mastctl.bench.result import finish
+    from mastctl.bench.run import BoardLost
+    from mastctl.bench.search import BoardNotFound
+    from mastctl.bench.teller import NobodyThere
+
+    board = load_board(args.board)
+    folder = args.survey or survey_folder(args.out)
+    while True:
+        try:
+            with _bench(args, board, folder) as (bench, teller):
+                done = finish(bench, teller, args.out, args.report)
+            break
+        except (Interrupted, BoardNotFound, BoardLost, NobodyThere) as reason:
+            if not _go_on(args, reason, folder):
+                kept = f"everything seen is kept in {folder}: the same command goes on"
+                raise CommandError(reason.code, f"{reason}; {kept}") from None
+    _tell(args, done.told(), done.lines())
+    return 0
+
+
+def _go_on(args: argparse.Namespace, reason: Exception, folder: Path) -> bool:
+    """Ask the person at the terminal, if there is one, whether to go on now."""
+    if args.json or not sys.stdin.isatty():
+        return False
+    output.tell(f"{reason}. Everything seen is kept in {folder}")
+    sys.stderr.write("Enter to go on, Ctrl-C to leave it for later. ")
+    sys.stderr.flush()
+    return bool(sys.stdin.readline())
+
+
+@contextmanager
+def _bench(args: argparse.Namespace, board: Any, folder: Path) -> Iterator[tuple[BenchRun, Teller]]:
+    """A run on a daemon that runs, or on one that is started for it, under a lease."""
+    from calib.survey import Sigma
+    from mastctl.bench.daemon_eyes import DaemonEyes, Interrupted
+    from mastctl.bench.finder import finder
+    from mastctl.bench.fitting import fit_in_rover
+    from mastctl.bench.folder import Kept, survey_cameras
+    from mastctl.bench.run import BenchRun, Wanted
+    from mastctl.bench.simulated import SimulatedPerson
+    from mastctl.bench.teller import Terminal
+    from mastctl.client import ClientError
+
+    with ExitStack() as stack:
+        client = stack.enter_context(_daemon(args))
+        try:
+            stack.enter_context(client.lease(name="calibrate bench"))
+        except ClientError as error:
+            raise Interrupted(f"the head cannot be steered: {error}") from None
+        served = list(client.status()["cameras"])
+        cameras = args.cameras or served
+        for name in cameras:
+            if name not in served:
+                raise WrongUse(f"--cameras names {name}; the daemon has {', '.join(served)}")
+        eyes = DaemonEyes(client, cameras, finder(board))
+        head = eyes.head
+        sizes = {name: camera.model.size_px for name, camera in head.rig.cameras.items()}
+        sigma = Sigma(0.0, 0.0, joint_rad=head.count_rad / 12**0.5, corner_px=0.1)
+        kept = Kept(folder, {"board": board}, sigma, survey_cameras(head.rig, sizes), head.rig.stereo)
+        teller: Teller = Terminal(max(board.size_m))
+        if client.status()["simulated"]:
+            teller = SimulatedPerson(client, board, head.rig, teller, args.placements)
+        elif args.placements is not None:
+            raise WrongUse("--placements moves the board of a simulated bench, and this one is real")
+        wanted = Wanted(args.wanted_px, args.pictures)
+        fit = fit_in_rover(head.rig.mast.rover_from_mast)
+        yield BenchRun(eyes, kept, "board", board, teller, fit, wanted), teller
+
+
+@contextmanager
+def _daemon(args: argparse.Namespace) -> Iterator[Client]:
+    """A client of the daemon named, of one that runs with this configuration, or of one that is started."""
+    from dataclasses import replace
+
+    from calib.files import digest_of
+    from mastctl.client import Client, ClientError
+    from mastctl.config import Listen, load_config
+    from mastctl.daemon import RunningDaemon
+    from mastctl.packaged import config_folder
+
+    if args.url is not None:
+        with Client(args.url, name="calibrate bench") as client:
+            client.status()
+            yield client
+        return
+    config = load_config(args.config or str(config_folder() / "bench.yaml"))
+    listen = config.listen
+    if listen.socket is not None or listen.port:
+        with Client(listen.url, timeout_s=5.0, name="calibrate bench") as client:
+            try:
+                running = client.status()
+            except ClientError:
+                running = None
+            if running is not None:
+                if running["mast"]["digest"] != digest_of(config.mast_file.read_bytes()):
+                    raise CommandError(
+                        "other_daemon",
+                        f"the daemon at {listen.url} uses the mast file {running['mast']['file']}, and "
+                        f"the configuration names {config.mast_file.name}; end it, or give --url",
+                    )
+                yield client
+                return
+    if config.hardware.simulation and "speed" not in config.hardware.simulation:
+        # A simulated bench waits for nobody.
+        simulation = {**config.hardware.simulation, "speed": "max"}
+        config = replace(config, hardware=replace(config.hardware, simulation=simulation))
+    with output.waiting(args.json, "starting the daemon"):
+        daemon = RunningDaemon(replace(config, listen=Listen(port=0)))
+    with daemon, Client(daemon.url, name="calibrate bench") as client:
+        yield client
+
+
+def _tell(args: argparse.Namespace, document: dict[str, Any], lines: list[str]) -> None:
+    if args.json:
+        output.print_json(document)
+    else:
+        sys.stdout.write("\n".join(lines) + "\n")

@@ -1,0 +1,153 @@
+"""A bench of corners alone: a true rig with faulty joints and a board, no pictures; quick, repeatable.
+
+The joints' errors are the simulator's own (`drivers.sim`), the kinematics SciPy's rotations.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from calib.bench.placements import Placement
+from calib.boards import AnyBoard, Corners
+from calib.mast.rig import Rig
+from calib.rigid import FloatArray, Rigid
+from drivers.sim_survey.survey import rover_from_head
+from mastctl.bench.eyes import Head, Look, Seen
+
+EDGE_PX = 3.0
+FLATTEST = math.cos(math.radians(72.0))
+
+
+@dataclass
+class TrueAxis:
+    """A joint as it is: counts, harmonics of the encoder (c, s), play, and on which flank it rests."""
+
+    count_rad: float = 0.0
+    harmonics_rad: tuple[tuple[float, float], ...] = ()
+    backlash_rad: float = 0.0
+    one_sided: bool = False
+    read_rad: float = 0.0
+    side: int = 0
+
+    def go(self, wanted_rad: float) -> float:
+        """Turn to a reading, and return the true angle."""
+        count = self.count_rad
+        reached = round(wanted_rad / count) * count if count else wanted_rad
+        if self.one_sided:
+            self.side = 1
+        elif abs(reached - self.read_rad) > 1e-12:
+            self.side = 1 if reached > self.read_rad else -1
+        self.read_rad = reached
+        behind = reached - 0.5 * self.side * self.backlash_rad * (not self.one_sided)
+        terms = (
+            c * math.cos(i * behind) + s * math.sin(i * behind)
+            for i, (c, s) in enumerate(self.harmonics_rad, 1)
+        )
+        return behind + sum(terms)
+
+
+@dataclass
+class CornerBench:
+    """Eyes whose pictures are corners.
+
+    Attributes
+    ----------
+    head
+        What is believed.
+    true_rig
+        What is so.
+    board
+        What stands there.
+    pan, tilt
+        The joints.
+    noise_px
+        Of a corner, each axis.
+    rover_from_board
+        Where the board stands now; None: nowhere.
+    """
+
+    head: Head
+    true_rig: Rig
+    board: AnyBoard
+    rng: np.random.Generator
+    pan: TrueAxis = field(default_factory=TrueAxis)
+    tilt: TrueAxis = field(default_factory=TrueAxis)
+    noise_px: float = 0.05
+    rover_from_board: Rigid | None = None
+    seconds: float = 0.0
+    looks: int = 0
+
+    def stand(self, placement: Placement, off: Mapping[str, float] | None = None) -> None:
+        """Place the board where it was asked for, as exactly as a person does."""
+        pose = placement.rover_from_board(self.true_rig.mast.rover_from_head(0.0, 0.0))
+        turn = Rigid(_small_turn(self.rng.normal(0.0, 0.08, 3)), np.zeros(3))
+        pose = pose @ turn
+        self.rover_from_board = Rigid(pose.rotation, pose.translation_m + self.rng.normal(0.0, 0.04, 3))
+
+    def look(self, pan_rad: float, tilt_rad: float, approach: tuple[int, int] = (0, 0)) -> Look:
+        """See `mastctl.bench.eyes.Eyes`."""
+        begun = self.pan.read_rad, self.tilt.read_rad
+        for axis, wanted, side in ((self.pan, pan_rad, approach[0]), (self.tilt, tilt_rad, approach[1])):
+            if side:
+                axis.go(wanted - 0.05 * side)
+        true_rad = self.pan.go(pan_rad), self.tilt.go(tilt_rad)
+        way_rad = max(abs(self.pan.read_rad - begun[0]), abs(self.tilt.read_rad - begun[1]))
+        seconds = way_rad / 1.0 + 1.2
+        self.seconds += seconds
+        self.looks += 1
+        seen = [self._seen(name, true_rad) for name in self.head.rig.cameras]
+        return Look(tuple(seen), self._side(self.pan), self._side(self.tilt), seconds)
+
+    def _side(self, axis: TrueAxis) -> int:
+        return 0 if axis.one_sided else axis.side
+
+    def _seen(self, camera: str, true_rad: tuple[float, float]) -> Seen:
+        held = self.true_rig.cameras[camera]
+        read = self.pan.read_rad, self.tilt.read_rad
+        if self.rover_from_board is None:
+            return Seen(camera, *read, None, "no corners")
+        pose = self.rover_from_board
+        if held.on == "head":
+            pose = rover_from_head(self.true_rig.mast, *true_rad).inverse @ pose
+        points = pose.points(self.board.in_board_m(self.board.ids))
+        sight = points - held.model.C
+        facing = sight @ pose.rotation[:, 2] > FLATTEST * np.linalg.norm(sight, axis=1)
+        pixels, valid = held.model.project(points)
+        size = np.array(held.model.size_px)
+        inside = valid & facing & ((pixels > EDGE_PX) & (pixels < size - 1 - EDGE_PX)).all(axis=1)
+        if inside.sum() < 6:
+            return Seen(camera, *read, None, "no corners")
+        noisy: FloatArray = pixels[inside] + self.rng.normal(0.0, self.noise_px, (int(inside.sum()), 2))
+        corners = Corners(self.board.ids[inside], noisy, np.full(int(inside.sum()), self.noise_px))
+        return Seen(camera, *read, corners)
+
+
+@dataclass
+class SelfPlacing:
+    """A teller who places the board of a `CornerBench` as asked, and keeps what it was told."""
+
+    bench: CornerBench
+    told: list[str] = field(default_factory=list)
+
+    def say(self, sentence: str) -> None:
+        """Keep it."""
+        self.told.append(sentence)
+
+    def progress(self, now: object) -> None:
+        """Keep it."""
+        self.told.append(now.words())  # type: ignore[attr-defined]
+
+    def place(self, name: str, placement: Placement, head: Head) -> None:
+        """Put the board there."""
+        self.told.append(f"{name}: {placement.words()}")
+        self.bench.stand(placement)
+
+
+def _small_turn(rotvec: FloatArray) -> FloatArray:
+    from scipy.spatial.transform import Rotation
+
+    return np.asarray(Rotation.from_rotvec(rotvec).as_matrix())
