@@ -3,23 +3,21 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
-from calib.boards import Corners
-from calib.errors import CalibError
+from calib.boards import AnyBoard
+from calib.corners import CornersNotFound, find_corners
 from calib.files.mast_file import parse_rig
+from calib.fit.bench_terms import FEWEST_CORNERS
 from calib.mast.rig import Rig
-from drivers.interfaces import Image
 from mastctl.bench.eyes import Head, Look, Seen
 from mastctl.client import Client, ClientError, Snapshot
 from mastctl.errors import MastctlError
-
-FindCorners = Callable[[Image], Corners]
 
 TURN_TIMEOUT_S = 90.0
 PATIENCE_S = 30.0
@@ -65,12 +63,12 @@ class DaemonEyes:
         Of the daemon, which should hold the lease.
     cameras
         Which of its cameras take pictures.
-    find
-        Finds the board's corners in a picture; a CalibError says why there are none.
+    board
+        What is looked for.
     """
 
-    def __init__(self, client: Client, cameras: Sequence[str], find: FindCorners) -> None:
-        self._client, self._cameras, self._find = client, tuple(cameras), find
+    def __init__(self, client: Client, cameras: Sequence[str], board: AnyBoard) -> None:
+        self._client, self._cameras, self._board = client, tuple(cameras), board
         self._pool = ThreadPoolExecutor(2, "bench-corners")
         status = client.status()
         self._rig = served_rig(parse_rig(client.mast_file(), "the daemon's mast file").rig, cameras)
@@ -168,12 +166,12 @@ class DaemonEyes:
 
     def _seen(self, shot: Snapshot) -> Seen:
         pan_rad, tilt_rad = shot.pan_rad, shot.tilt_rad
-        try:
-            corners = self._find(shot.image)
-        except CalibError as reason:
-            return Seen(shot.camera, pan_rad, tilt_rad, None, _why(shot.image, str(reason)), shot.data)
-        if not len(corners):
-            return Seen(shot.camera, pan_rad, tilt_rad, None, _why(shot.image, "no corners"), shot.data)
+        corners = find_corners(self._board, shot.image)
+        if isinstance(corners, CornersNotFound):
+            return Seen(shot.camera, pan_rad, tilt_rad, None, _why(shot.image, corners.reason), shot.data)
+        if len(corners) < FEWEST_CORNERS:
+            few = f"{len(corners)} corners of the board where {FEWEST_CORNERS} at least are expected"
+            return Seen(shot.camera, pan_rad, tilt_rad, None, few, shot.data)
         return Seen(shot.camera, pan_rad, tilt_rad, corners, "", shot.data)
 
     def _now_s(self) -> float:

@@ -139,7 +139,6 @@ def _bench(args: argparse.Namespace, board: Any, folder: Path) -> Iterator[tuple
     """A run on a daemon that runs, or on one that is started for it, under a lease."""
     from calib.survey import Sigma
     from mastctl.bench.daemon_eyes import DaemonEyes, Interrupted
-    from mastctl.bench.finder import finder
     from mastctl.bench.fitting import fit_in_rover
     from mastctl.bench.folder import Kept, survey_cameras
     from mastctl.bench.run import BenchRun, Wanted
@@ -158,7 +157,7 @@ def _bench(args: argparse.Namespace, board: Any, folder: Path) -> Iterator[tuple
         for name in cameras:
             if name not in served:
                 raise WrongUse(f"--cameras names {name}; the daemon has {', '.join(served)}")
-        eyes = DaemonEyes(client, cameras, finder(board))
+        eyes = DaemonEyes(client, cameras, board)
         head = eyes.head
         sizes = {name: camera.model.size_px for name, camera in head.rig.cameras.items()}
         sigma = Sigma(0.0, 0.0, joint_rad=head.count_rad / 12**0.5, corner_px=0.1)
