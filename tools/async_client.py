@@ -27,7 +27,7 @@ NAMES = {
     "__enter__": "__aenter__",
     "__exit__": "__aexit__",
 }
-PLAIN = {"__init__", "use_lease", "jog", "_target"}
+PLAIN = {"__init__", "use_lease", "jog", "_target", "_how_far"}
 """Functions that ask nothing."""
 STREAMS = {"events", "heard", "followed", "_stream", "async_followed"}
 ASKED = {"json", "command", "ask", "close", "operation", "acquire_lease", "wait"}

@@ -25,8 +25,10 @@ from calib.mast.rig import Mast, Rig, RigCamera
 MAST_SCHEMA = "mastctl/mast/1"
 CAMERA_SCHEMA = "mastctl/camera/1"
 
-CAMERA_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]*_(?:left|right)")
-_PAIR_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]*")
+CAMERA_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]*")
+"""``<pair>_left`` and ``<pair>_right`` for the eyes of a pair; a camera alone has a name without a side."""
+CAMERA_NAME_WORDS = "a camera's name is letters, digits, '_' and '-'"
+_PAIR_NAME = CAMERA_NAME
 _LETTERS: dict[str, str] = {"CAHV": "CAHV", "CAHVOR": "CAHVOR", "CAHVORE": "CAHVORE"}
 _MODEL_KEYS = ("size_px", "model", "C", "A", "H", "V")
 _MODEL_OPTIONS = ("O", "R", "E", "type", "linearity")
@@ -64,7 +66,7 @@ def parse_rig(data: bytes, path: str | Path) -> StoredRig:
     notes: tuple[str, ...] = ()
     for name in top.mapping("cameras"):
         if not CAMERA_NAME.fullmatch(name):
-            raise top.bad(f"cameras.{name}", "a camera's name is <pair>_left or <pair>_right")
+            raise top.bad(f"cameras.{name}", CAMERA_NAME_WORDS)
         place = f"cameras.{name}"
         section = Section(path, place, top.mapping("cameras")[name], ("on", *_MODEL_KEYS), _MODEL_OPTIONS)
         on = cast(Literal["head", "rover"], section.choice("on", ("head", "rover")))

@@ -8,7 +8,7 @@ import numpy as np
 
 from calib.camera.cahvor import Kind
 from calib.files import LARGEST_IMAGE_PX
-from calib.files.mast_file import CAMERA_NAME
+from calib.files.mast_file import CAMERA_NAME, CAMERA_NAME_WORDS
 from calib.files.strict import Section
 from calib.rigid import FloatArray
 from calib.survey.records import (
@@ -82,7 +82,7 @@ def cameras_of(top: Section) -> dict[str, SurveyCamera]:
     cameras: dict[str, SurveyCamera] = {}
     for name in top.mapping("cameras"):
         if not CAMERA_NAME.fullmatch(name):
-            raise top.bad(f"cameras.{name}", "a camera's name is <pair>_left or <pair>_right")
+            raise top.bad(f"cameras.{name}", CAMERA_NAME_WORDS)
         value: Any = top.mapping("cameras")[name]
         place = f"cameras.{name}"
         section = Section(top.path, place, value, ("on", "size_px", "model", "focal_px"), ("rough",))

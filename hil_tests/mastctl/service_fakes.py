@@ -183,6 +183,8 @@ class FakePointing:
     aim_px: Any = None
     predicted_px: Any = None
     target_px: Any = None
+    predicted_sigma_px: Any = None
+    predicted_covariance_px2: Any = None
     motion_evidence: Mapping[str, Any] = field(default_factory=dict)
 
 

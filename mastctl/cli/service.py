@@ -59,6 +59,13 @@ def add_commands(subparsers: argparse._SubParsersAction[Any]) -> None:
         "--angles", nargs=2, type=finite_number, metavar=("PAN", "TILT"), help="joint angles, radians"
     )
     point.add_argument("--aim", nargs=3, metavar=("CAMERA", "X", "Y"), help="where the target shall come")
+    far = point.add_mutually_exclusive_group()
+    far.add_argument("--range", type=positive_number, metavar="M", help="how far what the pixel shows is")
+    far.add_argument("--ground", type=finite_number, metavar="Z", help="it lies level at this z, rover frame")
+    far.add_argument(
+        "--plane", nargs=6, type=finite_number, metavar=("X", "Y", "Z", "NX", "NY", "NZ"),
+        help="or in the plane through a point at right angles to a direction, rover frame",
+    )  # fmt: skip
     point.add_argument("--pointings", type=int, choices=(1, 2), help="how often to point (default 1)")
     point.add_argument("--no-wait", action="store_true", help="print the operation's id and do not wait")
     point.add_argument(
@@ -173,6 +180,7 @@ def _point(args: argparse.Namespace) -> int:
     request: dict[str, Any] = {"pointings": args.pointings, "aim": _camera_pixel(args.aim)}
     if args.angles is not None:
         request["pan_rad"], request["tilt_rad"] = args.angles
+    request |= _how_far(args)
     with client_of(args) as client:
         operation_id = client.point(**request, **target_of(args, client))
         if args.no_wait:
@@ -185,6 +193,20 @@ def _point(args: argparse.Namespace) -> int:
     else:
         show_pointings(record)
     return 0
+
+
+def _how_far(args: argparse.Namespace) -> dict[str, Any]:
+    """What says how far a pixel's thing is, as `Client.point` takes it. Raises WrongUse."""
+    told: dict[str, Any] = {}
+    if args.range is not None:
+        told = {"range_m": args.range}
+    elif args.ground is not None:
+        told = {"plane": {"point_m": [0.0, 0.0, args.ground]}}
+    elif args.plane is not None:
+        told = {"plane": {"point_m": args.plane[:3], "normal": args.plane[3:]}}
+    if told and args.pixel is None and args.camera is None:
+        raise WrongUse("--range, --ground and --plane go with --pixel or --camera")
+    return told
 
 
 def _snapshot(args: argparse.Namespace) -> int:

@@ -421,6 +421,8 @@ class OperationListed(TypedDict):
     residual_sigma_px: list[float | None] | None
     position_m: list[float] | None
     range_m: float | None
+    range_from: str
+    range_interval_m: list[float | None] | None
     pointings: list[PointingTold]
     ended_because: NotRequired[str | None]
 
@@ -439,6 +441,8 @@ class OperationTold(TypedDict):
     residual_sigma_px: list[float | None] | None
     position_m: list[float] | None
     range_m: float | None
+    range_from: str
+    range_interval_m: list[float | None] | None
     pointings: list[PointingTold]
     ended_because: NotRequired[str | None]
     steps: list[StepTold]
@@ -466,6 +470,8 @@ class PointingTold(TypedDict):
     target_px: list[float] | None
     residual_px: list[float | None] | None
     residual_sigma_px: list[float | None] | None
+    predicted_sigma_px: list[float] | None
+    predicted_covariance_px2: list[list[float]] | None
     note: str
     motion_evidence: dict[str, dict[str, Any]]
 
@@ -492,17 +498,19 @@ class PreviewTold(TypedDict):
     camera: str
     frame_id: str
     pixel_px: list[float]
-    other_camera: str
-    other_frame_id: str
-    other_pixel_px: list[float]
-    other_sigma_px: list[float]
-    correlation: float
-    second: float
-    across_px: float
+    other_camera: str | None
+    other_frame_id: str | None
+    other_pixel_px: list[float] | None
+    other_sigma_px: list[float] | None
+    correlation: float | None
+    second: float | None
+    across_px: float | None
     position_m: list[float]
-    sigma_m: list[float]
+    sigma_m: list[float] | None
     range_m: float
-    range_sigma_m: float
+    range_sigma_m: float | None
+    range_from: str
+    range_interval_m: list[float | None] | None
     aim: AimTold
     goal_rad: list[float] | None
     refused: RefusedTold | None

@@ -184,6 +184,8 @@ class AsyncClient:
         tilt_rad: float | None = None,
         aim: tuple[str, float, float] | None = None,
         pointings: int | None = None,
+        range_m: float | None = None,
+        plane: Mapping[str, Sequence[float]] | None = None,
         deadline_s: float | None = None,
         idempotency_key: str | None = None,
     ) -> str:
@@ -201,6 +203,10 @@ class AsyncClient:
             (camera, x, y): where the target shall come; the daemon's default when left out.
         pointings
             1 (default) or 2.
+        range_m, plane
+            How far what the pixel shows is from its camera, metres, or a plane of the rover frame in which it
+            lies: ``{"point_m": (x, y, z), "normal": (x, y, z)}``, level without ``normal``. The pair's other
+            eye is not asked then.
         deadline_s
             How long it is given, seconds of the daemon's clock; then the head is stopped and the operation
             fails with ``deadline_passed``. By default from the longest way and the speed.
@@ -211,6 +217,7 @@ class AsyncClient:
         if aim is not None:
             body["aim"] = dict(zip(("camera", "x_px", "y_px"), aim, strict=True))
         others = {"pan_rad": pan_rad, "tilt_rad": tilt_rad, "pointings": pointings}
+        body |= _how_far(range_m, plane)
         body |= {key: value for key, value in others.items() if value is not None}
         return str(
             (await self._daemon.command("POST", "/point", body, key=idempotency_key, deadline_s=deadline_s))[
@@ -219,14 +226,19 @@ class AsyncClient:
         )
 
     async def preview(
-        self, pixel: tuple[str, str, float, float], *, aim: tuple[str, float, float] | None = None
+        self,
+        pixel: tuple[str, str, float, float],
+        *,
+        aim: tuple[str, float, float] | None = None,
+        range_m: float | None = None,
+        plane: Mapping[str, Sequence[float]] | None = None,
     ) -> PreviewTold:
         """Return what a pixel (camera, frame id, x, y) shows and where `point` would send the head.
 
         Nothing moves. ``position_m`` with ``sigma_m``, ``range_m``, the match in the other eye, ``goal_rad``,
-        and ``refused`` where the head would not be sent.
+        and ``refused`` where the head would not be sent. ``range_m`` and ``plane`` as for `point`.
         """
-        body = _target(pixel, None, None)
+        body = _target(pixel, None, None) | _how_far(range_m, plane)
         if aim is not None:
             body["aim"] = dict(zip(("camera", "x_px", "y_px"), aim, strict=True))
         return cast("PreviewTold", await self._daemon.json("POST", "/point/preview", json=body))
@@ -634,6 +646,14 @@ class AsyncClient:
 
     async def __aexit__(self, *ignored: object) -> None:
         await self.close()
+
+
+def _how_far(range_m: float | None, plane: Mapping[str, Sequence[float]] | None) -> dict[str, Any]:
+    """What says how far a pixel's thing is, as a body has it."""
+    told: dict[str, Any] = {} if range_m is None else {"range_m": range_m}
+    if plane is not None:
+        told["plane"] = {key: list(values) for key, values in plane.items()}
+    return told
 
 
 def _target(

@@ -9,6 +9,7 @@ which moves nothing, is asked for once more: no operation ends because one answe
 from __future__ import annotations
 
 import logging
+import math
 import threading
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
@@ -191,6 +192,12 @@ class Devices:
             If the head does not tell within 1 s, or tells something else.
         """
         return self._head.call("report", self._reported, READ_TIMEOUT_S, told=False)
+
+    @property
+    def reading_sigma_rad(self) -> Pair:
+        """What a reading of pan and tilt may be off by, one sigma: that of a count, 12-bit if not stated."""
+        pan, tilt = self.door.counts_rad
+        return pan / math.sqrt(12.0), tilt / math.sqrt(12.0)
 
     def goal(self, true_rad: Pair, here: HeadReading, corners: Sequence[Pair] = ()) -> Pair:
         """Return the readings to send the head to, so that it comes to true angles.

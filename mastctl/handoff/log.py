@@ -21,7 +21,7 @@ import numpy as np
 
 from calib.errors import BadFile
 from calib.files import digest_of, read_bytes
-from calib.files.mast_file import CAMERA_NAME
+from calib.files.mast_file import CAMERA_NAME, CAMERA_NAME_WORDS
 from calib.files.strict import Section
 from calib.files.yaml_text import kind_of
 from calib.handoff.bias import HandoffBias
@@ -197,7 +197,7 @@ def handoff_of(path: str | Path, number: int, value: Any) -> MatchedHandoff:
     if not isinstance(source, list) or len(source) != 2 or not all(isinstance(n, str) for n in source):
         raise line.bad("source", f"{kind_of(source)} where [left camera, right camera] is expected")
     if not all(CAMERA_NAME.fullmatch(name) for name in source):
-        raise line.bad("source", "a camera's name is <pair>_left or <pair>_right")
+        raise line.bad("source", CAMERA_NAME_WORDS)
     sigma_px, sigma_rad = line.number("sigma_px"), line.number("joint_sigma_rad")
     if sigma_px <= 0.0:
         raise line.bad("sigma_px", f"{sigma_px:g} where a number above zero is expected")
@@ -222,7 +222,7 @@ def _landed(line: Section) -> dict[str, Landed]:
     for name, value in line.mapping("destinations").items():
         key = f"destinations.{name}"
         if not CAMERA_NAME.fullmatch(name):
-            raise line.bad(key, "a camera's name is <pair>_left or <pair>_right")
+            raise line.bad(key, CAMERA_NAME_WORDS)
         one = Section(line.path, line.at(key), value, _LANDED_KEYS)
         verdict = cast(RefinedVerdict, one.choice("verdict", get_args(RefinedVerdict)))
         if not isinstance(value["reason"], str):

@@ -44,6 +44,8 @@ class Operation:
                 "residual_sigma_px": last.get("residual_sigma_px"),
                 "position_m": result.get("position_m"),
                 "range_m": result.get("range_m"),
+                "range_from": result.get("range_from", ""),
+                "range_interval_m": result.get("range_interval_m"),
                 "pointings": pointings,
             }
         )

@@ -46,11 +46,15 @@ class View:
 
 @dataclass(frozen=True, eq=False)
 class Clicked:
-    """The thing that was clicked: where in which view, and the surface around it in the rover frame."""
+    """The thing that was clicked: where in which view, and the surface around it in the rover frame.
+
+    ``others``: where else that may be, if its range is not known.
+    """
 
     view: View
     pixel_px: FloatArray
     plane: Plane
+    others: tuple[Plane, ...] = ()
 
 
 class Eyes:
@@ -185,7 +189,7 @@ class Eyes:
             ``target_...`` if no match is good.
         """
         settings = self._settings
-        planes = [clicked.plane]
+        planes = [clicked.plane, *clicked.others]
         ray = clicked.view.camera.ray(clicked.pixel_px)
         if abs(float(ray.directions @ clicked.plane.normal)) < 0.97:
             planes.append(Plane(clicked.plane.point_m, -ray.directions))  # if the slope was misjudged

@@ -6,6 +6,10 @@ Steps of a pixel request, as they stand in the record: ``rest``, ``frames``, ``t
 eye has no picture yet that the new one could be compared with). A position needs ``rest``, ``solve`` to
 ``settle`` and ``look``; joint angles ``rest`` and ``limits`` to ``settle``, no picture.
 
+With one camera (its partner is not configured, or ``range_m`` or a plane says how far the target is)
+``sight`` takes the place of ``stereo`` and ``triangulate``, ``range`` that of ``eyes``
+(`mastctl.pointing.one_eye`).
+
 A named frame's other eye may not be kept, and what was clicked may have been seen from another pose; so a
 fresh pair is always taken, the clicked patch is found in it, and range comes from that pair. The clicked
 patch itself, never a later copy of it, is what is looked for after each move, so nothing drifts.
@@ -18,7 +22,8 @@ from __future__ import annotations
 import logging
 import math
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -37,6 +42,7 @@ from mastctl.devices.joint_history import HeadReading
 from mastctl.devices.limits import Limits
 from mastctl.errors import MastctlError
 from mastctl.pointing.looking import Clicked, View, match_facts
+from mastctl.pointing.one_eye import OneEye
 from mastctl.pointing.requests import Aim, AnglesTarget, PixelTarget, PointRequest, PositionTarget
 from mastctl.pointing.results import (
     Pair,
@@ -166,6 +172,8 @@ class _Run:
         self._position_m: FloatArray | None = None
         self._point: Triangulation | None = None
         self._range_m: float | None = None
+        self._one_eye: OneEye | None = None
+        self._range_from = ""
         self._pointings: list[Pointing] = []
 
     def all(self, request: PointRequest) -> PointingResult:
@@ -200,28 +208,24 @@ class _Run:
             now = self._steps.look((aim.camera,), settled)[aim.camera]
             self._done(self._pointing(commanded, now, aim_px, None))
             return
-        self._point_at(self._see(target), aim, aim_px, request.pointings)
+        if self._alone(request):
+            self._point_with_one_eye(self._see_alone(request)[1], aim, aim_px, request.pointings)
+        else:
+            self._range_from = "stereo"
+            self._point_at(self._see(target), aim, aim_px, request.pointings)
 
     def preview(self, request: PointRequest) -> Preview:
         """See what was clicked, and where the head would go; nothing moves."""
         assert isinstance(request.target, PixelTarget)
         aim = aim_of(request, self._rig)
+        if self._alone(request):
+            return self._preview_alone(request, aim)
         found, partnered = self._seen(request.target)
-        assert self._point is not None
+        assert self._point is not None and found.other is not None
         point, now = self._point, found.now
         along = point.position_m - now.camera.ray(found.pixel_px).origins_m
         along /= np.linalg.norm(along)
-        goal, refused = None, None
-        try:
-            here = self._steps.head.read()
-            best = self._chosen(aim, np.array([aim.x_px, aim.y_px]), here, {})
-            goal = self._steps.head.goal((best.pan_rad, best.tilt_rad), here)
-            self._limits.check(*goal)
-            self._steps.head.way(*goal)
-        except (MastctlError, CalibError) as error:
-            refused = {
-                "code": getattr(error, "code", "failed"), "message": " ".join(str(error).split())
-            }  # fmt: skip
+        goal, refused = self._would_go(aim)
         return Preview(
             camera=now.frame.camera,
             frame_id=now.frame.frame_id,
@@ -237,10 +241,45 @@ class _Run:
             sigma_m=triple(np.sqrt(np.diag(point.covariance_m2))),
             range_m=float(point.ranges_m[0]),
             range_sigma_m=math.sqrt(float(along @ point.covariance_m2 @ along)),
+            range_from="stereo",
             aim=aim,
             goal_rad=goal,
             refused=refused,
         )
+
+    def _preview_alone(self, request: PointRequest, aim: Aim) -> Preview:
+        """The same by one camera."""
+        found, _ = self._see_alone(request)
+        eye = self._one_eye
+        assert eye is not None
+        self._position_m = eye.position_m
+        goal, refused = self._would_go(aim)
+        return Preview(
+            camera=found.now.frame.camera,
+            frame_id=found.now.frame.frame_id,
+            pixel_px=pair(found.pixel_px),
+            position_m=triple(eye.position_m),
+            range_m=eye.sight.range_m,
+            range_from=eye.range_from,
+            range_interval_m=eye.range_interval_m,
+            aim=aim,
+            goal_rad=goal,
+            refused=refused,
+        )
+
+    def _would_go(self, aim: Aim) -> tuple[Pair | None, Mapping[str, str] | None]:
+        """The readings that the head would be sent to, and why it would not."""
+        goal: Pair | None = None
+        try:
+            here = self._steps.head.read()
+            best = self._chosen(aim, np.array([aim.x_px, aim.y_px]), here, {})
+            goal = self._steps.head.goal((best.pan_rad, best.tilt_rad), here)
+            self._limits.check(*goal)
+            self._steps.head.way(*goal)
+        except (MastctlError, CalibError) as error:
+            words = " ".join(str(error).split())
+            return goal, {"code": getattr(error, "code", "failed"), "message": words}
+        return goal, None
 
     # Steps
 
@@ -259,12 +298,59 @@ class _Run:
         """Find the clicked thing in a fresh pair, and its position."""
         found = self._steps.clicked(target)
         now, other = found.now, found.other
+        assert other is not None
         with self._steps.step("stereo") as detail:
             detail.update(self._steps.one_moment(now, found.pixel_px, [other], found.resting))
             partnered = self._steps.unless_stopped(self._eyes.stereo, now, found.pixel_px, other)
             detail.update(match_facts(partnered.match), across_px=round(partnered.across_px, 3))
         self._triangulate(now, found.pixel_px, other, partnered.match)
         return found, partnered
+
+    def _alone(self, request: PointRequest) -> bool:
+        """Whether one camera points: how far it is was told, or there is no other eye."""
+        assert isinstance(request.target, PixelTarget)
+        told = request.range_m is not None or request.plane is not None
+        return told or self._eyes.partner(request.target.camera) is None
+
+    def _see_alone(self, request: PointRequest) -> tuple[FoundAgain, Clicked]:
+        """From the clicked pixel to a line of sight, and what is known of the range."""
+        assert isinstance(request.target, PixelTarget)
+        found = self._steps.clicked(request.target, alone=True)
+        with self._steps.step("sight") as detail:
+            self._one_eye = OneEye(self._rig, self._settings, self._devices.reading_sigma_rad, found, request)
+            detail.update(self._one_eye.told())
+            return found, self._one_eye.clicked(found)
+
+    def _point_with_one_eye(self, clicked: Clicked, aim: Aim, aim_px: FloatArray, pointings: int) -> None:
+        """Point once or twice at what one camera saw, and measure each time."""
+        eye = self._one_eye
+        assert eye is not None
+        for number in range(1, pointings + 1):
+            self._position_m = eye.position_m
+            resting = self._steps.rest() if number > 1 else None
+            commanded, settled = self._solve_and_go(aim, aim_px, resting)
+            now = self._steps.look((aim.camera,), settled)[aim.camera]
+            with self._steps.step("measure") as detail:
+                expected = eye.expected(now)
+                seen = self._steps.unless_stopped(self._eyes.look_for, clicked, now)
+                detail.update(
+                    camera=aim.camera, **match_facts(seen), residual_px=rounded(seen.pixel_px - aim_px)
+                )
+                detail.update(predicted_px=rounded(expected.pixel_px), **eye.check(now, seen, expected))
+            match_px = float(seen.sigma_px.max())
+            pointing = self._pointing(commanded, now, aim_px, seen)
+            known = expected.whole_px2(eye.sight.inverse_sigma_m) + match_px**2 * np.eye(2)
+            self._done(
+                replace(
+                    pointing,
+                    predicted_sigma_px=pair(np.sqrt(np.diag(known))),
+                    predicted_covariance_px2=(pair(known[0]), pair(known[1])),
+                )
+            )
+            with self._steps.step("range") as detail:
+                eye.learn(now, seen.pixel_px, match_px, expected)
+                detail.update(eye.told())
+        self._position_m, self._range_m = eye.position_m, eye.sight.range_m
 
     def _triangulate(self, one: View, one_px: FloatArray, other: View, seen: PatchMatch) -> None:
         with self._steps.step("triangulate") as detail:
@@ -380,7 +466,14 @@ class _Run:
         if not self._pointings:
             return None
         position = None if self._position_m is None else triple(self._position_m)
-        return PointingResult(position, self._range_m, tuple(self._pointings))
+        eye = self._one_eye
+        return PointingResult(
+            position,
+            self._range_m,
+            tuple(self._pointings),
+            self._range_from if eye is None else eye.range_from,
+            None if eye is None else eye.range_interval_m,
+        )
 
     def _stop(self) -> None:
         """Stop the mast whatever happened; what stops it must not hide why."""

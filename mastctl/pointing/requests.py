@@ -22,6 +22,7 @@ Pixel = Annotated[float, Field(strict=True, ge=-LARGEST_PX, le=LARGEST_PX)]
 Metres = Annotated[float, Field(strict=True, ge=-LARGEST_M, le=LARGEST_M)]
 Angle = Annotated[float, Field(strict=True, ge=-2 * math.pi, le=2 * math.pi)]
 Coordinate = Annotated[float, Field(strict=True)]  # a bounded position, carried on by a bounded pose
+Range = Annotated[float, Field(strict=True, ge=0.01, le=1e5)]
 Pointings = Annotated[int, Field(strict=True, ge=1, le=2)]
 
 
@@ -52,6 +53,21 @@ class AnglesTarget:
     tilt_rad: Angle
 
 
+@dataclass(frozen=True, config=CHECKED)
+class PlaneTarget:
+    """A plane of the rover frame in which a clicked thing lies: a point (3,), metres, and its normal (3,).
+
+    The normal's length and sign do not matter; by default the plane is level.
+    """
+
+    point_m: tuple[Metres, Metres, Metres]
+    normal: tuple[Metres, Metres, Metres] = (0.0, 0.0, -1.0)
+
+    def __post_init__(self) -> None:
+        if not math.hypot(*self.normal) > 1e-9:
+            raise ValueError("normal has no direction; expected a vector at right angles to the plane")
+
+
 Target = PixelTarget | PositionTarget | AnglesTarget
 
 
@@ -77,6 +93,11 @@ class PointRequest:
         else of the first stereo pair's left camera on the head.
     pointings
         How often to point, 1 or 2: a second one uses what the new pictures showed.
+    range_m
+        How far what a pixel shows is from its camera; then no other eye is asked. None: it is measured by
+        the pair, or not known where the camera is in none.
+    plane
+        Or the plane in which it lies.
 
     Raises
     ------
@@ -87,9 +108,16 @@ class PointRequest:
     target: Target
     aim: Aim | None = None
     pointings: Pointings = 1
+    range_m: Range | None = None
+    plane: PlaneTarget | None = None
 
     def __post_init__(self) -> None:
         if self.aim is not None and isinstance(self.target, AnglesTarget):
             raise ValueError("aim goes with pixel or position_m, not with joint angles")
+        for name, given in (("range_m", self.range_m), ("plane", self.plane)):
+            if given is not None and not isinstance(self.target, PixelTarget):
+                raise ValueError(f"{name} goes with pixel only")
+        if self.range_m is not None and self.plane is not None:
+            raise ValueError("range_m and plane both say how far it is; one of them is expected")
         if self.pointings == 2 and not isinstance(self.target, PixelTarget):
             raise ValueError("pointings is 2, which goes with pixel only: nothing else can be measured again")

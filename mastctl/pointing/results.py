@@ -50,6 +50,9 @@ class Pointing:
         (x, y) where the picture shows it; None where nothing was clicked that could be looked for.
     residual_px, residual_sigma_px
         target_px - aim_px, and one sigma of the match; None as above.
+    predicted_sigma_px, predicted_covariance_px2
+        One sigma of x and y of ``predicted_px``, and the whole (2, 2), of what one camera alone knows: the
+        range, mast file, joint readings. None where a pair measured.
     note
         One sentence that says why there is no residual; empty otherwise.
     motion_evidence
@@ -69,6 +72,8 @@ class Pointing:
     target_px: Pair | None
     residual_px: Pair | None
     residual_sigma_px: Pair | None
+    predicted_sigma_px: Pair | None = None
+    predicted_covariance_px2: tuple[Pair, Pair] | None = None
     note: str = ""
     motion_evidence: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
 
@@ -82,15 +87,19 @@ class Preview:
     camera, frame_id, pixel_px
         A fresh frame of the clicked camera, and where (x, y) it shows what was clicked.
     other_camera, other_frame_id, other_pixel_px, other_sigma_px
-        The same in the other eye of its pair, with one sigma of the match.
+        The same in the other eye of its pair, with one sigma of the match. None, as the next three, where one
+        camera points alone.
     correlation, second
         Of the best match in the other eye, and of the next best.
     across_px
         How far the match lies off the epipolar line.
     position_m, sigma_m
-        The point in the rover frame, and one sigma along each axis (the clicks', not the mast file's).
+        The point in the rover frame, and one sigma along each axis (the clicks', not the mast file's; None
+        with one camera).
     range_m, range_sigma_m
-        Its distance from the clicked camera, and one sigma along it.
+        Its distance from the clicked camera, and one sigma along it (None with one camera).
+    range_from, range_interval_m
+        As in `PointingResult`.
     aim
         Where it would come.
     goal_rad
@@ -102,20 +111,22 @@ class Preview:
     camera: str
     frame_id: str
     pixel_px: Pair
-    other_camera: str
-    other_frame_id: str
-    other_pixel_px: Pair
-    other_sigma_px: Pair
-    correlation: float
-    second: float
-    across_px: float
     position_m: tuple[float, float, float]
-    sigma_m: tuple[float, float, float]
     range_m: float
-    range_sigma_m: float
+    range_from: str
     aim: Aim
     goal_rad: Pair | None
     refused: Mapping[str, str] | None
+    range_interval_m: tuple[float, float | None] | None = None
+    other_camera: str | None = None
+    other_frame_id: str | None = None
+    other_pixel_px: Pair | None = None
+    other_sigma_px: Pair | None = None
+    correlation: float | None = None
+    second: float | None = None
+    across_px: float | None = None
+    sigma_m: tuple[float, float, float] | None = None
+    range_sigma_m: float | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,11 +134,22 @@ class PointingResult:
     """What came of a request: position in the rover frame, range from the aim camera, the pointings.
 
     ``position_m`` and ``range_m`` are those of the last pointing, None for joint angles.
+
+    Attributes
+    ----------
+    range_from
+        What says how far the target is: ``stereo``; ``given``, ``plane``, ``parallax`` or ``unknown`` with
+        one camera; empty where nothing was clicked.
+    range_interval_m
+        With one camera, the ranges that are 95 % likely after the last picture; the farther is None for
+        infinity.
     """
 
     position_m: tuple[float, float, float] | None
     range_m: float | None
     pointings: tuple[Pointing, ...]
+    range_from: str = ""
+    range_interval_m: tuple[float, float | None] | None = None
 
 
 class PointingError(MastctlError):
@@ -139,8 +161,8 @@ class PointingError(MastctlError):
         For programs. Own codes: ``stopped``, ``outside_image``, ``no_stereo``, ``head_fault``,
         ``head_moving``, ``bad_reading``, ``no_fresh_frame``, ``did_not_arrive``, ``did_not_settle``,
         ``not_in_view``, ``target_flat``, ``target_ambiguous``, ``target_border``, ``target_not_found``,
-        ``target_moving``, ``eyes_disagree``. That of a request that does not fit (`mastctl.pointing.wanted`),
-        of a driver, of the limits or of the geometry passes through.
+        ``target_moving``, ``eyes_disagree``, ``off_the_line``. That of a request that does not fit
+        (`mastctl.pointing.wanted`), of a driver, of the limits or of the geometry passes through.
     step
         The step that failed.
     result

@@ -45,6 +45,9 @@ class PointingSettings:
         How far the target may move between the exposures of a pair that serves a measurement.
     nearest_m
         Nothing nearer is looked for.
+    unknown_nearest_m
+        A thing whose range nobody tells is taken to be here or farther, in 95 of 100: nearer than a mast's
+        camera has the ground only looking straight down.
     search_px, wide_search_px
         Half windows around the predicted place: what arrival tolerance and mast file explain in a Navcam
         (6 mrad are 8 px) with room; then what a slipped encoder may do (2 degrees are 45 px in a Navcam, 120
@@ -78,6 +81,7 @@ class PointingSettings:
     same_moment_s: float = 1e-4
     between_eyes_px: float = 0.5
     nearest_m: float = 0.4
+    unknown_nearest_m: float = 1.0
     search_px: float = 48.0
     wide_search_px: float = 200.0
     eyes_px: float = 2.0

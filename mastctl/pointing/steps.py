@@ -41,16 +41,16 @@ class DevicesLike(HeadLike, CamerasLike, Protocol):
 
 @dataclass(frozen=True, eq=False)
 class FoundAgain:
-    """A clicked thing, found again in a fresh pair.
+    """A clicked thing, found again in fresh pictures.
 
     Attributes
     ----------
     view, clicked_px
         The named frame, and the pixel (2,) that was clicked in it.
     now, other
-        New pictures of the clicked camera and of its partner.
-    pixel_px
-        (2,) the thing in ``now``.
+        New pictures of the clicked camera and of its partner; None if that was not asked.
+    pixel_px, sigma_px
+        (2,) the thing in ``now``, and one sigma of either coordinate.
     resting
         The head while they were taken.
     """
@@ -58,8 +58,9 @@ class FoundAgain:
     view: View
     clicked_px: FloatArray
     now: View
-    other: View
+    other: View | None
     pixel_px: FloatArray
+    sigma_px: float
     resting: HeadReading
 
 
@@ -125,8 +126,8 @@ class Steps:
             detail.update(**_stands(resting))
         return resting
 
-    def clicked(self, target: PixelTarget) -> FoundAgain:
-        """Take a fresh pair and find in it what was clicked.
+    def clicked(self, target: PixelTarget, alone: bool = False) -> FoundAgain:
+        """Take a fresh pair, or the clicked camera's picture ``alone``, and find in it what was clicked.
 
         Raises
         ------
@@ -135,14 +136,15 @@ class Steps:
         """
         view = self.eyes.view(clicked_frame(target, self._rig, self._devices.frame_by_id))
         pixel = np.array([target.x_px, target.y_px])
-        partner = self.eyes.partner(target.camera)
-        assert partner is not None
+        partner = None if alone else self.eyes.partner(target.camera)
+        cameras = (target.camera,) if partner is None else (target.camera, partner)
         resting = self.rest()
         with self.step("frames") as detail:
             began_s = self._clock.now_s()
-            fresh = self.unless_stopped(self.eyes.new, (target.camera, partner), began_s, resting)
-            now, other = fresh[target.camera], fresh[partner]
-            detail.update(frame_ids=[now.frame.frame_id, other.frame.frame_id], **apart(now, [other]))
+            fresh = self.unless_stopped(self.eyes.new, cameras, began_s, resting)
+            now, other = fresh[target.camera], None if partner is None else fresh[partner]
+            detail.update(frame_ids=[fresh[name].frame.frame_id for name in cameras])
+            detail.update(apart(now, [] if other is None else [other]))
             self._motion_seen.remember(fresh)
             if view.frame.mast_digest != now.frame.mast_digest:
                 words = f"frame {target.frame_id} was taken with another mast file"
@@ -150,7 +152,8 @@ class Steps:
         with self.step("target") as detail:
             again = self.unless_stopped(self.eyes.again, view, pixel, now)
             detail.update(match_facts(again))
-        return FoundAgain(view, pixel, now, other, again.pixel_px, resting)
+        sigma_px = float(again.sigma_px.max())
+        return FoundAgain(view, pixel, now, other, again.pixel_px, sigma_px, resting)
 
     def go_to_true(self, pan_rad: float, tilt_rad: float, camera: str) -> tuple[Pair, HeadReading]:
         """Go to true angles, as `go` does; return the readings that were commanded, and the arrival."""

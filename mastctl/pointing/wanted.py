@@ -36,9 +36,7 @@ def aim_of(request: PointRequest, rig: Rig) -> Aim:
     return aim
 
 
-def clicked_frame(
-    target: PixelTarget, rig: Rig, find: Callable[[str], StampedFrame], mast_file: Rig | None = None
-) -> StampedFrame:
+def clicked_frame(target: PixelTarget, rig: Rig, find: Callable[[str], StampedFrame]) -> StampedFrame:
     """Return the frame that was clicked in, if its camera, the pixel and its moment serve.
 
     Parameters
@@ -49,18 +47,15 @@ def clicked_frame(
         The cameras that are configured.
     find
         Returns a kept frame by its id.
-    mast_file
-        The whole mast file's rig, to tell a pair that it lacks from one that the configuration lacks.
 
     Raises
     ------
     NotKnown, BadRequest, NotNow
-        ``unknown_camera``, ``no_stereo``, ``wrong_camera``, ``outside_image``, ``frame_moving``; whatever
+        ``unknown_camera``, ``wrong_camera``, ``outside_image``, ``frame_moving``; whatever
         ``find`` raises.
     """
     camera = target.camera
     check_known(camera, rig.cameras)
-    _check_pair(camera, rig, mast_file or rig)
     frame = find(target.frame_id)
     if frame.camera != camera:
         raise wrong_camera(frame, camera)
@@ -76,8 +71,11 @@ def wrong_camera(frame: StampedFrame, camera: str) -> BadRequest:
     return BadRequest("wrong_camera", f"frame {frame.frame_id} is of camera {frame.camera}, not of {camera}")
 
 
-def _check_pair(camera: str, rig: Rig, mast_file: Rig) -> None:
-    """Pass a camera whose other eye is configured too: without it there is no range. Raises BadRequest."""
+def check_pair(camera: str, rig: Rig, mast_file: Rig) -> None:
+    """Pass a camera whose other eye is configured too, as a track needs. Raises BadRequest ``no_stereo``.
+
+    ``rig`` has the cameras that are configured, ``mast_file`` all.
+    """
     if any(camera in eyes for eyes in rig.stereo.values()):
         return
     words = f"{camera} is in no stereo pair of the mast file"
@@ -85,7 +83,7 @@ def _check_pair(camera: str, rig: Rig, mast_file: Rig) -> None:
         if camera in eyes:
             other = eyes[1] if camera == eyes[0] else eyes[0]
             words = f"the other eye of the stereo pair {pair}, {other}, is not in the configuration"
-    raise BadRequest("no_stereo", f"{words}, so a pixel of {camera} has no range")
+    raise BadRequest("no_stereo", f"{words}, so what its pixels show cannot be followed")
 
 
 def _check_inside(rig: Rig, camera: str, x_px: float, y_px: float, what: str) -> None:

@@ -13,6 +13,7 @@ import numpy as np
 from calib.mast.rig import Rig
 from drivers.clock import Clock
 from mastctl.devices.devices import Devices
+from mastctl.devices.frames import check_known
 from mastctl.errors import NotNow
 from mastctl.health.health import CalibrationHealth
 from mastctl.operations.operations import Operations
@@ -20,7 +21,7 @@ from mastctl.operations.records import Operation
 from mastctl.pointing.loop import PointingLoop
 from mastctl.pointing.requests import AnglesTarget, PixelTarget, PointRequest, PositionTarget
 from mastctl.pointing.results import Preview
-from mastctl.pointing.wanted import aim_of, clicked_frame
+from mastctl.pointing.wanted import aim_of, check_pair, clicked_frame
 from mastctl.service.masts import Masts
 from mastctl.tracking.pose import RoverPose
 from mastctl.tracking.tracker import Tracker
@@ -124,6 +125,9 @@ class Steering:
         with self._masts.unchanged():
             if isinstance(target, PositionTarget):
                 target = self._in_rover(target)
+            if isinstance(target, PixelTarget):
+                check_known(target.camera, self._rig.cameras)
+                check_pair(target.camera, self._rig, self._masts.in_use.stored.rig)
             self._check(PointRequest(target))
             return self._tracker.start(target, told)
 
@@ -172,7 +176,7 @@ class Steering:
             words = f"the pixel was taken with mast file {taken_with:.8}..., the one in use is {in_use:.8}..."
             raise NotNow("other_mast_file", words)
         find = partial(self._devices.frame_by_id, max_age_s=CLICK_AGE_S)
-        frame = clicked_frame(target, self._rig, find, stored.rig)
+        frame = clicked_frame(target, self._rig, find)
         self._devices.hold(frame)  # until it has been found again, however many pictures somebody watches
         moved_s = self._tracker.moved_s
         if moved_s is not None and frame.exposure_began_s < moved_s:

@@ -153,6 +153,7 @@ class Looker:
             If it cannot be followed.
         """
         found = self._steps.clicked(target)
+        assert found.other is not None  # a track's pixel is of a pair: `check_pair`
         track = self._started(found.now, found.other, found.pixel_px, found.resting)
         pair = next(name for name, eyes in self._rig.stereo.items() if target.camera in eyes)
         return track, self._first(pair, track, found.now, found.other, found.pixel_px)

@@ -302,6 +302,8 @@ class PointingTold(_Told):
     target_px: Pixel | None
     residual_px: MaybePixel | None
     residual_sigma_px: MaybePixel | None
+    predicted_sigma_px: Pixel | None
+    predicted_covariance_px2: list[Pixel] | None
     note: str
     motion_evidence: dict[str, Json]
 
@@ -334,6 +336,8 @@ class OperationListed(_Told):
     residual_sigma_px: MaybePixel | None
     position_m: Point | None
     range_m: float | None
+    range_from: str
+    range_interval_m: list[float | None] | None
     pointings: list[PointingTold]
     ended_because: str | None = None
 
@@ -377,17 +381,19 @@ class PreviewTold(_Told):
     camera: str
     frame_id: str
     pixel_px: Pixel
-    other_camera: str
-    other_frame_id: str
-    other_pixel_px: Pixel
-    other_sigma_px: Pixel
-    correlation: float
-    second: float
-    across_px: float
+    other_camera: str | None
+    other_frame_id: str | None
+    other_pixel_px: Pixel | None
+    other_sigma_px: Pixel | None
+    correlation: float | None
+    second: float | None
+    across_px: float | None
     position_m: Point
-    sigma_m: Point
+    sigma_m: Point | None
     range_m: float
-    range_sigma_m: float
+    range_sigma_m: float | None
+    range_from: str
+    range_interval_m: list[float | None] | None
     aim: AimTold
     goal_rad: Angles | None
     refused: RefusedTold | None

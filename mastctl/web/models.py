@@ -23,9 +23,11 @@ from mastctl.pointing.requests import (
     Metres,
     Name,
     PixelTarget,
+    PlaneTarget,
     Pointings,
     PointRequest,
     PositionTarget,
+    Range,
     Target,
 )
 from mastctl.safety.latch import LONGEST
@@ -126,6 +128,8 @@ class PointBody(TrackBody):
     tilt_rad: Angle | None = None
     aim: Aim | None = None
     pointings: Pointings = 1
+    range_m: Range | None = None
+    plane: PlaneTarget | None = None
 
     def _check_targets(self) -> None:
         """Pass exactly one target, and what goes with it. Raises ValueError."""
@@ -147,7 +151,7 @@ class PointBody(TrackBody):
             target = self.target()
         else:
             target = AnglesTarget(self.pan_rad, self.tilt_rad)
-        return PointRequest(target, self.aim, self.pointings)
+        return PointRequest(target, self.aim, self.pointings, self.range_m, self.plane)
 
 
 class PreviewBody(_Strict):
@@ -155,6 +159,17 @@ class PreviewBody(_Strict):
 
     pixel: PixelTarget
     aim: Aim | None = None
+    range_m: Range | None = None
+    plane: PlaneTarget | None = None
+
+    @model_validator(mode="after")
+    def _whole(self) -> Self:
+        self.request()
+        return self
+
+    def request(self) -> PointRequest:
+        """Return it as the pointing loop takes it. Raises ValueError."""
+        return PointRequest(self.pixel, self.aim, range_m=self.range_m, plane=self.plane)
 
 
 class SigmaBody(_Strict):

@@ -11,7 +11,7 @@ from mastctl.as_json import as_json
 from mastctl.commands.deadlines import usual_s
 from mastctl.commands.entry import POINT, POSE, STOP, TRACK, TRACK_LOOK, TRACK_STOP
 from mastctl.errors import BadRequest, NotNow
-from mastctl.pointing.requests import AnglesTarget, PointRequest
+from mastctl.pointing.requests import AnglesTarget
 from mastctl.pointing.results import PointingError
 from mastctl.service.service import Service
 from mastctl.web import PREFIX
@@ -40,7 +40,7 @@ def add_pointing(app: FastAPI, service: Service, waiting: Waiting, commands: Com
 
     @app.post(f"{PREFIX}/point/preview", summary="What a pixel shows, before anything moves")
     async def preview(body: PreviewBody) -> dict[str, Any]:
-        asked = PointRequest(body.pixel, body.aim)
+        asked = body.request()
         service.check_camera(body.pixel.camera)
         cancelled = threading.Event()
         try:

@@ -92,7 +92,7 @@ REFUSALS: dict[str, Refusal] = {
         "sigma.joint_rad",
         "0 or more",
     ),
-    "camera name": ("survey", "  hazcam_left:", "  hazcam:", "cameras.hazcam", "<pair>_left"),
+    "camera name": ("survey", "  hazcam_left:", "  haz cam:", "cameras.haz cam", "letters, digits"),
     "no such model": ("survey", "model: CAHVORE", "model: CAHVAR", "cameras.hazcam_left.model", "CAHVORE"),
     "no such pair": (
         "survey",

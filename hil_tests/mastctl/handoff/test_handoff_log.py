@@ -98,11 +98,11 @@ LEFT = "destinations/hazcam_left"
         (changed("extra", 1), "line 2.extra", "unknown key"),
         (changed("time", "yesterday"), "line 2.time", "ISO 8601"),
         (changed("source", ["navcam_left"]), "line 2.source", "right camera"),
-        (changed("source", ["left", "right"]), "line 2.source", "<pair>_left"),
+        (changed("source", ["the left", "right"]), "line 2.source", "letters, digits"),
         (changed("sigma_px", 0), "line 2.sigma_px", "above zero"),
         (changed("joint_sigma_rad", -1.0), "line 2.joint_sigma_rad", "zero or more"),
         (changed("left_px", ["1", "2"]), "line 2.left_px[0]", "a number"),
-        (changed("destinations/front", {}), "line 2.destinations.front", "<pair>_left"),
+        (changed("destinations/the front", {}), "line 2.destinations.the front", "letters, digits"),
         (changed(f"{LEFT}/verdict", "good"), "line 2.destinations.hazcam_left.verdict", "accepted"),
         (changed(f"{LEFT}/found_px", None), "line 2.destinations.hazcam_left.found_px", "2 numbers"),
         (

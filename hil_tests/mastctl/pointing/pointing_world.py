@@ -138,6 +138,8 @@ class World:
         true_rad = told.pan_rad, told.tilt_rad
         return HeadReading(*true_rad, told.moving, told.time_s, told.faults, true_rad=true_rad)
 
+    reading_sigma_rad = (1e-5, 1e-5)
+
     def goal(self, true_rad: Pair, here: HeadReading, corners: Sequence[Pair] = ()) -> Pair:
         return true_rad  # joints that read true
 
