@@ -91,10 +91,7 @@ def read_package(name: str) -> Package:
     return Package(
         name,
         {module: _imported(text, inside) - {module} for module, text in inside.items()},
-        {
-            module: (ast.get_docstring(ast.parse(text)) or "").partition("\n")[0]
-            for module, text in inside.items()
-        },
+        {module: _first_sentence(text) for module, text in inside.items()},
         sum(text.count("\n") for text in texts.values()),
     )
 

@@ -228,7 +228,7 @@ def test_the_head_of_the_page_comes_to_rest_at_every_goal(installed: Path) -> No
     from bench_rig.head import BenchHead  # type: ignore[import-not-found]
 
     head, random = BenchHead(1e9), np.random.default_rng(4)
-    for pan_rad, tilt_rad in random.uniform(-1.0, 1.0, (200, 2)):
+    for pan_rad, tilt_rad in random.uniform(-3.0, 3.0, (200, 2)) / 3.0:  # off the grid of 2^-52
         head.move(pan_rad, tilt_rad)
         time.sleep(1e-6)
         reading = head.read()

@@ -15,6 +15,7 @@ from calib.mast.rig import Rig
 from calib.rigid import FloatArray
 from drivers.clock import Clock, deadlines_on
 from drivers.errors import DriverError
+from mastctl.devices.frames import StampedFrame
 from mastctl.devices.joint_history import HeadReading
 from mastctl.devices.keep_out import Pair
 from mastctl.devices.limits import Limits
@@ -37,6 +38,8 @@ T = TypeVar("T")
 
 class DevicesLike(HeadLike, CamerasLike, Protocol):
     """What the steps need of `mastctl.devices.devices.Devices`."""
+
+    def frame_by_id(self, frame_id: str) -> StampedFrame: ...
 
 
 @dataclass(frozen=True, eq=False)
