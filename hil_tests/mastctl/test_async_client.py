@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import asyncio
 import inspect
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
-from hil_tests.mastctl.service_fakes import FakeHardware, eventually, fake_daemon
+from hil_tests.mastctl.service_fakes import FakeHardware, eventually
 from hil_tests.mastctl.web.network import network_daemon
 from mastctl.client import AsyncClient, Client, ClientError
 from mastctl.daemon import RunningDaemon
@@ -17,12 +16,6 @@ from tools.async_client import FILES, FOLDER, written
 
 BOTH = tuple[RunningDaemon, FakeHardware]
 BOUND_S = 20.0
-
-
-@pytest.fixture
-def pair(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[BOTH]:
-    with fake_daemon(monkeypatch, tmp_path) as made:
-        yield made
 
 
 @pytest.mark.parametrize("source", FILES)

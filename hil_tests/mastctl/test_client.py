@@ -12,17 +12,11 @@ import numpy as np
 import pytest
 
 from calib.files.mast_file import parse_rig
-from hil_tests.mastctl.service_fakes import FakeHardware, ScriptedLoop, fake_daemon
+from hil_tests.mastctl.service_fakes import FakeHardware, ScriptedLoop
 from mastctl.client import Client, ClientError
 from mastctl.daemon import RunningDaemon
 
 BOTH = tuple[RunningDaemon, FakeHardware]
-
-
-@pytest.fixture
-def pair(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[BOTH]:
-    with fake_daemon(monkeypatch, tmp_path) as made:
-        yield made
 
 
 @pytest.fixture

@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 
 from hil_tests.mastctl.outside_daemon import daemon_process, line, under_way, write_config
-from hil_tests.mastctl.service_fakes import FakeHardware, FakeStep, ScriptedLoop, eventually, fake_daemon
+from hil_tests.mastctl.service_fakes import FakeHardware, FakeStep, ScriptedLoop, eventually
 from mastctl.client import Client, ClientError
 from mastctl.client import connection as connection_module
 from mastctl.daemon import RunningDaemon
@@ -22,12 +22,6 @@ from mastctl.web import events as events_module
 
 BOTH = tuple[RunningDaemon, FakeHardware]
 BOUND_S = 20.0
-
-
-@pytest.fixture
-def pair(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[BOTH]:
-    with fake_daemon(monkeypatch, tmp_path) as made:
-        yield made
 
 
 @pytest.fixture

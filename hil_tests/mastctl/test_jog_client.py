@@ -7,12 +7,11 @@ import signal
 import subprocess
 import sys
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import pytest
 
-from hil_tests.mastctl.service_fakes import FakeHardware, eventually, fake_daemon
+from hil_tests.mastctl.service_fakes import FakeHardware, eventually
 from mastctl.cli.main import main
 from mastctl.client import Client, ClientError
 from mastctl.daemon import RunningDaemon
@@ -31,12 +30,6 @@ with Client(sys.argv[1]) as client:
     except ClientError as error:
         print(error.code, flush=True)
 """
-
-
-@pytest.fixture
-def pair(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[tuple[RunningDaemon, FakeHardware]]:
-    with fake_daemon(monkeypatch, tmp_path) as made:
-        yield made
 
 
 @pytest.fixture

@@ -88,6 +88,9 @@ class Operations:
         self._on_ended = on_ended
         self._current: tuple[str, threading.Event, threading.Thread] | None = None
         self._closed = False
+        self._stops_of_its_own = (
+            0  # under way, for operations beyond their deadline; whoever waits, waits by `_ended`
+        )
         self._cancelled_because: MastctlError = Stopped(STOP_ASKED)
 
     @property
@@ -173,23 +176,21 @@ class Operations:
         return self._machine.refusal(need)
 
     def let_stopped_end(self) -> None:
-        """Wait for an operation that is being ended, `ENDS_SOON_S` at most; return at once if there is none.
+        """Wait for an operation that is being ended, and for a deadline's stop; `ENDS_SOON_S` at most.
 
-        The stop itself is answered as soon as the head has confirmed it.
+        Returns at once if there is none. Who asks for a stop is answered when the head has confirmed it.
         """
-        current = self._current
-        if current is not None and current[1].is_set():
-            self.wait_ended(current[0], ENDS_SOON_S)
-
-    def wait_ended(self, name: str, timeout_s: float) -> None:
-        """Wait until an operation has ended, ``timeout_s`` seconds at most."""
-        until_s = self._time.now_s() + timeout_s
+        until_s = self._time.now_s() + ENDS_SOON_S
         with self._ended:
-            while (current := self._current) is not None and current[0] == name:
+            while self._being_ended():
                 left_s = until_s - self._time.now_s()
                 if left_s <= 0:
                     return
                 self._ended.wait(left_s)
+
+    def _being_ended(self) -> bool:
+        current = self._current
+        return self._stops_of_its_own > 0 or (current is not None and current[1].is_set())
 
     def end_within(self, name: str, left_s: float, allowed_s: float) -> None:
         """Stop the mast and end an operation with ``deadline_passed`` if it runs longer; returns at once.
@@ -269,12 +270,17 @@ class Operations:
             current = self._current
             if current is None or current[0] != name or current[1].is_set():
                 return
+            with self._ended:
+                self._stops_of_its_own += 1
             self._cancelled_because = error
             current[1].set()
             self._mover.block_moves(name, str(error))
         self._machine.stop_asked()
         self._stop_unasked(f"when operation {name} was to end")
         self._machine.stop_ended()
+        with self._ended:
+            self._stops_of_its_own -= 1
+            self._ended.notify_all()
 
     def _stop_unasked(self, when: str) -> None:
         """Stop the mast where nobody waits for the answer; whatever its driver raises must not go further."""

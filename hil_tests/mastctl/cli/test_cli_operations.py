@@ -12,19 +12,13 @@ from typing import Any
 import pytest
 
 from calib.files.mast_file import save_rig
-from hil_tests.mastctl.service_fakes import FakeHardware, fake_daemon, rig
+from hil_tests.mastctl.service_fakes import FakeHardware, rig
 from mastctl.cli.examples import EXAMPLES
 from mastctl.cli.main import build_parser, main
 from mastctl.client import Client
 from mastctl.daemon import RunningDaemon
 
 BOTH = tuple[RunningDaemon, FakeHardware]
-
-
-@pytest.fixture
-def pair(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[BOTH]:
-    with fake_daemon(monkeypatch, tmp_path) as made:
-        yield made
 
 
 @pytest.fixture

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -12,18 +12,12 @@ import numpy as np
 import pytest
 
 from drivers.errors import NoReply
-from hil_tests.mastctl.service_fakes import FakeHardware, FakePointing, FakeResult, ScriptedLoop, fake_daemon
+from hil_tests.mastctl.service_fakes import FakeHardware, FakePointing, FakeResult, ScriptedLoop
 from mastctl.cli.main import main
 from mastctl.daemon import RunningDaemon
 
 BOTH = tuple[RunningDaemon, FakeHardware]
 Run = Callable[..., tuple[int, str, str]]
-
-
-@pytest.fixture
-def pair(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[BOTH]:
-    with fake_daemon(monkeypatch, tmp_path) as made:
-        yield made
 
 
 @pytest.fixture

@@ -263,7 +263,7 @@ def test_what_does_not_end_when_the_service_closes_is_given_up(
     operations.close()
     assert operations.get(name).state == "stopped"
     go.set()
-    operations.wait_ended(name, 10.0)
+    eventually(lambda: operations._current is None, "room for the next")
     assert operations.get(name).state == "stopped", "its late end changes nothing"
 
 
@@ -283,7 +283,7 @@ def test_the_newest_records_are_kept(operations: Operations) -> None:
     names = []
     for _ in range(KEPT_OPERATIONS + 1):
         names.append(operations.start({}, lambda record, cancelled: None).id)
-        operations.wait_ended(names[-1], 10.0)
+        eventually(lambda: operations._current is None, "room for the next")
         ended(operations, names[-1])
     assert [one.id for one in operations.all()] == names[:0:-1], "newest first"
     with pytest.raises(NotKnown, match=f"operation {names[0]} is not known"):
@@ -337,6 +337,34 @@ def test_a_deadline_that_is_over_already_ends_the_operation_at_once(operations: 
     error = ended(operations, name).error
     assert error is not None
     assert error["code"] == "deadline_passed"
+
+
+def test_the_next_command_waits_for_the_stop_of_a_deadline_and_is_not_refused_for_it(
+    mover: Mover, operations: Operations, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("mastctl.operations.operations.ENDS_SOON_S", 30.0)
+    asked, go = threading.Event(), threading.Event()
+
+    def slow_stop(name: str) -> None:
+        asked.set()
+        assert go.wait(30.0)
+
+    def ends_at_once(record: Any, cancelled: threading.Event) -> None:
+        assert cancelled.wait(30.0)
+
+    name = operations.start({}, ends_at_once).id
+    mover.hook = slow_stop
+    operations.end_within(name, 0.0, 5.0)
+    assert asked.wait(30.0)
+    ended(operations, name)
+    refused: list[Any] = []
+    next_one = threading.Thread(target=lambda: refused.append(operations.refusal("motion")))
+    next_one.start()
+    next_one.join(0.1)
+    assert not refused
+    go.set()
+    next_one.join(30.0)
+    assert refused == [None]
 
 
 def test_a_deadline_after_the_end_stops_nothing(mover: Mover, operations: Operations) -> None:

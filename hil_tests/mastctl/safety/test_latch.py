@@ -44,6 +44,15 @@ def folder(tmp_path: Path) -> Any:
 # The latch by itself
 
 
+def latched(folder: StateFolder) -> Latch:
+    """A latch with a stop that the disk holds."""
+    latch = Latch(folder)
+    latch.hold("smoke", "Ana")
+    latch.head_told()
+    assert latch.kept_within(BOUND_S)
+    return latch
+
+
 def test_a_latched_stop_is_found_by_the_next_daemon(folder: StateFolder) -> None:
     latch = Latch(folder)
     assert latch.held is None
@@ -122,10 +131,7 @@ def refuse(file: StateFile, *ignored: Any) -> None:
 def test_a_reset_on_a_full_disk_leaves_the_file_its_room_for_the_next_stop(
     folder: StateFolder, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    latch = Latch(folder)
-    latch.hold("smoke", "Ana")
-    latch.head_told()
-    assert latch.kept_within(BOUND_S)
+    latch = latched(folder)
     monkeypatch.setattr(StateFile, "write", refuse)
     latch.release("aired", "Ben")
     assert latch.held is None
@@ -139,10 +145,7 @@ def test_a_reset_on_a_full_disk_leaves_the_file_its_room_for_the_next_stop(
 def test_a_reset_takes_a_file_away_that_cannot_be_written(
     folder: StateFolder, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    latch = Latch(folder)
-    latch.hold("smoke", "Ana")
-    latch.head_told()
-    assert latch.kept_within(BOUND_S)
+    latch = latched(folder)
     monkeypatch.setattr(StateFile, "write", refuse)
     monkeypatch.setattr(StateFile, "overwrite", refuse)
     latch.release("aired", "Ben")
@@ -153,10 +156,7 @@ def test_a_reset_takes_a_file_away_that_cannot_be_written(
 def test_a_reset_that_the_disk_refuses_leaves_it_latched_here_and_there_however_often_it_is_asked(
     folder: StateFolder, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    latch = Latch(folder)
-    latch.hold("smoke", "Ana")
-    latch.head_told()
-    assert latch.kept_within(BOUND_S)
+    latch = latched(folder)
     with monkeypatch.context() as patch:
         for way in ("write", "overwrite", "remove"):
             patch.setattr(StateFile, way, refuse)
@@ -207,10 +207,7 @@ def test_a_stop_that_the_disk_took_in_part_is_no_release_until_the_disk_says_so(
 
 
 def test_a_stop_during_a_reset_wins(folder: StateFolder, monkeypatch: pytest.MonkeyPatch) -> None:
-    latch = Latch(folder)
-    latch.hold("smoke", "Ana")
-    latch.head_told()
-    assert latch.kept_within(BOUND_S)
+    latch = latched(folder)
     true = StateFile.write
 
     def write(file: StateFile, document: Any) -> None:
@@ -281,10 +278,7 @@ def test_a_file_that_cannot_be_written_over_is_written_anew(
 def test_nobody_is_told_that_the_disk_holds_a_stop_while_a_reset_writes_there(
     folder: StateFolder, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    latch = Latch(folder)
-    latch.hold("smoke", "Ana")
-    latch.head_told()
-    assert latch.kept_within(BOUND_S)
+    latch = latched(folder)
     told = []
     true = StateFile.write
 

@@ -17,17 +17,11 @@ from calib.files.mast_file import load_rig, save_rig
 from calib.mast.covariance import stored_covariance
 from calib.mast.rig import Mast, RigCamera
 from drivers.errors import NoReply
-from hil_tests.mastctl.service_fakes import FakeHardware, ScriptedLoop, eventually, fake_daemon, rig
+from hil_tests.mastctl.service_fakes import FakeHardware, ScriptedLoop, eventually, rig
 from mastctl.daemon import RunningDaemon
 from mastctl.errors import Stopped
 from mastctl.service import steering as steering_module
 from mastctl.service.mast_in_use import configured
-
-
-@pytest.fixture
-def pair(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[tuple[RunningDaemon, FakeHardware]]:
-    with fake_daemon(monkeypatch, tmp_path) as made:
-        yield made
 
 
 @pytest.fixture

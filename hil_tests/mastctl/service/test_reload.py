@@ -5,7 +5,6 @@ from __future__ import annotations
 import threading
 from collections.abc import Iterator
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,7 +12,7 @@ import pytest
 
 from calib.files.mast_file import save_rig
 from calib.mast.rig import Mast
-from hil_tests.mastctl.service_fakes import CONFIG, FakeHardware, ScriptedLoop, eventually, fake_daemon, rig
+from hil_tests.mastctl.service_fakes import CONFIG, FakeHardware, ScriptedLoop, eventually, rig
 from mastctl.client import Client, ClientError
 from mastctl.daemon import RunningDaemon
 from mastctl.devices.limits import Limits, OutsideLimits
@@ -22,12 +21,6 @@ from mastctl.service import reload as reload_module
 from mastctl.service.reload import FIXED
 
 Pair = tuple[RunningDaemon, FakeHardware]
-
-
-@pytest.fixture
-def pair(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[Pair]:
-    with fake_daemon(monkeypatch, tmp_path) as made:
-        yield made
 
 
 @pytest.fixture

@@ -31,12 +31,6 @@ ANGLES = {"pan_rad": 0.1, "tilt_rad": -0.1}
 
 
 @pytest.fixture
-def pair(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[tuple[RunningDaemon, FakeHardware]]:
-    with fake_daemon(monkeypatch, tmp_path) as made:
-        yield made
-
-
-@pytest.fixture
 def daemon(pair: tuple[RunningDaemon, FakeHardware]) -> RunningDaemon:
     return pair[0]
 

@@ -14,7 +14,7 @@ from urllib.parse import urlsplit
 import httpx
 import pytest
 
-from hil_tests.mastctl.service_fakes import FakeHardware, ScriptedLoop, eventually, fake_daemon
+from hil_tests.mastctl.service_fakes import FakeHardware, ScriptedLoop, eventually
 from mastctl.client import Client, ClientError
 from mastctl.commands.audit import AuditLog
 from mastctl.daemon import RunningDaemon
@@ -23,12 +23,6 @@ from mastctl.safety.stop_line import ask
 
 ANGLES = {"pan_rad": 0.1, "tilt_rad": -0.1}
 Pair = tuple[RunningDaemon, FakeHardware]
-
-
-@pytest.fixture
-def pair(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[Pair]:
-    with fake_daemon(monkeypatch, tmp_path) as made:
-        yield made
 
 
 @pytest.fixture

@@ -8,7 +8,6 @@ import threading
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from pathlib import Path
 from typing import Any
 
 import httpx
@@ -18,7 +17,7 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import ClientConnection, connect
 
 from hil_tests.described_answers import closed
-from hil_tests.mastctl.service_fakes import FakeHardware, ScriptedLoop, eventually, fake_daemon
+from hil_tests.mastctl.service_fakes import FakeHardware, ScriptedLoop, eventually
 from hil_tests.mastctl.web.network import NAME, Network, network_daemon
 from mastctl.daemon import RunningDaemon
 from mastctl.state.publisher import TOPICS
@@ -28,12 +27,6 @@ from tools.campaigns import fuzz_websocket
 
 BOTH = tuple[RunningDaemon, FakeHardware]
 BOUND_S = 20.0
-
-
-@pytest.fixture
-def pair(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[BOTH]:
-    with fake_daemon(monkeypatch, tmp_path) as made:
-        yield made
 
 
 @contextmanager
