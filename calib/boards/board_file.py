@@ -71,14 +71,25 @@ def load_board(path: str | Path) -> AnyBoard:
 
 
 def save_board(
-    path: str | Path, board: AnyBoard, bar_m: tuple[float, float] | None = None, name: str = ""
+    path: str | Path,
+    board: AnyBoard,
+    bar_m: tuple[float, float] | None = None,
+    name: str = "",
+    measured_m: tuple[float, float | None] | None = None,
 ) -> None:
-    """Write a BOARD.yaml atomically; ``bar_m`` are the lengths of the bars drawn, across and down.
+    """Write a BOARD.yaml atomically, after it was read as it will be.
+
+    Parameters
+    ----------
+    board
+        As drawn.
+    bar_m, measured_m
+        The bars' lengths as drawn, and as measured on the print, across and down.
 
     Raises
     ------
     BadFile
-        If the file system refuses.
+        If a bar cannot have been measured so, or the file system refuses.
     """
     document: dict[str, Any] = {"schema": SCHEMA}
     if name:
@@ -86,6 +97,29 @@ def save_board(
     document |= document_of(board)
     if bar_m is not None:
         document["bar_m"] = {"across": bar_m[0], "down": bar_m[1]}
+    if measured_m is not None:
+        document["measured"] = _measured(*measured_m)
+    _save(path, document)
+
+
+def measure(path: str | Path, across_m: float, down_m: float | None = None) -> tuple[float, float]:
+    """Write the measured lengths of a print's bars into its BOARD.yaml, and return the drawn ones.
+
+    The version before stays beside it. Raises BadFile: it is no board, has no bar, or none so long.
+    """
+    document = parse_mapping(read_bytes(path, MAX_BYTES), path)
+    load_board(path)
+    document["measured"] = _measured(across_m, down_m)
+    _save(path, document)
+    return document["bar_m"]["across"], document["bar_m"]["down"]
+
+
+def _measured(across_m: float, down_m: float | None) -> dict[str, float]:
+    return {"across_m": across_m} | ({} if down_m is None else {"down_m": down_m})
+
+
+def _save(path: str | Path, document: dict[str, Any]) -> None:
+    board_of(path, "", {key: value for key, value in document.items() if key != "schema"})
     save_bytes(path, dump_mapping(document))
 
 
@@ -167,7 +201,7 @@ def _aprilgrid(section: Section, columns: int, rows: int) -> AprilGrid:
 
 def _first_id(section: Section, dictionary: str, needed: int, what: str) -> int:
     """The first marker's number, all markers being in the dictionary."""
-    holds = len(cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, dictionary)).bytesList)
+    holds = dictionary_size(dictionary)
     if needed > holds:
         raise section.bad(
             "columns", f"the board needs {needed} {what}, and {dictionary} has {holds}; fewer are expected"
@@ -220,6 +254,11 @@ def _positive(section: Section, key: str) -> float:
     if value <= 0:
         raise section.bad(key, f"{value:g} where a number above 0 is expected")
     return value
+
+
+def dictionary_size(name: str) -> int:
+    """Return how many markers a dictionary has, by OpenCV's name."""
+    return len(cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, name)).bytesList)
 
 
 def dictionaries() -> tuple[str, ...]:

@@ -27,9 +27,9 @@ LEAST_PIXELS = 24
 MARGIN_PX = 1.6
 """A pixel counts if the board shows crossing edges up to so far around it."""
 
-ITERATIONS = 14
+ITERATIONS = 25
 SETTLED_PX = 1e-3
-START_BLUR_PX, BLUR_PX = 1.0, (0.3, 8.0)
+START_BLUR_PX, BLUR_PX = 1.0, (0.5, 8.0)
 PARAMETERS = 10
 
 

@@ -50,6 +50,9 @@ solve mast.yaml --camera navcam_left --target 6 1 0
 triangulate mast.yaml --pair navcam --pan 0.3 --tilt -0.2 --left 300 420 --right 271 420
 budget
 handoff mast.yaml --from navcam --to hazcam --pan 0.3 --tilt -0.2 --left 300 420 --right 271 420
+board make --kind charuco --paper A4 --out board.pdf
+board measured board.yaml --across-mm 149.6 --down-mm 149.8
+board find board.yaml picture.png
 calibrate survey --out mast.yaml --report report
 calibrate bench --config rig.yaml --board board.yaml --out mast.yaml --report report
 experiment pointing --targets 20 --out pointing
@@ -79,7 +82,7 @@ ptu home /dev/ttyUSB0
 _GROUPS = frozenset(
     (
         *("lease", "token", "track", "operations", "mast", "fault", "camera", "experiment", "record"),
-        *("sim", "servo", "ptu"),
+        *("sim", "servo", "ptu", "board"),
     )
 )
 

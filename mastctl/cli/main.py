@@ -42,6 +42,7 @@ MODULES: dict[str, tuple[str, ...]] = {
     "mastctl.cli.camera_files": ("camera",),
     "mastctl.cli.geometry": ("solve", "triangulate", "budget"),
     "mastctl.cli.handoff": ("handoff",),
+    "mastctl.cli.board": ("board",),
     "mastctl.cli.calibrate": ("calibrate",),
     "mastctl.cli.calibrate_bench": ("calibrate bench",),
     "mastctl.cli.experiment": ("experiment", "demo"),

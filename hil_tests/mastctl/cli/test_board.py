@@ -1,0 +1,177 @@
+"""Boards on paper: drawn by us, rasterised by Poppler and librsvg, found by OpenCV where BOARD.yaml says."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from calib.boards import Charuco, load_board
+from mastctl.board_print.sheet import PAPERS_MM, sheet_of
+from mastctl.cli.main import main
+
+DPI = 200
+PX_PER_MM = DPI / 25.4
+PRINTED_PX = 0.25
+"""Corners of a rasterised page, against where they were drawn: whole pixels are black or white there."""
+
+
+def rasterised(path: Path) -> NDArray[np.uint8]:
+    """The page as a program from outside draws it."""
+    out = path.with_suffix(".png")
+    if path.suffix == ".pdf":
+        tool = [
+            "pdftoppm",
+            "-r",
+            str(DPI),
+            "-png",
+            "-gray",
+            "-singlefile",
+            str(path),
+            str(out.with_suffix("")),
+        ]
+    else:
+        tool = ["rsvg-convert", "-d", str(DPI), "-p", str(DPI), str(path), "-o", str(out)]
+    if shutil.which(tool[0]) is None:
+        pytest.skip(f"{tool[0]} is not installed")
+    subprocess.run(tool, check=True, timeout=120)
+    image = cv2.imread(str(out), cv2.IMREAD_GRAYSCALE)
+    assert image is not None
+    return np.asarray(image, dtype=np.uint8)
+
+
+def made(tmp_path: Path, *options: str, suffix: str = "pdf") -> tuple[Path, Path]:
+    out = tmp_path / f"b.{suffix}"
+    assert main(["board", "make", "--out", str(out), *options]) == 0
+    return out, out.with_suffix(".yaml")
+
+
+@pytest.mark.parametrize("suffix", ["pdf", "svg"])
+def test_a_charuco_board_is_on_paper_where_its_file_says(tmp_path: Path, suffix: str) -> None:
+    out, yaml = made(tmp_path, "--kind", "charuco", "--square-mm", "22.5", suffix=suffix)
+    image = rasterised(out)
+    assert image.shape == pytest.approx((297 * PX_PER_MM, 210 * PX_PER_MM), abs=1.0)
+    board = load_board(yaml)
+    assert isinstance(board, Charuco)
+    dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, board.dictionary))
+    theirs = cv2.aruco.CharucoBoard((board.columns, board.rows), board.square_m, board.marker_m, dictionary)
+    corners, ids, _, _ = cv2.aruco.CharucoDetector(theirs).detectBoard(image)
+    found = np.asarray(ids).ravel()
+    assert len(found) == len(board.ids)
+    middle_mm = np.array(sheet_of(board, PAPERS_MM["A4"], "b").middle_mm)
+    wanted = (middle_mm + 1000 * board.in_board_m(found)[:, :2]) * PX_PER_MM - 0.5
+    off = np.asarray(corners).reshape(-1, 2) - wanted
+    assert float(np.sqrt(np.mean(off**2))) < PRINTED_PX
+
+
+def test_aprilgrid_and_dots_are_on_paper_where_their_files_say(tmp_path: Path) -> None:
+    for kind in ("aprilgrid", "dots"):
+        out, yaml = made(tmp_path, "--kind", kind, "--paper", "A3", "--landscape")
+        board = load_board(yaml)
+        image = rasterised(out)
+        middle_mm = np.array(sheet_of(board, PAPERS_MM["A3"][::-1], "b").middle_mm)
+        wanted = (middle_mm + 1000 * board.in_board_m(board.ids)[:, :2]) * PX_PER_MM - 0.5
+        if kind == "dots":
+            spots = cv2.connectedComponentsWithStats((image < 128).astype(np.uint8))
+            middles = spots[3][1:]
+            away = np.linalg.norm(wanted[:, None] - middles[None], axis=-1).min(axis=1)
+            assert away.max() < PRINTED_PX
+        else:
+            start = wanted.astype(np.float32).reshape(-1, 1, 2)
+            stop = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_MAX_ITER, 50, 1e-3)
+            off = cv2.cornerSubPix(image, start.copy(), (9, 9), (-1, -1), stop) - start
+            assert float(np.sqrt(np.mean(off**2))) < PRINTED_PX
+
+
+def test_the_bars_are_as_long_as_they_say(tmp_path: Path) -> None:
+    out, yaml = made(tmp_path, "--kind", "checkerboard", "--columns", "6", "--rows", "8", "--square-mm", "25")
+    dark = rasterised(out) < 128
+    sheet = sheet_of(load_board(yaml), PAPERS_MM["A4"], "b")
+    assert sheet.bar_m == (0.15, 0.2)
+    left = round((sheet.middle_mm[0] - 75) * PX_PER_MM)
+    below = round((sheet.middle_mm[1] + 100 + 7) * PX_PER_MM)
+    row = dark[below - 2 : below + 3, left - 20 :].any(axis=0)
+    assert int(row.sum()) == pytest.approx(150 * PX_PER_MM, abs=2.0)
+    column = dark[:, left - round(7 * PX_PER_MM) - 1 : left - round(7 * PX_PER_MM) + 2].any(axis=1)
+    longest = max(len(run) for run in "".join("x" if one else " " for one in column).split())
+    assert longest == pytest.approx(200 * PX_PER_MM, abs=2.0)
+
+
+def test_a_measured_print_has_other_sizes_and_is_not_drawn_over(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out, yaml = made(tmp_path, "--kind", "charuco")
+    drawn = load_board(yaml)
+    assert main(["board", "measured", str(yaml), "--across-mm", "149.4", "--down-mm", "219.56"]) == 0
+    board = load_board(yaml)
+    assert isinstance(board, Charuco) and isinstance(drawn, Charuco)
+    assert board.square_m == pytest.approx(0.996 * drawn.square_m)
+    assert board.aspect == pytest.approx(0.998 / 0.996)
+    capsys.readouterr()
+    assert main(["board", "make", "--kind", "charuco", "--out", str(out)]) == 2
+    assert "holds a measured board" in capsys.readouterr().err
+    assert load_board(yaml) == board
+    again = ["board", "make", "--kind", "charuco", "--out", str(out), "--json", "--measured-bar-mm", "149.4"]
+    assert main(again) == 0
+    assert json.loads(capsys.readouterr().out)["board"]["square_m"] == pytest.approx(0.0249)
+
+
+BAD = {
+    "of another kind": (
+        ["--kind", "charuco", "--tag-mm", "30"],
+        "--tag-mm says nothing of a board of kind charuco",
+    ),
+    "too large": (["--kind", "charuco", "--columns", "9", "--rows", "5"], "--square-mm 19.3 would fit"),
+    "paper": (["--kind", "dots", "--paper", "A9"], "--paper: 'A9' where one of A0, A1"),
+    "tiny paper": (["--kind", "dots", "--paper", "20x30"], "from 60 to 3000"),
+    "suffix": (["--kind", "dots", "--out", "board.png"], "ending in .pdf or .svg"),
+    "no square": (["--kind", "charuco", "--square-mm", "0"], "--square-mm: 0 where more than 0"),
+    "marker": (["--kind", "charuco", "--marker-mm", "30"], "marker_m: 0.03 where less than square_m"),
+    "dictionary": (
+        ["--kind", "charuco", "--dictionary", "5x5"],
+        "dictionary: the text '5x5' where one of DICT_",
+    ),
+    "ids": (["--kind", "aprilgrid", "--first-id", "580"], "first_id: 580 where an integer from 0 to"),
+    "three bars": (["--kind", "dots", "--measured-bar-mm", "1", "2", "3"], "one or two are expected"),
+    "inches": (["--kind", "dots", "--measured-bar-mm", "6.7"], "measured.across_m: 0.0067 where"),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_what_cannot_be_drawn_is_refused_in_one_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], case: str
+) -> None:
+    options, words = BAD[case]
+    out = [] if "--out" in options else ["--out", str(tmp_path / "b.pdf")]
+    assert main(["board", "make", *out, *options]) == 2
+    told = capsys.readouterr().err
+    assert words in told
+    assert told.count("\n") == 1
+    assert list(tmp_path.glob("b.yaml")) == []
+
+
+def test_corners_of_a_picture_are_told_and_written(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out, yaml = made(tmp_path, "--kind", "charuco")
+    rasterised(out)
+    dark = tmp_path / "dark.png"
+    cv2.imwrite(str(dark), np.zeros((480, 640), np.uint8))
+    capsys.readouterr()
+    table = tmp_path / "corners.csv"
+    pictures = [str(out.with_suffix(".png")), str(dark)]
+    assert main(["board", "find", str(yaml), *pictures, "--out", str(table), "--json"]) == 0
+    first, second = json.loads(capsys.readouterr().out)["pictures"]
+    assert first["corners"] >= 36  # a page without blur has edges of whole pixels
+    assert first["of"] == 40
+    assert "too dark" in second["reason"]
+    assert len(table.read_text().splitlines()) == 1 + first["corners"]
+    assert main(["board", "find", str(yaml), str(dark)]) == 1
+    assert main(["board", "find", str(yaml), str(yaml)]) == 2
+    assert "is no picture" in capsys.readouterr().err

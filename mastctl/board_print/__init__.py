@@ -1,0 +1,1 @@
+"""Boards on paper: the sheet, and its files."""

@@ -1,0 +1,213 @@
+"""A sheet of paper with a board on it, two bars to measure, and words that say what it is."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from calib.boards import AnyBoard, AprilGrid, Charuco, Checkerboard, DotBoard
+from calib.boards.pattern import Spots, pattern_of
+from mastctl.errors import MastctlError
+
+PAPERS_MM = {
+    "A0": (841.0, 1189.0), "A1": (594.0, 841.0), "A2": (420.0, 594.0), "A3": (297.0, 420.0),
+    "A4": (210.0, 297.0), "A5": (148.0, 210.0), "letter": (215.9, 279.4),
+    "legal": (215.9, 355.6), "tabloid": (279.4, 431.8),
+}  # fmt: skip
+
+MARGIN_MM = 10.0
+"""What printers leave white at the rim, and a little more."""
+
+GAP_MM, BAR_MM, LINE_MM, TICK_MM = 7.0, 10.0, 0.25, 4.0
+"""White around the board, a bar's length is a multiple of, how thick it is, its ends."""
+
+TEXT_MM, SMALL_MM = 3.6, 2.6
+FOOT_MM = 26.0
+SIDE_MM = 7.0
+
+Rectangle = tuple[float, float, float, float]
+
+
+@dataclass(frozen=True)
+class Words:
+    """A line of text: where its left end stands on the line (mm), how high, how it is turned."""
+
+    x_mm: float
+    y_mm: float
+    height_mm: float
+    text: str
+    upwards: bool = False
+
+
+@dataclass(frozen=True)
+class Sheet:
+    """What is printed, in millimetres from the paper's upper left corner, x right and y down.
+
+    Attributes
+    ----------
+    size_mm
+        Of the paper.
+    rectangles, ellipses
+        Black: (left, top, right, bottom); (x, y, half width, half height).
+    words
+        Lines of text.
+    board
+        The board, whose middle is at ``middle_mm``.
+    bar_m
+        Lengths of the bars across and down, metres.
+    """
+
+    size_mm: tuple[float, float]
+    rectangles: tuple[Rectangle, ...]
+    ellipses: tuple[Rectangle, ...]
+    words: tuple[Words, ...]
+    board: AnyBoard
+    middle_mm: tuple[float, float]
+    bar_m: tuple[float, float]
+
+
+class TooLarge(MastctlError):
+    """A board that the paper has no room for."""
+
+    code, exit_code = "too_large", 2
+
+
+def room_mm(paper_mm: tuple[float, float]) -> tuple[float, float]:
+    """Return how wide and high a board may be on a paper."""
+    return (
+        paper_mm[0] - 2 * MARGIN_MM - 2 * SIDE_MM - 2.0,
+        paper_mm[1] - 2 * MARGIN_MM - FOOT_MM - GAP_MM,
+    )
+
+
+def sheet_of(board: AnyBoard, paper_mm: tuple[float, float], name: str) -> Sheet:
+    """Lay a board out on paper.
+
+    Raises
+    ------
+    TooLarge
+        If it does not fit: by how much, and how large it may be.
+    """
+    width_mm, height_mm = (1000.0 * size for size in board.size_m)
+    wide_mm, high_mm = room_mm(paper_mm)
+    if width_mm > wide_mm + 1e-6 or height_mm > high_mm + 1e-6:
+        part = min(wide_mm / width_mm, high_mm / height_mm)
+        raise TooLarge(
+            f"the board is {width_mm:.0f} x {height_mm:.0f} mm, and paper of "
+            f"{paper_mm[0]:g} x {paper_mm[1]:g} mm"
+            f" has room for {wide_mm:.0f} x {high_mm:.0f} mm; {part_told(board, part)}"
+        )
+    left, top = (paper_mm[0] - width_mm) / 2, MARGIN_MM + (high_mm + GAP_MM - height_mm) / 2
+    middle = left + width_mm / 2, top + height_mm / 2
+    rectangles, ellipses = _printed(board, middle)
+    across_mm, down_mm = (max(BAR_MM, BAR_MM * math.floor(size / BAR_MM)) for size in (width_mm, height_mm))
+    foot = top + height_mm + GAP_MM
+    side = left - SIDE_MM
+    bars = [*_bar(left, foot, across_mm, False), *_bar(side, top, down_mm, True)]
+    words = [
+        Words(left + across_mm / 2 - 22.0, foot - 1.2, SMALL_MM, f"{across_mm:g} mm across: measure it"),
+        Words(side - 1.2, top + down_mm / 2 + 20.0, SMALL_MM, f"{down_mm:g} mm down: measure it", True),
+        Words(left, foot + 6.0, TEXT_MM, drawn(board)),
+        Words(
+            left,
+            foot + 10.5,
+            SMALL_MM,
+            f"mastctl board {name}    this side up, x to the right, y down, z into the paper",
+        ),
+        Words(
+            left,
+            foot + 14.5,
+            SMALL_MM,
+            f"Print at 100 % (no fit to page), glue flat. Write the bars' lengths into {name}.yaml:",
+        ),
+        Words(
+            left, foot + 18.5, SMALL_MM, f"mastctl board measured {name}.yaml --across-mm ... --down-mm ..."
+        ),
+    ]
+    bars += _up(left + width_mm - 3.0, foot + 4.0)
+    return Sheet(
+        paper_mm,
+        tuple(rectangles + bars),
+        tuple(ellipses),
+        tuple(words),
+        board,
+        middle,
+        (across_mm / 1000, down_mm / 1000),
+    )
+
+
+def drawn(board: AnyBoard) -> str:
+    """Return what a board is, in one line for people."""
+    match board:
+        case Charuco():
+            old = ", drawn as before OpenCV 4.6" if board.legacy else ""
+            ids = f" from {board.first_id}" if board.first_id else ""
+            return (
+                f"ChArUco, {board.columns} x {board.rows} squares of {_mm(board.square_m)} mm, "
+                f"markers of {_mm(board.marker_m)} mm, {board.dictionary}{ids}{old}"
+            )
+        case AprilGrid():
+            ids = f" from {board.first_id}" if board.first_id else ""
+            return (
+                f"AprilGrid, {board.columns} x {board.rows} tags of {_mm(board.tag_m)} mm, "
+                f"{_mm(board.gap_m)} mm apart, {board.family}{ids}"
+            )
+        case DotBoard():
+            return (
+                f"Dots, {board.columns} x {board.rows}, {_mm(board.spacing_m)} mm apart, "
+                f"{_mm(board.dot_diameter_m)} mm across"
+            )
+        case Checkerboard():
+            return f"Chessboard, {board.columns} x {board.rows} squares of {_mm(board.square_m)} mm"
+
+
+def part_told(board: AnyBoard, part: float) -> str:
+    """Return how large what is drawn may be at so large a part of what was wanted."""
+    key = {"charuco": "square", "checkerboard": "square", "aprilgrid": "tag", "dots": "spacing"}[board.kind]
+    size_mm = math.floor(10_000.0 * part * getattr(board, f"{key}_m")) / 10
+    return f"--{key}-mm {size_mm:g} would fit, or fewer columns and rows, or --landscape"
+
+
+def _printed(board: AnyBoard, middle: tuple[float, float]) -> tuple[list[Rectangle], list[Rectangle]]:
+    """The board's own rectangles and ellipses."""
+    pattern = pattern_of(board)
+    x, y = middle
+    if isinstance(pattern, Spots):
+        half = 500.0 * pattern.diameter_m
+        spots = [
+            (x + 1000.0 * a, y + 1000.0 * b, half, half * pattern.aspect)
+            for b in pattern.y_m
+            for a in pattern.x_m
+        ]
+        return [], spots
+    cells = [
+        (x + 1000.0 * left, y + 1000.0 * top, x + 1000.0 * right, y + 1000.0 * bottom)
+        for left, top, right, bottom in pattern.rectangles_m()
+    ]
+    return cells, []
+
+
+def _bar(x: float, y: float, length: float, down: bool) -> list[Rectangle]:
+    """A bar with ends whose outer sides are its length apart."""
+    line = (x, y - LINE_MM / 2, x + length, y + LINE_MM / 2)
+    ends = [
+        (x, y - TICK_MM / 2, x + LINE_MM, y + TICK_MM / 2),
+        (x + length - LINE_MM, y - TICK_MM / 2, x + length, y + TICK_MM / 2),
+    ]
+    if not down:
+        return [line, *ends]
+    return [(x - (t - y), y + (a - x), x - (s - y), y + (b - x)) for a, s, b, t in (line, *ends)]
+
+
+def _up(x: float, y: float) -> list[Rectangle]:
+    """An arrow that points up, of steps, 8 mm high."""
+    steps = 24
+    head = [
+        (x - 2.0 * k / steps, y + 4.0 * k / steps, x + 2.0 * k / steps, y + 4.0 * (k + 1) / steps)
+        for k in range(1, steps)
+    ]
+    return [*head, (x - 0.5, y + 4.0, x + 0.5, y + 8.0)]
+
+
+def _mm(metres: float) -> str:
+    return f"{1000.0 * metres:.3f}".rstrip("0").rstrip(".")
