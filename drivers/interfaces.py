@@ -120,6 +120,10 @@ class AxisReport:
         return None if self.left_rad is None else focal_px * math.tan(self.left_rad)
 
 
+COARSE_COUNT_RAD = math.tau / 4096
+"""What a head that does not say its counts is taken to have: those of a 12-bit servo, the coarsest."""
+
+
 @dataclass(frozen=True)
 class AxisMotion:
     """How an axis moves.

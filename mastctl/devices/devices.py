@@ -20,6 +20,7 @@ from calib.mast.rig import Rig
 from drivers.clock import Clock, deadlines_on
 from drivers.errors import BadReply, DriverError, LineLost, NoReply
 from drivers.interfaces import (
+    COARSE_COUNT_RAD,
     AxisReport,
     Camera,
     PanTilt,
@@ -196,8 +197,13 @@ class Devices:
     @property
     def reading_sigma_rad(self) -> Pair:
         """What a reading of pan and tilt may be off by, one sigma: that of a count, 12-bit if not stated."""
-        pan, tilt = self.door.counts_rad
+        pan, tilt = (self.counts_rad.get(axis, COARSE_COUNT_RAD) for axis in ("pan", "tilt"))
         return pan / math.sqrt(12.0), tilt / math.sqrt(12.0)
+
+    @property
+    def counts_rad(self) -> Mapping[str, float]:
+        """One count of ``pan`` and of ``tilt``, as far as the head says it."""
+        return self.door.counts_rad
 
     def goal(self, true_rad: Pair, here: HeadReading, corners: Sequence[Pair] = ()) -> Pair:
         """Return the readings to send the head to, so that it comes to true angles.

@@ -32,7 +32,6 @@ log = logging.getLogger(__name__)
 REST_S = 0.3  # after a move was taken, before a reading that says rest is one of its end
 TRAVEL_S = 0.1  # from a reading to the moment when the next command acts on the axes
 ASSUMED_RAD_PER_S2 = 0.4  # of a head that does not say how it brakes: the least that a driver can be set to
-COARSE_COUNT_RAD = np.pi / 2048
 PARTS = 16  # in which a goal ahead is tried
 ROUNDED = 1.01  # a servo rounds its acceleration up to its own unit
 
@@ -91,11 +90,9 @@ class Door:
         self.use_limits(limits)
 
     @property
-    def counts_rad(self) -> tuple[float, float]:
-        """One count of pan and of tilt; for a head that does not say a 12-bit servo's, the coarsest."""
-        still = AxisMotion(ASSUMED_RAD_PER_S2)
-        pan, tilt = (self._stated.get(axis, still).count_rad or COARSE_COUNT_RAD for axis in ("pan", "tilt"))
-        return pan, tilt
+    def counts_rad(self) -> Mapping[str, float]:
+        """One count of ``pan`` and of ``tilt``, as far as the head says it."""
+        return {axis: one.count_rad for axis, one in self._stated.items() if one.count_rad}
 
     def turns_to(self, goal: Pair) -> tuple[int, int]:
         """Return from which side pan and tilt come to a goal by themselves: 1, -1, 0 for the shortest way."""

@@ -13,12 +13,10 @@ from dataclasses import asdict, dataclass, fields
 from typing import Any
 
 from calib.files.mast_file import StoredRig
+from drivers.interfaces import COARSE_COUNT_RAD
 from mastctl.operations.records import Operation
 
 DISAGREE = "eyes_disagree"
-
-COARSE_COUNT_RAD = math.tau / 4096
-"""What a head that does not know its counts is taken to have: those of a 12-bit servo, the coarsest."""
 
 Pair = tuple[float, float]
 _PAIRS = ("from_rad", "to_rad", "residual_px", "off_px", "match_sigma_px", "count_rad")
@@ -109,7 +107,7 @@ def measured_by(operation: Operation, mast: StoredRig, time_s: float) -> Measure
         to_rad = settled["true_pan_rad"], settled["true_tilt_rad"]
         view = rig.camera_in_rover(found["camera"], *to_rad)
         predicted = view.project(seen["position_m"])[0].tolist()
-        counts = settled.get("counts", {})
+        counts = settled.get("count_rad", {})
         return measured_of(
             {
                 "time_s": time_s,
@@ -126,15 +124,11 @@ def measured_by(operation: Operation, mast: StoredRig, time_s: float) -> Measure
                 "residual_px": found["residual_px"],
                 "off_px": tuple(a - b for a, b in zip(found["pixel_px"], predicted, strict=True)),
                 "match_sigma_px": found["sigma_px"],
-                "count_rad": tuple(_count_rad(counts, axis) for axis in ("pan", "tilt")),
+                "count_rad": tuple(counts.get(axis, COARSE_COUNT_RAD) for axis in ("pan", "tilt")),
             }
         )
     except (LookupError, TypeError, ValueError):  # it did not come so far, or could not measure a number
         return None
-
-
-def _count_rad(counts: Mapping[str, Mapping[str, Any]], axis: str) -> float:
-    return float(counts.get(axis, {}).get("count_rad", COARSE_COUNT_RAD))
 
 
 def _numbers(values: object, key: str, size: int) -> tuple[float, ...]:

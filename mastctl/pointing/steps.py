@@ -200,6 +200,7 @@ class Steps:
             detail.update(**_stands(settled))
             model = None if camera is None else self._rig.cameras[camera].model
             detail.update(counts_told(self._devices, settled.tilt_rad, model))
+            detail.update(count_rad=dict(self._devices.counts_rad))
         return settled
 
     def before(

@@ -267,6 +267,9 @@ def test_a_goal_is_approached_from_the_configured_side() -> None:
         assert min(lowest) < 0.2 - 0.03
         assert reading.tilt_rad == pytest.approx(0.2, abs=COUNT_RAD)
         assert head.report()["tilt"].side == "positive"
+        told = head.axis_motion()
+        assert (told["tilt"].turn_to(0.2), told["pan"].turn_to(0.2)) == (1, 0)
+        assert told["tilt"].count_rad == pytest.approx(COUNT_RAD)
         head.close()
 
 

@@ -313,6 +313,9 @@ def test_acceleration_is_set_only_where_it_differs(opened: Opener) -> None:
 def test_a_goal_is_approached_from_one_side(opened: Opener, approach: str, way: int) -> None:
     axis = {"limits_rad": [-2.5, 2.5], "approach": approach, "approach_rad": 20 * PAN_STEP_RAD}
     head, unit = opened(pan=axis)
+    told = head.axis_motion()["pan"]
+    assert told.count_rad == pytest.approx(PAN_STEP_RAD) and told.turn_to(-0.3) == way
+    assert head.axis_motion()["tilt"].turn_to(-0.3) == 0
     for goal in (0.5, -0.3, -0.31, 2.5, -2.5):
         unit.heard.clear()
         head.move(goal, 0.0)

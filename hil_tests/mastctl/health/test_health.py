@@ -10,12 +10,13 @@ import numpy as np
 import pytest
 
 from calib.errors import BadFile
+from drivers.interfaces import COARSE_COUNT_RAD
 from hil_tests.mastctl.health.histories import DAY_S, NOON_S, bumped, pointing, stored_rig
 from hil_tests.mastctl.service_fakes import eventually
 from mastctl.health import journal as journal_module
 from mastctl.health.health import CalibrationHealth
 from mastctl.health.journal import FILE, Journal
-from mastctl.health.measured import COARSE_COUNT_RAD, Measured, measured_by, measured_of
+from mastctl.health.measured import Measured, measured_by, measured_of
 from mastctl.operations.records import Operation
 from mastctl.pointing.results import Step
 
@@ -34,7 +35,7 @@ def ended_pointing() -> Operation:
     details = {
         "rest": at,
         "triangulate": {"position_m": [3.0, 0.2, -1.0], "range_m": 3.1},
-        "settle": at | {"counts": {"pan": {"count_rad": 1e-4}}},
+        "settle": at | {"count_rad": {"pan": 1e-4}},
         "measure": {
             "camera": "pancam_left",
             "pixel_px": [float(predicted[0]) - 0.5, float(predicted[1]) + 0.5],

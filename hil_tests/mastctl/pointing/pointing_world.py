@@ -8,7 +8,7 @@ wrong ones.
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache
 
@@ -139,6 +139,7 @@ class World:
         return HeadReading(*true_rad, told.moving, told.time_s, told.faults, true_rad=true_rad)
 
     reading_sigma_rad = (1e-5, 1e-5)
+    counts_rad: Mapping[str, float] = field(default_factory=dict)
 
     def goal(self, true_rad: Pair, here: HeadReading, corners: Sequence[Pair] = ()) -> Pair:
         return true_rad  # joints that read true
