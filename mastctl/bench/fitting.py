@@ -13,6 +13,9 @@ from calib.mast.rig import Rig
 from calib.rigid import Rigid
 from calib.survey import Survey
 
+LEAST_PX, LEAST_SCALE = 0.01, 0.1
+"""No corner is surer than this, and none so much surer than its finder says; few pictures agree by chance."""
+
 
 @dataclass(frozen=True, eq=False)
 class Fitted:
@@ -26,6 +29,8 @@ class Fitted:
         Placement to rover_from_board.
     corner_rms_px
         Rms per axis of the fitted corners.
+    sigma_scale
+        How large residuals are against the sigmas that were stated of corners.
     calibration
         All of what the fit tells; None of a stand-in.
     """
@@ -33,6 +38,7 @@ class Fitted:
     rig: Rig
     boards: Mapping[str, Rigid]
     corner_rms_px: float
+    sigma_scale: float
     calibration: BenchCalibration | None
 
 
@@ -49,6 +55,7 @@ def fit_in_rover(rover_from_mast: Rigid) -> FitSurvey:
         done = fit_bench(survey, BenchOptions(rover_from_mast=rover_from_mast))
         boards = {placement: pose for (_, placement), pose in done.rover_from_board.items()}
         rms = float(np.sqrt(np.mean(np.square(list(done.rms_px.values())))))
-        return Fitted(done.rig, boards, rms, done)
+        scale = float(np.sqrt(done.chi2 / max(done.degrees_of_freedom, 1.0)))
+        return Fitted(done.rig, boards, max(rms, LEAST_PX), max(scale, LEAST_SCALE), done)
 
     return fit

@@ -11,16 +11,28 @@ from typing import Any
 
 import numpy as np
 
+from calib.bench.knowledge import Knowledge
+from calib.bench.workspace import Workspace, pointing
+from calib.errors import BadFile
 from calib.files.mast_file import StoredRig
 from calib.files.yaml_text import plain
 from calib.fit.bench_calibration import BenchCalibration
+from calib.mast.covariance import RigCovariance
 from calib.mast.rig import Rig
 from calib.survey import Survey
 from mastctl.bench.final import Checked
-from mastctl.bench.run import BenchRun
+from mastctl.bench.report import Told, workspace_covariance, write_bench_report
+from mastctl.bench.run import BenchRun, first_cameras
 from mastctl.bench.teller import Teller, px
 from mastctl.calibration.mast_file import as_lists, mast_keys, rounded_matrix
 from mastctl.calibration.run import save_new
+from mastctl.errors import MastctlError
+
+
+class NotReported(MastctlError):
+    """The mast file is saved, its report is not."""
+
+    code = "report_not_written"
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,8 +47,9 @@ class BenchDone:
         The mast file.
     checked
         What the end showed; None of a folder that was fitted again.
-    predicted_px, floor_px
-        Rms per axis of a first pointing that the calibration leaves, and what counts alone leave.
+    predicted_px, calibrated_px, floor_px
+        Rms per axis of a first pointing: what was expected when pictures sufficed, what the calibration's own
+        covariance tells, and what counts alone leave.
     seconds, placements, pictures
         Of the rover's time; how many; of the camera with most.
     page
@@ -48,6 +61,7 @@ class BenchDone:
     saved: StoredRig
     checked: Checked | None = None
     predicted_px: float | None = None
+    calibrated_px: float | None = None
     floor_px: float | None = None
     seconds: float | None = None
     placements: int = 0
@@ -75,6 +89,7 @@ class BenchDone:
             "pictures": self.pictures,
             "rover_seconds": self.seconds,
             "predicted_px": self.predicted_px,
+            "calibrated_px": self.calibrated_px,
             "counts_px": self.floor_px,
             "report": None if self.page is None else str(self.page),
         }
@@ -95,17 +110,32 @@ class BenchDone:
             }  # fmt: skip
         return document
 
+    def worth(self) -> Iterator[tuple[str, str]]:
+        """Yield what a pointing may expect, and what was measured: words and figures."""
+        if self.calibrated_px is not None:
+            yield "first pointing, rms an axis, by the calibration", px(self.calibrated_px)
+        if self.floor_px is not None:
+            yield "the same by the encoders' counts alone", px(self.floor_px)
+        if self.checked is not None and self.checked.pointing_rms_px is not None:
+            x, y = self.checked.pointing_rms_px
+            promised = self.checked.pointing_promised_px or 0.0
+            yield (
+                f"pointed at {len(self.checked.pointings)} corners, rms x and y",
+                f"{x:.2f}, {y:.2f} px, promised {promised:.2f}",
+            )
+        if self.seconds is not None:
+            yield (
+                "taken",
+                f"{self.placements} placements, {self.pictures} pictures a camera, "
+                f"{self.seconds:.0f} s of the rover's time",
+            )
+
     def lines(self) -> list[str]:
         """Return it for a person."""
         return list(self._lines())
 
     def _lines(self) -> Iterator[str]:
         fit = self.calibration
-        if self.seconds is not None:
-            yield (
-                f"{self.placements} placements, {self.pictures} pictures a camera, {self.seconds:.0f} s "
-                "of the rover's time"
-            )
         for name, (x, y) in fit.rms_px.items():
             line = f"{name}: rms {x:.3f}, {y:.3f} px"
             if name in fit.check_rms_px:
@@ -116,17 +146,7 @@ class BenchDone:
             yield line
         for term in fit.terms:
             yield term.sentence
-        if self.predicted_px is not None and self.floor_px is not None:
-            yield (
-                f"first pointing: {px(self.predicted_px)} rms an axis by the calibration, "
-                f"{px(self.floor_px)} by the encoders' counts"
-            )
-        if self.checked is not None and self.checked.pointing_rms_px is not None:
-            x, y = self.checked.pointing_rms_px
-            yield (
-                f"pointed at {len(self.checked.pointings)} corners: rms {x:.2f}, {y:.2f} px, "
-                f"promised {self.checked.pointing_promised_px:.2f}"
-            )
+        yield from (f"{what}: {value}" for what, value in self.worth())
         yield from (f"held: {sentence}" for sentence in fit.gauges)
         yield from (f"note: {sentence}" for sentence in fit.notes)
         yield from (f"left out: {outlier.sentence}" for outlier in fit.outliers[:10])
@@ -152,7 +172,7 @@ def finish(bench: BenchRun, teller: Teller, out: Path, report: Path | None) -> B
     survey = bench.survey()
     rig = replace(with_bench_fit(calibration, survey), name=bench.name)
     saved, _ = save_new(rig, out)
-    return BenchDone(
+    done = BenchDone(
         survey,
         calibration,
         saved,
@@ -163,6 +183,7 @@ def finish(bench: BenchRun, teller: Teller, out: Path, report: Path | None) -> B
         len(bench.placements()),
         bench.pictures(),
     )
+    return _reported(done, report, bench.head.rig, bench.workspace)
 
 
 def save_bench(survey: Survey, out: Path, report: Path | None) -> BenchDone:
@@ -171,7 +192,28 @@ def save_bench(survey: Survey, out: Path, report: Path | None) -> BenchDone:
 
     calibration = fit_bench(survey)
     saved, _ = save_new(with_bench_fit(calibration, survey), out)
-    return BenchDone(survey, calibration, saved)
+    shown = [image for image in survey.images if image.pan_rad is not None and image.tilt_rad is not None]
+    pans, tilts = ([float(getattr(i, f"{joint}_rad")) for i in shown] for joint in ("pan", "tilt"))
+    where = Workspace(first_cameras(calibration.rig), (min(pans), max(pans)), (min(tilts), max(tilts)))
+    return _reported(BenchDone(survey, calibration, saved), report, None, where)
+
+
+def _reported(done: BenchDone, folder: Path | None, former: Rig | None, where: Workspace) -> BenchDone:
+    """Write the report, if it is asked for."""
+    fit = done.calibration
+    known = Knowledge(fit.rig, {})
+    aim = pointing(known, where)
+    covariance = workspace_covariance(known.names, RigCovariance(fit.parameter_names, fit.covariance))
+    done = replace(done, calibrated_px=aim.rms_px(covariance))
+    if folder is None:
+        return done
+    told = Told(done.survey, fit, done.saved, done.checked, aim, covariance, tuple(done.worth()), former)
+    try:
+        return replace(done, page=write_bench_report(told, folder))
+    except (OSError, BadFile) as error:
+        raise NotReported(
+            f"the mast file {done.saved.path} is saved, but its report is not: {error}"
+        ) from None
 
 
 def with_bench_fit(calibration: BenchCalibration, survey: Survey) -> Rig:

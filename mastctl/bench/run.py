@@ -24,7 +24,7 @@ from calib.errors import CalibError
 from calib.fit.least_squares import covariance_of
 from calib.rigid import Rigid, rigid_rates
 from calib.survey import Survey
-from mastctl.bench.eyes import Eyes, Look
+from mastctl.bench.eyes import Eyes, Head, Look
 from mastctl.bench.final import Checked, point_at_corners, unvisited
 from mastctl.bench.fitting import FitSurvey, Fitted
 from mastctl.bench.folder import Kept, looks_of
@@ -35,7 +35,7 @@ from mastctl.errors import MastctlError
 FEWEST_LOOKS = 6
 """Of a placement: fewer leave the board's own place, and so what it tells, to chance."""
 
-LITTLE_GAIN, LAST_GAIN = 0.05, 0.01
+LITTLE_GAIN, LAST_GAIN = 0.12, 0.01
 """A look that promises less than this part of the predicted error is not worth its time at a placement, or at
 the last one that there may be."""
 
@@ -123,6 +123,7 @@ class BenchRun:
         self._aim = pointing(self._known, self._workspace)
         self._shots: list[Shot] = []
         self._looks: list[tuple[str, bool, Look]] = list(looks_of(kept.survey()))
+        self._scale = 1.0
         self._fitted_looks = 0
         self._pool = ThreadPoolExecutor(1, "bench-fit")
         self._pending: tuple[int, Future[Fitted]] | None = None
@@ -268,6 +269,16 @@ class BenchRun:
     def name(self) -> str:
         """The rig's name."""
         return self._eyes.head.rig.name
+
+    @property
+    def head(self) -> Head:
+        """The head as it was known before."""
+        return self._eyes.head
+
+    @property
+    def workspace(self) -> Workspace:
+        """Where it points."""
+        return self._workspace
 
     # -- what was done before -------------------------------------------------------------------------
 
@@ -423,7 +434,7 @@ class BenchRun:
 
     def _shot(self, name: str, look: Look) -> Shot:
         views = tuple(
-            View(one.camera, self._board.in_board_m(one.corners.ids), one.corners.sigma_px)
+            View(one.camera, self._board.in_board_m(one.corners.ids), self._scale * one.corners.sigma_px)
             for one in look.found
             if one.corners is not None and one.camera in self._known.rig.cameras
         )
@@ -468,7 +479,8 @@ class BenchRun:
         self.fitted = fitted
         self._known = replace(self._known, rig=fitted.rig, boards=dict(fitted.boards))
         self._believe_boards()
-        self._sought = replace(self._sought, sigma_px=max(fitted.corner_rms_px, 0.2 * self._kept.sigma_px))
+        self._scale = fitted.sigma_scale
+        self._sought = replace(self._sought, sigma_px=fitted.corner_rms_px)
         self._aim = pointing(self._known, self._workspace)
         self._shots = [self._shot(name, look) for name, check, look in self._looks if not check]
 
