@@ -71,9 +71,10 @@ class NoHandoff(CalibError):
 
 
 class NoCorrection(CalibError):
-    """Hand-offs that give no correction of the body cameras; ``code`` names the cause for programs.
+    """Hand-offs or a scene that give no correction of a rig; ``code`` names the cause for programs.
 
-    Codes: ``too_few``, ``one_sided``, ``inconsistent``, ``not_significant``, ``not_settled``.
+    Codes: ``too_few``, ``one_sided``, ``inconsistent``, ``not_significant``, ``not_settled``,
+    ``not_predictive``.
     """
 
     def __init__(self, code: str, message: str) -> None:

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mastctl.cli import output
+from mastctl.cli.output import positive_number
 from mastctl.cli.places import check_file, check_folder, unusable
 
 if TYPE_CHECKING:
@@ -31,7 +32,10 @@ def add_commands(subparsers: Any) -> None:
         "ends with 1 and writes nothing if they tell no significant correction.",
     )
     parser.add_argument(
-        "survey", type=Path, metavar="SURVEY", help="the survey folder; with --refine the mast file"
+        "survey",
+        type=Path,
+        metavar="SURVEY",
+        help="the survey folder; with --refine and --refine-scene the mast file",
     )
     parser.add_argument(
         "--refine",
@@ -39,6 +43,20 @@ def add_commands(subparsers: Any) -> None:
         action="append",
         metavar="HANDOFFS.jsonl",
         help="record of hand-offs to correct the body cameras by; may be given several times",
+    )
+    parser.add_argument(
+        "--refine-scene",
+        type=Path,
+        metavar="RECORD",
+        help="pictures of a scene at many angles, the rover standing still: a recording, a CSV of pictures "
+        "(camera,pan_rad,tilt_rad,file) or a folder of PDS3 products; corrects cameras, axes and joints",
+    )
+    parser.add_argument("--camera", metavar="NAME", help="with --refine-scene: this camera's pictures only")
+    parser.add_argument(
+        "--joint-sigma-rad",
+        type=positive_number,
+        metavar="RAD",
+        help="with --refine-scene: what a rest of the head is off by chance (default 0.0002)",
     )
     parser.add_argument("--out", type=Path, required=True, metavar="MAST.yaml", help="the mast file to write")
     parser.add_argument("--report", type=Path, metavar="DIR", help="folder for calibration.html")
@@ -64,10 +82,18 @@ def add_commands(subparsers: Any) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Read, check, find dots, fit, save, report; nothing is written before the fit is good."""
+    if args.refine and args.refine_scene is not None:
+        raise output.WrongUse("--refine and --refine-scene: one of them is expected")
     if args.refine:
         from mastctl.cli import calibrate_refine
 
         return calibrate_refine.run(args)
+    if args.refine_scene is not None:
+        from mastctl.cli import calibrate_scene
+
+        return calibrate_scene.run(args)
+    if args.camera is not None or args.joint_sigma_rad is not None:
+        raise output.WrongUse("--camera and --joint-sigma-rad belong to --refine-scene")
     args.method, args.mast = args.method or "joint", args.mast or 6
     return _from_survey(args)
 

@@ -7,8 +7,9 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from mastctl.cli import cameras, output
-from mastctl.cli.mast_files import camera_name, nearest_of, need_joints, tell_notes
+from mastctl.cli import camera_maps, cameras, output
+from mastctl.cli.chosen_camera import camera_of
+from mastctl.cli.mast_files import camera_name, need_joints, tell_notes
 from mastctl.cli.output import finite_number, positive_number
 
 if TYPE_CHECKING:
@@ -16,8 +17,7 @@ if TYPE_CHECKING:
 
     from calib.camera.cahvor import CameraModel
     from calib.files import CameraFile
-    from calib.files.any_camera import CameraFiles, Conversion
-    from calib.files.mast_file import StoredRig
+    from calib.files.any_camera import Conversion
 
 
 _SOURCES = "mast or camera file, .cahvor, PDS3 label, OpenCV's, ROS's, Kalibr's, mrcal's or COLMAP's"
@@ -78,8 +78,6 @@ def add_commands(subparsers: Any) -> None:
     )
     convert.set_defaults(run=camera_convert)
 
-    from mastctl.cli import camera_maps  # it takes a camera as the actions here do
-
     camera_maps.add_action(actions)
     cameras.add_actions(actions)
 
@@ -131,7 +129,7 @@ def camera_convert(args: argparse.Namespace) -> int:
     names = args.camera or [None]
     if len(set(names)) < len(names):
         raise output.WrongUse("--camera names one camera twice")
-    cameras = dict(_camera_of(source, name) for name in names)
+    cameras = dict(camera_of(source, name) for name in names)
     limit_px = LIMIT_PX if args.limit_px is None else args.limit_px
     done = save_any(cameras, args.target, args.to, args.lens, limit_px)
     notes = list(dict.fromkeys(note for camera in cameras.values() for note in camera.notes))
@@ -162,39 +160,6 @@ def _errors_told(cameras: Mapping[str, CameraFile], done: Conversion) -> dict[st
     }
 
 
-def chosen_camera(path: Path, name: str | None) -> tuple[str, CameraFile]:
-    """Return the camera of a file that is meant, and its name, notes told. Raises WrongUse and BadFile."""
-    from calib.files.any_camera import load_any
-
-    found, camera = _camera_of(load_any(path), name)
-    tell_notes(camera.notes)
-    return found, camera
-
-
-def _camera_of(source: StoredRig | CameraFile | CameraFiles, name: str | None) -> tuple[str, CameraFile]:
-    """Return the camera that is meant, and its name. Raises WrongUse."""
-    from calib.files import CameraFile
-    from calib.files.any_camera import CameraFiles
-
-    if isinstance(source, CameraFile):
-        _refuse_name(name)
-        return "camera", source
-    if isinstance(source, CameraFiles):
-        cameras = source.cameras
-        if name is None:
-            raise output.WrongUse(
-                f"{source.path} holds several cameras; --camera with one of {', '.join(cameras)}"
-            )
-        if name not in cameras:
-            raise output.WrongUse(f"no camera '{name}' in {source.path}; {nearest_of(name, cameras)}")
-        return name, cameras[name]
-    name = camera_name(source, name)
-    camera = source.rig.cameras[name]
-    provenance = {"mast_file_sha256": source.digest, **source.rig.provenance}
-    left_out = ("the mast file's 'fit' is left out",) if source.rig.fit else ()
-    return name, CameraFile(camera.model, camera.on, {}, provenance, source.notes + left_out)
-
-
 def _chosen_model(args: argparse.Namespace) -> CameraModel:
     """Return the camera of --camera at --pan and --tilt in the rover frame, or a single camera as it is."""
     from calib.files.any_camera import load_any
@@ -202,7 +167,7 @@ def _chosen_model(args: argparse.Namespace) -> CameraModel:
 
     source = load_any(args.file)
     if not isinstance(source, StoredRig):
-        _, camera = _camera_of(source, args.camera)
+        _, camera = camera_of(source, args.camera)
         tell_notes(camera.notes)
         if args.pan is not None or args.tilt is not None:
             raise output.WrongUse(f"{args.file} has no mast; leave --pan and --tilt out")
@@ -211,9 +176,3 @@ def _chosen_model(args: argparse.Namespace) -> CameraModel:
     name = camera_name(source, args.camera)
     need_joints(source.rig, name, args)
     return source.rig.camera_in_rover(name, args.pan or 0.0, args.tilt or 0.0)
-
-
-def _refuse_name(name: str | None) -> None:
-    """Refuse --camera where the file holds one camera without a name."""
-    if name is not None:
-        raise output.WrongUse("the file holds one camera without a name; leave --camera out")

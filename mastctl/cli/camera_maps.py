@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mastctl.cli import output
-from mastctl.cli.camera_files import chosen_camera
+from mastctl.cli.chosen_camera import chosen_camera
 from mastctl.cli.mast_files import read_mast_file, stereo_pair
 from mastctl.cli.output import positive_number
 

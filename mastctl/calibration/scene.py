@@ -1,0 +1,234 @@
+"""From pictures of a still scene to a corrected mast file: read, judged, saved."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from calib.camera.cahvor import CameraModel
+from calib.camera.parameters import parameter_names
+from calib.errors import NoCorrection
+from calib.files.mast_file import StoredRig
+from calib.files.yaml_text import plain
+from calib.fit.uncertainty import sigma_by_key
+from calib.mast.covariance import RigCovariance, stored_covariance
+from calib.mast.joints import UNKNOWN, Approach
+from calib.mast.rig import Rig
+from calib.pictures.warp import grey
+from calib.rigid import FloatArray, tangents
+from calib.scene.features import find_features
+from calib.scene.fit import SceneFit, corrected, fit_scene
+from calib.scene.views import View
+from drivers.errors import BadOptions
+from drivers.recorded_frames import SUFFIX, McapFrame, read_recording
+from drivers.recording import Pointing, read_folder, read_products
+from mastctl.calibration.mast_file import rounded_matrix
+from mastctl.calibration.run import save_new
+
+CSV_NAME = "frames.csv"
+PRODUCT_SUFFIXES = (".img", ".lbl")
+
+
+@dataclass(frozen=True, eq=False)
+class SceneProposal:
+    """What pictures of a scene say of a mast file: the mast, the record, its views by camera, and the fit."""
+
+    mast: StoredRig
+    record: Path
+    digest: str
+    views: tuple[View, ...]
+    fit: SceneFit
+
+
+def scene_views(rig: Rig, record: Path, camera: str | None = None) -> list[View]:
+    """Return the pictures of a record with the angles they were taken at; of cameras that the rig has.
+
+    Parameters
+    ----------
+    rig
+        Whose cameras count.
+    record
+        A recording (.mcap, or a folder of its segments), a CSV ``camera,pan_rad,tilt_rad,file`` (or a folder
+        with ``frames.csv``), or a folder of PDS3 products, whose camera is ``camera``.
+    camera
+        Only this camera's pictures.
+
+    Raises
+    ------
+    NoCorrection
+        ``too_few``: fewer than two pictures of the rig's cameras.
+    BadOptions
+        If the record cannot be read.
+    """
+    views = []
+    for pose, pointing in enumerate(_pointings(rig, record, camera)):
+        for name, frame in pointing.frames.items():
+            if name not in rig.cameras or (camera is not None and name != camera):
+                continue
+            image = grey(frame.image())
+            if image.shape[::-1] != rig.cameras[name].model.size_px:
+                size = "{} x {}".format(*rig.cameras[name].model.size_px)
+                found = f"a picture of {name} has {image.shape[1]} x {image.shape[0]} px"
+                raise BadOptions(f"{record}: {found} where {size} is expected", device=name)
+            label = f"{name} at pan {pointing.pan_rad:.3f}, tilt {pointing.tilt_rad:.3f}"
+            views.append(
+                View(label, name, image, pointing.pan_rad, pointing.tilt_rad, pose, _approach(frame))
+            )
+    if len(views) < 2:
+        found = f"{len(views)} pictures of {', '.join(rig.cameras)}"
+        raise NoCorrection("too_few", f"{record}: {found} where two at least are expected")
+    return views
+
+
+def _approach(frame: object) -> Approach:
+    if not isinstance(frame, McapFrame):
+        return UNKNOWN
+    pan, tilt = (float(frame.facts.get(f"{axis}_approach") or 0.0) for axis in ("pan", "tilt"))
+    return pan, tilt
+
+
+def _pointings(rig: Rig, record: Path, camera: str | None) -> Sequence[Pointing]:
+    """Where the head rested, and what its cameras took there."""
+    if record.is_dir():
+        if (record / CSV_NAME).is_file():
+            return read_folder(record / CSV_NAME)
+        products = sorted(one for one in record.iterdir() if one.suffix.lower() in PRODUCT_SUFFIXES)
+        if products:
+            if camera is None and len(rig.cameras) != 1:
+                names = ", ".join(rig.cameras)
+                raise BadOptions(
+                    f"{record} holds PDS3 products: --camera with one of {names} is expected", device="record"
+                )
+            return read_products(products, camera or next(iter(rig.cameras)))
+        return read_recording(record)
+    return read_recording(record) if record.suffix == SUFFIX else read_folder(record)
+
+
+def propose_scene(
+    mast: StoredRig, record: Path, joint_sigma_rad: float, camera: str | None = None
+) -> SceneProposal:
+    """Return what a record says of a mast file.
+
+    Raises
+    ------
+    NoCorrection
+        If it tells no correction: ``too_few`` features, ``not_significant``, or ``not_predictive``: what
+        explains some of the pictures does not hold for the others.
+    """
+    views = scene_views(mast.rig, record, camera)
+    fit = fit_scene(mast.rig, views, find_features(mast.rig, views), joint_sigma_rad)
+    before, after = fit.predicted_px
+    if not after < before:
+        why = f"{before:.2f} px become {after:.2f} px rms"
+        if np.isnan(after):
+            why = "all join the same two rests"
+        gain = f"would explain {fit.rms_px[0]:.2f} px down to {fit.rms_px[1]:.2f} px rms"
+        raise NoCorrection(
+            "not_predictive",
+            f"{', '.join(fit.taken)}: that {gain}, but pictures that had no part in it are not "
+            f"predicted better ({why}): rests of the head err each by itself",
+        )
+    return SceneProposal(mast, record, _digest(views), tuple(views), fit)
+
+
+def save_scene(proposal: SceneProposal, out: Path) -> tuple[StoredRig, Path | None]:
+    """Save the corrected mast file; return it, and where ``out``'s former one is. Raises BadFile."""
+    rig, fit = proposal.mast.rig, proposal.fit
+    known = stored_covariance(rig)
+    told = {**rig.fit, "refined_scene": scene_told(fit)}
+    if known is not None:
+        known = _widened(rig, known, fit)
+        told["covariance"] = rounded_matrix(known.covariance).tolist()
+        told["sigma"] = plain(sigma_by_key(fit.rig, known.names, known.covariance))
+    before = rig.provenance.get("refined", [])
+    provenance = {
+        **rig.provenance,
+        "refined": [
+            *(before if isinstance(before, list) else [before]),
+            {
+                "former_file": proposal.mast.path.name,
+                "former_digest": proposal.mast.digest,
+                "scene": proposal.record.name,
+                "pictures_digest": proposal.digest,
+                "corrected": list(fit.taken),
+                "program": f"mastctl {version('mastctl')}",
+                "date": datetime.now(UTC).isoformat(timespec="seconds"),
+            },
+        ],
+    }
+    return save_new(replace(fit.rig, fit=told, provenance=provenance), out)
+
+
+def scene_told(fit: SceneFit) -> dict[str, Any]:
+    """Return a correction as JSON or YAML."""
+    sigma = np.sqrt(np.diag(fit.covariance))
+    return {
+        "corrected": list(fit.taken),
+        "significance_sigmas": dict(fit.gains),
+        "parameters": list(fit.names),
+        "values": fit.values.tolist(),
+        "sigma": sigma.tolist(),
+        "covariance": rounded_matrix(fit.covariance).tolist(),
+        "unseen": list(fit.unseen),
+        "features": len(fit.features),
+        "outliers": list(fit.outliers),
+        "rms_px": {"before": fit.rms_px[0], "after": fit.rms_px[1]},
+        "median_px": {"before": fit.median_px[0], "after": fit.median_px[1]},
+        "predicted_rms_px": {"before": fit.predicted_px[0], "after": fit.predicted_px[1]},
+        "chi2_per_freedom": fit.scale,
+    }
+
+
+def _widened(rig: Rig, known: RigCovariance, fit: SceneFit) -> RigCovariance:
+    """The mast file's covariance and the correction's, added: too much rather than too little.
+
+    The correction was measured against cameras and axes as the file has them, so both errors stay.
+    """
+    rates = np.zeros((len(known.names), len(fit.names)))
+    at = {name: i for i, name in enumerate(known.names)}
+    bit = 1e-6
+    for column in range(len(fit.names)):
+        step = np.zeros(len(fit.names))
+        step[column] = bit
+        moved = corrected(rig, fit.names, step)
+        for name, camera in rig.cameras.items():
+            model = camera.model
+            change = _parameter_change(model, moved.cameras[name].model) / bit
+            for part, value in zip(parameter_names(model.kind), change, strict=True):
+                if (full := f"cameras.{name}.{part}") in at:
+                    rates[at[full], column] = value
+        if fit.names[column] in at:
+            rates[at[fit.names[column]], column] = 1.0
+    total = known.covariance + rates @ fit.covariance @ rates.T
+    return RigCovariance(known.names, (total + total.T) / 2)
+
+
+def _parameter_change(model: CameraModel, moved: CameraModel) -> FloatArray:
+    """How a camera's parameters changed, in the order of a step."""
+    change = [
+        moved.C - model.C,
+        tangents(model.A) @ (moved.A - model.A),
+        moved.H - model.H,
+        moved.V - model.V,
+    ]
+    if "O" in model.kind:
+        change += [tangents(model.O) @ (moved.O - model.O), (moved.R - model.R)[1:]]
+    if "E" in model.kind:
+        change.append(moved.E - model.E)
+    return np.concatenate(change)
+
+
+def _digest(views: Sequence[View]) -> str:
+    """SHA-256 of the pictures and their angles."""
+    digest = hashlib.sha256()
+    for view in views:
+        digest.update(f"{view.camera} {view.pan_rad!r} {view.tilt_rad!r}".encode())
+        digest.update(view.image.tobytes())
+    return digest.hexdigest()
