@@ -15,6 +15,8 @@ CASES = {
     "campaigns.handoff --out /dev/null/x.csv": "--out: /dev/null/x.csv: Not a directory",
     "campaigns.life --minutes 0": "--minutes: '0' where a number above zero is expected",
     "campaigns.motion --moves 0": "--moves: '0' where a whole number of at least 1 is expected",
+    "campaigns.provoked_surveys --cases 0": "--cases: '0' where a whole number of at least 1 is expected",
+    "campaigns.provoked_surveys --pairs eye": "has no stereo pair 'eye'",
     "campaigns.soak --minutes 0": "--minutes: '0' where a number above zero is expected",
     "benchmarks.load --rounds 0": "--rounds: '0' where a whole number of at least 1 is expected",
     "campaigns.coverage --joint-sigma-rad -1": "--joint-sigma-rad: '-1' where zero or more is expected",

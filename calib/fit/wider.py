@@ -21,7 +21,7 @@ from calib.fit.terms import ImageTerm
 from calib.mast.gimbal import MAST_NAMES, Gimbal, gimbal, gimbal_rates
 from calib.rigid import FloatArray, rigid_rates
 
-FALSE_ALARMS = 0.01
+FALSE_ALARMS = 0.0003
 """The chance that a survey that is as modelled is said to ask for any wider model."""
 
 EXPLAINS = 0.5

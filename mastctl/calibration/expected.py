@@ -10,9 +10,9 @@ import numpy as np
 from scipy.stats import chi2
 
 from calib.fit.calibration import Calibration, ImageResiduals
-from calib.fit.terms import DOTS_OF, PRISMS, TAPES
+from calib.fit.terms import DOTS_OF, JOINTS, PRISMS, TAPES
 from calib.fit.uncertainty import pixel_covariance
-from calib.rigid import rigid_rates
+from calib.rigid import FloatArray, rigid_rates
 from calib.survey import Survey
 from calib.survey.alignment import Alignment, NotAligned, rover_from_station, station_from_board
 
@@ -84,5 +84,25 @@ def _expected_px2(
     common = np.einsum("nip,pq,niq->ni", in_rover, setup.covariance, in_rover)
     _, by_fit = pixel_covariance(calibration, image.camera, pan, tilt, points)
     dots = calibration.widened(DOTS_OF + image.camera)
+    by_joints = _by_joints_px2(calibration, image, points, survey.sigma.joint_rad)
     relative = np.maximum(np.einsum("nii->ni", by_fit) - common, 0.0)
-    return float(np.nanmean(by_board + relative + (dots * image.sigma_px[:, None]) ** 2))
+    return float(np.nanmean(by_board + relative + by_joints + (dots * image.sigma_px[:, None]) ** 2))
+
+
+def _by_joints_px2(
+    calibration: Calibration, image: ImageResiduals, points_m: FloatArray, joint_rad: float
+) -> FloatArray:
+    """Variances (n, 2) that errors of a check image's own joint readings make: it has no part in the fit."""
+    found = np.zeros((len(points_m), 2))
+    if image.pan_rad is None or image.tilt_rad is None or joint_rad == 0.0:
+        return found
+    sigma_rad = calibration.widened(JOINTS) * joint_rad
+    for pan, tilt in ((sigma_rad, 0.0), (0.0, sigma_rad)):
+        ends = [
+            calibration.rig.camera_in_rover(
+                image.camera, image.pan_rad + sign * pan, image.tilt_rad + sign * tilt
+            ).project(points_m)[0]
+            for sign in (1, -1)
+        ]
+        found += ((ends[0] - ends[1]) / 2) ** 2
+    return found

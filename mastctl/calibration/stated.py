@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
 from calib.fit.calibration import Calibration
 from calib.fit.components import Component
-from calib.fit.terms import DOTS_OF, DRAWING, JOINTS
+from calib.fit.terms import DOTS_OF, DRAWING, JOINTS, PRISMS, TAPES
 from calib.survey import Sigma, Survey
 from mastctl.report.tables import Table
 
@@ -24,14 +25,17 @@ def stated(sigma: Sigma, kind: str) -> tuple[float, str, str]:
     return 1e3 * sigma.station_m, "mm", "station_m"
 
 
-def wrong_sentence(sigma: Sigma, component: Component) -> str:
-    """Return in words that a stated sigma is too small."""
+def wrong_sentence(sigma: Sigma, component: Component, wrong: Sequence[Component]) -> str:
+    """Return in words that a stated sigma is too small; ``wrong`` are all kinds for which it is."""
     told, unit, key = stated(sigma, component.kind)
-    return (
+    words = (
         f"{component.kind} scatter by {component.factor:.2f} ± {component.factor_sigma:.2f} times their "
         f"stated sigma: {component.factor * told:.2g} {unit} where {key} says {told:g} {unit}; the fit and "
         f"its uncertainties take {component.weighed * told:.2g} {unit}"
     )
+    if component.kind == PRISMS and all(other.kind != TAPES for other in wrong):
+        words += "; tapes do not, so it may be the drawing of the prisms that is off (prism_cad_m)"
+    return words
 
 
 def component_table(survey: Survey, calibration: Calibration) -> Table | None:

@@ -135,7 +135,7 @@ def _noise(survey: Survey, calibration: Calibration) -> list[Reason]:
     reasons = [Reason(unexplained if calibration.chi2_probability < RARELY else "good", words)]
     for component in wrong:
         grade: Grade = "bad" if component.factor > HOPELESS else "care"
-        reasons.append(Reason(grade, wrong_sentence(survey.sigma, component)))
+        reasons.append(Reason(grade, wrong_sentence(survey.sigma, component, wrong)))
     told = [c for c in calibration.components if np.isfinite(c.factor)]
     if told and not wrong:
         most = max(told, key=lambda c: c.factor)
@@ -159,7 +159,8 @@ def _wider(calibration: Calibration) -> list[Reason]:
         return [Reason("good", words)]
     first, *others = asked
     grade: Grade = "bad" if first.size_px > POINTING_GOOD_PX else "care"
-    words = f"{first.numbers} more numbers would gain {first.gain:.0f} in chi-square: {first.sentence}"
+    more = "one more number" if first.numbers == 1 else f"{first.numbers} more numbers"
+    words = f"{more} would gain {first.gain:.0f} in chi-square: {first.sentence}"
     reasons = [Reason(grade, words)]
     if others:
         names = _some([f"{model.name} ({model.gain:.0f} with {model.numbers})" for model in others])

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from calib.files.mast_file import load_rig, save_rig
-from calib.survey import read_survey
+from calib.survey import Sigma, read_survey
 from drivers.sim_survey.board import draw_board, photograph
 from hil_tests.mastctl.calibration.survey_world import edit_yaml, navcam_rig, navcam_survey, write_folder
 from mastctl.calibration.detection import missing, with_dots
@@ -65,6 +65,14 @@ def test_json_has_the_contracts_keys_and_the_truth_within_its_sigmas(
     assert told["mast"]["axis_offset_m"] == 0.0
     assert told["seconds"] > 0
     assert told["verdict"]["grade"] == "good", told["verdict"]
+    kinds = {one["kind"]: one for one in told["sigmas_found"]}
+    assert set(kinds) == {"dots of navcam_left", "dots of navcam_right", "tapes", "prisms"}
+    assert kinds["tapes"]["stated"] == 1.0 and kinds["tapes"]["unit"] == "mm"
+    assert 0.8 < kinds["tapes"]["factor"] < 1.2
+    assert "mast" in {one["name"] for one in told["wider_models"]}
+    assert not any(one["significant"] for one in told["wider_models"])
+    by_others = told["cross_validation"]
+    assert by_others["fitted_px"] < by_others["predicted_px"] < 1.2 * by_others["fitted_px"]
     assert load_rig(tmp_path / "m.yaml").digest == told["mast_file"]["digest"]
 
 
@@ -107,6 +115,7 @@ def test_the_report_is_one_page_with_everything_in_it(first: tuple[Path, Path]) 
     assert "<script" not in page and "<link" not in page
     assert not re.findall(r'(?:src|href)="(?!data:)', page)
     for title in (
+        "Measurements", "Wider models", "Each board by the others",
         "Verdict and reasons", "Residuals over the image", "Where the boards stood",
         "Error by distance and angle", "Correlation of parameters", "Predicted uncertainty of pointing",
         "Against the mast file in use: use.yaml",
@@ -236,3 +245,20 @@ def test_pictures_are_searched_by_processes_of_their_own(tmp_path: Path) -> None
     found, undetected = with_dots(read_survey(folder))
     assert [n for n, _ in undetected] == [name]
     assert set(found.dots) == set(known)
+
+
+def test_a_station_told_better_than_it_is_costs_trust_and_widens_sigmas(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    survey, _ = navcam_survey(2, sigma=Sigma(0.003, 0.1))
+    folder = write_folder(replace(survey, sigma=Sigma(0.001, 0.1)), tmp_path / "told-1-mm")
+    assert main(["calibrate", str(folder), "--out", str(tmp_path / "m.yaml"), "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert told["verdict"]["grade"] != "good"
+    assert any(
+        "tapes scatter by" in reason["sentence"] and "station_m says 1 mm" in reason["sentence"]
+        for reason in told["verdict"]["reasons"]
+    )
+    true = navcam_rig().mast
+    for key, values in (("translation_m", true.translation_m), ("rotation_rad", true.rotation_rad)):
+        assert (np.abs(np.array(told["mast"][key]) - values) < SIGMAS * np.array(told["sigma"][key])).all()

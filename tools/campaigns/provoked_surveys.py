@@ -1,0 +1,270 @@
+"""Provoke surveys, calibrate by them, and count how often the verdict errs, both ways.
+
+    .venv/bin/python -m tools.campaigns.provoked_surveys --cases 200 --seed 1
+
+Each case is a simulated survey (`drivers.sim_survey`) with one thing wrong, a fifth of them with none; what
+is wrong and how much is drawn (`tools.campaigns.survey_provocations`). It is checked, fitted and judged as
+`mastctl calibrate` does it. The verdict is held against the simulator's rig:
+
+- pixels that the new mast file predicts for points at 2 to 10 m, each camera by itself, three directions;
+- where a target lands that was clicked in a stereo pair of the head and pointed at, the same directions;
+- the mast's parameters together, unless its model is another one.
+
+The truth is *beyond 3 sigma* if errors of one camera or pair, rms over its places and in sigmas that the
+calibration states, exceed 3, or the mast's squared distance what chance makes of it once in 370. Trusted is
+what comes out as "trust it"; a refusal to calibrate counts by itself.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections import Counter
+from dataclasses import replace
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from scipy.stats import chi2
+
+from calib.camera.stereo import triangulate
+from calib.errors import CalibError
+from calib.files.mast_file import load_rig
+from calib.fit.calibration import Calibration
+from calib.fit.joint import fit_joint
+from calib.fit.significance import THREE_SIGMAS
+from calib.fit.uncertainty import pixel_covariance, pointing_covariance
+from calib.mast.gimbal import MAST_NAMES, numbers_of
+from calib.mast.pointing import solve
+from calib.mast.rig import Rig
+from calib.rigid import FloatArray
+from calib.survey import Sigma
+from drivers.sim_survey.plan import SurveyPlan, rover_from_head
+from mastctl.calibration.run import SurveyRefused, checked_survey
+from mastctl.calibration.verdict import judge_calibration
+from mastctl.cli.output import at_least
+from mastctl.cli.tasks import add_task_options, results_of
+from tools.arguments import end
+from tools.campaigns.survey_provocations import PROVOCATIONS, Provoked
+
+DIRECTIONS_RAD = ((-0.8, -0.2), (0.0, -0.4), (0.7, -0.7))
+RANGES_M = (2.0, 6.0, 10.0)
+PLACES = ((0.5, 0.5), (0.25, 0.7))
+"""Where points are seen, as parts of the picture's width and height."""
+
+SIGMAS = 3.0
+CLEAN = 5
+"""One case in so many has nothing wrong."""
+
+SIGMA = Sigma(station_m=0.001, dot_px=0.1)
+COUNTED_RAD = 1e-4
+"""What every other survey states of its joints, and what their readings err by."""
+
+
+class Task(NamedTuple):
+    """One survey of a true rig."""
+
+    rig: Rig
+    kind: str
+    seed: int
+
+
+class Outcome(NamedTuple):
+    """What came of a survey: what was wrong, the grade or '' if refused, the worst error in sigmas and of
+    what, and the reasons that were not good."""
+
+    kind: str
+    words: str
+    grade: str
+    sigmas: float
+    worst: str
+    reasons: tuple[str, ...]
+
+
+def judged(task: Task) -> Outcome:
+    """Return what the verdict on one provoked survey is, and how far the truth is."""
+    joint_rad = COUNTED_RAD if task.seed % 2 else 0.0
+    plan = SurveyPlan(sigma=replace(SIGMA, joint_rad=joint_rad))
+    rng = np.random.default_rng([task.seed, 7])
+    made = PROVOCATIONS[task.kind](task.rig, task.seed, plan, rng)
+    try:
+        warnings = checked_survey(made.survey)
+        fit = fit_joint(made.survey, made.mast_parameters)
+    except (SurveyRefused, CalibError) as refused:
+        return Outcome(task.kind, made.words, "", float("nan"), "", (str(refused),))
+    verdict = judge_calibration(made.survey, fit, warnings)
+    errors = errors_in_sigmas(made, fit)
+    worst = max(errors, key=errors.__getitem__)
+    reasons = tuple(r.sentence for r in verdict.reasons if r.grade != "good")
+    return Outcome(task.kind, made.words, verdict.grade, errors[worst], worst, reasons + tuple(warnings))
+
+
+def errors_in_sigmas(made: Provoked, fit: Calibration) -> dict[str, float]:
+    """Return how far a fit is from the truth, by what it is good for, in its own sigmas."""
+    found = {f"pixels of {name}": _rms(_pixels(made, fit, name)) for name in made.rig.cameras}
+    for pair, names in made.rig.stereo.items():
+        if made.rig.cameras[names[0]].on == "head":
+            found[f"pointing by {pair}"] = _rms(_pointing(made, fit, names))
+    fitted = fit.part("mast.")
+    if not made.waves and not (made.rig.mast.axis_offset_m or made.rig.mast.axis_twist_rad):
+        names = [fit.parameter_names[i].removeprefix("mast.") for i in fitted]
+        truth = dict(zip(MAST_NAMES, numbers_of(made.rig.mast), strict=True))
+        off = fit.estimate[fitted] - np.array([truth[name] for name in names])
+        covariance = fit.covariance[np.ix_(fitted, fitted)]
+        distance = float(off @ np.linalg.solve(covariance, off))
+        # The distance at which chance is that of three sigma of one number counts as three.
+        found["mast"] = SIGMAS * float(np.sqrt(distance / chi2.isf(THREE_SIGMAS, len(off))))
+    return found
+
+
+def _rms(errors: FloatArray) -> float:
+    return float(np.sqrt(np.mean(errors**2))) if errors.size else 0.0
+
+
+def _seen(made: Provoked, name: str, true_rad: FloatArray, points_m: FloatArray) -> FloatArray:
+    """True pixels (n, 2) of rover-frame points (n, 3), the kinematics SciPy's."""
+    camera = made.rig.cameras[name]
+    if camera.on == "head":
+        points_m = rover_from_head(made.rig.mast, *true_rad).inverse.points(points_m)
+    return camera.model.project(points_m)[0]
+
+
+def _points(made: Provoked, name: str, true_rad: FloatArray) -> FloatArray:
+    """Rover-frame points (n, 3) that a camera sees at its places and ranges."""
+    camera = made.rig.cameras[name]
+    rays = camera.model.ray(np.array(PLACES) * camera.model.size_px)
+    points = np.concatenate([rays.origins_m + r * rays.directions for r in RANGES_M])
+    return rover_from_head(made.rig.mast, *true_rad).points(points) if camera.on == "head" else points
+
+
+def _pixels(made: Provoked, fit: Calibration, name: str) -> FloatArray:
+    """Predicted less true pixels over their sigmas."""
+    errors = []
+    for angles in DIRECTIONS_RAD if made.rig.cameras[name].on == "head" else DIRECTIONS_RAD[:1]:
+        true_rad = np.array(angles)
+        points = _points(made, name, true_rad)
+        read_rad = made.read_rad(true_rad)
+        predicted, covariance = pixel_covariance(fit, name, float(read_rad[0]), float(read_rad[1]), points)
+        off = predicted - _seen(made, name, true_rad, points)
+        errors.append(off / np.sqrt(np.einsum("nii->ni", covariance)))
+    return np.concatenate(errors)
+
+
+def _pointing(made: Provoked, fit: Calibration, pair: tuple[str, str]) -> FloatArray:
+    """Where targets land less where they should, over the stated sigmas; exact clicks."""
+    errors = []
+    wanted = np.array(fit.rig.cameras[pair[0]].model.image_center_px)
+    for angles in DIRECTIONS_RAD:
+        true_rad = np.array(angles)
+        pan, tilt = made.read_rad(true_rad)
+        for target in _points(made, pair[0], true_rad):
+            clicks = [_seen(made, name, true_rad, target[None])[0] for name in pair]
+            sizes = [np.array(made.rig.cameras[name].model.size_px) for name in pair]
+            if any((c < 0).any() or (c > s - 1).any() for c, s in zip(clicks, sizes, strict=True)):
+                continue
+            range_m = float(np.linalg.norm(target - fit.rig.camera_in_rover(pair[0], pan, tilt).C))
+            try:
+                models = [fit.rig.camera_in_rover(name, pan, tilt) for name in pair]
+                position = triangulate(*models, *clicks).position_m
+                then = solve(fit.rig.mast, fit.rig.cameras[pair[0]].model, position, from_pan_rad=pan,
+                             from_tilt_rad=tilt)[0]  # fmt: skip
+                covariance = pointing_covariance(fit, pair, pan, tilt, clicks[0], range_m)
+            except CalibError:
+                continue
+            there = made.true_rad(np.array([then.pan_rad, then.tilt_rad]))
+            off = _seen(made, pair[0], there, target[None])[0] - wanted
+            errors.append(off / np.sqrt(np.diag(covariance)))
+    return np.array(errors)
+
+
+def tasks_of(rig: Rig, cases: int, seed: int) -> list[Task]:
+    """The cases: one kind after the other, the clean ones a fifth of all."""
+    wrong = [kind for kind in PROVOCATIONS if kind != "nothing wrong"]
+    kinds = [
+        "nothing wrong" if n % CLEAN == 0 else wrong[(n - n // CLEAN - 1) % len(wrong)] for n in range(cases)
+    ]
+    return [Task(rig, kind, seed + number) for number, kind in enumerate(kinds)]
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    root = Path(__file__).resolve().parents[2]
+    parser.add_argument(
+        "--rig", type=Path, default=root / "configs" / "sim" / "rocky8.yaml", help="the true rig"
+    )
+    parser.add_argument(
+        "--pairs", nargs="+", default=["navcam", "hazcam"], help="the stereo pairs that are surveyed"
+    )
+    parser.add_argument("--cases", type=at_least(1), default=200)
+    parser.add_argument("--seed", type=at_least(0), default=1, help="of the first survey; the others follow")
+    parser.add_argument("--only", choices=sorted(PROVOCATIONS), help="this kind alone")
+    add_task_options(parser)
+    options = parser.parse_args()
+    rig = load_rig(options.rig).rig
+    if lacking := [pair for pair in options.pairs if pair not in rig.stereo]:
+        parser.error(f"--rig {options.rig} has no stereo pair '{lacking[0]}'")
+    names = {name for pair in options.pairs for name in rig.stereo[pair]}
+    rig = replace(
+        rig,
+        cameras={name: camera for name, camera in rig.cameras.items() if name in names},
+        stereo={pair: rig.stereo[pair] for pair in options.pairs},
+    )
+    tasks = tasks_of(rig, options.cases, options.seed)
+    if options.only:
+        tasks = [task._replace(kind=options.only) for task in tasks]
+    began = time.monotonic()
+    found = results_of(options, "surveys", judged, tasks, lambda task: f"seed {task.seed}, {task.kind}")
+    if found is None:
+        return 0
+    report(found)
+    print(f"{options.cases} surveys from seed {options.seed}: {time.monotonic() - began:.0f} s")
+    return 0
+
+
+def report(outcomes: list[Outcome]) -> None:
+    """Print the table, and every case in which the verdict erred."""
+    heads = (
+        "cases",
+        "refused",
+        "trusted, right",
+        "trusted though wrong",
+        "doubted, wrong",
+        "doubted though right",
+    )
+    print(f"{'':16s} " + "  ".join(heads))
+    for kind in [*PROVOCATIONS, "all"]:
+        mine = [one for one in outcomes if kind in (one.kind, "all")]
+        if not mine:
+            continue
+        count = Counter(_cell(one) for one in mine)
+        cells = [len(mine), *(count[head] for head in heads[1:])]
+        print(
+            f"{kind:16s} "
+            + "  ".join(f"{cell:{len(head)}d}" for cell, head in zip(cells, heads, strict=True))
+        )
+    for head in ("trusted though wrong", "doubted though right"):
+        for one in outcomes:
+            if _cell(one) == head and (head.startswith("trusted") or one.kind == "nothing wrong"):
+                print(f"{head}: {one.words}: {one.worst} {one.sigmas:.1f} sigma; {' | '.join(one.reasons)}")
+    doubts = Counter(
+        one.kind for one in outcomes if _cell(one) == "trusted, right" and one.kind != "nothing wrong"
+    )
+    for kind, number in doubts.items():
+        words = sorted(one.words for one in outcomes if _cell(one) == "trusted, right" and one.kind == kind)
+        print(f"trusted and right in spite of {kind} ({number}): {'; '.join(words)}")
+
+
+def _cell(one: Outcome) -> str:
+    """Which column of the table an outcome belongs to."""
+    if not one.grade:
+        return "refused"
+    wrong = not one.sigmas <= SIGMAS
+    if one.grade == "good":
+        return "trusted though wrong" if wrong else "trusted, right"
+    return "doubted, wrong" if wrong else "doubted though right"
+
+
+if __name__ == "__main__":
+    end(main)

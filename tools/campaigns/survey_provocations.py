@@ -1,0 +1,244 @@
+"""What is wrong with a provoked survey, and what the rig then truly is: by the simulator, by no estimator.
+
+Each provocation draws how bad it is and returns the survey as it is written down, the rig as it is when the
+survey is over, and words. Sizes are spread evenly over their logarithm, from what no test can see to what
+nobody overlooks.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from calib.mast.rig import Rig
+from calib.rigid import FloatArray, Rigid
+from calib.survey import Sigma, Survey
+from drivers.sim_survey.blunders import (
+    with_bowed_board,
+    with_changed_focus,
+    with_encoder_errors,
+    with_moved_board,
+    with_moved_tape,
+    with_outlier_dots,
+    with_slipped_joint,
+    with_wrong_prism,
+)
+from drivers.sim_survey.plan import SurveyPlan
+from drivers.sim_survey.survey import simulate_survey
+
+Waves = Mapping[str, tuple[complex, complex]]
+
+
+@dataclass(frozen=True, eq=False)
+class Provoked:
+    """A survey as it is written down, and the truth about the rig that it was made of.
+
+    Attributes
+    ----------
+    survey, mast_parameters
+        What is fitted, and with how many numbers of the mast.
+    rig
+        The rig as it is in the end: its joints' zeros are those of the last readings.
+    waves
+        By how much a joint's reading is off around the turn (`drivers.sim_survey.blunders`).
+    words
+        What was done, and how much of it.
+    """
+
+    survey: Survey
+    rig: Rig
+    words: str
+    mast_parameters: int = 6
+    waves: Waves = field(default_factory=dict)
+
+    def read_rad(self, true_rad: FloatArray) -> FloatArray:
+        """Return what pan and tilt (2,) read when they truly are at some angles."""
+        off = [_wave(self.waves.get(joint), angle) for joint, angle in zip(JOINTS, true_rad, strict=True)]
+        return np.asarray(true_rad + np.array(off))
+
+    def true_rad(self, read_rad: FloatArray) -> FloatArray:
+        """Return where pan and tilt (2,) truly are when they read some angles."""
+        true = np.array(read_rad, dtype=np.float64)
+        for _ in range(20):
+            true = read_rad - (self.read_rad(true) - true)
+        return true
+
+
+JOINTS = ("pan", "tilt")
+
+
+def _wave(waves: tuple[complex, complex] | None, angle: float) -> float:
+    if waves is None:
+        return 0.0
+    return float((waves[0] * np.exp(-1j * angle) + waves[1] * np.exp(-2j * angle)).real)
+
+
+def clean(rig: Rig, seed: int, plan: SurveyPlan, rng: np.random.Generator) -> Provoked:
+    """Return a survey in which nothing is wrong."""
+    return Provoked(simulate_survey(rig, seed, plan)[0], rig, "nothing")
+
+
+def wrong_sigma(rig: Rig, seed: int, plan: SurveyPlan, rng: np.random.Generator) -> Provoked:
+    """Return a survey whose errors of one kind are larger than stated."""
+    told, times = plan.sigma, _spread(rng, 1.5, 5.0)
+    kinds: dict[str, Callable[[], tuple[Sigma, str]]] = {
+        "station": lambda: (replace(told, station_m=times * told.station_m), f"station {times:.2f} times"),
+        "dots": lambda: (replace(told, dot_px=times * told.dot_px), f"dots {times:.2f} times"),
+        "joints": lambda: (
+            replace(told, joint_rad=2 * times * 1e-4),
+            f"joints {0.2 * times:.2f} mrad, told {1e3 * told.joint_rad:g}",
+        ),
+        "drawing": lambda: (replace(told, prism_cad_m=0.001 * times), f"drawing {times:.1f} mm, told 0"),
+    }
+    happens, words = kinds[str(rng.choice(list(kinds)))]()
+    survey = simulate_survey(rig, seed, replace(plan, sigma=happens))[0]
+    return Provoked(replace(survey, sigma=told), rig, words)
+
+
+def wrong_model(rig: Rig, seed: int, plan: SurveyPlan, rng: np.random.Generator) -> Provoked:
+    """Return a survey of a rig that no fit of six parameters, or of the stated lenses, can be."""
+    which = rng.choice(["skew", "upright", "waves", "bow", "lens"])
+    if which == "skew":
+        offset_m, twist_rad = _signed(rng, 0.002, 0.02), _signed(rng, 0.001, 0.01)
+        skew = replace(rig, mast=replace(rig.mast, axis_offset_m=offset_m, axis_twist_rad=twist_rad))
+        words = f"axes {1e3 * offset_m:.1f} mm and {1e3 * twist_rad:.1f} mrad apart"
+        return Provoked(simulate_survey(skew, seed, plan)[0], skew, words)
+    survey, truth = simulate_survey(rig, seed, plan)
+    if which == "upright":
+        return Provoked(survey, rig, "a mast that leans by 20 mrad taken as upright", 4)
+    if which == "waves":
+        joint, size = str(rng.choice(JOINTS)), _spread(rng, 0.0005, 0.01)
+        waves = tuple(part * size * np.exp(1j * rng.uniform(-np.pi, np.pi)) for part in (1.0, 0.4))
+        words = f"{joint} {1e3 * size:.2f} mrad off around the turn"
+        return Provoked(
+            with_encoder_errors(survey, joint, *waves), rig, words, waves={joint: (waves[0], waves[1])}
+        )
+    if which == "bow":
+        bow_m = _signed(rng, 0.0003, 0.005)
+        return Provoked(with_bowed_board(survey, truth, bow_m), rig, f"board bent by {1e3 * bow_m:.1f} mm")
+    size_px = _spread(rng, 0.1, 2.0)
+    return Provoked(
+        _bent(survey, size_px), rig, f"dots bent by {size_px:.2f} px at the sides of the pictures"
+    )
+
+
+def blunders(rig: Rig, seed: int, plan: SurveyPlan, rng: np.random.Generator) -> Provoked:
+    """Return a survey with a dot in a hundred off, and tapes and a prism measured beside themselves."""
+    survey = simulate_survey(rig, seed, plan)[0]
+    off_px = _spread(rng, 1.0, 60.0)
+    words = [f"a dot of each image off by {off_px:.1f} px"]
+    for image in survey.images:
+        survey, _ = with_outlier_dots(survey, image.name, max(1, len(survey.dots[image.name].rows) // 100),
+                                      off_px, rng)  # fmt: skip
+    tapes = [p for p in survey.station if p.kind == "tape"]
+    for number in rng.choice(len(tapes), rng.integers(1, 3), replace=False):
+        tape, aside_m = tapes[number], _spread(rng, 0.003, 0.05)
+        survey = with_moved_tape(survey, tape.setup, tape.placement, tape.point, aside_m * _direction(rng))
+        words.append(f"a tape by {1e3 * aside_m:.0f} mm")
+    if rng.random() < 0.5:
+        prisms = [p for p in survey.station if p.kind == "prism"]
+        prism, aside_m = prisms[rng.integers(len(prisms))], _spread(rng, 0.003, 0.05)
+        survey = with_wrong_prism(survey, prism.setup, prism.point, aside_m * _direction(rng))
+        words.append(f"a prism by {1e3 * aside_m:.0f} mm")
+    return Provoked(survey, rig, ", ".join(words))
+
+
+def board_moved(rig: Rig, seed: int, plan: SurveyPlan, rng: np.random.Generator) -> Provoked:
+    """Return a survey in which a board moved between its tapes and its pictures, or between two of these."""
+    survey, truth = simulate_survey(rig, seed, plan)
+    places = list(dict.fromkeys((i.setup, i.placement) for i in survey.images if i.purpose != "check"))
+    setup, placement = places[rng.integers(len(places))]
+    shown = tuple(i.name for i in survey.images if (i.setup, i.placement) == (setup, placement))
+    moved = shown if rng.random() < 0.5 else shown[: len(shown) // 2]
+    shift_m = _spread(rng, 0.002, 0.03)
+    turn_rad = _spread(rng, 0.001, 0.03)
+    survey = with_moved_board(survey, truth, moved, shift_m * _direction(rng), turn_rad * _direction(rng))
+    words = f"{placement} by {1e3 * shift_m:.1f} mm, {1e3 * turn_rad:.1f} mrad before {len(moved)} of "
+    return Provoked(survey, rig, f"{words}{len(shown)} pictures")
+
+
+def slipped(rig: Rig, seed: int, plan: SurveyPlan, rng: np.random.Generator) -> Provoked:
+    """Return a survey in which a joint's reading jumped, at any picture of the head but the first."""
+    survey = simulate_survey(rig, seed, plan)[0]
+    head = [image.name for image in survey.images if image.pan_rad is not None]
+    first, joint = head[rng.integers(1, len(head))], str(rng.choice(JOINTS))
+    slip_rad = _signed(rng, 0.0003, 0.02)
+    words = f"{joint} by {1e3 * slip_rad:.2f} mrad from picture {head.index(first)} of {len(head)}"
+    return Provoked(
+        with_slipped_joint(survey, joint, first, slip_rad), _slipped_rig(rig, joint, slip_rad), words
+    )
+
+
+def refocused(rig: Rig, seed: int, plan: SurveyPlan, rng: np.random.Generator) -> Provoked:
+    """Return a survey in which a camera's focal length changed, at any of its pictures but the first."""
+    survey = simulate_survey(rig, seed, plan)[0]
+    camera = str(rng.choice(list(survey.cameras)))
+    mine = [image.name for image in survey.images if image.camera == camera and image.purpose != "check"]
+    first, more = mine[rng.integers(1, len(mine))], _signed(rng, 0.0003, 0.02)
+    words = f"{camera} by {100 * more:.2f} % from its picture {mine.index(first)} of {len(mine)}"
+    survey = with_changed_focus(survey, camera, first, 1 + more)
+    return Provoked(survey, _refocused_rig(rig, camera, 1 + more), words)
+
+
+PROVOCATIONS: dict[str, Callable[[Rig, int, SurveyPlan, np.random.Generator], Provoked]] = {
+    "nothing wrong": clean,
+    "wrong sigmas": wrong_sigma,
+    "wrong model": wrong_model,
+    "blunders": blunders,
+    "board moved": board_moved,
+    "slipped encoder": slipped,
+    "focus changed": refocused,
+}
+
+
+def _slipped_rig(rig: Rig, joint: str, slip_rad: float) -> Rig:
+    """The rig whose joint stands at its reading less a slip: an offset of pan, or of all head cameras."""
+    if joint == "pan":
+        turned = np.array([0.0, 0.0, slip_rad])
+        return replace(rig, mast=replace(rig.mast, rotation_rad=rig.mast.rotation_rad - turned))
+    turn = Rigid(Rotation.from_rotvec([0.0, -slip_rad, 0.0]).as_matrix(), np.zeros(3))
+    cameras = {
+        name: replace(camera, model=camera.model.moved(turn)) if camera.on == "head" else camera
+        for name, camera in rig.cameras.items()
+    }
+    return replace(rig, cameras=cameras)
+
+
+def _refocused_rig(rig: Rig, camera: str, times: float) -> Rig:
+    """The rig with one camera's picture so many times as large about its middle."""
+    model = rig.cameras[camera].model
+    x, y = (np.array(model.size_px) - 1) / 2
+    larger = replace(
+        model,
+        H=times * model.H + (1 - times) * x * model.A,
+        V=times * model.V + (1 - times) * y * model.A,
+    )
+    return replace(rig, cameras={**rig.cameras, camera: replace(rig.cameras[camera], model=larger)})
+
+
+def _bent(survey: Survey, size_px: float) -> Survey:
+    """The survey with dots moved down by the third power of their place across, as no lens model does."""
+    dots = dict(survey.dots)
+    size = {image.name: survey.cameras[image.camera].size_px for image in survey.images}
+    for name, seen in dots.items():
+        half = (size[name][0] - 1) / 2
+        bend = np.outer(size_px * ((seen.pixels_px[:, 0] - half) / half) ** 3, [0.0, 1.0])
+        dots[name] = replace(seen, pixels_px=seen.pixels_px + bend)
+    return replace(survey, dots=dots)
+
+
+def _spread(rng: np.random.Generator, low: float, high: float) -> float:
+    """A size, evenly over its logarithm."""
+    return float(np.exp(rng.uniform(np.log(low), np.log(high))))
+
+
+def _signed(rng: np.random.Generator, low: float, high: float) -> float:
+    return _spread(rng, low, high) * float(rng.choice([-1.0, 1.0]))
+
+
+def _direction(rng: np.random.Generator) -> FloatArray:
+    ahead = rng.standard_normal(3)
+    return np.asarray(ahead / np.linalg.norm(ahead))
