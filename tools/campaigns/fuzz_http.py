@@ -7,8 +7,9 @@ form and headers as described; what is wrong is refused) but one. That every bod
 accepted cannot hold: which keys go together (exactly one target), what is in reach and which ids there are
 stands in no form. Left out are the two endless event streams (/events, /track/stream) and /health/ready,
 whose 503 is an answer. What is asked at random latches emergency stops, takes leases and sets faults, for
-which nearly all that follows would be refused: they are taken back twice a second. Exit code 1 if anything
-was found.
+which nearly all that follows would be refused: they are taken back twice a second. For a third of the time
+it asks as who holds the lease, with bodies that fit the form, so that commands are carried out too. Exit
+code 1 if anything was found.
 """
 
 from __future__ import annotations
@@ -19,12 +20,13 @@ import subprocess
 import sys
 import tempfile
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
 from mastctl.cli.output import positive_number
 from mastctl.client import Client, ClientError
+from mastctl.commands.lease import LONGEST_S
 from mastctl.config import Listen, load_config
 from mastctl.daemon import RunningDaemon
 from mastctl.web import PREFIX
@@ -32,6 +34,8 @@ from tools.arguments import end
 
 LEFT_OUT = ("positive_data_acceptance",)
 UNASKED = f"^{PREFIX}/(events|track/stream|health/ready)$"
+UNASKED_AS_HOLDER = f"^{PREFIX}/(events|track/stream|health/ready|stop|estop|lease.*)$"
+DEADLINE_S = 20.0
 TAKEN_BACK_EACH_S = 0.5
 
 
@@ -45,7 +49,7 @@ def main() -> int:
     parser.add_argument("--seed", type=int, help="of an earlier run, to ask the same again")
     args = parser.parse_args()
     with simulated_daemon() as url:
-        return ask(url, 60.0 * args.minutes, args.examples, args.seed).returncode
+        return ask(url, 60.0 * args.minutes, args.examples, args.seed)
 
 
 @contextlib.contextmanager
@@ -56,17 +60,29 @@ def simulated_daemon() -> Iterator[str]:
         yield daemon.url
 
 
-def ask(url: str, seconds: float, examples: int, seed: int | None = None) -> subprocess.CompletedProcess[str]:
-    """Have schemathesis ask; what it says goes to stdout."""
+def ask(url: str, seconds: float, examples: int, seed: int | None = None) -> int:
+    """Have schemathesis ask, as anybody and as who steers; return its exit code, its words go to stdout."""
+    common = ["--max-examples", str(examples), *(() if seed is None else ("--seed", str(seed)))]
+    with taken_back(url):
+        anybody = ["--exclude-path-regex", UNASKED, "--phases", "examples,coverage,fuzzing"]
+        code = _asked(url, 2.0 / 3.0 * seconds, [*anybody, *common])
+    if code != 0:
+        return code
+    with Client(url, name="holder") as client:
+        lease = client.acquire_lease(for_s=LONGEST_S, take_over="the campaign goes on")["lease_id"]
+    holder = ["--exclude-path-regex", UNASKED_AS_HOLDER, "--phases", "fuzzing", "--mode", "positive"]
+    headers = ["--header", f"Mastctl-Lease: {lease}", "--header", f"Deadline-S: {DEADLINE_S:g}"]
+    return _asked(url, seconds / 3.0, [*holder, *headers, *common])
+
+
+def _asked(url: str, seconds: float, options: Sequence[str]) -> int:
     command = [
         *(str(Path(sys.executable).with_name("schemathesis")), "run", f"{url}/openapi.json", "--no-color"),
-        *("--checks", "all", "--exclude-checks", ",".join(LEFT_OUT), "--exclude-path-regex", UNASKED),
-        *("--phases", "examples,coverage,fuzzing", "--max-examples", str(examples)),
-        *("--max-time", f"{seconds:.0f}", "--request-timeout", "30", "--warnings", "off"),
-        *(() if seed is None else ("--seed", str(seed))),
+        *("--checks", "all", "--exclude-checks", ",".join(LEFT_OUT), "--max-time", f"{seconds:.0f}"),
+        *("--request-timeout", "30", "--warnings", "off", *options),
     ]
-    with tempfile.TemporaryDirectory() as folder, taken_back(url):  # it leaves a folder where it runs
-        return subprocess.run(command, cwd=folder, text=True, check=False)
+    with tempfile.TemporaryDirectory() as folder:  # it leaves a folder where it runs
+        return subprocess.run(command, cwd=folder, text=True, check=False).returncode
 
 
 @contextlib.contextmanager
