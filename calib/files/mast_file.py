@@ -112,7 +112,7 @@ def save_rig(rig: Rig, path: str | Path) -> StoredRig:
             name: {"on": camera.on, **_model_keys(camera.model)} for name, camera in rig.cameras.items()
         },
         "stereo": rig.stereo,
-        **({} if rig.joints == Joints() else {"joints": _joint_keys(rig.joints)}),
+        **({} if rig.joints == Joints() else {"joints": joint_keys(rig.joints)}),
         "fit": rig.fit,
         "provenance": rig.provenance,
     }
@@ -230,7 +230,7 @@ def _joints(section: Section) -> Joints:
     return Joints(**axes)
 
 
-def _joint_keys(joints: Joints) -> dict[str, Any]:
+def joint_keys(joints: Joints) -> dict[str, Any]:
     """Return both joints' keys in the contract's order."""
     return {
         name: {

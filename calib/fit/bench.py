@@ -20,7 +20,7 @@ from scipy.stats import chi2
 from calib.camera.cahvor import Kind
 from calib.fit.adjustment import HUBER, MAST, Adjustment, Estimate
 from calib.fit.bench_calibration import BenchCalibration, TermGain
-from calib.fit.bench_changes import find_change
+from calib.fit.bench_changes import find_change, reading_rates
 from calib.fit.bench_start import BenchNotFitted, BenchStart, bench_start
 from calib.fit.bench_terms import BenchTerms, bench_terms
 from calib.fit.calibration import ImageResiduals
@@ -31,6 +31,7 @@ from calib.fit.outliers import FALSE_ALARMS, name_outliers
 from calib.fit.residuals import image_residuals, rms_by_camera
 from calib.fit.start_values import SurveyNotFitted
 from calib.fit.stray_dots import stray_points
+from calib.fit.term_motions import moves_px, term_motions
 from calib.fit.terms import ImageTerm, with_kept
 from calib.fit.uncertainty import open_directions, sigma_by_key
 from calib.fit.usual_lens import lens_notes
@@ -58,6 +59,9 @@ wrong."""
 SLIP_RAD, SLIP_ASIDE = 0.003, 0.1
 """A board that moved by more than this about the pan axis, and by less than this part of it otherwise
 (radians and metres), did not move: pan slipped."""
+
+CHECK_SIGMAS = 4.0
+"""Check images that are off by so many sigmas more than expected were not predicted."""
 
 CHANGES = 4
 """Boards that moved are looked for so many times."""
@@ -359,6 +363,7 @@ class _Fit:
             covariance,
             total / max(freedom, 1.0),
             max(freedom, 1.0),
+            term_motions(problem, fit.state, {term: every[term] for term in candidates}),
         )
 
     def _told(
@@ -395,6 +400,7 @@ class _Fit:
             terms=self._gains(candidates, chosen, tests, problem, state),
             rms_px=rms_by_camera(images),
             check_rms_px=rms_by_camera(_checked(images, self.terms.checks)),
+            check_expected_px=self._expected(problem, state, covariance),
             images=images,
             outliers=name_outliers(problem, state, covariance, weighed.images),
             false_alarms=2 * FALSE_ALARMS,
@@ -410,6 +416,32 @@ class _Fit:
             bows_m=state.bows_m,
             seconds=time.perf_counter() - began,
         )
+
+    def _expected(
+        self, problem: Adjustment, state: Estimate, covariance: FloatArray
+    ) -> dict[str, tuple[float, float]]:
+        """By camera what check images should be off by, rms per axis, and the most that chance allows."""
+        squares: dict[str, list[FloatArray]] = {}
+        exact = problem.at_rest()
+        for term in self.terms.checks:
+            block = exact.image_block(state, term)
+            moved = [block.jacobian @ _root(covariance[np.ix_(block.columns, block.columns)])]
+            if term.attitude is not None and problem.joint_rad > 0:
+                moved.append(problem.joint_rad * reading_rates(exact, state, term))
+            rates = np.repeat(term.sigma_px, 2)[:, None] * np.concatenate(moved, axis=1)
+            # What moves a whole image counts once for it, not once for every corner.
+            together = np.linalg.svd(rates, compute_uv=False) ** 2
+            own = float(np.sum(np.repeat(term.sigma_px, 2) ** 2))
+            found = squares.setdefault(term.camera, [])
+            found.append(
+                np.array([2.0 * len(term.sigma_px), own, float(together.sum()), float(np.sum(together**2))])
+            )
+        expected = {}
+        for camera, found in squares.items():
+            count, own, shared, fourth = np.sum(found, axis=0)
+            mean, spread = (own + shared) / count, np.sqrt(2 * fourth + 2 * own**2 / count) / count
+            expected[camera] = (float(np.sqrt(mean)), float(np.sqrt(mean + CHECK_SIGMAS * spread)))
+        return expected
 
     def _rig(self, state: Estimate) -> Rig:
         cameras = {n: RigCamera(self.survey.cameras[n].on, m) for n, m in state.cameras.items()}
@@ -428,7 +460,7 @@ class _Fit:
         """Every term with what it gains."""
         every = candidate_terms(self.boards)
         _, now = self.choose(chosen, problem, Minimum(state, problem.with_huber(None).normal(state), True, 0))
-        moves = _moves_px(problem, state, {term: every[term] for term in chosen})
+        moves = moves_px(problem, state, {term: every[term] for term in chosen}, _values(state))
         found = []
         for term in candidates:
             test = now[term] if term in chosen else tests[term]
@@ -511,23 +543,6 @@ def _values(state: Estimate) -> dict[str, float]:
     return values
 
 
-def _moves_px(problem: Adjustment, state: Estimate, terms: Mapping[str, Sequence[str]]) -> dict[str, float]:
-    """Rms over all corners of what each term's values move pixels by, all else held."""
-    values = _values(state)
-    at = {term: {problem.names.index(n): values[n] for n in names} for term, names in terms.items()}
-    total, count = dict.fromkeys(terms, 0.0), 0
-    for image, block in problem.blocks(state):
-        if not isinstance(image, ImageTerm):
-            continue
-        sigma = np.repeat(image.sigma_px[image.keep], 2)
-        columns = block.columns.tolist()
-        for term, mine in at.items():
-            step = np.array([mine.get(i, 0.0) for i in columns])
-            total[term] += float(np.sum((sigma * (block.jacobian @ step)) ** 2))
-        count += len(sigma)
-    return {term: float(np.sqrt(square / max(count, 1))) for term, square in total.items()}
-
-
 def _checked(images: Sequence[ImageResiduals], checks: Sequence[ImageTerm]) -> list[ImageResiduals]:
     """The check images, less corners that disagree with the rest of their own image."""
     strays = {t.name: stray_points(t.in_board_m[:, :2], t.pixels_px, t.sigma_px) for t in checks}
@@ -536,6 +551,12 @@ def _checked(images: Sequence[ImageResiduals], checks: Sequence[ImageTerm]) -> l
         for i in images
         if i.name in strays
     ]
+
+
+def _root(covariance: FloatArray) -> FloatArray:
+    """A square root of a covariance."""
+    values, vectors = np.linalg.eigh(covariance)
+    return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0)))
 
 
 def _orders(problem: Adjustment) -> tuple[list[int], list[int]]:

@@ -10,6 +10,7 @@ import numpy as np
 
 from calib.fit.calibration import Degenerate, ImageResiduals, Outlier
 from calib.fit.components import Component
+from calib.fit.significance import THREE_SIGMAS
 from calib.mast.covariance import RigCovariance
 from calib.mast.rig import Rig
 from calib.rigid import FloatArray, Rigid
@@ -17,7 +18,7 @@ from calib.rigid import FloatArray, Rigid
 
 @dataclass(frozen=True, eq=False)
 class TermGain:
-    """A part of the model that enters only if the pictures ask for it.
+    """A part of the model that enters if the pictures ask for it, or cannot exclude one that would matter.
 
     Attributes
     ----------
@@ -55,6 +56,8 @@ class TermGain:
         told = f"{self.name}: {1e3 * size:.2f} ± {1e3 * spread:.2f} {milli}"
         if not self.entered:
             return f"{told}, not significant (chi-square {self.chi2:.1f}): left out"
+        if self.chance > THREE_SIGMAS and not self.name.endswith("harmonic 2"):
+            return f"{told}, chi-square {self.chi2:.1f}: not significant, but the pictures cannot exclude it"
         return f"{told}, moves pixels by {self.moves_px:.2f} px rms, lowers chi-square by {self.chi2:.0f}"
 
 
@@ -76,6 +79,8 @@ class BenchCalibration:
         Every term that could have entered.
     rms_px, check_rms_px
         Camera to (x, y) rms of the corners that were fitted, and of those of check images.
+    check_expected_px
+        Camera to what check images should be off by (rms per axis) and the most that chance allows.
     images
         What remains of every image.
     outliers
@@ -104,6 +109,7 @@ class BenchCalibration:
     terms: tuple[TermGain, ...]
     rms_px: Mapping[str, tuple[float, float]]
     check_rms_px: Mapping[str, tuple[float, float]]
+    check_expected_px: Mapping[str, tuple[float, float]]
     images: tuple[ImageResiduals, ...]
     outliers: tuple[Outlier, ...]
     false_alarms: float

@@ -221,10 +221,8 @@ def _rows(problem: Adjustment, state: Estimate, image: ImageTerm) -> _Rows:
     if image.board not in problem.held:
         rates["board"] = block.jacobian[:, -6:]  # a board's pose comes last
     if image.attitude is not None:
-        for axis in ("pan", "tilt"):
-            key = f"{axis}_rad"
-            moved = replace(image, **{key: getattr(image, key) + STEP})
-            rates[axis] = _difference(problem, state, state, moved, block.residual)[:, None]
+        both = reading_rates(problem, state, image)
+        rates["pan"], rates["tilt"] = both[:, :1], both[:, 1:]
     camera = state.cameras[image.camera]
     rates["focus"] = _difference(
         problem, state, _with(state, image, zoomed(camera, STEP)), image, block.residual
@@ -241,6 +239,14 @@ def _rows(problem: Adjustment, state: Estimate, image: ImageTerm) -> _Rows:
         block.columns,
         {what: weight[:, None] * rate for what, rate in rates.items()},
     )
+
+
+def reading_rates(problem: Adjustment, state: Estimate, image: ImageTerm) -> FloatArray:
+    """Return how the residuals of a head image change with what pan and tilt read, (m, 2), sigmas a
+    radian."""
+    here = problem.image_residual(state, image)
+    moved = (replace(image, pan_rad=image.pan_rad + STEP), replace(image, tilt_rad=image.tilt_rad + STEP))
+    return np.stack([_difference(problem, state, state, one, here) for one in moved], axis=1)
 
 
 def _difference(

@@ -4,6 +4,10 @@ All of them are fitted together once. Near that fit the problem is linear, so th
 costs, and what it does to the others, follows from the covariance (a Wald test of nested models): no further
 fit is needed until the choice is made. The least significant goes first, until all that are left are.
 
+A term that is not significant is left out only if the pictures show that it is small: what could hide in it
+moves pixels by less than ``HIDDEN_PX``. Else it stays with its sigma, so that the fit is not sure of what
+nobody has seen; but play, which is none or more, needs to be seen.
+
 The two harmonics of a joint enter together: over the part of a turn that a head sees boards in, one can do
 most of the other's work, and a fit with the wrong one alone would be sure of numbers that are not so.
 """
@@ -31,6 +35,11 @@ JOINT_TERMS = {
 AXIS_TERMS = {"axis offset": ("mast.axis_offset_m",), "axis twist": ("mast.axis_twist_rad",)}
 
 
+HIDDEN_PX = 0.1
+"""Rms that a term may move pixels by, one sigma, if it is left out: half of what a person's click is off
+by."""
+
+
 def candidate_terms(boards: Sequence[str]) -> dict[str, tuple[str, ...]]:
     """Return the terms that a model of some boards may have, by name, as their parameters' names."""
     bows = {f"bow of {board}": tuple(f"board {board}.bow_m.{a}" for a in "xy") for board in boards}
@@ -50,10 +59,12 @@ def entering_together(terms: Sequence[str]) -> list[tuple[str, ...]]:
 @dataclass(frozen=True)
 class Tested:
     """A term beside those that were chosen: what it gains, and the chance of that were it nothing; a first
-    harmonic before the second one, a second one beyond the first."""
+    harmonic before the second one, a second one beyond the first. ``hidden_px`` is what its sigma moves
+    pixels by, rms."""
 
     chi2: float
     chance: float
+    hidden_px: float
     values: FloatArray
     sigma: FloatArray
 
@@ -65,6 +76,7 @@ def choose_terms(
     covariance: FloatArray,
     scale: float,
     freedom: float,
+    motions: Mapping[str, FloatArray],
     enters: float = THREE_SIGMAS,
 ) -> tuple[tuple[str, ...], dict[str, Tested]]:
     """Return the terms that are needed, and how each one does beside these.
@@ -79,6 +91,9 @@ def choose_terms(
         Of the terms' parameters at the fit.
     scale, freedom
         The fit's chi-square over its degrees of freedom, and these.
+    motions
+        By group (its terms joined by a comma) the matrix (k, k), px², that gives the mean square of what its
+        numbers move pixels by.
     enters
         A group enters if so large a gain, were it nothing, had at most this chance.
     """
@@ -102,16 +117,24 @@ def choose_terms(
         # Play is a width: what comes out negative is none.
         negative = group[0].endswith("backlash") and here[0] <= 0.0
         likely = 1.0 if negative else chance(gain, len(mine), scale, freedom)
-        return Tested(gain, likely, here, np.sqrt(np.maximum(np.diag(spread), 0.0)))
+        motion = motions.get(",".join(group))
+        hidden = (
+            0.0 if motion is None else float(np.sqrt(max(np.sum(motion * spread) * max(scale, 1.0), 0.0)))
+        )
+        return Tested(gain, likely, hidden, here, np.sqrt(np.maximum(np.diag(spread), 0.0)))
 
     kept = entering_together(list(terms))
     while kept:
         beside = [term for group in kept for term in group]
         tests = {group: told(group, beside) for group in kept}
-        worst = max(tests, key=lambda group: (tests[group].chance, -tests[group].chi2))
-        if tests[worst].chance <= enters:
+        needless = [
+            group
+            for group, test in tests.items()
+            if test.chance > enters and (test.hidden_px < HIDDEN_PX or group[0].endswith("backlash"))
+        ]
+        if not needless:
             break
-        kept.remove(worst)
+        kept.remove(max(needless, key=lambda group: (tests[group].chance, -tests[group].chi2)))
     chosen = tuple(term for term in terms if any(term in group for group in kept))
     found = {}
     for term in places:

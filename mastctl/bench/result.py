@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
@@ -14,9 +15,10 @@ import numpy as np
 from calib.bench.knowledge import Knowledge
 from calib.bench.workspace import Workspace, pointing
 from calib.errors import BadFile
-from calib.files.mast_file import StoredRig
+from calib.files.mast_file import StoredRig, joint_keys
 from calib.files.yaml_text import plain
-from calib.fit.bench_calibration import BenchCalibration
+from calib.fit.bench import BenchOptions, fit_bench
+from calib.fit.bench_calibration import BenchCalibration, TermGain
 from calib.mast.covariance import RigCovariance
 from calib.mast.rig import Rig
 from calib.survey import Survey
@@ -24,8 +26,11 @@ from mastctl.bench.final import Checked
 from mastctl.bench.report import Told, workspace_covariance, write_bench_report
 from mastctl.bench.run import BenchRun, first_cameras
 from mastctl.bench.teller import Teller, px
+from mastctl.calibration.bench_verdict import judge_bench, predicted_pointing_px
 from mastctl.calibration.mast_file import as_lists, mast_keys, rounded_matrix
-from mastctl.calibration.run import save_new
+from mastctl.calibration.run import checked_survey, save_new
+from mastctl.calibration.stated import components_told
+from mastctl.calibration.verdict import Verdict
 from mastctl.errors import MastctlError
 
 
@@ -43,6 +48,8 @@ class BenchDone:
     ----------
     survey, calibration
         What was seen, and what was made of it.
+    verdict
+        Whether to trust it, and why.
     saved
         The mast file.
     checked
@@ -58,6 +65,7 @@ class BenchDone:
 
     survey: Survey
     calibration: BenchCalibration
+    verdict: Verdict
     saved: StoredRig
     checked: Checked | None = None
     predicted_px: float | None = None
@@ -77,9 +85,16 @@ class BenchDone:
             "mast": mast_keys(fit.rig),
             "sigma": {**plain(fit.sigma)["mast"], **plain(fit.sigma)},
             "seconds": fit.seconds,
-            "terms": [
-                {"name": term.name, "entered": term.entered, "sentence": term.sentence} for term in fit.terms
+            "joints": joint_keys(fit.rig.joints),
+            "chi2": _finite(fit.chi2),
+            "degrees_of_freedom": _finite(fit.degrees_of_freedom),
+            "sigmas_found": components_told(self.survey.sigma, fit.components),
+            "terms": [term_told(term) for term in fit.terms],
+            "bows_m": {board: bow.tolist() for board, bow in fit.bows_m.items()},
+            "degenerate": [
+                {"parameters": list(d.parameters), "sentence": d.sentence} for d in fit.degenerate
             ],
+            "verdict": self.verdict.told(),
             "gauges": list(fit.gauges),
             "notes": list(fit.notes),
             "outliers": [outlier.sentence for outlier in fit.outliers],
@@ -147,6 +162,8 @@ class BenchDone:
         for term in fit.terms:
             yield term.sentence
         yield from (f"{what}: {value}" for what, value in self.worth())
+        yield f"verdict: {self.verdict.words}"
+        yield from (f"{reason.grade}: {reason.sentence}" for reason in self.verdict.reasons)
         yield from (f"held: {sentence}" for sentence in fit.gauges)
         yield from (f"note: {sentence}" for sentence in fit.notes)
         yield from (f"left out: {outlier.sentence}" for outlier in fit.outliers[:10])
@@ -170,11 +187,13 @@ def finish(bench: BenchRun, teller: Teller, out: Path, report: Path | None) -> B
     calibration = fitted.calibration
     assert calibration is not None
     survey = bench.survey()
-    rig = replace(with_bench_fit(calibration, survey), name=bench.name)
+    verdict = judge_bench(survey, calibration)
+    rig = replace(with_bench_fit(calibration, survey, verdict), name=bench.name)
     saved, _ = save_new(rig, out)
     done = BenchDone(
         survey,
         calibration,
+        verdict,
         saved,
         checked,
         bench.predicted_px(),
@@ -186,16 +205,36 @@ def finish(bench: BenchRun, teller: Teller, out: Path, report: Path | None) -> B
     return _reported(done, report, bench.head.rig, bench.workspace)
 
 
-def save_bench(survey: Survey, out: Path, report: Path | None) -> BenchDone:
-    """Fit a bench's folder again and save the mast file."""
-    from calib.fit.bench import fit_bench
+def save_bench(survey: Survey, out: Path, report: Path | None, options: BenchOptions) -> BenchDone:
+    """Fit a bench's folder again and save the mast file.
 
-    calibration = fit_bench(survey)
-    saved, _ = save_new(with_bench_fit(calibration, survey), out)
+    Raises
+    ------
+    SurveyRefused
+        If something is missing.
+    BenchNotFitted
+        If the pictures do not determine a rig; nothing is written.
+    """
+    checked_survey(survey)
+    calibration = fit_bench(survey, options)
+    verdict = judge_bench(survey, calibration)
+    saved, _ = save_new(with_bench_fit(calibration, survey, verdict), out)
+    predicted = predicted_pointing_px(calibration)
+    fitted = [image for image in calibration.images if image.purpose != "check"]
+    done = BenchDone(
+        survey,
+        calibration,
+        verdict,
+        saved,
+        predicted_px=None if predicted is None else predicted[0],
+        floor_px=None if predicted is None else predicted[1],
+        placements=len(calibration.rover_from_board),
+        pictures=max(Counter(image.camera for image in fitted).values(), default=0),
+    )
     shown = [image for image in survey.images if image.pan_rad is not None and image.tilt_rad is not None]
     pans, tilts = ([float(getattr(i, f"{joint}_rad")) for i in shown] for joint in ("pan", "tilt"))
     where = Workspace(first_cameras(calibration.rig), (min(pans), max(pans)), (min(tilts), max(tilts)))
-    return _reported(BenchDone(survey, calibration, saved), report, None, where)
+    return _reported(done, report, None, where)
 
 
 def _reported(done: BenchDone, folder: Path | None, former: Rig | None, where: Workspace) -> BenchDone:
@@ -216,7 +255,21 @@ def _reported(done: BenchDone, folder: Path | None, former: Rig | None, where: W
         ) from None
 
 
-def with_bench_fit(calibration: BenchCalibration, survey: Survey) -> Rig:
+def term_told(term: TermGain) -> dict[str, Any]:
+    """Return a term of the model as JSON or YAML."""
+    return {
+        "name": term.name,
+        "entered": term.entered,
+        "values": dict(zip(term.parameters, term.values.tolist(), strict=True)),
+        "sigma": dict(zip(term.parameters, term.sigma.tolist(), strict=True)),
+        "chi2": float(term.chi2),
+        "chance": float(term.chance),
+        "moves_px": _finite(term.moves_px),
+        "sentence": term.sentence,
+    }
+
+
+def with_bench_fit(calibration: BenchCalibration, survey: Survey, verdict: Verdict) -> Rig:
     """Return the calibrated rig with ``fit`` and ``provenance`` filled in."""
     fit = {
         "method": "bench",
@@ -225,7 +278,11 @@ def with_bench_fit(calibration: BenchCalibration, survey: Survey) -> Rig:
         "sigma": plain(calibration.sigma),
         "chi2": _finite(calibration.chi2),
         "degrees_of_freedom": _finite(calibration.degrees_of_freedom),
-        "terms": [term.sentence for term in calibration.terms],
+        "sigmas_found": components_told(survey.sigma, calibration.components),
+        "terms": [term_told(term) for term in calibration.terms],
+        "bows_m": {board: bow.tolist() for board, bow in calibration.bows_m.items()},
+        "degenerate": [direction.sentence for direction in calibration.degenerate],
+        "verdict": verdict.told(),
         "gauges": list(calibration.gauges),
         "outliers": [outlier.name for outlier in calibration.outliers],
         "parameters": list(calibration.parameter_names),

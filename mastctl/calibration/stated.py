@@ -17,7 +17,7 @@ from mastctl.report.tables import Table
 def stated(sigma: Sigma, kind: str) -> tuple[float, str, str]:
     """Return the stated sigma of a kind of measurement, its unit, and its key under sigma in survey.yaml."""
     if kind.startswith(DOTS_OF):
-        return sigma.dot_px, "px", "dot_px"
+        return (sigma.dot_px, "px", "dot_px") if sigma.dot_px else (sigma.corner_px, "px", "corner_px")
     if kind == JOINTS:
         return 1e3 * sigma.joint_rad, "mrad", "joint_rad"
     if kind == DRAWING:
@@ -58,11 +58,11 @@ def component_table(survey: Survey, calibration: Calibration) -> Table | None:
     return Table(("measurements", "stated sigma", "found", "redundant numbers", "widened by"), rows)
 
 
-def components_told(survey: Survey, calibration: Calibration) -> list[dict[str, Any]]:
+def components_told(sigma: Sigma, components: Sequence[Component]) -> list[dict[str, Any]]:
     """Return the variance components as JSON or YAML."""
     found = []
-    for c in calibration.components:
-        told, unit, key = stated(survey.sigma, c.kind)
+    for c in components:
+        told, unit, key = stated(sigma, c.kind)
         found.append(
             {
                 "kind": c.kind,

@@ -14,6 +14,7 @@ from mastctl.cli.output import CommandError, WrongUse
 from mastctl.cli.places import check_file, check_folder
 
 if TYPE_CHECKING:
+    from calib.fit.bench import BenchOptions
     from mastctl.bench.run import BenchRun
     from mastctl.bench.teller import Teller
     from mastctl.client import Client
@@ -29,7 +30,9 @@ def add_commands(subparsers: Any) -> None:
         description="Turns the head to look for a board, chooses each next pose by what it would tell, asks "
         "for two to four placements of the board, and ends by itself when the wanted pointing error is met "
         "(docs/bench.md). Everything seen is kept in a folder: a run that ended goes on with the same "
-        "command. With FOLDER such a folder is fitted again, and nothing moves.",
+        "command. With FOLDER such a folder is fitted again, and nothing moves: then --like or --mast-at "
+        "say where the mast stands in the rover frame (default: it is the rover frame), and --model which "
+        "lenses.",
     )
     parser.add_argument(
         "folder", nargs="?", type=Path, metavar="FOLDER", help="a bench's folder to fit again"
@@ -62,6 +65,20 @@ def add_commands(subparsers: Any) -> None:
         "--placements", type=Path, metavar="FILE",
         help="of a simulated bench: where the board stands in turn (default: where it is asked for)",
     )  # fmt: skip
+    again = parser.add_argument_group("with FOLDER")
+    again.add_argument(
+        "--like",
+        type=Path,
+        metavar="MAST.yaml",
+        help="the mast stands in the rover frame as in this mast file",
+    )
+    again.add_argument(
+        "--mast-at", type=float, nargs=6, metavar=("X", "Y", "Z", "RX", "RY", "RZ"),
+        help="the mast stands there in the rover frame (metres, radians), as level and tape say",
+    )  # fmt: skip
+    again.add_argument(
+        "--model", choices=("CAHV", "CAHVOR", "CAHVORE"), help="of all cameras (default: as survey.yaml says)"
+    )
     parser.set_defaults(run=run)
 
 
@@ -74,6 +91,10 @@ def run(args: argparse.Namespace) -> int:
             if getattr(args, option) is not None:
                 raise WrongUse(f"--{option} drives a head; with FOLDER nothing is driven")
         return _again(args)
+    for option in ("like", "mast_at", "model"):
+        if getattr(args, option) is not None:
+            name = option.replace("_", "-")
+            raise WrongUse(f"--{name} is for fitting a folder again; name a bench's FOLDER")
     if args.board is None:
         raise WrongUse("--board is missing; the BOARD.yaml that 'mastctl board make' wrote is expected")
     return _drive(args)
@@ -96,9 +117,29 @@ def _again(args: argparse.Namespace) -> int:
             2,
         )
     with output.waiting(args.json, f"fitting {len(survey.images)} images"):
-        done = save_bench(survey, args.out, args.report)
+        done = save_bench(survey, args.out, args.report, _options(args))
     _tell(args, done.told(), done.lines())
     return 0
+
+
+def _options(args: argparse.Namespace) -> BenchOptions:
+    """What is chosen of a fit: lenses, and where the mast stands."""
+    import math
+
+    from calib.files.mast_file import load_rig
+    from calib.fit.bench import BenchOptions
+    from calib.mast.rig import Mast
+
+    if args.like is not None and args.mast_at is not None:
+        raise WrongUse("--like and --mast-at both say where the mast stands; give one")
+    place = None
+    if args.like is not None:
+        place = load_rig(args.like).rig.mast.rover_from_mast
+    elif args.mast_at is not None:
+        if not all(math.isfinite(number) for number in args.mast_at):
+            raise WrongUse("--mast-at holds a number that is not finite; metres and radians are expected")
+        place = Mast(args.mast_at[:3], args.mast_at[3:]).rover_from_mast
+    return BenchOptions(kind=args.model, rover_from_mast=place)
 
 
 def _drive(args: argparse.Namespace) -> int:
@@ -200,8 +241,8 @@ def _daemon(args: argparse.Namespace) -> Iterator[Client]:
                 if running["mast"]["digest"] != digest_of(config.mast_file.read_bytes()):
                     raise CommandError(
                         "other_daemon",
-                        f"the daemon at {listen.url} uses the mast file {running['mast']['file']}, and "
-                        f"the configuration names {config.mast_file.name}; end it, or give --url",
+                        f"the daemon at {listen.url} uses the mast file {running['mast']['file']}, and the "
+                        f"configuration names {config.mast_file.name}; end it, or give --url",
                     )
                 yield client
                 return

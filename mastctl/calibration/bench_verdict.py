@@ -1,0 +1,143 @@
+"""Whether to trust a bench's calibration, and why: a few tests, each one sentence."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from calib.bench.knowledge import Knowledge
+from calib.bench.workspace import Workspace, pointing
+from calib.errors import CalibError
+from calib.fit.bench_calibration import BenchCalibration
+from calib.rigid import FloatArray
+from calib.survey import Survey
+from mastctl.calibration.expected import RARELY
+from mastctl.calibration.stated import wrong_sentence
+from mastctl.calibration.verdict import (
+    HOPELESS,
+    MANY_LEFT_OUT,
+    POINTING_BAD_PX,
+    POINTING_GOOD_PX,
+    Grade,
+    Reason,
+    Verdict,
+)
+
+
+def judge_bench(survey: Survey, calibration: BenchCalibration) -> Verdict:
+    """Return whether to trust a bench's calibration; the worst of the reasons decides."""
+    reasons = [
+        *_noise(survey, calibration),
+        *(Reason("care", note) for note in calibration.notes if " moved during placement " in note),
+        *_placements(calibration),
+        *_checks(calibration),
+        *(Reason("bad", direction.sentence) for direction in calibration.degenerate),
+        *_pointing(calibration),
+        *_left_out(calibration),
+    ]
+    grades = {reason.grade for reason in reasons}
+    grade: Grade = "bad" if "bad" in grades else "care" if "care" in grades else "good"
+    return Verdict(grade, tuple(reasons))
+
+
+def predicted_pointing_px(calibration: BenchCalibration) -> tuple[float, float] | None:
+    """Return what a first pointing is off by, rms px an axis: by the calibration, and by readings alone.
+
+    Over the angles at which boards were seen, targets at 2, 6 and 10 m, clicked in the first pair of the head
+    (or its first camera, the range told). None if nothing can be pointed at.
+    """
+    rig = calibration.rig
+    on_head = [name for name, camera in rig.cameras.items() if camera.on == "head"]
+    pair = next((pair for pair in rig.stereo.values() if set(pair) <= set(on_head)), None)
+    readings = np.array([(i.pan_rad, i.tilt_rad) for i in calibration.images if i.camera in on_head])
+    (low_pan, low_tilt), (high_pan, high_tilt) = readings.min(axis=0).tolist(), readings.max(axis=0).tolist()
+    known = Knowledge(rig, {}, calibration.joint_rad)
+    where = Workspace(pair or (on_head[0],), (low_pan, high_pan), (low_tilt, high_tilt))
+    try:
+        landings = pointing(known, where)
+    except CalibError:
+        return None
+    return landings.rms_px(_in_order(calibration, known)), landings.by_counts_px(calibration.joint_rad)
+
+
+def _in_order(calibration: BenchCalibration, known: Knowledge) -> FloatArray:
+    """The covariance in another order of names; what was not fitted is exact."""
+    at = {name: i for i, name in enumerate(calibration.parameter_names)}
+    here = [i for i, name in enumerate(known.names) if name in at]
+    there = [at[known.names[i]] for i in here]
+    covariance = np.zeros((len(known.names),) * 2)
+    covariance[np.ix_(here, here)] = calibration.covariance[np.ix_(there, there)]
+    return covariance
+
+
+def _noise(survey: Survey, calibration: BenchCalibration) -> Iterator[Reason]:
+    """Whether the residuals are what the stated sigmas make them."""
+    freedom = max(calibration.degrees_of_freedom, 1.0)
+    factor = float(np.sqrt(calibration.chi2 / freedom))
+    words = (
+        f"chi-square is {calibration.chi2:.0f} for {freedom:.0f} degrees of freedom: the residuals are "
+        f"{factor:.2f} times what the stated sigmas make them"
+    )
+    wrong = [c for c in calibration.components if c.wrong]
+    unexplained: Grade = "bad" if factor > 2.0 and not wrong else "care"
+    yield Reason(unexplained if calibration.chi2_probability < RARELY else "good", words)
+    for component in wrong:
+        yield Reason(
+            "bad" if component.factor > HOPELESS else "care", wrong_sentence(survey.sigma, component)
+        )
+
+
+def _placements(calibration: BenchCalibration) -> Iterator[Reason]:
+    """Whether boards stood at places enough."""
+    if len(calibration.rover_from_board) < 2:
+        yield Reason(
+            "care",
+            "all pictures show one placement: how far off things are hangs on one board at one distance; "
+            "put it up once more, at another distance and turned by some 30 degrees",
+        )
+
+
+def _checks(calibration: BenchCalibration) -> Iterator[Reason]:
+    """Whether pictures that were not fitted are predicted as well as they should be."""
+    if not calibration.check_rms_px:
+        yield Reason("care", "there is no check picture: nothing shows how well the result predicts")
+    for camera, xy in calibration.check_rms_px.items():
+        expected, most = calibration.check_expected_px[camera]
+        seen = float(np.sqrt(np.mean(np.square(xy))))
+        yield Reason(
+            "good" if seen <= most else "bad",
+            f"check pictures of {camera} are off by {seen:.2f} px rms an axis where {expected:.2f} are "
+            f"expected; more than {most:.2f} would be bad",
+        )
+
+
+def _pointing(calibration: BenchCalibration) -> Iterator[Reason]:
+    """How much the calibration adds to a pointing from a click."""
+    predicted = predicted_pointing_px(calibration)
+    if predicted is None:
+        yield Reason("care", "pointing at 2 to 10 m is not possible at the angles at which boards were seen")
+        return
+    by_rig, by_counts = predicted
+    good = max(POINTING_GOOD_PX, by_counts)
+    grade: Grade = (
+        "good" if by_rig <= good else "care" if by_rig <= max(POINTING_BAD_PX, by_counts) else "bad"
+    )
+    words = f"a first pointing is uncertain by {by_rig:.2f} px an axis from calibration"
+    if by_counts > 0.0:
+        words += f", by {by_counts:.2f} from what a reading says"
+    yield Reason(grade, words)
+
+
+def _left_out(calibration: BenchCalibration) -> Iterator[Reason]:
+    """Whether too much was rejected."""
+    fitted = [image for image in calibration.images if image.purpose != "check"]
+    corners = sum(len(image.used) for image in fitted)
+    too_many = False
+    for kind, word, count in (("dot", "corners", corners), ("image", "pictures", len(fitted))):
+        left = sum(outlier.kind == kind for outlier in calibration.outliers)
+        if left > MANY_LEFT_OUT * max(count, 1):
+            too_many = True
+            yield Reason("care", f"{left} of {count} {word} were left out; look for the cause")
+    if calibration.outliers and not too_many:
+        yield Reason("good", f"{len(calibration.outliers)} measurements were left out, each named")
