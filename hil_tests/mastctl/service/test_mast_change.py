@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import threading
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -20,6 +21,7 @@ from drivers.errors import NoReply
 from hil_tests.mastctl.service_fakes import FakeHardware, ScriptedLoop, eventually, rig
 from mastctl.daemon import RunningDaemon
 from mastctl.errors import Stopped
+from mastctl.pointing.jog import Beat
 from mastctl.service import steering as steering_module
 from mastctl.service.mast_in_use import configured
 
@@ -118,6 +120,19 @@ def test_nothing_changes_while_the_head_moves(
     pair[1].head.moving = True
     refusal(web.post("/mast", json={"file": "better.yaml"}), 409, "moving")
     assert in_use(web) == before
+
+
+def test_no_jog_begins_between_the_check_that_the_head_rests_and_the_other_mast_file(
+    pair: tuple[RunningDaemon, FakeHardware],
+) -> None:
+    service = pair[0].service
+    with ThreadPoolExecutor(1) as pool:
+        with service.masts.resting():
+            jog = pool.submit(service.jogs.beat, Beat((0.1, 0.0)))
+            with pytest.raises(TimeoutError):
+                jog.result(0.2)
+            assert service.operations.running is None
+        assert jog.result(20.0)["taken"]
 
 
 def test_nothing_changes_while_the_head_is_silent(
