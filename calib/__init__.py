@@ -8,9 +8,12 @@ from importlib import import_module
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from calib.boards.board_file import load_board as load_board
     from calib.camera.cahvor import CameraModel as CameraModel
     from calib.camera.stereo import triangulate as triangulate
     from calib.camera.stereo import triangulate_many as triangulate_many
+    from calib.corners.find import CornersNotFound as CornersNotFound
+    from calib.corners.find import find_corners as find_corners
     from calib.dots.find import find_dots as find_dots
     from calib.dots.find_in_survey import detect_survey as detect_survey
     from calib.errors import BadFile as BadFile
@@ -39,8 +42,10 @@ if TYPE_CHECKING:
     from calib.survey.writer import write_survey as write_survey
 
 _MODULES = {
+    "calib.boards.board_file": ("load_board",),
     "calib.camera.cahvor": ("CameraModel",),
     "calib.camera.stereo": ("triangulate", "triangulate_many"),
+    "calib.corners.find": ("CornersNotFound", "find_corners"),
     "calib.dots.find": ("find_dots",),
     "calib.dots.find_in_survey": ("detect_survey",),
     "calib.errors": ("BadFile", "CalibError", "NoHandoff", "NoStereoPoint", "Unreachable"),

@@ -20,8 +20,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import cv2
-
 from calib.boards.kinds import AnyBoard, AprilGrid, Charuco, Checkerboard, DotBoard
 from calib.errors import BadFile
 from calib.files import read_bytes
@@ -258,9 +256,13 @@ def _positive(section: Section, key: str) -> float:
 
 def dictionary_size(name: str) -> int:
     """Return how many markers a dictionary has, by OpenCV's name."""
+    import cv2  # a survey with a station is read without it
+
     return len(cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, name)).bytesList)
 
 
 def dictionaries() -> tuple[str, ...]:
     """Return OpenCV's names of marker dictionaries."""
+    import cv2
+
     return tuple(name for name in dir(cv2.aruco) if name.startswith("DICT_"))
