@@ -36,8 +36,7 @@ AXIS_TERMS = {"axis offset": ("mast.axis_offset_m",), "axis twist": ("mast.axis_
 
 
 HIDDEN_PX = 0.1
-"""Rms that a term may move pixels by, one sigma, if it is left out: half of what a person's click is off
-by."""
+"""What may hide in a term that is left out, one sigma, rms: half of what a person's click is off by."""
 
 
 def candidate_terms(boards: Sequence[str]) -> dict[str, tuple[str, ...]]:

@@ -84,7 +84,7 @@ def _noise(survey: Survey, calibration: BenchCalibration) -> Iterator[Reason]:
     yield Reason(unexplained if calibration.chi2_probability < RARELY else "good", words)
     for component in wrong:
         yield Reason(
-            "bad" if component.factor > HOPELESS else "care", wrong_sentence(survey.sigma, component)
+            "bad" if component.factor > HOPELESS else "care", wrong_sentence(survey.sigma, component, wrong)
         )
 
 
