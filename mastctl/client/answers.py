@@ -69,6 +69,24 @@ class CalibrationTold(TypedDict):
     since: str | None
 
 
+class CameraMountTold(TypedDict):
+    """A configured camera: where it looks, by its frame's axes, and how much it sees.
+
+    ``azimuth_rad`` (to the right), ``elevation_rad`` (up) of the optical axis; ``width_rad``, ``height_rad``
+    of its picture's middle row and column; of a stereo pair ``pair``, ``eye`` and the ``partner``.
+    """
+
+    on: Literal["head", "rover"]
+    size_px: list[int]
+    azimuth_rad: float
+    elevation_rad: float
+    width_rad: float
+    height_rad: float
+    pair: str | None
+    eye: Literal["left", "right"] | None
+    partner: str | None
+
+
 class CameraTold(TypedDict):
     """A camera's newest frame; all null before the first."""
 
@@ -584,6 +602,15 @@ class ResetTold(TypedDict):
 
     latched: Literal[False]
     released: EstopHeld
+
+
+class RigTold(TypedDict):
+    """``GET /rig``: the configured cameras by the mast file in use, its date, its neighbours."""
+
+    digest: str
+    made: str | None
+    cameras: dict[str, CameraMountTold]
+    mast_files: list[str]
 
 
 class SelfCheck(TypedDict):

@@ -35,6 +35,7 @@ if TYPE_CHECKING:
         Recordings,
         ReloadTold,
         ResetTold,
+        RigTold,
         SessionTold,
         StandTold,
         StateTold,
@@ -242,6 +243,10 @@ class AsyncClient:
         if aim is not None:
             body["aim"] = dict(zip(("camera", "x_px", "y_px"), aim, strict=True))
         return cast("PreviewTold", await self._daemon.json("POST", "/point/preview", json=body))
+
+    async def rig(self) -> RigTold:
+        """Return the configured cameras by the mast file in use: where each looks and how much it sees."""
+        return cast("RigTold", await self._daemon.json("GET", "/rig"))
 
     async def operation(self, operation_id: str) -> OperationTold:
         """Return an operation's record."""

@@ -32,6 +32,7 @@ if TYPE_CHECKING:
         Recordings,
         ReloadTold,
         ResetTold,
+        RigTold,
         SessionTold,
         StandTold,
         StateTold,
@@ -235,6 +236,10 @@ class Client:
         if aim is not None:
             body["aim"] = dict(zip(("camera", "x_px", "y_px"), aim, strict=True))
         return cast("PreviewTold", self._daemon.json("POST", "/point/preview", json=body))
+
+    def rig(self) -> RigTold:
+        """Return the configured cameras by the mast file in use: where each looks and how much it sees."""
+        return cast("RigTold", self._daemon.json("GET", "/rig"))
 
     def operation(self, operation_id: str) -> OperationTold:
         """Return an operation's record."""

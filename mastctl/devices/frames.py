@@ -199,7 +199,8 @@ class FrameStore:
         return kept
 
     def tell(self, frame: StampedFrame) -> None:
-        """Tell of a frame, unless it was told of."""
+        """Tell of a frame that somebody uses, unless it was told of, and hold it."""
+        self._hold(frame, ASKED, self._kept)
         with self._lock:
             if frame.frame_id in self._told or frame.mast_digest != self._digest:
                 return
@@ -234,6 +235,12 @@ class FrameStore:
         kept
             How many of a camera.
         """
+        if by == ASKED:
+            self.tell(frame)
+        else:
+            self._hold(frame, by, kept)
+
+    def _hold(self, frame: StampedFrame, by: str, kept: int) -> None:
         with self._lock:
             if frame.mast_digest != self._digest:
                 return
@@ -241,8 +248,6 @@ class FrameStore:
             if frame in held:
                 held.remove(frame)
             held.append(frame)
-        if by == ASKED:
-            self.tell(frame)
 
     def let_go(self, by: str) -> None:
         """Hold nothing more for somebody."""

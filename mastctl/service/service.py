@@ -25,6 +25,7 @@ from mastctl.devices.devices import Devices
 from mastctl.devices.frames import StampedFrame, check_known
 from mastctl.errors import MastctlError
 from mastctl.handoff.check import HandoffCheck
+from mastctl.handoff.in_picture import in_picture
 from mastctl.health.health import CalibrationHealth
 from mastctl.live.pictures import WatchedCameras
 from mastctl.live.settings import LiveSettings
@@ -255,6 +256,18 @@ class Service:
         told = (status or self.tracker.status).told(self.clock.now_s())
         return {**told, "self_check": self.handoffs.told()}
 
+    def track_in(self, frame: StampedFrame) -> dict[str, float] | None:
+        """Return where a frame should show the track's target, pixels, with one sigma as an ellipse.
+
+        None without a target, or where the frame does not show it. The ellipse has half axes ``major_px`` and
+        ``minor_px``, the first turned by ``turn_rad`` from x towards y.
+        """
+        status, stored = self.tracker.status, self.stored
+        if status.state not in ACTIVE or status.position_m is None or frame.mast_digest != stored.digest:
+            return None
+        camera = stored.rig.camera_in_rover(frame.camera, *frame.true_rad)
+        return in_picture(camera, status.position_m, status.covariance_m2)
+
     def snapshot(self, camera: str, fresh: bool) -> StampedFrame:
         """Return a frame exposed after this call (``fresh``), or one that is at most a second old.
 
@@ -265,9 +278,7 @@ class Service:
         """
         now_s = self.clock.now_s()
         after_s = now_s if fresh else now_s - SNAPSHOT_AGE_S
-        frame = self.devices.frames([camera], after_s, SNAPSHOT_TIMEOUT_S)[camera]
-        self.devices.hold(frame)  # it may be clicked yet, also while somebody watches the camera live
-        return frame
+        return self.devices.frames([camera], after_s, SNAPSHOT_TIMEOUT_S)[camera]
 
     def check_camera(self, camera: str) -> None:
         """Pass a configured camera's name. Raises NotKnown."""

@@ -189,6 +189,33 @@ class CalibrationTold(_Told):
     since: str | None
 
 
+class CameraMountTold(_Told):
+    """A configured camera: where it looks, by its frame's axes, and how much it sees.
+
+    ``azimuth_rad`` (to the right), ``elevation_rad`` (up) of the optical axis; ``width_rad``, ``height_rad``
+    of its picture's middle row and column; of a stereo pair ``pair``, ``eye`` and the ``partner``.
+    """
+
+    on: Literal["head", "rover"]
+    size_px: Annotated[list[int], Field(min_length=2, max_length=2)]
+    azimuth_rad: float
+    elevation_rad: float
+    width_rad: float
+    height_rad: float
+    pair: str | None
+    eye: Literal["left", "right"] | None
+    partner: str | None
+
+
+class RigTold(_Told):
+    """``GET /rig``: the configured cameras by the mast file in use, its date, its neighbours."""
+
+    digest: str
+    made: str | None
+    cameras: dict[str, CameraMountTold]
+    mast_files: list[str]
+
+
 class TurnedTold(_Told):
     """How far a camera seems turned, by the axes of the frame that it is mounted on."""
 

@@ -23,6 +23,7 @@ from mastctl.web.guard import Guard
 from mastctl.web.images import add_images
 from mastctl.web.lease import add_lease
 from mastctl.web.limits import add_limits
+from mastctl.web.page import add_page
 from mastctl.web.pictures import add_pictures
 from mastctl.web.recordings import add_recordings
 from mastctl.web.refusals import add_errors
@@ -77,5 +78,6 @@ def create_app(
     streams = streams or Streams(service.machine.publisher)
     add_events(app, service, streams)
     add_images(app, service, streams)
+    add_page(app, service, waiting)
     describe(app)
     return Guard(app, entrance)

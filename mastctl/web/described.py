@@ -56,6 +56,7 @@ ANSWERS: Mapping[str, type[BaseModel]] = {
     "DELETE /simulation/faults": told.FaultsSet,
     "GET /health/live": told.LiveTold,
     "GET /health/ready": told.ReadyTold,
+    "GET /rig": told.RigTold,
     "GET /session": told.SessionTold,
     "POST /login": told.SessionTold,
     "POST /logout": told.LoggedOut,

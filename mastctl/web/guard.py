@@ -31,6 +31,8 @@ UNREAD = frozenset({f"{PREFIX}/stop", f"{PREFIX}/track/stop"})
 """Where no body is read; an emergency stop reads what it can of its own."""
 LOGIN, LOGOUT = f"{PREFIX}/login", f"{PREFIX}/logout"
 PAGES = frozenset({"/"})
+FILES = "/page/"
+"""Before the name of each of a page's files, which tell nothing and so ask for no token."""
 LARGEST_HEADERS_BYTES = 16384
 MOST_HEADERS = 100
 
@@ -140,7 +142,7 @@ class Guard:
             entrance.names.check_origin(headers)
         check_site(headers, page=path in PAGES and not changes(scope))
         _check_no_secret(scope)
-        if path == LOGIN or path in PAGES:
+        if path == LOGIN or path in PAGES or path.startswith(FILES):
             caller = entrance.stranger(headers)
         else:
             caller = entrance.caller(scope, headers)

@@ -100,6 +100,7 @@ class _Line:
         height, width = frame.image.shape[:2]
         age_s = max(0.0, self._service.clock.now_s() - frame.mid_exposure_s)
         facts = as_json(frame.facts) | {"size_px": [width, height], "age_s": age_s}
+        facts["track"] = self._service.track_in(frame)
         head = json.dumps(facts, allow_nan=False).encode()
         return b"".join((len(head).to_bytes(4, "little"), head, picture.jpeg))
 

@@ -1,0 +1,102 @@
+"""A real browser for the operator page: Debian's chromium, driven by Playwright."""
+
+from __future__ import annotations
+
+import re
+import shutil
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from typing import Any
+from urllib.parse import urlsplit
+
+import pytest
+from playwright.sync_api import Browser, BrowserContext, Page, sync_playwright
+
+BOUND_MS = 30_000
+
+
+@pytest.fixture(scope="module")
+def browser(request: pytest.FixtureRequest) -> Iterator[Browser]:
+    """One for a file: where Playwright runs no other test may run an event loop of its own."""
+    found = shutil.which("chromium") or shutil.which("chromium-browser")
+    if found is None:
+        words = "the page's tests need chromium: python -m tools.browser installs it on Debian"
+        (pytest.fail if request.config.getoption("--require-vm") else pytest.skip)(words)
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=found, args=["--no-sandbox"])
+        yield browser
+        browser.close()
+
+
+@dataclass
+class Visit:
+    """A page that was opened, and what it asked and complained of."""
+
+    page: Page
+    url: str
+    asked: list[tuple[str, str]] = field(default_factory=list)
+    complaints: list[str] = field(default_factory=list)
+
+    def posts(self, path: str) -> list[str]:
+        """Bodies of what was posted to a path of the API."""
+        self.page.title()  # whatever the browser told meanwhile is heard by that
+        return [body for where, body in self.asked if where == f"POST /api/v1{path}"]
+
+    def frame(self, camera: str = "navcam_left") -> Any:
+        """The image of a camera, once it is fresh."""
+        self.page.wait_for_selector(f".eye[data-camera={camera}]:not([data-stale])")
+        return self.page.locator(f".eye[data-camera={camera}] .frame")
+
+    def target(self, *states: str) -> str:
+        """The words of the panel of the target, once it is in a state."""
+        self.page.wait_for_selector(", ".join(f"#target[data-state={state}]" for state in states))
+        return self.page.locator("#target").inner_text()
+
+    def word(self, word: str) -> None:
+        """Wait until the state is told in a word."""
+        self.page.wait_for_selector(f"#state[data-word={word}]")
+
+
+@pytest.fixture
+def visit(browser: Browser) -> Iterator[Callable[..., Visit]]:
+    """Opens the page; in the end nothing may have gone off the host, and the console must be silent."""
+    contexts: list[BrowserContext] = []
+    made: list[Visit] = []
+
+    def opened(url: str, **options: Any) -> Visit:
+        context = browser.new_context(**{"viewport": {"width": 1400, "height": 950}, **options})
+        contexts.append(context)
+        context.set_default_timeout(BOUND_MS)
+        page = context.new_page()
+        one = Visit(page, url)
+        made.append(one)
+        page.on("console", lambda said: said.type == "error" and one.complaints.append(said.text))
+        page.on("pageerror", lambda error: one.complaints.append(str(error)))
+        page.on("request", lambda sent: one.asked.append((_named(sent), sent.post_data or "")))
+        page.on("websocket", lambda line: one.asked.append((f"WS {line.url}", "")))
+        page.goto(url)
+        return one
+
+    yield opened
+    complaints = [words for one in made for words in one.complaints if not _answered(words)]
+    foreign = [where for one in made for where, _ in one.asked if not _own(where, one.url)]
+    for context in contexts:
+        context.close()
+    assert not complaints, complaints
+    assert not foreign, foreign
+
+
+def _named(sent: Any) -> str:
+    parts = urlsplit(sent.url)
+    own = urlsplit(sent.frame.url).netloc if sent.frame.url != "about:blank" else parts.netloc
+    return f"{sent.method} {parts.path if parts.netloc == own else sent.url}"
+
+
+def _own(where: str, url: str) -> bool:
+    _, _, address = where.partition(" ")
+    return address.startswith("/") or urlsplit(address).netloc in ("", urlsplit(url).netloc)
+
+
+def _answered(words: str) -> bool:
+    """The browser's own line about an answer that is a refusal, or a daemon that a test has ended."""
+    return bool(re.search(r"Failed to load resource|WebSocket connection to .* failed|ERR_CONNECTION", words))

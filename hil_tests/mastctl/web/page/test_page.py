@@ -1,0 +1,362 @@
+"""The operator page in a real browser, on fakes: what is always in sight, STOP, control, old images, jog."""
+
+from __future__ import annotations
+
+import json
+import socket
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import httpx
+import pytest
+from axe_playwright_python.sync_playwright import Axe
+
+from drivers.errors import NoReply
+from hil_tests.mastctl.service_fakes import FakeHardware, ScriptedLoop, eventually, fake_daemon
+from hil_tests.mastctl.web.network import network_daemon
+from hil_tests.mastctl.web.page.conftest import Visit
+from mastctl.daemon import RunningDaemon
+from mastctl.pointing.requests import Aim
+from mastctl.pointing.results import Preview
+from mastctl.web.page import page_files
+
+BOTH = tuple[RunningDaemon, FakeHardware]
+Visits = Callable[..., Visit]
+SEEN = Preview(
+    "navcam_left", "a", (32.0, 24.0), "navcam_right", "b", (30.0, 24.0), (0.05, 0.05), 0.97, 0.4, 0.02,
+    (6.0, 0.5, 0.1), (0.03, 0.01, 0.01), 6.02, 0.031, Aim("navcam_left", 31.5, 23.5), (0.1, -0.1), None,
+)  # fmt: skip
+
+
+class Previewing(ScriptedLoop):
+    """A scripted loop that sees what is clicked."""
+
+    def preview(self, request: Any, cancelled: Any) -> Preview:
+        return SEEN
+
+
+@pytest.fixture
+def pair(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[BOTH]:
+    with fake_daemon(monkeypatch, tmp_path, loop=Previewing) as made:
+        yield made
+
+
+def test_the_page_is_its_own_files_and_light(pair: BOTH, visit: Visits) -> None:
+    daemon, _ = pair
+    assert sum(map(len, page_files().values())) < 300_000
+    one = visit(daemon.url)
+    one.word("ready")
+    one.frame()
+    answer = httpx.get(daemon.url, trust_env=False)
+    policy = answer.headers["content-security-policy"]
+    assert "default-src 'self'" in policy and "unsafe" not in policy
+    assert one.page.locator("#hardware").inner_text() == "HARDWARE"
+    assert "little.yaml" in one.page.locator("#mast").inner_text()
+    asked = {where for where, _ in one.asked}
+    assert {f"GET /page/{name}" for name in page_files() if name.endswith(".js")} <= asked
+    first = one.page.evaluate("performance.getEntriesByName('first-contentful-paint')[0]?.startTime")
+    assert first is not None and first < 10_000
+
+
+def test_a_click_shows_range_and_sigma_before_anything_moves_and_a_key_sends_it(
+    pair: BOTH, visit: Visits
+) -> None:
+    daemon, hardware = pair
+    one = visit(daemon.url)
+    one.frame().click(position={"x": 100, "y": 100})
+    words = one.target("preview")
+    assert "6.020 ± 0.031 m" in words and "0.970" in words
+    assert one.page.locator(".eye[data-camera=navcam_right] .over .match").count() > 0
+    assert not [call for call in hardware.head.calls if call[0] == "move"]
+    asked = json.loads(one.posts("/point/preview")[0])["pixel"]
+    assert asked["camera"] == "navcam_left" and asked["mast_digest"] == daemon.service.stored.digest
+    one.page.keyboard.press("p")
+    words = one.target("ended")
+    assert "+0.250" in words and "−0.500" in words and "± 0.050" in words
+    sent = json.loads(one.posts("/point")[0])["pixel"]
+    assert sent == asked, "what was seen is what is sent"
+
+
+def test_what_is_refused_is_told_in_words(pair: BOTH, visit: Visits, monkeypatch: pytest.MonkeyPatch) -> None:
+    daemon, hardware = pair
+
+    def refuse(*_: Any) -> Preview:
+        raise NoReply("the camera is away", device="navcam_left")
+
+    monkeypatch.setattr(Previewing, "preview", refuse)
+    one = visit(daemon.url)
+    one.frame().click()
+    assert "the camera is away" in one.target("refused")
+    one.page.keyboard.press("p")
+    assert not one.posts("/point") and not hardware.head.calls
+
+
+def test_a_stale_image_is_hatched_and_blocks_clicks(pair: BOTH, visit: Visits) -> None:
+    daemon, hardware = pair
+    one = visit(daemon.url)
+    one.frame()
+
+    def fail() -> None:
+        raise NoReply("no answer", device="navcam_left")
+
+    hardware.fake_cameras["navcam_left"].hook = fail
+    one.page.wait_for_selector(".eye[data-camera=navcam_left][data-stale]")
+    one.page.locator(".eye[data-camera=navcam_left] .frame").click()
+    assert "not of now" in one.target("refused")
+    assert not one.posts("/point/preview")
+    assert "no answer" in one.page.locator("#faults").inner_text()
+    assert "Clears when" in one.page.locator("#faults").inner_text()
+    hardware.fake_cameras["navcam_left"].hook = lambda: None
+    one.frame().click()
+    one.target("preview")
+
+
+@pytest.mark.parametrize("press", ["STOP", "Escape", "Enter"])
+def test_stop_needs_no_lease_and_no_confirmation(pair: BOTH, visit: Visits, press: str) -> None:
+    daemon, hardware = pair
+    with httpx.Client(base_url=f"{daemon.url}/api/v1", trust_env=False) as http:
+        http.post("/lease", json={"for_s": 60.0}, headers={"Mastctl-Client": "somebody"})
+        one = visit(daemon.url)
+        one.word("ready")
+        stop = one.page.get_by_role("button", name="STOP", exact=True)
+        if press == "STOP":
+            stop.click()
+        elif press == "Escape":
+            one.page.keyboard.press("Escape")
+        else:
+            stop.focus()
+            one.page.keyboard.press("Enter")
+        eventually(lambda: ("stop",) in hardware.head.calls, "the head was told to stop")
+        one.page.wait_for_selector("#stop[data-pressed=confirmed]")
+
+
+def test_stop_goes_out_while_every_other_request_hangs(
+    pair: BOTH, visit: Visits, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    daemon, hardware = pair
+    monkeypatch.setattr(Previewing, "preview", lambda *_: time.sleep(3.0) or SEEN)
+    one = visit(daemon.url)
+    frame = one.frame()
+    for _ in range(8):
+        frame.click()
+    one.page.keyboard.press("Escape")
+    eventually(lambda: ("stop",) in hardware.head.calls, "the head was told to stop", 2.5)
+
+
+def test_a_stop_that_is_not_confirmed_is_told_loudly(pair: BOTH, visit: Visits) -> None:
+    daemon, hardware = pair
+    one = visit(daemon.url)
+    one.word("ready")
+
+    def hook(name: str) -> None:
+        if name == "stop":
+            raise NoReply("the line is dead", device="pan_tilt")
+
+    hardware.head.hook = hook
+    one.page.get_by_role("button", name="STOP", exact=True).click()
+    said = one.page.locator("#stop-failed:not([hidden])")
+    said.wait_for()
+    assert "NOT CONFIRMED" in said.inner_text()
+    hardware.head.hook = lambda name: None
+
+
+def test_two_pages_and_the_lease(pair: BOTH, visit: Visits) -> None:
+    daemon, _ = pair
+    one, other = visit(daemon.url), visit(daemon.url)
+    for each in (one, other):
+        each.word("ready")
+    one.page.get_by_role("button", name="Take", exact=True).click()
+    one.page.get_by_role("button", name="Release", exact=True).wait_for()
+    over = other.page.get_by_role("button", name="Take over", exact=True)
+    over.wait_for()
+    assert "left" in other.page.locator("#control").inner_text()
+    other.page.locator("#home").click()
+    other.page.wait_for_selector("#jog .bad:not(:empty)")
+    assert "steers" in other.page.locator("#jog .bad").inner_text()
+    one.page.locator("#home").click()
+    eventually(lambda: daemon.service.operations.all(), "who holds the lease may move")
+    other.page.on("dialog", lambda asked: asked.accept())
+    over.click()
+    other.page.get_by_role("button", name="Release", exact=True).wait_for()
+    other.page.get_by_role("button", name="Release", exact=True).click()
+    eventually(lambda: daemon.service.leases.told() is None, "it is given back")
+
+
+def test_a_page_that_is_closed_gives_its_lease_back(pair: BOTH, visit: Visits) -> None:
+    daemon, _ = pair
+    one = visit(daemon.url)
+    one.word("ready")
+    one.page.get_by_role("button", name="Take", exact=True).click()
+    eventually(lambda: daemon.service.leases.told() is not None, "it holds the lease")
+    one.page.goto("about:blank")
+    eventually(lambda: daemon.service.leases.told() is None, "it is given back")
+
+
+def test_a_connection_that_is_cut_is_told_and_comes_back(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, visit: Visits
+) -> None:
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    listen = f"{{port: {port}}}"
+    with fake_daemon(monkeypatch, tmp_path, listen) as (daemon, _):
+        one = visit(daemon.url)
+        one.frame()
+    lost = one.page.locator("#lost")
+    lost.wait_for(state="visible")
+    assert "may go on until its deadline" in lost.inner_text()
+    one.page.wait_for_selector(".eye[data-camera=navcam_left][data-stale]")
+    one.page.get_by_role("button", name="STOP", exact=True).click()
+    one.page.wait_for_selector("#stop-failed:not([hidden])")
+    with fake_daemon(monkeypatch, tmp_path, listen):
+        lost.wait_for(state="hidden")
+        one.word("ready")
+        one.frame()
+        one.complaints.clear()
+
+
+def test_a_token_is_asked_for_and_who_may_look_cannot_move(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, visit: Visits
+) -> None:
+    with network_daemon(monkeypatch, tmp_path) as net:
+        one = visit(net.url)
+        one.page.locator("#login").wait_for(state="visible")
+        one.page.locator("#token").fill("nonsense")
+        one.page.get_by_role("button", name="Log in").click()
+        one.page.wait_for_selector("#login-said:not(:empty)")
+        one.page.keyboard.press("Escape")
+        eventually(lambda: ("stop",) in net.hardware.head.calls, "a stop needs no token")
+        assert one.page.locator("#login").is_visible()
+        one.page.locator("#token").fill(net.token("view"))
+        one.page.get_by_role("button", name="Log in").click()
+        one.frame().click()
+        assert "You may look" in one.target("refused")
+        assert one.page.locator("#home").is_disabled() and one.page.locator("#take").is_disabled()
+        assert not one.posts("/point/preview")
+        assert net.token("view") not in one.page.content()
+
+
+@pytest.mark.parametrize("ending", ["keyup", "window blur", "tab hidden", "focus goes elsewhere"])
+def test_a_jog_ends_when_its_key_its_window_or_its_focus_is_gone(
+    pair: BOTH, visit: Visits, ending: str
+) -> None:
+    daemon, hardware = pair
+    one = visit(daemon.url)
+    one.word("ready")
+    one.page.locator("#pad").focus()
+    one.page.keyboard.down("ArrowRight")
+    eventually(lambda: [c for c in hardware.head.calls if c[0] == "move"], "the head turns")
+    assert hardware.head.pan_rad > 0.0
+    if ending == "keyup":
+        one.page.keyboard.up("ArrowRight")
+    elif ending == "focus goes elsewhere":
+        one.page.locator("#goal-pan").focus()
+    elif ending == "window blur":
+        one.page.evaluate("window.dispatchEvent(new Event('blur'))")
+    else:
+        one.page.evaluate("document.dispatchEvent(new Event('visibilitychange'))")
+    eventually(lambda: daemon.service.operations.running is None, "the jog has ended")
+    assert json.loads(one.posts("/jog")[-1])["pan_rad_per_s"] == 0
+
+
+def test_a_finger_turns_the_head_and_chooses_a_point(pair: BOTH, visit: Visits) -> None:
+    daemon, hardware = pair
+    one = visit(daemon.url, has_touch=True, viewport={"width": 820, "height": 1180})
+    one.frame().tap()
+    one.target("preview")
+    one.page.locator("#point").tap()
+    one.target("ended")
+    small = one.page.evaluate(
+        "[...document.querySelectorAll('button')].filter(b => b.offsetParent && b.offsetHeight < 28).length"
+    )
+    assert small == 0, "each button is large enough for a finger"
+    assert one.page.evaluate("document.documentElement.scrollWidth <= innerWidth"), "nothing is cut off"
+    assert one.page.locator("#stop").is_visible()
+    one.page.locator("[data-way=right]").dispatch_event("pointerdown", {"pointerId": 1, "button": 0})
+    del hardware
+
+
+def test_by_the_keyboard_alone_a_pixel_is_chosen_and_sent(pair: BOTH, visit: Visits) -> None:
+    daemon, _ = pair
+    one = visit(daemon.url)
+    one.frame()
+    for _ in range(30):
+        one.page.keyboard.press("Tab")
+        if one.page.evaluate("document.activeElement.closest('.eye')?.dataset.camera") == "navcam_left":
+            break
+    for key in ("ArrowLeft", "Shift+ArrowUp", "Alt+ArrowRight"):
+        one.page.keyboard.press(key)
+    one.page.keyboard.press("Enter")
+    one.target("preview")
+    pixel = json.loads(one.posts("/point/preview")[0])["pixel"]
+    assert (pixel["x_px"], pixel["y_px"]) == (30.6, 13.5)
+    one.page.keyboard.press("p")
+    one.target("ended")
+
+
+def test_another_mast_file_takes_back_what_was_chosen(pair: BOTH, visit: Visits, tmp_path: Path) -> None:
+    daemon, _ = pair
+    other = (tmp_path / "little.yaml").read_text().replace("name: little", "name: other")
+    (tmp_path / "other.yaml").write_text(other)
+    one = visit(daemon.url)
+    one.frame().click()
+    one.target("preview")
+    with httpx.Client(base_url=f"{daemon.url}/api/v1", trust_env=False) as http:
+        assert http.post("/mast", json={"file": "other.yaml"}).status_code == 200
+    assert "Another mast file" in one.target("refused")
+    one.page.wait_for_selector("#mast >> text=other.yaml")
+    one.page.get_by_role("button", name="Go back").click()
+    one.page.wait_for_selector("#mast >> text=little.yaml")
+
+
+def test_an_emergency_stop_is_told_and_released_with_a_reason(pair: BOTH, visit: Visits) -> None:
+    daemon, _ = pair
+    one = visit(daemon.url)
+    one.word("ready")
+    with httpx.Client(base_url=f"{daemon.url}/api/v1", trust_env=False) as http:
+        http.post("/estop", json={"reason": "sparks", "name": "Ana"})
+    one.word("stopped")
+    assert "by Ana: sparks" in one.page.locator("#estop").inner_text()
+    one.page.locator("#release").click()
+    one.page.locator("#reset-reason").fill("a loose wire, mended")
+    one.page.locator("#reset-name").fill("Ben")
+    one.page.get_by_role("button", name="Release", exact=True).click()
+    one.word("holding")
+    assert one.page.locator("#estop").is_hidden()
+
+
+def test_places_are_kept_and_gone_to(pair: BOTH, visit: Visits) -> None:
+    daemon, hardware = pair
+    one = visit(daemon.url)
+    one.word("ready")
+    one.page.locator("#goal-pan").fill("10")
+    one.page.locator("#goal-tilt").fill("-5,5")
+    one.page.get_by_role("button", name="Go", exact=True).click()
+    eventually(lambda: hardware.head.calls, "it moves")
+    eventually(lambda: daemon.service.operations.running is None, "it has arrived")
+    asked = json.loads(one.posts("/point")[0])
+    assert asked["pan_rad"] == pytest.approx(0.17453, abs=1e-5)
+    assert asked["tilt_rad"] == pytest.approx(-0.09599, abs=1e-5)
+    one.page.locator("#goal-pan").fill("a lot")
+    one.page.get_by_role("button", name="Go", exact=True).click()
+    one.page.wait_for_selector("#jog .bad:not(:empty)")
+    assert "degrees" in one.page.locator("#jog .bad").inner_text()
+
+
+@pytest.mark.parametrize("scheme", ["dark", "light"])
+def test_axe_finds_nothing_serious(pair: BOTH, visit: Visits, scheme: str) -> None:
+    daemon, hardware = pair
+    one = visit(daemon.url, color_scheme=scheme)
+    one.frame().click()
+    one.target("preview")
+    one.page.keyboard.press("p")
+    one.target("ended")
+    found = [
+        (each["id"], each["impact"], each["nodes"][0]["html"][:160], each["nodes"][0].get("failureSummary"))
+        for each in Axe().run(one.page).response["violations"]
+        if each["impact"] in ("serious", "critical")
+    ]
+    assert not found, found
+    del hardware

@@ -1,0 +1,74 @@
+// Who steers: the lease, renewed while it is held, and given back on leaving.
+import { byId, say } from "./dom.js";
+import { client, held, parting, post, ask } from "./api.js";
+import { forTime } from "./words.js";
+
+const FOR_S = 30;
+const RENEW_MS = 10000;
+
+export class Control {
+  constructor(alarm) {
+    this.alarm = alarm;
+    this.words = byId("control");
+    this.button = byId("take");
+    this.button.addEventListener("click", () => this.press());
+    setInterval(() => held.lease && this.renew(), RENEW_MS);
+    setInterval(() => this.draw(), 1000);
+    window.addEventListener("pagehide", () => held.lease && parting("DELETE", "/lease"));
+  }
+
+  told(control) {
+    this.control = control;
+    this.toldMs = performance.now();
+    this.draw();
+  }
+
+  allow(may) {
+    this.may = may;
+    this.draw();
+  }
+
+  draw() {
+    const { control } = this;
+    const left = control?.for_s == null ? null : control.for_s - (performance.now() - this.toldMs) / 1000;
+    const gone = left !== null && left <= 0;
+    const mine = held.lease !== null;
+    const whose = control?.holder.endsWith(client) ? "what you started" : control?.holder;
+    if (mine) say(this.words, `you, renewed`);
+    else if (!control || gone) say(this.words, "nobody");
+    else if (control.kind === "operation") say(this.words, `${whose}, until it has ended`);
+    else say(this.words, `${control.holder}, ${forTime(left)} left`);
+    this.words.parentElement.dataset.whose = mine ? "mine" : control && !gone && !control.holder.endsWith(client) ? "other" : "nobody";
+    say(this.button, mine ? "Release" : control && !gone && control.kind === "lease" ? "Take over" : "Take");
+    this.button.disabled = !this.may;
+  }
+
+  async press() {
+    try {
+      if (held.lease) {
+        await ask("DELETE", "/lease");
+        held.lease = null;
+      } else if (this.button.textContent === "Take over") {
+        if (!confirm(`Take control from ${this.control.holder}? What runs goes on.`)) return;
+        held.lease = (await post("/lease/take", { for_s: FOR_S, reason: "taken over on the page" })).lease_id;
+      } else {
+        held.lease = (await post("/lease", { for_s: FOR_S })).lease_id;
+      }
+    } catch (error) {
+      if (error.code === "lease_over") held.lease = null;
+      this.alarm(error.message);
+    }
+    this.draw();
+  }
+
+  async renew() {
+    try {
+      await post("/lease/renew", { for_s: FOR_S });
+    } catch (error) {
+      if (error.status === 0) return; // the next one may come through
+      held.lease = null;
+      this.alarm(`You steer no longer: ${error.message}`);
+      this.draw();
+    }
+  }
+}

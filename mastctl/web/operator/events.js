@@ -1,0 +1,71 @@
+// What the daemon pushes: the newest of each topic and key, and whether anything is heard at all.
+import { address, get } from "./api.js";
+
+const AGAIN_MS = 1000;
+const SILENT_MS = 2500; // the head's joints are told several times a second
+
+export class Events extends EventTarget {
+  constructor() {
+    super();
+    this.known = new Map();
+    this.connected = false;
+    this.heardMs = 0;
+    this.lostMs = performance.now();
+    setInterval(() => this.watch(), 500);
+  }
+
+  open() {
+    this.wanted = true;
+    this.connect();
+  }
+
+  connect() {
+    this.line?.close();
+    const line = new WebSocket(address("/events"));
+    this.line = line;
+    line.onmessage = (message) => {
+      this.heard();
+      const event = JSON.parse(message.data);
+      this.known.set(`${event.topic} ${event.key}`, event.value);
+      this.dispatchEvent(new CustomEvent(event.topic, { detail: event }));
+    };
+    line.onclose = () => {
+      if (this.line !== line) return;
+      this.lost();
+      setTimeout(() => this.wanted && this.line === line && this.connect(), AGAIN_MS);
+    };
+  }
+
+  heard() {
+    this.heardMs = performance.now();
+    if (this.connected) return;
+    this.connected = true;
+    this.dispatchEvent(new Event("connected"));
+  }
+
+  lost() {
+    if (!this.connected) return;
+    this.connected = false;
+    this.lostMs = this.heardMs;
+    this.dispatchEvent(new Event("lost"));
+  }
+
+  /** Where nothing is heard a question tells a head that is silent from a daemon that is gone. */
+  async watch() {
+    if (!this.connected || this.asking || performance.now() - this.heardMs < SILENT_MS) return;
+    this.asking = true;
+    try {
+      await get("/health/live", { ms: 2000 });
+      this.heardMs = performance.now();
+    } catch {
+      this.lost();
+      this.connect();
+    } finally {
+      this.asking = false;
+    }
+  }
+
+  newest(topic, key) {
+    return this.known.get(`${topic} ${key}`);
+  }
+}

@@ -1,0 +1,177 @@
+// One camera: its newest image, how fresh that is, what is drawn over it, a loupe, and where one points.
+import { h, s, say, set } from "./dom.js";
+import { camera as called, deg, number } from "./words.js";
+
+const STALE_S = 1.0;
+const LOUPE_PX = 21; // image pixels across
+const ZOOM = 8;
+
+export class Eye {
+  constructor(name, choose) {
+    this.name = name;
+    this.choose = choose;
+    this.facts = null;
+    this.cursor = null;
+    this.marks = {};
+    this.intervals = [];
+    this.canvas = h("canvas", { class: "image", width: 1024, height: 768 });
+    this.pen = this.canvas.getContext("2d", { alpha: false });
+    this.over = s("svg", { class: "over", viewBox: "0 0 1024 768", "aria-hidden": "true" });
+    this.loupe = h("canvas", { class: "loupe", width: LOUPE_PX * ZOOM, height: LOUPE_PX * ZOOM, hidden: true });
+    this.glass = this.loupe.getContext("2d");
+    this.where = h("span", { class: "where" });
+    this.age = h("span", { class: "age" }, "no image yet");
+    this.facing = h("span", { class: "facing" });
+    this.stale = h("p", { class: "stale-words" }, "No image");
+    this.frame = h("div", {
+      class: "frame", tabindex: 0, role: "application", "aria-label": `Image of ${called(name)}: arrow keys move the cross-hair, Enter chooses`,
+      onpointermove: (event) => this.moved(event), onpointerleave: () => this.left(), onpointerdown: (event) => this.pressed(event),
+      onpointerup: (event) => this.released(event), onpointercancel: () => { this.drag = null; }, onkeydown: (event) => this.key(event), onblur: () => this.left(),
+    }, this.canvas, this.over, this.loupe, this.stale);
+    this.save = h("a", { class: "save", download: "", hidden: true }, "PNG");
+    this.element = h("figure", { class: "eye", "data-camera": name, "data-stale": "" }, this.frame,
+      h("figcaption", {}, h("strong", {}, called(name)), this.age, this.facing, this.where, this.save));
+  }
+
+  show(facts, bitmap, cameMs) {
+    const [width, height] = facts.size_px;
+    if (this.canvas.width !== width || this.canvas.height !== height) {
+      [this.canvas.width, this.canvas.height] = [width, height];
+      this.over.setAttribute("viewBox", `0 0 ${width} ${height}`);
+      this.frame.style.aspectRatio = `${width} / ${height}`;
+    }
+    this.pen.drawImage(bitmap, 0, 0);
+    if (this.facts) this.intervals = [...this.intervals.slice(-4), facts.mid_exposure_s - this.facts.mid_exposure_s];
+    this.facts = facts;
+    this.exposedMs = cameMs - 1000 * facts.age_s;
+    this.markTrack(facts.track);
+    this.fresh(performance.now());
+    if (this.cursor) this.look(this.cursor);
+    document.dispatchEvent(new CustomEvent("image-shown", { detail: { ...facts, shown_ms: performance.timeOrigin + performance.now() } }));
+  }
+
+  /** Whether the image is of now; a slow camera's own period is allowed. */
+  fresh(nowMs) {
+    const ageS = this.facts ? Math.max(0, (nowMs - this.exposedMs) / 1000) : Infinity;
+    const slow = this.intervals.length ? 2.5 * [...this.intervals].sort((a, b) => a - b)[Math.floor(this.intervals.length / 2)] : 0;
+    this.isStale = !(ageS <= Math.max(STALE_S, Math.min(slow, 10)));
+    set(this.element, "data-stale", this.isStale);
+    const told = this.facts ? `${number(ageS, 1)} s old` : "no image yet";
+    say(this.age, told);
+    say(this.stale, this.facts ? `Image ${told}: not of now` : "No image yet");
+    if (this.facts) say(this.facing, `${deg(this.facts.pan_rad)} ${deg(this.facts.tilt_rad)}`);
+  }
+
+  pixel(event) {
+    const box = this.frame.getBoundingClientRect();
+    const { width, height } = this.canvas;
+    const x = ((event.clientX - box.left) / box.width) * width - 0.5;
+    const y = ((event.clientY - box.top) / box.height) * height - 0.5;
+    return [clamp(Math.round(x * 10) / 10, 0, width - 1), clamp(Math.round(y * 10) / 10, 0, height - 1)];
+  }
+
+  moved(event) {
+    this.cursor = this.pixel(event);
+    if (this.drag) this.drawBox();
+    this.look(this.cursor);
+  }
+
+  left() {
+    this.cursor = null;
+    this.loupe.hidden = true;
+    this.draw("cursor", null);
+    say(this.where, "");
+  }
+
+  pressed(event) {
+    if (event.button !== 0) return;
+    this.frame.setPointerCapture?.(event.pointerId);
+    this.cursor = this.pixel(event);
+    this.drag = { from: this.cursor, facts: this.facts, stale: this.isStale };
+    this.look(this.cursor);
+  }
+
+  released(event) {
+    const drag = this.drag;
+    this.drag = null;
+    this.draw("box", null);
+    if (!drag) return;
+    const to = this.pixel(event);
+    const [width, height] = [Math.abs(to[0] - drag.from[0]), Math.abs(to[1] - drag.from[1])];
+    if (width > 12 && height > 12) this.choose(this, [(to[0] + drag.from[0]) / 2, (to[1] + drag.from[1]) / 2], drag.facts, "track");
+    // a finger hits with its centre where it leaves; a mouse where it went down
+    else this.choose(this, event.pointerType === "touch" ? to : drag.from, drag.facts, "point");
+    if (event.pointerType === "touch") this.left();
+  }
+
+  key(event) {
+    const ways = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowDown: [0, 1] };
+    const way = ways[event.key];
+    if (way) {
+      const step = event.shiftKey ? 10 : event.altKey ? 0.1 : 1;
+      const [x, y] = this.cursor ?? [(this.canvas.width - 1) / 2, (this.canvas.height - 1) / 2];
+      this.cursor = [clamp(Math.round((x + step * way[0]) * 10) / 10, 0, this.canvas.width - 1), clamp(Math.round((y + step * way[1]) * 10) / 10, 0, this.canvas.height - 1)];
+      this.look(this.cursor);
+    } else if (event.key === "Enter" && this.cursor) {
+      this.choose(this, this.cursor, this.facts, "point");
+    } else if (event.key.toLowerCase() === "t" && this.cursor) {
+      this.choose(this, this.cursor, this.facts, "track");
+    } else return;
+    event.preventDefault();
+  }
+
+  look([x, y]) {
+    const half = Math.floor(LOUPE_PX / 2);
+    const pen = this.glass;
+    pen.imageSmoothingEnabled = false;
+    pen.fillStyle = "#000";
+    pen.fillRect(0, 0, this.loupe.width, this.loupe.height);
+    const [left, top] = [Math.round(x) - half, Math.round(y) - half];
+    pen.drawImage(this.canvas, left, top, LOUPE_PX, LOUPE_PX, 0, 0, this.loupe.width, this.loupe.height);
+    const [u, v] = [(x - left + 0.5) * ZOOM, (y - top + 0.5) * ZOOM];
+    for (const [style, line] of [["#000", 3], ["#4cc3ea", 1]]) {
+      pen.strokeStyle = style;
+      pen.lineWidth = line;
+      pen.beginPath();
+      for (const [a, b] of [[0, u - 6], [u + 6, this.loupe.width]]) { pen.moveTo(a, v); pen.lineTo(b, v); }
+      for (const [a, b] of [[0, v - 6], [v + 6, this.loupe.height]]) { pen.moveTo(u, a); pen.lineTo(u, b); }
+      pen.stroke();
+    }
+    this.loupe.hidden = false;
+    set(this.loupe, "data-side", x < this.canvas.width / 2 ? "right" : "left");
+    say(this.where, `x ${number(x, 1)}  y ${number(y, 1)} px`);
+    this.draw("cursor", cross(x, y, "cursor", 14));
+  }
+
+  drawBox() {
+    const [x0, y0] = this.drag.from;
+    const [x1, y1] = this.cursor;
+    this.draw("box", s("rect", { class: "box", x: Math.min(x0, x1), y: Math.min(y0, y1), width: Math.abs(x1 - x0), height: Math.abs(y1 - y0) }));
+  }
+
+  draw(name, mark) {
+    this.marks[name]?.remove();
+    this.marks[name] = mark;
+    if (mark) this.over.append(mark);
+  }
+
+  mark(name, place, kind, words) {
+    this.draw(name, place ? s("g", {}, cross(place[0], place[1], kind, 26), words ? s("text", { class: kind, x: place[0] + 14, y: place[1] - 14 }, words) : null) : null);
+  }
+
+  markTrack(track) {
+    if (!track) return this.draw("track", null);
+    const { x_px: x, y_px: y } = track;
+    this.draw("track", s("g", {},
+      s("ellipse", { class: "track", rx: Math.max(3 * track.major_px, 4), ry: Math.max(3 * track.minor_px, 4), transform: `translate(${x} ${y}) rotate(${(track.turn_rad * 180) / Math.PI})` }),
+      cross(x, y, "track", 18)));
+  }
+}
+
+const clamp = (value, low, high) => Math.min(high, Math.max(low, value));
+
+function cross(x, y, kind, size) {
+  const gap = size / 4;
+  const d = `M${x - size} ${y}H${x - gap}M${x + gap} ${y}H${x + size}M${x} ${y - size}V${y - gap}M${x} ${y + gap}V${y + size}`;
+  return s("g", {}, s("path", { class: "halo", d }), s("path", { class: kind, d }));
+}

@@ -1,0 +1,167 @@
+// Turning the head by hand: heartbeats for as long as a key or a finger holds, and an end whatever ends it.
+import { byId, h, put, say } from "./dom.js";
+import { beat, post } from "./api.js";
+import { degrees, number } from "./words.js";
+
+const BEAT_MS = 120;
+const WAYS = { up: [0, 1, "▲", "Tilt up"], left: [-1, 0, "◀", "Pan left"], right: [1, 0, "▶", "Pan right"], down: [0, -1, "▼", "Tilt down"] };
+const KEYS = { ArrowUp: "up", ArrowLeft: "left", ArrowRight: "right", ArrowDown: "down" };
+
+export class Jog {
+  constructor(tell) {
+    this.tell = tell;
+    this.down = new Set();
+    this.rates = [0, 0];
+    this.sequence = 0;
+    this.id = null;
+    this.speed = h("input", { type: "range", id: "speed", min: 0.5, max: 30, step: 0.5, value: 5, oninput: () => this.told() });
+    this.speedWords = h("output", { for: "speed" });
+    this.held = h("p", { class: "warn", role: "status" });
+    this.pad = h("div", { class: "pad", id: "pad", tabindex: 0, role: "application", "aria-label": "Turn the head: hold an arrow key",
+      onkeydown: (event) => this.key(event, true), onkeyup: (event) => this.key(event, false), onblur: () => this.release() },
+      Object.entries(WAYS).map(([name, [, , sign, words]]) => h("button", { type: "button", class: name, tabindex: -1, "aria-label": words, "data-way": name,
+        onpointerdown: (event) => { event.currentTarget.setPointerCapture(event.pointerId); event.preventDefault(); this.pad.focus(); this.hold(name, true); },
+        onpointerup: () => this.hold(name, false), onpointercancel: () => this.hold(name, false), onlostpointercapture: () => this.hold(name, false), oncontextmenu: (event) => event.preventDefault() }, sign)));
+    this.pan = h("input", { id: "goal-pan", inputmode: "decimal", autocomplete: "off", size: 7 });
+    this.tilt = h("input", { id: "goal-tilt", inputmode: "decimal", autocomplete: "off", size: 7 });
+    this.presets = h("div", { class: "presets" });
+    this.goSaid = h("p", { class: "bad", role: "alert" });
+    this.all = h("fieldset", {},
+      h("div", { class: "side" }, this.pad, h("div", { class: "stack" }, h("label", { for: "speed" }, "Speed ", this.speedWords), this.speed, this.held)),
+      h("form", { class: "angles", onsubmit: (event) => { event.preventDefault(); this.goTyped(); } },
+        h("label", {}, "Pan ", this.pan, " °"), h("label", {}, "Tilt ", this.tilt, " °"), h("button", { type: "submit" }, "Go")),
+      this.presets, this.goSaid);
+    put(byId("jog"), this.all);
+    for (const [place, name] of [[window, "blur"], [window, "pagehide"], [document, "visibilitychange"]]) place.addEventListener(name, () => this.release());
+    this.told();
+    this.drawPresets();
+  }
+
+  use(limits) {
+    this.limits = limits;
+    this.speed.max = number(degrees(limits.speed_rad_per_s), 1);
+    this.told();
+  }
+
+  allow(may) {
+    this.all.disabled = !may;
+    this.pad.tabIndex = may ? 0 : -1;
+    this.may = may;
+    if (!may) this.release();
+  }
+
+  told() {
+    say(this.speedWords, `${number(Number(this.speed.value), 1)} °/s`);
+    this.turn();
+  }
+
+  key(event, down) {
+    const way = KEYS[event.key];
+    if (!way) return;
+    event.preventDefault();
+    if (!event.repeat) this.hold(way, down);
+  }
+
+  hold(way, down) {
+    if (!this.may) return;
+    if (down) this.down.add(way);
+    else this.down.delete(way);
+    for (const button of this.pad.children) button.dataset.held = this.down.has(button.dataset.way);
+    this.turn();
+  }
+
+  release() {
+    if (!this.down.size) return;
+    this.down.clear();
+    for (const button of this.pad.children) button.dataset.held = false;
+    this.turn();
+  }
+
+  turn() {
+    const rate = (Number(this.speed.value) * Math.PI) / 180;
+    const sum = [0, 0];
+    for (const way of this.down) { sum[0] += WAYS[way][0]; sum[1] += WAYS[way][1]; }
+    const rates = [sum[0] * rate, sum[1] * rate];
+    if (rates.join() === this.rates.join()) return;
+    this.rates = rates;
+    if (!this.busy) this.work();
+    else this.wake?.();
+  }
+
+  /** One heartbeat after the other, the next at once when the rates change. */
+  async work() {
+    this.busy = true;
+    try {
+      for (;;) {
+        const rates = this.rates;
+        const still = rates[0] === 0 && rates[1] === 0;
+        if (still && this.id === null) break;
+        const body = { pan_rad_per_s: rates[0], tilt_rad_per_s: rates[1], sequence: ++this.sequence };
+        if (this.id !== null) body.id = this.id;
+        const told = await beat(body);
+        this.id = told.id;
+        say(this.held, Object.values(told.held ?? {}).join(" "));
+        if (still) { this.id = null; continue; }
+        if (rates === this.rates) {
+          await new Promise((go) => { this.wake = go; setTimeout(go, BEAT_MS); });
+        }
+      }
+    } catch (error) {
+      this.id = null;
+      this.down.clear();
+      this.rates = [0, 0];
+      for (const button of this.pad.children) button.dataset.held = false;
+      say(this.held, error.message);
+    } finally {
+      this.busy = false;
+    }
+  }
+
+  async go(panRad, tiltRad) {
+    say(this.goSaid, "");
+    try {
+      await post("/point", { pan_rad: panRad, tilt_rad: tiltRad });
+    } catch (error) {
+      say(this.goSaid, error.message);
+    }
+  }
+
+  goTyped() {
+    const [pan, tilt] = [this.pan, this.tilt].map((input) => Number(input.value.trim().replace(",", ".").replace("\u2212", "-") || NaN));
+    if (!Number.isFinite(pan) || !Number.isFinite(tilt)) return say(this.goSaid, "Two angles in degrees are expected, such as 12.5 and -8.");
+    this.go((pan * Math.PI) / 180, (tilt * Math.PI) / 180);
+  }
+
+  drawPresets() {
+    const kept = this.kept();
+    put(this.presets,
+      h("button", { type: "button", id: "home", onclick: () => this.go(0, 0) }, "Home"),
+      Object.entries(kept).map(([name, [pan, tilt]]) => h("span", { class: "preset" },
+        h("button", { type: "button", onclick: () => this.go(pan, tilt) }, name),
+        h("button", { type: "button", class: "minus", "aria-label": `Forget ${name}`, onclick: () => this.forget(name) }, "×"))),
+      h("button", { type: "button", class: "quiet", onclick: () => this.keep() }, "Keep this place"));
+  }
+
+  kept() {
+    try {
+      return JSON.parse(localStorage.getItem("mastctl places")) ?? {};
+    } catch {
+      return {};
+    }
+  }
+
+  keep() {
+    if (!this.here) return;
+    const [pan, tilt] = this.here;
+    const name = `${number(degrees(pan), 1, true)}° ${number(degrees(tilt), 1, true)}°`;
+    localStorage.setItem("mastctl places", JSON.stringify({ ...this.kept(), [name]: [pan, tilt] }));
+    this.drawPresets();
+  }
+
+  forget(name) {
+    const kept = this.kept();
+    delete kept[name];
+    localStorage.setItem("mastctl places", JSON.stringify(kept));
+    this.drawPresets();
+  }
+}

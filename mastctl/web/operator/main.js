@@ -1,0 +1,191 @@
+// The page: what is always in sight, and the panels told of what changes.
+import { byId, h, put, say, set } from "./dom.js";
+import { get, post, stop } from "./api.js";
+import { forTime, sentence } from "./words.js";
+import { Control } from "./control.js";
+import { Events } from "./events.js";
+import { Faults, MastFile, OperationList, Recording, Residuals, Simulation, TrackPanel } from "./panels.js";
+import { HeadPanel } from "./head.js";
+import { Jog } from "./jog.js";
+import { Target } from "./target.js";
+import { Views } from "./views.js";
+
+const WORDS = { starting: "starting", ready: "ready", moving: "moving", tracking: "tracking", holding: "holding", stopping: "stopping", stopped: "stopped", fault: "fault", closing: "closing" };
+
+function alarm(words) {
+  const place = byId("alarm");
+  place.textContent = "";
+  place.textContent = words;
+  notice(words);
+}
+
+function speak(words, urgent = false) {
+  if (urgent) alarm(words);
+  else say(byId("said"), words);
+}
+
+/** What was refused beside its place, seen for some seconds. */
+let noticeTimer;
+function notice(words) {
+  clearTimeout(noticeTimer);
+  document.querySelector(".notice")?.remove();
+  const place = h("p", { class: "notice" }, words);
+  document.body.append(place);
+  noticeTimer = setTimeout(() => place.remove(), 8000);
+}
+
+// STOP: no lease, no confirmation, no queue; Escape does the same wherever the focus is.
+async function stopNow() {
+  byId("stop").dataset.pressed = "sent";
+  const failed = byId("stop-failed");
+  try {
+    await stop();
+    failed.hidden = true;
+    byId("stop").dataset.pressed = "confirmed";
+    say(byId("said"), "Stopped.");
+  } catch (error) {
+    failed.hidden = false;
+    failed.textContent = `STOP IS NOT CONFIRMED. ${error.message} Use the switch in the supply.`;
+    byId("stop").dataset.pressed = "failed";
+  }
+  setTimeout(() => { byId("stop").dataset.pressed = ""; }, 1200);
+}
+byId("stop").addEventListener("pointerdown", (event) => { if (event.button === 0) { event.preventDefault(); stopNow(); } });
+byId("stop").addEventListener("keydown", (event) => { if (event.key === "Enter" || event.key === " ") { event.preventDefault(); if (!event.repeat) stopNow(); } });
+byId("stop").addEventListener("click", (event) => { if (event.detail === 0) stopNow(); }); // a screen reader's or a switch's press
+document.addEventListener("keydown", (event) => { if (event.key === "Escape" && !event.repeat) stopNow(); }, { capture: true });
+for (const dialog of document.querySelectorAll("dialog")) dialog.addEventListener("cancel", (event) => event.preventDefault());
+
+const events = new Events();
+const views = new Views((eye, pixel, facts, what) => (what === "track" ? track.begin(eye, pixel, facts) : target.choose(eye, pixel, facts)));
+const target = new Target(views, events, speak);
+const track = new TrackPanel(events, views, speak);
+const head = new HeadPanel(events);
+const jog = new Jog(alarm);
+const control = new Control(alarm);
+const recording = new Recording(alarm);
+const mastFile = new MastFile(alarm);
+const residuals = new Residuals();
+const simulation = new Simulation();
+new Faults(events, alarm);
+new OperationList(events);
+
+// What is pushed
+
+let since = 0;
+function standing(now) {
+  set(byId("state"), "data-word", now.state);
+  const before = byId("word").textContent;
+  say(byId("word"), WORDS[now.state] ?? now.state);
+  say(byId("reason"), sentence(now.reason));
+  since = performance.now() - 1000 * now.state_for_s;
+  if (before !== now.state) speak(`${now.state}. ${now.reason}`, ["stopped", "fault"].includes(now.state) && Boolean(now.reason));
+  const latch = now.estop;
+  byId("estop").hidden = !latch;
+  if (latch) put(byId("estop"), h("strong", {}, "Emergency stop"), ` by ${latch.name}: ${latch.reason}. Nothing moves until it is released. `, h("button", { type: "button", id: "release", disabled: !may, onclick: () => byId("reset").showModal() }, "Release …"));
+  document.title = `${now.state} – mastctl`;
+}
+setInterval(() => say(byId("state-for"), events.connected ? `for ${forTime((performance.now() - since) / 1000)}` : ""), 500);
+
+events.addEventListener("state", (event) => standing(event.detail.value));
+events.addEventListener("lease", (event) => control.told(event.detail.value.control));
+events.addEventListener("joints", (event) => { jog.here = [event.detail.value.pan_rad, event.detail.value.tilt_rad]; });
+events.addEventListener("mast", () => refresh());
+events.addEventListener("command", (event) => {
+  const kind = event.detail.value.command ?? "";
+  refresh();
+  if (String(kind).startsWith("record")) recording.look();
+});
+events.addEventListener("operation", (event) => {
+  const record = event.detail.value;
+  if (record.residual_px) residuals.look();
+  const going = record.state === "running" ? record.steps.findLast((step) => step.name === "limits") : null;
+  head.goal(going ? [going.detail.pan_rad, going.detail.tilt_rad] : undefined);
+});
+events.addEventListener("connected", () => { byId("lost").hidden = true; refresh(); recording.look(); residuals.look(); });
+events.addEventListener("lost", () => { byId("lost").hidden = false; jog.release(); });
+setInterval(() => {
+  if (!events.connected && events.heardMs) {
+    byId("lost").hidden = false;
+    say(byId("lost-words"), `Connection lost for ${forTime((performance.now() - events.lostMs) / 1000)}.`);
+  }
+}, 500);
+
+// What is asked when something has changed, at most twice a second
+
+let may = false;
+let rig = null;
+let again = false;
+async function refresh() {
+  if (refresh.busy) { again = true; return; }
+  refresh.busy = true;
+  try {
+    const status = await get("/status");
+    if (!rig || rig.digest !== status.mast.digest || Object.keys(rig.cameras).length !== Object.keys(status.cameras).length) {
+      rig = await get("/rig");
+      views.use(rig);
+    }
+    show(status);
+  } catch (error) {
+    if (error.status) notice(error.message);
+  }
+  setTimeout(() => { refresh.busy = false; if (again) { again = false; refresh(); } }, 500);
+}
+
+function show(status) {
+  const simulated = status.hardware === "simulated";
+  const badge = byId("hardware");
+  say(badge, { simulated: "SIMULATED", real: "HARDWARE", replayed: "REPLAYED", mixed: "HARDWARE, PART SIMULATED" }[status.hardware] ?? status.hardware);
+  set(badge, "data-kind", status.hardware);
+  standing(status);
+  control.told(status.control);
+  head.use(status, rig, views);
+  jog.use(status.limits);
+  mastFile.told(status, rig);
+  simulation.use(status);
+  set(document.body, "data-simulated", simulated);
+}
+
+function allow(role) {
+  may = role !== "view";
+  set(document.body, "data-role", role);
+  for (const part of [target, track, jog, control, recording, mastFile, simulation]) part.allow(may);
+}
+
+// Who one is
+
+async function enter() {
+  try {
+    const session = await get("/session");
+    byId("login").close();
+    allow(session.role);
+    events.open();
+  } catch (error) {
+    if (error.status === 401) byId("login").showModal();
+    else { notice(error.message); setTimeout(enter, 2000); }
+  }
+}
+byId("login-form").addEventListener("submit", async (event) => {
+  event.preventDefault();
+  try {
+    await post("/login", { token: byId("token").value.trim() });
+    byId("token").value = "";
+    say(byId("login-said"), "");
+    enter();
+  } catch (error) {
+    say(byId("login-said"), error.message);
+  }
+});
+document.addEventListener("no-session", () => { if (!byId("login").open) byId("login").showModal(); });
+byId("reset-no").addEventListener("click", () => byId("reset").close());
+byId("reset-form").addEventListener("submit", async (event) => {
+  event.preventDefault();
+  try {
+    await post("/reset", { reason: byId("reset-reason").value, name: byId("reset-name").value });
+    byId("reset").close();
+  } catch (error) {
+    say(byId("reset-said"), error.message);
+  }
+});
+
+enter();

@@ -1,0 +1,216 @@
+// Click, see what it would mean, send it, read the residual.
+import { byId, h, put } from "./dom.js";
+import { fileOf, post } from "./api.js";
+import { camera as called, deg, metres, number, px } from "./words.js";
+import { residualPicture } from "./residual.js";
+
+const STEPS = {
+  rest: "the head rests", frames: "a fresh pair is taken", target: "what was clicked is found again", stereo: "found in the other eye", triangulate: "range",
+  before: "pictures from before the move", solve: "joint angles", limits: "limits", corner: "round a keep-out", move: "the head is sent", settle: "it has arrived and rests",
+  look: "new pictures", measure: "the target is found in them", eyes: "the other eye confirms it",
+};
+
+export class Target {
+  constructor(views, events, say) {
+    this.views = views;
+    this.events = events;
+    this.say = say;
+    this.state = "none";
+    this.number = 0;
+    this.place = byId("target");
+    this.may = false;
+    events.addEventListener("operation", (event) => this.operation(event.detail.value));
+    events.addEventListener("joints", () => this.state === "sent" && this.render());
+    events.addEventListener("mast", (event) => this.mast(event.detail.value.digest));
+    document.addEventListener("views-changed", () => this.draw());
+    document.addEventListener("keydown", (event) => {
+      if (event.key.toLowerCase() === "p" && !event.target.closest("input, select, textarea") && !event.ctrlKey && !event.metaKey) this.send();
+    });
+    this.render();
+  }
+
+  allow(may) {
+    this.may = may;
+    this.render();
+  }
+
+  refuse(words, code = "") {
+    this.state = "refused";
+    this.words = words;
+    this.code = code;
+    this.say(words, true);
+    this.draw();
+    this.render();
+  }
+
+  /** A pixel of a shown image was chosen; nothing moves by it. */
+  async choose(eye, pixel, facts) {
+    if (!this.may) return this.refuse("You may look. To point, log in with a token of the role operate.", "role");
+    const mine = ++this.number;
+    this.click = { camera: eye.name, pixel, facts };
+    this.preview = null;
+    if (!facts || eye.isStale) return this.refuse(`The image of ${called(eye.name)} is not of now, so nothing in it can be clicked.`, "stale");
+    if (facts.moving) return this.refuse("The head moved while this image was exposed. Click when it rests.", "frame_moving");
+    this.state = "asked";
+    this.say(`Chosen: ${called(eye.name)}, x ${number(pixel[0], 1)}, y ${number(pixel[1], 1)}. Looking for it in the other eye.`);
+    this.draw();
+    this.render();
+    try {
+      const preview = await post("/point/preview", { pixel: this.target() });
+      if (mine !== this.number) return;
+      this.preview = preview;
+      this.state = "preview";
+      this.say(`Range ${metres(preview.range_m)} plus or minus ${metres(preview.range_sigma_m)}. ${preview.refused ? preview.refused.message : "Press P to point."}`);
+    } catch (error) {
+      if (mine !== this.number) return;
+      return this.refuse(error.message, error.code);
+    }
+    this.draw();
+    this.render();
+  }
+
+  target() {
+    const { camera, pixel, facts } = this.click;
+    return { camera, frame_id: facts.frame_id, x_px: pixel[0], y_px: pixel[1], mast_digest: facts.mast_digest };
+  }
+
+  async send(pixel = null) {
+    if (!this.may || (!pixel && (this.state !== "preview" || this.preview.refused))) return;
+    const target = pixel ?? this.target();
+    this.state = "sent";
+    this.record = null;
+    this.id = null;
+    this.render();
+    try {
+      this.id = (await post("/point", { pixel: target })).id;
+      this.operation(this.events.newest("operation", this.id));
+    } catch (error) {
+      this.refuse(error.message, error.code);
+    }
+  }
+
+  /** Point again at what the new image showed. */
+  again() {
+    const last = this.record?.pointings.at(-1);
+    if (!last?.target_px) return;
+    this.send({ camera: last.camera, frame_id: last.frame_id, x_px: last.target_px[0], y_px: last.target_px[1] });
+  }
+
+  operation(record) {
+    if (!record || record.id !== this.id) return;
+    this.record = record;
+    if (["done", "failed", "stopped"].includes(record.state) && this.state === "sent") {
+      this.state = "ended";
+      if (record.residual_px) this.say(`Residual x ${number(record.residual_px[0], 2, true)}, y ${number(record.residual_px[1], 2, true)} pixels.`);
+      else if (record.error) this.say(record.error.message, true);
+      this.draw();
+    }
+    this.render();
+  }
+
+  mast(digest) {
+    if (["asked", "preview"].includes(this.state) && this.click.facts?.mast_digest !== digest) this.refuse("Another mast file came into use: what was chosen belongs to the one before. Choose it again.", "other_mast_file");
+  }
+
+  /** Cross-hairs in the images: what was clicked, the other eye's match, the aim. */
+  draw() {
+    for (const [name, eye] of this.views.eyes) {
+      let click = null, match = null, aim = null, found = null;
+      if (["asked", "preview", "sent"].includes(this.state) && this.click.camera === name) click = this.click.pixel;
+      if (["preview", "sent"].includes(this.state) && this.preview?.other_camera === name) match = this.preview.other_pixel_px;
+      const last = this.state === "ended" ? this.record?.pointings.at(-1) : null;
+      if (last?.camera === name) [aim, found] = [last.aim_px, last.target_px];
+      eye.mark("click", this.state === "sent" && this.moving() ? null : click, "click", null);
+      eye.mark("match", this.state === "sent" && this.moving() ? null : match, "match", match ? number(this.preview.correlation, 2) : null);
+      eye.mark("aim", aim, "aim", aim && !found ? "aim" : null);
+    }
+  }
+
+  moving() {
+    return this.record?.steps.some((step) => step.name === "move") ?? false;
+  }
+
+  render() {
+    const parts = {
+      none: () => [h("p", { class: "quiet" }, "Nothing chosen.")],
+      asked: () => [this.chosen(), h("p", { class: "busy" }, "Looking for it in a fresh pair …")],
+      preview: () => [this.chosen(), this.seen(), this.way(), this.go()],
+      refused: () => [h("p", { class: "bad" }, this.words), this.code === "no_stereo" ? h("p", { class: "quiet" }, "Without a second eye a pixel has no range; turn the head by angles or by hand.") : null],
+      sent: () => [this.seen(), this.progress()],
+      ended: () => [this.result(), this.progress()],
+    };
+    put(this.place, parts[this.state]());
+    this.place.dataset.state = this.state;
+    if (this.state === "ended" && this.record?.pointings.at(-1)?.aim_px && this.record.residual_px && this.drawn !== this.record.id) this.picture();
+  }
+
+  chosen() {
+    const { camera, pixel } = this.click;
+    return h("p", {}, `${called(camera)}  x ${number(pixel[0], 1)}  y ${number(pixel[1], 1)} px`);
+  }
+
+  seen() {
+    const seen = this.preview;
+    if (!seen) return null;
+    const clear = seen.correlation - seen.second;
+    const axis = (k) => h("td", { class: "n" }, `${number(seen.position_m[k], 3, true)} ± ${number(seen.sigma_m[k], 3)} m`);
+    return h("table", { class: "figures" },
+      h("tr", {}, h("th", { scope: "row" }, "Range"), h("td", { class: "n big", id: "range" }, `${number(seen.range_m, 3)} ± ${number(seen.range_sigma_m, 3)} m`)),
+      h("tr", {}, h("th", { scope: "row" }, "x forward"), axis(0)),
+      h("tr", {}, h("th", { scope: "row" }, "y right"), axis(1)),
+      h("tr", {}, h("th", { scope: "row" }, "z down"), axis(2)),
+      h("tr", {}, h("th", { scope: "row" }, "Match"), h("td", { class: "n" }, `${number(seen.correlation, 3)}, next best ${number(seen.second, 2)} (${clear > 0.3 ? "clear" : "close"})`)),
+      h("tr", {}, h("th", { scope: "row" }, "Off epipolar line"), h("td", { class: "n" }, px(seen.across_px))));
+  }
+
+  way() {
+    const seen = this.preview;
+    if (seen.refused) return h("p", { class: "bad" }, seen.refused.message);
+    const here = this.events.newest("joints", "pan_tilt") ?? [...this.events.known].find(([key]) => key.startsWith("joints"))?.[1];
+    const row = (name, k, now) => h("tr", {}, h("th", { scope: "row" }, name), h("td", { class: "n" }, deg(now)), h("td", {}, "→"), h("td", { class: "n" }, deg(seen.goal_rad[k])));
+    return h("table", { class: "figures" }, row("Pan", 0, here?.pan_rad), row("Tilt", 1, here?.tilt_rad));
+  }
+
+  go() {
+    if (this.preview.refused) return null;
+    return h("div", { class: "buttons" }, h("button", { type: "button", class: "go", id: "point", onclick: () => this.send() }, "Point ", h("kbd", {}, "P")));
+  }
+
+  progress() {
+    const record = this.record;
+    if (!record) return h("p", { class: "busy" }, "Sent …");
+    const over = ["done", "failed", "stopped"].includes(record.state);
+    return h("details", { class: "steps", open: !over }, h("summary", {}, over ? `Steps (${record.steps.length})` : "Under way"),
+      h("ol", {}, record.steps.map((step) => h("li", { class: step.state }, STEPS[step.name] ?? step.name, h("span", { class: "n" }, `${number(step.duration_s, 2)} s`)))));
+  }
+
+  result() {
+    const record = this.record;
+    if (record.state !== "done") return h("p", { class: "bad" }, record.error?.message ?? `The operation was ${record.state}.`);
+    const last = record.pointings.at(-1);
+    if (!last.residual_px) return h("p", { class: "quiet" }, last.note);
+    const [x, y] = last.residual_px;
+    const [sx, sy] = last.residual_sigma_px;
+    return [
+      h("div", { class: "residual" },
+        h("div", {}, h("p", { class: "quiet" }, "Residual in the new image"),
+          h("p", { class: "huge", id: "residual" }, h("span", {}, "x ", `${number(x, 3, true)} ± ${number(sx, 3)} px`), h("span", {}, "y ", `${number(y, 3, true)} ± ${number(sy, 3)} px`))),
+        h("div", { class: "inset", id: "inset" }, this.drawn === record.id ? this.inset : null)),
+      h("table", { class: "figures" },
+        h("tr", {}, h("td", {}), h("th", { scope: "col" }, "commanded"), h("th", { scope: "col" }, "measured")),
+        h("tr", {}, h("th", { scope: "row" }, "Pan"), h("td", { class: "n" }, deg(last.commanded_pan_rad, 3)), h("td", { class: "n" }, deg(last.measured_pan_rad, 3))),
+        h("tr", {}, h("th", { scope: "row" }, "Tilt"), h("td", { class: "n" }, deg(last.commanded_tilt_rad, 3)), h("td", { class: "n" }, deg(last.measured_tilt_rad, 3)))),
+      this.may ? h("div", { class: "buttons" }, h("button", { type: "button", id: "again", onclick: () => this.again() }, "Point a second time")) : null,
+    ];
+  }
+
+  async picture() {
+    const record = this.record;
+    this.drawn = record.id;
+    const last = record.pointings.at(-1);
+    this.inset = h("div");
+    const path = `/snapshot/${encodeURIComponent(last.camera)}?format=png&frame_id=${encodeURIComponent(last.frame_id)}`;
+    this.inset = await residualPicture(fileOf(path), last);
+    if (this.record === record) this.render();
+  }
+}

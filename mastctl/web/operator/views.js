@@ -1,0 +1,58 @@
+// Which cameras are in view, and their images.
+import { byId, h, put } from "./dom.js";
+import { Eye } from "./eye.js";
+import { Images } from "./images.js";
+import { fileOf } from "./api.js";
+
+export class Views {
+  constructor(choose) {
+    this.choose = choose;
+    this.eyes = new Map();
+    this.images = new Images((facts, bitmap, cameMs) => this.shown(facts, bitmap, cameMs));
+    this.groups = [];
+    setInterval(() => this.eyes.forEach((eye) => eye.fresh(performance.now())), 250);
+    document.addEventListener("visibilitychange", () => this.images.watch(document.hidden ? [] : this.names()));
+  }
+
+  use(rig) {
+    const groups = new Map();
+    for (const [name, told] of Object.entries(rig.cameras)) {
+      const key = told.pair ?? name;
+      groups.set(key, [...(groups.get(key) ?? []), name]);
+    }
+    this.groups = [...groups].map(([key, names]) => [key, names.sort((a, b) => (rig.cameras[a].eye ?? "").localeCompare(rig.cameras[b].eye ?? ""))]);
+    const kept = localStorage.getItem("mastctl view");
+    const first = ["navcam", ...groups.keys()].find((key) => groups.has(key));
+    this.choosePair(groups.has(kept) ? kept : first);
+  }
+
+  choosePair(key) {
+    this.key = key;
+    localStorage.setItem("mastctl view", key ?? "");
+    put(byId("tabs"), this.groups.map(([name]) => h("button", { type: "button", "aria-pressed": String(name === key), onclick: () => this.choosePair(name) }, name.replaceAll("_", " "))));
+    const names = this.names();
+    this.eyes = new Map(names.map((name) => [name, this.eyes.get(name) ?? new Eye(name, this.choose)]));
+    put(byId("eyes"), [...this.eyes.values()].map((eye) => eye.element));
+    this.images.watch(names);
+    document.dispatchEvent(new CustomEvent("views-changed"));
+  }
+
+  names() {
+    return this.groups.find(([name]) => name === this.key)?.[1] ?? [];
+  }
+
+  /** Bring a camera into view. */
+  bring(camera) {
+    const group = this.groups.find(([, names]) => names.includes(camera));
+    if (group && group[0] !== this.key) this.choosePair(group[0]);
+    return this.eyes.get(camera);
+  }
+
+  shown(facts, bitmap, cameMs) {
+    const eye = this.eyes.get(facts.camera);
+    if (!eye) return;
+    eye.show(facts, bitmap, cameMs);
+    eye.save.hidden = false;
+    eye.save.href = fileOf(`/snapshot/${encodeURIComponent(facts.camera)}?format=png&frame_id=${encodeURIComponent(facts.frame_id)}`);
+  }
+}

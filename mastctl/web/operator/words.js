@@ -1,0 +1,25 @@
+// Figures as people read them: units shown, the same number of decimals, a true minus.
+const MINUS = "\u2212";
+export const NONE = "\u2013";
+
+export function number(value, digits, sign = false) {
+  if (value === null || value === undefined || !Number.isFinite(value)) return NONE;
+  const rounded = Number(value.toFixed(digits)) || 0;
+  const text = Math.abs(rounded).toFixed(digits);
+  return (rounded < 0 ? MINUS : sign && rounded > 0 ? "+" : "") + text;
+}
+export const degrees = (rad) => (rad * 180) / Math.PI;
+export const deg = (rad, digits = 2) => (rad === null || rad === undefined ? NONE : `${number(degrees(rad), digits, true)}°`);
+export const metres = (m, digits = 3) => `${number(m, digits)} m`;
+export const px = (value, digits = 2) => `${number(value, digits, true)} px`;
+
+export function forTime(seconds) {
+  if (seconds === null || seconds === undefined) return "";
+  if (seconds < 60) return `${Math.floor(seconds)} s`;
+  if (seconds < 3600) return `${Math.floor(seconds / 60)} min ${Math.floor(seconds % 60)} s`;
+  return `${Math.floor(seconds / 3600)} h ${Math.floor((seconds % 3600) / 60)} min`;
+}
+
+export const camera = (name) => name.replaceAll("_", " ");
+
+export const sentence = (text) => (text ? text[0].toUpperCase() + text.slice(1) : "");

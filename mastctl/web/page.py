@@ -1,0 +1,105 @@
+"""The operator page: its files, read once, and what of the rig it draws."""
+
+from __future__ import annotations
+
+import math
+from importlib.resources import files
+from typing import Any
+
+import numpy as np
+from fastapi import FastAPI
+from fastapi.responses import Response
+
+from calib.mast.rig import RigCamera
+from mastctl.service.service import Service
+from mastctl.web import PREFIX
+from mastctl.web.waiting import Waiting
+
+FIRST = "index.html"
+KINDS = {
+    "html": "text/html; charset=utf-8",
+    "js": "text/javascript; charset=utf-8",
+    "css": "text/css; charset=utf-8",
+    "svg": "image/svg+xml",
+}
+MOST_MAST_FILES = 100
+
+
+def page_files() -> dict[str, bytes]:
+    """Return the page's files by name."""
+    folder = files("mastctl.web") / "operator"
+    return {one.name: one.read_bytes() for one in folder.iterdir() if one.name.rpartition(".")[2] in KINDS}
+
+
+def add_page(app: FastAPI, service: Service, waiting: Waiting) -> None:
+    """The page at ``/``, its files below ``/page/``, and ``GET /rig``."""
+    known = page_files()
+
+    def file(name: str) -> Response:
+        return Response(known[name], media_type=KINDS[name.rpartition(".")[2]])
+
+    @app.get("/", include_in_schema=False)
+    async def page() -> Response:
+        return file(FIRST)
+
+    for name in known:
+        app.add_api_route(f"/page/{name}", _giver(file(name)), methods=["GET"], include_in_schema=False)
+
+    @app.get(f"{PREFIX}/rig", summary="The configured cameras by the mast file in use")
+    async def rig() -> dict[str, Any]:
+        return await waiting.run(lambda: rig_told(service))
+
+
+def _giver(answer: Response) -> Any:
+    async def give() -> Response:
+        return answer
+
+    return give
+
+
+def rig_told(service: Service) -> dict[str, Any]:
+    """Return what of the rig is drawn. Reads the folder of the mast file."""
+    stored = service.stored
+    names = service.config.hardware.cameras
+    folder = service.masts.in_use.path.parent
+    made = stored.rig.provenance.get("date")
+    found = sorted(one.name for one in folder.glob("*.yaml"))[:MOST_MAST_FILES]
+    return {
+        "digest": stored.digest,
+        "made": None if made is None else str(made)[:40],
+        "cameras": {
+            name: _mount(camera) | _partners(name, stored.rig.stereo, names)
+            for name, camera in stored.rig.cameras.items()
+            if name in names
+        },
+        "mast_files": found,
+    }
+
+
+def _mount(camera: RigCamera) -> dict[str, Any]:
+    model = camera.model
+    width, height = model.size_px
+    x, y = (width - 1) / 2, (height - 1) / 2
+    places = [(x, y), (0, y), (width - 1, y), (x, 0), (x, height - 1)]
+    middle, left, right, top, bottom = model.ray(np.array(places, dtype=float)).directions
+    return {
+        "on": camera.on,
+        "size_px": [int(width), int(height)],
+        "azimuth_rad": math.atan2(middle[1], middle[0]),
+        "elevation_rad": math.asin(float(np.clip(-middle[2], -1.0, 1.0))),
+        "width_rad": _between(left, right),
+        "height_rad": _between(top, bottom),
+    }
+
+
+def _between(one: np.ndarray, other: np.ndarray) -> float:
+    return math.atan2(float(np.linalg.norm(np.cross(one, other))), float(one @ other))
+
+
+def _partners(name: str, stereo: Any, names: Any) -> dict[str, Any]:
+    for pair, (left, right) in stereo.items():
+        if name in (left, right):
+            other = right if name == left else left
+            eye = "left" if name == left else "right"
+            return {"pair": pair, "eye": eye, "partner": other if other in names else None}
+    return {"pair": None, "eye": None, "partner": None}

@@ -1,0 +1,46 @@
+"""Installs the browser that the page's tests and pictures need: Debian's chromium, unless one is there.
+
+.venv/bin/python -m tools.browser
+"""
+
+from __future__ import annotations
+
+import argparse
+import shutil
+import sys
+
+from tools.arguments import end
+from tools.virtual_machine.apt import Busy, apt_get
+
+NAMES = ("chromium", "chromium-browser")
+
+
+def chromium() -> str | None:
+    """Return the path of the machine's chromium, None where there is none."""
+    return next((found for name in NAMES if (found := shutil.which(name))), None)
+
+
+def main() -> int:
+    """Install it, and print where it is."""
+    argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    ).parse_args()
+    if chromium() is None:
+        if shutil.which("apt-get") is None:
+            print("no chromium, and no apt-get to install it by", file=sys.stderr)
+            return 1
+        for arguments in (("update",), ("install", "-y", "--no-install-recommends", "chromium")):
+            try:
+                done = apt_get(*arguments, tell=lambda words: print(words, file=sys.stderr))
+            except Busy as busy:
+                print(busy, file=sys.stderr)
+                return 1
+            if done.returncode != 0:
+                print(f"apt-get {' '.join(arguments)}: {done.stderr.strip()[-400:]}", file=sys.stderr)
+                return 1
+    print(chromium())
+    return 0
+
+
+if __name__ == "__main__":
+    end(main)
