@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from calib.camera.cahvor import CameraModel
 
@@ -13,9 +13,7 @@ STEP_M = 1e-3  # of the differences; a camera's curvature over it is far below a
 LEAST_SIGMA_PX = 0.05
 
 
-def in_picture(
-    camera: CameraModel, position_m: Sequence[float], covariance_m2: object
-) -> dict[str, float] | None:
+def in_picture(camera: CameraModel, position_m: ArrayLike, covariance_m2: object) -> dict[str, float] | None:
     """Return the pixel of a point and one sigma of it as an ellipse.
 
     Parameters
