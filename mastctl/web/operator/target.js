@@ -10,6 +10,11 @@ const STEPS = {
   look: "new pictures", measure: "the target is found in them", eyes: "the other eye confirms it",
 };
 
+const FROM = {
+  given: "The range was given.", plane: "The range is that of a plane.", parallax: "The range comes from two poses of one camera.",
+  unknown: "One camera alone cannot tell the range; after the first pointing its own parallax may.",
+};
+
 export class Target {
   constructor(views, events, say) {
     this.views = views;
@@ -52,7 +57,7 @@ export class Target {
     if (!facts || eye.isStale) return this.refuse(`The image of ${called(eye.name)} is not of now, so nothing in it can be clicked.`, "stale");
     if (facts.moving) return this.refuse("The head moved while this image was exposed. Click when it rests.", "frame_moving");
     this.state = "asked";
-    this.say(`Chosen: ${called(eye.name)}, x ${number(pixel[0], 1)}, y ${number(pixel[1], 1)}. Looking for it in the other eye.`);
+    this.say(`Chosen: ${called(eye.name)}, x ${number(pixel[0], 1)}, y ${number(pixel[1], 1)}. Looking for it.`);
     this.draw();
     this.render();
     try {
@@ -60,7 +65,7 @@ export class Target {
       if (mine !== this.number) return;
       this.preview = preview;
       this.state = "preview";
-      this.say(`Range ${metres(preview.range_m)} plus or minus ${metres(preview.range_sigma_m)}. ${preview.refused ? preview.refused.message : "Press P to point."}`);
+      this.say(`Range ${preview.range_sigma_m === null ? this.interval(preview) : `${metres(preview.range_m)} plus or minus ${metres(preview.range_sigma_m)}`}. ${preview.refused ? preview.refused.message : "Press P to point."}`);
     } catch (error) {
       if (mine !== this.number) return;
       return this.refuse(error.message, error.code);
@@ -117,7 +122,7 @@ export class Target {
     for (const [name, eye] of this.views.eyes) {
       let click = null, match = null, aim = null, found = null;
       if (["asked", "preview", "sent"].includes(this.state) && this.click.camera === name) click = this.click.pixel;
-      if (["preview", "sent"].includes(this.state) && this.preview?.other_camera === name) match = this.preview.other_pixel_px;
+      if (["preview", "sent"].includes(this.state) && this.preview?.other_camera === name && name) match = this.preview.other_pixel_px;
       const last = this.state === "ended" ? this.record?.pointings.at(-1) : null;
       if (last?.camera === name) [aim, found] = [last.aim_px, last.target_px];
       eye.mark("click", this.state === "sent" && this.moving() ? null : click, "click", null);
@@ -133,7 +138,7 @@ export class Target {
   render() {
     const parts = {
       none: () => [h("p", { class: "quiet" }, "Nothing chosen.")],
-      asked: () => [this.chosen(), h("p", { class: "busy" }, "Looking for it in a fresh pair …")],
+      asked: () => [this.chosen(), h("p", { class: "busy" }, "Looking for it in fresh images …")],
       preview: () => [this.chosen(), this.seen(), this.way(), this.go()],
       refused: () => [h("p", { class: "bad" }, this.words), this.code === "no_stereo" ? h("p", { class: "quiet" }, "Without a second eye a pixel has no range; turn the head by angles or by hand.") : null],
       sent: () => [this.seen(), this.progress()],
@@ -152,15 +157,24 @@ export class Target {
   seen() {
     const seen = this.preview;
     if (!seen) return null;
-    const clear = seen.correlation - seen.second;
-    const axis = (k) => h("td", { class: "n" }, `${number(seen.position_m[k], 3, true)} ± ${number(seen.sigma_m[k], 3)} m`);
+    const row = (name, value, more) => h("tr", {}, h("th", { scope: "row" }, name), h("td", { class: "n", ...more }, value));
+    const place = seen.position_m?.map((value, k) => row(["x forward", "y right", "z down"][k], `${number(value, 3, true)}${seen.sigma_m ? ` ± ${number(seen.sigma_m[k], 3)}` : ""} m`));
+    if (seen.range_sigma_m === null) {
+      return [h("table", { class: "figures" }, row("Range", this.interval(seen), { id: "range", class: "n big" }), place),
+        h("p", { class: "quiet" }, FROM[seen.range_from] ?? "")];
+    }
+    const clear = seen.correlation - seen.second > 0.3;
     return h("table", { class: "figures" },
-      h("tr", {}, h("th", { scope: "row" }, "Range"), h("td", { class: "n big", id: "range" }, `${number(seen.range_m, 3)} ± ${number(seen.range_sigma_m, 3)} m`)),
-      h("tr", {}, h("th", { scope: "row" }, "x forward"), axis(0)),
-      h("tr", {}, h("th", { scope: "row" }, "y right"), axis(1)),
-      h("tr", {}, h("th", { scope: "row" }, "z down"), axis(2)),
-      h("tr", {}, h("th", { scope: "row" }, "Match"), h("td", { class: "n" }, `${number(seen.correlation, 3)}, next best ${number(seen.second, 2)} (${clear > 0.3 ? "clear" : "close"})`)),
-      h("tr", {}, h("th", { scope: "row" }, "Off epipolar line"), h("td", { class: "n" }, px(seen.across_px))));
+      row("Range", `${number(seen.range_m, 3)} ± ${number(seen.range_sigma_m, 3)} m`, { id: "range", class: "n big" }), place,
+      row("Match", `${number(seen.correlation, 3)}, next best ${number(seen.second, 2)} (${clear ? "clear" : "close"})`),
+      row("Off epipolar line", px(seen.across_px)));
+  }
+
+  /** What one camera alone knows of the range. */
+  interval({ range_m: range, range_interval_m: between }) {
+    if (!between) return range === null ? "not known" : metres(range, 2);
+    const [low, high] = between;
+    return high === null || high > 1000 ? `beyond ${metres(low, 2)}` : `${number(low, 2)} to ${metres(high, 2)}`;
   }
 
   way() {

@@ -25,8 +25,15 @@ from mastctl.web.page import page_files
 BOTH = tuple[RunningDaemon, FakeHardware]
 Visits = Callable[..., Visit]
 SEEN = Preview(
-    "navcam_left", "a", (32.0, 24.0), "navcam_right", "b", (30.0, 24.0), (0.05, 0.05), 0.97, 0.4, 0.02,
-    (6.0, 0.5, 0.1), (0.03, 0.01, 0.01), 6.02, 0.031, Aim("navcam_left", 31.5, 23.5), (0.1, -0.1), None,
+    camera="navcam_left", frame_id="a", pixel_px=(32.0, 24.0), position_m=(6.0, 0.5, 0.1), range_m=6.02,
+    range_from="stereo", aim=Aim("navcam_left", 31.5, 23.5), goal_rad=(0.1, -0.1), refused=None,
+    other_camera="navcam_right", other_frame_id="b", other_pixel_px=(30.0, 24.0), other_sigma_px=(0.05, 0.05),
+    correlation=0.97, second=0.4, across_px=0.02, sigma_m=(0.03, 0.01, 0.01), range_sigma_m=0.031,
+)  # fmt: skip
+ALONE = Preview(
+    camera="navcam_left", frame_id="a", pixel_px=(32.0, 24.0), position_m=(6.0, 0.5, 0.1), range_m=6.02,
+    range_from="unknown", aim=Aim("navcam_left", 31.5, 23.5), goal_rad=(0.1, -0.1), refused=None,
+    range_interval_m=(1.5, None),
 )  # fmt: skip
 
 
@@ -77,6 +84,17 @@ def test_a_click_shows_range_and_sigma_before_anything_moves_and_a_key_sends_it(
     assert "+0.250" in words and "−0.500" in words and "± 0.050" in words
     sent = json.loads(one.posts("/point")[0])["pixel"]
     assert sent == asked, "what was seen is what is sent"
+
+
+def test_one_camera_alone_tells_between_which_ranges_it_is(
+    pair: BOTH, visit: Visits, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(Previewing, "preview", lambda *_: ALONE)
+    one = visit(pair[0].url)
+    one.frame().click()
+    words = one.target("preview")
+    assert "beyond 1.50 m" in words and "One camera alone" in words
+    assert one.page.locator("#point").is_visible()
 
 
 def test_what_is_refused_is_told_in_words(pair: BOTH, visit: Visits, monkeypatch: pytest.MonkeyPatch) -> None:

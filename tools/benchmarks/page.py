@@ -1,0 +1,104 @@
+"""The operator page in chromium, of a simulated pair of 1024x768: first paint, frames, their age, STOP.
+
+.venv/bin/python -m tools.benchmarks.page [--seconds 10] [--rate 30]
+"""
+
+from __future__ import annotations
+
+import argparse
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+import yaml
+from playwright.sync_api import Page, sync_playwright
+
+from mastctl.client import Client
+from tools.arguments import end
+from tools.browser import chromium
+from tools.living_daemon import simulated, started, vitals, written
+
+PAIR = ("navcam_left", "navcam_right")
+STOPS = 10
+SHOWN = """seconds => new Promise(done => {
+  const shown = [];
+  const hear = event => shown.push([event.detail.camera, event.detail.mid_exposure_s, event.detail.shown_ms]);
+  document.addEventListener("image-shown", hear);
+  setTimeout(() => { document.removeEventListener("image-shown", hear); done(shown); }, 1000 * seconds);
+})"""
+PRESSED = """() => new Promise(done => {
+  const button = document.getElementById("stop");
+  const began = performance.now();
+  const told = new MutationObserver(() => {
+    if (button.dataset.pressed !== "confirmed") return;
+    told.disconnect();
+    done(performance.now() - began);
+  });
+  told.observe(button, { attributes: true });
+  button.dispatchEvent(new PointerEvent("pointerdown", { button: 0, bubbles: true, cancelable: true }));
+})"""
+
+
+def main() -> int:
+    """Print a line for each."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("--seconds", type=float, default=10.0)
+    parser.add_argument("--rate", type=float, default=30.0, help="of the cameras, Hz")
+    asked = parser.parse_args()
+    path = chromium()
+    if path is None:
+        parser.error("there is no chromium; python -m tools.browser installs it")
+    with tempfile.TemporaryDirectory() as folder:
+        config = simulated(Path(folder), "memory", PAIR)
+        document = yaml.safe_load(config.read_text())
+        document["simulation"]["cameras"] = {"rate_hz": asked.rate}
+        written(Path(folder), document)
+        with started(config) as (daemon, port), sync_playwright() as playwright:
+            browser = playwright.chromium.launch(executable_path=path, args=["--no-sandbox"])
+            page = browser.new_page(viewport={"width": 1500, "height": 1000})
+            url = f"http://127.0.0.1:{port}"
+            page.goto(url)
+            for name in PAIR:
+                page.wait_for_selector(f".eye[data-camera={name}]:not([data-stale])")
+            page.reload()
+            page.wait_for_selector("#state[data-word=ready]")
+            paint = "performance.getEntriesByName('first-contentful-paint')[0].startTime"
+            print(f"first paint {page.evaluate(paint):.0f} ms")
+            images(page, daemon.pid, asked.seconds)
+            stops(page, url)
+            browser.close()
+    return 0
+
+
+def images(page: Page, pid: int, seconds: float) -> None:
+    """Frames a second of each camera, from exposure to screen, and the daemon's processor time."""
+    before, began_s = vitals(pid).cpu_s, time.monotonic()
+    shown = page.evaluate(SHOWN, seconds)
+    took_s = time.monotonic() - began_s
+    used = (vitals(pid).cpu_s - before) / took_s
+    ahead_s = time.time() - time.monotonic()
+    for name in PAIR:
+        ages = [shown_ms - 1e3 * (mid_s + ahead_s) for camera, mid_s, shown_ms in shown if camera == name]
+        print(
+            f"{name}: {len(ages) / seconds:.1f} frames/s, glass to page median {np.median(ages):.0f} ms, "
+            f"95 % {np.percentile(ages, 95):.0f} ms"
+        )
+    print(f"daemon: {100 * used:.0f} % of a core")
+
+
+def stops(page: Page, url: str) -> None:
+    """From the press during a motion until the head has confirmed."""
+    took_ms = []
+    with Client(url, name="benchmark") as client:
+        for k in range(STOPS):
+            moving = client.point(pan_rad=2.0 if k % 2 else -2.0, tilt_rad=-0.2)
+            page.wait_for_selector("#state[data-word=moving]")
+            took_ms.append(page.evaluate(PRESSED))
+            client.wait(moving)
+            page.wait_for_selector("#stop:not([data-pressed=confirmed])")
+    print(f"STOP: confirmed after {np.median(took_ms):.0f} ms, worst of {STOPS}: {max(took_ms):.0f} ms")
+
+
+if __name__ == "__main__":
+    end(main)

@@ -1,0 +1,46 @@
+"""The operator page with something to see: a simulated rover's daemon, its head turned to some rocks.
+
+tools/demo --page [--no-browser]
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import os
+import subprocess
+import sys
+import webbrowser
+
+from mastctl.client import Client
+from tools.arguments import end
+
+PAN_RAD, TILT_RAD = 0.03, -0.17
+
+
+def main() -> int:
+    """Serve it until Ctrl-C."""
+    parser = argparse.ArgumentParser(
+        prog="tools/demo --page", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--no-browser", action="store_true", help="only print the address")
+    asked = parser.parse_args()
+    command = [sys.executable, "-m", "mastctl", "run"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as daemon:
+        assert daemon.stdout is not None
+        url = daemon.stdout.readline().strip()
+        if not url:
+            return daemon.wait() or 1
+        with Client(url, name="demo") as client:
+            client.wait(client.point(pan_rad=PAN_RAD, tilt_rad=TILT_RAD))
+        print(f"The page is at {url}/: click a rock, press P, read the residual. Ctrl-C ends it.", flush=True)
+        if not asked.no_browser and (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+            webbrowser.open(url)
+        with contextlib.suppress(KeyboardInterrupt):
+            return daemon.wait()
+        daemon.terminate()
+    return 0
+
+
+if __name__ == "__main__":
+    end(main)
