@@ -47,6 +47,20 @@ class Visit:
         self.page.wait_for_selector(f".eye[data-camera={camera}]:not([data-stale])")
         return self.page.locator(f".eye[data-camera={camera}] .frame")
 
+    def choose(
+        self, camera: str = "navcam_left", part: tuple[float, float] = (0.5, 0.5), press: str = "click"
+    ) -> str:
+        """Choose a pixel, again where the machine was so busy that the image had grown old; what is told."""
+        for _ in range(6):
+            frame = self.frame(camera)
+            box = frame.bounding_box()
+            at = {"x": part[0] * box["width"], "y": part[1] * box["height"]}
+            getattr(frame, press)(position=at)
+            words = self.target("preview", "refused")
+            if "not of now" not in words:
+                break
+        return words
+
     def target(self, *states: str) -> str:
         """The words of the panel of the target, once it is in a state."""
         self.page.wait_for_selector(", ".join(f"#target[data-state={state}]" for state in states))

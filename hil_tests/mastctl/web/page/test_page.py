@@ -72,12 +72,11 @@ def test_a_click_shows_range_and_sigma_before_anything_moves_and_a_key_sends_it(
 ) -> None:
     daemon, hardware = pair
     one = visit(daemon.url)
-    one.frame().click(position={"x": 100, "y": 100})
-    words = one.target("preview")
+    words = one.choose(part=(0.2, 0.2))
     assert "6.020 ± 0.031 m" in words and "0.970" in words
     assert one.page.locator(".eye[data-camera=navcam_right] .over .match").count() > 0
     assert not [call for call in hardware.head.calls if call[0] == "move"]
-    asked = json.loads(one.posts("/point/preview")[0])["pixel"]
+    asked = json.loads(one.posts("/point/preview")[-1])["pixel"]
     assert asked["camera"] == "navcam_left" and asked["mast_digest"] == daemon.service.stored.digest
     one.page.keyboard.press("p")
     words = one.target("ended")
@@ -91,8 +90,7 @@ def test_one_camera_alone_tells_between_which_ranges_it_is(
 ) -> None:
     monkeypatch.setattr(Previewing, "preview", lambda *_: ALONE)
     one = visit(pair[0].url)
-    one.frame().click()
-    words = one.target("preview")
+    words = one.choose()
     assert "beyond 1.50 m" in words and "One camera alone" in words
     assert one.page.locator("#point").is_visible()
 
@@ -105,8 +103,7 @@ def test_what_is_refused_is_told_in_words(pair: BOTH, visit: Visits, monkeypatch
 
     monkeypatch.setattr(Previewing, "preview", refuse)
     one = visit(daemon.url)
-    one.frame().click()
-    assert "the camera is away" in one.target("refused")
+    assert "the camera is away" in one.choose()
     one.page.keyboard.press("p")
     assert not one.posts("/point") and not hardware.head.calls
 
@@ -127,7 +124,7 @@ def test_a_stale_image_is_hatched_and_blocks_clicks(pair: BOTH, visit: Visits) -
     assert "no answer" in one.page.locator("#faults").inner_text()
     assert "Clears when" in one.page.locator("#faults").inner_text()
     hardware.fake_cameras["navcam_left"].hook = lambda: None
-    one.frame().click()
+    one.choose()
     one.target("preview")
 
 
@@ -282,7 +279,7 @@ def test_a_jog_ends_when_its_key_its_window_or_its_focus_is_gone(
 def test_a_finger_turns_the_head_and_chooses_a_point(pair: BOTH, visit: Visits) -> None:
     daemon, hardware = pair
     one = visit(daemon.url, has_touch=True, viewport={"width": 820, "height": 1180})
-    one.frame().tap()
+    one.choose(press="tap")
     one.target("preview")
     one.page.locator("#point").tap()
     one.target("ended")
@@ -319,7 +316,7 @@ def test_another_mast_file_takes_back_what_was_chosen(pair: BOTH, visit: Visits,
     other = (tmp_path / "little.yaml").read_text().replace("name: little", "name: other")
     (tmp_path / "other.yaml").write_text(other)
     one = visit(daemon.url)
-    one.frame().click()
+    one.choose()
     one.target("preview")
     with httpx.Client(base_url=f"{daemon.url}/api/v1", trust_env=False) as http:
         assert http.post("/mast", json={"file": "other.yaml"}).status_code == 200
@@ -367,7 +364,7 @@ def test_places_are_kept_and_gone_to(pair: BOTH, visit: Visits) -> None:
 def test_axe_finds_nothing_serious(pair: BOTH, visit: Visits, scheme: str) -> None:
     daemon, hardware = pair
     one = visit(daemon.url, color_scheme=scheme)
-    one.frame().click()
+    one.choose()
     one.target("preview")
     one.page.keyboard.press("p")
     one.target("ended")
