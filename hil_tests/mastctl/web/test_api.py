@@ -325,7 +325,7 @@ def test_any_json_gets_a_sentence_or_an_operation(quiet: httpx.Client, body: Any
     ("method", "path", "status", "code"),
     [
         ("GET", "/api/v1/nothing", 404, "not_found"),
-        ("GET", "/", 404, "not_found"),
+        ("GET", "/page/nothing.js", 404, "not_found"),
         ("GET", "/api/v1/point", 405, "method_not_allowed"),
         ("DELETE", "/api/v1/status", 405, "method_not_allowed"),
         ("GET", "/api/v1/stop", 405, "method_not_allowed"),
