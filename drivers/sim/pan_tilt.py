@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import Any, TypeVar
 
+from calib.mast.joints import Joints
 from drivers.clock import Clock
 from drivers.errors import BadOptions, BadReply, DriverError, NoReply
 from drivers.faults import PAN_TILT, Fault, FaultPanel, nearest
@@ -113,6 +114,30 @@ def head_settings(value: Any) -> HeadSettings:
     for axis in (head.pan, head.tilt):
         check_together(axis)
     return head
+
+
+def with_joints(head: HeadSettings, joints: Joints) -> HeadSettings:
+    """Return a head whose encoders and gears err as a true rig's ``joints`` say; the same if they read true.
+
+    Raises
+    ------
+    BadOptions
+        If the head has errors of its encoders already, or comes to its goals over less than the play.
+    """
+    if joints.reads_true:
+        return head
+    if head.pan.harmonics_rad or head.tilt.harmonics_rad:
+        raise BadOptions(
+            "simulation.head has harmonics, and the true rig's joints say what encoders are wrong by too; "
+            "expected one of them"
+        )
+    pan, tilt = (
+        replace(axis, harmonics_rad=joint.harmonics_rad, backlash_rad=joint.backlash_rad)
+        for axis, joint in ((head.pan, joints.pan), (head.tilt, joints.tilt))
+    )
+    for axis in (pan, tilt):
+        check_together(axis)
+    return replace(head, pan=pan, tilt=tilt)
 
 
 class SimulatedPanTilt:

@@ -39,7 +39,7 @@ from drivers.sim.kept_scenes import kept_scene
 from drivers.sim.optics.lens import Lens
 from drivers.sim.optics.shutter import Shutter
 from drivers.sim.outside_scene import OutsideRenderer, outside_scene
-from drivers.sim.pan_tilt import SimulatedPanTilt
+from drivers.sim.pan_tilt import SimulatedPanTilt, with_joints
 from drivers.sim.placed import REACH_M, check_clear_of
 from drivers.sim.render import Renderer, Stills, compile_renderer
 from drivers.sim.scene import Scene, SceneSettings
@@ -142,11 +142,12 @@ class SimulatedRover:
         self._truth: dict[str, OrderedDict[int, FrameTruth]] = {n: OrderedDict() for n in self.rig.cameras}
         self.pan_tilt: PanTilt
         self._head: SimulatedPanTilt | WiredHead
+        axes = with_joints(settings.head, self.rig.joints)
         if settings.wire is None:
-            head = SimulatedPanTilt(settings.head, clock, self.faults)
+            head = SimulatedPanTilt(axes, clock, self.faults)
             self.pan_tilt, self._head = head, head
         else:
-            wired = WiredHead(settings.wire, settings.head, clock, self.faults)
+            wired = WiredHead(settings.wire, axes, clock, self.faults)
             self.pan_tilt, self._head = wired.pan_tilt, wired
         start_s = self._start_s = clock.now_s()
         self._right_eyes = {right for _, right in self.rig.stereo.values()}

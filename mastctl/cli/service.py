@@ -195,6 +195,24 @@ def _point(args: argparse.Namespace) -> int:
     return 0
 
 
+def _angle(read_rad: float, true_rad: float) -> str:
+    """An angle as read, and the true one where the mast file says that it is another."""
+    truly = "" if read_rad == true_rad else f", truly {true_rad:+.6f} rad"
+    return f"{read_rad:+.6f} rad{truly}"
+
+
+def _range(record: Mapping[str, Any]) -> str:
+    """How far the target is, and how sure that is where one camera tells it."""
+    told = f"range {record['range_m']:.3f} m"
+    if record["range_from"] not in ("parallax", "unknown"):
+        return told
+    near, far = record["range_interval_m"]
+    reach = "infinity" if far is None else f"{far:.3f} m"
+    return (
+        f"{told} by {record['range_from'].replace('unknown', 'a guess')}: 95 % from {near:.3f} m to {reach}"
+    )
+
+
 def _how_far(args: argparse.Namespace) -> dict[str, Any]:
     """What says how far a pixel's thing is, as `Client.point` takes it. Raises WrongUse."""
     told: dict[str, Any] = {}
@@ -308,7 +326,7 @@ def show_pointings(record: OperationTold) -> None:
         x, y, z = position_m
         notes.append(f"target at ({x:.3f}, {y:.3f}, {z:.3f}) m in the rover frame")
     if record["range_m"] is not None:
-        notes.append(f"range {record['range_m']:.3f} m")
+        notes.append(_range(record))
     output.print_table(
         f"operation {record['id']}", ("pointing", "residual x, px", "residual y, px"), rows, notes
     )
@@ -324,8 +342,8 @@ def _status_rows(status: Status) -> Iterator[tuple[str, str]]:
     if joints is None:
         yield "joints", "not read yet"
     else:
-        yield "pan", f"{joints['pan_rad']:+.6f} rad"
-        yield "tilt", f"{joints['tilt_rad']:+.6f} rad"
+        yield "pan", _angle(joints["pan_rad"], joints["true_pan_rad"])
+        yield "tilt", _angle(joints["tilt_rad"], joints["true_tilt_rad"])
         yield "measured", f"{joints['age_s']:.3f} s ago{', moving' if status['moving'] else ''}"
     limits = status["limits"]
     for axis, (low, high) in (("pan", limits["pan_rad"]), ("tilt", limits["tilt_rad"])):

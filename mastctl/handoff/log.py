@@ -4,7 +4,8 @@ Keys of a line: ``schema`` (``mastctl/handoff/1``), ``time`` (ISO 8601, UTC), ``
 (left and right camera), ``pan_rad``, ``tilt_rad``, ``joint_sigma_rad``, ``left_px``, ``right_px``,
 ``sigma_px`` (of each coordinate of those), ``to_pan_rad``, ``to_tilt_rad``, and ``destinations``, by camera:
 ``geometric_px``, ``geometric_covariance_px2`` (of the clicks), ``verdict``, ``reason``, ``found_px`` and
-``found_covariance_px2``, the last two null unless the verdict is ``accepted``.
+``found_covariance_px2``, the last two null unless the verdict is ``accepted``. Angles are true ones, by the
+joints of the mast file that ``mast_digest`` names.
 """
 
 from __future__ import annotations

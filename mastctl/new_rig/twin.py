@@ -14,6 +14,7 @@ import numpy as np
 from calib.camera.cahvor import CameraModel
 from calib.camera.parameters import parameter_names, parameter_part
 from calib.mast.covariance import RigCovariance, moved_rig, stored_covariance
+from calib.mast.joints import Joints
 from calib.mast.rig import Rig
 from calib.rigid import FloatArray, Rigid, rot_x, rot_y, rot_z, tangents
 from mastctl.new_rig.numbers import BadRig
@@ -75,6 +76,9 @@ def true_twin(believed: Rig, rng: np.random.Generator) -> Twin:
     step = vectors @ (np.sqrt(np.maximum(values, 0.0)) * rng.standard_normal(len(values)))
     try:
         true_rig = moved_rig(believed, known.names, step)
+        drawn = (true_rig.joints.pan, true_rig.joints.tilt)
+        pan, tilt = (replace(axis, backlash_rad=max(axis.backlash_rad, 0.0)) for axis in drawn)
+        true_rig = replace(true_rig, joints=Joints(pan, tilt))
         apart = {name: _apart_px(believed, true_rig, name) for name in believed.cameras}
     except ValueError as error:
         raise BadRig(f"a rig drawn with {by} is none ({error}): they are far too wide") from None

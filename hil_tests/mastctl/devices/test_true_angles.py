@@ -11,8 +11,9 @@ import pytest
 
 from calib.mast.joints import AxisJoint, Joints
 from drivers.clock import ManualClock
+from drivers.errors import BadOptions
 from drivers.interfaces import AxisMotion, Reading
-from drivers.sim.pan_tilt import SimulatedPanTilt, head_settings
+from drivers.sim.pan_tilt import SimulatedPanTilt, head_settings, with_joints
 from mastctl.devices import door as door_module
 from mastctl.devices.devices import Devices
 from mastctl.devices.door import Door
@@ -103,6 +104,20 @@ def test_by_way_of_a_corner_an_axis_comes_from_the_side_that_the_corner_leaves_i
     bench.go(*goal)
     off = np.subtract(bench.head.true_joints(bench.clock.now_s()), wanted)
     assert np.abs(off).max() < ORDER_RAD
+
+
+def test_a_true_rig_with_joints_makes_the_simulated_head_err_by_them() -> None:
+    plain = head_settings({"preset": "dynamixel_x"})
+    erring = with_joints(plain, TOLD)
+    assert (erring.pan.harmonics_rad, erring.tilt.backlash_rad) == (HARMONICS, BACKLASH_RAD)
+    assert with_joints(plain, Joints()) is plain
+    for more, words in (
+        ({"pan_harmonics_rad": HARMONICS}, "one of them"),
+        ({"approach_rad": 0.0035}, "take up"),
+    ):
+        told = head_settings({"preset": "dynamixel_x", "backlash_rad": 0.001} | more)
+        with pytest.raises(BadOptions, match=words):
+            with_joints(told, TOLD)
 
 
 def rows(*pans: float, joints: Joints | None = None) -> JointHistory:
