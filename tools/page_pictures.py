@@ -90,7 +90,7 @@ def on_a_tablet(page: Page, url: str, client: Client, out: Path) -> None:
 def kept(page: Page, path: Path) -> None:
     """Write a screenshot as a small JPEG."""
     image = cv2.imdecode(np.frombuffer(page.screenshot(), np.uint8), cv2.IMREAD_COLOR)
-    cv2.imwrite(str(path), image, [cv2.IMWRITE_JPEG_QUALITY, 82])
+    cv2.imwrite(str(path), image, [cv2.IMWRITE_JPEG_QUALITY, 74])
     print(path)
 
 

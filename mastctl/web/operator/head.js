@@ -91,7 +91,7 @@ export class HeadPanel {
       s("rect", { class: "field", x: x(pan[0]), y: y(tilt[1]), width: x(pan[1]) - x(pan[0]), height: y(tilt[0]) - y(tilt[1]) }),
       s("path", { class: "zero", d: `M${x(0)} ${y(tilt[1])}V${y(tilt[0])}M${x(pan[0])} ${y(0)}H${x(pan[1])}` }),
       out,
-      [pan[0], 0, pan[1]].map((value) => s("text", { class: "tickname", x: x(value), y: 142 }, deg(value, 0))),
+      [pan[0], 0, pan[1]].map((value, k) => s("text", { class: `tickname ${["start", "", "end"][k]}`, x: x(value), y: 142 }, deg(value, 0))),
       [tilt[0], 0, tilt[1]].map((value) => s("text", { class: "tickname end", x: 42, y: y(value) + 3 }, deg(value, 0))),
       this.wanted ? s("path", { class: "wanted", d: `M${x(this.wanted[0]) - 6} ${y(this.wanted[1])}h12m-6 -6v12` }) : null,
       here ? s("circle", { class: "now", cx: here[0], cy: here[1], r: 4.5 }) : null);

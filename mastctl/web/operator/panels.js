@@ -5,6 +5,9 @@ import { camera as called, deg, forTime, metres, number, sentence } from "./word
 
 const NAMES = { point: "Point", track: "Track", look: "Look", jog: "Jog" };
 
+/** A fault's message without the device's name, which stands before it. */
+const plain = ({ device, message }) => (message.startsWith(`${device}: `) ? message.slice(device.length + 2) : message).replace(/\.$/, "");
+
 export class Faults {
   constructor(events, alarm) {
     this.list = byId("faults");
@@ -17,13 +20,13 @@ export class Faults {
   told(device, faults) {
     const before = (this.faults.get(device) ?? []).map((one) => one.code).join();
     this.faults.set(device, faults);
-    if (faults.length && faults.map((one) => one.code).join() !== before) this.alarm(`${called(device)}: ${faults[0].message}, until ${faults[0].until}`);
+    if (faults.length && faults.map((one) => one.code).join() !== before) this.alarm(`${called(device)}: ${plain(faults[0])}, until ${faults[0].until}`);
     this.draw();
   }
 
   draw() {
     put(this.list, [...this.faults].flatMap(([device, faults]) => faults.map((fault) =>
-      h("li", {}, h("strong", {}, called(device)), ` ${fault.message} `, h("span", { class: "until" }, `Clears when ${fault.until}.`)))));
+      h("li", {}, h("strong", {}, called(device)), ` ${sentence(plain(fault))}. `, h("span", { class: "until" }, `Clears when ${fault.until}.`)))));
   }
 }
 
