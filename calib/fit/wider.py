@@ -13,11 +13,12 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.linalg import null_space
 
 from calib.fit.adjustment import Adjustment, Block, Estimate
 from calib.fit.score import Beside, Gain, Score
 from calib.fit.significance import chance
-from calib.fit.terms import ImageTerm
+from calib.fit.terms import DRAWING, ImageTerm
 from calib.mast.gimbal import MAST_NAMES, Gimbal, gimbal, gimbal_rates
 from calib.rigid import FloatArray, rigid_rates
 
@@ -29,6 +30,9 @@ EXPLAINS = 0.5
 
 FEWEST = 4
 """Of images or attitudes, for a change among them to be looked for."""
+
+DRAWING_ALARMS = 0.01
+"""The same of the prisms' drawing alone: few prisms check one another, and the rover frame hangs on them."""
 
 BEND_DEGREE = 4
 """Of the polynomials of the place in the picture by which a lens may be bent otherwise than modelled."""
@@ -50,8 +54,8 @@ class WiderModel:
     ----------
     name
         ``mast``, ``harmonics of pan``, ``slip of tilt``, ``attitude``, ``joint readings``,
-        ``lens of CAMERA``, ``change of CAMERA``, ``bow of the board``, ``spacing of the board`` or
-        ``board moved``.
+        ``lens of CAMERA``, ``change of CAMERA``, ``bow of the board``, ``spacing of the board``,
+        ``board moved`` or ``drawing`` (of the prisms).
     sentence
         What it says.
     numbers, gain
@@ -61,8 +65,8 @@ class WiderModel:
     significant
         Whether chance does not explain it, all models counted.
     size_px
-        By how much the further numbers move the dots that depend on them, rms, pixels; not-a-number for a
-        board that moved.
+        By how much the further numbers move the dots that depend on them, rms, pixels; not-a-number for what
+        moves points of the station.
     """
 
     name: str
@@ -98,9 +102,13 @@ def wider_models(
         *tests.changes(),
         *tests.board(),
         *tests.tapes(),
+        *tests.drawing(),
     ]
     limit = FALSE_ALARMS / max(len(found), 1)
-    found = [replace(model, significant=model.chance < limit) for model in found]
+    found = [
+        replace(model, significant=model.chance < (DRAWING_ALARMS if model.name == DRAWING else limit))
+        for model in found
+    ]
     return tuple(sorted(found, key=lambda model: (not model.significant, 2 * model.numbers - model.gain)))
 
 
@@ -353,6 +361,28 @@ class _Tests:
             f"{np.linalg.norm(turn):.1f} mrad from where its pictures show the board: it moved between them"
         )
         model = self.model("board moved", gains[worst], words, len(gains))
+        yield replace(model, size_px=float("nan"))
+
+    def drawing(self) -> Iterator[WiderModel]:
+        """Prisms that stand elsewhere on the rover than drawn, the same in every set-up."""
+        mine = [p for p in self.problem.station if p.board is None and p.keep]
+        if self.problem.prism_cad_m > 0 or not mine:
+            return
+        names = list(dict.fromkeys(point.point for point in mine))
+        score = Score(3 * len(names), len(self.gradient))
+        for point in mine:
+            block = self.problem.station_block(self.state, point)
+            score.add(block, 3 * names.index(point.point) + np.arange(3), -np.eye(3) / point.sigma_m)
+        # All prisms moved as one body are another rover frame, which no survey tells.
+        places = np.array([self.state.prisms_in_rover_m[name] for name in names])
+        as_one = rigid_rates(np.eye(3)[None], places, places.mean(axis=0)).reshape(-1, 6)
+        gain = score.beside(self.covariance, self.gradient).gain(null_space(as_one.T))
+        off_mm = 1e3 * float(np.sqrt(np.sum(gain.values**2) / len(names)))
+        words = (
+            f"the prisms stand elsewhere than drawn, by some {off_mm:.1f} mm: measure them on the rover "
+            "again, or state prism_cad_m and measure them from several set-ups"
+        )
+        model = self.model(DRAWING, gain, words)
         yield replace(model, size_px=float("nan"))
 
     def by_camera(self) -> dict[str, list[_View]]:

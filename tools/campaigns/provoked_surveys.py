@@ -157,7 +157,7 @@ def _pointing(made: Provoked, fit: Calibration, pair: tuple[str, str]) -> FloatA
     for angles in DIRECTIONS_RAD:
         true_rad = np.array(angles)
         pan, tilt = made.read_rad(true_rad)
-        for target in _points(made, pair[0], true_rad):
+        for target in _points(made, pair[0], true_rad)[:: len(PLACES)]:
             clicks = [_seen(made, name, true_rad, target[None])[0] for name in pair]
             sizes = [np.array(made.rig.cameras[name].model.size_px) for name in pair]
             if any((c < 0).any() or (c > s - 1).any() for c, s in zip(clicks, sizes, strict=True)):

@@ -13,7 +13,7 @@ from calib.fit.calibration import Calibration
 from calib.fit.joint import fit_joint
 from calib.fit.score import Score
 from calib.mast.rig import Rig
-from calib.survey import Survey
+from calib.survey import Sigma, Survey
 from drivers.sim_survey.blunders import (
     with_bowed_board,
     with_changed_focus,
@@ -89,6 +89,15 @@ def test_skew_axes_fitted_with_six_parameters_ask_for_eight(navcams: Rig) -> Non
     assert first.gain > 50
     assert "mast" not in [model.name for model in eight.wider]
     assert asked(eight) == []
+
+
+def test_prisms_that_stand_elsewhere_than_drawn_are_told(navcams: Rig) -> None:
+    """Off by 3 mm an axis, and told to be exact."""
+    survey = simulate_survey(navcams, 5, replace(PLAN, sigma=Sigma(0.001, 0.1, 0.0, 0.003)))[0]
+    fit = fit_joint(replace(survey, sigma=Sigma(0.001, 0.1)))
+    assert asked(fit)[0] == "drawing"
+    assert "prism_cad_m" in fit.wider[0].sentence
+    assert "drawing" not in [model.name for model in fit_joint(survey).wider]
 
 
 def test_an_upright_mast_that_leans_asks_for_six(navcams: Rig) -> None:
