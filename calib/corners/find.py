@@ -92,7 +92,7 @@ def find_corners(board: AnyBoard, image: Levels) -> Corners | CornersNotFound:
         if isinstance(stands, CornersNotFound):
             return stands
         start = _beside(board, stands)
-    found = _fitted(board, levels, pattern, start)
+    found = _inside(_fitted(board, levels, pattern, start), levels.shape)
     if len(found.ids) < FEWEST:
         return CornersNotFound(
             "markers of the board are seen, but its corners are covered, blurred or too small"
@@ -163,6 +163,13 @@ def _fitted(
     if found is None:
         return _Found(ids, fit_saddles(levels, pattern, places[ids], start.pixels_px, start.jacobians, 0.0))
     return found
+
+
+def _inside(found: _Found, shape: tuple[int, ...]) -> _Found:
+    """Leave out what was fitted beside the image, by the half of a corner that is in it."""
+    x, y = found.saddles.pixels_px.T
+    kept = (x > -0.5) & (y > -0.5) & (x < shape[1] - 0.5) & (y < shape[0] - 0.5)
+    return _Found(found.ids[kept], Saddles(*(part[kept] for part in found.saddles)))
 
 
 def _good(saddles: Saddles) -> NDArray[np.bool_]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import KW_ONLY, dataclass, replace
 from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
@@ -68,6 +68,7 @@ class BenchDone:
     verdict: Verdict
     saved: StoredRig
     checked: Checked | None = None
+    _: KW_ONLY
     predicted_px: float | None = None
     calibrated_px: float | None = None
     floor_px: float | None = None
@@ -196,11 +197,11 @@ def finish(bench: BenchRun, teller: Teller, out: Path, report: Path | None) -> B
         verdict,
         saved,
         checked,
-        bench.predicted_px(),
-        bench.floor_px,
-        bench.seconds(),
-        len(bench.placements()),
-        bench.pictures(),
+        predicted_px=bench.predicted_px(),
+        floor_px=bench.floor_px,
+        seconds=bench.seconds(),
+        placements=len(bench.placements()),
+        pictures=bench.pictures(),
     )
     return _reported(done, report, bench.head.rig, bench.workspace)
 

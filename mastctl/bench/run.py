@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 
@@ -124,6 +124,7 @@ class BenchRun:
         self._shots: list[Shot] = []
         self._looks: list[tuple[str, bool, Look]] = list(looks_of(kept.survey()))
         self._scale = 1.0
+        self._here = ""  # the placement that was worked at, and whose board so stands there
         self._fitted_looks = 0
         self._pool = ThreadPoolExecutor(1, "bench-fit")
         self._pending: tuple[int, Future[Fitted]] | None = None
@@ -174,7 +175,7 @@ class BenchRun:
             while not self._enough():
                 name, placement = self._next_placement()
                 self._teller.place(name, placement, self._eyes.head)
-                self._kept.note(event="placement", name=name, words=placement.words())
+                self._kept.note(event="placement", name=name, asked=asdict(placement))
                 self._work_at(name, placement)
             self._collect(wait=True)
             if self._fitted_looks < len(self._looks):
@@ -194,6 +195,9 @@ class BenchRun:
         """
         assert self.fitted is not None
         name = self._placements()[-1]
+        if self._here != name and not self._stands_still(name):
+            self._teller.say(f"not checked: the board does not stand any more as in placement {name}")
+            return Checked({}, ())
         old = [look for placement, check, look in self._looks if check]
         here = [shot for shot in self._shots if shot.placement == name]
         for shot in unvisited(self._known, self._sought, here, name, self.wanted.checks - len(old)):
@@ -294,6 +298,7 @@ class BenchRun:
             self._believe_boards()
         self._fitted_looks = len(self._looks)
         name = self._placements()[-1]
+        self._teller.stands(name, self._asked(name), self._eyes.head)
         if self._is_finished(name):
             return
         if self._stands_still(name):
@@ -302,6 +307,14 @@ class BenchRun:
         else:
             self._teller.say(f"the board does not stand any more as in placement {name}: that one is closed")
             self._kept.note(event="closed", name=name)
+
+    def _asked(self, name: str) -> Placement | None:
+        """What was asked for at a placement."""
+        for note in self._kept.notes:
+            if note.get("event") == "placement" and note.get("name") == name:
+                asked = dict(note["asked"])
+                return Placement(**{**asked, "turned_deg": tuple(asked["turned_deg"])})
+        return None
 
     def _stands_still(self, name: str) -> bool:
         """Whether the last attitude of a placement shows now what it showed then."""
@@ -360,6 +373,7 @@ class BenchRun:
         if placement is not None:
             search = Search(self._eyes, self._known, self._sought, self._teller)
             self._took(name, search.find(placement))
+        self._here = name
         share = self._share()
         in_vain: list[tuple[float, float]] = []
         missed = 0

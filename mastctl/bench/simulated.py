@@ -21,6 +21,9 @@ from mastctl.bench.eyes import Head
 from mastctl.bench.teller import NobodyThere, Progress, Teller
 from mastctl.client import Client
 
+BOARD = "bench"
+"""What the board is called in the simulation."""
+
 SCHEMA = "mastctl/placements/1"
 _BOUNDS: Mapping[str, tuple[float, float]] = {
     "range_m": (0.2, 20.0),
@@ -65,7 +68,24 @@ class SimulatedPerson:
         NobodyThere
             If the file has no more places.
         """
-        asked = placement
+        asked, placement = placement, self._where(name, placement)
+        said = "" if placement == asked else f" (asked for: {asked.words()})"
+        self._told.say(f"placement {name}: the board {placement.words()}{said}")
+        self.stand(placement)
+
+    def stands(self, name: str, placement: Placement | None, head: Head) -> None:
+        """Put a board back that the simulation has forgotten with a daemon that ended."""
+        if placement is not None and BOARD not in self._client.boards():
+            self.stand(self._where(name, placement))
+
+    def _where(self, name: str, placement: Placement) -> Placement:
+        """Where a placement truly is.
+
+        Raises
+        ------
+        NobodyThere
+            If the file has no more places.
+        """
         if self._places is not None:
             number = int(name.removeprefix("p")) - 1
             if number >= len(self._places):
@@ -73,17 +93,15 @@ class SimulatedPerson:
                     f"{self._file} has {len(self._places)} placements, and one more is asked for: "
                     f"{placement.words()}"
                 )
-            placement = self._places[number]
-        said = "" if placement == asked else f" (asked for: {asked.words()})"
-        self._told.say(f"placement {name}: the board {placement.words()}{said}")
-        self.stand(placement)
+            return self._places[number]
+        return placement
 
     def stand(self, placement: Placement) -> None:
         """Put the simulated board somewhere."""
         pose = placement.rover_from_board(self._rig.mast.rover_from_head(0.0, 0.0))
         quaternion = Rotation.from_matrix(pose.rotation).as_quat(scalar_first=True)
         self._client.put_board(
-            "bench", pose.translation_m.tolist(), document_of(self._board), quaternion=quaternion.tolist()
+            BOARD, pose.translation_m.tolist(), document_of(self._board), quaternion=quaternion.tolist()
         )
 
 

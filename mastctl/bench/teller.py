@@ -79,6 +79,10 @@ class Teller(Protocol):
         """Have the board placed, and return when it stands."""
         ...
 
+    def stands(self, name: str, placement: Placement | None, head: Head) -> None:
+        """Know that a run goes on before a board that was placed so."""
+        ...
+
 
 def px(value: float) -> str:
     """Return pixels as a person reads them."""
@@ -158,6 +162,9 @@ class Terminal:
     def progress(self, now: Progress) -> None:
         """Write a line."""
         self.say(now.words())
+
+    def stands(self, name: str, placement: Placement | None, head: Head) -> None:
+        """A real board stands where it stands."""
 
     def place(self, name: str, placement: Placement, head: Head) -> None:
         """Ask for the placement, and wait for Enter.

@@ -6,7 +6,6 @@ The joints' errors are the simulator's own (`drivers.sim`), the kinematics SciPy
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -81,12 +80,12 @@ class CornerBench:
     seconds: float = 0.0
     looks: int = 0
 
-    def stand(self, placement: Placement, off: Mapping[str, float] | None = None) -> None:
-        """Place the board where it was asked for, as exactly as a person does."""
+    def stand(self, placement: Placement) -> None:
+        """Place the board where it was asked for, as exactly as a person does: the same each time."""
+        rng = np.random.default_rng(abs(hash(placement)))
         pose = placement.rover_from_board(self.true_rig.mast.rover_from_head(0.0, 0.0))
-        turn = Rigid(_small_turn(self.rng.normal(0.0, 0.08, 3)), np.zeros(3))
-        pose = pose @ turn
-        self.rover_from_board = Rigid(pose.rotation, pose.translation_m + self.rng.normal(0.0, 0.04, 3))
+        pose = pose @ Rigid(_small_turn(rng.normal(0.0, 0.08, 3)), np.zeros(3))
+        self.rover_from_board = Rigid(pose.rotation, pose.translation_m + rng.normal(0.0, 0.04, 3))
 
     def look(self, pan_rad: float, tilt_rad: float, approach: tuple[int, int] = (0, 0)) -> Look:
         """See `mastctl.bench.eyes.Eyes`."""
@@ -140,6 +139,9 @@ class SelfPlacing:
     def progress(self, now: object) -> None:
         """Keep it."""
         self.told.append(now.words())  # type: ignore[attr-defined]
+
+    def stands(self, name: str, placement: Placement | None, head: Head) -> None:
+        """It stands there still."""
 
     def place(self, name: str, placement: Placement, head: Head) -> None:
         """Put the board there."""

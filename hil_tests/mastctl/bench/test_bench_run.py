@@ -2,6 +2,11 @@
 
 from __future__ import annotations
 
+import os
+import signal
+import subprocess
+import sys
+import time
 from pathlib import Path
 
 import numpy as np
@@ -143,3 +148,40 @@ def test_a_folder_of_another_board_is_refused(repository: Path, tmp_path: Path) 
     bench.noise_px = 0.11
     with pytest.raises(CalibError, match="other boards, sigmas or cameras"):
         run_of(bench, tmp_path / "bench")
+
+
+def test_a_run_that_is_killed_again_and_again_loses_no_look_and_comes_to_its_end(
+    repository: Path, tmp_path: Path
+) -> None:
+    folder, rng = tmp_path / "bench", np.random.default_rng(7)
+    before: list[str] = []
+    for kill in range(12):
+        command = [
+            sys.executable,
+            str(Path(__file__).with_name("killed_run.py")),
+            str(folder),
+            str(repository),
+        ]
+        world = {**os.environ, "PYTHONPATH": os.pathsep.join([str(repository), str(Path(__file__).parent)])}
+        process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=world)
+        assert process.stdout is not None and process.stdout.readline() == "begun\n"
+        if kill < 5:
+            wanted = len(before) + int(rng.integers(1, 12))
+            while process.poll() is None and len(_files(folder)) < wanted:
+                time.sleep(0.002)  # bounded by the run's own end
+            process.send_signal(signal.SIGKILL)
+        rest = process.stdout.read()
+        process.wait()
+        images = [image.name for image in read_survey(folder).images]  # readable, whatever it died of
+        assert images[: len(before)] == before
+        before = images
+        if rest == "done\n":
+            return
+    raise AssertionError("twelve starts did not end the run")
+
+
+def _files(folder: Path) -> list[str]:
+    try:
+        return (folder / "images.csv").read_text().splitlines()[1:]
+    except OSError:
+        return []

@@ -1,0 +1,197 @@
+"""Chosen attitudes of a bench against a grid of them and random ones: predicted pointing error by pictures.
+
+Three placements of a board, the same for all three ways, and as many pictures at each. Chosen attitudes
+come one after another from the information matrix; the grid puts the board's middle at even places of
+the picture; random ones put it anywhere in it. The error is what the information of all pictures leaves
+of a first pointing over the workspace, rms px an axis. Corners alone, nothing is rendered.
+
+    .venv/bin/python -m tools.campaigns.bench_poses --rig configs/sim/rocky8.yaml --benches 3 --seed 1
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from calib.bench.knowledge import Knowledge, Shot
+from calib.bench.placements import Placement
+from calib.bench.poses import Sought, expected_px, next_shot, seen
+from calib.bench.workspace import Pointing, Workspace, pointing
+from calib.boards import Charuco
+from calib.errors import CalibError, Unreachable
+from calib.files.mast_file import load_rig
+from calib.mast.pointing import solve
+from calib.mast.rig import Rig
+from calib.mast.solutions import choose
+from mastctl.cli.output import at_least
+from tools.arguments import end
+
+A2 = Charuco(10, 7, 0.055, 0.042)
+PAIR = ("navcam_left", "navcam_right")
+PLACEMENTS = (
+    Placement(1.0, -35.0, -15.0, (20.0, 0.0)),
+    Placement(1.6, 0.0, -25.0, (0.0, -25.0)),
+    Placement(2.6, 40.0, -5.0, (-25.0, 0.0)),
+)
+EACH = (2, 3, 4, 6, 8, 12, 16)
+"""Pictures at each placement."""
+SIGMA_PX = 0.05
+PAN_RAD, TILT_RAD = (-2.6, 2.6), (-1.2, 0.5)
+
+Way = Callable[[Knowledge, Sought, str, int, Pointing, np.random.Generator, Sequence[Shot]], list[Shot]]
+
+
+def main() -> int:
+    """Print the table."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--rig", type=Path, required=True, metavar="MAST.yaml", help="the true rig")
+    parser.add_argument("--benches", type=at_least(1), default=3, metavar="N")
+    parser.add_argument("--seed", type=at_least(0), default=1, metavar="S")
+    parser.add_argument("--two-sided", action="store_true", help="a head that comes from either side")
+    args = parser.parse_args()
+    rig = load_rig(args.rig).rig
+    rig = replace(rig, cameras={name: rig.cameras[name] for name in PAIR}, stereo={"navcam": PAIR}, fit={})
+    found: dict[str, list[list[float]]] = {name: [] for name in WAYS}
+    for bench in range(args.benches):
+        rng = np.random.default_rng([args.seed, bench])
+        for name, curve in one_bench(rig, rng, one_sided=not args.two_sided).items():
+            found[name].append(curve)
+    table = {name: np.sqrt(np.mean(np.square(curves), axis=0)) for name, curves in found.items()}
+    print("pictures a camera  " + "".join(f"{3 * k:8d}" for k in EACH))
+    for name, values in table.items():
+        print(f"{name:17s}  " + "".join(f"{value:8.3f}" for value in values))
+    for name in ("grid", "random"):
+        print(
+            f"{name} needs so many times the pictures of the chosen: " + needed(table["chosen"], table[name])
+        )
+    return 0
+
+
+def one_bench(rig: Rig, rng: np.random.Generator, one_sided: bool) -> dict[str, list[float]]:
+    """Return the predicted error by pictures of each way, on one bench."""
+    head = rig.mast.rover_from_head(0.0, 0.0)
+    boards = {}
+    for k, placement in enumerate(PLACEMENTS):
+        moved = replace(
+            placement,
+            bearing_deg=placement.bearing_deg + rng.normal(0, 4),
+            height_deg=placement.height_deg + rng.normal(0, 3),
+            turned_deg=(
+                placement.turned_deg[0] + rng.normal(0, 4),
+                placement.turned_deg[1] + rng.normal(0, 4),
+            ),
+        )
+        boards[f"p{k}"] = moved.rover_from_board(head)
+    known = Knowledge(rig, boards, joint_sigma_rad=5.6e-5 / math.sqrt(12.0))
+    aim = pointing(known, Workspace(PAIR, (-1.0, 1.0), (-0.8, 0.2), one_sided=one_sided))
+    sought = Sought(A2.in_board_m(A2.ids), SIGMA_PX, 8, PAN_RAD, TILT_RAD, one_sided)
+    curves: dict[str, list[float]] = {}
+    for name, way in WAYS.items():
+        curves[name] = []
+        for each in EACH:
+            shots: list[Shot] = []
+            for placement in boards:
+                shots += way(known, sought, placement, each, aim, rng, shots)
+            curves[name].append(expected_px(known, shots, aim))
+    return curves
+
+
+def chosen(
+    known: Knowledge,
+    sought: Sought,
+    placement: str,
+    count: int,
+    aim: Pointing,
+    rng: np.random.Generator,
+    shots: Sequence[Shot],
+) -> list[Shot]:
+    """Return attitudes each of which tells most after those before it."""
+    mine: list[Shot] = []
+    for _ in range(count):
+        choice = next_shot(known, sought, [*shots, *mine], placement, aim)
+        if choice is not None:
+            mine.append(choice.shot)
+    return mine
+
+
+def grid(
+    known: Knowledge,
+    sought: Sought,
+    placement: str,
+    count: int,
+    aim: Pointing,
+    rng: np.random.Generator,
+    shots: Sequence[Shot],
+) -> list[Shot]:
+    """Return attitudes that put the board's middle at even places of the first camera's picture."""
+    columns = math.ceil(math.sqrt(count * 4 / 3))
+    rows = math.ceil(count / columns)
+    places = [
+        (0.15 + 0.7 * (i + 0.5) / columns, 0.15 + 0.7 * (j + 0.5) / rows)
+        for j in range(rows)
+        for i in range(columns)
+    ]
+    taken = [places[k] for k in np.linspace(0, len(places) - 1, count).round().astype(int)]
+    return [shot for place in taken for shot in _at(known, sought, placement, place, rng)]
+
+
+def anywhere(
+    known: Knowledge,
+    sought: Sought,
+    placement: str,
+    count: int,
+    aim: Pointing,
+    rng: np.random.Generator,
+    shots: Sequence[Shot],
+) -> list[Shot]:
+    """Return attitudes that put the board's middle anywhere in the picture."""
+    mine: list[Shot] = []
+    for _ in range(50 * count):
+        if len(mine) < count:
+            mine += _at(known, sought, placement, (rng.uniform(), rng.uniform()), rng)
+    return mine
+
+
+WAYS: dict[str, Way] = {"chosen": chosen, "grid": grid, "random": anywhere}
+
+
+def _at(
+    known: Knowledge, sought: Sought, placement: str, place: tuple[float, float], rng: np.random.Generator
+) -> list[Shot]:
+    """The shot with the board's middle at a place of the picture, if it can be taken."""
+    model = known.rig.cameras[PAIR[0]].model
+    width, height = model.size_px
+    middle = known.boards[placement].translation_m
+    try:
+        found = solve(known.rig.mast, model, middle, (place[0] * width, place[1] * height))
+        angles = choose(found, sought.pan_limits_rad, sought.tilt_limits_rad)
+    except (Unreachable, CalibError):
+        return []
+    sides = (0, 0) if sought.one_sided else tuple(int(side) for side in rng.choice([-1, 1], 2))
+    read = known.rig.joints.read_rad((angles.pan_rad, angles.tilt_rad))
+    shot = seen(known, sought, Shot(placement, *read, (), *sides))
+    return [] if shot is None else [shot]
+
+
+def needed(chosen_px: np.ndarray, other_px: np.ndarray) -> str:
+    """Return how many times the pictures another way needs, at each number of the chosen ones."""
+    counts = 3.0 * np.array(EACH)
+    out = []
+    for count, wanted in zip(counts, chosen_px, strict=True):
+        if other_px.min() > wanted:
+            out.append(f"> {counts[-1] / count:.1f}")
+            continue
+        at = np.exp(np.interp(-np.log(wanted), -np.log(np.minimum.accumulate(other_px)), np.log(counts)))
+        out.append(f"{at / count:.1f}")
+    return ", ".join(out)
+
+
+if __name__ == "__main__":
+    end(main)
