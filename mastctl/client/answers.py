@@ -576,10 +576,11 @@ class RecordingListed(TypedDict):
 
 
 class Recordings(TypedDict):
-    """``GET /recordings``."""
+    """``GET /recordings``; ``free_mb``: of the disk, 10⁶ bytes, null if it does not say."""
 
     recordings: list[RecordingListed]
     recorder: RecorderTold
+    free_mb: float | None
 
 
 class RefusedTold(TypedDict):

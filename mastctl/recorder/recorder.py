@@ -180,6 +180,13 @@ class Recorder:
             "folder": str(self._shelf.folder),
         }
 
+    def free_mb(self) -> float | None:
+        """Return how much the disk has free, 10⁶ bytes; None if it does not say. Asks the disk."""
+        try:
+            return self._shelf.free_bytes() / MB
+        except OSError:
+            return None
+
     def faults(self) -> tuple[StandingFault, ...]:
         """Return what keeps it from recording."""
         found = [one for one in (self._now.words,) if one is not None]

@@ -88,7 +88,11 @@ class Recording:
 
     def told(self) -> dict[str, Any]:
         """Return every recording, and what is recorded now, as ``GET /recordings`` has it. Raises Unable."""
-        return {"recordings": self.recorder.recordings(), "recorder": self.recorder.told()}
+        return {
+            "recordings": self.recorder.recordings(),
+            "recorder": self.recorder.told(),
+            "free_mb": self.recorder.free_mb(),
+        }
 
     def close(self) -> None:
         """Hear nothing more and end the file; bounded."""

@@ -473,10 +473,11 @@ class RecorderTold(_Told):
 
 
 class Recordings(_Told):
-    """``GET /recordings``."""
+    """``GET /recordings``; ``free_mb``: of the disk, 10⁶ bytes, null if it does not say."""
 
     recordings: list[RecordingListed]
     recorder: RecorderTold
+    free_mb: float | None
 
 
 class RecordingEnded(_Told):

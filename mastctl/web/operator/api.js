@@ -70,6 +70,8 @@ export const post = (path, body, options) => ask("POST", path, body, options);
 
 /** Stops wait for nothing here. */
 export const stop = () => sent("POST", "/stop", {}, { ms: 4000, priority: "high", keepalive: true });
+/** Nor does the question whether anybody is there. */
+export const live = () => sent("GET", "/health/live", null, { ms: 2000 });
 /** Neither do heartbeats, of which one is under way at a time, nor what is said on leaving. */
 export const beat = (body) => sent("POST", "/jog", body, { ms: 2000, keepalive: true });
 export const parting = (method, path) => sent(method, path, {}, { keepalive: true }).catch(() => null);

@@ -39,7 +39,8 @@ export class Control {
     else if (control.kind === "operation") say(this.words, `${whose}, until it has ended`);
     else say(this.words, `${control.holder}, ${forTime(left)} left`);
     this.words.parentElement.dataset.whose = mine ? "mine" : control && !gone && !control.holder.endsWith(client) ? "other" : "nobody";
-    say(this.button, mine ? "Release" : control && !gone && control.kind === "lease" ? "Take over" : "Take");
+    if (this.sure && (mine || gone || control?.kind !== "lease")) this.sure = false;
+    say(this.button, this.sure ? "Take it from them?" : mine ? "Release" : control && !gone && control.kind === "lease" ? "Take over" : "Take");
     this.button.disabled = !this.may;
   }
 
@@ -48,8 +49,9 @@ export class Control {
       if (held.lease) {
         await ask("DELETE", "/lease");
         held.lease = null;
-      } else if (this.button.textContent === "Take over") {
-        if (!confirm(`Take control from ${this.control.holder}? What runs goes on.`)) return;
+      } else if (this.sure || this.button.textContent === "Take over") {
+        if (!this.sure) return this.makeSure();
+        this.sure = false;
         held.lease = (await post("/lease/take", { for_s: FOR_S, reason: "taken over on the page" })).lease_id;
       } else {
         held.lease = (await post("/lease", { for_s: FOR_S })).lease_id;
@@ -59,6 +61,13 @@ export class Control {
       this.alarm(error.message);
     }
     this.draw();
+  }
+
+  /** A second press within some seconds takes over: a dialogue of the browser's would keep STOP out. */
+  makeSure() {
+    this.sure = true;
+    this.draw();
+    setTimeout(() => { this.sure = false; this.draw(); }, 5000);
   }
 
   async renew() {

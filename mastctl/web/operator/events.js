@@ -1,5 +1,5 @@
 // What the daemon pushes: the newest of each topic and key, and whether anything is heard at all.
-import { address, get } from "./api.js";
+import { address, live } from "./api.js";
 
 const AGAIN_MS = 1000;
 const SILENT_MS = 2500; // the head's joints are told several times a second
@@ -55,7 +55,7 @@ export class Events extends EventTarget {
     if (!this.connected || this.asking || performance.now() - this.heardMs < SILENT_MS) return;
     this.asking = true;
     try {
-      await get("/health/live", { ms: 2000 });
+      await live();
       this.heardMs = performance.now();
     } catch {
       this.lost();

@@ -45,16 +45,17 @@ export class Recording {
   async look() {
     if (document.hidden) return;
     try {
-      this.told((await get("/recordings")).recorder);
+      const { recorder, free_mb: free } = await get("/recordings");
+      this.told(recorder, free);
     } catch {
       say(byId("recording"), "not known");
     }
   }
 
-  told(recorder) {
+  told(recorder, free) {
     this.run = recorder.run;
     const what = recorder.run ? `run ${recorder.run}` : recorder.recording ? `last ${forTime(recorder.ring_s)}` : "off";
-    const space = recorder.free_mb === null || recorder.free_mb === undefined ? "" : `, ${number(recorder.free_mb / 1000, 1)} GB free`;
+    const space = free === null ? "" : `, ${number(free / 1000, 1)} GB free`;
     say(byId("recording"), recorder.fault ? `fault: ${recorder.fault}` : what + space);
     byId("recording").parentElement.dataset.on = recorder.recording;
     say(byId("record"), recorder.run ? "End run" : "Record");
@@ -218,9 +219,10 @@ export class TrackPanel {
     const on = status && ["starting", "tracking"].includes(status.state);
     const hint = h("p", { class: "quiet" }, "Drag a box round a target, or press T at the cross-hair.");
     const said = this.said ? h("p", { class: "bad" }, this.said) : null;
-    if (!status || status.state === "idle") return put(this.place, hint, said);
     const row = (name, value) => h("tr", {}, h("th", { scope: "row" }, name), h("td", { class: "n" }, value));
-    const pose = status.pose;
+    const pose = status?.pose;
+    const stands = pose ? row("Rover at", `${number(pose.position_m[0], 2, true)}, ${number(pose.position_m[1], 2, true)} m, heading ${deg(2 * Math.atan2(pose.quaternion[3], pose.quaternion[0]), 1)}`) : null;
+    if (!status || status.state === "idle") return put(this.place, hint, stands ? h("table", { class: "figures" }, stands) : null, said);
     put(this.place,
       h("p", {}, h("strong", { class: `word ${status.state}` }, status.state), " ", status.reason),
       h("table", { class: "figures" },
@@ -229,7 +231,7 @@ export class TrackPanel {
         Object.entries(status.pixels ?? {}).map(([name, eye]) => row(called(name), eye.x_px === null ? eye.verdict : `${number(eye.x_px, 1)}, ${number(eye.y_px, 1)} px, ${eye.verdict}`)),
         row("Looks, misses", `${status.looks}, ${status.misses}`),
         status.handoffs.length ? row("Hand-offs", status.handoffs.map((one) => `${one.from_pair} → ${one.to_pair} at ${metres(one.range_m, 2)}`).join("; ")) : null,
-        pose ? row("Rover at", `${number(pose.position_m[0], 2, true)}, ${number(pose.position_m[1], 2, true)} m`) : null),
+        stands),
       this.plot(),
       said,
       this.may ? h("div", { class: "buttons" }, h("button", { type: "button", disabled: !on, onclick: () => this.act("/track/look") }, "Look again"), h("button", { type: "button", disabled: !on, onclick: () => this.act("/track/stop") }, "End the track")) : null,
