@@ -332,7 +332,13 @@ class _Run:
             now = self._steps.look((aim.camera,), settled)[aim.camera]
             with self._steps.step("measure") as detail:
                 expected = eye.expected(now)
-                seen = self._steps.unless_stopped(self._eyes.look_for, clicked, now)
+                try:
+                    seen = self._steps.unless_stopped(self._eyes.look_for, clicked, now)
+                except PointingError as error:
+                    if eye.range_from != "unknown" or not error.code.startswith("target_"):
+                        raise
+                    words = f"{error}; how far it is was not known: range_m or a plane would tell"
+                    raise PointingError(error.code, words) from None
                 detail.update(
                     camera=aim.camera, **match_facts(seen), residual_px=rounded(seen.pixel_px - aim_px)
                 )
