@@ -51,6 +51,7 @@ MODULES: dict[str, tuple[str, ...]] = {
     "mastctl.cli.doctor": ("doctor",),
     "mastctl.cli.record": ("record", "replay"),
     "mastctl.cli.sim": ("sim",),
+    "mastctl.cli.sentinel": ("sentinel",),
     "mastctl.cli.servo": ("servo",),
     "mastctl.cli.ptu": ("ptu",),
 }

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
+from datetime import UTC, datetime
+from pathlib import Path
 from typing import Any
 
 from calib.errors import BadFile
@@ -10,11 +12,12 @@ from drivers.errors import BadOptions
 from drivers.open_hardware import CAMERAS, HEADS, clock_for
 from mastctl.config import Config, load_config
 from mastctl.doctor.cameras import examine_camera
-from mastctl.doctor.findings import Finding, Machine
+from mastctl.doctor.findings import Finding, Level, Machine
 from mastctl.doctor.host import examine_clock, examine_descriptors, examine_folder
 from mastctl.doctor.mast_file import examine_mast_file
 from mastctl.doctor.serial_lines import examine_port
 from mastctl.safety.state_folder import usual_folder
+from mastctl.sentinel.folder import REFERENCE, read_looks, standing
 
 Asked = Callable[[str], Mapping[str, Any] | None]
 """Returns the status of the daemon at an address, None if nobody answers there."""
@@ -52,8 +55,19 @@ def examine(path: str | None, asked: Asked, machine: Machine | None = None) -> I
     yield from examine_folder(
         "state folder", config.state_folder or usual_folder(config.path, config.listen.url)
     )
+    yield from _sentinel((config.state_folder or usual_folder(config.path, config.listen.url)) / "sentinel")
     yield examine_clock()
     yield examine_descriptors()
+
+
+def _sentinel(folder: Path) -> Iterator[Finding]:
+    """What the drift sentinel's looks say, where it keeps them in the state folder."""
+    if not (folder / REFERENCE).is_file():
+        return
+    now = standing(read_looks(folder), datetime.now(UTC))
+    advice = "" if now.level == "good" else "look again: mastctl sentinel look; if it stays, calibrate again"
+    level: Level = "unsure" if now.level != "good" else "good"  # the daemon works all the same
+    yield Finding("drift", level, now.sentence, advice)
 
 
 def _daemon(config: Config, status: Mapping[str, Any] | None) -> Iterator[Finding]:

@@ -1,0 +1,131 @@
+"""What a sentinel keeps, and what its looks say together."""
+
+from __future__ import annotations
+
+import json
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from calib.errors import BadFile
+from calib.scene.drift import Change, Drift
+from mastctl.sentinel.folder import (
+    LOOKS,
+    REFERENCE,
+    Picture,
+    add_look,
+    read_looks,
+    read_reference,
+    save_reference,
+    standing,
+)
+
+NOW = datetime(2026, 5, 4, 12, 0, tzinfo=UTC)
+RESTS = [(0.0, -0.2), (0.5, -0.2)]
+
+
+def pictures() -> list[Picture]:
+    rng = np.random.default_rng(1)
+    return [
+        Picture("eye", pose, *rest, "d" * 64, rng.integers(0, 256, (48, 64)).astype(np.float32))
+        for pose, rest in enumerate(RESTS)
+    ]
+
+
+def day(ago: float, named: str | None = None, views: int = 4) -> dict[str, Any]:
+    told = (NOW - timedelta(days=ago)).isoformat()
+    return {
+        "time": told,
+        "views": views,
+        "named": named,
+        "sentence": f"{named} 1.80 mrad, 9 sigma" if named else "",
+    }
+
+
+def test_a_reference_comes_back_as_it_was_saved(tmp_path: Path) -> None:
+    save_reference(tmp_path / "s", "2026-05-01T00:00:00+00:00", RESTS, pictures())
+    reference = read_reference(tmp_path / "s")
+    assert reference.rests == tuple(RESTS)
+    picture = reference.picture("eye", 1)
+    assert picture is not None
+    np.testing.assert_array_equal(picture.image, pictures()[1].image)
+    assert reference.picture("eye", 0) is not None
+    assert reference.picture("other", 0) is None
+
+
+def test_a_new_reference_takes_the_place_of_the_old_one_and_its_looks(tmp_path: Path) -> None:
+    save_reference(tmp_path, "2026-05-01T00:00:00+00:00", RESTS, pictures())
+    add_look(tmp_path, NOW.isoformat(), Drift(2, (), (), None))
+    save_reference(tmp_path, "2026-05-02T00:00:00+00:00", RESTS[:1], pictures()[:1])
+    assert read_looks(tmp_path) == []
+    assert len(list(tmp_path.glob("pictures-*"))) == 1
+    assert read_reference(tmp_path).picture("eye", 0) is not None
+
+
+def test_looks_are_added_line_by_line_and_a_torn_one_costs_only_itself(tmp_path: Path) -> None:
+    change = Change("pan slipped", np.array([3e-3]), np.eye(1), 9.0)
+    add_look(tmp_path, NOW.isoformat(), Drift(4, ("eye at rest 2",), (change,), change))
+    with (tmp_path / LOOKS).open("a") as file:
+        file.write('{"time": "2026-0')
+    looks = read_looks(tmp_path)
+    assert len(looks) == 1
+    assert looks[0]["named"] == "pan slipped"
+    assert looks[0]["sentence"] == "pan slipped by +3.00 mrad, 9 sigma"
+    assert looks[0]["silent"] == ["eye at rest 2"]
+
+
+@pytest.mark.parametrize(
+    ("looks", "level", "phrase"),
+    [
+        ([], "unsure", "no look yet"),
+        ([day(1)], "good", "nothing has changed (1 looks, the last 24 h ago)"),
+        ([day(4), day(0.01, "eye turned")], "unsure", "seen once: look again"),
+        (
+            [day(4), day(3, "eye turned"), day(1, "eye turned")],
+            "bad",
+            "eye turned 1.80 mrad, 9 sigma, since 3 days",
+        ),
+        ([day(3, "eye turned"), day(2, "pan slipped"), day(1, "eye turned")], "unsure", "seen once"),
+        ([day(3, "eye turned"), day(2), day(1)], "good", "nothing has changed"),
+        ([day(3, "eye turned"), day(2, views=0), day(1, "eye turned")], "bad", "since 3 days"),
+        ([day(1, views=0)], "unsure", "saw nothing they knew"),
+    ],
+)
+def test_two_looks_must_name_the_same_before_it_is_told(
+    looks: list[dict[str, Any]], level: str, phrase: str
+) -> None:
+    now = standing(looks, NOW)
+    assert now.level == level
+    assert phrase in now.sentence
+
+
+@pytest.mark.parametrize(
+    ("change", "phrase"),
+    [
+        (lambda told: told.pop("rests"), "rests: the key is missing"),
+        (lambda told: told.update(schema="x"), "mastctl/sentinel/1"),
+        (lambda told: told["pictures"][0].update(pose=9), "pose: 9 where an integer from 0 to 1"),
+        (lambda told: told.update(rests=[[1]]), "a list of 2 numbers"),
+    ],
+)
+def test_a_damaged_reference_is_refused_in_a_sentence(change: Any, phrase: str, tmp_path: Path) -> None:
+    save_reference(tmp_path, "2026-05-01T00:00:00+00:00", RESTS, pictures())
+    told = json.loads((tmp_path / REFERENCE).read_text())
+    change(told)
+    (tmp_path / REFERENCE).write_text(json.dumps(told))
+    with pytest.raises(BadFile) as refused:
+        read_reference(tmp_path)
+    assert phrase in str(refused.value)
+
+
+def test_no_reference_says_how_to_take_one(tmp_path: Path) -> None:
+    with pytest.raises(BadFile, match="holds no reference; take one: mastctl sentinel reference"):
+        read_reference(tmp_path)
+    save_reference(tmp_path, "2026-05-01T00:00:00+00:00", RESTS, pictures())
+    for file in tmp_path.glob("pictures-*/*.png"):
+        file.write_bytes(b"spoiled")
+    with pytest.raises(BadFile, match="no picture that can be read"):
+        read_reference(tmp_path).picture("eye", 0)

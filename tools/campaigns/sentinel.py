@@ -1,0 +1,220 @@
+"""Let the drift sentinel look at a rover's surroundings day after day: false alarms, and real changes named.
+
+    .venv/bin/python -m tools.campaigns.sentinel --days 1000 --changes 100 --seed 1
+
+A day, at the level of features: six rests, two eyes; each rest of the head off by chance (0.2 mrad each
+joint), a mast that bends with the day's temperature (0.1 mrad), dust and dusk that leave 20 to 100 % of the
+features and make the rest up to twice as uncertain as told; light that moves whole views (0.07 px) and
+shadows that drag up to a quarter of the features along by some pixels; rocks that moved, up to 20 % of the
+features of a view, together, by up to 30 px; now and then (1 % of the views) another scene altogether. Each
+100 days have a reference of their own. Pixels come from this file's own formulas.
+
+Then changes of a random kind and size: how many looks until it is told, and is it named rightly.
+An alarm takes two looks one after the other that name the same.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from calib.camera.cahvor import CameraModel
+from calib.mast.rig import Mast, Rig, RigCamera
+from calib.rigid import FloatArray
+from calib.scene.drift import Drift, ViewShift, find_drift
+from mastctl.cli.output import at_least
+from tools.arguments import end
+
+SIZE = (1024, 768)
+FOCAL_PX = 1280.0
+EYES_M = {"navcam_left": np.array([0.06, -0.1, -0.08]), "navcam_right": np.array([0.06, 0.1, -0.08])}
+MAST_M = np.array([0.2, 0.0, -1.1])
+RESTS = tuple(
+    (pan, tilt) for tilt, pans in ((-0.2, (-1.8, 0.0, 1.8)), (-0.5, (-0.9, 0.9, 2.7))) for pan in pans
+)
+FEATURES = 60
+JOINT_SIGMA_RAD, BEND_RAD, LIGHT_PX = 2e-4, 1e-4, 0.07
+RENEWED = 100
+"""Days that a reference is looked at."""
+
+LOOKS = 12
+"""How many looks a change is given."""
+
+
+def rig() -> Rig:
+    """The rig that is believed: two ideal eyes on an upright mast."""
+    cx, cy = (SIZE[0] - 1) / 2, (SIZE[1] - 1) / 2
+    cameras = {
+        name: RigCamera("head", CameraModel("CAHV", SIZE, C, [1, 0, 0], [cx, FOCAL_PX, 0], [cy, 0, FOCAL_PX]))
+        for name, C in EYES_M.items()
+    }
+    return Rig("campaign", Mast(MAST_M, np.zeros(3)), cameras)
+
+
+@dataclass(frozen=True)
+class Truth:
+    """What is changed: turns of eyes, part of the focal length, slips, a turn of the rover; radians."""
+
+    turned: Mapping[str, FloatArray] = field(default_factory=dict)
+    focal: Mapping[str, float] = field(default_factory=dict)
+    slip: tuple[float, float] = (0.0, 0.0)
+    rover: FloatArray = field(default_factory=lambda: np.zeros(3))
+    name: str = ""
+
+
+def about(axis: int, angle_rad: float) -> FloatArray:
+    """A turn about x, y or z (3, 3), right-handed."""
+    c, s = np.cos(angle_rad), np.sin(angle_rad)
+    i, j = [(1, 2), (2, 0), (0, 1)][axis]
+    matrix = np.eye(3)
+    matrix[i, i] = matrix[j, j] = c
+    matrix[i, j], matrix[j, i] = -s, s
+    return matrix
+
+
+def shown(points: FloatArray, eye: str, pan: float, tilt: float, truth: Truth) -> FloatArray:
+    """Pixels (n, 2) of points (n, 3) in the rover's first frame, by a pinhole and turns one after another."""
+    r = truth.rover
+    seen = points @ (about(2, r[2]) @ about(1, r[1]) @ about(0, r[0]))
+    in_head = (seen - MAST_M) @ (about(2, pan + truth.slip[0]) @ about(1, tilt + truth.slip[1]))
+    t = truth.turned.get(eye, np.zeros(3))
+    x, y, z = ((in_head - EYES_M[eye]) @ (about(2, t[2]) @ about(1, t[1]) @ about(0, t[0]))).T
+    f = FOCAL_PX * (1.0 + truth.focal.get(eye, 0.0))
+    return np.stack([f * y / x + (SIZE[0] - 1) / 2, f * z / x + (SIZE[1] - 1) / 2], axis=1)
+
+
+class Site:
+    """A rover's surroundings with its reference look."""
+
+    def __init__(self, rng: np.random.Generator) -> None:
+        self.rng = rng
+        self.rig = rig()
+        self.pixels: dict[tuple[int, str], FloatArray] = {}
+        self.points: dict[tuple[int, str], FloatArray] = {}
+        self.then: dict[tuple[int, str], FloatArray] = {}
+        off = rng.normal(0.0, JOINT_SIGMA_RAD, (len(RESTS), 2))
+        for pose, (pan, tilt) in enumerate(RESTS):
+            for eye, place in EYES_M.items():
+                pixels = rng.uniform([30, 30], np.array(SIZE) - 30, (FEATURES, 2))
+                y = (pixels[:, 0] - (SIZE[0] - 1) / 2) / FOCAL_PX
+                z = (pixels[:, 1] - (SIZE[1] - 1) / 2) / FOCAL_PX
+                ahead = np.stack([np.ones(FEATURES), y, z], axis=1)
+                far = rng.uniform(2.0, 25.0, FEATURES)[:, None]
+                points = MAST_M + (place + ahead * far) @ (about(2, pan) @ about(1, tilt)).T
+                self.points[pose, eye] = points
+                self.then[pose, eye] = shown(points, eye, *(np.array([pan, tilt]) + off[pose]), Truth())
+
+    def look(self, truth: Truth) -> Drift:
+        """One day's look: what the sentinel finds."""
+        rng = self.rng
+        dust, spoil = rng.uniform(0.2, 1.0), rng.uniform(1.0, 2.0)
+        bend = rng.normal(0.0, BEND_RAD, 2)
+        shifts = []
+        for pose, (pan, tilt) in enumerate(RESTS):
+            angles = np.array([pan, tilt]) + rng.normal(0.0, JOINT_SIGMA_RAD, 2) + bend
+            for eye in EYES_M:
+                now = shown(self.points[pose, eye], eye, *angles, truth)
+                moved = now - self.then[pose, eye]
+                sigma = rng.uniform(0.03, 0.15, FEATURES)
+                moved = moved + spoil * sigma[:, None] * rng.normal(0, 1, moved.shape)
+                moved += rng.normal(0.0, LIGHT_PX, 2)
+                dragged = rng.random(FEATURES) < rng.uniform(0.0, 0.25)
+                moved[dragged] += rng.normal(0, 1, 2) * rng.uniform(0.0, 3.0)
+                if rng.random() < 0.3:
+                    rocks = rng.random(FEATURES) < rng.uniform(0.0, 0.2)
+                    moved[rocks] += rng.uniform(-30, 30, 2)
+                if rng.random() < 0.01:
+                    moved = rng.uniform(-20, 20, moved.shape)
+                kept = rng.random(FEATURES) < dust
+                shifts.append(
+                    ViewShift(eye, pose, pan, tilt, self.then[pose, eye][kept], moved[kept], sigma[kept])
+                )
+        return find_drift(self.rig, shifts)
+
+
+def alarm(before: Drift | None, now: Drift) -> str:
+    """What two looks one after the other name alike, '' if nothing."""
+    if before is None or before.named is None or now.named is None:
+        return ""
+    return now.named.what if before.named.what == now.named.what else ""
+
+
+def random_change(rng: np.random.Generator) -> Truth:
+    """A bump, a slip, another focus or a rover that sank, from some sigmas up."""
+    eye = str(rng.choice(list(EYES_M)))
+    direction = rng.normal(size=3)
+    direction /= np.linalg.norm(direction)
+    match rng.integers(5):
+        case 0:
+            return Truth(turned={eye: direction * rng.uniform(1.0e-3, 3e-3)}, name=f"{eye} turned")
+        case 1:
+            return Truth(
+                focal={eye: float(rng.choice([-1, 1]) * rng.uniform(1e-3, 5e-3))}, name=f"{eye} refocused"
+            )
+        case 2:
+            return Truth(
+                slip=(float(rng.choice([-1, 1]) * rng.uniform(1.5e-3, 5e-3)), 0.0), name="pan slipped"
+            )
+        case 3:
+            return Truth(
+                slip=(0.0, float(rng.choice([-1, 1]) * rng.uniform(1.5e-3, 5e-3))), name="tilt slipped"
+            )
+        case _:
+            level = np.array([direction[0], direction[1], 0.0])
+            level /= np.linalg.norm(level)
+            return Truth(rover=level * rng.uniform(2e-3, 5e-3), name="rover turned")
+
+
+def main() -> int:
+    """Run both parts; 1 if there was a false alarm."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--days", type=at_least(1), default=1000)
+    parser.add_argument("--changes", type=at_least(0), default=100)
+    parser.add_argument("--seed", type=at_least(0), default=1)
+    args = parser.parse_args()
+    rng = np.random.default_rng(args.seed)
+    site, before, false, largest = Site(rng), None, [], 0.0
+    for day in range(args.days):
+        if day and day % RENEWED == 0:
+            site, before = Site(rng), None
+        now = site.look(Truth())
+        largest = max(largest, *(change.sigmas for change in now.changes), 0.0)
+        if alarm(before, now):
+            false.append(f"day {day}: {now.sentence}")
+        before = now
+    print(
+        f"{args.days} days without a change, seed {args.seed}: {len(false)} false alarms, "
+        f"largest {largest:.1f} sigma"
+    )
+    for sentence in false:
+        print(f"  {sentence}")
+    told: Counter[str] = Counter()
+    for _ in range(args.changes):
+        truth, site, before = random_change(rng), Site(rng), None
+        kind = truth.name.split()[-1] if truth.name.startswith("navcam") else truth.name
+        for look in range(LOOKS):
+            now = site.look(truth)
+            if named := alarm(before, now):
+                right = named == truth.name or truth.name in now.instead
+                told[f"{kind}: {'named rightly' if right else 'named ' + named}"] += 1
+                told["looks"] += look + 1
+                break
+            before = now
+        else:
+            told[f"{kind}: not told in {LOOKS} looks"] += 1
+    found = sum(count for words, count in told.items() if "named" in words)
+    print(
+        f"{args.changes} changes: {found} told, "
+        f"after {told.pop('looks', 0) / max(found, 1):.1f} looks in the mean"
+    )
+    for words, count in sorted(told.items()):
+        print(f"  {words}: {count}")
+    return 1 if false else 0
+
+
+if __name__ == "__main__":
+    end(main)
