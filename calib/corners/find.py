@@ -24,8 +24,12 @@ from calib.dots.find import DotsFound, find_dots
 from calib.dots.plane_map import fit_plane_map
 from calib.survey import Board
 
-LEAST_SIGMA_PX = 0.006
+LEAST_SIGMA_PX = 0.004
 """What aliasing and whole grey levels leave at best."""
+
+SCALES = (0.2, 1.5)
+"""In a picture without blur what a fit leaves over is no noise, and corners are better than that says; a lens
+near a bent board needs more room than the smooth map has, so that much more is not the corners' fault."""
 
 FARTHEST_PX = 4.0
 """A corner is looked for so far from where the markers say that it is."""
@@ -69,8 +73,8 @@ def find_corners(board: AnyBoard, image: Levels) -> Corners | CornersNotFound:
     Returns
     -------
     Corners | CornersNotFound
-        sigma_px is what noise and blur leave of each corner, and no less than the corners' distances from a
-        smooth map say.
+        sigma_px is what noise and blur leave of each corner, made larger or smaller for all by how far they
+        are from a smooth map, where there are enough for one.
 
     Raises
     ------
@@ -187,7 +191,7 @@ def _good(saddles: Saddles) -> NDArray[np.bool_]:
 
 
 def _agreeing(board: AnyBoard, found: _Found) -> Corners | CornersNotFound:
-    """The corners that fit a smooth map of all, with sigmas that cover how far they are from it."""
+    """The corners that fit a smooth map of all, with sigmas that say how far they are from it."""
     points = board.in_board_m(found.ids)[:, :2]
     pixels = found.saddles.pixels_px
     sigma = np.hypot(found.saddles.sigma_px, LEAST_SIGMA_PX)
@@ -202,7 +206,8 @@ def _agreeing(board: AnyBoard, found: _Found) -> Corners | CornersNotFound:
         if freedom < 6:
             break
         excess = float(np.sum((off[good] / sigma[good, None]) ** 2)) / freedom
-        scale = max(1.0, np.sqrt(excess))
+        # A homography alone has no room for a lens: then its residuals are no measure of corners.
+        scale = float(np.clip(np.sqrt(excess), *SCALES)) if plane_map.degree else 1.0
         # by the median: a corner far off does not excuse itself
         usual = float(np.median(np.linalg.norm(off[good] / sigma[good, None], axis=-1))) / 1.177
         far = good & (np.linalg.norm(off, axis=-1) > FAR_OFF * max(1.0, usual) * sigma)
@@ -210,7 +215,8 @@ def _agreeing(board: AnyBoard, found: _Found) -> Corners | CornersNotFound:
             break
         good &= ~far
     order = np.argsort(found.ids[good])
-    return Corners(found.ids[good][order], pixels[good][order], (scale * sigma[good])[order])
+    told = np.maximum(scale * sigma[good], LEAST_SIGMA_PX)
+    return Corners(found.ids[good][order], pixels[good][order], told[order])
 
 
 def _dots(board: DotBoard, levels: Levels) -> Corners | CornersNotFound:
