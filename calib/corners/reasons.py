@@ -54,7 +54,10 @@ def why_not_this_board(board: MarkerBoard, markers: Markers, stands: Standing | 
     """Say that the markers in view are of a board drawn otherwise; '' if they are of this one."""
     found = len(markers.ids)
     standing_count = 0 if stands is None else len(stands.ids)
-    if found < 4 or standing_count == found:
+    last = board.first_id + count_of(board) - 1
+    outside = [int(number) for number in markers.ids if not board.first_id <= number <= last]
+    mine = found - len(outside)  # others may be of a second board, which is no harm
+    if found < 4 or standing_count == mine > 0:
         return ""
     if isinstance(board, Charuco):
         flipped = standing(markers, replace(board, legacy=not board.legacy))
@@ -65,14 +68,12 @@ def why_not_this_board(board: MarkerBoard, markers: Markers, stands: Standing | 
             )
             drawn = today if board.legacy else before
             return f"the markers in view stand as on another board: {drawn}; BOARD.yaml says otherwise"
-    if standing_count >= MOST_ELSEWHERE * found:
+    if mine and standing_count >= MOST_ELSEWHERE * mine:
         return ""
     for other, what in _relatives(board):
         others = standing(markers, other)
         if others is not None and len(others.ids) > max(0.8 * found, standing_count):
             return f"the markers in view stand as on another board: {what}, where {_drawn(board)} is expected"
-    last = board.first_id + count_of(board) - 1
-    outside = [int(number) for number in markers.ids if not board.first_id <= number <= last]
     if len(outside) > MOST_ELSEWHERE * found:
         wanted = f"{board.first_id} to {last} are expected"
         return f"another board is in view: its markers are {_some(outside)}, where {wanted}"

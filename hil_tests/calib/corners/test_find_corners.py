@@ -146,6 +146,20 @@ def test_what_is_wrong_with_a_picture_is_said(board: AnyBoard) -> None:
     assert "two boards with the same markers" in why_not(board, twice)
 
 
+def test_of_two_boards_with_different_markers_each_is_found() -> None:
+    small, large = Charuco(4, 4, 0.03, 0.0225), Charuco(9, 7, 0.03, 0.0225, first_id=50)
+    places = {small: (-0.2, -0.05, 0.9), large: (0.1, 0.03, 1.0)}
+    image = drawn(*((board, TURN, place) for board, place in places.items()))
+    for board, place in places.items():
+        assert float(np.abs(off_px(board, corners_of(board, image), TURN, place)).max()) < 0.2
+
+
+def test_sigmas_of_a_picture_without_blur_are_of_the_size_of_errors() -> None:
+    found = corners_of(APRILGRID, drawn((APRILGRID, TURN, (0, 0, 0.9)), blur_px=0.01))
+    off = off_px(APRILGRID, found, TURN, (0, 0, 0.9))
+    assert 0.4 < float(np.sqrt(np.mean((off / found.sigma_px[:, None]) ** 2))) < 1.6
+
+
 def test_another_board_than_stated_is_named() -> None:
     image = drawn((CHARUCO, TURN, (0.0, 0.0, 0.7)))
     tags = drawn((APRILGRID, TURN, (0.0, 0.0, 0.7)))
