@@ -15,7 +15,7 @@ from calib.corners import CornersNotFound, find_corners
 from calib.files.mast_file import parse_rig
 from calib.fit.bench_terms import FEWEST_CORNERS
 from calib.mast.rig import Rig
-from mastctl.bench.eyes import Head, Look, Seen
+from mastctl.bench.eyes import Head, Look, NotThere, Seen
 from mastctl.client import Client, ClientError, Snapshot
 from mastctl.errors import MastctlError
 
@@ -46,12 +46,6 @@ class Interrupted(MastctlError):
     """The bench cannot go on just now; nothing is lost."""
 
     code = "interrupted"
-
-
-class NotThere(MastctlError):
-    """An attitude that the daemon does not turn to, such as one in a keep-out."""
-
-    code = "not_there"
 
 
 class DaemonEyes:

@@ -7,6 +7,13 @@ from typing import Protocol
 
 from calib.boards import Corners
 from calib.mast.rig import Rig
+from mastctl.errors import MastctlError
+
+
+class NotThere(MastctlError):
+    """An attitude that the head does not turn to, such as one in a keep-out."""
+
+    code = "not_there"
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,6 +104,8 @@ class Eyes(Protocol):
 
         Raises
         ------
+        NotThere
+            If the head must not go there.
         MastctlError
             If the head does not get there, or no camera gives a picture.
         """

@@ -16,7 +16,7 @@ from calib.errors import CalibError, Unreachable
 from calib.mast.pointing import solve
 from calib.mast.solutions import choose
 from calib.rigid import FloatArray
-from mastctl.bench.eyes import Eyes, Look, Seen
+from mastctl.bench.eyes import Eyes, Look, NotThere, Seen
 
 POINTINGS = 4
 
@@ -156,7 +156,10 @@ def _point(
     sides = (0, 0)
     if not head.one_sided:
         sides = (1 if angles.pan_rad > here[0][0] else -1, 1 if angles.tilt_rad > here[0][1] else -1)
-    landed = eyes.look(*rig.joints.read_rad((angles.pan_rad, angles.tilt_rad), sides), sides)
+    try:
+        landed = eyes.look(*rig.joints.read_rad((angles.pan_rad, angles.tilt_rad), sides), sides)
+    except NotThere:
+        return None
     there = next((one for one in landed.found if one.camera == camera), None)
     if there is None or there.corners is None or corner not in there.corners.ids:
         return None

@@ -19,6 +19,7 @@ from calib.survey import Survey
 from mastctl.bench import drawn
 from mastctl.bench.differences import rig_differences
 from mastctl.bench.final import Checked
+from mastctl.calibration.verdict import Verdict
 from mastctl.report import pages, plots
 from mastctl.report.tables import Table, x_y
 
@@ -35,6 +36,7 @@ class Told:
 
     survey: Survey
     calibration: BenchCalibration
+    verdict: Verdict
     saved: StoredRig
     checked: Checked | None
     aim: Pointing
@@ -74,7 +76,7 @@ def _page(told: Told) -> str:
     return pages.page(
         "bench.html",
         title="Bench calibration",
-        badge=pages.Badge("BENCH", ""),
+        badge=pages.Badge(told.verdict.words.upper(), told.verdict.grade),
         facts=[
             ("survey", told.survey.folder.resolve().name),
             ("digest", told.survey.digest[:12]),
@@ -82,6 +84,7 @@ def _page(told: Told) -> str:
             ("fitted in", f"{fit.seconds:.1f} s"),
             ("made by", str(told.saved.rig.provenance.get("program"))),
         ],
+        reasons=[(pages.Badge(one.grade, one.grade), one.sentence) for one in told.verdict.reasons],
         worth=Table(("what", "value"), [list(row) for row in told.worth]),
         pointings=_pointings(told.checked),
         cameras=_cameras(fit, told.checked),

@@ -247,7 +247,9 @@ def _reported(done: BenchDone, folder: Path | None, former: Rig | None, where: W
     done = replace(done, calibrated_px=aim.rms_px(covariance))
     if folder is None:
         return done
-    told = Told(done.survey, fit, done.saved, done.checked, aim, covariance, tuple(done.worth()), former)
+    told = Told(
+        done.survey, fit, done.verdict, done.saved, done.checked, aim, covariance, tuple(done.worth()), former
+    )
     try:
         return replace(done, page=write_bench_report(told, folder))
     except (OSError, BadFile) as error:

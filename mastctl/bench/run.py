@@ -24,7 +24,7 @@ from calib.errors import CalibError
 from calib.fit.least_squares import covariance_of
 from calib.rigid import Rigid, rigid_rates
 from calib.survey import Survey
-from mastctl.bench.eyes import Eyes, Head, Look
+from mastctl.bench.eyes import Eyes, Head, Look, NotThere
 from mastctl.bench.final import Checked, point_at_corners, unvisited
 from mastctl.bench.fitting import FitSurvey, Fitted
 from mastctl.bench.folder import Kept, looks_of
@@ -204,8 +204,8 @@ class BenchRun:
             self._teller.say(
                 f"a picture that is not fitted, at pan {_deg(shot.pan_rad)}, tilt {_deg(shot.tilt_rad)}"
             )
-            look = self._eyes.look(shot.pan_rad, shot.tilt_rad, (shot.pan_approach, shot.tilt_approach))
-            if look.found:
+            look = self._look_at(shot)
+            if look is not None and look.found:
                 self._took(name, look, check=True)
         new = [look for placement, check, look in self._looks if check and placement == name]
         predicted_px = math.hypot(self.predicted_px(), self.floor_px)
@@ -385,7 +385,10 @@ class BenchRun:
                 break
             self._tell(name, choice)
             shot = choice.shot
-            look = self._eyes.look(shot.pan_rad, shot.tilt_rad, (shot.pan_approach, shot.tilt_approach))
+            look = self._look_at(shot)
+            if look is None:
+                in_vain.append((shot.pan_rad, shot.tilt_rad))
+                continue
             if not look.found:
                 in_vain.append((shot.pan_rad, shot.tilt_rad))
                 missed += 1
@@ -399,6 +402,14 @@ class BenchRun:
             missed = 0
             self._took(name, look)
         self._close(name)
+
+    def _look_at(self, shot: Shot) -> Look | None:
+        """Take a shot; None where the head must not go."""
+        try:
+            return self._eyes.look(shot.pan_rad, shot.tilt_rad, (shot.pan_approach, shot.tilt_approach))
+        except NotThere as reason:
+            self._teller.say(f"not looked there: {reason}")
+            return None
 
     def _share(self) -> int:
         """How many looks one placement may have, so that there are some left for the others."""

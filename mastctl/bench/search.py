@@ -13,7 +13,7 @@ from calib.bench.poses import Sought
 from calib.errors import CalibError, Unreachable
 from calib.mast.pointing import solve
 from calib.mast.solutions import choose
-from mastctl.bench.eyes import Eyes, Look
+from mastctl.bench.eyes import Eyes, Look, NotThere
 from mastctl.bench.teller import Teller
 from mastctl.errors import MastctlError
 
@@ -46,7 +46,11 @@ class Search:
         whys: dict[str, int] = {}
         looks = 0
         for pan_rad, tilt_rad in self._attitudes(placement):
-            look = self._eyes.look(pan_rad, tilt_rad)
+            try:
+                look = self._eyes.look(pan_rad, tilt_rad)
+            except NotThere as reason:
+                whys[str(reason)] = whys.get(str(reason), 0) + 1
+                continue
             if look.found:
                 return look
             looks += 1

@@ -1,0 +1,106 @@
+"""A bench's eyes on a whole daemon: what it is told when something is pulled out, dark, stopped or taken."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from calib.bench.placements import Placement
+from calib.boards import Charuco
+from mastctl.bench import daemon_eyes
+from mastctl.bench.daemon_eyes import DaemonEyes, Interrupted
+from mastctl.bench.eyes import NotThere
+from mastctl.bench.simulated import SimulatedPerson
+from mastctl.bench.teller import Terminal
+from mastctl.client import Client
+from mastctl.config import Listen, load_config
+from mastctl.daemon import RunningDaemon
+
+BOARD = Charuco(10, 7, 0.055, 0.042)
+CAMERAS = ("navcam_left", "navcam_right")
+
+
+@pytest.fixture(scope="module")
+def client(repository: Path) -> Iterator[Client]:
+    config = load_config(repository / "configs/bench.yaml")
+    simulation = {**config.hardware.simulation, "speed": "max", "samples": 1}
+    config = replace(config, listen=Listen(port=0), hardware=replace(config.hardware, simulation=simulation))
+    with RunningDaemon(config) as daemon, Client(daemon.url) as client:
+        yield client
+
+
+@pytest.fixture
+def eyes(client: Client, monkeypatch: pytest.MonkeyPatch) -> Iterator[DaemonEyes]:
+    monkeypatch.setattr(daemon_eyes, "PATIENCE_S", 0.2)
+    monkeypatch.setattr(daemon_eyes, "AGAIN_S", 0.05)
+    eyes = DaemonEyes(client, CAMERAS, BOARD)
+    person = SimulatedPerson(client, BOARD, eyes.head.rig, Terminal(0.55), None)
+    person.stand(Placement(1.2, 0.0, 0.0, (15.0, 0.0)))
+    yield eyes
+    client.clear_faults()
+
+
+def test_a_look_shows_the_board_with_one_reading_and_tells_what_the_head_is(eyes: DaemonEyes) -> None:
+    assert eyes.head.one_sided and eyes.head.count_rad == pytest.approx(5.6e-5, rel=0.01)
+    look = eyes.look(0.05, -0.02)
+    assert [one.camera for one in look.found] == list(CAMERAS)
+    assert look.pan_rad == pytest.approx(0.05, abs=1e-4) and look.seconds > 0.0
+    assert all(one.corners is not None and len(one.corners) > 20 and one.data for one in look.found)
+
+
+def test_a_camera_that_is_pulled_out_is_named_and_the_other_still_looks(
+    client: Client, eyes: DaemonEyes
+) -> None:
+    client.set_fault("navcam_right", "off")
+    look = eyes.look(0.02, 0.0)
+    assert [one.camera for one in look.found] == ["navcam_left"]
+    assert look.seen[1].why == "camera navcam_right gave no picture"
+
+
+def test_when_no_camera_gives_a_picture_the_bench_waits_and_then_says_so(
+    client: Client, eyes: DaemonEyes
+) -> None:
+    for camera in CAMERAS:
+        client.set_fault(camera, "off")
+    with pytest.raises(Interrupted, match="navcam"):
+        eyes.look(0.0, 0.0)
+    client.clear_faults()
+    assert eyes.look(0.0, 0.0).found  # and goes on
+
+
+def test_a_head_that_is_silent_ends_the_look_in_a_sentence(client: Client, eyes: DaemonEyes) -> None:
+    client.set_fault("pan_tilt", "off")
+    with pytest.raises(Interrupted):
+        eyes.look(0.3, -0.1)
+
+
+def test_pictures_in_the_dark_say_that_they_are_dark(client: Client, eyes: DaemonEyes) -> None:
+    for camera in CAMERAS:
+        client.set_fault(camera, "dark")
+    try:
+        whys = {one.why for one in eyes.look(0.0, 0.0).seen}
+    except Interrupted as told:
+        whys = {str(told)}
+    assert all("dark" in why for why in whys)
+
+
+def test_who_else_steers_is_named(client: Client, eyes: DaemonEyes) -> None:
+    with Client(client.url, name="Ana") as other, other.lease(), pytest.raises(Interrupted, match="Ana"):
+        eyes.look(0.1, 0.0)
+
+
+def test_an_emergency_stop_ends_the_look_and_says_how_to_go_on(client: Client, eyes: DaemonEyes) -> None:
+    client.estop(name="Ana", reason="a hand in the way")
+    try:
+        with pytest.raises(Interrupted, match="'mastctl reset' releases it"):
+            eyes.look(0.1, 0.0)
+    finally:
+        client.reset(name="Ana", reason="the hand is away")
+
+
+def test_beyond_the_limits_nothing_is_looked_at_and_nothing_ends(eyes: DaemonEyes) -> None:
+    with pytest.raises(NotThere):
+        eyes.look(3.0, 0.0)
