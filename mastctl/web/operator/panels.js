@@ -1,6 +1,6 @@
 // The quiet panels: faults, recording, mast file, residuals, operations, track, simulated faults.
 import { byId, h, put, s, say } from "./dom.js";
-import { ask, get, post } from "./api.js";
+import { ask, fileOf, get, post } from "./api.js";
 import { camera as called, deg, forTime, metres, number, sentence } from "./words.js";
 
 const NAMES = { point: "Point", track: "Track", look: "Look", jog: "Jog" };
@@ -155,6 +155,13 @@ export class OperationList {
     if (!this.drawing) this.drawing = setTimeout(() => this.draw(), 200);
   }
 
+  /** The image after the move, for as long as the daemon keeps it. */
+  picture(pointing) {
+    if (!pointing?.frame_id) return null;
+    const path = fileOf(`/snapshot/${encodeURIComponent(pointing.camera)}?format=png&frame_id=${encodeURIComponent(pointing.frame_id)}`);
+    return [" ", h("a", { class: "save", href: path, target: "_blank" }, "image")];
+  }
+
   draw() {
     this.drawing = null;
     const newest = [...this.records.values()].sort((a, b) => b.created_s - a.created_s).slice(0, 8);
@@ -162,7 +169,7 @@ export class OperationList {
       const [what] = Object.keys(record.request ?? {});
       const name = { pixel: "Point at a pixel", position_m: "Point at a position", pan_rad: "Turn to angles", track: "Begin a track", jog: "Jog", look: "Look for the track" }[what] ?? NAMES[what] ?? what ?? "";
       const result = record.residual_px ? record.residual_px.map((one) => number(one, 2, true)).join(", ") + " px" : record.error ? record.error.message : "";
-      return h("tr", {}, h("td", { class: `word ${record.state}` }, record.state), h("td", {}, name), h("td", { class: "result" }, result));
+      return h("tr", {}, h("td", { class: `word ${record.state}` }, record.state), h("td", {}, name), h("td", { class: "result" }, result, this.picture(record.pointings?.at(-1))));
     })) : h("p", { class: "quiet" }, "None yet."));
   }
 }

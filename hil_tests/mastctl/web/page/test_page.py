@@ -14,7 +14,7 @@ import pytest
 from axe_playwright_python.sync_playwright import Axe
 
 from drivers.errors import NoReply
-from hil_tests.mastctl.service_fakes import FakeHardware, ScriptedLoop, eventually, fake_daemon
+from hil_tests.mastctl.service_fakes import CONFIG, FakeHardware, ScriptedLoop, eventually, fake_daemon
 from hil_tests.mastctl.web.network import network_daemon
 from hil_tests.mastctl.web.page.conftest import Visit
 from mastctl.daemon import RunningDaemon
@@ -93,6 +93,19 @@ def test_one_camera_alone_tells_between_which_ranges_it_is(
     words = one.choose()
     assert "beyond 1.50 m" in words and "One camera alone" in words
     assert one.page.locator("#point").is_visible()
+
+
+def test_a_head_of_one_camera_has_one_image_and_everything_else(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, visit: Visits
+) -> None:
+    config = CONFIG.replace(", navcam_right: {{driver: fake}}, hazcam_left: {{driver: fake}}", "")
+    monkeypatch.setattr(Previewing, "preview", lambda *_: ALONE)
+    with fake_daemon(monkeypatch, tmp_path, config=config, loop=Previewing) as (daemon, _):
+        one = visit(daemon.url)
+        assert "beyond 1.50 m" in one.choose()
+        assert one.page.locator(".eye").count() == 1
+        one.page.keyboard.press("p")
+        one.target("ended")
 
 
 def test_what_is_refused_is_told_in_words(pair: BOTH, visit: Visits, monkeypatch: pytest.MonkeyPatch) -> None:
