@@ -61,7 +61,12 @@ def load_board(path: str | Path) -> AnyBoard:
     BadFile
         If it cannot be read or is no board: which key, what it holds, what is expected.
     """
-    document = parse_mapping(read_bytes(path, MAX_BYTES), path)
+    return parse_board(read_bytes(path, MAX_BYTES), path)
+
+
+def parse_board(data: bytes, path: str | Path) -> AnyBoard:
+    """Return the board that a BOARD.yaml's bytes hold; ``path`` is for messages. Raises BadFile."""
+    document = parse_mapping(data, path)
     schema = document.pop("schema", None)
     if schema != SCHEMA:
         raise BadFile(path, "schema", f"{kind_of(schema)} where '{SCHEMA}' is expected")

@@ -26,6 +26,9 @@ from typing import Any
 
 import numpy as np
 
+from calib.boards import AnyBoard
+from calib.boards.board_file import parse_board
+from calib.boards.pattern import pattern_of
 from calib.errors import BadFile
 from calib.files import CameraFile
 from calib.files.cahvor_text import format_cahvor, parse_cahvor
@@ -38,6 +41,8 @@ from calib.files.odl import parse_label
 from calib.files.opencv_yaml import parse_opencv
 from calib.files.pds3 import load_pds3_camera, read_product
 from calib.files.tables import parse_table
+from calib.survey.check import check_survey
+from calib.survey.reader import read_survey
 from mastctl.cli.main import main as mastctl
 from mastctl.cli.output import at_least
 from tools.arguments import end
@@ -172,6 +177,39 @@ VALID: dict[str, bytes] = {
     "pixels.csv": b"x_px,y_px\n320,240\n-1e9,0\ninf,0\n",
 }
 
+_BOARD = b"""schema: mastctl/board/1
+name: bench
+kind: charuco
+columns: 9
+rows: 12
+square_m: 0.02
+marker_m: 0.015
+dictionary: DICT_5X5_100
+first_id: 3
+legacy: false
+aspect: 1.001
+bar_m: {across: 0.15, down: 0.2}
+measured: {across_m: 0.1496, down_m: 0.1998}
+"""
+VALID["board.yaml"] = _BOARD
+_BENCH = {
+    "survey.yaml": b"""schema: mastctl/survey/1
+boards:
+  wall: {kind: aprilgrid, columns: 6, rows: 4, tag_m: 0.03, gap_m: 0.009, border: 2}
+  desk: {kind: dots, columns: 4, rows: 3, spacing_m: 0.02, dot_diameter_m: 0.01}
+sigma: {corner_px: 0.1, joint_rad: 0.0002}
+cameras:
+  eye_left: {on: head, size_px: [1024, 768], model: CAHVOR, focal_px: 1290}
+  low_left: {on: rover, size_px: [640, 480], model: CAHVORE, focal_px: 309}
+""",
+    "images.csv": b"""image,camera,placement,board,purpose,pan_rad,tilt_rad,pan_approach,tilt_approach,file
+one,eye_left,near,wall,camera,0.0,-0.17,1,-1,
+two,low_left,near,desk,camera,,,,,
+""",
+    "corners.csv": b"image,board,id,x_px,y_px,sigma_px\none,wall,0,4.5,3.25,0.02\ntwo,desk,11,100,200,\n",
+}
+VALID |= {f"bench_{name}": data for name, data in _BENCH.items()}
+
 _NASTY = [
     *b"nan -inf .inf 1e400 -1e308 5e-324 0 -0.0 ~ true '1' *a ? # \" ' = ^ : /* */".split(),
     *b"[ ] { } [[[[ , ; ( ) < >".split(),
@@ -274,6 +312,23 @@ def _product(data: bytes, path: str) -> None:
         _use_model(load_pds3_camera(file))
 
 
+def _use_board(board: AnyBoard) -> None:
+    if not np.isfinite(board.in_board_m(board.ids, (0.001, -0.001))).all() or min(board.size_m) <= 0.0:
+        raise AssertionError("a board without a size was accepted")
+    pattern_of(board)
+
+
+def _use_bench(data: bytes, broken_file: str) -> None:
+    with tempfile.TemporaryDirectory() as folder:
+        for name, valid in _BENCH.items():
+            (Path(folder) / name).write_bytes(data if name == broken_file else valid)
+        survey = read_survey(folder)
+        check_survey(survey)
+        for image in survey.images:
+            if image.name in survey.corners:
+                survey.boards[image.board].in_board_m(survey.corners[image.name].ids)
+
+
 #: Reader name to the valid file that it reads and the reading.
 READERS: dict[str, tuple[str, Callable[[bytes], Any]]] = {
     "mast": ("mast.yaml", lambda data: _use_rig(parse_rig(data, "f"))),
@@ -286,6 +341,10 @@ READERS: dict[str, tuple[str, Callable[[bytes], Any]]] = {
     "kalibr": ("chain.kalibr.yaml", lambda data: _use_all(parse_kalibr(data, "f"))),
     "mrcal": ("camera.cameramodel", lambda data: _use_model(parse_mrcal(data, "f"))),
     "colmap": ("cameras.txt", lambda data: _use_all(parse_colmap(data, "f"))),
+    "board": ("board.yaml", lambda data: _use_board(parse_board(data, "f"))),
+    "bench": ("bench_survey.yaml", lambda data: _use_bench(data, "survey.yaml")),
+    "bench images": ("bench_images.csv", lambda data: _use_bench(data, "images.csv")),
+    "bench corners": ("bench_corners.csv", lambda data: _use_bench(data, "corners.csv")),
     "points": ("points.csv", lambda data: parse_table(data, "f", ("x_m", "y_m", "z_m"))),
     "pixels": ("pixels.csv", lambda data: parse_table(data, "f", ("x_px", "y_px"))),
 }
