@@ -31,6 +31,9 @@ LEAST_PART = 0.01
 """A board or camera that moved explains at least this part of the weighted sum of squares: less is the
 model's."""
 
+STILL_FAR = 9.0
+"""Chi-square over its degrees of freedom that a cause leaves at most, or it explains half of it at least."""
+
 SIDE = 3
 """Pictures at least on either side of a change, at different standstills."""
 
@@ -134,6 +137,8 @@ def find_change(
     as_good = [c for c in found if c.chi2 >= AS_GOOD * most]
     best = min(as_good, key=lambda c: (len(c.step), -c.chi2))
     scale = max((chi2 - best.chi2) / max(freedom, 1.0), 0.1)
+    if scale > STILL_FAR and best.chi2 < 0.5 * chi2:  # it is the model that is wrong
+        return None
     if chance(best.chi2, len(best.step), scale, max(freedom, 1.0)) * count > UNLIKELY:
         return None
     if len(best.step) > 1 and best.chi2 < LEAST_PART * chi2:

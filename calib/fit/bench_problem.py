@@ -1,0 +1,234 @@
+"""A bench as a least-squares problem: its terms, where it starts, and where its rover frame is."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from calib.camera.cahvor import Kind
+from calib.fit.adjustment import HUBER, Adjustment, Estimate
+from calib.fit.bench_start import BenchNotFitted, BenchStart, bench_start
+from calib.fit.bench_terms import BenchTerms, bench_terms
+from calib.fit.model_terms import AXIS_TERMS, candidate_terms, joint_numbers
+from calib.fit.terms import ImageTerm, with_kept
+from calib.fit.view_poses import ViewPoses, ViewsTooFew, view_poses
+from calib.mast.gimbal import MAST_NAMES
+from calib.mast.joints import JOINTS_NAMES
+from calib.rigid import Rigid
+from calib.survey import Survey
+
+MOVES = 4
+"""Boards that moved far are looked for so many times."""
+
+TURNABOUTS = 0.34
+"""A board stood at two places in turn if no cut divides its pictures but for this part of the fewer ones."""
+
+AXES = tuple(MAST_NAMES.index(names[0].removeprefix("mast.")) for names in AXIS_TERMS.values())
+
+
+@dataclass(frozen=True)
+class BenchOptions:
+    """What is chosen and not measured.
+
+    Attributes
+    ----------
+    kind
+        Camera model of all cameras; None: as the survey says for each.
+    terms
+        The terms that enter; None: those that are significant.
+    rover_from_mast
+        Where the rover frame is: the mast's frame at zero angles in it, as a level and a tape give it.
+        Default: it is the mast's.
+    rover_from_board
+        Or the board and placement whose pose is known, and that pose.
+    """
+
+    kind: Kind | None = None
+    terms: Sequence[str] | None = None
+    rover_from_mast: Rigid | None = None
+    rover_from_board: tuple[tuple[str, str], Rigid] | None = None
+
+
+class BenchProblem:
+    """The problem of a bench's pictures; a board that turns out to have moved changes it.
+
+    Raises
+    ------
+    BenchNotFitted
+        If the pictures allow no start, or a board stood at two places in turn.
+    """
+
+    def __init__(self, survey: Survey, options: BenchOptions) -> None:
+        self.survey, self.options = survey, options
+        self.terms: BenchTerms = bench_terms(survey)
+        self.notes = list(self.terms.notes)
+        self.joint_rad = survey.sigma.joint_rad
+        if not any(t.attitude is not None for t in self.terms.images):
+            raise BenchNotFitted(
+                "no picture of a head camera shows a board: the head cannot be calibrated; at least 20 "
+                "pictures are expected, with pan and tilt both moved between them"
+            )
+        self.cameras = {t.camera: survey.cameras[t.camera] for t in self.terms.images}
+        self.boards = tuple(dict.fromkeys(t.board[0] for t in self.terms.images))
+        self.split: list[tuple[tuple[str, str], tuple[str, str], str]] = []
+        self.views = self._views()
+        self.begin()
+
+    def begin(self) -> None:
+        """Find where to start, and leave out placements that no head camera shows.
+
+        A board that stood elsewhere in all pictures from some one on counts as two placements.
+        """
+        start = self._start()
+        for _ in range(MOVES):
+            if not start.elsewhere:
+                break
+            board, elsewhere = next(iter(start.elsewhere.items()))
+            self._moved_far(board, elsewhere)
+            start = self._start()
+        self.notes += start.notes
+        images = [t for t in self.terms.images if t.board in start.estimate.rover_from_board]
+        checks = [t for t in self.terms.checks if t.board in start.estimate.rover_from_board]
+        self.terms = replace(self.terms, images=tuple(images), checks=tuple(checks))
+        self.start, self.doubtful = self._in_rover(start.estimate), start.doubtful
+        self.boards = tuple(dict.fromkeys(t.board[0] for t in images))
+
+    def _start(self) -> BenchStart:
+        return bench_start(self.terms.images, self.views, self.terms.attitudes if self.joint_rad > 0 else 0)
+
+    def _moved_far(self, board: tuple[str, str], elsewhere: frozenset[str]) -> None:
+        """Split the placement of a board that moved; refuse one that stood at two places in turn."""
+        shown = [t for t in self.terms.images if t.board == board]
+        there = np.array([t.name in elsewhere for t in shown])
+        changes = np.flatnonzero(there[1:] != there[:-1])
+        # A picture that says nothing clear may lie on either side: the change is where it divides best.
+        wrong = [
+            int(min((~there[:k]).sum() + there[k:].sum(), there[:k].sum() + (~there[k:]).sum()))
+            for k in range(len(shown) + 1)
+        ]
+        cut = int(np.argmin(wrong))
+        if wrong[cut] > TURNABOUTS * there.sum():
+            first = [shown[i + 1].name for i in changes[:3]]
+            raise BenchNotFitted(
+                f"board {board[0]} of placement {board[1]} stands at two places, now at one and now at the "
+                f"other (pictures {', '.join(first)} and others): two boards have the same ids, or it was "
+                "moved and put back; leave one board only, or print the other with other ids (first_id)"
+            )
+        before, after = shown[cut - 1].name, shown[cut].name
+        self.notes.append(
+            f"board {board[0]} moved during placement {board[1]}, between pictures {before} and {after}; "
+            "from there on it counts as another placement"
+        )
+        self.split_placement(board, after)
+
+    def split_placement(self, board: tuple[str, str], after: str) -> None:
+        """Give the images of a board from one on a placement of their own."""
+        names = [i.name for i in self.survey.images]
+        first = names.index(after)
+        moved = (board[0], f"{board[1]} from {after} on")
+        self.split.append((board, moved, after))
+
+        def relabelled(terms: Sequence[ImageTerm]) -> tuple[ImageTerm, ...]:
+            return tuple(
+                replace(t, board=moved) if t.board == board and names.index(t.name) >= first else t
+                for t in terms
+            )
+
+        self.terms = replace(
+            self.terms, images=relabelled(self.terms.images), checks=relabelled(self.terms.checks)
+        )
+
+    def _views(self) -> dict[str, ViewPoses]:
+        """What each camera says by itself."""
+        views = {}
+        for name, camera in self.cameras.items():
+            mine = [t for t in self.terms.images if t.camera == name]
+            try:
+                views[name] = view_poses(
+                    mine, self.options.kind or camera.kind, camera.size_px, camera.focal_px or None
+                )
+            except ViewsTooFew as error:
+                raise BenchNotFitted(f"camera {name}: {error}") from None
+        return views
+
+    def _in_rover(self, state: Estimate) -> Estimate:
+        """The start, which is in the mast's frame, carried to where the rover frame was chosen to be."""
+        options, known = self.options, self.options.rover_from_board
+        state = replace(state, bows_m={b: np.zeros(2) for b, _ in state.rover_from_board})
+        if known is not None and known[0] not in state.rover_from_board:
+            there = ", ".join("/".join(board) for board in state.rover_from_board)
+            raise BenchNotFitted(
+                f"no picture shows the board {'/'.join(known[0])} that is known; there are {there}"
+            )
+        rover_from_mast = options.rover_from_mast
+        if known is not None:
+            rover_from_mast = known[1] @ state.rover_from_board[known[0]].inverse
+        if rover_from_mast is None:
+            return state
+        angles = Rotation.from_matrix(rover_from_mast.rotation).as_euler("XYZ")
+        mast = np.array([*rover_from_mast.translation_m, *angles, *state.mast[6:]])
+        boards = {b: rover_from_mast @ pose for b, pose in state.rover_from_board.items()}
+        cameras = {
+            n: m.moved(rover_from_mast) if self.cameras[n].on == "rover" else m
+            for n, m in state.cameras.items()
+        }
+        if known is not None:
+            boards[known[0]] = known[1]
+        return replace(state, cameras=cameras, mast=mast, rover_from_board=boards)
+
+    def problem(self, chosen: Sequence[str], state: Estimate) -> Adjustment:
+        """The least-squares problem with some terms."""
+        known = self.options.rover_from_board
+        axes = [i for i, term in zip(AXES, AXIS_TERMS, strict=True) if term in chosen]
+        return Adjustment(
+            with_kept(self.terms.images, self.doubtful),
+            (),
+            state,
+            mast_parameters=[*(() if known is None else range(6)), *axes],
+            joint_rad=self.joint_rad,
+            joint_errors=joint_numbers(chosen),
+            bowed=[b for b in self.boards if f"bow of {b}" in chosen],
+            held=() if known is None else (known[0],),
+            huber=HUBER,
+        )
+
+    def seen(self, chosen: Sequence[str], start: Estimate) -> Adjustment:
+        """The problem without images whose corners have no pixel at the start."""
+        problem = self.problem(chosen, start)
+        unseen = {t.name for t in problem.images if not np.isfinite(problem.image_residual(start, t)).all()}
+        return problem.with_terms(with_kept(problem.images, unseen), ())
+
+    def candidates(self) -> tuple[str, ...]:
+        """Terms that pictures could tell: backlash only where the axis came from both sides."""
+        found = []
+        approaches = np.array([t.approach for t in self.terms.images if t.attitude is not None])
+        for term in candidate_terms(self.boards):
+            axis = 0 if term.startswith("pan") else 1
+            if term.endswith("backlash") and not {-1, 1} <= set(approaches[:, axis].tolist()):
+                self.notes.append(
+                    f"{term} cannot be told: {('pan', 'tilt')[axis]} did not come to rest from both sides"
+                )
+                continue
+            found.append(term)
+        return tuple(found)
+
+
+def without_terms(state: Estimate, terms: set[str]) -> Estimate:
+    """Return the state with some terms' numbers at nothing."""
+    mast, errors = state.mast.copy(), state.joint_errors.copy()
+    mast[[i for i, term in zip(AXES, AXIS_TERMS, strict=True) if term in terms]] = 0.0
+    errors[joint_numbers([term for term in terms if term.startswith(("pan ", "tilt "))])] = 0.0
+    bows = {b: np.zeros(2) if f"bow of {b}" in terms else bow for b, bow in state.bows_m.items()}
+    return replace(state, mast=mast, joint_errors=errors, bows_m=bows)
+
+
+def term_values(state: Estimate) -> dict[str, float]:
+    """The values of all terms' numbers by their names."""
+    values = dict(zip(JOINTS_NAMES, state.joint_errors.tolist(), strict=True))
+    values |= {f"mast.{MAST_NAMES[i]}": float(state.mast[i]) for i in AXES}
+    for board, bow in state.bows_m.items():
+        values |= {f"board {board}.bow_m.{a}": float(b) for a, b in zip("xy", bow, strict=True)}
+    return values
