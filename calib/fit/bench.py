@@ -12,6 +12,7 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -44,6 +45,9 @@ SLIP_RAD, SLIP_ASIDE = 0.003, 0.1
 LONE = 6.0
 """While changes are looked for, a corner so many times farther off than its image's median counts as
 wrong."""
+
+PART = 4
+"""As many pictures on one side of another are no blunders."""
 
 CHANGES = 4
 """Boards that moved are looked for so many times."""
@@ -87,13 +91,14 @@ def _fitted(bench: BenchProblem, began: float) -> BenchCalibration:
     start = without_terms(start, set(every) - set(chosen))
     last = bench.problem(chosen, start).with_terms(problem.images, ())
     problem, fit = without_blunders(last, start, bench.terms.images, bounded=not chooses)
+    _refuse_part(problem)
     _refuse_far(problem, fit.state)
     weighed = weigh(problem, fit, bench.terms.images)
     if not weighed.fit.settled:
         raise BenchNotFitted(
-            f"the fit did not settle: after {weighed.fit.steps} steps it was still finding better "
-            "values, so that neither they nor their sigmas are good; take more pictures, at more pan "
-            "and tilt angles and distances"
+            f"the fit did not settle: after {weighed.fit.steps} steps it was still finding better values, so "
+            "that neither they nor their sigmas are good; take more pictures, at more pan and tilt angles "
+            "and distances"
         )
     return told(bench, (problem, fit), weighed, named, chosen, tests, began)
 
@@ -142,9 +147,8 @@ def _refuse_slip(bench: BenchProblem, state: Estimate) -> None:
         aside = np.linalg.norm(turn[:2]) + np.linalg.norm(motion.translation_m)
         if abs(turn[2]) > SLIP_RAD and aside < SLIP_ASIDE * abs(turn[2]):
             raise BenchNotFitted(
-                f"pan slipped by about {1e3 * abs(turn[2]):.0f} mrad before picture {after}: the head "
-                "no longer "
-                "points where it read before; tighten what holds it on its axis and take the "
+                f"pan slipped by about {1e3 * abs(turn[2]):.0f} mrad before picture {after}: the head no "
+                "longer points where it read before; tighten what holds it on its axis and take the "
                 "pictures again"
             )
 
@@ -161,6 +165,35 @@ def _without_lone_strays(problem: Adjustment, state: Estimate) -> Adjustment:
         keep[keep] = length < LONE * max(float(np.median(length)), 1.0)
         terms.append(replace(t, keep=keep))
     return problem.with_terms(terms, ())
+
+
+def _refuse_part(problem: Adjustment) -> None:
+    """Raise if all pictures of a placement or a camera from some one on, or up to it, had to be left out."""
+    boards = [
+        ("placement " + b[1], [t for t in problem.images if t.board == b]) for b in _each(problem, "board")
+    ]
+    cameras = [
+        (f"camera {c}", [t for t in problem.images if t.camera == c]) for c in _each(problem, "camera")
+    ]
+    for what, shown in (*boards, *cameras):
+        out = np.array([not t.keep.any() for t in shown])
+        if out.sum() < PART or out.all():
+            continue
+        wrong = [
+            min((~out[:k]).sum() + out[k:].sum(), out[:k].sum() + (~out[k:]).sum())
+            for k in range(1, len(out))
+        ]
+        cut = int(np.argmin(wrong)) + 1
+        if wrong[cut - 1] <= 0.2 * out.sum():
+            raise BenchNotFitted(
+                f"{int(out.sum())} of {len(out)} pictures of {what} contradict the rest, all on one side of "
+                f"picture {shown[cut].name}: something changed before it; fasten board, head and cameras, "
+                "and take the pictures again, or take those out of images.csv"
+            )
+
+
+def _each(problem: Adjustment, what: str) -> list[Any]:
+    return list(dict.fromkeys(getattr(t, what) for t in problem.images))
 
 
 def _refuse_far(problem: Adjustment, state: Estimate) -> None:

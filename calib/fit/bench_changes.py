@@ -37,7 +37,7 @@ STILL_FAR = 9.0
 SIDE = 3
 """Pictures at least on either side of a change, at different standstills."""
 
-UNSEEN = 1e-5
+UNSEEN = 1e-3
 """A direction of a change is not looked at if the other unknowns take up all but this part of it."""
 
 LARGEST = 0.5
@@ -125,10 +125,12 @@ def find_change(
         Its (bounded) sum of squares, and degrees of freedom.
     """
     rows = [_rows(problem, state, image) for image in problem.images if image.keep.any()]
+    # Where the fit has not quite settled, what its last step would still do is none of the change's.
+    settling = covariance @ problem.normal(state).gradient
     found: list[Change] = []
     count = 0
     for what, board, camera, mine in _subjects(rows, problem):
-        changes = _tried(what, board, camera, mine, covariance)
+        changes = _tried(what, board, camera, mine, covariance, settling)
         count += len(changes)
         found += changes
     if not found:
@@ -168,6 +170,7 @@ def _tried(
     camera: str,
     rows: Sequence[_Rows],
     covariance: FloatArray,
+    settling: FloatArray,
 ) -> list[Change]:
     """The gain of every picture from which something may have changed."""
     size = rows[0].rates[what].shape[1]
@@ -185,7 +188,7 @@ def _tried(
         if min(_standstills(rows[:index]), _standstills(rows[index:])) < SIDE:
             continue
         left = own - shared @ covariance @ shared.T
-        gain, step = _gain(left, own, pull)
+        gain, step = _gain(left, own, pull - shared @ settling)
         if what != "board" and np.linalg.norm(step) > LARGEST:
             continue
         found.append(Change(what, board, camera, before.image.name, row.image.name, step, gain))
