@@ -25,7 +25,7 @@ from calib.fit.bench_problem import BenchOptions, BenchProblem, without_terms
 from calib.fit.bench_start import BenchNotFitted
 from calib.fit.bench_told import choose, told
 from calib.fit.joint import weigh, without_blunders
-from calib.fit.least_squares import covariance_of, minimise
+from calib.fit.least_squares import minimise
 from calib.fit.model_terms import Tested
 from calib.fit.start_values import SurveyNotFitted
 from calib.survey import Survey
@@ -122,9 +122,8 @@ def _look_for_changes(bench: BenchProblem, chosen: Sequence[str]) -> tuple[Adjus
         fit = minimise(problem, fit.state, weak=problem.weak, gain=1e-6)
         if not np.isfinite(fit.normal.cost) or not left:
             break
-        covariance = covariance_of(fit.normal.matrix, problem.weak)
         freedom = sum(2 * int(t.keep.sum()) for t in problem.images) - len(problem.names)
-        change = find_change(problem, fit.state, covariance, fit.normal.cost, freedom)
+        change = find_change(problem, fit.state, freedom)
         _refuse_slip(bench, fit.state)
         if change is None:
             break

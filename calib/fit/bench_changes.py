@@ -17,6 +17,7 @@ import numpy as np
 
 from calib.camera.cahvor import CameraModel
 from calib.fit.adjustment import Adjustment, Estimate
+from calib.fit.least_squares import covariance_of
 from calib.fit.significance import chance
 from calib.fit.terms import ImageTerm
 from calib.rigid import FloatArray, Rigid, moved_rigid
@@ -112,27 +113,26 @@ class _Rows:
     rates: dict[str, FloatArray]
 
 
-def find_change(
-    problem: Adjustment, state: Estimate, covariance: FloatArray, chi2: float, freedom: float
-) -> Change | None:
+def find_change(problem: Adjustment, state: Estimate, freedom: float) -> Change | None:
     """Return the change that explains most, or None if none is significant.
 
     Parameters
     ----------
-    problem, state, covariance
-        A fit with pulls bounded, and the inverse of its normal equations.
-    chi2, freedom
-        Its (bounded) sum of squares, and degrees of freedom.
+    problem, state, freedom
+        A fit with pulls bounded, and its degrees of freedom.
     """
     rows = [_rows(problem, state, image) for image in problem.images if image.keep.any()]
+    # Of this very state: what is left of a change that others nearly take up is a small difference.
+    chi2, matrix, gradient = problem.normal(state)
+    covariance = covariance_of(matrix, problem.weak)
     # Where the fit has not quite settled, what its last step would still do is none of the change's.
-    settling = covariance @ problem.normal(state).gradient
+    settling = covariance @ gradient
     found: list[Change] = []
     count = 0
     for what, board, camera, mine in _subjects(rows, problem):
         changes = _tried(what, board, camera, mine, covariance, settling)
         count += len(changes)
-        found += changes
+        found += [change for change in changes if change.chi2 < chi2]
     if not found:
         return None
     most = max(change.chi2 for change in found)
