@@ -8,6 +8,7 @@ from __future__ import annotations
 import argparse
 import contextlib
 import os
+import signal
 import subprocess
 import sys
 import webbrowser
@@ -36,6 +37,7 @@ def main() -> int:
         print(f"The page is at {url}/: click a rock, press P, read the residual. Ctrl-C ends it.", flush=True)
         if not asked.no_browser and (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
             webbrowser.open(url)
+        signal.signal(signal.SIGTERM, signal.default_int_handler)  # no daemon is left behind
         with contextlib.suppress(KeyboardInterrupt):
             return daemon.wait()
         daemon.terminate()
