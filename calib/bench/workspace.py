@@ -24,8 +24,8 @@ from calib.mast.pointing import solve
 from calib.rigid import FloatArray
 
 RANGES_M = (2.0, 6.0, 10.0)
-CLICKS = ((0.15, 0.2), (0.85, 0.8))
-"""Where in the picture targets are clicked, in parts of its width and height: off the middle, both ways."""
+CLICKS = ((0.15, 0.2), (0.85, 0.8), (0.85, 0.2), (0.15, 0.8))
+"""Where in the picture targets are clicked, in parts of its width and height: towards its corners."""
 STEPS = (5, 3)
 
 

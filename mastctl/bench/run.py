@@ -32,7 +32,7 @@ from mastctl.bench.search import Search
 from mastctl.bench.teller import Progress, Teller
 from mastctl.errors import MastctlError
 
-FEWEST_LOOKS = 6
+FEWEST_LOOKS = 8
 """Of a placement: fewer leave the board's own place, and so what it tells, to chance."""
 
 LITTLE_GAIN, LAST_GAIN = 0.12, 0.01
