@@ -132,10 +132,10 @@ def test_gross_corners_and_a_picture_of_something_else_are_left_out_and_named() 
 @pytest.mark.parametrize(
     ("mishap", "words"),
     [
-        (Mishap("pan", 7, 0.02), "pan slipped by about"),
+        (Mishap("pan", 7, 0.02), r"pan slipped by about (19|20)\."),
         (Mishap("tilt", 14, 0.004), "tilt slipped by about 4.0 mrad"),
         (Mishap("focus", 16, 0.01), "camera navcam_left was refocused"),
-        (Mishap("knock", 16, 0.004), "camera navcam_left was knocked"),
+        (Mishap("knock", 16, 0.004), r"camera navcam_left was knocked .* by about (3\.9|4\.0|4\.1) mrad"),
         (Mishap("twin", 0, 0.4), "two boards have the same ids"),
     ],
 )
