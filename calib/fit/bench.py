@@ -83,6 +83,7 @@ def _fitted(bench: BenchProblem, began: float) -> BenchCalibration:
     tests: dict[str, Tested] = {}
     every = bench.candidates()
     problem, start = _look_for_changes(bench, every)
+    _refuse_far(problem, start)  # before blunders are looked for one by one where nothing fits
     chooses = bench.options.terms is None
     if chooses:
         problem, fit = without_blunders(problem, start, bench.terms.images)
@@ -212,6 +213,6 @@ def _refuse_far(problem: Adjustment, state: Estimate) -> None:
             noise = np.median(np.concatenate([t.sigma_px for t in kept]))
             raise BenchNotFitted(
                 f"camera {name}: the fit leaves {typical:.1f} times the stated noise of a corner ({noise:g} "
-                "px): it ended in a wrong minimum, the board's measures are wrong, or the sigmas are too "
-                "small"
+                "px): it ended in a wrong minimum, the lens is none of this model, the board's measures are "
+                "wrong, or the sigmas are too small"
             )
