@@ -41,6 +41,7 @@ events state fault --count 5
 camera project mast.yaml --camera navcam_left --pan 0.3 --tilt -0.2 --points points.csv
 camera ray mast.yaml --camera navcam_left --pan 0.3 --tilt -0.2 --pixels pixels.csv
 camera convert camera.yaml camera.cahvor
+camera maps mast.yaml --pair navcam --out maps.npz
 camera list
 camera sync navcam_left navcam_right --config rover.yaml
 camera check /dev/video0 --rate 30
@@ -63,6 +64,10 @@ demo --out demo
 completion bash
 conform http://127.0.0.1:8420
 doctor --config rover.yaml
+sentinel reference --folder sentinel --rest 0,-0.3
+sentinel look --folder sentinel
+sentinel watch --folder sentinel --every-s 86400
+sentinel status --folder sentinel
 record start afternoon
 record stop
 record list
@@ -82,7 +87,7 @@ ptu home /dev/ttyUSB0
 _GROUPS = frozenset(
     (
         *("lease", "token", "track", "operations", "mast", "fault", "camera", "experiment", "record"),
-        *("sim", "servo", "ptu", "board"),
+        *("sim", "servo", "ptu", "board", "sentinel"),
     )
 )
 
