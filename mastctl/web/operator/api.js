@@ -70,6 +70,8 @@ export const post = (path, body, options) => ask("POST", path, body, options);
 
 /** Stops wait for nothing here. */
 export const stop = () => sent("POST", "/stop", {}, { ms: 4000, priority: "high", keepalive: true });
+/** It latches: nothing moves until somebody releases it with a reason. */
+export const estop = () => sent("POST", "/estop", { reason: "pressed on the page", name: client }, { ms: 4000, priority: "high", keepalive: true });
 /** Nor does the question whether anybody is there. */
 export const live = () => sent("GET", "/health/live", null, { ms: 2000 });
 /** Neither do heartbeats, of which one is under way at a time, nor what is said on leaving. */

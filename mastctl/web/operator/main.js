@@ -1,6 +1,6 @@
 // The page: what is always in sight, and the panels told of what changes.
 import { byId, h, put, say, set } from "./dom.js";
-import { get, post, stop } from "./api.js";
+import { estop, get, post, stop } from "./api.js";
 import { forTime, sentence } from "./words.js";
 import { Control } from "./control.js";
 import { Events } from "./events.js";
@@ -34,25 +34,29 @@ function notice(words) {
   noticeTimer = setTimeout(() => place.remove(), 8000);
 }
 
-// STOP: no lease, no confirmation, no queue; Escape does the same wherever the focus is.
-async function stopNow() {
-  byId("stop").dataset.pressed = "sent";
+// STOP and E-STOP: no lease, no confirmation, no queue; Escape does what STOP does wherever the focus is.
+async function press(button, send, name, done) {
+  button.dataset.pressed = "sent";
   const failed = byId("stop-failed");
   try {
-    await stop();
+    await send();
     failed.hidden = true;
-    byId("stop").dataset.pressed = "confirmed";
-    say(byId("said"), "Stopped.");
+    button.dataset.pressed = "confirmed";
+    say(byId("said"), done);
   } catch (error) {
     failed.hidden = false;
-    failed.textContent = `STOP IS NOT CONFIRMED. ${error.message} Use the switch in the supply.`;
-    byId("stop").dataset.pressed = "failed";
+    failed.textContent = `${name} IS NOT CONFIRMED. ${error.message} Use the switch in the supply.`;
+    button.dataset.pressed = "failed";
   }
-  setTimeout(() => { byId("stop").dataset.pressed = ""; }, 1200);
+  setTimeout(() => { button.dataset.pressed = ""; }, 1200);
 }
-byId("stop").addEventListener("pointerdown", (event) => { if (event.button === 0) { event.preventDefault(); stopNow(); } });
-byId("stop").addEventListener("keydown", (event) => { if (event.key === "Enter" || event.key === " ") { event.preventDefault(); if (!event.repeat) stopNow(); } });
-byId("stop").addEventListener("click", (event) => { if (event.detail === 0) stopNow(); }); // a screen reader's or a switch's press
+const stopNow = () => press(byId("stop"), stop, "STOP", "Stopped.");
+const latchNow = () => press(byId("latch"), estop, "E-STOP", "Emergency stop. Nothing moves until it is released.");
+for (const [id, now] of [["stop", stopNow], ["latch", latchNow]]) {
+  byId(id).addEventListener("pointerdown", (event) => { if (event.button === 0) { event.preventDefault(); now(); } });
+  byId(id).addEventListener("keydown", (event) => { if (event.key === "Enter" || event.key === " ") { event.preventDefault(); if (!event.repeat) now(); } });
+  byId(id).addEventListener("click", (event) => { if (event.detail === 0) now(); }); // a screen reader's or a switch's press
+}
 document.addEventListener("keydown", (event) => { if (event.key === "Escape" && !event.repeat) stopNow(); }, { capture: true });
 for (const dialog of document.querySelectorAll("dialog")) dialog.addEventListener("cancel", (event) => event.preventDefault());
 
@@ -82,7 +86,8 @@ function standing(now) {
   if (before !== now.state) speak(`${now.state}. ${now.reason}`, ["stopped", "fault"].includes(now.state) && Boolean(now.reason));
   const latch = now.estop;
   byId("estop").hidden = !latch;
-  if (latch) put(byId("estop"), h("strong", {}, "Emergency stop"), ` by ${latch.name}: ${latch.reason}. Nothing moves until it is released. `, h("button", { type: "button", id: "release", disabled: !may, onclick: () => byId("reset").showModal() }, "Release …"));
+  set(byId("latch"), "aria-pressed", String(Boolean(latch)));
+  if (latch) put(byId("estop"), h("strong", {}, "Emergency stop"), ` by ${latch.name}: ${latch.reason}. Nothing moves until it is released, after a restart of the daemon neither. `, h("button", { type: "button", id: "release", disabled: !may, onclick: () => byId("reset").showModal() }, "Release …"));
   document.title = `${now.state} – mastctl`;
 }
 setInterval(() => say(byId("state-for"), events.connected ? `for ${forTime((performance.now() - since) / 1000)}` : ""), 500);

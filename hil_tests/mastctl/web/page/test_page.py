@@ -355,6 +355,31 @@ def test_an_emergency_stop_is_told_and_released_with_a_reason(pair: BOTH, visit:
     assert one.page.locator("#estop").is_hidden()
 
 
+@pytest.mark.parametrize("by", ["press", "key"])
+def test_an_emergency_stop_is_pressed_without_a_lease_and_holds(pair: BOTH, visit: Visits, by: str) -> None:
+    daemon, hardware = pair
+    with httpx.Client(base_url=f"{daemon.url}/api/v1", trust_env=False) as http:
+        lease = http.post("/lease", json={"for_s": 60.0}, headers={"Mastctl-Client": "somebody"}).json()
+        one = visit(daemon.url)
+        one.word("ready")
+        latch = one.page.get_by_role("button", name="E-STOP latches until released")
+        assert latch.get_attribute("aria-pressed") == "false"
+        if by == "press":
+            latch.click()
+        else:
+            latch.focus()
+            one.page.keyboard.press("Enter")
+        eventually(lambda: ("stop",) in hardware.head.calls, "the head was told to stop")
+        one.page.wait_for_selector("#latch[aria-pressed=true]")
+        words = one.page.locator("#estop").inner_text()
+        assert "pressed on the page" in words and "Nothing moves until it is released" in words
+        assert len(one.posts("/estop")) == 1 and not one.posts("/stop")
+        refused = http.post(
+            "/point", json={"pan_rad": 0.1, "tilt_rad": 0.0}, headers={"Mastctl-Lease": lease["lease_id"]}
+        )
+        assert refused.json()["error"]["code"] == "estopped"
+
+
 def test_places_are_kept_and_gone_to(pair: BOTH, visit: Visits) -> None:
     daemon, hardware = pair
     one = visit(daemon.url)
