@@ -84,6 +84,7 @@ class Door:
         self._rig = rig
         self._sun = sun
         self._rover_from_site = np.eye(3)
+        self._sun_boxes: tuple[Box, ...] = ()
         self._boxes: tuple[KeepOuts | None, KeepOuts | None] = (None, None)  # without the sun, and with it
         self._sent: _Sent | None = None
         self._inside_s: Mapping[str, float] = {}  # where the head stands and should not, and since when
@@ -284,16 +285,21 @@ class Door:
         """Return the sun as ``GET /limits/sun`` tells it."""
         sun, now_s = self._sun, self._clock.now_s()
         if sun is None:
-            return {"sun": None}
+            return {"sun": None, "boxes": []}
         x, y, z = sun.direction
+        boxes = self._sun_boxes if sun.holds(now_s) else ()
         return {
+            "boxes": [
+                {"name": box.name, "pan_rad": list(box.pan_rad), "tilt_rad": list(box.tilt_rad)}
+                for box in boxes
+            ],
             "sun": {
                 "direction": [x, y, z],
                 "frame": sun.frame,
                 "half_angle_rad": sun.half_angle_rad,
                 "left_s": None if sun.until_s is None else max(0.0, sun.until_s - now_s),
                 "holds": sun.holds(now_s),
-            }
+            },
         }
 
     def _start(self, reading: Reading) -> tuple[Span, bool]:
@@ -328,6 +334,7 @@ class Door:
         made = []
         plain: list[Box] = [copy for box in limits.keep_out for copy in box.within(reach)]
         with_sun = list(plain)
+        self._sun_boxes = ()
         if sun is not None and self._rig is not None:
             direction = np.array(sun.direction)
             in_rover = direction if sun.frame == "rover" else self._rover_from_site @ direction
@@ -338,6 +345,7 @@ class Door:
                 Box(box.name, _as_read(joints.pan, box.pan_rad), _as_read(joints.tilt, box.tilt_rad))
                 for box in sun_boxes(self._rig, in_rover, sun.half_angle_rad, true_tilts)
             ]
+            self._sun_boxes = tuple(rows)
             with_sun += [copy for box in rows for copy in box.within(reach)]
         for boxes in (plain, with_sun):
             whole = KeepOuts(tuple(boxes), limits.margin_rad, self._beyond, limits.pan_rad, limits.tilt_rad)

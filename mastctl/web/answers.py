@@ -91,9 +91,10 @@ class ReadyTold(_Told):
 
 
 class SunTold(_Told):
-    """``GET /limits/sun``; null where none was told."""
+    """``GET /limits/sun``; null where none was told. ``boxes``: of joints, within its cone while it holds."""
 
     sun: Sun | None
+    boxes: list[BoxTold]
 
 
 class LastResidual(_Told):
@@ -208,10 +209,14 @@ class CameraMountTold(_Told):
 
 
 class RigTold(_Told):
-    """``GET /rig``: the configured cameras by the mast file in use, its date, its neighbours."""
+    """``GET /rig``: the configured cameras by the mast file in use, its date, its neighbours.
+
+    ``made`` as the file's provenance says it; ``written_s``: when the file was, seconds since 1970 (UTC).
+    """
 
     digest: str
     made: str | None
+    written_s: float | None
     cameras: dict[str, CameraMountTold]
     mast_files: list[str]
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from importlib.resources import files
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -67,6 +68,7 @@ def rig_told(service: Service) -> dict[str, Any]:
     return {
         "digest": stored.digest,
         "made": None if made is None else str(made)[:40],
+        "written_s": _written_s(service.masts.in_use.path),
         "cameras": {
             name: _mount(camera) | _partners(name, stored.rig.stereo, names)
             for name, camera in stored.rig.cameras.items()
@@ -74,6 +76,13 @@ def rig_told(service: Service) -> dict[str, Any]:
         },
         "mast_files": found,
     }
+
+
+def _written_s(path: Path) -> float | None:
+    try:
+        return path.stat().st_mtime
+    except OSError:  # it was moved since it was read
+        return None
 
 
 def _mount(camera: RigCamera) -> dict[str, Any]:

@@ -183,7 +183,7 @@ def test_the_sun_is_kept_out_until_its_moment_and_then_missed_aloud() -> None:
     door.check_goal(0.5, 0.0)
     assert [fault.code for fault in door.faults(at(0.5, 0.02))] == ["sun_not_known"]
     door.use_sun(None)
-    assert door.faults(at(0.5, 0.02)) == () and door.told() == {"sun": None}
+    assert door.faults(at(0.5, 0.02)) == () and door.told() == {"sun": None, "boxes": []}
 
 
 def test_a_sun_that_is_told_in_the_way_of_a_head_is_found_there_but_not_behind_it() -> None:

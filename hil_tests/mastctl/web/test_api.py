@@ -654,15 +654,17 @@ def test_what_is_not_http_does_no_harm(quiet: httpx.Client) -> None:
 
 
 def test_the_sun_is_told_kept_out_and_forgotten(web: httpx.Client) -> None:
-    assert web.get("/limits/sun").json() == {"sun": None}
+    assert web.get("/limits/sun").json() == {"sun": None, "boxes": []}
     body = {"azimuth_rad": 0.1, "elevation_rad": -0.1, "half_angle_rad": 0.2, "valid_s": 60.0}
-    told = web.post("/limits/sun", json=body).json()["sun"]
+    answer = web.post("/limits/sun", json=body).json()
+    told, boxes = answer["sun"], answer["boxes"]
+    assert any(low <= 0.1 <= high for low, high in (box["pan_rad"] for box in boxes))
     assert told["holds"] and told["frame"] == "site" and 50.0 < told["left_s"] <= 60.0
     assert "keep-out sun" in refused(web.post("/point", json=ANGLES), 422, "keep_out")
     vector = {"direction": [-2.0, 0.0, 0.0], "frame": "rover", "half_angle_rad": 0.2}
     assert web.post("/limits/sun", json=vector).json()["sun"]["direction"] == [-1.0, 0.0, 0.0]
     ended(web, web.post("/point", json=ANGLES).json()["id"])
-    assert web.delete("/limits/sun").json() == {"sun": None}
+    assert web.delete("/limits/sun").json() == {"sun": None, "boxes": []}
 
 
 @pytest.mark.parametrize(

@@ -1,6 +1,6 @@
 // Where the head is: figures against limits, a rose with each camera's field of view, a map of the joints.
 import { byId, h, put, s, say } from "./dom.js";
-import { camera as called, deg, degrees, number } from "./words.js";
+import { camera as called, deg, degrees, forTime, number } from "./words.js";
 
 const R = 84;
 
@@ -11,7 +11,8 @@ export class HeadPanel {
     this.rose = s("svg", { class: "rose", viewBox: "-118 -112 236 224", role: "img" });
     this.map = s("svg", { class: "map", viewBox: "0 0 220 150", role: "img" });
     this.note = h("p", { class: "quiet" });
-    put(byId("head"), this.figures, h("div", { class: "drawings" }, this.rose, this.map), this.note);
+    this.sunNote = h("p", { class: "quiet", id: "sun-note" });
+    put(byId("head"), this.figures, h("div", { class: "drawings" }, this.rose, this.map), this.sunNote, this.note);
     events.addEventListener("joints", (event) => { this.joints = event.detail.value; this.draw(); });
     document.addEventListener("views-changed", () => this.draw());
   }
@@ -19,6 +20,11 @@ export class HeadPanel {
   use(status, rig, views) {
     [this.limits, this.rig, this.views] = [status.limits, rig, views];
     this.joints ??= status.joints;
+    this.draw();
+  }
+
+  keptOff({ sun, boxes }) {
+    [this.sun, this.sunBoxes] = [sun, boxes];
     this.draw();
   }
 
@@ -33,6 +39,8 @@ export class HeadPanel {
     this.drawRose();
     this.drawMap();
     const off = this.joints && Math.max(Math.abs(this.joints.true_pan_rad - this.joints.pan_rad), Math.abs(this.joints.true_tilt_rad - this.joints.tilt_rad));
+    const { sun } = this;
+    say(this.sunNote, !sun ? "" : sun.holds ? `Hatched in the map: the head keeps ${deg(sun.half_angle_rad, 1).slice(1)} off the sun${sun.left_s === null ? "" : `, for ${forTime(sun.left_s)} more when this was told`}.` : "Where the sun stands is not known any more; nothing keeps the head off it.");
     say(this.note, off > 5e-6 ? `By the mast file's joints the head truly stands at ${deg(this.joints.true_pan_rad, 3)} ${deg(this.joints.true_tilt_rad, 3)}.` : "");
   }
 
@@ -80,14 +88,16 @@ export class HeadPanel {
     const x = (value) => left + (width * (value - pan[0] + edge)) / (pan[1] - pan[0] + 2 * edge);
     const y = (value) => top + (height * (tilt[1] + edge - value)) / (tilt[1] - tilt[0] + 2 * edge);
     const turns = [-2, -1, 0, 1, 2].map((k) => 2 * Math.PI * k);
-    const out = boxes.flatMap((box) => turns.map((turn) => {
+    const sun = this.sunBoxes ?? [];
+    const out = [...boxes.map((box) => [box, "out"]), ...sun.map((box) => [box, "sun"])].flatMap(([box, kind]) => turns.map((turn) => {
       const [a, b] = box.pan_rad.map((value) => Math.min(pan[1] + edge, Math.max(pan[0] - edge, value + turn)));
       const [c, d] = box.tilt_rad.map((value) => Math.min(tilt[1] + edge, Math.max(tilt[0] - edge, value)));
-      return b > a && d > c ? s("rect", { class: "out", x: x(a), y: y(d), width: x(b) - x(a), height: y(c) - y(d) }, s("title", {}, `keep-out ${box.name}`)) : null;
+      return b > a && d > c ? s("rect", { class: kind, x: x(a), y: y(d), width: x(b) - x(a), height: y(c) - y(d) }, s("title", {}, kind === "sun" ? "the cone around the sun" : `keep-out ${box.name}`)) : null;
     }));
     const here = this.joints ? [x(this.joints.pan_rad), y(this.joints.tilt_rad)] : null;
-    this.map.setAttribute("aria-label", `Joint map: pan ${deg(this.joints?.pan_rad, 1)}, tilt ${deg(this.joints?.tilt_rad, 1)}; ${boxes.length ? `${boxes.length} keep-outs` : "no keep-outs"}`);
+    this.map.setAttribute("aria-label", `Joint map: pan ${deg(this.joints?.pan_rad, 1)}, tilt ${deg(this.joints?.tilt_rad, 1)}; ${boxes.length ? `${boxes.length} keep-outs` : "no keep-outs"}${sun.length ? "; the cone around the sun" : ""}`);
     put(this.map,
+      s("defs", {}, s("pattern", { id: "sun-hatch", width: 5, height: 5, patternUnits: "userSpaceOnUse", patternTransform: "rotate(45)" }, s("rect", { class: "sun-ground", width: 5, height: 5 }), s("path", { class: "sun-line", d: "M0 0V5" }))),
       s("rect", { class: "field", x: x(pan[0]), y: y(tilt[1]), width: x(pan[1]) - x(pan[0]), height: y(tilt[0]) - y(tilt[1]) }),
       s("path", { class: "zero", d: `M${x(0)} ${y(tilt[1])}V${y(tilt[0])}M${x(pan[0])} ${y(0)}H${x(pan[1])}` }),
       out,

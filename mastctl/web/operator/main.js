@@ -96,6 +96,7 @@ events.addEventListener("state", (event) => standing(event.detail.value));
 events.addEventListener("lease", (event) => control.told(event.detail.value.control));
 events.addEventListener("joints", (event) => { jog.here = [event.detail.value.pan_rad, event.detail.value.tilt_rad]; });
 events.addEventListener("mast", () => refresh());
+events.addEventListener("fault", (event) => { if (event.detail.key === "sun") refresh(); });
 events.addEventListener("command", (event) => {
   const kind = event.detail.value.command ?? "";
   refresh();
@@ -130,6 +131,7 @@ async function refresh() {
       rig = await get("/rig");
       views.use(rig);
     }
+    head.keptOff(await get("/limits/sun"));
     show(status);
   } catch (error) {
     if (error.status) notice(error.message);

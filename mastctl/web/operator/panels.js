@@ -1,7 +1,7 @@
 // The quiet panels: faults, recording, mast file, residuals, operations, track, simulated faults.
 import { byId, h, put, s, say } from "./dom.js";
 import { ask, fileOf, get, post } from "./api.js";
-import { camera as called, deg, forTime, metres, number, sentence } from "./words.js";
+import { camera as called, deg, forTime, metres, moment, number, sentence } from "./words.js";
 
 const NAMES = { point: "Point", track: "Track", look: "Look", jog: "Jog" };
 
@@ -85,9 +85,10 @@ export class MastFile {
   told(status, rig) {
     const { mast, former_mast: former, calibration } = status;
     const verdict = calibration ? { good: "holds", drifts: "drifts", few: "too few pointings yet", unknown: "not known" }[calibration.verdict] : "not known";
-    byId("mast").replaceChildren(mast.file, h("span", { class: `verdict ${calibration?.verdict ?? ""}` }, verdict));
+    const [made, from] = rig.made ? [String(rig.made), "as the file says"] : rig.written_s ? [moment(rig.written_s), "the file's own time; it says no date"] : ["", "no date is known"];
+    byId("mast").replaceChildren(mast.file, h("span", { class: "verdict", title: from }, made ? `${rig.made ? "made" : "file of"} ${made.slice(0, 10)}` : "no date"), h("span", { class: `verdict ${calibration?.verdict ?? ""}` }, verdict));
     const row = (name, value) => h("tr", {}, h("th", { scope: "row" }, name), h("td", {}, value));
-    put(this.facts, row("In use", `${mast.file} (${mast.name})`), row("Made", rig.made ?? "no date in the file"), row("Digest", h("code", {}, mast.digest.slice(0, 12))),
+    put(this.facts, row("In use", `${mast.file} (${mast.name})`), row(rig.made ? "Made" : "Written", made ? `${made}, ${from}` : from), row("Digest", h("code", {}, mast.digest.slice(0, 12))),
       row("Calibration", sentence(calibration?.sentence) || "No verdict"), former ? row("Before it", former.file) : null);
     put(this.choice, rig.mast_files.map((name) => h("option", { value: name, selected: name === mast.file }, name)));
     this.back.hidden = !former;

@@ -20,6 +20,13 @@ export function forTime(seconds) {
   return `${Math.floor(seconds / 3600)} h ${Math.floor((seconds % 3600) / 60)} min`;
 }
 
+/** A moment by the clock of this place. */
+export function moment(since1970) {
+  const at = new Date(since1970 * 1000);
+  const two = (value) => String(value).padStart(2, "0");
+  return `${at.getFullYear()}-${two(at.getMonth() + 1)}-${two(at.getDate())} ${two(at.getHours())}:${two(at.getMinutes())}`;
+}
+
 export const camera = (name) => name.replaceAll("_", " ");
 
 export const sentence = (text) => (text ? text[0].toUpperCase() + text.slice(1) : "");

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import socket
 import time
 from collections.abc import Callable, Iterator
@@ -378,6 +379,39 @@ def test_an_emergency_stop_is_pressed_without_a_lease_and_holds(pair: BOTH, visi
             "/point", json={"pan_rad": 0.1, "tilt_rad": 0.0}, headers={"Mastctl-Lease": lease["lease_id"]}
         )
         assert refused.json()["error"]["code"] == "estopped"
+
+
+def test_the_cone_around_the_sun_is_in_the_joint_map_until_it_is_taken_back(
+    pair: BOTH, visit: Visits
+) -> None:
+    daemon, _ = pair
+    one = visit(daemon.url)
+    one.word("ready")
+    assert one.page.locator(".map .sun").count() == 0
+    sun = {"direction": [1.0, 0.2, -0.1], "frame": "rover", "half_angle_rad": 0.2}
+    with httpx.Client(base_url=f"{daemon.url}/api/v1", trust_env=False) as http:
+        http.post("/limits/sun", json=sun)
+        one.page.wait_for_selector(".map .sun", state="attached")
+        assert "11.5° off the sun" in one.page.locator("#sun-note").inner_text()
+        http.delete("/limits/sun")
+    one.page.wait_for_selector(".map .sun", state="detached")
+    assert one.page.locator("#sun-note").inner_text() == ""
+
+
+def test_the_mast_file_s_date_is_told_and_whose_it_is(pair: BOTH, visit: Visits, tmp_path: Path) -> None:
+    daemon, _ = pair
+    os.utime(tmp_path / "little.yaml", (1_700_000_000, 1_700_000_000))
+    plain = (tmp_path / "little.yaml").read_text()
+    dated = plain.replace("provenance: {}", "provenance: {date: '2025-03-04'}")
+    assert dated != plain
+    (tmp_path / "dated.yaml").write_text(dated)
+    one = visit(daemon.url)
+    one.page.wait_for_selector("#mast >> text=file of 2023-11-1")
+    assert "the file's own time" in one.page.locator("#mast-file").inner_text()
+    with httpx.Client(base_url=f"{daemon.url}/api/v1", trust_env=False) as http:
+        assert http.post("/mast", json={"file": "dated.yaml"}).status_code == 200
+    one.page.wait_for_selector("#mast >> text=made 2025-03-04")
+    assert "as the file says" in one.page.locator("#mast-file").inner_text()
 
 
 def test_places_are_kept_and_gone_to(pair: BOTH, visit: Visits) -> None:
