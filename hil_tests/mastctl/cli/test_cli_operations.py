@@ -14,7 +14,7 @@ import pytest
 from calib.files.mast_file import save_rig
 from hil_tests.mastctl.service_fakes import FakeHardware, rig
 from mastctl.cli.examples import EXAMPLES
-from mastctl.cli.main import build_parser, main
+from mastctl.cli.main import _as_one_word, build_parser, main
 from mastctl.client import Client
 from mastctl.daemon import RunningDaemon
 
@@ -112,4 +112,4 @@ def test_the_help_of_each_command_shows_an_example_that_it_takes() -> None:
     assert set(EXAMPLES) == set(known)
     for prog, example in EXAMPLES.items():
         assert example in " ".join(known[prog].format_help().split()), prog
-        assert "run" in parser.parse_args(shlex.split(example)[1:]), example
+        assert "run" in parser.parse_args(_as_one_word(shlex.split(example)[1:])), example
