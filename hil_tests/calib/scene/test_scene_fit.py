@@ -65,7 +65,7 @@ def scene(
     pan_harmonic: tuple[float, float] = (0.0, 0.0),
     pans: int = 8,
     slip: float = 0.0,
-    count: int = 250,
+    count: int = 120,
 ) -> tuple[list[View], list[Feature]]:
     """Rests all round at three tilts, and features on rough ground, each seen where the true rig shows it."""
     rng = np.random.default_rng(seed)
@@ -151,7 +151,7 @@ def test_a_rig_that_is_as_believed_is_left_as_it_is() -> None:
 
 
 def test_a_feature_that_moved_is_named_and_not_used() -> None:
-    views, features = scene(5, {"eye_left": np.array([0.0, 1.5e-3, 0.0])})
+    views, features = scene(5, {"eye_left": np.array([0.0, 1.5e-3, 0.0])}, count=250)
     wrong = replace(
         features[7],
         pixels_px=features[7].pixels_px + np.array([[0, 0]] + [[3.0, 4.0]] * (len(features[7].views) - 1)),
