@@ -625,6 +625,21 @@ class SelfCheck(TypedDict):
     offsets: list[OffsetTold]
 
 
+class SentinelTold(TypedDict):
+    """``GET /sentinel``: what its looks say together; ``none`` without a reference.
+
+    ``reference``, ``last_look`` and ``since`` (of a change) as ISO 8601.
+    """
+
+    level: Literal["none", "good", "unsure", "bad"]
+    sentence: str
+    looks: int
+    since: str | None
+    last_look: str | None
+    age_s: float | None
+    reference: str | None
+
+
 class SessionTold(TypedDict):
     """``GET /session``: who asks, what it may do, and by which way it came.
 

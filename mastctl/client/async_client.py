@@ -36,6 +36,7 @@ if TYPE_CHECKING:
         ReloadTold,
         ResetTold,
         RigTold,
+        SentinelTold,
         SessionTold,
         StandTold,
         StateTold,
@@ -174,6 +175,10 @@ class AsyncClient:
     async def calibration_health(self) -> CalibrationHealthTold:
         """Return whether residuals of the last days are as the mast file predicts, with the figures."""
         return cast("CalibrationHealthTold", await self._daemon.json("GET", "/calibration/health"))
+
+    async def sentinel(self) -> SentinelTold:
+        """Return what the drift sentinel in the daemon's state folder has found, and how long ago."""
+        return cast("SentinelTold", await self._daemon.json("GET", "/sentinel"))
 
     async def point(
         self,

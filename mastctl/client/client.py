@@ -33,6 +33,7 @@ if TYPE_CHECKING:
         ReloadTold,
         ResetTold,
         RigTold,
+        SentinelTold,
         SessionTold,
         StandTold,
         StateTold,
@@ -169,6 +170,10 @@ class Client:
     def calibration_health(self) -> CalibrationHealthTold:
         """Return whether residuals of the last days are as the mast file predicts, with the figures."""
         return cast("CalibrationHealthTold", self._daemon.json("GET", "/calibration/health"))
+
+    def sentinel(self) -> SentinelTold:
+        """Return what the drift sentinel in the daemon's state folder has found, and how long ago."""
+        return cast("SentinelTold", self._daemon.json("GET", "/sentinel"))
 
     def point(
         self,

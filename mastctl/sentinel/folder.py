@@ -226,12 +226,44 @@ def standing(looks: Sequence[Mapping[str, Any]], now: datetime) -> Standing:
     return Standing("bad", f"{last['sentence']}, since {_ago(first['time'], now)}", len(looks), first["time"])
 
 
+def findings(folder: Path, mast_digest: str, now: datetime) -> dict[str, Any]:
+    """Return what a folder says, as ``GET /sentinel`` tells it; ``mast_digest``: of the mast file in use."""
+    found: dict[str, Any] = {
+        "level": "none", "sentence": "no reference pictures have been taken", "looks": 0, "since": None,
+        "last_look": None, "age_s": None, "reference": None,
+    }  # fmt: skip
+    if not (folder / REFERENCE).is_file():
+        return found
+    try:
+        reference, looks = read_reference(folder), read_looks(folder)
+        says = standing(looks, now)
+    except BadFile as error:
+        return {**found, "level": "unsure", "sentence": str(error)}
+    except (KeyError, TypeError):
+        return {**found, "level": "unsure", "sentence": f"{folder / LOOKS} holds lines that are no looks"}
+    level, sentence = says.level, says.sentence
+    if reference.mast_digest != mast_digest:
+        level, sentence = "unsure", f"the reference is of another mast file: take a new one ({sentence})"
+    last = looks[-1]["time"] if looks else None
+    return {
+        "level": level, "sentence": sentence, "looks": says.looks, "since": says.since, "last_look": last,
+        "age_s": None if last is None else _age_s(last, now), "reference": reference.time,
+    }  # fmt: skip
+
+
+def _age_s(time: str, now: datetime) -> float | None:
+    try:
+        return max((now - datetime.fromisoformat(time)).total_seconds(), 0.0)
+    except (ValueError, TypeError):
+        return None
+
+
 def _ago(time: str, now: datetime) -> str:
     """How long ago in words."""
-    try:
-        hours = max((now - datetime.fromisoformat(time)).total_seconds(), 0.0) / 3600.0
-    except (ValueError, TypeError):
+    age_s = _age_s(time, now)
+    if age_s is None:
         return "an unknown time"
+    hours = age_s / 3600.0
     if hours < 1.0:
         return f"{60.0 * hours:.0f} min"
     return f"{hours:.0f} h" if hours < 48.0 else f"{hours / 24.0:.0f} days"

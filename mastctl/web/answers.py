@@ -97,6 +97,21 @@ class SunTold(_Told):
     boxes: list[BoxTold]
 
 
+class SentinelTold(_Told):
+    """``GET /sentinel``: what its looks say together; ``none`` without a reference.
+
+    ``reference``, ``last_look`` and ``since`` (of a change) as ISO 8601.
+    """
+
+    level: Literal["none", "good", "unsure", "bad"]
+    sentence: str
+    looks: Count
+    since: str | None
+    last_look: str | None
+    age_s: Seconds | None
+    reference: str | None
+
+
 class LastResidual(_Told):
     """The last measured residual, with one sigma, and the operation that measured it."""
 

@@ -74,7 +74,7 @@ def create_app(
     add_recordings(app, service, waiting, commands)
     add_reload(app, service, commands)
     add_simulation(app, service, waiting, commands)
-    add_watching(app, service)
+    add_watching(app, service, waiting)
     streams = streams or Streams(service.machine.publisher)
     add_events(app, service, streams)
     add_images(app, service, streams)

@@ -16,6 +16,7 @@ from mastctl.web.event_answers import Event
 
 ANSWERS: Mapping[str, type[BaseModel]] = {
     "GET /calibration/health": told.CalibrationHealthTold,
+    "GET /sentinel": told.SentinelTold,
     "GET /status": told.Status,
     "POST /point": told.Started,
     "POST /point/preview": told.PreviewTold,

@@ -2,22 +2,25 @@
 
 from __future__ import annotations
 
+from datetime import UTC, datetime
 from typing import Any
 
 from fastapi import FastAPI, Response
 
 from mastctl.errors import Unable
 from mastctl.metrics.metrics import CONTENT_TYPE
+from mastctl.sentinel.folder import findings
 from mastctl.service.service import Service
 from mastctl.state.standing import Word
 from mastctl.web import PREFIX
+from mastctl.web.waiting import Waiting
 
 WELL: frozenset[Word] = frozenset({"ready", "moving", "tracking", "holding"})
 """States in which a command is carried out."""
 
 
-def add_watching(app: FastAPI, service: Service) -> None:
-    """Metrics, health, and that of the calibration."""
+def add_watching(app: FastAPI, service: Service, waiting: Waiting) -> None:
+    """Metrics, health, that of the calibration, and the drift sentinel's findings."""
 
     @app.get("/metrics", summary="Figures in the text format of Prometheus", response_class=Response)
     async def metrics() -> Response:
@@ -43,3 +46,8 @@ def add_watching(app: FastAPI, service: Service) -> None:
     )
     async def calibration() -> dict[str, Any]:
         return service.health.told()
+
+    @app.get(f"{PREFIX}/sentinel", summary="What the drift sentinel's looks say, and how old the last one is")
+    async def sentinel() -> dict[str, Any]:
+        folder = service.folder.path / "sentinel"
+        return await waiting.run(lambda: findings(folder, service.stored.digest, datetime.now(UTC)))

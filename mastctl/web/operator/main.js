@@ -108,7 +108,7 @@ events.addEventListener("operation", (event) => {
   const going = record.state === "running" ? record.steps.findLast((step) => step.name === "limits") : null;
   head.goal(going ? [going.detail.pan_rad, going.detail.tilt_rad] : undefined);
 });
-events.addEventListener("connected", () => { byId("lost").hidden = true; refresh(); recording.look(); residuals.look(); });
+events.addEventListener("connected", () => { byId("lost").hidden = true; refresh(); recording.look(); residuals.look(); mastFile.look(); });
 events.addEventListener("lost", () => { byId("lost").hidden = false; jog.release(); });
 setInterval(() => {
   if (!events.connected && events.heardMs) {

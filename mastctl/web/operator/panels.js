@@ -79,7 +79,22 @@ export class MastFile {
     this.back = h("button", { type: "button", onclick: () => this.load(() => post("/mast/back", {})) }, "Go back");
     this.facts = h("table", { class: "figures" });
     this.said = h("p", { class: "bad", role: "alert" });
-    put(byId("mast-file"), this.facts, h("div", { class: "buttons" }, this.choice, this.use, this.back), this.said);
+    this.drift = h("p", { id: "drift" });
+    setInterval(() => this.look(), 60000);
+    put(byId("mast-file"), this.facts, this.drift, h("div", { class: "buttons" }, this.choice, this.use, this.back), this.said);
+  }
+
+  /** What the drift sentinel has found. */
+  async look() {
+    if (document.hidden) return;
+    try {
+      const found = await get("/sentinel");
+      const age = found.last_look === null ? "" : found.age_s === null ? " Last look: at an unknown time." : ` Last look ${forTime(found.age_s)} ago.`;
+      this.drift.className = { good: "", bad: "bad", unsure: "warn", none: "quiet" }[found.level];
+      say(this.drift, `Drift sentinel: ${found.sentence}.${age}`);
+    } catch (error) {
+      say(this.drift, `Drift sentinel: ${error.message}`);
+    }
   }
 
   told(status, rig) {

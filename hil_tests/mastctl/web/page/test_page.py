@@ -7,6 +7,7 @@ import os
 import socket
 import time
 from collections.abc import Callable, Iterator
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
 
@@ -412,6 +413,34 @@ def test_the_mast_file_s_date_is_told_and_whose_it_is(pair: BOTH, visit: Visits,
         assert http.post("/mast", json={"file": "dated.yaml"}).status_code == 200
     one.page.wait_for_selector("#mast >> text=made 2025-03-04")
     assert "as the file says" in one.page.locator("#mast-file").inner_text()
+
+
+def test_what_the_drift_sentinel_found_is_told_with_its_age(pair: BOTH, visit: Visits) -> None:
+    daemon, _ = pair
+    with httpx.Client(base_url=f"{daemon.url}/api/v1", trust_env=False) as http:
+        assert http.get("/sentinel").json()["level"] == "none"
+        folder = daemon.service.folder.path / "sentinel"
+        folder.mkdir()
+        digest = daemon.service.stored.digest
+        reference = {
+            "schema": "mastctl/sentinel/1", "time": "2026-01-01T00:00:00+00:00", "mast_digest": digest,
+            "rests": [[0.0, 0.0]], "pictures": [],
+        }  # fmt: skip
+        (folder / "reference.json").write_text(json.dumps(reference))
+        at = (datetime.now(UTC) - timedelta(hours=2)).isoformat(timespec="seconds")
+        words = "navcam_left turned 1.79 mrad about y, 9 sigma"
+        look = {"time": at, "views": 4, "named": "navcam_left", "sentence": words}
+        (folder / "looks.jsonl").write_text(2 * (json.dumps(look) + "\n"))
+        told = http.get("/sentinel").json()
+        assert told["level"] == "bad" and 7199 <= told["age_s"] < 7400
+        one = visit(daemon.url)
+        one.page.wait_for_selector("#drift.bad")
+        said = one.page.locator("#drift").inner_text()
+        assert words in said and "Last look 2 h 0 min ago" in said
+        (folder / "reference.json").write_text(json.dumps({**reference, "mast_digest": "0" * 64}))
+        assert "another mast file" in http.get("/sentinel").json()["sentence"]
+        (folder / "reference.json").write_text("{")
+        assert "take the reference again" in http.get("/sentinel").json()["sentence"]
 
 
 def test_places_are_kept_and_gone_to(pair: BOTH, visit: Visits) -> None:
