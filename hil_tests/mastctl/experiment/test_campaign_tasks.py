@@ -136,15 +136,13 @@ def values(result: Any) -> Any:
     return [values(one) for one in result] if isinstance(result, (list, tuple)) else result
 
 
-def test_campaigns_come_to_the_same_bits_in_one_process_two_and_a_cluster_of_two_workers() -> None:
-    places = [("local", 1), ("local", 2)]
+def test_campaigns_come_to_the_same_bits_in_one_process_and_in_a_cluster_of_two_workers() -> None:
     with two_dask_workers() as address:
         found = []
-        for place in (*places, (f"dask:{address}", None)):
+        for place in (("local", 1), (f"dask:{address}", None)):
             with open_executor(*place) as executor:
                 found.append(values(results_in(executor)))
-    here, *there = found
-    for other in there:
-        np.testing.assert_equal(other, here)
+    here, there = found
+    np.testing.assert_equal(there, here)
     _, pictures, *_ = here
     assert len(pictures) == 2 and pictures[0] != pictures[1]
