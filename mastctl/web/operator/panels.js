@@ -233,7 +233,7 @@ export class TrackPanel {
   told(status) {
     if (status.id !== this.status?.id) this.trail = [];
     this.status = status;
-    if (status.range_m !== null && !status.predicted) this.trail = [...this.trail.slice(-199), { range: status.range_m, pair: status.pair, sigma: status.covariance_m2 ? Math.sqrt(status.covariance_m2[0][0] + status.covariance_m2[1][1] + status.covariance_m2[2][2]) : null }];
+    if (status.range_m !== null && !status.predicted && status.looks !== this.trail.at(-1)?.look) this.trail = [...this.trail.slice(-199), { look: status.looks, range: status.range_m, pair: status.pair, sigma: status.covariance_m2 ? Math.sqrt(status.covariance_m2[0][0] + status.covariance_m2[1][1] + status.covariance_m2[2][2]) : null }];
     this.draw();
   }
 
@@ -256,6 +256,7 @@ export class TrackPanel {
         status.handoffs.length ? row("Hand-offs", status.handoffs.map((one) => `${one.from_pair} → ${one.to_pair} at ${metres(one.range_m, 2)}`).join("; ")) : null,
         stands),
       this.plot(),
+      this.errors(),
       said,
       this.may ? h("div", { class: "buttons" }, h("button", { type: "button", disabled: !on, onclick: () => this.act("/track/look") }, "Look again"), h("button", { type: "button", disabled: !on, onclick: () => this.act("/track/stop") }, "End the track")) : null,
       on ? null : hint);
@@ -265,15 +266,35 @@ export class TrackPanel {
   plot() {
     const { trail } = this;
     if (trail.length < 2) return null;
+    const caption = h("p", { class: "quiet" }, "Range, m, look by look");
     const top = Math.max(...trail.map((one) => one.range)) * 1.1;
     const [width, height] = [260, 80];
     const x = (k) => 30 + ((width - 36) * k) / (trail.length - 1);
     const y = (range) => height - 12 - ((height - 20) * range) / top;
-    return s("svg", { class: "approach", viewBox: `0 0 ${width} ${height}`, role: "img", "aria-label": `Range over ${trail.length} looks, now ${metres(trail.at(-1).range)}` },
+    return [caption, s("svg", { class: "approach", viewBox: `0 0 ${width} ${height}`, role: "img", "aria-label": `Range over ${trail.length} looks, now ${metres(trail.at(-1).range)}` },
       s("path", { class: "ring", d: `M30 ${height - 12}H${width}M30 4V${height - 12}` }),
       s("polyline", { class: "line", points: trail.map((one, k) => `${x(k)},${y(one.range)}`).join(" ") }),
       trail.map((one, k) => (k && one.pair !== trail[k - 1].pair ? s("path", { class: "handoff", d: `M${x(k)} 4V${height - 12}` }) : null)),
-      s("text", { class: "tickname end", x: 27, y: 10 }, number(top, 1)), s("text", { class: "tickname end", x: 27, y: height - 10 }, "0 m"));
+      s("text", { class: "tickname end", x: 27, y: 10 }, number(top, 1)), s("text", { class: "tickname end", x: 27, y: height - 10 }, "0 m"))];
+  }
+
+  /** The approach: how well the place was known, one sigma, against range; nearer is to the right. */
+  errors() {
+    const known = this.trail.filter((one) => one.sigma !== null);
+    if (known.length < 2) return null;
+    const far = Math.max(...known.map((one) => one.range));
+    const near = Math.min(...known.map((one) => one.range));
+    const top = 1.1 * Math.max(...known.map((one) => one.sigma));
+    const [width, height] = [260, 92];
+    const x = (range) => 38 + (width - 50) * (far > near ? (far - range) / (far - near) : 0.5);
+    const y = (sigma) => height - 24 - ((height - 32) * sigma) / top;
+    const last = known.at(-1);
+    return [h("p", { class: "quiet" }, "One sigma of its place, mm, against range"),
+      s("svg", { class: "approach errors", viewBox: `0 0 ${width} ${height}`, role: "img", "aria-label": `One sigma of the place against range, now ${number(1000 * last.sigma, 1)} mm at ${metres(last.range)}` },
+        s("path", { class: "ring", d: `M38 ${height - 24}H${width - 6}M38 4V${height - 24}` }),
+        known.map((one) => s("circle", { class: one === last ? "tip newest" : "tip", cx: x(one.range), cy: y(one.sigma), r: one === last ? 3.5 : 2.2 }, s("title", {}, `${called(one.pair ?? "")} ${metres(one.range)}: ${number(1000 * one.sigma, 1)} mm`))),
+        s("text", { class: "tickname end", x: 35, y: 12 }, number(1000 * top, 1)), s("text", { class: "tickname end", x: 35, y: height - 21 }, "0"),
+        s("text", { class: "tickname start", x: 38, y: height - 10 }, metres(far, 1)), s("text", { class: "tickname end", x: width - 8, y: height - 10 }, metres(near, 1)))];
   }
 }
 

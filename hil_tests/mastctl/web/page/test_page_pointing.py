@@ -64,6 +64,9 @@ def test_a_box_round_a_rock_begins_a_track_that_is_drawn_in_both_eyes(
     assert "tracking" in one.page.locator("#track").inner_text(), one.page.locator("#track").inner_text()
     for camera in ("navcam_left", "navcam_right"):
         one.page.wait_for_selector(f".eye[data-camera={camera}] .over .track")
+    one.page.get_by_role("button", name="Look again").click()
+    one.page.wait_for_selector("#track .approach.errors .newest", state="attached")
+    assert "mm at" in one.page.locator("#track .approach.errors").get_attribute("aria-label")
     one.page.get_by_role("button", name="End the track").click()
     eventually(lambda: rover.service.tracker.status.state == "stopped", "the track has ended")
 
