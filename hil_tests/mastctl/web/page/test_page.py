@@ -443,6 +443,21 @@ def test_what_the_drift_sentinel_found_is_told_with_its_age(pair: BOTH, visit: V
         assert "take the reference again" in http.get("/sentinel").json()["sentence"]
 
 
+def test_light_or_dark_is_switched_and_kept(pair: BOTH, visit: Visits) -> None:
+    one = visit(pair[0].url, color_scheme="dark")
+    ground = "getComputedStyle(document.body).backgroundColor"
+    one.word("ready")
+    dark = one.page.evaluate(ground)
+    one.page.get_by_role("button", name="Show the page light").click()
+    light = one.page.evaluate(ground)
+    assert light != dark
+    one.page.reload()
+    one.word("ready")
+    assert one.page.evaluate(ground) == light
+    one.page.get_by_role("button", name="Show the page dark").click()
+    assert one.page.evaluate(ground) == dark
+
+
 def test_places_are_kept_and_gone_to(pair: BOTH, visit: Visits) -> None:
     daemon, hardware = pair
     one = visit(daemon.url)
