@@ -148,7 +148,7 @@ def _stopped_on_the_way(daemon: Daemon, goal: tuple[float, float]) -> str:
         return ""
     expect(
         rests_rad > ARRIVED_RAD,
-        f"stopped {left_rad:.3f} rad before its goal the head went on to it ({took_s:.2f} s from that reading)",
+        f"stopped {left_rad:.3f} rad before its goal the head went on ({took_s:.2f} s from that reading)",
     )
     expect(record["state"] == "stopped", f"the operation that was stopped ended {record['state']!r}")
     word = daemon.status().get("state")
