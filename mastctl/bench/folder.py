@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import fcntl
 import json
 import os
+import weakref
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, cast
@@ -33,10 +35,15 @@ class Kept:
     cameras, stereo
         As of a survey.
 
+    Attributes
+    ----------
+    let_go
+        Call it, and another run may go on with the folder; the end of the process does the same.
+
     Raises
     ------
     BadFile
-        If the folder holds something else.
+        If the folder holds something else, or another run keeps its looks there.
     """
 
     def __init__(
@@ -49,6 +56,7 @@ class Kept:
     ) -> None:
         self.path, self.sigma_px = path, sigma.corner_px
         self._folder = BenchFolder(path, boards, sigma, cameras, stereo)
+        self.let_go = weakref.finalize(self, os.close, _locked(path))
         self._cameras = cameras
         self._journal = path / JOURNAL
         self.notes = _read_notes(self._journal)
@@ -103,6 +111,18 @@ class Kept:
     def seconds(self) -> float:
         """Return how long all looks took, seconds of the rover's clock."""
         return sum(float(note.get("seconds", 0.0)) for note in self.notes)
+
+
+def _locked(path: Path) -> int:
+    """A descriptor that keeps every other run out of a folder, until it is closed or the process ends."""
+    descriptor = os.open(path, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        os.close(descriptor)
+        words = "another run keeps its looks there; wait for its end, or name another folder (--survey)"
+        raise BadFile(path, "", words) from None
+    return descriptor
 
 
 def survey_cameras(rig: Rig, names: Mapping[str, tuple[int, int]]) -> dict[str, SurveyCamera]:

@@ -72,6 +72,7 @@ def test_a_run_that_died_goes_on_at_the_same_placement_without_asking_again(
     run._eyes = Mortal(bench, 5)  # type: ignore[assignment]  # dies in the middle of the first placement
     with pytest.raises(Dying):
         run.run()
+    run._kept.let_go()
     before = list(looks_of(read_survey(tmp_path / "bench")))
     again, second = run_of(bench, tmp_path / "bench")
     again.run()
@@ -90,6 +91,7 @@ def test_a_board_that_moved_while_the_run_was_dead_begins_another_placement(
     run._eyes = Mortal(bench, 5)  # type: ignore[assignment]
     with pytest.raises(Dying):
         run.run()
+    run._kept.let_go()
     assert bench.rover_from_board is not None
     aside = bench.rover_from_board.translation_m + np.array([0.0, 0.02, 0.0])
     bench.rover_from_board = Rigid(bench.rover_from_board.rotation, aside)
@@ -148,6 +150,14 @@ def test_a_folder_of_another_board_is_refused(repository: Path, tmp_path: Path) 
     bench.noise_px = 0.11
     with pytest.raises(CalibError, match="other boards, sigmas or cameras"):
         run_of(bench, tmp_path / "bench")
+
+
+def test_two_runs_do_not_keep_their_looks_in_one_folder(repository: Path, tmp_path: Path) -> None:
+    run, _ = run_of(corner_bench(repository), tmp_path / "bench")
+    with pytest.raises(CalibError, match="another run keeps its looks there"):
+        run_of(corner_bench(repository), tmp_path / "bench")
+    run._kept.let_go()
+    run_of(corner_bench(repository), tmp_path / "bench")
 
 
 def test_a_run_that_is_killed_again_and_again_loses_no_look_and_comes_to_its_end(
