@@ -7,7 +7,7 @@ import os
 import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from datetime import datetime
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -226,8 +226,9 @@ def standing(looks: Sequence[Mapping[str, Any]], now: datetime) -> Standing:
     return Standing("bad", f"{last['sentence']}, since {_ago(first['time'], now)}", len(looks), first["time"])
 
 
-def findings(folder: Path, mast_digest: str, now: datetime) -> dict[str, Any]:
+def findings(folder: Path, mast_digest: str) -> dict[str, Any]:
     """Return what a folder says, as ``GET /sentinel`` tells it; ``mast_digest``: of the mast file in use."""
+    now = datetime.now(UTC)
     found: dict[str, Any] = {
         "level": "none", "sentence": "no reference pictures have been taken", "looks": 0, "since": None,
         "last_look": None, "age_s": None, "reference": None,

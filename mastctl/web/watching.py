@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from datetime import UTC, datetime
 from typing import Any
 
 from fastapi import FastAPI, Response
@@ -50,4 +49,4 @@ def add_watching(app: FastAPI, service: Service, waiting: Waiting) -> None:
     @app.get(f"{PREFIX}/sentinel", summary="What the drift sentinel's looks say, and how old the last one is")
     async def sentinel() -> dict[str, Any]:
         folder = service.folder.path / "sentinel"
-        return await waiting.run(lambda: findings(folder, service.stored.digest, datetime.now(UTC)))
+        return await waiting.run(lambda: findings(folder, service.stored.digest))
