@@ -9,6 +9,7 @@ its left and right edges and against its upper and lower ones: the deflection th
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass, field
 from typing import ClassVar, Literal
 
@@ -23,7 +24,7 @@ FLAT: Bow = (0.0, 0.0)
 
 
 @dataclass(frozen=True)
-class _Grid:
+class _Grid(ABC):
     """Corners at crossings of lines; what a kind adds are the lines.
 
     Attributes
@@ -39,9 +40,9 @@ class _Grid:
     aspect: float = field(default=1.0, kw_only=True)
 
     @property
+    @abstractmethod
     def lines_m(self) -> tuple[FloatArray, FloatArray]:
         """Where the corners' columns (x) and rows (y) are, metres in the board frame, ascending."""
-        raise NotImplementedError
 
     @property
     def ids(self) -> IntArray:

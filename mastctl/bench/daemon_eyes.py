@@ -65,11 +65,11 @@ class DaemonEyes:
         self._client, self._cameras, self._board = client, tuple(cameras), board
         self._pool = ThreadPoolExecutor(2, "bench-corners")
         status = client.status()
-        self._rig = served_rig(parse_rig(client.mast_file(), "the daemon's mast file").rig, cameras)
+        rig = served_rig(parse_rig(client.mast_file(), "the daemon's mast file").rig, cameras)
         axes = status["axes"]
         limits = status["limits"]
         self._head = Head(
-            self._rig,
+            rig,
             (float(limits["pan_rad"][0]), float(limits["pan_rad"][1])),
             (float(limits["tilt_rad"][0]), float(limits["tilt_rad"][1])),
             one_sided=bool(axes) and all(axis["one_sided"] for axis in axes.values()),
@@ -147,10 +147,9 @@ class DaemonEyes:
         self._go(pan_rad, tilt_rad)
 
     def _go(self, pan_rad: float, tilt_rad: float) -> None:
-        """Have the daemon turn to readings; it is told true angles."""
-        true_rad = self._rig.joints.true_rad((pan_rad, tilt_rad))
+        """Have the daemon turn to readings, as its commanded angles are."""
         operation = self._client.wait(
-            self._client.point(pan_rad=true_rad[0], tilt_rad=true_rad[1]), timeout_s=TURN_TIMEOUT_S
+            self._client.point(pan_rad=pan_rad, tilt_rad=tilt_rad), timeout_s=TURN_TIMEOUT_S
         )
         if operation["state"] == "stopped":
             raise Interrupted("somebody pressed stop, and the head stands still")

@@ -10,24 +10,31 @@ import pytest
 
 from calib.bench.placements import Placement
 from calib.boards import Charuco
+from calib.files.mast_file import load_rig, save_rig
+from calib.mast.joints import AxisJoint, Joints
 from mastctl.bench import daemon_eyes
 from mastctl.bench.daemon_eyes import DaemonEyes, Interrupted
 from mastctl.bench.eyes import NotThere
 from mastctl.bench.simulated import SimulatedPerson
 from mastctl.bench.teller import Terminal
 from mastctl.client import Client
-from mastctl.config import Listen, load_config
+from mastctl.config import Config, Listen, load_config
 from mastctl.daemon import RunningDaemon
 
 BOARD = Charuco(10, 7, 0.055, 0.042)
 CAMERAS = ("navcam_left", "navcam_right")
 
 
-@pytest.fixture(scope="module")
-def client(repository: Path) -> Iterator[Client]:
+def bench(repository: Path) -> Config:
+    """The packaged bench, quick."""
     config = load_config(repository / "configs/bench.yaml")
     simulation = {**config.hardware.simulation, "speed": "max", "samples": 1}
-    config = replace(config, listen=Listen(port=0), hardware=replace(config.hardware, simulation=simulation))
+    return replace(config, listen=Listen(port=0), hardware=replace(config.hardware, simulation=simulation))
+
+
+@pytest.fixture(scope="module")
+def client(repository: Path) -> Iterator[Client]:
+    config = bench(repository)
     with RunningDaemon(config) as daemon, Client(daemon.url) as client:
         yield client
 
@@ -49,6 +56,19 @@ def test_a_look_shows_the_board_with_one_reading_and_tells_what_the_head_is(eyes
     assert [one.camera for one in look.found] == list(CAMERAS)
     assert look.pan_rad == pytest.approx(0.05, abs=1e-4) and look.seconds > 0.0
     assert all(one.corners is not None and len(one.corners) > 20 and one.data for one in look.found)
+
+
+def test_a_head_whose_mast_file_has_joints_is_turned_to_the_readings_that_are_wanted(
+    repository: Path, tmp_path: Path
+) -> None:
+    config = bench(repository)
+    wave = AxisJoint(harmonics_rad=((0.006, 0.0),))
+    rig = replace(load_rig(config.mast_file).rig, joints=Joints(wave, wave))
+    save_rig(rig, tmp_path / "waves.yaml")
+    config = replace(config, mast_file=tmp_path / "waves.yaml")
+    with RunningDaemon(config) as daemon, Client(daemon.url) as client:
+        look = DaemonEyes(client, CAMERAS, BOARD).look(0.05, -0.02)
+    assert (look.pan_rad, look.tilt_rad) == (pytest.approx(0.05, abs=1e-4), pytest.approx(-0.02, abs=1e-4))
 
 
 def test_a_camera_that_is_pulled_out_is_named_and_the_other_still_looks(
