@@ -158,15 +158,6 @@ def save_camera(camera: CameraFile, path: str | Path) -> CameraFile:
     return stored
 
 
-def schema_of(data: bytes) -> str:
-    """Return the schema that the bytes of a YAML file name, '' if they name none or are no YAML."""
-    try:
-        schema = parse_mapping(data, "").get("schema")
-    except BadFile:
-        return ""
-    return schema if isinstance(schema, str) else ""
-
-
 def _check_schema(document: dict[str, Any], path: str | Path, expected: str) -> None:
     """Refuse another schema before its keys are looked at."""
     if "schema" not in document:
