@@ -9,12 +9,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from calib.bench.knowledge import Knowledge, Shot, without_board
-from calib.bench.poses import Sought, seen
+from calib.bench.poses import Sought, readings, seen
 from calib.bench.workspace import Pointing
 from calib.errors import CalibError, Unreachable
 from calib.fit.least_squares import covariance_of
-from calib.mast.pointing import solve
-from calib.mast.solutions import choose
 from calib.rigid import FloatArray, Rigid
 
 RANGES_M = (0.8, 1.2, 1.8, 2.6)
@@ -167,12 +165,11 @@ def _told_by(known: Knowledge, sought: Sought, placement: Placement) -> FloatArr
     told, middle = [], supposed.boards[""].translation_m
     for k, (x, y) in enumerate(PATTERN):
         try:
-            found = solve(known.rig.mast, camera.model, middle, (x * width, y * height))
-            angles = choose(found, sought.pan_limits_rad, sought.tilt_limits_rad)
-        except (Unreachable, CalibError):
+            pan, tilt = readings(known.rig, sought, camera.model, middle, (x * width, y * height))
+        except (Unreachable, CalibError, ValueError):
             continue
         side = 0 if sought.one_sided else 1 if k % 2 else -1
-        shown = seen(supposed, sought, Shot("", angles.pan_rad, angles.tilt_rad, (), side, side))
+        shown = seen(supposed, sought, Shot("", pan, tilt, (), side, side))
         if shown is not None:
             told.append(supposed.of_shot(shown))
     if len(told) < 3:

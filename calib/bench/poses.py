@@ -9,10 +9,12 @@ import numpy as np
 
 from calib.bench.knowledge import Knowledge, Shot, View, without_board
 from calib.bench.workspace import Pointing
+from calib.camera.cahvor import CameraModel
 from calib.errors import CalibError, Unreachable
 from calib.fit.least_squares import covariance_of
 from calib.mast.pointing import solve
-from calib.mast.solutions import choose
+from calib.mast.rig import Rig
+from calib.mast.solutions import Solution, choose
 from calib.rigid import FloatArray
 
 PLACES = (-0.05, 0.12, 0.31, 0.5, 0.69, 0.88, 1.05)
@@ -87,10 +89,33 @@ def seen(known: Knowledge, sought: Sought, shot: Shot) -> Shot | None:
     return replace(shot, views=tuple(views)) if views else None
 
 
+def readings(
+    rig: Rig,
+    sought: Sought,
+    camera: CameraModel,
+    point_in_rover_m: FloatArray,
+    pixel_px: tuple[float, float] | None = None,
+) -> tuple[float, float]:
+    """Return what the joints read, within the head's limits, when a head camera has a point at a pixel.
+
+    By default that is the image's centre.
+
+    Raises
+    ------
+    Unreachable, CalibError, ValueError
+        If no reading does.
+    """
+
+    def read_rad(angles: Solution) -> tuple[float, float]:
+        return rig.joints.read_rad((angles.pan_rad, angles.tilt_rad))
+
+    found = solve(rig.mast, camera, point_in_rover_m, pixel_px)
+    return read_rad(choose(found, sought.pan_limits_rad, sought.tilt_limits_rad, read=read_rad))
+
+
 def attitudes(known: Knowledge, sought: Sought, placement: str) -> Iterator[tuple[float, float]]:
     """Yield joint readings, radians, that bring the board's middle to places all over each head camera."""
     middle = known.boards[placement].translation_m
-    joints = known.rig.joints
     for camera in known.rig.cameras.values():
         if camera.on != "head":
             continue
@@ -98,9 +123,7 @@ def attitudes(known: Knowledge, sought: Sought, placement: str) -> Iterator[tupl
         for x in PLACES:
             for y in PLACES:
                 try:
-                    found = solve(known.rig.mast, camera.model, middle, (x * width, y * height))
-                    angles = choose(found, sought.pan_limits_rad, sought.tilt_limits_rad)
-                    yield joints.read_rad((angles.pan_rad, angles.tilt_rad))
+                    yield readings(known.rig, sought, camera.model, middle, (x * width, y * height))
                 except (Unreachable, CalibError, ValueError):
                     continue
 

@@ -63,9 +63,10 @@ def choose(
     tilt_limits_rad: tuple[float, float],
     from_pan_rad: float = 0.0,
     from_tilt_rad: float = 0.0,
+    read: Callable[[Solution], tuple[float, float]] | None = None,
 ) -> Solution:
     """Return the solution within the joint limits that comes first: the first of `ordered`."""
-    return ordered(solutions, pan_limits_rad, tilt_limits_rad, from_pan_rad, from_tilt_rad)[0]
+    return ordered(solutions, pan_limits_rad, tilt_limits_rad, from_pan_rad, from_tilt_rad, read)[0]
 
 
 def ordered(

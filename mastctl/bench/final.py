@@ -14,7 +14,7 @@ from calib.boards import AnyBoard
 from calib.camera.stereo import triangulate
 from calib.errors import CalibError, Unreachable
 from calib.mast.pointing import solve
-from calib.mast.solutions import choose
+from calib.mast.solutions import Solution, choose
 from calib.rigid import FloatArray
 from mastctl.bench.eyes import Eyes, Look, NotThere, Seen
 
@@ -83,7 +83,7 @@ def unvisited(
 def point_at_corners(
     eyes: Eyes,
     known: Knowledge,
-    board: AnyBoard,
+    stands: tuple[str, AnyBoard],
     cameras: Sequence[str],
     clicked: Sequence[Look],
     promised_px: float,
@@ -93,8 +93,10 @@ def point_at_corners(
 
     Parameters
     ----------
-    eyes, known, board
-        The head, the fitted rig, what stands there.
+    eyes, known
+        The head, and the fitted rig with the boards' places.
+    stands
+        The placement, and the board that stands there.
     cameras
         The camera that points, and its partner if there is one.
     clicked
@@ -113,7 +115,7 @@ def point_at_corners(
         common = _common([seen[camera] for camera in cameras])
         rng.shuffle(common)
         for corner in common[:2]:
-            told = _point(eyes, known, cameras, look, seen, int(corner), promised_px, corner_px)
+            told = _point(eyes, known, stands, cameras, look, seen, int(corner), promised_px, corner_px)
             if told is not None:
                 done += 1
                 yield told
@@ -128,6 +130,7 @@ def _common(seen: Sequence[Seen]) -> FloatArray:
 def _point(
     eyes: Eyes,
     known: Knowledge,
+    stands: tuple[str, AnyBoard],
     cameras: Sequence[str],
     look: Look,
     seen: Mapping[str, Seen],
@@ -141,16 +144,20 @@ def _point(
     pixels = [_pixel(seen[name], corner) for name in cameras]
     here = [_true(known, seen[name], look) for name in cameras]
     models = [rig.camera_in_rover(name, *at) for name, at in zip(cameras, here, strict=True)]
+
+    def read_rad(angles: Solution) -> tuple[float, float]:
+        return rig.joints.read_rad((angles.pan_rad, angles.tilt_rad))
+
     try:
         if len(cameras) > 1:
             point = triangulate(models[0], models[1], pixels[0], pixels[1]).position_m
-        else:  # one eye is told the range: by the board's own place
+        else:  # one eye is told the range: how far the corner is by the fit
             ray = models[0].ray(pixels[0])
-            board = next(iter(known.boards.values()))
-            depth = (board.translation_m - ray.origins_m) @ board.rotation[:, 2]
-            point = ray.origins_m + ray.directions * depth / (ray.directions @ board.rotation[:, 2])
+            name, board = stands
+            (there_m,) = known.boards[name].points(board.in_board_m(np.array([corner])))
+            point = ray.origins_m + ray.directions * float(np.linalg.norm(there_m - ray.origins_m))
         found = solve(rig.mast, model, point, from_pan_rad=here[0][0], from_tilt_rad=here[0][1])
-        angles = choose(found, head.pan_limits_rad, head.tilt_limits_rad)
+        angles = choose(found, head.pan_limits_rad, head.tilt_limits_rad, *here[0], read=read_rad)
     except (Unreachable, CalibError):
         return None
     sides = (0, 0)
@@ -160,10 +167,10 @@ def _point(
         landed = eyes.look(*rig.joints.read_rad((angles.pan_rad, angles.tilt_rad), sides), sides)
     except NotThere:
         return None
-    there = next((one for one in landed.found if one.camera == camera), None)
-    if there is None or there.corners is None or corner not in there.corners.ids:
+    seen_there = next((one for one in landed.found if one.camera == camera), None)
+    if seen_there is None or seen_there.corners is None or corner not in seen_there.corners.ids:
         return None
-    x, y = _pixel(there, corner) - np.asarray(model.image_center_px)
+    x, y = _pixel(seen_there, corner) - np.asarray(model.image_center_px)
     turned = math.hypot(angles.pan_rad - here[0][0], angles.tilt_rad - here[0][1])
     return CornerPointing(
         corner,

@@ -26,7 +26,7 @@ class Fitted:
     rig
         Cameras, mast and joints.
     boards
-        Placement to rover_from_board.
+        Placement to rover_from_board; of a board that moved meanwhile, where it stood last.
     corner_rms_px
         Rms per axis of the fitted corners.
     sigma_scale
@@ -53,7 +53,8 @@ def fit_in_rover(rover_from_mast: Rigid) -> FitSurvey:
 
     def fit(survey: Survey) -> Fitted:
         done = fit_bench(survey, BenchOptions(rover_from_mast=rover_from_mast))
-        boards = {placement: pose for (_, placement), pose in done.rover_from_board.items()}
+        # Of a board that moved, "p1 from IMAGE on" comes after "p1": where it stands now.
+        boards = {placement.split(" ")[0]: pose for (_, placement), pose in done.rover_from_board.items()}
         rms = float(np.sqrt(np.mean(np.square(list(done.rms_px.values())))))
         scale = float(np.sqrt(done.chi2 / max(done.degrees_of_freedom, 1.0)))
         return Fitted(done.rig, boards, max(rms, LEAST_PX), max(scale, LEAST_SCALE), done)

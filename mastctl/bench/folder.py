@@ -10,6 +10,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, cast
 
+from calib.bench.placements import Placement
 from calib.boards import AnyBoard
 from calib.errors import BadFile
 from calib.mast.rig import Rig
@@ -107,6 +108,20 @@ class Kept:
             self._folder.append(image, one.corners, one.data or None)
         self._numbers[placement] = number
         self.note(event="look", placement=placement, number=number, seconds=round(look.seconds, 3))
+
+    def asked(self, name: str) -> Placement | None:
+        """Return what was asked for at a placement; None if nothing was, or a kill cut it short."""
+        for note in self.notes:
+            if note.get("event") == "placement" and note.get("name") == name:
+                asked = dict(note["asked"])
+                return Placement(**{**asked, "turned_deg": tuple(asked["turned_deg"])})
+        return None
+
+    def is_over(self, name: str) -> bool:
+        """Return whether a placement was ended."""
+        return any(
+            note.get("name") == name and note.get("event") in ("closed", "done") for note in self.notes
+        )
 
     def seconds(self) -> float:
         """Return how long all looks took, seconds of the rover's clock."""

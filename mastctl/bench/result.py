@@ -23,8 +23,9 @@ from calib.mast.covariance import RigCovariance
 from calib.mast.rig import Rig
 from calib.survey import Survey
 from mastctl.bench.final import Checked
+from mastctl.bench.known import first_cameras
 from mastctl.bench.report import Told, workspace_covariance, write_bench_report
-from mastctl.bench.run import BenchRun, first_cameras
+from mastctl.bench.run import BenchRun
 from mastctl.bench.teller import Teller, px
 from mastctl.calibration.bench_verdict import judge_bench, predicted_pointing_px
 from mastctl.calibration.mast_file import as_lists, mast_keys, rounded_matrix
@@ -184,12 +185,12 @@ def finish(bench: BenchRun, teller: Teller, out: Path, report: Path | None) -> B
     """
     bench.run()
     checked = bench.check()
-    fitted = bench.fit_all()
-    calibration = fitted.calibration
+    known = bench.known
+    calibration = known.fit().calibration
     assert calibration is not None
-    survey = bench.survey()
+    survey = known.kept.survey()
     verdict = judge_bench(survey, calibration)
-    rig = replace(with_bench_fit(calibration, survey, verdict), name=bench.name)
+    rig = replace(with_bench_fit(calibration, survey, verdict), name=known.head.rig.name)
     saved, _ = save_new(rig, out)
     done = BenchDone(
         survey,
@@ -197,13 +198,13 @@ def finish(bench: BenchRun, teller: Teller, out: Path, report: Path | None) -> B
         verdict,
         saved,
         checked,
-        predicted_px=bench.predicted_px(),
-        floor_px=bench.floor_px,
-        seconds=bench.seconds(),
-        placements=len(bench.placements()),
-        pictures=bench.pictures(),
+        predicted_px=known.predicted_px(),
+        floor_px=known.floor_px,
+        seconds=known.kept.seconds(),
+        placements=len(known.placements()),
+        pictures=known.pictures(),
     )
-    return _reported(done, report, bench.head.rig, bench.workspace)
+    return _reported(done, report, known.head.rig, known.workspace)
 
 
 def save_bench(survey: Survey, out: Path, report: Path | None, options: BenchOptions) -> BenchDone:

@@ -9,10 +9,8 @@ import numpy as np
 
 from calib.bench.knowledge import Knowledge
 from calib.bench.placements import Placement
-from calib.bench.poses import Sought
+from calib.bench.poses import Sought, readings
 from calib.errors import CalibError, Unreachable
-from calib.mast.pointing import solve
-from calib.mast.solutions import choose
 from mastctl.bench.eyes import Eyes, Look, NotThere
 from mastctl.bench.teller import Teller
 from mastctl.errors import MastctlError
@@ -93,9 +91,8 @@ class Search:
         model = next(c.model for c in rig.cameras.values() if c.on == "head")
         limits = self._sought.pan_limits_rad, self._sought.tilt_limits_rad
         try:
-            angles = choose(solve(rig.mast, model, middle), *limits)
-            return rig.joints.read_rad((angles.pan_rad, angles.tilt_rad))
-        except (Unreachable, CalibError):
+            return readings(rig, self._sought, model, middle)
+        except (Unreachable, CalibError, ValueError):
             pan, tilt = math.radians(placement.bearing_deg), math.radians(placement.height_deg)
             return min(max(pan, limits[0][0]), limits[0][1]), min(max(tilt, limits[1][0]), limits[1][1])
 

@@ -145,8 +145,8 @@ def _options(args: argparse.Namespace) -> BenchOptions:
 def _drive(args: argparse.Namespace) -> int:
     from calib.boards import load_board
     from mastctl.bench.daemon_eyes import Interrupted
+    from mastctl.bench.looks import BoardLost
     from mastctl.bench.result import finish
-    from mastctl.bench.run import BoardLost
     from mastctl.bench.search import BoardNotFound
     from mastctl.bench.teller import NobodyThere
 
@@ -182,9 +182,10 @@ def _bench(args: argparse.Namespace, board: Any, folder: Path) -> Iterator[tuple
     from mastctl.bench.daemon_eyes import DaemonEyes, Interrupted
     from mastctl.bench.fitting import fit_in_rover
     from mastctl.bench.folder import Kept, survey_cameras
-    from mastctl.bench.run import BenchRun, Wanted
+    from mastctl.bench.run import BenchRun
     from mastctl.bench.simulated import SimulatedPerson
     from mastctl.bench.teller import Terminal
+    from mastctl.bench.wanted import Wanted
     from mastctl.client import ClientError
 
     with ExitStack() as stack:

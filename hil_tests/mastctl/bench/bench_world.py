@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,10 +12,11 @@ from calib.boards import Charuco
 from calib.files.mast_file import load_rig
 from calib.mast.rig import Rig
 from calib.survey import Sigma
-from mastctl.bench.eyes import Head
+from mastctl.bench.eyes import Eyes, Head
 from mastctl.bench.fitting import fit_in_rover
 from mastctl.bench.folder import Kept, survey_cameras
-from mastctl.bench.run import BenchRun, Wanted
+from mastctl.bench.run import BenchRun
+from mastctl.bench.wanted import Wanted
 from tools.simulated.bench import CornerBench, SelfPlacing, TrueAxis
 
 BOARD = Charuco(10, 7, 0.055, 0.042)
@@ -31,9 +33,23 @@ def rigs(repository: Path) -> tuple[Rig, Rig]:
     return true, load_rig(repository / "configs/masts/bench_drawing.yaml").rig
 
 
-def corner_bench(repository: Path, seed: int = 1, one_sided: bool = True, **axis: object) -> CornerBench:
+def one_camera(repository: Path) -> tuple[Rig, Rig]:
+    """What is so of a head with one camera, and a drawing of it."""
+    true = load_rig(repository / "configs/sim/one_camera.yaml").rig
+    drawing = load_rig(repository / "configs/masts/bench_drawing.yaml").rig
+    drawn = replace(drawing, cameras={"navcam": drawing.cameras["navcam_left"]}, stereo={})
+    return replace(true, provenance={}), drawn
+
+
+def corner_bench(
+    repository: Path,
+    seed: int = 1,
+    one_sided: bool = True,
+    of: Callable[[Path], tuple[Rig, Rig]] = rigs,
+    **axis: object,
+) -> CornerBench:
     """A PTU's counts; ``axis`` is of both joints."""
-    true, believed = rigs(repository)
+    true, believed = of(repository)
     head = Head(believed, (-2.6, 2.6), (-1.2, 0.5), one_sided, PTU_COUNT_RAD)
     pan, tilt = (
         TrueAxis(PTU_COUNT_RAD, one_sided=one_sided, **axis)
@@ -50,9 +66,11 @@ def kept_in(folder: Path, bench: CornerBench) -> Kept:
     return Kept(folder, {"board": BOARD}, sigma, survey_cameras(rig, sizes), rig.stereo)
 
 
-def run_of(bench: CornerBench, folder: Path, wanted: Wanted | None = None) -> tuple[BenchRun, SelfPlacing]:
-    """A run, and who places the board for it."""
+def run_of(
+    bench: CornerBench, folder: Path, wanted: Wanted | None = None, eyes: Eyes | None = None
+) -> tuple[BenchRun, SelfPlacing]:
+    """A run, and who places the board for it; ``eyes`` instead of the bench's own."""
     teller = SelfPlacing(bench)
     fit = fit_in_rover(bench.head.rig.mast.rover_from_mast)
-    run = BenchRun(bench, kept_in(folder, bench), "board", BOARD, teller, fit, wanted or Wanted())
+    run = BenchRun(eyes or bench, kept_in(folder, bench), "board", BOARD, teller, fit, wanted or Wanted())
     return run, teller

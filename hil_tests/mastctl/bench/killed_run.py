@@ -14,8 +14,8 @@ def main(folder: str, repository: str) -> None:
     """Run it; the board stands where it stood, as it does while only the program dies."""
     bench = corner_bench(Path(repository), seed=5)
     run, _ = run_of(bench, Path(folder))
-    if run.placements():
-        number = int(run.placements()[-1].removeprefix("p"))
+    if run.known.placements():
+        number = int(run.known.placements()[-1].removeprefix("p"))
         bench.stand(_placement(number))
     run._teller.place = lambda name, *_: bench.stand(_placement(int(name[1:])))  # type: ignore[method-assign]
     sys.stdout.write("begun\n")

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from bench_world import corner_bench, run_of
+from bench_world import corner_bench, one_camera, run_of
 
 from calib.bench.knowledge import Knowledge
 from calib.bench.workspace import Workspace, pointing
@@ -20,8 +20,9 @@ from calib.rigid import Rigid
 from calib.survey import read_survey
 from mastctl.bench.eyes import Look
 from mastctl.bench.folder import looks_of
-from mastctl.bench.run import BoardLost, Wanted
+from mastctl.bench.looks import BoardLost
 from mastctl.bench.search import BoardNotFound
+from mastctl.bench.wanted import Wanted
 from tools.simulated.bench import CornerBench
 
 
@@ -31,7 +32,7 @@ def test_a_bench_ends_by_itself_with_what_was_wanted_met_on_paper_and_kept(
     bench = corner_bench(repository)
     run, teller = run_of(bench, tmp_path / "bench")
     fitted = run.run()
-    assert run.predicted_px() <= 0.2 and run.pictures() <= 60 and bench.seconds < 240.0
+    assert run.known.predicted_px() <= 0.2 and run.known.pictures() <= 60 and bench.seconds < 240.0
     survey = read_survey(tmp_path / "bench")
     looks = list(looks_of(survey))
     assert 2 <= len({placement for placement, _, _ in looks}) <= 4
@@ -45,6 +46,19 @@ def test_a_bench_ends_by_itself_with_what_was_wanted_met_on_paper_and_kept(
     for name, true in bench.true_rig.cameras.items():
         np.testing.assert_allclose(fitted.rig.cameras[name].model.H, true.model.H, atol=8.0)
     assert any("p2" in line for line in teller.told)
+
+
+def test_a_single_camera_is_calibrated_the_same_way_and_pointed_by_the_range_of_the_board_that_stands_there(
+    repository: Path, tmp_path: Path
+) -> None:
+    bench = corner_bench(repository, of=one_camera)
+    run, _ = run_of(bench, tmp_path / "bench")
+    run.run()
+    assert run.known.predicted_px() <= 0.2 and len(run.known.placements()) >= 2
+    checked = run.check()
+    assert len(checked.pointings) >= 3
+    x, y = checked.pointing_rms_px or (9.0, 9.0)
+    assert max(x, y) < 3.0 * (checked.pointing_promised_px or 0.0) < 1.0
 
 
 class Dying(RuntimeError):
@@ -68,8 +82,7 @@ def test_a_run_that_died_goes_on_at_the_same_placement_without_asking_again(
     repository: Path, tmp_path: Path
 ) -> None:
     bench = corner_bench(repository, seed=2)
-    run, _ = run_of(bench, tmp_path / "bench")
-    run._eyes = Mortal(bench, 5)  # type: ignore[assignment]  # dies in the middle of the first placement
+    run, _ = run_of(bench, tmp_path / "bench", eyes=Mortal(bench, 5))  # dies in the first placement
     with pytest.raises(Dying):
         run.run()
     run._kept.let_go()
@@ -80,15 +93,14 @@ def test_a_run_that_died_goes_on_at_the_same_placement_without_asking_again(
     assert len(before) == 5 and [p for p, _, _ in after][:5] == [p for p, _, _ in before]
     assert any("stands as it stood" in line for line in second.told)
     assert not any(line.startswith("p1: straight ahead") for line in second.told)
-    assert again.predicted_px() <= 0.2
+    assert again.known.predicted_px() <= 0.2
 
 
 def test_a_board_that_moved_while_the_run_was_dead_begins_another_placement(
     repository: Path, tmp_path: Path
 ) -> None:
     bench = corner_bench(repository, seed=3)
-    run, _ = run_of(bench, tmp_path / "bench")
-    run._eyes = Mortal(bench, 5)  # type: ignore[assignment]
+    run, _ = run_of(bench, tmp_path / "bench", eyes=Mortal(bench, 5))
     with pytest.raises(Dying):
         run.run()
     run._kept.let_go()
@@ -136,7 +148,7 @@ def test_play_and_harmonics_are_found_where_the_head_has_them(repository: Path, 
     run, _ = run_of(bench, tmp_path / "bench", Wanted(pointing_px=0.3))
     joints = run.run().rig.joints
     assert joints.pan.backlash_rad == pytest.approx(0.004, abs=4e-4)
-    known = Knowledge(run.known.rig, {})
+    known = Knowledge(run.known.now.rig, {})
     assert pointing(known, Workspace(("navcam_left", "navcam_right"), (-0.5, 0.5), (-0.4, 0.1)))
     read = np.linspace(-0.8, 0.8, 9)
     true = read + 0.006 * np.sin(read) + 0.002 * np.cos(2 * read)

@@ -1,0 +1,264 @@
+"""What a run knows: all it has seen, the rig and boards that this makes, and how well the rig would point.
+
+What is seen goes to the disk first. It is fitted beside the next moves, whenever there is a fifth more of it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import replace
+
+import numpy as np
+
+from calib.bench.board_pose import rover_from_board
+from calib.bench.knowledge import Knowledge, Shot, View
+from calib.bench.poses import Sought, expected_px, with_board
+from calib.bench.workspace import Pointing, Workspace, pointing
+from calib.boards import AnyBoard
+from calib.errors import CalibError
+from calib.fit.least_squares import covariance_of
+from calib.mast.rig import Rig
+from calib.rigid import Rigid, rigid_rates
+from mastctl.bench.eyes import Head, Look
+from mastctl.bench.fitting import FitSurvey, Fitted
+from mastctl.bench.folder import Kept, looks_of
+from mastctl.errors import MastctlError
+
+USUAL_PAN_RAD, USUAL_TILT_RAD = (-1.2, 1.2), (-0.9, 0.3)
+"""Where a rig points, as far as the limits let it."""
+
+CELLS = (8, 6)
+"""Of a picture, columns and rows, for its coverage."""
+
+
+class Known:
+    """What was seen, what follows from it, and the fit of it that is under way.
+
+    Parameters
+    ----------
+    head
+        As it is known before anything is seen.
+    kept
+        The survey's folder; what is in it already is known.
+    board_name, board
+        What is looked for.
+    fit
+        Makes a rig of the survey.
+    say
+        Is told what a fit refuses.
+
+    Attributes
+    ----------
+    now
+        The present estimate.
+    sought
+        What a shot has to show.
+    aim
+        What the rig is for.
+    workspace
+        Where it points.
+    looks
+        Placement, whether it is a check's, the look; in turn.
+    shots
+        What of them is fitted.
+    fitted
+        The last fit; None before the first.
+    fitted_looks
+        How many looks it knew.
+    """
+
+    def __init__(
+        self,
+        head: Head,
+        kept: Kept,
+        board_name: str,
+        board: AnyBoard,
+        fit: FitSurvey,
+        say: Callable[[str], None],
+    ) -> None:
+        self.head, self.board, self.kept = head, board, kept
+        self._board_name, self._fit, self._say = board_name, fit, say
+        self.workspace = Workspace(
+            first_cameras(head.rig),
+            _within(head.pan_limits_rad, USUAL_PAN_RAD),
+            _within(head.tilt_limits_rad, USUAL_TILT_RAD),
+            one_sided=head.one_sided,
+        )
+        every = board.in_board_m(board.ids)
+        least = len(every) if board.kind in ("dots", "checkerboard") else max(8, len(every) // 8)
+        self.sought = Sought(
+            every, kept.sigma_px, least, head.pan_limits_rad, head.tilt_limits_rad, head.one_sided
+        )
+        # A count is rounded both when the head is sent and when it is read.
+        self.now = Knowledge(head.rig, {}, head.count_rad / math.sqrt(12.0))
+        self.aim: Pointing = pointing(self.now, self.workspace)
+        self.looks: list[tuple[str, bool, Look]] = list(looks_of(kept.survey()))
+        self.shots: list[Shot] = []
+        self.fitted: Fitted | None = None
+        self.fitted_looks = 0
+        self._scale = 1.0
+        self._pool = ThreadPoolExecutor(1, "bench-fit")
+        self._pending: tuple[int, Future[Fitted]] | None = None
+
+    def end(self) -> None:
+        """Fit no more."""
+        self._pool.shutdown(wait=False, cancel_futures=True)
+
+    # -- what follows ----------------------------------------------------------------------------------
+
+    @property
+    def floor_px(self) -> float:
+        """What the head's counts alone leave of a first pointing, rms per axis."""
+        return self.aim.by_counts_px(self.now.joint_sigma_rad)
+
+    def predicted_px(self) -> float:
+        """Return what the pictures up to now leave of it, on paper."""
+        return expected_px(self.now, self.shots, self.aim) if self.shots else math.inf
+
+    def placements(self) -> list[str]:
+        """Return the names of the placements, in turn."""
+        return list(dict.fromkeys(placement for placement, _, _ in self.looks))
+
+    def of(self, name: str, check: bool | None = None) -> list[Look]:
+        """Return the looks of a placement: all, or those that are a check's or are not."""
+        return [one for at, is_check, one in self.looks if at == name and check in (None, is_check)]
+
+    def pictures(self) -> int:
+        """Return how many pictures the camera with most of them has."""
+        counts: dict[str, int] = {}
+        for _, _, look in self.looks:
+            for one in look.found:
+                counts[one.camera] = counts.get(one.camera, 0) + 1
+        return max(counts.values(), default=0)
+
+    def coverage(self) -> dict[str, float]:
+        """Return the part of each camera's picture in which corners were seen, 0 to 1, by its cells."""
+        cells: dict[str, set[tuple[int, int]]] = {}
+        for _, check, look in self.looks:
+            for one in () if check else look.found:
+                if one.corners is None or one.camera not in self.now.rig.cameras:
+                    continue
+                per_px = np.array(CELLS) / self.now.rig.cameras[one.camera].model.size_px
+                at = np.floor((one.corners.pixels_px + 0.5) * per_px).astype(int)
+                cells.setdefault(one.camera, set()).update(map(tuple, at.tolist()))
+        return {camera: min(len(found) / math.prod(CELLS), 1.0) for camera, found in cells.items()}
+
+    def promised_px(self, looks: Sequence[Look], name: str) -> dict[str, float]:
+        """Return what corners of looks that were not fitted should be off by, rms per axis, by camera."""
+        told: dict[str, list[float]] = {}
+        covariance = covariance_of(with_board(self.now, self.shots, name))
+        board = self.now.boards[name]
+        for look in looks:
+            shot = self._shot(name, look)
+            for view in shot.views:
+                points = board.points(view.in_board_m)
+                rates = self.now.rates(view.camera, shot, points)
+                to_board = rigid_rates(rates.to_points, points, board.translation_m)
+                both = np.concatenate([rates.to_rig, to_board], axis=2)
+                by_rig = np.einsum("nip,pq,niq->ni", both, covariance, both)
+                by_joints = self.now.joint_sigma_rad**2 * (rates.to_joints**2).sum(axis=2)
+                told.setdefault(view.camera, []).append(
+                    float(np.mean(by_rig + by_joints)) + self.sought.sigma_px**2
+                )
+        return {camera: math.sqrt(np.mean(values)) for camera, values in told.items()}
+
+    # -- what is learned -------------------------------------------------------------------------------
+
+    def take(self, name: str, look: Look, check: bool = False) -> None:
+        """Keep a look at a placement, add it to what is known, and fit beside what comes next if it is
+        worth it."""
+        self.kept.add(name, self._board_name, look, check)
+        self.looks.append((name, check, look))
+        if name not in self.now.boards:
+            self.now = replace(self.now, boards={**self.now.boards, name: self._board_from(look)})
+        if not check:
+            self.shots.append(self._shot(name, look))
+        self.collect()
+        to_fit = sum(1 for _, is_check, _ in self.looks if not is_check)
+        if not check and self._pending is None and _worth_a_fit(to_fit, self.fitted_looks):
+            self._pending = len(self.looks), self._pool.submit(self._fit, self.kept.survey())
+
+    def collect(self, wait: bool = False) -> None:
+        """Take over a fit that is ready; with ``wait``, the one under way. One that fails is told."""
+        if self._pending is None or not (wait or self._pending[1].done()):
+            return
+        looks, future = self._pending
+        self._pending = None
+        try:
+            self._use(future.result(), looks)
+        except CalibError as reason:
+            self._say(f"no fit yet: {reason}")
+
+    def fit(self) -> Fitted:
+        """Return the fit of everything that was seen. Raises CalibError if it cannot be fitted."""
+        self.collect(wait=True)
+        if self.fitted is None or self.fitted_looks < len(self.looks):
+            self._use(self._fit(self.kept.survey()), len(self.looks))
+        assert self.fitted is not None
+        return self.fitted
+
+    def believe_boards(self) -> None:
+        """See boards that no fit has placed with the present rig."""
+        for name, _, look in self.looks:
+            if name not in self.now.boards:
+                board = self._board_from(look)
+                self.now = replace(self.now, boards={**self.now.boards, name: board})
+        self.shots = [self._shot(name, look) for name, check, look in self.looks if not check]
+
+    def _use(self, fitted: Fitted, looks: int) -> None:
+        """Let a fit of so many looks be the present estimate; boards that it does not know stay where they
+        were seen."""
+        self.fitted, self.fitted_looks = fitted, looks
+        self.now = replace(self.now, rig=fitted.rig, boards=dict(fitted.boards))
+        self._scale = fitted.sigma_scale
+        self.sought = replace(self.sought, sigma_px=fitted.corner_rms_px)
+        self.aim = pointing(self.now, self.workspace)
+        self.believe_boards()
+
+    def _shot(self, name: str, look: Look) -> Shot:
+        views = tuple(
+            View(one.camera, self.board.in_board_m(one.corners.ids), self._scale * one.corners.sigma_px)
+            for one in look.found
+            if one.corners is not None and one.camera in self.now.rig.cameras
+        )
+        return Shot(name, look.pan_rad, look.tilt_rad, views, look.pan_approach, look.tilt_approach)
+
+    def _board_from(self, look: Look) -> Rigid:
+        """Where the board is, by the picture that shows most of it."""
+        one = max(look.found, key=lambda seen: 0 if seen.corners is None else len(seen.corners))
+        assert one.corners is not None
+        true_rad = self.now.rig.joints.true_rad(
+            (one.pan_rad, one.tilt_rad), (look.pan_approach, look.tilt_approach)
+        )
+        in_board_m = self.board.in_board_m(one.corners.ids)
+        return rover_from_board(self.now.rig, one.camera, *true_rad, in_board_m, one.corners.pixels_px)
+
+
+def first_cameras(rig: Rig) -> tuple[str, ...]:
+    """Return the cameras that point: the Navcam pair, else a pair on the head, else one camera.
+
+    Raises
+    ------
+    MastctlError
+        If no camera is on the head.
+    """
+    pairs = {n: p for n, p in rig.stereo.items() if all(rig.cameras[c].on == "head" for c in p)}
+    if pairs:
+        return pairs.get("navcam") or next(iter(pairs.values()))
+    single = [name for name, camera in rig.cameras.items() if camera.on == "head"]
+    if not single:
+        raise MastctlError("the mast file has no camera on the head, and so no head to calibrate")
+    return (single[0],)
+
+
+def _worth_a_fit(looks: int, fitted: int) -> bool:
+    """Whether there is a fifth more to fit than the last time."""
+    return looks >= 4 and looks >= fitted + max(2, fitted // 5)
+
+
+def _within(limits_rad: tuple[float, float], usual_rad: tuple[float, float]) -> tuple[float, float]:
+    """What of the usual range the limits leave; the limits where that is nothing."""
+    low, high = max(limits_rad[0], usual_rad[0]), min(limits_rad[1], usual_rad[1])
+    return (low, high) if low < high else limits_rad

@@ -1,0 +1,190 @@
+"""Looks at a board at one placement: find it, take what tells most, and see that it stayed where it was."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from calib.bench.knowledge import Shot
+from calib.bench.placements import Placement
+from calib.bench.poses import Choice, next_shot
+from mastctl.bench.eyes import Eyes, Look, NotThere
+from mastctl.bench.known import Known
+from mastctl.bench.search import Search
+from mastctl.bench.teller import Progress, Teller
+from mastctl.bench.wanted import Wanted
+from mastctl.errors import MastctlError
+
+FEWEST_LOOKS = 8
+"""Of a placement: fewer leave the board's own place, and so what it tells, to chance."""
+
+LITTLE_GAIN, LAST_GAIN = 0.12, 0.01
+"""A look that promises less than this part of the predicted error is not worth its time at a placement, or at
+the last one that there may be."""
+
+MOVED_PX = 1.0
+"""Corners further off than this at one and the same attitude, on the median, say that something moved."""
+
+UNSEEN_IN_A_ROW = 4
+"""Looks in a row that did not show the board where it was expected: it was taken away, or has moved."""
+
+
+class BoardLost(MastctlError):
+    """The board is not where it was."""
+
+    code = "board_lost"
+
+
+class Looks:
+    """Looks at boards through a head's cameras.
+
+    Parameters
+    ----------
+    eyes
+        The head and its cameras.
+    known
+        What is known, and learns by every look.
+    teller
+        Is told how it goes.
+    wanted
+        What to reach.
+    """
+
+    def __init__(self, eyes: Eyes, known: Known, teller: Teller, wanted: Wanted) -> None:
+        self._eyes, self._known, self._teller, self._wanted = eyes, known, teller, wanted
+        self.here = ""
+        """The placement that was worked at, and whose board so stands there."""
+
+    def find(self, name: str, placement: Placement) -> None:
+        """Look for a board that was placed anew.
+
+        Raises
+        ------
+        BoardNotFound
+            With what the pictures showed instead.
+        """
+        search = Search(self._eyes, self._known.now, self._known.sought, self._teller)
+        self._known.take(name, search.find(placement))
+
+    def work_at(self, name: str, most: int) -> None:
+        """Take what tells most of a board that was found, ``most`` looks or until others tell more.
+
+        Raises
+        ------
+        BoardLost
+            If it is not there any more.
+        """
+        known, self.here = self._known, name
+        in_vain: list[tuple[float, float]] = []
+        missed = 0
+        while True:
+            here = len(known.of(name))
+            known.collect()
+            choice = next_shot(known.now, known.sought, known.shots, name, known.aim, in_vain)
+            if choice is None or here >= most or self._suffices(here, choice):
+                break
+            self._tell(name, choice)
+            shot = choice.shot
+            look = self.look_at(shot)
+            if look is not None and look.found:
+                missed = 0
+                known.take(name, look)
+                continue
+            in_vain.append((shot.pan_rad, shot.tilt_rad))
+            if look is None:
+                continue
+            missed += 1
+            self._teller.say(_not_seen(look))
+            if missed >= UNSEEN_IN_A_ROW:
+                raise BoardLost(
+                    f"the board of placement {name} was not seen in {missed} looks in a row where "
+                    "it stood; put it back or place it anew, and start the same command again"
+                )
+        self._end(name)
+
+    def look_at(self, shot: Shot) -> Look | None:
+        """Take a shot; None where the head must not go."""
+        try:
+            return self._eyes.look(shot.pan_rad, shot.tilt_rad, (shot.pan_approach, shot.tilt_approach))
+        except NotThere as reason:
+            self._teller.say(f"not looked there: {reason}")
+            return None
+
+    def stands_still(self, name: str) -> bool:
+        """Return whether the last attitude of a placement shows now what it showed then."""
+        apart_px = self._again_px(self._known.of(name)[-1])
+        return apart_px is not None and apart_px <= MOVED_PX
+
+    def _again_px(self, then: Look) -> float | None:
+        """How far aside a look shows the board when it is taken again."""
+        now = self._eyes.look(then.pan_rad, then.tilt_rad, (then.pan_approach, then.tilt_approach))
+        return corners_apart_px(then, now)
+
+    def _suffices(self, here: int, choice: Choice) -> bool:
+        if here < FEWEST_LOOKS:
+            return False
+        now_px = self._known.predicted_px()
+        if (
+            now_px <= 0.7 * self._wanted.at_least_px(self._known.floor_px)
+            and self._known.fitted_looks >= here
+        ):
+            return True
+        last = len(self._known.placements()) >= self._wanted.placements[1]
+        return choice.expected_px > (1.0 - (LAST_GAIN if last else LITTLE_GAIN)) * now_px
+
+    def _end(self, name: str) -> None:
+        """Look once more where the placement began: did the board, or the head, stay as it was?"""
+        apart_px = self._again_px(self._known.of(name)[0])
+        if apart_px is not None and apart_px > self._allowed_px():
+            self._teller.say(
+                f"placement {name}: its first picture taken again shows the board {apart_px:.1f} px aside: "
+                "the board or the head moved meanwhile; the fit will tell which pictures to leave out"
+            )
+            self._known.kept.note(event="moved", name=name, apart_px=round(apart_px, 2))
+        self._known.kept.note(event="done", name=name)
+
+    def _allowed_px(self) -> float:
+        """How far one attitude may show a board aside: what two readings may differ by, and more."""
+        head = self._known.head
+        camera = head.rig.cameras[self._known.workspace.cameras[0]].model
+        return MOVED_PX + 3.0 * head.count_rad * float(np.linalg.norm(camera.H))
+
+    def _tell(self, name: str, choice: Choice) -> None:
+        known = self._known
+        self._teller.progress(
+            Progress(
+                name,
+                known.pictures(),
+                self._wanted.pictures,
+                known.predicted_px(),
+                self._wanted.at_least_px(known.floor_px),
+                known.floor_px,
+                (choice.shot.pan_rad, choice.shot.tilt_rad),
+                choice.expected_px,
+                known.coverage(),
+            )
+        )
+
+
+def corners_apart_px(then: Look, now: Look) -> float | None:
+    """Return how far corners lie apart in two looks from one attitude, median; None if none is common."""
+    apart: list[float] = []
+    before = {one.camera: one.corners for one in then.found}
+    for one in now.found:
+        old = before.get(one.camera)
+        if old is None or one.corners is None:
+            continue
+        _, a, b = np.intersect1d(old.ids, one.corners.ids, return_indices=True)
+        apart += np.linalg.norm(old.pixels_px[a] - one.corners.pixels_px[b], axis=1).tolist()
+    return float(np.median(apart)) if apart else None
+
+
+def deg(angle_rad: float) -> str:
+    """Return an angle as a person reads it."""
+    return f"{math.degrees(angle_rad):+.0f} degrees"
+
+
+def _not_seen(look: Look) -> str:
+    whys = dict.fromkeys(one.why for one in look.seen if one.why)
+    return "the board is not seen here: " + "; ".join(whys or ("no corners found",))
