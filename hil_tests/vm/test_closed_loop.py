@@ -10,7 +10,7 @@ from tools.closed_loop.__main__ import through_devices
 
 TIMEOUT_S = 900.0
 TOLD = ("no_reply", "no_fresh_frame", "bad_reply: pan_tilt: the joint readings around", "target_not_found")
-"""How a target fails when the machine is held up for a second by others, or when the day's noise chooses a pixel
+"""How a target fails when the machine is held up for a second by others, or when noise chooses a pixel
 at a rock's edge, whose match in the other eye stays undecided: told, and nothing wrong measured."""
 
 
