@@ -145,7 +145,7 @@ LOG_WORDS: Mapping[str, Word] = MappingProxyType(
 WHEN: Mapping[str, float] = MappingProxyType({"after_s": 0.0, "for_s": math.inf})
 """Parameters of every word: it begins ``after_s`` after it is set and lasts ``for_s`` seconds."""
 
-_BOUNDS = {
+BOUNDS = {
     "after_s": (0.0, 86400.0),
     "for_s": (0.0, math.inf),
     "delay_s": (0.0, 3600.0),
@@ -165,6 +165,7 @@ _BOUNDS = {
     "dy_px": (-4096.0, 4096.0),
     "seed": (0.0, 2.0**53),
 }
+"""The least and the most of each parameter."""
 
 
 def read_script(path: Path) -> list[Any]:
@@ -242,6 +243,11 @@ class FaultPanel:
         self._entries: dict[tuple[str, str], tuple[_Entry, ...]] = {}
         self._listeners: tuple[Callable[[], None], ...] = ()
 
+    @property
+    def words(self) -> Mapping[str, Mapping[str, Word]]:
+        """What each device takes: its words, by its name."""
+        return MappingProxyType(self._words)
+
     def listen(self, changed: Callable[[], None]) -> None:
         """Have a function called whenever a fault was set or taken back."""
         self._listeners = (*self._listeners, changed)
@@ -283,7 +289,7 @@ class FaultPanel:
                 raise BadOptions(
                     f"fault {word!r} of {device} has no parameter {name!r}{nearest(name, known)}"
                 )
-            low, high = _BOUNDS[name]
+            low, high = BOUNDS[name]
             number = isinstance(value, int | float)
             if not number or math.isnan(value) or not low <= value <= high:
                 raise BadOptions(

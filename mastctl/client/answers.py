@@ -472,6 +472,27 @@ class Operations(TypedDict):
     operations: list[OperationListed]
 
 
+class ParameterTold(TypedDict):
+    """A parameter of a fault word: its usual value and its bounds; null for one without an end."""
+
+    usual: float | None
+    least: float
+    most: float | None
+
+
+class PlaceTold(TypedDict):
+    """A place of the head, radians as it reads them."""
+
+    pan_rad: float
+    tilt_rad: float
+
+
+class PlacesTold(TypedDict):
+    """The places that are kept, by name; ``home`` is always among them."""
+
+    places: dict[str, PlaceTold]
+
+
 class PointingTold(TypedDict):
     """One pointing, and what was measured after it in a new picture."""
 
@@ -821,12 +842,36 @@ class TrackWord(TypedDict):
     id: str | None
 
 
+class TruthTold(TypedDict):
+    """Where a point of the simulated scene truly is: in the site, in the rover frame of a frame, and in it.
+
+    ``pixel_px`` is null where the camera could not see it, all three where the pixel shows the sky.
+    """
+
+    position_in_site_m: list[float] | None
+    position_m: list[float] | None
+    pixel_px: list[float] | None
+
+
 class TurnedTold(TypedDict):
     """How far a camera seems turned, by the axes of the frame that it is mounted on."""
 
     turn_rad: list[float]
     sigma_rad: list[float]
     log10_evidence: float
+
+
+class WordTold(TypedDict):
+    """A fault word: what it does, in one sentence, and its parameters; the unit is in the name."""
+
+    does: str
+    parameters: dict[str, ParameterTold]
+
+
+class WordsTold(TypedDict):
+    """The fault words of each simulated device."""
+
+    devices: dict[str, dict[str, WordTold]]
 
 
 Event = (

@@ -28,6 +28,8 @@ if TYPE_CHECKING:
         MastsTold,
         OperationListed,
         OperationTold,
+        PlacesTold,
+        PlaceTold,
         PoseTaken,
         PreviewTold,
         RecorderTold,
@@ -46,6 +48,9 @@ if TYPE_CHECKING:
         SunTold,
         TimeTold,
         TrackTold,
+        TruthTold,
+        WordsTold,
+        WordTold,
     )
     from mastctl.client.snapshot import Snapshot
 DEFAULT_URL = "http://127.0.0.1:8420"
@@ -507,6 +512,22 @@ class AsyncClient:
         """
         return Jog(lambda: self._daemon.beside(ANSWER_S))
 
+    async def places(self) -> dict[str, PlaceTold]:
+        """Return the places of the head that are kept, by name; ``home`` is always among them."""
+        return cast("PlacesTold", await self._daemon.json("GET", "/places"))["places"]
+
+    async def keep_place(self, name: str, pan_rad: float, tilt_rad: float) -> dict[str, PlaceTold]:
+        """Keep a place of the head by a name, for everybody; return all."""
+        body = {"pan_rad": pan_rad, "tilt_rad": tilt_rad}
+        path = f"/places/{quote(name, safe='')}"
+        return cast("PlacesTold", await self._daemon.command("POST", path, body))["places"]
+
+    async def forget_place(self, name: str) -> dict[str, PlaceTold]:
+        """Forget a place; return those that are left. Raises ClientError ``place_unknown``."""
+        return cast("PlacesTold", await self._daemon.command("DELETE", f"/places/{quote(name, safe='')}"))[
+            "places"
+        ]
+
     async def sun(self) -> SunTold:
         """Return the direction that no head camera looks into: ``sun``, null where none was told."""
         return cast("SunTold", await self._daemon.json("GET", "/limits/sun"))
@@ -630,6 +651,37 @@ class AsyncClient:
         return cast(
             "TimeTold", await self._daemon.command("POST", "/simulation/time", {"advance_s": duration_s})
         )
+
+    async def truth(
+        self,
+        frame_id: str,
+        *,
+        pixel: tuple[float, float] | None = None,
+        position_in_site_m: Sequence[float] | None = None,
+    ) -> TruthTold:
+        """Return what a pixel (x, y) of a frame truly shows, or where a point of the site truly lies in it.
+
+        Returns
+        -------
+        told
+            ``position_in_site_m``, ``position_m`` in the rover frame when the frame was taken, ``pixel_px``;
+            null where the camera could not see it, all where a pixel shows the sky.
+
+        Raises
+        ------
+        ClientError
+            ``not_simulated``; ``frame_too_old`` and such for a frame that is not kept.
+        """
+        asked: dict[str, Any] = {"frame_id": frame_id}
+        if pixel is not None:
+            asked |= dict(zip(("x_px", "y_px"), pixel, strict=True))
+        if position_in_site_m is not None:
+            asked |= dict(zip(("x_m", "y_m", "z_m"), position_in_site_m, strict=True))
+        return cast("TruthTold", await self._daemon.json("GET", "/simulation/truth", params=asked))
+
+    async def fault_words(self) -> dict[str, dict[str, WordTold]]:
+        """Return the fault words of each simulated device: what each ``does``, and its ``parameters``."""
+        return cast("WordsTold", await self._daemon.json("GET", "/simulation/words"))["devices"]
 
     async def faults(self) -> list[FaultSet]:
         """Return the faults that are switched on in a simulated rover."""

@@ -25,6 +25,8 @@ if TYPE_CHECKING:
         MastsTold,
         OperationListed,
         OperationTold,
+        PlacesTold,
+        PlaceTold,
         PoseTaken,
         PreviewTold,
         RecorderTold,
@@ -43,6 +45,9 @@ if TYPE_CHECKING:
         SunTold,
         TimeTold,
         TrackTold,
+        TruthTold,
+        WordsTold,
+        WordTold,
     )
     from mastctl.client.snapshot import Snapshot
 
@@ -495,6 +500,20 @@ class Client:
         """
         return Jog(lambda: self._daemon.beside(ANSWER_S))
 
+    def places(self) -> dict[str, PlaceTold]:
+        """Return the places of the head that are kept, by name; ``home`` is always among them."""
+        return cast("PlacesTold", self._daemon.json("GET", "/places"))["places"]
+
+    def keep_place(self, name: str, pan_rad: float, tilt_rad: float) -> dict[str, PlaceTold]:
+        """Keep a place of the head by a name, for everybody; return all."""
+        body = {"pan_rad": pan_rad, "tilt_rad": tilt_rad}
+        path = f"/places/{quote(name, safe='')}"
+        return cast("PlacesTold", self._daemon.command("POST", path, body))["places"]
+
+    def forget_place(self, name: str) -> dict[str, PlaceTold]:
+        """Forget a place; return those that are left. Raises ClientError ``place_unknown``."""
+        return cast("PlacesTold", self._daemon.command("DELETE", f"/places/{quote(name, safe='')}"))["places"]
+
     def sun(self) -> SunTold:
         """Return the direction that no head camera looks into: ``sun``, null where none was told."""
         return cast("SunTold", self._daemon.json("GET", "/limits/sun"))
@@ -615,6 +634,37 @@ class Client:
             ``time_passes`` where time passes by itself, ``not_simulated``.
         """
         return cast("TimeTold", self._daemon.command("POST", "/simulation/time", {"advance_s": duration_s}))
+
+    def truth(
+        self,
+        frame_id: str,
+        *,
+        pixel: tuple[float, float] | None = None,
+        position_in_site_m: Sequence[float] | None = None,
+    ) -> TruthTold:
+        """Return what a pixel (x, y) of a frame truly shows, or where a point of the site truly lies in it.
+
+        Returns
+        -------
+        told
+            ``position_in_site_m``, ``position_m`` in the rover frame when the frame was taken, ``pixel_px``;
+            null where the camera could not see it, all where a pixel shows the sky.
+
+        Raises
+        ------
+        ClientError
+            ``not_simulated``; ``frame_too_old`` and such for a frame that is not kept.
+        """
+        asked: dict[str, Any] = {"frame_id": frame_id}
+        if pixel is not None:
+            asked |= dict(zip(("x_px", "y_px"), pixel, strict=True))
+        if position_in_site_m is not None:
+            asked |= dict(zip(("x_m", "y_m", "z_m"), position_in_site_m, strict=True))
+        return cast("TruthTold", self._daemon.json("GET", "/simulation/truth", params=asked))
+
+    def fault_words(self) -> dict[str, dict[str, WordTold]]:
+        """Return the fault words of each simulated device: what each ``does``, and its ``parameters``."""
+        return cast("WordsTold", self._daemon.json("GET", "/simulation/words"))["devices"]
 
     def faults(self) -> list[FaultSet]:
         """Return the faults that are switched on in a simulated rover."""

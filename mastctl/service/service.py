@@ -43,6 +43,7 @@ from mastctl.safety.stop_threads import StopThreads
 from mastctl.service.mast_in_use import MastInUse, configured, read_mast
 from mastctl.service.masts import Masts
 from mastctl.service.opening import bounded, run_names
+from mastctl.service.places import Places
 from mastctl.service.recording import Recording
 from mastctl.service.socket_stops import SocketStops
 from mastctl.service.state import State
@@ -107,6 +108,8 @@ class Service:
         Where the web side stops: threads that nothing else can keep busy.
     folder, latch
         Where state is kept that outlives the daemon; the emergency stop, if one is latched.
+    places
+        Where the head is sent by a name.
     manager
         What started this process, and hears when the configuration is read again; nobody by default.
     reloading
@@ -129,6 +132,7 @@ class Service:
         self.started_s = clock.now_s()
         self._version = version("mastctl")
         self.folder = folder or StateFolder.temporary()
+        self.places = Places(self.folder.path)
         self.latch = Latch(self.folder)
         self.machine = Machine(clock, latch=self.latch.held)
         publisher = self.machine.publisher

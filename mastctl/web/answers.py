@@ -659,6 +659,51 @@ class FaultsSet(_Told):
     faults: list[FaultSet]
 
 
+class PlaceTold(_Told):
+    """A place of the head, radians as it reads them."""
+
+    pan_rad: float
+    tilt_rad: float
+
+
+class PlacesTold(_Told):
+    """The places that are kept, by name; ``home`` is always among them."""
+
+    places: dict[str, PlaceTold]
+
+
+class ParameterTold(_Told):
+    """A parameter of a fault word: its usual value and its bounds; null for one without an end."""
+
+    usual: float | None
+    least: float
+    most: float | None
+
+
+class WordTold(_Told):
+    """A fault word: what it does, in one sentence, and its parameters; the unit is in the name."""
+
+    does: str
+    parameters: dict[str, ParameterTold]
+
+
+class WordsTold(_Told):
+    """The fault words of each simulated device."""
+
+    devices: dict[str, dict[str, WordTold]]
+
+
+class TruthTold(_Told):
+    """Where a point of the simulated scene truly is: in the site, in the rover frame of a frame, and in it.
+
+    ``pixel_px`` is null where the camera could not see it, all three where the pixel shows the sky.
+    """
+
+    position_in_site_m: Point | None
+    position_m: Point | None
+    pixel_px: Pixel | None
+
+
 class SessionTold(_Told):
     """``GET /session``: who asks, what it may do, and by which way it came.
 

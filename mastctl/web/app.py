@@ -25,6 +25,7 @@ from mastctl.web.lease import add_lease
 from mastctl.web.limits import add_limits
 from mastctl.web.page import add_page
 from mastctl.web.pictures import add_pictures
+from mastctl.web.places import add_places
 from mastctl.web.recordings import add_recordings
 from mastctl.web.refusals import add_errors
 from mastctl.web.reload import add_reload
@@ -71,6 +72,7 @@ def create_app(
     add_tracking(app, service, commands)
     add_limits(app, service, commands)
     add_pictures(app, service, waiting, commands)
+    add_places(app, service, waiting, commands)
     add_recordings(app, service, waiting, commands)
     add_reload(app, service, commands)
     add_simulation(app, service, waiting, commands)

@@ -348,6 +348,13 @@ class MastBody(_Strict):
         return self
 
 
+class PlaceBody(_Strict):
+    """``POST /places/{name}``: the angles that are kept, as the head reads them."""
+
+    pan_rad: Angle
+    tilt_rad: Angle
+
+
 class LoginBody(_Strict):
     """``POST /login``: a token."""
 
@@ -412,6 +419,38 @@ class ImagesQuery(BaseModel):
     model_config = ConfigDict(extra="forbid")
 
     camera: Annotated[list[Name], Field(min_length=1, max_length=MOST_KEYS)]
+
+
+class TruthQuery(BaseModel):
+    """``GET /simulation/truth``: a frame, and a pixel of it or a point of the site, metres."""
+
+    model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
+
+    frame_id: Name
+    x_px: float | None = None
+    y_px: float | None = None
+    x_m: float | None = None
+    y_m: float | None = None
+    z_m: float | None = None
+
+    @model_validator(mode="after")
+    def _one(self) -> Self:
+        given = {name for name in ("x_px", "y_px", "x_m", "y_m", "z_m") if getattr(self, name) is not None}
+        if given not in ({"x_px", "y_px"}, {"x_m", "y_m", "z_m"}):
+            raise ValueError("x_px and y_px, or x_m, y_m and z_m, are expected, and not both")
+        return self
+
+    @property
+    def pixel_px(self) -> tuple[float, float] | None:
+        """The pixel, None where a point was given."""
+        return None if self.x_px is None or self.y_px is None else (self.x_px, self.y_px)
+
+    @property
+    def position_in_site_m(self) -> tuple[float, float, float] | None:
+        """The point, None where a pixel was given."""
+        if self.x_m is None or self.y_m is None or self.z_m is None:
+            return None
+        return self.x_m, self.y_m, self.z_m
 
 
 class FaultsQuery(BaseModel):

@@ -5,13 +5,15 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING, Annotated, Any
 
+import numpy as np
 from fastapi import FastAPI, Path, Query
 from scipy.spatial.transform import Rotation
 
 from calib.boards.board_file import board_of, document_of
 from calib.errors import BadFile
+from calib.rigid import FloatArray, Rigid
+from drivers.faults import BOUNDS, WHEN, FaultPanel
 from drivers.faults import Fault as SetFault
-from drivers.faults import FaultPanel
 from drivers.simulation_clock import MAX, SimulationClock
 from mastctl.as_json import as_json
 from mastctl.commands.entry import (
@@ -22,12 +24,12 @@ from mastctl.commands.entry import (
     SIMULATION_POSE,
     SIMULATION_TIME,
 )
-from mastctl.errors import BadRequest, NotKnown, NotNow
+from mastctl.errors import BadRequest, NoLonger, NotKnown, NotNow
 from mastctl.service.service import Service
 from mastctl.tracking.pose import RoverPose
 from mastctl.web import PREFIX
 from mastctl.web.commands import Commands, Headers
-from mastctl.web.models import BoardBody, FaultBody, FaultsQuery, StandBody, TimeBody
+from mastctl.web.models import BoardBody, FaultBody, FaultsQuery, StandBody, TimeBody, TruthQuery
 from mastctl.web.waiting import Waiting
 
 if TYPE_CHECKING:
@@ -136,6 +138,27 @@ def add_simulation(app: FastAPI, service: Service, waiting: Waiting, commands: C
 
         return await commands.run(SIMULATION_TIME, came, body.model_dump(), pass_by)
 
+    def truth_told(query: TruthQuery) -> dict[str, Any]:
+        rover = simulated("truths")
+        frame = service.devices.frame_by_id(query.frame_id)
+        try:
+            site_from_rover = rover.frame_truth(frame.camera, frame.sequence).site_from_rover
+            if query.pixel_px is not None:
+                point = rover.true_point(frame.camera, frame.sequence, query.pixel_px)
+                return _truth_told(site_from_rover, point, query.pixel_px)
+            point = site_from_rover.inverse.points(np.array(query.position_in_site_m))
+            return _truth_told(site_from_rover, point, rover.true_pixel(frame.camera, frame.sequence, point))
+        except LookupError as error:
+            raise NoLonger("frame_too_old", str(error.args[0])) from None
+
+    @app.get(f"{PREFIX}/simulation/truth", summary="What a pixel of a frame truly shows, or where a point is")
+    async def truth(query: Annotated[TruthQuery, Query()]) -> dict[str, Any]:
+        return await waiting.run(lambda: truth_told(query))
+
+    @app.get(f"{PREFIX}/simulation/words", summary="The fault words of each device, with their parameters")
+    async def words() -> dict[str, Any]:
+        return await waiting.run(lambda: {"devices": _words_told(panel())})
+
     def told() -> dict[str, Any]:
         return {"faults": [_fault_told(fault) for fault in panel().active()]}
 
@@ -158,6 +181,39 @@ def add_simulation(app: FastAPI, service: Service, waiting: Waiting, commands: C
             return told()
 
         return await commands.run(SIMULATION_FAULTS_OFF, came, query.model_dump(exclude_none=True), act)
+
+
+def _truth_told(site_from_rover: Rigid, point_m: FloatArray | None, pixel_px: Any) -> dict[str, Any]:
+    """A point of the rover frame and its pixel as JSON; without a point nothing is known."""
+    if point_m is None:
+        return {"position_in_site_m": None, "position_m": None, "pixel_px": None}
+    pixel = np.asarray(pixel_px, dtype=np.float64)
+    return {
+        "position_in_site_m": site_from_rover.points(point_m).tolist(),
+        "position_m": point_m.tolist(),
+        "pixel_px": pixel.tolist() if np.isfinite(pixel).all() else None,
+    }
+
+
+def _words_told(panel: FaultPanel) -> dict[str, Any]:
+    """What each device takes as JSON; what has no end is null."""
+
+    def parameter(name: str, usual: float) -> dict[str, float | None]:
+        least, most = BOUNDS[name]
+        return {"usual": as_json(usual), "least": least, "most": as_json(most)}
+
+    return {
+        device: {
+            name: {
+                "does": word.does,
+                "parameters": {
+                    one: parameter(one, usual) for one, usual in {**word.parameters, **WHEN}.items()
+                },
+            }
+            for name, word in words.items()
+        }
+        for device, words in panel.words.items()
+    }
 
 
 def _fault_told(fault: SetFault) -> dict[str, Any]:

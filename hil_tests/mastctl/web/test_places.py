@@ -1,0 +1,93 @@
+"""Places of the head that are kept by a name, for everybody and across restarts."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from hil_tests.mastctl.service_fakes import CONFIG, FakeHardware, fake_daemon
+from mastctl.client import Client, ClientError
+from mastctl.daemon import RunningDaemon
+from mastctl.service.places import FILE, MOST, Place, Places
+
+Pair = tuple[RunningDaemon, FakeHardware]
+HOME = {"pan_rad": 0.0, "tilt_rad": 0.0}
+CHART = {"pan_rad": 0.5, "tilt_rad": -0.25}
+
+
+def refused(code: str, act: Callable[[], object]) -> str:
+    with pytest.raises(ClientError) as refusal:
+        act()
+    assert refusal.value.code == code
+    return str(refusal.value)
+
+
+def test_what_one_keeps_another_sees_and_forgets(pair: Pair) -> None:
+    with Client(pair[0].url, name="bench") as bench, Client(pair[0].url, name="rover") as rover:
+        assert bench.places() == {"home": HOME}
+        bench.keep_place("colour chart 2", **CHART)
+        assert rover.places() == {"home": HOME, "colour chart 2": CHART}
+        assert rover.forget_place("colour chart 2") == {"home": HOME}
+        assert "no place is kept by the name 'x'" in refused("place_unknown", lambda: bench.forget_place("x"))
+    assert not [call for call in pair[1].head.calls if call[0] == "move"], "nothing moves by it"
+
+
+def test_home_is_another_place_until_it_is_forgotten(pair: Pair) -> None:
+    with Client(pair[0].url) as client:
+        assert client.keep_place("home", **CHART) == {"home": CHART}
+        assert client.forget_place("home") == {"home": HOME}
+        refused("place_unknown", lambda: client.forget_place("home"))
+
+
+def test_places_outlive_the_daemon(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    state = tmp_path / "state"
+    config = f"{CONFIG}state: {{{{folder: {state}}}}}\n"
+    with fake_daemon(monkeypatch, tmp_path, config=config) as (daemon, _), Client(daemon.url) as client:
+        client.keep_place("chart", **CHART)
+    with fake_daemon(monkeypatch, tmp_path, config=config) as (daemon, _), Client(daemon.url) as client:
+        assert client.places()["chart"] == CHART
+        (state / FILE).write_text("{")
+        assert FILE in refused("unreadable", client.places)
+        refused("unreadable", lambda: client.keep_place("chart", **CHART))
+        assert (state / FILE).read_text() == "{", "what cannot be read is not written over"
+        client.wait(client.point(pan_rad=0.1, tilt_rad=0.1))
+
+
+@pytest.mark.parametrize("name", ["", "../latch", "a/b", " x", "x" * 41, "<b>"])
+def test_a_name_that_is_none_is_refused(pair: Pair, name: str) -> None:
+    with Client(pair[0].url) as client, pytest.raises(ClientError):
+        client.keep_place(name, **CHART)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        '{"schema": "mastctl/places/1", "places": {"x": {"pan_rad": NaN, "tilt_rad": 0}}}',
+        '{"schema": "mastctl/places/1", "places": {"x": [1, 2]}}',
+        '{"schema": "mastctl/places/1", "places": [1]}',
+        '{"schema": "mastctl/latch/1"}',
+    ],
+)
+def test_a_file_of_something_else_is_refused_in_a_sentence(tmp_path: Path, text: str) -> None:
+    (tmp_path / FILE).write_text(text)
+    with pytest.raises(Exception, match=FILE) as refusal:
+        Places(tmp_path).told()
+    assert getattr(refusal.value, "code", "") == "unreadable"
+
+
+def test_no_more_places_are_kept_than_a_page_can_show(tmp_path: Path) -> None:
+    places = Places(tmp_path)
+    for number in range(MOST):
+        places.keep(f"place {number}", Place(0.01 * number, 0.0))
+    with pytest.raises(Exception, match="forget one"):
+        places.keep("one more", Place(0.0, 0.0))
+    assert len(places.keep("place 3", Place(1.0, 0.0))["places"]) == MOST + 1, "and home"
+
+
+def test_a_disk_that_takes_nothing_is_told(tmp_path: Path) -> None:
+    places = Places(tmp_path / "gone")
+    with pytest.raises(Exception, match="cannot be saved") as refusal:
+        places.keep("chart", Place(0.0, 0.0))
+    assert getattr(refusal.value, "code", "") == "not_saved"
