@@ -61,3 +61,10 @@ def last_residual(result: Any, name: str) -> Residual | None:
     if not (residual and sigma and None not in residual and None not in sigma):
         return None
     return Residual((residual[0], residual[1]), (sigma[0], sigma[1]), name)
+
+
+def last_frame(result: Any) -> str | None:
+    """Return the id of the picture that a result ends with, None where it took none."""
+    pointings = getattr(result, "pointings", None) or ()
+    frame_id = getattr(pointings[-1], "frame_id", None) if pointings else None
+    return frame_id if isinstance(frame_id, str) and frame_id else None

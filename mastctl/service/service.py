@@ -5,6 +5,7 @@ Here the parts are made, each with those below it in hand, and closed again, the
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import threading
 from dataclasses import asdict
@@ -32,7 +33,7 @@ from mastctl.live.settings import LiveSettings
 from mastctl.live.view import LiveView, check_installed
 from mastctl.metrics.metrics import Metrics
 from mastctl.operations.operations import Operations
-from mastctl.operations.records import Operation
+from mastctl.operations.records import Operation, last_frame
 from mastctl.pointing.jog import Jogs
 from mastctl.pointing.wanted import wrong_camera
 from mastctl.safety import stop_socket
@@ -62,6 +63,8 @@ SNAPSHOT_TIMEOUT_S = 5.0
 RENDERING_S = 20.0  # six simulated cameras share one renderer, on a machine that may be busy
 HARDWARE_CLOSE_S = 3.0
 AUDIT_FILE = "audit.jsonl"
+OPERATIONS = "operations"  # who holds the pictures that pointings end with
+KEPT_PICTURES = 8  # of a camera
 
 
 class Service:
@@ -396,8 +399,12 @@ class Service:
         self.machine.publisher.publish("lease", "lease", told)
 
     def _ended(self, operation: Operation) -> None:
-        """Have an operation's end recorded."""
+        """Have an operation's end recorded, and its last picture kept for who looks at it later."""
         self.entry.ended(operation.id, operation.state, operation.error)
+        frame_id = last_frame(operation.result)
+        if frame_id is not None:
+            with contextlib.suppress(MastctlError):  # it is gone already: the mast file has changed
+                self.devices.hold(self.devices.frame_by_id(frame_id), OPERATIONS, KEPT_PICTURES)
 
     def _handed_over(self, handoff: MatchedHandoff) -> None:
         """Have a hand-off counted and recorded."""

@@ -33,14 +33,15 @@ export class Control {
     const left = control?.for_s == null ? null : control.for_s - (performance.now() - this.toldMs) / 1000;
     const gone = left !== null && left <= 0;
     const mine = held.lease !== null;
-    const whose = control?.holder.endsWith(client) ? "what you started" : control?.holder;
+    const whose = control?.holder.endsWith(client) ? "you" : control?.holder;
     if (mine) say(this.words, `you, renewed`);
     else if (!control || gone) say(this.words, "nobody");
-    else if (control.kind === "operation") say(this.words, `${whose}, until it has ended`);
+    else if (control.kind === "operation") say(this.words, `${whose}, while it runs`);
     else say(this.words, `${control.holder}, ${forTime(left)} left`);
+    this.words.title = this.words.textContent;
     this.words.parentElement.dataset.whose = mine ? "mine" : control && !gone && !control.holder.endsWith(client) ? "other" : "nobody";
     if (this.sure && (mine || gone || control?.kind !== "lease")) this.sure = false;
-    say(this.button, this.sure ? "Take it from them?" : mine ? "Release" : control && !gone && control.kind === "lease" ? "Take over" : "Take");
+    say(this.button, !this.may ? "View only" : this.sure ? "Take it from them?" : mine ? "Release" : control && !gone && control.kind === "lease" ? "Take over" : "Take");
     this.button.disabled = !this.may;
   }
 

@@ -3,6 +3,7 @@ import { address, live } from "./api.js";
 
 const AGAIN_MS = 1000;
 const SILENT_MS = 2500; // the head's joints are told several times a second
+const KEPT = 64; // keys of a topic: operations and commands come for weeks
 
 export class Events extends EventTarget {
   constructor() {
@@ -25,15 +26,22 @@ export class Events extends EventTarget {
     this.line = line;
     line.onmessage = (message) => {
       this.heard();
-      const event = JSON.parse(message.data);
-      this.known.set(`${event.topic} ${event.key}`, event.value);
-      this.dispatchEvent(new CustomEvent(event.topic, { detail: event }));
+      this.take(JSON.parse(message.data));
     };
     line.onclose = () => {
       if (this.line !== line) return;
       this.lost();
       setTimeout(() => this.wanted && this.line === line && this.connect(), AGAIN_MS);
     };
+  }
+
+  take(event) {
+    const keys = this.known.get(event.topic) ?? new Map();
+    this.known.set(event.topic, keys);
+    keys.delete(event.key);
+    keys.set(event.key, event.value);
+    if (keys.size > KEPT) keys.delete(keys.keys().next().value);
+    this.dispatchEvent(new CustomEvent(event.topic, { detail: event }));
   }
 
   heard() {
@@ -66,6 +74,6 @@ export class Events extends EventTarget {
   }
 
   newest(topic, key) {
-    return this.known.get(`${topic} ${key}`);
+    return this.known.get(topic)?.get(key);
   }
 }

@@ -2,13 +2,13 @@
 import { byId, h, put, s, say } from "./dom.js";
 import { camera as called, deg, degrees, forTime, number } from "./words.js";
 
-const R = 84;
+const R = 78;
 
 export class HeadPanel {
   constructor(events) {
     this.events = events;
     this.figures = h("div", { class: "bars" });
-    this.rose = s("svg", { class: "rose", viewBox: "-118 -112 236 224", role: "img" });
+    this.rose = s("svg", { class: "rose", viewBox: "-128 -112 256 224", role: "img" });
     this.map = s("svg", { class: "map", viewBox: "0 0 220 150", role: "img" });
     this.note = h("p", { class: "quiet" });
     this.sunNote = h("p", { class: "quiet", id: "sun-note" });
@@ -65,7 +65,7 @@ export class HeadPanel {
       return s("path", { class: "tick", d: `M${ray(a, R)}L${ray(a, k % 6 ? R + 5 : R + 9)}` });
     });
     const names = [["0°", 0], ["90°", Math.PI / 2], ["180°", Math.PI], ["−90°", -Math.PI / 2]].map(([text, a]) =>
-      s("text", { class: "tickname", x: (R + 18) * Math.sin(a), y: -(R + 18) * Math.cos(a) + 3 }, text));
+      s("text", { class: "tickname", x: (R + 29) * Math.sin(a), y: -(R + 20) * Math.cos(a) + 6 }, text));
     const inView = this.views?.names() ?? [];
     const wedges = Object.entries(this.rig.cameras).sort((a, b) => b[1].width_rad - a[1].width_rad).map(([name, camera]) => {
       const middle = (camera.on === "head" ? pan : 0) + camera.azimuth_rad;
@@ -83,7 +83,7 @@ export class HeadPanel {
 
   drawMap() {
     const { pan_rad: pan, tilt_rad: tilt, keep_out: boxes } = this.limits;
-    const [left, top, width, height] = [38, 8, 176, 118];
+    const [left, top, width, height] = [46, 8, 168, 114];
     const edge = 0.06 * (pan[1] - pan[0]);
     const x = (value) => left + (width * (value - pan[0] + edge)) / (pan[1] - pan[0] + 2 * edge);
     const y = (value) => top + (height * (tilt[1] + edge - value)) / (tilt[1] - tilt[0] + 2 * edge);
@@ -101,8 +101,8 @@ export class HeadPanel {
       s("rect", { class: "field", x: x(pan[0]), y: y(tilt[1]), width: x(pan[1]) - x(pan[0]), height: y(tilt[0]) - y(tilt[1]) }),
       s("path", { class: "zero", d: `M${x(0)} ${y(tilt[1])}V${y(tilt[0])}M${x(pan[0])} ${y(0)}H${x(pan[1])}` }),
       out,
-      [pan[0], 0, pan[1]].map((value, k) => s("text", { class: `tickname ${["start", "", "end"][k]}`, x: x(value), y: 142 }, deg(value, 0))),
-      [tilt[0], 0, tilt[1]].map((value) => s("text", { class: "tickname end", x: 42, y: y(value) + 3 }, deg(value, 0))),
+      [pan[0], 0, pan[1]].map((value, k) => s("text", { class: `tickname ${["start", "", "end"][k]}`, x: x(value), y: 144 }, deg(value, 0))),
+      [tilt[0], 0, tilt[1]].map((value) => s("text", { class: "tickname end", x: 48, y: y(value) + 5 }, deg(value, 0))),
       this.wanted ? s("path", { class: "wanted", d: `M${x(this.wanted[0]) - 6} ${y(this.wanted[1])}h12m-6 -6v12` }) : null,
       here ? s("circle", { class: "now", cx: here[0], cy: here[1], r: 4.5 }) : null);
   }

@@ -1,7 +1,7 @@
 // Turning the head by hand: heartbeats for as long as a key or a finger holds, and an end whatever ends it.
 import { byId, h, put, say } from "./dom.js";
-import { beat, post } from "./api.js";
-import { degrees, number } from "./words.js";
+import { ask, beat, get, post } from "./api.js";
+import { deg, degrees, figure, number } from "./words.js";
 
 const BEAT_MS = 120;
 const WAYS = { up: [0, 1, "▲", "Tilt up"], left: [-1, 0, "◀", "Pan left"], right: [1, 0, "▶", "Pan right"], down: [0, -1, "▼", "Tilt down"] };
@@ -25,16 +25,19 @@ export class Jog {
     this.pan = h("input", { id: "goal-pan", inputmode: "decimal", autocomplete: "off", size: 7 });
     this.tilt = h("input", { id: "goal-tilt", inputmode: "decimal", autocomplete: "off", size: 7 });
     this.presets = h("div", { class: "presets" });
+    this.name = h("input", { id: "place-name", "aria-label": "Name of this place", placeholder: "name", autocomplete: "off", maxlength: 40, size: 9 });
     this.goSaid = h("p", { class: "bad", role: "alert" });
     this.all = h("fieldset", {},
       h("div", { class: "side" }, this.pad, h("div", { class: "stack" }, h("label", { for: "speed" }, "Speed ", this.speedWords), this.speed, this.held)),
       h("form", { class: "angles", onsubmit: (event) => { event.preventDefault(); this.goTyped(); } },
         h("label", {}, "Pan ", this.pan, " °"), h("label", {}, "Tilt ", this.tilt, " °"), h("button", { type: "submit" }, "Go")),
-      this.presets, this.goSaid);
+      this.presets,
+      h("form", { class: "angles", onsubmit: (event) => { event.preventDefault(); this.keep(); } }, this.name, h("button", { type: "submit", class: "quiet" }, "Keep this place")),
+      this.goSaid);
     put(byId("jog"), this.all);
     for (const [place, name] of [[window, "blur"], [window, "pagehide"], [document, "visibilitychange"]]) place.addEventListener(name, () => this.release());
     this.told();
-    this.drawPresets();
+    this.drawPlaces({ home: { pan_rad: 0, tilt_rad: 0 } });
   }
 
   use(limits) {
@@ -127,41 +130,45 @@ export class Jog {
   }
 
   goTyped() {
-    const [pan, tilt] = [this.pan, this.tilt].map((input) => Number(input.value.trim().replace(",", ".").replace("\u2212", "-") || NaN));
+    const [pan, tilt] = [this.pan, this.tilt].map((input) => figure(input.value));
     if (!Number.isFinite(pan) || !Number.isFinite(tilt)) return say(this.goSaid, "Two angles in degrees are expected, such as 12.5 and -8.");
     this.go((pan * Math.PI) / 180, (tilt * Math.PI) / 180);
   }
 
-  drawPresets() {
-    const kept = this.kept();
-    put(this.presets,
-      h("button", { type: "button", id: "home", onclick: () => this.go(0, 0) }, "Home"),
-      Object.entries(kept).map(([name, [pan, tilt]]) => h("span", { class: "preset" },
-        h("button", { type: "button", onclick: () => this.go(pan, tilt) }, name),
-        h("button", { type: "button", class: "minus", "aria-label": `Forget ${name}`, onclick: () => this.forget(name) }, "×"))),
-      h("button", { type: "button", class: "quiet", onclick: () => this.keep() }, "Keep this place"));
+  /** The places that the daemon keeps, for everybody. */
+  async look() {
+    await this.change(() => get("/places"));
   }
 
-  kept() {
+  async change(act) {
+    say(this.goSaid, "");
     try {
-      return JSON.parse(localStorage.getItem("mastctl places")) ?? {};
-    } catch {
-      return {};
+      this.drawPlaces((await act()).places);
+    } catch (error) {
+      say(this.goSaid, error.message);
     }
   }
 
-  keep() {
-    if (!this.here) return;
-    const [pan, tilt] = this.here;
-    const name = `${number(degrees(pan), 1, true)}° ${number(degrees(tilt), 1, true)}°`;
-    localStorage.setItem("mastctl places", JSON.stringify({ ...this.kept(), [name]: [pan, tilt] }));
-    this.drawPresets();
+  drawPlaces(places) {
+    const told = JSON.stringify(places);
+    if (told === this.drawn) return;
+    this.drawn = told;
+    put(this.presets, Object.entries(places).map(([name, { pan_rad: pan, tilt_rad: tilt }]) => {
+      const home = name === "home";
+      const there = `${deg(pan, 1)} ${deg(tilt, 1)}`;
+      return h("span", { class: "preset" },
+        h("button", { type: "button", id: home ? "home" : null, title: there, onclick: () => this.go(pan, tilt) }, home ? "Home" : name),
+        home ? null : h("button", { type: "button", class: "minus", "aria-label": `Forget ${name}`, onclick: () => this.change(() => ask("DELETE", `/places/${encodeURIComponent(name)}`)) }, "×"));
+    }));
   }
 
-  forget(name) {
-    const kept = this.kept();
-    delete kept[name];
-    localStorage.setItem("mastctl places", JSON.stringify(kept));
-    this.drawPresets();
+  /** Keep where the head is, by the name that was typed, else by its angles; as home it is where Home goes. */
+  async keep() {
+    if (!this.here) return;
+    const [pan, tilt] = this.here;
+    const typed = this.name.value.trim();
+    const name = typed.toLowerCase() === "home" ? "home" : typed || `${deg(pan, 1)} ${deg(tilt, 1)}`;
+    await this.change(() => post(`/places/${encodeURIComponent(name)}`, { pan_rad: pan, tilt_rad: tilt }));
+    if (!this.goSaid.textContent) this.name.value = "";
   }
 }

@@ -4,18 +4,27 @@ import { estop, get, post, stop } from "./api.js";
 import { forTime, sentence } from "./words.js";
 import { Control } from "./control.js";
 import { Events } from "./events.js";
-import { Faults, MastFile, OperationList, Recording, Residuals, Simulation, TrackPanel } from "./panels.js";
+import { Faults, MastFile, Recording } from "./panels.js";
 import { HeadPanel } from "./head.js";
 import { Jog } from "./jog.js";
+import { OperationList } from "./operations.js";
+import { Residuals } from "./residuals.js";
+import { Simulation } from "./simulation.js";
 import { Target } from "./target.js";
+import { TrackPanel } from "./track.js";
 import { Views } from "./views.js";
 
 const WORDS = { starting: "starting", ready: "ready", moving: "moving", tracking: "tracking", holding: "holding", stopping: "stopping", stopped: "stopped", fault: "fault", closing: "closing" };
 
-function alarm(words) {
+/** Told to screen readers at once; what is seen elsewhere needs no notice. */
+function announce(words) {
   const place = byId("alarm");
   place.textContent = "";
   place.textContent = words;
+}
+
+function alarm(words) {
+  announce(words);
   notice(words);
 }
 
@@ -62,7 +71,7 @@ for (const dialog of document.querySelectorAll("dialog")) dialog.addEventListene
 
 const events = new Events();
 const views = new Views((eye, pixel, facts, what) => (what === "track" ? track.begin(eye, pixel, facts) : target.choose(eye, pixel, facts)));
-const target = new Target(views, events, speak);
+const target = new Target(views, events, (words, urgent) => (urgent ? announce : speak)(words)); // seen in its panel
 const track = new TrackPanel(events, views, speak);
 const head = new HeadPanel(events);
 const jog = new Jog(alarm);
@@ -71,23 +80,30 @@ const recording = new Recording(alarm);
 const mastFile = new MastFile(alarm);
 const residuals = new Residuals();
 const simulation = new Simulation();
-new Faults(events, alarm);
+new Faults(events, announce);
 new OperationList(events);
 
 // What is pushed
 
 let since = 0;
+let latched = "";
 function standing(now) {
   set(byId("state"), "data-word", now.state);
   const before = byId("word").textContent;
   say(byId("word"), WORDS[now.state] ?? now.state);
-  say(byId("reason"), sentence(now.reason));
+  say(byId("reason"), now.estop ? "" : sentence(now.reason)); // the latch tells who and why itself
   since = performance.now() - 1000 * now.state_for_s;
-  if (before !== now.state) speak(`${now.state}. ${now.reason}`, ["stopped", "fault"].includes(now.state) && Boolean(now.reason));
+  if (before !== now.state) {
+    if (["stopped", "fault"].includes(now.state) && now.reason) announce(`${now.state}. ${now.reason}`);
+    else speak(`${now.state}. ${now.reason}`);
+  }
   const latch = now.estop;
   byId("estop").hidden = !latch;
   set(byId("latch"), "aria-pressed", String(Boolean(latch)));
-  if (latch) put(byId("estop"), h("strong", {}, "Emergency stop"), ` by ${latch.name}: ${latch.reason}. Nothing moves until it is released, after a restart of the daemon neither. `, h("button", { type: "button", id: "release", disabled: !may, onclick: () => byId("reset").showModal() }, "Release …"));
+  const words = latch ? ` by ${latch.name}: ${latch.reason}. Nothing moves until it is released, not even after a restart of the daemon. ` : "";
+  if (words !== latched) put(byId("estop"), h("strong", {}, "Emergency stop"), words, h("button", { type: "button", id: "release", onclick: () => byId("reset").showModal() }, "Release …"));
+  latched = words;
+  if (latch) byId("release").disabled = !may;
   document.title = `${now.state} – mastctl`;
 }
 setInterval(() => say(byId("state-for"), events.connected ? `for ${forTime((performance.now() - since) / 1000)}` : ""), 500);
@@ -100,16 +116,24 @@ events.addEventListener("fault", (event) => { if (event.detail.key === "sun") re
 events.addEventListener("command", (event) => {
   const kind = event.detail.value.command ?? "";
   refresh();
-  if (String(kind).startsWith("record")) recording.look();
+  if (kind.startsWith("record")) recording.look();
+  if (kind.startsWith("place")) jog.look();
 });
 events.addEventListener("operation", (event) => {
   const record = event.detail.value;
-  if (record.residual_px) residuals.look();
+  if (record.residual_px && record.state === "done") residuals.after(record.id);
   const going = record.state === "running" ? record.steps.findLast((step) => step.name === "limits") : null;
   head.goal(going ? [going.detail.pan_rad, going.detail.tilt_rad] : undefined);
 });
-events.addEventListener("connected", () => { byId("lost").hidden = true; refresh(); recording.look(); residuals.look(); mastFile.look(); });
-events.addEventListener("lost", () => { byId("lost").hidden = false; jog.release(); });
+events.addEventListener("connected", () => { byId("lost").hidden = true; refresh(); recording.look(); residuals.look(); mastFile.look(); jog.look(); });
+events.addEventListener("lost", () => {
+  byId("lost").hidden = false;
+  jog.release();
+  say(byId("reason"), `When it was last heard it was ${byId("word").textContent}.`);
+  say(byId("word"), "no connection");
+  set(byId("state"), "data-word", "lost");
+  document.title = "no connection – mastctl";
+});
 setInterval(() => {
   if (!events.connected && events.heardMs) {
     byId("lost").hidden = false;
@@ -149,7 +173,7 @@ function show(status) {
   head.use(status, rig, views);
   jog.use(status.limits);
   mastFile.told(status, rig);
-  simulation.use(status);
+  for (const part of [simulation, track, target]) part.use(status);
   set(document.body, "data-simulated", simulated);
 }
 

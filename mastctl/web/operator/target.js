@@ -3,6 +3,7 @@ import { byId, h, put } from "./dom.js";
 import { fileOf, post } from "./api.js";
 import { camera as called, deg, metres, number, px } from "./words.js";
 import { residualPicture } from "./residual.js";
+import { placeIn, shownBy } from "./truth.js";
 
 const STEPS = {
   rest: "the head rests", frames: "a fresh pair is taken", target: "what was clicked is found again", stereo: "found in the other eye", triangulate: "range",
@@ -10,10 +11,26 @@ const STEPS = {
   look: "new pictures", measure: "the target is found in them", eyes: "the other eye confirms it",
 };
 
+const ENDED = ["done", "failed", "stopped"];
+
 const FROM = {
   given: "The range was given.", plane: "The range is that of a plane.", parallax: "The range comes from two poses of one camera.",
   unknown: "One camera alone cannot tell the range; after the first pointing its own parallax may.",
 };
+
+const HOW = [
+  ["Click", "a point of a fresh image: its range is told before anything moves"],
+  ["Drag", "a box round a target to follow it"],
+  ["← ↑ → ↓", "move the cross-hair of a focused image (Shift: 10 px, Alt: 0.1 px)", "keys"],
+  ["Enter, T", "choose its point; follow it", "keys"],
+];
+
+/** An operation's steps, shut once it has ended. */
+export function steps(record) {
+  const over = ENDED.includes(record.state);
+  return h("details", { class: "steps", open: !over }, h("summary", {}, over ? `Steps (${record.steps.length})` : "Under way"),
+    h("ol", {}, record.steps.map((step) => h("li", { class: step.state }, STEPS[step.name] ?? step.name, h("span", { class: "n" }, `${number(step.duration_s, 2)} s`)))));
+}
 
 export class Target {
   constructor(views, events, say) {
@@ -37,6 +54,10 @@ export class Target {
   allow(may) {
     this.may = may;
     this.render();
+  }
+
+  use(status) {
+    this.simulated = status.simulated;
   }
 
   refuse(words, code = "") {
@@ -104,13 +125,30 @@ export class Target {
   operation(record) {
     if (!record || record.id !== this.id) return;
     this.record = record;
-    if (["done", "failed", "stopped"].includes(record.state) && this.state === "sent") {
+    if (ENDED.includes(record.state) && this.state === "sent") {
       this.state = "ended";
+      this.truly = null;
+      if (this.simulated && record.residual_px) this.judge(record);
       if (record.residual_px) this.say(`Residual x ${number(record.residual_px[0], 2, true)}, y ${number(record.residual_px[1], 2, true)} pixels.`);
       else if (record.error) this.say(record.error.message, true);
       this.draw();
     }
     this.render();
+  }
+
+  /** What only a simulation knows: how far what was chosen truly is from the aim in the new image. */
+  async judge(record) {
+    const { pixel } = record.request;
+    const last = record.pointings.at(-1);
+    try {
+      const place = await shownBy(pixel.frame_id, [pixel.x_px, pixel.y_px]);
+      const there = place && (await placeIn(last.frame_id, place)).pixel_px;
+      if (!there || this.record !== record) return;
+      this.truly = there.map((value, k) => value - last.aim_px[k]);
+      this.render();
+    } catch {
+      // an image that is not kept any more: what was measured stands alone
+    }
   }
 
   mast(digest) {
@@ -137,7 +175,7 @@ export class Target {
 
   render() {
     const parts = {
-      none: () => [h("p", { class: "quiet" }, "Nothing chosen.")],
+      none: () => [h("dl", { class: "how" }, HOW.map(([what, words, kind]) => h("div", { class: kind }, h("dt", {}, what), h("dd", {}, words))))],
       asked: () => [this.chosen(), h("p", { class: "busy" }, "Looking for it in fresh images …")],
       preview: () => [this.chosen(), this.seen(), this.way(), this.go()],
       refused: () => [h("p", { class: "bad" }, this.words), this.code === "no_stereo" ? h("p", { class: "quiet" }, "Without a second eye a pixel has no range; turn the head by angles or by hand.") : null],
@@ -166,8 +204,8 @@ export class Target {
     const clear = seen.correlation - seen.second > 0.3;
     return h("table", { class: "figures" },
       row("Range", `${number(seen.range_m, 3)} ± ${number(seen.range_sigma_m, 3)} m`, { id: "range", class: "n big" }), place,
-      row("Match", `${number(seen.correlation, 3)}, next best ${number(seen.second, 2)} (${clear ? "clear" : "close"})`),
-      row("Off epipolar line", px(seen.across_px)));
+      row("Match", `${number(seen.correlation, 3)}, next ${number(seen.second, 2)} (${clear ? "clear" : "close"})`),
+      row("Off epipolar", px(seen.across_px)));
   }
 
   /** What one camera alone knows of the range. */
@@ -180,7 +218,7 @@ export class Target {
   way() {
     const seen = this.preview;
     if (seen.refused) return h("p", { class: "bad" }, seen.refused.message);
-    const here = this.events.newest("joints", "pan_tilt") ?? [...this.events.known].find(([key]) => key.startsWith("joints"))?.[1];
+    const here = this.events.newest("joints", "pan_tilt");
     const row = (name, k, now) => h("tr", {}, h("th", { scope: "row" }, name), h("td", { class: "n" }, deg(now)), h("td", {}, "→"), h("td", { class: "n" }, deg(seen.goal_rad[k])));
     return h("table", { class: "figures" }, row("Pan", 0, here?.pan_rad), row("Tilt", 1, here?.tilt_rad));
   }
@@ -193,9 +231,7 @@ export class Target {
   progress() {
     const record = this.record;
     if (!record) return h("p", { class: "busy" }, "Sent …");
-    const over = ["done", "failed", "stopped"].includes(record.state);
-    return h("details", { class: "steps", open: !over }, h("summary", {}, over ? `Steps (${record.steps.length})` : "Under way"),
-      h("ol", {}, record.steps.map((step) => h("li", { class: step.state }, STEPS[step.name] ?? step.name, h("span", { class: "n" }, `${number(step.duration_s, 2)} s`)))));
+    return steps(record);
   }
 
   result() {
@@ -208,7 +244,8 @@ export class Target {
     return [
       h("div", { class: "residual" },
         h("div", {}, h("p", { class: "quiet" }, "Residual in the new image"),
-          h("p", { class: "huge", id: "residual" }, h("span", {}, "x ", `${number(x, 3, true)} ± ${number(sx, 3)} px`), h("span", {}, "y ", `${number(y, 3, true)} ± ${number(sy, 3)} px`))),
+          h("p", { class: "huge", id: "residual" }, h("span", {}, "x ", `${number(x, 3, true)} ± ${number(sx, 3)} px`), h("span", {}, "y ", `${number(y, 3, true)} ± ${number(sy, 3)} px`)),
+          this.truly ? h("p", { class: "quiet", id: "truly", title: "Only the simulation knows where it truly is" }, `truly ${this.truly.map((one) => number(one, 3, true)).join(", ")} px`) : null),
         h("div", { class: "inset", id: "inset" }, this.drawn === record.id ? this.inset : null)),
       h("table", { class: "figures" },
         h("tr", {}, h("td", {}), h("th", { scope: "col" }, "commanded"), h("th", { scope: "col" }, "measured")),

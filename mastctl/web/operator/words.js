@@ -27,6 +27,20 @@ export function moment(since1970) {
   return `${at.getFullYear()}-${two(at.getMonth() + 1)}-${two(at.getDate())} ${two(at.getHours())}:${two(at.getMinutes())}`;
 }
 
+/** The time of day of this place, of a moment as the daemon tells it. */
+export const clock = (at) => new Date(at).toLocaleTimeString("en-GB");
+
+/** A number as people type it. */
+export const figure = (text) => Number(text.trim().replace(",", ".").replace(MINUS, "-") || NaN);
+
+/** A name of the daemon's without its unit, the unit as people read it, and how many of it one of the daemon's is. */
+export function unitOf(name) {
+  const units = { rad_per_s: ["°/s", 180 / Math.PI], c_per_s: ["°C/s", 1], rad: ["°", 180 / Math.PI], s: ["s", 1], px: ["px", 1] };
+  const [end] = Object.keys(units).filter((one) => name.endsWith(`_${one}`)).sort((a, b) => b.length - a.length);
+  return end ? [name.slice(0, -end.length - 1), ...units[end]] : [name, "", 1];
+}
+
 export const camera = (name) => name.replaceAll("_", " ");
 
-export const sentence = (text) => (text ? text[0].toUpperCase() + text.slice(1) : "");
+/** A sentence begins with a capital, unless with a device's name. */
+export const sentence = (text) => (!text || /^\w*[_\d]/.test(text) ? text ?? "" : text[0].toUpperCase() + text.slice(1));
