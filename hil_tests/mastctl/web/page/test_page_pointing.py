@@ -9,6 +9,7 @@ import pytest
 
 from hil_tests.mastctl.service_fakes import eventually
 from hil_tests.mastctl.web.page.conftest import Visit
+from mastctl.client import Client
 from mastctl.config import load_config
 from mastctl.daemon import RunningDaemon
 from tools.living_daemon import simulated
@@ -41,6 +42,15 @@ def test_a_rock_is_clicked_pointed_at_and_its_residual_read(rover: RunningDaemon
         assert float(told.replace("−", "-")) == pytest.approx(value, abs=6e-4)
         assert float(sigma) == pytest.approx(expected, abs=6e-4)
     one.page.wait_for_selector("#inset svg .vector")
+    truly = re.findall(r"[+−]?\d\.\d{3}", one.page.locator("#truly").inner_text())
+    asked, last = record["request"]["pixel"], record["pointings"][-1]
+    with Client(rover.url) as client:
+        place = client.truth(asked["frame_id"], pixel=(asked["x_px"], asked["y_px"]))["position_in_site_m"]
+        assert place is not None
+        there = client.truth(last["frame_id"], position_in_site_m=place)["pixel_px"]
+    assert there is not None
+    for told, value, aim in zip(truly, there, last["aim_px"], strict=True):
+        assert float(told.replace("−", "-")) == pytest.approx(value - aim, abs=6e-4)
     one.page.wait_for_selector(".eye[data-camera=navcam_left] .over .aim")
     one.page.locator("#again").click()
     eventually(lambda: len(rover.service.operations.all()) == 2, "a second pointing was begun")
@@ -65,8 +75,16 @@ def test_a_box_round_a_rock_begins_a_track_that_is_drawn_in_both_eyes(
     for camera in ("navcam_left", "navcam_right"):
         one.page.wait_for_selector(f".eye[data-camera={camera}] .over .track")
     one.page.get_by_role("button", name="Look again").click()
-    one.page.wait_for_selector("#track .approach.errors .newest", state="attached")
-    assert "mm at" in one.page.locator("#track .approach.errors").get_attribute("aria-label")
+    plot = one.page.locator("#track .approach.errors")
+    one.page.wait_for_selector("#track .approach.errors[aria-label*='truly']")
+    words = re.search(r"truly ([\d.]+) mm off, one sigma ([\d.]+) mm at", plot.get_attribute("aria-label"))
+    assert words is not None, plot.get_attribute("aria-label")
+    truly_mm, sigma_mm = map(float, words.groups())
+    assert 0.0 < truly_mm < 6 * sigma_mm
+    one.page.locator("#track summary").click()
+    row = one.page.locator("#track tr", has_text="navcam").last.inner_text().split()
+    assert row[:2] == ["0", "navcam"] and len(row) == 6
+    assert "navcam" in one.page.locator("#track .strip").get_attribute("aria-label")
     one.page.get_by_role("button", name="End the track").click()
     eventually(lambda: rover.service.tracker.status.state == "stopped", "the track has ended")
 
@@ -74,6 +92,28 @@ def test_a_box_round_a_rock_begins_a_track_that_is_drawn_in_both_eyes(
 def test_a_fault_from_the_drawer_is_set_told_and_cleared(rover: RunningDaemon, visit: Visits) -> None:
     one = visit(rover.url)
     one.frame()
+    one.page.get_by_label("Device").select_option("navcam_left")
+    one.page.get_by_label("Fault", exact=True).select_option("slow")
+    assert "fraction of what it was" in one.page.locator("#fault-does").inner_text()
+    one.page.get_by_label("factor").fill("fast")
+    one.page.get_by_role("button", name="Set", exact=True).click()
+    one.page.wait_for_selector("#simulated .bad >> text=factor: 'fast' where a number is expected")
+    one.page.get_by_label("factor").fill("7")
+    one.page.get_by_role("button", name="Set", exact=True).click()
+    one.page.wait_for_selector("#simulated .bad >> text=factor is 7.0")
+    one.page.get_by_label("factor").fill("0,5")
+    one.page.get_by_role("button", name="Set", exact=True).click()
+    one.page.wait_for_selector("#simulated .set >> text=navcam left slow: factor 0.5")
+    one.page.get_by_label("Device").select_option("pan_tilt")
+    one.page.get_by_label("Fault", exact=True).select_option("wrong")
+    one.page.get_by_label("offset").fill("1")
+    one.page.get_by_label("axis").select_option("tilt")
+    one.page.get_by_role("button", name="Set", exact=True).click()
+    one.page.wait_for_selector("#simulated .set >> text=pan tilt wrong: offset 1°, axis tilt")
+    with Client(rover.url) as client:
+        wrong = next(fault for fault in client.faults() if fault["word"] == "wrong")
+    assert wrong["parameters"]["offset_rad"] == pytest.approx(0.0174533, abs=1e-6)
+    assert wrong["parameters"]["axis"] == 1
     one.page.get_by_label("Device").select_option("navcam_left")
     one.page.get_by_label("Fault", exact=True).select_option("off")
     one.page.get_by_role("button", name="Set", exact=True).click()
