@@ -37,6 +37,7 @@ from mastctl.access.access import Access
 from mastctl.access.tokens import TokenList
 from mastctl.config import Config, Listen
 from mastctl.errors import MastctlError
+from mastctl.guided.guide import Door
 from mastctl.queued_output import stall_while
 from mastctl.safety.state_folder import StateFolder
 from mastctl.safety.stop_threads import StopsHang
@@ -360,11 +361,14 @@ def _entrance(service: Service, url: str) -> Iterator[Entrance]:
     """Say who comes in, by where the daemon listens. Raises BadFile."""
     listen = service.config.listen
     names = Names(frozenset(listen.hosts), any_address=listen.needs_token, secure=listen.tls is not None)
+    certificate = None if listen.tls is None else listen.tls.certificate
+    service.guide.door = Door(url, None, certificate)
     if not listen.needs_token:
         yield Entrance(names, None, "loopback" if listen.socket is None else "unix")
         return
     tokens = TokenList(service.folder.path)
     access = Access(tokens)
+    service.guide.door = Door(url, access.lend, certificate)
     try:
         log.warning("%s asks everybody for a token, but for a stop; tokens lie in %s", url, tokens.folder)
         if listen.tls is None and listen.socket is None:

@@ -7,7 +7,9 @@ import logging
 import secrets
 import threading
 from collections import OrderedDict
+from collections.abc import Callable
 from dataclasses import dataclass
+from datetime import UTC, datetime
 
 from calib.errors import BadFile
 from drivers.clock import Clock, SystemClock
@@ -52,6 +54,7 @@ class Access:
         self._list = tokens
         self._clock = clock or SystemClock()
         self._tokens = tokens.first_run()
+        self._lent: tuple[Token, ...] = ()
         self._seen = self._stamp()
         self._guesses = Guesses()
         self._sessions: OrderedDict[str, Session] = OrderedDict()
@@ -84,6 +87,20 @@ class Access:
                 log.warning("a wrong token came from %s", address[:60])
             raise NotLetIn("wrong_token", "the token is nobody's; perhaps it was revoked")
         return found
+
+    def lend(self, name: str) -> tuple[str, Callable[[], None]]:
+        """Return a new token of the role operate for a program of this daemon's own, and what takes it back.
+
+        It is in memory only. Safe to use from any thread, as long as one lends at a time.
+        """
+        text = secrets.token_urlsafe(TOKEN_BYTES)
+        token = Token(name, "operate", digest_of(text), datetime.now(UTC).isoformat(timespec="seconds"))
+        self._lent = (*self._lent, token)
+
+        def take_back() -> None:
+            self._lent = tuple(one for one in self._lent if one is not token)
+
+        return text, take_back
 
     def known(self, text: str) -> Token | None:
         """Return whose token a text is, if it is one; nothing is counted."""
@@ -140,7 +157,7 @@ class Access:
     def _find(self, digest: str) -> Token | None:
         """The token of a digest; as slow for one that is not there as for one that is."""
         found = None
-        for token in self._tokens:
+        for token in (*self._tokens, *self._lent):
             if hmac.compare_digest(token.sha256, digest):
                 found = token
         return found

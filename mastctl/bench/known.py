@@ -11,6 +11,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from calib.bench.board_pose import rover_from_board
 from calib.bench.knowledge import Knowledge, Shot, View
@@ -24,13 +25,11 @@ from calib.rigid import Rigid, rigid_rates
 from mastctl.bench.eyes import Head, Look
 from mastctl.bench.fitting import FitSurvey, Fitted
 from mastctl.bench.folder import Kept, looks_of
+from mastctl.bench.teller import CELLS
 from mastctl.errors import MastctlError
 
 USUAL_PAN_RAD, USUAL_TILT_RAD = (-1.2, 1.2), (-0.9, 0.3)
 """Where a rig points, as far as the limits let it."""
-
-CELLS = (8, 6)
-"""Of a picture, columns and rows, for its coverage."""
 
 
 class Known:
@@ -133,17 +132,20 @@ class Known:
                 counts[one.camera] = counts.get(one.camera, 0) + 1
         return max(counts.values(), default=0)
 
-    def coverage(self) -> dict[str, float]:
-        """Return the part of each camera's picture in which corners were seen, 0 to 1, by its cells."""
-        cells: dict[str, set[tuple[int, int]]] = {}
+    def cells(self) -> dict[str, tuple[int, ...]]:
+        """Return how many corners were seen in each of `CELLS` of each camera's picture, row by row."""
+        columns, rows = CELLS
+        counts: dict[str, NDArray[np.int64]] = {}
         for _, check, look in self.looks:
             for one in () if check else look.found:
                 if one.corners is None or one.camera not in self.now.rig.cameras:
                     continue
                 per_px = np.array(CELLS) / self.now.rig.cameras[one.camera].model.size_px
                 at = np.floor((one.corners.pixels_px + 0.5) * per_px).astype(int)
-                cells.setdefault(one.camera, set()).update(map(tuple, at.tolist()))
-        return {camera: min(len(found) / math.prod(CELLS), 1.0) for camera, found in cells.items()}
+                x, y = np.clip(at, 0, [columns - 1, rows - 1]).T
+                camera = counts.setdefault(one.camera, np.zeros(columns * rows, dtype=np.int64))
+                np.add.at(camera, y * columns + x, 1)
+        return {camera: tuple(told.tolist()) for camera, told in counts.items()}
 
     def promised_px(self, looks: Sequence[Look], name: str) -> dict[str, float]:
         """Return what corners of looks that were not fitted should be off by, rms per axis, by camera."""

@@ -64,6 +64,7 @@ class Looks:
         BoardNotFound
             With what the pictures showed instead.
         """
+        self._teller.step("search")
         search = Search(self._eyes, self._known.now, self._known.sought, self._teller)
         self._known.take(name, search.find(placement))
 
@@ -76,6 +77,7 @@ class Looks:
             If it is not there any more.
         """
         known, self.here = self._known, name
+        self._teller.step("pictures")
         in_vain: list[tuple[float, float]] = []
         missed = 0
         while True:
@@ -162,7 +164,7 @@ class Looks:
                 known.floor_px,
                 (choice.shot.pan_rad, choice.shot.tilt_rad),
                 choice.expected_px,
-                known.coverage(),
+                known.cells(),
             )
         )
 

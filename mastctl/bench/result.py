@@ -184,7 +184,9 @@ def finish(bench: BenchRun, teller: Teller, out: Path, report: Path | None) -> B
         As `BenchRun.run`; no mast file is written.
     """
     bench.run()
+    teller.step("check")
     checked = bench.check()
+    teller.step("fit")
     known = bench.known
     calibration = known.fit().calibration
     assert calibration is not None

@@ -131,6 +131,7 @@ class BenchRun:
         if not known.looks:
             return
         self._teller.say(f"going on with {self._kept.path}: {known.pictures()} pictures a camera are there")
+        self._teller.step("fit")
         try:
             known.fit()
         except CalibError as reason:

@@ -18,7 +18,7 @@ from calib.files.strict import Section
 from calib.files.yaml_text import MAX_BYTES, parse_mapping
 from calib.mast.rig import Rig
 from mastctl.bench.eyes import Head
-from mastctl.bench.teller import NobodyThere, Progress, Teller
+from mastctl.bench.teller import NobodyThere, Progress, Step, Teller
 from mastctl.client import Client
 
 BOARD = "bench"
@@ -45,16 +45,31 @@ class SimulatedPerson:
         Who is told how it goes.
     file
         Where the board stands in turn; None: where it is asked for.
+    asks
+        Whether who is told is asked for each placement too, as at a real bench.
     """
 
-    def __init__(self, client: Client, board: AnyBoard, rig: Rig, told: Teller, file: Path | None) -> None:
+    def __init__(
+        self,
+        client: Client,
+        board: AnyBoard,
+        rig: Rig,
+        told: Teller,
+        file: Path | None,
+        asks: bool = False,
+    ) -> None:
         self._client, self._board, self._rig, self._told = client, board, rig, told
+        self._asks = asks
         self._places = None if file is None else read_placements(file)
         self._file = file
 
     def say(self, sentence: str) -> None:
         """Pass it on."""
         self._told.say(sentence)
+
+    def step(self, step: Step) -> None:
+        """Pass it on."""
+        self._told.step(step)
 
     def progress(self, now: Progress) -> None:
         """Pass it on."""
@@ -70,7 +85,10 @@ class SimulatedPerson:
         """
         asked, placement = placement, self._where(name, placement)
         said = "" if placement == asked else f" (asked for: {asked.words()})"
-        self._told.say(f"placement {name}: the board {placement.words()}{said}")
+        if self._asks:
+            self._told.place(name, asked, head)
+        if not self._asks or said:
+            self._told.say(f"placement {name}: the board {placement.words()}{said}")
         self.stand(placement)
 
     def stands(self, name: str, placement: Placement | None, head: Head) -> None:

@@ -6,7 +6,7 @@ import math
 import sys
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Literal, Protocol
 
 from calib.bench.placements import Placement
 from mastctl.bench.eyes import Head
@@ -14,6 +14,13 @@ from mastctl.errors import MastctlError
 
 COLUMNS, ROWS = 33, 11
 """Of each half of a sketch, signs."""
+
+
+Step = Literal["search", "pictures", "fit", "check"]
+"""What a run does beside asking for placements."""
+
+CELLS = (8, 6)
+"""Columns and rows into which a picture is divided to tell where corners were seen."""
 
 
 class NobodyThere(MastctlError):
@@ -38,8 +45,8 @@ class Progress:
         The next attitude, pan and tilt.
     expected_px
         What is predicted after it.
-    coverage
-        Part of each camera's picture in which corners were seen.
+    cells
+        Of each camera how many corners were seen in each of its picture's `CELLS`, row by row.
     """
 
     placement: str
@@ -50,7 +57,12 @@ class Progress:
     floor_px: float
     next_rad: tuple[float, float]
     expected_px: float
-    coverage: Mapping[str, float]
+    cells: Mapping[str, tuple[int, ...]]
+
+    @property
+    def coverage(self) -> Mapping[str, float]:
+        """Part of each camera's picture in which corners were seen, 0 to 1."""
+        return {name: sum(map(bool, counts)) / len(counts) for name, counts in self.cells.items()}
 
     def words(self) -> str:
         """Return it as a line."""
@@ -69,6 +81,10 @@ class Teller(Protocol):
 
     def say(self, sentence: str) -> None:
         """Tell something, once."""
+        ...
+
+    def step(self, step: Step) -> None:
+        """Tell what is done from now on."""
         ...
 
     def progress(self, now: Progress) -> None:
@@ -158,6 +174,9 @@ class Terminal:
         """Write a line."""
         sys.stderr.write(sentence + "\n")
         sys.stderr.flush()
+
+    def step(self, step: Step) -> None:
+        """Say nothing: sentences and progress show it."""
 
     def progress(self, now: Progress) -> None:
         """Write a line."""

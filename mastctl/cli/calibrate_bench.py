@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import argparse
+import logging
+import os
 import sys
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
@@ -19,7 +21,15 @@ if TYPE_CHECKING:
     from mastctl.bench.teller import Teller
     from mastctl.client import Client
 
+log = logging.getLogger(__name__)
+
 COMMAND = "calibrate bench"
+
+FOLLOWED = "bench calibration"
+"""What a run calls itself that a program follows."""
+
+BESIDE = 10
+"""Niceness of a run that a program follows: the daemon beside it comes first."""
 
 
 def add_commands(subparsers: Any) -> None:
@@ -65,6 +75,15 @@ def add_commands(subparsers: Any) -> None:
         "--placements", type=Path, metavar="FILE",
         help="of a simulated bench: where the board stands in turn (default: where it is asked for)",
     )  # fmt: skip
+    parser.add_argument(
+        "--by-hand", action="store_true",
+        help="of a simulated bench: ask for each placement as at a real one, before the board goes there",
+    )  # fmt: skip
+    parser.add_argument(
+        "--lines", action="store_true",
+        help="for a program that shows the run: everything as lines of JSON on stdout, 'stands' on stdin as "
+        "its answer; the run ends with stdin. Steers under $MASTCTL_LEASE, which the program renews",
+    )  # fmt: skip
     again = parser.add_argument_group("with FOLDER")
     again.add_argument(
         "--like",
@@ -87,9 +106,10 @@ def run(args: argparse.Namespace) -> int:
     check_file(args.out, "--out")
     check_folder(args.report, "--report")
     if args.folder is not None:
-        for option in ("config", "url", "board", "survey", "cameras", "placements"):
-            if getattr(args, option) is not None:
-                raise WrongUse(f"--{option} drives a head; with FOLDER nothing is driven")
+        for option in ("config", "url", "board", "survey", "cameras", "placements", "by_hand", "lines"):
+            if getattr(args, option) not in (None, False):
+                name = option.replace("_", "-")
+                raise WrongUse(f"--{name} drives a head; with FOLDER nothing is driven")
         return _again(args)
     for option in ("like", "mast_at", "model"):
         if getattr(args, option) is not None:
@@ -97,7 +117,7 @@ def run(args: argparse.Namespace) -> int:
             raise WrongUse(f"--{name} is for fitting a folder again; name a bench's FOLDER")
     if args.board is None:
         raise WrongUse("--board is missing; the BOARD.yaml that 'mastctl board make' wrote is expected")
-    return _drive(args)
+    return _drive_in_lines(args) if args.lines else _drive(args)
 
 
 def survey_folder(out: Path) -> Path:
@@ -142,6 +162,22 @@ def _options(args: argparse.Namespace) -> BenchOptions:
     return BenchOptions(kind=args.model, rover_from_mast=place)
 
 
+def _drive_in_lines(args: argparse.Namespace) -> int:
+    """Drive for a program: results and refusals are lines of its stream."""
+    from mastctl.bench.lines import Lines
+
+    os.nice(BESIDE)
+    args.lines = Lines(sys.stdout, sys.stdin)
+    try:
+        return _drive(args)
+    except Exception as error:  # whatever it is, the program hears of it
+        known = output.as_command_error(error)
+        args.lines.failed(known.code, output.one_line(str(known)) or known.code)
+        if known.code == "internal":
+            log.exception("the calibration met a defect of the program")
+        return known.exit_code
+
+
 def _drive(args: argparse.Namespace) -> int:
     from calib.boards import load_board
     from mastctl.bench.daemon_eyes import Interrupted
@@ -167,7 +203,7 @@ def _drive(args: argparse.Namespace) -> int:
 
 def _go_on(args: argparse.Namespace, reason: Exception, folder: Path) -> bool:
     """Ask the person at the terminal, if there is one, whether to go on now."""
-    if args.json or not sys.stdin.isatty():
+    if args.json or args.lines or not sys.stdin.isatty():
         return False
     output.tell(f"{reason}. Everything seen is kept in {folder}")
     sys.stderr.write("Enter to go on, Ctrl-C to leave it for later. ")
@@ -190,8 +226,12 @@ def _bench(args: argparse.Namespace, board: Any, folder: Path) -> Iterator[tuple
 
     with ExitStack() as stack:
         client = stack.enter_context(_daemon(args))
+        granted = os.environ.get("MASTCTL_LEASE") if args.lines else None
         try:
-            stack.enter_context(client.lease(name="calibrate bench"))
+            if granted:
+                client.use_lease(granted)
+            else:
+                stack.enter_context(client.lease(name="calibrate bench"))
         except ClientError as error:
             raise Interrupted(f"the head cannot be steered: {error}") from None
         served = list(client.status()["cameras"])
@@ -204,11 +244,16 @@ def _bench(args: argparse.Namespace, board: Any, folder: Path) -> Iterator[tuple
         sizes = {name: camera.model.size_px for name, camera in head.rig.cameras.items()}
         sigma = Sigma(0.0, 0.0, joint_rad=head.count_rad / 12**0.5, corner_px=0.1)
         kept = Kept(folder, {"board": board}, sigma, survey_cameras(head.rig, sizes), head.rig.stereo)
-        teller: Teller = Terminal(max(board.size_m))
-        if client.status()["simulated"]:
-            teller = SimulatedPerson(client, board, head.rig, teller, args.placements)
-        elif args.placements is not None:
-            raise WrongUse("--placements moves the board of a simulated bench, and this one is real")
+        simulated = client.status()["simulated"]
+        teller: Teller = args.lines or Terminal(max(board.size_m))
+        if args.lines:
+            args.lines.begun(head, board.size_m, str(folder), simulated, args.by_hand or not simulated)
+        if simulated:
+            asks = args.by_hand or bool(args.lines)
+            teller = SimulatedPerson(client, board, head.rig, teller, args.placements, asks)
+        elif args.placements is not None or args.by_hand:
+            option = "--by-hand" if args.placements is None else "--placements"
+            raise WrongUse(f"{option} is of a simulated bench, and this one is real")
         wanted = Wanted(args.wanted_px, args.pictures)
         fit = fit_in_rover(head.rig.mast.rover_from_mast)
         yield BenchRun(eyes, kept, "board", board, teller, fit, wanted), teller
@@ -226,7 +271,7 @@ def _daemon(args: argparse.Namespace) -> Iterator[Client]:
     from mastctl.packaged import config_folder
 
     if args.url is not None:
-        with Client(args.url, name="calibrate bench") as client:
+        with Client(args.url, name=FOLLOWED if args.lines else "calibrate bench") as client:
             client.status()
             yield client
         return
@@ -258,7 +303,9 @@ def _daemon(args: argparse.Namespace) -> Iterator[Client]:
 
 
 def _tell(args: argparse.Namespace, document: dict[str, Any], lines: list[str]) -> None:
-    if args.json:
+    if args.lines:
+        args.lines.done(document)
+    elif args.json:
         output.print_json(document)
     else:
         sys.stdout.write("\n".join(lines) + "\n")

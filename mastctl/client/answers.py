@@ -21,6 +21,100 @@ class AxisTold(TypedDict):
     one_sided: bool
 
 
+class BenchBegun(TypedDict):
+    """A bench calibration that has begun or goes on, is answered, or has ended."""
+
+    run: BenchRunTold
+
+
+class BenchEvent(TypedDict):
+    """A bench calibration went on, asks for a placement, or has ended."""
+
+    key: str
+    sequence: int
+    lost: int
+    topic: Literal["bench"]
+    value: BenchRunTold
+
+
+class BenchListed(TypedDict):
+    """A bench calibration whose folder is there."""
+
+    name: str
+    begun: str
+    by: str
+    board: str
+    state: Literal["running", "done", "interrupted", "damaged"]
+    sentence: str
+    pictures: int
+    grade: str | None
+    mast_file: str | None
+    report: str | None
+
+
+class BenchResult(TypedDict):
+    """What came of a bench calibration.
+
+    ``pointing_...``: corners that were pointed at, measured and promised; ``calibrated_px``, ``counts_px``:
+    what the calibration, and the encoders' counts alone, leave of a first pointing, rms an axis.
+    """
+
+    verdict: VerdictTold
+    cameras: list[ResidualTold]
+    pointing_rms_px: list[float] | None
+    pointing_promised_px: float | None
+    pointings: int
+    calibrated_px: float | None
+    counts_px: float | None
+    pictures: int
+    placements: int
+    rover_s: float | None
+    notes: list[str]
+
+
+class BenchRunTold(TypedDict):
+    """A bench calibration as far as it is known; ``asking`` waits for a placement."""
+
+    name: str
+    begun: str
+    by: str
+    state: Literal["running", "asking", "done", "interrupted"]
+    step: Literal["begin", "place", "search", "pictures", "check", "fit", "over"]
+    code: str | None
+    sentence: str
+    simulated: bool | None
+    by_hand: bool
+    wanted_px: float
+    board_m: list[float] | None
+    asked: PlacementAsked | None
+    placements: int
+    pictures: int
+    most: int
+    predicted_px: float | None
+    target_px: float | None
+    floor_px: float | None
+    expected_px: float | None
+    next_rad: list[float] | None
+    cameras: dict[str, CoverageTold]
+    curve: list[list[float]]
+    sentences: list[str]
+    odd: int
+    result: BenchResult | None
+    mast_file: str | None
+    report: str | None
+
+
+class BenchTold(TypedDict):
+    """The bench calibration at work or the last one, those whose folders are there, and packaged boards."""
+
+    run: BenchRunTold | None
+    runs: list[BenchListed]
+    boards: list[str]
+    folder: str
+    masts_folder: str
+    simulated: bool
+
+
 class BoardStands(TypedDict):
     """A board before a simulated rover: what it is, and rover_from_board."""
 
@@ -142,6 +236,13 @@ class ControlTold(TypedDict):
     kind: Literal["lease", "operation"]
     for_s: float | None
     until: str | None
+
+
+class CoverageTold(TypedDict):
+    """How many corners were seen in each cell of a camera's picture, 8 in a row, 6 rows."""
+
+    size_px: list[int]
+    cells: list[int]
 
 
 class ErrorTold(TypedDict):
@@ -487,6 +588,22 @@ class PlaceTold(TypedDict):
     tilt_rad: float
 
 
+class PlacementAsked(TypedDict):
+    """Where a board is asked for, from the head's axes; ``waits``: until somebody says that it stands.
+
+    ``bearing_deg`` to the right of pan zero, ``height_deg`` above the axes, ``turned_deg``: its face, to the
+    head's right and upwards.
+    """
+
+    name: str
+    range_m: float
+    bearing_deg: float
+    height_deg: float
+    turned_deg: list[float]
+    words: str
+    waits: bool
+
+
 class PlacesTold(TypedDict):
     """The places that are kept, by name; ``home`` is always among them."""
 
@@ -565,6 +682,13 @@ class ReadyTold(TypedDict):
     reason: str
 
 
+class ReasonTold(TypedDict):
+    """One reason of a verdict."""
+
+    grade: str
+    sentence: str
+
+
 class RecorderTold(TypedDict):
     """What is recorded now. ``dropped``: messages not written, by topic; ``fault``: what is wrong."""
 
@@ -619,11 +743,35 @@ class ReloadTold(TypedDict):
     notes: list[str]
 
 
+class ReportListed(TypedDict):
+    """A report that can be read."""
+
+    name: str
+    title: str
+    written: str
+
+
+class ReportsTold(TypedDict):
+    """The reports, the newest first, and the folder where others may be put."""
+
+    reports: list[ReportListed]
+    folder: str
+
+
 class ResetTold(TypedDict):
     """``POST /reset``: the emergency stop that was released."""
 
     latched: Literal[False]
     released: EstopHeld
+
+
+class ResidualTold(TypedDict):
+    """Rms of a camera's corners: fitted, not fitted, and what was promised of those that were not."""
+
+    camera: str
+    rms_px: list[float] | None
+    check_rms_px: list[float | None] | None
+    promised_px: float | None
 
 
 class RigTold(TypedDict):
@@ -861,6 +1009,14 @@ class TurnedTold(TypedDict):
     log10_evidence: float
 
 
+class VerdictTold(TypedDict):
+    """Whether to trust a calibration: ``good``, ``care``, ``bad``, and why."""
+
+    grade: str
+    words: str
+    reasons: list[ReasonTold]
+
+
 class WordTold(TypedDict):
     """A fault word: what it does, in one sentence, and its parameters; the unit is in the name."""
 
@@ -884,4 +1040,5 @@ Event = (
     | MastEvent
     | CommandEvent
     | LeaseEvent
+    | BenchEvent
 )

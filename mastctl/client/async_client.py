@@ -17,6 +17,9 @@ from mastctl.client.lease import HeldLease
 
 if TYPE_CHECKING:
     from mastctl.client.answers import (
+        BenchBegun,
+        BenchRunTold,
+        BenchTold,
         BoardStands,
         BoardsTold,
         CalibrationHealthTold,
@@ -36,6 +39,7 @@ if TYPE_CHECKING:
         RecordingEnded,
         Recordings,
         ReloadTold,
+        ReportsTold,
         ResetTold,
         RigTold,
         SentinelTold,
@@ -324,6 +328,58 @@ class AsyncClient:
                 return told
         wanted = " or ".join(states)
         raise ClientError("timeout", f"the state is {word} and not {wanted} after {timeout_s:g} s")
+
+    async def bench(self) -> BenchTold:
+        """Return the bench calibration at work or the last one (``run``), and those that are kept."""
+        return cast("BenchTold", await self._daemon.json("GET", "/bench"))
+
+    async def begin_bench(
+        self,
+        board: str | None = None,
+        *,
+        board_file: str | None = None,
+        goes_on: str | None = None,
+        wanted_px: float | None = None,
+        pictures: int | None = None,
+        by_hand: bool | None = None,
+    ) -> BenchRunTold:
+        """Have the daemon begin a bench calibration, or go on with one, and return it as it is then.
+
+        Parameters
+        ----------
+        board, board_file, goes_on
+            One of them: the name of a packaged board, the text of a BOARD.yaml, the name of a run.
+        wanted_px, pictures
+            What the calibration may leave of a first pointing, rms an axis, and how many pictures of each
+            camera at most; by default 0.2 and 60, or as the run had them.
+        by_hand
+            Whether a simulated board waits for `board_stands` too, as a real one does.
+
+        Raises
+        ------
+        ClientError
+            ``bench_runs``, ``bench_done``, ``bench_unknown``, ``bad_board``, ``unwritable``, ``disk_low``.
+        """
+        told: dict[str, Any] = {"board": board, "board_file": board_file, "goes_on": goes_on}
+        told |= {"wanted_px": wanted_px, "pictures": pictures, "by_hand": by_hand}
+        body = {key: value for key, value in told.items() if value is not None}
+        return cast("BenchBegun", await self._daemon.command("POST", "/bench", body))["run"]
+
+    async def board_stands(self) -> BenchRunTold:
+        """Say that the board stands where it was asked for."""
+        return cast("BenchBegun", await self._daemon.command("POST", "/bench/stands"))["run"]
+
+    async def leave_bench(self) -> BenchRunTold:
+        """End the bench calibration; it can go on later (`begin_bench`, ``goes_on``)."""
+        return cast("BenchBegun", await self._daemon.command("POST", "/bench/leave"))["run"]
+
+    async def reports(self) -> ReportsTold:
+        """Return the reports that can be read, the newest first."""
+        return cast("ReportsTold", await self._daemon.json("GET", "/reports"))
+
+    async def report(self, name: str) -> bytes:
+        """Return a report, HTML."""
+        return bytes((await self._daemon.ask("GET", f"/reports/{quote(name, safe='')}")).content)
 
     async def recordings(self) -> Recordings:
         """Return the daemon's recordings, and what it records now."""

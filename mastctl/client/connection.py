@@ -20,6 +20,8 @@ import httpx
 T = TypeVar("T")
 
 PREFIX = "/api/v1"
+OWN_CERTIFICATE = "MASTCTL_CERTIFICATE"
+"""Names the file of a daemon's own certificate, for a program that this daemon starts itself."""
 AGAIN_S = (0.1, 0.5)  # pauses before a command goes out again on a new connection
 _BAD_INPUT = frozenset({400, 404, 413, 415, 422})
 
@@ -48,6 +50,9 @@ class ClientError(Exception):
 
 def _trusted() -> ssl.SSLContext:
     """Whose certificates are taken: those of the machine, and of ``$MASTCTL_CA_FILE``. Raises ClientError."""
+    own = os.environ.get(OWN_CERTIFICATE)
+    if own:
+        return _pinned(own)
     context = ssl.create_default_context()
     ca_file = os.environ.get("MASTCTL_CA_FILE")
     if ca_file:
@@ -56,6 +61,21 @@ def _trusted() -> ssl.SSLContext:
         except (OSError, ssl.SSLError) as error:
             words = f"MASTCTL_CA_FILE: {ca_file}: no certificates can be read ({error})"
             raise ClientError("bad_url", words, exit_code=2) from None
+    return context
+
+
+def _pinned(certificate: str) -> ssl.SSLContext:
+    """Take one certificate and no other, whatever names it has. Raises ClientError."""
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
+    context.check_hostname = False
+    context.verify_flags |= ssl.VERIFY_X509_PARTIAL_CHAIN
+    end = "-----END CERTIFICATE-----"
+    try:
+        first, found, _ = Path(certificate).read_text(encoding="ascii", errors="replace").partition(end)
+        context.load_verify_locations(cadata=first + found)
+    except (OSError, ssl.SSLError) as error:
+        words = f"{OWN_CERTIFICATE}: {certificate}: no certificate can be read ({error})"
+        raise ClientError("bad_url", words, exit_code=2) from None
     return context
 
 

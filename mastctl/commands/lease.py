@@ -147,6 +147,11 @@ class Leases:
             self._check_free(caller)
             return self._grant(name or caller.name, for_s)
 
+    def holds(self, lease_id: str) -> bool:
+        """Return whether a lease runs now; takes no lock."""
+        lease = self._lease
+        return lease is not None and lease.id == lease_id and self._clock.now_s() < lease.until_s
+
     def renew(self, lease_id: str, for_s: float | None = None) -> Lease:
         """Have a lease run for ``for_s`` seconds from now on, by default as long as at first; return it.
 

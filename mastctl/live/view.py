@@ -22,11 +22,12 @@ from mastctl.errors import MastctlError, Unable
 from mastctl.live.screen import Screen
 from mastctl.live.settings import LiveSettings
 from mastctl.recorder.entries import Entries
+from mastctl.recorder.feed import ELSEWHERE
 from mastctl.recorder.recorder import Told
 from mastctl.recorder.schemas import OWN_TOPICS
 from mastctl.recorder.writer import Clocks
 from mastctl.state.faults import StandingFault
-from mastctl.state.publisher import Published, Publisher, ThreadSubscription
+from mastctl.state.publisher import TOPICS, Published, Publisher, ThreadSubscription
 
 log = logging.getLogger(__name__)
 
@@ -187,7 +188,7 @@ class LiveView:
         """Show the newest of everything, and what follows, until something else is watched."""
         rig, digest = self._mast
         entries = Entries(rig, digest)
-        self._news = news = self._publisher.subscribe()
+        self._news = news = self._publisher.subscribe(*(TOPICS - ELSEWHERE))
         entries.tell_cameras(screen, self._clock.now_s(), time.monotonic())
         known = _not_the_past(news.wait(0.0))
         while not news.closed and not self._stirred.is_set():

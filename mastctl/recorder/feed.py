@@ -10,11 +10,13 @@ from typing import Any
 from mastctl.devices.frames import StampedFrame
 from mastctl.errors import MastctlError
 from mastctl.recorder.recorder import Recorder
-from mastctl.state.publisher import Publisher, ThreadSubscription
+from mastctl.state.publisher import TOPICS, Publisher, ThreadSubscription, Topic
 
 log = logging.getLogger(__name__)
 
 CLOSE_S = 1.0
+ELSEWHERE: frozenset[Topic] = frozenset({"bench"})
+"""What is not recorded here: a run's own folder has all of it."""
 
 
 class Feed:
@@ -33,7 +35,7 @@ class Feed:
     ) -> None:
         self._recorder = recorder
         self._frame_by_id = frame_by_id
-        self._news = publisher.subscribe()
+        self._news = publisher.subscribe(*(TOPICS - ELSEWHERE))
         self._thread = threading.Thread(
             target=self._work, args=(self._news,), name="recorder feed", daemon=True
         )

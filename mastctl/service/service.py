@@ -25,6 +25,8 @@ from mastctl.config import Config
 from mastctl.devices.devices import Devices
 from mastctl.devices.frames import StampedFrame, check_known
 from mastctl.errors import MastctlError
+from mastctl.guided.guide import Guide
+from mastctl.guided.reports import Reports
 from mastctl.handoff.check import HandoffCheck
 from mastctl.handoff.in_picture import in_picture
 from mastctl.health.health import CalibrationHealth
@@ -113,6 +115,8 @@ class Service:
         Where state is kept that outlives the daemon; the emergency stop, if one is latched.
     places
         Where the head is sent by a name.
+    guide, reports
+        Bench calibrations that a program beside the daemon carries out, and the reports that are shown.
     manager
         What started this process, and hears when the configuration is read again; nobody by default.
     reloading
@@ -160,6 +164,16 @@ class Service:
         self.audit = AuditLog(self.folder.path / AUDIT_FILE, clock)
         answers = Answers(people_s, clock)
         self.entry = Entry(clock, self.leases, answers, self.audit, self.operations, publisher)
+        self.guide = Guide(
+            self.folder.path,
+            lambda: self.masts.in_use.path.parent,
+            self.leases,
+            self.stopping,
+            self.operations,
+            publisher,
+            hardware.kind == "simulated",
+        )
+        self.reports = Reports(self.folder.path, self.guide.runs)
         self.metrics = Metrics(lambda: self.state().told(), self.devices.errors, publisher)
         self.devices.fault_watch.also(self._own_faults)
         self.stop_socket: StopSocket | None = None
@@ -322,6 +336,7 @@ class Service:
                 return
             self._closed = True
         self.operations.close()
+        self.guide.close()
         self.devices.close()
         self.machine.publisher.close()
         self.metrics.close()

@@ -13,6 +13,7 @@ between, never the newest, and is told how many it lost: `Publisher.publish` nei
     mast        "in_use"            the mast file in use, as `GET /mast` tells it
     command     its number          the record of a command; under NUMBER.end how what it began has ended
     lease       "lease"             who steers
+    bench       "run"               `mastctl.guided.told.Run`, the bench calibration as far as it is known
 """
 
 from __future__ import annotations
@@ -29,7 +30,9 @@ from typing import Any, Literal, Self, TypeVar, get_args
 
 from mastctl.state.in_turn import InTurn
 
-Topic = Literal["state", "joints", "operation", "track", "fault", "frame", "mast", "command", "lease"]
+Topic = Literal[
+    "state", "joints", "operation", "track", "fault", "frame", "mast", "command", "lease", "bench"
+]
 TOPICS: frozenset[Topic] = frozenset(get_args(Topic))
 
 _Subscription = TypeVar("_Subscription", bound="Subscription")

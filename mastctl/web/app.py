@@ -14,6 +14,7 @@ from starlette.types import ASGIApp
 
 from mastctl.service.service import Service
 from mastctl.web.answers import ErrorBody
+from mastctl.web.bench import add_bench
 from mastctl.web.commands import Commands
 from mastctl.web.described import describe
 from mastctl.web.entrance import Entrance
@@ -74,6 +75,7 @@ def create_app(
     add_pictures(app, service, waiting, commands)
     add_places(app, service, waiting, commands)
     add_recordings(app, service, waiting, commands)
+    add_bench(app, service, waiting, commands)
     add_reload(app, service, commands)
     add_simulation(app, service, waiting, commands)
     add_watching(app, service, waiting)

@@ -12,6 +12,7 @@ from pydantic.json_schema import models_json_schema
 from mastctl.frame_facts import described_headers
 from mastctl.web import PREFIX
 from mastctl.web import answers as told
+from mastctl.web import bench_answers as bench
 from mastctl.web.event_answers import Event
 
 ANSWERS: Mapping[str, type[BaseModel]] = {
@@ -63,6 +64,11 @@ ANSWERS: Mapping[str, type[BaseModel]] = {
     "GET /health/live": told.LiveTold,
     "GET /health/ready": told.ReadyTold,
     "GET /rig": told.RigTold,
+    "GET /bench": bench.BenchTold,
+    "POST /bench": bench.BenchBegun,
+    "POST /bench/stands": bench.BenchBegun,
+    "POST /bench/leave": bench.BenchBegun,
+    "GET /reports": bench.ReportsTold,
     "GET /session": told.SessionTold,
     "POST /login": told.SessionTold,
     "POST /logout": told.LoggedOut,
@@ -73,6 +79,7 @@ FILES: Mapping[str, tuple[str, ...]] = {
     "GET /snapshot/{camera}": ("image/png", "image/jpeg"),
     "GET /mast": ("application/yaml",),
     "GET /metrics": ("text/plain",),
+    "GET /reports/{name}": ("text/html",),
 }
 PICTURES = ("GET /snapshot/{camera}",)
 _REFERENCE = "#/components/schemas/{model}"

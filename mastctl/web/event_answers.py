@@ -20,6 +20,7 @@ from mastctl.web.answers import (
     TrackTold,
     _Told,
 )
+from mastctl.web.bench_answers import BenchRunTold
 
 
 class HeadTold(Joints):
@@ -146,6 +147,13 @@ class LeaseEvent(_Event):
     value: LeaseTold
 
 
+class BenchEvent(_Event):
+    """A bench calibration went on, asks for a placement, or has ended."""
+
+    topic: Literal["bench"]
+    value: BenchRunTold
+
+
 Kinds = (
     StateEvent
     | JointsEvent
@@ -156,6 +164,7 @@ Kinds = (
     | MastEvent
     | CommandEvent
     | LeaseEvent
+    | BenchEvent
 )
 
 

@@ -202,5 +202,6 @@ _TOLD: Mapping[Topic, Callable[[Service, Any, float], Any]] = {
     "frame": _frame,
     "mast": lambda service, value, now_s: value,
     "command": _command,
+    "bench": lambda service, value, now_s: value.told(),
     "lease": lambda service, value, now_s: {"control": service.leases.told()},
 }

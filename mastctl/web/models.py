@@ -14,6 +14,7 @@ from calib.rigid import Rigid
 from mastctl.commands.entry import LONGEST_DEADLINE_S
 from mastctl.commands.lease import LONGEST_S, SHORTEST_S, USUAL_S
 from mastctl.devices.sun import LEAST_CONE_RAD, WIDEST_CONE_RAD, Sun, direction_of
+from mastctl.guided.guide import Wanted
 from mastctl.pointing.jog import Beat
 from mastctl.pointing.requests import (
     LARGEST_M,
@@ -353,6 +354,33 @@ class PlaceBody(_Strict):
 
     pan_rad: Angle
     tilt_rad: Angle
+
+
+class BenchBody(_Strict):
+    """``POST /bench``: with which board, and how far; or with which run to go on.
+
+    ``board`` names a packaged one, ``board_file`` is the text of a BOARD.yaml. ``wanted_px`` is what the
+    calibration may leave of a first pointing, rms an axis; ``pictures`` of each camera at most; ``by_hand``:
+    a simulated board waits for `POST /bench/stands` too, as a real one always does. Left out they are 0.2,
+    60 and false, or as the run had them that goes on.
+    """
+
+    board: Name | None = None
+    board_file: Annotated[str, Field(min_length=1, max_length=20000)] | None = None
+    goes_on: Name | None = None
+    wanted_px: Annotated[float, Field(ge=0.01, le=20.0)] | None = None
+    pictures: Annotated[int, Field(ge=12, le=500)] | None = None
+    by_hand: bool | None = None
+
+    @model_validator(mode="after")
+    def _one(self) -> BenchBody:
+        if sum(one is not None for one in (self.board, self.board_file, self.goes_on)) != 1:
+            raise ValueError("board, board_file or goes_on is expected, and one of them")
+        return self
+
+    def wanted(self) -> Wanted:
+        """Return it as the guide takes it."""
+        return Wanted(**self.model_dump())
 
 
 class LoginBody(_Strict):

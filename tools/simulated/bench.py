@@ -136,6 +136,9 @@ class SelfPlacing:
         """Keep it."""
         self.told.append(sentence)
 
+    def step(self, step: str) -> None:
+        """Pass over it."""
+
     def progress(self, now: object) -> None:
         """Keep it."""
         self.told.append(now.words())  # type: ignore[attr-defined]

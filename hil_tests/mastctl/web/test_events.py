@@ -20,6 +20,7 @@ from hil_tests.described_answers import closed
 from hil_tests.mastctl.service_fakes import FakeHardware, ScriptedLoop, eventually
 from hil_tests.mastctl.web.network import NAME, Network, network_daemon
 from mastctl.daemon import RunningDaemon
+from mastctl.guided.told import Run, heard
 from mastctl.state.publisher import TOPICS
 from mastctl.web import events as events_module
 from mastctl.web import sockets as sockets_module
@@ -71,6 +72,9 @@ def test_it_begins_with_what_is_known_and_then_tells_each_change(pair: BOTH) -> 
         assert [step["name"] for step in ended["value"]["steps"]] == ["look", "measure"]
 
 
+BENCH_BEGUN = b'{"event": "begun", "board_m": [0.5, 0.3], "cameras": {"a": [64, 48]}, "simulated": true}'
+
+
 def test_each_topic_is_told_by_the_model_that_openapi_describes(pair: BOTH) -> None:
     daemon, _ = pair
     with httpx.Client(base_url=daemon.url, trust_env=False) as http:
@@ -81,7 +85,10 @@ def test_each_topic_is_told_by_the_model_that_openapi_describes(pair: BOTH) -> N
         http.post("/api/v1/point", json={"pan_rad": 0.1, "tilt_rad": 0.0}, headers={"Mastctl-Client": "a"})
         http.post("/api/v1/lease", json={"for_s": 5.0}, headers={"Mastctl-Client": "a"})
         http.get("/api/v1/snapshot/navcam_left")
-    daemon.service.machine.publisher.publish("fault", "a device", ())
+    publisher = daemon.service.machine.publisher
+    publisher.publish("fault", "a device", ())
+    run = heard(Run("20261122-120000", "2026-11-22T12:00:00+00:00", "Ana"), BENCH_BEGUN)
+    publisher.publish("bench", "run", run)
     seen: set[str] = set()
     with socket_of(daemon.url) as line:
         for _ in range(200):

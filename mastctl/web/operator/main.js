@@ -2,12 +2,14 @@
 import { byId, h, put, say, set } from "./dom.js";
 import { estop, get, post, stop } from "./api.js";
 import { forTime, sentence } from "./words.js";
+import { Bench } from "./bench.js";
 import { Control } from "./control.js";
 import { Events } from "./events.js";
 import { Faults, MastFile, Recording } from "./panels.js";
 import { HeadPanel } from "./head.js";
 import { Jog } from "./jog.js";
 import { OperationList } from "./operations.js";
+import { Reports } from "./reports.js";
 import { Residuals } from "./residuals.js";
 import { Simulation } from "./simulation.js";
 import { Target } from "./target.js";
@@ -82,6 +84,8 @@ const residuals = new Residuals();
 const simulation = new Simulation();
 new Faults(events, announce);
 new OperationList(events);
+const bench = new Bench(events, speak);
+new Reports(events);
 
 // What is pushed
 
@@ -180,7 +184,7 @@ function show(status) {
 function allow(role) {
   may = role !== "view";
   set(document.body, "data-role", role);
-  for (const part of [target, track, jog, control, recording, mastFile, simulation]) part.allow(may);
+  for (const part of [target, track, jog, control, recording, mastFile, simulation, bench]) part.allow(may);
 }
 
 // Who one is

@@ -1,0 +1,331 @@
+"""A bench calibration by a program beside the daemon: what it tells, how it ends, and what it never does."""
+
+from __future__ import annotations
+
+import json
+import os
+import threading
+import time
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+from guided_world import BEGUN, DONE, PLACE, PROGRESS, lines, world
+
+from hil_tests.mastctl.service_fakes import eventually
+from mastctl.commands.caller import Caller
+from mastctl.errors import BadRequest, MastctlError, NotKnown, NotNow, Unable
+from mastctl.guided import child as child_module
+from mastctl.guided import guide as guide_module
+from mastctl.guided.guide import Door, command_of
+from mastctl.guided.runs import Folder
+from mastctl.guided.told import MOST_SENTENCES, Run, heard
+
+ANA, BO = Caller("Ana", "operate"), Caller("Bo", "operate")
+
+
+def gone(pid: int) -> bool:
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return True
+    return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] == "Z"
+
+
+def stop_pressed(who: str = "Bo", command: str = "stop") -> dict[str, Any]:
+    return {"number": 1, "command": command, "who": who, "result": "ok"}
+
+
+def test_a_run_is_followed_from_its_beginning_over_a_placement_to_its_verdict(tmp_path: Path) -> None:
+    script = lines(BEGUN, PLACE) + "assert answered() == 'stands'\n"
+    script += lines({"event": "stands", "name": "p1"}, {"event": "step", "step": "search"}, PROGRESS)
+    script += "import pathlib\npathlib.Path(REPORT).mkdir()\n"
+    script += "pathlib.Path(REPORT, 'bench.html').write_text('<title>Bench</title>')\n"
+    with world(tmp_path, script + lines(DONE)) as made:
+        begun = made.begin(wanted_px=0.5)
+        assert (begun.state, begun.by, begun.wanted_px) == ("running", "Ana", 0.5)
+        asked = made.until("asking").asked
+        assert asked is not None and asked.turned_deg == (20.0, 0.0) and asked.waits
+        assert made.leases.control().holder == "bench calibration"  # type: ignore[union-attr]
+        made.guide.stands()
+        run = made.until("done")
+        assert made.leases.control() is None and made.lent == []
+        assert run.curve == ((3, 6.2),) and run.cameras["navcam_left"].cells == (2,) * 48
+        assert run.result is not None and run.result["verdict"]["words"] == "trust it"
+        assert run.result["cameras"][0]["promised_px"] == 0.09
+        assert run.mast_file == f"bench-{run.name}.yaml" and run.report == run.name
+        eventually(lambda: made.told and made.told[-1].state == "done", "the end is published")
+        (listed,) = made.guide.told()["runs"]
+        assert (listed["state"], listed["grade"], listed["mast_file"]) == ("done", "good", run.mast_file)
+        with pytest.raises(NotNow, match="has its verdict"):
+            made.begin(board=None, goes_on=run.name)
+
+
+def test_who_hears_of_the_end_may_steer_already(tmp_path: Path) -> None:
+    """The end is told when the program is over, though it tells it before."""
+    with world(tmp_path, lines(BEGUN, DONE) + "time.sleep(0.3)\n") as made:
+        news = made.publisher.subscribe("bench")
+        made.begin()
+        while (run := news.wait(10.0)[-1].value).state != "done":
+            assert made.leases.control() is not None
+        assert made.leases.acquire(BO).holder == "Bo" and run.result is not None
+
+
+def test_the_program_knows_its_lease_and_token_and_neither_stands_on_its_command_line(tmp_path: Path) -> None:
+    script = (
+        lines(BEGUN)
+        + "tell(event='said', sentence=os.environ['MASTCTL_TOKEN'] + os.environ['MASTCTL_LEASE'])\n"
+    )
+    with world(tmp_path, script + lines(PLACE) + "answered()\n") as made:
+        made.begin()
+        run = made.until("asking")
+        work = made.guide._work
+        assert work is not None and run.sentences == (f"secret-of-the-child{work.lease.id}",)
+        shown = Path(f"/proc/{made.pid}/cmdline").read_bytes().decode()
+        assert "secret" not in shown and work.lease.id not in shown
+    folder = Folder(tmp_path / "run")
+    asked = {"wanted_px": 0.2, "pictures": 60, "by_hand": True}
+    words = command_of(folder, asked, Door("http://127.0.0.1:1", None), tmp_path / "m.yaml")
+    assert words[3:6] == ["calibrate", "bench", "--lines"] and words[-1] == "--by-hand"
+
+
+@pytest.mark.parametrize(
+    ("script", "words"),
+    [
+        ("os.kill(os.getpid(), signal.SIGKILL)\n", "was ended by SIGKILL"),
+        (
+            "sys.stderr.write('no numbers today\\n'); sys.exit(7)\n",
+            "ended with exit code 7 (no numbers today)",
+        ),
+        ("os._exit(0)\n", "ended with exit code 0"),
+        ("while True: print('x' * 50)\n", "told more than anybody could read"),
+    ],
+)
+def test_a_program_that_dies_or_floods_is_told_in_a_sentence_and_lets_others_steer(
+    tmp_path: Path, script: str, words: str
+) -> None:
+    with world(tmp_path, lines(BEGUN) + script) as made:
+        made.begin()
+        pid = made.pid
+        run = made.until("interrupted")
+        assert run.code == "program_ended" and words in run.sentence and "can go on" in run.sentence
+        assert gone(pid) and made.leases.control() is None and made.lent == []
+
+
+def test_what_the_program_says_of_its_own_end_is_kept(tmp_path: Path) -> None:
+    failed = {"event": "failed", "code": "board_not_found", "message": "the board was not found in 40 looks"}
+    with world(tmp_path, lines(BEGUN, failed) + "sys.exit(1)\n") as made:
+        made.begin()
+        run = made.until("interrupted")
+        assert (run.code, run.sentence) == ("board_not_found", "the board was not found in 40 looks")
+
+
+GARBAGE = [
+    "", "not json", "[]", "17", '"x"', "null", "{}", '{"event": 3}', '{"event": ["place"]}',
+    '{"event": "place"}', '{"event": "progress", "pictures": -1}', '{"event": "said"}',
+    '{"event": "said", "sentence": 3}', '{"event": "step", "step": "dance"}',
+    '{"event": "done", "result": 4}',
+    json.dumps({**PROGRESS, "predicted_px": "low"}), json.dumps({**PROGRESS, "cells": {"navcam_left": [1]}}),
+    json.dumps({**PROGRESS, "cells": {"other": [1] * 48}}), json.dumps({**PROGRESS, "pictures": True}),
+    json.dumps({**PROGRESS, "next_rad": [1]}), '{"event": "progress", "predicted_px": NaN}', "[" * 100000,
+    json.dumps({**PLACE, "range_m": 1e400}), json.dumps({**PLACE, "turned_deg": None}),
+    json.dumps({**BEGUN, "cameras": {"a": [1, 2, 3]}}), json.dumps({**BEGUN, "board_m": "large"}),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("line", GARBAGE)
+def test_a_line_that_makes_no_sense_changes_nothing_but_a_count(line: str) -> None:
+    before = heard(Run("a", "b", "c"), json.dumps(BEGUN).encode())
+    assert heard(before, line.encode()) == replace(before, odd=1)
+
+
+def test_a_run_stays_small_however_much_it_tells() -> None:
+    run = heard(Run("a", "b", "c"), json.dumps(BEGUN).encode())
+    for k in range(3000):
+        run = heard(run, json.dumps({"event": "said", "sentence": "long " * 2000 + str(k)}).encode())
+        run = heard(run, json.dumps({**PROGRESS, "pictures": k}).encode())
+    assert len(run.sentences) == MOST_SENTENCES and run.sentences[-1].startswith("long")
+    assert len(json.dumps(run.told())) < 40_000
+
+
+def test_a_stop_ends_the_run_and_what_it_began_meanwhile_and_waits_for_neither(tmp_path: Path) -> None:
+    with world(tmp_path, lines(BEGUN, PROGRESS) + "time.sleep(60)\n") as made:
+        made.begin()
+        eventually(lambda: made.guide.run and made.guide.run.pictures == 3, "it is at work")
+        pid = made.pid
+        made.stops.running = "000002-race"  # sent out between the stop and its end
+        begun_s = time.monotonic()
+        made.publisher.publish("command", "1", stop_pressed())
+        assert time.monotonic() - begun_s < 0.2
+        run = made.until("interrupted")
+        assert run.code == "stopped" and run.sentence.startswith("Bo pressed stop; the head stands still")
+        assert made.stops.running is None and gone(pid) and made.leases.control() is None
+
+
+def test_a_stop_while_the_board_is_placed_ends_the_run_too(tmp_path: Path) -> None:
+    with world(tmp_path, lines(BEGUN, PLACE) + "answered()\n") as made:
+        made.begin()
+        made.until("asking")
+        made.publisher.publish("command", "1", stop_pressed(command="estop"))
+        assert "the emergency stop" in made.until("interrupted").sentence
+        with pytest.raises(NotNow, match="no bench calibration is at work"):
+            made.guide.stands()
+
+
+def test_who_takes_over_ends_the_run_and_keeps_what_moves(tmp_path: Path) -> None:
+    with world(tmp_path, lines(BEGUN) + "time.sleep(60)\n") as made:
+        made.begin()
+        made.stops.running = "000003-now-of-Bo"
+        lease = made.leases.take(BO, "I need it")
+        run = made.until("interrupted")
+        assert run.code == "taken" and "Bo took over: I need it" in run.sentence
+        assert made.leases.holds(lease.id), "the new holder's lease is let alone"
+        assert made.stops.reasons == [] and made.stops.running is not None
+
+
+def test_a_lease_is_renewed_as_long_as_the_program_lives(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(guide_module, "LEASE_S", 1.2)
+    monkeypatch.setattr(guide_module, "RENEW_S", 0.3)
+    with world(tmp_path, lines(BEGUN, PLACE) + "answered()\ntime.sleep(60)\n") as made:
+        made.begin()
+        made.until("asking")
+        assert not threading.Event().wait(2.0)
+        control = made.leases.control()
+        assert control is not None and control.holder == "bench calibration"
+        assert made.guide.run is not None and made.guide.run.state == "asking"
+
+
+def test_a_program_that_hangs_is_ended_and_one_that_waits_for_a_person_is_not(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(guide_module, "SILENT_S", 0.8)
+    monkeypatch.setattr(guide_module, "LOOK_S", 0.05)
+    script = (
+        lines(BEGUN, PLACE) + "answered()\n" + lines({"event": "stands", "name": "p1"}) + "time.sleep(60)\n"
+    )
+    with world(tmp_path, script) as made:
+        made.begin()
+        made.until("asking")
+        assert not threading.Event().wait(1.2)
+        assert made.guide.run is not None and made.guide.run.state == "asking"
+        made.guide.stands()
+        assert made.until("interrupted").code == "silent"
+
+
+def test_a_program_that_told_its_end_and_hangs_is_ended_and_the_end_counts(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(guide_module, "LINGERS_S", 0.2)
+    monkeypatch.setattr(guide_module, "LOOK_S", 0.05)
+    with world(tmp_path, lines(BEGUN, DONE) + "time.sleep(60)\n") as made:
+        made.begin()
+        assert made.until("done").sentence == "verdict: trust it"
+
+
+def test_whoever_may_ends_a_run_and_it_goes_on_from_its_folder(tmp_path: Path) -> None:
+    script = lines(BEGUN) + "tell(event='said', sentence=os.getcwd())\n" + lines(PLACE) + "answered()\n"
+    with world(tmp_path, script) as made:
+        first = made.begin(pictures=33, by_hand=True)
+        made.until("asking")
+        made.stops.running = "000004"
+        left = made.guide.leave("Bo")
+        assert (
+            left.code == "left"
+            and left.sentence.startswith("Bo ended the run")
+            and made.stops.running is None
+        )
+        (listed,) = made.guide.told()["runs"]
+        assert (listed["name"], listed["state"]) == (first.name, "interrupted")
+        again = made.begin(board=None, goes_on=first.name)
+        assert (again.name, again.most, again.by_hand) == (first.name, 33, True)
+        assert made.until("asking").sentences[0].endswith(first.name)
+        assert made.guide.told()["runs"][0]["state"] == "running"
+
+
+def test_a_run_that_was_cut_off_with_its_daemon_is_listed_and_goes_on(tmp_path: Path) -> None:
+    with world(tmp_path, lines(BEGUN, PLACE) + "answered()\n") as made:
+        name = made.begin().name
+        made.until("asking")
+    end = tmp_path / "state" / "bench" / name / "end.json"
+    assert "the daemon ended" in end.read_text()
+    end.unlink()
+    with world(tmp_path, lines(BEGUN, DONE)) as made:
+        (listed,) = made.guide.told()["runs"]
+        assert listed["state"] == "interrupted" and "cut off" in listed["sentence"]
+        made.begin(board=None, goes_on=name)
+        assert made.until("done").name == name
+
+
+def test_one_at_a_time(tmp_path: Path) -> None:
+    with world(tmp_path, lines(BEGUN, PLACE) + "answered()\n") as made:
+        made.begin()
+        made.until("asking")
+        with pytest.raises(NotNow, match="Ana has a bench calibration running"):
+            made.begin()
+        pid = made.pid
+    assert gone(pid), "it ends with the daemon"
+
+
+def test_a_program_whose_daemon_dies_ends_by_itself(tmp_path: Path) -> None:
+    """Its answers end, however the daemon ended."""
+    with world(tmp_path, lines(BEGUN) + "time.sleep(60)\n") as made:
+        made.begin()
+        work = made.guide._work
+        assert work is not None and work.child is not None
+        pid = made.pid
+        work.child._process.stdin.close()  # type: ignore[union-attr]  # as the kernel does for a dead daemon
+        eventually(lambda: gone(pid), "the program is over")
+        assert "exit code 3" in made.until("interrupted").sentence
+
+
+@pytest.mark.parametrize(
+    ("wanted", "kind", "words"),
+    [
+        ({"board": "charuco_a0"}, BadRequest, "there is no board 'charuco_a0'; there are charuco_a2"),
+        ({"board": None, "board_file": "kind: chess"}, BadRequest, "schema"),
+        ({"board": None, "board_file": "schema: mastctl/board/1\nkind: chess"}, BadRequest, "kind"),
+        ({"board": None, "board_file": "\x00"}, BadRequest, "board"),
+        ({"board": None, "goes_on": "../../etc"}, NotKnown, "there is no run"),
+        ({"board": None, "goes_on": "20260101-000000"}, NotKnown, "there is no run"),
+    ],
+)
+def test_what_cannot_begin_is_refused_and_leaves_nothing_behind(
+    tmp_path: Path, wanted: dict[str, Any], kind: type[MastctlError], words: str
+) -> None:
+    with world(tmp_path, lines(BEGUN)) as made:
+        with pytest.raises(kind, match=words):
+            made.begin(**wanted)
+        assert made.leases.control() is None and made.guide.run is None
+        assert made.guide.told()["runs"] == []
+
+
+def test_where_the_mast_file_cannot_be_written_nothing_begins(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with world(tmp_path, lines(BEGUN)) as made:
+        made.masts.rmdir()
+        with pytest.raises(Unable, match="where this daemon cannot write"):
+            made.begin()
+        made.masts.mkdir()
+        monkeypatch.setattr(guide_module, "FREE_BYTES", 1 << 60)
+        with pytest.raises(Unable, match="are needed"):
+            made.begin()
+        assert made.leases.control() is None
+
+
+def test_a_program_that_cannot_be_started_leaves_the_right_to_steer_with_everybody(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def no_process(*_: Any, **__: Any) -> None:
+        raise OSError(11, "Resource temporarily unavailable")
+
+    with world(tmp_path, lines(BEGUN)) as made:
+        monkeypatch.setattr(child_module.subprocess, "Popen", no_process)
+        with pytest.raises(Unable, match="cannot be started"):
+            made.begin()
+        assert made.leases.control() is None and made.lent == []
+        monkeypatch.undo()
+        made.begin()

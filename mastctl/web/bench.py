@@ -1,0 +1,62 @@
+"""Routes of guided bench calibrations, and of reports."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any
+
+from fastapi import FastAPI, Path, Response
+
+from mastctl.commands.entry import BENCH, BENCH_LEAVE, BENCH_STANDS
+from mastctl.service.service import Service
+from mastctl.web import PREFIX
+from mastctl.web.commands import Commands, Headers
+from mastctl.web.models import BenchBody
+from mastctl.web.waiting import Waiting
+
+REPORT = (
+    "default-src 'none'; style-src 'unsafe-inline'; img-src data:; sandbox; base-uri 'none'; "
+    "form-action 'none'; frame-ancestors 'none'"
+)
+"""The Content-Security-Policy of a report: its own styles and drawings, no script, an origin of nobody's."""
+ReportName = Annotated[str, Path(pattern="^[A-Za-z0-9][A-Za-z0-9._-]{0,99}$")]
+
+
+def add_bench(app: FastAPI, service: Service, waiting: Waiting, commands: Commands) -> None:
+    """A bench calibration begun, answered, ended; reports."""
+    guide, reports = service.guide, service.reports
+
+    @app.get(f"{PREFIX}/bench", summary="The bench calibration at work, and those that are kept")
+    async def bench() -> dict[str, Any]:
+        return await waiting.run(guide.told)
+
+    @app.post(f"{PREFIX}/bench", status_code=202, summary="Begin a bench calibration, or go on with one")
+    async def begin(body: BenchBody, came: Headers) -> dict[str, Any]:
+        wanted, who = body.wanted(), came.caller.name
+
+        def act() -> dict[str, Any]:
+            return {"run": guide.start(wanted, who).told()}
+
+        asked = body.model_dump(exclude_none=True)
+        if body.board_file is not None:
+            asked["board_file"] = f"{len(body.board_file)} signs"
+        return await commands.run(BENCH, came, asked, act)
+
+    @app.post(f"{PREFIX}/bench/stands", summary="Say that the board stands where it was asked for")
+    async def stands(came: Headers) -> dict[str, Any]:
+        return await commands.run(BENCH_STANDS, came, {}, lambda: {"run": guide.stands().told()})
+
+    @app.post(f"{PREFIX}/bench/leave", summary="End the bench calibration; it can go on later")
+    async def leave(came: Headers) -> dict[str, Any]:
+        who = came.caller.name
+        return await commands.run_beside(BENCH_LEAVE, came, lambda: {"run": guide.leave(who).told()})
+
+    @app.get(f"{PREFIX}/reports", summary="The reports that can be read")
+    async def listed() -> dict[str, Any]:
+        found = await waiting.run(reports.all)
+        return {"reports": [one.told() for one in found], "folder": str(reports.folder)}
+
+    @app.get(f"{PREFIX}/reports/{{name}}", summary="A report", response_class=Response)
+    async def report(name: ReportName) -> Response:
+        page = await waiting.run(lambda: reports.page(name))
+        headers = {"Content-Security-Policy": REPORT, "Cross-Origin-Opener-Policy": "same-origin"}
+        return Response(page, media_type="text/html; charset=utf-8", headers=headers)

@@ -1,0 +1,161 @@
+"""What is told of guided bench calibrations and of reports, as /openapi.json describes it."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import Field
+
+from mastctl.guided.told import MOST_CELLS, State, Step
+from mastctl.web.answers import Angles, Count, MaybePixel, Pixel, _Told
+
+Cells = Annotated[list[Count], Field(min_length=MOST_CELLS, max_length=MOST_CELLS)]
+Pair = Annotated[list[float], Field(min_length=2, max_length=2)]
+OnCurve = Annotated[list[float], Field(min_length=2, max_length=2)]
+"""Pictures of a camera, and the rms predicted with them, pixels."""
+
+
+class PlacementAsked(_Told):
+    """Where a board is asked for, from the head's axes; ``waits``: until somebody says that it stands.
+
+    ``bearing_deg`` to the right of pan zero, ``height_deg`` above the axes, ``turned_deg``: its face, to the
+    head's right and upwards.
+    """
+
+    name: str
+    range_m: float
+    bearing_deg: float
+    height_deg: float
+    turned_deg: Pair
+    words: str
+    waits: bool
+
+
+class CoverageTold(_Told):
+    """How many corners were seen in each cell of a camera's picture, 8 in a row, 6 rows."""
+
+    size_px: Annotated[list[Count], Field(min_length=2, max_length=2)]
+    cells: Cells
+
+
+class ReasonTold(_Told):
+    """One reason of a verdict."""
+
+    grade: str
+    sentence: str
+
+
+class VerdictTold(_Told):
+    """Whether to trust a calibration: ``good``, ``care``, ``bad``, and why."""
+
+    grade: str
+    words: str
+    reasons: list[ReasonTold]
+
+
+class ResidualTold(_Told):
+    """Rms of a camera's corners: fitted, not fitted, and what was promised of those that were not."""
+
+    camera: str
+    rms_px: Pixel | None
+    check_rms_px: MaybePixel | None
+    promised_px: float | None
+
+
+class BenchResult(_Told):
+    """What came of a bench calibration.
+
+    ``pointing_...``: corners that were pointed at, measured and promised; ``calibrated_px``, ``counts_px``:
+    what the calibration, and the encoders' counts alone, leave of a first pointing, rms an axis.
+    """
+
+    verdict: VerdictTold
+    cameras: list[ResidualTold]
+    pointing_rms_px: Pixel | None
+    pointing_promised_px: float | None
+    pointings: Count
+    calibrated_px: float | None
+    counts_px: float | None
+    pictures: Count
+    placements: Count
+    rover_s: float | None
+    notes: list[str]
+
+
+class BenchRunTold(_Told):
+    """A bench calibration as far as it is known; ``asking`` waits for a placement."""
+
+    name: str
+    begun: str
+    by: str
+    state: State
+    step: Step
+    code: str | None
+    sentence: str
+    simulated: bool | None
+    by_hand: bool
+    wanted_px: float
+    board_m: Pair | None
+    asked: PlacementAsked | None
+    placements: Count
+    pictures: Count
+    most: Count
+    predicted_px: float | None
+    target_px: float | None
+    floor_px: float | None
+    expected_px: float | None
+    next_rad: Angles | None
+    cameras: dict[str, CoverageTold]
+    curve: list[OnCurve]
+    sentences: list[str]
+    odd: Count
+    result: BenchResult | None
+    mast_file: str | None
+    report: str | None
+
+
+class BenchListed(_Told):
+    """A bench calibration whose folder is there."""
+
+    name: str
+    begun: str
+    by: str
+    board: str
+    state: Literal["running", "done", "interrupted", "damaged"]
+    sentence: str
+    pictures: Count
+    grade: str | None
+    mast_file: str | None
+    report: str | None
+
+
+class BenchTold(_Told):
+    """The bench calibration at work or the last one, those whose folders are there, and packaged boards."""
+
+    run: BenchRunTold | None
+    runs: list[BenchListed]
+    boards: list[str]
+    folder: str
+    masts_folder: str
+    simulated: bool
+
+
+class BenchBegun(_Told):
+    """A bench calibration that has begun or goes on, is answered, or has ended."""
+
+    run: BenchRunTold
+
+
+class ReportListed(_Told):
+    """A report that can be read."""
+
+    name: str
+    title: str
+    written: str
+
+
+class ReportsTold(_Told):
+    """The reports, the newest first, and the folder where others may be put."""
+
+    reports: list[ReportListed]
+    folder: str
