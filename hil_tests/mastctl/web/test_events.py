@@ -20,7 +20,8 @@ from hil_tests.described_answers import closed
 from hil_tests.mastctl.service_fakes import FakeHardware, ScriptedLoop, eventually
 from hil_tests.mastctl.web.network import NAME, Network, network_daemon
 from mastctl.daemon import RunningDaemon
-from mastctl.guided.told import Run, heard
+from mastctl.guided.told import Run
+from mastctl.guided.told import heard as bench_heard
 from mastctl.state.publisher import TOPICS
 from mastctl.web import events as events_module
 from mastctl.web import sockets as sockets_module
@@ -87,7 +88,7 @@ def test_each_topic_is_told_by_the_model_that_openapi_describes(pair: BOTH) -> N
         http.get("/api/v1/snapshot/navcam_left")
     publisher = daemon.service.machine.publisher
     publisher.publish("fault", "a device", ())
-    run = heard(Run("20261122-120000", "2026-11-22T12:00:00+00:00", "Ana"), BENCH_BEGUN)
+    run = bench_heard(Run("20261122-120000", "2026-11-22T12:00:00+00:00", "Ana"), BENCH_BEGUN)
     publisher.publish("bench", "run", run)
     seen: set[str] = set()
     with socket_of(daemon.url) as line:
