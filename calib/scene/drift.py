@@ -10,13 +10,14 @@ of its features, and each rest one of both joints.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
 
+from calib.camera.cahvor import CameraModel
 from calib.fit.significance import chance, sigmas
 from calib.mast.rig import Rig
 from calib.rigid import FloatArray, Rigid, rot_x, rot_y, rot_z
@@ -38,7 +39,9 @@ LEAST_FEATURES = 8
 LEAST_PART, MOST_SPREAD_PX = 0.4, 1.5
 """Fewer of a view's features that move as one, or less alike, and it says nothing: fog, another scene."""
 
-RANGE_M = 5.0
+NEAREST_M, FARTHEST_M = 1.0, 30.0
+"""What is seen is taken to lie on level ground under the rover, within these ranges."""
+
 _TUKEY = 4.0
 _BIT = 1e-6
 
@@ -114,7 +117,8 @@ class Drift:
     """What a look says: views that told something and not, the changes by likelihood, and the one to name.
 
     ``named`` is the plainest change that explains nearly all; None below ``ALARM_SIGMAS``. ``instead`` are
-    others that would do as well: these pictures cannot tell them from it.
+    others that would do as well: these pictures cannot tell them from it. ``missing`` says why a camera, or
+    one at a rest, gave no picture.
     """
 
     views: int
@@ -122,6 +126,7 @@ class Drift:
     changes: tuple[Change, ...]
     named: Change | None
     instead: tuple[str, ...] = ()
+    missing: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def sentence(self) -> str:
@@ -250,15 +255,29 @@ def _noise(
 
 def _columns(rig: Rig, shifts: Sequence[ViewShift]) -> dict[str, FloatArray]:
     """By number that may change: how the views' numbers follow it (4v,)."""
-    views = [_responses(rig, shift.camera, shift.pan_rad, shift.tilt_rad) for shift in shifts]
+    views = [_responses(rig, shift) for shift in shifts]
     names = list(dict.fromkeys(name for view in views for name in view))
     nothing = np.zeros(4)
     return {name: np.concatenate([view.get(name, nothing) for view in views]) for name in names}
 
 
+def _responses(rig: Rig, shift: ViewShift) -> dict[str, FloatArray]:
+    """By number that may change: how a view's four numbers, taken from its own features, follow it."""
+    model, changed = _changed(rig, shift.camera, shift.pan_rad, shift.tilt_rad)
+    pixels = shift.pixels_px
+    rays = model.ray(pixels)
+    points = rays.origins_m + _ranges_m(rays.origins_m, rays.directions)[:, None] * rays.directions
+    rates = _rates(pixels, model.size_px).reshape(-1, 4)
+    moved_px = [np.nan_to_num(other.project(points)[0] - pixels).ravel() / _BIT for other in changed.values()]
+    numbers = np.linalg.lstsq(rates, np.column_stack(moved_px), rcond=None)[0]
+    return {name: np.asarray(numbers[:, k], dtype=np.float64) for k, name in enumerate(changed)}
+
+
 @lru_cache(maxsize=1024)
-def _responses(rig: Rig, camera: str, pan_rad: float, tilt_rad: float) -> dict[str, FloatArray]:
-    """By number that may change: how a view's four numbers follow it, per unit of it."""
+def _changed(
+    rig: Rig, camera: str, pan_rad: float, tilt_rad: float
+) -> tuple[CameraModel, dict[str, CameraModel]]:
+    """A camera in the rover, and by number that may change: as it is after a bit of that."""
     model = rig.camera_in_rover(camera, pan_rad, tilt_rad)
     changed = {
         "pan": rig.camera_in_rover(camera, pan_rad + _BIT, tilt_rad),
@@ -271,18 +290,15 @@ def _responses(rig: Rig, camera: str, pan_rad: float, tilt_rad: float) -> dict[s
             name = f"cameras.{camera}.{part}"
             moved = corrected(rig, [name], np.array([_BIT]))
             changed[name] = moved.camera_in_rover(camera, pan_rad, tilt_rad)
-    width, height = model.size_px
-    x, y = np.meshgrid(np.linspace(0.1, 0.9, 5) * width, np.linspace(0.1, 0.9, 5) * height)
-    pixels = np.stack([x.ravel(), y.ravel()], axis=1)
-    rays = model.ray(pixels)
-    points = rays.origins_m + RANGE_M * rays.directions
-    rates = _rates(pixels, model.size_px).reshape(-1, 4)
-    found = {}
-    for name, other in changed.items():
-        moved_px = np.nan_to_num(other.project(points)[0] - pixels) / _BIT
-        numbers = np.linalg.lstsq(rates, moved_px.ravel(), rcond=None)[0]
-        found[name] = np.asarray(numbers, dtype=np.float64)
-    return found
+    return model, changed
+
+
+def _ranges_m(origins_m: FloatArray, directions: FloatArray) -> FloatArray:
+    """How far rays (n, 3) of the rover frame go to level ground at z = 0; where they do not, to far away."""
+    down = directions[:, 2]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ranges = np.where((down > 0.0) & (origins_m[:, 2] < 0.0), -origins_m[:, 2] / down, FARTHEST_M)
+    return np.asarray(np.clip(ranges, NEAREST_M, FARTHEST_M))
 
 
 def _rates(pixels: FloatArray, size_px: tuple[int, int]) -> FloatArray:

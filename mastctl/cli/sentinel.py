@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import argparse
-import time
-from datetime import UTC, datetime
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -33,13 +34,22 @@ def add_commands(subparsers: argparse._SubParsersAction[Any]) -> None:
     reference.set_defaults(run=_reference)
     look = acts.add_parser("look", help="take them again and tell what has changed; 1 if something has")
     look.set_defaults(run=_look)
-    watch = acts.add_parser("watch", help="look again and again, whenever nobody steers, until Ctrl-C")
+    watch = acts.add_parser(
+        "watch", help="look again and again, whenever nobody needs the head, until Ctrl-C"
+    )
     watch.add_argument(
         "--every-s",
         type=positive_number,
         default=86400.0,
         metavar="S",
-        help="how often (default: once a day)",
+        help="how often, from the reference's time of day on (default: once a day)",
+    )
+    watch.add_argument(
+        "--idle-s",
+        type=positive_number,
+        default=300.0,
+        metavar="S",
+        help="how long nobody must have used the head (default 300 s)",
     )
     watch.set_defaults(run=_watch)
     status = acts.add_parser("status", help="what the looks so far say; 1 if something has changed")
@@ -62,24 +72,34 @@ def _rest(text: str) -> tuple[float, float]:
     return pan, tilt
 
 
-def _now() -> str:
-    return datetime.now(UTC).isoformat(timespec="seconds")
+@contextmanager
+def _steering(args: argparse.Namespace, client: Client) -> Iterator[None]:
+    """Steer alone: under the lease that was named, or one of its own."""
+    if args.lease is not None:
+        yield
+        return
+    with client.lease(NAME, for_s=120.0):
+        yield
 
 
 def _reference(args: argparse.Namespace) -> int:
     from mastctl.sentinel.folder import save_reference
     from mastctl.sentinel.look import head_cameras, take_pictures, usual_rests
+    from mastctl.sentinel.watch import now_utc
 
-    with client_of(args) as client, client.lease(NAME, for_s=120.0):
+    with client_of(args) as client, _steering(args, client):
         rests = args.rest or usual_rests(client)
         _, cameras = head_cameras(client)
         if not cameras:
             raise output.CommandError("no_camera", "the daemon has no camera on the head")
         with output.waiting(args.json, f"taking {len(rests)} rests"):
-            pictures = take_pictures(client, rests, cameras)
-    saved = save_reference(args.folder, _now(), rests, pictures)
-    taken = f"{len(saved.pictures)} pictures at {len(rests)} rests"
-    words = f"{args.folder}: {taken}, mast file {saved.mast_digest[:12]}"
+            taken = take_pictures(client, rests, cameras)
+    if taken.missing:
+        which, why = next(iter(taken.missing.items()))
+        raise output.CommandError("no_picture", f"no reference was taken: {which}: {why}")
+    saved = save_reference(args.folder, now_utc().isoformat(timespec="seconds"), rests, taken.pictures)
+    counts = f"{len(saved.pictures)} pictures at {len(rests)} rests"
+    words = f"{args.folder}: {counts}, mast file {saved.mast_digest[:12]}"
     told = {
         "folder": str(args.folder),
         "pictures": len(saved.pictures),
@@ -89,29 +109,28 @@ def _reference(args: argparse.Namespace) -> int:
     return 0
 
 
-def _look_once(args: argparse.Namespace, client: Client) -> dict[str, Any]:
+def _look(args: argparse.Namespace) -> int:
     from mastctl.sentinel.folder import add_look, read_reference
     from mastctl.sentinel.look import look_again
+    from mastctl.sentinel.watch import now_utc
 
     reference = read_reference(args.folder)
     with (
-        client.lease(NAME, for_s=120.0),
+        client_of(args) as client,
+        _steering(args, client),
         output.waiting(args.json, f"looking at {len(reference.rests)} rests"),
     ):
         drift = look_again(client, reference)
-    return add_look(args.folder, _now(), drift)
-
-
-def _look(args: argparse.Namespace) -> int:
-    with client_of(args) as client:
-        told = _look_once(args, client)
-    return _tell(args, told)
+    return _tell(args, add_look(args.folder, reference, now_utc().isoformat(timespec="seconds"), drift))
 
 
 def _tell(args: argparse.Namespace, look: dict[str, Any] | None) -> int:
-    from mastctl.sentinel.folder import read_looks, standing
+    from mastctl.sentinel.folder import read_looks, read_reference
+    from mastctl.sentinel.standing import standing
+    from mastctl.sentinel.watch import now_utc
 
-    now = standing(read_looks(args.folder), datetime.now(UTC))
+    reference = read_reference(args.folder)
+    now = standing(reference, read_looks(args.folder, reference), now_utc())
     told = {
         "level": now.level,
         "sentence": now.sentence,
@@ -120,31 +139,29 @@ def _tell(args: argparse.Namespace, look: dict[str, Any] | None) -> int:
         "look": look,
     }
     tell_result(args, told, now.sentence)
+    for which, why in (look or {}).get("missing", {}).items():
+        output.tell(f"{which}: no picture: {why}")
     return 1 if now.level == "bad" else 0
 
 
 def _watch(args: argparse.Namespace) -> int:
-    from mastctl.client import ClientError
-    from mastctl.errors import MastctlError
-    from mastctl.sentinel.folder import read_reference
-    from mastctl.sentinel.look import is_idle
+    from mastctl.sentinel.watch import watch
 
-    read_reference(args.folder)
-    while True:
-        try:
-            with client_of(args) as client:
-                if why := is_idle(client):
-                    output.tell(f"no look now: {why}")
-                else:
-                    _look_once(args, client)
-                    _tell(args, None)
-        except (ClientError, MastctlError) as error:
-            output.tell(f"no look now: {error}")
-        time.sleep(args.every_s)
+    watch(
+        args.folder,
+        lambda: client_of(args),
+        output.tell,
+        lambda look: _flush(_tell(args, look)),
+        args.every_s,
+        args.idle_s,
+    )
+    return 0
+
+
+def _flush(_code: int) -> None:
+    """What a look found is to be read at once, also through a pipe."""
+    sys.stdout.flush()
 
 
 def _status(args: argparse.Namespace) -> int:
-    from mastctl.sentinel.folder import read_reference
-
-    read_reference(args.folder)
     return _tell(args, None)

@@ -365,6 +365,9 @@ def _status_rows(status: Status) -> Iterator[tuple[str, str]]:
     calibration = status["calibration"]
     if calibration is not None:
         yield "calibration", calibration["sentence"]
+    sentinel = status["sentinel"]
+    if sentinel is not None and sentinel["level"] != "none":
+        yield "drift", sentinel["sentence"]
     yield "up", f"{status['uptime_s']:.0f} s, version {status['version']}"
 
 

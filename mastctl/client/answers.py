@@ -139,7 +139,9 @@ class BoxTold(TypedDict):
 
 
 class CalibrationHealthTold(TypedDict):
-    """``GET /calibration/health``: the verdict, its figures, and the newest pointings that count."""
+    """``GET /calibration/health``: the verdict, its figures, the newest pointings that count, and what the
+    drift sentinel's looks say.
+    """
 
     verdict: Literal["good", "drifts", "few", "unknown"]
     sentence: str
@@ -152,6 +154,7 @@ class CalibrationHealthTold(TypedDict):
     cameras: dict[str, TurnedTold]
     not_kept: str | None
     newest: list[MeasuredTold]
+    sentinel: SentinelTold | None
 
 
 class CalibrationTold(TypedDict):
@@ -895,6 +898,7 @@ class Status(TypedDict):
     control: ControlTold | None
     stop_socket: str | None
     calibration: CalibrationTold | None
+    sentinel: SentinelTold | None
     cameras: dict[str, CameraTold]
     faults: list[FaultTold]
     mast: MastTold

@@ -96,7 +96,11 @@ class Client:
 
     @contextmanager
     def lease(
-        self, name: str | None = None, for_s: float = 30.0, take_over: str | None = None
+        self,
+        name: str | None = None,
+        for_s: float = 30.0,
+        take_over: str | None = None,
+        gives_way: bool = False,
     ) -> Iterator[HeldLease]:
         """Steer alone inside the block: a thread renews the lease, and this client's commands carry it.
 
@@ -108,6 +112,9 @@ class Client:
             How long it outlives a holder that falls silent, 1 to 3600 s.
         take_over
             Why it is taken from whoever steers; None waits for nobody and takes nothing away.
+        gives_way
+            Whether it ends as soon as anybody else wants to steer, or stops the head: for what is done when
+            nobody needs the head.
 
         Yields
         ------
@@ -119,7 +126,7 @@ class Client:
         ClientError
             ``leased`` if somebody else steers.
         """
-        granted = self.acquire_lease(name, for_s, take_over)
+        granted = self.acquire_lease(name, for_s, take_over, gives_way)
         before, held = self._daemon.lease_id, HeldLease(self._daemon, granted, for_s)
         self._daemon.lease_id = held.id
         try:
@@ -134,7 +141,11 @@ class Client:
         return cast("ControlTold | None", found)
 
     def acquire_lease(
-        self, name: str | None = None, for_s: float = 30.0, take_over: str | None = None
+        self,
+        name: str | None = None,
+        for_s: float = 30.0,
+        take_over: str | None = None,
+        gives_way: bool = False,
     ) -> LeaseGranted:
         """Acquire or take over a lease that nobody renews; arguments as for `lease`.
 
@@ -147,6 +158,8 @@ class Client:
             return cast(
                 "LeaseGranted", self._daemon.command("POST", "/lease/take", body | {"reason": take_over})
             )
+        if gives_way:
+            body["gives_way"] = True
         return cast("LeaseGranted", self._daemon.command("POST", "/lease", body))
 
     def use_lease(self, lease_id: str | None) -> None:

@@ -216,6 +216,7 @@ class Entry:
 
     def first(self, command: Command, asked: Asked, act: Callable[[], Answer]) -> Answer:
         """Carry out a stop: it acts before anything is asked, locked or written, and is recorded after."""
+        self.leases.stop_came()  # takes no lock
         try:
             answer = act()
         except BaseException as error:

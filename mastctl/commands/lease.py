@@ -37,13 +37,18 @@ class Leased(NotNow):
 
 @dataclass(frozen=True)
 class Lease:
-    """The right to steer until ``until_s``, seconds of the lease's clock."""
+    """The right to steer until ``until_s``, seconds of the lease's clock.
+
+    One that ``gives_way`` ends as soon as anybody else wants to steer, or stops the head.
+    """
 
     id: str
     holder: str
     since_s: float
     for_s: float
     until_s: float
+    gives_way: bool = False
+    stops: object = None  # of those there were when it was granted, the last
 
 
 @dataclass(frozen=True)
@@ -88,6 +93,9 @@ class Leases:
         Whether an operation or a track runs; called with the lock held, so it must take none.
     on_change
         Told who steers after each change, and that a lease has ended by time when somebody asks next.
+    give_way
+        Stops what runs under a lease that gives way, before who came for it goes on; gets why. Called
+        without the lock.
     """
 
     def __init__(
@@ -95,10 +103,13 @@ class Leases:
         clock: Clock,
         running: Callable[[], bool],
         on_change: Callable[[Control | None], None] = lambda control: None,
+        give_way: Callable[[str], object] = lambda why: None,
     ) -> None:
         self._clock = clock
         self._running = running
         self._on_change = on_change
+        self._give_way = give_way
+        self._last_stop: object = None
         self._lock = threading.Lock()
         self._lease: Lease | None = None
         self._over: dict[str, str] = {}  # id of an ended lease: how it ended
@@ -108,7 +119,7 @@ class Leases:
     def control(self) -> Control | None:
         """Return who steers now, None for nobody."""
         lease = self._lease
-        if lease is not None and self._clock.now_s() < lease.until_s:
+        if lease is not None and self._clock.now_s() < lease.until_s and not self._was_stopped(lease):
             return Control(lease.holder, "lease", lease.until_s)
         under_way = next(iter(tuple(self._under_way.values())), None)
         party = under_way or (self._party if self._running() else None)
@@ -123,8 +134,14 @@ class Leases:
         """Return a lease as `told` would, whoever steers meanwhile."""
         return Control(lease.holder, "lease", lease.until_s).told(self._clock.now_s())
 
-    def acquire(self, caller: Caller, name: str | None = None, for_s: float = USUAL_S) -> Lease:
-        """Return a new lease if nobody else steers.
+    def stop_came(self) -> None:
+        """End a lease that gives way, since somebody stops the head. Takes no lock, waits for nothing."""
+        self._last_stop = object()
+
+    def acquire(
+        self, caller: Caller, name: str | None = None, for_s: float = USUAL_S, gives_way: bool = False
+    ) -> Lease:
+        """Return a new lease if nobody else steers, or who does gives way.
 
         Parameters
         ----------
@@ -134,6 +151,8 @@ class Leases:
             The holder's name, the caller's by default.
         for_s
             How long, seconds.
+        gives_way
+            Whether it ends as soon as anybody else wants to steer, or stops the head.
 
         Raises
         ------
@@ -141,11 +160,16 @@ class Leases:
             If somebody steers.
         BadRequest
             If ``for_s`` is out of bounds.
+        DriverError
+            If what runs under a lease that gives way could not be stopped; the new lease stands.
         """
         _check_time(for_s)
         with self._changing():
-            self._check_free(caller)
-            return self._grant(name or caller.name, for_s)
+            why = self._check_free(caller)
+            lease = self._grant(name or caller.name, for_s, gives_way)
+        if why:
+            self._give_way(why)
+        return lease
 
     def holds(self, lease_id: str) -> bool:
         """Return whether a lease runs now; takes no lock."""
@@ -179,12 +203,17 @@ class Leases:
     def take(self, caller: Caller, reason: str, name: str | None = None, for_s: float = USUAL_S) -> Lease:
         """Return a new lease, whoever steers; the former holder is told by whom it was taken, and why.
 
-        What runs goes on. Raises BadRequest if ``for_s`` is out of bounds.
+        What runs goes on, but for what runs under a lease that gives way. Raises as `acquire`.
         """
         _check_time(for_s)
         with self._changing():
-            self._end(f"{name or caller.name} took over: {reason}")
-            return self._grant(name or caller.name, for_s)
+            gave_way = self._lease is not None and self._lease.gives_way and self._running()
+            how = f"{name or caller.name} took over: {reason}"
+            self._end(how)
+            lease = self._grant(name or caller.name, for_s)
+        if gave_way:
+            self._give_way(how)
+        return lease
 
     @contextmanager
     def steering(self, caller: Caller, lease_id: str | None) -> Iterator[None]:
@@ -198,16 +227,20 @@ class Leases:
             If somebody else steers.
         NotNow
             ``lease_over``, ``lease_unknown``, for the lease that came with it.
+        DriverError
+            If what runs under a lease that gives way could not be stopped.
         """
-        ticket = object()
+        ticket, why = object(), ""
         with self._changing():
             if lease_id is not None:
                 party = self._held_by(lease_id).holder
             else:
-                self._check_free(caller)
+                why = self._check_free(caller)
                 party = caller.name
             self._under_way[ticket] = party
         try:
+            if why:
+                self._give_way(why)
             yield
         finally:
             with self._changing():
@@ -225,6 +258,8 @@ class Leases:
                 before = self._lease
                 if before is not None and self._clock.now_s() >= before.until_s:
                     self._end(f"its {before.for_s:g} s were over")
+                elif before is not None and self._was_stopped(before):
+                    self._end("the head was stopped")
                 try:
                     yield
                 finally:
@@ -233,11 +268,23 @@ class Leases:
             if changed:
                 self._on_change(self.control())
 
-    def _check_free(self, caller: Caller) -> None:
-        """Pass unless a lease runs, or somebody of another name steers. Raises Leased."""
+    def _check_free(self, caller: Caller) -> str:
+        """Pass unless a lease runs, or somebody of another name steers. Raises Leased.
+
+        A lease that gives way is ended; returns why what runs under it is to be stopped, '' if nothing does.
+        """
+        lease = self._lease
+        if lease is not None and lease.gives_way:
+            why = f"{caller.name} wants to steer, and {lease.holder} gives way"
+            self._end(why)
+            return why if self._running() else ""
         control = self.control()
         if control is not None and (control.kind == "lease" or control.holder != caller.name):
             raise Leased(control, self._clock.now_s())
+        return ""
+
+    def _was_stopped(self, lease: Lease) -> bool:
+        return lease.gives_way and lease.stops is not self._last_stop
 
     def _held_by(self, lease_id: str) -> Lease:
         """Return the lease that runs, if it is this one."""
@@ -249,9 +296,11 @@ class Leases:
             raise NotNow("lease_unknown", "the lease is not known, or ended long ago; acquire one")
         raise NotNow("lease_over", f"the lease has ended: {how}; acquire another")
 
-    def _grant(self, holder: str, for_s: float) -> Lease:
+    def _grant(self, holder: str, for_s: float, gives_way: bool = False) -> Lease:
         now_s = self._clock.now_s()
-        self._lease = Lease(secrets.token_hex(16), holder, now_s, for_s, now_s + for_s)
+        self._lease = Lease(
+            secrets.token_hex(16), holder, now_s, for_s, now_s + for_s, gives_way, self._last_stop
+        )
         return self._lease
 
     def _end(self, how: str) -> None:

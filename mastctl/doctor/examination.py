@@ -17,7 +17,8 @@ from mastctl.doctor.host import examine_clock, examine_descriptors, examine_fold
 from mastctl.doctor.mast_file import examine_mast_file
 from mastctl.doctor.serial_lines import examine_port
 from mastctl.safety.state_folder import usual_folder
-from mastctl.sentinel.folder import REFERENCE, read_looks, standing
+from mastctl.sentinel.folder import SENTINEL_FOLDER
+from mastctl.sentinel.standing import read_folder, standing
 
 Asked = Callable[[str], Mapping[str, Any] | None]
 """Returns the status of the daemon at an address, None if nobody answers there."""
@@ -55,16 +56,20 @@ def examine(path: str | None, asked: Asked, machine: Machine | None = None) -> I
     yield from examine_folder(
         "state folder", config.state_folder or usual_folder(config.path, config.listen.url)
     )
-    yield from _sentinel((config.state_folder or usual_folder(config.path, config.listen.url)) / "sentinel")
+    state_folder = config.state_folder or usual_folder(config.path, config.listen.url)
+    yield from _sentinel(state_folder / SENTINEL_FOLDER)
     yield examine_clock()
     yield examine_descriptors()
 
 
 def _sentinel(folder: Path) -> Iterator[Finding]:
     """What the drift sentinel's looks say, where it keeps them in the state folder."""
-    if not (folder / REFERENCE).is_file():
+    reference, looks, wrong = read_folder(folder)
+    if wrong:
+        yield Finding("drift", "unsure", wrong, "take a new reference: mastctl sentinel reference")
+    if reference is None:
         return
-    now = standing(read_looks(folder), datetime.now(UTC))
+    now = standing(reference, looks, datetime.now(UTC))
     advice = "" if now.level == "good" else "look again: mastctl sentinel look; if it stays, calibrate again"
     level: Level = "unsure" if now.level != "good" else "good"  # the daemon works all the same
     yield Finding("drift", level, now.sentence, advice)

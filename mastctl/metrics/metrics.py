@@ -186,6 +186,7 @@ class _Now:
         yield failed
         yield from _steering(status.get("control"))
         yield from _calibration(status.get("calibration"))
+        yield from _sentinel(status.get("sentinel"))
 
 
 def _steering(control: Mapping[str, Any] | None) -> Iterable[Metric]:
@@ -198,6 +199,17 @@ def _steering(control: Mapping[str, Any] | None) -> Iterable[Metric]:
             left.add_metric([], float(control["for_s"]))
     yield held
     yield left
+
+
+def _sentinel(told: Mapping[str, Any] | None) -> Iterable[Metric]:
+    """What the drift sentinel's looks say; nothing without a reference."""
+    if told is not None and told["reference"] is not None:
+        bad = float(told["level"] == "bad")
+        yield GaugeMetricFamily("mastctl_sentinel_drift", "1 if looks found a change.", bad)
+        if told["age_s"] is not None:
+            yield GaugeMetricFamily(
+                "mastctl_sentinel_look_age_seconds", "Since the last look.", told["age_s"]
+            )
 
 
 def _calibration(told: Mapping[str, Any] | None) -> Iterable[Metric]:

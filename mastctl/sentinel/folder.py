@@ -1,10 +1,12 @@
-"""What a sentinel keeps: its reference pictures, a line for each look, and what the looks say together."""
+"""What a sentinel keeps: its reference pictures, and a line for each look."""
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 import shutil
+import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -16,15 +18,20 @@ import numpy as np
 
 from calib.errors import BadFile
 from calib.files import read_bytes
+from calib.files.atomic import replace_bytes
 from calib.files.strict import Section
 from calib.pictures.warp import Grey, grey
 from calib.scene.drift import Drift
 
 SCHEMA = "mastctl/sentinel/1"
+SENTINEL_FOLDER = "sentinel"
+"""In a daemon's state folder: there its status finds it."""
+
 REFERENCE, LOOKS = "reference.json", "looks.jsonl"
-MOST_BYTES = 4_000_000
-CONFIRMED = 2
-"""So many looks one after the other must name the same change before it is told."""
+MOST_BYTES, MOST_PICTURE_BYTES = 4_000_000, 1 << 28
+PICTURE_KEYS = ("camera", "pose", "pan_rad", "tilt_rad", "file", "sha256")
+MOST_LOOKS_BYTES = 16_000_000
+"""Of the looks' file; what is older than that is not read."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,33 +56,28 @@ class Reference:
     pictures: tuple[Mapping[str, Any], ...]
     folder: Path
 
+    @property
+    def cameras(self) -> tuple[str, ...]:
+        """The cameras that it has pictures of."""
+        return tuple(dict.fromkeys(str(one["camera"]) for one in self.pictures))
+
+    def check(self) -> None:
+        """Pass if all pictures can be read. Raises BadFile."""
+        for one in self.pictures:
+            self.picture(one["camera"], one["pose"])
+
     def picture(self, camera: str, pose: int) -> Picture | None:
         """Return a picture, None if the reference has none of this camera there. Raises BadFile."""
         for told in self.pictures:
             if told["camera"] == camera and told["pose"] == pose:
                 path = self.folder / told["file"]
-                data = np.frombuffer(read_bytes(path, 1 << 28), np.uint8)
-                image = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE)
+                data = read_bytes(path, MOST_PICTURE_BYTES)
+                whole = hashlib.sha256(data).hexdigest() == told["sha256"]
+                image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE) if whole else None
                 if image is None:
-                    raise BadFile(path, "", "is no picture that can be read; take the reference again")
+                    raise BadFile(path, "", "is not the picture that was taken; take the reference again")
                 return Picture(camera, pose, told["pan_rad"], told["tilt_rad"], self.mast_digest, grey(image))
         return None
-
-
-@dataclass(frozen=True)
-class Standing:
-    """What the looks say together.
-
-    level
-        ``good``, ``bad`` for a change that two looks name alike, ``unsure`` for none, one, or silent ones.
-    sentence
-        For a person.
-    """
-
-    level: str
-    sentence: str
-    looks: int
-    since: str | None
 
 
 def save_reference(
@@ -90,36 +92,38 @@ def save_reference(
     BadFile
         If the file system refuses.
     """
-    told = []
+    inner = None
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        stamp = "".join(c for c in time if c.isdigit())
-        inner = folder / f"pictures-{stamp}"
-        inner.mkdir(exist_ok=True)
-        for one in pictures:
-            name = f"{inner.name}/{one.pose}-{one.camera}.png"
-            if not cv2.imwrite(str(folder / name), np.clip(np.rint(one.image), 0, 255).astype(np.uint8)):
-                raise OSError(None, "the picture cannot be written")
-            told.append(
-                {
-                    "camera": one.camera, "pose": one.pose, "pan_rad": one.pan_rad, "tilt_rad": one.tilt_rad,
-                    "file": name,
-                }
-            )  # fmt: skip
+        inner = Path(tempfile.mkdtemp(prefix="pictures-", dir=folder))
+        told = [_saved(folder, inner, one) for one in pictures]
         document = {
             "schema": SCHEMA, "time": time, "mast_digest": pictures[0].mast_digest,
             "rests": [list(rest) for rest in rests], "pictures": told,
         }  # fmt: skip
-        (folder / LOOKS).unlink(missing_ok=True)
-        new = folder / (REFERENCE + ".new")
-        new.write_text(json.dumps(document, indent=1))
-        new.replace(folder / REFERENCE)
-        for old in folder.glob("pictures-*"):
-            if old != inner:
-                shutil.rmtree(old)
+        replace_bytes(folder / REFERENCE, json.dumps(document, indent=1).encode(), 0o644)
     except OSError as error:
+        if inner is not None:
+            shutil.rmtree(inner, ignore_errors=True)  # what was there before still counts
         raise BadFile(folder, "", f"cannot be written: {error.strerror or error}") from None
+    (folder / LOOKS).unlink(missing_ok=True)
+    for old in folder.glob("pictures-*"):
+        if old != inner:
+            shutil.rmtree(old, ignore_errors=True)
     return read_reference(folder)
+
+
+def _saved(folder: Path, inner: Path, one: Picture) -> dict[str, Any]:
+    """Write a picture; what the reference says of it. Raises OSError."""
+    done, png = cv2.imencode(".png", np.clip(np.rint(one.image), 0, 255).astype(np.uint8))
+    if not done:
+        raise OSError(None, f"{one.camera}'s picture cannot be written as PNG")
+    path = inner / f"{one.pose}-{one.camera}.png"
+    path.write_bytes(png.tobytes())
+    return {
+        "camera": one.camera, "pose": one.pose, "pan_rad": one.pan_rad, "tilt_rad": one.tilt_rad,
+        "file": str(path.relative_to(folder)), "sha256": hashlib.sha256(png.tobytes()).hexdigest(),
+    }  # fmt: skip
 
 
 def read_reference(folder: Path) -> Reference:
@@ -147,7 +151,7 @@ def read_reference(folder: Path) -> Reference:
         pair = Section(path, "", {f"rests[{at}]": rest}, (f"rests[{at}]",)).vector(f"rests[{at}]", 100.0, 2)
         rests.append((float(pair[0]), float(pair[1])))
     for at, one in enumerate(top.values["pictures"]):
-        told = Section(path, f"pictures[{at}]", one, ("camera", "pose", "pan_rad", "tilt_rad", "file"))
+        told = Section(path, f"pictures[{at}]", one, PICTURE_KEYS)
         pictures.append(
             {
                 "camera": told.text("camera"),
@@ -155,116 +159,79 @@ def read_reference(folder: Path) -> Reference:
                 "pan_rad": told.number("pan_rad", 100.0),
                 "tilt_rad": told.number("tilt_rad", 100.0),
                 "file": told.text("file"),
+                "sha256": told.text("sha256"),
             }
         )
-    return Reference(top.text("time"), top.text("mast_digest"), tuple(rests), tuple(pictures), folder)
+    time = top.text("time")
+    try:
+        datetime.fromisoformat(time).astimezone(UTC)
+    except (ValueError, OverflowError):
+        raise top.bad("time", f"{time!r} where a moment of ISO 8601 is expected") from None
+    return Reference(time, top.text("mast_digest"), tuple(rests), tuple(pictures), folder)
 
 
-def add_look(folder: Path, time: str, drift: Drift) -> dict[str, Any]:
-    """Append what a look found, and return it. Raises BadFile."""
+def add_look(folder: Path, reference: Reference, time: str, drift: Drift) -> dict[str, Any]:
+    """Append what a look at a reference found, and return it. Raises BadFile."""
     named = drift.named
     line = {
         "time": time,
+        "reference": reference.time,
         "views": drift.views,
         "silent": list(drift.silent),
+        "missing": dict(drift.missing),
         "named": None if named is None else named.what,
         "sentence": drift.sentence,
         "instead": list(drift.instead),
-        "sigmas": None if named is None else named.sigmas,
-        "values": None if named is None else named.values.tolist(),
-        "likeliest": [[change.what, change.sigmas] for change in drift.changes[:3]],
+        "changes": {
+            change.what: {
+                "sigmas": change.sigmas,
+                "values": change.values.tolist(),
+                "sigma": np.sqrt(np.diag(change.covariance)).tolist(),
+            }
+            for change in drift.changes
+        },
     }
+    path = folder / LOOKS
     try:
-        with (folder / LOOKS).open("a") as file:
-            file.write(json.dumps(line) + "\n")
+        with path.open("a+b") as file:
+            file.seek(max(file.seek(0, os.SEEK_END) - 1, 0))
+            torn = file.read(1) not in (b"", b"\n")  # a line that was cut costs only itself
+            file.write(b"\n" * torn + json.dumps(line).encode() + b"\n")
             file.flush()
             os.fsync(file.fileno())
     except OSError as error:
-        raise BadFile(folder / LOOKS, "", f"cannot be written: {error.strerror or error}") from None
+        raise BadFile(
+            path, "", f"cannot be written: {error.strerror or error}; the look is not kept"
+        ) from None
     return line
 
 
-def read_looks(folder: Path) -> list[dict[str, Any]]:
-    """Return the looks, oldest first; lines that were cut or spoiled are left out."""
-    looks = []
+def read_looks(folder: Path, reference: Reference) -> list[dict[str, Any]]:
+    """Return the looks at a reference, oldest first; lines that were cut or spoiled are left out.
+
+    Raises
+    ------
+    BadFile
+        If there is a file of looks that cannot be read.
+    """
+    path = folder / LOOKS
     try:
-        text = (folder / LOOKS).read_text(errors="replace")
-    except OSError:
+        with path.open("rb") as file:
+            file.seek(max(file.seek(0, os.SEEK_END) - MOST_LOOKS_BYTES, 0))
+            rows = file.read().splitlines()
+    except FileNotFoundError:
         return []
-    for row in text.splitlines():
-        try:
-            told = json.loads(row)
-        except ValueError:
-            continue
-        if isinstance(told, dict) and isinstance(told.get("time"), str) and "named" in told:
-            looks.append(told)
-    return looks
+    except OSError as error:
+        raise BadFile(path, "", f"cannot be read: {error.strerror or error}") from None
+    return [look for row in rows if (look := _look(row)) and look.get("reference") == reference.time]
 
 
-def standing(looks: Sequence[Mapping[str, Any]], now: datetime) -> Standing:
-    """Return what the looks say together; ``now`` for how long ago."""
-    telling = [look for look in looks if look.get("views")]
-    if not telling:
-        words = (
-            "no look yet"
-            if not looks
-            else f"{len(looks)} looks saw nothing they knew: night, fog, another place?"
-        )
-        return Standing("unsure", words, len(looks), None)
-    last = telling[-1]
-    if not last["named"]:
-        words = f"nothing has changed ({len(telling)} looks, the last {_ago(last['time'], now)} ago)"
-        return Standing("good", words, len(looks), None)
-    first = last
-    alike = 0
-    for look in reversed(telling):
-        if look["named"] != last["named"]:
-            break
-        first, alike = look, alike + 1
-    if alike < CONFIRMED:
-        return Standing("unsure", f"{last['sentence']}, seen once: look again", len(looks), first["time"])
-    return Standing("bad", f"{last['sentence']}, since {_ago(first['time'], now)}", len(looks), first["time"])
-
-
-def findings(folder: Path, mast_digest: str) -> dict[str, Any]:
-    """Return what a folder says, as ``GET /sentinel`` tells it; ``mast_digest``: of the mast file in use."""
-    now = datetime.now(UTC)
-    found: dict[str, Any] = {
-        "level": "none", "sentence": "no reference pictures have been taken", "looks": 0, "since": None,
-        "last_look": None, "age_s": None, "reference": None,
-    }  # fmt: skip
-    if not (folder / REFERENCE).is_file():
-        return found
+def _look(row: bytes) -> dict[str, Any] | None:
+    """A line of the looks' file, None if it is none."""
     try:
-        reference, looks = read_reference(folder), read_looks(folder)
-        says = standing(looks, now)
-    except BadFile as error:
-        return {**found, "level": "unsure", "sentence": str(error)}
-    except (KeyError, TypeError):
-        return {**found, "level": "unsure", "sentence": f"{folder / LOOKS} holds lines that are no looks"}
-    level, sentence = says.level, says.sentence
-    if reference.mast_digest != mast_digest:
-        level, sentence = "unsure", f"the reference is of another mast file: take a new one ({sentence})"
-    last = looks[-1]["time"] if looks else None
-    return {
-        "level": level, "sentence": sentence, "looks": says.looks, "since": says.since, "last_look": last,
-        "age_s": None if last is None else _age_s(last, now), "reference": reference.time,
-    }  # fmt: skip
-
-
-def _age_s(time: str, now: datetime) -> float | None:
-    try:
-        return max((now - datetime.fromisoformat(time)).total_seconds(), 0.0)
-    except (ValueError, TypeError):
+        told = json.loads(row)
+        datetime.fromisoformat(told["time"]).astimezone(UTC)
+        whole = isinstance(told["sentence"], str) and told["views"] >= 0
+    except (ValueError, TypeError, KeyError, OverflowError, RecursionError):
         return None
-
-
-def _ago(time: str, now: datetime) -> str:
-    """How long ago in words."""
-    age_s = _age_s(time, now)
-    if age_s is None:
-        return "an unknown time"
-    hours = age_s / 3600.0
-    if hours < 1.0:
-        return f"{60.0 * hours:.0f} min"
-    return f"{hours:.0f} h" if hours < 48.0 else f"{hours / 24.0:.0f} days"
+    return told if whole and isinstance(told["named"], str | None) else None

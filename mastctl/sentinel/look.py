@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -20,12 +22,22 @@ TURN_TIMEOUT_S = 90.0
 EDGE_RAD = 0.05
 TILTS_RAD = (-0.2, -0.5)
 IDLE = "ready"
+NOT_THE_CAMERA = frozenset({"lease_over", "lease_unknown", "leased", "no_daemon", "closing"})
+"""What a snapshot is refused with where no other camera would do better."""
 
 
 class LookEnded(MastctlError):
     """A look that was broken off: somebody stopped the head, or another mast file is in use."""
 
     code = "look_ended"
+
+
+@dataclass
+class Taken:
+    """Pictures of a look; ``missing``: why a camera, or one at a rest, gave none."""
+
+    pictures: list[Picture] = field(default_factory=list)
+    missing: dict[str, str] = field(default_factory=dict)
 
 
 def usual_rests(client: Client) -> list[tuple[float, float]]:
@@ -38,12 +50,16 @@ def usual_rests(client: Client) -> list[tuple[float, float]]:
     return [(pan, tilt) for tilt in dict.fromkeys(tilts) for pan in pans]
 
 
-def is_idle(client: Client) -> str:
-    """Return '' where a look disturbs nobody, else why it would."""
+def is_idle(client: Client, for_s: float = 0.0) -> str:
+    """Return '' where a look disturbs nobody, else why it would; ``for_s``: how long nothing has happened."""
     if (control := client.control()) is not None:
-        return f"{control.get('name', 'somebody')} steers"
+        return f"{control['holder']} steers"
     status = client.status()
-    return "" if status["state"] == IDLE else f"the daemon's state is {status['state']}"
+    state, reason = status["state"], status["reason"]
+    if state != IDLE:
+        return f"the daemon's state is {state}" + (f" ({reason})" if reason else "")
+    since_s = float(status["state_for_s"])
+    return "" if since_s >= for_s else f"the head was used {since_s:.0f} s ago; {for_s:.0f} s are waited for"
 
 
 def take_pictures(
@@ -51,40 +67,59 @@ def take_pictures(
     rests: Sequence[tuple[float, float]],
     cameras: Sequence[str],
     progress: Callable[[int, int], None] | None = None,
-) -> list[Picture]:
+) -> Taken:
     """Return a picture of each camera at each rest (true pan, tilt), and bring the head back to where it was.
 
-    The client should hold the lease.
+    The client should hold the lease. A camera that gives no picture is asked no more; the others go on.
 
     Raises
     ------
     LookEnded
         If somebody stops the head.
     ClientError
-        If the daemon refuses, or a camera fails.
+        If the daemon refuses, or no camera gives a picture.
     """
     joints = client.status()["joints"]
-    pictures = []
-    for pose, (pan_rad, tilt_rad) in enumerate(rests):
-        _turn(client, pan_rad, tilt_rad)
-        for camera in cameras:
-            shot = client.snapshot(camera)
-            if shot.moving:
-                raise LookEnded(f"the head moved while {camera} took its picture; nothing was kept")
-            pictures.append(Picture(camera, pose, *shot.true_rad, shot.mast_digest, grey(shot.image)))
-        if progress is not None:
-            progress(pose + 1, len(rests))
+    taken, asked = Taken(), list(cameras)
+    try:
+        for pose, (pan_rad, tilt_rad) in enumerate(rests):
+            _turn(client, pan_rad, tilt_rad)
+            for camera in tuple(asked):
+                try:
+                    shot = client.snapshot(camera)
+                except ClientError as error:
+                    if error.code in NOT_THE_CAMERA:
+                        raise
+                    taken.missing[f"{camera} at rest {pose}"] = str(error)
+                    if error.code == "bad_frame":
+                        continue  # too dark or too bright here: elsewhere it may see
+                    asked.remove(camera)
+                    if not asked and not taken.pictures:
+                        raise
+                    continue
+                if shot.moving:
+                    raise LookEnded(f"the head moved while {camera} took its picture; nothing was kept")
+                taken.pictures.append(
+                    Picture(camera, pose, *shot.true_rad, shot.mast_digest, grey(shot.image))
+                )
+            if progress is not None:
+                progress(pose + 1, len(rests))
+    except ClientError:
+        if joints is not None:
+            with suppress(ClientError, LookEnded):  # refused if somebody else steers by now
+                _turn(client, float(joints["pan_rad"]), float(joints["tilt_rad"]))
+        raise
     if joints is not None:
         _turn(client, float(joints["pan_rad"]), float(joints["tilt_rad"]))
-    return pictures
+    return taken
 
 
 def _turn(client: Client, pan_rad: float, tilt_rad: float) -> None:
     operation = client.wait(client.point(pan_rad=pan_rad, tilt_rad=tilt_rad), timeout_s=TURN_TIMEOUT_S)
+    told: Mapping[str, Any] = operation.get("error") or {}
     if operation["state"] == "stopped":
-        raise LookEnded("somebody stopped the head; nothing was kept")
+        raise LookEnded(f"{told.get('message', 'somebody stopped the head')}; nothing was kept")
     if operation["state"] != "done":
-        told: Mapping[str, Any] = operation.get("error") or {}
         raise ClientError(str(told.get("code", "failed")), str(told.get("message", "the move failed")))
 
 
@@ -100,34 +135,69 @@ def look_again(
 ) -> Drift:
     """Take the pictures of a reference again and return what has changed.
 
+    Nothing moves before it is known that the reference can be compared with.
+
     Raises
     ------
     LookEnded
-        If another mast file is in use than at the reference, or somebody stops the head.
+        If another mast file or other cameras are in use than at the reference, or somebody stops the head.
+    BadFile
+        If a picture of the reference is damaged.
     """
-    rig, cameras = head_cameras(client)
-    pictures = take_pictures(client, reference.rests, cameras, progress)
-    if any(one.mast_digest != reference.mast_digest for one in pictures):
+    if client.status()["mast"]["digest"] != reference.mast_digest:
         raise LookEnded("another mast file is in use than when the reference was taken; take a new one")
-    return compared(rig, reference, pictures)
+    reference.check()
+    rig, served = head_cameras(client)
+    cameras = [name for name in served if name in reference.cameras]
+    if not cameras:
+        raise LookEnded(
+            f"the reference is of {', '.join(reference.cameras) or 'no camera'}, the daemon has "
+            f"{', '.join(served) or 'no camera on the head'}; take a new one"
+        )
+    taken = take_pictures(client, reference.rests, cameras, progress)
+    if any(one.mast_digest != reference.mast_digest for one in taken.pictures):
+        raise LookEnded("another mast file came into use during the look; nothing was kept")
+    drift = compared(rig, reference, taken.pictures)
+    gone = {name: "not configured any more" for name in reference.cameras if name not in served}
+    return replace(drift, missing=gone | taken.missing)
 
 
 def compared(
     rig: Rig, reference: Reference, pictures: Sequence[Picture], joint_sigma_rad: float = JOINT_SIGMA_RAD
 ) -> Drift:
-    """Return what has changed between a reference and new pictures. Raises BadFile."""
+    """Return what has changed between a reference and new pictures. Raises as `view_shifts`."""
+    return find_drift(rig, view_shifts(rig, reference, pictures), joint_sigma_rad)
+
+
+def view_shifts(rig: Rig, reference: Reference, pictures: Sequence[Picture]) -> list[ViewShift]:
+    """Return how far the features of a reference have moved in new pictures.
+
+    Raises
+    ------
+    BadFile
+        If a picture of the reference is damaged.
+    LookEnded
+        If the new pictures are of another size.
+    """
     shifts = []
     for now in pictures:
         then = reference.picture(now.camera, now.pose)
-        model = rig.cameras[now.camera].model
-        if then is None or then.image.shape != now.image.shape or now.image.shape[::-1] != model.size_px:
+        if then is None:
             continue
+        model = rig.cameras[now.camera].model
+        size_px = now.image.shape[::-1]
+        if then.image.shape != now.image.shape or size_px != model.size_px:
+            expected = "x".join(str(side) for side in then.image.shape[::-1])
+            raise LookEnded(
+                f"{now.camera}'s pictures are {size_px[0]}x{size_px[1]} where the reference has {expected}; "
+                "take a new one"
+            )
         pixels, moved, sigma = seen_again(model, then.image, now.image)
         if len(pixels):
             # what the head itself tells that it stands elsewhere is no drift
             moved = moved - _told_px(rig, then, now, pixels)
         shifts.append(ViewShift(now.camera, now.pose, then.pan_rad, then.tilt_rad, pixels, moved, sigma))
-    return find_drift(rig, shifts, joint_sigma_rad)
+    return shifts
 
 
 def _told_px(rig: Rig, then: Picture, now: Picture, pixels: np.ndarray) -> np.ndarray:

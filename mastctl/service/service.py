@@ -43,6 +43,8 @@ from mastctl.safety.latch import Latch
 from mastctl.safety.state_folder import StateFolder
 from mastctl.safety.stop_socket import StopSocket
 from mastctl.safety.stop_threads import StopThreads
+from mastctl.sentinel.folder import SENTINEL_FOLDER
+from mastctl.sentinel.in_service import SentinelFindings
 from mastctl.service.mast_in_use import MastInUse, configured, read_mast
 from mastctl.service.masts import Masts
 from mastctl.service.opening import bounded, run_names
@@ -99,6 +101,8 @@ class Service:
         What the track's hand-offs say of the mast file in use.
     health
         What the pointings' residuals say of it.
+    sentinel
+        What reference pictures, looked at again, say of it.
     entry, leases, audit
         Where each command passes, who steers, and what is recorded of it.
     metrics
@@ -160,7 +164,7 @@ class Service:
         self.live = None if config.live is None else self._live_view(config.live)
         self.watched = WatchedCameras(self.devices, clock)
         people_s = SystemClock()  # clients live in real time, whatever a simulated rover's clock does
-        self.leases = Leases(people_s, self._runs, self._steered)
+        self.leases = Leases(people_s, self._runs, self._steered, self.stopping.stop)
         self.audit = AuditLog(self.folder.path / AUDIT_FILE, clock)
         answers = Answers(people_s, clock)
         self.entry = Entry(clock, self.leases, answers, self.audit, self.operations, publisher)
@@ -174,6 +178,7 @@ class Service:
             hardware.kind == "simulated",
         )
         self.reports = Reports(self.folder.path, self.guide.runs)
+        self.sentinel = SentinelFindings(self.folder.path / SENTINEL_FOLDER, lambda: self.stored.digest)
         self.metrics = Metrics(lambda: self.state().told(), self.devices.errors, publisher)
         self.devices.fault_watch.also(self._own_faults)
         self.stop_socket: StopSocket | None = None
@@ -269,6 +274,7 @@ class Service:
             faults=faults,
             control=self.leases.told(),
             calibration=self.health.verdict.told(),
+            sentinel=self.sentinel.told(),
             stop_socket=None if self.stop_socket is None else str(self.stop_socket.path),
         )
 
@@ -343,6 +349,7 @@ class Service:
         self.stop_threads.close()
         self.handoffs.close()
         self.health.close()
+        self.sentinel.close()
         self.recording.close()
         self.watched.close()
         if self.live is not None:

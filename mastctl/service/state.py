@@ -49,6 +49,8 @@ class State:
         Path of the Unix socket for stops alone.
     calibration
         What pointings say of the mast file (`mastctl.health.verdict.Verdict.told`).
+    sentinel
+        What its looks say (`mastctl.sentinel.standing.findings`); None where they were not read yet.
     control
         Who steers, as `mastctl.commands.lease.Control.told` tells it; None for nobody.
     """
@@ -68,6 +70,7 @@ class State:
     faults: tuple[StandingFault, ...]
     stop_socket: str | None = None
     calibration: Mapping[str, Any] | None = None
+    sentinel: Mapping[str, Any] | None = None
     control: Mapping[str, Any] | None = None
 
     @property
@@ -86,6 +89,7 @@ class State:
             "track": picked(track, "state", "reason", "id"),
             "control": self.control,
             "calibration": self.calibration,
+            "sentinel": self.sentinel,
             "axes": {
                 name: {"count_rad": axis.count_rad, "one_sided": axis.rising_below_rad is not None}
                 for name, axis in self.axes.items()

@@ -270,7 +270,8 @@ class MeasuredTold(_Told):
 
 
 class CalibrationHealthTold(CalibrationTold):
-    """``GET /calibration/health``: the verdict, its figures, and the newest pointings that count."""
+    """``GET /calibration/health``: the verdict, its figures, the newest pointings that count, and what the
+    drift sentinel's looks say."""
 
     times_expected: float | None
     log10_evidence: float | None
@@ -279,6 +280,7 @@ class CalibrationHealthTold(CalibrationTold):
     cameras: dict[str, TurnedTold]
     not_kept: str | None
     newest: list[MeasuredTold]
+    sentinel: SentinelTold | None
 
 
 class StandingTold(_Told):
@@ -314,6 +316,7 @@ class Status(StandingTold):
     control: ControlTold | None
     stop_socket: str | None
     calibration: CalibrationTold | None
+    sentinel: SentinelTold | None
     cameras: dict[str, CameraTold]
     faults: list[FaultTold]
     mast: MastTold

@@ -33,7 +33,10 @@ def add_lease(app: FastAPI, service: Service, commands: Commands) -> None:
     async def acquire(body: LeaseBody, came: Headers) -> dict[str, Any]:
         name = None if body.name is None else told_name(body.name)
         return await commands.run(
-            LEASE, came, told(body), lambda: granted(leases.acquire(came.caller, name, body.for_s))
+            LEASE,
+            came,
+            told(body),
+            lambda: granted(leases.acquire(came.caller, name, body.for_s, body.gives_way)),
         )
 
     @app.post(f"{PREFIX}/lease/renew", summary="Have the lease run for its time from now on")
@@ -62,7 +65,7 @@ def add_lease(app: FastAPI, service: Service, commands: Commands) -> None:
             lambda: granted(leases.take(came.caller, body.reason, name, body.for_s)),
         )
 
-    def told(body: LeaseBody) -> dict[str, Any]:
+    def told(body: LeaseBody | TakeBody) -> dict[str, Any]:
         return body.model_dump(exclude_none=True)
 
 

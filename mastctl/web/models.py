@@ -69,10 +69,14 @@ class ResetBody(_Strict):
 
 
 class LeaseBody(_Strict):
-    """``POST /lease``: how long, and whose it is, if not the caller's."""
+    """``POST /lease``: how long, and whose it is, if not the caller's.
+
+    ``gives_way``: it ends as soon as anybody else wants to steer, or stops the head.
+    """
 
     name: Name | None = None
     for_s: LeaseS = USUAL_S
+    gives_way: bool = False
 
 
 class RenewBody(_Strict):
@@ -81,9 +85,11 @@ class RenewBody(_Strict):
     for_s: LeaseS | None = None
 
 
-class TakeBody(LeaseBody):
+class TakeBody(_Strict):
     """``POST /lease/take``: why, beside what goes with a lease."""
 
+    name: Name | None = None
+    for_s: LeaseS = USUAL_S
     reason: Annotated[str, Field(min_length=1, max_length=400, pattern=r"\S")]
 
 

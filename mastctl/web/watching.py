@@ -8,7 +8,8 @@ from fastapi import FastAPI, Response
 
 from mastctl.errors import Unable
 from mastctl.metrics.metrics import CONTENT_TYPE
-from mastctl.sentinel.folder import findings
+from mastctl.sentinel.folder import SENTINEL_FOLDER
+from mastctl.sentinel.standing import findings
 from mastctl.service.service import Service
 from mastctl.state.standing import Word
 from mastctl.web import PREFIX
@@ -44,9 +45,9 @@ def add_watching(app: FastAPI, service: Service, waiting: Waiting) -> None:
         summary="Whether residuals of the last days are as the mast file predicts",
     )
     async def calibration() -> dict[str, Any]:
-        return service.health.told()
+        return {**service.health.told(), "sentinel": service.sentinel.told()}
 
     @app.get(f"{PREFIX}/sentinel", summary="What the drift sentinel's looks say, and how old the last one is")
     async def sentinel() -> dict[str, Any]:
-        folder = service.folder.path / "sentinel"
+        folder = service.folder.path / SENTINEL_FOLDER
         return await waiting.run(lambda: findings(folder, service.stored.digest))

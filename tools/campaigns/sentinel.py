@@ -169,13 +169,28 @@ def random_change(rng: np.random.Generator) -> Truth:
             return Truth(rover=level * rng.uniform(2e-3, 5e-3), name="rover turned")
 
 
+def _rendered(args: argparse.Namespace) -> int:
+    """Rendered days, and changes of many sizes at ``--changes`` sites."""
+    from tools.campaigns.sentinel_rendered import calm_days, power
+
+    false = calm_days(args.days, args.seed, args.smaller, args.hour) if args.days else 0
+    if args.changes:
+        power(args.changes, args.seed, args.smaller, args.hour)
+    return 1 if false else 0
+
+
 def main() -> int:
     """Run both parts; 1 if there was a false alarm."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--days", type=at_least(1), default=1000)
+    parser.add_argument("--days", type=at_least(0), default=1000)
     parser.add_argument("--changes", type=at_least(0), default=100)
     parser.add_argument("--seed", type=at_least(0), default=1)
+    parser.add_argument("--rendered", action="store_true", help="full pictures of rendered days instead")
+    parser.add_argument("--smaller", type=at_least(1), default=1, help="in so many times fewer pixels a side")
+    parser.add_argument("--hour", choices=("any", "same"), default="any", help="of the looks, by the sun")
     args = parser.parse_args()
+    if args.rendered:
+        return _rendered(args)
     rng = np.random.default_rng(args.seed)
     site, before, false, largest = Site(rng), None, [], 0.0
     for day in range(args.days):
@@ -185,7 +200,7 @@ def main() -> int:
         largest = max(largest, *(change.sigmas for change in now.changes), 0.0)
         if alarm(before, now):
             false.append(f"day {day}: {now.sentence}")
-        before = now
+        before = now if now.views else before
     print(
         f"{args.days} days without a change, seed {args.seed}: {len(false)} false alarms, "
         f"largest {largest:.1f} sigma"
@@ -203,7 +218,7 @@ def main() -> int:
                 told[f"{kind}: {'named rightly' if right else 'named ' + named}"] += 1
                 told["looks"] += look + 1
                 break
-            before = now
+            before = now if now.views else before
         else:
             told[f"{kind}: not told in {LOOKS} looks"] += 1
     found = sum(count for words, count in told.items() if "named" in words)

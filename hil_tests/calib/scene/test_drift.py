@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from calib.scene.drift import ALARM_SIGMAS, ViewShift, find_drift, view_change
-from tools.campaigns.sentinel import SIZE, Site, Truth, rig
+from tools.campaigns.sentinel import RESTS, SIZE, Site, Truth, rig, shown
 
 SEED = 11
 
@@ -88,9 +88,12 @@ def test_another_scene_says_nothing_instead_of_something() -> None:
 
 def test_one_eye_at_one_rest_cannot_tell_a_bump_from_a_slip_and_says_so() -> None:
     rng = np.random.default_rng(SEED)
-    pixels = rng.uniform(50, 700, (40, 2))
-    moved = np.tile([0.0, 9.0], (40, 1)) + 0.05 * rng.normal(size=(40, 2))
-    drift = find_drift(rig(), [ViewShift("navcam_left", 0, 0.0, 0.0, pixels, moved, np.full(40, 0.05))])
+    site = Site(rng)
+    then = site.then[1, "navcam_left"]
+    pan, tilt = RESTS[1]
+    now = shown(site.points[1, "navcam_left"], "navcam_left", pan, tilt, Truth(slip=(0.0, 5e-3)))
+    moved = now - then + 0.05 * rng.normal(size=then.shape)
+    drift = find_drift(rig(), [ViewShift("navcam_left", 1, pan, tilt, then, moved, np.full(len(then), 0.05))])
     assert drift.named is not None
     named = {drift.named.what, *drift.instead}
     assert {"tilt slipped"} < named

@@ -23,7 +23,12 @@ class World:
         self.clock = ManualClock(100.0)
         self.runs = False
         self.changes: list[Control | None] = []
-        self.leases = Leases(self.clock, lambda: self.runs, self.changes.append)
+        self.gave_way: list[str] = []
+        self.leases = Leases(self.clock, lambda: self.runs, self.changes.append, self.give_way)
+
+    def give_way(self, why: str) -> None:
+        self.runs = False
+        self.gave_way.append(why)
 
     def steer(self, caller: Caller, lease: Lease | None = None, starts: bool = False) -> None:
         with self.leases.steering(caller, None if lease is None else lease.id):
@@ -194,3 +199,53 @@ def test_an_id_of_any_signs_is_unknown_and_no_defect(world: World) -> None:
     world.leases.acquire(BENCH)
     for lease_id in ("", "é" * 9, "\x00", "x" * 10000):
         refused("lease_unknown", lambda lease_id=lease_id: world.leases.renew(lease_id))  # type: ignore[misc]
+
+
+@pytest.mark.parametrize("by", ["command", "lease", "take"])
+def test_a_lease_that_gives_way_ends_for_whoever_comes_and_what_runs_is_stopped_first(
+    world: World, by: str
+) -> None:
+    lease = world.leases.acquire(BENCH, for_s=60.0, gives_way=True)
+    world.steer(BENCH, lease, starts=True)
+    if by == "command":
+        with world.leases.steering(ROVER, None):
+            assert not world.runs, "what ran is stopped before the command is carried out"
+    elif by == "lease":
+        assert world.leases.acquire(ROVER).holder == "rover"
+    else:
+        assert world.leases.take(ROVER, "why not").holder == "rover"
+    assert len(world.gave_way) == 1
+    assert "rover" in world.gave_way[0]
+    assert "rover" in refused("lease_over", lambda: world.steer(BENCH, lease))
+
+
+def test_a_lease_that_gives_way_stops_nothing_where_nothing_runs(world: World) -> None:
+    world.leases.acquire(BENCH, gives_way=True)
+    world.steer(ROVER)
+    assert world.gave_way == []
+    assert world.leases.control() is None
+
+
+def test_a_lease_that_gives_way_is_renewed_and_stands_against_nobody_but_ends_by_time(world: World) -> None:
+    lease = world.leases.acquire(BENCH, for_s=10.0, gives_way=True)
+    world.clock.advance(9.0)
+    world.leases.renew(lease.id)
+    world.clock.advance(9.0)
+    world.steer(BENCH, lease)
+    world.clock.advance(1.0)
+    assert "its 10 s were over" in refused("lease_over", lambda: world.steer(BENCH, lease))
+
+
+def test_a_stop_ends_a_lease_that_gives_way_and_no_other(world: World) -> None:
+    lease = world.leases.acquire(BENCH)
+    world.leases.stop_came()
+    world.steer(BENCH, lease)
+    world.leases.release(lease.id)
+    lease = world.leases.acquire(BENCH, gives_way=True)
+    world.steer(BENCH, lease)
+    with world.leases._lock:  # whoever holds it, the stop waits for nobody
+        world.leases.stop_came()
+        assert world.leases.control() is None
+    assert "the head was stopped" in refused("lease_over", lambda: world.steer(BENCH, lease))
+    assert "the head was stopped" in refused("lease_over", lambda: world.leases.renew(lease.id))
+    world.steer(BENCH, world.leases.acquire(BENCH, gives_way=True))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -12,19 +13,25 @@ import pytest
 
 from calib.errors import BadFile
 from calib.scene.drift import Change, Drift
+from mastctl.sentinel import folder as folder_module
 from mastctl.sentinel.folder import (
     LOOKS,
     REFERENCE,
     Picture,
+    Reference,
     add_look,
     read_looks,
     read_reference,
     save_reference,
-    standing,
 )
+from mastctl.sentinel.standing import findings, standing
+from mastctl.sentinel.watch import is_due
 
 NOW = datetime(2026, 5, 4, 12, 0, tzinfo=UTC)
 RESTS = [(0.0, -0.2), (0.5, -0.2)]
+
+
+REFERENCE_OF_A_WEEK = Reference((NOW - timedelta(days=7)).isoformat(), "d" * 64, (), (), Path())
 
 
 def pictures() -> list[Picture]:
@@ -57,32 +64,73 @@ def test_a_reference_comes_back_as_it_was_saved(tmp_path: Path) -> None:
 
 
 def test_a_new_reference_takes_the_place_of_the_old_one_and_its_looks(tmp_path: Path) -> None:
-    save_reference(tmp_path, "2026-05-01T00:00:00+00:00", RESTS, pictures())
-    add_look(tmp_path, NOW.isoformat(), Drift(2, (), (), None))
-    save_reference(tmp_path, "2026-05-02T00:00:00+00:00", RESTS[:1], pictures()[:1])
-    assert read_looks(tmp_path) == []
+    first = save_reference(tmp_path, "2026-05-01T00:00:00+00:00", RESTS, pictures())
+    add_look(tmp_path, first, NOW.isoformat(), Drift(2, (), (), None))
+    looks = (tmp_path / LOOKS).read_bytes()
+    second = save_reference(tmp_path, "2026-05-02T00:00:00+00:00", RESTS[:1], pictures()[:1])
+    assert read_looks(tmp_path, second) == []
+    (tmp_path / LOOKS).write_bytes(looks)  # as after a kill in between
+    assert read_looks(tmp_path, second) == []
     assert len(list(tmp_path.glob("pictures-*"))) == 1
     assert read_reference(tmp_path).picture("eye", 0) is not None
 
 
 def test_looks_are_added_line_by_line_and_a_torn_one_costs_only_itself(tmp_path: Path) -> None:
     change = Change("pan slipped", np.array([3e-3]), np.eye(1), 9.0)
-    add_look(tmp_path, NOW.isoformat(), Drift(4, ("eye at rest 2",), (change,), change))
+    reference = save_reference(tmp_path, "2026-05-01T00:00:00+00:00", RESTS, pictures())
+    drift = Drift(4, ("eye at rest 2",), (change,), change)
+    add_look(tmp_path, reference, NOW.isoformat(), drift)
     with (tmp_path / LOOKS).open("a") as file:
         file.write('{"time": "2026-0')
-    looks = read_looks(tmp_path)
-    assert len(looks) == 1
-    assert looks[0]["named"] == "pan slipped"
-    assert looks[0]["sentence"] == "pan slipped by +3.00 mrad, 9 sigma"
-    assert looks[0]["silent"] == ["eye at rest 2"]
+    add_look(tmp_path, reference, NOW.isoformat(), drift)
+    looks = read_looks(tmp_path, reference)
+    assert len(looks) == 2
+    assert looks[1]["named"] == "pan slipped"
+    assert looks[1]["sentence"] == "pan slipped by +3.00 mrad, 9 sigma"
+    assert looks[1]["silent"] == ["eye at rest 2"]
+
+
+@pytest.mark.parametrize(
+    "row", ["[]", "{}", "7", '{"time": 3, "views": 1}', '{"time": "x"}', "\x00", "[" * 100000]
+)
+def test_lines_that_are_no_looks_are_left_out(row: str, tmp_path: Path) -> None:
+    reference = save_reference(tmp_path, "2026-05-01T00:00:00+00:00", RESTS, pictures())
+    (tmp_path / LOOKS).write_text(row + "\n")
+    add_look(tmp_path, reference, NOW.isoformat(), Drift(2, (), (), None))
+    assert len(read_looks(tmp_path, reference)) == 1
+    assert findings(tmp_path, "d" * 64)["level"] == "good"
+
+
+def test_a_disk_that_is_full_costs_the_new_reference_and_not_the_old(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    first = save_reference(tmp_path, "2026-05-01T00:00:00+00:00", RESTS, pictures())
+    add_look(tmp_path, first, NOW.isoformat(), Drift(2, (), (), None))
+
+    def full(*_: object, **__: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    for what, name in ((Path, "write_bytes"), (folder_module, "replace_bytes")):
+        with monkeypatch.context() as patch:
+            patch.setattr(what, name, full)
+            with pytest.raises(BadFile, match="cannot be written: No space left on device"):
+                save_reference(tmp_path, "2026-05-02T00:00:00+00:00", RESTS, pictures())
+        found = read_reference(tmp_path)
+        found.check()
+        assert found.time == first.time
+        assert len(read_looks(tmp_path, found)) == 1
+        assert len(list(tmp_path.glob("pictures-*"))) == 1
+    monkeypatch.setattr("os.fsync", full)
+    with pytest.raises(BadFile, match="No space left on device; the look is not kept"):
+        add_look(tmp_path, first, NOW.isoformat(), Drift(2, (), (), None))
 
 
 @pytest.mark.parametrize(
     ("looks", "level", "phrase"),
     [
         ([], "unsure", "no look yet"),
-        ([day(1)], "good", "nothing has changed (1 looks, the last 24 h ago)"),
-        ([day(4), day(0.01, "eye turned")], "unsure", "seen once: look again"),
+        ([day(1)], "good", "nothing has changed, 1 look, last looked 24 h ago"),
+        ([day(4), day(0.01, "eye turned")], "unsure", "seen once 14 min ago: look again"),
         (
             [day(4), day(3, "eye turned"), day(1, "eye turned")],
             "bad",
@@ -97,9 +145,61 @@ def test_looks_are_added_line_by_line_and_a_torn_one_costs_only_itself(tmp_path:
 def test_two_looks_must_name_the_same_before_it_is_told(
     looks: list[dict[str, Any]], level: str, phrase: str
 ) -> None:
-    now = standing(looks, NOW)
+    now = standing(REFERENCE_OF_A_WEEK, looks, NOW)
     assert now.level == level
     assert phrase in now.sentence
+
+
+def history(sizes: list[float], sigma: float = 1e-4) -> list[dict[str, Any]]:
+    """A look a day, the last an hour ago; each measured a slip of so much."""
+    looks = []
+    for number, size in enumerate(sizes):
+        look = day(len(sizes) - 1 - number + 1 / 24, "pan slipped" if abs(size) > 6 * sigma else None)
+        looks.append(
+            {**look, "changes": {"pan slipped": {"values": [size], "sigma": [sigma], "sigmas": 1.0}}}
+        )
+    return looks
+
+
+def test_a_change_that_grew_is_told_as_slow_with_its_rate_and_one_that_came_at_once_is_not() -> None:
+    rng = np.random.default_rng(2)
+    days = np.arange(1, 31)
+    reference = Reference((NOW - timedelta(days=30, hours=1)).isoformat(), "d" * 64, (), (), Path())
+    noise = 5e-5 * rng.normal(size=30)
+    grown = standing(reference, history(list(4e-5 * days + noise)), NOW)
+    assert grown.level == "bad"
+    assert "grown slowly, 0.04 mrad a day, since 3" in grown.sentence
+    step = standing(reference, history(list(np.where(days > 20, 1.2e-3, 0.0) + noise)), NOW)
+    assert "slowly" not in step.sentence
+    assert "since 9 days" in step.sentence
+    late = standing(reference, history(list(6e-5 * np.maximum(days - 10, 0) + noise)), NOW)
+    assert "grown slowly, 0.059 mrad a day, since 20 days" in late.sentence
+    since = datetime.fromisoformat(late.since or "")
+    assert abs((NOW - since) / timedelta(days=1) - 20) < 3
+
+
+def test_a_clock_that_was_set_back_is_told_and_does_not_stop_the_looks() -> None:
+    reference = Reference((NOW + timedelta(days=3)).isoformat(), "d" * 64, (), (), Path())
+    assert "at a time 3 days ahead of this clock" in standing(reference, [], NOW).sentence
+    assert "ahead of this clock" in standing(reference, [day(-2)], NOW).sentence
+    assert is_due(reference, (NOW + timedelta(days=3, hours=1)).isoformat(), 86400.0, NOW)
+    assert not is_due(reference, NOW.isoformat(), 86400.0, NOW + timedelta(minutes=1))
+
+
+def test_a_look_is_due_at_the_references_time_of_day() -> None:
+    reference = Reference("2026-05-01T09:30:00+00:00", "d" * 64, (), (), Path())
+    morning = datetime(2026, 5, 3, 9, 29, tzinfo=UTC)
+    yesterday = "2026-05-02T09:31:00+00:00"
+    assert not is_due(reference, yesterday, 86400.0, morning)
+    assert is_due(reference, yesterday, 86400.0, morning + timedelta(minutes=1))
+    assert not is_due(reference, None, 86400.0, datetime(2026, 5, 1, 20, 0, tzinfo=UTC))
+
+
+def test_what_was_found_long_ago_says_so() -> None:
+    old = standing(REFERENCE_OF_A_WEEK, [day(30, "eye turned"), day(20, "eye turned")], NOW)
+    assert "since 30 days (last looked 20 days ago)" in old.sentence
+    blind = standing(REFERENCE_OF_A_WEEK, [day(5), *(day(ago, views=0) for ago in (4, 3, 2, 1))], NOW)
+    assert (blind.level, "4 looks since then saw nothing they knew" in blind.sentence) == ("unsure", True)
 
 
 @pytest.mark.parametrize(
@@ -127,5 +227,5 @@ def test_no_reference_says_how_to_take_one(tmp_path: Path) -> None:
     save_reference(tmp_path, "2026-05-01T00:00:00+00:00", RESTS, pictures())
     for file in tmp_path.glob("pictures-*/*.png"):
         file.write_bytes(b"spoiled")
-    with pytest.raises(BadFile, match="no picture that can be read"):
+    with pytest.raises(BadFile, match="is not the picture that was taken"):
         read_reference(tmp_path).picture("eye", 0)

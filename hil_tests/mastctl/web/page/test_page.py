@@ -429,7 +429,9 @@ def test_what_the_drift_sentinel_found_is_told_with_its_age(pair: BOTH, visit: V
         (folder / "reference.json").write_text(json.dumps(reference))
         at = (datetime.now(UTC) - timedelta(hours=2)).isoformat(timespec="seconds")
         words = "navcam_left turned 1.79 mrad about y, 9 sigma"
-        look = {"time": at, "views": 4, "named": "navcam_left", "sentence": words}
+        look = {
+            "time": at, "reference": reference["time"], "views": 4, "named": "navcam_left", "sentence": words,
+        }  # fmt: skip
         (folder / "looks.jsonl").write_text(2 * (json.dumps(look) + "\n"))
         told = http.get("/sentinel").json()
         assert told["level"] == "bad" and 7199 <= told["age_s"] < 7400

@@ -1,0 +1,102 @@
+"""A daemon on a simulated rover of two small Navcams, and changes of what is true that nobody tells it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from calib.files.mast_file import load_rig, save_rig
+from calib.mast.rig import Rig
+from calib.rigid import rot_x, rot_y, rot_z
+from mastctl.config import Listen, load_config
+from mastctl.daemon import RunningDaemon
+
+BY = 2
+"""The Navcams have so many times fewer pixels along each side."""
+
+RESTS = ("-1.2,-0.3", "0.0,-0.35", "1.2,-0.3")
+
+
+def small(rig: Rig) -> Rig:
+    """The Navcams alone, in fewer pixels; (0, 0) is the middle of the first one."""
+    cameras = {}
+    for name in ("navcam_left", "navcam_right"):
+        model = rig.cameras[name].model
+        width, height = model.size_px
+        h, v = (vector / BY + (0.5 / BY - 0.5) * model.A for vector in (model.H, model.V))
+        cameras[name] = replace(
+            rig.cameras[name], model=replace(model, size_px=(width // BY, height // BY), H=h, V=v)
+        )
+    return replace(rig, cameras=cameras, stereo={"navcam": rig.stereo["navcam"]}, joints=rig.joints)
+
+
+@contextmanager
+def small_rover(repository: Path, folder: Path) -> Iterator[RunningDaemon]:
+    """A running daemon; what is true differs from its mast file as on the packaged rover."""
+    config = load_config(repository / "configs/default.yaml")
+    save_rig(small(load_rig(config.mast_file).rig), folder / "mast.yaml")
+    save_rig(small(load_rig(repository / "configs/sim/rocky8.yaml").rig), folder / "true.yaml")
+    hardware = config.hardware
+    simulation = {
+        **hardware.simulation, "speed": "max", "samples": 1, "rover": str(folder / "true.yaml"),
+    }  # fmt: skip
+    cameras = {name: one for name, one in hardware.cameras.items() if name.startswith("navcam")}
+    hardware = replace(hardware, simulation=simulation, cameras=cameras)
+    config = replace(
+        config,
+        listen=Listen(port=0),
+        mast_file=folder / "mast.yaml",
+        hardware=hardware,
+        state_folder=folder / "state",
+    )
+    with RunningDaemon(config) as daemon:
+        yield daemon
+
+
+@contextmanager
+def truly(daemon: RunningDaemon, rig: Rig) -> Iterator[None]:
+    """Another true rig inside the block."""
+    rover = daemon.service.hardware.simulation
+    assert rover is not None
+    before, rover.rig = rover.rig, rig
+    try:
+        yield
+    finally:
+        rover.rig = before
+
+
+def bumped(rig: Rig, camera: str, turn_rad: tuple[float, float, float]) -> Rig:
+    """A camera turned about its own place, by small angles about x, y, z of the head."""
+    x, y, z = turn_rad
+    turn = rot_z(z) @ rot_y(y) @ rot_x(x)
+    one = rig.cameras[camera]
+    vectors = {letter: turn @ getattr(one.model, letter) for letter in "AHVO"}
+    model = replace(one.model, **vectors)
+    return replace(rig, cameras={**rig.cameras, camera: replace(one, model=model)})
+
+
+def refocused(rig: Rig, camera: str, part: float) -> Rig:
+    """A camera whose focal length is longer by a part."""
+    one = rig.cameras[camera]
+    told = {}
+    for letter in "HV":
+        vector = getattr(one.model, letter)
+        along = float(one.model.A @ vector) * one.model.A
+        told[letter] = along + (1.0 + part) * (vector - along)
+    return replace(rig, cameras={**rig.cameras, camera: replace(one, model=replace(one.model, **told))})
+
+
+def slipped(rig: Rig, pan_rad: float, tilt_rad: float) -> Rig:
+    """All that hangs on the head turned against its joints, as by a horn that slipped on its shaft."""
+    # pan stands upstream of tilt: what the pan's horn turns is the mast itself
+    mast = replace(rig.mast, rotation_rad=rig.mast.rotation_rad + np.array([0.0, 0.0, pan_rad]))
+    turn = rot_y(tilt_rad)
+    cameras = {}
+    for name, one in rig.cameras.items():
+        vectors = {letter: turn @ getattr(one.model, letter) for letter in "CAHVO"}
+        cameras[name] = replace(one, model=replace(one.model, **vectors)) if one.on == "head" else one
+    return replace(rig, mast=mast, cameras=cameras)

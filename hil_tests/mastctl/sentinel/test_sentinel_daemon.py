@@ -1,0 +1,352 @@
+"""The sentinel on a whole daemon: changes of the truth that nobody tells it, and people who need the head."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+from prometheus_client.parser import text_string_to_metric_families
+
+from calib.mast.rig import Rig
+from hil_tests.mastctl.sentinel.small_rover import RESTS, bumped, refocused, slipped, small_rover, truly
+from hil_tests.mastctl.service_fakes import eventually
+from mastctl.cli.main import main
+from mastctl.client import Client
+from mastctl.daemon import RunningDaemon
+from mastctl.sentinel.folder import LOOKS, read_looks, read_reference
+from mastctl.sentinel.watch import watch
+
+Run = Callable[..., tuple[int, str, str]]
+THERE = (0.4, -0.2)
+"""Where a person sends the head."""
+
+
+@pytest.fixture(scope="module")
+def daemon(repository: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunningDaemon]:
+    with small_rover(repository, tmp_path_factory.mktemp("sentinel")) as made:
+        folder = made.service.folder.path / "sentinel"
+        rests = [word for rest in RESTS for word in (f"--rest={rest}",)]
+        assert main(["sentinel", "reference", "--folder", str(folder), "--url", made.url, *rests]) == 0
+        yield made
+
+
+@pytest.fixture
+def folder(daemon: RunningDaemon) -> Path:
+    """The sentinel's folder in the daemon's state, without looks."""
+    found = daemon.service.folder.path / "sentinel"
+    (found / LOOKS).unlink(missing_ok=True)
+    return found
+
+
+@pytest.fixture
+def run(daemon: RunningDaemon, folder: Path, capsys: pytest.CaptureFixture[str]) -> Run:
+    def call(*words: str, where: Path = folder) -> tuple[int, str, str]:
+        capsys.readouterr()
+        asks = () if words[0] == "status" else ("--url", daemon.url)
+        code = main(["sentinel", *words, "--folder", str(where), *asks])
+        out, log = capsys.readouterr()
+        return code, out.strip(), log.strip()
+
+    return call
+
+
+@pytest.fixture
+def client(daemon: RunningDaemon) -> Iterator[Client]:
+    with Client(daemon.url, name="ana") as client:
+        yield client
+        client.clear_faults()
+        if client.status()["estop"] is not None:
+            client.reset(reason="the test is over", name="ana")
+
+
+def stands(client: Client) -> tuple[float, float]:
+    joints = client.status()["joints"]
+    assert joints is not None
+    return joints["pan_rad"], joints["tilt_rad"]
+
+
+@pytest.mark.parametrize(
+    ("change", "what"),
+    [
+        (lambda rig: bumped(rig, "navcam_left", (0.0, 1.8e-3, 0.0)), "navcam_left turned 1."),
+        (lambda rig: refocused(rig, "navcam_right", 5e-3), "navcam_right refocused: focal length +0.5"),
+        (lambda rig: slipped(rig, 0.0, 4e-3), "tilt slipped by +"),
+        (lambda rig: slipped(rig, 4e-3, 0.0), "pan slipped by +"),
+    ],
+    ids=["bumped", "refocused", "tilt horn", "pan horn"],
+)
+def test_a_change_of_the_truth_is_named_by_two_looks_and_told_everywhere(
+    change: Callable[[Rig], Rig], what: str, daemon: RunningDaemon, run: Run, client: Client
+) -> None:
+    rover = daemon.service.hardware.simulation
+    assert rover is not None
+    before = stands(client)
+    with truly(daemon, change(rover.rig)):
+        code, said, _ = run("look")
+        assert (code, said.startswith(what)) == (0, True), said
+        assert "seen once" in said
+        code, said, _ = run("look")
+    assert (code, said.startswith(what)) == (1, True), said
+    assert " sigma" in said and "since " in said
+    assert stands(client) == pytest.approx(before, abs=1e-3)
+    told = client.sentinel()
+    assert (told["level"], told["sentence"]) == ("bad", said)
+
+    def in_status() -> bool:
+        found = client.status()["sentinel"]
+        return found is not None and found["level"] == "bad"
+
+    eventually(in_status, "the finding in the status")
+    assert client.status()["faults"] == [] and client.status()["state"] == "ready"
+    health = client.calibration_health()
+    assert health["sentinel"] is not None and health["sentinel"]["sentence"].startswith(what)
+    text = daemon.service.metrics.text().decode()
+    found = {one.name: one for one in text_string_to_metric_families(text)}
+    assert found["mastctl_sentinel_drift"].samples[0].value == 1.0
+    assert found["mastctl_sentinel_look_age_seconds"].samples[0].value >= 0.0
+
+
+def test_where_nothing_changed_that_is_told_with_the_looks(run: Run) -> None:
+    assert run("status")[1].startswith("no look yet at the reference of ")
+    code, said, _ = run("look")
+    assert (code, said) == (0, "nothing has changed, 1 look, last looked 0 min ago")
+
+
+def test_a_slipped_encoder_is_a_slipped_joint(run: Run, client: Client) -> None:
+    client.set_fault("pan_tilt", "wrong", offset_rad=4e-3, axis=0)
+    run("look")
+    code, said, _ = run("look")
+    assert code == 1 and said.startswith("pan slipped by -")
+
+
+def test_a_camera_that_is_pulled_out_is_named_and_the_other_still_looks(run: Run, client: Client) -> None:
+    client.set_fault("navcam_left", "off")
+    code, said, log = run("look", "--json")
+    look = json.loads(said)["look"]
+    assert (code, look["views"]) == (0, 3)
+    assert list(look["missing"]) == ["navcam_left at rest 0"]
+    assert "navcam_left at rest 0: no picture: " in log
+
+
+def test_in_the_dark_nothing_is_found_and_that_is_said(run: Run, client: Client) -> None:
+    for eye in ("navcam_left", "navcam_right"):
+        client.set_fault(eye, "dark")
+    code, said, _ = run("look")
+    assert (code, said.startswith("1 look saw nothing they knew: night, fog")) == (0, True)
+    assert client.sentinel()["level"] == "unsure"
+
+
+def test_random_pixels_are_no_change(run: Run, client: Client) -> None:
+    client.set_fault("navcam_left", "garbage")
+    client.set_fault("navcam_right", "garbage")
+    assert run("look")[:2][1].startswith("1 look saw nothing they knew")
+
+
+def spoilt(folder: Path, to: Path, change: Callable[[dict[str, Any]], object]) -> Path:
+    shutil.copytree(folder, to)
+    told = json.loads((to / "reference.json").read_text())
+    change(told)
+    (to / "reference.json").write_text(json.dumps(told))
+    return to
+
+
+@pytest.mark.parametrize(
+    ("change", "code", "phrase"),
+    [
+        (lambda told: told.update(mast_digest="0" * 64), 1, "another mast file is in use than when"),
+        (
+            lambda told: [one.update(camera="pancam_left") for one in told["pictures"]],
+            1,
+            "the reference is of pancam_left, the daemon has navcam_left, navcam_right; take a new one",
+        ),
+        (lambda told: told["pictures"][0].update(sha256="0"), 2, "is not the picture that was taken"),
+        (lambda told: told["pictures"][0].update(file="gone.png"), 2, "gone.png"),
+        (lambda told: told.update(time="yesterday"), 2, "'yesterday' where a moment of ISO 8601"),
+    ],
+    ids=["mast file", "cameras", "spoiled", "gone", "time"],
+)
+def test_a_reference_that_cannot_be_compared_is_refused_before_anything_moves(
+    change: Callable[[dict[str, Any]], object],
+    code: int,
+    phrase: str,
+    folder: Path,
+    tmp_path: Path,
+    run: Run,
+    client: Client,
+) -> None:
+    where = spoilt(folder, tmp_path / "other", change)
+    before = [one["id"] for one in client.operations()]
+    got, _, log = run("look", where=where)
+    assert got == code
+    assert phrase in log and len(log.splitlines()) == 1
+    assert [one["id"] for one in client.operations()] == before
+
+
+def test_one_camera_less_than_the_reference_is_said(folder: Path, tmp_path: Path, run: Run) -> None:
+    where = spoilt(
+        folder,
+        tmp_path / "other",
+        lambda told: [
+            one.update(camera="pancam_left") for one in told["pictures"] if "left" in one["camera"]
+        ],
+    )
+    code, said, log = run("look", where=where)
+    assert (code, said.startswith("nothing has changed")) == (0, True)
+    assert log == "pancam_left: no picture: not configured any more"
+
+
+def test_pictures_of_another_size_are_refused_in_a_sentence(folder: Path, tmp_path: Path, run: Run) -> None:
+    import cv2
+
+    from mastctl.sentinel.folder import Picture, save_reference
+
+    reference = read_reference(folder)
+    smaller = []
+    for one in reference.pictures:
+        picture = reference.picture(one["camera"], one["pose"])
+        assert picture is not None
+        image = cv2.resize(picture.image, (256, 192))
+        smaller.append(
+            Picture(
+                picture.camera, picture.pose, picture.pan_rad, picture.tilt_rad, reference.mast_digest, image
+            )
+        )
+    save_reference(tmp_path / "s", reference.time, reference.rests, smaller)
+    code, _, log = run("look", where=tmp_path / "s")
+    assert code == 1
+    assert "navcam_left's pictures are 512x384 where the reference has 256x192; take a new one" in log
+
+
+class Meddling(Client):
+    """A client whose second picture is the moment for somebody else."""
+
+    def __init__(self, url: str, meddle: Callable[[], object]) -> None:
+        super().__init__(url, name="the sentinel's process")
+        self._meddle = meddle
+        self._pictures = 0
+
+    def snapshot(self, *words: Any, **options: Any) -> Any:
+        self._pictures += 1
+        if self._pictures == 2:
+            self._meddle()
+        return super().snapshot(*words, **options)
+
+
+class Over(Exception):
+    pass
+
+
+def watched(daemon: RunningDaemon, folder: Path, meddle: Callable[[], object]) -> list[str]:
+    """One turn of a watch that is due, with somebody who comes in the middle; what it told."""
+    told: list[str] = []
+
+    @contextmanager
+    def connect() -> Iterator[Client]:
+        with Meddling(daemon.url, meddle) as client:
+            yield client
+
+    def sleep(_s: float) -> None:
+        raise Over
+
+    with pytest.raises(Over):
+        watch(
+            folder,
+            connect,
+            told.append,
+            lambda look: told.append(f"looked: {look['views']}"),
+            1e-3,
+            0.0,
+            sleep,
+        )
+    return told
+
+
+def test_a_watch_looks_where_nobody_needs_the_head_and_lets_go_of_it(
+    daemon: RunningDaemon, folder: Path, client: Client
+) -> None:
+    assert watched(daemon, folder, lambda: None) == ["looked: 6"]
+    assert client.control() is None
+    assert len(read_looks(folder, read_reference(folder))) == 1
+
+
+def test_a_watch_gives_way_to_a_person_who_points_in_the_middle(
+    daemon: RunningDaemon, folder: Path, client: Client
+) -> None:
+    def point() -> None:
+        assert client.wait(client.point(pan_rad=THERE[0], tilt_rad=THERE[1]))["state"] == "done"
+
+    told = watched(daemon, folder, point)
+    assert told == ["no look now: ana wants to steer, and sentinel gives way; nothing was kept"]
+    assert stands(client) == pytest.approx(THERE, abs=1e-3)
+    assert read_looks(folder, read_reference(folder)) == []
+
+
+def test_a_watch_gives_way_to_a_lease_and_starts_none_while_it_holds(
+    daemon: RunningDaemon, folder: Path, client: Client
+) -> None:
+    lease = []
+    told = watched(daemon, folder, lambda: lease.append(client.acquire_lease(for_s=60.0)))
+    assert told == ["no look now: ana wants to steer, and sentinel gives way; nothing was kept"]
+    last = [one["id"] for one in client.operations()]
+    assert watched(daemon, folder, lambda: None) == ["no look now: ana steers"]
+    assert [one["id"] for one in client.operations()] == last
+    client.use_lease(lease[0]["lease_id"])
+    client.release_lease()
+    client.use_lease(None)
+
+
+@pytest.mark.parametrize("stop", ["stop", "estop"])
+def test_after_a_stop_in_the_middle_a_watch_moves_nothing_more(
+    stop: str, daemon: RunningDaemon, folder: Path, client: Client
+) -> None:
+    at: list[tuple[float, float]] = []
+    client.wait(client.point(pan_rad=0.0, tilt_rad=0.0))  # after a stop the head is held until a command
+
+    def press() -> None:
+        getattr(client, stop)()
+        at.append(stands(client))
+
+    told = watched(daemon, folder, press)
+    assert told == ["no look now: the head was stopped; nothing was kept"]
+    assert stands(client) == at[0]
+    (said,) = watched(daemon, folder, lambda: None)
+    state = {"stop": "holding", "estop": "stopped"}[stop]
+    assert said.startswith(f"no look now: the daemon's state is {state}")
+    assert stands(client) == at[0]
+
+
+def test_a_watch_waits_until_the_head_has_been_left_alone_for_a_while(
+    daemon: RunningDaemon, folder: Path, client: Client
+) -> None:
+    client.wait(client.point(pan_rad=0.0, tilt_rad=0.0))
+    told: list[str] = []
+
+    def sleep(_s: float) -> None:
+        raise Over
+
+    with pytest.raises(Over):
+        watch(folder, lambda: Client(daemon.url), told.append, lambda look: None, 1e-3, 3600.0, sleep)
+    assert len(told) == 1
+    assert "the head was used" in told[0] and "3600 s are waited for" in told[0]
+
+
+def test_a_stop_in_the_middle_of_a_look_on_request_ends_it(
+    daemon: RunningDaemon, folder: Path, client: Client, run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    snapshot = Client.snapshot
+
+    def stopped(self: Client, *words: Any, **options: Any) -> Any:
+        shot = snapshot(self, *words, **options)
+        client.estop()
+        return shot
+
+    monkeypatch.setattr(Client, "snapshot", stopped)
+    code, _, log = run("look")
+    assert code == 1
+    assert "emergency stop" in log
+    assert read_looks(folder, read_reference(folder)) == []
