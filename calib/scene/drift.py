@@ -21,7 +21,7 @@ from calib.camera.cahvor import CameraModel
 from calib.fit.significance import chance, sigmas
 from calib.mast.rig import Rig
 from calib.rigid import FloatArray, Rigid, rot_x, rot_y, rot_z
-from calib.scene.fit import corrected
+from calib.scene.terms import corrected
 
 ALARM_SIGMAS = 6.0
 """A change is told from here on, if two looks one after the other say so."""

@@ -7,12 +7,16 @@ on the patch as the rig foresees it.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import cached_property
 from typing import NamedTuple
 
 import cv2
 import numpy as np
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
 
 from calib.camera.cahvor import CameraModel
 from calib.errors import CalibError
@@ -20,7 +24,7 @@ from calib.mast.rig import Rig
 from calib.pictures.patch_match import match_patch
 from calib.pictures.patch_verdict import MatchSettings
 from calib.pictures.warp import Plane
-from calib.rigid import FloatArray
+from calib.rigid import FloatArray, Rigid
 from calib.scene.views import FARTHEST_M, LEAST_OVERLAP, NEAREST_M, View, overlap
 
 MOST_KEYPOINTS = 3000
@@ -32,7 +36,15 @@ WINDOW_PX = 4.0
 
 RATIO = 0.85
 MARGIN_PX = 22.0
-MOST_A_PAIR = 150
+MOST_A_PAIR, MOST_A_CELL, CELL_PX = 25, 3, 100
+"""Features of two pictures, and of a square of one: of 0.1 px, so many tell where one camera stands against
+the other ten times better than joints repeat."""
+
+ALIKE = 0.95
+"""A patch on the ground that correlates so needs no other try."""
+
+SAMPLES = 16
+"""Places along a line: not more than half a gate apart."""
 SAME_PX = 3.0
 """Keypoints nearer to a feature that is followed already are that feature."""
 
@@ -69,20 +81,21 @@ def find_features(rig: Rig, views: Sequence[View]) -> list[Feature]:
     """
     models = [view.model(rig) for view in views]
     keypoints = [_keypoints(view) for view in views]
-    taken: list[list[FloatArray]] = [[] for _ in views]
+    looks = [_Look(view, model, found) for view, model, found in zip(views, models, keypoints, strict=True)]
     features: list[Feature] = []
-    for first in range(len(views)):
+    for first, look in enumerate(looks):
         found: dict[int, list[tuple[int, FloatArray, FloatArray]]] = {}
-        free = _free(keypoints[first].pixels_px, taken[first])
-        for second in range(first + 1, len(views)):
+        free = look.free
+        for second in range(first + 1, len(looks)):
             if (
-                max(overlap(models[first], models[second]), overlap(models[second], models[first]))
+                overlap(models[first], models[second])
                 < LEAST_OVERLAP
+                > overlap(models[second], models[first])
             ):
                 continue
-            for keypoint, pixel, covariance in _pair(views, models, keypoints, first, second, free):
+            for keypoint, pixel, covariance in _pair(look, looks[second], free, set(found)):
                 found.setdefault(keypoint, []).append((second, pixel, covariance))
-                taken[second].append(pixel)
+                looks[second].followed.append(pixel)
         for keypoint, seen in found.items():
             features.append(
                 Feature(
@@ -92,6 +105,29 @@ def find_features(rig: Rig, views: Sequence[View]) -> list[Feature]:
                 )
             )
     return features
+
+
+@dataclass(eq=False)
+class _Look:
+    """A picture's camera and keypoints, and where features are followed in it already."""
+
+    view: View
+    model: CameraModel
+    keypoints: _Keypoints
+    followed: list[FloatArray] = field(default_factory=list)
+
+    @cached_property
+    def tree(self) -> cKDTree:
+        """The keypoints, to be asked which are near."""
+        return cKDTree(self.keypoints.pixels_px)
+
+    @property
+    def free(self) -> np.ndarray:
+        """Which keypoints are no feature that is followed already."""
+        pixels = self.keypoints.pixels_px
+        if not len(pixels) or not self.followed:
+            return np.ones(len(pixels), dtype=bool)
+        return np.asarray(cKDTree(np.array(self.followed)).query(pixels)[0] > SAME_PX)
 
 
 def _keypoints(view: View) -> _Keypoints:
@@ -108,68 +144,66 @@ def _keypoints(view: View) -> _Keypoints:
     return _Keypoints(pixels[kept], descriptors[kept])
 
 
-def _free(pixels: FloatArray, taken: Sequence[FloatArray]) -> np.ndarray:
-    """Which keypoints are no feature that is followed already."""
-    if not len(pixels) or not taken:
-        return np.ones(len(pixels), dtype=bool)
-    apart = np.linalg.norm(pixels[:, None] - np.array(taken)[None], axis=2)
-    return np.asarray((apart > SAME_PX).all(axis=1))
-
-
 def _pair(
-    views: Sequence[View],
-    models: Sequence[CameraModel],
-    keypoints: Sequence[_Keypoints],
-    first: int,
-    second: int,
-    free: np.ndarray,
+    first: _Look, second: _Look, free: np.ndarray, known: set[int]
 ) -> list[tuple[int, FloatArray, FloatArray]]:
-    """Features of one view in another: keypoint, pixel (2,) there, its covariance (2, 2)."""
-    one, other = keypoints[first], keypoints[second]
-    if not len(one.pixels_px) or not len(other.pixels_px):
-        return []
-    line, points = _lines(models[first], one.pixels_px, models[second])
-    candidates: list[tuple[float, int, int, int]] = []
-    for keypoint in np.flatnonzero(free & np.isfinite(line).any(axis=(1, 2))).tolist():
-        at = line[keypoint]
-        apart = np.linalg.norm(other.pixels_px[:, None] - at[None], axis=2)
-        apart[~np.isfinite(apart)] = np.inf
-        near = np.flatnonzero(apart.min(axis=1) < GATE_PX)
-        if not len(near):
-            continue
-        distance = np.linalg.norm(other.descriptors[near] - one.descriptors[keypoint], axis=1)
-        order = np.argsort(distance)
-        best = int(near[order[0]])
-        rival = next(
-            (d for i, d in zip(near[order[1:]], distance[order[1:]], strict=True)
-             if np.linalg.norm(other.pixels_px[i] - other.pixels_px[best]) > SAME_PX),
-            np.inf,
-        )  # fmt: skip
-        if distance[order[0]] < RATIO * rival:
-            candidates.append((float(distance[order[0]]), keypoint, best, int(apart[best].argmin())))
+    """Features of one view in another: keypoint, pixel (2,) there, its covariance (2, 2).
+
+    As many as tell where one camera is against the other, spread over what both see; those that are ``known``
+    from other views first.
+    """
     matched: list[tuple[int, FloatArray, FloatArray]] = []
     used: set[int] = set()
-    for _, keypoint, best, sample in sorted(candidates):
-        if best in used or len(matched) >= MOST_A_PAIR:
+    cells: Counter[tuple[int, int]] = Counter()
+    candidates = _candidates(first, second, free)
+    for keypoint, best, point_m in sorted(candidates, key=lambda one: one[0] not in known):
+        pixel = first.keypoints.pixels_px[keypoint]
+        x, y = (pixel // CELL_PX).astype(int).tolist()
+        if best in used or cells[x, y] >= MOST_A_CELL:
             continue
         used.add(best)
-        result = _matched(
-            views,
-            models,
-            first,
-            second,
-            one.pixels_px[keypoint],
-            points[keypoint, sample],
-            other.pixels_px[best],
-        )
+        result = _matched(first, second, pixel, point_m, second.keypoints.pixels_px[best])
         if result is not None:
+            cells[x, y] += 1
             matched.append((keypoint, *result))
+            if len(matched) == MOST_A_PAIR:
+                break
     return matched
+
+
+def _candidates(first: _Look, second: _Look, free: np.ndarray) -> list[tuple[int, int, FloatArray]]:
+    """Keypoints alike along the lines, likest first: one's, the other's, and the point (3,) in space."""
+    one, other = first.keypoints, second.keypoints
+    mine = np.flatnonzero(free)
+    if not len(mine) or not len(other.pixels_px):
+        return []
+    line, points = _lines(first.model, one.pixels_px[mine], second.model)
+    seen = np.argwhere(np.isfinite(line).all(axis=2))
+    near: list[list[int]] = list(
+        second.tree.query_ball_point(line[seen[:, 0], seen[:, 1]], GATE_PX, return_sorted=False)  # type: ignore[arg-type]
+    )
+    counts = [len(these) for these in near]
+    if not sum(counts):
+        return []
+    rows, samples = np.repeat(seen, counts, axis=0).T
+    theirs = np.concatenate([np.array(these, dtype=np.intp) for these in near if these])
+    pairs, at = np.unique(rows * len(other.pixels_px) + theirs, return_index=True)
+    rows, theirs, samples = pairs // len(other.pixels_px), pairs % len(other.pixels_px), samples[at]
+    distance = np.linalg.norm(other.descriptors[theirs] - one.descriptors[mine[rows]], axis=1)
+    order = np.lexsort((distance, rows))
+    rows, theirs, samples, distance = rows[order], theirs[order], samples[order], distance[order]
+    _, best, row = np.unique(rows, return_index=True, return_inverse=True)
+    apart = other.pixels_px[theirs] - other.pixels_px[theirs[best[row]]]
+    rival = np.full(len(best), np.inf)
+    np.minimum.at(rival, row, np.where((apart**2).sum(axis=1) > SAME_PX**2, distance, np.inf))
+    alike = best[distance[best] < RATIO * rival]
+    alike = alike[np.argsort(distance[alike], kind="stable")]
+    return [(int(mine[rows[k]]), int(theirs[k]), points[rows[k], samples[k]]) for k in alike.tolist()]
 
 
 def _lines(camera: CameraModel, pixels: FloatArray, other: CameraModel) -> tuple[FloatArray, FloatArray]:
     """Pixels (n, s, 2) of the epipolar lines in the other camera, nan outside, and points (n, s, 3)."""
-    inverse = np.linspace(1.0 / FARTHEST_M, 1.0 / NEAREST_M, 40)
+    inverse = np.linspace(1.0 / FARTHEST_M, 1.0 / NEAREST_M, SAMPLES)
     rays = camera.ray(pixels)
     points = rays.origins_m[:, None] + rays.directions[:, None] / inverse[None, :, None]
     seen, valid = other.project(points.reshape(-1, 3))
@@ -181,28 +215,22 @@ def _lines(camera: CameraModel, pixels: FloatArray, other: CameraModel) -> tuple
 
 
 def _matched(
-    views: Sequence[View],
-    models: Sequence[CameraModel],
-    first: int,
-    second: int,
-    pixel: FloatArray,
-    point_m: FloatArray,
-    start_px: FloatArray,
+    first: _Look, second: _Look, pixel: FloatArray, point_m: FloatArray, start_px: FloatArray
 ) -> tuple[FloatArray, FloatArray] | None:
     """The patch's place in the second view, if a patch on the ground or across the ray is there for sure.
 
     The second camera is turned so that the rig foresees the patch where SIFT has it.
     """
-    camera = _turned_to(models[second], point_m, start_px)
+    camera = _turned_to(second.model, point_m, start_px)
     best = None
-    for normal in (UP, models[first].C - point_m):
+    for normal in (UP, first.model.C - point_m):
         try:
             match = match_patch(
-                views[first].image,
-                models[first],
+                first.view.image,
+                first.model,
                 pixel,
                 Plane(point_m, normal / np.linalg.norm(normal)),
-                views[second].image,
+                second.view.image,
                 camera,
                 WINDOW_PX,
                 MatchSettings(),
@@ -211,6 +239,8 @@ def _matched(
             continue
         if match.verdict == "good" and (best is None or match.correlation > best.correlation):
             best = match
+            if best.correlation > ALIKE:
+                break
     if best is None:
         return None
     covariance = np.asarray(best.covariance_px2) + FLOOR_SIGMA_PX**2 * np.eye(2)
@@ -219,10 +249,6 @@ def _matched(
 
 def _turned_to(camera: CameraModel, point_m: FloatArray, pixel: FloatArray) -> CameraModel:
     """The camera turned about C by the little that brings a point onto a pixel."""
-    from scipy.spatial.transform import Rotation
-
-    from calib.rigid import Rigid
-
     wanted = camera.ray(pixel).directions
     has = point_m - camera.C
     axis = np.cross(wanted, has / np.linalg.norm(has))

@@ -24,7 +24,8 @@ from calib.mast.rig import Rig
 from calib.pictures.warp import grey
 from calib.rigid import FloatArray, tangents
 from calib.scene.features import find_features
-from calib.scene.fit import SceneFit, corrected, fit_scene
+from calib.scene.fit import SceneFit, fit_scene
+from calib.scene.terms import corrected
 from calib.scene.views import View
 from drivers.errors import BadOptions
 from drivers.recorded_frames import SUFFIX, McapFrame, read_recording
@@ -119,8 +120,8 @@ def propose_scene(
     Raises
     ------
     NoCorrection
-        If it tells no correction: ``too_few`` features, ``not_significant``, or ``not_predictive``: what
-        explains some of the pictures does not hold for the others.
+        If it tells no correction: ``too_few`` features, ``not_significant``, ``changed_halfway``, or
+        ``not_predictive``: what explains some of the pictures does not hold for the others.
     """
     views = scene_views(mast.rig, record, camera)
     fit = fit_scene(mast.rig, views, find_features(mast.rig, views), joint_sigma_rad)
@@ -179,8 +180,9 @@ def scene_told(fit: SceneFit) -> dict[str, Any]:
         "unseen": list(fit.unseen),
         "features": len(fit.features),
         "outliers": list(fit.outliers),
-        "rms_px": {"before": fit.rms_px[0], "after": fit.rms_px[1]},
-        "median_px": {"before": fit.median_px[0], "after": fit.median_px[1]},
+        "rms_px": dict(zip(("before", "after", "with_rests"), fit.rms_px, strict=True)),
+        "median_px": dict(zip(("before", "after", "with_rests"), fit.median_px, strict=True)),
+        "joint_sigma_rad": fit.joint_sigma_rad,
         "predicted_rms_px": {"before": fit.predicted_px[0], "after": fit.predicted_px[1]},
         "chi2_per_freedom": fit.scale,
     }

@@ -9,6 +9,7 @@ from mastctl.cli import output
 
 if TYPE_CHECKING:
     from calib.files.mast_file import StoredRig
+    from calib.scene.fit import SceneFit
     from mastctl.calibration.scene import SceneProposal
 
 OUTLIERS_SHOWN = 10
@@ -38,7 +39,7 @@ def run(args: argparse.Namespace) -> int:
     if args.json:
         output.print_json(_document(proposal, saved, None if previous is None else str(previous)))
     else:
-        _show(proposal, saved)
+        _show(proposal, saved, sigma_rad)
     return 0
 
 
@@ -53,7 +54,7 @@ def _document(proposal: SceneProposal, saved: StoredRig, previous: str | None) -
     }
 
 
-def _show(proposal: SceneProposal, saved: StoredRig) -> None:
+def _show(proposal: SceneProposal, saved: StoredRig, told_rad: float) -> None:
     """Corrections with their sigmas, what each term gained, and how the rest is predicted."""
     fit = proposal.fit
     sigma = fit.covariance.diagonal() ** 0.5
@@ -65,6 +66,8 @@ def _show(proposal: SceneProposal, saved: StoredRig) -> None:
     notes += [
         f"{len(fit.features)} features of {len(proposal.views)} pictures: {fit.rms_px[0]:.3f} px rms before, "
         f"{fit.rms_px[1]:.3f} after; {fit.median_px[0]:.3f} and {fit.median_px[1]:.3f} in the median",
+        f"each rest's own angles would explain it down to {fit.rms_px[2]:.3f} px rms: the joints repeat to "
+        f"{1e3 * fit.joint_sigma_rad:.2f} mrad{_scatter(fit, told_rad)}",
         f"pictures that had no part in the correction: {fit.predicted_px[0]:.3f} px rms before, "
         f"{fit.predicted_px[1]:.3f} after",
         *fit.outliers[:OUTLIERS_SHOWN],
@@ -83,3 +86,8 @@ def _show(proposal: SceneProposal, saved: StoredRig) -> None:
         rows,
         notes,
     )
+
+
+def _scatter(fit: SceneFit, told_rad: float) -> str:
+    """What is to be said of how rests scatter."""
+    return "" if fit.joint_sigma_rad <= told_rad else f", not to {1e3 * told_rad:.2f} as was told"

@@ -1,10 +1,13 @@
-"""Correct Opportunity's mast by some pairs of its Navcam frames, and predict another pair.
+"""What Opportunity's five Navcam frames tell of its mast: what is common to them, what is each frame's own.
 
-    .venv/bin/python -m tools.flight.scene ../shared/data/mer_navcam [--joint-sigma-rad RAD]
+    .venv/bin/python -m tools.flight.scene ../shared/data/mer_navcam
 
 Five frames of one rover pose; three pairs overlap. Features by `calib.scene.features`; what is told is what
-no place of a feature explains, median in pixels: as the labels have it; corrected by all pairs together; and
-each pair predicted by a correction that was made by the two others alone, its own rests as read.
+no place of a feature explains, pixels. First all pairs together: as the labels have it, with each rest's
+own two angles free, with the mast's numbers free, with both. Then each pair predicted by a correction that
+the two others alone make (`calib.scene.fit`, its own rule for which terms enter), its own rests as read, for
+joints that are told to repeat to so much. Beside it what is to be expected of a left-out pair: from its
+rests' scatter alone, were the correction exact, and from the correction's own sigmas too.
 """
 
 from __future__ import annotations
@@ -15,21 +18,31 @@ from pathlib import Path
 import numpy as np
 
 from calib.errors import NoCorrection
+from calib.mast.rig import Rig
 from calib.pictures.warp import grey
-from calib.scene.features import find_features
-from calib.scene.fit import JOINT_SIGMA_RAD, fit_scene, left_px
+from calib.rigid import FloatArray
+from calib.scene.features import Feature, find_features
+from calib.scene.fit import SceneFit, fit_scene, white_px
+from calib.scene.problem import SceneProblem
+from calib.scene.terms import terms_of
 from calib.scene.views import View
 from drivers.recording import read_products
-from mastctl.cli.output import positive_number
 from tools.arguments import end
 from tools.flight import mer
+
+TOLD_RAD = (5e-5, 2e-4, 1.3e-3)
+"""What joints may repeat to: as labels print them; what is taken if nothing is told; as flown."""
+
+LOOSE_RAD = 0.005
+DRAWS = 200
 
 
 def main() -> int:
     """Fit, predict, print."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("folder", type=Path)
-    parser.add_argument("--joint-sigma-rad", type=positive_number, default=JOINT_SIGMA_RAD)
     args = parser.parse_args()
     products = mer.labels(args.folder)
     rig = mer.rig(mer.fit(products), products)
@@ -41,28 +54,74 @@ def main() -> int:
         for at, one in enumerate(pointings)
     ]
     features = find_features(rig, views)
-    pairs = sorted({feature.views for feature in features})
-    fit = fit_scene(rig, views, features, args.joint_sigma_rad)
-    print(
-        f"{len(features)} features, joints repeat to {1e3 * args.joint_sigma_rad:g} mrad, "
-        f"corrected: {', '.join(fit.taken)}"
-    )
-    print(f"all pairs together: {fit.median_px[0]:.2f} px become {fit.median_px[1]:.2f} px in the median")
-    for pair in pairs:
-        mine = [feature for feature in features if feature.views == pair]
-        others = [feature for feature in features if feature.views != pair]
-        before = left_px(rig, views, mine)
-        try:
-            told = fit_scene(rig, views, others, args.joint_sigma_rad)
-            after = left_px(told.rig, views, mine)
-            words = f"{np.median(after):.2f} px predicted by the others ({', '.join(told.taken)})"
-        except NoCorrection as why:
-            words = str(why)
-        print(
-            f"frames {pair[0] + 1} and {pair[1] + 1}: {len(mine)} features, "
-            f"{np.median(before):.2f} px, {words}"
-        )
+    print(f"{len(features)} features, rms and median px of what no place explains")
+    for words, rests, terms in (
+        ("as the labels have it", False, False),
+        ("each rest's own pan and tilt free", True, False),
+        ("the mast's and the camera's numbers free", False, True),
+        ("both free", True, True),
+    ):
+        left = left_with(rig, views, features, rests, terms)
+        print(f"  {words}: {np.sqrt(np.mean(left**2)):.2f}, {np.median(left):.2f}")
+    for told in TOLD_RAD:
+        print(f"joints told to repeat to {1e3 * told:g} mrad")
+        for pair in sorted({feature.views for feature in features}):
+            predict(rig, views, features, pair, told)
     return 0
+
+
+def left_with(rig: Rig, views: list[View], features: list[Feature], rests: bool, terms: bool) -> FloatArray:
+    """What no place explains, px, where the rests' angles, the rig's numbers or both take what they like."""
+    names = tuple(name for term in terms_of(rig, views) for name in term.names) if terms else ()
+    problem = SceneProblem(rig, views, features, names, LOOSE_RAD if rests else 1e-9)
+    problem.free[:] = True
+    state = problem.solved(problem.start())
+    return np.abs(problem.rest(state.numbers, state.places)[0]) * white_px(features)
+
+
+def predict(
+    rig: Rig, views: list[View], features: list[Feature], pair: tuple[int, ...], told_rad: float
+) -> None:
+    """Print how a pair is predicted by the others."""
+    mine = [feature for feature in features if feature.views == pair]
+    others = [feature for feature in features if feature.views != pair]
+    begin = f"  frames {pair[0] + 1} and {pair[1] + 1}, {len(mine)} features"
+    try:
+        fit = fit_scene(rig, views, others, told_rad)
+    except NoCorrection as why:
+        print(f"{begin}: {why}")
+        return
+    problem = SceneProblem(rig, views, mine, fit.names, told_rad)
+    places = problem.start().places
+    rng = np.random.default_rng(1)
+
+    def left(terms: FloatArray, rests: FloatArray) -> FloatArray:
+        return problem.rest(np.concatenate([terms, rests]), places)[0] * white_px(features)
+
+    still, scatter = np.zeros(2 * problem.rests), fit.joint_sigma_rad
+    after = left(fit.values, still)
+    alone, whole = [], []
+    for _ in range(DRAWS):
+        rests = rng.normal(0.0, scatter, 2 * problem.rests)
+        terms = rng.multivariate_normal(fit.values, fit.covariance)
+        alone.append(np.median(np.abs(left(fit.values, rests) - after)))
+        whole.append(np.median(np.abs(left(terms, rests) - after)))
+    before = np.median(np.abs(left(np.zeros(len(fit.names)), still)))
+    expected = (
+        f"{np.mean(alone):.2f} from rests alone ({1e3 * scatter:.2f} mrad), {np.mean(whole):.2f} in all"
+    )
+    print(
+        f"{begin}: {before:.2f} px become {np.median(np.abs(after)):.2f}; expected {expected}; {_told(fit)}"
+    )
+
+
+def _told(fit: SceneFit) -> str:
+    """The correction's numbers with their sigmas."""
+    sigma = np.sqrt(np.diag(fit.covariance))
+    return ", ".join(
+        f"{name.removeprefix('cameras.' + mer.CAMERA + '.')} {1e3 * value:+.1f} ± {1e3 * one:.1f}"
+        for name, value, one in zip(fit.names, fit.values, sigma, strict=True)
+    )
 
 
 if __name__ == "__main__":

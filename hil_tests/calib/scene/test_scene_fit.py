@@ -11,7 +11,8 @@ from calib.camera.cahvor import CameraModel
 from calib.errors import NoCorrection
 from calib.mast.rig import Mast, Rig, RigCamera
 from calib.scene.features import Feature
-from calib.scene.fit import fit_scene, terms_of
+from calib.scene.fit import fit_scene
+from calib.scene.terms import terms_of
 from calib.scene.views import View
 
 SIZE = (1024, 768)

@@ -1,0 +1,108 @@
+"""What pictures of a still scene may correct in a rig: numbers, in terms that enter together."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from calib.camera.cahvor import CameraModel
+from calib.mast.joints import JOINTS_NAMES, joints_of
+from calib.mast.joints import numbers_of as joint_numbers
+from calib.mast.rig import Rig, RigCamera
+from calib.rigid import FloatArray, Rigid
+from calib.scene.views import View
+
+PRIOR = {"turn": 0.02, "scale": 0.01, "r1": 0.02, "mast": 0.005, "joints": 0.005}
+"""Sigma of each kind of number beforehand: radians, part of the focal length, R1."""
+
+LEAST_RESTS, LEAST_SPAN_RAD = 8, 1.0
+"""How many rests over how wide an angle tell what an axis reads wrong in the course of a turn."""
+
+LEAST_SPAN_TWICE_RAD = 2.0
+"""Over how wide an angle what it reads wrong twice a turn can be told from that."""
+
+LEAST_A_SIDE = 4
+"""Rests from either side that tell an axis's backlash."""
+
+
+@dataclass(frozen=True)
+class Term:
+    """Numbers of the rig that enter together: their names, what they are in words, and after which others."""
+
+    names: tuple[str, ...]
+    words: str
+    after: str = ""
+
+
+def terms_of(rig: Rig, views: Sequence[View]) -> tuple[Term, ...]:
+    """Return what pictures at these angles may correct."""
+    found = []
+    for name in sorted({view.camera for view in views if rig.cameras[view.camera].on == "head"}):
+        camera = f"cameras.{name}"
+        found.append(Term(tuple(f"{camera}.turn.{axis}" for axis in "xyz"), f"{name} turned in the head"))
+        found.append(Term((f"{camera}.scale",), f"{name} has another focal length"))
+        if rig.cameras[name].model.kind != "CAHV":
+            found.append(Term((f"{camera}.r1",), f"{name}'s lens bends otherwise"))
+    found.append(Term(("mast.axis_twist_rad",), "the tilt axis leans against the pan axis"))
+    rests = {view.pose: (view.pan_rad, view.tilt_rad, *view.approach) for view in views}
+    pan, tilt, pan_side, tilt_side = np.array(list(rests.values())).T
+    for axis, read, side in (("pan", pan, pan_side), ("tilt", tilt, tilt_side)):
+        joint, many = f"joints.{axis}", len(np.unique(read)) >= LEAST_RESTS
+        once, twice = (f"{axis} reads wrong {often} a turn" for often in ("once", "twice"))
+        if many and np.ptp(read) >= LEAST_SPAN_RAD:
+            found.append(Term((f"{joint}.c1", f"{joint}.s1"), once))
+        if many and np.ptp(read) >= LEAST_SPAN_TWICE_RAD:
+            found.append(Term((f"{joint}.c2", f"{joint}.s2"), twice, after=once))
+        if min((side > 0).sum(), (side < 0).sum()) >= LEAST_A_SIDE:
+            found.append(Term((f"{joint}.backlash_rad",), f"{axis} has play"))
+    return tuple(found)
+
+
+def prior_of(name: str) -> float:
+    """Return a number's sigma beforehand."""
+    parts = name.split(".")
+    return PRIOR[parts[2] if parts[0] == "cameras" else parts[0]]
+
+
+def corrected(rig: Rig, names: Sequence[str], values: FloatArray) -> Rig:
+    """Return a rig with numbers added: turns about C in the head frame, twist, joints' errors; radians."""
+    cameras = dict(rig.cameras)
+    numbers = joint_numbers(rig.joints)
+    twist = rig.mast.axis_twist_rad
+    turns: dict[str, FloatArray] = {}
+    lenses: dict[str, dict[str, float]] = {}
+    for name, value in zip(names, values, strict=True):
+        if name == "mast.axis_twist_rad":
+            twist += float(value)
+        elif name in JOINTS_NAMES:
+            numbers[JOINTS_NAMES.index(name)] += value
+        elif ".turn." not in name:
+            _, camera, number = name.split(".")
+            lenses.setdefault(camera, {})[number] = float(value)
+        else:
+            camera, axis = name.removeprefix("cameras.").split(".turn.")
+            turns.setdefault(camera, np.zeros(3))["xyz".index(axis)] = value
+    for camera, turn in turns.items():
+        held = cameras[camera]
+        cameras[camera] = RigCamera(held.on, turned(held.model, turn))
+    for camera, numbers_of_lens in lenses.items():
+        held = cameras[camera]
+        cameras[camera] = RigCamera(held.on, lensed(held.model, **numbers_of_lens))
+    mast = replace(rig.mast, axis_twist_rad=twist)
+    return replace(rig, cameras=cameras, mast=mast, joints=joints_of(numbers))
+
+
+def turned(model: CameraModel, turn_rad: FloatArray) -> CameraModel:
+    """Return a camera turned about its C by a rotation vector (3,)."""
+    rotation = Rotation.from_rotvec(turn_rad).as_matrix()
+    return model.moved(Rigid(rotation, model.C - rotation @ model.C))
+
+
+def lensed(model: CameraModel, scale: float = 0.0, r1: float = 0.0) -> CameraModel:
+    """Return a camera of a focal length longer by a part ``scale`` of itself, and of R1 larger by ``r1``."""
+    a = model.A
+    h, v = (letter + scale * (letter - (letter @ a) * a) for letter in (model.H, model.V))
+    return replace(model, H=h, V=v, R=model.R + np.array([0.0, r1, 0.0]))
