@@ -205,7 +205,7 @@ class ReplayedCamera:
                 return self._frame(wanted)
             if ready_s > deadline_s and now_s >= deadline_s:
                 raise NoFreshFrame(
-                    f"no frame exposed after {exposed_after_s:.3f} s came within {timeout_s:g} s; "
+                    f"no frame exposed after {exposed_after_s:.3f} s came within {timeout_s:.3g} s; "
                     f"the next one ends at {ready_s:.3f} s",
                     device=self._name,
                 )

@@ -1,5 +1,5 @@
 // Who steers: the lease, renewed while it is held, and given back on leaving.
-import { byId, say } from "./dom.js";
+import { byId, h, put, say, set } from "./dom.js";
 import { client, held, parting, post, ask } from "./api.js";
 import { forTime } from "./words.js";
 
@@ -10,6 +10,8 @@ export class Control {
   constructor(alarm) {
     this.alarm = alarm;
     this.words = byId("control");
+    [this.name, this.more] = [h("span", { class: "name" }), h("span")];
+    put(this.words, this.name, this.more);
     this.button = byId("take");
     this.button.addEventListener("click", () => this.press());
     setInterval(() => held.lease && this.renew(), RENEW_MS);
@@ -34,15 +36,20 @@ export class Control {
     const gone = left !== null && left <= 0;
     const mine = held.lease !== null;
     const whose = control?.holder.endsWith(client) ? "you" : control?.holder;
-    if (mine) say(this.words, `you, renewed`);
-    else if (!control || gone) say(this.words, "nobody");
-    else if (control.kind === "operation") say(this.words, `${whose}, while it runs`);
-    else say(this.words, `${control.holder}, ${forTime(left)} left`);
-    this.words.title = this.words.textContent;
+    if (mine) this.say("you", ", renewed");
+    else if (!control || gone) this.say("nobody", "");
+    else if (control.kind === "operation") this.say(whose, ", while it runs");
+    else this.say(control.holder, `, ${forTime(left)} left`);
     this.words.parentElement.dataset.whose = mine ? "mine" : control && !gone && !control.holder.endsWith(client) ? "other" : "nobody";
     if (this.sure && (mine || gone || control?.kind !== "lease")) this.sure = false;
     say(this.button, !this.may ? "View only" : this.sure ? "Take it from them?" : mine ? "Release" : control && !gone && control.kind === "lease" ? "Take over" : "Take");
     this.button.disabled = !this.may;
+  }
+
+  say(name, more) {
+    say(this.name, name);
+    say(this.more, more);
+    set(this.name, "title", name);
   }
 
   async press() {

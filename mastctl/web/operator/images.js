@@ -36,6 +36,8 @@ export class Images {
       const bitmap = await createImageBitmap(new Blob([new Uint8Array(data, 4 + length)], { type: "image/jpeg" }));
       if (this.line === line) this.show(facts, bitmap, cameMs);
       bitmap.close();
+    } catch {
+      // it cannot be decoded: the one before grows old in sight
     } finally {
       if (line.readyState === WebSocket.OPEN) line.send(facts.camera);
     }

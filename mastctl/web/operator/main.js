@@ -69,7 +69,16 @@ for (const [id, now] of [["stop", stopNow], ["latch", latchNow]]) {
   byId(id).addEventListener("click", (event) => { if (event.detail === 0) now(); }); // a screen reader's or a switch's press
 }
 document.addEventListener("keydown", (event) => { if (event.key === "Escape" && !event.repeat) stopNow(); }, { capture: true });
-for (const dialog of document.querySelectorAll("dialog")) dialog.addEventListener("cancel", (event) => event.preventDefault());
+
+/** A dialogue that leaves the stops within reach: of the browser's own kinds one shuts them out, the other nothing. */
+function ask(dialog) {
+  document.querySelector("main").inert = true;
+  if (!dialog.open) dialog.show();
+}
+function answered(dialog) {
+  dialog.close();
+  document.querySelector("main").inert = Boolean(document.querySelector("dialog[open]"));
+}
 
 const events = new Events();
 const views = new Views((eye, pixel, facts, what) => (what === "track" ? track.begin(eye, pixel, facts) : target.choose(eye, pixel, facts)));
@@ -105,7 +114,7 @@ function standing(now) {
   byId("estop").hidden = !latch;
   set(byId("latch"), "aria-pressed", String(Boolean(latch)));
   const words = latch ? ` by ${latch.name}: ${latch.reason}. Nothing moves until it is released, not even after a restart of the daemon. ` : "";
-  if (words !== latched) put(byId("estop"), h("strong", {}, "Emergency stop"), words, h("button", { type: "button", id: "release", onclick: () => byId("reset").showModal() }, "Release …"));
+  if (words !== latched) put(byId("estop"), h("strong", {}, "Emergency stop"), words, h("button", { type: "button", id: "release", onclick: () => ask(byId("reset")) }, "Release …"));
   latched = words;
   if (latch) byId("release").disabled = !may;
   document.title = `${now.state} – mastctl`;
@@ -192,11 +201,11 @@ function allow(role) {
 async function enter() {
   try {
     const session = await get("/session");
-    byId("login").close();
+    answered(byId("login"));
     allow(session.role);
     events.open();
   } catch (error) {
-    if (error.status === 401) byId("login").showModal();
+    if (error.status === 401) ask(byId("login"));
     else { notice(error.message); setTimeout(enter, 2000); }
   }
 }
@@ -211,13 +220,13 @@ byId("login-form").addEventListener("submit", async (event) => {
     say(byId("login-said"), error.message);
   }
 });
-document.addEventListener("no-session", () => { if (!byId("login").open) byId("login").showModal(); });
-byId("reset-no").addEventListener("click", () => byId("reset").close());
+document.addEventListener("no-session", () => ask(byId("login")));
+byId("reset-no").addEventListener("click", () => answered(byId("reset")));
 byId("reset-form").addEventListener("submit", async (event) => {
   event.preventDefault();
   try {
     await post("/reset", { reason: byId("reset-reason").value, name: byId("reset-name").value });
-    byId("reset").close();
+    answered(byId("reset"));
   } catch (error) {
     say(byId("reset-said"), error.message);
   }

@@ -259,6 +259,11 @@ def test_a_token_is_asked_for_and_who_may_look_cannot_move(
         one.page.keyboard.press("Escape")
         eventually(lambda: ("stop",) in net.hardware.head.calls, "a stop needs no token")
         assert one.page.locator("#login").is_visible()
+        told = len(net.hardware.head.calls)
+        one.page.get_by_role("button", name="STOP", exact=True).click()
+        eventually(
+            lambda: len(net.hardware.head.calls) > told, "nor does the button, which no dialogue covers"
+        )
         one.page.locator("#token").fill(net.token("view"))
         one.page.get_by_role("button", name="Log in").click()
         one.frame().click()
@@ -350,6 +355,8 @@ def test_an_emergency_stop_is_told_and_released_with_a_reason(pair: BOTH, visit:
     one.word("stopped")
     assert "by Ana: sparks" in one.page.locator("#estop").inner_text()
     one.page.locator("#release").click()
+    one.page.get_by_role("button", name="STOP", exact=True).click()
+    one.page.wait_for_selector("#stop[data-pressed=confirmed]")
     one.page.locator("#reset-reason").fill("a loose wire, mended")
     one.page.locator("#reset-name").fill("Ben")
     one.page.get_by_role("button", name="Release", exact=True).click()

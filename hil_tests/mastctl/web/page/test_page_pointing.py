@@ -58,6 +58,26 @@ def test_a_rock_is_clicked_pointed_at_and_its_residual_read(rover: RunningDaemon
     assert rover.service.operations.all()[0].told()["state"] == "done"
 
 
+def test_stop_during_a_motion_ends_it_where_the_head_is(rover: RunningDaemon, visit: Visits) -> None:
+    one = visit(rover.url)
+    one.word("ready")
+    with Client(rover.url) as client:
+        began = client.status()["joints"]
+        operation = client.point(pan_rad=-2.4, tilt_rad=0.0)
+        one.word("moving")
+        one.page.wait_for_selector(".range .wanted", state="attached")
+        one.page.keyboard.press("Escape")
+        one.page.wait_for_selector("#stop[data-pressed=confirmed]")
+        assert client.wait(operation)["state"] == "stopped"
+        one.page.wait_for_selector("#state:not([data-word=moving])")
+        stands = client.status()["joints"]
+        assert began is not None and stands is not None
+        assert -2.4 < stands["pan_rad"] < began["pan_rad"], "it stands on its way"
+        one.page.wait_for_selector(".operation .word.stopped")
+        one.page.wait_for_selector(".range .wanted", state="detached")
+        client.wait(client.point(**{axis: began[axis] for axis in ("pan_rad", "tilt_rad")}))
+
+
 def test_a_box_round_a_rock_begins_a_track_that_is_drawn_in_both_eyes(
     rover: RunningDaemon, visit: Visits
 ) -> None:
