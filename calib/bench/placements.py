@@ -147,7 +147,7 @@ def advise(
     base = known.information(shots)
     best: Advice | None = None
     for placement in every:
-        told = _told_by(known, sought, placement)
+        told = told_by(known, sought, placement)
         if told is None:
             continue
         rms = aim.rms_px(covariance_of(base + told))
@@ -156,8 +156,8 @@ def advise(
     return best
 
 
-def _told_by(known: Knowledge, sought: Sought, placement: Placement) -> FloatArray | None:
-    """What a pattern of shots of a board that stood so would tell of the rig."""
+def told_by(known: Knowledge, sought: Sought, placement: Placement) -> FloatArray | None:
+    """Return what a pattern of shots of a board that stood so would tell of the rig; None of too few."""
     head = known.rig.mast.rover_from_head(0.0, 0.0)
     supposed = replace(known, boards={"": placement.rover_from_board(head)})
     camera = next(c for c in known.rig.cameras.values() if c.on == "head")

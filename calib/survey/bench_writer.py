@@ -26,6 +26,10 @@ IMAGE_COLUMNS = (
 )
 
 
+class NotWritten(BadFile):
+    """The file system refuses, as a full disk does; what was written before is whole."""
+
+
 class BenchFolder:
     """A bench's folder that grows by one image at a time.
 
@@ -66,11 +70,12 @@ class BenchFolder:
                         self.path, "", "has an images.csv and no survey.yaml; an empty folder is expected"
                     )
                 replace_bytes(there, wanted, 0o644)
-            elif there.read_bytes() != wanted:
-                raise BadFile(there, "", "is of other boards, sigmas or cameras; another folder is expected")
         except OSError as error:
-            raise BadFile(self.path, "", f"cannot be written: {error.strerror or error}") from None
+            raise NotWritten(self.path, "", f"cannot be written: {error.strerror or error}") from None
         survey = read_survey(self.path)
+        place, words = _other(bench_document(survey), bench_document(header))
+        if words:
+            raise BadFile(there, place, f"{words}; another folder (--survey) is expected")
         self._images = list(survey.images)
         self._corners = dict(survey.corners)
 
@@ -111,7 +116,7 @@ class BenchFolder:
                 replace_bytes(self.path / "corners.csv", corners_table(images, found), 0o644)
                 self._corners = found
         except OSError as error:
-            raise BadFile(self.path, image.name, f"cannot be written: {error.strerror or error}") from None
+            raise NotWritten(self.path, image.name, f"cannot be written: {error.strerror or error}") from None
 
     def _write_picture(self, file: Path, picture: bytes) -> None:
         path = self.path / file
@@ -119,6 +124,28 @@ class BenchFolder:
             raise BadFile(self.path, str(file), "the picture lies outside the folder")
         path.parent.mkdir(parents=True, exist_ok=True)
         replace_bytes(path, picture, 0o644)
+
+
+def _other(there: Any, wanted: Any, place: str = "") -> tuple[str, str]:
+    """Where two documents first differ, and how in words; empty where they do not."""
+    if isinstance(there, Mapping) and isinstance(wanted, Mapping):
+        for key in [*there, *(key for key in wanted if key not in there)]:
+            at = f"{place}.{key}" if place else str(key)
+            if key not in wanted:
+                return at, "is in the folder, and is not asked for now"
+            if key not in there:
+                return at, "is asked for now, and is not in the folder"
+            found = _other(there[key], wanted[key], at)
+            if found[1]:
+                return found
+        return "", ""
+    if isinstance(there, (list, tuple)) and isinstance(wanted, (list, tuple)):
+        return (
+            (place, "")
+            if list(there) == list(wanted)
+            else (place, f"is {there!r}, now it would be {wanted!r}")
+        )
+    return (place, "") if there == wanted else (place, f"is {there!r}, now it would be {wanted!r}")
 
 
 def bench_files(survey: Survey) -> list[tuple[str, bytes]]:

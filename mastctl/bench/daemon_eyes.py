@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import replace
 from typing import Any
 
@@ -35,7 +36,7 @@ DARK_DN, BRIGHT_DN = 12.0, 245.0
 
 LASTING = frozenset(
     {
-        "leased", "lease_lost", "not_held", "estopped", "stopping", "no_daemon", "forbidden", "no_token",
+        "leased", "lease_over", "lease_unknown", "estopped", "stopping", "no_daemon", "forbidden", "no_token",
         "bad_token", "bad_url", "busy", "closing",
     }
 )  # fmt: skip
@@ -131,8 +132,12 @@ class DaemonEyes:
         return Look(tuple(seen), _side(one, "pan_approach"), _side(one, "tilt_approach"), seconds)
 
     def _turn(self, pan_rad: float, tilt_rad: float, approach: tuple[int, int]) -> None:
-        """Go to readings, by way of ones beside them where an axis would come from the other side."""
-        if any(approach) and not self._head.one_sided:
+        """Go to readings, by way of ones beside them where an axis would come from the other side.
+
+        A head that comes from either side goes through all of its play, so that it is known where in it it
+        rests.
+        """
+        if not self._head.one_sided:
             joints: Mapping[str, Any] = self._client.status()["joints"] or {}
             here = float(joints.get("pan_rad", pan_rad)), float(joints.get("tilt_rad", tilt_rad))
             beside = [
@@ -148,14 +153,31 @@ class DaemonEyes:
 
     def _go(self, pan_rad: float, tilt_rad: float) -> None:
         """Have the daemon turn to readings, as its commanded angles are."""
-        operation = self._client.wait(
-            self._client.point(pan_rad=pan_rad, tilt_rad=tilt_rad), timeout_s=TURN_TIMEOUT_S
-        )
+        try:
+            operation = self._client.wait(
+                self._client.point(pan_rad=pan_rad, tilt_rad=tilt_rad), timeout_s=TURN_TIMEOUT_S
+            )
+        except KeyboardInterrupt:  # who leaves leaves no head behind that turns
+            with suppress(ClientError), Client(self._client.url, name="calibrate bench") as client:
+                client.stop()
+            raise
+        told: Mapping[str, Any] = operation.get("error") or {}
+        why = str(told.get("message", "the move failed"))
         if operation["state"] == "stopped":
-            raise Interrupted("somebody pressed stop, and the head stands still")
+            raise Interrupted(self._stopped(why))
         if operation["state"] != "done":
-            told: Mapping[str, Any] = operation.get("error") or {}
-            raise ClientError(str(told.get("code", "failed")), str(told.get("message", "the move failed")))
+            raise ClientError(str(told.get("code", "failed")), why)
+
+    def _stopped(self, why: str) -> str:
+        """What stopped a move: an emergency stop, who took over, a daemon that ends, or the stop button."""
+        held = None
+        with suppress(ClientError):
+            held = self._client.status()["estop"]
+        if held is not None:
+            return f"the head was stopped in the middle of a move by {why}; 'mastctl reset' releases it"
+        if why == "a stop was asked for":
+            return "somebody pressed stop in the middle of a move, and the head stands still"
+        return f"the head was stopped in the middle of a move: {why}"
 
     def _seen(self, shot: Snapshot) -> Seen:
         pan_rad, tilt_rad = shot.pan_rad, shot.tilt_rad
@@ -180,8 +202,14 @@ def served_rig(rig: Rig, cameras: Sequence[str]) -> Rig:
 
 
 def _beside(wanted: float, now: float, side: int, limits: tuple[float, float]) -> float:
-    """Where to go first to come from a side; where it is wanted if it comes from there anyway."""
-    if not side or (wanted - now) * side >= COME_FROM_RAD:
+    """Where to go first to come from a side; where it is wanted if it comes from there anyway.
+
+    0 is the side that is on the way. Where a limit leaves no room on one side, it comes from the other.
+    """
+    side = side or (1 if wanted > now else -1)
+    if not limits[0] <= wanted - side * COME_FROM_RAD <= limits[1]:
+        side = -side
+    if (wanted - now) * side >= COME_FROM_RAD:
         return wanted
     return min(max(wanted - side * COME_FROM_RAD, limits[0]), limits[1])
 

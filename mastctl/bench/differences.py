@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from calib.camera.cahvor import CameraModel
+from calib.camera.difference import camera_axes
 from calib.camera.parameters import predict
 from calib.mast.rig import Rig
 from calib.rigid import FloatArray, Rigid, moved_rigid, rigid_rates
@@ -27,8 +28,8 @@ class Difference:
         Which, and its picture's size.
     pixels_px
         (n, 2) where it is compared.
-    whole_px, lens_px
-        (n, 2) new less former pixel of what the former saw there, far away: in all, and with the motion out.
+    lens_px
+        (n, 2) new less former pixel of what the former saw there, far away, the motion taken out.
     turned_rad, shifted_m
         (3,) the motion that makes the former camera project as the new one does, as well as one can.
     """
@@ -36,7 +37,6 @@ class Difference:
     camera: str
     size_px: tuple[int, int]
     pixels_px: FloatArray
-    whole_px: FloatArray
     lens_px: FloatArray
     turned_rad: FloatArray
     shifted_m: FloatArray
@@ -67,38 +67,60 @@ def rig_differences(new: Rig, former: Rig) -> Iterator[Difference]:
 
 def camera_difference(name: str, new: CameraModel, former: CameraModel) -> Difference:
     """Return how far a camera is from its former model."""
-    width, height = former.size_px
+    moved, _ = implied_motion([(new, former)])
+    pixels, far = _what_it_saw(former, RANGES_M[-1:])
+    seen, valid = new.project(moved.points(far))
+    lens = np.where(valid[:, None], seen, np.nan) - pixels
+    motion = moved.inverse  # points moved into the camera's place: the camera moved the other way
+    return Difference(name, former.size_px, pixels, lens, -_rotvec(moved.rotation), motion.translation_m)
+
+
+def implied_motion(pairs: Sequence[tuple[CameraModel, CameraModel]]) -> tuple[Rigid, float]:
+    """Return the motion of points after which new cameras see them as the former ones saw them before.
+
+    Parameters
+    ----------
+    pairs
+        New and former models; all of the new ones in one frame, all of the former in another.
+
+    Returns
+    -------
+    new_from_former
+        The motion, least squares over all pictures.
+    rms_px
+        What is left of pixels, rms per axis.
+    """
+    new, former = pairs[0]
+    axes, old = camera_axes(new), camera_axes(former)
+    moved = Rigid(axes @ old.T, new.C - axes @ old.T @ former.C)
+    for _ in range(STEPS):
+        rates, off = [], []
+        for new, former in pairs:
+            pixels, points = _what_it_saw(former, RANGES_M)
+            here = moved.points(points)
+            seen = predict(new, here)
+            off.append((seen.pixels_px - pixels).ravel())
+            rates.append(rigid_rates(seen.d_points, here, moved.translation_m).reshape(-1, 6))
+        residual, jacobian = np.concatenate(off), np.concatenate(rates)
+        good = np.isfinite(residual) & np.isfinite(jacobian).all(axis=1)
+        step = -np.asarray(np.linalg.lstsq(jacobian[good], residual[good], rcond=None)[0], dtype=np.float64)
+        moved = moved_rigid(moved, step)
+        if np.linalg.norm(step) < 1e-12:
+            break
+    return moved, float(np.sqrt(np.mean(residual[good] ** 2)))
+
+
+def _what_it_saw(camera: CameraModel, ranges_m: Sequence[float]) -> tuple[FloatArray, FloatArray]:
+    """Pixels (n, 2) over a camera's picture, and points (n, 3) seen there, range after range."""
+    width, height = camera.size_px
     x, y = np.meshgrid(
         (np.arange(GRID[0]) + 0.5) * width / GRID[0] - 0.5,
         (np.arange(GRID[1]) + 0.5) * height / GRID[1] - 0.5,
     )
     pixels = np.stack([x.ravel(), y.ravel()], axis=-1)
-    rays = former.ray(pixels)
-    points = np.concatenate([rays.origins_m + range_m * rays.directions for range_m in RANGES_M])
-    wanted = np.concatenate([pixels] * len(RANGES_M))
-    moved = Rigid.identity()
-    for _ in range(STEPS):
-        here = moved.points(points)
-        seen = predict(new, here)
-        off = (seen.pixels_px - wanted).ravel()
-        rates = rigid_rates(seen.d_points, here, moved.translation_m).reshape(-1, 6)
-        good = np.isfinite(off) & np.isfinite(rates).all(axis=1)
-        step = -np.linalg.lstsq(rates[good], off[good], rcond=None)[0]
-        moved = moved_rigid(moved, step)
-        if np.linalg.norm(step) < 1e-12:
-            break
-    far = points[-len(pixels) :]
-    whole = np.where(*_seen(new, far)) - pixels
-    lens = np.where(*_seen(new, moved.points(far))) - pixels
-    motion = moved.inverse  # points moved into the camera's place: the camera moved the other way
-    return Difference(
-        name, former.size_px, pixels, whole, lens, -_rotvec(moved.rotation), motion.translation_m
-    )
-
-
-def _seen(model: CameraModel, points: FloatArray) -> tuple[FloatArray, FloatArray, float]:
-    pixels, valid = model.project(points)
-    return valid[:, None], pixels, np.nan
+    rays = camera.ray(pixels)
+    points = [rays.origins_m + range_m * rays.directions for range_m in ranges_m]
+    return np.concatenate([pixels] * len(ranges_m)), np.concatenate(points)
 
 
 def _rotvec(rotation: FloatArray) -> FloatArray:

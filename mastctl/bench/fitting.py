@@ -7,11 +7,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calib.fit.bench import BenchOptions, fit_bench
 from calib.fit.bench_calibration import BenchCalibration
 from calib.mast.rig import Rig
 from calib.rigid import Rigid
 from calib.survey import Survey
+from mastctl.bench.frame import Frame, fit_in_frame
 
 LEAST_PX, LEAST_SCALE = 0.01, 0.1
 """No corner is surer than this, and none so much surer than its finder says; few pictures agree by chance."""
@@ -45,14 +45,11 @@ class Fitted:
 FitSurvey = Callable[[Survey], Fitted]
 
 
-def fit_in_rover(rover_from_mast: Rigid) -> FitSurvey:
-    """Return the fit of a bench whose mast stands in the rover frame as a drawing has it.
-
-    Where the mast frame is in the rover frame no board of unknown place can tell.
-    """
+def fit_in_rover(frame: Frame, former: Rig) -> FitSurvey:
+    """Return the fit of a bench in a rover frame that was stated."""
 
     def fit(survey: Survey) -> Fitted:
-        done = fit_bench(survey, BenchOptions(rover_from_mast=rover_from_mast))
+        done = fit_in_frame(survey, frame, former)
         # Of a board that moved, "p1 from IMAGE on" comes after "p1": where it stands now.
         boards = {placement.split(" ")[0]: pose for (_, placement), pose in done.rover_from_board.items()}
         rms = float(np.sqrt(np.mean(np.square(list(done.rms_px.values())))))

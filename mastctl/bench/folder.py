@@ -13,13 +13,19 @@ from typing import Any, cast
 from calib.bench.placements import Placement
 from calib.boards import AnyBoard
 from calib.errors import BadFile
+from calib.files.atomic import replace_bytes
+from calib.files.mast_file import load_rig
 from calib.mast.rig import Rig
 from calib.survey import Sigma, Survey, SurveyCamera, SurveyImage
-from calib.survey.bench_writer import BenchFolder
+from calib.survey.bench_writer import BenchFolder, NotWritten
 from calib.survey.records import Approach
 from mastctl.bench.eyes import Look, Seen
+from mastctl.bench.frame import Frame, frame_of
 
 JOURNAL = "bench.jsonl"
+
+FORMER = "former_mast.yaml"
+"""The mast file that was in use when the run began."""
 
 
 class Kept:
@@ -66,6 +72,17 @@ class Kept:
             number = int(_of_look(image).rsplit("-", 1)[1])
             self._numbers[image.placement] = max(number, self._numbers.get(image.placement, 0))
 
+    def begin(self, former: bytes, frame: Frame) -> None:
+        """Keep the mast file in use, unless one is kept already, and what the rover frame hangs on."""
+        path = self.path / FORMER
+        try:
+            if not path.exists():
+                replace_bytes(path, former, 0o644)
+        except OSError as error:
+            raise NotWritten(path, "", f"cannot be written: {error.strerror or error}") from None
+        if frame.stated and frame != frame_of(self.notes):
+            self.note(event="frame", **frame.told())
+
     def survey(self) -> Survey:
         """Return all that was seen."""
         return self._folder.survey()
@@ -81,7 +98,7 @@ class Kept:
                 file.flush()
                 os.fsync(file.fileno())
         except OSError as error:
-            raise BadFile(self._journal, "", f"cannot be written: {error.strerror or error}") from None
+            raise NotWritten(self._journal, "", f"cannot be written: {error.strerror or error}") from None
         self.notes.append(told)
 
     def add(self, placement: str, board: str, look: Look, check: bool) -> None:
@@ -138,6 +155,23 @@ def _locked(path: Path) -> int:
         words = "another run keeps its looks there; wait for its end, or name another folder (--survey)"
         raise BadFile(path, "", words) from None
     return descriptor
+
+
+def former_rig(folder: Path) -> Rig | None:
+    """Return the rig as it was known when a folder's run began; None of a folder that no run wrote.
+
+    Raises
+    ------
+    BadFile
+        If what is kept is no mast file.
+    """
+    path = folder / FORMER
+    return load_rig(path).rig if path.exists() else None
+
+
+def kept_frame(folder: Path) -> Frame:
+    """Return what the rover frame of a folder's run hangs on. Raises BadFile."""
+    return frame_of(_read_notes(folder / JOURNAL))
 
 
 def survey_cameras(rig: Rig, names: Mapping[str, tuple[int, int]]) -> dict[str, SurveyCamera]:

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.bench.board_pose import rover_from_board
+from calib.bench.body import FEWEST, body_cameras
 from calib.bench.knowledge import Knowledge, Shot, View
 from calib.bench.poses import Sought, expected_px, with_board
 from calib.bench.workspace import Pointing, Workspace, pointing
@@ -147,6 +148,17 @@ class Known:
                 np.add.at(camera, y * columns + x, 1)
         return {camera: tuple(told.tolist()) for camera, told in counts.items()}
 
+    def untied(self) -> list[str]:
+        """Return the body cameras that have seen too few of the placements that the head saw."""
+        on_head = [c for c, camera in self.now.rig.cameras.items() if camera.on == "head"]
+        seen = [(name, {one.camera for one in look.found}) for name, check, look in self.looks if not check]
+        by_head = {name for name, cameras in seen if cameras & set(on_head)}
+        return [
+            body
+            for body in body_cameras(self.now)
+            if len({name for name, cameras in seen if body in cameras} & by_head) < FEWEST
+        ]
+
     def promised_px(self, looks: Sequence[Look], name: str) -> dict[str, float]:
         """Return what corners of looks that were not fitted should be off by, rms per axis, by camera."""
         told: dict[str, list[float]] = {}
@@ -213,7 +225,9 @@ class Known:
         """Let a fit of so many looks be the present estimate; boards that it does not know stay where they
         were seen."""
         self.fitted, self.fitted_looks = fitted, looks
-        self.now = replace(self.now, rig=fitted.rig, boards=dict(fitted.boards))
+        body = {n: c for n, c in self.head.rig.cameras.items() if c.on == "rover"}
+        rig = replace(fitted.rig, cameras={**body, **fitted.rig.cameras})
+        self.now = replace(self.now, rig=rig, boards=dict(fitted.boards))
         self._scale = fitted.sigma_scale
         self.sought = replace(self.sought, sigma_px=fitted.corner_rms_px)
         self.aim = pointing(self.now, self.workspace)

@@ -17,12 +17,13 @@ from calib.bench.workspace import Workspace, pointing
 from calib.errors import BadFile
 from calib.files.mast_file import StoredRig, joint_keys
 from calib.files.yaml_text import plain
-from calib.fit.bench import BenchOptions, fit_bench
+from calib.fit.bench import BenchOptions
 from calib.fit.bench_calibration import BenchCalibration, TermGain
 from calib.mast.covariance import RigCovariance
 from calib.mast.rig import Rig
 from calib.survey import Survey
 from mastctl.bench.final import Checked
+from mastctl.bench.frame import Frame, fit_in_frame
 from mastctl.bench.known import first_cameras
 from mastctl.bench.report import Told, workspace_covariance, write_bench_report
 from mastctl.bench.run import BenchRun
@@ -192,7 +193,8 @@ def finish(bench: BenchRun, teller: Teller, out: Path, report: Path | None) -> B
     assert calibration is not None
     survey = known.kept.survey()
     verdict = judge_bench(survey, calibration)
-    rig = replace(with_bench_fit(calibration, survey, verdict), name=known.head.rig.name)
+    calibration = told_of_former(calibration, known.head.rig)
+    rig = with_former(with_bench_fit(calibration, survey, verdict), known.head.rig)
     saved, _ = save_new(rig, out)
     done = BenchDone(
         survey,
@@ -209,8 +211,10 @@ def finish(bench: BenchRun, teller: Teller, out: Path, report: Path | None) -> B
     return _reported(done, report, known.head.rig, known.workspace)
 
 
-def save_bench(survey: Survey, out: Path, report: Path | None, options: BenchOptions) -> BenchDone:
-    """Fit a bench's folder again and save the mast file.
+def save_bench(
+    survey: Survey, out: Path, report: Path | None, options: BenchOptions, frame: Frame, former: Rig | None
+) -> BenchDone:
+    """Fit a bench's folder again and save the mast file; ``frame`` and ``former`` as of `fit_in_frame`.
 
     Raises
     ------
@@ -220,9 +224,12 @@ def save_bench(survey: Survey, out: Path, report: Path | None, options: BenchOpt
         If the pictures do not determine a rig; nothing is written.
     """
     checked_survey(survey)
-    calibration = fit_bench(survey, options)
+    calibration = fit_in_frame(survey, frame, former, options)
     verdict = judge_bench(survey, calibration)
-    saved, _ = save_new(with_bench_fit(calibration, survey, verdict), out)
+    if former is not None:
+        calibration = told_of_former(calibration, former)
+    rig = with_bench_fit(calibration, survey, verdict)
+    saved, _ = save_new(rig if former is None else with_former(rig, former), out)
     predicted = predicted_pointing_px(calibration)
     fitted = [image for image in calibration.images if image.purpose != "check"]
     done = BenchDone(
@@ -238,7 +245,32 @@ def save_bench(survey: Survey, out: Path, report: Path | None, options: BenchOpt
     shown = [image for image in survey.images if image.pan_rad is not None and image.tilt_rad is not None]
     pans, tilts = ([float(getattr(i, f"{joint}_rad")) for i in shown] for joint in ("pan", "tilt"))
     where = Workspace(first_cameras(calibration.rig), (min(pans), max(pans)), (min(tilts), max(tilts)))
-    return _reported(done, report, None, where)
+    return _reported(done, report, former, where)
+
+
+def told_of_former(calibration: BenchCalibration, former: Rig) -> BenchCalibration:
+    """Return the calibration with a note on cameras that the former mast file has and no picture shows."""
+    notes = []
+    for name, camera in former.cameras.items():
+        if name in calibration.rig.cameras:
+            continue
+        if camera.on == "rover":
+            notes.append(f"camera {name} stays in the mast file as the former one has it")
+        else:
+            notes.append(
+                f"camera {name} is not in the mast file any more: the head is another frame now, and none of "
+                "its pictures shows the board"
+            )
+    return replace(calibration, notes=(*calibration.notes, *notes))
+
+
+def with_former(rig: Rig, former: Rig) -> Rig:
+    """Return the rig with the former one's name, and its body cameras that were not tied to the head."""
+    body = {n: c for n, c in former.cameras.items() if c.on == "rover" and n not in rig.cameras}
+    cameras = {**rig.cameras, **body}
+    order = [*(n for n in former.cameras if n in cameras), *(n for n in cameras if n not in former.cameras)]
+    stereo = {**{n: p for n, p in former.stereo.items() if set(p) <= set(cameras)}, **rig.stereo}
+    return replace(rig, name=former.name, cameras={n: cameras[n] for n in order}, stereo=stereo)
 
 
 def _reported(done: BenchDone, folder: Path | None, former: Rig | None, where: Workspace) -> BenchDone:

@@ -9,7 +9,8 @@ from __future__ import annotations
 import math
 from dataclasses import asdict
 
-from calib.bench.placements import Placement, advise, first_placement
+from calib.bench.body import advise_for_body
+from calib.bench.placements import Advice, Placement, advise, first_placement
 from calib.boards import AnyBoard
 from calib.errors import CalibError
 from mastctl.bench.eyes import Eyes
@@ -158,8 +159,14 @@ class BenchRun:
             self.known.fit()
         except CalibError as reason:
             self._teller.say(f"no fit yet: {reason}")
-        target_px = self.wanted.at_least_px(self.known.floor_px)
-        return len(over) >= self.wanted.placements[0] and self.known.predicted_px() <= target_px
+        if len(over) < self.wanted.placements[0] or self._body_advice() is not None:
+            return False
+        return self.known.predicted_px() <= self.wanted.at_least_px(self.known.floor_px)
+
+    def _body_advice(self) -> Advice | None:
+        """Where the board would tie body cameras to the head that are not tied yet."""
+        known, untied = self.known, self.known.untied()
+        return advise_for_body(known.now, known.sought, known.shots, untied) if untied else None
 
     def _room(self) -> int:
         """Looks that may still be taken for the fit."""
@@ -174,7 +181,7 @@ class BenchRun:
         known, name = self.known, f"p{len(self.known.placements()) + 1}"
         if not known.shots:
             return name, first_placement(known.now, known.sought)
-        advice = advise(known.now, known.sought, known.shots, known.aim)
+        advice = self._body_advice() or advise(known.now, known.sought, known.shots, known.aim)
         if advice is None:
             raise MastctlError("no place for the board can be seen within the head's limits")
         return name, advice.placement

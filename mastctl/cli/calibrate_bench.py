@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import logging
 import os
+import signal
 import sys
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
@@ -16,7 +17,7 @@ from mastctl.cli.output import CommandError, WrongUse
 from mastctl.cli.places import check_file, check_folder
 
 if TYPE_CHECKING:
-    from calib.fit.bench import BenchOptions
+    from mastctl.bench.frame import Frame
     from mastctl.bench.run import BenchRun
     from mastctl.bench.teller import Teller
     from mastctl.client import Client
@@ -40,9 +41,7 @@ def add_commands(subparsers: Any) -> None:
         description="Turns the head to look for a board, chooses each next pose by what it would tell, asks "
         "for two to four placements of the board, and ends by itself when the wanted pointing error is met "
         "(docs/bench.md). Everything seen is kept in a folder: a run that ended goes on with the same "
-        "command. With FOLDER such a folder is fitted again, and nothing moves: then --like or --mast-at "
-        "say where the mast stands in the rover frame (default: it is the rover frame), and --model which "
-        "lenses.",
+        "command. With FOLDER such a folder is fitted again, and nothing moves.",
     )
     parser.add_argument(
         "folder", nargs="?", type=Path, metavar="FOLDER", help="a bench's folder to fit again"
@@ -84,17 +83,25 @@ def add_commands(subparsers: Any) -> None:
         help="for a program that shows the run: everything as lines of JSON on stdout, 'stands' on stdin as "
         "its answer; the run ends with stdin. Steers under $MASTCTL_LEASE, which the program renews",
     )  # fmt: skip
-    again = parser.add_argument_group("with FOLDER")
-    again.add_argument(
-        "--like",
-        type=Path,
-        metavar="MAST.yaml",
-        help="the mast stands in the rover frame as in this mast file",
-    )
-    again.add_argument(
-        "--mast-at", type=float, nargs=6, metavar=("X", "Y", "Z", "RX", "RY", "RZ"),
-        help="the mast stands there in the rover frame (metres, radians), as level and tape say",
+    where = parser.add_argument_group(
+        "where the rover frame is, which pictures cannot tell (default: where the mast file in use has it; "
+        "of a FOLDER: as its run had it)"
+    ).add_mutually_exclusive_group()
+    pose = ("X", "Y", "Z", "RX", "RY", "RZ")
+    where.add_argument(
+        "--mast-at", type=float, nargs=6, metavar=pose,
+        help="the mast stands there (metres, radians as in a mast file), as level and tape say",
     )  # fmt: skip
+    where.add_argument("--like", type=Path, metavar="MAST.yaml", help="the mast stands as in this mast file")
+    where.add_argument(
+        "--board-at", type=float, nargs=6, metavar=("X", "Y", "Z", "YAW", "PITCH", "ROLL"),
+        help="the first placement's board stands there: its middle (metres), and its turn about the rover's "
+        "z, y, x (degrees; 0 0 0: upright, its face towards the rover)",
+    )  # fmt: skip
+    where.add_argument(
+        "--body-stays", action="store_true", help="body cameras stay where the former mast file has them"
+    )
+    again = parser.add_argument_group("with FOLDER")
     again.add_argument(
         "--model", choices=("CAHV", "CAHVOR", "CAHVORE"), help="of all cameras (default: as survey.yaml says)"
     )
@@ -111,10 +118,8 @@ def run(args: argparse.Namespace) -> int:
                 name = option.replace("_", "-")
                 raise WrongUse(f"--{name} drives a head; with FOLDER nothing is driven")
         return _again(args)
-    for option in ("like", "mast_at", "model"):
-        if getattr(args, option) is not None:
-            name = option.replace("_", "-")
-            raise WrongUse(f"--{name} is for fitting a folder again; name a bench's FOLDER")
+    if args.model is not None:
+        raise WrongUse("--model is for fitting a folder again; name a bench's FOLDER")
     if args.board is None:
         raise WrongUse("--board is missing; the BOARD.yaml that 'mastctl board make' wrote is expected")
     return _drive_in_lines(args) if args.lines else _drive(args)
@@ -126,7 +131,9 @@ def survey_folder(out: Path) -> Path:
 
 
 def _again(args: argparse.Namespace) -> int:
+    from calib.fit.bench import BenchOptions
     from calib.survey import read_survey
+    from mastctl.bench.folder import former_rig, kept_frame
     from mastctl.bench.result import save_bench
 
     survey = read_survey(args.folder)
@@ -136,30 +143,32 @@ def _again(args: argparse.Namespace) -> int:
             f"{args.folder} is a survey with a station; 'mastctl calibrate {args.folder}' fits it",
             2,
         )
+    frame = _frame(args)
+    if not frame.stated:
+        frame = kept_frame(args.folder)
+    options = BenchOptions(kind=args.model)
     with output.waiting(args.json, f"fitting {len(survey.images)} images"):
-        done = save_bench(survey, args.out, args.report, _options(args))
+        done = save_bench(survey, args.out, args.report, options, frame, former_rig(args.folder))
     _tell(args, done.told(), done.lines())
     return 0
 
 
-def _options(args: argparse.Namespace) -> BenchOptions:
-    """What is chosen of a fit: lenses, and where the mast stands."""
+def _frame(args: argparse.Namespace) -> Frame:
+    """What the rover frame hangs on, as far as it was said."""
     import math
 
     from calib.files.mast_file import load_rig
-    from calib.fit.bench import BenchOptions
-    from calib.mast.rig import Mast
+    from mastctl.bench.frame import Frame
 
-    if args.like is not None and args.mast_at is not None:
-        raise WrongUse("--like and --mast-at both say where the mast stands; give one")
-    place = None
+    for option in ("mast_at", "board_at"):
+        numbers = getattr(args, option)
+        if numbers is not None and not all(math.isfinite(number) for number in numbers):
+            raise WrongUse(f"--{option.replace('_', '-')} holds a number that is not finite")
+    mast_at = args.mast_at
     if args.like is not None:
-        place = load_rig(args.like).rig.mast.rover_from_mast
-    elif args.mast_at is not None:
-        if not all(math.isfinite(number) for number in args.mast_at):
-            raise WrongUse("--mast-at holds a number that is not finite; metres and radians are expected")
-        place = Mast(args.mast_at[:3], args.mast_at[3:]).rover_from_mast
-    return BenchOptions(kind=args.model, rover_from_mast=place)
+        mast = load_rig(args.like).rig.mast
+        mast_at = [*mast.translation_m.tolist(), *mast.rotation_rad.tolist()]
+    return Frame(mast_at, args.board_at, args.body_stays)
 
 
 def _drive_in_lines(args: argparse.Namespace) -> int:
@@ -180,6 +189,8 @@ def _drive_in_lines(args: argparse.Namespace) -> int:
 
 def _drive(args: argparse.Namespace) -> int:
     from calib.boards import load_board
+    from calib.fit.bench import BenchNotFitted
+    from calib.survey.bench_writer import NotWritten
     from mastctl.bench.daemon_eyes import Interrupted
     from mastctl.bench.looks import BoardLost
     from mastctl.bench.result import finish
@@ -188,6 +199,7 @@ def _drive(args: argparse.Namespace) -> int:
 
     board = load_board(args.board)
     folder = args.survey or survey_folder(args.out)
+    kept = f"everything seen is kept in {folder}: the same command goes on"
     while True:
         try:
             with _bench(args, board, folder) as (bench, teller):
@@ -195,8 +207,16 @@ def _drive(args: argparse.Namespace) -> int:
             break
         except (Interrupted, BoardNotFound, BoardLost, NobodyThere) as reason:
             if not _go_on(args, reason, folder):
-                kept = f"everything seen is kept in {folder}: the same command goes on"
                 raise CommandError(reason.code, f"{reason}; {kept}") from None
+        except (BenchNotFitted, NotWritten) as reason:
+            told = output.as_command_error(reason)
+            if isinstance(reason, BenchNotFitted):
+                kept += " with it, and --survey NEW begins anew"
+            raise CommandError(told.code, f"{reason}; {kept}", told.exit_code, told.detail) from None
+        except KeyboardInterrupt as interrupt:
+            number = getattr(interrupt, "number", signal.SIGINT)
+            words = f"interrupted; {kept}" if folder.exists() else "interrupted"
+            raise CommandError("interrupted", words, 128 + number) from None
     _tell(args, done.told(), done.lines())
     return 0
 
@@ -208,7 +228,11 @@ def _go_on(args: argparse.Namespace, reason: Exception, folder: Path) -> bool:
     output.tell(f"{reason}. Everything seen is kept in {folder}")
     sys.stderr.write("Enter to go on, Ctrl-C to leave it for later. ")
     sys.stderr.flush()
-    return bool(sys.stdin.readline())
+    try:
+        return bool(sys.stdin.readline())
+    except KeyboardInterrupt:
+        sys.stderr.write("\n")
+        return False
 
 
 @contextmanager
@@ -217,7 +241,7 @@ def _bench(args: argparse.Namespace, board: Any, folder: Path) -> Iterator[tuple
     from calib.survey import Sigma
     from mastctl.bench.daemon_eyes import DaemonEyes, Interrupted
     from mastctl.bench.fitting import fit_in_rover
-    from mastctl.bench.folder import Kept, survey_cameras
+    from mastctl.bench.folder import Kept, kept_frame, survey_cameras
     from mastctl.bench.run import BenchRun
     from mastctl.bench.simulated import SimulatedPerson
     from mastctl.bench.teller import Terminal
@@ -255,7 +279,8 @@ def _bench(args: argparse.Namespace, board: Any, folder: Path) -> Iterator[tuple
             option = "--by-hand" if args.placements is None else "--placements"
             raise WrongUse(f"{option} is of a simulated bench, and this one is real")
         wanted = Wanted(args.wanted_px, args.pictures)
-        fit = fit_in_rover(head.rig.mast.rover_from_mast)
+        kept.begin(client.mast_file(), _frame(args))
+        fit = fit_in_rover(kept_frame(folder), head.rig)
         yield BenchRun(eyes, kept, "board", board, teller, fit, wanted), teller
 
 

@@ -166,7 +166,7 @@ def test_a_folder_grows_by_images_and_goes_on_after_a_new_start(tmp_path: Path) 
 
 def test_a_folder_of_another_bench_is_not_gone_on_with(tmp_path: Path) -> None:
     grown(tmp_path)
-    with pytest.raises(BadFile, match="other boards, sigmas or cameras"):
+    with pytest.raises(BadFile, match="another folder"):
         BenchFolder(tmp_path, {"wall": BOARD}, Sigma(0, 0, corner_px=0.2), {CAMERA.name: CAMERA}, {})
 
 

@@ -15,6 +15,7 @@ from calib.survey import Sigma
 from mastctl.bench.eyes import Eyes, Head
 from mastctl.bench.fitting import fit_in_rover
 from mastctl.bench.folder import Kept, survey_cameras
+from mastctl.bench.frame import Frame
 from mastctl.bench.run import BenchRun
 from mastctl.bench.wanted import Wanted
 from tools.simulated.bench import CornerBench, SelfPlacing, TrueAxis
@@ -71,6 +72,6 @@ def run_of(
 ) -> tuple[BenchRun, SelfPlacing]:
     """A run, and who places the board for it; ``eyes`` instead of the bench's own."""
     teller = SelfPlacing(bench)
-    fit = fit_in_rover(bench.head.rig.mast.rover_from_mast)
+    fit = fit_in_rover(Frame(), bench.head.rig)
     run = BenchRun(eyes or bench, kept_in(folder, bench), "board", BOARD, teller, fit, wanted or Wanted())
     return run, teller

@@ -160,7 +160,9 @@ def test_a_folder_of_another_board_is_refused(repository: Path, tmp_path: Path) 
     bench = corner_bench(repository)
     run_of(bench, tmp_path / "bench")
     bench.noise_px = 0.11
-    with pytest.raises(CalibError, match="other boards, sigmas or cameras"):
+    with pytest.raises(
+        CalibError, match=r"sigma\.corner_px: is 0\.05, now it would be 0\.11; another folder"
+    ):
         run_of(bench, tmp_path / "bench")
 
 

@@ -1,0 +1,119 @@
+"""What ends a look while the head turns: a stop, emergency or not, a lease taken, Ctrl-C, a killed daemon."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from calib.boards import Charuco
+from mastctl.bench import daemon_eyes
+from mastctl.bench.daemon_eyes import DaemonEyes, Interrupted, _beside
+from mastctl.client import Client
+
+BOARD = Charuco(10, 7, 0.055, 0.042)
+FAR_RAD = 2.0
+PATIENCE_S = 30.0
+
+
+@pytest.fixture
+def daemon(repository: Path, tmp_path: Path) -> Iterator[tuple[str, subprocess.Popen[str]]]:
+    """A daemon in a process of its own whose head takes two seconds for two radians."""
+    text = (repository / "configs/bench.yaml").read_text().replace("8420", "0")
+    for folder in ("masts", "sim"):
+        text = text.replace(f" {folder}/", f" {repository}/configs/{folder}/")
+    (tmp_path / "bench.yaml").write_text(text)
+    command = [sys.executable, "-m", "mastctl", "run", "--config", str(tmp_path / "bench.yaml")]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+    assert process.stdout is not None
+    yield process.stdout.readline().split()[-1], process
+    process.kill()
+    process.wait()
+
+
+@pytest.fixture
+def url(daemon: tuple[str, subprocess.Popen[str]]) -> str:
+    return daemon[0]
+
+
+@pytest.fixture(autouse=True)
+def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(daemon_eyes, "PATIENCE_S", 0.2)
+    monkeypatch.setattr(daemon_eyes, "AGAIN_S", 0.05)
+
+
+def in_the_move(url: str, act: Callable[[Client], object]) -> threading.Thread:
+    """Do something as soon as the head turns."""
+
+    def wait_and_act() -> None:
+        with Client(url, name="Ana") as other:
+            until_s = time.monotonic() + PATIENCE_S
+            while not other.status()["moving"] and time.monotonic() < until_s:
+                time.sleep(0.01)
+            act(other)
+
+    thread = threading.Thread(target=wait_and_act)
+    thread.start()
+    return thread
+
+
+def far_look(url: str, act: Callable[[Client], object]) -> str:
+    """What a look says in the middle of whose move something is done."""
+    with Client(url, name="bench") as client, client.lease(name="calibrate bench"):
+        eyes = DaemonEyes(client, ("navcam_left",), BOARD)
+        thread = in_the_move(url, act)
+        with pytest.raises(Interrupted) as told:
+            eyes.look(FAR_RAD, 0.0)
+            eyes.look(-FAR_RAD, 0.0)
+        thread.join()
+        return str(told.value)
+
+
+def test_a_stop_an_emergency_stop_and_a_lease_that_is_taken_are_told_apart(url: str) -> None:
+    assert far_look(url, lambda ana: ana.stop()) == (
+        "somebody pressed stop in the middle of a move, and the head stands still"
+    )
+    told = far_look(url, lambda ana: ana.estop(reason="a hand in the way", name="Ana"))
+    assert "an emergency stop: a hand in the way (Ana)" in told and "'mastctl reset' releases it" in told
+    with Client(url) as client:
+        client.reset(reason="the hand is away", name="Ana")
+    told = far_look(url, lambda ana: ana.acquire_lease("Ana", 5.0, "the head is needed"))
+    assert "Ana took over: the head is needed" in told
+
+
+def test_a_daemon_that_is_killed_is_told_as_gone(daemon: tuple[str, subprocess.Popen[str]]) -> None:
+    url, process = daemon
+    told = far_look(url, lambda ana: process.kill())
+    assert "daemon" in told and url.removeprefix("http://") in told
+
+
+def test_ctrl_c_in_the_middle_of_a_move_leaves_no_head_behind_that_turns(url: str) -> None:
+    with Client(url, name="bench") as client, client.lease(name="calibrate bench"):
+        eyes = DaemonEyes(client, ("navcam_left",), BOARD)
+        main = threading.main_thread().ident
+        assert main is not None
+        thread = in_the_move(url, lambda ana: signal.pthread_kill(main, signal.SIGINT))
+        with pytest.raises(KeyboardInterrupt):
+            eyes.look(FAR_RAD, 0.0)
+        thread.join()
+    with Client(url) as other:
+        until_s = time.monotonic() + PATIENCE_S
+        while other.status()["moving"] and time.monotonic() < until_s:
+            time.sleep(0.01)
+        joints = other.status()["joints"]
+    assert joints is not None and joints["pan_rad"] < FAR_RAD - 0.2
+
+
+def test_a_head_with_play_goes_through_all_of_it_from_the_side_that_has_room() -> None:
+    limits = (-1.0, 0.5)
+    assert _beside(0.2, -0.5, 0, limits) == _beside(0.2, -0.5, 1, limits) == 0.2  # comes from below anyway
+    assert _beside(0.2, 0.19, 0, limits) == pytest.approx(0.14)  # too near to have gone through the play
+    assert _beside(0.2, -0.5, -1, limits) == pytest.approx(0.26)
+    assert _beside(0.49, 0.3, -1, limits) == 0.49  # no room above: from below, where it comes from anyway
+    assert _beside(0.49, 0.48, -1, limits) == pytest.approx(0.43)

@@ -1,0 +1,178 @@
+"""Where the rover frame of a bench is: no board of unknown place can tell, so it is stated."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from calib.bench.body import FEWEST
+from calib.fit.bench import BenchNotFitted, BenchOptions, fit_bench
+from calib.fit.bench_calibration import BenchCalibration
+from calib.mast.rig import Mast, Rig
+from calib.rigid import Rigid
+from calib.survey import Survey
+from mastctl.bench.differences import implied_motion
+from mastctl.errors import MastctlError
+
+UPRIGHT = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+"""rover_from_board of a board that stands upright and shows its face to the rover: its x is the rover's y."""
+
+
+class NoSuchFrame(MastctlError):
+    """What the rover frame should hang on is not there."""
+
+    code = "no_such_frame"
+    exit_code = 2
+
+
+@dataclass(frozen=True)
+class Frame:
+    """What the rover frame hangs on: one of these, or where the former mast file has the mast.
+
+    Attributes
+    ----------
+    mast_at
+        The mast at zero angles, as a level and a tape say: x, y, z, metres, and three angles, radians, as in
+        a mast file.
+    board_at
+        The board of the first placement: x, y, z of its middle, metres, and yaw, pitch, roll, degrees, about
+        the rover's z, y, x. 0 0 0: upright, its face to the rover.
+    body
+        Body cameras stay where the former mast file has them.
+    """
+
+    mast_at: Sequence[float] | None = None
+    board_at: Sequence[float] | None = None
+    body: bool = False
+
+    def told(self) -> dict[str, Any]:
+        """Return it as JSON."""
+        if self.body:
+            return {"body": True}
+        numbers = {"mast_at": self.mast_at, "board_at": self.board_at}
+        return {key: list(value) for key, value in numbers.items() if value is not None}
+
+    @property
+    def stated(self) -> bool:
+        """Whether anything is."""
+        return self.mast_at is not None or self.board_at is not None or self.body
+
+
+def frame_of(notes: Sequence[Mapping[str, Any]]) -> Frame:
+    """Return what a run's journal says the frame hangs on."""
+    told: Mapping[str, Any] = next((note for note in reversed(notes) if note.get("event") == "frame"), {})
+    return Frame(told.get("mast_at"), told.get("board_at"), bool(told.get("body")))
+
+
+def rover_from_board(board_at: Sequence[float]) -> Rigid:
+    """Return the pose of a board that was told in metres and degrees (see `Frame`)."""
+    turn = Rotation.from_euler("ZYX", board_at[3:], degrees=True).as_matrix()
+    return Rigid(turn @ UPRIGHT, np.array(board_at[:3]))
+
+
+def fit_in_frame(
+    survey: Survey, frame: Frame, former: Rig | None, options: BenchOptions | None = None
+) -> BenchCalibration:
+    """Fit a bench in the rover frame that was stated.
+
+    Parameters
+    ----------
+    survey
+        What was seen.
+    frame, former
+        What the frame hangs on, and the rig as it was known before.
+    options
+        What else is chosen.
+
+    Raises
+    ------
+    NoSuchFrame
+        If the frame hangs on something that is not there.
+    BenchNotFitted
+        If the pictures do not determine a rig.
+    """
+    options = options or BenchOptions()
+    survey, notes = without_lonely(survey)
+    if frame.mast_at is not None:
+        place = Mast(np.array(frame.mast_at[:3]), np.array(frame.mast_at[3:])).rover_from_mast
+        options = replace(options, rover_from_mast=place)
+    elif frame.board_at is not None:
+        first = next((i for i in survey.images if i.name in survey.corners), None)
+        if first is None:
+            raise BenchNotFitted("no picture shows a board, and the rover frame should hang on the first")
+        known = (first.board, first.placement), rover_from_board(frame.board_at)
+        options = replace(options, rover_from_board=known)
+    elif former is not None:
+        options = replace(options, rover_from_mast=former.mast.rover_from_mast)
+    done = fit_bench(survey, options)
+    if frame.body:
+        place, words = _by_body(done, former)
+        done = fit_bench(survey, replace(options, rover_from_mast=place))
+        notes = (*notes, words)
+    return replace(done, notes=(*done.notes, *notes))
+
+
+def _by_body(done: BenchCalibration, former: Rig | None) -> tuple[Rigid, str]:
+    """Where the mast stands if the body cameras stay where they were, and that in words."""
+    here = done.rig
+    if former is None:
+        raise NoSuchFrame("the folder holds no former mast file, and so no place of its body cameras")
+    names = [
+        name
+        for name, camera in here.cameras.items()
+        if camera.on == "rover" and name in former.cameras and former.cameras[name].on == "rover"
+    ]
+    if not names:
+        raise NoSuchFrame(
+            "no body camera is tied to the head, and so none says where the rover frame is; have the board "
+            "placed where one sees it, or say where the mast is (--mast-at)"
+        )
+    pairs = [(here.cameras[name].model, former.cameras[name].model) for name in names]
+    motion, rms_px = implied_motion(pairs)
+    words = (
+        f"the rover frame is where the former mast file has {' and '.join(names)}, which see "
+        f"{rms_px:.2f} px rms beside that"
+    )
+    return motion.inverse @ here.mast.rover_from_mast, words
+
+
+def without_lonely(survey: Survey) -> tuple[Survey, tuple[str, ...]]:
+    """Return the survey without body cameras that nothing ties to the head, and a sentence on each.
+
+    One placement ties none: of it, its focal length and its distance trade for each other.
+    """
+    head = {name for name, camera in survey.cameras.items() if camera.on == "head"}
+    shown = [i for i in survey.images if i.name in survey.corners and i.purpose != "check"]
+    by_head = {(i.board, i.placement) for i in shown if i.camera in head}
+    lonely, notes = set(), []
+    for name in survey.cameras:
+        if name in head:
+            continue
+        both = {(i.board, i.placement) for i in shown if i.camera == name} & by_head
+        if len(both) < FEWEST:
+            lonely.add(name)
+            count = "no placement" if not both else "1 placement"
+            notes.append(
+                f"body camera {name} is not tied to the head: it saw the board at {count} that the head saw "
+                f"too, {FEWEST} at least are expected; put the board low, where both see it"
+            )
+    if not lonely:
+        return survey, ()
+    return (
+        replace(
+            survey,
+            cameras={n: c for n, c in survey.cameras.items() if n not in lonely},
+            stereo={n: pair for n, pair in survey.stereo.items() if not set(pair) & lonely},
+            images=tuple(i for i in survey.images if i.camera not in lonely),
+            corners={
+                i.name: survey.corners[i.name]
+                for i in survey.images
+                if i.name in survey.corners and i.camera not in lonely
+            },
+        ),
+        tuple(notes),
+    )
