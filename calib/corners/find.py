@@ -19,24 +19,25 @@ from calib.corners.chessboard import chessboard_corners
 from calib.corners.lattice import Known, predicted
 from calib.corners.markers import Image, MarkerBoard, Standing, detect, standing
 from calib.corners.reasons import doubled, why_not_this_board, why_nothing
-from calib.corners.saddles import Levels, Saddles, fit_saddles
+from calib.corners.saddle_pixels import Crossings, Levels
+from calib.corners.saddles import Saddles, fit_saddles
 from calib.dots.find import DotsFound, find_dots
 from calib.dots.plane_map import fit_plane_map
+from calib.rigid import FloatArray
 from calib.survey import Board
 
-LEAST_SIGMA_PX = 0.004
+LEAST_SIGMA_PX = 0.001
 """What aliasing and whole grey levels leave at best."""
-
-SCALES = (0.2, 1.5)
-"""In a picture without blur what a fit leaves over is no noise, and corners are better than that says; a lens
-near a bent board needs more room than the smooth map has, so that much more is not the corners' fault."""
 
 FARTHEST_PX = 4.0
 """A corner is looked for so far from where the markers say that it is."""
 
 WORST_SIGMA_PX = 0.3
 UNSURE = 6.0
-"""A corner is dropped if it is so much less sure than the others: at the picture's rim, half covered."""
+"""A corner is dropped if it is so much less sure than the others: half covered."""
+
+BESIDE_RIM = 2.0
+"""Standard deviations of the blur that a corner is away from the picture's rim at least."""
 
 CONTRAST = 0.35
 """Of the others' median, at least; a corner half behind something has less."""
@@ -73,8 +74,8 @@ def find_corners(board: AnyBoard, image: Levels) -> Corners | CornersNotFound:
     Returns
     -------
     Corners | CornersNotFound
-        sigma_px is what noise and blur leave of each corner, made larger or smaller for all by how far they
-        are from a smooth map, where there are enough for one.
+        sigma_px is what noise, blur and slant leave of each corner, by what the fit of its grey levels left
+        over: errors that neighbours share, as of the print, are not in it.
 
     Raises
     ------
@@ -142,10 +143,11 @@ def _fitted(
 ) -> _Found:
     """The corners that the start names, and those that lie beside what was found."""
     places = board.in_board_m(board.ids)[:, :2]
+    printed = Crossings(pattern, places, _insets_m(board))
     ids, found = start.ids, None
     tried = set(map(int, ids))
     while len(ids):
-        new = fit_saddles(levels, pattern, places[ids], start.pixels_px, start.jacobians, FARTHEST_PX)
+        new = fit_saddles(levels, printed.some(ids), start.pixels_px, start.jacobians, FARTHEST_PX)
         both = (
             new
             if found is None
@@ -165,14 +167,24 @@ def _fitted(
         start = predicted(known, ids, places[ids])
         ids = start.ids  # less where the corners found lie too badly to say where the next one is
     if found is None:
-        return _Found(ids, fit_saddles(levels, pattern, places[ids], start.pixels_px, start.jacobians, 0.0))
+        return _Found(ids, fit_saddles(levels, printed.some(ids), start.pixels_px, start.jacobians, 0.0))
     return found
 
 
+def _insets_m(board: Charuco | AprilGrid | Checkerboard) -> FloatArray:
+    """How far from a corner, across and down, markers begin in the white squares; infinite if there are
+    none.
+    """
+    if not isinstance(board, Charuco):
+        return np.full(2, np.inf)
+    return (board.square_m - board.marker_m) / 2 * np.array([1.0, board.aspect])
+
+
 def _inside(found: _Found, shape: tuple[int, ...]) -> _Found:
-    """Leave out what was fitted beside the image, by the half of a corner that is in it."""
+    """Leave out what is nearer to the image's rim than the blur reaches, or beside it."""
+    rim = BESIDE_RIM * found.saddles.wide_px.max(axis=1, initial=0.0) - 0.5
     x, y = found.saddles.pixels_px.T
-    kept = (x > -0.5) & (y > -0.5) & (x < shape[1] - 0.5) & (y < shape[0] - 0.5)
+    kept = (x > rim) & (y > rim) & (x < shape[1] - 1 - rim) & (y < shape[0] - 1 - rim)
     return _Found(found.ids[kept], Saddles(*(part[kept] for part in found.saddles)))
 
 
@@ -191,32 +203,26 @@ def _good(saddles: Saddles) -> NDArray[np.bool_]:
 
 
 def _agreeing(board: AnyBoard, found: _Found) -> Corners | CornersNotFound:
-    """The corners that fit a smooth map of all, with sigmas that say how far they are from it."""
+    """The corners that fit a smooth map of all."""
     points = board.in_board_m(found.ids)[:, :2]
     pixels = found.saddles.pixels_px
     sigma = np.hypot(found.saddles.sigma_px, LEAST_SIGMA_PX)
     good = np.ones(len(points), dtype=bool)
-    scale = 1.0
     for _ in range(ROUNDS):
         plane_map = fit_plane_map(points[good], pixels[good])
-        if plane_map is None:
+        if plane_map is None or 2 * int(good.sum()) - plane_map.parameters < 6:
             break
-        off = plane_map.pixels(points) - pixels
-        freedom = 2 * int(good.sum()) - plane_map.parameters
-        if freedom < 6:
-            break
-        excess = float(np.sum((off[good] / sigma[good, None]) ** 2)) / freedom
-        # A homography alone has no room for a lens: then its residuals are no measure of corners.
-        scale = float(np.clip(np.sqrt(excess), *SCALES)) if plane_map.degree else 1.0
+        # what the map has no room for, a lens near by or a bent board, is in all of them
+        least = np.maximum(sigma, float(np.median(sigma[good])))
+        off = np.linalg.norm(plane_map.pixels(points) - pixels, axis=-1) / least
         # by the median: a corner far off does not excuse itself
-        usual = float(np.median(np.linalg.norm(off[good] / sigma[good, None], axis=-1))) / 1.177
-        far = good & (np.linalg.norm(off, axis=-1) > FAR_OFF * max(1.0, usual) * sigma)
+        usual = float(np.median(off[good])) / 1.177
+        far = good & (off > FAR_OFF * max(1.0, usual))
         if not far.any() or good.sum() - far.sum() < FEWEST:
             break
         good &= ~far
     order = np.argsort(found.ids[good])
-    told = np.maximum(scale * sigma[good], LEAST_SIGMA_PX)
-    return Corners(found.ids[good][order], pixels[good][order], told[order])
+    return Corners(found.ids[good][order], pixels[good][order], sigma[good][order])
 
 
 def _dots(board: DotBoard, levels: Levels) -> Corners | CornersNotFound:

@@ -29,9 +29,11 @@ Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
 
 PAPER_DN, INK_DN = 205.0, 35.0
-RAYS = 34
-WITHIN = np.stack([np.arange(RAYS) / RAYS, np.arange(RAYS) * 21 / RAYS % 1.0], axis=-1) - 0.5 + 0.5 / RAYS
-"""Places of rays in a pixel that sees an edge: Fibonacci's lattice, even across edges of any slant."""
+RAYS = 144
+WITHIN = np.stack([np.arange(RAYS) / RAYS, np.arange(RAYS) * 89 / RAYS % 1.0], axis=-1) - 0.5 + 0.5 / RAYS
+"""Places of rays in a pixel that sees an edge: Fibonacci's lattice, even across edges of any slant. So many,
+since of 34 some slants see but a few lines, and whole edges stand aside: corners by up to 0.05 px, against
+0.015 px."""
 
 RIM = np.array([[0.0, 0.0], [-0.5, 0.0], [0.0, -0.5], [-0.5, -0.5]])
 """Those that tell whether it does: middle, sides and corners, the others being the next pixels'."""

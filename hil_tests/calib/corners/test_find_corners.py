@@ -18,7 +18,12 @@ from drivers.sim.bench_boards import BenchBoard, BenchBoards
 
 Image = NDArray[np.uint8]
 F_PX, SIZE_PX = 900.0, (640, 480)
-CAMERA = CameraModel("CAHV", SIZE_PX, C=[0, 0, 0], A=[0, 0, 1], H=[F_PX, 0, 319.5], V=[0, F_PX, 239.5])
+FINER = 2
+FINE = CameraModel(
+    "CAHV", (640 * FINER, 480 * FINER), C=[0, 0, 0], A=[0, 0, 1],
+    H=[F_PX * FINER, 0, 320 * FINER - 0.5], V=[0, F_PX * FINER, 240 * FINER - 0.5],
+)  # fmt: skip
+"""The same camera with pixels half as wide: blurred on pixels as they are, edges along these would be bent."""
 MATRIX = np.array([[F_PX, 0, 319.5], [0, F_PX, 239.5], [0, 0, 1]])
 SHARP_PX = 0.03
 TURN = (0.4, -0.5, 0.2)
@@ -46,7 +51,8 @@ def drawn(*boards: tuple[AnyBoard, ArrayLike, ArrayLike], blur_px: float = 0.7) 
     for k, (board, turn, place) in enumerate(boards):
         rotation, _ = cv2.Rodrigues(np.asarray(turn, dtype=np.float64))
         scene.put(str(k), BenchBoard(board, Rigid(rotation, np.asarray(place, dtype=np.float64))))
-    light = cv2.GaussianBlur(scene.image(CAMERA, Rigid.identity()), (0, 0), blur_px)
+    fine = cv2.GaussianBlur(scene.image(FINE, Rigid.identity()), (0, 0), blur_px * FINER)
+    light = cv2.resize(fine, SIZE_PX, interpolation=cv2.INTER_AREA)
     noisy = light + np.random.default_rng(1).normal(0.0, 2.0, light.shape)
     return np.clip(np.rint(noisy), 0, 255).astype(np.uint8)
 
@@ -103,6 +109,8 @@ def test_a_board_that_reaches_out_of_the_picture_is_found_where_it_is_inside() -
     off = off_px(APRILGRID, found, TURN, place)
     assert 20 < len(found) < len(APRILGRID.ids)
     assert float(np.abs(off / found.sigma_px[:, None]).max()) < 6.0
+    rim = np.minimum(found.pixels_px, np.array(SIZE_PX) - 1 - found.pixels_px) + 0.5
+    assert float(rim.min()) > 2 * 0.7, "a corner of which the blur reaches out of the picture"
 
 
 def test_a_board_upside_down_or_on_its_side_keeps_its_ids() -> None:
