@@ -23,7 +23,7 @@ FINE = CameraModel(
     "CAHV", (640 * FINER, 480 * FINER), C=[0, 0, 0], A=[0, 0, 1],
     H=[F_PX * FINER, 0, 320 * FINER - 0.5], V=[0, F_PX * FINER, 240 * FINER - 0.5],
 )  # fmt: skip
-"""The same camera with pixels half as wide: blurred on pixels as they are, edges along these would be bent."""
+"""The same camera with finer pixels: blurred on whole ones, edges along these would be bent."""
 MATRIX = np.array([[F_PX, 0, 319.5], [0, F_PX, 239.5], [0, 0, 1]])
 SHARP_PX = 0.03
 TURN = (0.4, -0.5, 0.2)
