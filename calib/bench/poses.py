@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from calib.bench.knowledge import Knowledge, Shot, View, without_board
+from calib.bench.knowledge import Knowledge, Shot, View
 from calib.bench.workspace import Pointing
 from calib.camera.cahvor import CameraModel
 from calib.errors import CalibError, Unreachable
@@ -32,6 +32,12 @@ APART_RAD = 0.02
 
 SIDES_TRIED = 8
 """Of how many of the best attitudes every way to approach them is tried."""
+
+EXCHANGES = 2
+"""Rounds in which each of some shots that are chosen together may give way to a better one."""
+
+ANYWHERE = 1e-6
+"""What is known of a board's pose before any picture: it is within some kilometre (1/m², 1/rad²)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,8 +141,9 @@ def next_shot(
     placement: str,
     aim: Pointing,
     avoid: Collection[tuple[float, float]] = (),
+    ahead: int = 1,
 ) -> Choice | None:
-    """Return the shot of a placed board after which pointing is expected to be best; None if none shows it.
+    """Return the next shot of a placed board for pointing to be best in the end; None if none shows it.
 
     Parameters
     ----------
@@ -152,22 +159,71 @@ def next_shot(
         What the rig is for.
     avoid
         Attitudes (pan, tilt), radians, that are no use, as where the board was not found.
+    ahead
+        How many more shots there will be of this placement, this one among them. They are chosen together:
+        the best one by itself is seldom the beginning of the best few.
     """
     here = [shot for shot in shots if shot.placement == placement]
+    choices = list(candidates(known, sought, here, placement, avoid))
+    if not choices:
+        return None
     base = with_board(known, shots, placement)
+    told = np.array([known.of_shot(shot) for shot in choices])
+    plan = _together(base, told, aim, ahead)
+    first = min(plan, key=dict(zip(plan, _left_px(base, told[plan], aim), strict=True)).__getitem__)
+    others = [index for index in plan if index != first]
+    if not sought.one_sided:
+        # From which side a joint comes tells its backlash alone: that is asked of the best attitudes only.
+        beside = base + told[others].sum(axis=0)
+        best = [i for i in np.argsort(_left_px(beside, told, aim)) if i not in others][:SIDES_TRIED]
+        sides = [other for i in best for other in _other_sides(choices[i])]
+        choices += sides
+        told = np.concatenate([told, [known.of_shot(shot) for shot in sides]])
+        tried = [*best, *range(len(choices) - len(sides), len(choices))]
+        first = tried[int(np.argmin(_left_px(beside, told[tried], aim)))]
+    return Choice(choices[first], float(_left_px(base, told[[first]], aim)[0]))
 
-    def judged(shot: Shot) -> Choice:
-        return Choice(shot, aim.rms_px(covariance_of(without_board(base + known.of_shot(shot)))))
 
-    choices = [judged(shot) for shot in candidates(known, sought, here, placement, avoid)]
-    choices.sort(key=lambda one: one.expected_px)
-    # From which side a joint comes tells its backlash alone: that is asked of the best attitudes only.
-    for one in [] if sought.one_sided else choices[:SIDES_TRIED]:
-        shot = one.shot
-        sides = [(-shot.pan_approach, shot.tilt_approach), (shot.pan_approach, -shot.tilt_approach)]
-        sides.append((-shot.pan_approach, -shot.tilt_approach))
-        choices += [judged(replace(shot, pan_approach=pan, tilt_approach=tilt)) for pan, tilt in sides]
-    return min(choices, key=lambda one: one.expected_px, default=None)
+def _together(base: FloatArray, told: FloatArray, aim: Pointing, count: int) -> list[int]:
+    """Which of some shots (n, p + 6, p + 6) tell most together beside ``base``: one after the other, then
+    each exchanged for a better one while there is any (Fedorov's exchange)."""
+    plan: list[int] = []
+    whole = base.copy()
+    for _ in range(min(count, len(told))):
+        left = _left_px(whole, told, aim)
+        left[plan] = np.inf
+        plan.append(int(np.argmin(left)))
+        whole = whole + told[plan[-1]]
+    for _ in range(EXCHANGES if len(plan) > 1 else 0):
+        before = list(plan)
+        for place, index in enumerate(before):
+            rest = whole - told[index]
+            left = _left_px(rest, told, aim)
+            left[[other for other in plan if other != index]] = np.inf
+            plan[place] = int(np.argmin(left))
+            whole = rest + told[plan[place]]
+        if plan == before:
+            break
+    return plan
+
+
+def _left_px(base: FloatArray, told: FloatArray, aim: Pointing) -> FloatArray:
+    """Return the rms per axis (n,) of pointing that each of some shots (n, p + 6, p + 6) beside ``base``
+    would leave, pixels."""
+    whole = base + told
+    whole[:, -6:, -6:] += ANYWHERE * np.eye(6)
+    scale = 1.0 / np.sqrt(np.einsum("nii->ni", whole))
+    whole *= scale[:, :, None] * scale[:, None, :]
+    covariance = np.linalg.inv(whole) * scale[:, :, None] * scale[:, None, :]
+    return np.array([aim.rms_px(one) for one in covariance[:, :-6, :-6]])
+
+
+def _other_sides(shot: Shot) -> list[Shot]:
+    """The same attitude, come to from other sides."""
+    pan, tilt = shot.pan_approach, shot.tilt_approach
+    return [
+        replace(shot, pan_approach=i * pan, tilt_approach=j * tilt) for i, j in ((-1, 1), (1, -1), (-1, -1))
+    ]
 
 
 def with_board(known: Knowledge, shots: Sequence[Shot], placement: str) -> FloatArray:

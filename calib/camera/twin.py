@@ -2,7 +2,8 @@
 
 Exact twins are CAHVOR with O = A and a pinhole lens with k1 and k2, and a fisheye CAHVORE (type 2) without
 E and an equidistant lens with k1 and k2. A lens axis beside A is a turned image (τ) and nearly p1, p2; H
-and V that are not at right angles, and the moving entrance point of CAHVORE, have no twin.
+and V that are not at right angles are nearly a turned image too. The moving entrance point of CAHVORE has no
+twin.
 """
 
 from __future__ import annotations
@@ -173,6 +174,40 @@ def nearest_opencv(model: CameraModel, lens: LensKind, coefficients: Sequence[bo
         return OpencvCamera(lens, model.size_px, inner[:2], inner[2:4], told, moved_rigid(place, pose))
 
     return _fitted(build, start, scale, pixels, points, np.arange(len(start)) >= len(start) - len(free))
+
+
+def nearest_tilted(model: CameraModel) -> OpencvCamera:
+    """Return the pinhole camera with a turned image plane (OpenCV's 14 coefficients) that comes nearest.
+
+    A plane turned about both axes and a camera turned back leave a picture that leans by the product of both
+    turns: so OpenCV holds H and V that are not at right angles. Free are k1, k2, k3, p1, p2 and both turns.
+
+    Raises
+    ------
+    ValueError
+        As ``nearest_opencv``; and if the entrance point moves.
+    """
+    if model.lens.moving:
+        raise ValueError("the entrance point moves")
+    plain = nearest_opencv(model, "pinhole", [True] * 5)
+    pixels, points = _what_it_sees(model)
+    across, down = (vector - (vector @ model.A) * model.A for vector in (model.H, model.V))
+    lean = float(across @ down / np.linalg.norm(across) / np.linalg.norm(down))
+    # From no turn at all no fit begins: what a turn does to the lean grows as its square.
+    turn = max(np.sqrt(abs(lean)), 1e-3)
+    scale = np.concatenate([np.full(3, 0.01), np.full(4, 10.0), [0.1, 0.1, 0.01, 0.01, 0.1, 0.01, 0.01]])
+
+    def build(numbers: FloatArray) -> OpencvCamera:
+        told = np.concatenate([numbers[7:12], np.zeros(7), numbers[12:]])
+        place = moved_rigid(plain.frame_from_camera, np.r_[numbers[:3], 0.0, 0.0, 0.0])
+        return OpencvCamera("pinhole", model.size_px, numbers[3:5], numbers[5:7], told, place)
+
+    found = []
+    for sign in (1.0, -1.0):
+        inner = [plain.focal_px, plain.center_px, plain.distortion, [turn, sign * turn]]
+        start = np.concatenate([np.zeros(3), *inner])
+        found.append(_fitted(build, start, scale, pixels, points, np.arange(len(start)) > 6))
+    return min(found, key=lambda camera: twin_error(model, camera).worst_px)
 
 
 def nearest_cahvor(camera: OpencvCamera) -> CameraModel:

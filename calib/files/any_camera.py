@@ -10,7 +10,15 @@ import numpy as np
 
 from calib.camera.cahvor import CameraModel
 from calib.camera.opencv_camera import LensKind, OpencvCamera
-from calib.camera.twin import GOOD_PX, Camera, TwinError, nearest_opencv, nearest_square, twin_error
+from calib.camera.twin import (
+    GOOD_PX,
+    Camera,
+    TwinError,
+    nearest_opencv,
+    nearest_square,
+    nearest_tilted,
+    twin_error,
+)
 from calib.errors import BadFile
 from calib.files import CameraFile, read_bytes
 from calib.files.atomic import save_bytes
@@ -61,11 +69,12 @@ LENSES: dict[str, tuple[LensKind, tuple[int, ...]]] = {
     "plumb_bob": (_PINHOLE, (5, 4)),
     "rational_polynomial": (_PINHOLE, (8,)),
     "equidistant": ("equidistant", (4,)),
+    "tilted": (_PINHOLE, (14,)),
 }
 """The lenses that can be asked for: family, and how many coefficients files give it (the first fitted)."""
 
 _OFFERED: dict[str, tuple[str, ...]] = {
-    "opencv": ("plumb_bob", "rational_polynomial", "equidistant"),
+    "opencv": ("plumb_bob", "rational_polynomial", "equidistant", "tilted"),
     "ros": ("plumb_bob", "rational_polynomial", "equidistant"),
     "kalibr": ("radtan", "equidistant"),
     "mrcal": ("cahvor", "plumb_bob", "rational_polynomial"),
@@ -197,8 +206,8 @@ def save_any(
         One of ``FORMATS``; '' takes what the name asks for.
     lens
         The lens to take where the format has several (``radtan``, ``plumb_bob``, ``rational_polynomial``,
-        ``equidistant``, ``cahvor``); '' takes the plainest that comes near enough, else the one that comes
-        nearest.
+        ``equidistant``, ``tilted``, ``cahvor``); '' takes the plainest that comes near enough, else the one
+        that comes nearest.
     limit_px
         The largest distance between a pixel of the camera and of what is written, anywhere in the image.
 
@@ -323,6 +332,8 @@ def _twin(camera: CameraFile, lens: str) -> Camera:
         if count is not None:
             told = np.concatenate([kept, np.zeros(count - len(kept))])
             return OpencvCamera(family, was.size_px, was.focal_px, was.center_px, told, was.frame_from_camera)
+    if lens == "tilted":
+        return nearest_tilted(camera.model)
     return nearest_opencv(camera.model, family, [True] * counts[0])
 
 

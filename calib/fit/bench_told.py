@@ -64,9 +64,9 @@ def told(
     problem, state, covariance = weighed.problem, weighed.fit.state, weighed.covariance
     total, freedom = goodness(*_at_fit(stated))
     for one in weighed.components:
-        if one.wrong:
+        if one.wrong or one.generous:
             bench.notes.append(
-                f"{one.kind} are off by {one.factor:.2f} ± {one.factor_sigma:.2f} times the stated "
+                f"{one.kind} scatter by {one.factor:.2f} ± {one.factor_sigma:.2f} times the stated "
                 "sigma; they count with that"
             )
     # A parameter that is not seen keeps what is weakly known of it, and is told as open.

@@ -16,7 +16,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import chdtrc, fdtrc
+from scipy.special import chdtr, chdtrc, fdtrc
 
 from calib.fit.adjustment import Block
 from calib.fit.terms import DRAWING, JOINTS, PRISMS, TAPES, ImageTerm, StationTerm
@@ -26,8 +26,11 @@ FEWEST = 3.0
 """With less redundancy than this, nothing is said of a kind of measurement."""
 
 RARELY = 0.001
-"""A stated sigma is wrong if chance makes residuals so large in fewer than so many surveys, all kinds
-together."""
+"""A stated sigma is wrong if chance makes residuals so large, or so small, in fewer than so many surveys, all
+kinds together."""
+
+LEAST = 0.1
+"""A sigma is narrowed to this part of the stated one at most: what is smaller still is no noise."""
 
 STAYS = 20.0
 """What was called wrong stays so up to a chance so many times larger."""
@@ -51,9 +54,9 @@ class Component:
     factor, factor_sigma
         Sigma found over sigma stated, and how sure that is.
     weighed
-        By how much the stated sigma was widened for the fit: 1 where the factor is no more than luck.
-    chance
-        Of residuals as large, were the stated sigma right.
+        What the stated sigma was multiplied by for the fit: 1 where the factor is no more than luck.
+    chance, small_chance
+        Of residuals as large, and as small, were the stated sigma right.
     """
 
     kind: str
@@ -63,11 +66,17 @@ class Component:
     factor_sigma: float
     weighed: float
     chance: float
+    small_chance: float = 1.0
 
     @property
     def wrong(self) -> bool:
         """Whether the stated sigma is too small."""
         return self.weighed > 1.0
+
+    @property
+    def generous(self) -> bool:
+        """Whether the stated sigma is too large."""
+        return self.weighed < 1.0
 
 
 def kind_of(what: ImageTerm | StationTerm | str) -> str | None:
@@ -120,28 +129,33 @@ def variance_components(
             continue
         factor = float(np.sqrt(squares[kind] / r)) * told
         sigma = factor * float(np.sqrt(spread[index])) / 2
-        chance = float(chdtrc(r, squares[kind] * told**2))
-        found.append(Component(kind, counts[kind], r, factor, sigma, told, chance))
+        square = squares[kind] * told**2
+        found.append(
+            Component(
+                kind, counts[kind], r, factor, sigma, told, float(chdtrc(r, square)), float(chdtr(r, square))
+            )
+        )
     return tuple(found)
 
 
-def wider_sigmas(components: Sequence[Component]) -> dict[str, float]:
-    """Return by kind what a stated sigma should be multiplied by: 1 or more, never less.
+def found_sigmas(components: Sequence[Component]) -> dict[str, float]:
+    """Return by kind what a stated sigma should be multiplied by.
 
-    Luck makes no sigma smaller. A kind is widened where chance does not explain its residuals; one that was
-    widened before stays so a little longer, so that none comes and goes. Tapes and prisms are taken together
+    Luck changes none: a kind is widened, or narrowed, where chance does not explain its residuals; one that
+    was before stays so a little longer, so that none comes and goes. Tapes and prisms are taken together
     where they agree.
     """
     told = [c for c in components if np.isfinite(c.factor)]
     found = {c.kind: c.factor for c in told}
-    wrong = {c.kind for c in told if c.chance * len(told) < (STAYS if c.wrong else 1.0) * RARELY}
+    limit = {c.kind: (STAYS if c.weighed != 1.0 else 1.0) * RARELY / len(told) for c in told}
+    wrong = {c.kind for c in told if min(c.chance, c.small_chance) < limit[c.kind]}
     station = {c.kind: c for c in told if c.kind in (TAPES, PRISMS)}
     if len(station) == 2 and wrong & set(station) and _agree(station[TAPES], station[PRISMS]):
         square = sum(c.redundancy * c.factor**2 for c in station.values())
         together = float(np.sqrt(square / sum(c.redundancy for c in station.values())))
         found |= dict.fromkeys(station, together)
         wrong |= set(station)
-    return {kind: max(1.0, factor) if kind in wrong else 1.0 for kind, factor in found.items()}
+    return {kind: max(LEAST, factor) if kind in wrong else 1.0 for kind, factor in found.items()}
 
 
 def _agree(one: Component, other: Component) -> bool:

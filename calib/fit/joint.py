@@ -17,7 +17,7 @@ from scipy.stats import chi2
 
 from calib.fit.adjustment import HUBER, KNOWN_BEFOREHAND, MAST, Adjustment, Estimate
 from calib.fit.calibration import Calibration
-from calib.fit.components import Component, variance_components, wider_sigmas
+from calib.fit.components import Component, found_sigmas, variance_components
 from calib.fit.least_squares import Minimum, Normal, covariance_of, minimise
 from calib.fit.left_out_boards import left_out_boards
 from calib.fit.outliers import FALSE_ALARMS, judge, name_outliers
@@ -35,7 +35,7 @@ ROUNDS = 40
 """Times that measurements are judged and the fit done again, at most."""
 
 WEIGHINGS = 6
-"""Times that sigmas are widened and the fit done again, at most; three mostly do."""
+"""Times that sigmas are changed and the fit done again, at most; three mostly do."""
 
 WEIGHED = 0.02
 """Sigmas are good enough when the next ones differ by less than this part."""
@@ -92,7 +92,7 @@ class Weighed:
 
 
 def weigh(problem: Adjustment, fit: Minimum[Estimate], images: Sequence[ImageTerm]) -> Weighed:
-    """Return the fit with the sigma widened of each kind of measurement that is worse than stated.
+    """Return the fit with the sigma of each kind of measurement that is worse, or better, than stated.
 
     Parameters
     ----------
@@ -107,7 +107,7 @@ def weigh(problem: Adjustment, fit: Minimum[Estimate], images: Sequence[ImageTer
         covariance = covariance_of(fit.normal.matrix, problem.weak)
         components = variance_components(problem.blocks(fit.state), covariance, weighed)
         first = first or components
-        wanted = wider_sigmas(components)
+        wanted = found_sigmas(components)
         change = {kind: factor / weighed.get(kind, 1.0) for kind, factor in wanted.items()}
         if count == WEIGHINGS or all(abs(ratio - 1.0) < WEIGHED for ratio in change.values()):
             break

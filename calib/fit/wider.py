@@ -2,9 +2,10 @@
 
 Each model holds the fitted one as a special case (all further numbers 0), so that the gain in chi-square is
 tested (``calib.fit.score``): the axes of the mast, errors of the joints around the turn, a joint that slips
-or is read wrong once, lenses, a camera that changes between two pictures, the board's shape, a board that
-moved between tapes and pictures. Sigmas are those of the fit, widened where residuals ask for it. Where one
-defect shows in several models, that which gains most for its numbers is the likeliest.
+or is read wrong once, lenses, a camera that changes between two pictures, joints and cameras that drift from
+the first picture to the last, the board's shape, a board that moved between tapes and pictures. Sigmas are
+those of the fit, as residuals show them. Where one defect shows in several models, that which gains most for
+its numbers is the likeliest.
 """
 
 from __future__ import annotations
@@ -53,8 +54,9 @@ class WiderModel:
     Attributes
     ----------
     name
-        ``mast``, ``harmonics of pan``, ``slip of tilt``, ``attitude``, ``joint readings``,
-        ``lens of CAMERA``, ``change of CAMERA``, ``bow of the board``, ``spacing of the board``,
+        ``mast``, ``harmonics of pan``, ``slip of tilt``, ``drift of tilt``, ``attitude``,
+        ``joint readings``, ``lens of CAMERA``, ``change of CAMERA``, ``drift of CAMERA``,
+        ``bow of the board``, ``spacing of the board``,
         ``board moved`` or ``drawing`` (of the prisms).
     sentence
         What it says.
@@ -270,6 +272,10 @@ class _Tests:
                 "off its reading: an encoder or a horn slipped there"
             )
             yield self.model(f"slip of {name}", gains[worst], words, len(steps))
+            gain = beside.gain((eye[:, joint::2] @ self.passed([mine[0] for mine in order]))[:, None])
+            value, sigma = 1e3 * gain.values[0], 1e3 * gain.sigma[0]
+            words = f"{name} drifts off its reading, by {value:+.2f} ± {sigma:.2f} mrad from the first image "
+            yield self.model(f"drift of {name}", gain, words + "to the last: a mount or an encoder creeps")
 
     def lenses(self) -> Iterator[WiderModel]:
         """Lenses that bend otherwise than their models."""
@@ -307,6 +313,13 @@ class _Tests:
                 f"{1e3 * turn / half:+.1f} mrad): it was refocused or bumped there"
             )
             yield self.model(f"change of {name}", gains[worst], words, len(steps))
+            gain = beside.gain(np.asarray(np.kron(self.passed(mine)[:, None], np.eye(4)), dtype=np.float64))
+            x, y, scale, turn = gain.values
+            words = (
+                f"{name} drifts from the first image to the last (scale {100 * scale / half:+.2f} %, shifted "
+                f"by {x:+.1f}, {y:+.1f} px, turned by {1e3 * turn / half:+.1f} mrad): it creeps, or warms up"
+            )
+            yield self.model(f"drift of {name}", gain, words)
 
     def board(self) -> Iterator[WiderModel]:
         """The board's shape."""
@@ -384,6 +397,12 @@ class _Tests:
         )
         model = self.model(DRAWING, gain, words)
         yield replace(model, size_px=float("nan"))
+
+    def passed(self, views: Sequence[_View]) -> FloatArray:
+        """What part of the survey's images had been taken before each view's, 0 to 1."""
+        place = {image.name: k for k, image in enumerate(self.problem.images)}
+        last = max(len(place) - 1, 1)
+        return np.array([place[view.image.name] / last for view in views])
 
     def by_camera(self) -> dict[str, list[_View]]:
         """The images of each camera, in their order."""

@@ -74,24 +74,27 @@ def station_doubts(survey: Survey) -> Iterator[Finding]:
         )
     for (setup, _), seen in prisms.items():
         if (setup, "") not in inverted:
-            yield from _disagreement(f"set-up {setup}", "prism", design, seen, sigma_m, True)
+            yield from _disagreement(f"set-up {setup}", "prism", design, seen, sigma_m, True, True)
+    fitted = {(image.setup, image.placement) for image in survey.images if image.purpose != "check"}
     for (setup, placement), seen in tapes.items():
         place = f"set-up {setup}, placement {placement}"
         design, sigma_m = survey.board.tapes_in_board_m, survey.sigma.station_m
-        yield from _disagreement(place, "tape", design, seen, sigma_m, False)
+        again = (setup, placement) in fitted
+        yield from _disagreement(place, "tape", design, seen, sigma_m, False, again)
     yield from _copies(survey)
 
 
 def dot_doubts(survey: Survey) -> Iterator[Finding]:
     """Yield grids seen in a mirror, dots found twice, and images that share their dots."""
     flipped, first_with = [], dict[bytes, str]()
+    fitted = {image.name for image in survey.images if image.purpose != "check"}
     for name, dots in survey.dots.items():
         spread = _dots_per_board(survey, dots)
         if spread is not None and np.linalg.det(spread) < 0:
             flipped.append(name)
         near = _found_twice(dots)
         if near is not None:
-            yield Finding("warning", f"dots.csv, image {name}", *near)
+            yield Finding("warning", f"dots.csv, image {name}", *near, tested_again=name in fitted)
         key = dots.pixels_px.tobytes()
         if key in first_with:
             yield Finding(
@@ -160,6 +163,7 @@ def _disagreement(
     seen: Mapping[str, FloatArray],
     sigma_m: float,
     needed: bool,
+    tested_again: bool,
 ) -> Iterator[Finding]:
     """Yield which points of a group do not fit the design, and whether two names are exchanged."""
     names = list(seen)
@@ -184,6 +188,7 @@ def _disagreement(
             place,
             f"{what} {', '.join(off)} does not fit the others and will be left out",
             f"Measure it again, with the sight on the middle of the {what}",
+            tested_again,
         )
     else:
         yield Finding(
@@ -191,6 +196,7 @@ def _disagreement(
             place,
             f"the {what}s do not have the drawing's shape: {found.doubt}",
             f"Measure the {what}s of this {'set-up' if needed else 'placement'} again",
+            tested_again and not needed,
         )
 
 

@@ -187,12 +187,15 @@ class Finding:
         What is so, with its numbers.
     advice
         What to measure or correct.
+    tested_again
+        Whether it is about single measurements that the joint fit tests itself, by all the others.
     """
 
     severity: Literal["error", "warning"]
     place: str
     message: str
     advice: str
+    tested_again: bool = False
 
     def __str__(self) -> str:
         return f"{self.severity}: {self.place}: {self.message}. {self.advice}."

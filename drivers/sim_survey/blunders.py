@@ -89,6 +89,12 @@ def with_slipped_joint(survey: Survey, joint: str, first: str, slip_rad: float) 
     return _read_otherwise(survey, joint, lambda image, angle: angle + slip_rad * (image.name in later))
 
 
+def with_drifting_joint(survey: Survey, joint: str, drift_rad: float) -> Survey:
+    """Return the survey with a joint read too high by more and more, by ``drift_rad`` at the last image."""
+    passed = _passed(survey)
+    return _read_otherwise(survey, joint, lambda image, angle: angle + drift_rad * passed[image.name])
+
+
 def with_encoder_errors(survey: Survey, joint: str, first_rad: complex, second_rad: complex) -> Survey:
     """Return the survey with a joint's readings off by two waves around the turn.
 
@@ -123,6 +129,19 @@ def with_changed_focus(survey: Survey, camera: str, first: str, times: float) ->
     return replace(survey, dots={**survey.dots, **changed})
 
 
+def with_drifting_focus(survey: Survey, camera: str, times: float) -> Survey:
+    """Return the survey with a camera's picture larger and larger, ``times`` as large at the last image."""
+    middle = (np.array(survey.cameras[camera].size_px) - 1) / 2
+    passed = _passed(survey)
+    dots = dict(survey.dots)
+    for image in survey.images:
+        if image.camera == camera:
+            scale = 1 + (times - 1) * passed[image.name]
+            seen = dots[image.name]
+            dots[image.name] = replace(seen, pixels_px=middle + scale * (seen.pixels_px - middle))
+    return replace(survey, dots=dots)
+
+
 def with_moved_board(
     survey: Survey, truth: SurveyTruth, images: tuple[str, ...], shift_m: ArrayLike, turn_rad: ArrayLike
 ) -> Survey:
@@ -151,6 +170,11 @@ def with_bowed_board(survey: Survey, truth: SurveyTruth, bow_m: float) -> Survey
         bent = places + np.outer(bow_m * (places[:, 0] / half_m) ** 2, [0.0, 0.0, 1.0])
         dots[name] = _seen_elsewhere(survey, truth, name, places, bent)
     return replace(survey, dots=dots)
+
+
+def _passed(survey: Survey) -> dict[str, float]:
+    """What part of the images was taken before each, 0 to 1."""
+    return {image.name: k / max(len(survey.images) - 1, 1) for k, image in enumerate(survey.images)}
 
 
 def _from(survey: Survey, first: str) -> set[str]:

@@ -83,7 +83,8 @@ class Looks:
         while True:
             here = len(known.of(name))
             known.collect()
-            choice = next_shot(known.now, known.sought, known.shots, name, known.aim, in_vain)
+            ahead = max(FEWEST_LOOKS - here, 1)
+            choice = next_shot(known.now, known.sought, known.shots, name, known.aim, in_vain, ahead)
             if choice is None or here >= most or self._suffices(here, choice):
                 break
             self._tell(name, choice)

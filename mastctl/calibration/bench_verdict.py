@@ -13,15 +13,14 @@ from calib.fit.bench_calibration import BenchCalibration
 from calib.rigid import FloatArray
 from calib.survey import Survey
 from mastctl.calibration.expected import RARELY
-from mastctl.calibration.stated import wrong_sentence
 from mastctl.calibration.verdict import (
-    HOPELESS,
     MANY_LEFT_OUT,
     POINTING_BAD_PX,
     POINTING_GOOD_PX,
     Grade,
     Reason,
     Verdict,
+    sigma_reasons,
 )
 
 
@@ -82,10 +81,7 @@ def _noise(survey: Survey, calibration: BenchCalibration) -> Iterator[Reason]:
     wrong = [c for c in calibration.components if c.wrong]
     unexplained: Grade = "bad" if factor > 2.0 and not wrong else "care"
     yield Reason(unexplained if calibration.chi2_probability < RARELY else "good", words)
-    for component in wrong:
-        yield Reason(
-            "bad" if component.factor > HOPELESS else "care", wrong_sentence(survey.sigma, component, wrong)
-        )
+    yield from sigma_reasons(survey, calibration.components)
 
 
 def _placements(calibration: BenchCalibration) -> Iterator[Reason]:

@@ -22,12 +22,14 @@ RARELY = 0.001
 class CheckSize(NamedTuple):
     """Rms per axis of what was seen, and of what noise and the covariance of the fit make of it; pixels.
 
-    ``limit_px`` is passed once in a thousand times, if the sigmas are right.
+    ``limit_px`` is passed once in a thousand times, if the sigmas are right; ``chance`` is that of more than
+    was seen.
     """
 
     seen_px: float
     expected_px: float
     limit_px: float
+    chance: float
 
 
 def check_sizes(survey: Survey, calibration: Calibration) -> dict[str, CheckSize]:
@@ -56,7 +58,8 @@ def check_sizes(survey: Survey, calibration: Calibration) -> dict[str, CheckSize
         each = np.array([part for _, part in pairs])
         freedom = 2 * each.sum() ** 2 / np.sum(each**2)
         limit = expected * np.sqrt(chi2.isf(RARELY, freedom) / freedom)
-        sizes[camera] = CheckSize(float(seen), float(expected), float(limit))
+        rarer = float(chi2.sf(freedom * (seen / expected) ** 2, freedom))
+        sizes[camera] = CheckSize(float(seen), float(expected), float(limit), rarer)
     return sizes
 
 

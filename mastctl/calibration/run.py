@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
+from calib.errors import CalibError
 from calib.files.atomic import keep_previous, previous_path
 from calib.files.mast_file import StoredRig, save_rig
 from calib.fit.calibration import Calibration
@@ -51,8 +52,8 @@ class Calibrated:
     previous: Path | None
 
 
-def checked_survey(survey: Survey, method: Method = "joint") -> tuple[str, ...]:
-    """Return the sentences of the check's warnings; ``method`` decides which images have to show a camera.
+def checked_survey(survey: Survey, method: Method = "joint") -> tuple[Finding, ...]:
+    """Return the warnings of the check; ``method`` decides which images have to show a camera.
 
     Raises
     ------
@@ -62,7 +63,7 @@ def checked_survey(survey: Survey, method: Method = "joint") -> tuple[str, ...]:
     findings = check_survey(survey, only_camera_images=method == "paper")
     if any(finding.severity == "error" for finding in findings):
         raise SurveyRefused(survey, findings)
-    return tuple(sentence_of(finding) for finding in findings)
+    return findings
 
 
 def calibrate(
@@ -70,7 +71,7 @@ def calibrate(
     out: Path,
     method: Method = "joint",
     mast_parameters: int = 6,
-    warnings: tuple[str, ...] = (),
+    warnings: tuple[Finding, ...] = (),
     undetected: tuple[tuple[str, str], ...] = (),
 ) -> Calibrated:
     """Fit a checked survey, judge the result, and save it as a mast file.
@@ -95,9 +96,19 @@ def calibrate(
         If ``out`` cannot be written; it holds what it held before.
     """
     calibration = FITS[method](survey, mast_parameters)
-    verdict = judge_calibration(survey, calibration, warnings, [name for name, _ in undetected])
+    jointly = None if method == "joint" else _jointly(survey, mast_parameters)
+    verdict = judge_calibration(survey, calibration, warnings, [name for name, _ in undetected], jointly)
     saved, previous = save_new(with_fit(calibration, survey, verdict.told()), out)
-    return Calibrated(survey, calibration, verdict, warnings, undetected, saved, previous)
+    sentences = tuple(sentence_of(finding) for finding in warnings)
+    return Calibrated(survey, calibration, verdict, sentences, undetected, saved, previous)
+
+
+def _jointly(survey: Survey, mast_parameters: int) -> Calibration | CalibError:
+    """The joint fit, whose tests judge a survey whichever method calibrates by it; or why there is none."""
+    try:
+        return fit_joint(survey, mast_parameters)
+    except CalibError as error:
+        return error
 
 
 def save_new(rig: Rig, out: Path) -> tuple[StoredRig, Path | None]:

@@ -26,14 +26,14 @@ def stated(sigma: Sigma, kind: str) -> tuple[float, str, str]:
 
 
 def wrong_sentence(sigma: Sigma, component: Component, wrong: Sequence[Component]) -> str:
-    """Return in words that a stated sigma is too small; ``wrong`` are all kinds for which it is."""
+    """Return in words that a stated sigma is none; ``wrong`` are all kinds for which it is too small."""
     told, unit, key = stated(sigma, component.kind)
     words = (
         f"{component.kind} scatter by {component.factor:.2f} ± {component.factor_sigma:.2f} times their "
         f"stated sigma: {component.factor * told:.2g} {unit} where {key} says {told:g} {unit}; the fit and "
         f"its uncertainties take {component.weighed * told:.2g} {unit}"
     )
-    if component.kind == PRISMS and all(other.kind != TAPES for other in wrong):
+    if component.wrong and component.kind == PRISMS and all(other.kind != TAPES for other in wrong):
         words += "; tapes do not, so it may be the drawing of the prisms that is off (prism_cad_m)"
     return words
 
@@ -55,7 +55,7 @@ def component_table(survey: Survey, calibration: Calibration) -> Table | None:
                 f"{c.weighed:.2f}",
             ]
         )
-    return Table(("measurements", "stated sigma", "found", "redundant numbers", "widened by"), rows)
+    return Table(("measurements", "stated sigma", "found", "redundant numbers", "taken times"), rows)
 
 
 def components_told(sigma: Sigma, components: Sequence[Component]) -> list[dict[str, Any]]:
@@ -75,6 +75,7 @@ def components_told(sigma: Sigma, components: Sequence[Component]) -> list[dict[
                 "factor_sigma": c.factor_sigma if np.isfinite(c.factor) else None,
                 "widened_by": c.weighed,
                 "chance": c.chance,
+                "small_chance": c.small_chance,
             }
         )
     return found

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -11,8 +11,9 @@ from scipy.spatial.transform import Rotation
 
 from calib.errors import CalibError
 from calib.fit.calibration import Calibration
+from calib.fit.components import Component
 from calib.fit.uncertainty import pointing_covariance
-from calib.survey import Survey
+from calib.survey import Finding, Survey
 from mastctl.calibration.exchanged import exchanged_boards
 from mastctl.calibration.expected import RARELY, check_sizes
 from mastctl.calibration.stated import wrong_sentence
@@ -46,7 +47,8 @@ ODD_IMAGE = 6.0
 FEW_IMAGES = 4
 
 HOPELESS = 5.0
-"""Measurements that scatter so many times their stated sigma are not what they are taken for."""
+"""Measurements that scatter so many times their stated sigma, or by so much less, are not what they are taken
+for."""
 
 
 @dataclass(frozen=True)
@@ -78,8 +80,9 @@ class Verdict:
 def judge_calibration(
     survey: Survey,
     calibration: Calibration,
-    warnings: Sequence[str] = (),
+    warnings: Sequence[Finding] = (),
     undetected: Sequence[str] = (),
+    jointly: Calibration | CalibError | None = None,
 ) -> Verdict:
     """Return whether to trust a calibration.
 
@@ -90,14 +93,18 @@ def judge_calibration(
     calibration
         What came of it.
     warnings
-        What the check of the survey warned of.
+        What the check of the survey warned of. What the joint fit tests again, finer, is left to its tests.
     undetected
         Names of images in which no dots were found.
+    jointly
+        The joint fit of a survey that was calibrated by the paper's method, which has no tests of its own; or
+        why there is none.
     """
     reasons = [
         *_noise(survey, calibration),
         *_wider(calibration),
         *_by_the_others(calibration),
+        *_jointly(survey, jointly),
         *_odd_images(calibration),
         *_checks(survey, calibration),
         *_open(calibration),
@@ -108,8 +115,9 @@ def judge_calibration(
     ]
     if undetected:
         reasons.append(Reason("care", f"no dots were found in {len(undetected)} images: {_some(undetected)}"))
-    if warnings:
-        reasons.append(Reason("care", f"the check of the survey warned {len(warnings)} times"))
+    joint = np.isfinite(calibration.chi2_probability)
+    if count := sum(not (joint and warning.tested_again) for warning in warnings):
+        reasons.append(Reason("care", f"the check of the survey warned {count} times"))
     grades = {reason.grade for reason in reasons}
     grade: Grade = "bad" if "bad" in grades else "care" if "care" in grades else "good"
     return Verdict(grade, tuple(reasons))
@@ -133,15 +141,31 @@ def _noise(survey: Survey, calibration: Calibration) -> list[Reason]:
     wrong = [c for c in calibration.components if c.wrong]
     unexplained: Grade = "bad" if factor > 2.0 and not wrong else "care"
     reasons = [Reason(unexplained if calibration.chi2_probability < RARELY else "good", words)]
-    for component in wrong:
-        grade: Grade = "bad" if component.factor > HOPELESS else "care"
-        reasons.append(Reason(grade, wrong_sentence(survey.sigma, component, wrong)))
+    reasons += sigma_reasons(survey, calibration.components)
     told = [c for c in calibration.components if np.isfinite(c.factor)]
     if told and not wrong:
         most = max(told, key=lambda c: c.factor)
         words = f"each kind of measurement scatters no more than stated, most of all {most.kind}: "
         words += f"{most.factor:.2f} ± {most.factor_sigma:.2f} times their sigma"
         reasons.append(Reason("good", words))
+    return reasons
+
+
+def sigma_reasons(survey: Survey, components: Sequence[Component]) -> list[Reason]:
+    """Return a reason for each kind of measurement whose stated sigma is not what its residuals show.
+
+    Too small a sigma is a fault of the survey. Too large a one is none, once the fit takes what was found;
+    unless it is so far off that the measurements may be smoothed, or copies.
+    """
+    wrong = [c for c in components if c.wrong]
+    reasons = []
+    for c in (*wrong, *(c for c in components if c.generous)):
+        grade: Grade = "good" if c.generous else "care"
+        if c.factor > HOPELESS:
+            grade = "bad"
+        elif c.factor < 1.0 / HOPELESS:
+            grade = "care"
+        reasons.append(Reason(grade, wrong_sentence(survey.sigma, c, wrong)))
     return reasons
 
 
@@ -190,6 +214,17 @@ def _by_the_others(calibration: Calibration) -> list[Reason]:
         )
         reasons.append(Reason("good", f"{words}{fitted:.3f} px with it"))
     return reasons
+
+
+def _jointly(survey: Survey, fit: Calibration | CalibError | None) -> list[Reason]:
+    """What the joint fit's tests say of a survey that another method calibrated."""
+    if fit is None:
+        return []
+    if isinstance(fit, CalibError):
+        words = "whether sigmas and model are right was not tested, since the survey cannot be fitted jointly"
+        return [Reason("care", f"{words}: {fit}")]
+    reasons = [*sigma_reasons(survey, fit.components), *_wider(fit), *_by_the_others(fit)]
+    return [replace(reason, sentence=f"fitted jointly, {reason.sentence}") for reason in reasons]
 
 
 def _odd_images(calibration: Calibration) -> list[Reason]:

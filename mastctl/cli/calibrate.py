@@ -100,7 +100,7 @@ def run(args: argparse.Namespace) -> int:
 
 def _from_survey(args: argparse.Namespace) -> int:
     from calib.survey import read_survey
-    from mastctl.calibration.run import SurveyRefused, calibrate, checked_survey
+    from mastctl.calibration.run import SurveyRefused, calibrate, checked_survey, sentence_of
 
     survey = read_survey(args.survey)
     try:
@@ -115,7 +115,7 @@ def _from_survey(args: argparse.Namespace) -> int:
     survey, undetected = _with_dots(args, survey)
     warnings = checked_survey(survey, args.method)  # once more, with the dots that were found
     for warning in warnings:
-        output.tell(f"warning: {warning}")
+        output.tell(f"warning: {sentence_of(warning)}")
     with output.waiting(args.json, f"fitting {len(survey.images)} images ({args.method})"):
         done = calibrate(survey, args.out, args.method, args.mast, warnings, undetected)
     page = _report(args, done, in_use)

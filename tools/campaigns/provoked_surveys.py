@@ -12,7 +12,9 @@ is wrong and how much is drawn (`tools.campaigns.survey_provocations`). It is ch
 
 The truth is *beyond 3 sigma* if errors of one camera or pair, rms over its places and in sigmas that the
 calibration states, exceed 3, or the mast's squared distance what chance makes of it once in 370. Trusted is
-what comes out as "trust it"; a refusal to calibrate counts by itself.
+what comes out as "trust it", doubted as "use it with care", rejected as "do not trust it"; a refusal to
+calibrate counts by itself. Of surveys with nothing wrong it is told besides how often each test was passed,
+at the level that it claims and at 5 %: whether chances are what they say.
 """
 
 from __future__ import annotations
@@ -30,16 +32,20 @@ from scipy.stats import chi2
 from calib.camera.stereo import triangulate
 from calib.errors import CalibError
 from calib.files.mast_file import load_rig
+from calib.fit import components, wider
 from calib.fit.calibration import Calibration
 from calib.fit.joint import fit_joint
 from calib.fit.significance import THREE_SIGMAS
+from calib.fit.terms import DRAWING
 from calib.fit.uncertainty import pixel_covariance, pointing_covariance
 from calib.mast.gimbal import MAST_NAMES, numbers_of
 from calib.mast.pointing import solve
 from calib.mast.rig import Rig
 from calib.rigid import FloatArray
-from calib.survey import Sigma
+from calib.survey import Sigma, Survey
 from drivers.sim_survey.plan import SurveyPlan, rover_from_head
+from mastctl.calibration import expected
+from mastctl.calibration.expected import check_sizes
 from mastctl.calibration.run import SurveyRefused, checked_survey
 from mastctl.calibration.verdict import judge_calibration
 from mastctl.cli.output import at_least
@@ -61,6 +67,21 @@ COUNTED_RAD = 1e-4
 """What every other survey states of its joints, and what their readings err by."""
 
 
+FAR = ("beyond", "within")
+"""Where the truth is, against three of the stated sigmas."""
+
+SAID = {"good": "trusted", "care": "doubted", "bad": "rejected"}
+
+LEVELS = {
+    "sigmas": components.RARELY,
+    "wider models": wider.FALSE_ALARMS,
+    "prisms' drawing": wider.DRAWING_ALARMS,
+    "boards by the others": expected.RARELY,
+    "check images": 4 * expected.RARELY,
+}
+"""At what chance each test warns; check images do for each of four cameras."""
+
+
 class Task(NamedTuple):
     """One survey of a true rig."""
 
@@ -71,7 +92,7 @@ class Task(NamedTuple):
 
 class Outcome(NamedTuple):
     """What came of a survey: what was wrong, the grade or '' if refused, the worst error in sigmas and of
-    what, and the reasons that were not good."""
+    what, the reasons that were not good, and by test the chance of what it found (`chances_of`)."""
 
     kind: str
     words: str
@@ -79,6 +100,7 @@ class Outcome(NamedTuple):
     sigmas: float
     worst: str
     reasons: tuple[str, ...]
+    chances: dict[str, float]
 
 
 def judged(task: Task) -> Outcome:
@@ -91,12 +113,27 @@ def judged(task: Task) -> Outcome:
         warnings = checked_survey(made.survey)
         fit = fit_joint(made.survey, made.mast_parameters)
     except (SurveyRefused, CalibError) as refused:
-        return Outcome(task.kind, made.words, "", float("nan"), "", (str(refused),))
+        return Outcome(task.kind, made.words, "", float("nan"), "", (str(refused),), {})
     verdict = judge_calibration(made.survey, fit, warnings)
     errors = errors_in_sigmas(made, fit)
     worst = max(errors, key=errors.__getitem__)
     reasons = tuple(r.sentence for r in verdict.reasons if r.grade != "good")
-    return Outcome(task.kind, made.words, verdict.grade, errors[worst], worst, reasons + tuple(warnings))
+    reasons += tuple(str(warning) for warning in warnings)
+    return Outcome(
+        task.kind, made.words, verdict.grade, errors[worst], worst, reasons, chances_of(made.survey, fit)
+    )
+
+
+def chances_of(survey: Survey, fit: Calibration) -> dict[str, float]:
+    """Return by test the chance of what it found or more, were all right, all that it tried counted."""
+    found: dict[str, list[float]] = {
+        "sigmas": [c.chance for c in fit.components if np.isfinite(c.factor)],
+        "wider models": [m.chance for m in fit.wider if m.name != DRAWING],
+        "prisms' drawing": [m.chance for m in fit.wider if m.name == DRAWING],
+        "boards by the others": [b.least_chance for b in fit.left_out_boards],
+        "check images": [size.chance for size in check_sizes(survey, fit).values()],
+    }
+    return {test: min(1.0, len(each) * min(each)) for test, each in found.items() if each}
 
 
 def errors_in_sigmas(made: Provoked, fit: Calibration) -> dict[str, float]:
@@ -225,14 +262,7 @@ def main() -> int:
 
 def report(outcomes: list[Outcome]) -> None:
     """Print the table, and every case in which the verdict erred."""
-    heads = (
-        "cases",
-        "refused",
-        "trusted, right",
-        "trusted though wrong",
-        "doubted, wrong",
-        "doubted though right",
-    )
+    heads = ("cases", "refused", *(f"{far}: {what}" for far in FAR for what in SAID.values()))
     print(f"{'':16s} " + "  ".join(heads))
     for kind in [*PROVOCATIONS, "all"]:
         mine = [one for one in outcomes if kind in (one.kind, "all")]
@@ -244,26 +274,34 @@ def report(outcomes: list[Outcome]) -> None:
             f"{kind:16s} "
             + "  ".join(f"{cell:{len(head)}d}" for cell, head in zip(cells, heads, strict=True))
         )
-    for head in ("trusted though wrong", "doubted though right"):
-        for one in outcomes:
-            if _cell(one) == head and (head.startswith("trusted") or one.kind == "nothing wrong"):
-                print(f"{head}: {one.words}: {one.worst} {one.sigmas:.1f} sigma; {' | '.join(one.reasons)}")
-    doubts = Counter(
-        one.kind for one in outcomes if _cell(one) == "trusted, right" and one.kind != "nothing wrong"
-    )
-    for kind, number in doubts.items():
-        words = sorted(one.words for one in outcomes if _cell(one) == "trusted, right" and one.kind == kind)
-        print(f"trusted and right in spite of {kind} ({number}): {'; '.join(words)}")
+    for one in outcomes:
+        trusted = _cell(one) == f"{FAR[0]}: {SAID['good']}"
+        if trusted or (one.kind == "nothing wrong" and one.grade != "good"):
+            print(f"{_cell(one)}: {one.words}: {one.worst} {one.sigmas:.1f} sigma; {' | '.join(one.reasons)}")
+    for kind in PROVOCATIONS:
+        mine = [one for one in outcomes if one.kind == kind and kind != "nothing wrong"]
+        for far, said in ((FAR[1], SAID["good"]), (FAR[1], SAID["bad"])):
+            if words := sorted(one.words for one in mine if _cell(one) == f"{far}: {said}"):
+                print(f"{said} in spite of {kind}, truth {far} ({len(words)}): {'; '.join(words)}")
+    false_alarms([one.chances for one in outcomes if one.kind == "nothing wrong" and one.grade])
+
+
+def false_alarms(chances: list[dict[str, float]]) -> None:
+    """Print how often each test said of surveys with nothing wrong that something is."""
+    for test, level in LEVELS.items():
+        mine = [found[test] for found in chances if test in found]
+        usual, rare = (sum(chance < limit for chance in mine) for limit in (0.05, level))
+        if mine:
+            print(
+                f"nothing wrong, {test}: {usual} of {len(mine)} below 5 %, {rare} below its {100 * level:g} %"
+            )
 
 
 def _cell(one: Outcome) -> str:
     """Which column of the table an outcome belongs to."""
     if not one.grade:
         return "refused"
-    wrong = not one.sigmas <= SIGMAS
-    if one.grade == "good":
-        return "trusted though wrong" if wrong else "trusted, right"
-    return "doubted, wrong" if wrong else "doubted though right"
+    return f"{FAR[one.sigmas <= SIGMAS]}: {SAID[one.grade]}"
 
 
 if __name__ == "__main__":

@@ -19,6 +19,8 @@ from calib.survey import Sigma, Survey
 from drivers.sim_survey.blunders import (
     with_bowed_board,
     with_changed_focus,
+    with_drifting_focus,
+    with_drifting_joint,
     with_encoder_errors,
     with_moved_board,
     with_moved_tape,
@@ -183,6 +185,21 @@ def refocused(rig: Rig, seed: int, plan: SurveyPlan, rng: np.random.Generator) -
     return Provoked(survey, _refocused_rig(rig, camera, 1 + more), words)
 
 
+def drifting(rig: Rig, seed: int, plan: SurveyPlan, rng: np.random.Generator) -> Provoked:
+    """Return a survey in which a joint's reading, or a camera's focal length, drifts from first to last."""
+    survey = simulate_survey(rig, seed, plan)[0]
+    if rng.random() < 0.7:
+        joint, drift_rad = str(rng.choice(JOINTS)), _signed(rng, 0.0003, 0.02)
+        words = f"{joint} by {1e3 * drift_rad:.2f} mrad from the first picture to the last"
+        return Provoked(
+            with_drifting_joint(survey, joint, drift_rad), _slipped_rig(rig, joint, drift_rad), words
+        )
+    camera, more = str(rng.choice(list(survey.cameras))), _signed(rng, 0.0003, 0.02)
+    survey = with_drifting_focus(survey, camera, 1 + more)
+    words = f"focal length of {camera} by {100 * more:.2f} % from the first picture to the last"
+    return Provoked(survey, _refocused_rig(rig, camera, 1 + more), words)
+
+
 PROVOCATIONS: dict[str, Callable[[Rig, int, SurveyPlan, np.random.Generator], Provoked]] = {
     "nothing wrong": clean,
     "wrong sigmas": wrong_sigma,
@@ -191,6 +208,7 @@ PROVOCATIONS: dict[str, Callable[[Rig, int, SurveyPlan, np.random.Generator], Pr
     "board moved": board_moved,
     "slipped encoder": slipped,
     "focus changed": refocused,
+    "slow drift": drifting,
 }
 
 

@@ -9,12 +9,13 @@ import pytest
 
 from calib.fit.adjustment import Block
 from calib.fit.calibration import Calibration
-from calib.fit.components import Component, variance_components, wider_sigmas
+from calib.fit.components import Component, found_sigmas, variance_components
 from calib.fit.joint import fit_joint
 from calib.fit.terms import StationTerm
 from calib.mast.rig import Rig
 from calib.survey import Sigma, Survey
 from hil_tests.calib.fit.small_surveys import survey_of
+from mastctl.calibration.verdict import judge_calibration
 
 OFF = 3.5
 """How many of its own sigmas a found factor may be from the true one."""
@@ -56,9 +57,13 @@ def test_the_kind_that_is_worse_than_stated_is_found_and_no_other(
         assert abs(c.factor - expected) < OFF * c.factor_sigma, c
 
 
-def test_the_covariance_is_that_of_the_errors_that_happened(navcams: Rig) -> None:
-    """A survey that states the truth has it; one that states a third must come to the same."""
-    happens = replace(STATED, station_m=0.003)
+@pytest.mark.parametrize(
+    "happens",
+    [replace(STATED, station_m=0.003), replace(STATED, station_m=0.0004), replace(STATED, dot_px=0.025)],
+    ids=["station worse", "station better", "dots better"],
+)
+def test_the_covariance_is_that_of_the_errors_that_happened(navcams: Rig, happens: Sigma) -> None:
+    """A survey that states the truth has it; one that states too much or too little must come to the same."""
     _, fit = told_otherwise(navcams, happens)
     honest = fit_joint(survey_of(navcams, 4, sigma=happens))
     n = len(fit.part("mast."))
@@ -67,11 +72,24 @@ def test_the_covariance_is_that_of_the_errors_that_happened(navcams: Rig) -> Non
     assert np.abs(fit.estimate[:n] - honest.estimate[:n]).max() < 1e-3
 
 
-def test_errors_smaller_than_stated_narrow_nothing(navcams: Rig) -> None:
+def test_a_sigma_that_is_too_large_is_told_and_harms_nothing(navcams: Rig) -> None:
     stated = Sigma(station_m=0.003, dot_px=0.3, joint_rad=3e-4)
     survey = replace(survey_of(navcams, 4, sigma=STATED), sigma=stated)
     fit = fit_joint(survey)
-    assert all(c.factor < 0.6 and c.weighed == 1.0 for c in fit.components)
+    assert fit.chi2 < 0.2 * fit.degrees_of_freedom
+    found = by_kind(fit)
+    for kind in ("tapes", "dots of navcam_left", "dots of navcam_right"):
+        assert found[kind].generous and found[kind].weighed == pytest.approx(1 / 3, rel=0.25)
+    told = [
+        r for r in judge_calibration(survey, fit).reasons if "times their stated sigma: 0.1 px" in r.sentence
+    ]
+    assert len(told) == 2 and {r.grade for r in told} == {"good"}
+
+
+def test_luck_with_few_numbers_narrows_nothing() -> None:
+    few = Component("prisms", 24, 8.0, 0.5, 0.1, 1.0, 0.99, 0.02)
+    many = Component("dots of navcam_left", 800, 700.0, 0.97, 0.03, 1.0, 0.9, 0.1)
+    assert found_sigmas([few, many]) == {"prisms": 1.0, "dots of navcam_left": 1.0}
 
 
 def heights(sigma_m: float, count: int, rng: np.random.Generator) -> list[tuple[StationTerm, Block]]:
@@ -94,8 +112,8 @@ def test_of_a_mean_it_is_the_sample_variance() -> None:
 def test_tapes_and_prisms_share_a_sigma_unless_they_cannot() -> None:
     tapes = Component("tapes", 300, 270.0, 3.0, 0.13, 1.0, 1e-30)
     few = Component("prisms", 24, 12.0, 2.0, 0.4, 1.0, 0.01)
-    assert wider_sigmas([tapes, few])["prisms"] == wider_sigmas([tapes, few])["tapes"] > 2.9
+    assert found_sigmas([tapes, few])["prisms"] == found_sigmas([tapes, few])["tapes"] > 2.9
     good = replace(tapes, factor=1.0, chance=0.5)
     bad = replace(few, factor=4.0, chance=1e-20)
-    apart = wider_sigmas([good, bad])
+    apart = found_sigmas([good, bad])
     assert apart == {"tapes": 1.0, "prisms": 4.0}

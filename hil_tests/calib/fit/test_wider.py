@@ -17,6 +17,8 @@ from calib.survey import Sigma, Survey
 from drivers.sim_survey.blunders import (
     with_bowed_board,
     with_changed_focus,
+    with_drifting_focus,
+    with_drifting_joint,
     with_encoder_errors,
     with_moved_board,
     with_slipped_joint,
@@ -65,6 +67,8 @@ SPOILED: dict[str, tuple[Callable[[Made], Survey], str]] = {
         lambda m: with_changed_focus(m[0], "navcam_left", names(m[0])[7], 1.001),
         "refocused or bumped there",
     ),
+    "drift of pan": (lambda m: with_drifting_joint(m[0], "pan", 0.004), "from the first image to the last"),
+    "drift of navcam_left": (lambda m: with_drifting_focus(m[0], "navcam_left", 1.002), "creeps"),
     "bow of the board": (lambda m: with_bowed_board(*m, 0.0006), "not flat"),
     "harmonics of tilt": (lambda m: with_encoder_errors(m[0], "tilt", 0.004j, 0.002), "around the turn"),
 }

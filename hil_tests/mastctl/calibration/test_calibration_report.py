@@ -9,8 +9,10 @@ import pytest
 
 from calib.fit.calibration import Calibration, Degenerate, Outlier
 from calib.fit.joint import fit_joint
+from calib.fit.paper import fit_paper
+from calib.fit.start_values import SurveyNotFitted
 from calib.fit.uncertainty import rig_moved_along
-from calib.survey import Survey
+from calib.survey import Finding, Survey
 from hil_tests.mastctl.calibration.survey_world import navcam_rig, navcam_survey
 from mastctl.calibration.drawn import boards
 from mastctl.calibration.expected import check_sizes
@@ -88,7 +90,12 @@ def test_the_worst_reason_decides(fitted: tuple[Survey, Calibration]) -> None:
     survey, calibration = fitted
     assert judge_calibration(survey, calibration).grade == "good"
     assert judge_calibration(survey, calibration, undetected=["a"]).grade == "care"
-    assert judge_calibration(survey, calibration, warnings=["w"]).grade == "care"
+    warning = Finding("warning", "set-up level, placement mast-1", "its tapes are off", "Measure them again")
+    assert judge_calibration(survey, calibration, warnings=[warning]).grade == "care"
+    tape = replace(warning, tested_again=True)  # as the fit did, and found nothing
+    assert judge_calibration(survey, calibration, warnings=[tape]).grade == "good"
+    exact = replace(calibration, chi2_probability=float("nan"))  # the paper's method takes tapes as exact
+    assert judge_calibration(survey, exact, warnings=[tape]).grade == "care"
     unseen = replace(calibration, check_rms_px={})
     assert judge_calibration(survey, unseen).grade == "care"
     prism = Outlier("prism", "prism p3 of set-up level", 50.0, 20.0, 0.02)
@@ -118,3 +125,17 @@ def test_a_placement_whose_name_looks_like_a_formula_is_drawn(fitted: tuple[Surv
     drawn = boards(replace(calibration, rover_from_board=renamed, images=tuple(images)), survey.board)
     assert plots.as_png(drawn).startswith(b"\x89PNG")
     assert any("$" in text.get_text() for text in drawn.axes[0].texts)
+
+
+def test_what_the_papers_method_made_is_judged_by_the_joint_fits_tests(
+    fitted: tuple[Survey, Calibration],
+) -> None:
+    survey = fitted[0]
+    told = replace(survey, sigma=replace(survey.sigma, station_m=survey.sigma.station_m / 4))
+    by_paper = fit_paper(told)
+    verdict = judge_calibration(told, by_paper, jointly=fit_joint(told))
+    assert any(
+        r.grade == "care" and r.sentence.startswith("fitted jointly, tapes scatter") for r in verdict.reasons
+    )
+    lost = judge_calibration(survey, by_paper, jointly=SurveyNotFitted("no start was found"))
+    assert lost.grade == "care" and any("was not tested" in r.sentence for r in lost.reasons)
