@@ -22,6 +22,9 @@ from tools.living_daemon import simulated, started
 CAMERAS = ("pancam_left", "pancam_right", "navcam_left", "navcam_right", "hazcam_left", "hazcam_right")
 DESK = {"width": 1500, "height": 1000}
 TABLET = {"width": 820, "height": 1180}
+TALL = {"width": 1500, "height": 1240}
+STONE = (0.5, 0.62)  # beside the larger rock, as the head looks then
+STEPS_M = (0.3, 0.6, 0.9, 1.2, 1.5)
 FRESH = ".eye[data-camera=navcam_left]:not([data-stale])", ".eye[data-camera=navcam_right]:not([data-stale])"
 ROCK = (0.857, 0.862)  # of the image's width and height
 
@@ -46,6 +49,9 @@ def main() -> int:
             dark = browser.new_context(viewport=DESK, color_scheme="dark").new_page()
             pointed(dark, url, out)
             dark.close()
+            desk = browser.new_context(viewport=TALL, color_scheme="light").new_page()
+            followed(desk, url, client, out)
+            desk.close()
             light = browser.new_context(viewport=TABLET, color_scheme="light", has_touch=True).new_page()
             on_a_tablet(light, url, client, out)
             light.close()
@@ -77,6 +83,31 @@ def pointed(page: Page, url: str, out: Path) -> None:
     kept(page, out / "page.jpg")
 
 
+def followed(page: Page, url: str, client: Client, out: Path) -> None:
+    """A target that is followed while the rover drives up to it."""
+    client.pose(**client.true_pose())
+    client.wait(client.point(pan_rad=0.03, tilt_rad=-0.17))
+    opened(page, url)
+    box: Any = page.locator(".eye[data-camera=navcam_left] .frame").bounding_box()
+    x, y = box["x"] + STONE[0] * box["width"], box["y"] + STONE[1] * box["height"]
+    page.mouse.move(x - 20, y - 20)
+    page.mouse.down()
+    page.mouse.move(x + 20, y + 20, steps=4)
+    page.mouse.up()
+    page.wait_for_selector("#track .word.tracking", timeout=90_000)
+    for ahead_m in STEPS_M:
+        client.stand(ahead_m, 0.0, 0.0)
+        client.wait_track(client.pose(**client.true_pose(), sigma=(0.01, 0.009))["operation"])
+    page.wait_for_selector("#track .errors[aria-label*=truly]")
+    page.mouse.move(10, TALL["height"] - 10)
+    page.wait_for_timeout(1500)
+    kept(page, out / "page_track.jpg")
+    page.get_by_role("button", name="End the track").click()
+    page.wait_for_selector("#track .word.stopped")
+    client.stand(0.0, 0.0, 0.0)
+    client.pose(**client.true_pose())
+
+
 def on_a_tablet(page: Page, url: str, client: Client, out: Path) -> None:
     """A camera that has stopped, with its fault; then an emergency stop."""
     opened(page, url)
@@ -85,6 +116,12 @@ def on_a_tablet(page: Page, url: str, client: Client, out: Path) -> None:
     page.wait_for_selector("#faults li")
     kept(page, out / "page_fault.jpg")
     client.clear_faults()
+    client.estop(name="Ana", reason="a cable chain caught on the deck")
+    page.wait_for_selector("#estop:not([hidden])")
+    for each in FRESH:
+        page.wait_for_selector(each)
+    kept(page, out / "page_stopped.jpg")
+    client.reset(name="Ana", reason="the chain is free")
 
 
 def kept(page: Page, path: Path) -> None:

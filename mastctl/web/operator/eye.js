@@ -45,6 +45,7 @@ export class Eye {
     this.facts = facts;
     this.exposedMs = cameMs - 1000 * facts.age_s;
     this.markTrack(facts.track);
+    set(this.facing, "title", `frame ${facts.frame_id}, exposed at ${number(facts.mid_exposure_s, 3)} s, mast file ${facts.mast_digest.slice(0, 12)}`);
     this.fresh(performance.now());
     if (this.cursor) this.look(this.cursor);
     document.dispatchEvent(new CustomEvent("image-shown", { detail: { ...facts, shown_ms: performance.timeOrigin + performance.now() } }));

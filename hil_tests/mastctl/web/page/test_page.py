@@ -309,8 +309,20 @@ def test_a_finger_turns_the_head_and_chooses_a_point(pair: BOTH, visit: Visits) 
     assert small == 0, "each button is large enough for a finger"
     assert one.page.evaluate("document.documentElement.scrollWidth <= innerWidth"), "nothing is cut off"
     assert one.page.locator("#stop").is_visible()
-    one.page.locator("[data-way=right]").dispatch_event("pointerdown", {"pointerId": 1, "button": 0})
-    del hardware
+    eventually(lambda: daemon.service.operations.running is None, "it has arrived")
+    button = one.page.locator("[data-way=right]")
+    button.scroll_into_view_if_needed()
+    box = button.bounding_box()
+    assert box is not None
+    point = {"x": box["x"] + box["width"] / 2, "y": box["y"] + box["height"] / 2}
+    here = len(hardware.head.calls)
+    finger = one.page.context.new_cdp_session(one.page)
+    finger.send("Input.dispatchTouchEvent", {"type": "touchStart", "touchPoints": [point]})
+    eventually(lambda: len(hardware.head.calls) > here, "the head turns")
+    finger.send("Input.dispatchTouchEvent", {"type": "touchEnd", "touchPoints": []})
+    eventually(lambda: daemon.service.operations.running is None, "the jog has ended")
+    assert json.loads(one.posts("/jog")[-1])["pan_rad_per_s"] == 0
+    assert max(json.loads(body)["pan_rad_per_s"] for body in one.posts("/jog")) > 0
 
 
 def test_by_the_keyboard_alone_a_pixel_is_chosen_and_sent(pair: BOTH, visit: Visits) -> None:
