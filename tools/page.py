@@ -34,7 +34,7 @@ def main() -> int:
             return daemon.wait() or 1
         with Client(url, name="demo") as client:
             client.wait(client.point(pan_rad=PAN_RAD, tilt_rad=TILT_RAD))
-        print(f"The page is at {url}/: click a rock, press P, read the residual. Ctrl-C ends it.", flush=True)
+        print(f"Click a rock, press P, read the residual; Ctrl-C ends it. The page: {url}/", flush=True)
         if not asked.no_browser and (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
             webbrowser.open(url)
         signal.signal(signal.SIGTERM, signal.default_int_handler)  # no daemon is left behind

@@ -114,7 +114,7 @@ function standing(now) {
   byId("estop").hidden = !latch;
   set(byId("latch"), "aria-pressed", String(Boolean(latch)));
   const words = latch ? ` by ${latch.name}: ${latch.reason}. Nothing moves until it is released, not even after a restart of the daemon. ` : "";
-  if (words !== latched) put(byId("estop"), h("strong", {}, "Emergency stop"), words, h("button", { type: "button", id: "release", onclick: () => ask(byId("reset")) }, "Release …"));
+  if (words !== latched) put(byId("estop"), h("span", {}, h("strong", {}, "Emergency stop"), words), h("button", { type: "button", id: "release", onclick: () => ask(byId("reset")) }, "Release …"));
   latched = words;
   if (latch) byId("release").disabled = !may;
   document.title = `${now.state} – mastctl`;
