@@ -25,7 +25,7 @@ from calib.pictures.patch_match import match_patch
 from calib.pictures.patch_verdict import MatchSettings
 from calib.pictures.warp import Plane
 from calib.rigid import FloatArray, Rigid
-from calib.scene.views import FARTHEST_M, LEAST_OVERLAP, NEAREST_M, View, overlap
+from calib.scene.views import FARTHEST_M, NEAREST_M, View, overlapping
 
 MOST_KEYPOINTS = 3000
 GATE_PX = 20.0
@@ -82,17 +82,14 @@ def find_features(rig: Rig, views: Sequence[View]) -> list[Feature]:
     models = [view.model(rig) for view in views]
     keypoints = [_keypoints(view) for view in views]
     looks = [_Look(view, model, found) for view, model, found in zip(views, models, keypoints, strict=True)]
+    together: list[list[int]] = [[] for _ in views]
+    for first, second in overlapping(models):
+        together[first].append(second)
     features: list[Feature] = []
     for first, look in enumerate(looks):
         found: dict[int, list[tuple[int, FloatArray, FloatArray]]] = {}
         free = look.free
-        for second in range(first + 1, len(looks)):
-            if (
-                overlap(models[first], models[second])
-                < LEAST_OVERLAP
-                > overlap(models[second], models[first])
-            ):
-                continue
+        for second in together[first]:
             for keypoint, pixel, covariance in _pair(look, looks[second], free, set(found)):
                 found.setdefault(keypoint, []).append((second, pixel, covariance))
                 looks[second].followed.append(pixel)

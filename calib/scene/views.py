@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,6 +14,9 @@ from calib.pictures.warp import Grey
 
 FARTHEST_M, NEAREST_M = 1e3, 1.5
 LEAST_OVERLAP = 0.02
+ASIDE_RAD = 0.5
+"""By how much what is near looks to be elsewhere for a camera beside or below."""
+
 _GRID = 12
 
 
@@ -45,6 +49,28 @@ class View:
         return rig.camera_in_rover(
             self.camera, *rig.joints.true_rad((self.pan_rad, self.tilt_rad), self.approach)
         )
+
+
+def overlapping(models: Sequence[CameraModel]) -> list[tuple[int, int]]:
+    """Return which of the pictures' cameras, in the rover frame, see enough of the same to share features."""
+    ahead = np.array([model.A for model in models])
+    half = np.array([_half_width_rad(model) for model in models])
+    apart = np.arccos(np.clip(ahead @ ahead.T, -1.0, 1.0))
+    near = np.triu(apart < half[:, None] + half + ASIDE_RAD, 1)
+    return [
+        (first, second)
+        for first, second in np.argwhere(near).tolist()
+        if max(overlap(models[first], models[second]), overlap(models[second], models[first]))
+        >= LEAST_OVERLAP
+    ]
+
+
+def _half_width_rad(model: CameraModel) -> float:
+    """How far a picture's corner is from A."""
+    x, y = np.array(model.size_px) - 1.0
+    rays = model.ray(np.array([[0.0, 0.0], [x, 0.0], [0.0, y], [x, y]]))
+    seen = rays.directions[rays.valid]
+    return float(np.arccos(np.clip(seen @ model.A, -1.0, 1.0)).max()) if len(seen) == 4 else np.pi
 
 
 def overlap(one: CameraModel, other: CameraModel) -> float:

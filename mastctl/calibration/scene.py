@@ -26,7 +26,7 @@ from calib.rigid import FloatArray, tangents
 from calib.scene.features import find_features
 from calib.scene.fit import SceneFit, fit_scene
 from calib.scene.terms import corrected
-from calib.scene.views import View
+from calib.scene.views import View, overlapping
 from drivers.errors import BadOptions
 from drivers.recorded_frames import SUFFIX, McapFrame, read_recording
 from drivers.recording import Pointing, read_folder, read_products
@@ -39,13 +39,18 @@ PRODUCT_SUFFIXES = (".img", ".lbl")
 
 @dataclass(frozen=True, eq=False)
 class SceneProposal:
-    """What pictures of a scene say of a mast file: the mast, the record, its views by camera, and the fit."""
+    """What pictures of a scene say of a mast file: the mast, the record, its views by camera, and the fit.
+
+    ``other_mast`` is how many of the pictures were taken while another mast file was in use: what the joints
+    read counts all the same.
+    """
 
     mast: StoredRig
     record: Path
     digest: str
     views: tuple[View, ...]
     fit: SceneFit
+    other_mast: int
 
 
 def scene_views(rig: Rig, record: Path, camera: str | None = None) -> list[View]:
@@ -69,7 +74,8 @@ def scene_views(rig: Rig, record: Path, camera: str | None = None) -> list[View]
         If the record cannot be read.
     """
     views = []
-    for pose, pointing in enumerate(_pointings(rig, record, camera)):
+    pointings = _pointings(rig, record, camera)
+    for pose, pointing in enumerate(pointings):
         for name, frame in pointing.frames.items():
             if name not in rig.cameras or (camera is not None and name != camera):
                 continue
@@ -83,9 +89,18 @@ def scene_views(rig: Rig, record: Path, camera: str | None = None) -> list[View]
                 View(label, name, image, pointing.pan_rad, pointing.tilt_rad, pose, _approach(frame))
             )
     if len(views) < 2:
-        found = f"{len(views)} pictures of {', '.join(rig.cameras)}"
-        raise NoCorrection("too_few", f"{record}: {found} where two at least are expected")
+        wanted = camera or ", ".join(rig.cameras)
+        has = sorted({name for one in pointings for name in one.frames})
+        found = f"{len(views)} pictures of {wanted} in a record of {', '.join(has) or 'none'}"
+        raise NoCorrection("too_few", f"{record}: {found}; two at least are expected")
     return views
+
+
+def _other_mast(mast: StoredRig, pointings: Sequence[Pointing]) -> int:
+    """How many pictures were taken while another mast file was in use, where the record says."""
+    frames = [frame for pointing in pointings for frame in pointing.frames.values()]
+    told = [frame.facts.get("mast_digest") for frame in frames if isinstance(frame, McapFrame)]
+    return sum(digest not in (None, "", mast.digest) for digest in told)
 
 
 def _approach(frame: object) -> Approach:
@@ -124,19 +139,31 @@ def propose_scene(
         ``not_predictive``: what explains some of the pictures does not hold for the others.
     """
     views = scene_views(mast.rig, record, camera)
-    fit = fit_scene(mast.rig, views, find_features(mast.rig, views), joint_sigma_rad)
+    other = _other_mast(mast, _pointings(mast.rig, record, camera))
+    if not overlapping([view.model(mast.rig) for view in views]):
+        raise NoCorrection(
+            "too_few",
+            f"{record}: no two of {len(views)} pictures overlap, as {mast.path.name} has the head; a fifth "
+            "or more is expected",
+        )
+    try:
+        fit = fit_scene(mast.rig, views, find_features(mast.rig, views), joint_sigma_rad)
+    except NoCorrection as why:
+        if why.code == "too_few" and other:
+            raise NoCorrection(why.code, f"{why}; {other} were taken with another mast file") from None
+        raise
     before, after = fit.predicted_px
     if not after < before:
-        why = f"{before:.2f} px become {after:.2f} px rms"
+        reason = f"{before:.2f} px become {after:.2f} px rms"
         if np.isnan(after):
-            why = "all join the same two rests"
+            reason = "all join the same two rests"
         gain = f"would explain {fit.rms_px[0]:.2f} px down to {fit.rms_px[1]:.2f} px rms"
         raise NoCorrection(
             "not_predictive",
             f"{', '.join(fit.taken)}: that {gain}, but pictures that had no part in it are not "
-            f"predicted better ({why}): rests of the head err each by itself",
+            f"predicted better ({reason}): rests of the head err each by itself",
         )
-    return SceneProposal(mast, record, _digest(views), tuple(views), fit)
+    return SceneProposal(mast, record, _digest(views), tuple(views), fit, other)
 
 
 def save_scene(proposal: SceneProposal, out: Path) -> tuple[StoredRig, Path | None]:

@@ -50,6 +50,7 @@ def _document(proposal: SceneProposal, saved: StoredRig, previous: str | None) -
         "mast_file": {"path": str(saved.path), "digest": saved.digest, "previous": previous},
         "former": {"path": str(proposal.mast.path), "digest": proposal.mast.digest},
         "pictures": len(proposal.views),
+        "other_mast": proposal.other_mast,
         **scene_told(proposal.fit),
     }
 
@@ -74,6 +75,10 @@ def _show(proposal: SceneProposal, saved: StoredRig, told_rad: float) -> None:
     ]
     if len(fit.outliers) > OUTLIERS_SHOWN:
         notes.append(f"and {len(fit.outliers) - OUTLIERS_SHOWN} more were not used, all named by --json")
+    if proposal.other_mast:
+        notes.append(
+            f"{proposal.other_mast} pictures were taken with another mast file; what joints read counts"
+        )
     if fit.scale > 1.0:
         notes.append(f"the sigmas are widened by {fit.scale**0.5:.2f}, as the residuals ask")
     notes += [

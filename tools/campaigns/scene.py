@@ -45,6 +45,7 @@ POINTS = 400
 FROM_TO = (((0.0, -0.2), (0.3, -0.35)), ((-1.2, -0.4), (-0.9, -0.2)))
 """Rests of which one's picture foretells the other's."""
 PLACES, RANGES_M = ((0.4, 0.55), (0.75, 0.3)), (2.0, 5.0, 15.0)
+LEAST_PX = 1e-6
 KINDS = ("turn", "focus", "lean", "encoder", "turn+encoder", "focus+lean")
 
 
@@ -162,8 +163,10 @@ def score(task: SceneTask) -> Score | str:
     sigma = np.sqrt(np.diag(fit.covariance))
     off = {n: (v - names.get(n, 0.0)) / s for n, v, s in zip(fit.names, fit.values, sigma, strict=True)}
     before, after, spread = foretold(believed, true, fit)
+    moved = spread > LEAST_PX  # what goes by an eye that was not corrected is as it was
     rms = [float(np.sqrt(np.mean(one**2))) for one in (before, after)]
-    return Score(task.kind, fit.taken, off, after / spread, *rms, fit.joint_sigma_rad, fit.scale, seconds)
+    pixels = after[moved] / spread[moved]
+    return Score(task.kind, fit.taken, off, pixels, *rms, fit.joint_sigma_rad, fit.scale, seconds)
 
 
 def foretold(believed: Rig, true: Rig, fit: SceneFit) -> tuple[FloatArray, FloatArray, FloatArray]:
