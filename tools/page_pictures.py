@@ -12,12 +12,14 @@ from typing import Any
 
 import cv2
 import numpy as np
-from playwright.sync_api import Page, sync_playwright
+import yaml
+from playwright.sync_api import Browser, Page, sync_playwright
 
 from mastctl.client import Client
+from mastctl.packaged import config_folder
 from tools.arguments import end
 from tools.browser import chromium
-from tools.living_daemon import simulated, started
+from tools.living_daemon import simulated, started, written
 
 CAMERAS = ("pancam_left", "pancam_right", "navcam_left", "navcam_right", "hazcam_left", "hazcam_right")
 DESK = {"width": 1500, "height": 1000}
@@ -33,16 +35,24 @@ def main() -> int:
     """Take them all."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--out", type=Path, default=Path("docs/img"))
-    out = parser.parse_args().out
+    parser.add_argument("--only", choices=("rover", "bench"), help="those of one of both")
+    args = parser.parse_args()
     path = chromium()
     if path is None:
         parser.error("there is no chromium; python -m tools.browser installs it")
-    with (
-        tempfile.TemporaryDirectory() as folder,
-        started(simulated(Path(folder), "memory", CAMERAS)) as (_, port),
-        sync_playwright() as playwright,
-    ):
+    with tempfile.TemporaryDirectory() as folder, sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=path, args=["--no-sandbox"])
+        if args.only != "bench":
+            rover(browser, Path(folder), args.out)
+        if args.only != "rover":
+            bench(browser, Path(folder), args.out)
+        browser.close()
+    return 0
+
+
+def rover(browser: Browser, folder: Path, out: Path) -> None:
+    """Pointing, and what goes wrong."""
+    with started(simulated(folder, "memory", CAMERAS)) as (_, port):
         url = f"http://127.0.0.1:{port}"
         with Client(url, name="pictures") as client:
             client.wait(client.point(pan_rad=0.03, tilt_rad=-0.17))
@@ -55,8 +65,6 @@ def main() -> int:
             light = browser.new_context(viewport=TABLET, color_scheme="light", has_touch=True).new_page()
             on_a_tablet(light, url, client, out)
             light.close()
-        browser.close()
-    return 0
 
 
 def opened(page: Page, url: str) -> None:
@@ -122,6 +130,33 @@ def on_a_tablet(page: Page, url: str, client: Client, out: Path) -> None:
         page.wait_for_selector(each)
     kept(page, out / "page_stopped.jpg")
     client.reset(name="Ana", reason="the chain is free")
+
+
+def bench(browser: Browser, folder: Path, out: Path) -> None:
+    """A bench calibration that asks for its second placement."""
+    page = browser.new_context(viewport=DESK, color_scheme="light").new_page()
+    with started(bench_config(folder)) as (_, port):
+        url = f"http://127.0.0.1:{port}"
+        opened(page, url)
+        with Client(url, name="pictures") as client:
+            client.begin_bench("charuco_a2", by_hand=True)
+            page.wait_for_selector(".stands:visible")
+            client.board_stands()
+        page.wait_for_selector(".bench-words:has-text('p2: put')", timeout=900_000)
+        page.locator(".panel.bench").evaluate("panel => panel.scrollIntoView({block: 'end'})")
+        page.wait_for_timeout(1500)
+        kept(page, out / "page_bench.jpg")
+
+
+def bench_config(folder: Path) -> Path:
+    """The packaged bench with a mast file, and a state, of its own."""
+    packaged = config_folder()
+    document = yaml.safe_load((packaged / "bench.yaml").read_text())
+    (folder / "mast.yaml").write_bytes((packaged / document["mast_file"]).read_bytes())
+    simulation = {**document["simulation"], "rover": str(packaged / document["simulation"]["rover"])}
+    simulation |= {"samples": 1, "cameras": {"rate_hz": 2.0}, "speed": 3.0}
+    own = {"mast_file": "mast.yaml", "listen": {"port": 0}, "state": {"folder": str(folder / "state")}}
+    return written(folder, {**document, **own, "simulation": simulation})
 
 
 def kept(page: Page, path: Path) -> None:

@@ -29,7 +29,7 @@ COMMAND = "calibrate bench"
 FOLLOWED = "bench calibration"
 """What a run calls itself that a program follows."""
 
-BESIDE = 10
+BESIDE = 5
 """Niceness of a run that a program follows: the daemon beside it comes first."""
 
 

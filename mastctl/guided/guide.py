@@ -172,6 +172,7 @@ class Guide:
         self._command = command
         self._starting = threading.Lock()
         self._telling = threading.Lock()
+        self._publishing = threading.Lock()
         self._work: _Work | None = None
         self._closed = False
 
@@ -436,7 +437,9 @@ class Guide:
         self._publish(work)
 
     def _publish(self, work: _Work) -> None:
-        self._publisher.publish("bench", "run", work.run)
+        """Tell how it is now; in turn, so that nobody hears an older word after a newer one."""
+        with self._publishing:
+            self._publisher.publish("bench", "run", work.run)
 
 
 def _stop_of(one: Published) -> str | None:

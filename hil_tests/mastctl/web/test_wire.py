@@ -346,3 +346,31 @@ def test_a_certificate_and_a_key_that_do_not_belong_together_are_refused_before_
         network_daemon(monkeypatch, tmp_path, f", tls: {{certificate: {certificate}, key: {certificate}}}"),
     ):
         pass
+
+
+def test_a_program_of_the_daemon_trusts_its_certificate_and_no_other_whatever_its_name(
+    secured: Network, certificate: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    door = secured.daemon.service.guide.door
+    assert door is not None and door.certificate == certificate and door.lend is not None
+    token, take_back = door.lend("a program")
+    by_another_name = f"https://localhost:{secured.port}"
+    monkeypatch.setenv("MASTCTL_CERTIFICATE", str(certificate))
+    with Client(by_another_name, token=token) as client:
+        assert client.session()["role"] == "operate"
+    take_back()
+    with Client(by_another_name, token=token) as client, pytest.raises(ClientError) as refusal:
+        client.session()
+    assert refusal.value.code == "wrong_token"
+    other = tmp_path / "other.pem"
+    openssl = shutil.which("openssl") or ""
+    made = f"{openssl} req -x509 -newkey ec -pkeyopt ec_paramgen_curve:prime256v1 -nodes -subj /CN={NAME}"
+    subprocess.run(
+        [*made.split(), "-keyout", str(tmp_path / "k"), "-out", str(other)], check=True, capture_output=True
+    )
+    monkeypatch.setenv("MASTCTL_CERTIFICATE", str(other))
+    with Client(secured.url, token=token) as client, pytest.raises(ClientError):
+        client.session()
+    monkeypatch.setenv("MASTCTL_CERTIFICATE", str(tmp_path / "none.pem"))
+    with pytest.raises(ClientError, match="no certificate can be read"):
+        Client(secured.url)

@@ -16,7 +16,8 @@ export class Bench {
     this.speak = speak;
     this.kept = [];
     this.build();
-    events.addEventListener("bench", (event) => this.told(event.detail.value));
+    this.heard = 0; // what is pushed is newer than any answer that was under way meanwhile
+    events.addEventListener("bench", (event) => { this.heard += 1; this.told(event.detail.value); });
     events.addEventListener("connected", () => this.look());
     events.addEventListener("mast", (event) => { this.inUse = event.detail.value.file; this.later(); });
   }
@@ -29,7 +30,7 @@ export class Bench {
     this.stands = button("It stands", () => this.act(() => post("/bench/stands", {})), "go stands");
     this.leave = button("End it for now", () => this.act(() => post("/bench/leave", {})));
     this.goOn = button("Go on", () => this.begin({ goes_on: this.run.name }), "go");
-    this.fresh = button("Begin another …", () => { this.closed = this.run?.name; this.draw(); });
+    this.fresh = button("Begin another …", () => { this.closed = this.run?.name; this.anew.open = true; this.draw(); });
     this.asked = h("div", { class: "bench-place" }, h("h3", {}, "Where the board goes"), this.words, this.where, this.stands);
     this.seen = h("div", { class: "coverages" });
     this.cover = h("div", {}, h("h3", {}, "Seen so far"), this.seen);
@@ -39,11 +40,12 @@ export class Bench {
     this.error = h("div", {}, h("h3", {}, "Predicted error of a first pointing"), this.plot, this.facts, this.table);
     this.verdict = h("div", { class: "bench-verdict" });
     this.log = h("ul", { class: "bench-log", "aria-label": "What it said last" });
-    this.now = h("div", { class: "bench-now" }, this.steps, this.verdict, h("div", { class: "bench-parts" }, this.asked, this.cover, this.error), this.log, h("div", { class: "buttons" }, this.goOn, this.leave, this.fresh));
+    this.now = h("div", { class: "bench-now" }, this.steps, this.verdict, h("div", { class: "bench-parts" }, this.asked, h("div", { class: "bench-side" }, this.cover, this.error)), this.log, h("div", { class: "buttons" }, this.goOn, this.leave, this.fresh));
     this.said = h("p", { class: "bad", role: "alert" });
     this.buildForm();
     this.others = h("details", { class: "bench-runs" }, h("summary", {}, "Earlier runs"), h("table", { class: "figures list" }));
-    put(byId("bench"), this.form, this.now, this.said, this.others);
+    this.anew = h("details", {}, h("summary", {}, "Begin a bench calibration …"), this.form);
+    put(byId("bench"), this.anew, this.now, this.said, this.others);
     this.now.hidden = true;
   }
 
@@ -68,12 +70,13 @@ export class Bench {
   }
 
   async look() {
+    const { heard } = this;
     try {
       const kept = await get("/bench");
       [this.kept, this.simulated] = [kept.runs, kept.simulated];
       if (this.board.options.length !== kept.boards.length + 1) put(this.board, kept.boards.map((name) => h("option", { value: name }, paper(name))), h("option", { value: "" }, "another: its BOARD.yaml …"));
       if (!this.known) { this.known = true; this.board.value = this.simulated && kept.boards.includes("charuco_a2") ? "charuco_a2" : ""; }
-      if (kept.run) this.run = kept.run;
+      if (kept.run && heard === this.heard) this.run = kept.run;
       this.later();
     } catch (error) {
       say(this.said, error.message);
@@ -104,10 +107,11 @@ export class Bench {
 
   begin(body) {
     return this.act(async () => {
+      const { heard } = this;
       const { run } = await post("/bench", body);
       held.lease = null; // it steers from now on
       this.closed = null;
-      if (this.run?.name !== run.name || this.run.state !== "asking") this.told(run);
+      if (heard === this.heard) this.told(run);
     });
   }
 
@@ -134,7 +138,7 @@ export class Bench {
     const over = run && ["done", "interrupted"].includes(run.state);
     const shown = run && this.closed !== run.name;
     const going = run && !over;
-    this.form.hidden = Boolean(shown);
+    this.anew.hidden = Boolean(shown);
     this.now.hidden = !shown;
     this.fileRow.hidden = this.board.value !== "";
     this.handRow.hidden = !this.simulated;
@@ -180,7 +184,7 @@ export class Bench {
     this.error.hidden = !run.curve.length;
     put(this.plot, curve(run));
     const next = run.next_rad && !["done", "interrupted"].includes(run.state) ? row("Most helps now", `pan ${deg(run.next_rad[0], 0)}, tilt ${deg(run.next_rad[1], 0)}: to ${px(run.expected_px)}`) : null;
-    put(this.facts, row("Now, wanted", `${px(run.predicted_px)}, ${px(run.target_px)}`), row("Counts alone leave", px(run.floor_px)), row("Pictures a camera", `${run.pictures} of ${run.most} at most`), next);
+    put(this.facts, row("Now, wanted", `${px(run.predicted_px)}, ${px(run.target_px)}`), row("Counts alone leave", px(run.floor_px)), row("Pictures a camera", ["done", "interrupted"].includes(run.state) ? String(run.pictures) : `${run.pictures} of ${run.most} at most`), next);
     put(this.table.lastChild, h("tr", {}, h("th", { scope: "col" }, "pictures"), h("th", { scope: "col" }, "predicted, px")), run.curve.map(([k, value]) => h("tr", {}, h("td", { class: "n" }, k), h("td", { class: "n" }, number(value, 3)))));
   }
 

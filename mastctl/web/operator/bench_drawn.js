@@ -34,12 +34,12 @@ export function fromAbove(asked, size) {
   const [bx, by] = at(middle);
   return s("svg", { class: "sketch", viewBox: `0 0 ${width} ${height}`, role: "img", "aria-label": `From above: the board ${asked.words}` },
     arcs.map((r) => s("circle", { class: "arc", cx: width / 2, cy: base, r: r * scale })),
-    arcs.filter((r) => r * scale < base - 8).map((r) => s("text", { class: "tickname start", x: width / 2 + 3, y: base - r * scale - 2 }, `${number(r, step < 1 ? 1 : 0)} m`)),
+    arcs.filter((r) => r * scale < base - 8).map((r) => s("text", { class: "tickname end", x: width / 2 - 0.6 * r * scale - 3, y: base - 0.8 * r * scale }, `${number(r, step < 1 ? 1 : 0)} m`)),
     s("path", { class: "sight", d: `M${point(width / 2, base)}L${point(bx, by)}` }),
     s("path", { class: "plate", d: `M${edges.map((one) => point(...at(one))).join("L")}` }),
     s("path", { class: "face", d: `M${point(bx, by)}L${point(...at(towards))}` }),
     s("path", { class: "head", d: `M${point(width / 2 - 9, base + 8)}V${base - 5}L${point(width / 2, base - 13)}L${point(width / 2 + 9, base - 5)}V${base + 8}Z` }),
-    s("text", { class: "tickname", x: width / 2, y: height - 2 }, "head, looking up the page"));
+    s("text", { class: "tickname", x: width / 2, y: height - 2 }, "the head, pan 0 upwards"));
 }
 
 /** As the head at zero sees it: 120 by 80 degrees, the board as it would look. */

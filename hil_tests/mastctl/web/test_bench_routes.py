@@ -1,0 +1,303 @@
+"""Bench calibrations and reports over HTTP: who may, when not, and that nothing moves after a stop."""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import httpx
+import pytest
+
+from hil_tests.mastctl.guided.guided_world import BEGUN, DONE, HEAD, PLACE, PROGRESS, lines
+from hil_tests.mastctl.service_fakes import FakeHardware, ScriptedLoop, eventually
+from hil_tests.mastctl.web.network import network_daemon
+from mastctl.client import Client, ClientError
+from mastctl.daemon import RunningDaemon
+from mastctl.guided.guide import Door
+from mastctl.guided.runs import Folder
+from mastctl.guided.told import Run
+
+Pair = tuple[RunningDaemon, FakeHardware]
+STEERS = """
+from mastctl.client import Client, ClientError
+client = Client(URL, name="bench calibration")
+client.use_lease(os.environ["MASTCTL_LEASE"])
+"""
+"""As the real program does: by what it finds in its environment."""
+
+
+def scripted(daemon: RunningDaemon, script: str) -> None:
+    """Have a daemon's guide run a script of the test."""
+
+    def command(run: Folder, asked: dict[str, Any], door: Door, mast_file: Path) -> list[str]:
+        names = f"URL, MAST, REPORT = {door.url!r}, {str(mast_file)!r}, {str(run.report)!r}\n"
+        return [sys.executable, "-c", HEAD + names + script]
+
+    daemon.service.guide._command = command
+
+
+def ended(daemon: RunningDaemon) -> Run:
+    def over() -> Run | None:
+        run = daemon.service.guide.run
+        return run if run is not None and run.over else None
+
+    eventually(over, "the run is over", 30.0)
+    run = daemon.service.guide.run
+    assert run is not None
+    return run
+
+
+def refused(code: str, act: Callable[[], object]) -> ClientError:
+    with pytest.raises(ClientError) as refusal:
+        act()
+    assert refusal.value.code == code, refusal.value
+    return refusal.value
+
+
+@pytest.fixture
+def ana(pair: Pair) -> Iterator[Client]:
+    with Client(pair[0].url, name="Ana") as client:
+        yield client
+
+
+@pytest.fixture
+def bo(pair: Pair) -> Iterator[Client]:
+    with Client(pair[0].url, name="Bo") as client:
+        yield client
+
+
+def test_who_begins_hands_the_lease_to_the_program_and_nobody_steers_meanwhile(
+    pair: Pair, ana: Client, bo: Client
+) -> None:
+    daemon, hardware = pair
+    point = STEERS + "client.wait(client.point(pan_rad=0.2, tilt_rad=0.1))\n"
+    scripted(daemon, lines(BEGUN) + point + lines(PLACE) + "answered()\n" + lines(DONE))
+    lease = ana.acquire_lease()
+    ana.use_lease(lease["lease_id"])
+    run = ana.begin_bench("charuco_a3", wanted_px=0.3, pictures=20)
+    assert (run["by"], run["state"], run["most"]) == ("Ana", "running", 20)
+    assert "Ana began it" in str(refused("lease_over", ana.renew_lease))
+    ana.use_lease(None)
+    for client in (ana, bo):
+        told = refused("leased", lambda c=client: c.point(pan_rad=0.0, tilt_rad=0.0))
+        assert told.detail is not None and told.detail["holder"] == "bench calibration"
+        refused("leased", lambda c=client: c.begin_bench("charuco_a3"))
+    for event in bo.events("bench"):
+        if event["value"]["state"] == "asking":
+            break
+    assert any(call[0] == "move" for call in hardware.head.calls), "the program steered"
+    assert bo.board_stands()["name"] == run["name"]
+    over = ended(daemon)
+    assert over.state == "done" and over.mast_file is not None
+    assert bo.control() is None and bo.bench()["runs"][0]["by"] == "Ana"
+    refused("nothing_asked" if not over.over else "bench_idle", bo.board_stands)
+    refused("bench_idle", bo.leave_bench)
+    assert ana.point(pan_rad=0.0, tilt_rad=0.0)
+
+
+def test_nothing_begins_while_somebody_steers_something_runs_or_an_emergency_stop_holds(
+    pair: Pair, ana: Client, bo: Client, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    daemon, _ = pair
+    scripted(daemon, lines(BEGUN))
+    with bo.lease():
+        refused("leased", lambda: ana.begin_bench("charuco_a3"))
+    goes_on = threading.Event()
+
+    def waits(request: Any, record: Any, cancelled: threading.Event, devices: Any) -> Any:
+        goes_on.wait(20.0)
+        return ScriptedLoop.good(request, record, cancelled, devices)
+
+    monkeypatch.setattr(ScriptedLoop, "script", staticmethod(waits))
+    running = ana.point(pan_rad=0.1, tilt_rad=0.0)
+    refused("busy", lambda: ana.begin_bench("charuco_a3"))
+    goes_on.set()
+    ana.wait(running)
+    ana.estop(name="Ana", reason="a hand")
+    refused("estopped", lambda: ana.begin_bench("charuco_a3"))
+    assert ana.bench()["runs"] == [] and ana.bench()["run"] is None
+    ana.reset(name="Ana", reason="away")
+
+
+@pytest.mark.parametrize(
+    "body", [{}, {"board": "a", "goes_on": "b"}, {"board": "a", "pictures": 3}, {"x": 1}]
+)
+def test_a_body_that_makes_no_sense_is_refused_in_a_sentence(pair: Pair, body: dict[str, Any]) -> None:
+    answer = httpx.post(f"{pair[0].url}/api/v1/bench", json=body, trust_env=False)
+    assert answer.status_code == 422 and answer.json()["error"]["code"] == "bad_request"
+
+
+TIRELESS = (
+    lines(BEGUN)
+    + STEERS
+    + """
+k = 0
+while True:
+    k += 1
+    try:
+        client.wait(client.point(pan_rad=0.01 * (k % 50), tilt_rad=0.0))
+    except ClientError:
+        pass
+"""
+)
+
+
+@pytest.mark.parametrize("how", ["stop", "estop", "leave"])
+def test_nothing_moves_after_a_stop_though_the_program_never_gives_up(
+    pair: Pair, ana: Client, how: str
+) -> None:
+    """It takes no notice of refusals: between two of its moves the stop finds nothing that it could end."""
+    daemon, hardware = pair
+    scripted(daemon, TIRELESS)
+    for _ in range(4):
+        ana.begin_bench("charuco_a3")
+        before = len(hardware.head.calls)
+        eventually(lambda b=before: len(hardware.head.calls) > b + 6, "it moves the head", 30.0)
+        if how == "leave":
+            assert ana.leave_bench()["state"] == "interrupted"
+        else:
+            ana.stop() if how == "stop" else ana.estop(name="Ana", reason="a hand")
+        run = ended(daemon)
+        assert run.code == ("left" if how == "leave" else "stopped"), run.sentence
+        eventually(lambda: daemon.service.operations.running is None, "nothing runs")
+        moves = [call for call in hardware.head.calls if call[0] == "move"]
+        newest = ana.operations()[0]["id"]
+        threading.Event().wait(0.3)
+        assert [call for call in hardware.head.calls if call[0] == "move"] == moves
+        assert ana.operations()[0]["id"] == newest and ana.control() is None
+        if how == "estop":
+            ana.reset(name="Ana", reason="away")
+
+
+def test_who_takes_over_ends_it_and_it_goes_on_later(pair: Pair, ana: Client, bo: Client) -> None:
+    daemon, _ = pair
+    scripted(daemon, lines(BEGUN, PROGRESS) + "time.sleep(60)\n")
+    name = ana.begin_bench("charuco_a3")["name"]
+    with bo.lease(take_over="the arm is in the way"):
+        run = ended(daemon)
+        assert run.code == "taken" and "Bo took over: the arm is in the way" in run.sentence
+        refused("leased", lambda: ana.begin_bench(goes_on=name))
+    scripted(daemon, lines(BEGUN, DONE))
+    ana.begin_bench(goes_on=name)
+    assert ended(daemon).state == "done"
+    refused("bench_done", lambda: ana.begin_bench(goes_on=name))
+    refused("bench_unknown", lambda: ana.begin_bench(goes_on="20010101-000000"))
+
+
+def test_a_board_file_is_judged_and_kept_and_not_written_into_the_record(pair: Pair, ana: Client) -> None:
+    daemon, _ = pair
+    scripted(daemon, lines(BEGUN, DONE))
+    refused("bad_board", lambda: ana.begin_bench(board_file="kind: [charuco"))
+    text = "schema: mastctl/board/1\nkind: charuco\ncolumns: 9\nrows: 6\nsquare_m: 0.03\n"
+    text += "marker_m: 0.022\ndictionary: DICT_5X5_100\n# printed on a Tuesday\n"
+    run = ana.begin_bench(board_file=text)
+    folder = Path(ana.bench()["folder"]) / run["name"]
+    assert (folder / "board.yaml").read_text() == text
+    ended(daemon)
+    eventually(lambda: b'"bench"' in (daemon.service.folder.path / "audit.jsonl").read_bytes(), "recorded")
+    assert b"Tuesday" not in (daemon.service.folder.path / "audit.jsonl").read_bytes()
+
+
+def test_the_program_shows_a_token_that_ends_with_it_and_a_viewer_only_reads(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    with network_daemon(monkeypatch, tmp_path) as net:
+        script = STEERS + "seen = client.session()\n"
+        script += "known = [seen['name'], seen['role'], os.environ['MASTCTL_TOKEN']]\n"
+        script += "tell(event='said', sentence=json.dumps(known))\n"
+        scripted(net.daemon, lines(BEGUN) + script + lines(PLACE) + "answered()\n")
+        for path in ("/bench", "/reports"):
+            assert net.ask("GET", path).status_code == 401
+            assert net.ask("GET", path, "view").status_code == 200
+        for path in ("/bench", "/bench/stands", "/bench/leave"):
+            assert net.ask("POST", path, "view", json={}).status_code == 403
+        assert net.ask("POST", "/bench", "operate", json={"board": "charuco_a4"}).status_code == 202
+        guide = net.daemon.service.guide
+        eventually(lambda: guide.run and guide.run.state == "asking", "it came in", 30.0)
+        assert guide.run is not None
+        name, role, token = json.loads(guide.run.sentences[0])
+        assert (name, role) == ("bench calibration/bench calibration", "operate")
+        shown = {"headers": {"Authorization": f"Bearer {token}"}}
+        assert net.ask("GET", "/status", **shown).status_code == 200
+        assert net.ask("POST", "/bench/leave", "operate", json={}).status_code == 200
+        assert net.ask("GET", "/status", **shown).status_code == 401
+        assert token not in (tmp_path / "daemon.yaml").read_text()
+        for path in net.daemon.service.folder.path.rglob("*"):
+            assert not path.is_file() or token.encode() not in path.read_bytes(), path
+
+
+# Reports
+
+PAGE = "<!doctype html><title>Pointing &amp; more</title><style>p{color:red}</style><script>x()</script>"
+
+
+@pytest.fixture
+def shelf(pair: Pair) -> Path:
+    folder = pair[0].service.reports.folder
+    (folder / "arm").mkdir(parents=True)
+    (folder / "pointing.html").write_text(PAGE)
+    (folder / "arm" / "approach.html").write_text("no title")
+    (folder.parent / "secret.html").write_text("secret")
+    (folder / "link.html").symlink_to(folder.parent / "secret.html")
+    (folder / "far").symlink_to(folder.parent)
+    (folder / "notes.txt").write_text("no page")
+    return folder
+
+
+def test_reports_are_listed_and_read_and_can_do_nothing(pair: Pair, ana: Client, shelf: Path) -> None:
+    told = ana.reports()
+    assert {(one["name"], one["title"]) for one in told["reports"]} == {
+        ("pointing.html", "Pointing & more"), ("arm.approach.html", "arm.approach.html"),
+    }  # fmt: skip
+    answer = httpx.get(f"{pair[0].url}/api/v1/reports/pointing.html", trust_env=False)
+    assert answer.text == PAGE and answer.headers["content-type"] == "text/html; charset=utf-8"
+    policy = answer.headers["content-security-policy"].split("; ")
+    assert "default-src 'none'" in policy and "sandbox" in policy and "frame-ancestors 'none'" in policy
+    assert not any("script" in one or "allow" in one for one in policy)
+    assert (
+        answer.headers["x-content-type-options"] == "nosniff" and answer.headers["x-frame-options"] == "DENY"
+    )
+    page = httpx.get(pair[0].url, trust_env=False).headers["content-security-policy"]
+    assert "unsafe" not in page and "sandbox" not in page
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "..", "../secret.html", "..%2fsecret.html", "%2e%2e%2fsecret.html", "..%5csecret.html", "link.html",
+        "far.secret.html", "notes.txt", "secret.html", "%00", "pointing.html%00.png", "a" * 200, "arm",
+        "arm%2fapproach.html", "/etc/passwd", "%2fetc%2fpasswd", "pointing.html/", "20260101-000000",
+    ],
+)  # fmt: skip
+def test_what_is_no_report_is_not_there_whatever_its_name(pair: Pair, shelf: Path, name: str) -> None:
+    answer = httpx.get(f"{pair[0].url}/api/v1/reports/{name}", trust_env=False)
+    assert answer.status_code in (404, 422) or (name.endswith("/") and answer.status_code == 307)
+    assert "secret" not in answer.text.replace("secret.html", "")
+
+
+def test_the_report_of_a_run_is_read_by_its_name(pair: Pair, ana: Client) -> None:
+    daemon, _ = pair
+    script = f"os.mkdir(REPORT); open(os.path.join(REPORT, 'bench.html'), 'w').write({PAGE!r})\n"
+    scripted(daemon, lines(BEGUN) + script + lines(DONE))
+    name = ana.begin_bench("charuco_a4")["name"]
+    assert ended(daemon).report == name
+    assert ana.report(name).decode() == PAGE
+    assert [one["name"] for one in ana.reports()["reports"]] == [name]
+    refused("report_unknown", lambda: ana.report("20260101-000000"))
+
+
+def test_a_daemon_that_ends_takes_its_program_with_it(pair: Pair, ana: Client) -> None:
+    daemon, _ = pair
+    scripted(daemon, lines(BEGUN, PLACE) + "answered()\n")
+    ana.begin_bench("charuco_a4")
+    work = daemon.service.guide._work
+    assert work is not None and work.child is not None
+    daemon.close()
+    with pytest.raises(ProcessLookupError):
+        os.kill(work.child.pid, 0)
+    assert work.run.code == "closing"
