@@ -11,7 +11,6 @@ import numpy as np
 from calib.fit.calibration import Degenerate, ImageResiduals, Outlier
 from calib.fit.components import Component
 from calib.fit.significance import THREE_SIGMAS
-from calib.mast.covariance import RigCovariance
 from calib.mast.rig import Rig
 from calib.rigid import FloatArray, Rigid
 
@@ -72,9 +71,6 @@ class BenchCalibration:
     parameter_names, covariance
         (p,) and (p, p) of the mast's, the joints' and the cameras' parameters that were fitted
         (``calib.mast.covariance``); what was held is exact.
-    unknowns
-        The same with boards' poses and bows beside them: ``placement b1/p2.turn_rad.x`` and
-        ``board b1.bow_m.x``. Angles of single standstills are taken into account and not among them.
     terms
         Every term that could have entered.
     rms_px, check_rms_px
@@ -104,7 +100,6 @@ class BenchCalibration:
     rig: Rig
     parameter_names: tuple[str, ...]
     covariance: FloatArray
-    unknowns: RigCovariance
     sigma: Mapping[str, Any]
     terms: tuple[TermGain, ...]
     rms_px: Mapping[str, tuple[float, float]]

@@ -208,12 +208,21 @@ class BenchProblem:
         for term in candidate_terms(self.boards):
             axis = 0 if term.startswith("pan") else 1
             if term.endswith("backlash") and not {-1, 1} <= set(approaches[:, axis].tolist()):
-                self.notes.append(
-                    f"{term} cannot be told: {('pan', 'tilt')[axis]} did not come to rest from both sides"
-                )
+                self.notes.append(_one_sided(term, ("pan", "tilt")[axis], set(approaches[:, axis].tolist())))
                 continue
             found.append(term)
         return tuple(found)
+
+
+def _one_sided(term: str, joint: str, sides: set[int]) -> str:
+    """Why a joint's backlash is not looked for."""
+    if not sides & {-1, 1}:
+        return f"{term} is not looked for: nobody knows from which side {joint} came to rest"
+    side = "smaller" if 1 in sides else "larger"
+    return (
+        f"{term} is not looked for: {joint} came to rest from {side} angles only, as in a head that "
+        "approaches every goal from one side; its play is then part of its zero, and no error"
+    )
 
 
 def without_terms(state: Estimate, terms: set[str]) -> Estimate:

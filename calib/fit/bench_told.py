@@ -70,7 +70,7 @@ def told(
                 "sigma; they count with that"
             )
     # A parameter that is not seen keeps what is weakly known of it, and is told as open.
-    mine, whole = _orders(problem)
+    mine = _order(problem)
     rig = _rig(bench, state)
     known = _part(problem.names, covariance, mine)
     sigma = sigma_by_key(rig, known.names, known.covariance)
@@ -80,7 +80,6 @@ def told(
         rig=rig,
         parameter_names=known.names,
         covariance=known.covariance,
-        unknowns=_part(problem.names, covariance, whole),
         sigma=sigma,
         terms=_gains(bench, candidates, chosen, tests, problem, state),
         rms_px=rms_by_camera(images),
@@ -214,13 +213,11 @@ def _root(covariance: FloatArray) -> FloatArray:
     return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0)))
 
 
-def _orders(problem: Adjustment) -> tuple[list[int], list[int]]:
-    """Indices of the rig's parameters, mast first, joints, cameras; and of these with boards behind."""
+def _order(problem: Adjustment) -> list[int]:
+    """Indices of the rig's parameters, mast first, joints, cameras."""
     first = {"mast": 0, "joints": 1, "cameras": 2}
     owner = [name.split(".")[0] for name in problem.names]
-    mine = sorted((i for i, o in enumerate(owner) if o in first), key=lambda i: (first[owner[i]], i))
-    boards = [i for i, o in enumerate(owner) if o.startswith(("placement ", "board "))]
-    return mine, [*mine, *boards]
+    return sorted((i for i, o in enumerate(owner) if o in first), key=lambda i: (first[owner[i]], i))
 
 
 def _part(names: Sequence[str], covariance: FloatArray, at: Sequence[int]) -> RigCovariance:

@@ -98,11 +98,11 @@ class Looks:
             if look is None:
                 continue
             missed += 1
-            self._teller.say(_not_seen(look))
+            self._teller.say(f"the board is not seen here: {_whys(look)}")
             if missed >= UNSEEN_IN_A_ROW:
                 raise BoardLost(
-                    f"the board of placement {name} was not seen in {missed} looks in a row where "
-                    "it stood; put it back or place it anew, and start the same command again"
+                    f"the board of placement {name} was not seen in {missed} looks in a row where it stood "
+                    f"({_whys(look)}); put it back or place it anew, and start the same command again"
                 )
         self._end(name)
 
@@ -188,6 +188,6 @@ def deg(angle_rad: float) -> str:
     return f"{math.degrees(angle_rad):+.0f} degrees"
 
 
-def _not_seen(look: Look) -> str:
-    whys = dict.fromkeys(one.why for one in look.seen if one.why)
-    return "the board is not seen here: " + "; ".join(whys or ("no corners found",))
+def _whys(look: Look) -> str:
+    """Why a look does not show the board, camera by camera."""
+    return "; ".join(dict.fromkeys(one.why for one in look.seen if one.why)) or "no corners found"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Iterator
 
 import numpy as np
@@ -20,6 +21,18 @@ OVERLAP = 0.7
 
 MOST_LOOKS = 120
 
+TELLING = ("another board", "mirrored", "two boards")
+"""What `calib.corners` says of a board in view that is not the one that is looked for."""
+
+LOOKS_BESIDE = 8
+"""Looks after such a one: the right board may hang beside it."""
+
+SPOILED = ("too dark", "too bright", "next to nothing", "is blurred", "during its exposure")
+SPOILED_LOOKS, MOSTLY = 24, 0.9
+"""If so many looks, and so large a part of them, were no good, no other will be."""
+
+_NUMBERS = re.compile(r"[-+]?[0-9][0-9.]*")
+
 
 class BoardNotFound(MastctlError):
     """No look within the limits showed the board."""
@@ -32,6 +45,7 @@ class Search:
 
     def __init__(self, eyes: Eyes, known: Knowledge, sought: Sought, teller: Teller) -> None:
         self._eyes, self._known, self._sought, self._teller = eyes, known, sought, teller
+        self._on_head = {name for name, camera in known.rig.cameras.items() if camera.on == "head"}
 
     def find(self, placement: Placement) -> Look:
         """Return the first look that shows the board.
@@ -41,27 +55,24 @@ class Search:
         BoardNotFound
             With what the pictures showed instead.
         """
-        whys: dict[str, int] = {}
-        looks = 0
+        whys = _Whys()
         for pan_rad, tilt_rad in self._attitudes(placement):
             try:
                 look = self._eyes.look(pan_rad, tilt_rad)
             except NotThere as reason:
-                whys[str(reason)] = whys.get(str(reason), 0) + 1
+                whys.refused(str(reason))
                 continue
-            if look.found:
+            if any(one.camera in self._on_head for one in look.found):
                 return look
-            looks += 1
-            for one in look.seen:
-                if one.why:
-                    whys[one.why] = whys.get(one.why, 0) + 1
-            if looks == 1:
+            whys.add(look)
+            if whys.looks == 1:
                 self._teller.say("the board is not where it was asked for; looking around")
-            if looks >= MOST_LOOKS:
+            if whys.decided or whys.looks >= MOST_LOOKS:
                 break
-        shown = max(whys, key=lambda why: whys[why], default="no corners were found")
+        everywhere = "" if whys.decided else " all over the head's limits"
+        count = "1 look" if whys.looks == 1 else f"{whys.looks} looks"
         raise BoardNotFound(
-            f"the board was not found in {looks} looks all over the head's limits ({shown}); place it as "
+            f"the board was not found in {count}{everywhere} ({whys.shown}); place it as "
             "asked, in the light, facing the head, and start the same command again"
         )
 
@@ -95,6 +106,54 @@ class Search:
         except (Unreachable, CalibError, ValueError):
             pan, tilt = math.radians(placement.bearing_deg), math.radians(placement.height_deg)
             return min(max(pan, limits[0][0]), limits[0][1]), min(max(tilt, limits[1][0]), limits[1][1])
+
+
+class _Whys:
+    """What looks showed instead of the board."""
+
+    def __init__(self) -> None:
+        self.looks = 0
+        self._counts: dict[str, int] = {}
+        self._told: dict[str, str] = {}
+        self._first_telling = 0
+
+    def refused(self, reason: str) -> None:
+        """Count an attitude that the head does not turn to."""
+        self._count(reason)
+
+    def add(self, look: Look) -> None:
+        """Count a look; the same thing with other numbers is the same."""
+        self.looks += 1
+        whys = {_NUMBERS.sub("", one.why): one.why for one in look.seen if one.why}
+        for why in whys.values():
+            self._count(why)
+        if not self._first_telling and any(_has(why, TELLING) for why in whys):
+            self._first_telling = self.looks
+
+    @property
+    def decided(self) -> bool:
+        """Whether looking further shows nothing else: another board is there, or pictures are no good."""
+        if self._first_telling and self.looks >= self._first_telling + LOOKS_BESIDE:
+            return True
+        spoiled = sum(count for why, count in self._counts.items() if _has(why, SPOILED))
+        return self.looks >= SPOILED_LOOKS and spoiled >= MOSTLY * self.looks
+
+    @property
+    def shown(self) -> str:
+        """The sentence that tells most."""
+        if not self._counts:
+            return "no corners were found"
+        most = max(self._counts, key=lambda why: (_has(why, TELLING), self._counts[why]))
+        return self._told[most]
+
+    def _count(self, why: str) -> None:
+        kind = _NUMBERS.sub("", why)
+        self._counts[kind] = self._counts.get(kind, 0) + 1
+        self._told.setdefault(kind, why)
+
+
+def _has(why: str, words: tuple[str, ...]) -> bool:
+    return any(word in why for word in words)
 
 
 def _steps(low: float, high: float, middle: float, step: float) -> list[float]:

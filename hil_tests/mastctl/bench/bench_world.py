@@ -17,6 +17,7 @@ from mastctl.bench.fitting import fit_in_rover
 from mastctl.bench.folder import Kept, survey_cameras
 from mastctl.bench.frame import Frame
 from mastctl.bench.run import BenchRun
+from mastctl.bench.teller import Teller
 from mastctl.bench.wanted import Wanted
 from tools.simulated.bench import CornerBench, SelfPlacing, TrueAxis
 
@@ -68,10 +69,16 @@ def kept_in(folder: Path, bench: CornerBench) -> Kept:
 
 
 def run_of(
-    bench: CornerBench, folder: Path, wanted: Wanted | None = None, eyes: Eyes | None = None
+    bench: CornerBench,
+    folder: Path,
+    wanted: Wanted | None = None,
+    eyes: Eyes | None = None,
+    teller: Teller | None = None,
 ) -> tuple[BenchRun, SelfPlacing]:
-    """A run, and who places the board for it; ``eyes`` instead of the bench's own."""
-    teller = SelfPlacing(bench)
+    """A run, and who places the board for it; ``eyes`` and ``teller`` instead of the bench's own."""
+    person = SelfPlacing(bench)
     fit = fit_in_rover(Frame(), bench.head.rig)
-    run = BenchRun(eyes or bench, kept_in(folder, bench), "board", BOARD, teller, fit, wanted or Wanted())
-    return run, teller
+    run = BenchRun(
+        eyes or bench, kept_in(folder, bench), "board", BOARD, teller or person, fit, wanted or Wanted()
+    )
+    return run, person
