@@ -35,14 +35,14 @@ def small(rig: Rig) -> Rig:
 
 
 @contextmanager
-def small_rover(repository: Path, folder: Path) -> Iterator[RunningDaemon]:
+def small_rover(repository: Path, folder: Path, speed: float | str = "max") -> Iterator[RunningDaemon]:
     """A running daemon; what is true differs from its mast file as on the packaged rover."""
     config = load_config(repository / "configs/default.yaml")
     save_rig(small(load_rig(config.mast_file).rig), folder / "mast.yaml")
     save_rig(small(load_rig(repository / "configs/sim/rocky8.yaml").rig), folder / "true.yaml")
     hardware = config.hardware
     simulation = {
-        **hardware.simulation, "speed": "max", "samples": 1, "rover": str(folder / "true.yaml"),
+        **hardware.simulation, "speed": speed, "samples": 1, "rover": str(folder / "true.yaml"),
     }  # fmt: skip
     cameras = {name: one for name, one in hardware.cameras.items() if name.startswith("navcam")}
     hardware = replace(hardware, simulation=simulation, cameras=cameras)
