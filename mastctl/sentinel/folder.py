@@ -172,8 +172,26 @@ def read_reference(folder: Path) -> Reference:
 
 def add_look(folder: Path, reference: Reference, time: str, drift: Drift) -> dict[str, Any]:
     """Append what a look at a reference found, and return it. Raises BadFile."""
+    line = look_line(reference, time, drift)
+    path = folder / LOOKS
+    try:
+        with path.open("a+b") as file:
+            file.seek(max(file.seek(0, os.SEEK_END) - 1, 0))
+            torn = file.read(1) not in (b"", b"\n")  # a line that was cut costs only itself
+            file.write(b"\n" * torn + json.dumps(line).encode() + b"\n")
+            file.flush()
+            os.fsync(file.fileno())
+    except OSError as error:
+        raise BadFile(
+            path, "", f"cannot be written: {error.strerror or error}; the look is not kept"
+        ) from None
+    return line
+
+
+def look_line(reference: Reference, time: str, drift: Drift) -> dict[str, Any]:
+    """Return what is kept of a look at a reference."""
     named = drift.named
-    line = {
+    return {
         "time": time,
         "reference": reference.time,
         "views": drift.views,
@@ -191,19 +209,6 @@ def add_look(folder: Path, reference: Reference, time: str, drift: Drift) -> dic
             for change in drift.changes
         },
     }
-    path = folder / LOOKS
-    try:
-        with path.open("a+b") as file:
-            file.seek(max(file.seek(0, os.SEEK_END) - 1, 0))
-            torn = file.read(1) not in (b"", b"\n")  # a line that was cut costs only itself
-            file.write(b"\n" * torn + json.dumps(line).encode() + b"\n")
-            file.flush()
-            os.fsync(file.fileno())
-    except OSError as error:
-        raise BadFile(
-            path, "", f"cannot be written: {error.strerror or error}; the look is not kept"
-        ) from None
-    return line
 
 
 def read_looks(folder: Path, reference: Reference) -> list[dict[str, Any]]:

@@ -4,13 +4,14 @@
 
 A day, at the level of features: six rests, two eyes; each rest of the head off by chance (0.2 mrad each
 joint), a mast that bends with the day's temperature (0.1 mrad), dust and dusk that leave 20 to 100 % of the
-features and make the rest up to twice as uncertain as told; light that moves whole views (0.07 px) and
-shadows that drag up to a quarter of the features along by some pixels; rocks that moved, up to 20 % of the
-features of a view, together, by up to 30 px; now and then (1 % of the views) another scene altogether. Each
-100 days have a reference of their own. Pixels come from this file's own formulas.
+features and make the rest up to twice as uncertain as told; light that moves a rest's views together, turns
+and stretches each, by what was measured in rendered pictures (``--rendered``); shadows that drag up to a
+quarter of the features along by some pixels; rocks that moved, up to 20 % of the features of a view,
+together, by up to 30 px; now and then (1 % of the views) another scene altogether. Each 100 days have a
+reference of their own. Pixels come from this file's own formulas.
 
 Then changes of a random kind and size: how many looks until it is told, and is it named rightly.
-An alarm takes two looks one after the other that name the same.
+An alarm takes two looks one after the other that name the same. Then masts that lean slowly: told as slow?
 """
 
 from __future__ import annotations
@@ -19,6 +20,8 @@ import argparse
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
 
 import numpy as np
 
@@ -27,6 +30,8 @@ from calib.mast.rig import Mast, Rig, RigCamera
 from calib.rigid import FloatArray
 from calib.scene.drift import Drift, ViewShift, find_drift
 from mastctl.cli.output import at_least
+from mastctl.sentinel.folder import Reference, look_line
+from mastctl.sentinel.standing import slow_course, standing
 from tools.arguments import end
 
 SIZE = (1024, 768)
@@ -37,7 +42,13 @@ RESTS = tuple(
     (pan, tilt) for tilt, pans in ((-0.2, (-1.8, 0.0, 1.8)), (-0.5, (-0.9, 0.9, 2.7))) for pan in pans
 )
 FEATURES = 60
-JOINT_SIGMA_RAD, BEND_RAD, LIGHT_PX = 2e-4, 1e-4, 0.07
+JOINT_SIGMA_RAD, BEND_RAD = 2e-4, 1e-4
+LIGHT_PX, EYE_PX, LIGHT_TURN, LIGHT_SCALE = np.array([0.13, 0.13]), 0.03, 1.6e-4, 2.4e-4
+"""What light moves both views of a rest, and one of them, by, turns and stretches it by; one sigma."""
+
+SLOW_RAD, SLOW_DAYS = (2e-5, 1e-4), 60
+"""How fast a mast leans, radians a day, and for how long."""
+
 RENEWED = 100
 """Days that a reference is looked at."""
 
@@ -115,13 +126,17 @@ class Site:
         bend = rng.normal(0.0, BEND_RAD, 2)
         shifts = []
         for pose, (pan, tilt) in enumerate(RESTS):
+            light = rng.normal(0.0, LIGHT_PX)
             angles = np.array([pan, tilt]) + rng.normal(0.0, JOINT_SIGMA_RAD, 2) + bend
             for eye in EYES_M:
                 now = shown(self.points[pose, eye], eye, *angles, truth)
                 moved = now - self.then[pose, eye]
                 sigma = rng.uniform(0.03, 0.15, FEATURES)
                 moved = moved + spoil * sigma[:, None] * rng.normal(0, 1, moved.shape)
-                moved += rng.normal(0.0, LIGHT_PX, 2)
+                arm = self.then[pose, eye] - (np.array(SIZE) - 1) / 2
+                across = np.stack([-arm[:, 1], arm[:, 0]], axis=1)
+                moved += light + rng.normal(0.0, EYE_PX, 2)
+                moved += rng.normal(0.0, LIGHT_TURN) * across + rng.normal(0.0, LIGHT_SCALE) * arm
                 dragged = rng.random(FEATURES) < rng.uniform(0.0, 0.25)
                 moved[dragged] += rng.normal(0, 1, 2) * rng.uniform(0.0, 3.0)
                 if rng.random() < 0.3:
@@ -228,7 +243,34 @@ def main() -> int:
     )
     for words, count in sorted(told.items()):
         print(f"  {words}: {count}")
+    _slow(rng, args.changes // 5)
     return 1 if false else 0
+
+
+def _slow(rng: np.random.Generator, masts: int) -> None:
+    """Masts that lean by a little each day: are they told, as slow, and how fast?"""
+    told, slow, off = 0, 0, []
+    for _ in range(masts):
+        site, rate = Site(rng), float(rng.choice([-1, 1])) * rng.uniform(*SLOW_RAD)
+        begin = datetime(2026, 1, 1, tzinfo=UTC)
+        reference = Reference(begin.isoformat(), "", RESTS, (), Path())
+        looks = []
+        for day in range(1, SLOW_DAYS + 1):
+            now = begin + timedelta(days=day)
+            drift = site.look(Truth(slip=(0.0, rate * day)))
+            looks.append(look_line(reference, now.isoformat(), drift))
+        says = standing(reference, looks, now)
+        told += says.level == "bad"
+        course = slow_course(reference.time, looks, "tilt slipped")
+        if "grown slowly" in says.sentence and course is not None:
+            slow += 1
+            off.append(course[0] / rate - 1.0)
+    if masts:
+        worst = f", the rate within {100 * max(map(abs, off)):.0f} %" if off else ""
+        print(
+            f"{masts} masts that lean by 0.02 to 0.1 mrad a day for {SLOW_DAYS} days: {told} told, "
+            f"{slow} as slow{worst}"
+        )
 
 
 if __name__ == "__main__":

@@ -11,9 +11,11 @@ import numpy as np
 
 from calib.files.mast_file import load_rig, save_rig
 from calib.mast.rig import Rig
-from calib.rigid import rot_x, rot_y, rot_z
+from calib.rigid import rot_y
 from mastctl.config import Listen, load_config
 from mastctl.daemon import RunningDaemon
+from tools.campaigns.sentinel import Truth
+from tools.campaigns.sentinel_days import changed, smaller
 
 BY = 2
 """The Navcams have so many times fewer pixels along each side."""
@@ -22,16 +24,12 @@ RESTS = ("-1.2,-0.3", "0.0,-0.35", "1.2,-0.3")
 
 
 def small(rig: Rig) -> Rig:
-    """The Navcams alone, in fewer pixels; (0, 0) is the middle of the first one."""
+    """The Navcams alone, in fewer pixels."""
     cameras = {}
     for name in ("navcam_left", "navcam_right"):
-        model = rig.cameras[name].model
-        width, height = model.size_px
-        h, v = (vector / BY + (0.5 / BY - 0.5) * model.A for vector in (model.H, model.V))
-        cameras[name] = replace(
-            rig.cameras[name], model=replace(model, size_px=(width // BY, height // BY), H=h, V=v)
-        )
-    return replace(rig, cameras=cameras, stereo={"navcam": rig.stereo["navcam"]}, joints=rig.joints)
+        one = rig.cameras[name]
+        cameras[name] = replace(one, model=smaller(one.model, BY))
+    return replace(rig, cameras=cameras, stereo={"navcam": rig.stereo["navcam"]})
 
 
 @contextmanager
@@ -71,23 +69,18 @@ def truly(daemon: RunningDaemon, rig: Rig) -> Iterator[None]:
 
 def bumped(rig: Rig, camera: str, turn_rad: tuple[float, float, float]) -> Rig:
     """A camera turned about its own place, by small angles about x, y, z of the head."""
-    x, y, z = turn_rad
-    turn = rot_z(z) @ rot_y(y) @ rot_x(x)
-    one = rig.cameras[camera]
-    vectors = {letter: turn @ getattr(one.model, letter) for letter in "AHVO"}
-    model = replace(one.model, **vectors)
-    return replace(rig, cameras={**rig.cameras, camera: replace(one, model=model)})
+    return _with(rig, camera, Truth(turned={camera: np.array(turn_rad)}))
 
 
 def refocused(rig: Rig, camera: str, part: float) -> Rig:
     """A camera whose focal length is longer by a part."""
+    return _with(rig, camera, Truth(focal={camera: part}))
+
+
+def _with(rig: Rig, camera: str, truth: Truth) -> Rig:
     one = rig.cameras[camera]
-    told = {}
-    for letter in "HV":
-        vector = getattr(one.model, letter)
-        along = float(one.model.A @ vector) * one.model.A
-        told[letter] = along + (1.0 + part) * (vector - along)
-    return replace(rig, cameras={**rig.cameras, camera: replace(one, model=replace(one.model, **told))})
+    model = changed(one.model, camera, truth)
+    return replace(rig, cameras={**rig.cameras, camera: replace(one, model=model)})
 
 
 def slipped(rig: Rig, pan_rad: float, tilt_rad: float) -> Rig:
