@@ -76,7 +76,7 @@ export class Bench {
       [this.kept, this.simulated] = [kept.runs, kept.simulated];
       if (this.board.options.length !== kept.boards.length + 1) put(this.board, kept.boards.map((name) => h("option", { value: name }, paper(name))), h("option", { value: "" }, "another: its BOARD.yaml …"));
       if (!this.known) { this.known = true; this.board.value = this.simulated && kept.boards.includes("charuco_a2") ? "charuco_a2" : ""; }
-      if (kept.run && heard === this.heard) this.run = kept.run;
+      if (heard === this.heard) this.run = kept.run; // null after a restart of the daemon
       this.later();
     } catch (error) {
       say(this.said, error.message);

@@ -1,0 +1,70 @@
+"""The program itself on the simulated bench: its daemon killed half-way, gone on with, stopped."""
+
+from __future__ import annotations
+
+import os
+import signal
+from pathlib import Path
+
+import yaml
+
+from hil_tests.mastctl.service_fakes import eventually
+from mastctl.client import Client
+from tools.living_daemon import started, written
+
+BOUND_S = 300.0
+"""A look takes a second; many, where others use the machine."""
+
+
+def config(folder: Path, repository: Path) -> Path:
+    """The packaged bench, quick, with a mast file and a state of its own."""
+    packaged = repository / "configs"
+    document = yaml.safe_load((packaged / "bench.yaml").read_text())
+    (folder / "mast.yaml").write_bytes((packaged / document["mast_file"]).read_bytes())
+    simulation = {**document["simulation"], "rover": str(packaged / document["simulation"]["rover"])}
+    simulation |= {"samples": 1, "speed": "max"}
+    own = {"mast_file": "mast.yaml", "listen": {"port": 0}, "state": {"folder": str(folder / "state")}}
+    return written(folder, {**document, **own, "simulation": simulation})
+
+
+def gone(pid: int) -> bool:
+    return not Path(f"/proc/{pid}").exists() or "\nState:\tZ" in Path(f"/proc/{pid}/status").read_text()
+
+
+def children(pid: int) -> list[int]:
+    """Processes that a process has started and that are at work."""
+    found = []
+    for task in Path(f"/proc/{pid}/task").iterdir():
+        found += [int(word) for word in (task / "children").read_text().split()]
+    return found
+
+
+def test_a_run_whose_daemon_is_killed_leaves_nobody_behind_goes_on_with_the_next_and_obeys_a_stop(
+    tmp_path: Path, repository: Path
+) -> None:
+    path = config(tmp_path, repository)
+
+    def pictures(client: Client) -> int:
+        return (client.bench()["run"] or {"pictures": 0})["pictures"]
+
+    with started(path) as (daemon, port), Client(f"http://127.0.0.1:{port}", name="Ana") as client:
+        name = client.begin_bench("charuco_a2")["name"]
+        eventually(lambda: pictures(client) >= 2, "two pictures", BOUND_S)
+        (program,) = children(daemon.pid)
+        os.kill(daemon.pid, signal.SIGKILL)
+        eventually(lambda: gone(program), "the program is over too", 30.0)
+    with started(path) as (daemon, port), Client(f"http://127.0.0.1:{port}", name="Ana") as client:
+        (kept,) = client.bench()["runs"]
+        assert (kept["name"], kept["state"]) == (name, "interrupted") and kept["pictures"] >= 2
+        client.begin_bench(goes_on=name)
+        eventually(lambda: pictures(client) > kept["pictures"], "more", BOUND_S)
+        (program,) = children(daemon.pid)
+        run = client.bench()["run"]
+        assert run is not None and any("going on with" in words for words in run["sentences"])
+        client.stop()
+        eventually(lambda: client.bench()["runs"][0]["state"] == "interrupted", "it has ended", BOUND_S)
+        run = client.bench()["run"]
+        assert run is not None and gone(program) and client.control() is None
+        # Where the stop met a move the program itself may have been the first to say so.
+        assert run["code"] in ("stopped", "interrupted") and "stop" in run["sentence"], run["sentence"]
+        assert client.bench()["runs"][0]["pictures"] > kept["pictures"]
