@@ -78,6 +78,11 @@ export class Control {
     setTimeout(() => { this.sure = false; this.draw(); }, 5000);
   }
 
+  /** A daemon that was started again knows no lease of before. */
+  again() {
+    if (held.lease) this.renew();
+  }
+
   async renew() {
     try {
       await post("/lease/renew", { for_s: FOR_S });

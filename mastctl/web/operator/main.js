@@ -121,8 +121,9 @@ function standing(now) {
 }
 setInterval(() => say(byId("state-for"), events.connected ? `for ${forTime((performance.now() - since) / 1000)}` : ""), 500);
 
-events.addEventListener("state", (event) => standing(event.detail.value));
-events.addEventListener("lease", (event) => control.told(event.detail.value.control));
+let pushed = 0; // an answer that was asked for before the last of these is older than they are
+events.addEventListener("state", (event) => { pushed += 1; standing(event.detail.value); });
+events.addEventListener("lease", (event) => { pushed += 1; control.told(event.detail.value.control); });
 events.addEventListener("joints", (event) => { jog.here = [event.detail.value.pan_rad, event.detail.value.tilt_rad]; });
 events.addEventListener("mast", () => refresh());
 events.addEventListener("fault", (event) => { if (event.detail.key === "sun") refresh(); });
@@ -138,7 +139,7 @@ events.addEventListener("operation", (event) => {
   const going = record.state === "running" ? record.steps.findLast((step) => step.name === "limits") : null;
   head.goal(going ? [going.detail.pan_rad, going.detail.tilt_rad] : undefined);
 });
-events.addEventListener("connected", () => { byId("lost").hidden = true; refresh(); recording.look(); residuals.look(); mastFile.look(); jog.look(); });
+events.addEventListener("connected", () => { byId("lost").hidden = true; refresh(); recording.look(); residuals.look(); mastFile.look(); jog.look(); control.again(); });
 events.addEventListener("lost", () => {
   byId("lost").hidden = false;
   jog.release();
@@ -163,6 +164,7 @@ async function refresh() {
   if (refresh.busy) { again = true; return; }
   refresh.busy = true;
   try {
+    const before = pushed;
     const status = await get("/status");
     if (!rig || rig.digest !== status.mast.digest || Object.keys(rig.cameras).length !== Object.keys(status.cameras).length) {
       rig = await get("/rig");
@@ -170,6 +172,10 @@ async function refresh() {
     }
     head.keptOff(await get("/limits/sun"));
     show(status);
+    if (before === pushed) {
+      standing(status);
+      control.told(status.control);
+    }
   } catch (error) {
     if (error.status) notice(error.message);
   }
@@ -181,8 +187,6 @@ function show(status) {
   const badge = byId("hardware");
   say(badge, { simulated: "SIMULATED", real: "HARDWARE", replayed: "REPLAYED", mixed: "HARDWARE, PART SIMULATED" }[status.hardware] ?? status.hardware);
   set(badge, "data-kind", status.hardware);
-  standing(status);
-  control.told(status.control);
   head.use(status, rig, views);
   jog.use(status.limits);
   mastFile.told(status, rig);
@@ -205,7 +209,10 @@ async function enter() {
     allow(session.role);
     events.open();
   } catch (error) {
-    if (error.status === 401) ask(byId("login"));
+    if (error.status === 401) {
+      say(byId("word"), "not logged in");
+      ask(byId("login"));
+    }
     else { notice(error.message); setTimeout(enter, 2000); }
   }
 }

@@ -234,6 +234,8 @@ def test_a_connection_that_is_cut_is_told_and_comes_back(
     with fake_daemon(monkeypatch, tmp_path, listen) as (daemon, _):
         one = visit(daemon.url)
         one.frame()
+        one.page.get_by_role("button", name="Take", exact=True).click()
+        one.page.get_by_role("button", name="Release", exact=True).wait_for()
     lost = one.page.locator("#lost")
     lost.wait_for(state="visible")
     assert "may go on until its deadline" in lost.inner_text()
@@ -244,6 +246,8 @@ def test_a_connection_that_is_cut_is_told_and_comes_back(
         lost.wait_for(state="hidden")
         one.word("ready")
         one.frame()
+        one.page.wait_for_selector(".notice >> text=You steer no longer")
+        one.page.get_by_role("button", name="Take", exact=True).wait_for()
         one.complaints.clear()
 
 

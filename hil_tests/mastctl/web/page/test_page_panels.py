@@ -235,3 +235,39 @@ def test_a_preview_that_hangs_leaves_stop_and_the_next_click(
     one.page.route("**/point/preview", lambda route: route.fulfill(status=409, body=refused))
     frame.click()
     one.page.wait_for_selector("#target >> text=Seen again.")
+
+
+def test_an_answer_from_before_a_stop_does_not_take_it_back(pair: BOTH, visit: Visits) -> None:
+    """What is pushed is newer than a status that was asked for before it and comes after it."""
+    daemon, _ = pair
+    one = visit(daemon.url)
+    one.word("ready")
+    held: list[Any] = []
+
+    def hold(route: Any) -> None:
+        if held:
+            route.continue_()
+        else:
+            held.append((route, route.fetch()))
+
+    one.page.route("**/api/v1/status", hold)
+    with Client(daemon.url) as client:
+        client.keep_place("chart", 0.1, 0.1)  # a command: the page asks for the status again
+        one.page.wait_for_timeout(1500)
+        assert len(held) == 1, "one question at a time"
+        client.estop(name="Ana", reason="sparks")
+    one.word("stopped")
+    one.page.evaluate(
+        """() => {
+          window.shown = [];
+          const place = document.getElementById("estop");
+          new MutationObserver(() => window.shown.push(place.hidden)).observe(place, { attributes: true });
+        }"""
+    )
+    route, answer = held[0]
+    with one.page.expect_response("**/api/v1/status"):  # the next one, of after the stop
+        route.fulfill(response=answer)
+    with one.page.expect_response("**/api/v1/status"), Client(daemon.url) as client:
+        client.forget_place("chart")
+    assert True not in one.page.evaluate("window.shown"), "it was never taken back"
+    assert "by Ana: sparks" in one.page.locator("#estop").inner_text()
