@@ -5,7 +5,7 @@
 Simulated surveys of the Navcams (12 placements for the mast). In each a joint is read off by some size: from
 the middle of the head's pictures on, or at one placement alone. Counted is how often the fit names it (as a
 slip or an attitude), and how often it says at least that something is wrong (any wider model, a stated sigma
-that is too small, a board that contradicts the others, an image left out).
+that is too small, a board that contradicts the others, an image or a point of the station left out).
 """
 
 from __future__ import annotations
@@ -78,7 +78,7 @@ def found(task: Task) -> Found:
     asked = [model.name for model in fit.wider if model.significant]
     odd = any(one.least_chance * len(fit.left_out_boards) < RARELY for one in fit.left_out_boards)
     wrong = any(component.wrong for component in fit.components)
-    left_out = any(outlier.kind == "image" for outlier in fit.outliers)
+    left_out = any(outlier.kind != "dot" for outlier in fit.outliers)
     return Found(any(name in NAMES[task.way] for name in asked), bool(asked) or odd or wrong or left_out)
 
 

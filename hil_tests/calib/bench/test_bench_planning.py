@@ -131,6 +131,22 @@ def test_no_other_attitude_would_tell_more_than_the_chosen_one(rig: Rig) -> None
     assert best.expected_px <= min(others) + 1e-9
 
 
+def test_a_few_shots_chosen_together_leave_less_than_one_after_the_other(rig: Rig) -> None:
+    known = standing(rig, Placement(1.2, 10.0, -5.0, (20.0, 0.0)))
+    aim = pointing(known, Workspace(PAIR, (-0.9, 0.9), (-0.6, 0.1), one_sided=True))
+    left = []
+    for count_ahead in (False, True):
+        shots: list[Shot] = []
+        for taken in range(5):
+            ahead = 5 - taken if count_ahead else 1
+            choice = next_shot(known, sought(True), shots, "p1", aim, ahead=ahead)
+            assert choice is not None
+            shots.append(choice.shot)
+        assert len({(shot.pan_rad, shot.tilt_rad) for shot in shots}) == 5
+        left.append(expected_px(known, shots, aim))
+    assert left[1] < 0.9 * left[0]
+
+
 def test_an_attitude_that_showed_no_board_is_not_tried_again(rig: Rig) -> None:
     known = standing(rig, Placement(1.2, 0.0, 0.0))
     aim = pointing(known, Workspace(PAIR, (-0.9, 0.9), (-0.6, 0.1)))
