@@ -40,6 +40,9 @@ MOST_A_PAIR, MOST_A_CELL, CELL_PX = 25, 3, 100
 """Features of two pictures, and of a square of one: of 0.1 px, so many tell where one camera stands against
 the other ten times better than joints repeat."""
 
+MOST_PARTNERS = 8
+"""Later pictures that one is held against, those that overlap most: they are tied together through these."""
+
 ALIKE = 0.95
 """A patch on the ground that correlates so needs no other try."""
 
@@ -83,8 +86,10 @@ def find_features(rig: Rig, views: Sequence[View]) -> list[Feature]:
     keypoints = [_keypoints(view) for view in views]
     looks = [_Look(view, model, found) for view, model, found in zip(views, models, keypoints, strict=True)]
     together: list[list[int]] = [[] for _ in views]
-    for first, second in overlapping(models):
-        together[first].append(second)
+    parts = overlapping(models)
+    for first, second in sorted(parts, key=lambda pair: -parts[pair]):
+        if len(together[first]) < MOST_PARTNERS:
+            together[first].append(second)
     features: list[Feature] = []
     for first, look in enumerate(looks):
         found: dict[int, list[tuple[int, FloatArray, FloatArray]]] = {}

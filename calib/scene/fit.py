@@ -159,7 +159,7 @@ def _chosen(
             if _possible(problem, term, with_it, free)
         ]
         by_chance, term, with_it = min(tried, key=lambda one: one[0], default=(1.0, None, None))
-        gains |= {one.words: sigmas(min(len(tried) * p, 1.0)) for p, one, _ in tried}
+        gains |= {one.words: abs(sigmas(min(len(tried) * p, 1.0))) for p, one, _ in tried}
         if term is None or with_it is None or len(tried) * by_chance > THREE_SIGMAS:
             return taken, gains, fitted or quadratic.fitted(free), state
         taken.append(term)

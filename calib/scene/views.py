@@ -51,18 +51,18 @@ class View:
         )
 
 
-def overlapping(models: Sequence[CameraModel]) -> list[tuple[int, int]]:
-    """Return which of the pictures' cameras, in the rover frame, see enough of the same to share features."""
+def overlapping(models: Sequence[CameraModel]) -> dict[tuple[int, int], float]:
+    """Return by which part pictures overlap, of cameras in the rover frame; for those that do at all."""
     ahead = np.array([model.A for model in models])
     half = np.array([_half_width_rad(model) for model in models])
     apart = np.arccos(np.clip(ahead @ ahead.T, -1.0, 1.0))
-    near = np.triu(apart < half[:, None] + half + ASIDE_RAD, 1)
-    return [
-        (first, second)
-        for first, second in np.argwhere(near).tolist()
-        if max(overlap(models[first], models[second]), overlap(models[second], models[first]))
-        >= LEAST_OVERLAP
-    ]
+    found = {}
+    for first, second in np.argwhere(np.triu(apart < half[:, None] + half + ASIDE_RAD, 1)).tolist():
+        one, other = models[first], models[second]
+        part = max(overlap(one, other), overlap(other, one))
+        if part >= LEAST_OVERLAP:
+            found[first, second] = part
+    return found
 
 
 def _half_width_rad(model: CameraModel) -> float:

@@ -60,7 +60,7 @@ def _show(proposal: SceneProposal, saved: StoredRig, told_rad: float) -> None:
     fit = proposal.fit
     sigma = fit.covariance.diagonal() ** 0.5
     rows = [
-        [name, f"{1e3 * value:+.3f}", f"{1e3 * one:.3f}", "not seen" if name in fit.unseen else ""]
+        [name, f"{1e3 * value:+.3f}", f"{1e3 * one:.3f}", _unit(name), "not seen" * (name in fit.unseen)]
         for name, value, one in zip(fit.names, fit.values, sigma, strict=True)
     ]
     notes = [f"{words}: {gain:.1f} sigma" for words, gain in fit.gains.items()]
@@ -85,12 +85,12 @@ def _show(proposal: SceneProposal, saved: StoredRig, told_rad: float) -> None:
         f"proposed mast file: {saved.path} ({saved.digest[:12]}); {proposal.mast.path} is as it was",
         "what pictures cannot tell, where the rover is and the joints' zero, stays as the former file has it",
     ]
-    output.print_table(
-        "Corrected by the scene",
-        ["number", "10^-3 (mrad; of the focal length; R1)", "sigma", ""],
-        rows,
-        notes,
-    )
+    output.print_table("Corrected by the scene", ["number", "added", "sigma", "", ""], rows, notes)
+
+
+def _unit(name: str) -> str:
+    """What a number is told in."""
+    return {"scale": "1/1000 of the focal length", "r1": "1/1000"}.get(name.rpartition(".")[2], "mrad")
 
 
 def _scatter(fit: SceneFit, told_rad: float) -> str:

@@ -65,29 +65,53 @@ def scene(
     focal: dict[str, float] | None = None,
     pan_harmonic: tuple[float, float] = (0.0, 0.0),
     pans: int = 8,
-    slip: float = 0.0,
     count: int = 120,
+    repeat: float = 5e-5,
+    play: float = 0.0,
+    moved: tuple[int, float] | None = None,
 ) -> tuple[list[View], list[Feature]]:
-    """Rests all round at three tilts, and features on rough ground, each seen where the true rig shows it."""
+    """Rests all round at two tilts, and features on rough ground, each seen where the true rig shows it.
+
+    From the rest that ``moved`` names on, the rover stands so many metres farther ahead and turned by a
+    hundredth of that, in radians, about its forward axis. With ``play`` each other rest is reached from
+    larger angles of pan.
+    """
     rng = np.random.default_rng(seed)
     reads = [
         (pan, tilt) for tilt in (-0.15, -0.45) for pan in np.linspace(-np.pi, np.pi, pans, endpoint=False)
     ]
     views = [
-        View(f"{name} {pose}", name, np.zeros((2, 2), np.float32), pan, tilt, pose)
+        View(
+            f"{name} {pose}",
+            name,
+            np.zeros((2, 2), np.float32),
+            pan,
+            tilt,
+            pose,
+            ((-1.0 if pose % 2 else 1.0) if play else 0.0, 0.0),
+        )
         for pose, (pan, tilt) in enumerate(reads)
         for name in EYES_M
     ]
     true = []
-    for pan, tilt in reads:
-        wrong = pan_harmonic[0] * np.cos(pan) + pan_harmonic[1] * np.sin(pan)
-        true.append((pan + wrong + rng.normal(0, 5e-5), tilt + rng.normal(0, 5e-5)))
-    if slip:
-        true[3] = (true[3][0] + slip, true[3][1])
+    for pose, (pan, tilt) in enumerate(reads):
+        wrong = pan_harmonic[0] * np.cos(pan) + pan_harmonic[1] * np.sin(pan) + (pose % 2 - 0.5) * play
+        true.append((pan + wrong + rng.normal(0, repeat), tilt + rng.normal(0, repeat)))
     bearing, far = rng.uniform(-np.pi, np.pi, count), rng.uniform(1.8, 15.0, count)
     points = np.stack([far * np.cos(bearing), far * np.sin(bearing), rng.normal(0, 0.15, count)], axis=1)
     features = []
-    shown = [pixels_of(points, view.camera, *true[view.pose], bump or {}, focal or {}) for view in views]
+    by = 0.0 if moved is None else moved[1]
+    after = (points - [by, 0.0, 0.0]) @ turn(0, 0.01 * by)
+    shown = [
+        pixels_of(
+            after if moved and view.pose >= moved[0] else points,
+            view.camera,
+            *true[view.pose],
+            bump or {},
+            focal or {},
+        )
+        for view in views
+    ]
     ahead = [
         ((points - MAST_M) @ (turn(2, view.pan_rad) @ turn(1, view.tilt_rad)))[:, 0] > 0.5 for view in views
     ]
@@ -161,6 +185,30 @@ def test_a_feature_that_moved_is_named_and_not_used() -> None:
     x, y = wrong.pixels_px[0]
     assert any(f"({x:.0f}, {y:.0f})" in sentence and "sigma off" in sentence for sentence in fit.outliers)
     assert len(fit.outliers) < 0.03 * len(features)
+
+
+def test_rests_that_scatter_more_than_was_told_are_not_taken_for_a_wrong_rig() -> None:
+    views, features = scene(8, repeat=1e-3)
+    with pytest.raises(NoCorrection) as refused:
+        fit_scene(believed(), views, features)
+    assert refused.value.code == "not_significant"
+
+
+def test_an_axis_with_play_is_told_by_rests_from_both_sides() -> None:
+    views, features = scene(9, play=3e-3, count=250)
+    fit = fit_scene(believed(), views, features)
+    assert fit.taken == ("pan has play",)
+    assert abs(fit.values[0] - 3e-3) < 4 * np.sqrt(fit.covariance[0, 0])
+    assert fit.rms_px[1] < 0.5 * fit.rms_px[0]
+
+
+def test_a_rover_that_moved_between_two_rests_is_told_with_the_place() -> None:
+    views, features = scene(10, moved=(8, 0.02), count=250)
+    with pytest.raises(
+        NoCorrection, match=r"tilt -0.450 rad the rover moved by .* one side alone"
+    ) as refused:
+        fit_scene(believed(), views, features)
+    assert refused.value.code == "changed_halfway"
 
 
 def test_what_few_rests_cannot_tell_is_not_asked() -> None:
