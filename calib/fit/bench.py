@@ -22,7 +22,7 @@ from calib.fit.adjustment import HUBER, Adjustment, Estimate
 from calib.fit.bench_calibration import BenchCalibration
 from calib.fit.bench_changes import find_change
 from calib.fit.bench_problem import BenchOptions, BenchProblem, without_terms
-from calib.fit.bench_start import BenchNotFitted
+from calib.fit.bench_start import BenchNotFitted, SomethingChanged
 from calib.fit.bench_told import choose, told
 from calib.fit.joint import weigh, without_blunders
 from calib.fit.least_squares import minimise
@@ -30,7 +30,7 @@ from calib.fit.model_terms import Tested
 from calib.fit.start_values import SurveyNotFitted
 from calib.survey import Survey
 
-__all__ = ["BenchNotFitted", "BenchOptions", "fit_bench"]
+__all__ = ["BenchNotFitted", "BenchOptions", "SomethingChanged", "fit_bench"]
 
 WRONG_MINIMUM = 3.0
 """A fit is refused if a camera's typical corner is this many times farther off than its sigma says."""
@@ -129,7 +129,7 @@ def _look_for_changes(bench: BenchProblem, chosen: Sequence[str]) -> tuple[Adjus
         if change is None:
             break
         if change.board is None:
-            raise BenchNotFitted(change.sentence)
+            raise SomethingChanged(change.sentence)
         bench.notes.append(f"{change.sentence}; from there on it counts as another placement")
         bench.split_placement(change.board, change.after)
         bench.begin()
@@ -146,7 +146,7 @@ def _refuse_slip(bench: BenchProblem, state: Estimate) -> None:
         turn = Rotation.from_matrix(motion.rotation).as_rotvec()
         aside = np.linalg.norm(turn[:2]) + np.linalg.norm(motion.translation_m)
         if abs(turn[2]) > SLIP_RAD and aside < SLIP_ASIDE * abs(turn[2]):
-            raise BenchNotFitted(
+            raise SomethingChanged(
                 f"pan slipped by about {1e3 * abs(turn[2]):.0f} mrad before picture {after}: the head no "
                 "longer points where it read before; tighten what holds it on its axis and take the "
                 "pictures again"

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from calib.camera.cahvor import Kind
 from calib.fit.adjustment import HUBER, Adjustment, Estimate
-from calib.fit.bench_start import BenchNotFitted, BenchStart, bench_start
+from calib.fit.bench_start import BenchNotFitted, BenchStart, SomethingChanged, bench_start
 from calib.fit.bench_terms import BenchTerms, bench_terms
 from calib.fit.model_terms import AXIS_TERMS, candidate_terms, joint_numbers
 from calib.fit.terms import ImageTerm, with_kept
@@ -112,7 +112,7 @@ class BenchProblem:
         cut = int(np.argmin(wrong))
         if wrong[cut] > TURNABOUTS * there.sum():
             first = [shown[i + 1].name for i in changes[:3]]
-            raise BenchNotFitted(
+            raise SomethingChanged(
                 f"board {board[0]} of placement {board[1]} stands at two places, now at one and now at the "
                 f"other (pictures {', '.join(first)} and others): two boards have the same ids, or it was "
                 "moved and put back; leave one board only, or print the other with other ids (first_id)"

@@ -51,6 +51,11 @@ class BenchNotFitted(CalibError):
     how."""
 
 
+class SomethingChanged(BenchNotFitted):
+    """A joint slipped, a camera was knocked or refocused, two boards have the same ids: more pictures mend
+    nothing, somebody has to."""
+
+
 @dataclass(frozen=True, eq=False)
 class BenchStart:
     """The state to begin with, images that do not agree with it, sentences for a person, and by board and

@@ -240,4 +240,6 @@ def _sentence(error: ClientError) -> str:
         return f"somebody else steers the head: {error}"
     if error.code == "estopped":
         return f"the emergency stop is latched ('mastctl reset' releases it): {error}"
+    if "picture is dark" in str(error):
+        return f"{error}; turn on a light, or let the camera expose longer"
     return str(error)

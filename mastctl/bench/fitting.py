@@ -45,11 +45,11 @@ class Fitted:
 FitSurvey = Callable[[Survey], Fitted]
 
 
-def fit_in_rover(frame: Frame, former: Rig) -> FitSurvey:
-    """Return the fit of a bench in a rover frame that was stated."""
+def fit_in_rover(frame: Frame, former: Rig, moved: Callable[[], Mapping[str, float]]) -> FitSurvey:
+    """Return the fit of a bench in a rover frame that was stated; ``moved`` as of `fit_in_frame`."""
 
     def fit(survey: Survey) -> Fitted:
-        done = fit_in_frame(survey, frame, former)
+        done = fit_in_frame(survey, frame, former, moved=moved())
         # Of a board that moved, "p1 from IMAGE on" comes after "p1": where it stands now.
         boards = {placement.split(" ")[0]: pose for (_, placement), pose in done.rover_from_board.items()}
         rms = float(np.sqrt(np.mean(np.square(list(done.rms_px.values())))))

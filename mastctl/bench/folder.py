@@ -6,7 +6,7 @@ import fcntl
 import json
 import os
 import weakref
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, cast
 
@@ -140,6 +140,10 @@ class Kept:
             note.get("name") == name and note.get("event") in ("closed", "done") for note in self.notes
         )
 
+    def moved(self) -> dict[str, float]:
+        """Return the placements whose first picture, taken again, showed the board aside: by how many px."""
+        return moved_placements(self.notes)
+
     def seconds(self) -> float:
         """Return how long all looks took, seconds of the rover's clock."""
         return sum(float(note.get("seconds", 0.0)) for note in self.notes)
@@ -167,6 +171,16 @@ def former_rig(folder: Path) -> Rig | None:
     """
     path = folder / FORMER
     return load_rig(path).rig if path.exists() else None
+
+
+def moved_placements(notes: Iterable[Mapping[str, Any]]) -> dict[str, float]:
+    """Return what a journal says of placements that moved: by how many pixels."""
+    return {str(note["name"]): float(note["apart_px"]) for note in notes if note.get("event") == "moved"}
+
+
+def kept_moved(folder: Path) -> dict[str, float]:
+    """Return the placements of a folder's run that moved (see `Kept.moved`). Raises BadFile."""
+    return moved_placements(_read_notes(folder / JOURNAL))
 
 
 def kept_frame(folder: Path) -> Frame:

@@ -10,7 +10,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from calib.bench.body import FEWEST
-from calib.fit.bench import BenchNotFitted, BenchOptions, fit_bench
+from calib.fit.bench import BenchNotFitted, BenchOptions, SomethingChanged, fit_bench
 from calib.fit.bench_calibration import BenchCalibration
 from calib.mast.rig import Mast, Rig
 from calib.rigid import Rigid
@@ -75,7 +75,11 @@ def rover_from_board(board_at: Sequence[float]) -> Rigid:
 
 
 def fit_in_frame(
-    survey: Survey, frame: Frame, former: Rig | None, options: BenchOptions | None = None
+    survey: Survey,
+    frame: Frame,
+    former: Rig | None,
+    options: BenchOptions | None = None,
+    moved: Mapping[str, float] | None = None,
 ) -> BenchCalibration:
     """Fit a bench in the rover frame that was stated.
 
@@ -87,6 +91,9 @@ def fit_in_frame(
         What the frame hangs on, and the rig as it was known before.
     options
         What else is chosen.
+    moved
+        Placements at whose end the first picture was taken again and showed the board aside, by so many
+        pixels. Where the fit does not find out what moved when, it does without them.
 
     Raises
     ------
@@ -96,6 +103,31 @@ def fit_in_frame(
         If the pictures do not determine a rig.
     """
     options = options or BenchOptions()
+    try:
+        return _fit_in_frame(survey, frame, former, options)
+    except SomethingChanged:
+        raise
+    except BenchNotFitted as reason:
+        rest = tuple(image for image in survey.images if image.placement not in (moved or {}))
+        if not moved or not rest:
+            raise
+        told = [
+            f"the board or the head moved during placement {name} (its first picture taken again shows the "
+            f"board {apart_px:.1f} px aside): its pictures are left out"
+            for name, apart_px in moved.items()
+        ]
+        corners = {i.name: survey.corners[i.name] for i in rest if i.name in survey.corners}
+        try:
+            done = _fit_in_frame(replace(survey, images=rest, corners=corners), frame, former, options)
+        except BenchNotFitted:
+            raise BenchNotFitted(f"{'; '.join(told)}, and what is left is too little: {reason}") from None
+        return replace(done, notes=(*done.notes, *told))
+
+
+def _fit_in_frame(
+    survey: Survey, frame: Frame, former: Rig | None, options: BenchOptions
+) -> BenchCalibration:
+    """The fit of what a survey shows."""
     survey, notes = without_lonely(survey)
     if frame.mast_at is not None:
         place = Mast(np.array(frame.mast_at[:3]), np.array(frame.mast_at[3:])).rover_from_mast

@@ -219,7 +219,11 @@ class Known:
             if name not in self.now.boards:
                 board = self._board_from(look)
                 self.now = replace(self.now, boards={**self.now.boards, name: board})
-        self.shots = [self._shot(name, look) for name, check, look in self.looks if not check]
+        # What moved, and could not be fitted, tells nothing.
+        spoiled = set(self.kept.moved()) - set(self.fitted.boards) if self.fitted else set()
+        self.shots = [
+            self._shot(name, look) for name, check, look in self.looks if not check and name not in spoiled
+        ]
 
     def _use(self, fitted: Fitted, looks: int) -> None:
         """Let a fit of so many looks be the present estimate; boards that it does not know stay where they

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import KW_ONLY, dataclass, replace
 from datetime import UTC, datetime
 from importlib.metadata import version
@@ -212,9 +212,15 @@ def finish(bench: BenchRun, teller: Teller, out: Path, report: Path | None) -> B
 
 
 def save_bench(
-    survey: Survey, out: Path, report: Path | None, options: BenchOptions, frame: Frame, former: Rig | None
+    survey: Survey,
+    out: Path,
+    report: Path | None,
+    options: BenchOptions,
+    frame: Frame,
+    former: Rig | None,
+    moved: Mapping[str, float],
 ) -> BenchDone:
-    """Fit a bench's folder again and save the mast file; ``frame`` and ``former`` as of `fit_in_frame`.
+    """Fit a bench's folder again and save the mast file; the rest is of `fit_in_frame`.
 
     Raises
     ------
@@ -224,7 +230,7 @@ def save_bench(
         If the pictures do not determine a rig; nothing is written.
     """
     checked_survey(survey)
-    calibration = fit_in_frame(survey, frame, former, options)
+    calibration = fit_in_frame(survey, frame, former, options, moved)
     verdict = judge_bench(survey, calibration)
     if former is not None:
         calibration = told_of_former(calibration, former)

@@ -13,6 +13,7 @@ from calib.bench.body import advise_for_body
 from calib.bench.placements import Advice, Placement, advise, first_placement
 from calib.boards import AnyBoard
 from calib.errors import CalibError
+from calib.fit.bench import SomethingChanged
 from mastctl.bench.eyes import Eyes
 from mastctl.bench.final import Checked, point_at_corners, unvisited
 from mastctl.bench.fitting import FitSurvey, Fitted
@@ -71,7 +72,8 @@ class BenchRun:
             If the head or the cameras fail, the board is not found, or somebody stops it. What was seen is in
             the folder.
         CalibError
-            If what was seen cannot be fitted.
+            If what was seen cannot be fitted; at the end of a placement already if something changed that no
+            more pictures mend.
         """
         try:
             self._take_up()
@@ -157,6 +159,8 @@ class BenchRun:
             return False
         try:
             self.known.fit()
+        except SomethingChanged:
+            raise  # no other placement mends it
         except CalibError as reason:
             self._teller.say(f"no fit yet: {reason}")
         if len(over) < self.wanted.placements[0] or self._body_advice() is not None:

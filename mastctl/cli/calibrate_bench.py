@@ -133,7 +133,7 @@ def survey_folder(out: Path) -> Path:
 def _again(args: argparse.Namespace) -> int:
     from calib.fit.bench import BenchOptions
     from calib.survey import read_survey
-    from mastctl.bench.folder import former_rig, kept_frame
+    from mastctl.bench.folder import former_rig, kept_frame, kept_moved
     from mastctl.bench.result import save_bench
 
     survey = read_survey(args.folder)
@@ -148,7 +148,8 @@ def _again(args: argparse.Namespace) -> int:
         frame = kept_frame(args.folder)
     options = BenchOptions(kind=args.model)
     with output.waiting(args.json, f"fitting {len(survey.images)} images"):
-        done = save_bench(survey, args.out, args.report, options, frame, former_rig(args.folder))
+        former, moved = former_rig(args.folder), kept_moved(args.folder)
+        done = save_bench(survey, args.out, args.report, options, frame, former, moved)
     _tell(args, done.told(), done.lines())
     return 0
 
@@ -280,7 +281,7 @@ def _bench(args: argparse.Namespace, board: Any, folder: Path) -> Iterator[tuple
             raise WrongUse(f"{option} is of a simulated bench, and this one is real")
         wanted = Wanted(args.wanted_px, args.pictures)
         kept.begin(client.mast_file(), _frame(args))
-        fit = fit_in_rover(kept_frame(folder), head.rig)
+        fit = fit_in_rover(kept_frame(folder), head.rig, kept.moved)
         yield BenchRun(eyes, kept, "board", board, teller, fit, wanted), teller
 
 

@@ -3,7 +3,7 @@
     .venv/bin/python -m tools.campaigns.bench_provoked [--only NAME ...]
 
 One daemon of the packaged bench, one run of `mastctl calibrate bench` a case. Boards are rendered where and
-as they are wrong; slips, darkness and cables are the simulator's faults; what a camera would do to a picture
+as they are wrong; darkness and cables are the simulator's faults; what a camera would do to a picture
 (mirrored print, focus, blur) is done to its pixels by OpenCV on the way to the command. Told are the exit
 code, the pictures that are in the folder afterwards, whether it can be read, and the sentence.
 """
@@ -73,8 +73,9 @@ def twin_board(client: Client) -> None:
 
 
 def slipped(client: Client) -> None:
-    """The pan encoder reads 10 mrad more than before."""
-    client.set_fault("pan_tilt", "wrong", offset_rad=0.01, axis=0)
+    """The whole rover turns by 10 mrad about its pan axis, and so the head, which reads what it read."""
+    turn_rad, (ahead_m, aside_m) = 0.01, (0.3443, -0.0043)  # of configs/sim/rocky8.yaml
+    client.stand(turn_rad * aside_m, -turn_rad * ahead_m, turn_rad)
 
 
 def all_off(client: Client) -> None:
@@ -183,6 +184,7 @@ def clean(url: str) -> None:
     """Put everything in order again."""
     with Client(url) as client:
         client.clear_faults()
+        client.stand(0.0, 0.0, 0.0)
         for name in client.boards():
             client.take_board(name)
 

@@ -77,8 +77,7 @@ def run_of(
 ) -> tuple[BenchRun, SelfPlacing]:
     """A run, and who places the board for it; ``eyes`` and ``teller`` instead of the bench's own."""
     person = SelfPlacing(bench)
-    fit = fit_in_rover(Frame(), bench.head.rig)
-    run = BenchRun(
-        eyes or bench, kept_in(folder, bench), "board", BOARD, teller or person, fit, wanted or Wanted()
-    )
+    kept = kept_in(folder, bench)
+    fit = fit_in_rover(Frame(), bench.head.rig, kept.moved)
+    run = BenchRun(eyes or bench, kept, "board", BOARD, teller or person, fit, wanted or Wanted())
     return run, person

@@ -12,10 +12,14 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from calib.files.mast_file import load_rig, save_rig
+from calib.fit.bench import BenchNotFitted, BenchOptions
+from calib.fit.bench_calibration import BenchCalibration
 from calib.mast.rig import Mast, Rig
-from calib.survey import write_survey
+from calib.survey import Survey, read_survey, write_survey
 from drivers.sim_survey.bench import NAVCAMS, BenchCamera, BenchPlan, Placement, simulate_bench
+from mastctl.bench import frame
 from mastctl.bench.folder import FORMER
+from mastctl.calibration.bench_verdict import judge_bench
 from mastctl.cli.main import main
 
 HAZCAM = BenchCamera(
@@ -120,3 +124,23 @@ def test_a_body_camera_that_nothing_ties_is_named_and_stays_where_it_was(
         "body camera hazcam is not tied to the head: it saw the board at 1 " in n for n in told["notes"]
     )
     np.testing.assert_array_equal(rig.cameras["hazcam"].model.C, TRUE.cameras["hazcam"].model.C)
+
+
+def test_a_placement_that_moved_and_spoils_the_fit_is_left_out_with_a_sentence(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    survey = read_survey(folder)
+    whole = frame.fit_bench
+
+    def fits_only_without_p1(survey: Survey, options: BenchOptions) -> BenchCalibration:
+        if any(image.placement == "p1" for image in survey.images):
+            raise BenchNotFitted("the fit leaves 24.6 times the stated noise of a corner")
+        return whole(survey, options)
+
+    monkeypatch.setattr(frame, "fit_bench", fits_only_without_p1)
+    with pytest.raises(BenchNotFitted, match=r"24\.6 times"):
+        frame.fit_in_frame(survey, frame.Frame(), None)
+    done = frame.fit_in_frame(survey, frame.Frame(), None, moved={"p1": 24.7})
+    assert {placement for _, placement in done.rover_from_board} == {"p2", "p3"}
+    (reason,) = [r for r in judge_bench(survey, done).reasons if "placement p1" in r.sentence]
+    assert reason.grade == "care" and "shows the board 24.7 px aside" in reason.sentence

@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +17,7 @@ from bench_world import corner_bench, one_camera, run_of
 from calib.bench.knowledge import Knowledge
 from calib.bench.workspace import Workspace, pointing
 from calib.errors import CalibError
+from calib.fit.bench import SomethingChanged
 from calib.rigid import Rigid
 from calib.survey import read_survey
 from mastctl.bench.eyes import Look
@@ -209,3 +211,23 @@ def _files(folder: Path) -> list[str]:
         return (folder / "images.csv").read_text().splitlines()[1:]
     except OSError:
         return []
+
+
+def test_a_head_that_slipped_ends_the_run_with_the_placement_and_names_it(
+    repository: Path, tmp_path: Path
+) -> None:
+    bench = corner_bench(repository, seed=6)
+    run, _ = run_of(bench, tmp_path / "bench")
+    looked, taken = bench.look, 0
+
+    def look(pan_rad: float, tilt_rad: float, approach: tuple[int, int] = (0, 0)) -> Look:
+        nonlocal taken
+        taken += 1
+        shown = looked(pan_rad + 0.01 * (taken > 6), tilt_rad, approach)
+        read = [replace(one, pan_rad=one.pan_rad - 0.01 * (taken > 6)) for one in shown.seen]
+        return replace(shown, seen=tuple(read))
+
+    bench.look = look  # type: ignore[method-assign]
+    with pytest.raises(SomethingChanged, match=r"slipped by about .* mrad .*p1-006"):
+        run.run()
+    assert run.known.placements() == ["p1"]
