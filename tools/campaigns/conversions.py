@@ -78,7 +78,7 @@ def _row(model: CameraModel, format: str) -> str:
             done = save_any(CameraFile(model, "head"), path, format, limit_px=NO_LIMIT_PX)
             read = load_any(path)
         except BadFile as error:
-            return f"refused: {error.problem}"
+            return f"refused: {error.reason}"
         assert isinstance(read, CameraFile)
         seen = "" if format == "mrcal" else f"{_by_opencv(model, path, format):9.4f}"
         back = np.nan
