@@ -42,6 +42,9 @@ BESIDE_RIM = 2.0
 CONTRAST = 0.35
 """Of the others' median, at least; a corner half behind something has less."""
 
+WIDEST = 1.7
+"""Of the others' median, what blurs an edge at most: something that lies across it makes it wider."""
+
 LEFT_OVER = 0.12
 """Of its contrast, at most, or three times what is usual in the image."""
 
@@ -199,6 +202,7 @@ def _good(saddles: Saddles) -> NDArray[np.bool_]:
             saddles.sigma_px < min(WORST_SIGMA_PX, UNSURE * float(np.nanmedian(saddles.sigma_px)))
         )
         good &= saddles.contrast > CONTRAST * np.nanmedian(saddles.contrast)
+        good &= (saddles.wide_px < WIDEST * np.nanmedian(saddles.wide_px, axis=0)).all(axis=1)
         return np.asarray(good & (left_over < max(LEFT_OVER, 3.0 * float(np.nanmedian(left_over)))))
 
 

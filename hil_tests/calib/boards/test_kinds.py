@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from calib.boards import AprilGrid, Charuco, Checkerboard, DotBoard
+from calib.boards.pattern import pattern_of
 
 CHARUCO = Charuco(9, 12, 0.02, 0.015)
 
@@ -51,3 +52,19 @@ def test_a_bow_lifts_the_middle_towards_who_looks_and_leaves_the_outer_corners()
 def test_a_corner_that_the_board_does_not_have_is_no_place() -> None:
     with pytest.raises(ValueError, match="0 to 87 are"):
         CHARUCO.in_board_m([88])
+
+
+@pytest.mark.parametrize("legacy", [False, True])
+@pytest.mark.parametrize(("columns", "rows", "first_id"), [(5, 7, 0), (6, 8, 17), (7, 6, 17)])
+def test_a_charuco_board_is_drawn_as_opencv_draws_it(
+    columns: int, rows: int, first_id: int, legacy: bool
+) -> None:
+    texels, texel_m = 56, 0.001  # so many that a marker's cells are whole texels
+    board = Charuco(columns, rows, 0.056, 0.042, "DICT_5X5_100", first_id, legacy)
+    dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_5X5_100)
+    ids = np.arange(columns * rows // 2) + first_id
+    theirs = cv2.aruco.CharucoBoard((columns, rows), 0.056, 0.042, dictionary, ids)
+    theirs.setLegacyPattern(legacy)
+    drawing = theirs.generateImage((columns * texels, rows * texels), marginSize=0, borderBits=1)
+    x, y = ((np.arange(n * texels) + 0.5 - n * texels / 2) * texel_m for n in (columns, rows))
+    assert np.array_equal(pattern_of(board).is_black(*np.meshgrid(x, y)), drawing < 128)

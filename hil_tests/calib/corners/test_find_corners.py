@@ -168,6 +168,15 @@ def test_sigmas_of_a_picture_without_blur_are_of_the_size_of_errors() -> None:
     assert 0.4 < float(np.sqrt(np.mean((off / found.sigma_px[:, None]) ** 2))) < 1.6
 
 
+def test_a_blur_of_2_5_px_spoils_no_corner_by_the_markers_beside_it() -> None:
+    place = (0.0, 0.0, 0.5)
+    found = corners_of(CHARUCO, drawn((CHARUCO, (0.1, 0.2, 0.3), place), blur_px=2.5))
+    off = off_px(CHARUCO, found, (0.1, 0.2, 0.3), place)
+    assert len(found) > 40
+    assert float(np.sqrt(np.mean(off**2))) < 0.04  # noise alone: 0.025
+    assert 0.6 < float(np.sqrt(np.mean((off / found.sigma_px[:, None]) ** 2))) < 1.6
+
+
 def test_another_board_than_stated_is_named() -> None:
     image = drawn((CHARUCO, TURN, (0.0, 0.0, 0.7)))
     tags = drawn((APRILGRID, TURN, (0.0, 0.0, 0.7)))
