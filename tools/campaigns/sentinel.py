@@ -43,8 +43,9 @@ RESTS = tuple(
 )
 FEATURES = 60
 JOINT_SIGMA_RAD, BEND_RAD = 2e-4, 1e-4
-LIGHT_PX, EYE_PX, LIGHT_TURN, LIGHT_SCALE = np.array([0.13, 0.13]), 0.03, 1.6e-4, 2.4e-4
-"""What light moves both views of a rest, and one of them, by, turns and stretches it by; one sigma."""
+LIGHT_PX, EYE_PX, LIGHT_TURN, LIGHT_SCALE = np.array([0.16, 0.08]), 0.03, 1e-4, 1.4e-4
+"""What light moves both views of a rest, and one of them, by, turns and stretches it by beside the features'
+own noise; one sigma, of rendered days at any hour (at the same hour two thirds of it)."""
 
 SLOW_RAD, SLOW_DAYS = (2e-5, 1e-4), 60
 """How fast a mast leans, radians a day, and for how long."""
