@@ -47,6 +47,12 @@ def pair(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[BOTH]:
         yield made
 
 
+AWAY = """
+Object.defineProperty(document, "hidden", {configurable: true, get: () => true});
+document.dispatchEvent(new Event("visibilitychange"));
+"""
+
+
 def begin(one: Visit, board: str = "charuco_a3") -> None:
     """Begin one by the form."""
     opened(one)
@@ -237,10 +243,10 @@ def _serious(one: Visit) -> None:
 def test_a_simulated_bench_is_calibrated_from_the_button_to_the_verdict(
     repository: Path, tmp_path: Path, visit: Visits
 ) -> None:
-    """The program itself; pictures are few, since each is drawn, and time goes three times as fast."""
+    """The program itself. The page says that it is not looked at, so that no pictures are drawn for it."""
     shutil.copy(repository / "configs/masts/bench_drawing.yaml", tmp_path)
     config = load_config(repository / "configs/bench.yaml")
-    simulation = {**config.hardware.simulation, "speed": 3.0, "samples": 1, "cameras": {"rate_hz": 2.0}}
+    simulation = {**config.hardware.simulation, "speed": "max", "samples": 1}
     config = replace(
         config,
         mast_file=tmp_path / "bench_drawing.yaml",
@@ -250,8 +256,9 @@ def test_a_simulated_bench_is_calibrated_from_the_button_to_the_verdict(
     )
     with RunningDaemon(config) as daemon:
         one = visit(daemon.url)
-        one.page.context.set_default_timeout(300_000)
+        one.page.context.set_default_timeout(540_000)
         opened(one)
+        one.page.evaluate(AWAY)
         wanted, pictures = one.page.locator(".bench-form input[type=number]").all()
         wanted.fill("5")
         pictures.fill("12")
@@ -260,7 +267,7 @@ def test_a_simulated_bench_is_calibrated_from_the_button_to_the_verdict(
         one.page.wait_for_selector(".coverage:has-text('navcam right')")
         one.page.wait_for_selector(".bench-grade")
         words = shown(one)
-        assert "Trust it" in words or "With care" in words.capitalize(), words
+        assert re.search("Trust it|Use it with care", words), words
         rows = one.page.locator(".residual-table tr").all_inner_texts()
         assert len(rows) == 4 and all(re.search(r"\d\.\d{3}", row) for row in rows[1:]), rows
         one.page.click("#bench-use")
