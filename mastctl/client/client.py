@@ -576,8 +576,8 @@ class Client:
     def keep_place(self, name: str, pan_rad: float, tilt_rad: float) -> dict[str, PlaceTold]:
         """Keep a place of the head by a name, for everybody; return all."""
         body = {"pan_rad": pan_rad, "tilt_rad": tilt_rad}
-        path = f"/places/{quote(name, safe='')}"
-        return cast("PlacesTold", self._daemon.command("POST", path, body))["places"]
+        answer = self._daemon.command("POST", f"/places/{quote(name, safe='')}", body)
+        return cast("PlacesTold", answer)["places"]
 
     def forget_place(self, name: str) -> dict[str, PlaceTold]:
         """Forget a place; return those that are left. Raises ClientError ``place_unknown``."""
