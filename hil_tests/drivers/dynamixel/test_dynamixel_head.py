@@ -16,6 +16,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from drivers.dynamixel.head import open_head
@@ -260,11 +261,11 @@ def test_a_goal_is_approached_from_the_configured_side() -> None:
         head = it.open()
         head.move(0.0, 0.5)
         settled(head)
-        lowest = [1.0]
+        begun_s = time.monotonic()
         head.move(0.0, 0.2)
-        while (reading := head.read()).moving:
-            lowest.append(reading.tilt_rad)
-        assert min(lowest) < 0.2 - 0.03
+        reading = settled(head)
+        way = np.linspace(begun_s, time.monotonic(), 500)
+        assert 0.2 - 0.06 < min(it.axes[1].mechanical_rad(moment_s) for moment_s in way) < 0.2 - 0.03
         assert reading.tilt_rad == pytest.approx(0.2, abs=COUNT_RAD)
         assert head.report()["tilt"].side == "positive"
         told = head.axis_motion()
