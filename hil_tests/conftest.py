@@ -45,7 +45,11 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     )
 
 
-LONG = ("test_on_a_real_driver", "test_closed_loop", "test_bench_suite", "test_packaging", "test_camera_sync")
+LONG = (
+    "test_on_a_real_driver", "test_closed_loop", "test_bench_suite", "test_packaging", "test_camera_sync",
+    "test_campaign_tasks", "test_guided_bench", "test_page_bench", "test_soak_and_faults",
+    "test_health_end_to_end",
+)  # fmt: skip
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

@@ -115,7 +115,7 @@ def small_works() -> list[Work[Any, Any]]:
         render_bias.run_row: [render_bias.Row("flat", "hazcam turned", 2.0, n, 1, 2, 1) for n in (1, 2)],
         life.offs: [life.Head("few or more", head, moves, 1) for moves in (2, 3)],
         keep_out.run_case: [keep_out.Case(f"suite/{name}", True) for name in "ab"],
-        match_sigma.run_look: [match_sigma.Look(rig, relief_m, 1, 0, 2) for relief_m in (0.15, 0.5)],
+        match_sigma.run_look: [match_sigma.Look(rig, 0.5, 1, number, 1) for number in (0, 1)],
     }
     return [Work(function, pair, lambda _: "small") for function, pair in tasks.items()]
 
