@@ -240,6 +240,9 @@ def _sentence(error: ClientError) -> str:
         return f"somebody else steers the head: {error}"
     if error.code == "estopped":
         return f"the emergency stop is latched ('mastctl reset' releases it): {error}"
+    if error.code == "lease_over" and "the head was stopped" in str(error):
+        how = str(error).removeprefix("the lease has ended: ").removesuffix("; acquire another")
+        return f"{how}; 'mastctl reset' releases it" if "emergency" in how else how
     if "picture is dark" in str(error):
         return f"{error}; turn on a light, or let the camera expose longer"
     return str(error)

@@ -256,7 +256,7 @@ def _bench(args: argparse.Namespace, board: Any, folder: Path) -> Iterator[tuple
             if granted:
                 client.use_lease(granted)
             else:
-                stack.enter_context(client.lease(name="calibrate bench"))
+                stack.enter_context(client.lease(name="calibrate bench", ends_with_stop=True))
         except ClientError as error:
             raise Interrupted(f"the head cannot be steered: {error}") from None
         served = list(client.status()["cameras"])

@@ -78,7 +78,7 @@ def _steering(args: argparse.Namespace, client: Client) -> Iterator[None]:
     if args.lease is not None:
         yield
         return
-    with client.lease(NAME, for_s=120.0):
+    with client.lease(NAME, for_s=120.0, ends_with_stop=True):
         yield
 
 

@@ -38,7 +38,7 @@ class BenchEvent(TypedDict):
 
 
 class BenchListed(TypedDict):
-    """A bench calibration whose folder is there."""
+    """A bench calibration whose folder is there; ``size_mb``: of its pictures."""
 
     name: str
     begun: str
@@ -47,6 +47,7 @@ class BenchListed(TypedDict):
     state: Literal["running", "done", "interrupted", "damaged"]
     sentence: str
     pictures: int
+    size_mb: float
     grade: str | None
     mast_file: str | None
     report: str | None

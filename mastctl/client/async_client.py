@@ -103,6 +103,7 @@ class AsyncClient:
         for_s: float = 30.0,
         take_over: str | None = None,
         gives_way: bool = False,
+        ends_with_stop: bool = False,
     ) -> AsyncIterator[HeldLease]:
         """Steer alone inside the block: a thread renews the lease, and this client's commands carry it.
 
@@ -117,6 +118,9 @@ class AsyncClient:
         gives_way
             Whether it ends as soon as anybody else wants to steer, or stops the head: for what is done when
             nobody needs the head.
+        ends_with_stop
+            Whether it ends as soon as anybody stops the head: for a program that would go on with its next
+            move otherwise.
 
         Yields
         ------
@@ -128,7 +132,7 @@ class AsyncClient:
         ClientError
             ``leased`` if somebody else steers.
         """
-        granted = await self.acquire_lease(name, for_s, take_over, gives_way)
+        granted = await self.acquire_lease(name, for_s, take_over, gives_way, ends_with_stop)
         before, held = (self._daemon.lease_id, HeldLease(self._daemon, granted, for_s))
         self._daemon.lease_id = held.id
         try:
@@ -148,6 +152,7 @@ class AsyncClient:
         for_s: float = 30.0,
         take_over: str | None = None,
         gives_way: bool = False,
+        ends_with_stop: bool = False,
     ) -> LeaseGranted:
         """Acquire or take over a lease that nobody renews; arguments as for `lease`.
 
@@ -163,6 +168,8 @@ class AsyncClient:
             )
         if gives_way:
             body["gives_way"] = True
+        if ends_with_stop:
+            body["ends_with_stop"] = True
         return cast("LeaseGranted", await self._daemon.command("POST", "/lease", body))
 
     def use_lease(self, lease_id: str | None) -> None:
@@ -385,6 +392,13 @@ class AsyncClient:
     async def leave_bench(self) -> BenchRunTold:
         """End the bench calibration; it can go on later (`begin_bench`, ``goes_on``)."""
         return cast("BenchBegun", await self._daemon.command("POST", "/bench/leave"))["run"]
+
+    async def forget_bench(self, name: str) -> BenchTold:
+        """Remove a bench calibration that is over, with its pictures and report; its mast file stays.
+
+        Returns what is left, as `bench`. Refused with ``bench_runs``, ``bench_unknown``, ``unwritable``.
+        """
+        return cast("BenchTold", await self._daemon.command("DELETE", f"/bench/runs/{quote(name, safe='')}"))
 
     async def reports(self) -> ReportsTold:
         """Return the reports that can be read, the newest first."""

@@ -21,8 +21,8 @@ from drivers.clock import Clock
 from mastctl.commands.audit import AuditLog
 from mastctl.commands.caller import Caller, Role
 from mastctl.commands.idempotency import Answer, Answers
-from mastctl.commands.lease import Leases
-from mastctl.errors import BadRequest, MastctlError, NotNow, error_body
+from mastctl.commands.lease import Leases, StopCame
+from mastctl.errors import BadRequest, MastctlError, NotNow, Stopped, error_body
 from mastctl.state.publisher import Publisher
 from mastctl.state.refusals import Need
 
@@ -80,6 +80,7 @@ PLACE_FORGET = Command("place.forget")
 BENCH = Command("bench", steers=True, need="track")
 BENCH_STANDS = Command("bench.stands")  # a fact about the board, told by who has placed it
 BENCH_LEAVE = Command("bench.leave")
+BENCH_FORGET = Command("bench.forget")
 LEASE = Command("lease")
 LEASE_RENEW = Command("lease.renew")
 LEASE_RELEASE = Command("lease.release")
@@ -110,6 +111,9 @@ class Asked:
         How long it is given from ``asked_s`` on, seconds of the daemon's clock; None for the usual time.
     asked_s
         When it came, by the daemon's clock; needed for a deadline only.
+    last_stop
+        `mastctl.commands.lease.Leases.last_stop` when it came: what steers is not carried out after a later
+        one. None: that is not known.
     """
 
     caller: Caller
@@ -118,6 +122,7 @@ class Asked:
     lease: str | None = None
     key: str | None = None
     deadline_s: float | None = None
+    last_stop: StopCame | None = None
 
     def __post_init__(self) -> None:
         deadline_s = self.deadline_s
@@ -129,10 +134,12 @@ class Asked:
 
 
 class JudgesAndEnds(Protocol):
-    """What of `mastctl.operations.operations.Operations` refuses what does not fit, and ends what is late."""
+    """What of `mastctl.operations.operations.Operations` refuses what does not fit, and ends what is late, or
+    was asked for before a stop."""
 
     def refusal(self, need: Need) -> MastctlError | None: ...
     def end_within(self, name: str, left_s: float, told_s: float) -> None: ...
+    def end_stopped(self, name: str) -> None: ...
 
 
 class Entry:
@@ -196,7 +203,8 @@ class Entry:
             ``key_reused``.
         NotNow
             ``deadline_passed`` if its time was over before it began; ``leased``, ``lease_over``,
-            ``lease_unknown``; ``key_in_use``; what the state refuses.
+            ``lease_unknown``; ``key_in_use``; ``stopped`` if a stop came since it was asked for; what the
+            state refuses.
         """
         again = False
         try:
@@ -216,7 +224,9 @@ class Entry:
 
     def first(self, command: Command, asked: Asked, act: Callable[[], Answer]) -> Answer:
         """Carry out a stop: it acts before anything is asked, locked or written, and is recorded after."""
-        self.leases.stop_came()  # takes no lock
+        by = asked.caller.name
+        how = f"an emergency stop ({by})" if command is ESTOP else by
+        self.leases.stop_came(f"the head was stopped by {how}")  # takes no lock
         try:
             answer = act()
         except BaseException as error:
@@ -243,6 +253,10 @@ class Entry:
         if asked.deadline_s is not None and self._left_s(asked, asked.deadline_s) <= 0.0:
             words = f"the {asked.deadline_s:g} s for {command.name} were over before it could begin"
             raise NotNow("deadline_passed", words)
+        if self._stopped_since(command, asked):
+            raise Stopped(
+                f"{command.name} was asked for before a stop came, and is not carried out; ask again"
+            )
         steering: AbstractContextManager[None] = nullcontext()
         if command.steers:
             steering = self.leases.steering(asked.caller, asked.lease)
@@ -252,10 +266,16 @@ class Entry:
                 raise refusal
             answer = act()
             operation = _operation_of(answer)
+            if operation is not None and self._stopped_since(command, asked):
+                self._operations.end_stopped(operation)
             allowed_s = usual_s if asked.deadline_s is None else asked.deadline_s
             if operation is not None and allowed_s is not None and operation not in self._began:
                 self._operations.end_within(operation, self._left_s(asked, allowed_s), allowed_s)
             return answer
+
+    def _stopped_since(self, command: Command, asked: Asked) -> bool:
+        """Whether a stop came after a command that steers was asked for."""
+        return command.steers and asked.last_stop not in (None, self.leases.last_stop)
 
     def _left_s(self, asked: Asked, allowed_s: float) -> float:
         return asked.asked_s + allowed_s - self._clock.now_s()

@@ -35,11 +35,19 @@ class Leased(NotNow):
         super().__init__("leased", f"{control.sentence(now_s)}; wait, or take over with a reason")
 
 
+@dataclass(frozen=True, eq=False)
+class StopCame:
+    """A stop that came; ``how`` tells which, and by whom."""
+
+    how: str = "the head was stopped"
+
+
 @dataclass(frozen=True)
 class Lease:
     """The right to steer until ``until_s``, seconds of the lease's clock.
 
     One that ``gives_way`` ends as soon as anybody else wants to steer, or stops the head.
+    ``last_stop`` is that of `Leases.last_stop` after which the next one ends it; None: no stop does.
     """
 
     id: str
@@ -48,7 +56,7 @@ class Lease:
     for_s: float
     until_s: float
     gives_way: bool = False
-    stops: object = None  # of those there were when it was granted, the last
+    last_stop: StopCame | None = None
 
 
 @dataclass(frozen=True)
@@ -109,7 +117,7 @@ class Leases:
         self._running = running
         self._on_change = on_change
         self._give_way = give_way
-        self._last_stop: object = None
+        self._last_stop = StopCame()
         self._lock = threading.Lock()
         self._lease: Lease | None = None
         self._over: dict[str, str] = {}  # id of an ended lease: how it ended
@@ -119,7 +127,7 @@ class Leases:
     def control(self) -> Control | None:
         """Return who steers now, None for nobody."""
         lease = self._lease
-        if lease is not None and self._clock.now_s() < lease.until_s and not self._was_stopped(lease):
+        if lease is not None and self._clock.now_s() < lease.until_s and not self.was_stopped(lease):
             return Control(lease.holder, "lease", lease.until_s)
         under_way = next(iter(tuple(self._under_way.values())), None)
         party = under_way or (self._party if self._running() else None)
@@ -134,12 +142,26 @@ class Leases:
         """Return a lease as `told` would, whoever steers meanwhile."""
         return Control(lease.holder, "lease", lease.until_s).told(self._clock.now_s())
 
-    def stop_came(self) -> None:
-        """End a lease that gives way, since somebody stops the head. Takes no lock, waits for nothing."""
-        self._last_stop = object()
+    @property
+    def last_stop(self) -> StopCame:
+        """The last stop; another object as soon as another one comes. Takes no lock."""
+        return self._last_stop
+
+    def stop_came(self, how: str = "the head was stopped") -> None:
+        """End a lease that ends with a stop: somebody stops the head. Takes no lock, waits for nothing."""
+        self._last_stop = StopCame(how)
+
+    def was_stopped(self, lease: Lease) -> bool:
+        """Return whether a stop has come that ends a lease; takes no lock."""
+        return lease.last_stop is not None and lease.last_stop is not self._last_stop
 
     def acquire(
-        self, caller: Caller, name: str | None = None, for_s: float = USUAL_S, gives_way: bool = False
+        self,
+        caller: Caller,
+        name: str | None = None,
+        for_s: float = USUAL_S,
+        gives_way: bool = False,
+        ends_with_stop: bool = False,
     ) -> Lease:
         """Return a new lease if nobody else steers, or who does gives way.
 
@@ -153,6 +175,8 @@ class Leases:
             How long, seconds.
         gives_way
             Whether it ends as soon as anybody else wants to steer, or stops the head.
+        ends_with_stop
+            Whether it ends as soon as anybody stops the head, and for that alone.
 
         Raises
         ------
@@ -166,7 +190,8 @@ class Leases:
         _check_time(for_s)
         with self._changing():
             why = self._check_free(caller)
-            lease = self._grant(name or caller.name, for_s, gives_way)
+            last_stop = self._last_stop if gives_way or ends_with_stop else None
+            lease = self._grant(name or caller.name, for_s, gives_way, last_stop)
         if why:
             self._give_way(why)
         return lease
@@ -200,17 +225,25 @@ class Leases:
             self._held_by(lease_id)
             self._end("it was released")
 
-    def take(self, caller: Caller, reason: str, name: str | None = None, for_s: float = USUAL_S) -> Lease:
+    def take(
+        self,
+        caller: Caller,
+        reason: str,
+        name: str | None = None,
+        for_s: float = USUAL_S,
+        last_stop: StopCame | None = None,
+    ) -> Lease:
         """Return a new lease, whoever steers; the former holder is told by whom it was taken, and why.
 
-        What runs goes on, but for what runs under a lease that gives way. Raises as `acquire`.
+        What runs goes on, but for what runs under a lease that gives way. With ``last_stop`` it ends with the
+        first stop after that one. Raises as `acquire`.
         """
         _check_time(for_s)
         with self._changing():
             gave_way = self._lease is not None and self._lease.gives_way and self._running()
             how = f"{name or caller.name} took over: {reason}"
             self._end(how)
-            lease = self._grant(name or caller.name, for_s)
+            lease = self._grant(name or caller.name, for_s, last_stop=last_stop)
         if gave_way:
             self._give_way(how)
         return lease
@@ -258,8 +291,8 @@ class Leases:
                 before = self._lease
                 if before is not None and self._clock.now_s() >= before.until_s:
                     self._end(f"its {before.for_s:g} s were over")
-                elif before is not None and self._was_stopped(before):
-                    self._end("the head was stopped")
+                elif before is not None and self.was_stopped(before):
+                    self._end(self._last_stop.how)
                 try:
                     yield
                 finally:
@@ -283,9 +316,6 @@ class Leases:
             raise Leased(control, self._clock.now_s())
         return ""
 
-    def _was_stopped(self, lease: Lease) -> bool:
-        return lease.gives_way and lease.stops is not self._last_stop
-
     def _held_by(self, lease_id: str) -> Lease:
         """Return the lease that runs, if it is this one."""
         lease = self._lease
@@ -296,11 +326,11 @@ class Leases:
             raise NotNow("lease_unknown", "the lease is not known, or ended long ago; acquire one")
         raise NotNow("lease_over", f"the lease has ended: {how}; acquire another")
 
-    def _grant(self, holder: str, for_s: float, gives_way: bool = False) -> Lease:
+    def _grant(
+        self, holder: str, for_s: float, gives_way: bool = False, last_stop: StopCame | None = None
+    ) -> Lease:
         now_s = self._clock.now_s()
-        self._lease = Lease(
-            secrets.token_hex(16), holder, now_s, for_s, now_s + for_s, gives_way, self._last_stop
-        )
+        self._lease = Lease(secrets.token_hex(16), holder, now_s, for_s, now_s + for_s, gives_way, last_stop)
         return self._lease
 
     def _end(self, how: str) -> None:

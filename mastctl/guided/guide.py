@@ -25,12 +25,12 @@ from typing import Any, Protocol
 from calib.errors import BadFile
 from drivers.errors import DriverError
 from mastctl.commands.caller import Caller
-from mastctl.commands.lease import Lease, Leases
+from mastctl.commands.lease import Lease, Leases, StopCame
 from mastctl.errors import BadRequest, MastctlError, NotNow, Unable
 from mastctl.guided.child import Child
 from mastctl.guided.runs import Folder, Runs, board_bytes, keep_board, known_boards
 from mastctl.guided.told import Run, State, ended, heard
-from mastctl.state.publisher import Published, Publisher
+from mastctl.state.publisher import Published, Publisher, ThreadSubscription
 
 log = logging.getLogger(__name__)
 
@@ -39,6 +39,9 @@ LEASE_S, RENEW_S = 30.0, 8.0
 LOOK_S = 0.5
 SILENT_S = 900.0
 """A search all over the limits takes minutes, and says little; longer than this hangs."""
+
+TOLD_S = 2.0
+"""So long it is waited to hear who pressed a stop that has ended the lease already."""
 
 LINGERS_S = 10.0
 """After it has told its end a program is given so long to be over."""
@@ -199,8 +202,16 @@ class Guide:
             "simulated": self._simulated,
         }
 
-    def start(self, wanted: Wanted, who: str) -> Run:
+    def start(self, wanted: Wanted, who: str, last_stop: StopCame | None = None) -> Run:
         """Begin a run, or go on with one, and return it.
+
+        Parameters
+        ----------
+        wanted, who
+            What is asked for, and by whom.
+        last_stop
+            `mastctl.commands.lease.Leases.last_stop` when it was asked for: the next stop ends the program's
+            right to steer, before the program itself is ended. None: that of now.
 
         Raises
         ------
@@ -209,14 +220,14 @@ class Guide:
         NotKnown
             ``bench_unknown``.
         BadRequest
-            ``bad_board``.
+            ``bad_board``, ``bad_run``.
         Unable
             ``unwritable``, ``disk_low``, ``no_process``, ``closing``.
         """
         if not self._starting.acquire(blocking=False):
             raise NotNow("bench_runs", "another bench calibration begins just now")
         try:
-            return self._start(wanted, who)
+            return self._start(wanted, who, last_stop or self._leases.last_stop)
         finally:
             self._starting.release()
 
@@ -243,6 +254,31 @@ class Guide:
         self._finish(work, "interrupted", "left", f"{who} ended the run; {GOES_ON}", and_motion=True)
         return work.run
 
+    def forget(self, name: str) -> dict[str, Any]:
+        """Remove a run that is over, with all it saw and its report; return what is left, as `told`.
+
+        Its mast file stays where it is.
+
+        Raises
+        ------
+        NotNow
+            ``bench_runs`` for the run that is at work, or while one begins.
+        NotKnown
+            ``bench_unknown``.
+        Unable
+            ``unwritable``.
+        """
+        if not self._starting.acquire(blocking=False):
+            raise NotNow("bench_runs", "a bench calibration begins just now")
+        try:
+            now = self.run
+            if now is not None and not now.over and now.name == name:
+                raise NotNow("bench_runs", f"run {name} is at work; end it first")
+            self.runs.forget(name)
+        finally:
+            self._starting.release()
+        return self.told()
+
     def close(self) -> None:
         """End the program, if one is at work, and begin no other; never raises."""
         self._closed = True
@@ -252,7 +288,7 @@ class Guide:
 
     # Begin
 
-    def _start(self, wanted: Wanted, who: str) -> Run:
+    def _start(self, wanted: Wanted, who: str, last_stop: StopCame) -> Run:
         now, door = self.run, self.door
         if now is not None and not now.over:
             raise NotNow("bench_runs", f"{now.by} has a bench calibration running since {now.begun}")
@@ -261,7 +297,8 @@ class Guide:
         masts = self._masts_folder()
         _check_room(masts, self.runs.folder.parent)
         folder, asked = self._asked(wanted, who)
-        lease = self._leases.take(Caller(HOLDER, "operate", "inside"), f"{who} began it", HOLDER, LEASE_S)
+        inside = Caller(HOLDER, "operate", "inside")
+        lease = self._leases.take(inside, f"{who} began it", HOLDER, LEASE_S, last_stop)
         text, give_back = (None, lambda: None) if door.lend is None else door.lend(HOLDER)
         run = Run(
             folder.name,
@@ -301,8 +338,12 @@ class Guide:
             folder = self.runs.named(wanted.goes_on)
             try:
                 before, end = folder.asked(), folder.end()
+                before |= {"begun": str(before["begun"]), "mast_file": str(before["mast_file"])}
             except BadFile as error:
                 raise BadRequest("bad_run", str(error)) from None
+            except KeyError as error:
+                words = f"{folder.path / 'run.json'}: {error.args[0]} is missing; begin another run"
+                raise BadRequest("bad_run", words) from None
             if end is not None and end.get("state") == "done":
                 raise NotNow("bench_done", f"run {folder.name} has its verdict; begin another")
         else:
@@ -370,8 +411,10 @@ class Guide:
                 stopped = next(filter(None, map(_stop_of, news.wait(LOOK_S))), None)
                 if work.over.is_set():
                     return
+                if stopped is None and self._leases.was_stopped(work.lease):
+                    stopped = _who_stopped(news)
                 if stopped is not None:
-                    words = f"{stopped}; the head stands still, {GOES_ON}"
+                    words = f"{stopped}, {GOES_ON}"
                     self._finish(work, "interrupted", "stopped", words, and_motion=True)
                     return
                 try:
@@ -443,11 +486,22 @@ class Guide:
 
 
 def _stop_of(one: Published) -> str | None:
-    """Who pressed stop, if that is what was published."""
+    """Who pressed stop and whether the head confirmed it, if that is what was published."""
     if one.topic != "command" or one.value.get("command") not in ("stop", "estop") or "ended" in one.value:
         return None
     what = "stop" if one.value["command"] == "stop" else "the emergency stop"
-    return f"{one.value.get('who', 'somebody')} pressed {what}"
+    stands = "the head stands still" if one.value.get("result") == "ok" else "the head did not confirm it"
+    return f"{one.value.get('who', 'somebody')} pressed {what}; {stands}"
+
+
+def _who_stopped(news: ThreadSubscription) -> str:
+    """Who pressed the stop that has ended the lease: it is published when the head has confirmed it."""
+    until_s = time.monotonic() + TOLD_S
+    while (left_s := until_s - time.monotonic()) > 0.0 and not news.closed:
+        stopped = next(filter(None, map(_stop_of, news.wait(left_s))), None)
+        if stopped is not None:
+            return stopped
+    return "somebody pressed stop"
 
 
 def _check_room(masts: Path, state: Path) -> None:

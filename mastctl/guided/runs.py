@@ -10,6 +10,7 @@
 from __future__ import annotations
 
 import re
+import shutil
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -103,6 +104,7 @@ class Folder:
             "state": state,
             "sentence": str(end.get("sentence", cut)),
             "pictures": _pictures(self.seen),
+            "size_mb": _size_mb(self.seen),
             "grade": end.get("grade"),
             "mast_file": asked.get("mast_file") if state == "done" else None,
             "report": self.name if self.page.is_file() else None,
@@ -136,6 +138,17 @@ class Runs:
                 return one
         raise NotKnown("bench_unknown", f"there is no run '{name[:60]}' in {self.folder}")
 
+    def forget(self, name: str) -> None:
+        """Remove a run's folder. Raises NotKnown ``bench_unknown``, Unable ``unwritable``."""
+        folder = self.named(name).path
+        going = folder.with_name(f"{name}.removed")  # a half of it is no run
+        try:
+            folder.rename(going)
+            shutil.rmtree(going)
+        except OSError as error:
+            left = going if going.exists() else folder
+            raise Unable("unwritable", f"{left} cannot be removed: {error.strerror or error}") from None
+
     def all(self) -> list[Folder]:
         """Return all, the newest first. What is no run's folder, or a link, is passed over."""
         try:
@@ -156,7 +169,8 @@ class Runs:
             except BadFile as error:
                 yield {
                     "name": one.name, "begun": "", "by": "", "board": "", "state": "damaged",
-                    "sentence": str(error), "pictures": 0, "grade": None, "mast_file": None, "report": None,
+                    "sentence": str(error), "pictures": 0, "size_mb": 0.0, "grade": None,
+                    "mast_file": None, "report": None,
                 }  # fmt: skip
 
 
@@ -195,6 +209,14 @@ def keep_board(folder: Folder, data: bytes) -> None:
     except OSError as error:
         words = f"{folder.board} cannot be written: {error.strerror or error}"
         raise Unable("unwritable", words) from None
+
+
+def _size_mb(seen: Path) -> float:
+    """How large the pictures are, which are nearly all of a run."""
+    try:
+        return sum(one.stat().st_size for one in (seen / "images").iterdir()) / 1e6
+    except OSError:
+        return 0.0
 
 
 def _pictures(seen: Path) -> int:

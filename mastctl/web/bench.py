@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import hashlib
 from typing import Annotated, Any
 
 from fastapi import FastAPI, Path, Response
 
-from mastctl.commands.entry import BENCH, BENCH_LEAVE, BENCH_STANDS
+from mastctl.commands.entry import BENCH, BENCH_FORGET, BENCH_LEAVE, BENCH_STANDS
+from mastctl.guided.runs import NAME
 from mastctl.service.service import Service
 from mastctl.web import PREFIX
 from mastctl.web.commands import Commands, Headers
@@ -18,6 +20,7 @@ REPORT = (
     "form-action 'none'; frame-ancestors 'none'"
 )
 """The Content-Security-Policy of a report: its own styles and drawings, no script, an origin of nobody's."""
+RunName = Annotated[str, Path(pattern=f"^{NAME.pattern}$")]
 ReportName = Annotated[str, Path(pattern="^[A-Za-z0-9][A-Za-z0-9._-]{0,99}$")]
 
 
@@ -31,14 +34,15 @@ def add_bench(app: FastAPI, service: Service, waiting: Waiting, commands: Comman
 
     @app.post(f"{PREFIX}/bench", status_code=202, summary="Begin a bench calibration, or go on with one")
     async def begin(body: BenchBody, came: Headers) -> dict[str, Any]:
-        wanted, who = body.wanted(), came.caller.name
+        wanted, who, last_stop = body.wanted(), came.caller.name, service.leases.last_stop
 
         def act() -> dict[str, Any]:
-            return {"run": guide.start(wanted, who).told()}
+            return {"run": guide.start(wanted, who, last_stop).told()}
 
         asked = body.model_dump(exclude_none=True)
         if body.board_file is not None:
-            asked["board_file"] = f"{len(body.board_file)} signs"
+            digest = hashlib.sha256(body.board_file.encode("utf-8", "surrogatepass")).hexdigest()
+            asked["board_file"] = f"{len(body.board_file)} signs, SHA-256 {digest[:16]}"
         return await commands.run(BENCH, came, asked, act)
 
     @app.post(f"{PREFIX}/bench/stands", summary="Say that the board stands where it was asked for")
@@ -49,6 +53,13 @@ def add_bench(app: FastAPI, service: Service, waiting: Waiting, commands: Comman
     async def leave(came: Headers) -> dict[str, Any]:
         who = came.caller.name
         return await commands.run_beside(BENCH_LEAVE, came, lambda: {"run": guide.leave(who).told()})
+
+    @app.delete(
+        f"{PREFIX}/bench/runs/{{name}}",
+        summary="Remove a bench calibration that is over, pictures and report",
+    )
+    async def forget(name: RunName, came: Headers) -> dict[str, Any]:
+        return await commands.run(BENCH_FORGET, came, {"name": name}, lambda: guide.forget(name))
 
     @app.get(f"{PREFIX}/reports", summary="The reports that can be read")
     async def listed() -> dict[str, Any]:

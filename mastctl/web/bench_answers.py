@@ -115,7 +115,7 @@ class BenchRunTold(_Told):
 
 
 class BenchListed(_Told):
-    """A bench calibration whose folder is there."""
+    """A bench calibration whose folder is there; ``size_mb``: of its pictures."""
 
     name: str
     begun: str
@@ -124,6 +124,7 @@ class BenchListed(_Told):
     state: Literal["running", "done", "interrupted", "damaged"]
     sentence: str
     pictures: Count
+    size_mb: float
     grade: str | None
     mast_file: str | None
     report: str | None

@@ -130,6 +130,7 @@ class Commands:
             came.lease,
             came.key if keyed else None,
             min(times_s, default=None),
+            self._service.leases.last_stop,
         )
 
 

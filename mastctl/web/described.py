@@ -68,6 +68,7 @@ ANSWERS: Mapping[str, type[BaseModel]] = {
     "POST /bench": bench.BenchBegun,
     "POST /bench/stands": bench.BenchBegun,
     "POST /bench/leave": bench.BenchBegun,
+    "DELETE /bench/runs/{name}": bench.BenchTold,
     "GET /reports": bench.ReportsTold,
     "GET /session": told.SessionTold,
     "POST /login": told.SessionTold,

@@ -36,7 +36,9 @@ def add_lease(app: FastAPI, service: Service, commands: Commands) -> None:
             LEASE,
             came,
             told(body),
-            lambda: granted(leases.acquire(came.caller, name, body.for_s, body.gives_way)),
+            lambda: granted(
+                leases.acquire(came.caller, name, body.for_s, body.gives_way, body.ends_with_stop)
+            ),
         )
 
     @app.post(f"{PREFIX}/lease/renew", summary="Have the lease run for its time from now on")

@@ -71,12 +71,14 @@ class ResetBody(_Strict):
 class LeaseBody(_Strict):
     """``POST /lease``: how long, and whose it is, if not the caller's.
 
-    ``gives_way``: it ends as soon as anybody else wants to steer, or stops the head.
+    ``gives_way``: it ends as soon as anybody else wants to steer, or stops the head; ``ends_with_stop``: with
+    a stop only.
     """
 
     name: Name | None = None
     for_s: LeaseS = USUAL_S
     gives_way: bool = False
+    ends_with_stop: bool = False
 
 
 class RenewBody(_Strict):

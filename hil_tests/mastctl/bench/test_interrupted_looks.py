@@ -87,6 +87,22 @@ def test_a_stop_an_emergency_stop_and_a_lease_that_is_taken_are_told_apart(url: 
     assert "Ana took over: the head is needed" in told
 
 
+def test_a_stop_between_two_moves_ends_it_and_is_told(url: str) -> None:
+    with (
+        Client(url, name="Ana") as ana,
+        Client(url, name="bench") as client,
+        client.lease(name="calibrate bench", ends_with_stop=True),
+    ):
+        eyes = DaemonEyes(client, ("navcam_left",), BOARD)
+        eyes.look(0.1, 0.0)
+        ana.stop()
+        stands = ana.status()["joints"]
+        with pytest.raises(Interrupted, match=r"^the head was stopped by Ana$"):
+            eyes.look(0.2, 0.0)
+        now = ana.status()["joints"]
+        assert stands is not None and now is not None and now["pan_rad"] == stands["pan_rad"]
+
+
 def test_a_daemon_that_is_killed_is_told_as_gone(daemon: tuple[str, subprocess.Popen[str]]) -> None:
     url, process = daemon
     told = far_look(url, lambda ana: process.kill())

@@ -34,6 +34,7 @@ class World:
         self.path = path
         self.audit = AuditLog(path)
         self.deadlines: list[tuple[str, float, float]] = []
+        self.ended_by_stop: list[str] = []
         self.refuses: str | None = None
         self.publisher = Publisher()
         self.entry = Entry(
@@ -54,6 +55,9 @@ class World:
 
     def end_within(self, name: str, left_s: float, allowed_s: float) -> None:
         self.deadlines.append((name, left_s, allowed_s))
+
+    def end_stopped(self, name: str) -> None:
+        self.ended_by_stop.append(name)
 
     def refusal(self, need: str) -> NotNow | None:
         return None if self.refuses is None else NotNow(self.refuses, f"{need} does not fit")
@@ -275,3 +279,22 @@ def test_of_heartbeats_the_first_is_recorded_and_what_is_refused(world: World) -
     told = [(line.get("result"), line.get("ended")) for line in world.lines()]
     assert told == [("ok", None), ("leased", None), (None, "000001-abcd")]
     assert world.deadlines == [("000001-abcd", 9.0, 9.0)]
+
+
+def test_what_steers_and_was_asked_for_before_a_stop_is_not_carried_out_after_it(world: World) -> None:
+    early = world.asked(last_stop=world.leases.last_stop)
+    world.entry.first(STOP, world.asked(ROVER), dict)
+    words = refused("stopped", lambda: world.entry.run(POINT, early, world.act))
+    assert "asked for before a stop came" in words and world.acts == 0
+    world.entry.run(POSE, early, dict)  # moves nothing
+    world.entry.run(POINT, world.asked(last_stop=world.leases.last_stop), world.act)
+    assert world.acts == 1 and world.ended_by_stop == []
+
+
+def test_what_begins_while_a_stop_comes_is_ended_by_it(world: World) -> None:
+    def act() -> Answer:
+        world.leases.stop_came()
+        return world.act()
+
+    world.entry.run(POINT, world.asked(last_stop=world.leases.last_stop), act)
+    assert world.ended_by_stop == ["000001-abcd"]

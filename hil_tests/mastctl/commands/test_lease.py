@@ -249,3 +249,26 @@ def test_a_stop_ends_a_lease_that_gives_way_and_no_other(world: World) -> None:
     assert "the head was stopped" in refused("lease_over", lambda: world.steer(BENCH, lease))
     assert "the head was stopped" in refused("lease_over", lambda: world.leases.renew(lease.id))
     world.steer(BENCH, world.leases.acquire(BENCH, gives_way=True))
+
+
+def test_a_lease_that_ends_with_a_stop_gives_way_to_nobody_and_is_over_when_one_comes(world: World) -> None:
+    lease = world.leases.acquire(BENCH, ends_with_stop=True)
+    refused("leased", lambda: world.steer(ROVER))
+    refused("leased", lambda: world.leases.acquire(ROVER))
+    world.leases.renew(lease.id)
+    assert not world.leases.was_stopped(lease)
+    with world.leases._lock:  # whoever holds it, the stop waits for nobody
+        world.leases.stop_came()
+        assert world.leases.was_stopped(lease) and world.leases.control() is None
+    assert "the head was stopped" in refused("lease_over", lambda: world.steer(BENCH, lease))
+    assert world.gave_way == []
+
+
+def test_a_lease_that_is_taken_ends_with_a_stop_that_came_while_it_was_being_asked_for(world: World) -> None:
+    before = world.leases.last_stop
+    world.leases.stop_came()
+    lease = world.leases.take(BENCH, "the run begins", last_stop=before)
+    assert world.leases.control() is None
+    assert "the head was stopped" in refused("lease_over", lambda: world.steer(BENCH, lease))
+    lease = world.leases.take(BENCH, "another begins", last_stop=world.leases.last_stop)
+    world.steer(BENCH, lease)

@@ -18,7 +18,7 @@ from mastctl.commands.caller import Caller
 from mastctl.errors import BadRequest, MastctlError, NotKnown, NotNow, Unable
 from mastctl.guided import child as child_module
 from mastctl.guided import guide as guide_module
-from mastctl.guided.guide import Door, command_of
+from mastctl.guided.guide import Door, Wanted, command_of
 from mastctl.guided.runs import Folder
 from mastctl.guided.told import MOST_SENTENCES, Run, heard
 
@@ -161,6 +161,65 @@ def test_a_stop_ends_the_run_and_what_it_began_meanwhile_and_waits_for_neither(t
         run = made.until("interrupted")
         assert run.code == "stopped" and run.sentence.startswith("Bo pressed stop; the head stands still")
         assert made.stops.running is None and gone(pid) and made.leases.control() is None
+
+
+def test_a_stop_takes_the_programs_right_to_steer_before_anybody_hears_of_it(tmp_path: Path) -> None:
+    with world(tmp_path, lines(BEGUN) + "time.sleep(60)\n") as made:
+        made.begin()
+        work = made.guide._work
+        assert work is not None
+        with made.leases.steering(BO, work.lease.id):
+            pass
+        made.leases.stop_came()
+        with pytest.raises(NotNow, match="the head was stopped"), made.leases.steering(BO, work.lease.id):
+            pass
+        made.publisher.publish("command", "1", stop_pressed() | {"result": "no_reply"})
+        run = made.until("interrupted")
+        assert run.code == "stopped"
+        assert run.sentence.startswith("Bo pressed stop; the head did not confirm it")
+
+
+def test_a_stop_that_came_before_the_program_was_there_ends_the_run_too(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(guide_module, "TOLD_S", 0.1)
+    with world(tmp_path, lines(BEGUN) + "time.sleep(60)\n") as made:
+        before = made.leases.last_stop
+        made.leases.stop_came()
+        made.guide.start(Wanted(board="charuco_a4"), "Ana", before)
+        assert made.leases.control() is None
+        run = made.until("interrupted")
+        assert run.code == "stopped" and run.sentence.startswith("somebody pressed stop")
+
+
+def test_a_run_is_removed_with_all_it_saw_but_not_while_it_is_at_work(tmp_path: Path) -> None:
+    with world(tmp_path, lines(BEGUN) + "time.sleep(60)\n") as made:
+        made.begin()
+        folder = made.guide.runs.all()[0]
+        (folder.seen / "images").mkdir(parents=True)
+        (folder.seen / "images" / "0-p1-navcam_left.png").write_bytes(bytes(3_000_000))
+        with pytest.raises(NotNow, match="is at work"):
+            made.guide.forget(folder.name)
+        made.guide.leave("Ana")
+        (listed,) = made.guide.told()["runs"]
+        assert listed["size_mb"] == pytest.approx(3.0)
+        with pytest.raises(NotKnown, match="there is no run"):
+            made.guide.forget("20260101-000000")
+        assert made.guide.forget(folder.name)["runs"] == []
+        assert list(made.guide.runs.folder.iterdir()) == []
+
+
+def test_a_run_whose_own_words_are_damaged_does_not_go_on_and_keeps_nobody_from_steering(
+    tmp_path: Path,
+) -> None:
+    with world(tmp_path, lines(BEGUN) + "time.sleep(60)\n") as made:
+        made.begin()
+        made.guide.leave("Ana")
+        folder = made.guide.runs.all()[0]
+        folder.keep_asked({"by": "Ana"})
+        with pytest.raises(BadRequest, match="begun is missing"):
+            made.begin(board=None, goes_on=folder.name)
+        assert made.leases.control() is None and made.lent == []
 
 
 def test_a_stop_while_the_board_is_placed_ends_the_run_too(tmp_path: Path) -> None:

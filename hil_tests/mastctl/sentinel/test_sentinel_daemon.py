@@ -312,7 +312,8 @@ def test_after_a_stop_in_the_middle_a_watch_moves_nothing_more(
         at.append(stands(client))
 
     told = watched(daemon, folder, press)
-    assert told == ["no look now: the head was stopped; nothing was kept"]
+    by = {"stop": "ana", "estop": "an emergency stop (ana)"}[stop]
+    assert told == [f"no look now: the head was stopped by {by}; nothing was kept"]
     assert stands(client) == at[0]
     (said,) = watched(daemon, folder, lambda: None)
     state = {"stop": "holding", "estop": "stopped"}[stop]
@@ -335,18 +336,23 @@ def test_a_watch_waits_until_the_head_has_been_left_alone_for_a_while(
     assert "the head was used" in told[0] and "3600 s are waited for" in told[0]
 
 
+@pytest.mark.parametrize("stop", ["stop", "estop"])
 def test_a_stop_in_the_middle_of_a_look_on_request_ends_it(
-    daemon: RunningDaemon, folder: Path, client: Client, run: Run, monkeypatch: pytest.MonkeyPatch
+    stop: str, daemon: RunningDaemon, folder: Path, client: Client, run: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     snapshot = Client.snapshot
 
     def stopped(self: Client, *words: Any, **options: Any) -> Any:
         shot = snapshot(self, *words, **options)
-        client.estop()
+        if not at:
+            getattr(client, stop)()
+            at.append(stands(client))
         return shot
 
+    at: list[tuple[float, float]] = []
     monkeypatch.setattr(Client, "snapshot", stopped)
     code, _, log = run("look")
     assert code == 1
-    assert "emergency stop" in log
+    assert {"stop": "the head was stopped by ana", "estop": "emergency stop"}[stop] in log
+    assert stands(client) == at[0], "nothing moves after it"
     assert read_looks(folder, read_reference(folder)) == []

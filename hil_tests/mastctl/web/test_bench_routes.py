@@ -301,3 +301,46 @@ def test_a_daemon_that_ends_takes_its_program_with_it(pair: Pair, ana: Client) -
     with pytest.raises(ProcessLookupError):
         os.kill(work.child.pid, 0)
     assert work.run.code == "closing"
+
+
+def test_the_program_moves_nothing_after_a_stop_however_late_the_guide_hears_of_it(
+    pair: Pair, ana: Client, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    daemon, hardware = pair
+    goes_on = "while True:\n  try: client.wait(client.point(pan_rad=0.1, tilt_rad=0.0))\n"
+    goes_on += "  except ClientError as error: tell(event='said', sentence=error.code)\n  time.sleep(0.02)\n"
+    scripted(daemon, lines(BEGUN) + STEERS + goes_on)
+    monkeypatch.setattr("mastctl.guided.guide._stop_of", lambda one: None)  # nobody tells it
+    monkeypatch.setattr("mastctl.guided.guide.TOLD_S", 3.0)
+
+    def moves() -> int:
+        return sum(call[0] == "move" for call in hardware.head.calls)
+
+    ana.begin_bench("charuco_a3")
+    eventually(lambda: moves() > 3, "the program steers", 30.0)
+    ana.stop()
+    after = moves()
+
+    def refusals() -> int:
+        run = daemon.service.guide.run
+        return 0 if run is None else sum(one == "lease_over" for one in run.sentences)
+
+    eventually(lambda: refusals() > 3, "the program is refused", 30.0)
+    assert moves() == after
+    assert ended(daemon).code == "stopped"
+
+
+def test_a_run_is_removed_over_http_by_who_may_operate(pair: Pair, ana: Client) -> None:
+    daemon, _ = pair
+    scripted(daemon, lines(BEGUN) + "time.sleep(60)\n")
+    name = ana.begin_bench("charuco_a3")["name"]
+    refused("bench_runs", lambda: ana.forget_bench(name))
+    ana.leave_bench()
+    assert ana.forget_bench(name)["runs"] == []
+    refused("bench_unknown", lambda: ana.forget_bench(name))
+    for odd in ("..", "../audit.jsonl", "stands"):
+        assert httpx.delete(f"{daemon.url}/api/v1/bench/runs/{odd.replace('/', '%2F')}").status_code in (
+            404,
+            405,
+            422,
+        )

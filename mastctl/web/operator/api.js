@@ -21,15 +21,22 @@ export const held = { lease: null };
 let free = AT_ONCE;
 const waiting = [];
 
-async function turn() {
+async function turn(method) {
   if (free > 0) free -= 1;
-  else await new Promise((go) => waiting.push(go));
+  else await new Promise((go, refuse) => waiting.push({ method, go, refuse }));
 }
 
 function done() {
   const next = waiting.shift();
-  if (next) next();
+  if (next) next.go();
   else free += 1;
+}
+
+/** What still waits here when a stop is pressed is never sent: nothing moves by it afterwards. */
+function dropWaiting() {
+  const dropped = waiting.filter(({ method }) => method !== "GET");
+  waiting.splice(0, waiting.length, ...waiting.filter(({ method }) => method === "GET"));
+  for (const { refuse } of dropped) refuse(new Refusal(0, "stopped", "It was not sent: STOP was pressed before."));
 }
 
 async function sent(method, path, body, options) {
@@ -57,7 +64,7 @@ async function sent(method, path, body, options) {
 }
 
 export async function ask(method, path, body, options = {}) {
-  await turn();
+  await turn(method);
   try {
     return await sent(method, path, body, options);
   } finally {
@@ -69,9 +76,14 @@ export const get = (path, options) => ask("GET", path, undefined, options);
 export const post = (path, body, options) => ask("POST", path, body, options);
 
 /** Stops wait for nothing here. */
-export const stop = () => sent("POST", "/stop", {}, { ms: 4000, priority: "high", keepalive: true });
+function first(path, body) {
+  const answer = sent("POST", path, body, { ms: 4000, priority: "high", keepalive: true });
+  dropWaiting();
+  return answer;
+}
+export const stop = () => first("/stop", {});
 /** It latches: nothing moves until somebody releases it with a reason. */
-export const estop = () => sent("POST", "/estop", { reason: "pressed on the page", name: client }, { ms: 4000, priority: "high", keepalive: true });
+export const estop = () => first("/estop", { reason: "pressed on the page", name: client });
 /** Nor does the question whether anybody is there. */
 export const live = () => sent("GET", "/health/live", null, { ms: 2000 });
 /** Neither do heartbeats, of which one is under way at a time, nor what is said on leaving. */

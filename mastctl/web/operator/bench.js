@@ -1,6 +1,6 @@
 // A bench calibration, step by step: where the board goes, how far it is, and what came of it.
 import { byId, h, put, say } from "./dom.js";
-import { fileOf, get, held, post } from "./api.js";
+import { ask, fileOf, get, held, post } from "./api.js";
 import { camera as called, deg, forTime, number, sentence } from "./words.js";
 import { asSeen, coverage, curve, fromAbove } from "./bench_drawn.js";
 
@@ -225,8 +225,25 @@ export class Bench {
     const rows = this.kept.filter((one) => one.name !== this.run?.name || this.closed === one.name);
     this.others.hidden = !rows.length;
     put(this.others.lastChild, rows.map((one) => h("tr", {},
-      h("td", {}, clock(one.begun)), h("td", {}, one.board), h("td", { class: "n" }, `${one.pictures} pictures`),
+      h("td", {}, clock(one.begun)), h("td", {}, one.board), h("td", { class: "n" }, `${one.pictures} pictures, ${number(one.size_mb, 0)} MB`),
       h("td", { class: one.grade ? GRADES[one.grade] : "" }, one.state === "done" ? "done" : sentence(one.sentence)),
-      h("td", { class: "n" }, one.state === "interrupted" ? h("button", { type: "button", disabled: !this.may || going || this.busy, onclick: () => this.begin({ goes_on: one.name }) }, "Go on") : one.mast_file, one.report ? [" ", this.link(one.report, "report")] : null))));
+      h("td", { class: "n" }, one.state === "interrupted" ? h("button", { type: "button", disabled: !this.may || going || this.busy, onclick: () => this.begin({ goes_on: one.name }) }, "Go on") : one.mast_file, one.report ? [" ", this.link(one.report, "report")] : null),
+      h("td", {}, one.state === "running" ? null : this.remover(one)))));
+  }
+
+  remover({ name, begun }) {
+    const words = this.sure === name ? "Really remove" : "Remove";
+    return h("button", { type: "button", class: "quiet", disabled: !this.may || this.busy, "aria-label": `${words} the run of ${clock(begun)}`, onclick: () => this.forget(name) }, words);
+  }
+
+  /** A second press within some seconds removes a run; its mast file stays. */
+  forget(name) {
+    if (this.sure === name) {
+      this.sure = null;
+      return this.act(async () => { this.kept = (await ask("DELETE", `/bench/runs/${encodeURIComponent(name)}`)).runs; });
+    }
+    this.sure = name;
+    this.draw();
+    setTimeout(() => { if (this.sure === name) { this.sure = null; this.draw(); } }, 5000);
   }
 }

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import socket
+import threading
 import time
 from collections.abc import Callable, Iterator
 from datetime import UTC, datetime, timedelta
@@ -173,6 +174,28 @@ def test_stop_goes_out_while_every_other_request_hangs(
         frame.click()
     one.page.keyboard.press("Escape")
     eventually(lambda: ("stop",) in hardware.head.calls, "the head was told to stop", 2.5)
+
+
+def test_what_the_page_had_not_sent_yet_when_stop_was_pressed_is_never_sent(
+    pair: BOTH, visit: Visits, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    daemon, hardware = pair
+    answered = threading.Event()
+    monkeypatch.setattr(Previewing, "preview", lambda *_: answered.wait(20.0) and SEEN)
+    one = visit(daemon.url)
+    frame = one.frame()
+    for _ in range(5):
+        frame.click()
+    eventually(lambda: len(one.posts("/point/preview")) >= 4, "no request is free")
+    one.page.fill("#goal-pan", "20")
+    one.page.fill("#goal-tilt", "-5")
+    one.page.click(".angles button:has-text('Go')")
+    one.page.keyboard.press("Escape")
+    eventually(lambda: ("stop",) in hardware.head.calls, "the head was told to stop")
+    answered.set()
+    one.page.wait_for_selector("#jog .bad:has-text('STOP was pressed')")
+    one.choose()
+    assert one.posts("/point") == [] and not any(call[0] == "move" for call in hardware.head.calls)
 
 
 def test_a_stop_that_is_not_confirmed_is_told_loudly(pair: BOTH, visit: Visits) -> None:

@@ -208,6 +208,23 @@ def test_a_board_of_ones_own_is_chosen_by_its_file_and_a_bad_one_is_told_with_it
     one.page.wait_for_selector(".curve")
 
 
+def test_an_earlier_run_is_removed_by_a_second_press_and_its_size_was_told(pair: BOTH, visit: Visits) -> None:
+    daemon, _ = pair
+    scripted(daemon, AT_WORK)
+    one = visit(daemon.url)
+    begin(one)
+    one.page.click("#bench button:has-text('End it for now')")
+    one.page.wait_for_selector(".bench-verdict:has-text('ended the run')")
+    one.page.click("#bench button:has-text('Begin another')")
+    one.page.click(".bench-runs summary")
+    assert "0 pictures, 0 MB" in one.page.locator(".bench-runs").inner_text()
+    one.page.click(".bench-runs button:has-text('Remove')")
+    assert len(daemon.service.guide.runs.all()) == 1, "one press removes nothing"
+    one.page.click(".bench-runs button:has-text('Really remove')")
+    eventually(lambda: not daemon.service.guide.runs.all(), "the run is gone")
+    one.page.wait_for_selector(".bench-runs", state="hidden")
+
+
 @pytest.mark.parametrize("scheme", ["dark", "light"])
 def test_it_goes_by_the_keyboard_alone_and_axe_finds_nothing_serious(
     pair: BOTH, visit: Visits, scheme: str
