@@ -3,6 +3,7 @@ import { address, live } from "./api.js";
 
 const AGAIN_MS = 1000;
 const SILENT_MS = 2500; // the head's joints are told several times a second
+const DEAD_MS = 10000; // nothing for so long: the line itself may be dead, though the daemon answers
 const KEPT = 64; // keys of a topic: operations and commands come for weeks
 
 export class Events extends EventTarget {
@@ -24,8 +25,10 @@ export class Events extends EventTarget {
     this.line?.close();
     const line = new WebSocket(address("/events"));
     this.line = line;
+    this.toldMs = performance.now();
     line.onmessage = (message) => {
       this.heard();
+      this.toldMs = this.heardMs;
       this.take(JSON.parse(message.data));
     };
     line.onclose = () => {
@@ -65,6 +68,7 @@ export class Events extends EventTarget {
     try {
       await live();
       this.heardMs = performance.now();
+      if (this.heardMs - this.toldMs > DEAD_MS) this.connect();
     } catch {
       this.lost();
       this.connect();

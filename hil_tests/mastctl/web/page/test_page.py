@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import socket
 import threading
 import time
@@ -245,6 +246,29 @@ def test_a_page_that_is_closed_gives_its_lease_back(pair: BOTH, visit: Visits) -
     one.page.get_by_role("button", name="Release", exact=True).wait_for()
     one.page.goto("about:blank")
     eventually(lambda: daemon.service.leases.told() is None, "it is given back")
+
+
+def test_a_stream_that_died_in_silence_while_the_daemon_answers_is_begun_again(
+    pair: BOTH, visit: Visits
+) -> None:
+    daemon, _ = pair
+    cut = threading.Event()
+    lines: list[Any] = []
+
+    def relay(line: Any) -> None:
+        server, first = line.connect_to_server(), not lines
+        lines.append(line)
+        server.on_message(lambda told: None if first and cut.is_set() else line.send(told))
+
+    one = visit(daemon.url)
+    one.page.route_web_socket(re.compile("/events"), relay)
+    one.page.reload()
+    one.word("ready")
+    cut.set()
+    eventually(lambda: bool(one.page.title()) and len(lines) == 2, "it is begun again", 40.0)
+    httpx.post(f"{daemon.url}/api/v1/estop", trust_env=False)
+    one.word("stopped")
+    assert len(lines) == 2, "and not again while it tells"
 
 
 def test_a_connection_that_is_cut_is_told_and_comes_back(
