@@ -16,7 +16,6 @@ from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
-from scipy.stats import chi2
 
 from calib.fit.adjustment import HUBER, Adjustment, Estimate
 from calib.fit.bench_calibration import BenchCalibration
@@ -24,7 +23,7 @@ from calib.fit.bench_changes import find_change
 from calib.fit.bench_problem import BenchOptions, BenchProblem, without_terms
 from calib.fit.bench_start import BenchNotFitted, SomethingChanged
 from calib.fit.bench_told import choose, told
-from calib.fit.joint import weigh, without_blunders
+from calib.fit.joint import typical_length, weigh, without_blunders
 from calib.fit.least_squares import minimise
 from calib.fit.model_terms import Tested
 from calib.fit.start_values import SurveyNotFitted
@@ -33,7 +32,8 @@ from calib.survey import Survey
 __all__ = ["BenchNotFitted", "BenchOptions", "SomethingChanged", "fit_bench"]
 
 WRONG_MINIMUM = 3.0
-"""A fit is refused if a camera's typical corner is this many times farther off than its sigma says."""
+"""A fit is refused if a camera's typical corner is this many times farther off than its sigma says, or than
+``corner_px`` of the survey where that is more: a print's errors are in no corner's own sigma."""
 
 SCAN_HUBER = 100.0
 """Length in sigmas from which pulls are bounded while changes are looked for: these are no blunders."""
@@ -83,7 +83,7 @@ def _fitted(bench: BenchProblem, began: float) -> BenchCalibration:
     tests: dict[str, Tested] = {}
     every = bench.candidates()
     problem, start = _look_for_changes(bench, every)
-    _refuse_far(problem, start)  # before blunders are looked for one by one where nothing fits
+    _refuse_far(bench, problem, start)  # before blunders are looked for one by one where nothing fits
     chooses = bench.options.terms is None
     if chooses:
         problem, fit = without_blunders(problem, start, bench.terms.images)
@@ -93,7 +93,7 @@ def _fitted(bench: BenchProblem, began: float) -> BenchCalibration:
     last = bench.problem(chosen, start).with_terms(problem.images, ())
     problem, fit = without_blunders(last, start, bench.terms.images, bounded=not chooses)
     _refuse_part(problem)
-    _refuse_far(problem, fit.state)
+    _refuse_far(bench, problem, fit.state)
     weighed = weigh(problem, fit, bench.terms.images)
     if not weighed.fit.settled:
         raise BenchNotFitted(
@@ -119,6 +119,11 @@ def _look_for_changes(bench: BenchProblem, chosen: Sequence[str]) -> tuple[Adjus
         problem = bench.seen(chosen, bench.start)
         problem = problem.with_terms([replace(t, keep=t.keep & ~strays[t.name]) for t in problem.images], ())
         fit = minimise(problem, bench.start, weak=problem.weak, gain=1e-4)
+        if np.isfinite(fit.normal.cost) and bench.allow_inexact(problem, fit.state):
+            problem = bench.seen(chosen, fit.state)
+            keep = {n: ~s for n, s in strays.items()}
+            problem = problem.with_terms([replace(t, keep=t.keep & keep[t.name]) for t in problem.images], ())
+            fit = minimise(problem, fit.state, weak=problem.weak, gain=1e-4)
         problem = _without_lone_strays(problem, fit.state).with_huber(SCAN_HUBER)
         fit = minimise(problem, fit.state, weak=problem.weak, gain=1e-6)
         if not np.isfinite(fit.normal.cost) or not left:
@@ -196,7 +201,7 @@ def _each(problem: Adjustment, what: str) -> list[Any]:
     return list(dict.fromkeys(getattr(t, what) for t in problem.images))
 
 
-def _refuse_far(problem: Adjustment, state: Estimate) -> None:
+def _refuse_far(bench: BenchProblem, problem: Adjustment, state: Estimate) -> None:
     """Raise if a camera's typical corner is far above its noise, or too many images were left out."""
     for name in state.cameras:
         mine = [t for t in problem.images if t.camera == name]
@@ -207,12 +212,10 @@ def _refuse_far(problem: Adjustment, state: Estimate) -> None:
                 "rest; check that pan counts right and tilt up, that each picture's placement is the right "
                 "one, and that nothing but the head moved"
             )
-        lengths = [np.linalg.norm(problem.image_residual(state, t).reshape(-1, 2), axis=1) for t in kept]
-        typical = float(np.median(np.concatenate(lengths))) / np.sqrt(chi2.median(2))
+        typical, noise_px = typical_length(problem, state, kept, bench.survey.sigma.corner_px)
         if typical > WRONG_MINIMUM:
-            noise = np.median(np.concatenate([t.sigma_px for t in kept]))
             raise BenchNotFitted(
-                f"camera {name}: the fit leaves {typical:.1f} times the stated noise of a corner ({noise:g} "
-                "px): it ended in a wrong minimum, the lens is none of this model, the board's measures are "
-                "wrong, or the sigmas are too small"
+                f"camera {name}: the fit leaves {typical:.1f} times the stated noise of a corner "
+                f"({noise_px:g} px): it ended in a wrong minimum, the lens is none of this model, the "
+                "board's measures are wrong, or the sigmas are too small"
             )

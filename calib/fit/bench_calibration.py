@@ -91,6 +91,8 @@ class BenchCalibration:
         How large errors were against what was stated; the covariance is by what they were.
     joint_rad
         What one joint reading is off by, besides its joint's errors.
+    inexact_m
+        What corners are off by on the board beyond their own sigmas; 0 where these explain them.
     rover_from_board, bows_m
         Poses by board and placement; by board its bow (across, down), metres.
     seconds
@@ -107,7 +109,6 @@ class BenchCalibration:
     check_expected_px: Mapping[str, tuple[float, float]]
     images: tuple[ImageResiduals, ...]
     outliers: tuple[Outlier, ...]
-    false_alarms: float
     degenerate: tuple[Degenerate, ...]
     gauges: tuple[str, ...]
     notes: tuple[str, ...]
@@ -116,6 +117,7 @@ class BenchCalibration:
     chi2_probability: float
     components: tuple[Component, ...]
     joint_rad: float
+    inexact_m: float
     rover_from_board: Mapping[tuple[str, str], Rigid]
     bows_m: Mapping[str, FloatArray]
     seconds: float

@@ -6,7 +6,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.optimize import brentq
 from scipy.spatial.transform import Rotation
+from scipy.stats import chi2
 
 from calib.camera.cahvor import Kind
 from calib.fit.adjustment import HUBER, Adjustment, Estimate
@@ -17,7 +19,7 @@ from calib.fit.terms import ImageTerm, with_kept
 from calib.fit.view_poses import ViewPoses, ViewsTooFew, view_poses
 from calib.mast.gimbal import MAST_NAMES
 from calib.mast.joints import JOINTS_NAMES
-from calib.rigid import Rigid
+from calib.rigid import FloatArray, Rigid
 from calib.survey import Survey
 
 MOVES = 4
@@ -25,6 +27,9 @@ MOVES = 4
 
 TURNABOUTS = 0.34
 """A board stood at two places in turn if no cut divides its pictures but for this part of the fewer ones."""
+
+INEXACT = 1.5
+"""Corners that are typically so many of their own sigmas off are less exact than noise leaves them."""
 
 AXES = tuple(MAST_NAMES.index(names[0].removeprefix("mast.")) for names in AXIS_TERMS.values())
 
@@ -74,6 +79,8 @@ class BenchProblem:
         self.cameras = {t.camera: survey.cameras[t.camera] for t in self.terms.images}
         self.boards = tuple(dict.fromkeys(t.board[0] for t in self.terms.images))
         self.split: list[tuple[tuple[str, str], tuple[str, str], str]] = []
+        self.own_px = {t.name: t.sigma_px for t in (*self.terms.images, *self.terms.checks)}
+        self.inexact_m = 0.0
         self.views = self._views()
         self.begin()
 
@@ -201,6 +208,46 @@ class BenchProblem:
         unseen = {t.name for t in problem.images if not np.isfinite(problem.image_residual(start, t)).all()}
         return problem.with_terms(with_kept(problem.images, unseen), ())
 
+    def allow_inexact(self, problem: Adjustment, state: Estimate) -> bool:
+        """Take corners for as inexact on the board as a fit shows them, where their own sigmas are less.
+
+        A print, and a lens that is only nearly of its model, are off by more than noise leaves of a corner.
+        What is added stays below ``corner_px``: more is no print. Returns whether sigmas changed.
+        """
+        every = (*self.terms.images, *self.terms.checks)
+        per_m = {t.name: _px_per_m(problem, state, t) for t in every}
+        kept = [t for t in problem.images if t.keep.any()]
+        own = np.concatenate([self.own_px[t.name][t.keep] for t in kept])
+        scale = np.concatenate([per_m[t.name][t.keep] for t in kept])
+        off_px = np.concatenate(
+            [problem.image_residual(state, t).reshape(-1, 2) * t.sigma_px[t.keep, None] for t in kept]
+        )
+        square = np.sum(off_px**2, axis=1)
+
+        def typical(inexact_m: float) -> float:
+            return float(np.median(square / (own**2 + (inexact_m * scale) ** 2)) / chi2.median(2))
+
+        most_px2 = self.survey.sigma.corner_px**2 - float(np.median(own)) ** 2
+        most_m = float(np.sqrt(max(most_px2, 0.0)) / np.median(scale))
+        found_m = 0.0
+        if most_m > 0.0 and typical(0.0) > INEXACT**2:
+            found_m = (
+                most_m if typical(most_m) > 1.0 else float(brentq(lambda m: typical(m) - 1.0, 0.0, most_m))
+            )
+        if abs(found_m - self.inexact_m) < 0.1 * max(found_m, self.inexact_m, 1e-9):
+            return False
+        self.inexact_m = found_m
+
+        def less_sure(terms: Sequence[ImageTerm]) -> tuple[ImageTerm, ...]:
+            return tuple(
+                replace(t, sigma_px=np.hypot(self.own_px[t.name], found_m * per_m[t.name])) for t in terms
+            )
+
+        self.terms = replace(
+            self.terms, images=less_sure(self.terms.images), checks=less_sure(self.terms.checks)
+        )
+        return True
+
     def candidates(self) -> tuple[str, ...]:
         """Terms that pictures could tell: backlash only where the axis came from both sides."""
         found = []
@@ -212,6 +259,13 @@ class BenchProblem:
                 continue
             found.append(term)
         return tuple(found)
+
+
+def _px_per_m(problem: Adjustment, state: Estimate, term: ImageTerm) -> FloatArray:
+    """How many pixels (n,) a metre across the line of sight is where each corner of an image is."""
+    camera = state.cameras[term.camera]
+    away_m = np.linalg.norm(problem.in_camera(state, term) - camera.C, axis=1)
+    return np.asarray(np.linalg.norm(np.cross(camera.A, camera.H)) / away_m)
 
 
 def _one_sided(term: str, joint: str, sides: set[int]) -> str:

@@ -17,7 +17,7 @@ from calib.fit.calibration import ImageResiduals
 from calib.fit.joint import Weighed, goodness
 from calib.fit.least_squares import Minimum, covariance_of
 from calib.fit.model_terms import Tested, candidate_terms, choose_terms
-from calib.fit.outliers import FALSE_ALARMS, name_outliers
+from calib.fit.outliers import name_outliers
 from calib.fit.residuals import image_residuals, rms_by_camera
 from calib.fit.stray_dots import stray_points
 from calib.fit.term_motions import moves_px, term_motions
@@ -74,7 +74,7 @@ def told(
     rig = _rig(bench, state)
     known = _part(problem.names, covariance, mine)
     sigma = sigma_by_key(rig, known.names, known.covariance)
-    images = image_residuals(bench.survey, problem, state, weighed.images, bench.terms.checks)
+    images = image_residuals(bench.survey, problem, state, bench.terms.images, bench.terms.checks)
     size = problem.parts[MAST].stop
     return BenchCalibration(
         rig=rig,
@@ -84,10 +84,9 @@ def told(
         terms=_gains(bench, candidates, chosen, tests, problem, state),
         rms_px=rms_by_camera(images),
         check_rms_px=rms_by_camera(_checked(images, bench.terms.checks)),
-        check_expected_px=_expected(bench, problem, state, covariance),
+        check_expected_px=_expected(bench, weighed),
         images=images,
         outliers=name_outliers(problem, state, covariance, weighed.images),
-        false_alarms=2 * FALSE_ALARMS,
         degenerate=open_directions(problem, problem.names[:size], covariance[:size, :size]),
         gauges=_gauges(bench, chosen),
         notes=(*bench.notes, *lens_notes(rig, sigma)),
@@ -96,16 +95,18 @@ def told(
         chi2_probability=float(chi2.sf(total, freedom)) if freedom > 0 else float("nan"),
         components=weighed.components,
         joint_rad=problem.joint_rad,
+        inexact_m=bench.inexact_m,
         rover_from_board=state.rover_from_board,
         bows_m=state.bows_m,
         seconds=time.perf_counter() - began,
     )
 
 
-def _expected(
-    bench: BenchProblem, problem: Adjustment, state: Estimate, covariance: FloatArray
-) -> dict[str, tuple[float, float]]:
-    """By camera what check images should be off by, rms per axis, and the most that chance allows."""
+def _expected(bench: BenchProblem, weighed: Weighed) -> dict[str, tuple[float, float]]:
+    """By camera what check images should be off by, rms per axis, and the most that chance allows: their
+    corners scatter as those that were fitted."""
+    problem, state, covariance = weighed.problem, weighed.fit.state, weighed.covariance
+    scatter = {c.kind: c.weighed for c in weighed.components}
     squares: dict[str, list[FloatArray]] = {}
     exact = problem.at_rest()
     for term in bench.terms.checks:
@@ -116,7 +117,7 @@ def _expected(
         rates = np.repeat(term.sigma_px, 2)[:, None] * np.concatenate(moved, axis=1)
         # What moves a whole image counts once for it, not once for every corner.
         together = np.linalg.svd(rates, compute_uv=False) ** 2
-        own = float(np.sum(np.repeat(term.sigma_px, 2) ** 2))
+        own = 2.0 * float(np.sum((scatter.get(term.kind, 1.0) * term.sigma_px) ** 2))
         found = squares.setdefault(term.camera, [])
         found.append(
             np.array([2.0 * len(term.sigma_px), own, float(together.sum()), float(np.sum(together**2))])

@@ -130,8 +130,6 @@ class Calibration:
         board, as it is named, the camera cannot see.
     outliers
         What was left out.
-    false_alarms
-        The chance that a survey without blunders loses any measurement.
     degenerate
         What the survey leaves open.
     notes
@@ -166,7 +164,6 @@ class Calibration:
     rms_px: Mapping[str, tuple[float, float]]
     check_rms_px: Mapping[str, tuple[float, float]]
     outliers: tuple[Outlier, ...]
-    false_alarms: float
     degenerate: tuple[Degenerate, ...]
     notes: tuple[str, ...]
     chi2: float

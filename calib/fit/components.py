@@ -150,7 +150,7 @@ def found_sigmas(components: Sequence[Component]) -> dict[str, float]:
     limit = {c.kind: (STAYS if c.weighed != 1.0 else 1.0) * RARELY / len(told) for c in told}
     wrong = {c.kind for c in told if min(c.chance, c.small_chance) < limit[c.kind]}
     station = {c.kind: c for c in told if c.kind in (TAPES, PRISMS)}
-    if len(station) == 2 and wrong & set(station) and _agree(station[TAPES], station[PRISMS]):
+    if len(station) == 2 and wrong & set(station) and as_one(station[TAPES], station[PRISMS]):
         square = sum(c.redundancy * c.factor**2 for c in station.values())
         together = float(np.sqrt(square / sum(c.redundancy for c in station.values())))
         found |= dict.fromkeys(station, together)
@@ -158,8 +158,8 @@ def found_sigmas(components: Sequence[Component]) -> dict[str, float]:
     return {kind: max(LEAST, factor) if kind in wrong else 1.0 for kind, factor in found.items()}
 
 
-def _agree(one: Component, other: Component) -> bool:
-    """Whether two kinds may have one sigma."""
+def as_one(one: Component, other: Component) -> bool:
+    """Return whether two kinds may have one sigma."""
     ratio = (one.factor / other.factor) ** 2
     above = float(fdtrc(one.redundancy, other.redundancy, ratio))
     return 2 * min(above, 1 - above) > APART

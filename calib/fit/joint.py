@@ -20,7 +20,7 @@ from calib.fit.calibration import Calibration
 from calib.fit.components import Component, found_sigmas, variance_components
 from calib.fit.least_squares import Minimum, Normal, covariance_of, minimise
 from calib.fit.left_out_boards import left_out_boards
-from calib.fit.outliers import FALSE_ALARMS, judge, name_outliers
+from calib.fit.outliers import judge, name_outliers
 from calib.fit.residuals import check_rms, image_residuals, rms_by_camera, station_residuals
 from calib.fit.start_values import Start, SurveyNotFitted, start_values
 from calib.fit.terms import ImageTerm, StationTerm, widened_images, with_kept
@@ -41,8 +41,9 @@ WEIGHED = 0.02
 """Sigmas are good enough when the next ones differ by less than this part."""
 
 WRONG_MINIMUM = 6.0
-"""A fit is refused if the typical dot is this many times farther off than its sigma says: stated sigmas are
-wrong by two or three, wrong minima by a hundred."""
+"""A fit is refused if the typical dot is this many times farther off than its sigma says, or than ``dot_px``
+of the survey where that is more (a print is in no dot's own sigma): stated sigmas are wrong by two or three,
+wrong minima by a hundred."""
 
 MANY = 0.15
 """More than this part of the tapes left out (and more than three) are no blunders: the model fails."""
@@ -68,7 +69,7 @@ def fit_joint(survey: Survey, mast_parameters: int = 6) -> Calibration:
     from_here = start_values(survey, mast_parameters)
     problem = joint_problem(survey, from_here, mast_parameters)
     problem, fit = without_blunders(problem, from_here.estimate, from_here.images)
-    _refuse_wrong_minimum(problem, fit.state)
+    _refuse_wrong_minimum(problem, fit.state, survey.sigma.dot_px)
     _refuse_unsettled(fit)
     weighed = weigh(problem, fit, from_here.images)
     _refuse_unsettled(weighed.fit)
@@ -185,7 +186,7 @@ def _refuse_unsettled(fit: Minimum[Estimate]) -> None:
         )
 
 
-def _refuse_wrong_minimum(problem: Adjustment, state: Estimate) -> None:
+def _refuse_wrong_minimum(problem: Adjustment, state: Estimate, dot_px: float) -> None:
     """Raise if a camera's typical dot is far above its noise, or if the station contradicts the rest."""
     tapes = [p for p in problem.station if p.board is not None]
     left_out = sum(not p.keep for p in tapes)
@@ -203,14 +204,25 @@ def _refuse_wrong_minimum(problem: Adjustment, state: Estimate) -> None:
                 f"camera {name}: {len(mine) - len(kept)} of its {len(mine)} images do not agree with the "
                 "rest; check which placement each belongs to and the joint angles"
             )
-        lengths = [np.linalg.norm(problem.image_residual(state, t).reshape(-1, 2), axis=1) for t in kept]
-        typical = float(np.median(np.concatenate(lengths))) / np.sqrt(chi2.median(2))
+        typical, noise_px = typical_length(problem, state, kept, dot_px)
         if typical > WRONG_MINIMUM:
             raise SurveyNotFitted(
                 f"camera {name}: the fit leaves {typical:.1f} times the stated noise of a dot "
-                f"({np.median(np.concatenate([t.sigma_px for t in kept])):g} px); either it ended in a wrong "
+                f"({noise_px:g} px); either it ended in a wrong "
                 "minimum or the sigmas in survey.yaml are too small"
             )
+
+
+def typical_length(
+    problem: Adjustment, state: Estimate, images: Sequence[ImageTerm], least_px: float
+) -> tuple[float, float]:
+    """Return how far the typical dot of some images is off, in sigmas, and the median of these, pixels; no
+    sigma counts as less than ``least_px``."""
+    own_px = np.concatenate([t.sigma_px[t.keep] for t in images])
+    told_px = np.maximum(own_px, least_px)
+    residuals = np.concatenate([problem.image_residual(state, t).reshape(-1, 2) for t in images])
+    lengths = np.linalg.norm(residuals, axis=1) * own_px / told_px
+    return float(np.median(lengths) / np.sqrt(chi2.median(2))), float(np.median(told_px))
 
 
 def _calibration(
@@ -255,7 +267,6 @@ def _calibration(
         rms_px=rms_by_camera(images),
         check_rms_px=check_rms(survey, state, images),
         outliers=(*name_outliers(problem, state, covariance, weighed.images), *from_here.stray_checks),
-        false_alarms=3 * FALSE_ALARMS,
         degenerate=open_directions(problem, problem.names[:size], covariance[:size, :size]),
         notes=tuple(notes),
         chi2=chi_square,

@@ -124,7 +124,6 @@ def _fit(survey: Survey, mast_parameters: int, began: float) -> Calibration:
         rms_px=rms_by_camera(images),
         check_rms_px=check_rms(survey, state, images),
         outliers=(*from_here.blunders, *_left_out(images, {**dict.fromkeys(left_out, np.nan), **doubtful})),
-        false_alarms=0.0,
         degenerate=open_directions(problem, names, mast_alone),
         notes=tuple(notes),
         chi2=float(sum(in_sigmas)),

@@ -54,15 +54,12 @@ class ViewPoses:
         By image name which of its points (n,) disagree with the rest of it.
     doubtful
         Images that no pose explains.
-    typical_px
-        How far the median corner of the images is off that the lens was fitted to.
     """
 
     model: CameraModel
     poses: dict[str, tuple[Rigid, ...]]
     strays: dict[str, np.ndarray]
     doubtful: frozenset[str]
-    typical_px: float
 
 
 def view_poses(
@@ -112,8 +109,7 @@ def view_poses(
             off[term.name] = found_poses[0][0]
     typical = max(float(np.median(list(off.values()))) if off else np.inf, 1.0)
     doubtful = {t.name for t in images if t.name not in off or off[t.name] > GROSS * typical}
-    noise = float(np.median(np.concatenate([t.sigma_px for t in clean])))
-    return ViewPoses(model, poses, strays, frozenset(doubtful), best[0] * noise)
+    return ViewPoses(model, poses, strays, frozenset(doubtful))
 
 
 def _strays(term: ImageTerm) -> np.ndarray:

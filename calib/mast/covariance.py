@@ -51,6 +51,15 @@ class RigCovariance(ReadOnlyArrays):
         kept = [i for i, name in enumerate(self.names) if name.startswith(("mast.", "joints.", *wanted))]
         return RigCovariance(tuple(self.names[i] for i in kept), self.covariance[np.ix_(kept, kept)])
 
+    def among(self, names: Sequence[str]) -> FloatArray:
+        """Return the covariance (k, k) of other names in their order; what has no place here is exact."""
+        at = {name: i for i, name in enumerate(self.names)}
+        theirs = [i for i, name in enumerate(names) if name in at]
+        mine = [at[names[i]] for i in theirs]
+        covariance = np.zeros((len(names), len(names)))
+        covariance[np.ix_(theirs, theirs)] = self.covariance[np.ix_(mine, mine)]
+        return covariance
+
 
 def stored_covariance(rig: Rig) -> RigCovariance | None:
     """Return the covariance of a rig's mast file, or None if it has none.

@@ -155,6 +155,10 @@ class BenchPlan:
         How far pan and tilt go to either side of the board, at most; less where it would not be seen.
     corner_px, noise
         What is stated, and what happens, times that.
+    own_px
+        Sigma that each corner comes with, and what it is off by then, times the noise; 0: corner_px.
+    print_m
+        How far each corner is printed beside its place, one sigma an axis, the same in all pictures.
     gross
         Part of the corners that are grossly off.
     mishaps
@@ -175,6 +179,8 @@ class BenchPlan:
     reach_rad: tuple[float, float] = (0.32, 0.26)
     corner_px: float = 0.1
     noise: float = 1.0
+    own_px: float = 0.0
+    print_m: float = 0.0
     gross: float = 0.0
     mishaps: tuple[Mishap, ...] = ()
 
@@ -224,6 +230,9 @@ class _Bench:
         self.twin_m = 0.0
         ids = plan.board.ids
         self.points = plan.board.in_board_m(ids, plan.bow_m)
+        printed = np.random.default_rng([seed, 2]).standard_normal((len(ids), 2))
+        self.points[:, :2] += plan.print_m * printed
+        self.own_px = plan.own_px or plan.corner_px
 
     def survey(self) -> Survey:
         plan = self.plan
@@ -316,7 +325,7 @@ class _Bench:
         """Note the corners that a camera sees."""
         plan = self.plan
         pixels = camera.pixels(in_head if camera.on == "head" else in_rover)
-        noise = plan.noise * plan.corner_px * self.errors.standard_normal(pixels.shape)
+        noise = plan.noise * self.own_px * self.errors.standard_normal(pixels.shape)
         wrong = self.errors.random(len(pixels)) < plan.gross
         far = self.errors.uniform(*GROSS_PX, len(pixels)) * wrong
         angle = self.errors.uniform(-np.pi, np.pi, len(pixels))
@@ -337,5 +346,5 @@ class _Bench:
             )
         )  # fmt: skip
         self.corners[image] = Corners(
-            plan.board.ids[inside], found[inside], np.full(int(inside.sum()), plan.corner_px)
+            plan.board.ids[inside], found[inside], np.full(int(inside.sum()), self.own_px)
         )

@@ -12,7 +12,6 @@ from calib.bench.workspace import Pointing
 from calib.files.atomic import save_bytes
 from calib.files.mast_file import StoredRig
 from calib.fit.bench_calibration import BenchCalibration
-from calib.mast.covariance import RigCovariance
 from calib.mast.rig import Rig
 from calib.rigid import FloatArray
 from calib.survey import Survey
@@ -58,16 +57,6 @@ def write_bench_report(told: Told, folder: Path) -> Path:
     path = folder / PAGE
     save_bytes(path, page)
     return path
-
-
-def workspace_covariance(names: tuple[str, ...], known: RigCovariance) -> FloatArray:
-    """Return a fit's covariance in the order of other names; what the fit held is exact."""
-    at = {name: k for k, name in enumerate(known.names)}
-    mine = [k for k, name in enumerate(names) if name in at]
-    theirs = [at[names[k]] for k in mine]
-    out = np.zeros((len(names), len(names)))
-    out[np.ix_(mine, mine)] = np.asarray(known.covariance)[np.ix_(theirs, theirs)]
-    return out
 
 
 def _page(told: Told) -> str:

@@ -25,7 +25,7 @@ from calib.survey import Survey
 from mastctl.bench.final import Checked
 from mastctl.bench.frame import Frame, fit_in_frame
 from mastctl.bench.known import first_cameras
-from mastctl.bench.report import Told, workspace_covariance, write_bench_report
+from mastctl.bench.report import Told, write_bench_report
 from mastctl.bench.run import BenchRun
 from mastctl.bench.teller import Teller, px
 from mastctl.calibration.bench_verdict import judge_bench, predicted_pointing_px
@@ -91,7 +91,7 @@ class BenchDone:
             "joints": joint_keys(fit.rig.joints),
             "chi2": _finite(fit.chi2),
             "degrees_of_freedom": _finite(fit.degrees_of_freedom),
-            "sigmas_found": components_told(self.survey.sigma, fit.components),
+            "sigmas_found": components_told(self.survey, fit),
             "terms": [term_told(term) for term in fit.terms],
             "bows_m": {board: bow.tolist() for board, bow in fit.bows_m.items()},
             "degenerate": [
@@ -284,7 +284,7 @@ def _reported(done: BenchDone, folder: Path | None, former: Rig | None, where: W
     fit = done.calibration
     known = Knowledge(fit.rig, {})
     aim = pointing(known, where)
-    covariance = workspace_covariance(known.names, RigCovariance(fit.parameter_names, fit.covariance))
+    covariance = RigCovariance(fit.parameter_names, fit.covariance).among(known.names)
     done = replace(done, calibrated_px=aim.rms_px(covariance))
     if folder is None:
         return done
@@ -322,7 +322,7 @@ def with_bench_fit(calibration: BenchCalibration, survey: Survey, verdict: Verdi
         "sigma": plain(calibration.sigma),
         "chi2": _finite(calibration.chi2),
         "degrees_of_freedom": _finite(calibration.degrees_of_freedom),
-        "sigmas_found": components_told(survey.sigma, calibration.components),
+        "sigmas_found": components_told(survey, calibration),
         "terms": [term_told(term) for term in calibration.terms],
         "bows_m": {board: bow.tolist() for board, bow in calibration.bows_m.items()},
         "degenerate": [direction.sentence for direction in calibration.degenerate],

@@ -10,7 +10,7 @@ from calib.bench.knowledge import Knowledge
 from calib.bench.workspace import Workspace, pointing
 from calib.errors import CalibError
 from calib.fit.bench_calibration import BenchCalibration
-from calib.rigid import FloatArray
+from calib.mast.covariance import RigCovariance
 from calib.survey import Survey
 from mastctl.calibration.expected import RARELY
 from mastctl.calibration.verdict import (
@@ -29,6 +29,7 @@ def judge_bench(survey: Survey, calibration: BenchCalibration) -> Verdict:
     reasons = [
         *_noise(survey, calibration),
         *(Reason("care", note) for note in calibration.notes if " moved during placement " in note),
+        *_inexact(calibration),
         *_placements(calibration),
         *_checks(calibration),
         *(Reason("bad", direction.sentence) for direction in calibration.degenerate),
@@ -57,17 +58,8 @@ def predicted_pointing_px(calibration: BenchCalibration) -> tuple[float, float] 
         landings = pointing(known, where)
     except CalibError:
         return None
-    return landings.rms_px(_in_order(calibration, known)), landings.by_counts_px(calibration.joint_rad)
-
-
-def _in_order(calibration: BenchCalibration, known: Knowledge) -> FloatArray:
-    """The covariance in another order of names; what was not fitted is exact."""
-    at = {name: i for i, name in enumerate(calibration.parameter_names)}
-    here = [i for i, name in enumerate(known.names) if name in at]
-    there = [at[known.names[i]] for i in here]
-    covariance = np.zeros((len(known.names),) * 2)
-    covariance[np.ix_(here, here)] = calibration.covariance[np.ix_(there, there)]
-    return covariance
+    covariance = RigCovariance(calibration.parameter_names, calibration.covariance).among(known.names)
+    return landings.rms_px(covariance), landings.by_counts_px(calibration.joint_rad)
 
 
 def _noise(survey: Survey, calibration: BenchCalibration) -> Iterator[Reason]:
@@ -81,7 +73,18 @@ def _noise(survey: Survey, calibration: BenchCalibration) -> Iterator[Reason]:
     wrong = [c for c in calibration.components if c.wrong]
     unexplained: Grade = "bad" if factor > 2.0 and not wrong else "care"
     yield Reason(unexplained if calibration.chi2_probability < RARELY else "good", words)
-    yield from sigma_reasons(survey, calibration.components)
+    yield from sigma_reasons(survey, calibration)
+
+
+def _inexact(calibration: BenchCalibration) -> Iterator[Reason]:
+    """Whether corners are where the board's measures and the lenses have them, but for noise."""
+    if calibration.inexact_m > 0.0:
+        yield Reason(
+            "care",
+            f"corners are off by some {1e3 * calibration.inexact_m:.2g} mm on the board, more than their own "
+            "sigmas say: an inexact print, or a lens that is only nearly of its model; they count with that, "
+            "but it is the same in every picture, and uncertainties are rather too small",
+        )
 
 
 def _placements(calibration: BenchCalibration) -> Iterator[Reason]:

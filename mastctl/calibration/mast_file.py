@@ -36,7 +36,7 @@ def with_fit(calibration: Calibration, survey: Survey, verdict: Mapping[str, Any
         "sigma": plain(calibration.sigma),
         "chi2": _finite(calibration.chi2),
         "degrees_of_freedom": _finite(calibration.degrees_of_freedom),
-        "sigmas_found": components_told(survey.sigma, calibration.components),
+        "sigmas_found": components_told(survey, calibration),
         "asked_for": [model.sentence for model in calibration.wider if model.significant],
         "outliers": [outlier.name for outlier in calibration.outliers],
         "degenerate": [direction.sentence for direction in calibration.degenerate],

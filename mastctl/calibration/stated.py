@@ -7,17 +7,27 @@ from typing import Any
 
 import numpy as np
 
-from calib.fit.calibration import Calibration
+from calib.fit.bench_calibration import BenchCalibration
+from calib.fit.calibration import Calibration, ImageResiduals
 from calib.fit.components import Component
 from calib.fit.terms import DOTS_OF, DRAWING, JOINTS, PRISMS, TAPES
-from calib.survey import Sigma, Survey
+from calib.survey import Survey
 from mastctl.report.tables import Table
 
+Images = Sequence[ImageResiduals]
 
-def stated(sigma: Sigma, kind: str) -> tuple[float, str, str]:
-    """Return the stated sigma of a kind of measurement, its unit, and its key under sigma in survey.yaml."""
+OWN = "their own sigmas"
+"""What says a sigma that dots or corners came with, each its own; told is the median."""
+
+
+def stated(survey: Survey, images: Images, kind: str) -> tuple[float, str, str]:
+    """Return the stated sigma of a kind of measurement, its unit, and its key under sigma in survey.yaml, or
+    `OWN`."""
+    sigma = survey.sigma
     if kind.startswith(DOTS_OF):
-        return (sigma.dot_px, "px", "dot_px") if sigma.dot_px else (sigma.corner_px, "px", "corner_px")
+        own_px = _own_px(images, kind.removeprefix(DOTS_OF))
+        told = (sigma.corner_px, "px", "corner_px") if survey.boards else (sigma.dot_px, "px", "dot_px")
+        return told if own_px in (None, told[0]) else (own_px, "px", OWN)
     if kind == JOINTS:
         return 1e3 * sigma.joint_rad, "mrad", "joint_rad"
     if kind == DRAWING:
@@ -25,13 +35,28 @@ def stated(sigma: Sigma, kind: str) -> tuple[float, str, str]:
     return 1e3 * sigma.station_m, "mm", "station_m"
 
 
-def wrong_sentence(sigma: Sigma, component: Component, wrong: Sequence[Component]) -> str:
+def _own_px(images: Images, camera: str) -> float | None:
+    """The median sigma that a camera's dots or corners were fitted with, before any was found."""
+    own = [image.sigma_px for image in images if image.camera == camera and image.purpose != "check"]
+    return float(np.median(np.concatenate(own))) if own else None
+
+
+def allowed(survey: Survey, images: Images, kind: str) -> float:
+    """Return by how much a kind may exceed its stated sigma before that of survey.yaml is exceeded: dots and
+    corners come with what noise leaves of them, prints and lenses are in ``dot_px`` and ``corner_px``."""
+    told, _, key = stated(survey, images, kind)
+    whole_px = survey.sigma.corner_px if survey.boards else survey.sigma.dot_px
+    return max(1.0, whole_px / told) if key == OWN else 1.0
+
+
+def wrong_sentence(survey: Survey, images: Images, component: Component, wrong: Sequence[Component]) -> str:
     """Return in words that a stated sigma is none; ``wrong`` are all kinds for which it is too small."""
-    told, unit, key = stated(sigma, component.kind)
+    told, unit, key = stated(survey, images, component.kind)
+    says = "say" if key == OWN else "says"
     words = (
         f"{component.kind} scatter by {component.factor:.2f} ± {component.factor_sigma:.2f} times their "
-        f"stated sigma: {component.factor * told:.2g} {unit} where {key} says {told:g} {unit}; the fit and "
-        f"its uncertainties take {component.weighed * told:.2g} {unit}"
+        f"stated sigma: {component.factor * told:.2g} {unit} where {key} {says} {told:.3g} {unit}; the fit "
+        f"and its uncertainties take {component.weighed * told:.2g} {unit}"
     )
     if component.wrong and component.kind == PRISMS and all(other.kind != TAPES for other in wrong):
         words += "; tapes do not, so it may be the drawing of the prisms that is off (prism_cad_m)"
@@ -44,12 +69,12 @@ def component_table(survey: Survey, calibration: Calibration) -> Table | None:
         return None
     rows = []
     for c in calibration.components:
-        told, unit, _ = stated(survey.sigma, c.kind)
+        told, unit, _ = stated(survey, calibration.images, c.kind)
         known = np.isfinite(c.factor)
         rows.append(
             [
                 c.kind,
-                f"{told:g} {unit}",
+                f"{told:.3g} {unit}",
                 f"{c.factor * told:.3g} ± {c.factor_sigma * told:.1g} {unit}" if known else "cannot be told",
                 f"{c.redundancy:.0f} of {c.count}",
                 f"{c.weighed:.2f}",
@@ -58,22 +83,22 @@ def component_table(survey: Survey, calibration: Calibration) -> Table | None:
     return Table(("measurements", "stated sigma", "found", "redundant numbers", "taken times"), rows)
 
 
-def components_told(sigma: Sigma, components: Sequence[Component]) -> list[dict[str, Any]]:
+def components_told(survey: Survey, calibration: Calibration | BenchCalibration) -> list[dict[str, Any]]:
     """Return the variance components as JSON or YAML."""
     found = []
-    for c in components:
-        told, unit, key = stated(sigma, c.kind)
+    for c in calibration.components:
+        told, unit, key = stated(survey, calibration.images, c.kind)
         found.append(
             {
                 "kind": c.kind,
                 "stated": told,
                 "unit": unit,
-                "key": f"sigma.{key}",
+                "key": "sigma_px" if key == OWN else f"sigma.{key}",
                 "count": c.count,
                 "redundancy": c.redundancy,
                 "factor": c.factor if np.isfinite(c.factor) else None,
                 "factor_sigma": c.factor_sigma if np.isfinite(c.factor) else None,
-                "widened_by": c.weighed,
+                "taken_times": c.weighed,
                 "chance": c.chance,
                 "small_chance": c.small_chance,
             }

@@ -10,13 +10,15 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from calib.errors import CalibError
+from calib.fit.bench_calibration import BenchCalibration
 from calib.fit.calibration import Calibration
-from calib.fit.components import Component
+from calib.fit.components import Component, as_one
+from calib.fit.terms import PRISMS, TAPES
 from calib.fit.uncertainty import pointing_covariance
 from calib.survey import Finding, Survey
 from mastctl.calibration.exchanged import exchanged_boards
 from mastctl.calibration.expected import RARELY, check_sizes
-from mastctl.calibration.stated import wrong_sentence
+from mastctl.calibration.stated import allowed, wrong_sentence
 from mastctl.calibration.tested import cross_validation_px
 
 Grade = Literal["good", "care", "bad"]
@@ -141,7 +143,7 @@ def _noise(survey: Survey, calibration: Calibration) -> list[Reason]:
     wrong = [c for c in calibration.components if c.wrong]
     unexplained: Grade = "bad" if factor > 2.0 and not wrong else "care"
     reasons = [Reason(unexplained if calibration.chi2_probability < RARELY else "good", words)]
-    reasons += sigma_reasons(survey, calibration.components)
+    reasons += sigma_reasons(survey, calibration)
     told = [c for c in calibration.components if np.isfinite(c.factor)]
     if told and not wrong:
         most = max(told, key=lambda c: c.factor)
@@ -151,22 +153,40 @@ def _noise(survey: Survey, calibration: Calibration) -> list[Reason]:
     return reasons
 
 
-def sigma_reasons(survey: Survey, components: Sequence[Component]) -> list[Reason]:
+def sigma_reasons(survey: Survey, calibration: Calibration | BenchCalibration) -> list[Reason]:
     """Return a reason for each kind of measurement whose stated sigma is not what its residuals show.
 
     Too small a sigma is a fault of the survey. Too large a one is none, once the fit takes what was found;
     unless it is so far off that the measurements may be smoothed, or copies.
     """
+    components, images = calibration.components, calibration.images
     wrong = [c for c in components if c.wrong]
     reasons = []
     for c in (*wrong, *(c for c in components if c.generous)):
         grade: Grade = "good" if c.generous else "care"
-        if c.factor > HOPELESS:
+        if c.factor > HOPELESS * allowed(survey, images, c.kind):
             grade = "bad"
         elif c.factor < 1.0 / HOPELESS:
             grade = "care"
-        reasons.append(Reason(grade, wrong_sentence(survey.sigma, c, wrong)))
-    return reasons
+        reasons.append(Reason(grade, wrong_sentence(survey, images, c, wrong)))
+    return [*reasons, *_one_station(survey, components)]
+
+
+def _one_station(survey: Survey, components: Sequence[Component]) -> list[Reason]:
+    """Whether prisms scatter as the tapes of the same station do: by tapes alone its sigma is found smaller
+    than stated, and a wrong prism hides under the stated one."""
+    by_kind = {c.kind: c for c in components if np.isfinite(c.factor)}
+    tapes, prisms = by_kind.get(TAPES), by_kind.get(PRISMS)
+    if tapes is None or prisms is None or not tapes.generous or prisms.factor < tapes.factor:
+        return []
+    if as_one(tapes, prisms):
+        return []
+    sigma_mm = 1e3 * survey.sigma.station_m
+    words = (
+        f"prisms scatter by {prisms.factor * sigma_mm:.1f} mm where the tapes of the same station do by "
+        f"{tapes.factor * sigma_mm:.1f} mm: one of them, or their drawing, is wrong; measure them again"
+    )
+    return [Reason("care", words)]
 
 
 def _wider(calibration: Calibration) -> list[Reason]:
@@ -223,7 +243,7 @@ def _jointly(survey: Survey, fit: Calibration | CalibError | None) -> list[Reaso
     if isinstance(fit, CalibError):
         words = "whether sigmas and model are right was not tested, since the survey cannot be fitted jointly"
         return [Reason("care", f"{words}: {fit}")]
-    reasons = [*sigma_reasons(survey, fit.components), *_wider(fit), *_by_the_others(fit)]
+    reasons = [*sigma_reasons(survey, fit), *_wider(fit), *_by_the_others(fit)]
     return [replace(reason, sentence=f"fitted jointly, {reason.sentence}") for reason in reasons]
 
 

@@ -217,7 +217,7 @@ def _document(done: Calibrated, in_use: StoredRig | None, page: Path | None) -> 
         "chi2": _finite(fit.chi2),
         "degrees_of_freedom": _finite(fit.degrees_of_freedom),
         "chi2_probability": _finite(fit.chi2_probability),
-        "sigmas_found": components_told(done.survey.sigma, fit.components),
+        "sigmas_found": components_told(done.survey, fit),
         "wider_models": wider_told(fit),
         "cross_validation": cross_validation_told(fit),
         "outliers": [

@@ -68,7 +68,7 @@ def take_pictures(
     cameras: Sequence[str],
     progress: Callable[[int, int], None] | None = None,
 ) -> Taken:
-    """Return a picture of each camera at each rest (true pan, tilt), and bring the head back to where it was.
+    """Return a picture of each camera at each rest (pan, tilt as read), and bring the head back.
 
     The client should hold the lease. A camera that gives no picture is asked no more; the others go on.
 

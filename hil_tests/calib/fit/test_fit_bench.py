@@ -156,6 +156,24 @@ def test_a_board_that_moved_counts_as_two_placements_and_is_named(size_m: float)
         assert np.abs(errors_in_sigmas(plan, fit, name)).max() < IN_SIGMAS
 
 
+def test_a_print_less_exact_than_its_corners_are_found_is_weighed_and_not_refused() -> None:
+    plan = BenchPlan(attitudes=10, own_px=0.01, print_m=1e-4)
+    fit = fit_bench(simulate_bench(3, plan))
+    assert fit.inexact_m == pytest.approx(1e-4, rel=0.25)
+    for name in plan.cameras:
+        seen_px = float(np.sqrt(np.mean(np.square(fit.check_rms_px[name]))))
+        expected_px, most_px = fit.check_expected_px[name]
+        assert 0.03 < seen_px < most_px
+        assert 0.7 < seen_px / expected_px < 1.4
+
+
+def test_corners_far_beyond_what_the_folder_allows_are_refused() -> None:
+    survey = simulate_bench(3, BenchPlan(attitudes=10, own_px=0.01, corner_px=0.01, print_m=3e-4))
+    with pytest.raises(BenchNotFitted, match=r"times the stated noise of a corner \(0\.01 px\)"):
+        fit_bench(survey)
+    assert fit_bench(simulate_bench(3, BenchPlan(attitudes=10, own_px=0.01))).inexact_m == 0.0
+
+
 def test_a_joint_that_hardly_moves_is_named() -> None:
     survey = simulate_bench(1, BenchPlan(attitudes=8, reach_rad=(0.3, 0.01)))
     with pytest.raises(BenchNotFitted, match=r"tilt moves by 1.* at most while camera navcam_.* sees one"):

@@ -98,6 +98,21 @@ def test_one_placement_alone_is_told(tmp_path: Path, capsys: pytest.CaptureFixtu
     )
 
 
+def test_a_print_less_exact_than_its_corners_are_found_is_told(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    plan = replace(PLAN, backlash_rad=0.0, count_rad=0.0, own_px=0.01, print_m=1e-4)
+    write_survey(simulate_bench(1, plan), tmp_path / "b")
+    code, told, _ = run(capsys, tmp_path / "b", "--out", tmp_path / "m.yaml")
+    assert code == 0
+    assert told["verdict"]["grade"] == "care"
+    (sentence,) = [r["sentence"] for r in told["verdict"]["reasons"] if "inexact print" in r["sentence"]]
+    assert sentence.startswith("corners are off by some 0.1 mm on the board") or "0.09" in sentence
+    (kind,) = [one for one in told["sigmas_found"] if one["kind"] == "dots of navcam_left"]
+    assert kind["key"] == "sigma_px"
+    assert kind["factor"] * kind["stated"] == pytest.approx(told["rms_px"]["navcam_left"][0], rel=0.3)
+
+
 def test_what_drives_a_head_is_refused_with_a_folder(
     folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from calib.fit.calibration import Calibration, Degenerate, Outlier
+from calib.fit.components import Component
 from calib.fit.joint import fit_joint
 from calib.fit.paper import fit_paper
 from calib.fit.start_values import SurveyNotFitted
@@ -113,6 +114,20 @@ def test_the_worst_reason_decides(fitted: tuple[Survey, Calibration]) -> None:
     bad = judge_calibration(survey, replace(calibration, images=tuple(off)))
     assert bad.grade == "bad"
     assert any(r.grade == "bad" and "check images of navcam_left" in r.sentence for r in bad.reasons)
+
+
+def test_prisms_that_scatter_more_than_the_tapes_of_their_station_cost_trust(
+    fitted: tuple[Survey, Calibration],
+) -> None:
+    survey, fit = fitted
+    tapes = Component("tapes", 270, 199.0, 0.24, 0.01, 0.24, 1.0, 1e-80)
+    prisms = Component("prisms", 24, 12.0, 1.31, 0.27, 1.0, 0.06, 0.94)
+    grades = []
+    for factor in (1.31, 0.3):
+        components = (tapes, replace(prisms, factor=factor))
+        reasons = judge_calibration(survey, replace(fit, components=components)).reasons
+        grades.append([r.grade for r in reasons if r.sentence.startswith("prisms scatter by")])
+    assert grades == [["care"], []]
 
 
 def test_a_placement_whose_name_looks_like_a_formula_is_drawn(fitted: tuple[Survey, Calibration]) -> None:
