@@ -94,7 +94,8 @@ def _fitted(bench: BenchProblem, began: float) -> BenchCalibration:
     problem, fit = without_blunders(last, start, bench.terms.images, bounded=not chooses)
     _refuse_part(problem)
     _refuse_far(bench, problem, fit.state)
-    weighed = weigh(problem, fit, bench.terms.images)
+    # counts and the least of corners are known; what a simulated or lucky bench has less is no knowledge
+    weighed = weigh(problem, fit, bench.terms.images, narrows=False)
     if not weighed.fit.settled:
         raise BenchNotFitted(
             f"the fit did not settle: after {weighed.fit.steps} steps it was still finding better values, so "

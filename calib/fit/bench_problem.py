@@ -28,7 +28,7 @@ MOVES = 4
 TURNABOUTS = 0.34
 """A board stood at two places in turn if no cut divides its pictures but for this part of the fewer ones."""
 
-INEXACT = 1.5
+INEXACT = 1.15
 """Corners that are typically so many of their own sigmas off are less exact than noise leaves them."""
 
 AXES = tuple(MAST_NAMES.index(names[0].removeprefix("mast.")) for names in AXIS_TERMS.values())

@@ -9,6 +9,9 @@ import numpy as np
 from calib.fit.terms import ImageTerm
 from calib.survey import Survey, SurveyImage
 
+SUREST = 0.1
+"""Part of ``corner_px`` below which no corner's own sigma counts: what neighbours share is not in it."""
+
 FEWEST_CORNERS = 6
 """An image with fewer takes no part: with four, a pose goes through them whatever they are."""
 
@@ -62,7 +65,7 @@ def bench_terms(survey: Survey) -> BenchTerms:
             np.zeros(0, dtype=np.int64),
             board.in_board_m(corners.ids),
             corners.pixels_px,
-            corners.sigma_px,
+            np.maximum(corners.sigma_px, SUREST * survey.sigma.corner_px),
             np.ones(len(corners.ids), dtype=bool),
             (image.pan_approach, image.tilt_approach) if on_head else (0, 0),
             bend,

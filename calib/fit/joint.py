@@ -92,7 +92,9 @@ class Weighed:
     excess: float
 
 
-def weigh(problem: Adjustment, fit: Minimum[Estimate], images: Sequence[ImageTerm]) -> Weighed:
+def weigh(
+    problem: Adjustment, fit: Minimum[Estimate], images: Sequence[ImageTerm], *, narrows: bool = True
+) -> Weighed:
     """Return the fit with the sigma of each kind of measurement that is worse, or better, than stated.
 
     Parameters
@@ -101,6 +103,8 @@ def weigh(problem: Adjustment, fit: Minimum[Estimate], images: Sequence[ImageTer
         Fitted with the stated sigmas, blunders left out.
     images
         All that were fitted, with every dot.
+    narrows
+        Whether a sigma may become smaller than stated.
     """
     weighed: dict[str, float] = {}
     first: tuple[Component, ...] = ()
@@ -109,6 +113,8 @@ def weigh(problem: Adjustment, fit: Minimum[Estimate], images: Sequence[ImageTer
         components = variance_components(problem.blocks(fit.state), covariance, weighed)
         first = first or components
         wanted = found_sigmas(components)
+        if not narrows:
+            wanted = {kind: max(1.0, factor) for kind, factor in wanted.items()}
         change = {kind: factor / weighed.get(kind, 1.0) for kind, factor in wanted.items()}
         if count == WEIGHINGS or all(abs(ratio - 1.0) < WEIGHED for ratio in change.values()):
             break

@@ -23,13 +23,16 @@ from mastctl.calibration.verdict import (
     sigma_reasons,
 )
 
+LITTLE = 0.2
+"""Corners that are off by less than this part of ``corner_px`` are no reason for doubt."""
+
 
 def judge_bench(survey: Survey, calibration: BenchCalibration) -> Verdict:
     """Return whether to trust a bench's calibration; the worst of the reasons decides."""
     reasons = [
         *_noise(survey, calibration),
         *(Reason("care", note) for note in calibration.notes if " moved during placement " in note),
-        *_inexact(calibration),
+        *_inexact(survey, calibration),
         *_placements(calibration),
         *_checks(calibration),
         *(Reason("bad", direction.sentence) for direction in calibration.degenerate),
@@ -76,11 +79,12 @@ def _noise(survey: Survey, calibration: BenchCalibration) -> Iterator[Reason]:
     yield from sigma_reasons(survey, calibration)
 
 
-def _inexact(calibration: BenchCalibration) -> Iterator[Reason]:
+def _inexact(survey: Survey, calibration: BenchCalibration) -> Iterator[Reason]:
     """Whether corners are where the board's measures and the lenses have them, but for noise."""
     if calibration.inexact_m > 0.0:
+        off_px = float(np.median(np.concatenate([image.sigma_px for image in calibration.images])))
         yield Reason(
-            "care",
+            "care" if off_px > LITTLE * survey.sigma.corner_px else "good",
             f"corners are off by some {1e3 * calibration.inexact_m:.2g} mm on the board, more than their own "
             "sigmas say: an inexact print, or a lens that is only nearly of its model; they count with that, "
             "but it is the same in every picture, and uncertainties are rather too small",

@@ -166,7 +166,7 @@ def sigma_reasons(survey: Survey, calibration: Calibration | BenchCalibration) -
         grade: Grade = "good" if c.generous else "care"
         if c.factor > HOPELESS * allowed(survey, images, c.kind):
             grade = "bad"
-        elif c.factor < 1.0 / HOPELESS:
+        elif c.factor < 1.0 / HOPELESS and not survey.boards:  # a bench's are counts, which nobody chose
             grade = "care"
         reasons.append(Reason(grade, wrong_sentence(survey, images, c, wrong)))
     return [*reasons, *_one_station(survey, components)]
