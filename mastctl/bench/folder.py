@@ -69,7 +69,7 @@ class Kept:
         self.notes = _read_notes(self._journal)
         self._numbers: dict[str, int] = {}
         for image in self._folder.survey().images:
-            number = int(_of_look(image).rsplit("-", 1)[1])
+            number = _number_of(image, path)
             self._numbers[image.placement] = max(number, self._numbers.get(image.placement, 0))
 
     def begin(self, former: bytes, frame: Frame) -> None:
@@ -222,6 +222,18 @@ def looks_of(survey: Survey) -> Iterator[tuple[str, bool, Look]]:
 def _of_look(image: SurveyImage) -> str:
     """The name of an image without its camera's."""
     return image.name.removesuffix(f"-{image.camera}")
+
+
+def _number_of(image: SurveyImage, path: Path) -> int:
+    """Which look of its placement an image is of. Raises BadFile for one that no run took."""
+    number = _of_look(image).removeprefix(f"{image.placement}-")
+    if not (number.isascii() and number.isdigit()):
+        words = (
+            f"{image.name} where PLACEMENT-NUMBER-CAMERA is expected: no run took these pictures; "
+            "fit them by `mastctl calibrate bench FOLDER`, or name another folder for a run (--survey)"
+        )
+        raise BadFile(path / "images.csv", "", words)
+    return int(number)
 
 
 def _ends_a_line(path: Path) -> bool:

@@ -15,12 +15,14 @@ import pytest
 from bench_world import corner_bench, run_of
 
 from calib.boards import Charuco, save_board
+from calib.errors import BadFile
 from calib.fit.bench import BenchNotFitted
-from calib.survey import bench_writer, read_survey
+from calib.survey import bench_writer, read_survey, write_survey
 from calib.survey.bench_writer import NotWritten
+from drivers.sim_survey.bench import BenchPlan, simulate_bench
 from mastctl.bench.daemon_eyes import Interrupted
 from mastctl.bench.eyes import Look
-from mastctl.bench.folder import looks_of
+from mastctl.bench.folder import Kept, looks_of
 from mastctl.bench.run import BenchRun
 from mastctl.bench.search import BoardNotFound
 from mastctl.bench.teller import Terminal
@@ -166,3 +168,9 @@ def test_a_search_that_can_find_nothing_ends_soon_and_says_why(
     with pytest.raises(BoardNotFound, match=re.escape(why.split("{")[0])):
         run.run()
     assert bench.looks <= most + 2
+
+
+def test_a_folder_whose_pictures_no_run_took_is_refused_in_a_sentence(tmp_path: Path) -> None:
+    theirs = write_survey(simulate_bench(1, BenchPlan(attitudes=3, checks=1)), tmp_path / "theirs")
+    with pytest.raises(BadFile, match="navcam_left-001 where PLACEMENT-NUMBER-CAMERA is expected"):
+        Kept(theirs.folder, theirs.boards, theirs.sigma, theirs.cameras, theirs.stereo)
