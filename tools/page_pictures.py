@@ -37,6 +37,7 @@ def main() -> int:
     parser.add_argument("--out", type=Path, default=Path("docs/img"))
     parser.add_argument("--only", choices=("rover", "bench"), help="those of one of both")
     args = parser.parse_args()
+    args.out.mkdir(parents=True, exist_ok=True)
     path = chromium()
     if path is None:
         parser.error("there is no chromium; python -m tools.browser installs it")
