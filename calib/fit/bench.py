@@ -10,7 +10,7 @@ squares.
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -24,7 +24,7 @@ from calib.fit.bench_problem import BenchOptions, BenchProblem, without_terms
 from calib.fit.bench_start import BenchNotFitted, SomethingChanged
 from calib.fit.bench_told import choose, told
 from calib.fit.joint import typical_length, weigh, without_blunders
-from calib.fit.least_squares import minimise
+from calib.fit.least_squares import Minimum, minimise
 from calib.fit.model_terms import Tested
 from calib.fit.start_values import SurveyNotFitted
 from calib.survey import Survey
@@ -117,14 +117,9 @@ def _look_for_changes(bench: BenchProblem, chosen: Sequence[str]) -> tuple[Adjus
     """
     strays = {n: s for view in bench.views.values() for n, s in view.strays.items()}
     for left in range(CHANGES, -1, -1):
-        problem = bench.seen(chosen, bench.start)
-        problem = problem.with_terms([replace(t, keep=t.keep & ~strays[t.name]) for t in problem.images], ())
-        fit = minimise(problem, bench.start, weak=problem.weak, gain=1e-4)
+        problem, fit = _roughly(bench, chosen, strays, bench.start)
         if np.isfinite(fit.normal.cost) and bench.allow_inexact(problem, fit.state):
-            problem = bench.seen(chosen, fit.state)
-            keep = {n: ~s for n, s in strays.items()}
-            problem = problem.with_terms([replace(t, keep=t.keep & keep[t.name]) for t in problem.images], ())
-            fit = minimise(problem, fit.state, weak=problem.weak, gain=1e-4)
+            problem, fit = _roughly(bench, chosen, strays, fit.state)
         problem = _without_lone_strays(problem, fit.state).with_huber(SCAN_HUBER)
         fit = minimise(problem, fit.state, weak=problem.weak, gain=1e-6)
         if not np.isfinite(fit.normal.cost) or not left:
@@ -140,6 +135,15 @@ def _look_for_changes(bench: BenchProblem, chosen: Sequence[str]) -> tuple[Adjus
         bench.split_placement(change.board, change.after)
         bench.begin()
     return problem.with_huber(HUBER), fit.state
+
+
+def _roughly(
+    bench: BenchProblem, chosen: Sequence[str], strays: Mapping[str, Any], start: Estimate
+) -> tuple[Adjustment, Minimum[Estimate]]:
+    """The problem with some terms, without what single cameras showed to be wrong, and a first fit of it."""
+    problem = bench.seen(chosen, start)
+    problem = problem.with_terms([replace(t, keep=t.keep & ~strays[t.name]) for t in problem.images], ())
+    return problem, minimise(problem, start, weak=problem.weak, gain=1e-4)
 
 
 def _refuse_slip(bench: BenchProblem, state: Estimate) -> None:

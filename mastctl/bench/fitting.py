@@ -30,7 +30,7 @@ class Fitted:
     corner_rms_px
         Rms per axis of the fitted corners.
     sigma_scale
-        How large residuals are against the sigmas that were stated of corners.
+        How large residuals are against the sigmas that corners came with.
     calibration
         All of what the fit tells; None of a stand-in.
     """
@@ -53,7 +53,10 @@ def fit_in_rover(frame: Frame, former: Rig, moved: Callable[[], Mapping[str, flo
         # Of a board that moved, "p1 from IMAGE on" comes after "p1": where it stands now.
         boards = {placement.split(" ")[0]: pose for (_, placement), pose in done.rover_from_board.items()}
         rms = float(np.sqrt(np.mean(np.square(list(done.rms_px.values())))))
-        scale = float(np.sqrt(done.chi2 / max(done.degrees_of_freedom, 1.0)))
+        # Corners were fitted with what print and lens add; those that a run plans with come without it.
+        fitted_px = np.median(np.concatenate([image.sigma_px for image in done.images]))
+        own_px = np.median(np.concatenate([one.sigma_px for one in survey.corners.values()]))
+        scale = float(np.sqrt(done.chi2 / max(done.degrees_of_freedom, 1.0)) * fitted_px / own_px)
         return Fitted(done.rig, boards, max(rms, LEAST_PX), max(scale, LEAST_SCALE), done)
 
     return fit

@@ -12,13 +12,15 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from calib.files.mast_file import load_rig, save_rig
-from calib.fit.bench import BenchNotFitted, BenchOptions
+from calib.fit.bench import BenchNotFitted, BenchOptions, fit_bench
 from calib.fit.bench_calibration import BenchCalibration
 from calib.mast.rig import Mast, Rig
 from calib.survey import Survey, read_survey, write_survey
 from drivers.sim_survey.bench import NAVCAMS, BenchCamera, BenchPlan, Placement, simulate_bench
 from mastctl.bench import frame
+from mastctl.bench.fitting import fit_in_rover
 from mastctl.bench.folder import FORMER
+from mastctl.bench.frame import Frame
 from mastctl.calibration.bench_verdict import judge_bench
 from mastctl.cli.main import main
 
@@ -144,3 +146,11 @@ def test_a_placement_that_moved_and_spoils_the_fit_is_left_out_with_a_sentence(
     assert {placement for _, placement in done.rover_from_board} == {"p2", "p3"}
     (reason,) = [r for r in judge_bench(survey, done).reasons if "placement p1" in r.sentence]
     assert reason.grade == "care" and "shows the board 24.7 px aside" in reason.sentence
+
+
+@pytest.mark.parametrize("print_m", [0.0, 1e-4])
+def test_a_run_plans_with_corners_that_are_off_by_what_print_and_lens_add(print_m: float) -> None:
+    survey = simulate_bench(1, BenchPlan(attitudes=9, checks=3, own_px=0.01, print_m=print_m))
+    former = fit_bench(survey).rig
+    fitted = fit_in_rover(Frame(), former, dict)(survey)
+    assert fitted.sigma_scale * 0.01 == pytest.approx(fitted.corner_rms_px, rel=0.4)
