@@ -17,6 +17,7 @@ import pytest
 REPOSITORY = Path(__file__).resolve().parent.parent
 VM_CONFTEST = REPOSITORY / "hil_tests" / "vm" / "conftest.py"
 SHARED_DATA = REPOSITORY.parent / "shared" / "data"
+LONG_PARTS = (1, 2, 3, 4)  # of the long run; CI takes them in turns
 
 # Whoever runs the tests may ignore signals, as nohup does and a shell for what it puts into the background;
 # that is inherited, and would make daemons and commands under test ignore them too.
@@ -43,18 +44,46 @@ def pytest_addoption(parser: pytest.Parser) -> None:
         action="store_true",
         help="fail, not skip, without the kernel of hil_tests/vm",
     )
+    parser.addoption("--long", action="store_true", help="run the long tests instead of the quick ones")
+    parser.addoption(
+        "--long-part", type=int, choices=LONG_PARTS, help="with --long: only those of one part", metavar="N"
+    )
 
 
-LONG = (
+def pytest_configure(config: pytest.Config) -> None:
+    """Declare the marker of the long run."""
+    config.addinivalue_line(
+        "markers",
+        "long(part, why): left out of the quick run; belongs to one of the four parts of the long run that "
+        "CI takes in turns. docs/testing.md lists these tests with their reasons",
+    )
+
+
+FIRST = (
     "test_on_a_real_driver", "test_closed_loop", "test_bench_suite", "test_packaging", "test_camera_sync",
     "test_campaign_tasks", "test_guided_bench", "test_page_bench", "test_soak_and_faults",
     "test_health_end_to_end",
 )  # fmt: skip
 
 
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Put the few files that take longest first: none of them is to begin when all others have ended."""
-    items.sort(key=lambda item: item.path.stem not in LONG)
+@pytest.hookimpl(trylast=True)
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Keep the quick tests or the long ones; put the few files that take longest first."""
+    wanted_part = config.getoption("--long-part")
+    kept, left = [], []
+    for item in items:
+        marker = item.get_closest_marker("long")
+        if marker is None:
+            runs = not config.getoption("--long")
+        else:
+            part, why = marker.args
+            if part not in LONG_PARTS or not why:
+                raise pytest.UsageError(f"{item.nodeid}: long needs a part of {LONG_PARTS} and a reason")
+            runs = config.getoption("--long") and wanted_part in (None, part)
+        (kept if runs else left).append(item)
+    if left:
+        config.hook.pytest_deselected(items=left)
+    items[:] = sorted(kept, key=lambda item: item.path.stem not in FIRST)
 
 
 @pytest.hookimpl(wrapper=True, tryfirst=True)
