@@ -15,6 +15,7 @@ import select
 import socket
 import termios
 import time
+from typing import Protocol
 from urllib.parse import urlsplit
 
 import serial
@@ -31,6 +32,43 @@ open, since changing it makes pyserial set up the port anew (over the network wi
 _BROKEN = (OSError, EOFError, termios.error, ValueError, TypeError, AttributeError, IndexError)
 """What pyserial raises when the other side is gone: SerialException, which is an OSError; reset_input_buffer
 gives termios.error; a port closed under a read TypeError or AttributeError."""
+
+
+class ByteLine(Protocol):
+    """An open line of bytes, as a driver talks on it: a `SerialLine`, or one in memory.
+
+    One thread reads; any may write beside it.
+    """
+
+    @property
+    def baud(self) -> int:
+        """Bits per second."""
+        ...
+
+    @property
+    def byte_s(self) -> float:
+        """Time of one byte on the wire, seconds."""
+        ...
+
+    def write(self, data: bytes) -> None:
+        """Send bytes. Raises LineLost."""
+        ...
+
+    def read(self, wait_s: float) -> bytes:
+        """Return the bytes that have come or come within ``wait_s``; else none. Raises LineLost."""
+        ...
+
+    def close(self) -> None:
+        """Let go of the line, whatever state it is in; twice does no harm."""
+        ...
+
+
+class OpenLine(Protocol):
+    """How a driver opens its line: `SerialLine`, unless somebody gives it another."""
+
+    def __call__(self, port: str, baud: int, device: str = "") -> ByteLine:
+        """Return an open line; parameters and errors as of `SerialLine`."""
+        ...
 
 
 class _SocketPort(protocol_socket.Serial):  # type: ignore[misc]

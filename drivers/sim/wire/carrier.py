@@ -9,8 +9,6 @@ from __future__ import annotations
 import heapq
 import itertools
 import logging
-import os
-import select
 import threading
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
@@ -80,11 +78,10 @@ class Line(ABC):
         self._schedule: list[tuple[float, int, bool, bytes]] = []  # when, order, to the device?, bytes
         self._order = itertools.count()
         self._to_device_free_s = self._to_host_free_s = -float("inf")
-        self._changed = threading.Condition()
+        self._changed = clock.signal()
         self._up = self._wanted_up = True
-        self._closing = False
-        self._wake_read, self._wake_write = os.pipe()
-        self._thread = threading.Thread(target=self._run, name="simulated line", daemon=True)
+        self._closing = self._ended = False
+        self._thread = clock.thread(self._run, "simulated line")
 
     def hang_up(self) -> None:
         """Break the connection, as if the cable were pulled; return when it is broken."""
@@ -95,17 +92,17 @@ class Line(ABC):
         self._want(up=True)
 
     def close(self) -> None:
-        """End the thread and let go of every descriptor; a second call does nothing."""
+        """End the thread and let go of what the line holds; a second call does nothing."""
         if self._closing:
             return
+        self._closing = True
+        self._wake()
         with self._changed:
-            self._closing = True
-        os.write(self._wake_write, b"x")
-        self._thread.join()
+            while not self._ended:
+                self._changed.wait()
+        self._thread.join()  # it waits for nothing any more
         self._disconnect()
         self._dismantle()
-        os.close(self._wake_read)
-        os.close(self._wake_write)
 
     def __enter__(self: _L) -> _L:
         return self
@@ -126,28 +123,44 @@ class Line(ABC):
     def _disconnect(self) -> None:
         """Break it; nothing if it is broken."""
 
-    def _dismantle(self) -> None:  # noqa: B027  # only a pseudo terminal has something
+    def _dismantle(self) -> None:  # noqa: B027  # memory has nothing
         """Let go of what outlives a hang-up."""
 
     @abstractmethod
-    def _readable(self) -> list[int]:
-        """The descriptors that may have something for ``_take``."""
+    def _listen(self, wait_s: float) -> bytes:
+        """Wait until the host sends, `_wake` is called, or so long at most; return what the host has sent,
+        empty for nothing that the device would understand."""
 
     @abstractmethod
-    def _take(self, ready: Sequence[int]) -> bytes:
-        """What the host has sent, empty for nothing that the device would understand."""
+    def _wake(self) -> None:
+        """End a `_listen` that is under way, or the next one; from any thread."""
 
     @abstractmethod
     def _give(self, data: bytes) -> None:
         """Hand bytes to the host; what it does not make room for is lost, as on a real line."""
 
+    def _understood(self, data: bytes, host_baud: int) -> bytes:
+        """What is left for the device of bytes that a host sends at a speed."""
+        if not self._wire_time:
+            return data
+        if isinstance(self.device, ManyBauds):
+            self.device.host_baud = host_baud
+        return data if host_baud == self.device.baud else b""  # else framing errors only
+
+    def _heard(self, data: bytes, host_baud: int) -> bytes:
+        """What a host that listens at a speed takes for the device's bytes."""
+        if self._wire_time and host_baud != self.device.baud:
+            return bytes(byte ^ 0xA5 for byte in data)
+        return data
+
     def _want(self, up: bool) -> None:
+        self._wanted_up = up
+        if self._closing or threading.current_thread() is self._thread:
+            return
+        self._wake()
         with self._changed:
-            self._wanted_up = up
-            if self._closing or threading.current_thread() is self._thread:
-                return
-            os.write(self._wake_write, b"x")
-            self._changed.wait_for(lambda: self._up == up or self._closing, timeout=10.0)
+            while self._up != up and not self._ended:
+                self._changed.wait()
 
     def _run(self) -> None:
         """Carry bytes until the line is closed."""
@@ -158,16 +171,15 @@ class Line(ABC):
                 wait_s = POLL_S
                 if self._schedule:
                     wait_s = min(wait_s, max(0.0, self._schedule[0][0] - self._clock.now_s()))
-                ends = self._readable() if self._up else []
-                ready = select.select([self._wake_read, *ends], [], [], wait_s)[0]
-                if self._wake_read in ready:
-                    os.read(self._wake_read, 4096)
-                data = self._take(ready) if self._up else b""
+                data = self._listen(wait_s)
                 if data:
                     self._arrive(data, self._clock.now_s())
             except Exception:  # a defect of the simulator must show, and not end the line in silence
                 log.exception("the simulated line stumbled")
                 self._clock.sleep(POLL_S)
+        with self._changed:
+            self._ended = True
+            self._changed.notify_all()
 
     def _follow(self, now_s: float) -> None:
         """Hang up or come back, poll the device, and carry out what is due."""

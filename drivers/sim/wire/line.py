@@ -1,4 +1,4 @@
-"""The ends of a simulated line that a host can open: a pseudo terminal or a TCP port.
+"""The ends of a simulated line that another program can open: a pseudo terminal or a TCP port.
 
 On a pseudo terminal the host's bytes count only at the device's baud rate, as on a real line, and both
 directions take 10 bits a byte.
@@ -10,25 +10,64 @@ import contextlib
 import errno
 import fcntl
 import os
+import select
 import shutil
 import socket
 import struct
 import tempfile
 import tty
+from abc import abstractmethod
 from collections.abc import Sequence
 from pathlib import Path
 
 from drivers.clock import Clock
 from drivers.errors import BadOptions
 from drivers.faults import FaultPanel
-from drivers.sim.wire.carrier import Line, ManyBauds, Observer
+from drivers.sim.wire.carrier import Line, Observer
 from drivers.sim.wire.carrier import WireDevice as WireDevice
 from drivers.sim.wire.line_faults import Reply as Reply
 
 _TCGETS2 = 0x802C542A  # asm-generic/ioctls.h; struct termios2: 4 flags, line, 19 characters, 2 speeds
 
 
-class PtyLine(Line):
+class _KernelLine(Line):
+    """A line whose host is beyond the kernel: its thread waits in real time."""
+
+    def __init__(
+        self,
+        device: WireDevice,
+        clock: Clock,
+        faults: FaultPanel | None,
+        wire_time: bool,
+        observer: Observer | None,
+    ) -> None:
+        super().__init__(device, clock, faults, wire_time, observer)
+        self._wake_read, self._wake_write = os.pipe()
+
+    @abstractmethod
+    def _readable(self) -> list[int]:
+        """The descriptors that may have something for ``_take``."""
+
+    @abstractmethod
+    def _take(self, ready: Sequence[int]) -> bytes:
+        """As `_listen`, of descriptors that have something."""
+
+    def _listen(self, wait_s: float) -> bytes:
+        ends = self._readable() if self._up else []
+        ready = select.select([self._wake_read, *ends], [], [], wait_s)[0]
+        if self._wake_read in ready:
+            os.read(self._wake_read, 4096)
+        return self._take(ready) if self._up else b""
+
+    def _wake(self) -> None:
+        os.write(self._wake_write, b"x")
+
+    def _dismantle(self) -> None:
+        os.close(self._wake_read)
+        os.close(self._wake_write)
+
+
+class PtyLine(_KernelLine):
     """A serial line as a pseudo terminal; a context manager.
 
     Parameters
@@ -79,8 +118,6 @@ class PtyLine(Line):
         except OSError as error:
             self._disconnect()
             self._dismantle()
-            os.close(self._wake_read)
-            os.close(self._wake_write)
             raise BadOptions(
                 f"the link {self.path} to a simulated line cannot be made: {error.strerror}"
             ) from None
@@ -108,6 +145,7 @@ class PtyLine(Line):
         self._master = self._slave = -1
 
     def _dismantle(self) -> None:
+        super()._dismantle()
         if self._folder is not None:
             shutil.rmtree(self._folder, ignore_errors=True)
 
@@ -118,12 +156,7 @@ class PtyLine(Line):
         if self._master not in ready:
             return b""
         data = os.read(self._master, 4096)
-        if not self._wire_time:
-            return data
-        host_baud = self._host_baud()
-        if isinstance(self.device, ManyBauds):
-            self.device.host_baud = host_baud
-        return data if host_baud == self.device.baud else b""  # else framing errors only
+        return self._understood(data, self._host_baud() if self._wire_time else 0)
 
     def _host_baud(self) -> int:
         """The speed that the host has set on its end."""
@@ -131,8 +164,7 @@ class PtyLine(Line):
         return int(struct.unpack_from("I", state, 40)[0])
 
     def _give(self, data: bytes) -> None:
-        if self._wire_time and self._host_baud() != self.device.baud:
-            data = bytes(byte ^ 0xA5 for byte in data)
+        data = self._heard(data, self._host_baud() if self._wire_time else 0)
         try:
             os.write(self._master, data)
         except OSError as error:
@@ -140,7 +172,7 @@ class PtyLine(Line):
                 raise
 
 
-class TcpLine(Line):
+class TcpLine(_KernelLine):
     """A device behind a TCP port, one host at a time; a context manager.
 
     Parameters
@@ -184,8 +216,7 @@ class TcpLine(Line):
             self._connect()
         except (OSError, OverflowError) as error:
             self._disconnect()
-            os.close(self._wake_read)
-            os.close(self._wake_write)
+            self._dismantle()
             raise BadOptions(f"cannot listen at {host}:{port}: {error}") from None
         self._thread.start()
 
