@@ -6,6 +6,8 @@ import atexit
 import os
 import shutil
 import signal
+import subprocess
+import sys
 import tempfile
 from collections import Counter
 from collections.abc import Generator
@@ -17,6 +19,7 @@ import pytest
 REPOSITORY = Path(__file__).resolve().parent.parent
 VM_CONFTEST = REPOSITORY / "hil_tests" / "vm" / "conftest.py"
 SHARED_DATA = REPOSITORY.parent / "shared" / "data"
+MOST_ALONE = 12  # failed tests that are tried alone: more than these are no matter of chance
 LONG_PARTS = (1, 2, 3, 4)  # of the long run; CI takes them in turns
 
 # Whoever runs the tests may ignore signals, as nohup does and a shell for what it puts into the background;
@@ -47,6 +50,11 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--long", action="store_true", help="run the long tests instead of the quick ones")
     parser.addoption(
         "--long-part", type=int, choices=LONG_PARTS, help="with --long: only those of one part", metavar="N"
+    )
+    parser.addoption(
+        "--tell-flaky",
+        action="store_true",
+        help="run each failed test once more by itself and name those that then pass; the run still fails",
     )
 
 
@@ -90,6 +98,8 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> Generator[None]:
     """Say in the last line before the counts what did not run for want of the kernel, and what mends it."""
     yield
+    if terminalreporter.config.getoption("--tell-flaky"):
+        _tell_flaky(terminalreporter)
     skipped = terminalreporter.getreports("skipped")
     reasons = Counter(
         why for path, _, why in (told.longrepr for told in skipped) if Path(path) == VM_CONFTEST
@@ -97,6 +107,19 @@ def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> Genera
     for reason, tests in reasons.items():
         what = f"{tests} test{'s' if tests > 1 else ''} on a kernel with virtual cameras"
         terminalreporter.write_line(f"not run: {what}: {reason.removeprefix('Skipped: ')}")
+
+
+def _tell_flaky(terminalreporter: pytest.TerminalReporter) -> None:
+    """Run the failed tests one by one and name those that pass alone. What failed has failed nevertheless."""
+    bad = [*terminalreporter.getreports("failed"), *terminalreporter.getreports("error")]
+    config = terminalreporter.config
+    command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider"]
+    command += ["--long"] if config.getoption("--long") else []
+    for test in sorted({report.nodeid for report in bad if "::" in report.nodeid})[:MOST_ALONE]:
+        alone = subprocess.run([*command, test], cwd=config.rootpath, stdout=subprocess.DEVNULL, check=False)
+        terminalreporter.write_line(
+            f"{'fails alone too' if alone.returncode else 'flaky (passes alone)'}: {test}"
+        )
 
 
 @pytest.fixture(scope="session")
