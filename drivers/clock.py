@@ -97,6 +97,43 @@ class _MachineTime:
         return nullcontext()
 
 
+class Turn:
+    """A lock for who waits on a clock inside it; whoever has it may take it again. A context manager."""
+
+    def __init__(self, clock: Clock) -> None:
+        self._free = clock.signal()
+        self._owner: int | None = None
+        self._depth = 0
+
+    def acquire(self, blocking: bool = True) -> bool:
+        """Take it, and wait for it if ``blocking``; return whether the calling thread has it now."""
+        me = threading.get_ident()
+        with self._free:
+            while self._owner not in (None, me):
+                if not blocking:
+                    return False
+                self._free.wait()
+            self._owner = me
+            self._depth += 1
+            return True
+
+    def release(self) -> None:
+        """Give it back, as often as it was taken."""
+        with self._free:
+            self._depth -= 1
+            if self._depth == 0:
+                self._owner = None
+                self._free.notify_all()
+
+    def __enter__(self) -> None:
+        self.acquire()
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.release()
+
+
 class SystemClock(_MachineTime):
     """CLOCK_MONOTONIC."""
 

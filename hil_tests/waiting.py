@@ -6,9 +6,10 @@ has eight other busy processes; a test that means "quickly" asserts an order of 
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from typing import TypeVar
+
+from drivers.clock import Clock, SystemClock
 
 NET_S = 60.0
 LOOK_EVERY_S = 0.005
@@ -16,18 +17,19 @@ LOOK_EVERY_S = 0.005
 T = TypeVar("T")
 
 
-def until(holds: Callable[[], T], what: str, within_s: float = NET_S) -> T:
+def until(holds: Callable[[], T], what: str, within_s: float = NET_S, clock: Clock | None = None) -> T:
     """Call ``holds`` until it returns something true, and return that.
 
     Raises
     ------
     AssertionError
-        Naming ``what`` if it did not hold within ``within_s`` seconds of real time.
+        Naming ``what`` if it did not hold within ``within_s`` seconds of ``clock``, of real time by default.
     """
-    end_s = time.monotonic() + within_s
+    clock = clock or SystemClock()
+    end_s = clock.now_s() + within_s
     while True:
         if found := holds():
             return found
-        if time.monotonic() > end_s:
+        if clock.now_s() > end_s:
             raise AssertionError(f"not within {within_s:g} s: {what}")
-        time.sleep(LOOK_EVERY_S)
+        clock.sleep(LOOK_EVERY_S)

@@ -1,6 +1,6 @@
 """One question at a time with a unit: each answer is matched to its question, or is not taken at all.
 
-The answer to a question is the next line that fits it, within a deadline of the monotonic clock. A line that
+The answer to a question is the next line that fits it, within a deadline of the clock. A line that
 does not fit is an error, never skipped in silence, unless it is the last answer once more. After any error
 the two sides may be out of step: an answer may still be under way. Then nothing is asked before `in_step` has
 let the line fall quiet and has asked the resolutions of both axes, whose words no other answer has: since a
@@ -16,16 +16,16 @@ One that stays terse or without such an echo is understood too; it is listened t
 from __future__ import annotations
 
 import threading
-import time
 from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import TypeVar
 
+from drivers.clock import Clock
 from drivers.errors import BadReply, DriverError, NoReply, Refused
 from drivers.flir_ptu.replies import Answer, LineSplitter, answer_of, hits_of, number_of, without_hits
-from drivers.serial_line import SerialLine
+from drivers.serial_line import ByteLine
 
 T = TypeVar("T")
 
@@ -92,6 +92,8 @@ class Conversation:
         The head's name in errors.
     on_hit
         Told the axis, ``pan`` or ``tilt``, whenever a limit hit comes that nobody asked for.
+    clock
+        What its deadlines run on; it goes on while somebody waits for the line.
 
     Attributes
     ----------
@@ -99,8 +101,9 @@ class Conversation:
         Whether nothing is asked any more when something was shouted.
     """
 
-    def __init__(self, line: SerialLine, device: str, on_hit: Callable[[str], None]) -> None:
+    def __init__(self, line: ByteLine, device: str, on_hit: Callable[[str], None], clock: Clock) -> None:
         self._line = line
+        self._clock = clock
         self._device = device
         self._on_hit = on_hit
         self._splitter = LineSplitter()
@@ -139,7 +142,7 @@ class Conversation:
         if manners != self._manners:  # the first time, and after a power cycle
             for command in ("FV", "EE"):
                 self._line.write(f"{command} ".encode())
-                self._next_answer(command, time.monotonic() + self.reply_s, skip=True)
+                self._next_answer(command, self._clock.now_s() + self.reply_s, skip=True)
                 self._quiet()
             found, self._manners = self._resolutions()
         self._in_step = True
@@ -207,7 +210,7 @@ class Conversation:
         """
         self._quiet()
         self._line.write(b"R ")
-        answer = self._next_answer("R", time.monotonic() + patience_s, skip=True)
+        answer = self._next_answer("R", self._clock.now_s() + patience_s, skip=True)
         if not answer.good:
             raise Refused(f"refuses R: {answer.text or 'without words'}", device=self._device)
 
@@ -246,7 +249,7 @@ class Conversation:
         while self._shouts:
             self._answered, self._last_written = b"", command  # two stops have the same answer
             try:
-                answer = self._next_answer(command, time.monotonic() + self.reply_s, skip=False)
+                answer = self._next_answer(command, self._clock.now_s() + self.reply_s, skip=False)
             except (NoReply, BadReply):
                 return False
             if not (answer.good and answer.exact):
@@ -298,7 +301,7 @@ class Conversation:
             self._give_way(command)
             written = self._written(command)
             self._line.write(f"{written} ".encode())
-        answer = self._next_answer(written, time.monotonic() + patience_s, skip=False)
+        answer = self._next_answer(written, self._clock.now_s() + patience_s, skip=False)
         if self._manners.echo and not answer.echo:
             raise BadReply(f"answered {command} without its echo", device=self._device)
         if self._manners.exact and not answer.exact:
@@ -354,7 +357,7 @@ class Conversation:
         while (written := self._written(query.letters)).isupper():
             pass  # that would not tell whether the echo keeps small letters
         self._line.write(f"{written} ".encode())
-        until_s = time.monotonic() + self.reply_s
+        until_s = self._clock.now_s() + self.reply_s
         refusal = ""
         while True:
             try:
@@ -396,11 +399,11 @@ class Conversation:
     def _next_line(self, command: str, until_s: float) -> bytes:
         """The next complete line."""
         while not self._lines:
-            data = self._line.read(max(0.0, until_s - time.monotonic()))
+            data = self._line.read(max(0.0, until_s - self._clock.now_s()))
             for line in self._splitter.feed(data):
                 self._note_hits(line)
                 self._lines.append(line)
-            if not self._lines and time.monotonic() >= until_s:
+            if not self._lines and self._clock.now_s() >= until_s:
                 raise NoReply(f"did not answer {command.upper()} within its deadline", device=self._device)
         return self._lines.popleft()
 
@@ -411,8 +414,8 @@ class Conversation:
         self._shouts = 0
         unknown = self._manners.exact is None
         quiet_s = QUIET_S if unknown or self._manners.exact else max(QUIET_S, self.reply_s)
-        until_s = time.monotonic() + quiet_s + LONGEST_DRAIN_S
-        while time.monotonic() < until_s:
+        until_s = self._clock.now_s() + quiet_s + LONGEST_DRAIN_S
+        while self._clock.now_s() < until_s:
             data = self._line.read(quiet_s)
             if not data:
                 break

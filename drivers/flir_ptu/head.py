@@ -14,15 +14,13 @@ for the service's soft limits and not for the decision what to do about a fault:
 from __future__ import annotations
 
 import logging
-import threading
-import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from typing import Any
 
 from drivers.absence import Absence
 from drivers.approach import rising_below_rad
-from drivers.clock import Clock, SystemClock
+from drivers.clock import Clock, SystemClock, Turn, deadlines_on
 from drivers.errors import BadReply, DriverError, HardwareFault, LineLost, NoReply, OutOfRange
 from drivers.flir_ptu import conversation as ask
 from drivers.flir_ptu.axis import StepAxis
@@ -33,7 +31,7 @@ from drivers.flir_ptu.position import measure
 from drivers.flir_ptu.ready import checked_version, ready_axes
 from drivers.flir_ptu.supply import SupplyWatch
 from drivers.interfaces import AxisMotion, Reading
-from drivers.serial_line import SerialLine
+from drivers.serial_line import OpenLine, SerialLine
 
 log = logging.getLogger(__name__)
 
@@ -42,7 +40,9 @@ STOP_OVER_S = 1.0  # how long a reading waits for the stop that it gave way to
 GIVING_WAY_S = 2.0  # how long a reading begins anew where one stop comes after another
 
 
-def open_head(options: Mapping[str, Any], clock: Clock | None = None) -> FlirPtu:
+def open_head(
+    options: Mapping[str, Any], clock: Clock | None = None, open_line: OpenLine = SerialLine
+) -> FlirPtu:
     """Return the open head that the options name.
 
     Parameters
@@ -50,7 +50,10 @@ def open_head(options: Mapping[str, Any], clock: Clock | None = None) -> FlirPtu
     options
         See `drivers.flir_ptu.options`.
     clock
-        Stamps the readings; the machine's monotonic clock when left out.
+        Stamps the readings, and deadlines run on it if it goes on by itself; the machine's monotonic clock
+        when left out.
+    open_line
+        How its line is opened.
 
     Raises
     ------
@@ -61,7 +64,7 @@ def open_head(options: Mapping[str, Any], clock: Clock | None = None) -> FlirPtu
     LineLost, NoReply, BadReply, Refused
         If the unit cannot be reached.
     """
-    return FlirPtu(options_from(options), clock or SystemClock())
+    return FlirPtu(options_from(options), clock or SystemClock(), open_line)
 
 
 class FlirPtu:
@@ -77,15 +80,16 @@ class FlirPtu:
 
     stops_beside = True
 
-    def __init__(self, options: Options, clock: Clock) -> None:
+    def __init__(self, options: Options, clock: Clock, open_line: OpenLine) -> None:
         self._options = options
         self._clock = clock
-        self._lock = threading.RLock()
-        self._stop_asked = threading.Event()
-        self._stop_over = threading.Event()
-        self._stop_over.set()
+        self._time = deadlines_on(clock)
+        self._open_line = open_line
+        self._turn = Turn(self._time)
+        self._stop_over = self._time.signal()
+        self._stop_asked = False
         self._count = StepCount()
-        self._supply = SupplyWatch(options)
+        self._supply = SupplyWatch(options, self._time)
         self._absence = Absence()
         self._deaf = False  # to limit hits
         self._closed = False
@@ -107,14 +111,16 @@ class FlirPtu:
         WrongDevice
             If what answers after that does not fit the options any more.
         """
-        until = time.monotonic() + GIVING_WAY_S
+        until_s = self._time.now_s() + GIVING_WAY_S
         while True:
             try:
                 return self._read()
             except Interrupted:  # several stops may come into one reading
-                if time.monotonic() > until:
+                if self._time.now_s() > until_s:
                     raise
-            self._stop_over.wait(STOP_OVER_S)
+            with self._stop_over:
+                if self._stop_asked:
+                    self._stop_over.wait(STOP_OVER_S)
 
     def _read(self) -> Reading:
         with self._talking() as talk:
@@ -162,7 +168,7 @@ class FlirPtu:
             if self._count.doubted:
                 words = "told of a limit hit while it stood still; it is checked before it moves"
                 raise BadReply(words, device=DEVICE)
-            if self._stop_asked.is_set():
+            if self._stop_asked:
                 raise DriverError("a stop came before the move was started", device=DEVICE)
             for name, axis in self._axes.items():
                 axis.sent(ways[name][0], self._clock.now_s())
@@ -183,9 +189,8 @@ class FlirPtu:
         NoReply, BadReply, LineLost
             If the unit did not confirm.
         """
-        self._stop_asked.set()
-        self._stop_over.clear()
-        free = self._lock.acquire(blocking=False)
+        self._stop_asked = True
+        free = self._turn.acquire(blocking=False)
         try:
             self._forget_legs()
             in_order = free and self._talk is not None and self._talk.is_in_step and not self._count.doubted
@@ -198,14 +203,15 @@ class FlirPtu:
                 self._halt_in_order()
         finally:
             self._forget_legs()  # those of a move that was under way beside it, whatever the unit has said
-            self._stop_asked.clear()
-            self._stop_over.set()
+            with self._stop_over:
+                self._stop_asked = False
+                self._stop_over.notify_all()
             if free:
-                self._lock.release()
+                self._turn.release()
 
     def close(self) -> None:
         """Halt and let go of the line."""
-        with self._lock:
+        with self._turn:
             if self._closed:
                 return
             try:
@@ -221,7 +227,7 @@ class FlirPtu:
     @contextmanager
     def _talking(self, gives_way: bool = True) -> Iterator[Conversation]:
         """The conversation in step, for one caller at a time; a line that turns out dead is closed."""
-        with self._lock:
+        with self._turn:
             if self._closed:
                 raise NoReply("it is closed", device=DEVICE)
             talk = self._talk or self._connect()
@@ -242,12 +248,12 @@ class FlirPtu:
 
     def _connect(self) -> Conversation:
         """Open the line, check the unit, and leave it standing still; not too often."""
-        if time.monotonic() < self._absence.again_s and not self._stop_asked.is_set():
+        if self._time.now_s() < self._absence.again_s and not self._stop_asked:
             self._absence.check()
         self._deaf = True  # a unit that homes itself at power-up reports its limit switches
         try:
-            line = SerialLine(self._options.port, self._options.baud, DEVICE)
-            talk = self._talk = Conversation(line, DEVICE, self._hit)
+            line = self._open_line(self._options.port, self._options.baud, DEVICE)
+            talk = self._talk = Conversation(line, DEVICE, self._hit, self._time)
             talk.shout("H")  # before any question: it may still be under way
             resolutions = talk.in_step()
             self._deaf = False
@@ -265,7 +271,7 @@ class FlirPtu:
 
     def _give_up(self, error: DriverError) -> None:
         """Close the line, and remember why and until when."""
-        self._absence.note(error, time.monotonic())
+        self._absence.note(error, self._time.now_s())
         self._drop()
 
     def _drop(self) -> None:
@@ -346,7 +352,7 @@ class FlirPtu:
 
     def _go_on(self, talk: Conversation, axis: StepAxis) -> None:
         """Send an axis that is where its approach begins to its goal."""
-        if axis.next_target is not None and axis.at_target and not self._stop_asked.is_set():
+        if axis.next_target is not None and axis.at_target and not self._stop_asked:
             talk.tell(f"{axis.name[0].upper()}P{axis.next_target}")
             axis.sent(axis.next_target, self._clock.now_s())
 

@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import logging
 import re
-import time
 from dataclasses import dataclass
 
+from drivers.clock import Clock
 from drivers.errors import Refused
 from drivers.flir_ptu.conversation import Conversation
 from drivers.flir_ptu.options import DEVICE, Options
@@ -63,9 +63,10 @@ class SupplyWatch:
         What is wrong, in plain words; empty if nothing is, or the unit does not tell.
     """
 
-    def __init__(self, options: Options) -> None:
+    def __init__(self, options: Options, clock: Clock) -> None:
         self.words: tuple[str, ...] = ()
         self._options = options
+        self._clock = clock
         self._at_start: Supply | None = None  # None: this unit does not tell
         self._due_s = 0.0
 
@@ -80,7 +81,7 @@ class SupplyWatch:
 
     def look(self, talk: Conversation) -> None:
         """Ask and judge now and then; a fault is told only if it is measured twice. Raises as `begin`."""
-        if self._at_start is None or time.monotonic() < self._due_s:
+        if self._at_start is None or self._clock.now_s() < self._due_s:
             return
         words: tuple[str, ...] = ()
         for _ in range(2):
@@ -90,7 +91,7 @@ class SupplyWatch:
             words = supply_words(supply, self._at_start, self._options)
             if not words:
                 break
-        self.words, self._due_s = words, time.monotonic() + EVERY_S
+        self.words, self._due_s = words, self._clock.now_s() + EVERY_S
 
 
 def _ask(talk: Conversation) -> Supply | None:

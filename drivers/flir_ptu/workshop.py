@@ -6,11 +6,12 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 
+from drivers.clock import Clock, SystemClock
 from drivers.errors import DriverError, Refused
 from drivers.flir_ptu import conversation as ask
 from drivers.flir_ptu.conversation import Conversation
 from drivers.flir_ptu.options import DEVICE
-from drivers.serial_line import SerialLine
+from drivers.serial_line import ByteLine, OpenLine, SerialLine
 
 HOMING_S = 60.0
 """How long a reset may take; up to 30 s, the manual says."""
@@ -40,37 +41,40 @@ class Facts:
     tilt: AxisFacts
 
 
-def facts(port: str, baud: int) -> Facts:
+def facts(port: str, baud: int, clock: Clock | None = None, open_line: OpenLine = SerialLine) -> Facts:
     """Return what a unit says about itself. Moves nothing.
+
+    ``clock`` and ``open_line`` are as of `drivers.flir_ptu.head.open_head`.
 
     Raises
     ------
     LineLost, NoReply, BadReply, Refused
         If it cannot be talked to.
     """
-    with _talking(port, baud) as talk:
+    with _talking(open_line(port, baud, DEVICE), clock) as talk:
         return _facts(talk)
 
 
-def home(port: str, baud: int) -> Facts:
+def home(port: str, baud: int, clock: Clock | None = None, open_line: OpenLine = SerialLine) -> Facts:
     """Reset a unit: both axes SWEEP THEIR FULL RANGE, whatever limits are set, and end at position 0.
 
-    Takes up to half a minute. Afterwards the unit knows its positions and its resolution.
+    Takes up to half a minute. Afterwards the unit knows its positions and its resolution. ``clock`` and
+    ``open_line`` are as of `drivers.flir_ptu.head.open_head`.
 
     Raises
     ------
     LineLost, NoReply, BadReply, Refused
         If it does not come through.
     """
-    with _talking(port, baud) as talk:
+    with _talking(open_line(port, baud, DEVICE), clock) as talk:
         talk.reset(HOMING_S)
         return _facts(talk)
 
 
 @contextmanager
-def _talking(port: str, baud: int) -> Iterator[Conversation]:
+def _talking(line: ByteLine, clock: Clock | None) -> Iterator[Conversation]:
     """A conversation on a line of its own."""
-    talk = Conversation(SerialLine(port, baud, DEVICE), DEVICE, lambda axis: None)
+    talk = Conversation(line, DEVICE, lambda axis: None, clock or SystemClock())
     try:
         with talk.patient():
             yield talk

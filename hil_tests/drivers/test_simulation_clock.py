@@ -14,7 +14,7 @@ from dataclasses import replace
 import pytest
 
 from drivers import simulation_clock
-from drivers.clock import SystemClock
+from drivers.clock import SystemClock, Turn
 from drivers.errors import BadOptions
 from drivers.hardware import DeviceSettings, HardwareSettings
 from drivers.open_hardware import clock_for
@@ -297,3 +297,23 @@ def test_bytes_on_a_simulated_wire_refuse_it_too() -> None:
     simulation = {"rover": "rover.yaml", "speed": 10, "wire": "dynamixel"}
     with pytest.raises(BadOptions, match="travel in real time"):
         clock_for(replace(SIMULATED, simulation=simulation))
+
+
+def test_a_turn_is_kept_while_its_thread_waits_on_the_clock_and_may_be_taken_twice() -> None:
+    clock = SimulationClock()
+    turn, order = Turn(clock), []
+
+    def works(name: str) -> None:
+        with turn, turn:
+            order.append(f"{name} began")
+            clock.sleep(1.0)
+            order.append(f"{name} ended")
+
+    def looks() -> None:
+        clock.sleep(0.5)
+        order.append(f"free {turn.acquire(blocking=False)}")
+
+    ended(started(clock, lambda: works("one"), lambda: works("two"), looks))
+    assert order == ["one began", "free False", "one ended", "two began", "two ended"]
+    assert clock.now_s() == 2.0
+    assert turn.acquire(blocking=False)

@@ -8,8 +8,13 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Sequence
+from typing import Any
 
 from drivers.sim.wire.line import Reply
+
+OPTIONS: dict[str, Any] = {
+    "pan": {"limits_rad": [-2.5, 2.5]}, "tilt": {"limits_rad": [-0.7, 0.5]}, "settle_s": 0.0,
+}  # fmt: skip
 
 
 class ScriptedPtu:

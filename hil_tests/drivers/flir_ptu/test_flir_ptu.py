@@ -11,11 +11,10 @@ import json
 import math
 import socket
 import threading
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from contextlib import ExitStack, suppress
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, cast
 
 import pytest
 from hypothesis import given, settings
@@ -38,45 +37,26 @@ from drivers.flir_ptu.head import FlirPtu, open_head
 from drivers.flir_ptu.options import options_from
 from drivers.flir_ptu.replies import LineSplitter, answer_of, hits_of, number_of
 from drivers.flir_ptu.workshop import AxisFacts, facts, home
+from drivers.interfaces import Reading
 from drivers.sim.wire.line import PtyLine
-from hil_tests.drivers.dynamixel.dynamixel_rig import until
-from hil_tests.drivers.flir_ptu.scripted_ptu import ScriptedPtu
+from hil_tests.drivers.flir_ptu.ptu_bench import Bench
+from hil_tests.drivers.flir_ptu.scripted_ptu import OPTIONS, ScriptedPtu
+from hil_tests.waiting import NET_S, until
 from mastctl.cli.main import main
 
 ARCSEC = math.pi / 180 / 3600
 PAN_STEP_RAD, TILT_STEP_RAD = 185.142857 * ARCSEC, 46.285714 * ARCSEC
-OPTIONS: dict[str, Any] = {
-    "pan": {"limits_rad": [-2.5, 2.5]},
-    "tilt": {"limits_rad": [-0.7, 0.5]},
-    "settle_s": 0.0,
-}
-
-Opener = Callable[..., tuple[FlirPtu, ScriptedPtu]]
-
-
-@pytest.fixture
-def opened() -> Iterator[Opener]:
-    """Open a head on a scripted unit; both are closed at the end. Bytes take no time on the wire."""
-    with ExitStack() as stack:
-
-        def open_on(unit: ScriptedPtu | None = None, **options: Any) -> tuple[FlirPtu, ScriptedPtu]:
-            unit = unit or ScriptedPtu()
-            line = stack.enter_context(PtyLine(unit, SystemClock(), wire_time=False))
-            head = open_head({**OPTIONS, "port": line.path, **options})
-            stack.callback(head.close)
-            return head, unit
-
-        yield open_on
+BOTH = pytest.mark.parametrize("opened", ["memory", "pty"], indirect=True)
+"""For what is tried on a real line too."""
 
 
 def settled(head: FlirPtu) -> tuple[float, float]:
     """Read until the head has settled; return its angles."""
-    for _ in range(1000):
+    reading = head.read()
+    while reading.moving:
+        head._clock.sleep(0.002)
         reading = head.read()
-        if not reading.moving:
-            return reading.pan_rad, reading.tilt_rad
-        time.sleep(0.002)
-    raise AssertionError("the head never settled")
+    return reading.pan_rad, reading.tilt_rad
 
 
 # What is an answer
@@ -175,7 +155,7 @@ def test_no_bytes_whatever_break_the_parser_and_pieces_do_not_matter(data: bytes
     ("start", "end", "e_series"), [(b"", b"\r", False), (b"\n", b"\r\n", False), (b"\n", b"\r\n", True)]
 )
 def test_every_way_of_answering_gives_the_same_head(
-    opened: Opener, verbose: bool, echo: bool, obeys: bool, start: bytes, end: bytes, e_series: bool
+    opened: Bench, verbose: bool, echo: bool, obeys: bool, start: bytes, end: bytes, e_series: bool
 ) -> None:
     unit = ScriptedPtu(verbose=verbose, echo=echo, obeys=obeys, start=start, end=end, e_series=e_series)
     unit.positions = {"P": 100, "T": -40}
@@ -187,7 +167,7 @@ def test_every_way_of_answering_gives_the_same_head(
     assert unit.positions == {"P": round(0.5 / PAN_STEP_RAD), "T": round(0.2 / TILT_STEP_RAD)}
 
 
-def test_opening_moves_nothing_and_voids_what_was_left_in_slaved_mode(opened: Opener) -> None:
+def test_opening_moves_nothing_and_voids_what_was_left_in_slaved_mode(opened: Bench) -> None:
     unit = ScriptedPtu()
     unit.positions, unit.slaved = {"P": 7, "T": 8}, {"P": 500, "T": -500}
     head, _ = opened(unit)
@@ -197,7 +177,7 @@ def test_opening_moves_nothing_and_voids_what_was_left_in_slaved_mode(opened: Op
     assert not [command for command in unit.heard if command.startswith("W")], "step mode left alone"
 
 
-def test_goals_are_rounded_to_the_nearest_step_and_start_together(opened: Opener) -> None:
+def test_goals_are_rounded_to_the_nearest_step_and_start_together(opened: Bench) -> None:
     head, unit = opened()
     for steps in (10.4, 10.6, -10.4, -10.6):
         unit.heard.clear()
@@ -206,14 +186,14 @@ def test_goals_are_rounded_to_the_nearest_step_and_start_together(opened: Opener
         assert unit.heard[-4:] == ["S", f"PP{round(steps)}", f"TP{round(-steps)}", "I"]
 
 
-def test_sign_and_zero_turn_steps_into_the_masts_angles(opened: Opener) -> None:
+def test_sign_and_zero_turn_steps_into_the_masts_angles(opened: Bench) -> None:
     head, unit = opened(tilt={"limits_rad": [-0.3, 0.5], "sign": -1, "zero_rad": 0.1})
     head.move(0.0, 0.4)
     assert unit.positions["T"] == -round(0.3 / TILT_STEP_RAD)
     assert head.read().tilt_rad == pytest.approx(0.4, abs=TILT_STEP_RAD / 2)
 
 
-def test_limits_go_into_the_unit_and_are_checked_before_it(opened: Opener) -> None:
+def test_limits_go_into_the_unit_and_are_checked_before_it(opened: Bench) -> None:
     head, unit = opened()
     low, high = round(-2.5 / PAN_STEP_RAD), round(2.5 / PAN_STEP_RAD)
     at = unit.heard.index(f"PNU{low}")
@@ -225,7 +205,7 @@ def test_limits_go_into_the_unit_and_are_checked_before_it(opened: Opener) -> No
     assert len(unit.heard) == before, "nothing was sent"
 
 
-def test_a_unit_without_user_limits_keeps_its_factory_limits(opened: Opener) -> None:
+def test_a_unit_without_user_limits_keeps_its_factory_limits(opened: Bench) -> None:
     unit = ScriptedPtu()
     unit.user_limits = False
     head, _ = opened(unit)
@@ -234,7 +214,7 @@ def test_a_unit_without_user_limits_keeps_its_factory_limits(opened: Opener) -> 
     assert unit.positions["P"] == round(0.1 / PAN_STEP_RAD)
 
 
-def test_limits_beyond_the_units_own_are_refused(opened: Opener) -> None:
+def test_limits_beyond_the_units_own_are_refused(opened: Bench) -> None:
     with pytest.raises(
         WrongDevice, match=r"options.pan.limits_rad is -3.0000 to 2.5000 rad, the unit itself"
     ):
@@ -243,7 +223,7 @@ def test_limits_beyond_the_units_own_are_refused(opened: Opener) -> None:
 
 @pytest.mark.parametrize(("steps", "reachable"), [(3090, True), (3091, False)])
 def test_limits_may_go_as_far_as_the_unit_itself_and_not_a_step_further(
-    opened: Opener, steps: int, reachable: bool
+    opened: Bench, steps: int, reachable: bool
 ) -> None:
     for ends in ([-steps, 0], [0, steps]):
         with ExitStack() as stack:
@@ -254,7 +234,7 @@ def test_limits_may_go_as_far_as_the_unit_itself_and_not_a_step_further(
 
 @pytest.mark.parametrize(("told", "right"), [("185.142857", True), ("92.571428", False)])
 def test_a_unit_in_another_step_mode_than_the_options_say_is_refused(
-    opened: Opener, told: str, right: bool
+    opened: Bench, told: str, right: bool
 ) -> None:
     unit = ScriptedPtu()
     unit.resolutions["P"] = told
@@ -265,14 +245,14 @@ def test_a_unit_in_another_step_mode_than_the_options_say_is_refused(
 
 
 @pytest.mark.parametrize("answer", [b"* 0 seconds arc per Pan position", b"! Gear ratio unknown"])
-def test_a_unit_that_does_not_know_its_resolution_has_to_be_homed(opened: Opener, answer: bytes) -> None:
+def test_a_unit_that_does_not_know_its_resolution_has_to_be_homed(opened: Bench, answer: bytes) -> None:
     unit = ScriptedPtu()
     unit.answers["PR"] = answer
     with pytest.raises(DriverError, match=r"home it|Gear ratio unknown"):
         opened(unit)
 
 
-def test_another_resolution_after_a_reset_is_taken_over(opened: Opener) -> None:
+def test_another_resolution_after_a_reset_is_taken_over(opened: Bench) -> None:
     head, unit = opened()
     head.move(0.5, 0.2)
     settled(head)
@@ -288,7 +268,7 @@ def test_another_resolution_after_a_reset_is_taken_over(opened: Opener) -> None:
     assert unit.positions["P"] == round(0.25 / (PAN_STEP_RAD / 2))
 
 
-def test_speed_is_set_in_steps_a_second_within_what_the_unit_does(opened: Opener) -> None:
+def test_speed_is_set_in_steps_a_second_within_what_the_unit_does(opened: Bench) -> None:
     head, unit = opened(speed_rad_per_s=0.5)
     head.move(0.1, 0.1)
     assert unit.speeds == {"P": int(0.5 / PAN_STEP_RAD), "T": int(0.5 / TILT_STEP_RAD)}
@@ -303,14 +283,14 @@ def test_speed_is_set_in_steps_a_second_within_what_the_unit_does(opened: Opener
             head.move(0.1, 0.1, bad)
 
 
-def test_acceleration_is_set_only_where_it_differs(opened: Opener) -> None:
+def test_acceleration_is_set_only_where_it_differs(opened: Bench) -> None:
     _, unit = opened(acceleration_rad_per_s2=2000 * PAN_STEP_RAD)
     assert not [command for command in unit.heard if command.startswith("PA") and command != "PA"]
     assert f"TA{round(2000 * PAN_STEP_RAD / TILT_STEP_RAD)}" in unit.heard
 
 
 @pytest.mark.parametrize(("approach", "way"), [("positive", 1), ("negative", -1), ("gravity", 1)])
-def test_a_goal_is_approached_from_one_side(opened: Opener, approach: str, way: int) -> None:
+def test_a_goal_is_approached_from_one_side(opened: Bench, approach: str, way: int) -> None:
     axis = {"limits_rad": [-2.5, 2.5], "approach": approach, "approach_rad": 20 * PAN_STEP_RAD}
     head, unit = opened(pan=axis)
     told = head.axis_motion()["pan"]
@@ -331,7 +311,7 @@ def test_a_goal_is_approached_from_one_side(opened: Opener, approach: str, way: 
 # Bad lines
 
 
-def test_a_refusal_carries_the_units_own_words(opened: Opener) -> None:
+def test_a_refusal_carries_the_units_own_words(opened: Bench) -> None:
     head, unit = opened()
     unit.answers["S"] = b"! Pan-tilt is not feeling well"
     before = dict(unit.positions)
@@ -342,7 +322,7 @@ def test_a_refusal_carries_the_units_own_words(opened: Opener) -> None:
 
 
 @pytest.mark.parametrize("step", ["S", "PP", "TP"])
-def test_a_move_that_is_not_confirmed_step_by_step_never_starts(opened: Opener, step: str) -> None:
+def test_a_move_that_is_not_confirmed_step_by_step_never_starts(opened: Bench, step: str) -> None:
     head, unit = opened()
     goal = {"S": "S", "PP": f"PP{round(0.5 / PAN_STEP_RAD)}", "TP": f"TP{round(0.2 / TILT_STEP_RAD)}"}[step]
     usual = unit._usual
@@ -356,7 +336,7 @@ def test_a_move_that_is_not_confirmed_step_by_step_never_starts(opened: Opener, 
     assert unit.positions == {"P": -round(0.5 / PAN_STEP_RAD), "T": -round(0.2 / TILT_STEP_RAD)}
 
 
-def test_a_late_answer_is_never_taken_for_the_next(opened: Opener) -> None:
+def test_a_late_answer_is_never_taken_for_the_next(opened: Bench) -> None:
     head, unit = opened()
     settled(head)
     held: list[bytes] = []
@@ -372,15 +352,15 @@ def test_a_late_answer_is_never_taken_for_the_next(opened: Opener) -> None:
     unit.unasked = held[0]  # it comes while the driver gets into step, or before
     assert head.read().pan_rad == 0.0
     unit.unasked = held[0]
-    time.sleep(0.05)
+    opened.until(lambda: head._talk._line._buffer, "the bytes")
     assert head.read().pan_rad == 0.0
 
 
-def test_a_damaged_digit_is_asked_again(opened: Opener) -> None:
+def test_a_damaged_digit_is_asked_again(opened: Bench) -> None:
     head, unit = opened()
     head.move(0.5, 0.2)
     at = settled(head)[0]
-    time.sleep(0.25)
+    opened.clock.sleep(0.25)
     settled(head)
     lies = iter([b"* Current Pan position is 9557"])
     usual = unit._usual
@@ -388,10 +368,10 @@ def test_a_damaged_digit_is_asked_again(opened: Opener) -> None:
     assert head.read().pan_rad == at
 
 
-def test_positions_that_contradict_each_other_are_refused(opened: Opener) -> None:
+def test_positions_that_contradict_each_other_are_refused(opened: Bench) -> None:
     head, unit = opened()
     settled(head)
-    time.sleep(0.25)
+    opened.clock.sleep(0.25)
     settled(head)
     lies = itertools.count(1000, 300)
     unit.answers["PP"] = lambda command: f"* Current Pan position is {next(lies)}".encode()
@@ -399,13 +379,15 @@ def test_positions_that_contradict_each_other_are_refused(opened: Opener) -> Non
         head.read()
 
 
-def test_a_limit_hit_stops_the_head_until_it_is_homed(opened: Opener) -> None:
-    head, unit = opened()
+def test_a_limit_hit_stops_the_head_until_it_is_homed(opened: Bench) -> None:
+    unit = ScriptedPtu()
+    line = opened.line(unit)
+    head = opened.head(line)
     settled(head)
     head.move(0.2, 0.0)
     unit.heard.clear()
     unit.unasked = b"!P"
-    time.sleep(0.05)
+    opened.until(lambda: head._talk._line._buffer, "the hit")
     reading = head.read()
     assert any("pan axis ran into its limit switch" in word for word in reading.faults)
     assert "H" in unit.heard
@@ -414,29 +396,25 @@ def test_a_limit_hit_stops_the_head_until_it_is_homed(opened: Opener) -> None:
     assert any("limit switch" in word for word in head.read().faults), "it does not go away by itself"
     head.close()
     unit.answers["R"] = b"!T!T!P!P*"
-    home(head._options.port, 9600)
+    home(line.path, 9600, opened.clock, line.open)
     assert "R" in unit.heard
-    head = open_head({**OPTIONS, "port": head._options.port})
+    head = opened.head(line)
     assert head.read().faults == ()
     head.move(0.1, 0.1)
-    head.close()
 
 
 def rested(head: FlirPtu) -> None:
     """Read until the head has stood for so long that it cannot be anywhere else."""
-    until_s = time.monotonic() + 20
-    while not all(axis.rests for axis in head._axes.values()):
-        head.read()
-        assert time.monotonic() < until_s
+    until(lambda: head.read() and all(axis.rests for axis in head._axes.values()), "rest", clock=head._clock)
 
 
-def test_a_limit_hit_of_a_resting_head_is_looked_into_and_forgotten(opened: Opener) -> None:
+def test_a_limit_hit_of_a_resting_head_is_looked_into_and_forgotten(opened: Bench) -> None:
     head, unit = opened()
     rested(head)
     before = head.read()
     unit.heard.clear()
     unit.unasked = b"!P"
-    time.sleep(0.05)
+    opened.until(lambda: head._talk._line._buffer, "the hit")
     head.read()
     reading = head.read()
     assert reading.faults == () and (reading.pan_rad, reading.tilt_rad) == (before.pan_rad, before.tilt_rad)
@@ -445,11 +423,11 @@ def test_a_limit_hit_of_a_resting_head_is_looked_into_and_forgotten(opened: Open
     head.move(0.1, 0.1)
 
 
-def test_a_limit_hit_of_a_resting_head_that_has_moved_meanwhile_stays(opened: Opener) -> None:
+def test_a_limit_hit_of_a_resting_head_that_has_moved_meanwhile_stays(opened: Bench) -> None:
     head, unit = opened()
     rested(head)
     unit.unasked, unit.positions = b"!T!T!P!P*\r", {"P": 400, "T": 0}
-    time.sleep(0.05)
+    opened.until(lambda: head._talk._line._buffer, "the hits")
     head.read()
     assert any("unit may have lost count" in word for word in head.read().faults)
     with pytest.raises(HardwareFault, match="home it"):
@@ -469,7 +447,7 @@ def test_a_limit_hit_of_a_resting_head_that_has_moved_meanwhile_stays(opened: Op
     ],
 )
 def test_supply_and_temperature_are_watched_while_the_head_rests(
-    opened: Opener, monkeypatch: pytest.MonkeyPatch, options: dict[str, Any], answer: str, words: str
+    opened: Bench, monkeypatch: pytest.MonkeyPatch, options: dict[str, Any], answer: str, words: str
 ) -> None:
     monkeypatch.setattr("drivers.flir_ptu.supply.EVERY_S", 0.0)
     unit = ScriptedPtu()
@@ -484,7 +462,7 @@ def test_supply_and_temperature_are_watched_while_the_head_rests(
     assert head.read().faults == ()
 
 
-def test_an_e46_has_to_be_told_its_resolution(opened: Opener) -> None:
+def test_an_e46_has_to_be_told_its_resolution(opened: Bench) -> None:
     unit = ScriptedPtu()
     unit.answers["V"] = b"* Pan-Tilt Controller v3.2.2(E46-C14/E), (C)2011 FLIR Commercial Systems, Inc."
     with pytest.raises(WrongDevice, match="an E46, which does not know its gears before it was homed"):
@@ -499,11 +477,11 @@ def test_an_e46_has_to_be_told_its_resolution(opened: Opener) -> None:
     opened(unit, **right)
 
 
-def test_facts_of_a_unit_are_told_without_moving_it() -> None:
+def test_facts_of_a_unit_are_told_without_moving_it(opened: Bench) -> None:
     unit = ScriptedPtu(verbose=False, echo=False)
     unit.answers |= {"O": b"* Input 30 VDC @ 86 degF", "WP": b"* Pan in HALF step mode"}
-    with PtyLine(unit, SystemClock(), wire_time=False) as line:
-        found = facts(line.path, 9600)
+    line = opened.line(unit)
+    found = facts(line.path, 9600, opened.clock, line.open)
     assert (
         found.version.startswith("Pan-Tilt Controller v2.13.0") and found.supply == "Input 30 VDC @ 86 degF"
     )
@@ -530,59 +508,59 @@ def test_homing_by_command_needs_to_be_meant(capsys: pytest.CaptureFixture[str])
     assert main(["ptu", "info", "/dev/null", "--baud", "1"]) == 2
 
 
-def test_a_limit_hit_before_an_answer_does_not_hide_it(opened: Opener) -> None:
+def test_a_limit_hit_before_an_answer_does_not_hide_it(opened: Bench) -> None:
     head, unit = opened()
     unit.answers["TP"] = b"!T* Current Tilt position is 0"
     reading = head.read()
     assert reading.tilt_rad == 0.0 and "tilt axis" in reading.faults[0]
 
 
-def test_an_axis_that_does_not_come_to_its_target_is_told(opened: Opener) -> None:
+def test_an_axis_that_does_not_come_to_its_target_is_told(opened: Bench) -> None:
     head, unit = opened()
     settled(head)
     unit.answers[f"PP{round(0.5 / PAN_STEP_RAD)}"] = b"*"  # says yes and does nothing
     unit.speeds["P"] = 1000
     head.move(0.5, 0.0)
-    until_s = time.monotonic() + 10
-    while not (words := head.read().faults) and time.monotonic() < until_s:
-        time.sleep(0.05)
+    words = opened.until(lambda: head.read().faults, "the fault")
     assert words == ("pan stands at 0.0000 rad and does not reach its target 0.5000 rad",)
     assert head.read().moving
 
 
-def test_a_unit_that_lost_count_while_the_line_was_down_is_not_moved(opened: Opener) -> None:
-    with ExitStack() as stack:
-        unit = ScriptedPtu()
-        line = stack.enter_context(PtyLine(unit, SystemClock(), wire_time=False))
-        head = open_head({**OPTIONS, "port": line.path})
-        stack.callback(head.close)
-        head.move(0.5, 0.2)
-        settled(head)
-        line.hang_up()
-        with pytest.raises(LineLost, match=r"hung up|failed in"):
-            head.read()
-        with pytest.raises(LineLost):
-            head.move(0.1, 0.1)
-        unit.positions["P"] = 0
-        line.come_back()
-        unit.heard.clear()
-        until_s = time.monotonic() + 10
-        while time.monotonic() < until_s:
-            try:
-                reading = head.read()
-                break
-            except LineLost:
-                time.sleep(0.02)
-        assert reading.faults[0].startswith(
-            "pan was at 0.5000 rad before the unit or its line was away and is at 0.0"
-        )
-        assert unit.positions == {"P": 0, "T": round(0.2 / TILT_STEP_RAD)}, "it comes back without moving"
-        assert {"LU", "PN", "PR", "H"} <= set(unit.heard), "and is checked again"
-        with pytest.raises(HardwareFault, match="before the unit or its line was away"):
-            head.move(0.1, 0.1)
+def answered(opened: Bench, head: FlirPtu) -> Reading:
+    """Read until the line is back."""
+
+    def reading() -> Reading | None:
+        with suppress(LineLost):
+            return head.read()
+        return None
+
+    return cast(Reading, opened.until(reading, "the line is back"))
 
 
-def test_a_power_cycle_behind_an_open_line_is_noticed(opened: Opener) -> None:
+@BOTH
+def test_a_unit_that_lost_count_while_the_line_was_down_is_not_moved(opened: Bench) -> None:
+    unit = ScriptedPtu()
+    line = opened.line(unit)
+    head = opened.head(line)
+    head.move(0.5, 0.2)
+    settled(head)
+    line.hang_up()
+    with pytest.raises(LineLost, match=r"hung up|failed in"):
+        head.read()
+    with pytest.raises(LineLost):
+        head.move(0.1, 0.1)
+    unit.positions["P"] = 0
+    line.come_back()
+    unit.heard.clear()
+    words = "pan was at 0.5000 rad before the unit or its line was away and is at 0.0"
+    assert answered(opened, head).faults[0].startswith(words)
+    assert unit.positions == {"P": 0, "T": round(0.2 / TILT_STEP_RAD)}, "it comes back without moving"
+    assert {"LU", "PN", "PR", "H"} <= set(unit.heard), "and is checked again"
+    with pytest.raises(HardwareFault, match="before the unit or its line was away"):
+        head.move(0.1, 0.1)
+
+
+def test_a_power_cycle_behind_an_open_line_is_noticed(opened: Bench) -> None:
     head, unit = opened(speed_rad_per_s=0.5)
     head.move(0.5, 0.2)
     settled(head)
@@ -597,155 +575,137 @@ def test_a_power_cycle_behind_an_open_line_is_noticed(opened: Opener) -> None:
     assert {"LU", "H"} <= set(unit.heard) and unit.positions == {"P": 0, "T": 0}
 
 
-def test_another_unit_on_the_line_is_refused(opened: Opener) -> None:
-    with ExitStack() as stack:
-        unit = ScriptedPtu()
-        line = stack.enter_context(PtyLine(unit, SystemClock(), wire_time=False))
-        head = open_head({**OPTIONS, "port": line.path})
-        stack.callback(head.close)
-        line.hang_up()
-        unit.answers["V"] = b"* Pan-Tilt Controller v3.02(D48)"
-        with pytest.raises(LineLost):
-            head.read()
-        line.come_back()
-        until_s = time.monotonic() + 10
-        with pytest.raises(WrongDevice, match="another unit answers"):
-            while time.monotonic() < until_s:
-                try:
-                    head.read()
-                except LineLost:
-                    time.sleep(0.02)
+@BOTH
+def test_another_unit_on_the_line_is_refused(opened: Bench) -> None:
+    unit = ScriptedPtu()
+    line = opened.line(unit)
+    head = opened.head(line)
+    line.hang_up()
+    unit.answers["V"] = b"* Pan-Tilt Controller v3.02(D48)"
+    with pytest.raises(LineLost):
+        head.read()
+    line.come_back()
+    with pytest.raises(WrongDevice, match="another unit answers"):
+        answered(opened, head)
 
 
-def test_a_stop_does_not_wait_for_a_call_under_way(opened: Opener) -> None:
+def tries(call: Callable[[], object]) -> Callable[[], None]:
+    """The call, whatever the driver says to it."""
+
+    def tried() -> None:
+        with suppress(DriverError):
+            call()
+
+    return tried
+
+
+@BOTH
+def test_a_stop_does_not_wait_for_a_call_under_way(opened: Bench) -> None:
     head, unit = opened()
     unit.answers["PP"] = lambda command: None
-    began = threading.Event()
-
-    def reading() -> None:
-        began.set()
-        with pytest.raises(DriverError):
-            head.read()
-
-    thread = threading.Thread(target=reading)
-    thread.start()
-    began.wait()
-    while "PP" not in unit.heard[-1:]:
-        time.sleep(0.001)
+    reading = opened.begun(tries(head.read))
+    opened.until(lambda: "PP" in unit.heard[-1:], "a question without an answer")
     before = len(unit.heard)
     head.stop()
-    thread.join()
+    opened.ended(*reading)
     assert unit.heard[before] == "H", "it went out beside the reading"
     assert unit.heard[-1] == "H", "and once more in order"
 
 
-def test_a_stop_goes_out_while_the_unit_still_owes_another_call_its_answer(opened: Opener) -> None:
+@BOTH
+def test_a_stop_goes_out_while_the_unit_still_owes_another_call_its_answer(opened: Bench) -> None:
     head, unit = opened()
     assert head._talk is not None
     head._talk.reply_s = 0.8
     asked, under_way = threading.Event(), []
     unit.answers["TP"] = lambda command: asked.set()
-    unit.answers["H"] = lambda command: under_way.append(thread.is_alive()) or b"*"
-
-    def reading() -> None:
-        with suppress(DriverError):
-            head.read()
-
-    thread = threading.Thread(target=reading)
-    thread.start()
-    assert asked.wait(10.0)
+    unit.answers["H"] = lambda command: under_way.append(reading[0].is_alive()) or b"*"
+    reading = opened.begun(tries(head.read))
+    opened.until(asked.is_set, "the question")
     head.stop()
-    thread.join()
+    opened.ended(*reading)
     assert under_way[0]
 
 
+@BOTH
 @pytest.mark.parametrize("stops", [1, 3])
-def test_a_stop_into_a_question_that_is_answered_keeps_both_sides_in_step(opened: Opener, stops: int) -> None:
+def test_a_stop_into_a_question_that_is_answered_keeps_both_sides_in_step(opened: Bench, stops: int) -> None:
     head, unit = opened()
-    asked, halted = threading.Event(), threading.Event()
+    talk = head._talk
+    assert talk is not None
+    talk.reply_s = NET_S
+    asked = threading.Event()
 
     def late(command: str) -> bytes:
         asked.set()
-        assert halted.wait(10.0)
+        opened.until(lambda: talk._shouts == stops, "all stops are sent")
+        del unit.answers["PP"]
         return b"* Current Pan position is 0"
 
     readings: list[Any] = []
-    reading = threading.Thread(target=lambda: readings.append(head.read()))
     unit.answers["PP"] = late
-    talk = head._talk
-    assert talk is not None
-    talk.reply_s = 10.0
     unit.heard.clear()
-    reading.start()
-    assert asked.wait(10.0)
-    threads = [threading.Thread(target=head.stop) for _ in range(stops)]
-    for thread in threads:
-        thread.start()
-    until(lambda: talk._shouts == stops, "all of them are sent")
-    del unit.answers["PP"]
-    halted.set()
-    for thread in (*threads, reading):
-        thread.join(10.0)
+    threads = opened.begun(lambda: readings.append(head.read()))
+    opened.until(asked.is_set, "the question")
+    threads += opened.begun(*[head.stop] * stops)
+    opened.ended(*threads)
     assert len(readings) == 1, "and the reading is made after the stop"
     assert unit.heard[: 2 + stops] == ["TP", "PP"] + ["H"] * stops
     assert not [command for command in unit.heard if command in ("PR", "TR")], "nobody asks for the step"
     assert talk.is_in_step
 
 
-def test_a_reading_that_stop_after_stop_comes_into_is_made_after_the_last(opened: Opener) -> None:
+def test_a_reading_that_stop_after_stop_comes_into_is_made_after_the_last(opened: Bench) -> None:
     head, unit = opened()
     rested(head)
     talk = head._talk
     assert talk is not None
-    talk.reply_s = 10.0
+    talk.reply_s = NET_S
     stops: list[threading.Thread] = []
 
     def interrupted(command: str) -> bytes:
         if len(stops) < 5:
-            stops.append(threading.Thread(target=head.stop))
-            stops[-1].start()
-            until(lambda: talk._shouts == 1, "the stop is sent")
+            stops.extend(opened.begun(head.stop))
+            opened.until(lambda: talk._shouts == 1, "the stop is sent")
         return b"* Current Tilt position is 0"
 
     unit.answers["TP"] = interrupted
     head.read()
-    for stop in stops:
-        stop.join(10.0)
+    opened.ended(*stops)
     assert len(stops) == 5
 
 
-def test_a_move_that_a_stop_comes_into_is_not_started(opened: Opener) -> None:
+def test_a_move_that_a_stop_comes_into_is_not_started(opened: Bench) -> None:
     head, unit = opened()
-    assert head._talk is not None
-    stopping = threading.Thread(target=head.stop)
+    talk = head._talk
+    assert talk is not None
+    stopping: list[threading.Thread] = []
 
     def slaved(command: str) -> bytes:
-        stopping.start()
-        until(lambda: head._talk is not None and head._talk._shouts == 1, "the stop")
+        stopping.extend(opened.begun(head.stop))
+        opened.until(lambda: talk._shouts == 1, "the stop")
         return b"*"
 
     unit.answers["S"] = slaved
     unit.heard.clear()
     with pytest.raises(DriverError, match="a stop came before PP"):
         head.move(0.5, 0.2)
-    stopping.join(10.0)
+    opened.ended(*stopping)
     assert "I" not in unit.heard
     assert not head.read().moving
 
 
-def test_a_stop_goes_out_before_a_unit_that_is_in_doubt_is_checked(opened: Opener) -> None:
+def test_a_stop_goes_out_before_a_unit_that_is_in_doubt_is_checked(opened: Bench) -> None:
     head, unit = opened()
     rested(head)
     unit.unasked = b"!P"
-    while not head._count.doubted:
-        with suppress(DriverError):
-            head.move(0.1, 0.1)
+    opened.until(lambda: tries(lambda: head.move(0.1, 0.1))() or head._count.doubted, "the hit")
     unit.heard.clear()
     head.stop()
     assert unit.heard[0] == "H"
 
 
-def test_no_second_leg_follows_a_stop_that_was_not_confirmed(opened: Opener) -> None:
+def test_no_second_leg_follows_a_stop_that_was_not_confirmed(opened: Bench) -> None:
     axis = {"limits_rad": [-2.5, 2.5], "approach": "positive", "approach_rad": 20 * PAN_STEP_RAD}
     head, unit = opened(pan=axis)
     head.move(-0.5, 0.0)
@@ -761,23 +721,23 @@ def test_no_second_leg_follows_a_stop_that_was_not_confirmed(opened: Opener) -> 
 @pytest.mark.parametrize("capitals", [False, True], ids=["exact_echo", "echo_in_capitals"])
 @pytest.mark.parametrize("unasked", [b"* Current Pan position is 22\r", b"PP * Current Pan pos", b"\xff\x80"])
 def test_a_stop_is_sent_though_something_came_that_nobody_asked_for(
-    opened: Opener, unasked: bytes, capitals: bool
+    opened: Bench, unasked: bytes, capitals: bool
 ) -> None:
     head, unit = opened(ScriptedPtu(capitals=capitals))
     head.move(0.5, 0.2)
     assert head._talk is not None
     unit.heard.clear()
     unit.unasked = unasked
-    until(lambda: head._talk._line._serial.in_waiting == len(unasked), "the bytes")
+    opened.until(lambda: len(head._talk._line._buffer) == len(unasked), "the bytes")
     head.stop()
     assert unit.heard[0] == "H"
     assert unit.heard[-1] == "H", "and confirmed"
 
 
-def test_a_stop_tries_a_line_that_is_away_at_once_and_halts_before_it_asks(opened: Opener) -> None:
+def test_a_stop_tries_a_line_that_is_away_at_once_and_halts_before_it_asks(opened: Bench) -> None:
     head, unit = opened()
     head._give_up(LineLost("the line is gone", device="ptu"))
-    head._absence.again_s = time.monotonic() + 60.0
+    head._absence.again_s = opened.clock.now_s() + 60.0
     unit.heard.clear()
     head.stop()
     assert unit.heard[0] == "H"
@@ -831,7 +791,7 @@ def test_a_host_that_does_not_listen_is_a_lost_line(scheme: str) -> None:
         open_head({**OPTIONS, "port": f"{scheme}://127.0.0.1"})
 
 
-def test_two_programs_cannot_have_the_same_line(opened: Opener) -> None:
+def test_two_programs_cannot_have_the_same_line(opened: Bench) -> None:
     with PtyLine(ScriptedPtu(), SystemClock(), wire_time=False) as line:
         head = open_head({**OPTIONS, "port": line.path})
         try:

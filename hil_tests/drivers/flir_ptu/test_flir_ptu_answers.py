@@ -3,52 +3,33 @@
 from __future__ import annotations
 
 import math
-import time
 from collections import deque
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack, suppress
+from contextlib import suppress
 from types import SimpleNamespace
-from typing import Any, cast
+from typing import cast
 
 import pytest
 
-from drivers.clock import ManualClock, SystemClock
 from drivers.errors import DriverError, NoReply
 from drivers.flir_ptu.axis import StepAxis
 from drivers.flir_ptu.count import StepCount
-from drivers.flir_ptu.head import FlirPtu, open_head
+from drivers.flir_ptu.head import FlirPtu
 from drivers.interfaces import Reading
-from drivers.sim.wire.line import PtyLine
+from hil_tests.drivers.flir_ptu.ptu_bench import Bench
 from hil_tests.drivers.flir_ptu.scripted_ptu import ScriptedPtu
 
 PAN_STEP_RAD, TILT_STEP_RAD = (math.radians(arcsec / 3600) for arcsec in (185.142857, 46.285714))
-OPTIONS: dict[str, Any] = {
-    "pan": {"limits_rad": [-2.5, 2.5]}, "tilt": {"limits_rad": [-0.7, 0.5]}, "settle_s": 0.0,
-}  # fmt: skip
-
-Opener = Callable[..., tuple[FlirPtu, PtyLine]]
 
 
-@pytest.fixture
-def opened() -> Iterator[Opener]:
-    with ExitStack() as stack:
-
-        def open_on(unit: ScriptedPtu, clock: Any = None, **options: Any) -> tuple[FlirPtu, PtyLine]:
-            line = stack.enter_context(PtyLine(unit, SystemClock(), wire_time=False))
-            head = open_head({**OPTIONS, "port": line.path, **options}, clock)
-            stack.callback(head.close)
-            return head, line
-
-        yield open_on
-
-
-def answered(head: FlirPtu) -> Reading:
+def answered(opened: Bench, head: FlirPtu) -> Reading:
     """Read until the unit is there again."""
-    for _ in range(200):
+
+    def reading() -> Reading | None:
         with suppress(DriverError):
             return head.read()
-        time.sleep(0.02)
-    raise AssertionError("the unit did not come back")
+        return None
+
+    return cast(Reading, opened.until(reading, "the unit is back"))
 
 
 class Damaged(ScriptedPtu):
@@ -63,19 +44,20 @@ class Damaged(ScriptedPtu):
 
 
 def test_a_version_that_was_damaged_when_the_head_was_opened_does_not_lock_the_unit_out(
-    opened: Opener,
+    opened: Bench,
 ) -> None:
     garbled = b"* Pan-Tilt Controller v2.13.0(D46/E), (C)2004-2006 Dir%cted Perception, Inc."
-    head, line = opened(Damaged(V=garbled))
+    line = opened.line(Damaged(V=garbled))
+    head = opened.head(line)
     assert "Directed Perception" in head.version
     line.hang_up()
     with pytest.raises(DriverError):
         head.read()
     line.come_back()
-    assert answered(head).faults == ()
+    assert answered(opened, head).faults == ()
 
 
-def test_digits_that_were_damaged_when_the_head_was_opened_are_not_kept(opened: Opener) -> None:
+def test_digits_that_were_damaged_when_the_head_was_opened_are_not_kept(opened: Bench) -> None:
     unit = Damaged(
         PN=b"* Minimum Pan position is -9090", TU=b"* Maximum Tilt speed is 9902 positions/sec",
         PS=b"* Target Pan speed is 7000 positions/sec",
@@ -86,7 +68,7 @@ def test_digits_that_were_damaged_when_the_head_was_opened_are_not_kept(opened: 
 
 
 @pytest.mark.parametrize("which", [0, 1, 2, 3])
-def test_a_resolution_with_a_damaged_digit_does_not_scale_the_angles(opened: Opener, which: int) -> None:
+def test_a_resolution_with_a_damaged_digit_does_not_scale_the_angles(opened: Bench, which: int) -> None:
     unit = ScriptedPtu()
     told = iter(
         [b"* 185.142857 seconds arc per Pan position"] * which
@@ -119,7 +101,7 @@ class Behind(ScriptedPtu):
 
 
 @pytest.mark.parametrize("lag", [1, 2, 3, 4])
-def test_positions_of_some_questions_ago_are_no_reading(opened: Opener, lag: int) -> None:
+def test_positions_of_some_questions_ago_are_no_reading(opened: Bench, lag: int) -> None:
     unit = Behind()
     head, _ = opened(unit)
     unit.lag = lag
@@ -131,19 +113,19 @@ def test_positions_of_some_questions_ago_are_no_reading(opened: Opener, lag: int
 @pytest.mark.parametrize("answer_s", [0.03, 0.1, 0.25])
 @pytest.mark.parametrize("moves", [("pan", "tilt"), ("pan",), ("tilt",)])
 def test_both_angles_are_of_the_moment_told_however_slowly_the_unit_answers(
-    opened: Opener, moves: tuple[str, ...], answer_s: float
+    opened: Bench, moves: tuple[str, ...], answer_s: float
 ) -> None:
-    clock, unit = ManualClock(), ScriptedPtu()
+    clock, unit = opened.clock, ScriptedPtu()
     rates = {"P": 300.0 * ("pan" in moves), "T": -700.0 * ("tilt" in moves)}  # positions a second
 
     def told(command: str) -> bytes:
         axis = command[0]
         position = round(rates[axis] * clock.now_s())
-        clock.advance(answer_s)
+        clock.sleep(answer_s)
         return f"* Current {'Pan' if axis == 'P' else 'Tilt'} position is {position}".encode()
 
-    head, _ = opened(unit, clock)
-    clock.advance(1.0)
+    head, _ = opened(unit)
+    clock.sleep(1.0)
     unit.answers = {"PP": told, "TP": told}
     for _ in range(2):  # the second one knows the axis that rests
         reading = head.read()
@@ -154,21 +136,20 @@ def test_both_angles_are_of_the_moment_told_however_slowly_the_unit_answers(
         assert reading.tilt_rad == pytest.approx(tilt_rad, abs=(700 * 0.005 + 1) * TILT_STEP_RAD)
 
 
-def test_a_head_that_was_stopped_rests_only_after_it_has_stood_from_then_on(opened: Opener) -> None:
-    clock = ManualClock()
-    head, _ = opened(ScriptedPtu(), clock, settle_s=0.5)
+def test_a_head_that_was_stopped_rests_only_after_it_has_stood_from_then_on(opened: Bench) -> None:
+    head, _ = opened(settle_s=0.5)
     head.read()
-    clock.advance(60.0)
+    opened.clock.sleep(60.0)
     assert not head.read().moving
     head.stop()
-    clock.advance(0.4)
+    opened.clock.sleep(0.4)
     assert head.read().moving
-    clock.advance(0.2)
+    opened.clock.sleep(0.2)
     assert not head.read().moving
 
 
 def test_only_silent_calls_in_a_row_make_the_line_be_opened_anew(
-    opened: Opener, monkeypatch: pytest.MonkeyPatch
+    opened: Bench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("drivers.flir_ptu.head.SILENT_CALLS", 2)
     unit = ScriptedPtu()
@@ -187,7 +168,7 @@ def test_only_silent_calls_in_a_row_make_the_line_be_opened_anew(
     assert "V" not in unit.heard, "the unit is checked only after the line was opened anew"
     silent_call()
     silent_call()
-    answered(head)
+    answered(opened, head)
     assert "V" in unit.heard
 
 
