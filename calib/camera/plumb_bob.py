@@ -11,7 +11,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.optimize import least_squares
 
 from calib.camera.cahvor import CameraModel
 from calib.rigid import FloatArray, ReadOnlyArrays, frozen_array
@@ -69,6 +68,8 @@ def nearest_plumb_bob(model: CameraModel) -> PlumbBob:
     ValueError
         If fewer than half of the image's pixels have a ray in front of the camera.
     """
+    from scipy.optimize import least_squares  # slow to load, and few ask for this
+
     width, height = model.size_px
     columns, rows = np.linspace(0.0, width - 1.0, GRID[0]), np.linspace(0.0, height - 1.0, GRID[1])
     pixels = np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2)

@@ -8,13 +8,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.optimize import brentq
 from scipy.spatial.transform import Rotation
-from scipy.stats import chi2
 
 from calib.camera.cahvor import Kind
 from calib.fit.adjustment import HUBER, Adjustment, Estimate
 from calib.fit.bench_start import BenchNotFitted, BenchStart, SomethingChanged, bench_start
 from calib.fit.bench_terms import BenchTerms, bench_terms
 from calib.fit.model_terms import AXIS_TERMS, candidate_terms, joint_numbers
+from calib.fit.significance import MEDIAN_OF_TWO
 from calib.fit.terms import ImageTerm, with_kept
 from calib.fit.view_poses import ViewPoses, ViewsTooFew, view_poses
 from calib.mast.gimbal import MAST_NAMES
@@ -225,7 +225,7 @@ class BenchProblem:
         square = np.sum(off_px**2, axis=1)
 
         def typical(inexact_m: float) -> float:
-            return float(np.median(square / (own**2 + (inexact_m * scale) ** 2)) / chi2.median(2))
+            return float(np.median(square / (own**2 + (inexact_m * scale) ** 2)) / MEDIAN_OF_TWO)
 
         most_px2 = self.survey.sigma.corner_px**2 - float(np.median(own)) ** 2
         most_m = float(np.sqrt(max(most_px2, 0.0)) / np.median(scale))

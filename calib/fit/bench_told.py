@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtrc
 
 from calib.fit.adjustment import MAST, Adjustment, Estimate
 from calib.fit.bench_calibration import BenchCalibration, TermGain
@@ -92,7 +92,7 @@ def told(
         notes=(*bench.notes, *lens_notes(rig, sigma)),
         chi2=total,
         degrees_of_freedom=freedom,
-        chi2_probability=float(chi2.sf(total, freedom)) if freedom > 0 else float("nan"),
+        chi2_probability=float(chdtrc(freedom, total)) if freedom > 0 else float("nan"),
         components=weighed.components,
         joint_rad=problem.joint_rad,
         inexact_m=bench.inexact_m,

@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtrc, chdtri
 
 from calib.fit.adjustment import HUBER, KNOWN_BEFOREHAND, MAST, Adjustment, Estimate
 from calib.fit.calibration import Calibration
@@ -22,6 +22,7 @@ from calib.fit.least_squares import Minimum, Normal, covariance_of, minimise
 from calib.fit.left_out_boards import left_out_boards
 from calib.fit.outliers import judge, name_outliers
 from calib.fit.residuals import check_rms, image_residuals, rms_by_camera, station_residuals
+from calib.fit.significance import MEDIAN_OF_TWO
 from calib.fit.start_values import Start, SurveyNotFitted, start_values
 from calib.fit.terms import ImageTerm, StationTerm, widened_images, with_kept
 from calib.fit.uncertainty import open_directions, sigma_by_key
@@ -228,7 +229,7 @@ def typical_length(
     told_px = np.maximum(own_px, least_px)
     residuals = np.concatenate([problem.image_residual(state, t).reshape(-1, 2) for t in images])
     lengths = np.linalg.norm(residuals, axis=1) * own_px / told_px
-    return float(np.median(lengths) / np.sqrt(chi2.median(2))), float(np.median(told_px))
+    return float(np.median(lengths) / np.sqrt(MEDIAN_OF_TWO)), float(np.median(told_px))
 
 
 def _calibration(
@@ -246,7 +247,7 @@ def _calibration(
     notes = list(from_here.notes)
     mine = covariance[:size, :size]
     chi_square, freedom = goodness(problem, state, covariance)
-    if freedom > 0 and chi2.sf(chi_square, freedom) < 0.001:
+    if freedom > 0 and chdtrc(freedom, chi_square) < 0.001:
         notes.append(
             f"the residuals are {np.sqrt(chi_square / freedom):.2f} times what their sigmas allow "
             f"(chi-square {chi_square:.0f} for {freedom:.0f}); uncertainties are scaled up by as much"
@@ -277,7 +278,7 @@ def _calibration(
         notes=tuple(notes),
         chi2=chi_square,
         degrees_of_freedom=freedom,
-        chi2_probability=float(chi2.sf(chi_square, freedom)) if freedom > 0 else float("nan"),
+        chi2_probability=float(chdtrc(freedom, chi_square)) if freedom > 0 else float("nan"),
         images=images,
         station=station_residuals(problem, state),
         components=weighed.components,
@@ -308,7 +309,7 @@ def _prism_notes(problem: Adjustment, state: Estimate, mast_parameters: int) -> 
     for setup in state.rover_from_station:
         prisms = [p for p in problem.station if p.setup == setup and p.board is None and p.keep]
         residuals = np.array([problem.station_residual(state, p) for p in prisms])
-        if float(np.sum(residuals**2)) > chi2.isf(0.001, 3 * len(prisms)):
+        if float(np.sum(residuals**2)) > chdtri(3 * len(prisms), 0.001):
             worst = 1000 * float(np.linalg.norm(residuals, axis=1).max()) * prisms[0].sigma_m
             why = "an upright mast" if mast_parameters == 4 else "their CAD positions"
             notes.append(

@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from calib.fit.adjustment import Adjustment, Estimate
 from calib.fit.calibration import Outlier
@@ -156,13 +156,13 @@ class _Limits:
 
     @property
     def dot(self) -> float:
-        return float(chi2.isf(FALSE_ALARMS / max(self.dots, 1), 2)) * self.dot_scale
+        return float(chdtri(2, FALSE_ALARMS / max(self.dots, 1))) * self.dot_scale
 
     def image(self, dots: int) -> float:
-        return float(chi2.isf(FALSE_ALARMS / max(self.images, 1), 2 * max(dots, 1))) * self.dot_scale
+        return float(chdtri(2 * max(dots, 1), FALSE_ALARMS / max(self.images, 1))) * self.dot_scale
 
     def point(self, freedom: int) -> float:
-        return float(chi2.isf(FALSE_ALARMS / max(self.points, 1), freedom)) * self.point_scale
+        return float(chdtri(freedom, FALSE_ALARMS / max(self.points, 1))) * self.point_scale
 
 
 def _tested(
@@ -261,4 +261,4 @@ def _scale(statistics: Sequence[FloatArray], freedom: int) -> float:
     if not statistics:
         return 1.0
     typical = float(np.median(np.concatenate([s.ravel() for s in statistics])))
-    return max(1.0, typical / float(chi2.median(freedom)))
+    return max(1.0, typical / float(chdtri(freedom, 0.5)))

@@ -13,7 +13,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import chi2 as chi_square
+from scipy.special import chdtri
 
 from calib.fit.adjustment import Adjustment, Estimate
 from calib.fit.least_squares import covariance_of, minimise
@@ -125,7 +125,7 @@ def adjust_prisms(survey: Survey, *, false_alarm: float = FALSE_ALARM) -> Adjust
 
 
 def _limit(freedom: int, false_alarm: float) -> float:
-    return float(chi_square.isf(false_alarm, freedom))
+    return float(chdtri(freedom, false_alarm))
 
 
 def _without(

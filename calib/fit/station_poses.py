@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from calib.fit.calibration import Outlier
 from calib.fit.prisms import adjust_prisms
@@ -108,4 +108,4 @@ def _outlier(
     kind: Literal["prism", "tape"], name: str, where: str, off_m: FloatArray, sigma_m: float
 ) -> Outlier:
     off = float(np.linalg.norm(off_m))
-    return Outlier(kind, f"{kind} {name} {where}", (off / sigma_m) ** 2, float(chi2.isf(GROSS, 3)), off)
+    return Outlier(kind, f"{kind} {name} {where}", (off / sigma_m) ** 2, float(chdtri(3, GROSS)), off)

@@ -13,9 +13,10 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from calib.fit.calibration import Outlier
+from calib.fit.significance import MEDIAN_OF_TWO
 from calib.rigid import FloatArray
 from calib.survey import Dots, Survey
 
@@ -57,8 +58,8 @@ def without_stray_dots(survey: Survey) -> tuple[Survey, tuple[Outlier, ...]]:
     if not tested:
         return survey, ()
     every = np.concatenate([statistic for statistic, _ in tested.values()])
-    scale = max(1.0, float(np.median(every) / chi2.median(2)))
-    limit = float(chi2.isf(FALSE_ALARMS / len(every), 2)) * scale
+    scale = max(1.0, float(np.median(every) / MEDIAN_OF_TWO))
+    limit = float(chdtri(2, FALSE_ALARMS / len(every))) * scale
     kept, outliers = dict(survey.dots), list[Outlier]()
     for name, (statistic, off_px) in tested.items():
         bad = statistic > limit
@@ -91,7 +92,7 @@ def stray_points(places_m: FloatArray, pixels_px: FloatArray, sigma_px: FloatArr
     scale = max(float(np.abs(places_m - middle).max()), 1e-9)
     sigma = np.hypot(sigma_px, POLYNOMIAL_PX)
     statistic, _ = _off_polynomial((places_m - middle) / scale, pixels_px, sigma, degree)
-    typical = max(1.0, float(np.median(statistic) / chi2.median(2)))
+    typical = max(1.0, float(np.median(statistic) / MEDIAN_OF_TWO))
     return np.asarray(statistic > GROSS * typical)
 
 

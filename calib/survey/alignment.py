@@ -13,7 +13,7 @@ from itertools import combinations
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from calib.errors import CalibError
 from calib.rigid import FloatArray, Rigid, rigid_rates
@@ -222,7 +222,7 @@ def _chi2(pose: Rigid, a: FloatArray, b: FloatArray, sigma: FloatArray) -> float
 
 
 def _limit(freedom: int, false_alarm: float) -> float:
-    return float(chi2.isf(false_alarm, freedom))
+    return float(chdtri(freedom, false_alarm))
 
 
 def _covariance(pose: Rigid, a: FloatArray, sigma: FloatArray) -> FloatArray:
@@ -267,7 +267,7 @@ def _doubt(
         in_a, in_b = (float(np.linalg.norm(points[i] - points[j])) for points in (a, b))
         lines.append((abs(in_a - in_b) / float(np.hypot(sigma[i], sigma[j])), i, j, in_a, in_b))
     lines.sort(reverse=True)
-    limit = float(np.sqrt(chi2.isf(false_alarm, 1)))
+    limit = float(np.sqrt(chdtri(1, false_alarm)))
     off = [line for line in lines if line[0] > limit]
     if not off:
         one = [name for name, use in zip(names, used, strict=True) if use]

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import pytest
 
 from calib.files.mast_file import load_rig
-from calib.fit.calibration import Calibration
-from calib.fit.joint import fit_joint
-from calib.fit.paper import fit_paper
 from calib.mast.rig import Rig
-from hil_tests.calib.fit.small_surveys import survey_of
+
+if TYPE_CHECKING:
+    from calib.fit.calibration import Calibration
 
 
 @pytest.fixture(scope="session")
@@ -31,10 +31,16 @@ def navcams(true_rig: Rig) -> Rig:
 @pytest.fixture(scope="session")
 def joint(true_rig: Rig) -> Calibration:
     """The joint fit of survey 1."""
+    from calib.fit.joint import fit_joint  # slow to load, and most tests need no fit
+    from hil_tests.calib.fit.small_surveys import survey_of
+
     return fit_joint(survey_of(true_rig, 1))
 
 
 @pytest.fixture(scope="session")
 def paper(true_rig: Rig) -> Calibration:
     """The paper's fit of survey 1."""
+    from calib.fit.paper import fit_paper
+    from hil_tests.calib.fit.small_surveys import survey_of
+
     return fit_paper(survey_of(true_rig, 1))

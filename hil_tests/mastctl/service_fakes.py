@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
@@ -19,9 +19,9 @@ from calib.files.mast_file import save_rig
 from calib.mast.rig import Mast, Rig, RigCamera
 from drivers.interfaces import Camera, Frame, PanTilt, Reading
 from mastctl.config import load_config
-from mastctl.daemon import RunningDaemon
-from mastctl.service import service as service_module
-from mastctl.service import steering as steering_module
+
+if TYPE_CHECKING:
+    from mastctl.daemon import RunningDaemon
 
 SIZE_PX = (64, 48)
 
@@ -228,6 +228,10 @@ def fake_daemon(
     loop: type[ScriptedLoop] = ScriptedLoop,
 ) -> Iterator[tuple[RunningDaemon, FakeHardware]]:
     """A daemon on fakes: a real server on loopback, fake devices, a scripted loop."""
+    from mastctl.daemon import RunningDaemon  # slow to load, and most of these fakes need no daemon
+    from mastctl.service import service as service_module
+    from mastctl.service import steering as steering_module
+
     hardware = FakeHardware()
     save_rig(rig(), folder / "little.yaml")
     (folder / "daemon.yaml").write_text((config or CONFIG).format(listen=listen))

@@ -7,7 +7,7 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtrc, chdtri
 
 from calib.fit.calibration import Calibration, ImageResiduals
 from calib.fit.terms import DOTS_OF, JOINTS, PRISMS, TAPES
@@ -57,8 +57,8 @@ def check_sizes(survey: Survey, calibration: Calibration) -> dict[str, CheckSize
         seen, expected = np.sqrt(np.mean(pairs, axis=0))
         each = np.array([part for _, part in pairs])
         freedom = 2 * each.sum() ** 2 / np.sum(each**2)
-        limit = expected * np.sqrt(chi2.isf(RARELY, freedom) / freedom)
-        rarer = float(chi2.sf(freedom * (seen / expected) ** 2, freedom))
+        limit = expected * np.sqrt(chdtri(freedom, RARELY) / freedom)
+        rarer = float(chdtrc(freedom, freedom * (seen / expected) ** 2))
         sizes[camera] = CheckSize(float(seen), float(expected), float(limit), rarer)
     return sizes
 
