@@ -54,6 +54,11 @@ class Clock(Protocol):
         """Whether time passes while somebody waits; else waits for other threads run in real time."""
         ...
 
+    @property
+    def stands_for_work(self) -> bool:
+        """Whether it stands still while a thread that it knows computes: who computes holds up all others."""
+        ...
+
     def now_s(self) -> float:
         """Return the time now, seconds."""
         ...
@@ -86,6 +91,7 @@ class _MachineTime:
     """Signals and threads of a clock that waits for nobody's computing."""
 
     runs = True
+    stands_for_work = False
 
     def signal(self) -> Signal:
         return _MachineSignal(threading.Lock())

@@ -90,6 +90,7 @@ class SimulationClock:
     """
 
     runs = True
+    stands_for_work = True
 
     def __init__(self, speed: float = math.inf, start_s: float = 0.0) -> None:
         if not speed > 0:

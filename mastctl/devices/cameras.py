@@ -9,6 +9,7 @@ from __future__ import annotations
 import logging
 import math
 import threading
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -18,7 +19,7 @@ import numpy as np
 
 from calib.mast.rig import Rig
 from drivers.absent_camera import AbsentCamera
-from drivers.clock import Clock
+from drivers.clock import Clock, SystemClock
 from drivers.errors import BadFrame, BadReply, DriverError, NoFreshFrame
 from drivers.interfaces import Camera, Frame, FrameTime, KnowsSize, Paced, Reading
 from drivers.pairing import Offset, Pairing, learned
@@ -28,7 +29,7 @@ from mastctl.devices.faults import FaultWords
 from mastctl.devices.frames import FrameStore, StampedFrame
 from mastctl.devices.joint_history import JointHistory
 from mastctl.devices.thread import Asked, DeviceThread
-from mastctl.errors import NoLonger
+from mastctl.errors import MastctlError, NoLonger
 from mastctl.state.faults import StandingFault
 
 log = logging.getLogger(__name__)
@@ -36,6 +37,8 @@ log = logging.getLogger(__name__)
 READINGS_S = 1.0  # for the head's readings to reach beyond an exposure
 SIZE_TIMEOUT_S = 1.0
 CAMERA_GRACE_S = 3.0  # beyond the time given to next_frame: copying and decoding on a busy machine
+GLANCES_SHARE = 0.1  # of real time that glances hold up a simulation's clock, at most
+GLANCE_PATIENCE_S, GLANCE_AGAIN_S = 20.0, 0.5  # of real time, for pictures that are needed
 MOVED_RAD = 1e-5  # a head camera's picture that stays the same to the last bit beyond this is frozen
 WORDS = {
     "next_frame": FaultWords("a picture comes"),
@@ -97,14 +100,19 @@ class Cameras:
         self._learned: dict[tuple[str, str], Offset] = {}
         self._still_since: dict[str, StampedFrame] = {}  # per camera the first frame of the same content
         self._stamping = {name: threading.Lock() for name in self._cameras}
+        self._looking = threading.Condition()
+        self._looks = Counter[str]()  # calls of `frames` under way, of each camera
+        self._people = SystemClock()  # who only watches lives in real time
+        self._glancing = False  # where a glance holds up the clock: one at a time, and not before this moment
+        self._glance_from_s = 0.0
         self._threads = {name: self._thread_of(name) for name in self._cameras}
         if rig is not None:
             self._check_sizes()
 
     def frames(
-        self, cameras: Sequence[str], exposed_after_s: float, timeout_s: float, told: bool = True
+        self, cameras: Sequence[str], exposed_after_s: float, timeout_s: float
     ) -> dict[str, StampedFrame]:
-        """Return one frame of each camera, asked for in parallel, with its facts.
+        """Return one frame of each camera, asked for in parallel, with its facts; before any `glance`.
 
         Frames of several cameras belong together (`drivers.pairing`): exposed at one trigger, or nearest in
         time. Each serves one such set. All are ``moving`` if the head moved at any time from the first
@@ -118,8 +126,6 @@ class Cameras:
             Only frames whose exposure began after this moment count, seconds of CLOCK_MONOTONIC.
         timeout_s
             What each camera is given, seconds; the call itself ends at most the grace and 1 s later.
-        told
-            Whether the frame is told of, and recorded; False for one that is only watched.
 
         Raises
         ------
@@ -132,14 +138,103 @@ class Cameras:
         """
         for camera in cameras:
             frame_checks.check_known(camera, self._cameras)
-        deadline_s = self._time.now_s() + timeout_s
+        names = tuple(dict.fromkeys(cameras))
+        with self._looking:
+            self._looks.update(names)
+        try:
+            return self._look(names, exposed_after_s, timeout_s)
+        finally:
+            with self._looking:
+                self._looks.subtract(names)
+                self._looking.notify_all()
+
+    def glance(
+        self, camera: str, exposed_after_s: float, max_age_s: float, timeout_s: float, told: bool = False
+    ) -> StampedFrame:
+        """Return a frame for somebody who only watches, and who is never in the way of `frames`.
+
+        A frame that somebody needed serves, if it is new enough. The camera itself is asked only while no
+        call of `frames` waits for it; on a clock that stands while a picture is made, while none waits for
+        any camera, and for `GLANCES_SHARE` of real time at most. Not for who is at work on such a clock.
+
+        Parameters
+        ----------
+        camera
+            The name of a configured camera.
+        exposed_after_s, max_age_s
+            The exposure began after that moment of CLOCK_MONOTONIC, and at most so long ago, seconds.
+        timeout_s
+            What the camera is given, seconds.
+        told
+            Whether the frame is told of, and recorded.
+
+        Raises
+        ------
+        NoFreshFrame
+            Also if only needed frames were taken for `GLANCE_PATIENCE_S`, and none new enough.
+        BadFrame, NoReply, DriverError, BadReply
+            As `frames`.
+        """
+        until_s = self._people.now_s() + GLANCE_PATIENCE_S
+        while True:
+            after_s = max(exposed_after_s, self._clock.now_s() - max_age_s)
+            newest = self._store.newest(camera)
+            if newest is not None and newest.exposure_began_s > after_s:
+                return self._stamped(camera, newest, told)
+            with self._looking:
+                began_s = self._people.now_s()
+                if self._in_the_way(camera):
+                    if began_s > until_s:
+                        raise NoFreshFrame("all pictures taken now are needed elsewhere", device=camera)
+                    early_s = self._glance_from_s - began_s
+                    self._looking.wait(early_s if early_s > 0.0 else GLANCE_AGAIN_S)
+                    continue
+                self._glancing = True
+            try:
+                frame = self._glanced(camera, self._known_from(after_s), self._time.now_s() + timeout_s)
+                return self._stamped(camera, frame, told)
+            except _Needed:
+                continue
+            finally:
+                with self._looking:
+                    self._glancing = False
+                    ended_s = self._people.now_s()
+                    self._glance_from_s = ended_s + (ended_s - began_s) * (1.0 / GLANCES_SHARE - 1.0)
+                    self._looking.notify_all()
+
+    def _in_the_way(self, camera: str) -> bool:
+        """Whether a glance would hold anybody up."""
+        if not self._clock.stands_for_work:
+            return self._looks[camera] > 0
+        early = self._people.now_s() < self._glance_from_s
+        return early or self._glancing or any(count > 0 for count in self._looks.values())
+
+    def _glanced(self, camera: str, after_s: float, deadline_s: float) -> Frame | StampedFrame:
+        take = self._taker(camera, after_s, deadline_s)
+
+        def unless_needed() -> Frame | StampedFrame:
+            if self._looks[camera] > 0:
+                raise _Needed
+            return take()
+
+        left_s = max(0.0, deadline_s - self._time.now_s())
+        asked = self._threads[camera].submit("next_frame", unless_needed, left_s + self._grace_s)
+        return self._threads[camera].wait(asked, deadline_s + self._grace_s)
+
+    def _known_from(self, exposed_after_s: float) -> float:
+        """The moment, or a later one before which nobody knows where the head stood."""
         if (oldest_s := self._history.oldest_s) is None:
             oldest_s = self._read().time_s
-        exposed_after_s = max(exposed_after_s, oldest_s)  # before that nobody knows where the head stood
-        names = tuple(dict.fromkeys(cameras))
+        return max(exposed_after_s, oldest_s)
+
+    def _look(
+        self, names: Sequence[str], exposed_after_s: float, timeout_s: float
+    ) -> dict[str, StampedFrame]:
+        deadline_s = self._time.now_s() + timeout_s
+        exposed_after_s = self._known_from(exposed_after_s)
         if len(names) < 2:
             frames = self._fetched(dict.fromkeys(names, exposed_after_s), deadline_s)
-            return {name: self._stamped(name, frame, told) for name, frame in frames.items()}
+            return {name: self._stamped(name, frame, True) for name, frame in frames.items()}
         used_s = max(self._paired_s.get(name, -math.inf) for name in names)
         pairing = Pairing(names[0], self._offsets(names, deadline_s))
         frames = self._fetched(pairing.moments(max(exposed_after_s, used_s)), deadline_s)
@@ -149,7 +244,7 @@ class Cameras:
                 raise NoFreshFrame(words, device=min(after_s))
             frames |= self._fetched(after_s, deadline_s)
         self._paired_s |= {name: frame.exposure_began_s for name, frame in frames.items()}
-        return self._together({name: self._stamped(name, frame, told) for name, frame in frames.items()})
+        return self._together({name: self._stamped(name, frame, True) for name, frame in frames.items()})
 
     def _offsets(self, names: Sequence[str], deadline_s: float) -> dict[str, Offset]:
         """What is known of each camera's times beside the first one's."""
@@ -392,6 +487,10 @@ class Cameras:
                 f"the picture is frozen: equal to the last bit although the head moved {moved_rad:.6f} rad",
                 device=frame.camera,
             )
+
+
+class _Needed(MastctlError):
+    """A glance that gives way: somebody needs a frame of that camera."""
 
 
 @dataclass(frozen=True)

@@ -318,10 +318,16 @@ class Devices:
     # The cameras
 
     def frames(
-        self, cameras: Sequence[str], exposed_after_s: float, timeout_s: float, told: bool = True
+        self, cameras: Sequence[str], exposed_after_s: float, timeout_s: float
     ) -> dict[str, StampedFrame]:
         """Return one frame of each camera, with its facts; see `mastctl.devices.cameras.Cameras.frames`."""
-        return self._cameras.frames(cameras, exposed_after_s, timeout_s, told)
+        return self._cameras.frames(cameras, exposed_after_s, timeout_s)
+
+    def glance(
+        self, camera: str, exposed_after_s: float, max_age_s: float, timeout_s: float, told: bool = False
+    ) -> StampedFrame:
+        """Return a frame for who only watches; see `mastctl.devices.cameras.Cameras.glance`."""
+        return self._cameras.glance(camera, exposed_after_s, max_age_s, timeout_s, told)
 
     def frame_by_id(self, frame_id: str, max_age_s: float | None = None) -> StampedFrame:
         """Return a frame that is still kept. Raises NotKnown, NoLonger, NotNow."""

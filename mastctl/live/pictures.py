@@ -1,13 +1,14 @@
 """Cameras that somebody watches: each asked for its newest picture once for all who are ready for one.
 
-Nothing is queued. Who watches says for each camera when it is ready for another picture, and is given the
-newest when there is one; one that was not fetched yet is replaced. A camera that nobody is ready for is not
-asked.
+Nothing is queued, and no frame that somebody needs waits for one that is only watched. A watcher says for
+each camera when it is ready for another picture, and is given the newest when there is one; one that was not
+fetched yet is replaced. A camera that nobody is ready for is not asked.
 """
 
 from __future__ import annotations
 
 import logging
+import math
 import threading
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -25,6 +26,8 @@ log = logging.getLogger(__name__)
 JPEG_QUALITY = 80  # 110 kB of 1024x768 gravel; a pixel's own grey is off by 2 of 255
 APART_S = 0.045  # least time between two pictures: more than 15 a second from cameras of 15, 20, 30 or 60
 NEW_S = 0.05  # a picture that was exposed this long ago is still new
+STANDS_S = 0.25  # and one this long ago where the clock may stand: two frames of 15 Hz, and their read-out
+AGAIN_S = 0.25  # a picture that stays the newest, since its clock stands, is shown again so often, real time
 TIMEOUT_S = 1.0
 FAILING_S = 0.5  # how long a camera is left alone that gave none
 HELD = 4  # pictures of a camera that each watcher may click though newer ones came
@@ -34,9 +37,9 @@ AHEAD = 2  # pictures on their way to a watcher: one being shown, one being sent
 class CamerasLike(Protocol):
     """Who takes pictures, and keeps those that are looked at."""
 
-    def frames(
-        self, cameras: Sequence[str], exposed_after_s: float, timeout_s: float, told: bool
-    ) -> dict[str, StampedFrame]: ...
+    def glance(
+        self, camera: str, exposed_after_s: float, max_age_s: float, timeout_s: float
+    ) -> StampedFrame: ...
     def hold(self, frame: StampedFrame, by: str, kept: int) -> None: ...
     def let_go(self, by: str) -> None: ...
 
@@ -111,24 +114,24 @@ class WatchedCameras:
     # In a camera's own thread, which ends when nobody watches
 
     def _work(self, camera: str) -> None:
+        stands = self._clock.stands_for_work
         made: Picture | None = None
-        failing = False
-        while self._wanted(camera, FAILING_S if failing else 0.0):
+        pause_s = 0.0
+        while self._wanted(camera, pause_s):
             try:
-                after_s = self._clock.now_s() - NEW_S
-                if made is not None:
-                    after_s = max(after_s, made.frame.exposure_began_s + APART_S)
-                frame = self._cameras.frames([camera], after_s, TIMEOUT_S, told=False)[camera]
-                made, failing = (
-                    Picture(frame, frame.jpeg or encoded(frame.image, "jpeg", JPEG_QUALITY)),
-                    False,
-                )
+                after_s = -math.inf if made is None or stands else made.frame.exposure_began_s + APART_S
+                frame = self._cameras.glance(camera, after_s, STANDS_S if stands else NEW_S, TIMEOUT_S)
+                if made is not None and made.frame is frame:
+                    pause_s = AGAIN_S
+                else:
+                    made = Picture(frame, frame.jpeg or encoded(frame.image, "jpeg", JPEG_QUALITY))
+                    pause_s = 0.0
             except (DriverError, MastctlError) as error:  # its fault tells more
                 log.debug("no picture of %s for who watches it: %s", camera, error)
-                made, failing = None, True
+                made, pause_s = None, FAILING_S
             except Exception:  # a defect must not end the thread
                 log.exception("pictures of %s met a defect of the program", camera)
-                made, failing = None, True
+                made, pause_s = None, FAILING_S
             else:
                 for watcher in self._ready(camera):
                     self._cameras.hold(frame, watcher.name, HELD)

@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import importlib.util
 import logging
+import math
 import threading
 import time
 from collections.abc import Sequence
@@ -46,9 +47,9 @@ CLOSE_S = 3.0
 class CamerasLike(Protocol):
     """Who takes pictures, and finds them again."""
 
-    def frames(
-        self, cameras: Sequence[str], exposed_after_s: float, timeout_s: float
-    ) -> dict[str, StampedFrame]: ...
+    def glance(
+        self, camera: str, exposed_after_s: float, max_age_s: float, timeout_s: float, told: bool
+    ) -> StampedFrame: ...
     def frame_by_id(self, frame_id: str) -> StampedFrame: ...
 
 
@@ -87,7 +88,7 @@ class LiveView:
         self._news: ThreadSubscription | None = None
         self._screen: Screen | None = None
         self._fault: StandingFault | None = None
-        self._lookers = {name: _Looker(name, cameras, clock, self._closing, self._looked) for name in names}
+        self._lookers = {name: _Looker(name, cameras, self._closing, self._looked) for name in names}
         self._thread = threading.Thread(target=self._work, name="live view", daemon=True)
         self._thread.start()
 
@@ -213,12 +214,10 @@ class LiveView:
 class _Looker:
     """Asks one camera for pictures while it is wanted; at first for one, to know of which kind they are."""
 
-    def __init__(
-        self, camera: str, cameras: CamerasLike, clock: Clock, closing: threading.Event, on_kind: Any
-    ) -> None:
+    def __init__(self, camera: str, cameras: CamerasLike, closing: threading.Event, on_kind: Any) -> None:
         self.schema = ""
         self.wanted = threading.Event()
-        self._camera, self._cameras, self._clock = camera, cameras, clock
+        self._camera, self._cameras = camera, cameras
         self._closing, self._on_kind = closing, on_kind
         threading.Thread(target=self._work, name=f"live view of {camera}", daemon=True).start()
 
@@ -236,9 +235,8 @@ class _Looker:
             self._closing.wait(PICTURES_S if self._look() else FAILING_S)
 
     def _look(self) -> bool:
-        after_s = self._clock.now_s() - PICTURES_S
         try:
-            frame = self._cameras.frames([self._camera], after_s, PICTURE_TIMEOUT_S)[self._camera]
+            frame = self._cameras.glance(self._camera, -math.inf, PICTURES_S, PICTURE_TIMEOUT_S, told=True)
         except (DriverError, MastctlError):
             return False
         schema = "foxglove.CompressedImage" if frame.jpeg else "foxglove.RawImage"

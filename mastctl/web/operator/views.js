@@ -11,7 +11,7 @@ export class Views {
     this.images = new Images((facts, bitmap, cameMs) => this.shown(facts, bitmap, cameMs));
     this.groups = [];
     setInterval(() => this.eyes.forEach((eye) => eye.fresh(performance.now())), 250);
-    document.addEventListener("visibilitychange", () => this.images.watch(document.hidden ? [] : this.names()));
+    document.addEventListener("visibilitychange", () => this.watch());
   }
 
   use(rig) {
@@ -33,8 +33,13 @@ export class Views {
     const names = this.names();
     this.eyes = new Map(names.map((name) => [name, this.eyes.get(name) ?? new Eye(name, this.choose)]));
     put(byId("eyes"), [...this.eyes.values()].map((eye) => eye.element));
-    this.images.watch(names);
+    this.watch();
     document.dispatchEvent(new CustomEvent("views-changed"));
+  }
+
+  /** Pictures of the cameras in view, while anybody sees the page. */
+  watch() {
+    this.images.watch(document.hidden ? [] : this.names());
   }
 
   names() {

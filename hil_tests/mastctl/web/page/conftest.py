@@ -39,8 +39,13 @@ class Visit:
 
     def posts(self, path: str) -> list[str]:
         """Bodies of what was posted to a path of the API."""
-        self.page.title()  # whatever the browser told meanwhile is heard by that
+        self.told()
         return [body for where, body in self.asked if where == f"POST /api/v1{path}"]
+
+    def told(self) -> list[str]:
+        """What was asked for so far."""
+        self.page.title()  # whatever the browser told meanwhile is heard by that
+        return [where for where, _ in self.asked]
 
     def frame(self, camera: str = "navcam_left") -> Any:
         """The image of a camera, once it is fresh."""

@@ -27,6 +27,7 @@ from mastctl.pointing.results import Preview
 from mastctl.web.page import page_files
 
 BOTH = tuple[RunningDaemon, FakeHardware]
+HIDDEN = "Object.defineProperty(document, 'hidden', {get: () => !window.seen})"
 Visits = Callable[..., Visit]
 SEEN = Preview(
     camera="navcam_left", frame_id="a", pixel_px=(32.0, 24.0), position_m=(6.0, 0.5, 0.1), range_m=6.02,
@@ -143,6 +144,23 @@ def test_a_stale_image_is_hatched_and_blocks_clicks(pair: BOTH, visit: Visits) -
     hardware.fake_cameras["navcam_left"].hook = lambda: None
     one.choose()
     one.target("preview")
+
+
+def test_a_page_that_is_hidden_from_the_start_asks_for_no_picture_until_it_is_seen(
+    pair: BOTH, visit: Visits
+) -> None:
+    daemon, hardware = pair
+    one = visit("about:blank")
+    one.page.add_init_script(HIDDEN)
+    one.url = daemon.url
+    one.page.goto(daemon.url)
+    one.page.wait_for_selector(".eye")  # the cameras are known: pictures would be asked for now
+    one.page.locator("#tabs button").last.click()
+    one.page.wait_for_selector(".eye[data-camera=hazcam_left]")
+    assert not [where for where in one.told() if "/api/v1/images" in where]
+    assert not any(camera.asked for camera in hardware.fake_cameras.values())
+    one.page.evaluate("window.seen = true; document.dispatchEvent(new Event('visibilitychange'))")
+    one.frame("hazcam_left")
 
 
 @pytest.mark.parametrize("press", ["STOP", "Escape", "Enter"])
