@@ -6,6 +6,7 @@ import json
 import re
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from functools import cache
 from typing import Any
 
 import jsonschema_rs
@@ -13,23 +14,23 @@ import pytest
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from mastctl import daemon as daemon_module
-from mastctl.web.guard import Guard
+from mastctl.web.app import api
+from mastctl.web.described import description
 
 
 class Described:
-    """What one application says of itself, and where an answer was another."""
+    """What daemons say of themselves, and where an answer was another."""
 
-    def __init__(self, document: Mapping[str, Any], complaints: list[str]) -> None:
+    def __init__(self, document: Mapping[str, Any]) -> None:
         self._document = closed(document)
-        self._complaints = complaints
         self._validators: dict[str, Any] = {}
         self._paths = [
             (re.compile(re.sub(r"\\\{[^}]*\\\}", "[^/]+", re.escape(path))), path, methods)
             for path, methods in self._document["paths"].items()
         ]
 
-    def check(self, scope: Scope, status: int, kind: str, body: bytes) -> None:
-        """Take note of an answer that is not as described."""
+    def check(self, scope: Scope, status: int, kind: str, body: bytes) -> Iterator[str]:
+        """Tell where an answer is not as described."""
         found = next(
             ((path, known) for form, path, known in self._paths if form.fullmatch(scope["path"])), None
         )
@@ -41,25 +42,21 @@ class Described:
         responses = known[method]["responses"]
         told = responses.get(str(status)) or responses.get(f"{status // 100}XX")
         if told is None:
-            self._complaints.append(f"{where} is none of the described {', '.join(responses)}")
+            yield f"{where} is none of the described {', '.join(responses)}"
             return
         content = told.get("content", {})
         if kind not in content:
-            self._complaints.append(f"{where} is {kind}, described are {', '.join(content)}")
+            yield f"{where} is {kind}, described are {', '.join(content)}"
         elif kind == "application/json":
             validator = self._validator(f"{method} {path} {status}", content[kind]["schema"])
-            self._complaints += [
-                f"{where}, {'/'.join(map(str, error.instance_path))}: {error.message[:200]}"
-                for error in validator.iter_errors(json.loads(body))
-            ]
+            for error in validator.iter_errors(json.loads(body)):
+                yield f"{where}, {'/'.join(map(str, error.instance_path))}: {error.message[:200]}"
         elif kind == "text/event-stream":
             event = self._validator(f"{path} event", content[kind]["x-event"])
             for line in body.decode().splitlines():
                 if line.startswith("data:"):
-                    self._complaints += [
-                        f"{where}, event: {error.message[:200]}"
-                        for error in event.iter_errors(json.loads(line.removeprefix("data:")))
-                    ]
+                    for error in event.iter_errors(json.loads(line.removeprefix("data:"))):
+                        yield f"{where}, event: {error.message[:200]}"
 
     def _validator(self, name: str, schema: Mapping[str, Any]) -> Any:
         if name not in self._validators:
@@ -78,6 +75,12 @@ def closed(document: Mapping[str, Any]) -> Any:
     return [closed(one) for one in document] if isinstance(document, list) else document
 
 
+@cache
+def described() -> Described:
+    """What the daemons of this process say of themselves; they have it in common."""
+    return Described(json.loads(description(api())))
+
+
 @contextmanager
 def answers_checked() -> Iterator[list[str]]:
     """Have every daemon of this process checked; yields what was not as described."""
@@ -85,12 +88,10 @@ def answers_checked() -> Iterator[list[str]]:
     plain: Callable[..., ASGIApp] = daemon_module.create_app
 
     def create_app(*args: Any, **options: Any) -> ASGIApp:
-        app = plain(*args, **options)
-        assert isinstance(app, Guard)
-        described = Described(app.openapi(), complaints)
+        app, known = plain(*args, **options), described()
 
         async def watched(scope: Scope, receive: Receive, send: Send) -> None:
-            status, kind, body = 0, "", b""
+            status, kind, body = 0, "", bytearray()
 
             async def seen(message: Message) -> None:
                 nonlocal status, kind, body
@@ -106,7 +107,7 @@ def answers_checked() -> Iterator[list[str]]:
                 await app(scope, receive, seen)
             finally:
                 if status and scope["type"] == "http":
-                    described.check(scope, status, kind, body)
+                    complaints.extend(known.check(scope, status, kind, bytes(body)))
 
         return watched
 

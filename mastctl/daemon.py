@@ -53,9 +53,9 @@ from mastctl.web.connections import (
     sweep,
 )
 from mastctl.web.entrance import Entrance
-from mastctl.web.events import Streams
 from mastctl.web.secure import arriving
 from mastctl.web.sockets import LARGEST_BYTES, PING_S, Socket
+from mastctl.web.streams import Streams
 from mastctl.web.waiting import Waiting
 from mastctl.web.whose_page import Names
 

@@ -18,7 +18,7 @@ from hil_tests.mastctl.service_fakes import FakeHardware, FakeStep, ScriptedLoop
 from mastctl.client import Client, ClientError
 from mastctl.client import connection as connection_module
 from mastctl.daemon import RunningDaemon
-from mastctl.web import events as events_module
+from mastctl.web import streams as streams_module
 
 BOTH = tuple[RunningDaemon, FakeHardware]
 BOUND_S = 20.0
@@ -179,14 +179,14 @@ def test_a_stream_that_breaks_is_begun_again(
 def test_without_a_stream_left_the_daemon_is_asked(
     client: Client, go: threading.Event, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(events_module.Streams, "listening", full)
+    monkeypatch.setattr(streams_module.Streams, "listening", full)
     operation = client.point(pan_rad=0.0, tilt_rad=0.0)
     threading.Timer(0.3, go.set).start()
     assert client.wait(operation, timeout_s=BOUND_S)["state"] == "done"
 
 
 def full(self: Any, topics: Any, keys: Any) -> Any:
-    raise events_module.Unable("too_many", "no more may listen", 1.0)
+    raise streams_module.Unable("too_many", "no more may listen", 1.0)
 
 
 def test_an_unknown_operation_is_said_at_once(client: Client) -> None:

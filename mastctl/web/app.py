@@ -7,24 +7,26 @@ Every refusal is ``{"error": {"code", "message", "detail"}}``.
 
 from __future__ import annotations
 
+from functools import cache
 from importlib.metadata import version
 
 from fastapi import FastAPI
-from starlette.types import ASGIApp
+from starlette.types import ASGIApp, Receive, Scope, Send
 
 from mastctl.service.service import Service
 from mastctl.web.answers import ErrorBody
 from mastctl.web.bench import add_bench
 from mastctl.web.commands import Commands
-from mastctl.web.described import describe
+from mastctl.web.described import add_description
 from mastctl.web.entrance import Entrance
 from mastctl.web.estop import add_estop
-from mastctl.web.events import Streams, add_events
+from mastctl.web.events import add_events
 from mastctl.web.guard import Guard
 from mastctl.web.images import add_images
 from mastctl.web.lease import add_lease
 from mastctl.web.limits import add_limits
 from mastctl.web.page import add_page
+from mastctl.web.parts import Parts
 from mastctl.web.pictures import add_pictures
 from mastctl.web.places import add_places
 from mastctl.web.recordings import add_recordings
@@ -33,6 +35,7 @@ from mastctl.web.reload import add_reload
 from mastctl.web.routes import add_pointing, add_tracking
 from mastctl.web.sessions import add_sessions
 from mastctl.web.simulation import add_simulation
+from mastctl.web.streams import Streams
 from mastctl.web.waiting import Waiting
 from mastctl.web.watching import add_watching
 
@@ -56,32 +59,34 @@ def create_app(
     """
     waiting = waiting or Waiting(service.clock)
     entrance = entrance or Entrance()
+    streams = streams or Streams(service.machine.publisher)
+    parts = Parts(service, waiting, Commands(service, waiting), streams, entrance)
+    routes = api()
+
+    async def served(scope: Scope, receive: Receive, send: Send) -> None:
+        scope.setdefault("state", {})["parts"] = parts
+        await routes(scope, receive, send)
+
+    return Guard(served, entrance)
+
+
+@cache
+def api() -> FastAPI:
+    """Return the routes. They hold nothing of any daemon; making them takes 0.1 s, so once a process."""
     app = FastAPI(
         title="mastctl",
         version=version("mastctl"),
         description="A rover mast: state, pointing with a measured residual, pictures with their facts.",
         responses={status: {"model": ErrorBody, "description": "Refused"} for status in ("4XX", "5XX", 422)},
+        openapi_url=None,  # served by a route of our own, which does not make it on the event loop
         docs_url=None,
         redoc_url=None,
     )
     add_errors(app)
-    add_sessions(app, entrance)
-    commands = Commands(service, waiting)
-    add_pointing(app, service, waiting, commands)
-    add_estop(app, service, waiting, commands)
-    add_lease(app, service, commands)
-    add_tracking(app, service, commands)
-    add_limits(app, service, commands)
-    add_pictures(app, service, waiting, commands)
-    add_places(app, service, waiting, commands)
-    add_recordings(app, service, waiting, commands)
-    add_bench(app, service, waiting, commands)
-    add_reload(app, service, commands)
-    add_simulation(app, service, waiting, commands)
-    add_watching(app, service, waiting)
-    streams = streams or Streams(service.machine.publisher)
-    add_events(app, service, streams)
-    add_images(app, service, streams)
-    add_page(app, service, waiting)
-    describe(app)
-    return Guard(app, entrance)
+    for add in (
+        *(add_sessions, add_pointing, add_estop, add_lease, add_tracking, add_limits, add_pictures),
+        *(add_places, add_recordings, add_bench, add_reload, add_simulation, add_watching, add_events),
+        *(add_images, add_page, add_description),
+    ):
+        add(app)
+    return app

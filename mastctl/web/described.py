@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Mapping
+from functools import cache
 from typing import Any
 
 from fastapi import FastAPI
+from fastapi.responses import JSONResponse, Response
 from pydantic import BaseModel
 from pydantic.json_schema import models_json_schema
 
@@ -14,6 +17,7 @@ from mastctl.web import PREFIX
 from mastctl.web import answers as told
 from mastctl.web import bench_answers as bench
 from mastctl.web.event_answers import Event
+from mastctl.web.parts import Here
 
 ANSWERS: Mapping[str, type[BaseModel]] = {
     "GET /calibration/health": told.CalibrationHealthTold,
@@ -83,16 +87,33 @@ FILES: Mapping[str, tuple[str, ...]] = {
     "GET /reports/{name}": ("text/html",),
 }
 PICTURES = ("GET /snapshot/{camera}",)
+_ONE_MAKES_IT = threading.Lock()
 _REFERENCE = "#/components/schemas/{model}"
 
 
-def describe(app: FastAPI) -> None:
-    """Let /openapi.json name these models, of an app that has all its routes.
+def add_description(app: FastAPI) -> None:
+    """``GET /openapi.json``, of an app that has all its routes.
 
-    It is made here, before the first request: that takes a tenth of a second, in which the event loop would
-    let no stop and no heartbeat through.
+    It is made when somebody first asks, and in a thread: that takes a tenth of a second, in which the event
+    loop would let no stop and no heartbeat through.
     """
-    _describe(app.openapi())
+
+    @app.get("/openapi.json", include_in_schema=False)
+    async def told(here: Here) -> Response:
+        return Response(await here.waiting.run(lambda: description(app)), media_type="application/json")
+
+
+def description(app: FastAPI) -> bytes:
+    """Return what /openapi.json tells of an app that has all its routes."""
+    with _ONE_MAKES_IT:
+        return _made(app)
+
+
+@cache
+def _made(app: FastAPI) -> bytes:
+    document = app.openapi()
+    _describe(document)
+    return bytes(JSONResponse(document).body)
 
 
 def answer_schemas() -> dict[str, Any]:

@@ -12,18 +12,17 @@ from fastapi import FastAPI, Request
 from mastctl.commands.entry import ESTOP, RESET
 from mastctl.errors import Unable
 from mastctl.safety.stop_threads import StopsHang
-from mastctl.service.service import Service
 from mastctl.web import PREFIX
-from mastctl.web.commands import Commands, Headers
+from mastctl.web.commands import Headers
 from mastctl.web.models import EstopBody, ResetBody
-from mastctl.web.waiting import Waiting
+from mastctl.web.parts import Here
 
 BODY_S = 0.05  # a body comes with its request; who sends it later is stopped without its words
 LARGEST_BODY_BYTES = 4096
 ANY_BODY = {"anyOf": [EstopBody.model_json_schema(), {}]}  # a stop is refused for no body
 
 
-def add_estop(app: FastAPI, service: Service, waiting: Waiting, commands: Commands) -> None:
+def add_estop(app: FastAPI) -> None:
     """The emergency stop, which needs no body that makes sense, and the reset, which does."""
 
     @app.post(
@@ -31,23 +30,25 @@ def add_estop(app: FastAPI, service: Service, waiting: Waiting, commands: Comman
         summary="Stop the mast and let nothing move it until it is reset, across restarts too",
         openapi_extra={"requestBody": {"content": {"application/json": {"schema": ANY_BODY}}}},
     )
-    async def estop(request: Request) -> dict[str, Any]:
+    async def estop(request: Request, here: Here) -> dict[str, Any]:
         told = await _told(request)
         words = told.get("reason"), told.get("name")
+        stopping = here.service.stopping
         try:
-            return await commands.first(
-                ESTOP, request, lambda: service.stopping.estop(*words), {"reason": words[0], "name": words[1]}
+            return await here.commands.first(
+                ESTOP, request, lambda: stopping.estop(*words), {"reason": words[0], "name": words[1]}
             )
         except StopsHang as error:
-            await waiting.run(lambda: service.stopping.latch_estop(*words))
+            await here.waiting.run(lambda: stopping.latch_estop(*words))
             raise Unable("stop_unconfirmed", f"the emergency stop is latched, but {error}") from None
 
     @app.post(f"{PREFIX}/reset", summary="Release the emergency stop; nothing moves before the next command")
-    async def reset(body: ResetBody, came: Headers) -> dict[str, Any]:
+    async def reset(body: ResetBody, came: Headers, here: Here) -> dict[str, Any]:
         def act() -> dict[str, Any]:
-            return {"latched": False, "released": asdict(service.stopping.reset(body.reason, body.name))}
+            released = here.service.stopping.reset(body.reason, body.name)
+            return {"latched": False, "released": asdict(released)}
 
-        return await commands.run(RESET, came, body.model_dump(), act)
+        return await here.commands.run(RESET, came, body.model_dump(), act)
 
 
 async def _told(request: Request) -> dict[str, str]:

@@ -9,8 +9,7 @@ from __future__ import annotations
 
 import asyncio
 import json
-from collections.abc import AsyncIterator, Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import AsyncIterator, Callable, Mapping
 from typing import Annotated, Any
 
 from fastapi import FastAPI, Query, WebSocket
@@ -20,79 +19,26 @@ from starlette.types import Receive, Scope, Send
 from starlette.websockets import WebSocketDisconnect
 
 from mastctl.as_json import as_json
-from mastctl.errors import MastctlError, Unable
+from mastctl.errors import MastctlError
 from mastctl.service.service import Service
 from mastctl.service.state import fault_told, joints_told, standing_told
-from mastctl.state.publisher import LoopSubscription, Published, Publisher, Topic
+from mastctl.state.publisher import LoopSubscription, Published, Topic
 from mastctl.web import PREFIX
 from mastctl.web.answer import error_response
 from mastctl.web.connections import EVENTS
 from mastctl.web.models import EventsQuery
+from mastctl.web.parts import Here, Parts
 from mastctl.web.refusals import told as refused
 from mastctl.web.sentences import sentence
 
 ALIVE_S = 2.0  # between signs of life where nothing changes
-MOST = 100
 GOING_AWAY = 1001  # RFC 6455, 7.4.1
-FULL_S = 1.0
 
-Telling = Callable[[Published, int], str]
-
-
-class Streams:
-    """Who listens to one daemon; used on its event loop only.
-
-    Parameters
-    ----------
-    publisher
-        What is listened to.
-    most
-        How many may listen at once, so that they leave connections for everybody else.
-    """
-
-    def __init__(self, publisher: Publisher, most: int = MOST) -> None:
-        self._publisher = publisher
-        self._most = most
-        self._open: set[LoopSubscription] = set()
-        self._ended = False
-
-    @contextmanager
-    def listening(self, topics: tuple[Topic, ...], keys: frozenset[str] | None) -> Iterator[LoopSubscription]:
-        """Listen inside the block to topics, all of them if none is named, of some keys or of every one.
-
-        Raises
-        ------
-        Unable
-            ``too_many`` listen already, ``closing``.
-        """
-        if self._ended:
-            raise Unable("closing", "the daemon ends; nothing more will be told")
-        if len(self._open) >= self._most:
-            words = f"{self._most} listen to events already, and no more may; ask again later"
-            raise Unable("too_many", words, FULL_S)
-        with self._publisher.subscribe_here(*topics, keys=keys) as news:
-            self._open.add(news)
-            try:
-                yield news
-            finally:
-                self._open.discard(news)
-
-    def end(self) -> None:
-        """Let every stream tell what it has not told yet, and end."""
-        self._ended = True
-        for news in tuple(self._open):
-            news.close()
+Telling = Callable[[Service, Published, int], str]
 
 
-def add_events(app: FastAPI, service: Service, streams: Streams) -> None:
+def add_events(app: FastAPI) -> None:
     """The event stream, and the track's own."""
-
-    def tell(one: Published, lost: int) -> str:
-        event = {"topic": one.topic, "key": one.key, "sequence": one.sequence, "lost": lost}
-        return json.dumps(event | {"value": value_told(service, one)}, allow_nan=False)
-
-    def tell_track(one: Published, lost: int) -> str:
-        return json.dumps(service.track_told(one.value), allow_nan=False)
 
     @app.get(
         EVENTS,
@@ -100,8 +46,8 @@ def add_events(app: FastAPI, service: Service, streams: Streams) -> None:
         response_class=StreamingResponse,
         responses={200: {"content": {"text/event-stream": {}}}},
     )
-    async def events(query: Annotated[EventsQuery, Query()]) -> StreamingResponse:
-        return _Lines(streams, query.names, query.keys, tell)
+    async def events(query: Annotated[EventsQuery, Query()], here: Here) -> StreamingResponse:
+        return _Lines(here, query.names, query.keys, _event)
 
     @app.get(
         f"{PREFIX}/track/stream",
@@ -109,15 +55,15 @@ def add_events(app: FastAPI, service: Service, streams: Streams) -> None:
         response_class=StreamingResponse,
         responses={200: {"content": {"text/event-stream": {}}}},
     )
-    async def track() -> StreamingResponse:
-        return _Lines(streams, ("track",), None, tell_track)
+    async def track(here: Here) -> StreamingResponse:
+        return _Lines(here, ("track",), None, _track)
 
     @app.websocket(EVENTS)
-    async def socket(line: WebSocket) -> None:
+    async def socket(line: WebSocket, here: Here) -> None:
         try:
             query = _asked(line)
-            with streams.listening(query.names, query.keys) as news:
-                await _tell(line, news, tell)
+            with here.streams.listening(query.names, query.keys) as news:
+                await _tell(line, news, here.service)
         except ValidationError as error:
             words = sentence({**error.errors()[0], "loc": ("query", *error.errors()[0]["loc"])}, EventsQuery)
             await line.send_denial_response(error_response(422, "bad_request", words))
@@ -132,15 +78,24 @@ def _asked(line: WebSocket) -> EventsQuery:
     return EventsQuery.model_validate(told | ({"key": query.getlist("key")} if "key" in query else {}))
 
 
+def _event(service: Service, one: Published, lost: int) -> str:
+    event = {"topic": one.topic, "key": one.key, "sequence": one.sequence, "lost": lost}
+    return json.dumps(event | {"value": value_told(service, one)}, allow_nan=False)
+
+
+def _track(service: Service, one: Published, lost: int) -> str:
+    return json.dumps(service.track_told(one.value), allow_nan=False)
+
+
 class _Lines(StreamingResponse):
     """Events as server-sent ones, until the daemon or the client ends."""
 
     def __init__(
-        self, streams: Streams, topics: tuple[Topic, ...], keys: frozenset[str] | None, tell: Telling
+        self, here: Parts, topics: tuple[Topic, ...], keys: frozenset[str] | None, tell: Telling
     ) -> None:
         super().__init__(self._lines(), media_type="text/event-stream")
-        self._listening = streams.listening(topics, keys)
-        self._tell = tell
+        self._listening = here.streams.listening(topics, keys)
+        self._service, self._tell = here.service, tell
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         with self._listening as self._news:
@@ -151,14 +106,14 @@ class _Lines(StreamingResponse):
         while True:
             found = await news.wait(ALIVE_S)
             for one in found:
-                yield f"id: {one.sequence}\ndata: {self._tell(one, news.lost)}\n\n"
+                yield f"id: {one.sequence}\ndata: {self._tell(self._service, one, news.lost)}\n\n"
             if not found:
                 if news.closed:
                     return
                 yield ": alive\n\n"
 
 
-async def _tell(line: WebSocket, news: LoopSubscription, tell: Telling) -> None:
+async def _tell(line: WebSocket, news: LoopSubscription, service: Service) -> None:
     """Tell through a WebSocket until the daemon or the client ends."""
     await line.accept()
     gone = asyncio.ensure_future(line.receive())  # a client's only message is its end
@@ -166,7 +121,7 @@ async def _tell(line: WebSocket, news: LoopSubscription, tell: Telling) -> None:
     try:
         while found := await news.wait():
             for one in found:
-                await line.send_text(tell(one, news.lost))
+                await line.send_text(_event(service, one, news.lost))
         if not gone.done():
             await line.close(GOING_AWAY)
     except WebSocketDisconnect:

@@ -11,8 +11,7 @@ from collections.abc import Mapping
 from typing import Any
 from urllib.parse import parse_qsl
 
-from fastapi import FastAPI
-from starlette.types import Message, Receive, Scope, Send
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from mastctl.commands.caller import Caller
 from mastctl.errors import MastctlError
@@ -57,14 +56,10 @@ class Guard:
         What the daemon asks of who comes in.
     """
 
-    def __init__(self, app: FastAPI, entrance: Entrance | None = None) -> None:
+    def __init__(self, app: ASGIApp, entrance: Entrance | None = None) -> None:
         self._app = app
         self._entrance = entrance or Entrance()
         self._rate = Rate()
-
-    def openapi(self) -> dict[str, Any]:
-        """Return what the API says of itself, as ``/openapi.json`` does."""
-        return self._app.openapi()
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["type"] == "http":

@@ -22,24 +22,25 @@ from mastctl.live.pictures import Picture, Watcher
 from mastctl.service.service import Service
 from mastctl.web.answer import error_response
 from mastctl.web.connections import IMAGES
-from mastctl.web.events import GOING_AWAY, Streams
+from mastctl.web.events import GOING_AWAY
 from mastctl.web.models import ImagesQuery
+from mastctl.web.parts import Here
 from mastctl.web.refusals import told as refused
 from mastctl.web.sentences import sentence
 
 
-def add_images(app: FastAPI, service: Service, streams: Streams) -> None:
+def add_images(app: FastAPI) -> None:
     """The WebSocket of live pictures."""
 
     @app.websocket(IMAGES)
-    async def socket(line: WebSocket) -> None:
+    async def socket(line: WebSocket, here: Here) -> None:
         try:
             cameras = _asked(line).camera
             for camera in cameras:
-                service.check_camera(camera)
-            with streams.listening((), frozenset()) as ending:  # counted as a listener, and ended as one
+                here.service.check_camera(camera)
+            with here.streams.listening((), frozenset()) as ending:  # counted as a listener, and ended as one
                 await line.accept()
-                await _Line(service, line, cameras).run(asyncio.ensure_future(ending.wait()))
+                await _Line(here.service, line, cameras).run(asyncio.ensure_future(ending.wait()))
         except ValidationError as error:
             words = sentence({**error.errors()[0], "loc": ("query", *error.errors()[0]["loc"])}, ImagesQuery)
             await line.send_denial_response(error_response(422, "bad_request", words))

@@ -9,41 +9,44 @@ from fastapi import FastAPI
 from mastctl.commands.entry import JOG, SUN, SUN_FORGET
 from mastctl.service.service import Service
 from mastctl.web import PREFIX
-from mastctl.web.commands import Commands, Headers
+from mastctl.web.commands import Headers
 from mastctl.web.models import JogBody, SunBody
+from mastctl.web.parts import Here
 
 
-def add_limits(app: FastAPI, service: Service, commands: Commands) -> None:
+def add_limits(app: FastAPI) -> None:
     """The jog, and the sun."""
-    door = service.devices.door
 
     @app.post(f"{PREFIX}/jog", summary="A heartbeat: turn the head at a rate, for half a second")
-    async def jog(body: JogBody, came: Headers) -> dict[str, Any]:
+    async def jog(body: JogBody, came: Headers, here: Here) -> dict[str, Any]:
         asked = body.model_dump(exclude_none=True)
-        return await commands.run(JOG, came, asked, lambda: service.jogs.beat(body.beat()))
+        return await here.commands.run(JOG, came, asked, lambda: here.service.jogs.beat(body.beat()))
 
     @app.get(f"{PREFIX}/limits/sun", summary="The direction that no head camera looks into")
-    async def sun() -> dict[str, Any]:
-        return door.told()
+    async def sun(here: Here) -> dict[str, Any]:
+        return here.service.devices.door.told()
 
     @app.post(f"{PREFIX}/limits/sun", summary="Say where the sun stands; the head keeps off it")
-    async def tell(body: SunBody, came: Headers) -> dict[str, Any]:
-        sun = body.sun(service.clock.now_s())
+    async def tell(body: SunBody, came: Headers, here: Here) -> dict[str, Any]:
+        service = here.service
+        door, sun = service.devices.door, body.sun(service.clock.now_s())
 
         def act() -> dict[str, Any]:
             door.use_sun(sun)
             stop_before_keep_outs(service)
             return door.told()
 
-        return await commands.run(SUN, came, body.model_dump(exclude_none=True), act)
+        return await here.commands.run(SUN, came, body.model_dump(exclude_none=True), act)
 
     @app.delete(f"{PREFIX}/limits/sun", summary="Keep the head off no sun any more")
-    async def forget(came: Headers) -> dict[str, Any]:
+    async def forget(came: Headers, here: Here) -> dict[str, Any]:
+        door = here.service.devices.door
+
         def act() -> dict[str, Any]:
             door.use_sun(None)
             return door.told()
 
-        return await commands.run(SUN_FORGET, came, {}, act)
+        return await here.commands.run(SUN_FORGET, came, {}, act)
 
 
 def stop_before_keep_outs(service: Service) -> None:

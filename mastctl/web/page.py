@@ -14,7 +14,7 @@ from fastapi.responses import Response
 from calib.mast.rig import RigCamera
 from mastctl.service.service import Service
 from mastctl.web import PREFIX
-from mastctl.web.waiting import Waiting
+from mastctl.web.parts import Here
 
 FIRST = "index.html"
 KINDS = {
@@ -32,7 +32,7 @@ def page_files() -> dict[str, bytes]:
     return {one.name: one.read_bytes() for one in folder.iterdir() if one.name.rpartition(".")[2] in KINDS}
 
 
-def add_page(app: FastAPI, service: Service, waiting: Waiting) -> None:
+def add_page(app: FastAPI) -> None:
     """The page at ``/``, its files below ``/page/``, and ``GET /rig``."""
     known = page_files()
 
@@ -47,8 +47,8 @@ def add_page(app: FastAPI, service: Service, waiting: Waiting) -> None:
         app.add_api_route(f"/page/{name}", _giver(file(name)), methods=["GET"], include_in_schema=False)
 
     @app.get(f"{PREFIX}/rig", summary="The configured cameras by the mast file in use")
-    async def rig() -> dict[str, Any]:
-        return await waiting.run(lambda: rig_told(service))
+    async def rig(here: Here) -> dict[str, Any]:
+        return await here.waiting.run(lambda: rig_told(here.service))
 
 
 def _giver(answer: Response) -> Any:

@@ -13,14 +13,14 @@ from mastctl.devices.frames import StampedFrame
 from mastctl.frame_facts import headers_of
 from mastctl.report.pictures import encoded
 from mastctl.service.mast_in_use import MastInUse
-from mastctl.service.service import Service
+from mastctl.service.masts import Masts
 from mastctl.web import PREFIX
-from mastctl.web.commands import Commands, Headers
+from mastctl.web.commands import Headers
 from mastctl.web.models import MastBody, SnapshotQuery
-from mastctl.web.waiting import Waiting
+from mastctl.web.parts import Here
 
 
-def add_pictures(app: FastAPI, service: Service, waiting: Waiting, commands: Commands) -> None:
+def add_pictures(app: FastAPI) -> None:
     """Frames with their facts, and the mast file they are to be read by."""
 
     @app.get(
@@ -29,21 +29,19 @@ def add_pictures(app: FastAPI, service: Service, waiting: Waiting, commands: Com
         response_class=Response,
         responses={200: {"content": {"image/png": {}, "image/jpeg": {}}}},
     )
-    async def snapshot(camera: str, query: Annotated[SnapshotQuery, Query()]) -> Response:
+    async def snapshot(camera: str, query: Annotated[SnapshotQuery, Query()], here: Here) -> Response:
+        service, waiting = here.service, here.waiting
         service.check_camera(camera)
         frame_id = query.frame_id
         if frame_id is not None:
-            return await waiting.run(lambda: picture(service.kept_frame(camera, frame_id), query.format))
+            return await waiting.run(lambda: _picture(service.kept_frame(camera, frame_id), query.format))
         return await waiting.picture(
-            camera, lambda: picture(service.snapshot(camera, query.fresh), query.format)
+            camera, lambda: _picture(service.snapshot(camera, query.fresh), query.format)
         )
 
-    def picture(frame: StampedFrame, kind: str) -> Response:
-        return Response(encoded(frame.image, kind), media_type=f"image/{kind}", headers=headers_of(frame))
-
     @app.get(f"{PREFIX}/mast", summary="The mast file in use, byte for byte", response_class=Response)
-    async def mast() -> Response:
-        in_use = service.masts.in_use
+    async def mast(here: Here) -> Response:
+        in_use = here.service.masts.in_use
         return Response(
             in_use.data,
             media_type="application/yaml",
@@ -51,15 +49,22 @@ def add_pictures(app: FastAPI, service: Service, waiting: Waiting, commands: Com
         )
 
     @app.post(f"{PREFIX}/mast", summary="Use another mast file, or the former one, from now on")
-    async def load_mast(body: MastBody, came: Headers) -> dict[str, Any]:
-        name = body.file
-        work = service.masts.back if name is None else partial(service.masts.load, name)
-        return await commands.run(MAST, came, body.model_dump(exclude_none=True), lambda: told(work()))
+    async def load_mast(body: MastBody, came: Headers, here: Here) -> dict[str, Any]:
+        masts, name = here.service.masts, body.file
+        work = masts.back if name is None else partial(masts.load, name)
+        asked = body.model_dump(exclude_none=True)
+        return await here.commands.run(MAST, came, asked, lambda: _told(masts, work()))
 
     @app.post(f"{PREFIX}/mast/back", summary="Go back to the former mast file")
-    async def back(came: Headers) -> dict[str, Any]:
-        return await commands.run(MAST_BACK, came, {}, lambda: told(service.masts.back()))
+    async def back(came: Headers, here: Here) -> dict[str, Any]:
+        masts = here.service.masts
+        return await here.commands.run(MAST_BACK, came, {}, lambda: _told(masts, masts.back()))
 
-    def told(mast: MastInUse) -> dict[str, Any]:
-        former = service.masts.former
-        return {"mast": mast.told(), "former_mast": None if former is None else former.told()}
+
+def _picture(frame: StampedFrame, kind: str) -> Response:
+    return Response(encoded(frame.image, kind), media_type=f"image/{kind}", headers=headers_of(frame))
+
+
+def _told(masts: Masts, mast: MastInUse) -> dict[str, Any]:
+    former = masts.former
+    return {"mast": mast.told(), "former_mast": None if former is None else former.told()}

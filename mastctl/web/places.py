@@ -8,29 +8,28 @@ from fastapi import FastAPI, Path
 
 from mastctl.commands.entry import PLACE_FORGET, PLACE_KEEP
 from mastctl.service.places import Place
-from mastctl.service.service import Service
 from mastctl.web import PREFIX
-from mastctl.web.commands import Commands, Headers
+from mastctl.web.commands import Headers
 from mastctl.web.models import PlaceBody
-from mastctl.web.waiting import Waiting
+from mastctl.web.parts import Here
 
 PlaceName = Annotated[str, Path(pattern=r"^[\w+−-][\w .,:°+−-]{0,39}$")]
 
 
-def add_places(app: FastAPI, service: Service, waiting: Waiting, commands: Commands) -> None:
+def add_places(app: FastAPI) -> None:
     """What is kept, keeping and forgetting; who goes there asks `POST /point` for its angles."""
-    places = service.places
 
     @app.get(f"{PREFIX}/places", summary="The places of the head that are kept by a name")
-    async def told() -> dict[str, Any]:
-        return await waiting.run(places.told)
+    async def told(here: Here) -> dict[str, Any]:
+        return await here.waiting.run(here.service.places.told)
 
     @app.post(f"{PREFIX}/places/{{name}}", summary="Keep a place by a name")
-    async def keep(name: PlaceName, body: PlaceBody, came: Headers) -> dict[str, Any]:
-        place = Place(body.pan_rad, body.tilt_rad)
+    async def keep(name: PlaceName, body: PlaceBody, came: Headers, here: Here) -> dict[str, Any]:
+        places, place = here.service.places, Place(body.pan_rad, body.tilt_rad)
         asked = {"name": name, **body.model_dump()}
-        return await commands.run(PLACE_KEEP, came, asked, lambda: places.keep(name, place))
+        return await here.commands.run(PLACE_KEEP, came, asked, lambda: places.keep(name, place))
 
     @app.delete(f"{PREFIX}/places/{{name}}", summary="Forget a place")
-    async def forget(name: PlaceName, came: Headers) -> dict[str, Any]:
-        return await commands.run(PLACE_FORGET, came, {"name": name}, lambda: places.forget(name))
+    async def forget(name: PlaceName, came: Headers, here: Here) -> dict[str, Any]:
+        places = here.service.places
+        return await here.commands.run(PLACE_FORGET, came, {"name": name}, lambda: places.forget(name))

@@ -8,19 +8,19 @@ from fastapi import FastAPI
 
 from mastctl.commands.entry import RELOAD
 from mastctl.service.reload import reload
-from mastctl.service.service import Service
 from mastctl.web import PREFIX
-from mastctl.web.commands import Commands, Headers
+from mastctl.web.commands import Headers
+from mastctl.web.parts import Here
 
 
-def add_reload(app: FastAPI, service: Service, commands: Commands) -> None:
+def add_reload(app: FastAPI) -> None:
     """``POST /reload``."""
 
     @app.post(
         f"{PREFIX}/reload", summary="Read the configuration again: all of it comes into use, or nothing"
     )
-    async def read_again(came: Headers) -> dict[str, Any]:
+    async def read_again(came: Headers, here: Here) -> dict[str, Any]:
         def act() -> dict[str, Any]:
-            return reload(service)
+            return reload(here.service)
 
-        return await commands.run(RELOAD, came, {}, act)
+        return await here.commands.run(RELOAD, came, {}, act)

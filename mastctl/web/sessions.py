@@ -10,17 +10,17 @@ from mastctl.access.access import SESSION_S
 from mastctl.commands.caller import Caller, Role
 from mastctl.errors import NotNow
 from mastctl.web import PREFIX
-from mastctl.web.entrance import Entrance, address_of, cookie_name, credentials
+from mastctl.web.entrance import address_of, cookie_name, credentials
 from mastctl.web.models import LoginBody
+from mastctl.web.parts import Here
 
 
-def add_sessions(app: FastAPI, entrance: Entrance) -> None:
+def add_sessions(app: FastAPI) -> None:
     """Log-in, log-out, and who one is."""
-    access = entrance.access
-    secure = entrance.names.secure
 
     @app.get(f"{PREFIX}/session", summary="Who asks, and what it may do")
-    async def session(request: Request) -> dict[str, Any]:
+    async def session(request: Request, here: Here) -> dict[str, Any]:
+        access = here.entrance.access
         caller: Caller = request.scope["state"]["caller"]
         shown = credentials(request.scope, request.headers)
         held = None
@@ -30,7 +30,8 @@ def add_sessions(app: FastAPI, entrance: Entrance) -> None:
         return _told(caller.name, caller.role, caller.via, left_s, access is not None)
 
     @app.post(f"{PREFIX}/login", summary="Begin a page's session by a token")
-    async def login(body: LoginBody, request: Request, response: Response) -> dict[str, Any]:
+    async def login(body: LoginBody, request: Request, response: Response, here: Here) -> dict[str, Any]:
+        access = here.entrance.access
         if access is None:
             raise NotNow("no_login", "nobody needs a token here: the daemon serves this machine only")
         secret, token, _ = access.log_in(body.token, address_of(request.scope))
@@ -39,14 +40,15 @@ def add_sessions(app: FastAPI, entrance: Entrance) -> None:
             secret,
             max_age=int(SESSION_S),
             path="/",
-            secure=secure,
+            secure=here.entrance.names.secure,
             httponly=True,
             samesite="strict",
         )
         return _told(token.name, token.role, "token", SESSION_S, True)
 
     @app.post(f"{PREFIX}/logout", summary="End a page's session")
-    async def logout(request: Request, response: Response) -> dict[str, Any]:
+    async def logout(request: Request, response: Response, here: Here) -> dict[str, Any]:
+        access, secure = here.entrance.access, here.entrance.names.secure
         shown = credentials(request.scope, request.headers)
         if access is not None and shown.session is not None:
             access.log_out(shown.session)

@@ -10,21 +10,20 @@ from mastctl.errors import Unable
 from mastctl.metrics.metrics import CONTENT_TYPE
 from mastctl.sentinel.folder import SENTINEL_FOLDER
 from mastctl.sentinel.standing import findings
-from mastctl.service.service import Service
 from mastctl.state.standing import Word
 from mastctl.web import PREFIX
-from mastctl.web.waiting import Waiting
+from mastctl.web.parts import Here
 
 WELL: frozenset[Word] = frozenset({"ready", "moving", "tracking", "holding"})
 """States in which a command is carried out."""
 
 
-def add_watching(app: FastAPI, service: Service, waiting: Waiting) -> None:
+def add_watching(app: FastAPI) -> None:
     """Metrics, health, that of the calibration, and the drift sentinel's findings."""
 
     @app.get("/metrics", summary="Figures in the text format of Prometheus", response_class=Response)
-    async def metrics() -> Response:
-        return Response(service.metrics.text(), media_type=CONTENT_TYPE)
+    async def metrics(here: Here) -> Response:
+        return Response(here.service.metrics.text(), media_type=CONTENT_TYPE)
 
     @app.get(f"{PREFIX}/health/live", summary="Whether requests are answered: they are")
     async def live() -> dict[str, bool]:
@@ -34,8 +33,8 @@ def add_watching(app: FastAPI, service: Service, waiting: Waiting) -> None:
         f"{PREFIX}/health/ready",
         summary="Whether commands are carried out: 200 if they are, else 503 and why not",
     )
-    async def ready() -> dict[str, str | bool]:
-        now = service.machine.standing
+    async def ready(here: Here) -> dict[str, str | bool]:
+        now = here.service.machine.standing
         if now.word not in WELL:
             raise Unable("not_ready", f"{now.word}: {now.reason}" if now.reason else now.word)
         return {"ready": True, "state": now.word, "reason": now.reason}
@@ -44,10 +43,12 @@ def add_watching(app: FastAPI, service: Service, waiting: Waiting) -> None:
         f"{PREFIX}/calibration/health",
         summary="Whether residuals of the last days are as the mast file predicts",
     )
-    async def calibration() -> dict[str, Any]:
+    async def calibration(here: Here) -> dict[str, Any]:
+        service = here.service
         return {**service.health.told(), "sentinel": service.sentinel.told()}
 
     @app.get(f"{PREFIX}/sentinel", summary="What the drift sentinel's looks say, and how old the last one is")
-    async def sentinel() -> dict[str, Any]:
+    async def sentinel(here: Here) -> dict[str, Any]:
+        service = here.service
         folder = service.folder.path / SENTINEL_FOLDER
-        return await waiting.run(lambda: findings(folder, service.stored.digest))
+        return await here.waiting.run(lambda: findings(folder, service.stored.digest))

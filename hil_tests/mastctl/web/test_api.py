@@ -25,6 +25,7 @@ from hil_tests.mastctl.service_fakes import CONFIG, FakeHardware, Hang, Scripted
 from mastctl.daemon import RunningDaemon
 from mastctl.devices import devices as devices_module
 from mastctl.service import steering as steering_module
+from mastctl.web import described as described_module
 from mastctl.web.bodies import LARGEST_BODY_BYTES
 
 ANGLES = {"pan_rad": 0.1, "tilt_rad": -0.1}
@@ -606,11 +607,43 @@ def test_the_interface_describes_itself(quiet: httpx.Client) -> None:
     assert refusal["schema"]["$ref"].endswith("/ErrorBody")
 
 
-def test_the_description_is_made_before_the_first_request_and_holds_no_stop_up(
+def test_the_description_is_made_once_and_holds_no_stop_up(
     quiet: httpx.Client, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("fastapi.applications.get_openapi", lambda **facts: pytest.fail("made late"))
-    assert quiet.get(str(quiet.base_url.copy_with(path="/openapi.json"))).status_code == 200
+    making, plain, made = Hang(), described_module._describe, []
+
+    def slow(document: Any) -> None:
+        making()
+        made.append(document)
+        plain(document)
+
+    monkeypatch.setattr(described_module, "_describe", slow)
+    described_module._made.cache_clear()
+    where = str(quiet.base_url.copy_with(path="/openapi.json"))
+    answers: list[int] = []
+    asking = [threading.Thread(target=lambda: answers.append(quiet.get(where).status_code)) for _ in range(2)]
+    for one in asking:
+        one.start()
+    try:
+        assert making.entered.wait(60.0)
+        assert quiet.post("/stop").status_code == 200
+        assert answers == [], "the stop was answered while the description was made"
+    finally:
+        making.let_go()
+        for one in asking:
+            one.join(60.0)
+    assert answers == [200, 200]
+    assert len(made) == 1
+
+
+def test_daemons_of_one_process_have_nothing_in_common_but_their_routes(
+    quiet: httpx.Client, web: httpx.Client
+) -> None:
+    lease = web.post("/lease", json={"name": "one of them"}).json()
+    assert web.get("/lease").json()["control"]["holder"] == "one of them"
+    assert quiet.get("/lease").json()["control"] is None
+    web.post("/point", json=ANGLES, headers={"Mastctl-Lease": lease["lease_id"]})
+    assert [len(one.get("/operations").json()["operations"]) for one in (web, quiet)] == [1, 0]
 
 
 @pytest.mark.parametrize(

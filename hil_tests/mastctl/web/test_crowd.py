@@ -26,7 +26,7 @@ from hil_tests.mastctl.service_fakes import Hang, eventually, fake_daemon
 from mastctl import daemon as daemon_module
 from mastctl.client import Client, ClientError
 from mastctl.web import connections as connections_module
-from mastctl.web.events import Streams
+from mastctl.web.streams import Streams
 
 
 def in_threads(count: int, ask: Callable[[], Any]) -> list[threading.Thread]:

@@ -20,11 +20,12 @@ from hil_tests.described_answers import closed
 from hil_tests.mastctl.service_fakes import FakeHardware, ScriptedLoop, eventually
 from hil_tests.mastctl.web.network import NAME, Network, network_daemon
 from mastctl.daemon import RunningDaemon
+from mastctl.errors import Unable
 from mastctl.guided.told import Run
 from mastctl.guided.told import heard as bench_heard
 from mastctl.state.publisher import TOPICS
-from mastctl.web import events as events_module
 from mastctl.web import sockets as sockets_module
+from mastctl.web.streams import Streams
 from tools.campaigns import fuzz_websocket
 
 BOTH = tuple[RunningDaemon, FakeHardware]
@@ -191,8 +192,8 @@ def test_it_ends_with_the_daemon_after_its_last_words(pair: BOTH, monkeypatch: p
 
 def test_not_everybody_may_listen_at_once(pair: BOTH, monkeypatch: pytest.MonkeyPatch) -> None:
     daemon, _ = pair
-    streams = events_module.Streams(daemon.service.machine.publisher, 0)
-    with pytest.raises(events_module.Unable, match="0 listen to events already"), streams.listening((), None):
+    streams = Streams(daemon.service.machine.publisher, 0)
+    with pytest.raises(Unable, match="0 listen to events already"), streams.listening((), None):
         pass
 
 

@@ -1,0 +1,50 @@
+"""What the routes are given: the parts of the daemon that a request came to.
+
+The routes themselves are made once a process, whatever many daemons it holds.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Annotated, cast
+
+from fastapi import Depends
+from fastapi.requests import HTTPConnection
+
+from mastctl.service.service import Service
+from mastctl.web.commands import Commands
+from mastctl.web.entrance import Entrance
+from mastctl.web.streams import Streams
+from mastctl.web.waiting import Waiting
+
+
+@dataclass(frozen=True)
+class Parts:
+    """What serves one daemon's requests.
+
+    Attributes
+    ----------
+    service
+        What the daemon holds.
+    waiting
+        Runs what may wait.
+    commands
+        Carries commands out.
+    streams
+        Who listens to events.
+    entrance
+        What is asked of who comes in.
+    """
+
+    service: Service
+    waiting: Waiting
+    commands: Commands
+    streams: Streams
+    entrance: Entrance
+
+
+async def _parts(line: HTTPConnection) -> Parts:
+    return cast(Parts, line.scope["state"]["parts"])
+
+
+Here = Annotated[Parts, Depends(_parts)]
