@@ -17,6 +17,7 @@ import pytest
 from calib.camera.cahvor import CameraModel
 from calib.files.mast_file import save_rig
 from calib.mast.rig import Mast, Rig, RigCamera
+from drivers.clock import Clock, SystemClock
 from drivers.interfaces import Camera, Frame, PanTilt, Reading
 from mastctl.config import load_config
 
@@ -60,13 +61,14 @@ class FakeHead:
     answer: Any = None
     calls: list[tuple[Any, ...]] = field(default_factory=list)
     threads: set[int] = field(default_factory=set)
+    clock: Clock = field(default_factory=SystemClock)
 
     def read(self) -> Any:
         self.threads.add(threading.get_ident())
         self.hook("read")
         if self.answer is not None:
             return self.answer(self) if callable(self.answer) else self.answer
-        return Reading(self.pan_rad, self.tilt_rad, self.moving, time.monotonic(), self.faults)
+        return Reading(self.pan_rad, self.tilt_rad, self.moving, self.clock.now_s(), self.faults)
 
     def move(self, pan_rad: float, tilt_rad: float, speed_rad_per_s: float | None = None) -> None:
         self.threads.add(threading.get_ident())
@@ -86,8 +88,9 @@ class FakeHead:
 class FakeCamera:
     """A camera that takes a picture whenever it is asked; ``change(frame)`` may make something else of it."""
 
-    def __init__(self, name: str, seed: int = 0) -> None:
+    def __init__(self, name: str, seed: int = 0, clock: Clock | None = None) -> None:
         self.name = name
+        self._clock = clock or SystemClock()
         self.sequence = 0
         self.hook: Callable[[], Any] = lambda: None
         self.change: Callable[[Frame], Any] = lambda frame: frame
@@ -98,8 +101,8 @@ class FakeCamera:
         self.asked.append((exposed_after_s, timeout_s))
         self.hook()
         exposure_s = 0.002
-        begin_s = max(time.monotonic(), exposed_after_s) + 0.001
-        time.sleep(max(0.0, begin_s + exposure_s - time.monotonic()))
+        begin_s = max(self._clock.now_s(), exposed_after_s) + 0.001
+        self._clock.sleep(begin_s + exposure_s - self._clock.now_s())
         self.sequence += 1
         width, height = SIZE_PX
         image = self._random.integers(0, 255, (height, width), dtype=np.uint8)
@@ -112,9 +115,13 @@ class FakeCamera:
 class FakeHardware:
     """What open_hardware gives, made of fakes."""
 
-    def __init__(self, cameras: tuple[str, ...] = ("navcam_left", "navcam_right", "hazcam_left")) -> None:
-        self.head = FakeHead()
-        self.fake_cameras = {name: FakeCamera(name, seed) for seed, name in enumerate(cameras)}
+    def __init__(
+        self,
+        cameras: tuple[str, ...] = ("navcam_left", "navcam_right", "hazcam_left"),
+        clock: Clock | None = None,
+    ) -> None:
+        self.head = FakeHead(clock=clock or SystemClock())
+        self.fake_cameras = {name: FakeCamera(name, seed, clock) for seed, name in enumerate(cameras)}
         self.kind = "real"
         self.simulation: Any = None
         self.closed = 0

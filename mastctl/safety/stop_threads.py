@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import threading
-import time
 from collections.abc import Callable
 from concurrent.futures import Future
 from queue import SimpleQueue
 from typing import TypeVar
 
+from drivers.clock import Clock, SystemClock
 from mastctl.errors import Unable
 
 T = TypeVar("T")
@@ -25,10 +25,14 @@ class StopsHang(Unable):
 
 
 class StopThreads:
-    """Daemon threads that run one call after the other; safe to use from any thread."""
+    """Daemon threads that run one call after the other; safe to use from any thread.
 
-    def __init__(self, threads: int = THREADS) -> None:
+    They wait for calls, never for ``clock``, which only tells how long one has been under way.
+    """
+
+    def __init__(self, threads: int = THREADS, clock: Clock | None = None) -> None:
         self._threads = threads
+        self._clock = clock or SystemClock()
         self._calls: SimpleQueue[Callable[[], None] | None] = SimpleQueue()
         self._began_s: dict[object, float] = {}  # of the calls under way
         for number in range(threads):
@@ -42,7 +46,7 @@ class StopThreads:
         StopsHang
             If every thread has been in its call for longer than a stop may take.
         """
-        now_s = time.monotonic()
+        now_s = self._clock.now_s()
         under_way_s = [now_s - began_s for began_s in self._began_s.copy().values()]
         if len(under_way_s) >= self._threads and min(under_way_s) > OVERDUE_S:
             raise StopsHang(
@@ -53,7 +57,7 @@ class StopThreads:
         future.set_running_or_notify_cancel()  # who no longer waits does not take the stop back
 
         def call() -> None:
-            self._began_s[future] = time.monotonic()
+            self._began_s[future] = self._clock.now_s()
             try:
                 result = function()
             except BaseException as error:  # it belongs to who waits

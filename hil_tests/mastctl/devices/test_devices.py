@@ -6,7 +6,6 @@ import itertools
 import logging
 import math
 import threading
-import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from types import SimpleNamespace
@@ -19,8 +18,9 @@ from drivers.clock import SystemClock
 from drivers.errors import BadFrame, BadReply, DriverError, LineLost, NoFreshFrame, NoReply
 from drivers.interfaces import Frame, FrameTime, Reading
 from drivers.simulation_clock import SimulationClock
-from hil_tests.mastctl.service_fakes import FakeCamera, FakeHardware, Hang, eventually, rig
-from mastctl.devices import cameras as cameras_module
+from hil_tests.mastctl.devices.turned import Hang, Turned
+from hil_tests.mastctl.service_fakes import FakeCamera, FakeHardware, rig
+from hil_tests.waiting import NET_S, until
 from mastctl.devices import devices as devices_module
 from mastctl.devices import joint_history
 from mastctl.devices.devices import Devices
@@ -35,49 +35,38 @@ ANGLE_TOLERANCE_RAD = 1e-12
 
 
 @pytest.fixture
-def hardware() -> FakeHardware:
-    return FakeHardware()
+def hardware(clock: Turned) -> FakeHardware:
+    return FakeHardware(clock=clock)
 
 
 @pytest.fixture
-def deadline_s() -> float:
-    """More than a busy machine takes; nothing waits for it but what hangs."""
-    return 10.0
-
-
-impatient = pytest.mark.parametrize("deadline_s", [0.4])
-"""For what hangs, so that the test ends."""
-
-
-@pytest.fixture
-def devices(hardware: FakeHardware, monkeypatch: pytest.MonkeyPatch, deadline_s: float) -> Iterator[Devices]:
-    for name in ("READ_TIMEOUT_S", "MOVE_TIMEOUT_S", "STOP_TIMEOUT_S"):
-        monkeypatch.setattr(devices_module, name, deadline_s)
-    for name in ("READINGS_S", "CAMERA_GRACE_S"):
-        monkeypatch.setattr(cameras_module, name, deadline_s)
-    made = Devices(hardware, LIMITS, DIGEST, SystemClock(), rig())
-    yield made
+def devices(hardware: FakeHardware, clock: Turned) -> Iterator[Devices]:
+    made = Devices(hardware, LIMITS, DIGEST, clock, rig())
+    with clock.at_work():
+        yield made
     hardware.head.hook = lambda name: None
     made.close()
 
 
-def now() -> float:
-    return time.monotonic()
+def now(devices: Devices) -> float:
+    return devices._clock.now_s()
 
 
 # The head
 
 
 def test_a_reading_is_measured_after_it_was_asked_for(devices: Devices) -> None:
-    asked_s = now()
+    asked_s = now(devices)
     assert devices.read().time_s >= asked_s
 
 
-def test_the_head_is_read_all_the_time_by_one_thread(devices: Devices, hardware: FakeHardware) -> None:
-    eventually(lambda: devices.last_reading is not None, "a first reading")
+def test_the_head_is_read_all_the_time_by_one_thread(
+    devices: Devices, hardware: FakeHardware, clock: Turned
+) -> None:
+    clock.until(lambda: devices.last_reading is not None, "a first reading")
     first = devices.last_reading
     assert first is not None
-    eventually(lambda: (devices.last_reading or first).time_s > first.time_s, "a second reading")
+    clock.until(lambda: (devices.last_reading or first).time_s > first.time_s, "a second reading")
     devices.read()
     devices.move(0.1, 0.1)
     assert len(hardware.head.threads) == 1
@@ -87,21 +76,30 @@ def test_the_head_is_read_all_the_time_by_one_thread(devices: Devices, hardware:
 JUNK_READINGS: list[tuple[str, Any]] = [
     ("nothing", lambda head: None or SimpleNamespace()),
     ("text", "pan 0 tilt 0"),
-    ("nan", lambda head: Reading(math.nan, 0.0, False, now())),
-    ("infinite", lambda head: Reading(0.0, math.inf, False, now())),
-    ("beyond a turn", lambda head: Reading(6.3, 0.0, False, now())),
+    ("nan", lambda head: Reading(math.nan, 0.0, False, head.clock.now_s())),
+    ("infinite", lambda head: Reading(0.0, math.inf, False, head.clock.now_s())),
+    ("beyond a turn", lambda head: Reading(6.3, 0.0, False, head.clock.now_s())),
     (
         "text angle",
-        lambda head: SimpleNamespace(pan_rad="0", tilt_rad=0.0, moving=False, time_s=now(), faults=()),
+        lambda head: SimpleNamespace(
+            pan_rad="0", tilt_rad=0.0, moving=False, time_s=head.clock.now_s(), faults=()
+        ),
     ),
     (
         "true angle",
-        lambda head: SimpleNamespace(pan_rad=True, tilt_rad=0.0, moving=False, time_s=now(), faults=()),
+        lambda head: SimpleNamespace(
+            pan_rad=True, tilt_rad=0.0, moving=False, time_s=head.clock.now_s(), faults=()
+        ),
     ),
-    ("moving 2", lambda head: SimpleNamespace(pan_rad=0.0, tilt_rad=0.0, moving=2, time_s=now(), faults=())),
-    ("future", lambda head: Reading(0.0, 0.0, False, now() + 0.5)),
-    ("old", lambda head: Reading(0.0, 0.0, False, now() - 1.5)),
-    ("backwards", lambda head: Reading(0.0, 0.0, False, now() - 0.5)),
+    (
+        "moving 2",
+        lambda head: SimpleNamespace(
+            pan_rad=0.0, tilt_rad=0.0, moving=2, time_s=head.clock.now_s(), faults=()
+        ),
+    ),
+    ("future", lambda head: Reading(0.0, 0.0, False, head.clock.now_s() + 0.5)),
+    ("old", lambda head: Reading(0.0, 0.0, False, head.clock.now_s() - 1.5)),
+    ("backwards", lambda head: Reading(0.0, 0.0, False, head.clock.now_s() - 0.5)),
 ]
 
 
@@ -213,36 +211,36 @@ def test_an_error_that_cannot_be_made_anew_keeps_its_code(devices: Devices, hard
 def test_what_a_head_says_of_itself_is_told_in_lines_that_anybody_can_read(
     said: Any, told: tuple[str, ...]
 ) -> None:
-    answer = SimpleNamespace(pan_rad=0.0, tilt_rad=0.0, moving=False, time_s=now(), faults=said)
-    assert joint_history.checked(answer, "pan_tilt", now(), None).faults == told
+    answer = SimpleNamespace(pan_rad=0.0, tilt_rad=0.0, moving=False, time_s=9.0, faults=said)
+    assert joint_history.checked(answer, "pan_tilt", 9.0, None).faults == told
 
 
 def test_faults_that_are_no_words_are_a_bad_reply() -> None:
-    answer = SimpleNamespace(pan_rad=0.0, tilt_rad=0.0, moving=False, time_s=now(), faults=5)
+    answer = SimpleNamespace(pan_rad=0.0, tilt_rad=0.0, moving=False, time_s=9.0, faults=5)
     with pytest.raises(BadReply, match="faults is 5 where words are expected"):
-        joint_history.checked(answer, "pan_tilt", now(), None)
+        joint_history.checked(answer, "pan_tilt", 9.0, None)
 
 
-@impatient
 def test_a_hanging_read_ends_in_no_reply_and_the_cameras_go_on(
-    devices: Devices, hardware: FakeHardware
+    devices: Devices, hardware: FakeHardware, clock: Turned
 ) -> None:
     devices.read()
-    hang = Hang()
+    hang = Hang(clock)
     hardware.head.hook = lambda name: hang() if name == "read" else None
     with pytest.raises(NoReply):
         devices.read()
     assert {fault.device for fault in devices.faults()} == {"pan_tilt"}
+    clock.sleep(0.001)
     with pytest.raises(NoReply, match="does not answer"):  # at once: nobody queues behind a hanging call
         devices.read()
     assert hardware.fake_cameras["navcam_left"].asked == []
     with pytest.raises(DriverError):  # the frame comes, but nobody knows the joint angles
-        devices.frames(["navcam_left"], now(), 0.3)
+        devices.frames(["navcam_left"], now(devices), 0.3)
     assert len(hardware.fake_cameras["navcam_left"].asked) == 1
     hardware.head.hook = lambda name: None
     hang.let_go()
-    eventually(lambda: devices.faults() == (), "the head working again")
-    assert devices.frames(["navcam_left"], now(), 1.0)
+    clock.until(lambda: devices.faults() == (), "the head working again")
+    assert devices.frames(["navcam_left"], now(devices), 1.0)
 
 
 def test_a_lost_line_is_forgotten_when_any_call_finds_it_back(
@@ -295,12 +293,11 @@ def test_a_reading_lost_on_the_line_is_asked_for_once_more(
     assert reads == ["read"], "a line that is gone is not asked again"
 
 
-@impatient
 def test_a_reading_that_hangs_when_asked_once_more_ends_with_the_first_error(
-    devices: Devices, hardware: FakeHardware
+    devices: Devices, hardware: FakeHardware, clock: Turned
 ) -> None:
     stop_polling(devices)
-    hang = Hang()
+    hang = Hang(clock)
     failures = iter([NoReply("lost on the line")])
 
     def fails(name: str) -> None:
@@ -312,21 +309,20 @@ def test_a_reading_that_hangs_when_asked_once_more_ends_with_the_first_error(
     hardware.head.hook = fails
     with pytest.raises(NoReply, match="lost on the line"):
         devices.read()
-    assert hang.entered.is_set()
+    hang.reached()
     devices.stop()
     assert hardware.head.calls == [("stop",)], "a stop goes out beside it"
     hang.let_go()
 
 
-@impatient
-def test_a_late_answer_is_dropped(devices: Devices, hardware: FakeHardware) -> None:
-    hang = Hang()
+def test_a_late_answer_is_dropped(devices: Devices, hardware: FakeHardware, clock: Turned) -> None:
+    hang = Hang(clock)
     hardware.head.hook = lambda name: hang() if name == "move" else None
     with pytest.raises(NoReply):
         devices.move(0.5, 0.5)
     hardware.head.hook = lambda name: None
     hang.let_go()
-    eventually(lambda: "ended only now" in devices.faults()[0].message, "the late move's return")
+    clock.until(lambda: "ended only now" in devices.faults()[0].message, "the late move's return")
     assert devices.faults()[0].until == "a later move is taken in time"
     devices.move(0.1, 0.2)
     assert devices.faults() == ()
@@ -337,11 +333,11 @@ def test_a_late_answer_is_dropped(devices: Devices, hardware: FakeHardware) -> N
 
 
 def test_stop_goes_before_moves_that_wait_and_they_are_never_sent(
-    devices: Devices, hardware: FakeHardware
+    devices: Devices, hardware: FakeHardware, clock: Turned
 ) -> None:
-    hang = Hang()
+    hang = Hang(clock)
     hardware.head.hook = lambda name: hang() if name == "read" else None
-    assert hang.entered.wait(5.0)
+    hang.reached()
     refused: list[BaseException] = []
 
     def move() -> None:
@@ -350,39 +346,37 @@ def test_stop_goes_before_moves_that_wait_and_they_are_never_sent(
         except (DriverError, Stopped) as error:
             refused.append(error)
 
-    mover = threading.Thread(target=move)
-    mover.start()
+    mover = clock.begun(move)
+    clock.until(lambda: devices._head._jobs, "the move waits")
     devices.stop()
     assert hardware.head.calls == [("stop",)]  # beside the hanging thread
     hang.let_go()
     hardware.head.hook = lambda name: None
-    mover.join(5.0)
+    clock.ended(mover)
     assert len(refused) == 1
     devices.read()
     assert [call[0] for call in hardware.head.calls] == ["stop", "stop"]  # once more, in order
 
 
-@impatient
 def test_a_move_that_hung_while_a_stop_went_out_is_followed_by_a_stop(
-    devices: Devices, hardware: FakeHardware
+    devices: Devices, hardware: FakeHardware, clock: Turned
 ) -> None:
-    hang = Hang()
+    hang = Hang(clock)
     hardware.head.hook = lambda name: hang() if name == "move" else None
     with pytest.raises(NoReply):
         devices.move(0.5, 0.5)
     devices.stop()
     hang.let_go()
-    eventually(lambda: len(hardware.head.calls) == 3, "the owed stop")
+    clock.until(lambda: len(hardware.head.calls) == 3, "the owed stop")
     assert [call[0] for call in hardware.head.calls] == ["stop", "move", "stop"]
 
 
-@impatient
 def test_a_stop_that_hangs_says_that_the_head_may_still_move(
-    devices: Devices, hardware: FakeHardware
+    devices: Devices, hardware: FakeHardware, clock: Turned
 ) -> None:
-    hang = Hang()
+    hang = Hang(clock)
     hardware.head.hook = hang
-    assert hang.entered.wait(5.0)
+    hang.reached()
     with pytest.raises(NoReply, match="may still move"):
         devices.stop()
     hang.let_go()
@@ -413,7 +407,7 @@ def test_blocked_moves_are_refused_until_they_are_allowed(devices: Devices, hard
 def test_a_frame_carries_its_facts(devices: Devices, hardware: FakeHardware) -> None:
     hardware.head.pan_rad, hardware.head.tilt_rad = 0.25, -0.125
     assert devices.read().pan_rad == 0.25
-    asked_s = now()
+    asked_s = now(devices)
     frame = devices.frames(["navcam_left"], asked_s, 1.0)["navcam_left"]
     assert frame.camera == "navcam_left"
     assert frame.frame_id.startswith(f"navcam_left-000001-{DIGEST[:8]}-")
@@ -425,11 +419,11 @@ def test_a_frame_carries_its_facts(devices: Devices, hardware: FakeHardware) -> 
     assert devices.frame_by_id(frame.frame_id) is frame
 
 
-def test_cameras_are_asked_in_parallel(devices: Devices, hardware: FakeHardware) -> None:
-    together = threading.Barrier(2)
-    for name in ("navcam_left", "navcam_right"):
-        hardware.fake_cameras[name].hook = lambda: together.wait(5.0)
-    assert set(devices.frames(["navcam_left", "navcam_right"], now(), 3.0)) == {"navcam_left", "navcam_right"}
+def test_cameras_are_asked_in_parallel(devices: Devices, hardware: FakeHardware, clock: Turned) -> None:
+    asked = hardware.fake_cameras["navcam_left"].asked, hardware.fake_cameras["navcam_right"].asked
+    for name in EYES:
+        hardware.fake_cameras[name].hook = lambda: clock.until(lambda: all(asked), "both are asked")
+    assert set(devices.frames(EYES, now(devices), 3.0)) == set(EYES)
 
 
 class Ticking(FakeCamera):
@@ -439,21 +433,21 @@ class Ticking(FakeCamera):
     every_s = 0.05
 
     def recent_times(self) -> list[FrameTime]:
-        newest = math.floor((now() - 0.002 - self.phase_s) / self.every_s)
+        newest = math.floor((self._clock.now_s() - 0.002 - self.phase_s) / self.every_s)
         return [FrameTime(n, n * self.every_s + self.phase_s - 0.001) for n in range(newest - 20, newest + 1)]
 
     def next_frame(self, exposed_after_s: float, timeout_s: float) -> Any:
         self.hook()
         sequence = math.floor((exposed_after_s + 0.001 - self.phase_s) / self.every_s) + 1
         mid_s = sequence * self.every_s + self.phase_s
-        time.sleep(max(0.0, mid_s + 0.001 - now()))
+        self._clock.sleep(mid_s + 0.001 - self._clock.now_s())
         image = self._random.integers(0, 255, (48, 64), dtype=np.uint8)
         return self.change(Frame(image, sequence, mid_s, 0.002))
 
 
 @pytest.fixture
-def ticking(hardware: FakeHardware) -> tuple[Ticking, Ticking]:
-    eyes = Ticking("navcam_left", 1), Ticking("navcam_right", 2)
+def ticking(hardware: FakeHardware, clock: Turned) -> tuple[Ticking, Ticking]:
+    eyes = Ticking("navcam_left", 1, clock), Ticking("navcam_right", 2, clock)
     eyes[1].phase_s = 0.024
     hardware.fake_cameras |= {eye.name: eye for eye in eyes}
     return eyes
@@ -470,11 +464,11 @@ def test_frames_of_two_eyes_are_always_the_same_partners(
     ticking: tuple[Ticking, Ticking], devices: Devices
 ) -> None:
     for later_s in (0.0, 0.013, 0.031, 0.007, 0.022):  # now the one, now the other is first after it
-        assert apart_s(devices.frames(EYES, now() + later_s, 2.0)) == pytest.approx(0.024, abs=1e-6)
+        assert apart_s(devices.frames(EYES, now(devices) + later_s, 2.0)) == pytest.approx(0.024, abs=1e-6)
 
 
 def test_each_frame_serves_one_pair(ticking: tuple[Ticking, Ticking], devices: Devices) -> None:
-    asked_s = now()
+    asked_s = now(devices)
     pairs = [devices.frames(EYES, asked_s, 2.0) for _ in range(3)]
     for eye in EYES:
         assert len({pair[eye].frame_id for pair in pairs}) == 3
@@ -486,7 +480,7 @@ def test_eyes_that_never_belong_together_are_told(ticking: tuple[Ticking, Tickin
         eye.period_s = 0.04  # wrong: it is 50 ms
     ticking[1].phase_s = 0.025  # from either neighbour more than half of what is said to be the period
     with pytest.raises(NoFreshFrame, match="no frames of navcam_left, navcam_right that belong together"):
-        devices.frames(EYES, now(), 0.3)
+        devices.frames(EYES, now(devices), 0.3)
 
 
 @pytest.mark.parametrize("times", [lambda: [(1, math.nan)] * 9, lambda: ["noon"] * 9, lambda: 1 / 0])
@@ -495,11 +489,11 @@ def test_times_that_cannot_be_true_are_a_typed_error(
 ) -> None:
     ticking[1].recent_times = times  # type: ignore[method-assign]
     with pytest.raises(DriverError, match=r"tell no times of navcam_left and navcam_right|in recent_times"):
-        devices.frames(EYES, now(), 2.0)
+        devices.frames(EYES, now(devices), 2.0)
 
 
 def test_a_move_between_two_exposures_moves_both(
-    devices: Devices, hardware: FakeHardware, monkeypatch: pytest.MonkeyPatch
+    devices: Devices, hardware: FakeHardware, monkeypatch: pytest.MonkeyPatch, clock: Turned
 ) -> None:
     """Even if the readings around either exposure do not reach over the pause between them."""
     still = JointHistory.at_exposure
@@ -508,20 +502,20 @@ def test_a_move_between_two_exposures_moves_both(
         return replace(still(self, began_s, mid_s, ended_s, device), moving=ended_s - began_s > 0.004)
 
     monkeypatch.setattr(JointHistory, "at_exposure", at_exposure)
-    assert not devices.frames(["navcam_left"], now(), 1.0)["navcam_left"].moving  # 2 ms of exposure
-    exposed = threading.Event()
+    assert not devices.frames(["navcam_left"], now(devices), 1.0)["navcam_left"].moving  # 2 ms of exposure
+    exposed: list[Frame] = []
 
     def tell(frame: Frame) -> Frame:
-        exposed.set()
+        exposed.append(frame)
         return frame
 
     hardware.fake_cameras["navcam_left"].change = tell
-    hardware.fake_cameras["navcam_right"].hook = lambda: exposed.wait(10.0)
-    assert all(frame.moving for frame in devices.frames(EYES, now(), 2.0).values())
+    hardware.fake_cameras["navcam_right"].hook = lambda: clock.until(lambda: exposed, "the other's exposure")
+    assert all(frame.moving for frame in devices.frames(EYES, now(devices), 2.0).values())
 
 
 def test_a_frame_that_serves_already_is_not_taken_again(devices: Devices, hardware: FakeHardware) -> None:
-    asked_s = now()
+    asked_s = now(devices)
     first = devices.frames(["navcam_left"], asked_s, 1.0)["navcam_left"]
     assert devices.frames(["navcam_left"], asked_s, 1.0)["navcam_left"] is first
     assert devices.frames(["navcam_left"], first.exposure_began_s, 1.0)["navcam_left"] is not first
@@ -529,7 +523,7 @@ def test_a_frame_that_serves_already_is_not_taken_again(devices: Devices, hardwa
 
 def test_an_unknown_camera_is_named_with_those_that_are_known(devices: Devices) -> None:
     with pytest.raises(NotKnown, match=r"navcam_center is not configured.*navcam_left"):
-        devices.frames(["navcam_center"], now(), 1.0)
+        devices.frames(["navcam_center"], now(devices), 1.0)
 
 
 Change = Callable[[Any], Any]
@@ -568,23 +562,23 @@ def test_a_frame_that_cannot_be_used_is_refused(
     camera = hardware.fake_cameras["navcam_left"]
     camera.change = change
     with pytest.raises(error, match=f"^navcam_left: .*{words}"):
-        devices.frames(["navcam_left"], now(), 1.0)
+        devices.frames(["navcam_left"], now(devices), 1.0)
     assert [fault.device for fault in devices.faults()] == ["navcam_left"]
-    assert devices.frames(["navcam_right"], now(), 1.0)
+    assert devices.frames(["navcam_right"], now(devices), 1.0)
     camera.change = lambda frame: frame
-    assert devices.frames(["navcam_left"], now(), 1.0)
+    assert devices.frames(["navcam_left"], now(devices), 1.0)
     assert devices.faults() == ()
 
 
 @pytest.mark.parametrize("step", [0, -1])
 def test_count_and_time_must_grow_together(devices: Devices, hardware: FakeHardware, step: int) -> None:
-    first = devices.frames(["navcam_left"], now(), 1.0)["navcam_left"]
+    first = devices.frames(["navcam_left"], now(devices), 1.0)["navcam_left"]
     camera = hardware.fake_cameras["navcam_left"]
     camera.change = lambda frame: replace(frame, sequence=first.sequence + step)
     with pytest.raises(BadFrame, match="must grow together"):
-        devices.frames(["navcam_left"], now(), 1.0)
+        devices.frames(["navcam_left"], now(devices), 1.0)
     # A camera that came back and counts anew is served again, and the old number names no picture.
-    again = devices.frames(["navcam_left"], now(), 1.0)["navcam_left"]
+    again = devices.frames(["navcam_left"], now(devices), 1.0)["navcam_left"]
     assert again.sequence == first.sequence + step
     assert again.frame_id != first.frame_id
     with pytest.raises(NotKnown):
@@ -592,10 +586,10 @@ def test_count_and_time_must_grow_together(devices: Devices, hardware: FakeHardw
 
 
 def test_the_next_count_of_an_earlier_moment_is_no_next_picture(
-    devices: Devices, hardware: FakeHardware
+    devices: Devices, hardware: FakeHardware, clock: Turned
 ) -> None:
     since_s = devices.read().time_s
-    eventually(lambda: now() > since_s + 0.2, "readings before the exposure")
+    clock.until(lambda: now(devices) > since_s + 0.2, "readings before the exposure")
     camera = hardware.fake_cameras["navcam_left"]
     camera.change = lambda frame: replace(frame, mid_exposure_s=frame.mid_exposure_s - 0.05, exposure_s=0.1)
     first = devices.frames(["navcam_left"], since_s, 1.0)["navcam_left"]
@@ -611,29 +605,30 @@ def test_a_head_camera_that_shows_the_same_after_a_move_is_frozen(
     still = np.random.default_rng(7).integers(0, 255, (48, 64), dtype=np.uint8)
     for camera in hardware.fake_cameras.values():
         camera.change = lambda frame: replace(frame, image=still.copy())
-    before = devices.frames(["navcam_left", "hazcam_left"], now(), 1.0)
-    again = devices.frames(["navcam_left"], now(), 1.0)  # nothing moved: a still picture is no proof
+    before = devices.frames(["navcam_left", "hazcam_left"], now(devices), 1.0)
+    again = devices.frames(["navcam_left"], now(devices), 1.0)  # nothing moved: a still picture is no proof
     assert again["navcam_left"].frame_id != before["navcam_left"].frame_id
     devices.move(0.001, 0.0)
     with pytest.raises(BadFrame, match="frozen"):
-        devices.frames(["navcam_left"], now(), 1.0)
-    assert devices.frames(["hazcam_left"], now(), 1.0)  # on the body the same picture is right
+        devices.frames(["navcam_left"], now(devices), 1.0)
+    assert devices.frames(["hazcam_left"], now(devices), 1.0)  # on the body the same picture is right
 
 
-@impatient
-def test_a_hanging_camera_is_faulty_and_the_others_go_on(devices: Devices, hardware: FakeHardware) -> None:
-    hang = Hang()
+def test_a_hanging_camera_is_faulty_and_the_others_go_on(
+    devices: Devices, hardware: FakeHardware, clock: Turned
+) -> None:
+    hang = Hang(clock)
     hardware.fake_cameras["navcam_left"].hook = hang
     with pytest.raises(NoReply, match=r"^navcam_left: next_frame did not end"):
-        devices.frames(["navcam_left", "navcam_right"], now(), 0.1)
-    eventually(lambda: "does not answer" in devices.faults()[0].message, "the fault in plain words")
+        devices.frames(["navcam_left", "navcam_right"], now(devices), 0.1)
+    clock.until(lambda: "does not answer" in devices.faults()[0].message, "the fault in plain words")
     with pytest.raises(NoReply, match="does not answer"):
-        devices.frames(["navcam_left"], now(), 0.1)
-    assert devices.frames(["navcam_right"], now(), 1.0)
+        devices.frames(["navcam_left"], now(devices), 0.1)
+    assert devices.frames(["navcam_right"], now(devices), 1.0)
     hardware.fake_cameras["navcam_left"].hook = lambda: None
     hang.let_go()
-    eventually(lambda: devices.faults() == (), "the camera working again")
-    assert devices.frames(["navcam_left"], now(), 1.0)
+    clock.until(lambda: devices.faults() == (), "the camera working again")
+    assert devices.frames(["navcam_left"], now(devices), 1.0)
 
 
 def test_a_frame_exposed_around_a_move_command_counts_as_moving(
@@ -646,13 +641,13 @@ def test_a_frame_exposed_around_a_move_command_counts_as_moving(
         return frame
 
     hardware.fake_cameras["navcam_left"].change = move_meanwhile
-    assert devices.frames(["navcam_left"], now(), 1.0)["navcam_left"].moving
+    assert devices.frames(["navcam_left"], now(devices), 1.0)["navcam_left"].moving
 
 
 def test_only_the_newest_frames_are_kept_and_the_refusal_says_which_case_it_is(devices: Devices) -> None:
-    first = devices.frames(["navcam_left"], now(), 1.0)["navcam_left"]
+    first = devices.frames(["navcam_left"], now(devices), 1.0)["navcam_left"]
     for _ in range(KEPT_FRAMES):
-        devices.frames(["navcam_left"], now(), 1.0)
+        devices.frames(["navcam_left"], now(devices), 1.0)
     camera, sequence, mast, run = first.frame_id.rsplit("-", 3)
     cases = {
         first.frame_id: "frame_too_old",
@@ -669,7 +664,7 @@ def test_only_the_newest_frames_are_kept_and_the_refusal_says_which_case_it_is(d
 
 
 def test_a_kept_frame_can_still_be_too_old(devices: Devices) -> None:
-    frame = devices.frames(["navcam_left"], now(), 1.0)["navcam_left"]
+    frame = devices.frames(["navcam_left"], now(devices), 1.0)["navcam_left"]
     with pytest.raises(NoLonger, match="s old, at most 0 s"):
         devices.frame_by_id(frame.frame_id, max_age_s=0.0)
 
@@ -744,7 +739,7 @@ def test_a_camera_of_another_size_than_the_mast_files_is_refused_at_the_start() 
         BadFrame, match=r"navcam_left: the image is 64x47 px where the mast file has 64x48 px"
     ):
         Devices(hardware, LIMITS, DIGEST, SystemClock(), rig())
-    eventually(lambda: set(threading.enumerate()) <= before, "no thread is left")
+    until(lambda: set(threading.enumerate()) <= before, "no thread is left")
 
 
 def test_a_start_that_is_refused_on_the_simulations_clock_blames_no_driver(
@@ -754,16 +749,17 @@ def test_a_start_that_is_refused_on_the_simulations_clock_blames_no_driver(
     hardware.fake_cameras["navcam_left"] = SizedCamera("navcam_left", 0)
     with pytest.raises(BadFrame), clock.at_work():
         Devices(hardware, LIMITS, DIGEST, clock, rig())
-    eventually(lambda: set(threading.enumerate()) <= before, "no thread is left")
+    until(lambda: set(threading.enumerate()) <= before, "no thread is left")
     assert "hangs" not in caplog.text
 
 
-def test_a_picture_right_after_the_start_is_one_whose_angles_are_known() -> None:
-    hardware = FakeHardware()
-    hardware.fake_cameras["navcam_left"] = Ticking("navcam_left", 1)  # has taken pictures for long already
-    devices = Devices(hardware, LIMITS, DIGEST, SystemClock(), rig())
+def test_a_picture_right_after_the_start_is_one_whose_angles_are_known(
+    hardware: FakeHardware, clock: Turned
+) -> None:
+    hardware.fake_cameras["navcam_left"] = Ticking("navcam_left", 1, clock)  # has taken pictures for long
+    devices = Devices(hardware, LIMITS, DIGEST, clock, rig())
     try:
-        begun_s = now()
+        begun_s = clock.now_s()
         may_be_old_s = begun_s - 1.0
         frame = devices.frames(["navcam_left"], may_be_old_s, 2.0)["navcam_left"]
         assert frame.exposure_began_s > begun_s - 0.5
@@ -774,11 +770,10 @@ def test_a_picture_right_after_the_start_is_one_whose_angles_are_known() -> None
 # The end
 
 
-def test_close_stops_the_head_and_leaves_no_thread() -> None:
+def test_close_stops_the_head_and_leaves_no_thread(hardware: FakeHardware, clock: Turned) -> None:
     before = set(threading.enumerate())
-    hardware = FakeHardware()
-    devices = Devices(hardware, LIMITS, DIGEST, SystemClock(), rig())
-    devices.frames(list(hardware.cameras), now(), 1.0)
+    devices = Devices(hardware, LIMITS, DIGEST, clock, rig())
+    devices.frames(list(hardware.cameras), clock.now_s(), 1.0)
     devices.move(0.1, 0.1)
     devices.close()
     devices.close()
@@ -794,8 +789,9 @@ def test_close_ends_although_every_driver_hangs(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     monkeypatch.setattr(devices_module, "STOP_TIMEOUT_S", 0.2)
-    hardware, hang = FakeHardware(), Hang()
-    devices = Devices(hardware, LIMITS, DIGEST, SystemClock(), rig())
+    clock = SystemClock()  # closing waits for threads in real time
+    hardware, hang = FakeHardware(), Hang(clock)
+    devices = Devices(hardware, LIMITS, DIGEST, clock, rig())
     before = set(threading.enumerate())
     hardware.head.hook = hang
     for camera in hardware.fake_cameras.values():
@@ -803,14 +799,15 @@ def test_close_ends_although_every_driver_hangs(
 
     def ask() -> None:
         with pytest.raises(NoReply):
-            devices.frames(["navcam_left"], now(), 0.1)
+            devices.frames(["navcam_left"], now(devices), 0.1)
 
     asker = threading.Thread(target=ask)
     asker.start()
-    assert hang.entered.wait(5.0)
+    hang.reached()
     with caplog.at_level(logging.WARNING):
         devices.close()
     assert "did not confirm the last stop" in caplog.text
-    asker.join(10.0)
+    asker.join(NET_S)
+    assert not asker.is_alive()
     hang.let_go()
-    eventually(lambda: set(threading.enumerate()) <= before, "all threads gone once the drivers return")
+    until(lambda: set(threading.enumerate()) <= before, "all threads gone once the drivers return")

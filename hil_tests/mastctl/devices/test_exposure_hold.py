@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import threading
-import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -13,23 +12,21 @@ import pytest
 
 from drivers.clock import SystemClock
 from drivers.errors import DriverError, NoReply, Refused
+from hil_tests.mastctl.devices.turned import Hang, Turned
 from hil_tests.mastctl.service_fakes import (
     SIZE_PX,
     FakeCamera,
     FakeHardware,
-    Hang,
     ScriptedLoop,
-    eventually,
     fake_daemon,
     rig,
 )
+from hil_tests.waiting import NET_S
 from mastctl.client import Client
-from mastctl.devices import cameras as cameras_module
-from mastctl.devices import exposure_hold as exposure_hold_module
 from mastctl.devices.devices import Devices
 from mastctl.devices.limits import Limits
 
-DEADLINE_S = 0.3
+LIMITS = Limits((-2.0, 2.0), (-1.0, 1.0), 0.5)
 
 
 class HoldingCamera(FakeCamera):
@@ -38,8 +35,8 @@ class HoldingCamera(FakeCamera):
     on_hold: Callable[[], Any] = staticmethod(lambda: None)
     on_release: Callable[[], Any] = staticmethod(lambda: None)
 
-    def __init__(self, name: str, seed: int = 0) -> None:
-        super().__init__(name, seed)
+    def __init__(self, name: str, seed: int, clock: Turned) -> None:
+        super().__init__(name, seed, clock)
         self.told: list[str] = []
         self.threads: set[str] = set()
 
@@ -62,18 +59,18 @@ class HoldingCamera(FakeCamera):
 
 
 @pytest.fixture
-def hardware() -> FakeHardware:
-    made = FakeHardware()
-    made.fake_cameras = {name: HoldingCamera(name, seed) for seed, name in enumerate(made.fake_cameras)}
+def hardware(clock: Turned) -> FakeHardware:
+    made = FakeHardware(clock=clock)
+    names = enumerate(made.fake_cameras)
+    made.fake_cameras = {name: HoldingCamera(name, seed, clock) for seed, name in names}
     return made
 
 
 @pytest.fixture
-def devices(hardware: FakeHardware, monkeypatch: pytest.MonkeyPatch) -> Iterator[Devices]:
-    monkeypatch.setattr(cameras_module, "CAMERA_GRACE_S", DEADLINE_S)
-    monkeypatch.setattr(exposure_hold_module, "HOLD_TIMEOUT_S", DEADLINE_S, raising=False)
-    made = Devices(hardware, Limits((-2.0, 2.0), (-1.0, 1.0), 0.5), "0" * 64, SystemClock(), rig())
-    yield made
+def devices(hardware: FakeHardware, clock: Turned) -> Iterator[Devices]:
+    made = Devices(hardware, LIMITS, "0" * 64, clock, rig())
+    with clock.at_work():
+        yield made
     made.close()
 
 
@@ -91,103 +88,104 @@ def failing(error: BaseException) -> Callable[[], None]:
 
 
 def test_an_exposure_is_held_before_every_picture_of_the_block_and_released_after_it(
-    devices: Devices, hardware: FakeHardware
+    devices: Devices, hardware: FakeHardware, clock: Turned
 ) -> None:
     with pytest.raises(ZeroDivisionError), devices.exposure_held():
-        devices.frames(["navcam_left"], time.monotonic(), 1.0)
+        devices.frames(["navcam_left"], clock.now_s(), 1.0)
         raise ZeroDivisionError
     left = camera(hardware)
-    eventually(lambda: left.told == ["held", "picture", "released"], "the release")
+    clock.until(lambda: left.told == ["held", "picture", "released"], "the release")
     assert left.threads == {"device navcam_left"}, "both ends in the camera's own thread"
 
 
 def test_a_hold_that_waits_for_a_busy_camera_comes_before_the_next_picture(
-    devices: Devices, hardware: FakeHardware
+    devices: Devices, hardware: FakeHardware, clock: Turned
 ) -> None:
-    hang, left = Hang(), camera(hardware)
+    hang, left = Hang(clock), camera(hardware)
     left.hook = hang
-    asker = threading.Thread(target=lambda: devices.frames(["navcam_left"], time.monotonic(), 5.0))
-    asker.start()
-    assert hang.entered.wait(5.0)
+    asker = clock.begun(lambda: devices.frames(["navcam_left"], clock.now_s(), 5.0))
+    hang.reached()
     with devices.exposure_held():
         assert left.told == []
         hang.let_go()
-        asker.join(5.0)
-        devices.frames(["navcam_left"], time.monotonic(), 1.0)
-    eventually(lambda: left.told == ["picture", "held", "picture", "released"], "the release")
+        clock.ended(asker)
+        devices.frames(["navcam_left"], clock.now_s(), 1.0)
+    clock.until(lambda: left.told == ["picture", "held", "picture", "released"], "the release")
 
 
 @pytest.mark.parametrize("error", [Refused("no"), ValueError("no"), SystemExit(1), StopIteration()])
 def test_a_camera_that_cannot_hold_is_told_and_the_others_hold(
-    devices: Devices, hardware: FakeHardware, error: BaseException
+    devices: Devices, hardware: FakeHardware, error: BaseException, clock: Turned
 ) -> None:
     left, right = camera(hardware), camera(hardware, "navcam_right")
     left.on_hold = failing(error)
     with devices.exposure_held():
-        devices.frames(["navcam_left", "navcam_right"], time.monotonic(), 2.0)
-    eventually(lambda: right.told == ["held", "picture", "released"], "the release of the other")
+        devices.frames(["navcam_left", "navcam_right"], clock.now_s(), 2.0)
+    clock.until(lambda: right.told == ["held", "picture", "released"], "the release of the other")
     assert left.told == ["picture"]
     (fault,) = devices.faults()
     assert fault.device == "navcam_left" and fault.until == "an operation can hold the exposure again"
     left.on_hold = lambda: None
     with devices.exposure_held():
         pass
-    eventually(lambda: left.told == ["picture", "held", "released"], "a hold that goes well")
+    clock.until(lambda: left.told == ["picture", "held", "released"], "a hold that goes well")
     assert devices.faults() == ()
 
 
-def test_a_release_that_fails_keeps_no_other_camera_held(devices: Devices, hardware: FakeHardware) -> None:
+def test_a_release_that_fails_keeps_no_other_camera_held(
+    devices: Devices, hardware: FakeHardware, clock: Turned
+) -> None:
     for name, each in hardware.fake_cameras.items():
         assert isinstance(each, HoldingCamera)
         if name != "hazcam_left":
             each.on_release = failing(RuntimeError("no"))
     with devices.exposure_held():
         pass
-    eventually(lambda: camera(hardware, "hazcam_left").told == ["held", "released"], "the release")
-    eventually(lambda: len(devices.faults()) == 2, "both faults")
+    clock.until(lambda: camera(hardware, "hazcam_left").told == ["held", "released"], "the release")
+    clock.until(lambda: len(devices.faults()) == 2, "both faults")
 
 
 def test_a_camera_that_hangs_while_it_is_told_to_hold_keeps_nobody_waiting_and_is_released_when_it_is_back(
-    devices: Devices, hardware: FakeHardware
+    devices: Devices, hardware: FakeHardware, clock: Turned
 ) -> None:
-    hang, left = Hang(), camera(hardware)
+    hang, left = Hang(clock), camera(hardware)
     left.on_hold = hang
     with devices.exposure_held():
-        assert hang.entered.wait(5.0)
+        hang.reached()
         devices.move(0.1, 0.1)
-        devices.frames(["navcam_right"], time.monotonic(), 1.0)
-    eventually(lambda: camera(hardware, "navcam_right").told[-1] == "released", "the release of the other")
-    eventually(lambda: any("hold_exposure" in f.message for f in devices.faults()), "the fault")
+        devices.frames(["navcam_right"], clock.now_s(), 1.0)
+    clock.until(lambda: camera(hardware, "navcam_right").told[-1] == "released", "the release of the other")
+    clock.until(lambda: any("hold_exposure" in f.message for f in devices.faults()), "the fault")
     for _ in range(3):  # the next operations find it hanging; none queues up
         with devices.exposure_held(), pytest.raises(NoReply, match="hold_exposure has been under way"):
-            devices.frames(["navcam_left"], time.monotonic(), 1.0)
+            devices.frames(["navcam_left"], clock.now_s(), 1.0)
     assert left.told == []
     left.on_hold = lambda: None
     hang.let_go()
-    eventually(lambda: left.told == ["held", "released"], "the late hold's release")
-    assert devices.frames(["navcam_left"], time.monotonic(), 1.0)
+    clock.until(lambda: left.told == ["held", "released"], "the late hold's release")
+    assert devices.frames(["navcam_left"], clock.now_s(), 1.0)
     assert devices.faults() == ()
 
 
 def test_a_release_that_hangs_is_a_fault_of_that_camera_alone(
-    devices: Devices, hardware: FakeHardware
+    devices: Devices, hardware: FakeHardware, clock: Turned
 ) -> None:
-    hang, left = Hang(), camera(hardware)
+    hang, left = Hang(clock), camera(hardware)
     left.on_release = hang
     with devices.exposure_held():
         pass
-    assert hang.entered.wait(5.0)
-    eventually(lambda: any("release_exposure" in f.message for f in devices.faults()), "the fault")
+    hang.reached()
+    clock.until(lambda: any("release_exposure" in f.message for f in devices.faults()), "the fault")
     with devices.exposure_held():
-        devices.frames(["navcam_right"], time.monotonic(), 1.0)
+        devices.frames(["navcam_right"], clock.now_s(), 1.0)
     hang.let_go()
-    eventually(lambda: devices.faults() == (), "the camera's return")
+    clock.until(lambda: devices.faults() == (), "the camera's return")
 
 
 def test_joint_angles_are_pointed_at_although_a_camera_hangs_in_its_hold(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    hang = Hang()
+    hang = Hang(SystemClock())
     with fake_daemon(monkeypatch, tmp_path) as (daemon, hardware):
         monkeypatch.setattr(ScriptedLoop, "script", staticmethod(ScriptedLoop.good))
         left = hardware.fake_cameras["navcam_left"]
@@ -200,9 +198,9 @@ def test_joint_angles_are_pointed_at_although_a_camera_hangs_in_its_hold(
         monkeypatch.setattr(left, "exposure_held", exposure_held, raising=False)
         with Client(daemon.url) as client:
             for _ in range(2):
-                operation = client.wait(client.point(pan_rad=0.1, tilt_rad=0.1), timeout_s=10.0)
+                operation = client.wait(client.point(pan_rad=0.1, tilt_rad=0.1), timeout_s=NET_S)
                 assert operation["state"] == "done"
-        assert hang.entered.is_set()
+        hang.reached()
         hang.let_go()
 
 
@@ -231,34 +229,32 @@ class Asked(FakeCamera):
 
 
 def test_a_camera_that_hangs_when_asked_for_its_size_keeps_the_service_from_nothing(
-    monkeypatch: pytest.MonkeyPatch,
+    clock: Turned,
 ) -> None:
-    monkeypatch.setattr(cameras_module, "SIZE_TIMEOUT_S", DEADLINE_S)
-    hardware, hang = FakeHardware(), Hang()
-    asked = Asked("navcam_left")
+    hardware, hang = FakeHardware(clock=clock), Hang(clock)
+    asked = Asked("navcam_left", clock=clock)
     asked.on_size = hang
     hardware.fake_cameras["navcam_left"] = asked
-    devices = Devices(hardware, Limits((-2.0, 2.0), (-1.0, 1.0), 0.5), "0" * 64, SystemClock(), rig())
-    try:
-        assert devices.frames(["navcam_right"], time.monotonic(), 1.0)
+    with clock.at_work():
+        devices = Devices(hardware, LIMITS, "0" * 64, clock, rig())
+        assert devices.frames(["navcam_right"], clock.now_s(), 1.0)
         assert "size_px has been under way" in devices.faults()[0].message
         hang.let_go()
-        eventually(lambda: devices.faults() == (), "the camera's return")
-        assert devices.frames(["navcam_left"], time.monotonic(), 1.0)
-    finally:
-        devices.close()
+        clock.until(lambda: devices.faults() == (), "the camera's return")
+        assert devices.frames(["navcam_left"], clock.now_s(), 1.0)
+    devices.close()
 
 
 def test_a_camera_that_hangs_when_asked_for_its_times_fails_its_own_pictures_only(
-    devices: Devices, hardware: FakeHardware
+    devices: Devices, hardware: FakeHardware, clock: Turned
 ) -> None:
-    hang = Hang()
-    asked = Asked("navcam_left")
+    hang = Hang(clock)
+    asked = Asked("navcam_left", clock=clock)
     asked.on_times = hang
     devices._cameras._cameras["navcam_left"] = asked
-    begun_s = time.monotonic()
+    begun_s = clock.now_s()
     with pytest.raises(DriverError, match="navcam_left"):
-        devices.frames(["navcam_left", "navcam_right"], time.monotonic(), 0.1)
-    assert time.monotonic() - begun_s < 10.0
-    assert devices.frames(["navcam_right"], time.monotonic(), 1.0)
+        devices.frames(["navcam_left", "navcam_right"], clock.now_s(), 0.1)
+    assert clock.now_s() - begun_s < 5.0
+    assert devices.frames(["navcam_right"], clock.now_s(), 1.0)
     hang.let_go()

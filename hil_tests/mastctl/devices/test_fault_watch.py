@@ -6,56 +6,57 @@ from collections.abc import Iterator
 
 import pytest
 
-from drivers.clock import SystemClock
 from drivers.errors import NoReply
-from hil_tests.mastctl.service_fakes import FakeHardware, Hang, eventually, rig
+from hil_tests.mastctl.devices.turned import Hang, Turned
+from hil_tests.mastctl.service_fakes import FakeHardware, rig
 from mastctl.devices.devices import HEAD, Devices
 from mastctl.devices.limits import Limits
 from mastctl.state.machine import Machine
 
 
 @pytest.fixture
-def hardware() -> FakeHardware:
-    return FakeHardware()
+def hardware(clock: Turned) -> FakeHardware:
+    return FakeHardware(clock=clock)
 
 
 @pytest.fixture
-def machine() -> Machine:
-    return Machine(SystemClock())
+def machine(clock: Turned) -> Machine:
+    return Machine(clock)
 
 
 @pytest.fixture
-def devices(hardware: FakeHardware, machine: Machine) -> Iterator[Devices]:
+def devices(hardware: FakeHardware, machine: Machine, clock: Turned) -> Iterator[Devices]:
     limits = Limits((-2.0, 2.0), (-1.0, 1.0), 0.5)
-    made = Devices(hardware, limits, "0" * 64, SystemClock(), rig(), machine=machine)
-    eventually(lambda: machine.standing.word == "ready", "a first reading")
-    yield made
+    made = Devices(hardware, limits, "0" * 64, clock, rig(), machine=machine)
+    with clock.at_work():
+        clock.until(lambda: machine.standing.word == "ready", "a first reading")
+        yield made
     hardware.head.hook = lambda name: None
     made.close()
 
 
 def test_a_head_that_hangs_is_a_fault_although_nobody_asks(
-    devices: Devices, hardware: FakeHardware, machine: Machine
+    devices: Devices, hardware: FakeHardware, machine: Machine, clock: Turned
 ) -> None:
-    hang = Hang()
+    hang = Hang(clock)
     with machine.publisher.subscribe("fault", known=False) as heard:
         hardware.head.hook = lambda name: hang() if name == "read" else None
-        eventually(lambda: machine.standing.word == "fault", "the fault")
+        clock.until(lambda: machine.standing.word == "fault", "the fault")
         assert "does not answer: read has been under way" in machine.standing.reason
         assert machine.standing.reason.endswith("until the head is read again")
         hardware.head.hook = lambda name: None
         hang.let_go()
-        eventually(lambda: machine.standing.word == "holding", "the end of the fault")
+        clock.until(lambda: machine.standing.word == "holding", "the end of the fault")
         assert machine.standing.reason.startswith("it is over: ")
         told = heard.wait(0)
         assert [(one.key, one.value) for one in told] == [(HEAD, ())] and heard.lost <= 3
 
 
 def test_what_the_head_reports_is_one_fault_as_long_as_it_lasts(
-    devices: Devices, hardware: FakeHardware, machine: Machine
+    devices: Devices, hardware: FakeHardware, machine: Machine, clock: Turned
 ) -> None:
     hardware.head.faults = ("tilt motor is hot",)
-    eventually(lambda: machine.standing.word == "fault", "the fault")
+    clock.until(lambda: machine.standing.word == "fault", "the fault")
     began = machine.standing
     for _ in range(5):
         devices.read()
@@ -63,7 +64,7 @@ def test_what_the_head_reports_is_one_fault_as_long_as_it_lasts(
     assert fault == began.faults[0], "since it began, not since the last reading"
     assert machine.standing is began
     hardware.head.faults = ()
-    eventually(lambda: machine.standing.word == "holding", "the end of the fault")
+    clock.until(lambda: machine.standing.word == "holding", "the end of the fault")
 
 
 def test_a_stop_that_is_not_confirmed_is_told_before_it_is_over(
@@ -86,7 +87,7 @@ def test_a_stop_that_is_not_confirmed_is_told_before_it_is_over(
 
 
 def test_a_fault_of_a_camera_is_published_and_changes_no_state(
-    devices: Devices, hardware: FakeHardware, machine: Machine
+    devices: Devices, hardware: FakeHardware, machine: Machine, clock: Turned
 ) -> None:
     def fail() -> None:
         raise NoReply("gone", device="navcam_left")
@@ -95,14 +96,14 @@ def test_a_fault_of_a_camera_is_published_and_changes_no_state(
         hardware.fake_cameras["navcam_left"].hook = fail
         with pytest.raises(NoReply):
             devices.frames(["navcam_left"], 0.0, 1.0)
-        (told,) = heard.wait(10.0)
+        (told,) = clock.until(lambda: heard.wait(0), "the fault")
         assert (told.topic, told.key) == ("fault", "navcam_left")
         assert [fault.code for fault in told.value] == ["no_reply"]
         hardware.fake_cameras["navcam_left"].hook = lambda: None
         frame = devices.frames(["navcam_left"], 0.0, 1.0)["navcam_left"]
-        (facts,) = [one for one in heard.wait(10.0) if one.topic == "frame"]
+        (facts,) = [one for one in clock.until(lambda: heard.wait(0), "the facts") if one.topic == "frame"]
         assert facts.value.frame_id == frame.frame_id and not hasattr(facts.value, "image")
-        eventually(lambda: machine.publisher.newest("fault", "navcam_left") == (), "its end")
+        clock.until(lambda: machine.publisher.newest("fault", "navcam_left") == (), "its end")
     assert machine.standing.word == "ready"
 
 

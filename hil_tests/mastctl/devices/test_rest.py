@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 import math
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from drivers.clock import SystemClock
 from drivers.interfaces import Reading
+from hil_tests.mastctl.devices.turned import Turned
 from hil_tests.mastctl.pointing.pointing_world import World, click, run
-from hil_tests.mastctl.service_fakes import FakeHardware, eventually, rig
+from hil_tests.mastctl.service_fakes import FakeHardware, rig
 from mastctl.devices.devices import Devices
 from mastctl.devices.joint_history import JointHistory
 from mastctl.devices.limits import Limits
@@ -227,23 +226,17 @@ def test_too_few_readings_tell_no_dither() -> None:
     assert not dithers([Reading(0.0, 0.0, False, 0.05 * n) for n in range(12)])
 
 
-@pytest.fixture
-def shaken() -> Iterator[Devices]:
-    hardware = FakeHardware()
-    count = [0]
+def test_the_service_takes_a_head_that_dithers_for_one_at_rest(clock: Turned) -> None:
+    hardware, count = FakeHardware(clock=clock), [0]
 
     def answer(head: object) -> Reading:
         count[0] += 1
-        return Reading(shaking(count[0]), 0.0, count[0] % 2 == 0, time.monotonic())
+        return Reading(shaking(count[0]), 0.0, count[0] % 2 == 0, clock.now_s())
 
     hardware.head.answer = answer
-    devices = Devices(hardware, Limits((-2.0, 2.0), (-1.0, 1.0), 0.5), "0" * 64, SystemClock(), rig())
-    yield devices
-    devices.close()
-
-
-def test_the_service_takes_a_head_that_dithers_for_one_at_rest(shaken: Devices) -> None:
-    first_s = shaken.read().time_s
-    eventually(lambda: shaken.read().time_s - first_s > 1.5, "a second of readings")
-    assert not any(shaken.read().moving for _ in range(20))
-    assert not shaken.frames(["navcam_left"], time.monotonic(), 2.0)["navcam_left"].moving
+    shaken = Devices(hardware, Limits((-2.0, 2.0), (-1.0, 1.0), 0.5), "0" * 64, clock, rig())
+    with clock.at_work():
+        clock.sleep(1.5)
+        assert not any(shaken.read().moving for _ in range(20))
+        assert not shaken.frames(["navcam_left"], clock.now_s(), 2.0)["navcam_left"].moving
+    shaken.close()

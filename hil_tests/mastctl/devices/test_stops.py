@@ -5,7 +5,6 @@ from __future__ import annotations
 import itertools
 import logging
 import threading
-import time
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -14,29 +13,30 @@ import pytest
 from drivers.clock import SystemClock
 from drivers.errors import DriverError, LineLost, NoReply, Refused
 from drivers.interfaces import Reading
-from hil_tests.mastctl.service_fakes import FakeHardware, Hang, eventually, rig
+from hil_tests.mastctl.devices.turned import Hang, Turned
+from hil_tests.mastctl.service_fakes import FakeHardware, rig
+from hil_tests.waiting import NET_S, until
 from mastctl.devices import devices as devices_module
 from mastctl.devices.devices import Devices
 from mastctl.devices.limits import Limits
 from mastctl.devices.stops import room_s
 from mastctl.errors import MastctlError, Stopped
 
-DEADLINE_S = 0.3
-BUSY_MACHINE_S = 5.0
+LIMITS = Limits((-2.0, 2.0), (-1.0, 1.0), 0.5)
+DEADLINE_S = 1.0
 
 
 @pytest.fixture
-def hardware() -> FakeHardware:
-    return FakeHardware()
+def hardware(clock: Turned) -> FakeHardware:
+    return FakeHardware(clock=clock)
 
 
 @pytest.fixture
-def devices(hardware: FakeHardware, monkeypatch: pytest.MonkeyPatch) -> Iterator[Devices]:
-    for name in ("READ_TIMEOUT_S", "MOVE_TIMEOUT_S", "STOP_TIMEOUT_S"):
-        monkeypatch.setattr(devices_module, name, DEADLINE_S)
-    made = Devices(hardware, Limits((-2.0, 2.0), (-1.0, 1.0), 0.5), "0" * 64, SystemClock(), rig())
-    made.read()
-    yield made
+def devices(hardware: FakeHardware, clock: Turned) -> Iterator[Devices]:
+    made = Devices(hardware, LIMITS, "0" * 64, clock, rig())
+    with clock.at_work():
+        made.read()
+        yield made
     hardware.head.hook = lambda name: None
     made.close()
 
@@ -46,7 +46,7 @@ class Hangs:
 
     def __init__(self, hardware: FakeHardware, *names: str, times: int = 1_000_000) -> None:
         self._names = dict.fromkeys(names, times)
-        self.hang = Hang()
+        self.hang = Hang(hardware.head.clock)
         self.entered: list[str] = []
         hardware.head.hook = self
 
@@ -74,9 +74,9 @@ def one_fault(devices: Devices) -> Any:
 
 
 def test_no_move_goes_out_while_an_old_stop_is_inside_the_driver(
-    devices: Devices, hardware: FakeHardware, caplog: pytest.LogCaptureFixture
+    devices: Devices, hardware: FakeHardware, caplog: pytest.LogCaptureFixture, clock: Turned
 ) -> None:
-    reads, stops = Hang(), Hang()
+    reads, stops = Hang(clock), Hang(clock)
     inside: list[str] = []
 
     def hang(name: str) -> None:
@@ -87,29 +87,31 @@ def test_no_move_goes_out_while_an_old_stop_is_inside_the_driver(
             stops()
 
     hardware.head.hook = hang
-    assert reads.entered.wait(BUSY_MACHINE_S)
+    reads.reached()
     with pytest.raises(NoReply, match="may still move"):
         devices.stop()
     reads.let_go()
-    eventually(lambda: hardware.head.calls == [("stop",)], "the stop in turn")
+    clock.until(lambda: hardware.head.calls == [("stop",)], "the stop in turn")
     devices.read()
     with pytest.raises(
         Stopped, match=r"a stop asked for \d+\.\d s ago has not come back from the driver yet"
     ):
         devices.move(0.5, 0.5)
-    eventually(lambda: "the head may still move" in one_fault(devices).message, "the first one overdue")
+    clock.until(lambda: "the head may still move" in one_fault(devices).message, "the first one overdue")
     with caplog.at_level(logging.WARNING):
         stops.let_go()
-        eventually(lambda: "ended only now" in one_fault(devices).message, "the late stop told")
+        clock.until(lambda: "ended only now" in one_fault(devices).message, "the late stop told")
     assert "a stop asked for" in caplog.text and "ended only now" in caplog.text
     devices.move(0.5, 0.5)
     assert hardware.head.calls[-1][:3] == ("move", 0.5, 0.5), "no old stop ends the new move"
-    eventually(lambda: devices.faults() == (), "the head at rest after a move")
+    clock.until(lambda: devices.faults() == (), "the head at rest after a move")
 
 
-def test_a_move_that_waits_when_a_stop_hangs_is_never_sent(devices: Devices, hardware: FakeHardware) -> None:
+def test_a_move_that_waits_when_a_stop_hangs_is_never_sent(
+    devices: Devices, hardware: FakeHardware, clock: Turned
+) -> None:
     hangs = Hangs(hardware, "read", "stop", times=1)
-    assert hangs.hang.entered.wait(BUSY_MACHINE_S)
+    hangs.hang.reached()
     refused: list[Exception] = []
 
     def move() -> None:
@@ -118,26 +120,24 @@ def test_a_move_that_waits_when_a_stop_hangs_is_never_sent(devices: Devices, har
         except (DriverError, MastctlError) as error:
             refused.append(error)
 
-    movers = [threading.Thread(target=move) for _ in range(3)]
-    for mover in movers:
-        mover.start()
+    movers = clock.begun(move, move, move)
     with pytest.raises(NoReply):
         devices.stop()
     hangs.let_go()
-    for mover in movers:
-        mover.join(BUSY_MACHINE_S)
+    clock.ended(movers)
     devices.stop()
     assert len(refused) == 3 and moves(hardware) == []
 
 
 def test_a_late_stop_is_told_until_the_next_one_is_confirmed(
-    devices: Devices, hardware: FakeHardware
+    devices: Devices, hardware: FakeHardware, clock: Turned
 ) -> None:
     hangs = Hangs(hardware, "stop")
     with pytest.raises(NoReply, match="may still move"):
         devices.stop()
+    clock.sleep(0.1)
     hangs.let_go()
-    eventually(lambda: "ended only now" in one_fault(devices).message, "the late stop's return")
+    clock.until(lambda: "ended only now" in one_fault(devices).message, "the late stop's return")
     assert "until" not in one_fault(devices).until and one_fault(devices).until.startswith(
         "a stop is confirmed"
     )
@@ -150,18 +150,20 @@ def test_a_late_stop_is_told_until_the_next_one_is_confirmed(
 # Stops that get through
 
 
-def test_a_stop_gets_its_own_way_when_an_earlier_one_hangs(devices: Devices, hardware: FakeHardware) -> None:
+def test_a_stop_gets_its_own_way_when_an_earlier_one_hangs(
+    devices: Devices, hardware: FakeHardware, clock: Turned
+) -> None:
     hangs = Hangs(hardware, "stop", times=1)
     with pytest.raises(NoReply):
         devices.stop()
     devices.stop()
     assert hardware.head.calls == [("stop",)] and hangs.entered == ["stop"]
     hangs.let_go()
-    eventually(lambda: len(hardware.head.calls) >= 2, "the first one's return")
+    clock.until(lambda: len(hardware.head.calls) >= 2, "the first one's return")
 
 
 def test_a_stop_without_a_thread_of_its_own_says_so_and_nothing_stays_of_it(
-    devices: Devices, hardware: FakeHardware, monkeypatch: pytest.MonkeyPatch
+    devices: Devices, hardware: FakeHardware, monkeypatch: pytest.MonkeyPatch, clock: Turned
 ) -> None:
     def refuse(thread: threading.Thread) -> None:
         raise RuntimeError("can't start new thread")
@@ -174,42 +176,37 @@ def test_a_stop_without_a_thread_of_its_own_says_so_and_nothing_stays_of_it(
         with pytest.raises(NoReply, match=r"none could be sent beside the call that hangs \(can't start"):
             devices.stop()
     hangs.let_go()
-    eventually(lambda: len(hardware.head.calls) >= 2, "both stops' return")
+    clock.until(lambda: len(hardware.head.calls) >= 2, "both stops' return")
     devices.stop()
     assert devices.faults() == ()
     devices.move(0.1, 0.1)
 
 
 def test_a_stop_is_confirmed_by_an_earlier_one_that_comes_back(
-    devices: Devices, hardware: FakeHardware
+    devices: Devices, hardware: FakeHardware, clock: Turned
 ) -> None:
     hangs = Hangs(hardware, "stop", times=1)
     done: list[str] = []
-    askers = [threading.Thread(target=lambda: (devices.stop(), done.append("done"))) for _ in range(5)]
-    for asker in askers:
-        asker.start()
-    assert hangs.hang.entered.wait(BUSY_MACHINE_S)
+    askers = clock.begun(*[lambda: (devices.stop(), done.append("done"))] * 5)
+    hangs.hang.reached()
     hangs.let_go()
-    for asker in askers:
-        asker.join(BUSY_MACHINE_S)
+    clock.ended(askers)
     assert len(done) == 5
 
 
 def test_a_stop_behind_one_that_was_confirmed_is_overdue_by_its_own_time_only(
-    devices: Devices, hardware: FakeHardware
+    devices: Devices, hardware: FakeHardware, clock: Turned
 ) -> None:
-    hangs = [Hang(), Hang()]
+    hangs = [Hang(clock), Hang(clock)]
     left = list(hangs)
     hardware.head.hook = lambda name: left.pop(0)() if name == "stop" and left else None
-    askers = [threading.Thread(target=devices.stop) for _ in range(2)]
-    askers[0].start()
-    assert hangs[0].entered.wait(BUSY_MACHINE_S)
-    askers[1].start()
-    eventually(lambda: devices._stops._queued_s is not None, "the second one queued")
+    askers = clock.begun(devices.stop)
+    hangs[0].reached()
+    askers += clock.begun(devices.stop)
+    clock.until(lambda: devices._stops._queued_s is not None, "the second one queued")
     hangs[0].let_go()
-    for asker in askers:
-        asker.join(BUSY_MACHINE_S)
-    assert hangs[1].entered.wait(BUSY_MACHINE_S)
+    clock.ended(askers)
+    hangs[1].reached()
     (inside,) = devices._stops._inside
     waited_s = inside.began_s - inside.asked_s
     assert waited_s > 0.0
@@ -219,16 +216,16 @@ def test_a_stop_behind_one_that_was_confirmed_is_overdue_by_its_own_time_only(
 
 
 def test_stops_repeated_into_a_hanging_driver_pile_up_neither_threads_nor_calls(
-    devices: Devices, hardware: FakeHardware, monkeypatch: pytest.MonkeyPatch
+    devices: Devices, hardware: FakeHardware, monkeypatch: pytest.MonkeyPatch, clock: Turned
 ) -> None:
     monkeypatch.setattr(devices_module, "STOP_TIMEOUT_S", 0.06)
     hangs = Hangs(hardware, "read", "stop")
-    assert hangs.hang.entered.wait(BUSY_MACHINE_S)
-    begun_s = time.monotonic()
+    hangs.hang.reached()
+    begun_s = clock.now_s()
     for _ in range(40):
         with pytest.raises(NoReply):
             devices.stop()
-    hung_s = time.monotonic() - begun_s
+    hung_s = clock.now_s() - begun_s
     beside = sum(thread.name == "stop beside" for thread in threading.enumerate())
     most, at_s = 0, begun_s  # as many as the rule allows in the time that it took
     began_s: list[float] = []
@@ -238,7 +235,7 @@ def test_stops_repeated_into_a_hanging_driver_pile_up_neither_threads_nor_calls(
     assert 1 <= beside <= most < 40
     assert len(devices._head._jobs) <= 1
     hangs.let_go()
-    eventually(lambda: not any(t.name == "stop beside" for t in threading.enumerate()), "all back")
+    clock.until(lambda: not any(t.name == "stop beside" for t in threading.enumerate()), "all back")
     devices.stop()
 
 
@@ -273,34 +270,35 @@ HANGING = [
 @pytest.mark.parametrize("first", CALLS)
 @pytest.mark.parametrize("hanging", HANGING, ids="+".join)
 def test_every_call_ends_within_its_deadline_whatever_hangs(
-    devices: Devices, hardware: FakeHardware, hanging: tuple[str, ...], first: str
+    devices: Devices, hardware: FakeHardware, hanging: tuple[str, ...], first: str, clock: Turned
 ) -> None:
     hangs = Hangs(hardware, *hanging)
     for name in (first, *CALLS, "move", "stop"):
-        begun_s = time.monotonic()
+        begun_s = clock.now_s()
         try:
             CALLS[name](devices)
         except (DriverError, MastctlError) as error:
             assert "\n" not in str(error) and str(error)
-        assert time.monotonic() - begun_s < DEADLINE_S + BUSY_MACHINE_S, name
+        assert clock.now_s() - begun_s <= DEADLINE_S + 1e-6, name
     if "stop" not in hanging:
         assert ("stop",) in hardware.head.calls
     hangs.let_go()
-    eventually(lambda: not any(t.name == "stop beside" for t in threading.enumerate()), "all back")
+    clock.until(lambda: not any(t.name == "stop beside" for t in threading.enumerate()), "all back")
     devices.stop()
     assert hardware.head.calls[-1] == ("stop",)
     devices.move(0.1, 0.1)
     assert hardware.head.calls[-1][0] == "move"
-    eventually(lambda: devices.faults() == (), "everything well again")
+    clock.until(lambda: devices.faults() == (), "everything well again")
 
 
 @pytest.mark.parametrize("hanging", HANGING, ids="+".join)
 def test_closing_ends_whatever_hangs_and_a_move_that_comes_back_meanwhile_is_stopped(
-    hardware: FakeHardware, monkeypatch: pytest.MonkeyPatch, hanging: tuple[str, ...]
+    monkeypatch: pytest.MonkeyPatch, hanging: tuple[str, ...]
 ) -> None:
     for name in ("READ_TIMEOUT_S", "MOVE_TIMEOUT_S", "STOP_TIMEOUT_S"):
-        monkeypatch.setattr(devices_module, name, DEADLINE_S)
-    devices = Devices(hardware, Limits((-2.0, 2.0), (-1.0, 1.0), 0.5), "0" * 64, SystemClock(), rig())
+        monkeypatch.setattr(devices_module, name, 0.3)
+    hardware = FakeHardware()  # closing waits for threads in real time
+    devices = Devices(hardware, LIMITS, "0" * 64, SystemClock(), rig())
     hangs = Hangs(hardware, *hanging)
     for call in (CALLS["move"], CALLS["read"]):
         try:
@@ -309,14 +307,14 @@ def test_closing_ends_whatever_hangs_and_a_move_that_comes_back_meanwhile_is_sto
             continue
     closing = threading.Thread(target=devices.close)
     closing.start()
-    eventually(lambda: devices._closed, "closing")
+    until(lambda: devices._closed, "closing")
     if "move" in hanging:
         hangs.let_go()
-    closing.join(2 * BUSY_MACHINE_S)
+    closing.join(NET_S)
     assert not closing.is_alive()
     hangs.let_go()
     if "move" in hanging:
-        eventually(lambda: hardware.head.calls[-1] == ("stop",), "the stop after the late move")
+        until(lambda: hardware.head.calls[-1] == ("stop",), "the stop after the late move")
     with pytest.raises((DriverError, Stopped)):
         devices.move(0.1, 0.1)
 
@@ -325,7 +323,7 @@ def test_closing_ends_whatever_hangs_and_a_move_that_comes_back_meanwhile_is_sto
 
 
 def test_a_stop_that_failed_once_is_a_fault_until_a_move_was_taken_and_the_head_rests(
-    devices: Devices, hardware: FakeHardware
+    devices: Devices, hardware: FakeHardware, clock: Turned
 ) -> None:
     def fail(name: str) -> None:
         if name == "stop":
@@ -345,11 +343,11 @@ def test_a_stop_that_failed_once_is_a_fault_until_a_move_was_taken_and_the_head_
     devices.read()
     assert devices.faults() == (fault,)
     hardware.head.moving = False
-    eventually(lambda: devices.faults() == (), "the end of the fault")
+    clock.until(lambda: devices.faults() == (), "the end of the fault")
 
 
 def test_a_stop_that_a_lost_line_kept_back_is_a_fault_until_the_head_is_read_at_rest(
-    devices: Devices, hardware: FakeHardware
+    devices: Devices, hardware: FakeHardware, clock: Turned
 ) -> None:
     def lose(name: str) -> None:
         raise LineLost("the line hung up")
@@ -364,7 +362,7 @@ def test_a_stop_that_a_lost_line_kept_back_is_a_fault_until_the_head_is_read_at_
     assert "the head may still move" in one_fault(devices).message
     assert one_fault(devices).until == "the line is back and the head rests, or a stop is confirmed"
     hardware.head.moving = False
-    eventually(lambda: devices.faults() == (), "the end of the fault")
+    clock.until(lambda: devices.faults() == (), "the end of the fault")
 
 
 def test_a_line_that_is_lost_after_a_refused_stop_does_not_make_rest_the_proof(
@@ -392,7 +390,7 @@ def test_a_line_that_is_lost_after_a_refused_stop_does_not_make_rest_the_proof(
 
 
 def test_rest_after_a_move_of_before_the_stop_proves_nothing(
-    devices: Devices, hardware: FakeHardware
+    devices: Devices, hardware: FakeHardware, clock: Turned
 ) -> None:
     def fail(name: str) -> None:
         if name == "stop":
@@ -405,15 +403,15 @@ def test_rest_after_a_move_of_before_the_stop_proves_nothing(
         devices.stop()
     fault = one_fault(devices)
     hardware.head.moving = False
-    since_s = time.monotonic()
-    eventually(lambda: time.monotonic() > since_s + 2 * devices_module.REST_S and devices.read(), "rest")
+    since_s = clock.now_s()
+    clock.until(lambda: clock.now_s() > since_s + 2 * devices_module.REST_S and devices.read(), "rest")
     assert devices.faults() == (fault,)
     hardware.head.hook = lambda name: None
     devices.move(0.3, 0.1)
-    eventually(lambda: devices.faults() == (), "the end of the fault")
+    clock.until(lambda: devices.faults() == (), "the end of the fault")
 
 
-def test_every_fault_says_what_takes_it_back(devices: Devices, hardware: FakeHardware) -> None:
+def test_every_fault_says_what_takes_it_back(devices: Devices, hardware: FakeHardware, clock: Turned) -> None:
     hardware.head.faults = ("tilt motor is hot",)
     devices.read()
 
@@ -422,7 +420,7 @@ def test_every_fault_says_what_takes_it_back(devices: Devices, hardware: FakeHar
 
     hardware.head.hook = fail
     hardware.fake_cameras["navcam_left"].change = lambda frame: None
-    for call in (*list(CALLS.values())[:3], lambda d: d.frames(["navcam_left"], time.monotonic(), 1.0)):
+    for call in (*list(CALLS.values())[:3], lambda d: d.frames(["navcam_left"], clock.now_s(), 1.0)):
         with pytest.raises(DriverError):
             call(devices)
     faults = devices.faults()
@@ -434,11 +432,11 @@ def test_every_fault_says_what_takes_it_back(devices: Devices, hardware: FakeHar
 
 
 def test_a_report_that_hangs_or_is_junk_is_a_typed_error_within_a_second(
-    hardware: FakeHardware, devices: Devices
+    hardware: FakeHardware, devices: Devices, clock: Turned
 ) -> None:
     from drivers.interfaces import Reporting
 
-    hang = Hang()
+    hang = Hang(clock)
     answers: list[Any] = [{"pan": "north"}]
 
     class Counting(Reporting):
@@ -449,7 +447,7 @@ def test_a_report_that_hangs_or_is_junk_is_a_typed_error_within_a_second(
             return answers.pop()
 
         def read(self) -> Reading:
-            return Reading(0.0, 0.0, False, time.monotonic())
+            return Reading(0.0, 0.0, False, clock.now_s())
 
         def move(self, pan_rad: float, tilt_rad: float, speed_rad_per_s: float | None = None) -> None: ...
         def stop(self) -> None: ...
