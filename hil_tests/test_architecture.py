@@ -76,6 +76,18 @@ def test_every_tool_says_how_it_is_used(
     assert not rest.startswith(("options:", "positional arguments:")), "it does not say what it does"
 
 
+@pytest.mark.parametrize("room", ["dynamixel", "flir_ptu"])
+def test_a_driver_waits_on_the_clock_that_it_is_given_and_on_nothing_beside_it(
+    room: str, repository: Path
+) -> None:
+    beside = re.compile(
+        r"^import time$|^from (?:time|queue) |threading\.(?:Thread|Event|Condition|Timer|Semaphore)", re.M
+    )
+    files = sorted((repository / "drivers" / room).glob("*.py"))
+    assert len(files) > 10
+    assert {file.name: found for file in files if (found := beside.findall(file.read_text()))} == {}
+
+
 def test_no_room_imports_upwards_or_in_a_circle() -> None:
     for name in PACKAGES:
         assert read_package(name).circles == [], name

@@ -11,12 +11,11 @@ from __future__ import annotations
 
 import logging
 import threading
-import time
 from collections import deque
 from collections.abc import Callable
-from queue import Empty, SimpleQueue
 from typing import Any, TypeVar, cast
 
+from drivers.clock import Clock, SystemClock
 from drivers.dynamixel.port import Overtaken
 from drivers.errors import DriverError, NoReply
 
@@ -25,17 +24,19 @@ T = TypeVar("T")
 
 
 class _Job:
-    """A call on its way; plain locks, since a call waits for little more than the thread's turn."""
+    """A call on its way; what its caller waits on is its own, so that no other call can hold it up."""
 
-    def __init__(self, function: Callable[[], Any], *, first: bool = False, void: object = None) -> None:
+    def __init__(
+        self, function: Callable[[], Any], clock: Clock, *, first: bool = False, void: object = None
+    ) -> None:
         self.function = function
         self.first = first
         self.void = void  # what has to be the last stop still when its turn comes; None: whatever
         self.result: Any = None
         self.error: BaseException | None = None
         self.claimed = threading.Lock()  # by the owner thread to run it, or by its caller to give it up
-        self.done = threading.Lock()
-        self.done.acquire()
+        self._ended = False
+        self._signal = clock.signal()
 
     def run(self) -> None:
         """Run it, unless its caller gave it up."""
@@ -45,7 +46,16 @@ class _Job:
             self.result = self.function()
         except BaseException as error:  # whatever happens belongs to the caller, not to this thread
             self.error = error
-        self.done.release()
+        with self._signal:
+            self._ended = True
+            self._signal.notify_all()
+
+    def ends_within(self, timeout_s: float) -> bool:
+        """Wait until it has been run; return whether that was within ``timeout_s``."""
+        with self._signal:
+            if not self._ended:
+                self._signal.wait(timeout_s)  # told once, and of nothing else
+            return self._ended
 
 
 class Bus:
@@ -56,20 +66,23 @@ class Bus:
     name
         Of the thread and in errors.
     between
-        Called in the thread whenever nothing is asked; returns the time of CLOCK_MONOTONIC, seconds, at
-        which it wants to run again. It must keep what goes wrong itself; what it raises is only logged.
+        Called in the thread whenever nothing is asked; returns the time of the clock, seconds, at which it
+        wants to run again. It must keep what goes wrong itself; what it raises is only logged.
+    clock
+        Every wait runs on it; the machine's when left out.
     """
 
-    def __init__(self, name: str, between: Callable[[], float]) -> None:
+    def __init__(self, name: str, between: Callable[[], float], clock: Clock | None = None) -> None:
         self._name = name
         self._between = between
         self._urgent_jobs: deque[_Job] = deque()
         self._jobs: deque[_Job] = deque()
         self._serving_urgent = False
         self._last_stop = object()  # replaced by each
-        self._wake: SimpleQueue[None] = SimpleQueue()
         self._closing: _Job | None = None
-        self._thread = threading.Thread(target=self._serve, name=f"bus {name}", daemon=True)
+        self._clock = clock or SystemClock()
+        self._called = self._clock.signal()
+        self._thread = self._clock.thread(self._serve, f"bus {name}")
 
     def start(self) -> None:
         """Begin to serve; until then calls wait."""
@@ -112,12 +125,12 @@ class Bus:
         """
         if self._closing is not None:
             raise NoReply(f"{self._name} is closed; {what} was not sent")
-        job = _Job(function, first=first, void=self._last_stop if moves else None)
+        job = _Job(function, self._clock, first=first, void=self._last_stop if moves else None)
         if first:
             self._last_stop = object()
         (self._urgent_jobs if first else self._jobs).append(job)
-        self._wake.put(None)
-        if not job.done.acquire(timeout=timeout_s):
+        self._wake()
+        if not job.ends_within(timeout_s):
             begun = not job.claimed.acquire(blocking=False)
             words = "it is still under way" if begun else "its turn did not come"
             raise NoReply(f"{what} on {self._name} did not end within {timeout_s:g} s: {words}")
@@ -130,31 +143,35 @@ class Bus:
     def close(self, last: Callable[[], None], timeout_s: float) -> None:
         """Run ``last`` in the thread as the last call of all and end the thread; never raises."""
         if self._closing is None:
-            self._closing = job = _Job(last, first=True)
+            self._closing = job = _Job(last, self._clock, first=True)
             self._last_stop = object()
             self._urgent_jobs.append(job)
-            self._wake.put(None)
-            self._thread.join(timeout_s)
-            if self._thread.is_alive():
+            self._wake()
+            if not job.ends_within(timeout_s):
                 log.warning("%s: the bus thread hangs and is left behind", self._name)
-            elif job.error is not None:
+                return
+            self._thread.join(timeout_s)  # it waits for nothing any more
+            if job.error is not None:
                 log.warning("%s: %s", self._name, job.error)
 
+    def _wake(self) -> None:
+        """Have the thread look for calls; they are in their row already, so that `urgent` sees a stop."""
+        with self._called:
+            self._called.notify_all()
+
     def _serve(self) -> None:
-        again_s = time.monotonic()
+        again_s = self._clock.now_s()
         while True:
-            if not (self._urgent_jobs or self._jobs):
-                wait_s = again_s - time.monotonic()
+            job = self._next()
+            if job is None:
+                wait_s = again_s - self._clock.now_s()
                 if wait_s <= 0:
                     again_s = self._round()
                     continue
-                try:
-                    self._wake.get(timeout=wait_s)
-                except Empty:
-                    continue
-            job = self._next()
-            if job is None:
-                continue  # a wake-up for a call that was served already
+                with self._called:
+                    if not (self._urgent_jobs or self._jobs):
+                        self._called.wait(wait_s, idle=True)
+                continue
             self._serving_urgent = job.first
             job.run()
             self._serving_urgent = False
@@ -177,12 +194,12 @@ class Bus:
         try:
             return self._between()
         except Overtaken:
-            return time.monotonic()
+            return self._clock.now_s()
         except DriverError as error:  # its owner keeps and tells it
             log.debug("%s: %s", self._name, error)
         except Exception:  # a defect must not end the thread that feeds the watchdogs
             log.exception("%s: the bus thread's own round failed", self._name)
-        return time.monotonic() + 0.1
+        return self._clock.now_s() + 0.1
 
 
 def _overtaken() -> None:

@@ -1,6 +1,6 @@
 """A servo's own millisecond counter against our clock: whether an answer that holds it is of its question.
 
-Once it is known at which moment of CLOCK_MONOTONIC the counter (Realtime Tick) showed what, an answer has to
+Once it is known at which moment of our clock the counter (Realtime Tick) showed what, an answer has to
 show what the counter shows between our question and the answer's coming. That moment is kept as an interval
 which good answers narrow, so that a chain of answers, each a little late, cannot carry it along. No I/O.
 """
@@ -21,7 +21,7 @@ class Counter:
     tick
         What it showed, ms.
     sent_s, received_s
-        When that was asked and when it came, seconds of CLOCK_MONOTONIC.
+        When that was asked and when it came, seconds of our clock.
     """
 
     def __init__(self, tick: int, sent_s: float, received_s: float) -> None:

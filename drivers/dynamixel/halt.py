@@ -2,23 +2,28 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Mapping
 from typing import Any
 
+from drivers.clock import Clock
 from drivers.dynamixel.link import Link
 from drivers.dynamixel.pair import ServoAxis
 from drivers.dynamixel.servo import WATCHDOG_TRIPPED
 from drivers.dynamixel.settings import dynamixel_settings
 from drivers.errors import DriverError, NoReply
+from drivers.serial_line import OpenLine, SerialLine
 
 TRIES = 5
 AT_REST_S = 2.0
 SLOW = 1  # counts of speed that a holding servo may show
 
 
-def halt(options: Mapping[str, Any]) -> list[str]:
+def halt(
+    options: Mapping[str, Any], clock: Clock | None = None, open_line: OpenLine = SerialLine
+) -> list[str]:
     """Tell each axis that holds to stand where it is, by itself, and see that it does. Torque stays as it is.
+
+    ``clock`` and ``open_line`` are those of `Link`.
 
     Raises
     ------
@@ -30,7 +35,7 @@ def halt(options: Mapping[str, Any]) -> list[str]:
         If an axis did not confirm; the other was told all the same.
     """
     head = dynamixel_settings(options)
-    link = Link(head.port, head.baud, head.reply_timeout_s)
+    link = Link(head.port, head.baud, head.reply_timeout_s, clock=clock, open_line=open_line)
     try:
         axes = (ServoAxis(link, "pan", head.pan, head), ServoAxis(link, "tilt", head.tilt, head))
         told: dict[str, str] = {}
@@ -45,7 +50,7 @@ def halt(options: Mapping[str, Any]) -> list[str]:
         missing = {name: error for name, error in failed.items() if name not in told}
         for axis in axes:
             if axis.servo.name in told:
-                _see_rest(axis)
+                _see_rest(axis, link.clock)
     finally:
         link.close()
     if missing:
@@ -65,9 +70,9 @@ def _stood(axis: ServoAxis) -> str:
     return "was told to stand where it is, and holds"
 
 
-def _see_rest(axis: ServoAxis) -> None:
+def _see_rest(axis: ServoAxis, clock: Clock) -> None:
     """Wait until an axis stands. Raises NoReply."""
-    until_s = time.monotonic() + AT_REST_S
+    until_s = clock.now_s() + AT_REST_S
     while abs(axis.servo.look().values["present_velocity"]) > SLOW:
-        if time.monotonic() > until_s:
+        if clock.now_s() > until_s:
             raise NoReply(f"{axis.servo.name} was told to stand, but still moves")

@@ -14,14 +14,13 @@ from __future__ import annotations
 
 import logging
 import threading
-import time
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from typing import Any, TypeVar
 
 from drivers.absence import Absence
 from drivers.approach import rising_below_rad
-from drivers.clock import Clock, SystemClock
+from drivers.clock import Clock, SystemClock, deadlines_on
 from drivers.dynamixel.bus import Bus
 from drivers.dynamixel.hardware_errors import Reboots
 from drivers.dynamixel.pair import ready_pair
@@ -30,6 +29,7 @@ from drivers.dynamixel.settings import DynamixelSettings, dynamixel_settings
 from drivers.dynamixel.watch import GivenUp
 from drivers.errors import DriverError, LineLost, NoReply, OutOfRange
 from drivers.interfaces import AxisMotion, AxisReport, Reading, Reporting
+from drivers.serial_line import OpenLine, SerialLine
 
 log = logging.getLogger(__name__)
 T = TypeVar("T")
@@ -39,7 +39,9 @@ CLOSE_TIMEOUT_S = 2.0
 AXES = ("pan", "tilt")
 
 
-def open_head(options: Mapping[str, Any], clock: Clock | None = None) -> DynamixelHead:
+def open_head(
+    options: Mapping[str, Any], clock: Clock | None = None, open_line: OpenLine = SerialLine
+) -> DynamixelHead:
     """Open the head that the options of ``driver: dynamixel`` describe; see `settings.DynamixelSettings`.
 
     Raises
@@ -49,7 +51,7 @@ def open_head(options: Mapping[str, Any], clock: Clock | None = None) -> Dynamix
     LineLost, NoReply, WrongDevice, HardwareFault, Refused
         If the servos cannot be reached or do not fit; the line is closed again.
     """
-    return DynamixelHead(dynamixel_settings(options), clock)
+    return DynamixelHead(dynamixel_settings(options), clock, open_line)
 
 
 class DynamixelHead(Reporting):
@@ -60,7 +62,9 @@ class DynamixelHead(Reporting):
     settings
         What it is made of.
     clock
-        Stamps the readings; deadlines run on the machine's monotonic clock.
+        Stamps the readings. Deadlines run on it too if it runs, else on the machine's.
+    open_line
+        Opens the line, whose waits end by the clock of the deadlines.
 
     Raises
     ------
@@ -68,14 +72,18 @@ class DynamixelHead(Reporting):
         As `open_head`.
     """
 
-    def __init__(self, settings: DynamixelSettings, clock: Clock | None = None) -> None:
+    def __init__(
+        self, settings: DynamixelSettings, clock: Clock | None = None, open_line: OpenLine = SerialLine
+    ) -> None:
         self.settings = settings
-        self._clock = clock or SystemClock()
+        self._stamps = clock or SystemClock()
+        self._clock = deadlines_on(self._stamps)
+        self._open_line = open_line
         self._reboots = Reboots()
         self._absence = Absence()
         self._closed = False
         self._state = threading.Lock()
-        self._bus = Bus(settings.port, self._round)
+        self._bus = Bus(settings.port, self._round, self._clock)
         self._session: Session | None = self._connect()
         self._motions = [axis.motion for axis in self._session.pair.axes]
         self._bus.start()
@@ -204,7 +212,7 @@ class DynamixelHead(Reporting):
 
     def _round(self) -> float:
         """What the thread does between calls; returns when it wants to be called again."""
-        now_s = time.monotonic()
+        now_s = self._clock.now_s()
         if self._session is None:
             if now_s >= self._absence.again_s:
                 self._come_back()
@@ -215,8 +223,8 @@ class DynamixelHead(Reporting):
     def _connect(self) -> Session:
         """Open the line, make both servos ready without moving them, and read them once."""
         head = self.settings
-        pair = ready_pair(head, self._reboots, self._bus.urgent)
-        session = Session(pair, head, self._clock, self._reboots)
+        pair = ready_pair(head, self._reboots, self._bus.urgent, clock=self._clock, open_line=self._open_line)
+        session = Session(pair, head, self._stamps, self._reboots)
         try:
             session.poll_once()
         except BaseException as error:  # whatever it was goes on to the caller; the line is not left open
@@ -232,7 +240,7 @@ class DynamixelHead(Reporting):
         except DriverError as error:
             if str(error) != str(self._absence.error):
                 log.warning("%s: still away: %s", self.settings.port, error)
-            self._absence.note(error, time.monotonic())
+            self._absence.note(error, self._clock.now_s())
             return
         log.warning("%s is back: limits and modes checked, the head stands still", self.settings.port)
         self._session, self._motions = session, [axis.motion for axis in session.pair.axes]
@@ -243,7 +251,7 @@ class DynamixelHead(Reporting):
         with suppress(LineLost):
             session.pair.brake()
         session.pair.close()
-        now_s = time.monotonic()
+        now_s = self._clock.now_s()
         self._session = None
         self._absence.note(error, now_s, self.settings.silence_s)
         log.warning("%s; trying again in %.1f s", error, self._absence.again_s - now_s)

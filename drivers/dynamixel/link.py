@@ -12,11 +12,11 @@ is of its question:
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 
+from drivers.clock import Clock
 from drivers.dynamixel.exchange import Exchange
 from drivers.dynamixel.group import (
     GroupAnswer,
@@ -32,6 +32,7 @@ from drivers.dynamixel.packets import BROADCAST_ID, PING, REBOOT, WRITE, Status,
 from drivers.dynamixel.port import QUIET_S, Port
 from drivers.dynamixel.tick_counters import TickCounters
 from drivers.errors import BadReply, DriverError, LineLost, Refused
+from drivers.serial_line import OpenLine, SerialLine
 
 REPLY_TIMEOUT_S = 0.05  # USB adapters hold bytes back for up to 16 ms, the servo for up to 0.5 ms
 
@@ -62,9 +63,13 @@ class Link:
         How long a reply may take beyond its time on the wire.
     urgent
         As of `Port`, whose ``Overtaken`` every method may raise but `shout`.
+    clock, open_line
+        As of `Port`.
 
     Attributes
     ----------
+    clock
+        That of its deadlines.
     exchange
         Asks one servo; its answers are proven by nothing.
 
@@ -80,9 +85,13 @@ class Link:
         baud: int,
         reply_timeout_s: float = REPLY_TIMEOUT_S,
         urgent: Callable[[], bool] = lambda: False,
+        *,
+        clock: Clock | None = None,
+        open_line: OpenLine = SerialLine,
     ) -> None:
         self.name = port
-        self._port = Port(port, baud, reply_timeout_s, urgent)
+        self._port = Port(port, baud, reply_timeout_s, urgent, clock=clock, open_line=open_line)
+        self.clock = self._port.clock
         self.exchange = Exchange(self._port)
         self._counters = TickCounters(self.exchange)
         self._group_questions: dict[tuple[bool, tuple[Part, ...]], GroupQuestion] = {}
@@ -123,7 +132,7 @@ class Link:
         """
         port = self._port
         port.send(instruction_packet(BROADCAST_ID, PING), 0)
-        port.deadline_s = time.monotonic() + port.reply_timeout_s + 253 * (0.003 + 14 * port.byte_s)
+        port.deadline_s = self.clock.now_s() + port.reply_timeout_s + 253 * (0.003 + 14 * port.byte_s)
         found: dict[int, Pinged] = {}
         before, understood = port.received_bytes, 0
         while (status := port.receive()) is not None:
@@ -242,14 +251,14 @@ class Link:
         if question is None:
             question = self._group_questions[key] = group_question(fast, parts)
         if (unmet := self._counters.unmet(question)) is not None:
-            now_s = time.monotonic()
+            now_s = self.clock.now_s()
             return GroupAnswer({}, dict.fromkeys(question.parts, unmet), now_s, now_s)
         try:
             sent_s = self._port.send(question.packet, question.reply_bytes)
             statuses, wrong = (self._fast_replies if fast else self._replies)(question, sent_s)
         except LineLost as error:
             raise self.exchange.placed(error, list(question.parts), "group read") from error
-        received_s = time.monotonic()
+        received_s = self.clock.now_s()
         missing = {}
         if len(statuses) < len(question.parts):
             for servo_id, part in question.parts.items():

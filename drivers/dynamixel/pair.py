@@ -7,9 +7,9 @@ from __future__ import annotations
 
 import itertools
 import logging
-import time
 from collections.abc import Callable, Sequence
 
+from drivers.clock import Clock
 from drivers.dynamixel.group import GroupAnswer, Part
 from drivers.dynamixel.hardware_errors import Reboots
 from drivers.dynamixel.link import Link
@@ -18,6 +18,7 @@ from drivers.dynamixel.motion import AxisMotion, Sample, motion_blocks
 from drivers.dynamixel.servo import Servo
 from drivers.dynamixel.settings import DynamixelSettings, ServoAxisSettings
 from drivers.errors import DriverError, LineLost
+from drivers.serial_line import OpenLine, SerialLine
 
 log = logging.getLogger(__name__)
 
@@ -50,6 +51,7 @@ class ServoAxis:
 
     def __init__(self, link: Link, name: str, settings: ServoAxisSettings, head: DynamixelSettings) -> None:
         self.settings = settings
+        self._clock = link.clock
         self.servo = Servo(link, name, settings, head)
         self.motion = AxisMotion(self.servo.name, settings, head.settle_s)
         self.hardware_error = ""
@@ -70,7 +72,7 @@ class ServoAxis:
         """Take where the axis stands if it brakes now as its goal; returns that, None if it holds nothing."""
         if not self.motion.holds or self.motion.sample is None:
             return None
-        goal = self.motion.braking_counts(time.monotonic(), self.acceleration_rad_per_s2)
+        goal = self.motion.braking_counts(self._clock.now_s(), self.acceleration_rad_per_s2)
         self.motion.halt(goal)
         return goal
 
@@ -227,13 +229,20 @@ class Pair:
         self.link.close()
 
 
-def ready_pair(head: DynamixelSettings, reboots: Reboots, urgent: Callable[[], bool]) -> Pair:
+def ready_pair(
+    head: DynamixelSettings,
+    reboots: Reboots,
+    urgent: Callable[[], bool],
+    *,
+    clock: Clock | None = None,
+    open_line: OpenLine = SerialLine,
+) -> Pair:
     """Open the line and make both servos ready, without moving them: checked, set up, holding, armed.
 
     Without a watchdog an axis may still be under way: each is told to stand first, whatever the other does.
     An axis whose torque was dropped to set it up holds again if it cannot be made ready.
 
-    ``reboots`` are those done to this head; ``urgent`` is that of `Link`.
+    ``reboots`` are those done to this head; ``urgent``, ``clock`` and ``open_line`` are those of `Link`.
 
     Raises
     ------
@@ -242,7 +251,7 @@ def ready_pair(head: DynamixelSettings, reboots: Reboots, urgent: Callable[[], b
     LineLost, NoReply, WrongDevice, HardwareFault, Refused
         If the servos cannot be reached or do not fit; the line is closed again.
     """
-    link = Link(head.port, head.baud, head.reply_timeout_s, urgent)
+    link = Link(head.port, head.baud, head.reply_timeout_s, urgent, clock=clock, open_line=open_line)
     try:
         pair = Pair(link, head)
         if not head.watchdog_counts:

@@ -6,12 +6,12 @@ Every wait gives way to a stop; a stop itself goes out whatever is under way.
 from __future__ import annotations
 
 import contextlib
-import time
 from collections.abc import Callable, Iterator
 
+from drivers.clock import Clock, SystemClock
 from drivers.dynamixel.packets import Status, take_status
 from drivers.errors import BadReply
-from drivers.serial_line import SerialLine
+from drivers.serial_line import OpenLine, SerialLine
 
 QUIET_S = 0.02  # a USB adapter may hold bytes back for 16 ms
 LONGEST_DRAIN_S = 0.3
@@ -41,13 +41,19 @@ class Port:
         How long a reply may take beyond its time on the wire.
     urgent
         Says that something urgent waits for the line: then nothing more is sent and no wait goes on.
+    clock
+        Deadlines run on it; the machine's when left out. The line's own waits have to end by it too.
+    open_line
+        Opens the line.
 
     Attributes
     ----------
+    clock
+        That of the deadlines.
     suspect
         Whether a reply may still be under way: then it is listened until the line is quiet before sending.
     deadline_s
-        Until when `receive` waits, seconds of CLOCK_MONOTONIC.
+        Until when `receive` waits, seconds of the clock.
     received_bytes
         In all, since the line was opened.
 
@@ -60,16 +66,25 @@ class Port:
     """
 
     def __init__(
-        self, name: str, baud: int, reply_timeout_s: float, urgent: Callable[[], bool] = lambda: False
+        self,
+        name: str,
+        baud: int,
+        reply_timeout_s: float,
+        urgent: Callable[[], bool] = lambda: False,
+        *,
+        clock: Clock | None = None,
+        open_line: OpenLine = SerialLine,
     ) -> None:
         self.name = name
+        self.clock = clock or SystemClock()
         self.reply_timeout_s = reply_timeout_s
         self.suspect = False
         self.deadline_s = 0.0
         self.received_bytes = 0
         self._urgent = urgent
         self._buffer = bytearray()
-        self._line = SerialLine(name, baud)
+        self._open_line = open_line
+        self._line = open_line(name, baud)
 
     @property
     def baud(self) -> int:
@@ -85,7 +100,7 @@ class Port:
         """Open the line anew at another speed. Raises LineLost, BadOptions."""
         self._line.close()
         self._buffer.clear()
-        self._line = SerialLine(self.name, baud)
+        self._line = self._open_line(self.name, baud)
 
     def close(self) -> None:
         """Let go of the line, whatever state it is in."""
@@ -106,7 +121,7 @@ class Port:
         Returns
         -------
         float
-            A moment just before it was sent, seconds of CLOCK_MONOTONIC.
+            A moment just before it was sent, seconds of the clock.
 
         Raises
         ------
@@ -117,12 +132,12 @@ class Port:
         """
         if self.suspect or self._buffer or self._fetch(0.0):
             self.drain()
-        sent_s = time.monotonic()
+        sent_s = self.clock.now_s()
         if self._urgent():
             raise Overtaken
         self._line.write(packet)
         wire_s = (len(packet) + reply_bytes) * self._line.byte_s
-        self.deadline_s = time.monotonic() + self.reply_timeout_s + wire_s
+        self.deadline_s = self.clock.now_s() + self.reply_timeout_s + wire_s
         return sent_s
 
     def send_now(self, data: bytes) -> None:
@@ -138,7 +153,7 @@ class Port:
             status = take_status(self._buffer, fast=fast)
             if status is not None:
                 return status
-            if not self._fetch(max(0.0, self.deadline_s - time.monotonic())):
+            if not self._fetch(max(0.0, self.deadline_s - self.clock.now_s())):
                 status = take_status(self._buffer, at_end=True, fast=fast)
                 self.suspect = self.suspect or status is None
                 return status
@@ -153,13 +168,13 @@ class Port:
         LineLost
             If the line is gone.
         """
-        until_s = time.monotonic() + longest_s
+        until_s = self.clock.now_s() + longest_s
         dropped = len(self._buffer)
         self._buffer.clear()
         while self._fetch(quiet_s):
             dropped += len(self._buffer)
             self._buffer.clear()
-            if time.monotonic() > until_s:
+            if self.clock.now_s() > until_s:
                 raise BadReply(
                     f"{self.name} is never quiet: {dropped} bytes in {longest_s:g} s that nobody wants",
                     detail={"port": self.name},
@@ -168,17 +183,17 @@ class Port:
 
     def _fetch(self, wait_s: float) -> bool:
         """Move bytes that come within ``wait_s`` to the buffer; returns whether any did."""
-        until_s = time.monotonic() + wait_s
+        until_s = self.clock.now_s() + wait_s
         give_way_s = None
         while True:
-            now_s = time.monotonic()
+            now_s = self.clock.now_s()
             if self._urgent():
                 give_way_s = give_way_s or now_s + REPLY_UNDER_WAY_S
             if data := self._line.read(max(0.0, min(until_s - now_s, SLICE_S))):
                 self._buffer += data
                 self.received_bytes += len(data)
                 return True
-            if time.monotonic() >= until_s:
+            if self.clock.now_s() >= until_s:
                 return False
             if give_way_s is not None and now_s >= give_way_s:
                 self.suspect = True

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import itertools
 import logging
-import time
 
 from drivers.dynamixel.group import Part
 from drivers.dynamixel.hardware_errors import Reboots, hardware_fault_words
@@ -129,7 +128,7 @@ class Servo(ServoTable):
             In plain words.
         """
         error = self.get("hardware_error")
-        now_s = time.monotonic()
+        now_s = self._link.clock.now_s()
         if error and self._settings.on_hardware_error == "reboot" and reboots.left(now_s):
             log.warning("%s: %s; rebooting it", self.name, ", ".join(hardware_error_words(error)))
             reboots.note(now_s)
@@ -142,13 +141,13 @@ class Servo(ServoTable):
         """Restart the servo and wait until it answers; torque drops. Raises NoReply, LineLost."""
         self._link.reboot(self._servo_id)
         self.truth.forget()
-        until_s = time.monotonic() + REBOOT_S
+        until_s = self._link.clock.now_s() + REBOOT_S
         while True:
             try:
                 self.get("model_number")
                 return
             except (NoReply, BadReply):
-                if time.monotonic() > until_s:
+                if self._link.clock.now_s() > until_s:
                     raise
 
     def look(self) -> Sample:
@@ -335,9 +334,9 @@ class Servo(ServoTable):
 
     def _come_to_rest(self) -> int:
         """Wait until the axis stands (it may have been falling) and hold it there; returns the goal."""
-        until_s = time.monotonic() + COME_TO_REST_S
+        until_s = self._link.clock.now_s() + COME_TO_REST_S
         sample = self.look()
-        while abs(sample.values["present_velocity"]) > 1 and time.monotonic() < until_s:
+        while abs(sample.values["present_velocity"]) > 1 and self._link.clock.now_s() < until_s:
             sample = self.look()
         low, high = self._settings.limit_counts
         goal = min(max(sample.counts, low), high)

@@ -7,7 +7,7 @@ begins a new one.
 from __future__ import annotations
 
 import logging
-import time
+import math
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 
@@ -37,23 +37,24 @@ class Session:
     head
         What the configuration says.
     clock
-        Stamps the readings.
+        Stamps the readings; deadlines run on that of the pair's line.
     reboots
         Done to this head, over all its lines.
 
     Attributes
     ----------
     poll_due_s
-        When the servos want to be read again, seconds of CLOCK_MONOTONIC.
+        When the servos want to be read again, seconds of the line's clock.
     """
 
     def __init__(self, pair: Pair, head: DynamixelSettings, clock: Clock, reboots: Reboots) -> None:
         self.pair = pair
         self.poll_due_s = 0.0
         self._head = head
-        self._clock = clock
+        self._stamps = clock
+        self._clock = pair.link.clock
         self._watch = Watch(pair, head, reboots)
-        self._polled_s = 0.0
+        self._polled_s = -math.inf
         self._failed_polls = 0
 
     def look(self) -> None:
@@ -71,14 +72,14 @@ class Session:
 
     def _poll(self) -> None:
         """Poll both servos, repeating what a bad line spoilt; raises as `look`."""
-        began_s = time.monotonic()
+        began_s = self._clock.now_s()
         for attempt in range(1, ATTEMPTS + 1):
             try:
                 self.poll_once()
             except LineLost as error:
                 raise GivenUp(error) from None
             except DriverError as error:
-                self._polled_s = time.monotonic()
+                self._polled_s = self._clock.now_s()
                 self.poll_due_s = self._polled_s + 1 / self._head.poll_hz
                 if attempt < ATTEMPTS and self._polled_s - began_s < PATIENCE_S:
                     continue
@@ -100,7 +101,7 @@ class Session:
             As `Pair.samples` and `ServoAxis.go_on`.
         """
         samples = self.pair.samples()
-        now_s = time.monotonic()
+        now_s = self._clock.now_s()
         gap_s, self._polled_s = now_s - self._polled_s, now_s
         self.poll_due_s = now_s + 1 / self._head.poll_hz
         for axis, sample in zip(self.pair.axes, samples, strict=True):
@@ -117,7 +118,7 @@ class Session:
     def read(self) -> Reading:
         """Return what both servos measure now; raises as `look`."""
         self.look()
-        now_s = time.monotonic()
+        now_s = self._clock.now_s()
         motions = [axis.motion for axis in self.pair.axes]
         samples = [motion.sample for motion in motions if motion.sample is not None]
         pan, tilt = (
@@ -127,7 +128,7 @@ class Session:
         received_s = max(sample.received_s for sample in samples)
         wire_s = min(0.5 * (received_s - min(sample.sent_s for sample in samples)), now_s)
         moving = not all(motion.settled(now_s) for motion in motions)
-        stamp_s = self._clock.now_s() - (now_s - received_s) - wire_s
+        stamp_s = self._stamps.now_s() - (now_s - received_s) - wire_s
         return Reading(pan, tilt, moving, stamp_s, self._watch.faults(now_s))
 
     def move(self, angles_rad: Sequence[float], speed_rad_per_s: float) -> None:
@@ -220,10 +221,10 @@ class Session:
             self.pair.brake()
         except LineLost as error:
             return dict.fromkeys(self.pair.axes, error)
-        until_s = time.monotonic() + STOP_PATIENCE_S
+        until_s = self._clock.now_s() + STOP_PATIENCE_S
         # the one that was heard of last first: it is the one that will answer
         waiting = sorted(self.pair.axes, key=lambda axis: -axis.motion.heard_s)
-        while waiting and (not failed or time.monotonic() < until_s):
+        while waiting and (not failed or self._clock.now_s() < until_s):
             for axis in tuple(waiting):
                 try:
                     self._confirm(axis)

@@ -5,8 +5,6 @@ A reply that holds its servo's counter is of its question if the counter shows t
 
 from __future__ import annotations
 
-import time
-
 from drivers.dynamixel.counter import Counter
 from drivers.dynamixel.exchange import Exchange
 from drivers.dynamixel.group import GroupQuestion
@@ -23,6 +21,7 @@ class TickCounters:
 
     def __init__(self, exchange: Exchange) -> None:
         self._exchange = exchange
+        self._clock = exchange.port.clock
         self._known: dict[int, Counter] = {}
 
     def forget(self, servo_id: int) -> None:
@@ -48,7 +47,7 @@ class TickCounters:
             return None
         at = question.ticks[servo_id]
         tick = int.from_bytes(status.data[at : at + 2], "little")
-        doubts = self._known[servo_id].doubts(tick, sent_s, time.monotonic())
+        doubts = self._known[servo_id].doubts(tick, sent_s, self._clock.now_s())
         if not doubts:
             return None
         self._exchange.stray(status)
@@ -73,9 +72,9 @@ class TickCounters:
         """The counter in a reply of so many bytes around it, and when that was asked and came."""
         before, after = shape
         self._exchange.quiet(QUIET_S)
-        sent_s = time.monotonic()
+        sent_s = self._clock.now_s()
         data = self._exchange.read(servo_id, address - before, before + 2 + after, "realtime_tick")
-        return int.from_bytes(data[before : before + 2], "little"), sent_s, time.monotonic()
+        return int.from_bytes(data[before : before + 2], "little"), sent_s, self._clock.now_s()
 
     def _bad(self, servo_id: int, word: str, words: str) -> BadReply:
         return BadReply(

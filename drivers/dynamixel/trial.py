@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
@@ -181,7 +180,7 @@ def _restored(table: ServoTable, values: Mapping[str, int]) -> Iterator[None]:
 def _step(link: Link, table: ServoTable, model: Model, goal: int, fence: tuple[int, int]) -> TrialStep:
     """Watch one short move to its end."""
     block = Block(model.registers, "goal_velocity", "present_temperature")
-    began_s = time.monotonic()
+    began_s = link.clock.now_s()
     most = 0
     still = 0
     while True:
@@ -197,10 +196,10 @@ def _step(link: Link, table: ServoTable, model: Model, goal: int, fence: tuple[i
                 f"(allowed {fence[0]} to {fence[1]}); it is stopped"
             )
         still = still + 1 if abs(values["present_velocity"]) <= 1 and not values["moving_status"] & 2 else 0
-        elapsed_s = time.monotonic() - began_s
+        elapsed_s = link.clock.now_s() - began_s
         if (still >= 5 and elapsed_s > 0.2) or elapsed_s > 10.0:
             break
-        time.sleep(POLL_S)
+        link.clock.sleep(POLL_S)
     left = abs(values["present_position"] - goal)
     if left > max(abs(fence[1] - fence[0]) / 16, 4):
         raise HardwareFault(

@@ -6,7 +6,7 @@ Looked for in registers that a poll does not read, and in the alert bit that it 
 from __future__ import annotations
 
 import logging
-import time
+import math
 from collections.abc import Sequence
 
 from drivers.dynamixel.hardware_errors import Reboots, hardware_fault_words
@@ -54,11 +54,12 @@ class Watch:
         self._pair = pair
         self._head = head
         self._reboots = reboots
-        self._looked_s = 0.0
+        self._clock = pair.link.clock
+        self._looked_s = -math.inf
 
     def look_soon(self) -> None:
         """Have the next `look` look: the servos may have stopped by themselves."""
-        self._looked_s = 0.0
+        self._looked_s = -math.inf
 
     def look(self) -> None:
         """Look now and then, and after every silence, whether a watchdog has tripped or torque is gone.
@@ -70,7 +71,7 @@ class Watch:
         NoReply, Refused, LineLost, BadReply
             If a servo cannot be asked.
         """
-        now_s = time.monotonic()
+        now_s = self._clock.now_s()
         errors = any(axis.hardware_error for axis in self._pair.axes)
         expected = (
             self.tripped or errors or not any(axis.motion.other_goal_words() for axis in self._pair.axes)
@@ -126,7 +127,7 @@ class Watch:
         """Arm both watchdogs; raises as `Pair.arm`."""
         self._pair.arm()
         if self._head.watchdog_counts:
-            self._looked_s = time.monotonic()
+            self._looked_s = self._clock.now_s()
 
     def arm_axis(self, axis: ServoAxis) -> None:
         """Arm one watchdog; raises as `Servo.set`."""
@@ -168,7 +169,7 @@ class Watch:
                 if not one.hardware_error:
                     raise
         log.error("%s", words)
-        if axis.settings.on_hardware_error == "reboot" and self._reboots.left(time.monotonic()):
+        if axis.settings.on_hardware_error == "reboot" and self._reboots.left(self._clock.now_s()):
             raise GivenUp(HardwareFault(words, detail={"hardware_error": error}))
 
     def check_free(self) -> None:

@@ -5,16 +5,17 @@ For one thread and a line that no daemon holds. Nothing here moves a servo; `tri
 
 from __future__ import annotations
 
-import time
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 
+from drivers.clock import Clock
 from drivers.dynamixel.link import Link, Pinged
 from drivers.dynamixel.models import BAUD_RATES, MODELS_BY_NUMBER, Model, hardware_error_words
 from drivers.dynamixel.register_words import register_words
 from drivers.dynamixel.servo_table import ServoTable, again, identified
 from drivers.errors import BadOptions, NoReply, Refused, WrongDevice
+from drivers.serial_line import OpenLine, SerialLine
 
 HIGHEST_ID = 252
 
@@ -40,8 +41,14 @@ class Scan:
     garbled: tuple[int, ...]
 
 
-def scan(port: str, bauds: Sequence[int], reply_timeout_s: float) -> Scan:
-    """Ask at every baud rate who is there.
+def scan(
+    port: str,
+    bauds: Sequence[int],
+    reply_timeout_s: float,
+    clock: Clock | None = None,
+    open_line: OpenLine = SerialLine,
+) -> Scan:
+    """Ask at every baud rate who is there; ``clock`` and ``open_line`` are those of `Link`.
 
     Raises
     ------
@@ -51,7 +58,7 @@ def scan(port: str, bauds: Sequence[int], reply_timeout_s: float) -> Scan:
     found: list[FoundServo] = []
     garbled: list[int] = []
     for baud in bauds:
-        link = Link(port, baud, reply_timeout_s)
+        link = Link(port, baud, reply_timeout_s, clock=clock, open_line=open_line)
         try:
             pings, noise = link.ping_all()
             if noise:
@@ -163,7 +170,7 @@ def set_id(link: Link, old: int, new: int, new_baud: int | None = None, *, torqu
         _confirm(link, new, model, f"servo {old} did not take the id {new}")
     if new_baud is not None and new_baud != link.baud:
         _change(link, new, model, "baud", codes[new_baud])
-        time.sleep(0.05)  # the servo changes its rate after its answer
+        link.clock.sleep(0.05)  # the servo changes its rate after its answer
         link.set_baud(new_baud)
         _confirm(link, new, model, f"servo {new} does not answer at {new_baud} baud")
 

@@ -317,3 +317,28 @@ def test_a_turn_is_kept_while_its_thread_waits_on_the_clock_and_may_be_taken_twi
     assert order == ["one began", "free False", "one ended", "two began", "two ended"]
     assert clock.now_s() == 2.0
     assert turn.acquire(blocking=False)
+
+
+def test_a_signal_of_the_machines_clock_wakes_all_who_wait_and_nobody_twice() -> None:
+    signal, told = SystemClock().signal(), []
+
+    def waits() -> None:
+        with signal:
+            told.append("waits")
+            told.append(str(signal.wait(LONG_S)))
+
+    with signal:
+        assert not signal.wait(0.001)
+        assert not signal.wait(-1.0), "a moment that has passed"
+        signal.notify_all()  # nobody waits any more
+        assert not signal.wait(0.001), "what was told before is not told again"
+    threads = [threading.Thread(target=waits, daemon=True) for _ in range(3)]
+    for thread in threads:
+        thread.start()
+    while True:
+        with signal:
+            if told.count("waits") == 3:
+                signal.notify_all()
+                break
+    ended(threads)
+    assert told == ["waits"] * 3 + ["True"] * 3

@@ -1,30 +1,34 @@
-"""A Dynamixel head on simulated servos behind a pseudo terminal, and what only the tester knows about it.
+"""A Dynamixel head on simulated servos behind a line in memory, and what only the tester knows about it.
 
-The simulator's registers and packets are its own (``drivers/sim/wire``), not the driver's.
+The simulator's registers and packets are its own (``drivers/sim/wire``), not the driver's. Everything runs on
+a clock that is turned: the test computes in its turn, and time passes only while it waits on that clock. With
+``real`` the line is a pseudo terminal and the clock the machine's, for what only a kernel can show.
 """
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
-from drivers.clock import SystemClock
+from drivers.clock import Clock, SystemClock
 from drivers.dynamixel.head import DynamixelHead, open_head
 from drivers.errors import DriverError
 from drivers.faults import FaultPanel
 from drivers.interfaces import PanTilt, Reading
+from drivers.serial_line import OpenLine, SerialLine
 from drivers.sim.pan_tilt import AxisSettings
 from drivers.sim.wire.axis import WireAxis
 from drivers.sim.wire.dynamixel_bus import DynamixelBus
 from drivers.sim.wire.dynamixel_packets import Instruction, InstructionParser
 from drivers.sim.wire.dynamixel_servo import SimulatedServo
 from drivers.sim.wire.line import PtyLine
+from drivers.sim.wire.memory_line import MemoryLine
+from drivers.simulation_clock import SimulationClock
+from hil_tests.drivers.turned import START_S, Turned
 
 COUNT_RAD = 2 * 3.141592653589793 / 4096
-LONG_S = 20.0
 SLOW_TO_BRAKE, QUICK_TO_BRAKE = (AxisSettings(COUNT_RAD, 0.0, -3.0, 3.0, 1.0, a) for a in (4.0, 20.0))
 X = "xm430_w350"
 
@@ -42,18 +46,31 @@ class Ear:
 
 
 @dataclass
-class Rig:
+class Rig(Turned):
     """Servos, what turns on them, their line, its faults, and the options of a head that drives them."""
 
+    clock: Clock
     axes: tuple[WireAxis, WireAxis]
     servos: list[SimulatedServo]
-    line: PtyLine
+    line: MemoryLine | PtyLine
     options: dict[str, Any]
     panel: FaultPanel
     ear: Ear = field(default_factory=Ear)
 
+    @property
+    def open_line(self) -> OpenLine:
+        return SerialLine if isinstance(self.line, PtyLine) else self.line.open
+
     def open(self, **changes: Any) -> DynamixelHead:
-        return open_head({**self.options, **changes})
+        return open_head({**self.options, **changes}, self.clock, self.open_line)
+
+    def angle_rad(self, axis: int) -> float:
+        """Where an axis truly stands."""
+        return self.axes[axis].angle_rad(self.now_s())
+
+    def speed_rad_per_s(self, axis: int) -> float:
+        """How fast an axis truly turns."""
+        return self.axes[axis].velocity_rad_per_s(self.now_s())
 
 
 @contextmanager
@@ -62,9 +79,10 @@ def rig(
     starts_rad: tuple[float, float] = (0.0, 0.0),
     pan: dict[str, int] | None = None,
     mechanism: AxisSettings = QUICK_TO_BRAKE,
+    real: bool = False,
 ) -> Iterator[Rig]:
     """Two servos of a 12-bit or other kind; ``pan`` are initial registers of the pan servo."""
-    clock = SystemClock()
+    clock = SystemClock() if real else SimulationClock(start_s=START_S)
     now_s = clock.now_s()
     panel, ear = FaultPanel(clock.now_s, ()), Ear()
     axes = (
@@ -76,16 +94,20 @@ def rig(
         SimulatedServo(model, i + 1, axis, settings={"baud_rate": 3, **extra[i]}, time_s=now_s)
         for i, (model, axis) in enumerate(zip(models, axes, strict=True))
     ]
-    with PtyLine(DynamixelBus(servos), clock, panel, wire_time=False, observer=ear) as line:
+    make = PtyLine if real else MemoryLine
+    with (
+        clock.at_work(),
+        make(DynamixelBus(servos), clock, panel, wire_time=False, observer=ear) as line,
+    ):
         options = {
             "port": line.path,
             "pan": {"id": 1, "model": models[0], "limits_rad": [-2.5, 2.5]},
             "tilt": {"id": 2, "model": models[1], "limits_rad": [-1.2, 1.0]},
             "reply_timeout_s": 0.1,
             "acceleration_rad_per_s2": 15.0,
-            "watchdog_s": 0.4,  # the machine may be busy
+            "watchdog_s": 0.4,
         }
-        yield Rig(axes, servos, line, options, panel, ear)
+        yield Rig(clock, axes, servos, line, options, panel, ear)
 
 
 @contextmanager
@@ -98,25 +120,6 @@ def opened(**how: Any) -> Iterator[tuple[Rig, DynamixelHead]]:
             yield it, head
         finally:
             head.close()
-
-
-def until(true: Callable[[], Any], what: str) -> Any:
-    """Wait for something that must come."""
-    end_s = time.monotonic() + LONG_S
-    while time.monotonic() < end_s:
-        if found := true():
-            return found
-        time.sleep(0.005)
-    raise AssertionError(f"{what} did not come in {LONG_S:g} s")
-
-
-def settled(head: PanTilt) -> Reading:
-    def look() -> Reading | None:
-        reading = head.read()
-        return None if reading.moving else reading
-
-    found: Reading = until(look, "rest")
-    return found
 
 
 def read_or_none(head: PanTilt) -> Reading | None:

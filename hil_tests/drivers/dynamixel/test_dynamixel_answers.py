@@ -1,12 +1,11 @@
 """Every answer is of its question: servos on a line that repeats, holds back or misnames their replies.
 
 A status packet tells who speaks and not what was asked. The lines here are the worst there can be: the
-order of the bytes is set by hand, so that nothing depends on how quick the machine is.
+order of the bytes is set by hand.
 """
 
 from __future__ import annotations
 
-import time
 from collections import deque
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
@@ -14,8 +13,7 @@ from functools import partial
 
 import pytest
 
-from drivers.clock import SystemClock
-from drivers.dynamixel.head import open_head
+from drivers.dynamixel.head import DynamixelHead, open_head
 from drivers.errors import DriverError
 from drivers.faults import FaultPanel
 from drivers.interfaces import Reading
@@ -24,8 +22,11 @@ from drivers.sim.wire.axis import WireAxis
 from drivers.sim.wire.dynamixel_bus import DynamixelBus
 from drivers.sim.wire.dynamixel_packets import unstuffed
 from drivers.sim.wire.dynamixel_servo import VOLTAGE, SimulatedServo
-from drivers.sim.wire.line import PtyLine, Reply
-from hil_tests.drivers.dynamixel.dynamixel_rig import failed, until
+from drivers.sim.wire.line import Reply
+from drivers.sim.wire.memory_line import MemoryLine
+from drivers.simulation_clock import SimulationClock
+from hil_tests.drivers.dynamixel.dynamixel_rig import failed
+from hil_tests.drivers.turned import START_S, Turned
 
 COUNT_RAD = 2 * 3.141592653589793 / 4096
 MECHANISM = AxisSettings(COUNT_RAD, 0.0, -3.0, 3.0, 1.0, 20.0)
@@ -94,11 +95,11 @@ class Telling(Line):
         return replies
 
 
-class Servos:
+class Servos(Turned):
     """Two servos fresh from the factory, and how often they were rebooted."""
 
     def __init__(self) -> None:
-        self.clock = SystemClock()
+        self.clock = SimulationClock(start_s=START_S)
         self.panel = FaultPanel(self.clock.now_s, ())
         now_s = self.clock.now_s()
         self.axes = [WireAxis(MECHANISM, number=n, time_s=now_s) for n in (0, 1)]
@@ -115,20 +116,26 @@ class Servos:
         self.reboots += 1
         SimulatedServo.reboot(servo, time_s)
 
-    def options(self, path: str, **changes: object) -> dict[str, object]:
+    @contextmanager
+    def opened(self, far_end: Line, **changes: object) -> Iterator[DynamixelHead]:
+        """A head that has opened over a line with this end."""
         ends = [
             {"id": n, "model": "XM430-W350", "limits_rad": [-1.0, 1.0], "on_hardware_error": "reboot"}
             for n in (1, 2)
         ]
-        return {
-            "port": path, "pan": ends[0], "tilt": ends[1], "reply_timeout_s": 0.1, "watchdog_s": 0.4,
-            "acceleration_rad_per_s2": 15.0, **changes,
-        }  # fmt: skip
-
-    @contextmanager
-    def line(self, far_end: Line) -> Iterator[PtyLine]:
-        with PtyLine(far_end, self.clock, self.panel, wire_time=False) as line:
-            yield line
+        with (
+            self.clock.at_work(),
+            MemoryLine(far_end, self.clock, self.panel, wire_time=False) as line,
+        ):
+            options = {
+                "port": line.path, "pan": ends[0], "tilt": ends[1], "reply_timeout_s": 0.1,
+                "watchdog_s": 0.4, "acceleration_rad_per_s2": 15.0, **changes,
+            }  # fmt: skip
+            head = open_head(options, self.clock, line.open)
+            try:
+                yield head
+            finally:
+                head.close()
 
 
 def counts_of(reading: Reading) -> tuple[int, int]:
@@ -150,33 +157,29 @@ def as_configured(servo: SimulatedServo) -> bool:
 @pytest.mark.parametrize("lag", [1, 2, 3, 4, 5])
 def test_a_head_whose_every_answer_is_repeated_later_opens_as_it_should(lag: int) -> None:
     it = Servos()
-    with it.line(Repeating(it.bus, lag)) as line:
-        head = open_head(it.options(line.path))
+    with it.opened(Repeating(it.bus, lag)):
         assert all(as_configured(servo) for servo in it.servos)
-        head.close()
     assert it.reboots == 0
 
 
 @pytest.mark.parametrize("lag", [1, 2, 3, 4, 5])
 def test_a_head_whose_every_answer_comes_questions_late_is_not_opened(lag: int) -> None:
     it = Servos()
-    with it.line(HoldingBack(it.bus, lag)) as line, pytest.raises(DriverError):
-        open_head(it.options(line.path, reply_timeout_s=0.02)).close()
+    with pytest.raises(DriverError), it.opened(HoldingBack(it.bus, lag), reply_timeout_s=0.02):
+        pass
     assert it.reboots == 0
 
 
 @pytest.mark.parametrize("lag", [1, 2, 3])
 def test_a_servo_that_is_rebooted_for_an_error_is_taken_for_no_other_and_has_no_other(lag: int) -> None:
     it = Servos()
-    with it.line(Repeating(it.bus, lag)) as line:
-        head = open_head(it.options(line.path))
+    with it.opened(Repeating(it.bus, lag)) as head:
         told = set()
         it.servos[0].raise_error(VOLTAGE)
-        until(lambda: failed(head), "the error")
+        it.until(lambda: failed(head), "the error")
         while (error := failed(head)) is not None:
             told.add(str(error))
-            time.sleep(0.002)
-        head.close()
+            it.clock.sleep(0.002)
     assert all("hardware error 0x01" in words for words in told), told
     assert it.reboots == 1
 
@@ -185,8 +188,7 @@ def test_what_was_lost_is_not_filled_in_from_another_moment() -> None:
     it = Servos()
     it.bus.waits_for_predecessor = False
     far_end = Telling(it.bus)
-    with it.line(far_end) as line:
-        head = open_head(it.options(line.path, speed_rad_per_s=1.0))
+    with it.opened(far_end, speed_rad_per_s=1.0) as head:
         head.move(0.9, 0.9)
         seen = set()
         while len(seen) < 20:
@@ -198,7 +200,6 @@ def test_what_was_lost_is_not_filled_in_from_another_moment() -> None:
                 )
             if not far_end.lose and reading.moving is False:
                 head.move(-reading.pan_rad, -reading.tilt_rad)
-        head.close()
     assert seen <= far_end.told
 
 
@@ -207,8 +208,7 @@ def test_a_reply_of_pan_under_the_id_of_tilt_is_no_reading(probability: float) -
     it = Servos()
     it.bus.waits_for_predecessor = False
     far_end = Telling(it.bus)
-    with it.line(far_end) as line:
-        head = open_head(it.options(line.path))
+    with it.opened(far_end) as head:
         head.move(0.9, -0.9)
         it.panel.set("pan_tilt", "misnamed", replies=1000, probability=probability, seed=3)
         seen, failed = set(), 0
@@ -222,6 +222,5 @@ def test_a_reply_of_pan_under_the_id_of_tilt_is_no_reading(probability: float) -
                     (2048 + round(reading.pan_rad / COUNT_RAD), 2048 + round(reading.tilt_rad / COUNT_RAD))
                 )
         it.panel.clear()
-        head.close()
     assert seen <= far_end.told
     assert seen if probability < 1 else failed == 60

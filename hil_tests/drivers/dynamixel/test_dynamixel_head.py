@@ -1,7 +1,8 @@
-"""A Dynamixel head on simulated servos behind a pseudo terminal: start-up, faults, watchdog, unplugging.
+"""A Dynamixel head on simulated servos, on a turned clock: start-up, faults, watchdog, unplugging.
 
-The simulator's registers and packets are its own (``drivers/sim/wire``), not the driver's. Nothing is timed:
-what must happen is waited for, and a wait that is long enough for a busy machine ends in a failure.
+The simulator's registers and packets are its own (``drivers/sim/wire``), not the driver's. On a real pseudo
+terminal and the machine's clock are a plug that is pulled under way, the process that is killed, the lock of
+a line that is taken, and what closing leaves open: the kernel has its part in each.
 """
 
 from __future__ import annotations
@@ -11,7 +12,6 @@ import multiprocessing as mp
 import os
 import signal
 import threading
-import time
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -36,16 +36,14 @@ from drivers.interfaces import PanTilt
 from drivers.sim.wire.dynamixel_servo import HEAT, OVERLOAD
 from hil_tests.drivers.dynamixel.dynamixel_rig import (
     COUNT_RAD,
-    LONG_S,
     SLOW_TO_BRAKE,
     X,
     failed,
     opened,
     read_or_none,
     rig,
-    settled,
-    until,
 )
+from hil_tests.waiting import NET_S
 
 # Start-up
 
@@ -59,7 +57,7 @@ def test_start_up_sets_the_servos_and_moves_neither(models: tuple[str, str]) -> 
         reading = head.read()
         assert reading.pan_rad == pytest.approx(0.4, abs=COUNT_RAD)
         assert reading.tilt_rad == pytest.approx(-0.3, abs=COUNT_RAD)
-        now_s = time.monotonic()
+        now_s = it.now_s()
         assert [axis.angle_rad(now_s) for axis in it.axes] == [0.4, -0.3]
         for servo, (low, high) in zip(it.servos, ((-2.5, 2.5), (-1.2, 1.0)), strict=True):
             table, count_rad, zero = servo.table, servo.model.count_rad, servo.model.zero_counts
@@ -103,8 +101,8 @@ def test_what_does_not_fit_is_refused_in_words_and_the_line_is_let_go(
         options = {**it.options, **{k: {**it.options[k], **v} for k, v in changes.items()}}
         for _ in range(2):  # the second time shows that the port was let go
             with pytest.raises((WrongDevice, NoReply), match=words):
-                open_head(options)
-        now_s = time.monotonic()
+                it.open(**options)
+        now_s = it.now_s()
         assert [axis.angle_rad(now_s) for axis in it.axes] == list(how.get("starts_rad", (0.0, 0.0)))
 
 
@@ -139,9 +137,9 @@ def test_a_hardware_error_at_the_start_is_refused_or_rebooted_as_configured() ->
 def test_an_axis_that_droops_below_its_limit_is_not_locked_out() -> None:
     with opened(starts_rad=(2.5 + 2 * COUNT_RAD, -1.2 - 3 * COUNT_RAD)) as (it, head):
         assert [servo.table["goal_position"] for servo in it.servos] == [3677, 1266]  # the limits, inwards
-        assert settled(head).faults == ()
+        assert it.settled(head).faults == ()
         head.move(2.3, -1.0)
-        assert settled(head).tilt_rad == pytest.approx(-1.0, abs=COUNT_RAD)
+        assert it.settled(head).tilt_rad == pytest.approx(-1.0, abs=COUNT_RAD)
 
 
 def test_an_axis_farther_outside_than_it_droops_is_refused() -> None:
@@ -217,13 +215,13 @@ def test_a_profile_that_is_zeroed_under_way_is_noticed_and_put_right(register: s
         it.options["pan"].update(approach="positive", approach_rad=0.3)
         head = it.open()
         head.move(-0.3, 0.0)
-        until(lambda: head.read().pan_rad < -0.2, "motion")
+        it.until(lambda: head.read().pan_rad < -0.2, "motion")
         it.servos[0].table[register] = 0  # as fast as it can
-        error = until(lambda: failed(head), "the fault")
+        error = it.until(lambda: failed(head), "the fault")
         assert "profile" in str(error)
         last_stretch = (2048 - round(0.3 / COUNT_RAD)).to_bytes(4, "little")
         assert not any(last_stretch in one.parameters for _, one in it.ear.heard), "the last stretch went out"
-        until(lambda: read_or_none(head), "the head")
+        it.until(lambda: read_or_none(head), "the head")
         assert it.servos[0].table[register] > 0
         head.close()
 
@@ -232,7 +230,7 @@ def test_a_move_is_sent_with_its_own_speed_and_the_configured_acceleration() -> 
     """XM430: 214.577 rev/min2 and 0.229 rev/min a count (its table in the manufacturer's e-manual)."""
     with opened(options={"acceleration_rad_per_s2": 20.0}) as (it, head):
         head.move(0.2, -0.1, 0.8)
-        settled(head)
+        it.settled(head)
         for servo in it.servos:
             assert servo.table["profile_acceleration"] == math.ceil(20.0 / (214.577 * math.tau / 3600))
             assert servo.table["profile_velocity"] == math.floor(0.8 / (0.229 * math.tau / 60))
@@ -241,7 +239,7 @@ def test_a_move_is_sent_with_its_own_speed_and_the_configured_acceleration() -> 
 def test_both_axes_go_to_the_nearest_count_and_the_report_says_what_is_left() -> None:
     with opened() as (it, head):
         head.move(0.5, -0.3)
-        reading = settled(head)
+        reading = it.settled(head)
         assert reading.pan_rad == pytest.approx(0.5, abs=COUNT_RAD / 2)
         report = head.report()
         for axis, commanded in (("pan", 0.5), ("tilt", -0.3)):
@@ -260,11 +258,11 @@ def test_a_goal_is_approached_from_the_configured_side() -> None:
         it.options["tilt"].update(approach="positive", approach_rad=0.05)
         head = it.open()
         head.move(0.0, 0.5)
-        settled(head)
-        begun_s = time.monotonic()
+        it.settled(head)
+        begun_s = it.now_s()
         head.move(0.0, 0.2)
-        reading = settled(head)
-        way = np.linspace(begun_s, time.monotonic(), 500)
+        reading = it.settled(head)
+        way = np.linspace(begun_s, it.now_s(), 500)
         assert 0.2 - 0.06 < min(it.axes[1].mechanical_rad(moment_s) for moment_s in way) < 0.2 - 0.03
         assert reading.tilt_rad == pytest.approx(0.2, abs=COUNT_RAD)
         assert head.report()["tilt"].side == "positive"
@@ -287,9 +285,9 @@ def test_goals_outside_the_limits_are_refused_before_anything_is_sent(goal: tupl
 def test_stop_brakes_holds_and_forgets_the_goal() -> None:
     with opened() as (it, head):
         head.move(2.0, 0.0)
-        until(lambda: head.read().pan_rad > 0.2, "motion")
+        it.until(lambda: head.read().pan_rad > 0.2, "motion")
         head.stop()
-        reading = settled(head)
+        reading = it.settled(head)
         assert reading.pan_rad < 1.5
         assert head.report()["pan"].commanded_rad is None
         assert it.servos[0].table["torque_enable"] == 1
@@ -303,7 +301,7 @@ def test_stop_may_let_an_axis_go_and_a_move_takes_hold_of_it_again() -> None:
         assert [servo.table["torque_enable"] for servo in it.servos] == [0, 1]
         assert head.read().faults == ()
         head.move(0.3, 0.0)
-        assert settled(head).pan_rad == pytest.approx(0.3, abs=COUNT_RAD)
+        assert it.settled(head).pan_rad == pytest.approx(0.3, abs=COUNT_RAD)
         head.close()
 
 
@@ -324,17 +322,17 @@ def test_the_watchdog_is_fed_while_nobody_calls() -> None:
     with opened() as (it, head):
         head.read()
         before = len(it.ear.heard)
-        until(lambda: len(it.ear.heard) > before + 60, "a second of polls")
+        it.until(lambda: len(it.ear.heard) > before + 60, "a second of polls")
         assert it.servos[0].table["bus_watchdog"] == 20
         assert head.read().faults == ()
 
 
 def test_servos_that_stand_are_read_seldom_and_often_enough_for_their_watchdog() -> None:
     with opened() as (it, head):
-        settled(head)
-        before, began_s = len(it.ear.heard), time.monotonic()
-        until(lambda: len(it.ear.heard) > before + 40, "two seconds of polls")
-        assert time.monotonic() - began_s > 1.0  # a busy machine only makes it longer
+        it.settled(head)
+        before, began_s = len(it.ear.heard), it.now_s()
+        it.until(lambda: len(it.ear.heard) > before + 40, "two seconds of polls")
+        assert 1.0 < it.now_s() - began_s < 3.0
         for reply_timeout_s in (0.01, 0.05, 0.2):
             patient = replace(head.settings, watchdog_s=0.3, reply_timeout_s=reply_timeout_s)
             assert patient.resting_poll_s + reply_timeout_s + QUIET_S < 0.3  # one reply may be lost
@@ -354,43 +352,42 @@ def test_fast_reads_are_used_only_after_they_proved_themselves() -> None:
 def test_a_silent_host_stops_a_motion_and_moving_again_is_deliberate() -> None:
     with opened() as (it, head):
         head.move(2.0, 0.0)
-        until(lambda: head.read().pan_rad > 0.1, "motion")
-        free = threading.Event()
-        tripped = lambda: it.servos[0].table["bus_watchdog"] == 255  # noqa: E731
-        stalled = threading.Thread(target=lambda: head._bus.call("stall", lambda: free.wait(LONG_S), LONG_S))
-        stalled.start()
-        until(tripped, "the watchdog")
+        it.until(lambda: head.read().pan_rad > 0.1, "motion")
+        stalled_s = it.now_s()
+        free = it.gate()
+        stalled = it.beside(lambda: head._bus.call("stall", free.wait, 60.0))
+        it.until(lambda: it.servos[0].table["bus_watchdog"] == 255, "the watchdog")
+        assert 0.4 - 0.1 <= it.now_s() - stalled_s <= 0.4 + 0.02, "it was fed last within a poll before"
         free.set()
-        stalled.join()
-        reading = until(lambda: (r := read_or_none(head)) and r.faults and r, "the fault")
+        stalled.wait()
+        reading = it.until(lambda: (r := read_or_none(head)) and r.faults and r, "the fault")
         assert "watchdog" in reading.faults[0]
         with pytest.raises(WatchdogTripped, match="stop arms it anew"):
             head.move(0.0, 0.0)
-        until(lambda: it.axes[0].velocity_rad_per_s(time.monotonic()) == 0, "rest")
-        stood_rad = it.axes[0].angle_rad(time.monotonic())
+        it.until(lambda: it.speed_rad_per_s(0) == 0, "rest")
+        stood_rad = it.angle_rad(0)
         head.stop()
-        reading = settled(head)
+        reading = it.settled(head)
         assert reading.faults == ()
         assert reading.pan_rad == pytest.approx(stood_rad, abs=2 * COUNT_RAD)  # it did not go on
         head.move(0.1, 0.0)
-        assert settled(head).pan_rad == pytest.approx(0.1, abs=COUNT_RAD)
+        assert it.settled(head).pan_rad == pytest.approx(0.1, abs=COUNT_RAD)
 
 
 def test_a_silent_host_at_rest_has_interrupted_nothing() -> None:
     with opened() as (it, head):
         head.move(0.3, 0.0)
-        settled(head)
-        free = threading.Event()
-        stalled = threading.Thread(target=lambda: head._bus.call("stall", lambda: free.wait(LONG_S), LONG_S))
-        stalled.start()
-        until(lambda: it.servos[0].table["bus_watchdog"] == 255, "the watchdog")
+        it.settled(head)
+        free = it.gate()
+        stalled = it.beside(lambda: head._bus.call("stall", free.wait, 60.0))
+        it.until(lambda: it.servos[0].table["bus_watchdog"] == 255, "the watchdog")
         free.set()
-        stalled.join()
-        until(lambda: it.servos[0].table["bus_watchdog"] == 20, "the watchdog armed again")
-        assert settled(head).faults == ()
-        assert it.axes[0].angle_rad(time.monotonic()) == pytest.approx(0.3, abs=COUNT_RAD)
+        stalled.wait()
+        it.until(lambda: it.servos[0].table["bus_watchdog"] == 20, "the watchdog armed again")
+        assert it.settled(head).faults == ()
+        assert it.angle_rad(0) == pytest.approx(0.3, abs=COUNT_RAD)
         head.move(0.1, 0.0)
-        assert settled(head).pan_rad == pytest.approx(0.1, abs=COUNT_RAD)
+        assert it.settled(head).pan_rad == pytest.approx(0.1, abs=COUNT_RAD)
 
 
 def drive_and_wait(path: str, options: dict[str, Any], ready: Any) -> None:
@@ -404,66 +401,67 @@ def drive_and_wait(path: str, options: dict[str, Any], ready: Any) -> None:
 
 
 def test_a_killed_process_leaves_a_head_that_stops_by_itself() -> None:
-    with rig(mechanism=SLOW_TO_BRAKE) as it:
+    with rig(mechanism=SLOW_TO_BRAKE, real=True) as it:
         del it.options["acceleration_rad_per_s2"], it.options["watchdog_s"]  # as they come
         context = mp.get_context("spawn")
         ready = context.Event()
         process = context.Process(target=drive_and_wait, args=(it.line.path, it.options, ready), daemon=True)
         process.start()
-        assert ready.wait(LONG_S)
+        assert ready.wait(NET_S)
         assert process.pid is not None
-        killed_s = time.monotonic()
+        killed_s = it.now_s()
         os.kill(process.pid, signal.SIGKILL)
         process.join()
-        until(lambda: it.servos[0].table["bus_watchdog"] == 255, "the watchdog")
-        until(lambda: it.axes[0].velocity_rad_per_s(time.monotonic()) == 0, "rest")
+        it.until(lambda: it.servos[0].table["bus_watchdog"] == 255, "the watchdog")
+        it.until(lambda: it.speed_rad_per_s(0) == 0, "rest")
         # What the axis did between is known to the simulator for every moment, whenever we look.
         assert it.axes[0].velocity_rad_per_s(killed_s + 0.5) == 0
-        stood_rad = it.axes[0].angle_rad(time.monotonic())
+        stood_rad = it.angle_rad(0)
         assert stood_rad < 2.0
         head = it.open()  # a new start is deliberate: it arms anew, and does not go on to the old goal
-        assert settled(head).pan_rad == pytest.approx(stood_rad, abs=2 * COUNT_RAD)
+        assert it.settled(head).pan_rad == pytest.approx(stood_rad, abs=2 * COUNT_RAD)
         head.move(0.0, 0.0)
-        assert settled(head).pan_rad == pytest.approx(0.0, abs=COUNT_RAD)
+        assert it.settled(head).pan_rad == pytest.approx(0.0, abs=COUNT_RAD)
         head.close()
 
 
-def test_unplugged_and_plugged_in_again_it_comes_back_without_moving() -> None:
-    with opened() as (it, head):
+@pytest.mark.parametrize("real", [False, True], ids=["turned", "pseudo_terminal"])
+def test_unplugged_and_plugged_in_again_it_comes_back_without_moving(real: bool) -> None:
+    with opened(real=real) as (it, head):
         head.move(2.0, 0.0)
-        until(lambda: head.read().pan_rad > 0.1, "motion")
+        it.until(lambda: head.read().pan_rad > 0.1, "motion")
         it.line.hang_up()
-        error = until(lambda: failed(head), "the fault")
+        error = it.until(lambda: failed(head), "the fault")
         assert isinstance(error, LineLost)
         assert it.line.path in str(error)
         for act in (head.read, head.stop, lambda: head.move(0.0, 0.0)):
             with pytest.raises(LineLost):
                 act()
-        until(lambda: it.servos[0].table["bus_watchdog"] == 255, "the watchdog")
-        until(lambda: it.axes[0].velocity_rad_per_s(time.monotonic()) == 0, "rest")
-        stood_rad = it.axes[0].angle_rad(time.monotonic())
+        it.until(lambda: it.servos[0].table["bus_watchdog"] == 255, "the watchdog")
+        it.until(lambda: it.speed_rad_per_s(0) == 0, "rest")
+        stood_rad = it.angle_rad(0)
         it.line.come_back()
-        reading = until(lambda: read_or_none(head), "the head")
+        reading = it.until(lambda: read_or_none(head), "the head")
         assert reading.pan_rad == pytest.approx(stood_rad, abs=2 * COUNT_RAD)
-        assert settled(head).faults == ()
-        assert it.axes[0].angle_rad(time.monotonic()) == pytest.approx(stood_rad, abs=2 * COUNT_RAD)
+        assert it.settled(head).faults == ()
+        assert it.angle_rad(0) == pytest.approx(stood_rad, abs=2 * COUNT_RAD)
         head.move(0.1, 0.0)
-        assert settled(head).pan_rad == pytest.approx(0.1, abs=COUNT_RAD)
+        assert it.settled(head).pan_rad == pytest.approx(0.1, abs=COUNT_RAD)
 
 
 def test_a_servo_that_lost_its_power_is_set_up_anew() -> None:
     with opened() as (it, head):
         servo = it.servos[1]
-        servo.set_power(False, time.monotonic())
-        assert isinstance(until(lambda: failed(head), "the fault"), DriverError)
-        servo.set_power(True, time.monotonic())
+        servo.set_power(False, it.now_s())
+        assert isinstance(it.until(lambda: failed(head), "the fault"), DriverError)
+        servo.set_power(True, it.now_s())
         assert servo.table["profile_velocity"] == 0  # as fast as it can: must not be left so
-        until(lambda: read_or_none(head), "the head")
+        it.until(lambda: read_or_none(head), "the head")
         assert servo.table["profile_velocity"] > 0
         assert servo.table["torque_enable"] == 1
         assert servo.table["bus_watchdog"] == 20
         head.move(0.0, 0.2)
-        assert settled(head).tilt_rad == pytest.approx(0.2, abs=COUNT_RAD)
+        assert it.settled(head).tilt_rad == pytest.approx(0.2, abs=COUNT_RAD)
 
 
 def test_a_servo_that_is_exchanged_is_refused_when_it_comes_back() -> None:
@@ -472,7 +470,7 @@ def test_a_servo_that_is_exchanged_is_refused_when_it_comes_back() -> None:
         it.servos[0].table["model_number"] = 1120
         it.servos[0].model = it.servos[0].model.__class__(**{**vars_of(it.servos[0].model), "number": 1120})
         it.line.come_back()
-        error = until(lambda: isinstance(e := failed(head), WrongDevice) and e, "the refusal")
+        error = it.until(lambda: isinstance(e := failed(head), WrongDevice) and e, "the refusal")
         assert "XM540-W270" in str(error)
 
 
@@ -483,12 +481,12 @@ def vars_of(instance: Any) -> dict[str, Any]:
 def test_a_hardware_error_is_a_fault_stops_the_other_axis_and_blocks_moves() -> None:
     with opened() as (it, head):
         head.move(2.0, 0.9)
-        until(lambda: head.read().pan_rad > 0.1, "motion")
+        it.until(lambda: head.read().pan_rad > 0.1, "motion")
         it.servos[1].raise_error(OVERLOAD)
-        reading = until(lambda: (r := head.read()).faults and r, "the fault")
+        reading = it.until(lambda: (r := head.read()).faults and r, "the fault")
         assert reading.faults[0].startswith("tilt (servo 2) reports overload (hardware error 0x20)")
         assert "torque is off" in reading.faults[0]
-        assert settled(head).pan_rad < 1.9
+        assert it.settled(head).pan_rad < 1.9
         with pytest.raises(HardwareFault, match="overload"):
             head.move(0.0, 0.0)
         head.stop()  # must work all the same
@@ -500,8 +498,8 @@ def test_a_hardware_error_is_rebooted_away_where_the_configuration_says_so() -> 
             it.options[axis]["on_hardware_error"] = "reboot"
         head = it.open()
         it.servos[0].raise_error(HEAT)
-        until(lambda: failed(head), "the fault")
-        reading = until(lambda: read_or_none(head), "the head")
+        it.until(lambda: failed(head), "the fault")
+        reading = it.until(lambda: read_or_none(head), "the head")
         assert reading.faults == ()
         assert it.servos[0].table["hardware_error_status"] == 0
         assert it.servos[0].table["torque_enable"] == 1
@@ -526,9 +524,9 @@ def test_a_supply_that_stays_low_reboots_a_servo_three_times_and_no_more(
             return sum(one.code == 2 and one.parameters[:2] == b"\0\0" for _, one in it.ear.heard[since:])
 
         reboot = 8
-        until(lambda: codes().count(reboot) >= 3, "three reboots")
+        it.until(lambda: codes().count(reboot) >= 3, "three reboots")
         third = [n for n, code in enumerate(codes()) if code == reboot][2]
-        until(lambda: asked_who(third) > 10, "more tries")
+        it.until(lambda: asked_who(third) > 10, "more tries")
         assert codes().count(reboot) == 3
         assert isinstance(failed(head), HardwareFault)
         head.close()
@@ -537,18 +535,18 @@ def test_a_supply_that_stays_low_reboots_a_servo_three_times_and_no_more(
 def test_a_setting_changed_behind_the_drivers_back_is_noticed_and_put_right() -> None:
     with opened() as (it, head):
         it.servos[0].table["torque_enable"] = 0
-        until(lambda: failed(head), "the fault")
-        until(lambda: read_or_none(head), "the head")
+        it.until(lambda: failed(head), "the fault")
+        it.until(lambda: read_or_none(head), "the head")
         assert it.servos[0].table["torque_enable"] == 1
 
 
 def test_two_heads_cannot_have_one_line() -> None:
-    with opened() as (it, _), pytest.raises(LineLost, match="held by another program"):
+    with opened(real=True) as (it, _), pytest.raises(LineLost, match="held by another program"):
         it.open()
 
 
 def test_closing_leaves_no_thread_and_no_descriptor() -> None:
-    with rig() as it:
+    with rig(real=True) as it:
         it.open().close()
         threads, descriptors = threading.active_count(), len(list(Path("/proc/self/fd").iterdir()))
         for _ in range(3):

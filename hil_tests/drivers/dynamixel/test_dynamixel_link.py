@@ -1,4 +1,8 @@
-"""Each defect of the SDK (facts of the servo layer, section 1), shown to the driver by scripted servos."""
+"""Each defect of the SDK (facts of the servo layer, section 1), shown to the driver by scripted servos.
+
+On a turned clock, but where pyserial or the kernel has its part: baud rates, the lock of a port, a pulled
+plug, sockets and RFC 2217, low-level errors, and waiting that costs no processor time.
+"""
 
 from __future__ import annotations
 
@@ -8,6 +12,7 @@ import termios
 import threading
 import time
 from collections.abc import Callable, Sequence
+from functools import partial
 from types import SimpleNamespace
 
 import pytest
@@ -19,18 +24,19 @@ from drivers.dynamixel.bus import Bus
 from drivers.dynamixel.group import Part
 from drivers.dynamixel.link import Link
 from drivers.dynamixel.models import REGISTERS, Register
-from drivers.dynamixel.port import Port
 from drivers.errors import BadOptions, BadReply, LineLost, NoReply, Refused
 from drivers.serial_line import SerialLine
 from drivers.sim.wire.dynamixel_packets import Instruction, fast_status_packets
 from drivers.sim.wire.line import Reply, TcpLine
-from hil_tests.drivers.dynamixel.scripted_servos import ScriptedServos, number, says, scripted
+from hil_tests.drivers.dynamixel.scripted_servos import BAUD_RATE, ScriptedServos, number, says, scripted
+from hil_tests.drivers.turned import turned
+from hil_tests.waiting import NET_S
 
 X = REGISTERS["X"]
-POSITION, TORQUE, BAUD_RATE = X["present_position"], X["torque_enable"], 1_000_000
+POSITION, TORQUE = X["present_position"], X["torque_enable"]
 PING, READ, WRITE, REBOOT, SYNC_READ, SYNC_WRITE, BULK_READ, BULK_WRITE = 1, 2, 3, 8, 0x82, 0x83, 0x92, 0x93
 FAST_SYNC_READ = 0x8A
-PATIENT_S = 5.0  # where an answer comes: no test depends on the machine's load
+PATIENT_S = NET_S  # where an answer comes
 SHORT_S = 0.03  # where none comes
 BOTH = [Part(1, 132, 4), Part(2, 132, 4)]
 
@@ -48,12 +54,12 @@ def asked(link: Link, servo_id: int, register: Register) -> int:
 
 def test_values_are_signed() -> None:  # defect 15
     with scripted(always(says(1, number(-5)))) as (line, _):
-        assert asked(Link(line.path, BAUD_RATE, PATIENT_S), 1, POSITION) == -5
+        assert asked(line.link(PATIENT_S), 1, POSITION) == -5
 
 
 def test_an_error_without_data_is_an_error_and_no_value() -> None:  # defect 7
     with scripted(always(says(1, error=5))) as (line, _):
-        link = Link(line.path, BAUD_RATE, PATIENT_S)
+        link = line.link(PATIENT_S)
         for register in (TORQUE, POSITION):
             with pytest.raises(Refused, match="wrong length") as caught:
                 asked(link, 1, register)
@@ -65,7 +71,7 @@ def test_an_error_without_data_is_an_error_and_no_value() -> None:  # defect 7
 
 def test_a_missing_servo_is_named_and_the_other_is_read() -> None:  # defect 5
     with scripted(always(says(2, number(77)))) as (line, _):
-        answer = Link(line.path, BAUD_RATE, SHORT_S).group_read(BOTH)
+        answer = line.link(SHORT_S).group_read(BOTH)
     assert isinstance(answer.missing[1], NoReply)
     assert answer.missing[1].detail["servo_id"] == 1
     assert list(answer.missing) == [1]
@@ -74,7 +80,7 @@ def test_a_missing_servo_is_named_and_the_other_is_read() -> None:  # defect 5
 
 def test_group_reads_keep_the_error_byte() -> None:  # defect 6
     with scripted(always(says(1, number(1), error=0x80), says(2, error=7))) as (line, _):
-        answer = Link(line.path, BAUD_RATE, PATIENT_S).group_read(BOTH)
+        answer = line.link(PATIENT_S).group_read(BOTH)
     assert answer.statuses[1].alert
     assert isinstance(answer.missing[2], Refused)
 
@@ -83,7 +89,7 @@ def test_group_reads_keep_the_error_byte() -> None:  # defect 6
 def test_what_is_sent_is_stuffed(value: int) -> None:  # defect 8
     # -131073 is FF FF FD FF: sent as it is, its first three bytes would begin a packet
     with scripted(lambda i, n: [says(i.packet_id)]) as (line, servos):
-        Link(line.path, BAUD_RATE, PATIENT_S).write(1, X["goal_position"], value)
+        line.link(PATIENT_S).write(1, X["goal_position"], value)
     assert servos.heard[0].parameters == number(116, 2) + number(value)
     assert servos.bytes_heard[4:].find(b"\xff\xff\xfd\xff") < 0
 
@@ -91,7 +97,7 @@ def test_what_is_sent_is_stuffed(value: int) -> None:  # defect 8
 def test_stuffed_answers_are_read_right() -> None:
     # a register that itself holds a packet's head
     with scripted(always(says(1, b"\xff\xff\xfd\xff"), says(2, b"\x00\xff\xff\xfd"))) as (line, _):
-        answer = Link(line.path, BAUD_RATE, PATIENT_S).group_read(BOTH)
+        answer = line.link(PATIENT_S).group_read(BOTH)
     assert POSITION.decode(answer.statuses[1].data) == -131073
     assert answer.statuses[2].data == b"\x00\xff\xff\xfd"
 
@@ -101,7 +107,7 @@ def test_a_late_reply_is_not_taken_for_the_next_answer() -> None:  # defect 10
         return [says(1, number(555), delay_s=1.5 * SHORT_S) if count == 0 else says(1, number(2048))]
 
     with scripted(answer) as (line, _):
-        link = Link(line.path, BAUD_RATE, SHORT_S)
+        link = line.link(SHORT_S)
         with pytest.raises(NoReply):
             asked(link, 1, X["present_velocity"])
         link.quiet(4 * SHORT_S)
@@ -111,7 +117,7 @@ def test_a_late_reply_is_not_taken_for_the_next_answer() -> None:  # defect 10
 
 def test_after_a_timeout_the_line_is_listened_to_before_the_next_question() -> None:  # defect 10
     with scripted(always()) as (line, _):
-        link = Link(line.path, BAUD_RATE, SHORT_S)
+        link = line.link(SHORT_S)
         with pytest.raises(NoReply):
             asked(link, 1, POSITION)
         assert link._port.suspect
@@ -126,7 +132,7 @@ def test_what_came_unasked_is_dropped_before_a_question() -> None:
         return [says(1, number(count)), *([extra] if count == 0 else [])]
 
     with scripted(answer) as (line, _):
-        link = Link(line.path, BAUD_RATE, PATIENT_S)
+        link = line.link(PATIENT_S)
         assert asked(link, 1, POSITION) == 0
         assert link._port._buffer or link._port._fetch(PATIENT_S)  # the stray one is there now
         assert asked(link, 1, POSITION) == 1
@@ -134,7 +140,7 @@ def test_what_came_unasked_is_dropped_before_a_question() -> None:
 
 def test_replies_of_others_and_of_other_lengths_are_stepped_over() -> None:
     with scripted(always(says(2, number(1)), says(1, b"\x01"), says(1, number(9)))) as (line, _):
-        link = Link(line.path, BAUD_RATE, PATIENT_S)
+        link = line.link(PATIENT_S)
         assert asked(link, 1, POSITION) == 9
         assert link._port.suspect  # whose replies they were may say more
 
@@ -144,22 +150,25 @@ def test_noise_and_a_broken_packet_before_the_answer_cost_nothing() -> None:
     broken[-1] ^= 1
     noise = Reply(b"\x00\xff\xff\xfd\x00\x01\xff\x00\x55" + bytes(broken))
     with scripted(always(noise, says(1, number(9)))) as (line, _):
-        assert asked(Link(line.path, BAUD_RATE, PATIENT_S), 1, POSITION) == 9
+        assert asked(line.link(PATIENT_S), 1, POSITION) == 9
 
 
-def test_a_line_that_is_never_quiet_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
-    with scripted(always()) as (line, _):
-        port = Port(line.path, BAUD_RATE, SHORT_S)
-        monkeypatch.setattr(port, "_fetch", lambda wait_s: port._buffer.extend(b"x") or True)
-        with pytest.raises(BadReply, match="never quiet"):
-            port.drain(longest_s=0.0)
+def test_a_line_that_is_never_quiet_says_so() -> None:
+    with scripted(always()) as (line, servos):
+        servos.poll = lambda time_s: [Reply(b"x")]  # type: ignore[method-assign]
+        link = line.link(SHORT_S)
+        line.clock.sleep(0.01)
+        began_s = line.now_s()
+        with pytest.raises(BadReply, match=r"never quiet: \d+ bytes in 0\.3 s"):
+            asked(link, 1, POSITION)
+        assert line.now_s() - began_s == pytest.approx(0.3, abs=0.011)
 
 
 def test_a_pulled_plug_is_a_lost_line_and_nothing_stays_busy() -> None:  # defects 1 and 13
-    with scripted(lambda i, n: [says(i.packet_id, number(3))]) as (line, _):
-        link = Link(line.path, BAUD_RATE, PATIENT_S)
+    with scripted(lambda i, n: [says(i.packet_id, number(3))], real=True) as (line, _):
+        link = line.link(PATIENT_S)
         assert asked(link, 1, POSITION) == 3
-        line.hang_up()
+        line.line.hang_up()
         for act in (
             lambda: asked(link, 1, POSITION),
             lambda: link.write(1, TORQUE, 0),
@@ -172,24 +181,24 @@ def test_a_pulled_plug_is_a_lost_line_and_nothing_stays_busy() -> None:  # defec
             assert caught.value.detail["port"] == line.path
             assert caught.value.detail["servo_id"] == 1
         link.close()
-        line.come_back()
-        again = Link(line.path, BAUD_RATE, PATIENT_S)
+        line.line.come_back()
+        again = line.link(PATIENT_S)
         assert asked(again, 1, POSITION) == 3
 
 
 def test_the_port_cannot_be_opened_twice() -> None:  # defect 12
-    with scripted(always()) as (line, _):
-        link = Link(line.path, BAUD_RATE)
+    with scripted(always(), real=True) as (line, _):
+        link = line.link()
         with pytest.raises(LineLost, match="held by another program"):
-            Link(line.path, BAUD_RATE)
+            line.link()
         link.close()
-        Link(line.path, BAUD_RATE).close()
+        line.link().close()
 
 
 @pytest.mark.parametrize("baud", [4_500_000, 10_500_000, 12_345])
 def test_any_baud_rate_is_tried(baud: int) -> None:  # defect 16
-    with scripted(always(says(1, number(8)))) as (line, _):
-        assert asked(Link(line.path, baud, PATIENT_S), 1, POSITION) == 8
+    with scripted(always(says(1, number(8))), real=True) as (line, _):
+        assert asked(line.link(PATIENT_S, baud), 1, POSITION) == 8
 
 
 def test_a_port_that_is_not_there_and_a_url_that_cannot_be(tmp_path: object) -> None:
@@ -253,7 +262,7 @@ class SerialServer:
 
 
 def test_over_rfc2217() -> None:
-    with scripted(always(says(1, number(-7)), says(2, b"\xff\xff\xfd\xff"))) as (line, _):
+    with scripted(always(says(1, number(-7)), says(2, b"\xff\xff\xfd\xff")), real=True) as (line, _):
         server = SerialServer(line.path)
         link = Link(server.url, BAUD_RATE, PATIENT_S)
         assert asked(link, 1, POSITION) == -7
@@ -274,25 +283,25 @@ def test_the_clock_on_the_wall_means_nothing(monkeypatch: pytest.MonkeyPatch) ->
     def steps_back() -> float:
         raise AssertionError("the driver asked for the time of day")
 
-    with scripted(always(says(1, number(1)))) as (line, _):
-        link = Link(line.path, BAUD_RATE, PATIENT_S)
+    with scripted(always(says(1, number(1))), real=True) as (line, _):
+        link = line.link(PATIENT_S)
         monkeypatch.setattr(time, "time", steps_back)
         assert asked(link, 1, POSITION) == 1
 
 
 def test_waiting_costs_no_processor_time() -> None:  # defect 2
-    with scripted(always()) as (line, _):
-        link = Link(line.path, BAUD_RATE, 0.5)
+    with scripted(always(), real=True) as (line, _):
+        link = line.link(0.5)
         before_s = time.thread_time()
         with pytest.raises(NoReply):
             asked(link, 1, POSITION)
-        assert time.thread_time() - before_s < 0.1  # the SDK spins: 0.5 s; load only makes it less
+        assert time.thread_time() - before_s < 0.1  # the SDK spins: 0.5 s
 
 
 def test_group_reads_are_sync_for_equal_blocks_and_bulk_for_others() -> None:
     answer = always(says(1, number(1)), says(2, number(2)))
     with scripted(answer) as (line, servos):
-        link = Link(line.path, BAUD_RATE, PATIENT_S)
+        link = line.link(PATIENT_S)
         link.group_read(BOTH)
         link.group_read([Part(1, 132, 4), Part(2, 580, 4)])
         link.group_write([Part(1, 116, 4, number(-1)), Part(2, 116, 4, number(7))])
@@ -318,7 +327,7 @@ def test_a_fast_group_read_checks_every_block() -> None:
         return [Reply(bytes(spoilt))]
 
     with scripted(answer) as (line, _):
-        link = Link(line.path, BAUD_RATE, PATIENT_S)
+        link = line.link(PATIENT_S)
         good = link.group_read(BOTH, fast=True)
         assert POSITION.decode(good.statuses[1].data) == -3
         assert good.statuses[2].data == b"\xff\xff\xfd\x07"  # not stuffed in a fast answer
@@ -328,9 +337,9 @@ def test_a_fast_group_read_checks_every_block() -> None:
 
 
 def test_calls_of_many_threads_queue_instead_of_failing() -> None:  # defect 11
-    with scripted(lambda i, n: [says(i.packet_id, number(i.packet_id))]) as (line, _):
-        link = Link(line.path, BAUD_RATE, PATIENT_S)
-        bus = Bus(line.path, lambda: time.monotonic() + 60.0)
+    with scripted(lambda i, n: [says(i.packet_id, number(i.packet_id), delay_s=0.001)]) as (line, _):
+        link = line.link(PATIENT_S)
+        bus = Bus(line.path, lambda: line.now_s() + 60.0, line.clock)
         bus.start()
         got: list[tuple[int, int]] = []
 
@@ -338,58 +347,86 @@ def test_calls_of_many_threads_queue_instead_of_failing() -> None:  # defect 11
             for _ in range(30):
                 got.append((servo_id, bus.call("read", lambda: asked(link, servo_id, POSITION), 30.0)))
 
-        threads = [threading.Thread(target=ask, args=(servo_id,)) for servo_id in range(1, 6)]
-        for thread in threads:
-            thread.start()
-        for thread in threads:
-            thread.join()
+        for ended in [line.beside(partial(ask, servo_id)) for servo_id in range(1, 6)]:
+            ended.wait()
         bus.close(link.close, PATIENT_S)
     assert len(got) == 150
     assert all(asked == answered for asked, answered in got)
+    assert len({asked for asked, _ in got[:10]}) == 5, "none waits for all calls of another"
 
 
 def test_a_call_whose_turn_does_not_come_is_never_made() -> None:
+    with turned() as it:
+        bus = Bus("test", lambda: it.now_s() + 60.0, it.clock)
+        bus.start()
+        begun, free = it.gate(), it.gate()
+        made: list[int] = []
+
+        def hang() -> None:
+            begun.set()
+            free.wait()
+
+        hanging = it.beside(lambda: bus.call("hang", hang, 2 * PATIENT_S))
+        begun.wait()
+        began_s = it.now_s()
+        with pytest.raises(NoReply, match="its turn did not come"):
+            bus.call("late", lambda: made.append(1), 0.05)
+        assert it.now_s() == pytest.approx(began_s + 0.05, abs=1e-9)
+        free.set()
+        hanging.wait()
+        bus.call("after", lambda: None, PATIENT_S)
+        bus.close(lambda: None, PATIENT_S)
+        with pytest.raises(NoReply, match="closed"):
+            bus.call("too late", lambda: made.append(2), PATIENT_S)
+        assert made == []
+
+
+def test_a_call_that_hangs_is_told_as_under_way_and_closing_leaves_its_thread_behind(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    with turned() as it:
+        bus = Bus("test", lambda: it.now_s() + 60.0, it.clock)
+        bus.start()
+        free = it.gate()
+        with pytest.raises(NoReply, match=r"hang on test did not end within 0\.5 s: it is still under way"):
+            bus.call("hang", free.wait, 0.5)
+        began_s = it.now_s()
+        bus.close(lambda: None, 2.0)
+        assert it.now_s() == pytest.approx(began_s + 2.0, abs=1e-9)
+        assert "the bus thread hangs and is left behind" in caplog.text
+        free.set()
+
+
+def test_on_the_machines_clock_calls_are_served_and_the_thread_ends() -> None:
     bus = Bus("test", lambda: time.monotonic() + 60.0)
     bus.start()
-    begun, free = threading.Event(), threading.Event()
-    made: list[int] = []
-
-    def hang() -> None:
-        begun.set()
-        free.wait(PATIENT_S)
-
-    hanging = threading.Thread(target=lambda: bus.call("hang", hang, 2 * PATIENT_S))
-    hanging.start()
-    assert begun.wait(PATIENT_S)
-    with pytest.raises(NoReply, match="its turn did not come"):
-        bus.call("late", lambda: made.append(1), 0.05)
-    free.set()
-    hanging.join()
-    bus.call("after", lambda: None, PATIENT_S)
-    bus.close(lambda: None, PATIENT_S)
-    with pytest.raises(NoReply, match="closed"):
-        bus.call("too late", lambda: made.append(2), PATIENT_S)
-    assert made == []
+    assert bus.call("ask", lambda: 7, NET_S) == 7
+    with pytest.raises(NoReply, match=r"did not end within 0\.01 s"):
+        bus.call("hang", lambda: time.sleep(0.1), 0.01)
+    bus.close(lambda: None, NET_S)
+    assert not bus._thread.is_alive()
 
 
 def test_what_goes_wrong_in_the_owner_threads_round_does_not_end_it() -> None:
-    rounds: list[int] = []
+    with turned() as it:
+        rounds: list[float] = []
 
-    def between() -> float:
-        rounds.append(1)
-        if len(rounds) == 1:
-            raise RuntimeError("a defect")
-        return time.monotonic() + 60.0
+        def between() -> float:
+            rounds.append(it.now_s())
+            if len(rounds) == 1:
+                raise RuntimeError("a defect")
+            return it.now_s() + 60.0
 
-    bus = Bus("test", between)
-    bus.start()
-    assert bus.call("ask", lambda: 7, PATIENT_S) == 7
-    bus.close(lambda: None, PATIENT_S)
-    assert rounds
+        bus = Bus("test", between, it.clock)
+        bus.start()
+        assert bus.call("ask", lambda: 7, PATIENT_S) == 7
+        it.clock.sleep(1.0)
+        bus.close(lambda: None, PATIENT_S)
+        assert [time_s - rounds[0] for time_s in rounds] == pytest.approx([0.0, 0.1])
 
 
 def test_a_low_level_error_of_any_kind_becomes_a_lost_line(monkeypatch: pytest.MonkeyPatch) -> None:
-    with scripted(always()) as (line, _):
+    with scripted(always(), real=True) as (line, _):
         port = SerialLine(line.path, BAUD_RATE)
         for error in (
             termios.error(5, "Input/output error"),
@@ -436,7 +473,7 @@ def test_letting_go_of_a_socket_does_not_wait() -> None:
 
 
 def test_what_a_full_buffer_does_not_take_is_left_to_pyserial(monkeypatch: pytest.MonkeyPatch) -> None:
-    with scripted(always()) as (line, _):
+    with scripted(always(), real=True) as (line, _):
         port = SerialLine(line.path, BAUD_RATE)
         for taken, rest in ((0, b"abc"), (1, b"bc"), (3, None)):
             left: list[bytes] = []

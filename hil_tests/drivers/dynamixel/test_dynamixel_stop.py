@@ -1,13 +1,11 @@
 """A Dynamixel head that is told to stop stands, each axis by itself, whatever the other or the line does.
 
 What is promised in time is seen in the order of the packets, and in where the simulator's axes stand, which
-it knows for every moment: a busy machine changes neither.
+it knows for every moment of the turned clock.
 """
 
 from __future__ import annotations
 
-import threading
-import time
 from collections.abc import Callable
 from contextlib import suppress
 from typing import Any
@@ -25,15 +23,14 @@ from drivers.sim.wire.dynamixel_packets import BROADCAST, Instruction
 from drivers.sim.wire.dynamixel_servo import VOLTAGE
 from hil_tests.drivers.dynamixel.dynamixel_rig import (
     COUNT_RAD,
-    LONG_S,
     Rig,
     failed,
     opened,
     read_or_none,
     rig,
-    settled,
-    until,
 )
+from hil_tests.drivers.turned import Gate, turned
+from hil_tests.waiting import NET_S
 
 GOAL_ADDRESS = 116
 WRITE, SYNC_WRITE = 3, 0x83
@@ -80,7 +77,7 @@ def last_words(it: Rig) -> int:
 
 
 def unpowered(it: Rig, axis: int) -> None:
-    it.servos[axis].set_power(False, time.monotonic())
+    it.servos[axis].set_power(False, it.now_s())
 
 
 def mute(it: Rig, axis: int) -> None:
@@ -121,9 +118,9 @@ def assert_each_stands_where_it_brakes(it: Rig, told_s: float) -> None:
         first_s, first_goal = goals[number + 1][0]
         before = [i for s, i in it.ear.heard if told_s < s < first_s and not goals_in(i)]
         assert len(before) <= 1, f"{before} went out between the call and the brake of servo {number + 1}"
-        until(lambda a=axis: a.velocity_rad_per_s(time.monotonic()) == 0, "rest")
+        it.until(lambda a=axis: a.velocity_rad_per_s(it.now_s()) == 0, "rest")
         at_rad, speed = axis.angle_rad(first_s), abs(axis.velocity_rad_per_s(first_s))
-        way_rad = abs(axis.angle_rad(time.monotonic()) - at_rad)
+        way_rad = abs(axis.angle_rad(it.now_s()) - at_rad)
         assert way_rad <= speed**2 / (2 * ACCELERATION) + BRAKING_SPARE_RAD, f"servo {number + 1}"
         for _, goal in goals[number + 1]:
             assert abs(goal - first_goal) * COUNT_RAD <= BRAKING_SPARE_RAD, f"servo {number + 1}: {goals}"
@@ -131,7 +128,7 @@ def assert_each_stands_where_it_brakes(it: Rig, told_s: float) -> None:
 
 def under_way(it: Rig, head: DynamixelHead, goal: tuple[float, float] = (2.0, 0.9)) -> None:
     head.move(*goal)
-    until(lambda: all(abs(axis.angle_rad(time.monotonic())) > 0.15 for axis in it.axes), "motion")
+    it.until(lambda: all(abs(axis.angle_rad(it.now_s())) > 0.15 for axis in it.axes), "motion")
 
 
 @pytest.mark.parametrize("axis", [0, 1], ids=["pan", "tilt"])
@@ -143,11 +140,11 @@ def test_a_stop_brakes_each_axis_at_once_whatever_the_other_does(
     with opened(options={"acceleration_rad_per_s2": ACCELERATION}) as (it, head):
         under_way(it, head)
         fault(it, axis)
-        told_s = time.monotonic()
+        told_s = it.now_s()
         if not unnoticed:
             heard = len(it.ear.heard)
-            until(lambda: len(it.ear.heard) >= heard + 2, "a question that is not answered as it should be")
-            now_s = time.monotonic()
+            it.until(lambda: len(it.ear.heard) >= heard + 2, "a question that is answered wrongly")
+            now_s = it.now_s()
             # if that was the end of the line already, the axes were told to brake when it was given up
             told_s = told_s if any(goals_after(it, told_s).values()) else now_s
         with suppress(DriverError):
@@ -162,10 +159,10 @@ def test_after_a_stop_that_was_not_confirmed_nothing_feeds_a_watchdog(
     with opened() as (it, head):
         under_way(it, head)
         fault(it, 0)
-        told_s = time.monotonic()
+        told_s = it.now_s()
         with pytest.raises(DriverError, match=r"pan .servo 1. did not confirm the stop and may still move"):
             head.stop()
-        until(lambda: len(goals_after(it, told_s)[2]) == 2 * COPIES, "the last words")
+        it.until(lambda: len(goals_after(it, told_s)[2]) == 2 * COPIES, "the last words")
 
         def more() -> list[Instruction]:
             return [one for _, one in it.ear.heard[last_words(it) + 1 :]]
@@ -173,9 +170,9 @@ def test_after_a_stop_that_was_not_confirmed_nothing_feeds_a_watchdog(
         while not more():  # a user who hits the button again and again
             with pytest.raises(DriverError):
                 head.stop()
-            time.sleep(0.005)
+            it.clock.sleep(0.005)
         assert it.servos[1].table["bus_watchdog"] == 255, "something was said before the watchdog had tripped"
-        assert not it.axes[1].under_way(time.monotonic())
+        assert not it.axes[1].under_way(it.now_s())
 
 
 @pytest.mark.parametrize("silent", [0, 1], ids=["pan", "tilt"])
@@ -183,17 +180,17 @@ def test_a_stop_given_again_and_again_does_not_keep_the_other_axis_running(silen
     options = {"acceleration_rad_per_s2": 5.0, "watchdog_s": 0.28, "reply_timeout_s": 0.05}
     with opened(options=options) as (it, head):
         head.move(2.4, 0.95)
-        until(lambda: all(axis.angle_rad(time.monotonic()) > 0.1 for axis in it.axes), "motion")
+        it.until(lambda: all(axis.angle_rad(it.now_s()) > 0.1 for axis in it.axes), "motion")
         unpowered(it, silent)
-        told_s = time.monotonic()
+        told_s = it.now_s()
         for _ in range(15):
             with suppress(DriverError):
                 head.stop()
-            time.sleep(0.1)
+            it.clock.sleep(0.1)
         axis = it.axes[1 - silent]
-        until(lambda: axis.velocity_rad_per_s(time.monotonic()) == 0, "rest")
+        it.until(lambda: axis.velocity_rad_per_s(it.now_s()) == 0, "rest")
         first_s = goals_after(it, told_s)[2 - silent][0][0]
-        way_rad = axis.angle_rad(time.monotonic()) - axis.angle_rad(first_s)
+        way_rad = axis.angle_rad(it.now_s()) - axis.angle_rad(first_s)
         assert way_rad <= 1.0**2 / (2 * 5.0) + BRAKING_SPARE_RAD
         assert axis.velocity_rad_per_s(first_s + 0.5) == 0
 
@@ -206,11 +203,11 @@ def test_no_second_leg_goes_out_after_a_stop(fault: Callable[[Rig, int], None]) 
         head = it.open(acceleration_rad_per_s2=ACCELERATION)
         under_way(it, head, (-2.0, -0.9))
         fault(it, 0)
-        told_s = time.monotonic()
+        told_s = it.now_s()
         with suppress(DriverError):
             head.stop()
         assert_each_stands_where_it_brakes(it, told_s)
-        until(lambda: read_or_none(head) or failed(head), "an answer")
+        it.until(lambda: read_or_none(head) or failed(head), "an answer")
         assert_each_stands_where_it_brakes(it, told_s)
         head.close()
 
@@ -218,14 +215,14 @@ def test_no_second_leg_goes_out_after_a_stop(fault: Callable[[Rig, int], None]) 
 def test_a_head_whose_line_is_given_up_is_told_to_brake_first() -> None:
     with opened(options={"acceleration_rad_per_s2": ACCELERATION}) as (it, head):
         under_way(it, head)
-        sent_s = time.monotonic()
+        sent_s = it.now_s()
         unpowered(it, 0)
-        until(lambda: head._absence.error, "giving up")
+        it.until(lambda: head._absence.error, "giving up")
         stands = goals_after(it, sent_s)[2]
         assert stands, "the line was given up with the tilt under way"
         axis = it.axes[1]
-        until(lambda: axis.velocity_rad_per_s(time.monotonic()) == 0, "rest")
-        way_rad = axis.angle_rad(time.monotonic()) - axis.angle_rad(stands[0][0])
+        it.until(lambda: axis.velocity_rad_per_s(it.now_s()) == 0, "rest")
+        way_rad = axis.angle_rad(it.now_s()) - axis.angle_rad(stands[0][0])
         assert way_rad <= 1.0 / (2 * ACCELERATION) + BRAKING_SPARE_RAD
 
 
@@ -233,8 +230,8 @@ def test_a_servo_with_an_error_that_leaves_its_torque_on_brakes_too() -> None:
     with opened() as (it, head):
         under_way(it, head)
         alert(it, 0)
-        until(lambda: head.read().faults, "the fault")
-        reading = settled(head)
+        it.until(lambda: head.read().faults, "the fault")
+        reading = it.settled(head)
         assert reading.pan_rad < 1.8
         assert reading.tilt_rad < 0.85
         assert it.servos[0].table["torque_enable"] == 1
@@ -243,7 +240,7 @@ def test_a_servo_with_an_error_that_leaves_its_torque_on_brakes_too() -> None:
 def test_stopping_an_axis_that_droops_again_and_again_does_not_let_it_creep() -> None:
     with opened() as (it, head):
         head.move(0.5, 0.3)
-        settled(head)
+        it.settled(head)
         goal = it.servos[1].table["goal_position"]
         it.panel.set("pan_tilt", "wrong", axis=1, offset_rad=-2 * COUNT_RAD)
         for _ in range(5):
@@ -257,14 +254,12 @@ def test_a_stop_clears_a_trip_that_nobody_has_noticed_yet_without_moving() -> No
         for servo in it.servos:
             with it.line.device.held():  # type: ignore[attr-defined]
                 servo.table["bus_watchdog"] = 255
-                servo.drive.stop(time.monotonic())
+                servo.drive.stop(it.now_s())
         head.stop()
         assert [servo.table["bus_watchdog"] for servo in it.servos] == [20, 20]
-        stood = [axis.angle_rad(time.monotonic()) for axis in it.axes]
-        assert settled(head).faults == ()
-        assert [axis.angle_rad(time.monotonic()) for axis in it.axes] == pytest.approx(
-            stood, abs=2 * COUNT_RAD
-        )
+        stood = [axis.angle_rad(it.now_s()) for axis in it.axes]
+        assert it.settled(head).faults == ()
+        assert [axis.angle_rad(it.now_s()) for axis in it.axes] == pytest.approx(stood, abs=2 * COUNT_RAD)
 
 
 @pytest.mark.parametrize("fault", [unpowered, mute], ids=lambda fault: fault.__name__)
@@ -273,16 +268,16 @@ def test_a_tripped_tilt_beside_a_silent_pan_stays_where_it_is(fault: Callable[[R
         under_way(it, head)
         with it.line.device.held():  # type: ignore[attr-defined]
             it.servos[1].table["bus_watchdog"] = 255
-            it.servos[1].drive.stop(time.monotonic())
+            it.servos[1].drive.stop(it.now_s())
         fault(it, 0)
         with pytest.raises(DriverError, match="pan"):
             head.stop()
         axis = it.axes[1]
-        until(lambda: axis.velocity_rad_per_s(time.monotonic()) == 0, "rest")
-        stood_rad = axis.angle_rad(time.monotonic())
+        it.until(lambda: axis.velocity_rad_per_s(it.now_s()) == 0, "rest")
+        stood_rad = axis.angle_rad(it.now_s())
         heard = len(it.ear.heard)
-        until(lambda: len(it.ear.heard) > heard + 3, "some tries to come back")
-        assert axis.angle_rad(time.monotonic()) == pytest.approx(stood_rad, abs=2 * COUNT_RAD)
+        it.until(lambda: len(it.ear.heard) > heard + 3, "some tries to come back")
+        assert axis.angle_rad(it.now_s()) == pytest.approx(stood_rad, abs=2 * COUNT_RAD)
 
 
 @pytest.mark.parametrize("silent", [0, 1], ids=["pan", "tilt"])
@@ -293,7 +288,7 @@ def test_closing_beside_a_silent_servo_leaves_the_other_as_configured(silent: in
         head = it.open()
         under_way(it, head)
         mute(it, silent)
-        closing_s = time.monotonic()
+        closing_s = it.now_s()
         head.close()
         assert it.servos[1 - silent].table["torque_enable"] == 0
         assert it.servos[1 - silent].table["bus_watchdog"] == 0
@@ -306,10 +301,8 @@ def test_a_stop_breaks_off_what_is_under_way_and_its_caller_is_told() -> None:
         under_way(it, head)
         mute(it, 0)
         errors: list[BaseException] = []
-        begun = threading.Event()
 
         def read() -> None:
-            begun.set()
             for _ in range(50):
                 try:
                     head.read()
@@ -317,59 +310,67 @@ def test_a_stop_breaks_off_what_is_under_way_and_its_caller_is_told() -> None:
                     errors.append(error)
                     return
 
-        reader = threading.Thread(target=read)
-        reader.start()
-        begun.wait(LONG_S)
+        reader = it.beside(read)
         heard = len(it.ear.heard)
-        until(lambda: len(it.ear.heard) > heard + 1, "a question without an answer")
-        told_s = time.monotonic()
+        it.until(lambda: len(it.ear.heard) > heard + 1, "a question without an answer")
+        told_s = it.now_s()
         with suppress(DriverError):
             head.stop()
-        reader.join(LONG_S)
+        reader.wait()
         assert errors, "the read did not end"
         assert_each_stands_where_it_brakes(it, told_s)
 
 
 def test_a_move_that_waits_when_a_stop_comes_is_not_begun() -> None:
-    bus = Bus("test", lambda: time.monotonic() + 60.0)
-    bus.start()
-    free, done, errors = threading.Event(), [], []
+    with turned() as it:
+        bus = Bus("test", lambda: it.now_s() + 60.0, it.clock)
+        bus.start()
+        free = it.gate()
+        done: list[str] = []
+        errors: list[DriverError] = []
 
-    def call(what: str, **how: Any) -> threading.Thread:
-        def run() -> None:
-            try:
-                bus.call(what, lambda: done.append(what), LONG_S, **how)
-            except DriverError as error:
-                errors.append(error)
+        def call(what: str, **how: Any) -> Gate:
+            def run() -> None:
+                try:
+                    bus.call(what, lambda: done.append(what), NET_S, **how)
+                except DriverError as error:
+                    errors.append(error)
 
-        thread = threading.Thread(target=run)
-        thread.start()
-        return thread
+            return it.beside(run)
 
-    hold = threading.Thread(target=lambda: bus.call("hold", lambda: free.wait(LONG_S), LONG_S))
-    hold.start()
-    until(lambda: not bus._jobs, "the thread to be busy")
-    move, read = call("move", moves=True), call("read")
-    until(lambda: len(bus._jobs) == 2, "both to wait")
-    stop = call("stop", first=True)
-    until(bus.urgent, "the stop to wait")
-    late_move = call("a later move", moves=True)
-    until(lambda: len(bus._jobs) == 3, "the later move to wait")
-    free.set()
-    for thread in (hold, move, read, stop, late_move):
-        thread.join(LONG_S)
-    assert done == ["stop", "read", "a later move"]
-    assert isinstance(errors[0], NoReply)
-    assert str(errors[0]) == "move on test was not begun; nothing was sent, since a stop came"
-    bus.close(lambda: None, LONG_S)
+        busy = it.gate()
+
+        def keep() -> None:
+            busy.set()
+            free.wait()
+
+        hold = it.beside(lambda: bus.call("hold", keep, NET_S))
+        busy.wait()
+        move, read = call("move", moves=True), call("read")
+        it.until(lambda: len(bus._jobs) == 2, "both to wait")
+        stop = call("stop", first=True)
+        it.until(bus.urgent, "the stop to wait")
+        late_move = call("a later move", moves=True)
+        it.until(lambda: len(bus._jobs) == 3, "the later move to wait")
+        free.set()
+        for ended in (hold, move, read, stop, late_move):
+            ended.wait()
+        assert done == ["stop", "read", "a later move"]
+        assert isinstance(errors[0], NoReply)
+        assert str(errors[0]) == "move on test was not begun; nothing was sent, since a stop came"
+        bus.close(lambda: None, NET_S)
 
 
 def test_a_queued_move_does_not_move_the_head_after_the_stop_that_overtook_it() -> None:
     with opened() as (it, head):
-        free = threading.Event()
-        stalled = threading.Thread(target=lambda: head._bus.call("stall", lambda: free.wait(LONG_S), LONG_S))
-        stalled.start()
-        until(lambda: not head._bus._jobs, "the thread to be busy")
+        free, busy = it.gate(), it.gate()
+
+        def stall() -> None:
+            busy.set()
+            free.wait()
+
+        stalled = it.beside(lambda: head._bus.call("stall", stall, NET_S))
+        busy.wait()
         errors: list[DriverError] = []
 
         def move() -> None:
@@ -378,17 +379,15 @@ def test_a_queued_move_does_not_move_the_head_after_the_stop_that_overtook_it() 
             except DriverError as error:
                 errors.append(error)
 
-        mover = threading.Thread(target=move)
-        mover.start()
-        until(lambda: head._bus._jobs, "the move to wait")
-        stopper = threading.Thread(target=head.stop)
-        stopper.start()
-        until(head._bus.urgent, "the stop to wait")
+        mover = it.beside(move)
+        it.until(lambda: head._bus._jobs, "the move to wait")
+        stopper = it.beside(head.stop)
+        it.until(head._bus.urgent, "the stop to wait")
         free.set()
-        for thread in (stalled, mover, stopper):
-            thread.join(LONG_S)
+        for ended in (stalled, mover, stopper):
+            ended.wait()
         assert "since a stop came" in str(errors[0])
-        assert settled(head).pan_rad == pytest.approx(0.0, abs=COUNT_RAD)
+        assert it.settled(head).pan_rad == pytest.approx(0.0, abs=COUNT_RAD)
         assert it.servos[0].table["goal_position"] == 2048
 
 
@@ -400,11 +399,10 @@ def test_a_stop_that_breaks_off_a_taking_hold_leaves_no_torque_on_where_it_lets_
         head = it.open()
         head.stop()
         assert [servo.table["torque_enable"] for servo in it.servos] == [0, 0]
-        mover = threading.Thread(target=lambda: failed_move(head))
-        mover.start()
-        until(lambda: it.servos[held].table["torque_enable"], "torque")
+        mover = it.beside(lambda: failed_move(head))
+        it.until(lambda: it.servos[held].table["torque_enable"], "torque")
         head.stop()
-        mover.join(LONG_S)
+        mover.wait()
         assert [servo.table["torque_enable"] for servo in it.servos] == [0, 0]
         head.close()
 
@@ -418,26 +416,26 @@ def failed_move(head: DynamixelHead) -> None:
 def test_without_a_watchdog_a_stop_tries_a_line_that_is_away_at_once(silent: int | None) -> None:
     with opened(options={"watchdog_s": 0}) as (it, head):
         head.move(2.4, 0.9, 0.2)
-        until(lambda: all(axis.angle_rad(time.monotonic()) > 0.05 for axis in it.axes), "motion")
+        it.until(lambda: all(axis.angle_rad(it.now_s()) > 0.05 for axis in it.axes), "motion")
         it.line.hang_up()
-        until(lambda: failed(head) and head._session is None, "the line to be given up")
+        it.until(lambda: failed(head) and head._session is None, "the line to be given up")
         with pytest.raises(LineLost):
             head.stop()
-        head._absence.again_s = time.monotonic() + LONG_S  # not before somebody asks for it
+        head._absence.again_s = it.now_s() + NET_S  # not before somebody asks for it
         if silent is not None:
             unpowered(it, silent)
         it.line.come_back()
-        back_s = time.monotonic()
+        back_s = it.now_s()
         if silent is None:
             head.stop()
         else:
             with pytest.raises(NoReply):
                 head.stop()
         for axis in (it.axes[number] for number in reachable(it)):
-            until(lambda a=axis: a.velocity_rad_per_s(time.monotonic()) == 0, "rest")
-            assert axis.angle_rad(time.monotonic()) - axis.angle_rad(back_s) < 0.4, "it ran on to its goal"
+            it.until(lambda a=axis: a.velocity_rad_per_s(it.now_s()) == 0, "rest")
+            assert axis.angle_rad(it.now_s()) - axis.angle_rad(back_s) < 0.4, "it ran on to its goal"
         if silent is None:
-            assert settled(head).faults == ()
+            assert it.settled(head).faults == ()
 
 
 @pytest.mark.parametrize("register", ["min_position_limit", "goal_position"])
@@ -448,15 +446,15 @@ def test_an_axis_whose_torque_was_dropped_to_set_it_up_holds_again_when_that_is_
     options = {"torque_off_at_start": True, "watchdog_s": 0}
     with opened(options=options) as (it, head):
         it.line.hang_up()
-        until(lambda: failed(head) and head._session is None, "the line to be given up")
+        it.until(lambda: failed(head) and head._session is None, "the line to be given up")
         table = it.servos[1].table
         table["min_position_limit"] += 1  # somebody else has set it, so that it must be set up anew
-        limp, true_set = threading.Event(), Servo.set
+        limp, true_set = it.gate(), Servo.set
 
         def set_late(servo: Servo, name: str, value: int) -> None:
-            if name == register and not table["torque_enable"] and not limp.is_set():
+            if name == register and not table["torque_enable"] and not limp.is_open:
                 limp.set()
-                until(head._bus.urgent, "who overtakes it")
+                it.until(head._bus.urgent, "who overtakes it")
             true_set(servo, name, value)
 
         monkeypatch.setattr(Servo, "set", set_late)
@@ -469,7 +467,7 @@ def test_an_axis_whose_torque_was_dropped_to_set_it_up_holds_again_when_that_is_
 
         monkeypatch.setattr(Link, "close", close)
         it.line.come_back()
-        assert limp.wait(LONG_S)
+        limp.wait()
         getattr(head, overtaking)()
         assert broken_off == [1]
         assert table["torque_enable"] == 1
@@ -489,6 +487,6 @@ def test_a_move_whose_goals_went_out_but_that_is_told_as_failed_brakes(
         with pytest.raises(NoReply):
             head.move(2.0, 0.9)
         it.panel.clear()
-        until(lambda: all(not axis.under_way(time.monotonic()) for axis in it.axes), "rest")
-        assert it.axes[0].angle_rad(time.monotonic()) < 1.5
-        assert it.axes[1].angle_rad(time.monotonic()) < 0.8
+        it.until(lambda: all(not axis.under_way(it.now_s()) for axis in it.axes), "rest")
+        assert it.angle_rad(0) < 1.5
+        assert it.angle_rad(1) < 0.8

@@ -1,0 +1,93 @@
+"""What a test of a driver does on the clock that everything of it runs on: waiting, and threads beside it.
+
+On a `SimulationClock` the test itself has to be ``at_work``; then nothing here takes any real time, and a run
+is the same each time. On the machine's clock all of it works too, with the net of `hil_tests.waiting`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import TypeVar
+
+from drivers.clock import Clock
+from drivers.interfaces import PanTilt, Reading
+from drivers.simulation_clock import SimulationClock
+from hil_tests import waiting
+
+START_S = 1000.0
+T = TypeVar("T")
+
+
+class Turned:
+    """Waiting by a clock.
+
+    Attributes
+    ----------
+    clock
+        Everything runs on it.
+    """
+
+    clock: Clock
+
+    def now_s(self) -> float:
+        return self.clock.now_s()
+
+    def until(self, true: Callable[[], T], what: str) -> T:
+        """Wait for something that must come, and return it."""
+        return waiting.until(true, what, clock=self.clock)
+
+    def settled(self, head: PanTilt) -> Reading:
+        """Return the first reading of a head that stands."""
+        readings: list[Reading] = []
+
+        def stands() -> bool:
+            readings.append(head.read())
+            return not readings[-1].moving
+
+        self.until(stands, "rest")
+        return readings[-1]
+
+    def gate(self) -> Gate:
+        return Gate(self.clock)
+
+    def beside(self, target: Callable[[], object]) -> Gate:
+        """Run ``target`` in a thread of its own; the gate opens when it has ended."""
+        ended = self.gate()
+
+        def run() -> None:
+            try:
+                target()
+            finally:
+                ended.set()
+
+        self.clock.thread(run, "beside the test").start()
+        return ended
+
+
+@contextmanager
+def turned() -> Iterator[Turned]:
+    """A turned clock with nothing on it, at which the test is at work."""
+    it = Turned()
+    it.clock = SimulationClock(start_s=START_S)
+    with it.clock.at_work():
+        yield it
+
+
+class Gate:
+    """Closed until somebody opens it; who waits at it waits on the clock."""
+
+    def __init__(self, clock: Clock) -> None:
+        self.is_open = False
+        self._signal = clock.signal()
+
+    def set(self) -> None:
+        with self._signal:
+            self.is_open = True
+            self._signal.notify_all()
+
+    def wait(self) -> None:
+        """Wait until it is open; raises AssertionError after a minute of the clock."""
+        with self._signal:
+            while not self.is_open:
+                assert self._signal.wait(waiting.NET_S), "the gate stayed closed"
