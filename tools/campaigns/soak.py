@@ -77,22 +77,22 @@ def soak(
         ledger.check(daemon.poll() is None, "the daemon has ended by itself")
     if "Traceback" in (said := (folder / "daemon.log").read_text()):
         ledger.check(False, f"the daemon's log has a traceback: {said[said.index('Traceback') :][:1500]}")
-    _judge(weighed[0], weighed[-1], ledger)
+    judge(weighed[0], weighed[-1], ledger)
     print(ledger.tables())
     return ledger.wrong
 
 
 def _weigh(pid: int) -> Vitals:
     """The lightest of some seconds: a thread or a file may just be on its way out."""
-    weighed = []
+    weighed = [vitals(pid)]
     until_s = time.monotonic() + WEIGH_S
     while time.monotonic() < until_s:
-        weighed.append(vitals(pid))
         time.sleep(0.2)
+        weighed.append(vitals(pid))
     return min(weighed, key=lambda one: (one.threads + one.descriptors, one.rss_mb))
 
 
-def _judge(first: Vitals, last: Vitals, ledger: Ledger) -> None:
+def judge(first: Vitals, last: Vitals, ledger: Ledger) -> None:
     """Compare the daemon at its last rest with what it was at its first."""
     grown_mb = last.rss_mb - first.rss_mb
     ledger.check(grown_mb <= MOST_GROWTH_MB, f"memory grew by {grown_mb:.1f} MB, {MOST_GROWTH_MB:g} allowed")

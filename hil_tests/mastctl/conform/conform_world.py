@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import http.client
+import re
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -26,7 +27,11 @@ from mastctl.daemon import RunningDaemon
 
 HERE = "hil_tests.mastctl.conform.conform_world"
 PERIOD_S = 0.02
+KEPT_S = 30.0
 COUNT_RAD, FASTEST_RAD_PER_S = 1e-4, 2.0
+SPEED_RAD_PER_S = 0.5
+CRAWLING_RAD_PER_S = 0.001
+"""Nothing that a check asks for is reached within a minute: what is done meanwhile is done in the move."""
 
 
 def open_head(low_rad: float = -2.0, high_rad: float = 2.0) -> SimulatedPanTilt:
@@ -37,12 +42,16 @@ def open_head(low_rad: float = -2.0, high_rad: float = 2.0) -> SimulatedPanTilt:
 
 
 class NoiseCamera:
-    """A free-running camera of 50 Hz that sees noise."""
+    """A free-running camera of 50 Hz that sees noise, and gives the first frame after the moment asked for.
+
+    It keeps the frames of some seconds, so that both cameras of a pair give frames of one moment,
+    however late on a busy machine the second one is asked.
+    """
 
     period_s, trigger = PERIOD_S, ""
 
     def __init__(self, seed: int = 0) -> None:
-        self._random = np.random.default_rng(seed)
+        self._seed = seed
         self._closed = threading.Event()
 
     def recent_times(self) -> list[object]:
@@ -50,31 +59,33 @@ class NoiseCamera:
 
     def next_frame(self, exposed_after_s: float, timeout_s: float) -> Frame:
         now_s = time.monotonic()
-        sequence = int(max(exposed_after_s, now_s) / PERIOD_S) + 1
+        sequence = int(max(exposed_after_s, now_s - KEPT_S) / PERIOD_S) + 1
         wait_s = sequence * PERIOD_S + 0.002 - now_s
         if self._closed.wait(max(0.0, min(wait_s, timeout_s))):
             raise NoReply("it is closed")
         if wait_s > timeout_s:
             raise NoFreshFrame(f"no frame within {timeout_s:g} s")
-        image = self._random.integers(0, 255, SIZE_PX[::-1], dtype=np.uint8)
+        random = np.random.default_rng((self._seed, sequence))
+        image = random.integers(0, 255, SIZE_PX[::-1], dtype=np.uint8)
         return Frame(image, sequence, sequence * PERIOD_S + 0.001, 0.002)
 
     def close(self) -> None:
         self._closed.set()
 
 
-def configuration(folder: Path) -> Path:
+def configuration(folder: Path, speed_rad_per_s: float = SPEED_RAD_PER_S) -> Path:
     """A configuration of devices from outside that never wait."""
     save_rig(rig(), folder / "little.yaml")
     text = CONFIG.format(listen="{port: 0}").replace("{driver: fake}", f"{{driver: '{HERE}:open_head'}}", 1)
+    text = re.sub(r"(speed_rad_per_s: )[\d.]+", rf"\g<1>{speed_rad_per_s}", text)
     (folder / "daemon.yaml").write_text(text.replace("{driver: fake}", f"{{driver: '{HERE}:NoiseCamera'}}"))
     return folder / "daemon.yaml"
 
 
 @contextmanager
-def true_daemon(folder: Path) -> Iterator[str]:
+def true_daemon(folder: Path, speed_rad_per_s: float = SPEED_RAD_PER_S) -> Iterator[str]:
     """A daemon as it is, on such devices; its address."""
-    with RunningDaemon(load_config(configuration(folder))) as daemon:
+    with RunningDaemon(load_config(configuration(folder, speed_rad_per_s))) as daemon:
         yield daemon.url
 
 

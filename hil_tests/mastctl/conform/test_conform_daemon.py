@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import signal
 import threading
-import time
 import xml.etree.ElementTree as ET
 from collections.abc import Callable, Iterator
 from contextlib import suppress
@@ -16,7 +15,8 @@ import cv2
 import numpy as np
 import pytest
 
-from hil_tests.mastctl.conform.conform_world import Passing, Proxy, true_daemon
+from hil_tests.mastctl.conform.conform_world import CRAWLING_RAD_PER_S, Passing, Proxy, true_daemon
+from hil_tests.waiting import until
 from mastctl.cli.main import main
 from mastctl.client import Client, ClientError
 from mastctl.conform.daemon_run import CHECKS, check_daemon, daemon_under_test
@@ -210,16 +210,21 @@ def steps_reversed(record: dict[str, Any], told: Passing) -> Any:
     return changed(record, "steps", value=lambda steps: steps[::-1]) if "steps" in record else record
 
 
-def clicked_without_residual(told: Passing) -> bool:
+def done_at_once(*words: str) -> Any:
+    """Takes a pointing with these words in it and says that it is done, without doing anything."""
     fake = {"id": "fake", "state": "done", "steps": [], "residual_px": None, "residual_sigma_px": None}
-    for when, status, body in (
-        (to("POST", "/point", "pixel"), 202, {"id": "fake"}), (to("GET", "/operations/fake"), 200, fake),
-    ):  # fmt: skip
-        if when(told):
-            told.status, told.headers = status, {"Content-Type": "application/json"}
-            told.data = json.dumps(body).encode()
-            return True
-    return False
+
+    def before(told: Passing) -> bool:
+        for when, status, body in (
+            (to("POST", "/point", *words), 202, {"id": "fake"}), (to("GET", "/operations/fake"), 200, fake),
+        ):  # fmt: skip
+            if when(told):
+                told.status, told.headers = status, {"Content-Type": "application/json"}
+                told.data = json.dumps(body).encode()
+                return True
+        return False
+
+    return {"before": before}
 
 
 def error_without(key: str, value: Any = None) -> Any:
@@ -282,8 +287,7 @@ LIES: list[tuple[str, str, Any]] = [
      says_instead(200, {"lease_id": "x" * 32}, lambda told: told.status == 422)),
     ("one key for anything", "keys.once",
      says_instead(202, {"id": "x"}, lambda told: b"key_reused" in told.data)),
-    ("a deadline that ends nothing", "deadline.ends",
-     edited("/operations/", lambda record, _: {**record, "state": "done", "error": None})),
+    ("a deadline that ends nothing", "deadline.ends", done_at_once()),
     ("another goal", "motion.pointing", {"before": elsewhere}),
     ("limits not held", "motion.pointing",
      edited("/status", lambda s, _: changed(s, "joints", "tilt_rad", value=1.2) if s["moving"] else s)),
@@ -301,7 +305,7 @@ LIES: list[tuple[str, str, Any]] = [
     ("steps out of order", "times.operations", edited("/operations/", steps_reversed)),
     ("an end before the begin", "times.operations",
      edited("/operations/", lambda record, _: {**record, "ended_s": record["created_s"]})),
-    ("done without a residual", "clicks.pointed", {"before": clicked_without_residual}),
+    ("done without a residual", "clicks.pointed", done_at_once("pixel")),
     ("no way home", "motion.home",
      answers(409, error("busy"), to("POST", "/point"))),
     ("everything is there", "refusals.paths", says_instead(200, {}, to("GET", "/no-such-thing"))),
@@ -379,17 +383,27 @@ def moving_now(told: Passing) -> bool:
     return told.path == f"{API}/status" and told.status == 200 and json.loads(told.data)["moving"]
 
 
-def stands_short_of(daemon_url: str, goal_rad: float) -> bool:
-    with Client(daemon_url) as client:
-        until_s = time.monotonic() + 10
-        while (status := client.status())["moving"] or status["operation"]:
-            assert time.monotonic() < until_s
+@pytest.fixture
+def crawling(tmp_path: Path) -> Iterator[Proxy]:
+    """Before a daemon whose head cannot arrive while a test runs."""
+    with true_daemon(tmp_path, CRAWLING_RAD_PER_S) as url:
+        made = Proxy(url)
+        yield made
+        made.close()
+
+
+def stands_short_of(url: str, goal_rad: float) -> bool:
+    with Client(url) as client:
+        status = until(lambda: at_rest(client), "the head has come to rest")
         return bool(status["state"] == "holding" and abs(status["joints"]["pan_rad"] - goal_rad) > 0.01)
 
 
-def test_a_connection_that_is_lost_while_the_head_moves_ends_with_a_stop(
-    proxy: Proxy, daemon_url: str
-) -> None:
+def at_rest(client: Client) -> dict[str, Any] | None:
+    status = client.status()
+    return None if status["moving"] or status["operation"] else status
+
+
+def test_a_connection_that_is_lost_while_the_head_moves_ends_with_a_stop(crawling: Proxy) -> None:
     cut = threading.Event()
 
     def after(told: Passing) -> None:
@@ -398,22 +412,23 @@ def test_a_connection_that_is_lost_while_the_head_moves_ends_with_a_stop(
         if cut.is_set() and "/stop" not in told.path:
             told.status = 0
 
-    proxy.after = after
+    crawling.after = after
     names = ("motion.pointing", "motion.home")
-    assert states(proxy.url, *names) == dict(zip(names, ("failed", "skipped"), strict=True))
-    assert stands_short_of(daemon_url, 0.18)
+    assert states(crawling.url, *names) == dict(zip(names, ("failed", "skipped"), strict=True))
+    crawling.honest()
+    assert stands_short_of(crawling.url, 0.18)
 
 
-def test_control_c_while_the_head_moves_stops_it(proxy: Proxy, daemon_url: str) -> None:
+def test_control_c_while_the_head_moves_stops_it(crawling: Proxy) -> None:
     def after(told: Passing) -> None:
         if moving_now(told):
-            proxy.honest()
+            crawling.honest()
             signal.pthread_kill(threading.main_thread().ident or 0, signal.SIGINT)
 
-    proxy.after = after
+    crawling.after = after
     with pytest.raises(KeyboardInterrupt):
-        states(proxy.url, "motion.pointing")
-    assert stands_short_of(daemon_url, 0.18)
+        states(crawling.url, "motion.pointing")
+    assert stands_short_of(crawling.url, 0.18)
 
 
 def test_a_stop_at_the_end_that_is_not_confirmed_is_said(proxy: Proxy) -> None:
@@ -445,11 +460,9 @@ def test_wrong_use_is_refused_before_anything_moves(
     assert refusal(capsys) == "no_daemon"
 
 
-def test_a_daemon_at_work_is_left_alone(
-    proxy: Proxy, daemon_url: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    with Client(daemon_url) as client:
+def test_a_daemon_at_work_is_left_alone(crawling: Proxy, capsys: pytest.CaptureFixture[str]) -> None:
+    with Client(crawling.url) as client:
         name = client.point(pan_rad=0.6, tilt_rad=0.0)
-        assert main(["conform", proxy.url, "--motion", "--json"]) == 1
+        assert main(["conform", crawling.url, "--motion", "--json"]) == 1
         assert refusal(capsys) == "busy"
-        assert client.wait(name)["state"] == "done"
+        assert client.operation(name)["state"] == "running"

@@ -3,23 +3,55 @@
 from __future__ import annotations
 
 import time
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 
+from tools.campaigns import soak as campaign
 from tools.campaigns.faults import trials
-from tools.campaigns.soak import soak
 from tools.campaigns.soak_ledger import Ledger
+from tools.living_daemon import Vitals
 
 
+def test_a_daemon_among_faults_and_bad_clients_does_as_wanted(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """So short a run has no warm-up: whether the daemon grows is the long one's question."""
+    monkeypatch.setattr(campaign, "WEIGH_S", 0.0)
+    monkeypatch.setattr(campaign, "judge", lambda first, last, ledger: None)
+    assert campaign.soak(tmp_path, "memory", 3.0, seed=3, settle_s=0.5, rests=1) == []
+
+
+@pytest.mark.long(4, "two minutes: memory, threads and descriptors are weighed after a warm-up")
 def test_a_daemon_among_faults_and_bad_clients_stays_the_same(tmp_path: Path) -> None:
-    wrong = soak(tmp_path, "memory", 10.0, seed=3, settle_s=0.5, rests=1)
-    # so short a run has no warm-up: memory, threads and descriptors are the long one's
-    assert [
-        one for one in wrong if "memory grew" not in one and " more than after the warm-up" not in one
-    ] == []
+    assert campaign.soak(tmp_path, "memory", 80.0, seed=3, rests=1) == []
 
 
+@pytest.mark.parametrize(
+    ("more", "said"),
+    [
+        ({"rss_mb": 120.5}, "memory grew by 20.5 MB, 20 allowed"),
+        ({"threads": 9}, "1 threads more than after the warm-up"),
+        (
+            {"descriptors": 22, "open_files": {"socket": 5}},
+            "2 descriptors more than after the warm-up: {'socket': 2}",
+        ),
+    ],
+)
+def test_a_daemon_that_has_grown_is_not_as_wanted(more: dict[str, Any], said: str) -> None:
+    first = Vitals(100.0, 8, 20, 1.0, {"socket": 3})
+    ledger = Ledger()
+    campaign.judge(first, replace(first, rss_mb=119.9, cpu_s=9.0), ledger)
+    assert ledger.wrong == []
+    campaign.judge(first, replace(first, **more), ledger)
+    assert ledger.wrong == [said]
+
+
+@pytest.mark.long(
+    4, "a whole daemon in real time for each; pointing/test_pointing_faults.py has each fault quickly"
+)
 @pytest.mark.parametrize("during", ["pointing", "tracking"])
 def test_a_fault_under_way_is_told_ends_what_it_must_and_is_over_when_it_is_over(
     during: str, tmp_path: Path

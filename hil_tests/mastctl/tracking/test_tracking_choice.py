@@ -45,9 +45,10 @@ def test_the_papers_pair_looks_at_each_range(rig: Rig, range_m: float, pair: str
 
 @pytest.mark.parametrize("range_m", [9.0, 4.0, 2.0])
 def test_the_target_comes_midway_between_the_middles_of_both_pictures(rig: Rig, range_m: float) -> None:
-    for choice in choose_pairs(rig, ahead(range_m)):
-        if choice.pan_rad is None or choice.tilt_rad is None:
-            continue
+    turned = [choice for choice in choose_pairs(rig, ahead(range_m)) if choice.pan_rad is not None]
+    assert {choice.pair for choice in turned} == {"pancam", "navcam"}
+    for choice in turned:
+        assert choice.pan_rad is not None and choice.tilt_rad is not None
         left, right = (
             rig.camera_in_rover(eye, choice.pan_rad, choice.tilt_rad) for eye in rig.stereo[choice.pair]
         )
