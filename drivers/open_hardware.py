@@ -56,8 +56,8 @@ def clock_for(settings: HardwareSettings) -> Clock:
     Raises
     ------
     BadOptions
-        If a speed is asked for that is none, or that a device cannot follow: real ones, those from outside,
-        and simulated wires live in real time.
+        If a speed is asked for that is none, or that a device cannot follow: real ones and those from outside
+        live in real time.
     """
     speed = simulation_speed(settings.simulation.get("speed", 1.0))
     if speed == 1.0:
@@ -66,8 +66,6 @@ def clock_for(settings: HardwareSettings) -> Clock:
     for name, device in {PAN_TILT: settings.pan_tilt, **settings.cameras}.items():
         if device.driver not in OURS:
             raise BadOptions(f"{told} driver {device.driver!r} lives in real time", device=name)
-    if settings.simulation.get("wire") is not None:
-        raise BadOptions(f"{told} the bytes of simulation.wire travel in real time")
     return SimulationClock(speed)
 
 

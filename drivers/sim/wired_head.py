@@ -1,4 +1,4 @@
-"""A simulated head behind bytes: a simulator at one end of a pseudo terminal, the real driver at the other.
+"""A simulated head behind bytes: a simulator at one end of a line in memory, the real driver at the other.
 
 The simulated rover uses it where a configuration says ``simulation.wire``. The cameras look from the axes of
 the simulator, so what they show followed from the bytes.
@@ -12,25 +12,28 @@ from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Any
 
-from drivers.clock import Clock, SystemClock
+from drivers.clock import Clock
 from drivers.errors import BadOptions
 from drivers.faults import FaultPanel
 from drivers.interfaces import PanTilt
+from drivers.serial_line import OpenLine
 from drivers.sim.axis import AxisSettings
 from drivers.sim.pan_tilt import PRESETS, HeadSettings
 from drivers.sim.wire.axis import WireAxis
+from drivers.sim.wire.carrier import WireDevice
 from drivers.sim.wire.dynamixel_bus import DynamixelBus
 from drivers.sim.wire.dynamixel_registers import BAUD_RATES
 from drivers.sim.wire.dynamixel_servo import SimulatedServo
-from drivers.sim.wire.line import PtyLine, WireDevice
+from drivers.sim.wire.memory_line import MemoryLine
 from drivers.sim.wire.ptu import SimulatedPtu
 
 _MARGIN_RAD = math.radians(0.5)
 """How far inside the simulator's own range the driver's limits are."""
 
 _WATCHDOG_S, _BRAKING_S = 0.38, 0.095
-"""Renderer, simulator and driver share one process, which on a busy machine is silent for 0.3 s now and then.
-So the servos wait longer than usual, and brake harder, since they must stand 0.5 s after the last packet."""
+"""On the machine's clock renderer, simulator and driver share one process, which on a busy machine is silent
+for 0.3 s now and then. So the servos wait longer than usual, and brake harder, since they must stand 0.5 s
+after the last packet."""
 
 
 @dataclass(frozen=True)
@@ -79,7 +82,7 @@ class WiredHead:
     head
         What it is made of; its approach is done by the driver.
     clock
-        The machine's own: bytes do not wait for a clock that is turned by hand.
+        What simulator, line and driver live on: the machine's own or the simulation's, none turned by hand.
     faults
         Those of ``pan_tilt`` act on the axes and on the line.
 
@@ -100,8 +103,8 @@ class WiredHead:
 
     def __init__(self, wire: str, head: HeadSettings, clock: Clock, faults: FaultPanel) -> None:
         check_head(wire, head)
-        if not isinstance(clock, SystemClock):
-            raise BadOptions(f"simulation.wire {wire!r} goes with the machine's own clock only")
+        if not clock.runs:
+            raise BadOptions(f"simulation.wire {wire!r} needs a clock that goes on by itself")
         now_s = clock.now_s()
         self._axes = (
             WireAxis(head.pan, faults, number=0, time_s=now_s),
@@ -111,9 +114,9 @@ class WiredHead:
         device, open_head, options = make(_HEADS[head.name], head, self._axes, now_s)
         if head.pan.settle_s > 0:
             options["settle_s"] = head.pan.settle_s
-        self.line = PtyLine(device, clock, faults)
+        self.line = MemoryLine(device, clock, faults)
         try:
-            self.pan_tilt: PanTilt = open_head({**options, "port": self.line.path}, clock)
+            self.pan_tilt: PanTilt = open_head({**options, "port": self.line.path}, clock, self.line.open)
         except BaseException:
             self.line.close()
             raise
@@ -129,7 +132,7 @@ class WiredHead:
         self.line.close()
 
 
-_Made = tuple[WireDevice, Callable[[Mapping[str, Any], Clock], PanTilt], dict[str, Any]]
+_Made = tuple[WireDevice, Callable[[Mapping[str, Any], Clock, OpenLine], PanTilt], dict[str, Any]]
 
 
 def _dynamixel(kind: _Wire, head: HeadSettings, axes: tuple[WireAxis, WireAxis], time_s: float) -> _Made:
@@ -150,7 +153,7 @@ def _dynamixel(kind: _Wire, head: HeadSettings, axes: tuple[WireAxis, WireAxis],
     speed_rad_per_s = head.pan.speed_rad_per_s
     options: dict[str, Any] = {
         "baud": baud,
-        "reply_timeout_s": 0.25,  # the simulator shares its processors with a renderer
+        "reply_timeout_s": 0.25,  # as long as the process may be silent
         "speed_rad_per_s": speed_rad_per_s,
         "acceleration_rad_per_s2": max(head.pan.acceleration_rad_per_s2, speed_rad_per_s / _BRAKING_S),
         "watchdog_s": _WATCHDOG_S,

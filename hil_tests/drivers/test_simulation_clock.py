@@ -293,10 +293,10 @@ def test_real_devices_refuse_a_time_of_another_speed(driver: str) -> None:
             clock_for(settings)
 
 
-def test_bytes_on_a_simulated_wire_refuse_it_too() -> None:
+def test_a_simulated_wire_follows_it() -> None:
     simulation = {"rover": "rover.yaml", "speed": 10, "wire": "dynamixel"}
-    with pytest.raises(BadOptions, match="travel in real time"):
-        clock_for(replace(SIMULATED, simulation=simulation))
+    clock = clock_for(replace(SIMULATED, simulation=simulation))
+    assert isinstance(clock, SimulationClock) and clock.speed == 10
 
 
 def test_a_turn_is_kept_while_its_thread_waits_on_the_clock_and_may_be_taken_twice() -> None:

@@ -74,7 +74,7 @@ def add_commands(subparsers: Any) -> None:
     )  # fmt: skip
     demo.add_argument(
         "--speed", type=_speed, metavar="N",
-        help="1: the rover takes its time; 10: a tenth of it; max: nothing waits (default; 1 behind --wire)",
+        help="1: the rover takes its time; 10: a tenth of it; max: nothing waits (default)",
     )  # fmt: skip
     demo.set_defaults(run=run_demo, out=Path("mastctl_demo"))
 

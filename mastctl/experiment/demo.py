@@ -26,14 +26,11 @@ def demo_config(
     """Return the packaged configuration on any free port, with the head, wire and seed of the demo.
 
     None leaves the head to the wire, and the wire away: see `drivers.sim.rover`. ``bricks`` stand in
-    the scene. ``speed`` is `drivers.simulation_clock.simulation_speed`'s; without one nothing waits, but
-    behind a wire, whose bytes travel in real time.
+    the scene. ``speed`` is `drivers.simulation_clock.simulation_speed`'s; without one nothing waits.
     """
     chosen = {key: value for key, value in (("head", head), ("wire", wire)) if value is not None}
     packaged = {key: value for key, value in config.hardware.simulation.items() if key != "head"}
-    if speed is None:
-        speed = MAX if wire is None else 1
-    simulation = {**packaged, **chosen, "seed": seed, "speed": speed}
+    simulation = {**packaged, **chosen, "seed": seed, "speed": MAX if speed is None else speed}
     if bricks:
         simulation["scene"] = {**packaged.get("scene", {}), "bricks": bricks}
     return replace(config, listen=Listen(port=0), hardware=replace(config.hardware, simulation=simulation))
