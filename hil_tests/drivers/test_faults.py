@@ -12,7 +12,7 @@ from drivers.errors import BadOptions
 from drivers.faults import CAMERA_WORDS, HEAD_WORDS, LOG_WORDS, PAN_TILT, WHEN, FaultPanel, read_script
 from drivers.sim.hanging import HangingCamera
 from hil_tests.drivers.fault_bench import SIZE, START, Bench
-from tools.campaigns.servo_rigs import dynamixel_pty, in_memory, ptu_pty
+from tools.campaigns.servo_rigs import dynamixel, in_memory, ptu
 
 
 @pytest.fixture
@@ -138,7 +138,7 @@ def test_every_parameter_of_a_word_can_be_set_and_has_bounds(bench: Bench, devic
             bench.panel.set(device, word, **{name: -1e300})
 
 
-HEADS = {"in memory": in_memory, "Dynamixel": dynamixel_pty, "PTU": ptu_pty}
+HEADS = {"in memory": in_memory, "Dynamixel": dynamixel, "PTU": ptu}
 NOT_HERE = {"in memory": {"duplicate", "noise", "misnamed"}, "Dynamixel": {"not_a_number"}}
 
 
@@ -154,7 +154,7 @@ def test_every_word_of_a_head_is_asked_for_in_memory_and_behind_bytes(
         return find(panel, device, word, time_s)
 
     monkeypatch.setattr(FaultPanel, "_entry", noted)
-    with HEADS[name]() as rig:
+    with HEADS[name](turned=True) as rig:
         rig.head.move(0.1, 0.1)
         rig.head.read()
     assert set(HEAD_WORDS) - asked == NOT_HERE.get(name, set())

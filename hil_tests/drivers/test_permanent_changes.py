@@ -9,7 +9,6 @@ from typing import Any
 
 import pytest
 
-from drivers.clock import SystemClock
 from drivers.dynamixel import trial, workshop
 from drivers.dynamixel.link import Link
 from drivers.faults import FaultPanel
@@ -18,9 +17,10 @@ from drivers.flir_ptu.head import open_head as open_ptu
 from drivers.sim.pan_tilt import AxisSettings
 from drivers.sim.wire.axis import WireAxis
 from drivers.sim.wire.dynamixel_servo import SimulatedServo
-from drivers.sim.wire.line import PtyLine
+from drivers.sim.wire.memory_line import MemoryLine
 from drivers.sim.wire.ptu import SimulatedPtu
-from hil_tests.drivers.dynamixel.dynamixel_rig import X, rig, settled, until
+from hil_tests.drivers.dynamixel.dynamixel_rig import X, rig
+from hil_tests.drivers.turned import turned
 
 
 @pytest.fixture(scope="module")
@@ -67,10 +67,10 @@ def test_a_dynamixel_head_writes_no_permanent_register_that_is_not_listed(
         try:
             assert {"operating_mode", "drive_mode", "return_delay_time"} <= written
             head.move(0.2, 0.1)
-            settled(head)
+            it.settled(head)
             head.stop()
             it.servos[0].raise_error(32)
-            until(lambda: it.servos[0].table["hardware_error_status"] == 0, "the reboot")
+            it.until(lambda: it.servos[0].table["hardware_error_status"] == 0, "the reboot")
         finally:
             head.close()
     assert written <= listed["run"], written - listed["run"]
@@ -90,7 +90,7 @@ def test_the_commands_for_a_servo_on_the_bench_write_what_is_listed(
     written: set[str], listed: dict[str, set[str]]
 ) -> None:
     with rig() as it:
-        link = Link(it.line.path, 1_000_000)
+        link = Link(it.line.path, 1_000_000, clock=it.clock, open_line=it.open_line)
         try:
             workshop.facts(link, 1)
             assert written == set()
@@ -103,24 +103,24 @@ def test_the_commands_for_a_servo_on_the_bench_write_what_is_listed(
 
 
 def test_a_ptu_is_never_told_to_save() -> None:
-    clock = SystemClock()
-    axis = AxisSettings(0.001, 0.0, -2.7, 2.7, 1.0, 4.0)
-    tilt = AxisSettings(0.001, 0.0, -1.3, 0.5, 1.0, 4.0)
-    panel = FaultPanel(clock.now_s, ())
-    now_s = clock.now_s()
-    unit = SimulatedPtu(
-        "d46_70", WireAxis(axis, panel, number=0, time_s=now_s), WireAxis(tilt, panel, number=1, time_s=now_s)
-    )
-    with PtyLine(unit, clock, panel, wire_time=False) as line:
-        ends = {"pan": {"limits_rad": [-1.0, 1.0], "sign": -1}, "tilt": {"limits_rad": [-0.5, 0.3]}}
-        options = {"port": line.path, "speed_rad_per_s": 0.8, "acceleration_rad_per_s2": 2.0, **ends}
-        head = open_ptu(options, clock)
-        try:
-            head.move(0.1, 0.1)
-            settled(head)
-            head.stop()
-        finally:
-            head.close()
-        assert unit.eeprom_writes == 0
-        ptu_workshop.facts(line.path, 9600)
-        assert unit.eeprom_writes == 0
+    with turned() as it:
+        axis = AxisSettings(0.001, 0.0, -2.7, 2.7, 1.0, 4.0)
+        tilt = AxisSettings(0.001, 0.0, -1.3, 0.5, 1.0, 4.0)
+        panel = FaultPanel(it.now_s, ())
+        axes = [
+            WireAxis(one, panel, number=number, time_s=it.now_s()) for number, one in enumerate((axis, tilt))
+        ]
+        unit = SimulatedPtu("d46_70", *axes)
+        with MemoryLine(unit, it.clock, panel, wire_time=False) as line:
+            ends = {"pan": {"limits_rad": [-1.0, 1.0], "sign": -1}, "tilt": {"limits_rad": [-0.5, 0.3]}}
+            options = {"port": line.path, "speed_rad_per_s": 0.8, "acceleration_rad_per_s2": 2.0, **ends}
+            head = open_ptu(options, it.clock, line.open)
+            try:
+                head.move(0.1, 0.1)
+                it.settled(head)
+                head.stop()
+            finally:
+                head.close()
+            assert unit.eeprom_writes == 0
+            ptu_workshop.facts(line.path, 9600, it.clock, line.open)
+            assert unit.eeprom_writes == 0

@@ -6,6 +6,7 @@ is the same each time. On the machine's clock all of it works too, with the net 
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import TypeVar
@@ -63,6 +64,26 @@ class Turned:
 
         self.clock.thread(run, "beside the test").start()
         return ended
+
+    def outside(self, target: Callable[[], object]) -> None:
+        """Run what joins threads of the clock in a thread that the clock does not know, and wait for its end.
+
+        Time passes meanwhile only as far as that thread waits on the clock.
+        """
+        signal, ended = self.clock.signal(), []
+
+        def run() -> None:
+            try:
+                target()
+            finally:
+                with signal:
+                    ended.append(True)
+                    signal.notify_all()
+
+        with signal:
+            threading.Thread(target=run, daemon=True).start()
+            while not ended:
+                signal.wait(idle=True)
 
 
 @contextmanager

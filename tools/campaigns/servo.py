@@ -46,15 +46,15 @@ from tools.campaigns.servo_rigs import (
     LIMITS_RAD,
     Rig,
     as_opened,
-    dynamixel_pty,
+    dynamixel,
     fresh_servos,
     opened_on,
-    ptu_pty,
+    ptu,
 )
 
 DRIVERS: dict[str, Callable[[], AbstractContextManager[Rig]]] = {
-    "dynamixel_pty": partial(dynamixel_pty, watchdog_s=0.3, reply_timeout_s=0.05),
-    "ptu_pty": ptu_pty,
+    "dynamixel_pty": partial(dynamixel, watchdog_s=0.3, reply_timeout_s=0.05),
+    "ptu_pty": ptu,
 }
 MIXTURE = "mixture"
 WORDS = (*HEAD_WORDS, MIXTURE)

@@ -2,6 +2,9 @@
 
 Backlash and sag are nothing here, so the angle that the mechanism stands at is the angle of the motor, which
 a reading has to tell; a reading rounds it to the device's count.
+
+A rig lives on the machine's clock behind a pseudo terminal or TCP, or (``turned``) in memory on a clock that
+is turned: whoever has it is at work on that clock, and waits on it.
 """
 
 from __future__ import annotations
@@ -12,21 +15,25 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from typing import Any
 
-from drivers.clock import SystemClock
+from drivers.clock import Clock, SystemClock
 from drivers.dynamixel.head import DynamixelHead
 from drivers.dynamixel.head import open_head as open_dynamixel
 from drivers.faults import FaultPanel
 from drivers.flir_ptu.head import open_head as open_flir_ptu
 from drivers.interfaces import PanTilt
+from drivers.serial_line import OpenLine, SerialLine
 from drivers.sim.pan_tilt import AxisSettings, HeadSettings, SimulatedPanTilt
 from drivers.sim.wire.axis import WireAxis
 from drivers.sim.wire.dynamixel_bus import DynamixelBus
 from drivers.sim.wire.dynamixel_servo import SimulatedServo
-from drivers.sim.wire.line import PtyLine, TcpLine
+from drivers.sim.wire.line import PtyLine, TcpLine, WireDevice
+from drivers.sim.wire.memory_line import MemoryLine
 from drivers.sim.wire.ptu import SimulatedPtu
+from drivers.simulation_clock import SimulationClock
 
 LIMITS_RAD = ((-1.0, 1.0), (-0.6, 0.4))
 SPEED_RAD_PER_S, ACCELERATION_RAD_PER_S2 = 1.2, 20.0
+START_S = 1000.0  # of a turned clock
 X_COUNT_RAD = math.tau / 4096  # e-manual, X series
 D46_STEP_RAD = math.radians(324 / 7 / 3600)  # D46-70, half step of 46.2857"
 D48E_STEP_RAD = math.radians(162 / 7 / 3600)  # eighth step of 23.142857"
@@ -42,6 +49,8 @@ class Rig:
         What it is.
     head
         The driver under test.
+    clock
+        What it lives on.
     panel
         Where faults are set.
     true_rad
@@ -60,39 +69,43 @@ class Rig:
 
     name: str
     head: PanTilt
+    clock: Clock
     panel: FaultPanel
     true_rad: Callable[[float], tuple[float, float]]
     count_rad: float
-    line: PtyLine | TcpLine | None = None
+    line: MemoryLine | PtyLine | TcpLine | None = None
     sent: list[int] = field(default_factory=lambda: [0])
     settle_rad: float = 1e-9
     fastest_rad_per_s: float | None = SPEED_RAD_PER_S
 
 
 @contextmanager
-def in_memory() -> Iterator[Rig]:
+def in_memory(turned: bool = False) -> Iterator[Rig]:
     """The simulated head without any bytes."""
-    clock = SystemClock()
-    axes = [
-        AxisSettings(X_COUNT_RAD, 0.0, low, high, SPEED_RAD_PER_S, ACCELERATION_RAD_PER_S2)
-        for low, high in LIMITS_RAD
-    ]
-    panel = FaultPanel(clock.now_s, ())
-    head = SimulatedPanTilt(HeadSettings("in memory", *axes), clock, panel)
-    try:
-        yield Rig("in memory", head, panel, head.true_joints, X_COUNT_RAD)
-    finally:
-        head.close()
+    with _clock(turned) as clock:
+        axes = [
+            AxisSettings(X_COUNT_RAD, 0.0, low, high, SPEED_RAD_PER_S, ACCELERATION_RAD_PER_S2)
+            for low, high in LIMITS_RAD
+        ]
+        panel = FaultPanel(clock.now_s, ())
+        head = SimulatedPanTilt(HeadSettings("in memory", *axes), clock, panel)
+        try:
+            yield Rig("in memory", head, clock, panel, head.true_joints, X_COUNT_RAD)
+        finally:
+            head.close()
 
 
 @contextmanager
-def dynamixel_pty(watchdog_s: float = 0.0, reply_timeout_s: float = 0.2) -> Iterator[Rig]:
-    """Two XM430 servos behind a pseudo terminal.
+def dynamixel(
+    watchdog_s: float = 0.0, reply_timeout_s: float = 0.2, *, turned: bool = False
+) -> Iterator[Rig]:
+    """Two XM430 servos behind a serial line.
 
     By default patient and without a watchdog: on a busy machine simulator and driver both come late.
     """
     with ExitStack() as stack:
-        clock, panel, axes = _axes()
+        clock = stack.enter_context(_clock(turned))
+        panel, axes = _axes(clock)
         settings = {"baud_rate": 3, "return_delay_time": 0}  # 1 Mbaud
         servos = [
             SimulatedServo("xm430_w350", number, axis, settings=settings, time_s=clock.now_s())
@@ -100,16 +113,16 @@ def dynamixel_pty(watchdog_s: float = 0.0, reply_timeout_s: float = 0.2) -> Iter
         ]
         sent = [0]
         bus = DynamixelBus(servos)
-        line = stack.enter_context(PtyLine(bus, clock, panel, wire_time=False, observer=_counter(sent)))
+        line, opens = _serial_line(stack, bus, clock, panel, sent)
         ends = [{"id": n, "model": "XM430-W350", "limits_rad": list(LIMITS_RAD[n - 1])} for n in (1, 2)]
         options: dict[str, Any] = {
             "port": line.path, "baud": 1_000_000, "pan": ends[0], "tilt": ends[1],
             "speed_rad_per_s": SPEED_RAD_PER_S, "acceleration_rad_per_s2": ACCELERATION_RAD_PER_S2,
             "watchdog_s": watchdog_s, "reply_timeout_s": reply_timeout_s,
         }  # fmt: skip
-        head = open_dynamixel(options, clock)
+        head = open_dynamixel(options, clock, opens)
         stack.callback(head.close)
-        yield Rig("Dynamixel, pty", head, panel, _truth(axes), X_COUNT_RAD, line, sent)
+        yield Rig("Dynamixel", head, clock, panel, _truth(axes), X_COUNT_RAD, line, sent)
 
 
 class CountedServo(SimulatedServo):
@@ -126,7 +139,8 @@ class CountedServo(SimulatedServo):
 @contextmanager
 def fresh_servos() -> Iterator[tuple[PtyLine, FaultPanel, list[CountedServo]]]:
     """Two XM430 servos as from the factory but for the baud rate, on a line of their own."""
-    clock, panel, axes = _axes()
+    clock = SystemClock()
+    panel, axes = _axes(clock)
     servos = [
         CountedServo("xm430_w350", number, axis, settings={"baud_rate": 3}, time_s=clock.now_s())
         for number, axis in enumerate(axes, start=1)
@@ -159,14 +173,15 @@ def as_opened(servo: SimulatedServo, head: DynamixelHead) -> bool:
 
 
 @contextmanager
-def ptu_pty() -> Iterator[Rig]:
-    """A D46-70 behind a pseudo terminal."""
+def ptu(*, turned: bool = False) -> Iterator[Rig]:
+    """A D46-70 behind a serial line."""
     with ExitStack() as stack:
-        clock, panel, axes = _axes()
+        clock = stack.enter_context(_clock(turned))
+        panel, axes = _axes(clock)
         sent = [0]
         unit = SimulatedPtu("d46_70", *axes)
-        line = stack.enter_context(PtyLine(unit, clock, panel, wire_time=False, observer=_counter(sent)))
-        yield _ptu_rig(stack, "PTU, pty", line.path, line, unit, clock, panel, axes, sent)
+        line, opens = _serial_line(stack, unit, clock, panel, sent)
+        yield _ptu_rig(stack, "PTU", line.path, opens, line, unit, clock, panel, axes, sent)
 
 
 @contextmanager
@@ -175,7 +190,8 @@ def line_alone(driver: str) -> Iterator[tuple[dict[str, Any], Callable[[float], 
 
     Dynamixel servos stop by their watchdog 0.4 s after the last packet.
     """
-    clock, panel, axes = _axes()
+    clock = SystemClock()
+    panel, axes = _axes(clock)
     device: DynamixelBus | SimulatedPtu
     if driver == "dynamixel":
         settings = {"baud_rate": 3, "return_delay_time": 0}
@@ -200,22 +216,23 @@ def line_alone(driver: str) -> Iterator[tuple[dict[str, Any], Callable[[float], 
 def ptu_tcp() -> Iterator[Rig]:
     """A D48E, whose answers look otherwise, behind a TCP port."""
     with ExitStack() as stack:
-        clock, panel, axes = _axes()
+        clock = SystemClock()
+        panel, axes = _axes(clock)
         sent = [0]
         unit = SimulatedPtu("d48e", *axes)
         line = stack.enter_context(TcpLine(unit, clock, panel, banner=unit.banner, observer=_counter(sent)))
-        yield _ptu_rig(
-            stack, "PTU, TCP", f"socket://127.0.0.1:{line.port}", line, unit, clock, panel, axes, sent
-        )
+        port = f"socket://127.0.0.1:{line.port}"
+        yield _ptu_rig(stack, "PTU, TCP", port, SerialLine, line, unit, clock, panel, axes, sent)
 
 
 def _ptu_rig(
     stack: ExitStack,
     name: str,
     port: str,
-    line: PtyLine | TcpLine,
+    opens: OpenLine,
+    line: MemoryLine | PtyLine | TcpLine,
     unit: SimulatedPtu,
-    clock: SystemClock,
+    clock: Clock,
     panel: FaultPanel,
     axes: tuple[WireAxis, WireAxis],
     sent: list[int],
@@ -231,15 +248,33 @@ def _ptu_rig(
         "tilt": {"limits_rad": list(LIMITS_RAD[1])},
         "speed_rad_per_s": SPEED_RAD_PER_S,
     }
-    head = open_flir_ptu(options, clock)
+    head = open_flir_ptu(options, clock, opens)
     stack.callback(head.close)
     fastest = unit.pan.now.fastest * step_rad  # its own; the options' speed is for moves that name none
-    return Rig(name, head, panel, _truth(axes), step_rad, line, sent, fastest_rad_per_s=fastest)
+    return Rig(name, head, clock, panel, _truth(axes), step_rad, line, sent, fastest_rad_per_s=fastest)
 
 
-def _axes() -> tuple[SystemClock, FaultPanel, tuple[WireAxis, WireAxis]]:
+@contextmanager
+def _clock(turned: bool) -> Iterator[Clock]:
+    """What a rig lives on; whoever has the rig is at work on it."""
+    clock = SimulationClock(start_s=START_S) if turned else SystemClock()
+    with clock.at_work():
+        yield clock
+
+
+def _serial_line(
+    stack: ExitStack, device: WireDevice, clock: Clock, panel: FaultPanel, sent: list[int]
+) -> tuple[MemoryLine | PtyLine, OpenLine]:
+    """A line to a device, and how a driver opens it."""
+    if isinstance(clock, SystemClock):
+        pty = PtyLine(device, clock, panel, wire_time=False, observer=_counter(sent))
+        return stack.enter_context(pty), SerialLine
+    line = MemoryLine(device, clock, panel, wire_time=False, observer=_counter(sent))
+    return stack.enter_context(line), line.open
+
+
+def _axes(clock: Clock) -> tuple[FaultPanel, tuple[WireAxis, WireAxis]]:
     """The two motors."""
-    clock = SystemClock()
     panel = FaultPanel(clock.now_s, ())
     settings = [
         AxisSettings(X_COUNT_RAD, 0.0, low, high, SPEED_RAD_PER_S, ACCELERATION_RAD_PER_S2)
@@ -248,7 +283,7 @@ def _axes() -> tuple[SystemClock, FaultPanel, tuple[WireAxis, WireAxis]]:
     now_s = clock.now_s()
     pan = WireAxis(settings[0], panel, number=0, time_s=now_s)
     tilt = WireAxis(settings[1], panel, number=1, time_s=now_s)
-    return clock, panel, (pan, tilt)
+    return panel, (pan, tilt)
 
 
 def _truth(axes: tuple[WireAxis, WireAxis]) -> Callable[[float], tuple[float, float]]:
@@ -267,7 +302,7 @@ def _counter(sent: list[int]) -> Callable[..., None]:
 
 RIGS: dict[str, Callable[[], Any]] = {
     "in_memory": in_memory,
-    "dynamixel_pty": dynamixel_pty,
-    "ptu_pty": ptu_pty,
+    "dynamixel_pty": dynamixel,
+    "ptu_pty": ptu,
     "ptu_tcp": ptu_tcp,
 }

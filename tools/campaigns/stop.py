@@ -24,7 +24,7 @@ from drivers.sim.wire.dynamixel_servo import VOLTAGE
 from mastctl.cli.output import at_least
 from mastctl.cli.tasks import add_task_options, results_of
 from tools.arguments import end
-from tools.campaigns.servo_rigs import ACCELERATION_RAD_PER_S2, Rig, dynamixel_pty
+from tools.campaigns.servo_rigs import ACCELERATION_RAD_PER_S2, Rig, dynamixel
 
 AXES = ("pan", "tilt")
 LONGEST_S = 20.0
@@ -74,7 +74,7 @@ def trial(one: Trial) -> Stopped:
     """Stop a moving head of which one servo has failed; tell of the other axis."""
     logging.disable(logging.CRITICAL)  # each trial gives a line up, and says so
     fault, axis, after_s = one.fault, one.axis, one.after_s
-    with dynamixel_pty(watchdog_s=0.3, reply_timeout_s=0.05) as rig:
+    with dynamixel(watchdog_s=0.3, reply_timeout_s=0.05) as rig:
         assert rig.line is not None and isinstance(rig.line.device, DynamixelBus)
         bus, other = rig.line.device, 1 - axis
         changes: list[tuple[float, int]] = []
