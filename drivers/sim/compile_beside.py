@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import contextlib
 import fcntl
+import gc
 import os
 import subprocess
 import sys
@@ -24,40 +25,48 @@ PATIENCE_S = 120.0
 """After so long it is left to this process."""
 
 
+_compiling: list[subprocess.Popen[bytes]] = []
+"""The process that compiles for this one, as long as a block wants it."""
+
+
 @contextlib.contextmanager
 def drawing_compiled_beside() -> Iterator[None]:
     """Let another process compile what draws while the block runs, and wait for it at its end.
 
-    Nothing happens where it is compiled already, where there is one processor only, or where nothing can be
-    kept. Whether it went well or not, `drivers.sim.render.compile_renderer` has to follow.
+    A block inside another one waits for the process of the outer one: whoever knows early that pictures will
+    be drawn has it begin before the rest is imported. Nothing happens where it is compiled already, where
+    there is one processor only, or where nothing can be kept. Whether it went well or not,
+    `drivers.sim.render.compile_renderer` has to follow.
     """
-    beside = None if is_compiled() else _begun()
+    mine = [] if _compiling or is_compiled() else _begun()
+    _compiling.extend(mine)
     try:
         yield
-        if beside is not None:
+        for beside in tuple(_compiling):
             with contextlib.suppress(subprocess.TimeoutExpired):
                 beside.wait(PATIENCE_S)
     finally:
-        if beside is not None:
+        for beside in mine:
+            _compiling.remove(beside)
             assert beside.stdin is not None
             beside.stdin.close()
             beside.kill()
             beside.wait()
 
 
-def _begun() -> subprocess.Popen[bytes] | None:
-    """The process that compiles, if one is of use here."""
+def _begun() -> list[subprocess.Popen[bytes]]:
+    """The process that compiles; none where it is of no use."""
     if len(os.sched_getaffinity(0)) < 2 or not sys.executable:
-        return None
+        return []
     folder = _folder()
     with contextlib.suppress(OSError):
         folder.mkdir(parents=True, exist_ok=True)
     if not os.access(folder, os.W_OK):
-        return None
+        return []
     command = [sys.executable, "-P", "-m", "drivers.sim.compile_beside"]
     path = os.pathsep.join(str(Path(place).absolute()) for place in sys.path)
     try:
-        return subprocess.Popen(
+        beside = subprocess.Popen(
             command,
             env={**os.environ, "PYTHONPATH": path},
             stdin=subprocess.PIPE,  # it ends with whoever holds the other end
@@ -66,7 +75,8 @@ def _begun() -> subprocess.Popen[bytes] | None:
             start_new_session=True,  # Ctrl-C is for the one who waits
         )
     except OSError:
-        return None
+        return []
+    return [beside]
 
 
 def _folder() -> Path:
@@ -83,6 +93,7 @@ def _ends_with_its_maker() -> None:
 
 def main() -> None:
     """Compile what draws, if nobody else has."""
+    gc.disable()  # a tenth less to do, for 100 MB of a process that ends soon
     threading.Thread(target=_ends_with_its_maker, daemon=True).start()
     with (_folder() / "lock").open("w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)  # goes with the process, however it ends

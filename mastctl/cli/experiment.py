@@ -141,6 +141,7 @@ def _run_simulated(args: argparse.Namespace) -> int:
 
 def run_demo(args: argparse.Namespace) -> int:
     """Start a simulated rover behind a daemon on a free port, and run the experiment on it."""
+    from drivers.sim.compile_beside import drawing_compiled_beside
     from mastctl.config import load_config
     from mastctl.experiment.demo import SimulationTruth, demo_config, head_note, own_config
     from mastctl.experiment.pointing import head_pair
@@ -152,7 +153,8 @@ def run_demo(args: argparse.Namespace) -> int:
         )
     else:
         config = own_config(load_config(args.config), head=args.head, wire=args.wire, speed=args.speed)
-    with simulated_daemon(args, config) as (daemon, client):
+    # compiling begins before the daemon is imported
+    with drawing_compiled_beside(), simulated_daemon(args, config) as (daemon, client):
         rover = daemon.hardware.simulation
         assert rover is not None  # both configurations are of simulated rovers
         rig = daemon.service.stored.rig

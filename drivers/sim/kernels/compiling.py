@@ -97,18 +97,22 @@ def _say_once(folder: str, reason: str | None) -> None:
     )
 
 
+_ALL: dict[str, Any] = {"nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True}
+_INSIDE = {**_ALL, "no_cpython_wrapper": True}  # packing and unpacking a world is much code, for nobody
+
+
 def entry(function: Function) -> Function:
     """Compile what Python calls, without the interpreter lock; kept on disk."""
-    made: Any = numba.njit(nogil=True, error_model="numpy")(function)
+    made: Any = numba.njit(**_ALL)(function)
     made._cache = Kept(function)
     return cast(Function, made)
 
 
 def part(function: Function) -> Function:
     """Compile what only other compiled functions call."""
-    return cast(Function, numba.njit(nogil=True, error_model="numpy")(function))
+    return cast(Function, numba.njit(**_INSIDE)(function))
 
 
 def inlined(function: Function) -> Function:
     """Compile into the callers."""
-    return cast(Function, numba.njit(nogil=True, error_model="numpy", forceinline=True)(function))
+    return cast(Function, numba.njit(**_INSIDE, forceinline=True)(function))

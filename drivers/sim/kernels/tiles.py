@@ -245,10 +245,10 @@ def render_tiles(
             if starts.shape[0] == 0 and clear < FAR:
                 clear = sweep(inner, bundle, count, mx, my, -mz, clear, abs(bx) > abs(by))
             place = Block(clear, beyond, n_block, pitch)
-            n = 0
-            for y in range(j * block, y1):
-                for x in range(i * block, x1):
+            y0, x0 = j * block, i * block
+            for y in range(y0, y1):
+                for x in range(x0, x1):
+                    n = ((y - y0) * (x1 - x0) + x - x0) * q
                     light = pixel_light(world, view, place, bundle, n, in_block, hits, y, x, 1 < q <= SHARING)
-                    n += q
                     if light == light:
                         image[y, x] = min(light, 255.0)

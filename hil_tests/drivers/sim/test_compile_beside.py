@@ -55,6 +55,18 @@ def test_the_other_process_ends_well_and_is_waited_for(begun: list[subprocess.Po
     assert process.returncode == 0
 
 
+def test_a_block_in_a_block_waits_for_the_process_of_the_outer_one(
+    begun: list[subprocess.Popen[bytes]],
+) -> None:
+    with drawing_compiled_beside():
+        with drawing_compiled_beside():
+            pass
+        (process,) = begun
+        assert process.returncode is not None
+    with drawing_compiled_beside():
+        assert len(begun) == 2
+
+
 def test_the_other_process_is_not_left_behind(begun: list[subprocess.Popen[bytes]]) -> None:
     with pytest.raises(KeyboardInterrupt), drawing_compiled_beside():
         raise KeyboardInterrupt
