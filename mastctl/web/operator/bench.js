@@ -40,7 +40,8 @@ export class Bench {
     this.error = h("div", {}, h("h3", {}, "Predicted error of a first pointing"), this.plot, this.facts, this.table);
     this.verdict = h("div", { class: "bench-verdict" });
     this.log = h("ul", { class: "bench-log", "aria-label": "What it said last" });
-    this.now = h("div", { class: "bench-now" }, this.steps, this.verdict, h("div", { class: "bench-parts" }, this.asked, h("div", { class: "bench-side" }, this.cover, this.error)), this.log, h("div", { class: "buttons" }, this.goOn, this.leave, this.fresh));
+    this.next = h("p", { class: "bench-next" });
+    this.now = h("div", { class: "bench-now" }, this.steps, this.verdict, this.next, h("div", { class: "buttons" }, this.goOn, this.fresh), h("div", { class: "bench-parts" }, this.asked, h("div", { class: "bench-side" }, this.cover, this.error)), this.log, h("div", { class: "buttons" }, this.leave));
     this.said = h("p", { class: "bad", role: "alert" });
     this.buildForm();
     this.others = h("details", { class: "bench-runs" }, h("summary", {}, "Earlier runs"), h("table", { class: "figures list" }));
@@ -73,7 +74,7 @@ export class Bench {
     const { heard } = this;
     try {
       const kept = await get("/bench");
-      [this.kept, this.simulated] = [kept.runs, kept.simulated];
+      [this.kept, this.simulated, this.folder] = [kept.runs, kept.simulated, kept.folder];
       if (this.board.options.length !== kept.boards.length + 1) put(this.board, kept.boards.map((name) => h("option", { value: name }, paper(name))), h("option", { value: "" }, "another: its BOARD.yaml …"));
       if (!this.known) { this.known = true; this.board.value = this.simulated && kept.boards.includes("charuco_a2") ? "charuco_a2" : ""; }
       if (heard === this.heard) this.run = kept.run; // null after a restart of the daemon
@@ -146,7 +147,8 @@ export class Bench {
     this.start.disabled ||= Boolean(going);
     this.drawOthers(going);
     if (!shown) return;
-    this.goOn.hidden = run.state !== "interrupted";
+    this.goOn.hidden = this.next.hidden = run.state !== "interrupted";
+    say(this.next, `What it saw is kept in ${this.folder ?? ""}/${run.name}: ${run.pictures} pictures a camera. ${this.may ? "" : "Whoever may operate chooses: "}Go on continues from there, with the board where it stands; Begin another starts anew.`);
     this.leave.hidden = over;
     this.fresh.hidden = !over;
     this.drawSteps(run);
@@ -159,6 +161,7 @@ export class Bench {
   }
 
   drawSteps(run) {
+    this.steps.hidden = run.state === "interrupted"; // it has left out those before the verdict
     const at = run.step === "begin" ? -1 : STEPS.findIndex(([name]) => name === run.step);
     put(this.steps, STEPS.map(([name, words], k) => h("li", { "aria-current": k === at ? "step" : null, class: k < at ? "past" : null },
       words, name === "place" && run.placements ? ` (${run.placements} of 2 to 4)` : name === "pictures" && run.pictures ? ` (${run.pictures})` : "")));
@@ -224,6 +227,10 @@ export class Bench {
   drawOthers(going) {
     const rows = this.kept.filter((one) => one.name !== this.run?.name || this.closed === one.name);
     this.others.hidden = !rows.length;
+    const cut = !this.run && this.kept[0]?.state === "interrupted"; // by the end of its daemon: nothing else tells it
+    if (cut && !this.cut) this.others.open = true;
+    this.cut = cut;
+    say(this.others.firstChild, cut ? "Earlier runs; the last was interrupted: go on with it, or begin another" : "Earlier runs");
     put(this.others.lastChild, rows.map((one) => h("tr", {},
       h("td", {}, clock(one.begun)), h("td", {}, one.board), h("td", { class: "n" }, `${one.pictures} pictures, ${number(one.size_mb, 0)} MB`),
       h("td", { class: one.grade ? GRADES[one.grade] : "" }, one.state === "done" ? "done" : sentence(one.sentence)),

@@ -129,9 +129,16 @@ def test_stop_ends_it_says_so_and_it_goes_on_from_there(pair: BOTH, visit: Visit
     assert any(call[0] == "stop" for call in hardware.head.calls)
     with pytest.raises(ProcessLookupError):
         os.kill(work.child.pid, 0)
+    (kept,) = daemon.service.guide.runs.all()
+    next_words = one.page.locator(".bench-next").inner_text()
+    assert f"is kept in {kept.path}: 3 pictures a camera" in next_words
+    assert "Go on continues" in next_words and "Begin another starts anew" in next_words
+    assert not one.page.locator(".bench-place").is_visible(), "no board is asked for"
+    assert not one.page.locator(".bench-steps").is_visible(), "no step is ticked that was not taken"
     scripted(daemon, lines(BEGUN) + ENDS + lines(DONE))
     one.page.click("#bench button:has-text('Go on')")
     one.page.wait_for_selector(".bench-grade")
+    assert not one.page.locator(".bench-next").is_visible()
     assert len(daemon.service.guide.runs.all()) == 1, "the same run"
 
 
@@ -153,6 +160,22 @@ def test_a_program_that_is_killed_is_told_and_another_steers_until_it_goes_on(
     scripted(daemon, lines(BEGUN) + ENDS + lines(DONE))
     one.page.click("#bench button:has-text('Go on')")
     one.page.wait_for_selector(".bench-grade")
+
+
+def test_a_run_that_its_daemon_cut_off_is_told_with_what_to_do_next(pair: BOTH, visit: Visits) -> None:
+    daemon, _ = pair
+    scripted(daemon, AT_WORK)
+    one = visit(daemon.url)
+    begin(one)
+    one.page.click("#bench button:has-text('End it for now')")
+    one.page.wait_for_selector(".bench-next")
+    daemon.service.guide._work = None  # as another daemon, which only finds its folder
+    one.page.reload()
+    one.page.wait_for_selector(".bench-runs[open] summary:has-text('interrupted: go on with it')")
+    scripted(daemon, lines(BEGUN) + ENDS + lines(DONE))
+    one.page.click(".bench-runs button:has-text('Go on')")
+    one.page.wait_for_selector(".bench-grade")
+    assert len(daemon.service.guide.runs.all()) == 1, "the same run"
 
 
 def test_who_had_the_lease_steers_no_longer_and_is_not_alarmed(pair: BOTH, visit: Visits) -> None:
