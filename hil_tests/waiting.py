@@ -7,6 +7,7 @@ has eight other busy processes; a test that means "quickly" asserts an order of 
 from __future__ import annotations
 
 from collections.abc import Callable
+from threading import Thread
 from typing import TypeVar
 
 from drivers.clock import Clock, SystemClock
@@ -33,3 +34,8 @@ def until(holds: Callable[[], T], what: str, within_s: float = NET_S, clock: Clo
         if clock.now_s() > end_s:
             raise AssertionError(f"not within {within_s:g} s: {what}")
         clock.sleep(LOOK_EVERY_S)
+
+
+def joined(*threads: Thread) -> None:
+    """Wait until threads have ended; `Thread.join` with a timeout returns also when they have not."""
+    until(lambda: not any(one.is_alive() for one in threads), "the end of " + ", ".join(map(str, threads)))

@@ -10,6 +10,8 @@ from urllib.request import urlopen
 
 import pytest
 
+from hil_tests.waiting import NET_S
+
 if TYPE_CHECKING:
     from hil_tests.mastctl.service_fakes import FakeHardware
     from mastctl.daemon import RunningDaemon
@@ -41,6 +43,6 @@ def pair(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[tuple[Runn
     from hil_tests.mastctl.service_fakes import fake_daemon
 
     with fake_daemon(monkeypatch, tmp_path) as made:
-        with urlopen(f"{made[0].url}/api/v1/health/live", timeout=20.0):
+        with urlopen(f"{made[0].url}/api/v1/health/live", timeout=NET_S):
             pass
         yield made

@@ -15,15 +15,21 @@ from pathlib import Path
 from typing import Any
 
 from calib.files.mast_file import save_rig
-from hil_tests.mastctl.service_fakes import CONFIG, eventually, rig
+from hil_tests.mastctl.service_fakes import CONFIG, rig
+from hil_tests.waiting import NET_S, until
 from mastctl.client import Client, ClientError
 
-BOUND_S = 60.0  # only ends a failing test
-GOAL_RAD = 1.9  # nearly four seconds away
+BOUND_S = NET_S
+GOAL_RAD = 1.9
+SPEED_RAD_PER_S = 0.01  # the goal is three minutes away: within a test's net the head does not arrive
 SHORT_OF_GOAL_RAD = 1.5  # a head that stands before this was stopped, however slow the machine is
 
 # Devices from outside for daemons of their own process: a head that takes its time, a camera that may hang.
-OUTSIDE = """
+OUTSIDE = (
+    f"""
+SPEED_RAD_PER_S = {SPEED_RAD_PER_S}
+"""
+    + """
 import os, time
 from types import SimpleNamespace
 
@@ -39,7 +45,7 @@ class Head:
             log.write(word + "\\n")
 
     def pan(self):
-        way, gone = self.goal - self.at, 0.5 * (time.monotonic() - self.begun)
+        way, gone = self.goal - self.at, SPEED_RAD_PER_S * (time.monotonic() - self.begun)
         return self.goal if gone >= abs(way) else self.at + np.sign(way) * gone
 
     def read(self):
@@ -66,6 +72,7 @@ class Camera:
     def close(self):
         pass
 """
+)
 
 
 def write_config(folder: Path, listen: str = "{port: 0}", devices: str = OUTSIDE) -> Path:
@@ -76,6 +83,7 @@ def write_config(folder: Path, listen: str = "{port: 0}", devices: str = OUTSIDE
         "pan_tilt: {driver: fake}",
         f"pan_tilt: {{driver: 'outside_devices:Head', options: {{log: '{folder / 'head.log'}'}}}}",
     )
+    text = text.replace("speed_rad_per_s: 0.5", f"speed_rad_per_s: {SPEED_RAD_PER_S}")
     path = folder / "daemon.yaml"
     path.write_text(text.replace("driver: fake", "driver: 'outside_devices:Camera'"))
     return path
@@ -122,11 +130,11 @@ def answers(url: str) -> bool:
 def under_way(client: Client) -> None:
     """Send the head on its long way and wait until it moves."""
     client.point(pan_rad=GOAL_RAD, tilt_rad=0.0)
-    eventually(lambda: client.status()["moving"], "the move", BOUND_S)
+    until(lambda: client.status()["moving"], "the move")
 
 
 def stands_short_of_its_goal(client: Client) -> None:
-    eventually(lambda: not client.status()["moving"], "the rest", BOUND_S)
+    until(lambda: not client.status()["moving"], "the rest")
     assert client.status()["joints"]["pan_rad"] < SHORT_OF_GOAL_RAD
 
 
@@ -146,7 +154,7 @@ class Pipe:
     def drain(self, until: bytes) -> bytes:
         """Read until some words came."""
         got = b""
-        until_s = time.monotonic() + BOUND_S
+        until_s = time.monotonic() + NET_S
         while until not in got and time.monotonic() < until_s:
             got += os.read(self.read, 4096)
         return got

@@ -11,6 +11,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
+import httpx
 import numpy as np
 import pytest
 
@@ -19,12 +20,18 @@ from calib.files.mast_file import save_rig
 from calib.mast.rig import Mast, Rig, RigCamera
 from drivers.clock import Clock, SystemClock
 from drivers.interfaces import Camera, Frame, PanTilt, Reading
+from hil_tests.waiting import NET_S
 from mastctl.config import load_config
 
 if TYPE_CHECKING:
     from mastctl.daemon import RunningDaemon
 
 SIZE_PX = (64, 48)
+
+PLAIN: dict[str, Any] = {"trust_env": False, "verify": False, "timeout": NET_S}
+"""How a test's client asks a daemon: with the net, and without the machine's certificates, 17 ms to read."""
+HTTP = httpx.Client(**PLAIN, limits=httpx.Limits(max_keepalive_connections=0))
+"""For single questions; no connection outlives one."""
 
 
 def rig(size_px: tuple[int, int] = SIZE_PX) -> Rig:
@@ -139,7 +146,10 @@ class FakeHardware:
 
 
 class Hang:
-    """Something to hang in: ``hook`` blocks until ``let_go``; ``entered`` says that somebody hangs."""
+    """Something to hang in: ``hook`` blocks until ``let_go``; ``entered`` says that somebody hangs.
+
+    It hangs longer than any net: what was answered before ``let_go`` was answered while it hung.
+    """
 
     def __init__(self) -> None:
         self.entered = threading.Event()
@@ -147,7 +157,7 @@ class Hang:
 
     def __call__(self, *ignored: Any) -> None:
         self.entered.set()
-        self._go.wait(30.0)
+        self._go.wait(2.0 * NET_S)
 
     def let_go(self) -> None:
         self._go.set()

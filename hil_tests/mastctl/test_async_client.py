@@ -8,14 +8,14 @@ from pathlib import Path
 
 import pytest
 
-from hil_tests.mastctl.service_fakes import FakeHardware, eventually
+from hil_tests.mastctl.service_fakes import FakeHardware
 from hil_tests.mastctl.web.network import network_daemon
+from hil_tests.waiting import NET_S, until
 from mastctl.client import AsyncClient, Client, ClientError
 from mastctl.daemon import RunningDaemon
 from tools.async_client import FILES, FOLDER, written
 
 BOTH = tuple[RunningDaemon, FakeHardware]
-BOUND_S = 20.0
 
 
 @pytest.mark.parametrize("source", FILES)
@@ -43,19 +43,19 @@ def test_a_whole_visit(pair: BOTH) -> None:
 
     async def visit() -> None:
         async with AsyncClient(daemon.url) as client:
-            assert (await client.status())["state"] in ("ready", "starting")
+            assert (await client.status())["state"] == "ready"
             shot = await client.snapshot("navcam_left")
             assert shot.image.shape == (48, 64)
             async with client.lease() as held:
                 assert (await client.control() or {})["holder"] == held.holder
                 operation = await client.point(pan_rad=0.1, tilt_rad=0.0)
                 record, again = await asyncio.gather(
-                    client.wait(operation, BOUND_S, lambda step: steps.append(step["name"])),
-                    client.wait(operation, BOUND_S),
+                    client.wait(operation, NET_S, lambda step: steps.append(step["name"])),
+                    client.wait(operation, NET_S),
                 )
                 assert record["state"] == again["state"] == "done"
             assert await client.control() is None
-            assert (await client.wait_state("ready", timeout_s=BOUND_S))["state"] == "ready"
+            assert (await client.wait_state("ready", timeout_s=NET_S))["state"] == "ready"
             async for event in client.events("mast"):
                 assert event["topic"] == "mast"
                 break
@@ -65,7 +65,7 @@ def test_a_whole_visit(pair: BOTH) -> None:
 
     asyncio.run(visit())
     assert steps == ["look", "measure"]
-    eventually(lambda: publisher.listeners == before, "nobody listens any more")
+    until(lambda: publisher.listeners == before, "nobody listens any more")
 
 
 def test_its_refusals_are_those_of_the_other(pair: BOTH) -> None:
@@ -99,6 +99,6 @@ def test_a_lease_keeps_the_token_that_its_client_was_given(
         url = f"http://127.0.0.1:{net.port}"
         with Client(url, token=net.token("operate")) as client:
             with client.lease(for_s=1.0) as held:
-                eventually(lambda: held.lost is None, "it is held")
+                until(lambda: held.lost is None, "it is held")
                 assert client.control() is not None
             assert client.control() is None, "it was released, with the token"

@@ -5,7 +5,6 @@ from __future__ import annotations
 import subprocess
 import sys
 import threading
-import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -14,14 +13,14 @@ from typing import Any
 import pytest
 
 from hil_tests.mastctl.outside_daemon import daemon_process, line, under_way, write_config
-from hil_tests.mastctl.service_fakes import FakeHardware, FakeStep, ScriptedLoop, eventually
+from hil_tests.mastctl.service_fakes import FakeHardware, FakeStep, ScriptedLoop
+from hil_tests.waiting import NET_S, until
 from mastctl.client import Client, ClientError
 from mastctl.client import connection as connection_module
 from mastctl.daemon import RunningDaemon
 from mastctl.web import streams as streams_module
 
 BOTH = tuple[RunningDaemon, FakeHardware]
-BOUND_S = 20.0
 
 
 @pytest.fixture
@@ -70,10 +69,10 @@ def test_a_wait_asks_once_and_then_listens(
         steps.append(step["name"])
 
     with ThreadPoolExecutor(1) as pool:
-        waiting = pool.submit(client.wait, operation, BOUND_S, on_step)
-        eventually(lambda: publisher.listeners > before and steps == ["look"], "it listens")
+        waiting = pool.submit(client.wait, operation, NET_S, on_step)
+        until(lambda: publisher.listeners > before and steps == ["look"], "it listens")
         go.set()
-        assert waiting.result(BOUND_S)["state"] == "done"
+        assert waiting.result(NET_S)["state"] == "done"
     assert steps == ["look", "look", "measure"]
     assert paths == [f"GET /api/v1/operations/{operation}"]
 
@@ -86,19 +85,19 @@ def test_an_end_between_the_question_and_the_subscription_is_not_missed(
 
     def after_the_end(self: Any, *args: Any) -> Any:
         go.set()
-        eventually(lambda: operations.get(operation).state == "done", "it has ended")
+        until(lambda: operations.get(operation).state == "done", "it has ended")
         return heard(self, *args)
 
     monkeypatch.setattr(connection_module.DaemonHttp, "heard", after_the_end)
-    assert client.wait(operation, timeout_s=BOUND_S)["state"] == "done"
+    assert client.wait(operation, timeout_s=NET_S)["state"] == "done"
 
 
 def test_two_wait_at_once(client: Client, go: threading.Event, pair: BOTH) -> None:
     operation = client.point(pan_rad=0.0, tilt_rad=0.0)
     with Client(pair[0].url) as other, ThreadPoolExecutor(2) as pool:
-        waiting = [pool.submit(one.wait, operation, BOUND_S) for one in (client, other)]
+        waiting = [pool.submit(one.wait, operation, NET_S) for one in (client, other)]
         go.set()
-        assert [one.result(BOUND_S)["state"] for one in waiting] == ["done", "done"]
+        assert [one.result(NET_S)["state"] for one in waiting] == ["done", "done"]
 
 
 def test_a_daemon_that_ends_during_a_wait_is_one_plain_sentence(
@@ -108,15 +107,15 @@ def test_a_daemon_that_ends_during_a_wait_is_one_plain_sentence(
     publisher = pair[0].service.machine.publisher
     before = publisher.listeners
     with ThreadPoolExecutor(1) as pool:
-        waiting = pool.submit(client.wait, operation, BOUND_S)
-        eventually(lambda: publisher.listeners > before, "it listens")
+        waiting = pool.submit(client.wait, operation, NET_S)
+        until(lambda: publisher.listeners > before, "it listens")
         pair[0].close()
         try:
-            assert waiting.result(BOUND_S)["state"] == "stopped"  # its last word came in time
+            assert waiting.result(NET_S)["state"] == "stopped"  # its last word came in time
         except ClientError as error:
             assert error.code == "no_daemon" and "Traceback" not in str(error)
     with pytest.raises(ClientError, match="no daemon answers at") as refused:
-        client.wait(operation, timeout_s=BOUND_S)
+        client.wait(operation, timeout_s=NET_S)
     assert refused.value.code == "no_daemon"
 
 
@@ -133,9 +132,9 @@ def test_a_daemon_that_is_killed_while_a_client_listens_is_one_plain_sentence(
 
     monkeypatch.setattr(connection_module.DaemonHttp, "heard", noted)
     waits: dict[str, Callable[[Client, str], Any]] = {
-        "operation": lambda client, name: client.wait(name, BOUND_S),
-        "state": lambda client, name: client.wait_state("stopped", timeout_s=BOUND_S),
-        "track": lambda client, name: client.wait_track(name, BOUND_S),
+        "operation": lambda client, name: client.wait(name, 2.0 * NET_S),
+        "state": lambda client, name: client.wait_state("stopped", timeout_s=2.0 * NET_S),
+        "track": lambda client, name: client.wait_track(name, 2.0 * NET_S),
     }
     with (
         daemon_process(tmp_path, write_config(tmp_path)) as daemon,
@@ -146,12 +145,10 @@ def test_a_daemon_that_is_killed_while_a_client_listens_is_one_plain_sentence(
         under_way(client)
         operation = client.status()["operation"]
         waiting = pool.submit(waits[way], waiter, operation)
-        assert listens.wait(BOUND_S)
+        assert listens.wait(NET_S)
         daemon.kill()
-        began_s = time.monotonic()
         with pytest.raises(ClientError) as told:
-            waiting.result(BOUND_S)
-        assert time.monotonic() - began_s < BOUND_S / 2, "it does not wait for its whole time"
+            waiting.result(NET_S)  # it does not wait for its whole time
     assert told.value.code == "no_daemon"
     assert "\n" not in str(told.value)
     assert "no daemon answers at" in str(told.value)
@@ -172,7 +169,7 @@ def test_a_stream_that_breaks_is_begun_again(
             go.set()
 
     monkeypatch.setattr(connection_module.DaemonHttp, "heard", breaking)
-    assert client.wait(operation, timeout_s=BOUND_S)["state"] == "done"
+    assert client.wait(operation, timeout_s=NET_S)["state"] == "done"
     assert len(broken) == 2
 
 
@@ -182,7 +179,7 @@ def test_without_a_stream_left_the_daemon_is_asked(
     monkeypatch.setattr(streams_module.Streams, "listening", full)
     operation = client.point(pan_rad=0.0, tilt_rad=0.0)
     threading.Timer(0.3, go.set).start()
-    assert client.wait(operation, timeout_s=BOUND_S)["state"] == "done"
+    assert client.wait(operation, timeout_s=NET_S)["state"] == "done"
 
 
 def full(self: Any, topics: Any, keys: Any) -> Any:
@@ -191,16 +188,16 @@ def full(self: Any, topics: Any, keys: Any) -> Any:
 
 def test_an_unknown_operation_is_said_at_once(client: Client) -> None:
     with pytest.raises(ClientError) as refused:
-        client.wait("000001-none", timeout_s=BOUND_S)
+        client.wait("000001-none", timeout_s=NET_S)
     assert refused.value.code == "operation_unknown"
 
 
 def test_a_state_is_waited_for(client: Client, go: threading.Event) -> None:
     words: list[str] = []
     client.point(pan_rad=0.0, tilt_rad=0.0)
-    client.wait_state("moving", timeout_s=BOUND_S)
+    client.wait_state("moving", timeout_s=NET_S)
     go.set()
-    told = client.wait_state("ready", timeout_s=BOUND_S, on_change=lambda one: words.append(one["state"]))
+    told = client.wait_state("ready", timeout_s=NET_S, on_change=lambda one: words.append(one["state"]))
     assert told["state"] == words[-1] == "ready"
     with pytest.raises(ClientError, match=r"the state is ready and not stopped after 0\.2 s"):
         client.wait_state("stopped", timeout_s=0.2)

@@ -10,7 +10,6 @@ from pathlib import Path
 import pytest
 
 from hil_tests.mastctl.outside_daemon import (
-    BOUND_S,
     SHORT_OF_GOAL_RAD,
     daemon_process,
     line,
@@ -18,7 +17,7 @@ from hil_tests.mastctl.outside_daemon import (
     under_way,
     write_config,
 )
-from hil_tests.mastctl.service_fakes import eventually
+from hil_tests.waiting import NET_S, until
 from mastctl import signals
 from mastctl.cli.main import main
 from mastctl.client import Client
@@ -43,7 +42,7 @@ def test_a_signal_that_ends_stops_the_mast_first(tmp_path: Path, name: str) -> N
         with Client(line(daemon)) as client:
             under_way(client)
         daemon.send_signal(signal.Signals[name])
-        _, log = daemon.communicate(timeout=BOUND_S)
+        _, log = daemon.communicate(timeout=NET_S)
     assert (daemon.returncode, "Traceback" in log) == (0, False), log
     words = (tmp_path / "head.log").read_text().splitlines()
     assert words[0] == "move"
@@ -60,22 +59,24 @@ def test_a_closed_terminal_is_survived_where_nohup_asked_for_it(tmp_path: Path) 
         with Client(url) as client:
             assert client.status()["state"] == "ready"
         daemon.send_signal(signal.SIGTERM)
-        assert daemon.wait(BOUND_S) == 0
+        assert daemon.wait(NET_S) == 0
 
 
 def test_a_second_signal_does_not_cut_the_closing_short(tmp_path: Path) -> None:
     config = write_config(tmp_path)
     text = (tmp_path / "outside_devices.py").read_text()
-    slow = text.replace('self.note("close")', 'self.note("closing"); time.sleep(0.5); self.note("close")')
+    note, wait = 'self.note("close")', "while not os.path.exists('may_close'): time.sleep(0.01)"
+    slow = text.replace(note, f'self.note("closing")\n        {wait}\n        {note}')
     (tmp_path / "outside_devices.py").write_text(slow)
     with daemon_process(tmp_path, config) as daemon:
         line(daemon)
         daemon.send_signal(signal.SIGTERM)
         log = tmp_path / "head.log"
-        eventually(lambda: log.exists() and "closing" in log.read_text(), "the closing", BOUND_S)
+        until(lambda: log.exists() and "closing" in log.read_text(), "the closing")
         daemon.send_signal(signal.SIGTERM)
         daemon.send_signal(signal.SIGHUP)
-        daemon.wait(BOUND_S)
+        (tmp_path / "may_close").touch()
+        assert daemon.wait(NET_S) == 0
     assert log.read_text().splitlines()[-1] == "close"
 
 
@@ -84,7 +85,7 @@ def test_a_daemon_that_is_suspended_stops_the_mast_first(tmp_path: Path) -> None
         under_way(client)
         daemon.send_signal(signal.SIGTSTP)
         state = Path(f"/proc/{daemon.pid}/stat")
-        eventually(lambda: state.read_text().rpartition(")")[2].split()[0] == "T", "the suspension", BOUND_S)
+        until(lambda: state.read_text().rpartition(")")[2].split()[0] == "T", "the suspension")
         words = (tmp_path / "head.log").read_text().splitlines()
         assert [word.split()[0] for word in words[:2]] == ["move", "stop"]
         daemon.send_signal(signal.SIGCONT)

@@ -17,7 +17,8 @@ from drivers.clock import SystemClock
 from drivers.errors import DriverError
 from drivers.interfaces import Frame, Reading
 from drivers.open_hardware import BUILT_IN
-from hil_tests.mastctl.service_fakes import FakeHardware, Hang, eventually, rig
+from hil_tests.mastctl.service_fakes import FakeHardware, Hang, rig
+from hil_tests.waiting import until
 from mastctl.devices import devices as devices_module
 from mastctl.devices import frames, joint_history, rest, stops
 from mastctl.devices.cameras import CAMERA_GRACE_S
@@ -168,7 +169,7 @@ def test_a_stop_comes_beside_a_call_under_way_from_another_thread(made: Any) -> 
     reading_in: list[int] = []
     hardware.head.hook = hook
     try:
-        eventually(hang.entered.is_set, "a read under way")
+        until(hang.entered.is_set, "a read under way")
         devices.stop()
         assert stopped_in and stopped_in[0] not in reading_in
     finally:

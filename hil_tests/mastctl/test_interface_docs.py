@@ -8,10 +8,9 @@ import re
 from collections.abc import Iterator
 from pathlib import Path
 
-import httpx
 import pytest
 
-from hil_tests.mastctl.service_fakes import fake_daemon
+from hil_tests.mastctl.service_fakes import HTTP, fake_daemon
 from mastctl.cli.main import MODULES, build_parser
 from mastctl.client import client, jog
 from mastctl.web import PREFIX
@@ -61,7 +60,7 @@ def test_every_command_is_known_by_the_module_that_brings_it() -> None:
 def routes(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> set[tuple[str, str]]:
     """Method and path of every route, as the daemon tells them."""
     with fake_daemon(monkeypatch, tmp_path) as (daemon, _):
-        document = httpx.get(f"{daemon.url}/openapi.json", timeout=30.0).json()
+        document = HTTP.get(f"{daemon.url}/openapi.json").json()
     found = {
         (method.upper(), plain(path.removeprefix(PREFIX)))
         for path, methods in document["paths"].items()

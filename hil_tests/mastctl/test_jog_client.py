@@ -11,7 +11,8 @@ from typing import Any
 
 import pytest
 
-from hil_tests.mastctl.service_fakes import FakeHardware, eventually
+from hil_tests.mastctl.service_fakes import FakeHardware
+from hil_tests.waiting import NET_S, until
 from mastctl.cli.main import main
 from mastctl.client import Client, ClientError
 from mastctl.daemon import RunningDaemon
@@ -48,11 +49,11 @@ def test_the_client_keeps_the_head_turning_and_lets_go_at_the_end(
     hardware = pair[1]
     with client.jog() as jog:
         jog.rates(0.1, 0.0)
-        eventually(lambda: len(moves(hardware)) > 8, "many goals, more than one heartbeat is good for")
+        until(lambda: len(moves(hardware)) > 8, "many goals, more than one heartbeat is good for")
         jog.rates(0.0, 0.0)
-        eventually(lambda: ("stop",) in hardware.head.calls, "a stop")
+        until(lambda: ("stop",) in hardware.head.calls, "a stop")
         jog.rates(0.0, -0.1)
-        eventually(lambda: moves(hardware)[-1][2] < 0.0, "a second jog of the same block")
+        until(lambda: moves(hardware)[-1][2] < 0.0, "a second jog of the same block")
     (second, first) = client.operations()
     assert (first["state"], second["state"]) == ("done", "done")
     client.wait(client.point(pan_rad=0.0, tilt_rad=0.0))
@@ -61,10 +62,10 @@ def test_the_client_keeps_the_head_turning_and_lets_go_at_the_end(
 def test_a_refusal_is_told_to_who_sets_the_next_rate(client: Client) -> None:
     with client.jog() as first:
         first.rates(0.1, 0.0)
-        eventually(lambda: client.operations(), "the first jog")
+        until(lambda: client.operations(), "the first jog")
         with pytest.raises(ClientError, match="is running") as refused, client.jog() as second:
             second.rates(0.1, 0.0)
-            eventually(lambda: second._error is not None, "its refusal")
+            until(lambda: second._error is not None, "its refusal")
         assert refused.value.code == "busy"
         first.check()
 
@@ -76,14 +77,14 @@ def test_a_client_that_hangs_stops_the_head_and_begins_nothing_when_it_wakes(
     other = subprocess.Popen([sys.executable, "-c", HANGING, pair[0].url], stdout=subprocess.PIPE, text=True)
     try:
         assert other.stdout is not None and other.stdout.readline() == "turns\n"
-        eventually(lambda: len(moves(hardware)) > 3, "goals")
+        until(lambda: len(moves(hardware)) > 3, "goals")
         os.kill(other.pid, signal.SIGSTOP)
-        eventually(lambda: ("stop",) in hardware.head.calls, "the stop")
-        eventually(lambda: client.operations()[0]["state"] == "done", "the jog's end")
+        until(lambda: ("stop",) in hardware.head.calls, "the stop")
+        until(lambda: client.operations()[0]["state"] == "done", "the jog's end")
         sent = len(moves(hardware))
         os.kill(other.pid, signal.SIGCONT)
         assert other.stdout.readline() == "jog_ended\n"
-        assert other.wait(20.0) == 0
+        assert other.wait(NET_S) == 0
         assert len(moves(hardware)) == sent
     finally:
         other.kill()
@@ -94,11 +95,11 @@ def test_a_client_that_dies_stops_the_head(pair: tuple[RunningDaemon, FakeHardwa
     hardware = pair[1]
     other = subprocess.Popen([sys.executable, "-c", HANGING, pair[0].url], stdout=subprocess.PIPE, text=True)
     try:
-        eventually(lambda: len(moves(hardware)) > 3, "goals", within_s=30.0)
+        until(lambda: len(moves(hardware)) > 3, "goals")
     finally:
         other.kill()
         other.wait()
-    eventually(lambda: ("stop",) in hardware.head.calls, "the stop")
+    until(lambda: ("stop",) in hardware.head.calls, "the stop")
 
 
 def test_the_command_turns_for_some_seconds_and_says_where_it_let_go(
@@ -113,5 +114,5 @@ def test_the_command_turns_for_some_seconds_and_says_where_it_let_go(
 def test_rates_that_are_none_are_refused(client: Client) -> None:
     with pytest.raises(ClientError) as refused, client.jog() as jog:
         jog.rates(1e6, 0.0)
-        eventually(lambda: jog._error is not None, "its refusal")
+        until(lambda: jog._error is not None, "its refusal")
     assert refused.value.code == "bad_request" and "pan_rad_per_s" in str(refused.value)

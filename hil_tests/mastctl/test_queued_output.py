@@ -10,7 +10,6 @@ from pathlib import Path
 import pytest
 
 from hil_tests.mastctl.outside_daemon import (
-    BOUND_S,
     Pipe,
     answers,
     daemon_process,
@@ -19,7 +18,8 @@ from hil_tests.mastctl.outside_daemon import (
     under_way,
     write_config,
 )
-from hil_tests.mastctl.service_fakes import Hang, eventually
+from hil_tests.mastctl.service_fakes import Hang
+from hil_tests.waiting import NET_S, until
 from mastctl.client import Client
 from mastctl.queued_output import QueuedHandler, QueuedText, QueuedWriter, stall_while
 
@@ -33,13 +33,13 @@ def test_a_full_pipe_for_its_words_does_not_hold_a_stop(tmp_path: Path, full: st
         if full in (name, "both"):
             pipe.fill()
     with daemon_process(tmp_path, config, stdout=out.write, stderr=log.write) as daemon:
-        eventually(lambda: answers(url), "the daemon's first answer", BOUND_S)
-        with Client(url, timeout_s=5.0) as client:
+        until(lambda: answers(url), "the daemon's first answer")
+        with Client(url, timeout_s=NET_S) as client:
             under_way(client)
             assert client.stop()["stopped"] is True
             stands_short_of_its_goal(client)
         daemon.send_signal(signal.SIGTERM)
-        assert daemon.wait(BOUND_S) == 0
+        assert daemon.wait(NET_S) == 0
     assert (tmp_path / "head.log").read_text().splitlines()[-1] == "close"
 
 
@@ -55,7 +55,7 @@ def test_what_does_not_fit_is_dropped_and_counted_and_said_when_it_flows_again()
     assert 10 <= kept <= 12, "those in the queue, and one or two in the writing thread's hands"
     assert f"{100 - kept} messages were dropped" in told
     QueuedText(writer).write("again\n")
-    assert writer.flush(BOUND_S)
+    assert writer.flush(NET_S)
     assert b"again" in pipe.drain(b"again")
 
 
@@ -102,7 +102,7 @@ def test_words_that_take_for_ever_to_be_made_hold_only_the_thread_that_writes() 
     handler.handle(logging.makeLogRecord({"msg": "%s", "args": (Slow(),)}))
     handler.handle(logging.makeLogRecord({"msg": "%d", "args": ("no number",)}))
     handler.handle(logging.makeLogRecord({"msg": "next"}))
-    assert hang.entered.wait(BOUND_S)
+    assert hang.entered.wait(NET_S)
     hang.let_go()
     told = pipe.drain(b"next").decode()
     assert told.splitlines() == [

@@ -12,7 +12,8 @@ from pathlib import Path
 
 import pytest
 
-from hil_tests.mastctl.outside_daemon import BOUND_S, OUTSIDE, daemon_process, write_config
+from hil_tests.mastctl.outside_daemon import OUTSIDE, daemon_process, write_config
+from hil_tests.waiting import NET_S
 from mastctl.service_manager import Heartbeat, ServiceManager
 
 
@@ -159,7 +160,7 @@ HEAD_THAT_ENDS_BADLY = OUTSIDE.replace(
 @contextmanager
 def watched_daemon(folder: Path, listener: socket.socket) -> Iterator[subprocess.Popen[str]]:
     """A daemon that a manager watches, once it has said that it is ready."""
-    listener.settimeout(BOUND_S)
+    listener.settimeout(NET_S)
     environ = environment(listener, WATCHDOG_USEC="800000")
     with pytest.MonkeyPatch.context() as patch:
         for name, value in environ.items():
@@ -187,7 +188,7 @@ def test_a_daemon_says_that_it_is_ready_that_it_lives_and_that_it_ends(
             heard(manager, "WATCHDOG=1")
         daemon.send_signal(signal.SIGTERM)
         heard(manager, "STOPPING=1")
-        assert daemon.wait(BOUND_S) == 0
+        assert daemon.wait(NET_S) == 0
 
 
 def test_each_state_is_told_in_words_and_a_fault_with_its_reason(

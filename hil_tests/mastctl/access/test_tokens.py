@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 
 from calib.errors import BadFile
+from hil_tests.waiting import joined
 from mastctl.access.tokens import MOST_TOKENS, TokenList, TokenRefused
 from mastctl.commands.caller import ROLES
 
@@ -120,6 +121,5 @@ def test_commands_at_the_same_time_lose_no_token(tokens: TokenList) -> None:
     threads = [threading.Thread(target=tokens.new, args=(f"t{i}", "view")) for i in range(8)]
     for one in threads:
         one.start()
-    for one in threads:
-        one.join()
+    joined(*threads)
     assert {one.name for one in tokens.read() or ()} == {*ROLES, *(f"t{i}" for i in range(8))}

@@ -16,9 +16,8 @@ import pytest
 import serial
 from dynamixel_sdk import PacketHandler, PortHandler
 
+from hil_tests.waiting import NET_S
 from mastctl.cli.main import main
-
-PATIENCE_S = 30.0
 
 
 class Sim:
@@ -38,7 +37,7 @@ class Sim:
     def end(self, number: int) -> tuple[int, str, str]:
         """Send a signal; exit code, the rest of standard output, the rest of standard error."""
         self.process.send_signal(number)
-        out, log = self.process.communicate(timeout=PATIENCE_S)
+        out, log = self.process.communicate(timeout=NET_S)
         return self.process.returncode, out.decode(), log.decode()
 
 
@@ -125,7 +124,7 @@ def test_faults_come_from_a_script_and_live(repository: Path, tmp_path: Path) ->
 
 def test_the_end_of_standard_input_ends_it_only_when_asked_to(repository: Path) -> None:
     with sim(repository, "ptu", "--pty", "--until-eof") as running:
-        assert running.process.communicate(timeout=PATIENCE_S)[0] == b""
+        assert running.process.communicate(timeout=NET_S)[0] == b""
         assert running.process.returncode == 0
     with sim(repository, "ptu", "--pty") as running:
         assert running.process.stdin is not None

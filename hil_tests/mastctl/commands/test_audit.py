@@ -12,6 +12,7 @@ from typing import Any
 import pytest
 
 from hil_tests.mastctl.service_fakes import Hang
+from hil_tests.waiting import NET_S
 from mastctl.commands import audit as audit_module
 from mastctl.commands.audit import LONGEST_LINE_BYTES, WAITING, AuditLog
 
@@ -101,13 +102,13 @@ def test_who_says_something_is_not_held_by_a_disk_that_hangs_and_the_loss_is_cou
     disk.hook = hang
     log = AuditLog(path)
     log.put({"number": 0})
-    assert hang.entered.wait(10.0)
+    assert hang.entered.wait(NET_S)
     for number in range(1, WAITING + 51):
         log.put({"number": number})  # returns, or the test never ends
     hang.let_go()
-    assert log.flush(10.0)
+    assert log.flush(NET_S)
     log.put({"number": -1})
-    assert log.flush(10.0)
+    assert log.flush(NET_S)
     told = lines(path)
     assert sum(line.get("lost", 0) for line in told) == 50
     assert len([line for line in told if "number" in line]) == WAITING + 2
@@ -118,7 +119,7 @@ def test_files_are_bounded_and_the_oldest_goes(tmp_path: Path) -> None:
     log = AuditLog(tmp_path / "audit.jsonl", file_bytes=200, files=3)
     for number in range(100):
         log.put({"number": number})
-    assert log.flush(10.0)
+    assert log.flush(NET_S)
     log.close()
     names = ["audit.jsonl.2", "audit.jsonl.1", "audit.jsonl"]
     assert sorted(path.name for path in tmp_path.iterdir()) == sorted(names)

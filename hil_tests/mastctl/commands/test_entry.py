@@ -12,6 +12,7 @@ import pytest
 
 from drivers.clock import ManualClock
 from drivers.errors import NoReply
+from hil_tests.waiting import NET_S, joined
 from mastctl.commands.audit import AuditLog
 from mastctl.commands.caller import Caller
 from mastctl.commands.entry import JOG, POINT, POSE, STOP, Answer, Asked, Command, Entry
@@ -70,7 +71,7 @@ class World:
         return {"id": f"00000{self.acts}-abcd"}
 
     def lines(self) -> list[dict[str, Any]]:
-        assert self.audit.flush(10.0)
+        assert self.audit.flush(NET_S)
         return [json.loads(line) for line in self.path.read_text().splitlines()]
 
 
@@ -207,7 +208,7 @@ def test_a_replay_while_the_first_is_at_work_under_a_lease_waits_for_it_and_hold
 
     def slow() -> Answer:
         inside.set()
-        assert go.wait(10.0)
+        assert go.wait(NET_S)
         return world.act()
 
     asked, got = world.asked(key="k"), list[Answer]()
@@ -215,15 +216,14 @@ def test_a_replay_while_the_first_is_at_work_under_a_lease_waits_for_it_and_hold
         threading.Thread(target=lambda: got.append(world.entry.run(POINT, asked, slow))) for _ in range(3)
     ]
     threads[0].start()
-    assert inside.wait(10.0)
+    assert inside.wait(NET_S)
     for thread in threads[1:]:
         thread.start()
     assert world.leases.control() is not None
     refused("leased", lambda: world.leases.acquire(ROVER))
     world.entry.first(STOP, world.asked(ROVER), lambda: {"stopped": True})
     go.set()
-    for thread in threads:
-        thread.join(10.0)
+    joined(*threads)
     assert got == [{"id": "000001-abcd"}] * 3
 
 

@@ -9,7 +9,7 @@ import pytest
 from drivers.clock import ManualClock
 from drivers.errors import NoReply
 from drivers.simulation_clock import SimulationClock
-from hil_tests.mastctl.service_fakes import eventually
+from hil_tests.waiting import NET_S, joined, until
 from mastctl.commands.idempotency import KEPT, KEPT_BYTES, KEPT_S, Answer, Answers
 from mastctl.errors import BadRequest, NotNow
 
@@ -102,7 +102,7 @@ def test_many_at_once_act_once_and_get_one_answer_also_on_a_clock_that_takes_tur
         inside.set()
         if clock is not None:
             clock.sleep(5.0)  # lets the others have their turns
-        assert go.wait(10.0)
+        assert go.wait(NET_S)
         return acts()
 
     def ask() -> None:
@@ -111,12 +111,11 @@ def test_many_at_once_act_once_and_get_one_answer_also_on_a_clock_that_takes_tur
     make = threading.Thread if clock is None else lambda target: clock.thread(target, "asks")
     threads = [make(target=ask) for _ in range(6)]
     threads[0].start()
-    assert inside.wait(10.0)
+    assert inside.wait(NET_S)
     for thread in threads[1:]:
         thread.start()
     go.set()
-    for thread in threads:
-        thread.join(10.0)
+    joined(*threads)
     assert acts.done == 1
     assert sorted(again for _, again in got) == [False] + [True] * 5
     assert all(answer == {"id": 1} for answer, _ in got)
@@ -127,7 +126,7 @@ def test_the_second_of_two_gets_the_firsts_refusal(answers: Answers) -> None:
 
     def slow() -> Answer:
         inside.set()
-        assert go.wait(10.0)
+        assert go.wait(NET_S)
         raise NotNow("busy", "another runs")
 
     def ask() -> None:
@@ -138,13 +137,12 @@ def test_the_second_of_two_gets_the_firsts_refusal(answers: Answers) -> None:
 
     first, second = threading.Thread(target=ask), threading.Thread(target=ask)
     first.start()
-    assert inside.wait(10.0)
+    assert inside.wait(NET_S)
     second.start()
     with pytest.raises(BadRequest):  # what asks otherwise waits for nobody
         answers.once("bench", "k", OTHER, slow)
     go.set()
-    first.join(10.0)
-    second.join(10.0)
+    joined(first, second)
     assert refusals == ["busy", "busy"]
 
 
@@ -154,12 +152,12 @@ def test_who_waits_too_long_for_the_first_is_told(clock: ManualClock) -> None:
 
     def slow() -> Answer:
         inside.set()
-        go.wait(10.0)
+        go.wait(NET_S)
         return {"id": 1}
 
     first = threading.Thread(target=lambda: answers.once("bench", "k", SAME, slow))
     first.start()
-    assert inside.wait(10.0)
+    assert inside.wait(NET_S)
     told: list[str] = []
 
     def ask() -> None:
@@ -173,10 +171,10 @@ def test_who_waits_too_long_for_the_first_is_told(clock: ManualClock) -> None:
     with answers._changed:
         clock.advance(31.0)
         answers._changed.notify_all()
-    eventually(lambda: told or clock.advance(31.0) or _notify(answers), "the refusal")
+    until(lambda: told or clock.advance(31.0) or _notify(answers), "the refusal")
     assert told == ["key_in_use"]
     go.set()
-    first.join(10.0)
+    joined(first)
 
 
 def _notify(answers: Answers) -> None:
@@ -189,18 +187,18 @@ def test_keys_are_bounded_and_those_at_work_are_not_forgotten(answers: Answers) 
 
     def slow() -> Answer:
         inside.set()
-        go.wait(30.0)
+        go.wait(NET_S)
         return {"id": -1}
 
     first = threading.Thread(target=lambda: answers.once("bench", "first", SAME, slow))
     first.start()
-    assert inside.wait(10.0)
+    assert inside.wait(NET_S)
     acts = Acts()
     for number in range(KEPT + 10):
         answers.once("bench", str(number), SAME, acts)
     assert len(answers._kept) == KEPT
     go.set()
-    first.join(10.0)
+    joined(first)
     assert answers.once("bench", "first", SAME, acts) == ({"id": -1}, True)
 
 

@@ -8,6 +8,7 @@ from collections.abc import Callable
 import pytest
 
 from drivers.clock import ManualClock
+from hil_tests.waiting import joined
 from mastctl.commands.caller import Caller
 from mastctl.commands.lease import LONGEST_S, REMEMBERED, SHORTEST_S, Control, Lease, Leased, Leases
 from mastctl.errors import BadRequest, MastctlError, NotNow
@@ -62,8 +63,7 @@ def test_of_many_who_acquire_at_once_exactly_one_steers() -> None:
         threads = [threading.Thread(target=acquire, args=(number,)) for number in range(8)]
         for thread in threads:
             thread.start()
-        for thread in threads:
-            thread.join()
+        joined(*threads)
         assert (len(got), refusals) == (1, ["leased"] * 7)
 
 

@@ -10,7 +10,8 @@ import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
 from drivers.interfaces import Reading
-from hil_tests.mastctl.service_fakes import FakePointing, FakeResult, eventually
+from hil_tests.mastctl.service_fakes import FakePointing, FakeResult
+from hil_tests.waiting import until
 from mastctl.metrics.metrics import Metrics
 from mastctl.operations.records import Operation
 from mastctl.state.publisher import Publisher
@@ -87,7 +88,7 @@ def test_operations_are_counted_once_when_they_have_ended(publisher: Publisher) 
     )
     publisher.publish("operation", "2", operation("2", "failed", error={"code": "did_not_arrive"}))
     failed = "mastctl_operations_total", (("code", "did_not_arrive"), ("state", "failed"))
-    eventually(lambda: failed in scraped(metrics), "the second operation")
+    until(lambda: failed in scraped(metrics), "the second operation")
     found = scraped(metrics)
     assert found["mastctl_operations_total", (("code", ""), ("state", "done"))] == 1.0
     assert found["mastctl_step_seconds_count", (("step", "move"),)] == 1.0
@@ -100,7 +101,7 @@ def test_frames_that_nobody_got_are_counted_by_the_cameras_own_count(publisher: 
     taken = "mastctl_frames_total", (("camera", "navcam_left"),)
     for number, sequence in enumerate((7, 8, 12), 1):
         publisher.publish("frame", "navcam_left", SimpleNamespace(sequence=sequence))
-        eventually(lambda number=number: scraped(metrics).get(taken) == number, "the frame")
+        until(lambda number=number: scraped(metrics).get(taken) == number, "the frame")
     assert scraped(metrics)["mastctl_frames_missed_total", (("camera", "navcam_left"),)] == 3.0
     metrics.close()
 
@@ -111,9 +112,9 @@ def test_readings_of_the_head_are_counted_by_the_time_between_them(publisher: Pu
     publisher.publish("joints", "pan_tilt", Reading(0.0, 0.0, False, 10.0))
     publisher.publish("command", "1", {"command": "point", "result": "ok"})
     point = "mastctl_commands_total", (("command", "point"), ("result", "ok"))
-    eventually(lambda: point in scraped(metrics), "what was published after it")
+    until(lambda: point in scraped(metrics), "what was published after it")
     publisher.publish("joints", "pan_tilt", Reading(0.0, 0.0, False, 10.04))
-    eventually(lambda: scraped(metrics)[count] == 1.0, "the second reading")
+    until(lambda: scraped(metrics)[count] == 1.0, "the second reading")
     assert scraped(metrics)["mastctl_reading_interval_seconds_sum", ()] == pytest.approx(0.04)
     metrics.close()
 
@@ -123,7 +124,7 @@ def test_a_record_that_nobody_foresaw_does_not_end_the_counting(publisher: Publi
     publisher.publish("frame", "navcam_left", object())
     publisher.publish("operation", "3", operation("3", "stopped", error={"code": "stopped"}))
     stopped = "mastctl_operations_total", (("code", "stopped"), ("state", "stopped"))
-    eventually(lambda: stopped in scraped(metrics), "what came after it")
+    until(lambda: stopped in scraped(metrics), "what came after it")
     metrics.close()
 
 
@@ -131,7 +132,7 @@ def test_two_daemons_in_one_process_count_each_for_itself(publisher: Publisher) 
     one, other = Metrics(lambda: STATUS, dict, publisher), Metrics(lambda: STATUS, dict, Publisher())
     publisher.publish("command", "1", {"command": "stop", "result": "ok"})
     counted = "mastctl_commands_total", (("command", "stop"), ("result", "ok"))
-    eventually(lambda: counted in scraped(one), "the command")
+    until(lambda: counted in scraped(one), "the command")
     assert counted not in scraped(other)
     one.close()
     other.close()

@@ -11,7 +11,8 @@ import pytest
 from drivers.clock import ManualClock
 from drivers.errors import NoReply
 from drivers.simulation_clock import SimulationClock
-from hil_tests.mastctl.service_fakes import FakePointing, FakeResult, eventually
+from hil_tests.mastctl.service_fakes import FakePointing, FakeResult
+from hil_tests.waiting import NET_S, joined, until
 from mastctl.errors import NotKnown, NotNow, Stopped, Unable, error_body
 from mastctl.operations.operations import KEPT_OPERATIONS, STOP_ASKED, Operations
 from mastctl.operations.records import Operation
@@ -56,13 +57,13 @@ def word(operations: Operations) -> str:
 
 
 def ended(operations: Operations, name: str) -> Operation:
-    eventually(lambda: operations.get(name).state not in ("queued", "running"), "its end")
+    until(lambda: operations.get(name).state not in ("queued", "running"), "its end")
     return operations.get(name)
 
 
 def until_cancelled(record: Callable[[Any], None], cancelled: threading.Event) -> None:
     record("it waits")
-    assert cancelled.wait(30.0)
+    assert cancelled.wait(NET_S)
     raise Stopped("cancelled")
 
 
@@ -73,7 +74,7 @@ def pointed(*residuals: Any) -> FakeResult:
 
 def test_a_stop_blocks_and_halts_before_it_ends_what_runs(operations: Operations, mover: Mover) -> None:
     name = operations.start({}, until_cancelled).id
-    eventually(lambda: operations.get(name).steps, "its step")
+    until(lambda: operations.get(name).steps, "its step")
     seen: list[Any] = []
     mover.hook = lambda _: seen.append((dict(mover.blocks).values(), operations._machine.standing.word))
     assert operations.stop() == name
@@ -92,7 +93,7 @@ def test_no_move_goes_out_between_a_stop_and_the_end_of_what_it_stopped(
     go = threading.Event()
 
     def slow(record: Callable[[Any], None], cancelled: threading.Event) -> None:
-        assert cancelled.wait(30.0) and go.wait(30.0)
+        assert cancelled.wait(NET_S) and go.wait(NET_S)
         raise Stopped("cancelled")
 
     name = operations.start({}, slow).id
@@ -191,7 +192,7 @@ def test_who_waits_for_the_end_is_told_when_the_next_may_start(operations: Opera
         raise ZeroDivisionError
 
     name = operations.start({}, lambda record, cancelled: None, on_end).id
-    eventually(lambda: heard, "the end")
+    until(lambda: heard, "the end")
     assert heard == [("done", None)]
     assert operations.get(name).state == "done"
 
@@ -216,11 +217,11 @@ def test_closing_halts_the_head_and_ends_what_runs_and_nothing_starts_after_it(
 def test_a_stop_does_not_wait_for_the_operation_but_the_next_command_does(
     operations: Operations, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("mastctl.operations.operations.ENDS_SOON_S", 30.0)
+    monkeypatch.setattr("mastctl.operations.operations.ENDS_SOON_S", 2.0 * NET_S)
     go = threading.Event()
 
     def ends_late(record: Any, cancelled: threading.Event) -> None:
-        assert go.wait(30.0)
+        assert go.wait(NET_S)
         assert cancelled.is_set()
         raise Stopped("it noticed")
 
@@ -232,7 +233,7 @@ def test_a_stop_does_not_wait_for_the_operation_but_the_next_command_does(
     waits.start()
     assert operations.running == first
     go.set()
-    waits.join(30.0)
+    joined(waits)
     assert seen == [None]
     assert operations.running is None
     assert operations.get(first).state == "stopped"
@@ -244,7 +245,7 @@ def test_a_command_after_a_stop_waits_for_a_bounded_time(
 ) -> None:
     monkeypatch.setattr("mastctl.operations.operations.ENDS_SOON_S", 0.05)
     go = threading.Event()
-    operations.start({}, lambda record, cancelled: go.wait(30.0))
+    operations.start({}, lambda record, cancelled: go.wait(NET_S))
     operations.stop()
     refused = operations.refusal("motion")
     assert refused is not None
@@ -259,11 +260,11 @@ def test_what_does_not_end_when_the_service_closes_is_given_up(
 ) -> None:
     monkeypatch.setattr("mastctl.operations.operations.END_TIMEOUT_S", 0.05)
     go = threading.Event()
-    name = operations.start({}, lambda record, cancelled: go.wait(30.0)).id
+    name = operations.start({}, lambda record, cancelled: go.wait(NET_S)).id
     operations.close()
     assert operations.get(name).state == "stopped"
     go.set()
-    eventually(lambda: operations._current is None, "room for the next")
+    until(lambda: operations._current is None, "room for the next")
     assert operations.get(name).state == "stopped", "its late end changes nothing"
 
 
@@ -283,7 +284,7 @@ def test_the_newest_records_are_kept(operations: Operations) -> None:
     names = []
     for _ in range(KEPT_OPERATIONS + 1):
         names.append(operations.start({}, lambda record, cancelled: None).id)
-        eventually(lambda: operations._current is None, "room for the next")
+        until(lambda: operations._current is None, "room for the next")
         ended(operations, names[-1])
     assert [one.id for one in operations.all()] == names[:0:-1], "newest first"
     with pytest.raises(NotKnown, match=f"operation {names[0]} is not known"):
@@ -327,7 +328,7 @@ def test_an_operation_that_runs_beyond_its_time_ends_with_the_mast_stopped(
     assert record.error["code"] == "deadline_passed"
     assert "did not end in the 5 s it was given" in record.error["message"]
     assert ("stop", None) in mover.told
-    eventually(lambda: not mover.blocks, "moves are taken again")
+    until(lambda: not mover.blocks, "moves are taken again")
     operations.start({}, lambda record, cancelled: None)
 
 
@@ -342,28 +343,28 @@ def test_a_deadline_that_is_over_already_ends_the_operation_at_once(operations: 
 def test_the_next_command_waits_for_the_stop_of_a_deadline_and_is_not_refused_for_it(
     mover: Mover, operations: Operations, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("mastctl.operations.operations.ENDS_SOON_S", 30.0)
+    monkeypatch.setattr("mastctl.operations.operations.ENDS_SOON_S", 2.0 * NET_S)
     asked, go = threading.Event(), threading.Event()
 
     def slow_stop(name: str) -> None:
         asked.set()
-        assert go.wait(30.0)
+        assert go.wait(NET_S)
 
     def ends_at_once(record: Any, cancelled: threading.Event) -> None:
-        assert cancelled.wait(30.0)
+        assert cancelled.wait(NET_S)
 
     name = operations.start({}, ends_at_once).id
     mover.hook = slow_stop
     operations.end_within(name, 0.0, 5.0)
-    assert asked.wait(30.0)
+    assert asked.wait(NET_S)
     ended(operations, name)
     refused: list[Any] = []
     next_one = threading.Thread(target=lambda: refused.append(operations.refusal("motion")))
     next_one.start()
     next_one.join(0.1)
-    assert not refused
+    assert not refused, "it waits"
     go.set()
-    next_one.join(30.0)
+    joined(next_one)
     assert refused == [None]
 
 
@@ -383,15 +384,15 @@ def test_a_stop_before_the_deadline_is_the_last_word(mover: Mover, operations: O
     go = threading.Event()
 
     def slow_to_end(record: Callable[[Any], None], cancelled: threading.Event) -> None:
-        assert cancelled.wait(30.0)
-        assert go.wait(30.0)
+        assert cancelled.wait(NET_S)
+        assert go.wait(NET_S)
         raise Stopped("cancelled")
 
     name = operations.start({}, slow_to_end).id
     operations.stop()
     before = len(mover.told)
     operations.end_within(name, 0.0, 5.0)
-    eventually(
+    until(
         lambda: not any(one.name == f"deadline of {name}" for one in threading.enumerate()), "the watch's end"
     )
     assert len(mover.told) == before
@@ -405,13 +406,13 @@ def test_a_stop_after_the_deadline_is_sent_all_the_same(mover: Mover, operations
     go = threading.Event()
 
     def slow_to_end(record: Callable[[Any], None], cancelled: threading.Event) -> None:
-        assert cancelled.wait(30.0)
-        assert go.wait(30.0)
+        assert cancelled.wait(NET_S)
+        assert go.wait(NET_S)
         raise Stopped("cancelled")
 
     name = operations.start({}, slow_to_end).id
     operations.end_within(name, 0.0, 5.0)
-    eventually(lambda: ("stop", None) in mover.told, "the deadline's stop")
+    until(lambda: ("stop", None) in mover.told, "the deadline's stop")
     assert word(operations) == "stopping"
     stops = mover.told.count(("stop", None))
     operations.stop()

@@ -8,11 +8,12 @@ from collections.abc import Iterator
 import pytest
 
 from hil_tests.mastctl.service.test_rover_time import configured
-from hil_tests.mastctl.service_fakes import eventually
+from hil_tests.waiting import until
 from mastctl.client import Client
 from mastctl.commands.deadlines import usual_s
 from mastctl.daemon import RunningDaemon
 from mastctl.devices.limits import Limits
+from mastctl.pointing.requests import AnglesTarget, PointRequest
 
 FAR = {"pan_rad": 1.2, "tilt_rad": 0.2}
 
@@ -47,7 +48,7 @@ def test_a_head_that_does_not_arrive_in_time_is_stopped_and_the_deadline_is_told
     assert "1 s it was given" in record["error"]["message"]
     assert record["ended_s"] - began_s == pytest.approx(1.0, abs=0.3)
     client.advance(30.0)  # a slow head brakes slowly too
-    eventually(lambda: rests(daemon), "the head rests")
+    until(lambda: rests(daemon), "the head rests")
     assert daemon.service.devices.read().pan_rad < 0.5
     client.clear_faults()
     assert client.wait(client.point(**FAR))["state"] == "done"
@@ -64,11 +65,14 @@ def test_the_loops_own_deadline_says_more_and_comes_before_the_usual_one(
 def test_a_stop_before_the_deadline_is_what_is_told(rover: tuple[RunningDaemon, Client]) -> None:
     daemon, client = rover
     client.set_fault("pan_tilt", "slow", factor=0.001)
-    operation = client.point(**FAR, deadline_s=3600.0)
-    client.stop()
-    assert client.wait(operation)["error"]["code"] in ("stopped", "did_not_arrive")
+    service = daemon.service
+    with service.clock.at_work():  # no time passes: neither the deadline nor the loop's own comes
+        operation = service.steering.point(PointRequest(AnglesTarget(**FAR)), {}).id
+        service.operations.end_within(operation, 3600.0, 3600.0)
+        service.stopping.stop()
+    assert client.wait(operation)["error"]["code"] == "stopped"
     watch = f"deadline of {operation}"
-    eventually(lambda: all(one.name != watch for one in threading.enumerate()), "the watch's end")
+    until(lambda: all(one.name != watch for one in threading.enumerate()), "the watch's end")
     assert daemon.service.operations.running is None
 
 

@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
 
 import pytest
 
+from hil_tests.waiting import until
 from mastctl.config import load_config
 from mastctl.devices.keep_out import Box, KeptOut
 from mastctl.pointing.requests import AnglesTarget, PointRequest
 from mastctl.service.service import Service
 
-LONG_S = 120.0
 DECK = Box("deck", (-0.5, 0.5), (-1.2, -0.4))
 WALL = Box("wall", (1.5, 1.6), (-1.3, 1.6))
 
@@ -32,10 +31,7 @@ def service() -> Iterator[Service]:
 
 def pointed(service: Service, pan_rad: float, tilt_rad: float) -> dict[str, Any]:
     name = service.steering.point(PointRequest(AnglesTarget(pan_rad, tilt_rad)), {}).id
-    until_s = time.monotonic() + LONG_S
-    while service.operations.get(name).state in ("queued", "running"):
-        assert time.monotonic() < until_s
-        time.sleep(0.005)
+    until(lambda: service.operations.get(name).ended_s is not None, f"the end of operation {name}")
     return service.operations.get(name).told()
 
 

@@ -18,7 +18,8 @@ from calib.files.mast_file import load_rig, save_rig
 from calib.mast.covariance import stored_covariance
 from calib.mast.rig import Mast, RigCamera
 from drivers.errors import NoReply
-from hil_tests.mastctl.service_fakes import FakeHardware, ScriptedLoop, eventually, rig
+from hil_tests.mastctl.service_fakes import PLAIN, FakeHardware, ScriptedLoop, rig
+from hil_tests.waiting import NET_S, until
 from mastctl.daemon import RunningDaemon
 from mastctl.errors import Stopped
 from mastctl.pointing.jog import Beat
@@ -42,7 +43,7 @@ def folder(daemon: RunningDaemon) -> Path:
 
 @pytest.fixture
 def web(daemon: RunningDaemon) -> Iterator[httpx.Client]:
-    with httpx.Client(base_url=f"{daemon.url}/api/v1", trust_env=False, timeout=20.0) as client:
+    with httpx.Client(base_url=f"{daemon.url}/api/v1", **PLAIN) as client:
         yield client
 
 
@@ -153,14 +154,14 @@ def test_nothing_changes_while_an_operation_runs(
     web: httpx.Client, folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def until_stopped(request: Any, record: Any, cancelled: threading.Event, devices: Any) -> None:
-        assert cancelled.wait(30.0)
+        assert cancelled.wait(NET_S)
         raise Stopped("stopped by the test")
 
     monkeypatch.setattr(ScriptedLoop, "script", staticmethod(until_stopped))
     started = web.post("/point", json={"pan_rad": 0.1, "tilt_rad": -0.1}).json()["id"]
     refusal(web.post("/mast", json={"file": "better.yaml"}), 409, "busy")
     web.post("/stop")
-    eventually(lambda: web.get(f"/operations/{started}").json()["state"] == "stopped", "the end")
+    until(lambda: web.get(f"/operations/{started}").json()["state"] == "stopped", "the end")
     assert web.post("/mast", json={"file": "better.yaml"}).status_code == 200
 
 

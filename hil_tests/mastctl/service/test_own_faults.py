@@ -7,7 +7,8 @@ from pathlib import Path
 import pytest
 
 from calib.errors import BadFile
-from hil_tests.mastctl.service_fakes import eventually, fake_daemon
+from hil_tests.mastctl.service_fakes import fake_daemon
+from hil_tests.waiting import until
 from mastctl.client import Client
 from mastctl.safety.state_file import StateFile
 from mastctl.state.faults import StandingFault
@@ -23,10 +24,10 @@ def test_each_change_is_published_although_nobody_asks_and_the_status_has_it(
         publisher = daemon.service.machine.publisher
         with monkeypatch.context() as patch:
             patch.setattr(getattr(daemon.service, part), "faults", lambda: (FULL,))
-            eventually(lambda: publisher.newest("fault", "a file") == (FULL,), "the fault")
+            until(lambda: publisher.newest("fault", "a file") == (FULL,), "the fault")
             assert ("a file", "full") in [(one["device"], one["code"]) for one in client.status()["faults"]]
             assert client.status()["state"] != "fault", "the head is well"
-        eventually(lambda: publisher.newest("fault", "a file") == (), "the fault's end")
+        until(lambda: publisher.newest("fault", "a file") == (), "the fault's end")
 
 
 def test_an_emergency_stop_that_the_disk_does_not_take_is_published_as_a_fault(
@@ -51,8 +52,8 @@ state: {{folder: state}}
             for way in ("write", "overwrite"):
                 patch.setattr(StateFile, way, refuse)
             assert client.estop(reason="smoke")["kept"] is False
-            eventually(
+            until(
                 lambda: [one.code for one in publisher.newest("fault", "state") or ()] == ["latch_not_kept"],
                 "the fault",
             )
-        eventually(lambda: publisher.newest("fault", "state") == (), "the fault's end")
+        until(lambda: publisher.newest("fault", "state") == (), "the fault's end")

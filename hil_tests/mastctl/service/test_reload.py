@@ -12,7 +12,8 @@ import pytest
 
 from calib.files.mast_file import save_rig
 from calib.mast.rig import Mast
-from hil_tests.mastctl.service_fakes import CONFIG, FakeHardware, ScriptedLoop, eventually, rig
+from hil_tests.mastctl.service_fakes import CONFIG, FakeHardware, ScriptedLoop, rig
+from hil_tests.waiting import NET_S, joined, until
 from mastctl.client import Client, ClientError
 from mastctl.daemon import RunningDaemon
 from mastctl.devices.limits import Limits, OutsideLimits
@@ -163,16 +164,16 @@ def test_nothing_is_read_while_an_operation_runs(
     pair: Pair, client: Client, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def until_stopped(request: Any, record: Any, cancelled: threading.Event, devices: Any) -> None:
-        assert cancelled.wait(10.0)
+        assert cancelled.wait(NET_S)
         raise Stopped("stopped")
 
     monkeypatch.setattr(ScriptedLoop, "script", staticmethod(until_stopped), raising=False)
     write(pair, "speed_rad_per_s: 0.5", "speed_rad_per_s: 0.1")
     client.point(pan_rad=0.1, tilt_rad=0.0)
-    eventually(lambda: client.status()["state"] == "moving", "it moves")
+    until(lambda: client.status()["state"] == "moving", "it moves")
     refused(client, "busy")
     client.stop()
-    eventually(lambda: client.status()["operation"] is None, "the operation ends")
+    until(lambda: client.status()["operation"] is None, "the operation ends")
     assert client.reload()["changed"]
 
 
@@ -185,7 +186,7 @@ def test_two_reloads_at_once_change_it_once(
 
     def slow(path: Any) -> Any:
         first_reads.set()
-        assert go_on.wait(10.0)
+        assert go_on.wait(NET_S)
         return load(path)
 
     monkeypatch.setattr(reload_module, "load_config", slow)
@@ -195,10 +196,9 @@ def test_two_reloads_at_once_change_it_once(
     ]
     for thread in threads:
         thread.start()
-    assert first_reads.wait(10.0)
+    assert first_reads.wait(NET_S)
     go_on.set()
-    for thread in threads:
-        thread.join(10.0)
+    joined(*threads)
     assert sorted(len(one["changed"]) for one in told) == [0, 1]
 
 

@@ -4,21 +4,23 @@ from __future__ import annotations
 
 import contextlib
 import logging
+import socket
 import threading
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import httpx
 import pytest
 
 from drivers.clock import SystemClock
 from drivers.errors import DriverError
 from drivers.faults import FaultPanel
-from hil_tests.mastctl.outside_daemon import BOUND_S
-from hil_tests.mastctl.service_fakes import FakeHardware, Hang, ScriptedLoop, eventually, fake_daemon
+from hil_tests.mastctl.service_fakes import FakeHardware, Hang, ScriptedLoop, fake_daemon
+from hil_tests.waiting import NET_S, joined, until
 from mastctl.client import Client, ClientError
+from mastctl.daemon import RunningDaemon
 from mastctl.errors import Stopped, Unable
 from mastctl.operations import operations as operations_module
 from mastctl.operations.operations import Operations
@@ -27,6 +29,18 @@ from mastctl.pointing.loop import PointingLoop
 from mastctl.safety import stop_threads as stop_threads_module
 from mastctl.tracking import tracker as tracker_module
 from mastctl.web import commands as commands_module
+
+
+def asked_to_stop(daemon: RunningDaemon) -> threading.Thread:
+    """A client that asks for a stop in a thread of its own, and may wait long for the answer."""
+
+    def stop() -> None:
+        with contextlib.suppress(ClientError), Client(daemon.url) as client:
+            client.stop()
+
+    asking = threading.Thread(target=stop)
+    asking.start()
+    return asking
 
 
 def test_the_head_is_told_before_the_track_and_before_any_word(
@@ -41,17 +55,35 @@ def test_the_head_is_told_before_the_track_and_before_any_word(
         before = logger.level
         logger.addHandler(handler)
         logger.setLevel(logging.INFO)
+        stopping = asked_to_stop(daemon)
         try:
-            with contextlib.suppress(ClientError), Client(daemon.url, timeout_s=0.5) as client:
-                client.stop()
-            assert ("stop",) in hardware.head.calls
+            until(lambda: ("stop",) in hardware.head.calls, "the head is told, while the words hang")
         finally:
             logger.removeHandler(handler)
             logger.setLevel(before)
             hang.let_go()
+            joined(stopping)
 
 
 # Locks
+
+MAY_WAIT = (
+    ("POST", "/point"), ("POST", "/pose"), ("POST", "/track"), ("POST", "/track/look"),
+    ("POST", "/simulation/faults"), ("GET", "/simulation/faults"), ("POST", "/mast/back"),
+)  # fmt: skip
+"""What may wait for a lock that somebody holds."""
+
+
+def asked(url: str, method: str, path: str) -> socket.socket:
+    """A connection on which a request was sent, and nothing read."""
+    body = '{"pan_rad": 0.1, "tilt_rad": 0.1}' if path == "/point" else '{"device": "pan_tilt"}'
+    host, port = url.removeprefix("http://").split(":")
+    line = socket.create_connection((host, int(port)), timeout=NET_S)
+    head = (
+        f"Host: {host}\r\nConnection: close\r\nContent-Type: application/json\r\nContent-Length: {len(body)}"
+    )
+    line.sendall(f"{method} /api/v1{path} HTTP/1.1\r\n{head}\r\n\r\n{body}".encode())
+    return line
 
 
 def locks_of(thing: Any, seen: set[int]) -> Iterator[tuple[str, Any]]:
@@ -83,20 +115,16 @@ def test_no_lock_that_somebody_holds_keeps_the_event_loop(
         for one in ("Masts._lock", "Operations._lock", "Tracker._lock", "FrameStore._lock"):
             assert one in found
         for place, lock in found.items():
-            with lock, httpx.Client(base_url=f"{daemon.url}/api/v1", timeout=0.3) as hasty:
-                for method, path in (
-                    ("POST", "/point"), ("POST", "/pose"), ("POST", "/track"), ("POST", "/track/look"),
-                    ("POST", "/simulation/faults"), ("GET", "/simulation/faults"), ("POST", "/mast/back"),
-                ):  # fmt: skip
-                    body = {"pan_rad": 0.1, "tilt_rad": 0.1} if path == "/point" else {"device": "pan_tilt"}
-                    with contextlib.suppress(httpx.TimeoutException):  # these may wait for it
-                        hasty.request(method, path, json=body)
-                for path in ("/status", "/track", "/operations", f"/operations/{operation}", "/mast"):
-                    assert client._daemon._http.get(f"/api/v1{path}").status_code == 200, (
-                        f"{path} while {place} is held"
-                    )
+            with lock:
+                waiting = [asked(daemon.url, *request) for request in MAY_WAIT]
+                for path in 2 * ("/status", "/track", "/operations", f"/operations/{operation}", "/mast"):
+                    answer = client._daemon._http.get(f"/api/v1{path}")
+                    assert answer.status_code == 200, f"{path} while {place} is held"
+            for one in waiting:
+                with one:
+                    assert one.recv(65536).startswith(b"HTTP/1.1 "), f"after {place} was held"
             client.stop()
-            eventually(lambda: client.status()["operation"] is None, "the end of what was started")
+            until(lambda: client.status()["operation"] is None, "the end of what was started")
 
 
 def test_a_lock_of_the_bookkeeping_does_not_keep_a_stop_from_the_head(
@@ -110,9 +138,10 @@ def test_a_lock_of_the_bookkeeping_does_not_keep_a_stop_from_the_head(
             service.machine.publisher._turns._lock,
         ):  # fmt: skip
             hardware.head.calls.clear()
-            with lock, contextlib.suppress(ClientError), Client(daemon.url, timeout_s=1.0) as client:
-                client.stop()
-            assert ("stop",) in hardware.head.calls
+            with lock:
+                stopping = asked_to_stop(daemon)
+                until(lambda: ("stop",) in hardware.head.calls, "the head is told")
+            joined(stopping)
 
 
 def test_a_fifth_stop_is_answered_honestly_while_four_hang(
@@ -124,14 +153,7 @@ def test_a_fifth_stop_is_answered_honestly_while_four_hang(
     with fake_daemon(monkeypatch, tmp_path) as (daemon, _):
         monkeypatch.setattr(daemon.service.stopping, "stop", hang)
         told: list[ClientError] = []
-
-        def stop() -> None:
-            with Client(daemon.url) as client, contextlib.suppress(ClientError):
-                client.stop()
-
-        four = [threading.Thread(target=stop) for _ in range(4)]
-        for one in four:
-            one.start()
+        four = [asked_to_stop(daemon) for _ in range(4)]
 
         def refused() -> bool:
             with Client(daemon.url) as client:
@@ -141,12 +163,11 @@ def test_a_fifth_stop_is_answered_honestly_while_four_hang(
                     told.append(error)
             return bool(told) and "4 stops are under way" in str(told[-1])
 
-        eventually(refused, "an answer to the fifth", BOUND_S)
+        until(refused, "an answer to the fifth")
         assert told[-1].code == "stop_pending"
         assert "may still move" in str(told[-1])
         hang.let_go()
-        for one in four:
-            one.join()
+        joined(*four)
 
 
 # Operations
@@ -185,7 +206,7 @@ def test_a_stop_that_raises_anything_leaves_room_for_the_next_operation(
         with monkeypatch.context() as patch:
             patch.setattr(ScriptedLoop, "script", staticmethod(fail))
             patch.setattr(daemon.service.devices, "stop", broken)
-            record = client.wait(client.point(pan_rad=0.1, tilt_rad=0.1), timeout_s=BOUND_S)
+            record = client.wait(client.point(pan_rad=0.1, tilt_rad=0.1), timeout_s=NET_S)
         assert record["state"] == "failed"
         assert client.wait(client.point(pan_rad=0.1, tilt_rad=0.1))["state"] == "done"
 
@@ -207,9 +228,9 @@ def test_a_result_and_an_error_that_cannot_be_told_leave_room_too(
 
     with fake_daemon(monkeypatch, tmp_path) as (daemon, _), Client(daemon.url) as client:
         monkeypatch.setattr(ScriptedLoop, "script", staticmethod(fail))
-        assert client.wait(client.point(pan_rad=0.1, tilt_rad=0.1), timeout_s=BOUND_S)["state"] == "failed"
+        assert client.wait(client.point(pan_rad=0.1, tilt_rad=0.1), timeout_s=NET_S)["state"] == "failed"
         monkeypatch.setattr(ScriptedLoop, "script", staticmethod(lambda *_: Odd()))
-        assert client.wait(client.point(pan_rad=0.1, tilt_rad=0.1), timeout_s=BOUND_S)["state"] == "done"
+        assert client.wait(client.point(pan_rad=0.1, tilt_rad=0.1), timeout_s=NET_S)["state"] == "done"
 
 
 def test_nothing_starts_and_nothing_moves_while_a_stop_is_under_way(
@@ -218,20 +239,14 @@ def test_nothing_starts_and_nothing_moves_while_a_stop_is_under_way(
     hang = Hang()
     with fake_daemon(monkeypatch, tmp_path) as (daemon, hardware), Client(daemon.url) as client:
         hardware.head.hook = lambda name: hang() if name == "stop" else None
-
-        def stop() -> None:
-            with contextlib.suppress(ClientError), Client(daemon.url) as other:
-                other.stop()
-
-        stopping = threading.Thread(target=stop)
-        stopping.start()
-        assert hang.entered.wait(BOUND_S)
+        stopping = asked_to_stop(daemon)
+        assert hang.entered.wait(NET_S)
         assert client.status()["state"] == "stopping"
         with pytest.raises(ClientError) as refused:
             client.point(pan_rad=0.1, tilt_rad=0.1)
         assert refused.value.code == "stopping"
         hang.let_go()
-        stopping.join()
+        joined(stopping)
         assert client.status()["state"] == "holding"
         assert client.wait(client.point(pan_rad=0.1, tilt_rad=0.1))["state"] == "done"
 
@@ -254,12 +269,12 @@ def test_an_operation_that_ends_while_the_head_is_being_stopped_was_stopped_by_t
     go = threading.Event()
 
     def refused(record: Any, cancelled: threading.Event) -> None:
-        assert go.wait(BOUND_S)
+        assert go.wait(NET_S)
         raise Stopped("a move was refused, since the mast is being stopped")
 
     def until_it_has_ended() -> None:
         go.set()
-        eventually(lambda: operations.running is None, "the operation's end", BOUND_S)
+        until(lambda: operations.running is None, "the operation's end")
 
     operations = Operations(ScriptedMover(until_it_has_ended), SystemClock())
     name = operations.start({}, refused).id
@@ -273,10 +288,10 @@ def test_an_operation_that_was_done_before_its_stop_is_not_told_as_stopped() -> 
 
     def until_it_has_ended() -> None:
         go.set()
-        eventually(lambda: operations.running is None, "the operation's end", BOUND_S)
+        until(lambda: operations.running is None, "the operation's end")
 
     operations = Operations(ScriptedMover(until_it_has_ended), SystemClock())
-    name = operations.start({}, lambda record, cancelled: go.wait(BOUND_S)).id
+    name = operations.start({}, lambda record, cancelled: go.wait(NET_S)).id
     assert operations.stop() is None
     assert operations.get(name).state == "done"
 
@@ -303,7 +318,15 @@ def test_whoever_sees_a_record_that_has_ended_sees_no_operation_running() -> Non
 
     operations._keep = keep_and_look  # type: ignore[method-assign]
     operations.start({}, lambda record, cancelled: None)
-    eventually(lambda: seen == [None], "the end, seen as one")
+    until(lambda: seen == [None], "the end, seen as one")
+
+
+class PatientLoop(PointingLoop):
+    """A loop that would wait for a picture longer than any net."""
+
+    def __init__(self, *given: Any) -> None:
+        super().__init__(*given)
+        self._settings = replace(self._settings, frame_timeout_s=2.0 * NET_S)
 
 
 def waiting_pointing(client: Client, hardware: FakeHardware, hang: Hang) -> str:
@@ -311,7 +334,7 @@ def waiting_pointing(client: Client, hardware: FakeHardware, hang: Hang) -> str:
     frame_id = client.snapshot("navcam_left").frame_id
     hardware.fake_cameras["navcam_left"].hook = hang
     operation = client.point(pixel=("navcam_left", frame_id, 30.0, 20.0))
-    assert hang.entered.wait(BOUND_S)
+    assert hang.entered.wait(NET_S)
     return operation
 
 
@@ -320,13 +343,12 @@ def test_a_stop_ends_a_pointing_that_waits_for_a_picture(
 ) -> None:
     hang = Hang()
     with (
-        fake_daemon(monkeypatch, tmp_path, loop=PointingLoop) as (daemon, hardware),  # type: ignore[arg-type]
+        fake_daemon(monkeypatch, tmp_path, loop=PatientLoop) as (daemon, hardware),  # type: ignore[arg-type]
         Client(daemon.url) as client,
     ):
         operation = waiting_pointing(client, hardware, hang)
         client.stop()
-        # The picture would be waited for 5 s and more; the hanging camera is still at it.
-        eventually(lambda: client.operation(operation)["state"] == "stopped", "the end", within_s=2.5)
+        until(lambda: client.operation(operation)["state"] == "stopped", "the end")
         assert client.operation(operation)["error"]["message"] == "a stop was asked for"
         assert client.status()["state"] == "holding"
         assert client.wait(client.point(pan_rad=0.1, tilt_rad=0.1))["state"] == "done"
@@ -340,12 +362,12 @@ def test_a_stop_that_an_operation_has_not_heeded_yet_is_told_as_stopping(
 
     def deaf(*_: Any) -> None:
         entered.set()
-        leave.wait(BOUND_S)
+        leave.wait(NET_S)
 
     with fake_daemon(monkeypatch, tmp_path) as (daemon, _), Client(daemon.url) as client:
         monkeypatch.setattr(ScriptedLoop, "script", staticmethod(deaf))
         client.point(pan_rad=0.1, tilt_rad=0.1)
-        assert entered.wait(BOUND_S)
+        assert entered.wait(NET_S)
         assert client.status()["state"] == "moving"
         client.stop()
         assert client.status()["state"] == "stopping"
@@ -353,7 +375,7 @@ def test_a_stop_that_an_operation_has_not_heeded_yet_is_told_as_stopping(
             client.point(pan_rad=0.1, tilt_rad=0.1)
         assert refused.value.code == "stopping"
         leave.set()
-        eventually(lambda: client.status()["state"] == "holding", "the end")
+        until(lambda: client.status()["state"] == "holding", "the end")
 
 
 def test_a_defect_at_the_end_of_a_look_ends_the_track_instead_of_keeping_it_busy(
@@ -366,6 +388,6 @@ def test_a_defect_at_the_end_of_a_look_ends_the_track_instead_of_keeping_it_busy
         monkeypatch.setattr(tracker_module, "started", fail)
         frame_id = client.snapshot("navcam_left").frame_id
         client.start_track(pixel=("navcam_left", frame_id, 30.0, 20.0))
-        eventually(lambda: client.track()["state"] == "stopped", "the end of the track")
+        until(lambda: client.track()["state"] == "stopped", "the end of the track")
         assert "defect" in client.track()["reason"]
         assert client.track()["operation"] is None

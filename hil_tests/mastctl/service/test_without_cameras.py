@@ -7,11 +7,11 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import httpx
 import pytest
 
 from calib.files.mast_file import save_rig
-from hil_tests.mastctl.service_fakes import FakeHardware, eventually, rig
+from hil_tests.mastctl.service_fakes import HTTP, FakeHardware, rig
+from hil_tests.waiting import until
 from mastctl.cli.main import main
 from mastctl.config import load_config
 from mastctl.daemon import RunningDaemon
@@ -63,23 +63,23 @@ def bare(
 
 def outcome(daemon: RunningDaemon, command: str, body: dict[str, object]) -> dict[str, Any]:
     """The error object of a request or of its operation; empty where it was done."""
-    answer = httpx.post(f"{daemon.url}/api/v1/{command}", json=body)
+    answer = HTTP.post(f"{daemon.url}/api/v1/{command}", json=body)
     if answer.status_code != 202:
         error = answer.json()["error"]
         assert 400 <= answer.status_code < 500, answer.text
     else:
         place = f"{daemon.url}/api/v1/operations/{answer.json()['id']}"
-        eventually(lambda: httpx.get(place).json()["state"] not in ("queued", "running"), "the end")
-        error = httpx.get(place).json()["error"] or {}
+        until(lambda: HTTP.get(place).json()["state"] not in ("queued", "running"), "the end")
+        error = HTTP.get(place).json()["error"] or {}
     assert isinstance(error, dict)
     return error
 
 
 def test_a_head_without_cameras_is_moved_by_angles(bare: RunningDaemon) -> None:
-    status = httpx.get(f"{bare.url}/api/v1/status").json()
+    status = HTTP.get(f"{bare.url}/api/v1/status").json()
     assert status["state"] == "ready" and not status["cameras"] and status["faults"] == []
     assert outcome(bare, "point", ANGLES) == {}
-    assert httpx.get(f"{bare.url}/api/v1/status").json()["joints"]["pan_rad"] == 0.3
+    assert HTTP.get(f"{bare.url}/api/v1/status").json()["joints"]["pan_rad"] == 0.3
 
 
 @pytest.mark.parametrize(
@@ -112,7 +112,7 @@ def test_commands_and_page_serve_a_head_alone(
     assert main(["snapshot", "navcam_left", "--url", bare.url, "--out", "never.png"]) != 0
     told = capsys.readouterr().err.strip().splitlines()[-1]
     assert "navcam_left is not configured" in told
-    answer = httpx.post(f"{bare.url}/api/v1/mast", json={"file": "little.yaml"})
+    answer = HTTP.post(f"{bare.url}/api/v1/mast", json={"file": "little.yaml"})
     assert answer.status_code == 200, answer.text
 
 
@@ -129,7 +129,7 @@ def test_one_eye_of_a_pair_is_not_said_to_be_missing_from_the_mast_file(
             ),
             ("hazcam_left", "hazcam_left is in no stereo pair of the mast file"),
         ):
-            answer = httpx.get(f"{daemon.url}/api/v1/snapshot/{camera}")
+            answer = HTTP.get(f"{daemon.url}/api/v1/snapshot/{camera}")
             frame_id = next(value for key, value in answer.headers.items() if key.endswith("frame-id"))
             body = {"pixel": {"camera": camera, "frame_id": frame_id, "x_px": 30, "y_px": 20}}
             error = outcome(daemon, "track", body)

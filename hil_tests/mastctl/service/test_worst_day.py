@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -11,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from hil_tests.waiting import until
 from mastctl.config import load_config
 from mastctl.packaged import config_folder
 from mastctl.pointing.requests import PixelTarget, PointRequest
@@ -18,7 +18,6 @@ from mastctl.service.service import Service
 
 AIM_PX = (511.5, 383.5)
 CLICKS = ((300.0, 420.0), (700.0, 500.0), (450.0, 600.0))
-LONG_S = 120.0
 
 
 @contextmanager
@@ -44,10 +43,7 @@ def pointed(service: Service, pixel_px: tuple[float, float]) -> tuple[dict[str, 
     name = service.steering.point(
         PointRequest(PixelTarget("navcam_left", frame.frame_id, *pixel_px), pointings=2), {}
     ).id
-    until_s = time.monotonic() + LONG_S
-    while service.operations.get(name).state in ("queued", "running"):
-        assert time.monotonic() < until_s, f"operation {name} still runs"
-        time.sleep(0.002)
+    until(lambda: service.operations.get(name).ended_s is not None, f"the end of operation {name}")
     told = service.operations.get(name).told()
     assert told["state"] == "done", told.get("error")
     service.clock.sleep(30.0)  # until nothing rings any more

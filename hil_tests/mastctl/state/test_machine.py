@@ -16,6 +16,7 @@ from typing import Any
 import pytest
 
 from drivers.clock import ManualClock
+from hil_tests.waiting import joined
 from mastctl.errors import MastctlError, NotNow, Unable
 from mastctl.state.faults import StandingFault
 from mastctl.state.machine import Machine
@@ -23,7 +24,6 @@ from mastctl.state.publisher import Publisher, Topic
 from mastctl.state.standing import Latched, Residual, Standing, Word
 from mastctl.state.table import CHOICES, EVENTS, HAPPENS, MEANINGS, TABLE, WORDS, leads_to
 
-BOUND_S = 30.0
 LATCH = Latched("Ana", "a hand in the way", "2026-01-02T03:04:05Z")
 SILENT = StandingFault("pan_tilt", "no_reply", "the head is silent", 3.0, "it answers")
 HOT = StandingFault("pan_tilt", "device_fault", "the tilt motor is hot", 4.0, "it has cooled")
@@ -378,11 +378,9 @@ class Storm:
         threads = [threading.Thread(target=run, args=one) for one in [*works, (self.head, "e")]]
         for thread in threads:
             thread.start()
-        for thread in threads[2:4]:
-            thread.join(BOUND_S)
+        joined(*threads[2:4])
         self.over.set()
-        for thread in threads:
-            thread.join(BOUND_S)
+        joined(*threads)
         assert not defects, f"{self.words}: {defects}"
         with contextlib.suppress(MastctlError):  # nothing may be latched
             asked_reset(self.machine, "a")

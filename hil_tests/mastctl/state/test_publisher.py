@@ -10,11 +10,9 @@ import weakref
 
 import pytest
 
-from hil_tests.mastctl.service_fakes import eventually
+from hil_tests.waiting import NET_S, joined, until
 from mastctl.state.in_turn import InTurn
 from mastctl.state.publisher import Published, Publisher
-
-BOUND_S = 20.0
 
 
 def told(some: list[Published]) -> list[tuple[str, str, object]]:
@@ -93,9 +91,9 @@ def test_a_waiting_thread_wakes_for_a_value_and_for_the_end() -> None:
     thread = threading.Thread(target=listen, daemon=True)
     thread.start()
     publisher.publish("state", "machine", "ready")
-    eventually(lambda: heard == [("state", "machine", "ready")], "the value")
+    until(lambda: heard == [("state", "machine", "ready")], "the value")
     publisher.close()
-    thread.join(BOUND_S)
+    joined(thread)
     assert not thread.is_alive()
     assert subscription.wait() == [], "a closed one does not wait"
     assert publisher.subscribe().closed
@@ -120,8 +118,8 @@ def test_a_coroutine_waits_without_keeping_its_loop_and_hears_other_threads() ->
             thread = threading.Thread(target=lambda: publish_all(publisher, 500))
             thread.start()
             while not heard or heard[-1][2] != 499:
-                heard += told(await subscription.wait(BOUND_S))
-            thread.join()
+                heard += told(await subscription.wait(NET_S))
+            joined(thread)
             assert len(heard) + subscription.lost == 500
             publisher.close()
             assert await subscription.wait(None) == [] and subscription.closed
@@ -168,7 +166,7 @@ def test_all_listeners_hear_what_many_threads_say_in_one_order(seed: int) -> Non
 
     def listen(number: int) -> None:
         while not subscriptions[number].closed:
-            heard[number] += subscriptions[number].wait(BOUND_S)
+            heard[number] += subscriptions[number].wait(NET_S)
 
     def say(name: str) -> None:
         chance = random.Random(f"{seed} {name}")
@@ -179,12 +177,10 @@ def test_all_listeners_hear_what_many_threads_say_in_one_order(seed: int) -> Non
     speakers = [threading.Thread(target=say, args=(f"thread {number}",)) for number in range(4)]
     for thread in (*listeners, *speakers):
         thread.start()
-    for thread in speakers:
-        thread.join(BOUND_S)
-    eventually(lambda: all(len(h) + s.lost == 1600 for h, s in zip(heard, subscriptions, strict=True)), "all")
+    joined(*speakers)
+    until(lambda: all(len(h) + s.lost == 1600 for h, s in zip(heard, subscriptions, strict=True)), "all")
     publisher.close()
-    for thread in listeners:
-        thread.join(BOUND_S)
+    joined(*listeners)
     known: dict[int, Published] = {}
     for mine in heard:
         by_key: dict[tuple[str, str], int] = {}

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import os
 import signal
-import time
 import urllib.request
 from collections.abc import Callable
 from contextlib import suppress
@@ -13,6 +12,7 @@ from pathlib import Path
 
 import pytest
 
+from hil_tests.waiting import NET_S, until
 from mastctl.client import Client, ClientError
 from mastctl.testing import RoverError, SetFault, SimulatedRover
 
@@ -20,7 +20,6 @@ pytestmark = pytest.mark.mastctl(picture_width_px=320, scene={"relief_m": 0.0, "
 
 SetsFault = Callable[..., SetFault]
 
-PATIENCE_S = 60.0  # only ends a failing test
 MIDDLE_PX = (159.5, 119.5)
 SEEN: list[str] = []
 
@@ -37,17 +36,15 @@ def ended(client: Client, pixel: tuple[str, str, float, float]) -> str:
 
 def points_again(client: Client) -> None:
     """Stop, which also arms a bus watchdog that has tripped, and point, until that is done."""
-    until_s = time.monotonic() + PATIENCE_S
-    while True:
+
+    def done() -> bool:
         try:
             client.stop()
-            code = ended(client, clicked(client))
-        except ClientError as error:  # the head still moves, or has just come back
-            code = error.code
-        if code == "done":
-            return
-        assert time.monotonic() < until_s, code
-        time.sleep(0.2)  # a head that was lost is asked again twice a second
+            return ended(client, clicked(client)) == "done"
+        except ClientError:  # the head still moves, or has just come back
+            return False
+
+    until(done, "it points again")
 
 
 def code_of_snapshot(client: Client, camera: str) -> str:
@@ -71,7 +68,7 @@ def listening_at(port: int) -> list[int]:
 
 
 def test_the_address_is_that_of_a_daemon(mast_daemon: str) -> None:
-    with urllib.request.urlopen(f"{mast_daemon}/api/v1/status", timeout=30) as answer:
+    with urllib.request.urlopen(f"{mast_daemon}/api/v1/status", timeout=NET_S) as answer:
         assert b'"simulated"' in answer.read()
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
-import time
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -17,12 +16,11 @@ from calib.camera.cahvor import CameraModel
 from calib.files.mast_file import load_rig
 from drivers.errors import BadOptions
 from drivers.hardware import DeviceSettings
+from hil_tests.waiting import until
 from mastctl.config import load_config
 from mastctl.packaged import config_folder
 from mastctl.testing.daemons import config_for_a_test
 from mastctl.testing.pictures import resized, with_width
-
-PATIENCE_S = 60.0  # only ends a failing test
 
 HOLDER = """
 import os, sys, threading, time
@@ -85,10 +83,7 @@ def test_its_process_ends_when_the_one_that_made_it_is_killed(
     serving = [pid for pid in pids if b"mastctl.testing.serve" in Path(f"/proc/{pid}/cmdline").read_bytes()]
     assert len(serving) == 1
     made.kill()
-    until_s = time.monotonic() + PATIENCE_S
-    while runs(serving[0]):
-        assert time.monotonic() < until_s
-        time.sleep(0.02)
+    until(lambda: not runs(serving[0]), "its end")
 
 
 XDIST = """
@@ -110,10 +105,7 @@ def test_its_process_ends_when_the_pytest_of_its_worker_is_killed_and_the_worker
         try:
             assert runs(worker) and runs(serving)
             made.kill()
-            until_s = time.monotonic() + PATIENCE_S
-            while runs(serving):
-                assert time.monotonic() < until_s
-                time.sleep(0.02)
+            until(lambda: not runs(serving), "its end")
             assert runs(worker)
         finally:
             made.kill()

@@ -12,7 +12,8 @@ from urllib.parse import urlsplit
 import httpx
 import pytest
 
-from hil_tests.mastctl.service_fakes import FakeHardware, fake_daemon
+from hil_tests.mastctl.service_fakes import PLAIN, FakeHardware, fake_daemon
+from hil_tests.waiting import NET_S
 from mastctl.access.tokens import TokenList
 from mastctl.commands.caller import Role
 from mastctl.daemon import RunningDaemon
@@ -50,10 +51,10 @@ class Network:
         headers = {"Host": f"{NAME}:{self.port}"}
         if role is not None:
             headers["Authorization"] = f"Bearer {self.token(role)}"
-        with httpx.Client(base_url=f"{self.url}/api/v1", trust_env=False, timeout=20.0) as client:
+        with httpx.Client(base_url=f"{self.url}/api/v1", **PLAIN) as client:
             return client.request(method, path, headers={**headers, **told}, **options)  # type: ignore[arg-type]
 
-    def raw(self, text: str | bytes, timeout_s: float = 20.0) -> bytes:
+    def raw(self, text: str | bytes, timeout_s: float = NET_S) -> bytes:
         """Send bytes, and return what comes until the daemon closes."""
         data = text.encode("latin-1") if isinstance(text, str) else text
         with socket.create_connection(("127.0.0.1", self.port), timeout=timeout_s) as line:

@@ -21,9 +21,11 @@ from hypothesis import strategies as st
 
 from drivers.errors import NoReply
 from drivers.faults import FaultPanel
-from hil_tests.mastctl.service_fakes import CONFIG, FakeHardware, Hang, ScriptedLoop, eventually, fake_daemon
+from hil_tests.mastctl.service_fakes import CONFIG, HTTP, PLAIN, FakeHardware, Hang, ScriptedLoop, fake_daemon
+from hil_tests.waiting import NET_S, joined, until
 from mastctl.daemon import RunningDaemon
 from mastctl.devices import devices as devices_module
+from mastctl.service import service as service_module
 from mastctl.service import steering as steering_module
 from mastctl.web import described as described_module
 from mastctl.web.bodies import LARGEST_BODY_BYTES
@@ -43,7 +45,7 @@ def hardware(pair: tuple[RunningDaemon, FakeHardware]) -> FakeHardware:
 
 @pytest.fixture
 def web(daemon: RunningDaemon) -> Iterator[httpx.Client]:
-    with httpx.Client(base_url=f"{daemon.url}/api/v1", trust_env=False, timeout=20.0) as client:
+    with httpx.Client(base_url=f"{daemon.url}/api/v1", **PLAIN) as client:
         yield client
 
 
@@ -61,9 +63,7 @@ def refused(answer: httpx.Response, status: int, code: str) -> str:
 
 def ended(web: httpx.Client, operation: str) -> dict[str, Any]:
     """An operation's record after its end."""
-    eventually(
-        lambda: web.get(f"/operations/{operation}").json()["state"] not in ("queued", "running"), "the end"
-    )
+    until(lambda: web.get(f"/operations/{operation}").json()["state"] not in ("queued", "running"), "the end")
     return dict(web.get(f"/operations/{operation}").json())
 
 
@@ -74,13 +74,13 @@ def test_status_tells_what_the_contract_asks(
     web: httpx.Client, daemon: RunningDaemon, hardware: FakeHardware
 ) -> None:
     hardware.head.pan_rad = 0.5
-    eventually(lambda: daemon.service.devices.read().pan_rad == 0.5, "a reading")
+    until(lambda: daemon.service.devices.read().pan_rad == 0.5, "a reading")
     web.get("/snapshot/navcam_left")
     status = web.get("/status").json()
     assert status["state"] == "ready"
     assert (status["simulated"], status["hardware"]) == (False, "real")
     assert status["joints"]["pan_rad"] == 0.5
-    assert 0.0 <= status["joints"]["age_s"] < 5.0
+    assert 0.0 <= status["joints"]["age_s"] <= status["uptime_s"]
     assert status["moving"] is False
     limits = {"pan_rad": [-2.0, 2.0], "tilt_rad": [-1.0, 1.0], "speed_rad_per_s": 0.5}
     assert {key: status["limits"][key] for key in limits} == limits
@@ -94,7 +94,7 @@ def test_status_tells_what_the_contract_asks(
     assert status["mast"] == {"file": "little.yaml", "name": "little", "digest": daemon.service.stored.digest}
     assert status["faults"] == []
     assert status["version"]
-    assert status["uptime_s"] > 0.0
+    assert 0.0 < status["uptime_s"] < NET_S
 
 
 def test_a_head_that_fails_shows_as_fault_in_plain_words(web: httpx.Client, hardware: FakeHardware) -> None:
@@ -102,12 +102,12 @@ def test_a_head_that_fails_shows_as_fault_in_plain_words(web: httpx.Client, hard
         raise NoReply("no answer on the bus", device="pan_tilt")
 
     hardware.head.hook = fail
-    eventually(lambda: web.get("/status").json()["state"] == "fault", "the fault")
+    until(lambda: web.get("/status").json()["state"] == "fault", "the fault")
     fault = web.get("/status").json()["faults"][0]
     assert (fault["device"], fault["code"]) == ("pan_tilt", "no_reply")
     assert fault["message"] == "pan_tilt: no answer on the bus"
     hardware.head.hook = lambda name: None
-    eventually(lambda: web.get("/status").json()["state"] == "holding", "recovery")
+    until(lambda: web.get("/status").json()["state"] == "holding", "recovery")
 
 
 # Point
@@ -166,7 +166,7 @@ def test_a_second_operation_is_refused_naming_the_first(
     hang = Hang()
     monkeypatch.setattr(ScriptedLoop, "script", staticmethod(lambda *any: hang()))
     first = web.post("/point", json=ANGLES).json()["id"]
-    assert hang.entered.wait(5.0)
+    assert hang.entered.wait(NET_S)
     assert web.get("/status").json()["state"] == "moving"
     assert first in refused(web.post("/point", json=ANGLES), 409, "busy")
     hang.let_go()
@@ -248,7 +248,7 @@ def idle(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[RunningDaem
 @pytest.fixture
 def quiet(idle: tuple[RunningDaemon, FakeHardware]) -> Iterator[httpx.Client]:
     """A client of the idle daemon; afterwards nothing may have happened there."""
-    with httpx.Client(base_url=f"{idle[0].url}/api/v1", trust_env=False, timeout=20.0) as client:
+    with httpx.Client(base_url=f"{idle[0].url}/api/v1", **PLAIN) as client:
         yield client
         assert client.get("/operations").json() == {"operations": []}
     assert [call for call in idle[1].head.calls if call[0] == "move"] == []
@@ -424,7 +424,7 @@ def test_nothing_is_aimed_with_a_camera_that_the_daemon_lacks(
     with fake_daemon(monkeypatch, tmp_path, config=lacking, loop=Loop) as (daemon, _):
         assert sorted(given[0].cameras) == ["hazcam_left", "navcam_right"]
         assert dict(given[0].stereo) == {}
-        with httpx.Client(base_url=f"{daemon.url}/api/v1", trust_env=False) as client:
+        with httpx.Client(base_url=f"{daemon.url}/api/v1", **PLAIN) as client:
             body = {"position_m": [6, 1, 0], "aim": {"camera": "navcam_left", "x_px": 1, "y_px": 1}}
             assert "navcam_right" in refused(client.post("/point", json=body), 422, "bad_aim")
 
@@ -453,7 +453,7 @@ def test_a_click_is_refused_by_name_if_its_frame_does_not_serve(
 
 def test_a_click_on_a_frame_taken_in_motion_is_refused(web: httpx.Client, hardware: FakeHardware) -> None:
     hardware.head.moving = True
-    eventually(lambda: web.get("/status").json()["moving"], "motion")
+    until(lambda: web.get("/status").json()["moving"], "motion")
     assert web.get("/status").json()["state"] == "moving"
     shot = web.get("/snapshot/navcam_left?fresh=true")
     assert shot.headers["X-Mastctl-Moving"] == "true"
@@ -472,12 +472,12 @@ def test_stop_ends_the_operation_and_lets_no_later_move_out(
     def stubborn(request: Any, record: Any, cancelled: threading.Event, devices: Any) -> None:
         devices.move(0.1, 0.1)
         entered.set()
-        cancelled.wait(10.0)
+        assert cancelled.wait(NET_S)
         devices.move(0.2, 0.2)  # a loop that looked before the stop came, and moves after it
 
     monkeypatch.setattr(ScriptedLoop, "script", staticmethod(stubborn))
     operation = web.post("/point", json=ANGLES).json()["id"]
-    assert entered.wait(5.0)
+    assert entered.wait(NET_S)
     answer = web.post("/stop")
     assert answer.status_code == 200
     assert answer.json() == {"stopped": True, "operation": operation}
@@ -510,21 +510,16 @@ def test_stop_does_not_wait_behind_hanging_cameras(
     for camera in hardware.fake_cameras.values():
         camera.hook = hang
     askers = [
-        threading.Thread(
-            target=lambda: httpx.get(
-                f"{daemon.url}/api/v1/snapshot/navcam_left?fresh=true", trust_env=False, timeout=30.0
-            )
-        )
+        threading.Thread(target=lambda: HTTP.get(f"{daemon.url}/api/v1/snapshot/navcam_left?fresh=true"))
         for _ in range(45)  # more than there are worker threads
     ]
     for asker in askers:
         asker.start()
-    assert hang.entered.wait(5.0)
+    assert hang.entered.wait(NET_S)
     assert web.post("/stop").status_code == 200
     assert hardware.head.calls == [("stop",)]
     hang.let_go()
-    for asker in askers:
-        asker.join(30.0)
+    joined(*askers)
 
 
 def test_an_unconfirmed_stop_says_so(
@@ -533,7 +528,7 @@ def test_an_unconfirmed_stop_says_so(
     monkeypatch.setattr(devices_module, "STOP_TIMEOUT_S", 0.3)
     hang = Hang()
     hardware.head.hook = hang
-    assert hang.entered.wait(5.0)
+    assert hang.entered.wait(NET_S)
     assert "may still move" in refused(web.post("/stop"), 504, "no_reply")
     hardware.head.hook = lambda name: None
     hang.let_go()
@@ -563,7 +558,10 @@ def test_a_snapshot_is_the_picture_with_its_facts(web: httpx.Client, daemon: Run
     assert again.content[:3] == b"\xff\xd8\xff"
 
 
-def test_a_fresh_snapshot_is_exposed_after_the_request_and_another_may_be_kept(web: httpx.Client) -> None:
+def test_a_fresh_snapshot_is_exposed_after_the_request_and_another_may_be_kept(
+    web: httpx.Client, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(service_module, "SNAPSHOT_AGE_S", NET_S)
     first, second = (web.get("/snapshot/navcam_left").headers["X-Mastctl-Frame-Id"] for _ in range(2))
     assert first == second
     now_s = web.get("/status").json()["now_s"]
@@ -651,7 +649,7 @@ def test_daemons_of_one_process_have_nothing_in_common_but_their_routes(
 )
 def test_a_foreign_host_name_is_refused(quiet: httpx.Client, host: str) -> None:
     where = urlsplit(str(quiet.base_url))
-    with socket.create_connection((where.hostname, where.port), timeout=5.0) as line:
+    with socket.create_connection((where.hostname, where.port), timeout=NET_S) as line:
         line.sendall(f"GET /api/v1/status HTTP/1.1\r\nHost: {host}\r\nConnection: close\r\n\r\n".encode())
         answer = b"".join(iter(lambda: line.recv(65536), b""))
     assert answer.startswith(b"HTTP/1.1 403")
@@ -677,7 +675,7 @@ def test_the_services_own_page_may_ask(quiet: httpx.Client) -> None:
 
 def test_what_is_not_http_does_no_harm(quiet: httpx.Client) -> None:
     where = urlsplit(str(quiet.base_url))
-    with socket.create_connection((where.hostname, where.port), timeout=5.0) as line:
+    with socket.create_connection((where.hostname, where.port), timeout=NET_S) as line:
         line.sendall(b"\x00\x01\x02 GET\r\n\r\n")
         assert line.recv(4096).startswith(b"HTTP/1.1 400")
     assert quiet.get("/status").status_code == 200
@@ -688,11 +686,11 @@ def test_what_is_not_http_does_no_harm(quiet: httpx.Client) -> None:
 
 def test_the_sun_is_told_kept_out_and_forgotten(web: httpx.Client) -> None:
     assert web.get("/limits/sun").json() == {"sun": None, "boxes": []}
-    body = {"azimuth_rad": 0.1, "elevation_rad": -0.1, "half_angle_rad": 0.2, "valid_s": 60.0}
+    body = {"azimuth_rad": 0.1, "elevation_rad": -0.1, "half_angle_rad": 0.2, "valid_s": 3600.0}
     answer = web.post("/limits/sun", json=body).json()
     told, boxes = answer["sun"], answer["boxes"]
     assert any(low <= 0.1 <= high for low, high in (box["pan_rad"] for box in boxes))
-    assert told["holds"] and told["frame"] == "site" and 50.0 < told["left_s"] <= 60.0
+    assert told["holds"] and told["frame"] == "site" and 3600.0 - NET_S < told["left_s"] <= 3600.0
     assert "keep-out sun" in refused(web.post("/point", json=ANGLES), 422, "keep_out")
     vector = {"direction": [-2.0, 0.0, 0.0], "frame": "rover", "half_angle_rad": 0.2}
     assert web.post("/limits/sun", json=vector).json()["sun"]["direction"] == [-1.0, 0.0, 0.0]

@@ -10,12 +10,12 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-import httpx
 import pytest
 
 from hil_tests.mastctl.guided.guided_world import BEGUN, DONE, HEAD, PLACE, PROGRESS, lines
-from hil_tests.mastctl.service_fakes import FakeHardware, ScriptedLoop, eventually
+from hil_tests.mastctl.service_fakes import HTTP, FakeHardware, ScriptedLoop
 from hil_tests.mastctl.web.network import network_daemon
+from hil_tests.waiting import NET_S, until
 from mastctl.client import Client, ClientError
 from mastctl.daemon import RunningDaemon
 from mastctl.guided.guide import Door
@@ -46,7 +46,7 @@ def ended(daemon: RunningDaemon) -> Run:
         run = daemon.service.guide.run
         return run if run is not None and run.over else None
 
-    eventually(over, "the run is over", 30.0)
+    until(over, "the run is over")
     run = daemon.service.guide.run
     assert run is not None
     return run
@@ -110,7 +110,7 @@ def test_nothing_begins_while_somebody_steers_something_runs_or_an_emergency_sto
     goes_on = threading.Event()
 
     def waits(request: Any, record: Any, cancelled: threading.Event, devices: Any) -> Any:
-        goes_on.wait(20.0)
+        goes_on.wait(NET_S)
         return ScriptedLoop.good(request, record, cancelled, devices)
 
     monkeypatch.setattr(ScriptedLoop, "script", staticmethod(waits))
@@ -128,7 +128,7 @@ def test_nothing_begins_while_somebody_steers_something_runs_or_an_emergency_sto
     "body", [{}, {"board": "a", "goes_on": "b"}, {"board": "a", "pictures": 3}, {"x": 1}]
 )
 def test_a_body_that_makes_no_sense_is_refused_in_a_sentence(pair: Pair, body: dict[str, Any]) -> None:
-    answer = httpx.post(f"{pair[0].url}/api/v1/bench", json=body, trust_env=False)
+    answer = HTTP.post(f"{pair[0].url}/api/v1/bench", json=body)
     assert answer.status_code == 422 and answer.json()["error"]["code"] == "bad_request"
 
 
@@ -157,14 +157,14 @@ def test_nothing_moves_after_a_stop_though_the_program_never_gives_up(
     for _ in range(4):
         ana.begin_bench("charuco_a3")
         before = len(hardware.head.calls)
-        eventually(lambda b=before: len(hardware.head.calls) > b + 6, "it moves the head", 30.0)
+        until(lambda b=before: len(hardware.head.calls) > b + 6, "it moves the head")
         if how == "leave":
             assert ana.leave_bench()["state"] == "interrupted"
         else:
             ana.stop() if how == "stop" else ana.estop(name="Ana", reason="a hand")
         run = ended(daemon)
         assert run.code == ("left" if how == "leave" else "stopped"), run.sentence
-        eventually(lambda: daemon.service.operations.running is None, "nothing runs")
+        until(lambda: daemon.service.operations.running is None, "nothing runs")
         moves = [call for call in hardware.head.calls if call[0] == "move"]
         newest = ana.operations()[0]["id"]
         threading.Event().wait(0.3)
@@ -199,7 +199,7 @@ def test_a_board_file_is_judged_and_kept_and_not_written_into_the_record(pair: P
     folder = Path(ana.bench()["folder"]) / run["name"]
     assert (folder / "board.yaml").read_text() == text
     ended(daemon)
-    eventually(lambda: b'"bench"' in (daemon.service.folder.path / "audit.jsonl").read_bytes(), "recorded")
+    until(lambda: b'"bench"' in (daemon.service.folder.path / "audit.jsonl").read_bytes(), "recorded")
     assert b"Tuesday" not in (daemon.service.folder.path / "audit.jsonl").read_bytes()
 
 
@@ -218,7 +218,7 @@ def test_the_program_shows_a_token_that_ends_with_it_and_a_viewer_only_reads(
             assert net.ask("POST", path, "view", json={}).status_code == 403
         assert net.ask("POST", "/bench", "operate", json={"board": "charuco_a4"}).status_code == 202
         guide = net.daemon.service.guide
-        eventually(lambda: guide.run and guide.run.state == "asking", "it came in", 30.0)
+        until(lambda: guide.run and guide.run.state == "asking", "it came in")
         assert guide.run is not None
         name, role, token = json.loads(guide.run.sentences[0])
         assert (name, role) == ("bench calibration/bench calibration", "operate")
@@ -254,7 +254,7 @@ def test_reports_are_listed_and_read_and_can_do_nothing(pair: Pair, ana: Client,
     assert {(one["name"], one["title"]) for one in told["reports"]} == {
         ("pointing.html", "Pointing & more"), ("arm.approach.html", "arm.approach.html"),
     }  # fmt: skip
-    answer = httpx.get(f"{pair[0].url}/api/v1/reports/pointing.html", trust_env=False)
+    answer = HTTP.get(f"{pair[0].url}/api/v1/reports/pointing.html")
     assert answer.text == PAGE and answer.headers["content-type"] == "text/html; charset=utf-8"
     policy = answer.headers["content-security-policy"].split("; ")
     assert "default-src 'none'" in policy and "sandbox" in policy and "frame-ancestors 'none'" in policy
@@ -262,7 +262,7 @@ def test_reports_are_listed_and_read_and_can_do_nothing(pair: Pair, ana: Client,
     assert (
         answer.headers["x-content-type-options"] == "nosniff" and answer.headers["x-frame-options"] == "DENY"
     )
-    page = httpx.get(pair[0].url, trust_env=False).headers["content-security-policy"]
+    page = HTTP.get(pair[0].url).headers["content-security-policy"]
     assert "unsafe" not in page and "sandbox" not in page
 
 
@@ -275,7 +275,7 @@ def test_reports_are_listed_and_read_and_can_do_nothing(pair: Pair, ana: Client,
     ],
 )  # fmt: skip
 def test_what_is_no_report_is_not_there_whatever_its_name(pair: Pair, shelf: Path, name: str) -> None:
-    answer = httpx.get(f"{pair[0].url}/api/v1/reports/{name}", trust_env=False)
+    answer = HTTP.get(f"{pair[0].url}/api/v1/reports/{name}")
     assert answer.status_code in (404, 422) or (name.endswith("/") and answer.status_code == 307)
     assert "secret" not in answer.text.replace("secret.html", "")
 
@@ -317,7 +317,7 @@ def test_the_program_moves_nothing_after_a_stop_however_late_the_guide_hears_of_
         return sum(call[0] == "move" for call in hardware.head.calls)
 
     ana.begin_bench("charuco_a3")
-    eventually(lambda: moves() > 3, "the program steers", 30.0)
+    until(lambda: moves() > 3, "the program steers")
     ana.stop()
     after = moves()
 
@@ -325,7 +325,7 @@ def test_the_program_moves_nothing_after_a_stop_however_late_the_guide_hears_of_
         run = daemon.service.guide.run
         return 0 if run is None else sum(one == "lease_over" for one in run.sentences)
 
-    eventually(lambda: refusals() > 3, "the program is refused", 30.0)
+    until(lambda: refusals() > 3, "the program is refused")
     assert moves() == after
     assert ended(daemon).code == "stopped"
 
@@ -339,7 +339,7 @@ def test_a_run_is_removed_over_http_by_who_may_operate(pair: Pair, ana: Client) 
     assert ana.forget_bench(name)["runs"] == []
     refused("bench_unknown", lambda: ana.forget_bench(name))
     for odd in ("..", "../audit.jsonl", "stands"):
-        assert httpx.delete(f"{daemon.url}/api/v1/bench/runs/{odd.replace('/', '%2F')}").status_code in (
+        assert HTTP.delete(f"{daemon.url}/api/v1/bench/runs/{odd.replace('/', '%2F')}").status_code in (
             404,
             405,
             422,

@@ -5,10 +5,10 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-import httpx
 import pytest
 
-from hil_tests.mastctl.service_fakes import eventually, fake_daemon
+from hil_tests.mastctl.service_fakes import HTTP, fake_daemon
+from hil_tests.waiting import until
 from mastctl.client import Client
 from mastctl.web import PREFIX
 from mastctl.web.described import ANSWERS, EVENTS, FILES
@@ -21,7 +21,7 @@ def test_every_route_has_a_model_a_kind_of_file_or_events_and_no_other_is_named(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     with fake_daemon(monkeypatch, tmp_path) as (daemon, _):
-        document = httpx.get(f"{daemon.url}/openapi.json", timeout=30.0).json()
+        document = HTTP.get(f"{daemon.url}/openapi.json").json()
     routes = {
         f"{method.upper()} {path.removeprefix(PREFIX)}"
         for path, methods in document["paths"].items()
@@ -45,8 +45,8 @@ def test_three_routes_are_not_asked_and_what_has_the_others_refused_is_taken_bac
         client.estop()
         client.acquire_lease("somebody", 3600.0)
         with taken_back(daemon.url):
-            eventually(lambda: client.control() is None, "the lease is released")
-            eventually(lambda: client.status()["estop"] is None, "the stop is reset")
+            until(lambda: client.control() is None, "the lease is released")
+            until(lambda: client.status()["estop"] is None, "the stop is reset")
         client.wait(client.point(pan_rad=0.1, tilt_rad=0.1))
 
 
@@ -55,7 +55,7 @@ def test_whatever_is_asked_the_answer_is_as_described(
 ) -> None:
     with fake_daemon(monkeypatch, tmp_path) as (daemon, _):
         code = ask(daemon.url, FUZZ_S, examples=3)
-        counted = httpx.get(f"{daemon.url}/metrics", timeout=30.0).text
+        counted = HTTP.get(f"{daemon.url}/metrics").text
     told = capfd.readouterr().out[-6000:].encode("ascii", "backslashreplace").decode()  # xdist sends UTF-8
     assert code == 0, told
     done = r'commands_total{command="(point|jog|track.stop|record.start|reload)",result="ok"}'

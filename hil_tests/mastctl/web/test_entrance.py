@@ -11,8 +11,9 @@ from typing import Any
 import httpx
 import pytest
 
-from hil_tests.mastctl.service_fakes import FakeHardware, eventually, fake_daemon
+from hil_tests.mastctl.service_fakes import PLAIN, FakeHardware, fake_daemon
 from hil_tests.mastctl.web.network import NAME, Network, network_daemon
+from hil_tests.waiting import until
 from mastctl.access.guesses import MOST_OF_ONE
 from mastctl.commands.caller import Role
 
@@ -159,9 +160,9 @@ def test_guessing_ends_in_silence_for_a_while_and_a_stop_never_does(
 def test_a_new_token_opens_and_a_revoked_one_does_not_while_the_daemon_runs(net: Network) -> None:
     made = net.tokens.new("bench", "operate")
     bearer = {"Authorization": f"Bearer {made}"}
-    eventually(lambda: net.ask("GET", "/status", headers=bearer).status_code == 200, "the new token")
+    until(lambda: net.ask("GET", "/status", headers=bearer).status_code == 200, "the new token")
     net.tokens.revoke("bench")
-    eventually(lambda: net.ask("GET", "/status", headers=bearer).status_code == 401, "its end")
+    until(lambda: net.ask("GET", "/status", headers=bearer).status_code == 401, "its end")
 
 
 def test_no_token_stands_in_the_log(
@@ -399,7 +400,7 @@ def test_on_the_loopback_address_everybody_may_do_everything_and_nobody_logs_in(
 ) -> None:
     with fake_daemon(monkeypatch, tmp_path) as (daemon, hardware):
         assert isinstance(hardware, FakeHardware)
-        with httpx.Client(base_url=f"{daemon.url}/api/v1", trust_env=False) as web:
+        with httpx.Client(base_url=f"{daemon.url}/api/v1", **PLAIN) as web:
             told = web.get("/session", headers={"Mastctl-Client": "bench"}).json()
             assert told == {
                 "name": "bench", "role": "admin", "via": "loopback", "ends_in_s": None, "needs_token": False

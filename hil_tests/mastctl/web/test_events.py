@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import socket
 import threading
+import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
@@ -17,8 +18,9 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import ClientConnection, connect
 
 from hil_tests.described_answers import closed
-from hil_tests.mastctl.service_fakes import FakeHardware, ScriptedLoop, eventually
+from hil_tests.mastctl.service_fakes import HTTP, PLAIN, FakeHardware, ScriptedLoop
 from hil_tests.mastctl.web.network import NAME, Network, network_daemon
+from hil_tests.waiting import NET_S, joined, until
 from mastctl.daemon import RunningDaemon
 from mastctl.errors import Unable
 from mastctl.guided.told import Run
@@ -29,14 +31,13 @@ from mastctl.web.streams import Streams
 from tools.campaigns import fuzz_websocket
 
 BOTH = tuple[RunningDaemon, FakeHardware]
-BOUND_S = 20.0
 
 
 @contextmanager
 def listening(url: str, query: str = "", **headers: str) -> Iterator[Iterator[dict[str, Any]]]:
     """The server-sent events of a daemon."""
     with (
-        httpx.Client(trust_env=False, timeout=BOUND_S) as http,
+        httpx.Client(**PLAIN) as http,
         http.stream("GET", f"{url}/api/v1/events{query}", headers=headers) as answer,
     ):
         assert answer.status_code == 200, answer.read()
@@ -48,17 +49,17 @@ def listening(url: str, query: str = "", **headers: str) -> Iterator[Iterator[di
 def socket_of(url: str, query: str = "", **options: Any) -> connect:
     """A WebSocket of a daemon."""
     address = f"ws{url.removeprefix('http')}/api/v1/events{query}"
-    return connect(address, open_timeout=BOUND_S, close_timeout=2.0, proxy=None, **options)
+    return connect(address, open_timeout=NET_S, close_timeout=2.0, proxy=None, **options)
 
 
-def until(events: Iterator[dict[str, Any]], holds: Any) -> dict[str, Any]:
+def first(events: Iterator[dict[str, Any]], holds: Any) -> dict[str, Any]:
     """The first event of which something holds."""
     return next(event for event in events if holds(event))
 
 
 def heard(line: ClientConnection) -> Iterator[dict[str, Any]]:
     while True:
-        yield json.loads(line.recv(timeout=BOUND_S))
+        yield json.loads(line.recv(timeout=NET_S))
 
 
 def test_it_begins_with_what_is_known_and_then_tells_each_change(pair: BOTH) -> None:
@@ -67,9 +68,9 @@ def test_it_begins_with_what_is_known_and_then_tells_each_change(pair: BOTH) -> 
         first = {event["topic"]: event for event in (next(events) for _ in range(3))}
         assert set(first) == {"state", "mast", "track"}
         assert first["mast"]["value"]["digest"] == daemon.service.stored.digest
-        with httpx.Client(base_url=f"{daemon.url}/api/v1", trust_env=False) as http:
+        with httpx.Client(base_url=f"{daemon.url}/api/v1", **PLAIN) as http:
             begun = http.post("/point", json={"pan_rad": 0.1, "tilt_rad": 0.0}).json()["id"]
-        ended = until(events, lambda e: e["topic"] == "operation" and e["value"]["state"] == "done")
+        ended = first(events, lambda e: e["topic"] == "operation" and e["value"]["state"] == "done")
         assert ended["key"] == ended["value"]["id"] == begun
         assert [step["name"] for step in ended["value"]["steps"]] == ["look", "measure"]
 
@@ -79,7 +80,7 @@ BENCH_BEGUN = b'{"event": "begun", "board_m": [0.5, 0.3], "cameras": {"a": [64, 
 
 def test_each_topic_is_told_by_the_model_that_openapi_describes(pair: BOTH) -> None:
     daemon, _ = pair
-    with httpx.Client(base_url=daemon.url, trust_env=False) as http:
+    with httpx.Client(base_url=daemon.url, **PLAIN) as http:
         document = closed(http.get("/openapi.json").json())
         described = document["paths"]["/api/v1/events"]["get"]["responses"]["200"]["content"]
         event = described["text/event-stream"]["x-event"]
@@ -94,7 +95,7 @@ def test_each_topic_is_told_by_the_model_that_openapi_describes(pair: BOTH) -> N
     seen: set[str] = set()
     with socket_of(daemon.url) as line:
         for _ in range(200):
-            one = json.loads(line.recv(timeout=BOUND_S))
+            one = json.loads(line.recv(timeout=NET_S))
             validator.validate(one)
             seen.add(one["topic"])
             if seen == TOPICS:
@@ -104,7 +105,7 @@ def test_each_topic_is_told_by_the_model_that_openapi_describes(pair: BOTH) -> N
 
 def test_the_key_of_a_command_is_told_to_nobody_else(pair: BOTH) -> None:
     daemon, _ = pair
-    with httpx.Client(base_url=f"{daemon.url}/api/v1", trust_env=False) as http:
+    with httpx.Client(base_url=f"{daemon.url}/api/v1", **PLAIN) as http:
         http.post("/lease", json={}, headers={"Idempotency-Key": "very-own", "Mastctl-Client": "a"})
     with listening(daemon.url, "?topics=command,lease") as events:
         told = next(events), next(events)
@@ -115,18 +116,19 @@ def test_the_key_of_a_command_is_told_to_nobody_else(pair: BOTH) -> None:
 def test_topics_and_keys_are_chosen(pair: BOTH) -> None:
     daemon, _ = pair
     publisher = daemon.service.machine.publisher
+    before = publisher.listeners
     with socket_of(daemon.url, "?topics=fault&key=b") as line:
-        eventually(lambda: publisher.listeners > 0, "somebody listens")
+        until(lambda: publisher.listeners == before + 1, "somebody listens")
         for device in ("a", "b"):
             publisher.publish("fault", device, ())
-        told = json.loads(line.recv(timeout=BOUND_S))
+        told = json.loads(line.recv(timeout=NET_S))
     assert (told["topic"], told["key"], told["value"], told["lost"]) == ("fault", "b", [], 0)
 
 
 @pytest.mark.parametrize("query", ["?topics=state,weather", "?topic=state", "?key=" + "&key=".join("a" * 17)])
 def test_what_is_no_topic_is_refused_in_a_sentence_both_ways(pair: BOTH, query: str) -> None:
     daemon, _ = pair
-    answer = httpx.get(f"{daemon.url}/api/v1/events{query}", trust_env=False)
+    answer = HTTP.get(f"{daemon.url}/api/v1/events{query}")
     assert answer.status_code == 422
     with pytest.raises(InvalidStatus) as refused, socket_of(daemon.url, query):
         pass
@@ -141,27 +143,29 @@ def test_what_is_no_topic_is_refused_in_a_sentence_both_ways(pair: BOTH, query: 
 def test_a_slow_reader_gets_the_newest_and_is_told_what_it_lost(pair: BOTH) -> None:
     daemon, _ = pair
     publisher = daemon.service.machine.publisher
+    before = publisher.listeners
     with listening(daemon.url, "?topics=command") as events:
-        eventually(lambda: publisher.listeners > 0, "somebody listens")
+        until(lambda: publisher.listeners == before + 1, "somebody listens")
         record = {"number": 1, "time": "", "monotonic_s": 0.0, "command": "x", "who": "x", "role": "admin"}
         words = "long " * 2000  # soon more than a connection holds
         for number in range(3000):
             publisher.publish("command", "1", {**record, "number": number, "via": "test", "message": words})
-        last = until(events, lambda e: e["value"]["number"] == 2999)
+        last = first(events, lambda e: e["value"]["number"] == 2999)
     assert last["lost"] > 1000
 
 
 def test_a_listener_that_stalls_holds_nobody(pair: BOTH) -> None:
     daemon, _ = pair
     publisher = daemon.service.machine.publisher
+    before = publisher.listeners
     with socket_of(daemon.url, "?topics=fault") as stalled, listening(daemon.url, "?topics=fault") as events:
-        eventually(lambda: publisher.listeners >= 2, "both listen")
+        until(lambda: publisher.listeners == before + 2, "both listen")
         stalled.socket.settimeout(None)
         for _ in range(2000):
             publisher.publish("fault", "x" * 5000, ())
         publisher.publish("fault", "last", ())
-        assert until(events, lambda e: e["key"] == "last")
-        with httpx.Client(base_url=f"{daemon.url}/api/v1", trust_env=False) as http:
+        assert first(events, lambda e: e["key"] == "last")
+        with httpx.Client(base_url=f"{daemon.url}/api/v1", **PLAIN) as http:
             assert http.post("/stop").status_code == 200
 
 
@@ -170,9 +174,9 @@ def test_it_ends_with_the_daemon_after_its_last_words(pair: BOTH, monkeypatch: p
     monkeypatch.setattr(
         ScriptedLoop,
         "script",
-        staticmethod(lambda request, record, cancelled, devices: cancelled.wait(BOUND_S)),
+        staticmethod(lambda request, record, cancelled, devices: cancelled.wait(NET_S)),
     )
-    with httpx.Client(base_url=f"{daemon.url}/api/v1", trust_env=False) as http:
+    with httpx.Client(base_url=f"{daemon.url}/api/v1", **PLAIN) as http:
         http.post("/point", json={"pan_rad": 0.1, "tilt_rad": 0.0})
     with (
         listening(daemon.url, "?topics=operation") as events,
@@ -186,7 +190,7 @@ def test_it_ends_with_the_daemon_after_its_last_words(pair: BOTH, monkeypatch: p
         with pytest.raises(ConnectionClosed) as ended:
             told += [one["value"]["state"] for one in heard(line)]
         assert ended.value.rcvd is not None and ended.value.rcvd.code == 1001
-        ending.join(BOUND_S)
+        joined(ending)
     assert not ending.is_alive()
 
 
@@ -200,13 +204,13 @@ def test_not_everybody_may_listen_at_once(pair: BOTH, monkeypatch: pytest.Monkey
 def test_streams_of_one_daemon_are_counted_and_their_places_come_free(pair: BOTH) -> None:
     daemon, _ = pair
     publisher = daemon.service.machine.publisher
-    httpx.get(f"{daemon.url}/api/v1/status", trust_env=False)  # the daemon's own listeners are there by then
+    HTTP.get(f"{daemon.url}/api/v1/status")  # the daemon's own listeners are there by then
     before = publisher.listeners
     for _ in range(3):
         with listening(daemon.url, "?topics=state") as events, socket_of(daemon.url, "?topics=state") as line:
-            next(events), line.recv(timeout=BOUND_S)
+            next(events), line.recv(timeout=NET_S)
             assert publisher.listeners == before + 2
-        eventually(lambda: publisher.listeners == before, "nobody listens any more")
+        until(lambda: publisher.listeners == before, "nobody listens any more")
 
 
 # Who may listen
@@ -239,7 +243,7 @@ def test_a_websocket_asks_for_a_token_as_every_request_does(net: Network) -> Non
     assert refusal(net, Authorization="Bearer wrong") == (401, "wrong_token")
     assert refusal(net, f"?token={net.token('view')}") == (400, "token_in_address")
     with socket_of(net.url, additional_headers={"Authorization": bearer(net)}) as line:
-        assert json.loads(line.recv(timeout=BOUND_S))["sequence"] > 0
+        assert json.loads(line.recv(timeout=NET_S))["sequence"] > 0
 
 
 def test_another_sites_page_opens_no_websocket(net: Network) -> None:
@@ -258,7 +262,7 @@ def test_a_pages_session_opens_one_only_from_its_own_page(net: Network) -> None:
     assert refusal(net, Cookie=cookie, Origin="http://evil.example") == (403, "foreign_origin")
     own = {"Cookie": cookie, "Host": f"{NAME}:{net.port}"}
     request = "".join(f"{name}: {value}\r\n" for name, value in own.items())
-    with socket.create_connection(("127.0.0.1", net.port), timeout=BOUND_S) as line:
+    with socket.create_connection(("127.0.0.1", net.port), timeout=NET_S) as line:
         line.sendall(
             f"GET /api/v1/events HTTP/1.1\r\n{request}Origin: {net.origin}\r\nUpgrade: websocket\r\n"
             "Connection: Upgrade\r\nSec-WebSocket-Version: 13\r\n"
@@ -290,7 +294,7 @@ def test_nothing_that_is_sent_into_a_websocket_harms_the_daemon(
     with ThreadPoolExecutor(4) as pool:
         done = fuzz_websocket.campaign(daemon.url, 0, 4 * len(fuzz_websocket.ATTACKS), pool)
     assert set(done.values()) == {4}
-    eventually(lambda: publisher.listeners == before, "every attacker is forgotten")
+    until(lambda: publisher.listeners == before, "every attacker is forgotten")
     assert [record.getMessage() for record in caplog.records if record.levelname == "ERROR"] == []
 
 
@@ -308,7 +312,7 @@ def test_nothing_that_is_sent_into_a_websocket_harms_the_daemon(
 )
 def test_what_a_client_sends_ends_its_websocket_and_says_why(pair: BOTH, sent: bytes, code: int) -> None:
     daemon, _ = pair
-    with socket.create_connection(("127.0.0.1", int(daemon.url.rpartition(":")[2])), timeout=BOUND_S) as line:
+    with socket.create_connection(("127.0.0.1", int(daemon.url.rpartition(":")[2])), timeout=NET_S) as line:
         fuzz_websocket.opened(line, "/api/v1/events?topics=lease")
         line.sendall(sent)
         got = b"".join(iter(lambda: line.recv(65536), b""))
@@ -319,14 +323,16 @@ def test_a_websocket_whose_client_does_not_read_is_left(pair: BOTH, monkeypatch:
     daemon, _ = pair
     monkeypatch.setattr(sockets_module, "STALLED_S", 0.2)
     publisher = daemon.service.machine.publisher
-    with socket.create_connection(("127.0.0.1", int(daemon.url.rpartition(":")[2])), timeout=BOUND_S) as line:
+    before = publisher.listeners
+    with socket.create_connection(("127.0.0.1", int(daemon.url.rpartition(":")[2])), timeout=NET_S) as line:
         line.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
         fuzz_websocket.opened(line)
-        eventually(lambda: publisher.listeners > 0, "it listens")
-        before = publisher.listeners
+        until(lambda: publisher.listeners == before + 1, "it listens")
+        began_s = time.monotonic()
 
         def left() -> bool:
             publisher.publish("fault", "x" * 200000, ())
-            return publisher.listeners < before
+            return publisher.listeners == before
 
-        eventually(left, "it is left", within_s=BOUND_S)
+        until(left, "it is left")
+        assert time.monotonic() - began_s > sockets_module.STALLED_S, "it was given its time"

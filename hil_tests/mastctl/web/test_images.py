@@ -16,13 +16,13 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import ClientConnection, connect
 
 from drivers.errors import NoReply
-from hil_tests.mastctl.service_fakes import FakeHardware, eventually, fake_daemon
+from hil_tests.mastctl.service_fakes import HTTP, PLAIN, FakeHardware, fake_daemon
 from hil_tests.mastctl.web.network import network_daemon
+from hil_tests.waiting import NET_S, until
 from mastctl.daemon import RunningDaemon
 from mastctl.live import pictures
 
 BOTH = tuple[RunningDaemon, FakeHardware]
-BOUND_S = 20.0
 LEFT, RIGHT = "navcam_left", "navcam_right"
 
 
@@ -35,12 +35,12 @@ def pair(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[BOTH]:
 def watching(url: str, *cameras: str, **options: Any) -> connect:
     query = "&".join(f"camera={name}" for name in cameras)
     address = f"ws{url.removeprefix('http')}/api/v1/images?{query}"
-    return connect(address, open_timeout=BOUND_S, close_timeout=2.0, proxy=None, **options)
+    return connect(address, open_timeout=NET_S, close_timeout=2.0, proxy=None, **options)
 
 
 def received(line: ClientConnection) -> tuple[dict[str, Any], Any]:
     """The facts and the pixels of the next picture."""
-    message = line.recv(timeout=BOUND_S)
+    message = line.recv(timeout=NET_S)
     assert isinstance(message, bytes)
     length = int.from_bytes(message[:4], "little")
     data = np.frombuffer(message[4 + length :], np.uint8)
@@ -57,7 +57,7 @@ def test_a_picture_comes_with_its_facts_and_uncompressed(pair: BOTH) -> None:
     for name in ("mid_exposure_s", "pan_rad", "tilt_rad", "mast_digest", "moving", "exposure_s"):
         assert facts[name] == getattr(frame, name)
     assert facts["size_px"] == [64, 48] and image.shape == frame.image.shape
-    assert 0.0 <= facts["age_s"] < BOUND_S
+    assert 0.0 <= facts["age_s"] < NET_S, "by the clock of its exposure"
 
 
 def test_who_shows_none_is_sent_two_and_then_none_until_it_says_so(pair: BOTH) -> None:
@@ -86,13 +86,13 @@ def test_the_clicked_picture_stays_known_while_it_is_shown_however_many_another_
             received(quick)
             quick.send(LEFT)
         assert daemon.service.devices.frame_by_id(shown).frame_id == shown
-    eventually(lambda: not daemon.service.watched._watchers, "both have left")
+    until(lambda: not daemon.service.watched._watchers, "both have left")
     assert not [key for key in daemon.service.devices._store._held if key[0] != "asked"]
 
 
 def test_a_snapshot_stays_known_while_somebody_watches(pair: BOTH) -> None:
     daemon, _ = pair
-    with httpx.Client(base_url=f"{daemon.url}/api/v1", trust_env=False) as http:
+    with httpx.Client(base_url=f"{daemon.url}/api/v1", **PLAIN) as http:
         taken = http.get(f"/snapshot/{LEFT}").headers["X-Mastctl-Frame-Id"]
         with watching(daemon.url, LEFT) as line:
             for _ in range(20):
@@ -112,7 +112,7 @@ def test_what_is_only_watched_is_not_published_until_somebody_takes_it(pair: BOT
         assert news.wait(0.0) == []
         daemon.service.devices.hold(daemon.service.devices.frame_by_id(facts["frame_id"]))
         daemon.service.devices.hold(daemon.service.devices.frame_by_id(facts["frame_id"]))
-        assert [one.value.frame_id for one in news.wait(BOUND_S)] == [facts["frame_id"]]
+        assert [one.value.frame_id for one in news.wait(NET_S)] == [facts["frame_id"]]
 
 
 def test_a_camera_that_fails_holds_no_other_up_and_comes_back(
@@ -131,7 +131,7 @@ def test_a_camera_that_fails_holds_no_other_up_and_comes_back(
         for _ in range(4):
             assert received(line)[0]["camera"] == LEFT
             line.send(LEFT)
-        assert failed.is_set()
+        assert failed.wait(NET_S)
         hardware.fake_cameras[RIGHT].hook = lambda: None
         seen = set[str]()
         while RIGHT not in seen:
@@ -144,7 +144,7 @@ def test_nobody_watching_asks_no_camera(pair: BOTH) -> None:
     daemon, hardware = pair
     with watching(daemon.url, LEFT) as line:
         received(line)
-    eventually(lambda: not daemon.service.watched._at_work, "the camera's thread has ended")
+    until(lambda: not daemon.service.watched._at_work, "the camera's thread has ended")
     asked = len(hardware.fake_cameras[LEFT].asked)
     with watching(daemon.url, RIGHT) as line:
         received(line)
@@ -166,7 +166,7 @@ def test_what_is_no_camera_s_name_ends_it(pair: BOTH, words: str | bytes, code: 
         line.send(words)
         with pytest.raises(ConnectionClosed) as ended:
             while True:
-                line.recv(timeout=BOUND_S)
+                line.recv(timeout=NET_S)
     assert ended.value.rcvd is not None and ended.value.rcvd.code == code
 
 
@@ -175,9 +175,9 @@ def test_too_many_words_end_it_and_a_stop_comes_through_meanwhile(pair: BOTH) ->
     with watching(daemon.url, LEFT) as line, pytest.raises(ConnectionClosed) as ended:
         for _ in range(2000):
             line.send("nobody")
-        assert httpx.post(f"{daemon.url}/api/v1/stop", trust_env=False).status_code == 200
+        assert HTTP.post(f"{daemon.url}/api/v1/stop").status_code == 200
         while True:
-            line.recv(timeout=BOUND_S)
+            line.recv(timeout=NET_S)
     assert ended.value.rcvd is None or ended.value.rcvd.code == 1008
 
 
@@ -187,7 +187,7 @@ def test_the_daemon_s_end_ends_it(monkeypatch: pytest.MonkeyPatch, tmp_path: Pat
         received(line)
     with pytest.raises(ConnectionClosed) as ended:
         while True:
-            line.recv(timeout=BOUND_S)
+            line.recv(timeout=NET_S)
     assert ended.value.rcvd is not None and ended.value.rcvd.code in (1001, 1012)
 
 

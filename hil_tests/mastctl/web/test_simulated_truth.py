@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import math
 
-import httpx
 import numpy as np
 import pytest
 
 from drivers.faults import CAMERA_WORDS, HEAD_WORDS
+from hil_tests.mastctl.service_fakes import HTTP
 from mastctl.client import Client, ClientError
 
 pytestmark = pytest.mark.mastctl(picture_width_px=512, scene={"relief_m": 0.0, "rocks": 0})
@@ -48,7 +48,7 @@ def test_the_sky_and_a_point_behind_the_camera_are_null(mast_client: Client) -> 
 )
 def test_half_a_question_is_refused(mast_client: Client, query: str) -> None:
     address = f"{mast_client.url}/api/v1/simulation/truth?frame_id=x&{query}"
-    answer = httpx.get(address, trust_env=False, timeout=30.0)
+    answer = HTTP.get(address)
     assert answer.status_code == 422 and answer.json()["error"]["code"] == "bad_request", answer.text
 
 

@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-import httpx
 from prometheus_client.parser import text_string_to_metric_families
 
-from hil_tests.mastctl.service_fakes import FakeHardware, eventually
+from hil_tests.mastctl.service_fakes import HTTP, FakeHardware
+from hil_tests.waiting import until
 from mastctl.daemon import RunningDaemon
 
 BOTH = tuple[RunningDaemon, FakeHardware]
 
 
 def test_metrics_are_read_by_prometheus_own_parser(pair: BOTH) -> None:
-    answer = httpx.get(f"{pair[0].url}/metrics")
+    answer = HTTP.get(f"{pair[0].url}/metrics")
     assert answer.status_code == 200
     assert answer.headers["content-type"].startswith("text/plain; version=0.0.4")
     found = {family.name for family in text_string_to_metric_families(answer.text)}
@@ -21,10 +21,10 @@ def test_metrics_are_read_by_prometheus_own_parser(pair: BOTH) -> None:
 
 def test_a_daemon_whose_head_is_read_is_ready_and_one_that_is_stopped_says_why_not(pair: BOTH) -> None:
     url = f"{pair[0].url}/api/v1"
-    assert httpx.get(f"{url}/health/live").json() == {"live": True}
-    eventually(lambda: httpx.get(f"{url}/health/ready").status_code == 200, "the first reading")
-    httpx.post(f"{url}/estop", json={"reason": "a dog is near the mast", "name": "Ida"})
-    answer = httpx.get(f"{url}/health/ready")
+    assert HTTP.get(f"{url}/health/live").json() == {"live": True}
+    until(lambda: HTTP.get(f"{url}/health/ready").status_code == 200, "the first reading")
+    HTTP.post(f"{url}/estop", json={"reason": "a dog is near the mast", "name": "Ida"})
+    answer = HTTP.get(f"{url}/health/ready")
     assert answer.status_code == 503
     error = answer.json()["error"]
     assert error["code"] == "not_ready"
@@ -32,5 +32,5 @@ def test_a_daemon_whose_head_is_read_is_ready_and_one_that_is_stopped_says_why_n
 
 
 def test_another_sites_page_reads_no_metrics(pair: BOTH) -> None:
-    answer = httpx.get(f"{pair[0].url}/metrics", headers={"Sec-Fetch-Site": "cross-site"})
+    answer = HTTP.get(f"{pair[0].url}/metrics", headers={"Sec-Fetch-Site": "cross-site"})
     assert answer.status_code == 403
