@@ -26,9 +26,20 @@ def complaints() -> Iterator[list[str]]:
         yield found
 
 
+def _starts_daemons() -> bool:
+    """Whether any file of this process may; the daemon is slow to load for one that does not."""
+    return "mastctl.daemon" in sys.modules
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _daemons_of_whole_files_are_asked_too(request: pytest.FixtureRequest) -> None:
+    if _starts_daemons():
+        request.getfixturevalue("complaints")
+
+
 @pytest.fixture(autouse=True)
 def _every_answer_is_described(request: pytest.FixtureRequest) -> Iterator[None]:
-    if "mastctl.daemon" not in sys.modules:  # slow to load: not for a test whose file starts no daemon
+    if not _starts_daemons():
         yield
         return
     complaints = request.getfixturevalue("complaints")
@@ -45,4 +56,16 @@ def pair(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[tuple[Runn
     with fake_daemon(monkeypatch, tmp_path) as made:
         with urlopen(f"{made[0].url}/api/v1/health/live", timeout=NET_S):
             pass
+        yield made
+
+
+@pytest.fixture(scope="module")
+def standing(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[RunningDaemon, FakeHardware]]:
+    """A daemon on fakes for a file's questions that change nothing."""
+    from hil_tests.mastctl.service_fakes import fake_daemon
+
+    with (
+        pytest.MonkeyPatch.context() as patch,
+        fake_daemon(patch, tmp_path_factory.mktemp("standing")) as made,
+    ):
         yield made

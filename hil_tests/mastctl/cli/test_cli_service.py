@@ -20,17 +20,21 @@ BOTH = tuple[RunningDaemon, FakeHardware]
 Run = Callable[..., tuple[int, str, str]]
 
 
-@pytest.fixture
-def run(pair: BOTH, capsys: pytest.CaptureFixture[str]) -> Run:
-    """Run a command against the daemon: exit code, stdout, stderr."""
+def runs(url: str, capsys: pytest.CaptureFixture[str]) -> Run:
+    """Run a command against a daemon: exit code, stdout, stderr."""
 
     def call(*words: str) -> tuple[int, str, str]:
         capsys.readouterr()
-        code = main([*words, "--url", pair[0].url])
+        code = main([*words, "--url", url])
         out, log = capsys.readouterr()
         return code, out, log
 
     return call
+
+
+@pytest.fixture
+def run(pair: BOTH, capsys: pytest.CaptureFixture[str]) -> Run:
+    return runs(pair[0].url, capsys)
 
 
 def document(result: tuple[int, str, str], code: int = 0) -> dict[str, Any]:
@@ -165,8 +169,14 @@ def test_a_failed_operation_ends_with_1_and_its_reason(run: Run, monkeypatch: py
     ],
 )
 def test_wrong_use_and_bad_input_end_with_2(
-    run: Run, pair: BOTH, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, words: tuple[str, ...], code: str
+    standing: BOTH,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
+    words: tuple[str, ...],
+    code: str,
 ) -> None:
+    run = runs(standing[0].url, capsys)
     monkeypatch.chdir(tmp_path)
     if "mars" in words:
         assert main([*words, "--json"]) == 2
@@ -176,7 +186,7 @@ def test_wrong_use_and_bad_input_end_with_2(
     assert (exit_code, out) == (2, "")
     assert log.startswith("mastctl: ")
     assert log.count("\n") == 1
-    assert [call for call in pair[1].head.calls if call[0] == "move"] == []
+    assert [call for call in standing[1].head.calls if call[0] == "move"] == []
 
 
 def test_stop_tells_what_it_stopped(run: Run, pair: BOTH) -> None:

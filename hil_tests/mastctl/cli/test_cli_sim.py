@@ -59,7 +59,7 @@ def sim(repository: Path, *words: str) -> Iterator[Sim]:
             process.communicate()
 
 
-def ask(port: str, text: bytes, timeout_s: float = 5.0) -> bytes:
+def ask(port: str, text: bytes, timeout_s: float = NET_S) -> bytes:
     with serial.Serial(port, 9600, timeout=timeout_s) as host:
         host.write(text)
         return bytes(host.read_until(b"\n"))
@@ -82,6 +82,7 @@ def test_servos_of_two_models_answer_the_plain_sdk(repository: Path) -> None:
         facts = json.loads(running.first)
         assert facts["baud"] == 1_000_000 and [servo["id"] for servo in facts["servos"]] == [7, 8]
         port, packets = PortHandler(facts["port"]), PacketHandler(2.0)
+        port.setPacketTimeout = lambda length: port.setPacketTimeoutMillis(1e3 * NET_S)  # its own is 34 ms
         port.setBaudRate(facts["baud"])
         try:
             for servo_id, model_number in ((7, 1020), (8, 2000)):
@@ -94,7 +95,7 @@ def test_servos_of_two_models_answer_the_plain_sdk(repository: Path) -> None:
 def test_a_ptu_behind_tcp_greets_as_an_e_series_unit_does(repository: Path) -> None:
     with sim(repository, "ptu", "--tcp", "0", "--model", "d48e") as running:
         assert running.first.startswith("socket://127.0.0.1:")
-        with socket.create_connection(("127.0.0.1", int(running.first.rpartition(":")[2])), 5.0) as host:
+        with socket.create_connection(("127.0.0.1", int(running.first.rpartition(":")[2])), NET_S) as host:
             heard = b""
             while not heard.endswith(b"unit\r\n"):
                 heard += host.recv(1000)

@@ -92,12 +92,13 @@ def test_a_head_that_stands_outside_new_limits_may_go_back_in_and_no_further(
     ],
 )
 def test_what_is_opened_at_the_start_is_refused_by_key_and_nothing_is_applied(
-    pair: Pair, client: Client, old: str, new: str, key: str
+    standing: Pair, old: str, new: str, key: str
 ) -> None:
-    write(pair, old, new)
-    path = pair[0].service.config.path
+    write(standing, old, new)
+    path = standing[0].service.config.path
     path.write_text(path.read_text().replace("speed_rad_per_s: 0.5", "speed_rad_per_s: 0.1"))
-    words = refused(client, "restart_needed")
+    with Client(standing[0].url) as client:
+        words = refused(client, "restart_needed")
     assert f"{key} ({FIXED[key][1]})" in words
 
 
@@ -110,11 +111,10 @@ def test_what_is_opened_at_the_start_is_refused_by_key_and_nothing_is_applied(
         ("speed_rad_per_s: 0.5", "speed: 0.5", "speed"),
     ],
 )
-def test_a_broken_file_is_refused_with_its_place(
-    pair: Pair, client: Client, old: str, new: str, words: str
-) -> None:
-    write(pair, old, new)
-    assert words in refused(client, "bad_config")
+def test_a_broken_file_is_refused_with_its_place(standing: Pair, old: str, new: str, words: str) -> None:
+    write(standing, old, new)
+    with Client(standing[0].url) as client:
+        assert words in refused(client, "bad_config")
 
 
 def test_a_file_that_is_gone_is_refused(pair: Pair, client: Client) -> None:

@@ -238,20 +238,13 @@ BAD_POINTS: list[tuple[Any, str]] = [
 ]
 
 
-@pytest.fixture(scope="module")
-def idle(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[RunningDaemon, FakeHardware]]:
-    """A daemon for requests that must change nothing."""
-    with pytest.MonkeyPatch.context() as patch, fake_daemon(patch, tmp_path_factory.mktemp("idle")) as made:
-        yield made
-
-
 @pytest.fixture
-def quiet(idle: tuple[RunningDaemon, FakeHardware]) -> Iterator[httpx.Client]:
-    """A client of the idle daemon; afterwards nothing may have happened there."""
-    with httpx.Client(base_url=f"{idle[0].url}/api/v1", **PLAIN) as client:
+def quiet(standing: tuple[RunningDaemon, FakeHardware]) -> Iterator[httpx.Client]:
+    """A client of the standing daemon; afterwards nothing may have happened there."""
+    with httpx.Client(base_url=f"{standing[0].url}/api/v1", **PLAIN) as client:
         yield client
         assert client.get("/operations").json() == {"operations": []}
-    assert [call for call in idle[1].head.calls if call[0] == "move"] == []
+    assert [call for call in standing[1].head.calls if call[0] == "move"] == []
 
 
 @pytest.mark.parametrize(("body", "words"), BAD_POINTS, ids=[str(b[0])[:40] for b in BAD_POINTS])
@@ -496,11 +489,12 @@ def test_stop_ends_the_operation_and_lets_no_later_move_out(
     [(b"", ""), (b"{", "application/json"), (b"now!", "text/plain"), (b"{}", "application/json")],
 )
 def test_stop_works_whatever_body_comes_with_it(
-    web: httpx.Client, hardware: FakeHardware, body: bytes, kind: str
+    quiet: httpx.Client, standing: tuple[RunningDaemon, FakeHardware], body: bytes, kind: str
 ) -> None:
-    answer = web.post("/stop", content=body, headers={"content-type": kind} if kind else {})
+    standing[1].head.calls.clear()
+    answer = quiet.post("/stop", content=body, headers={"content-type": kind} if kind else {})
     assert answer.json() == {"stopped": True, "operation": None}
-    assert hardware.head.calls == [("stop",)]
+    assert standing[1].head.calls == [("stop",)]
 
 
 def test_stop_does_not_wait_behind_hanging_cameras(

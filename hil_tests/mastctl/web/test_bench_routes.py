@@ -127,8 +127,8 @@ def test_nothing_begins_while_somebody_steers_something_runs_or_an_emergency_sto
 @pytest.mark.parametrize(
     "body", [{}, {"board": "a", "goes_on": "b"}, {"board": "a", "pictures": 3}, {"x": 1}]
 )
-def test_a_body_that_makes_no_sense_is_refused_in_a_sentence(pair: Pair, body: dict[str, Any]) -> None:
-    answer = HTTP.post(f"{pair[0].url}/api/v1/bench", json=body)
+def test_a_body_that_makes_no_sense_is_refused_in_a_sentence(standing: Pair, body: dict[str, Any]) -> None:
+    answer = HTTP.post(f"{standing[0].url}/api/v1/bench", json=body)
     assert answer.status_code == 422 and answer.json()["error"]["code"] == "bad_request"
 
 
@@ -236,9 +236,9 @@ def test_the_program_shows_a_token_that_ends_with_it_and_a_viewer_only_reads(
 PAGE = "<!doctype html><title>Pointing &amp; more</title><style>p{color:red}</style><script>x()</script>"
 
 
-@pytest.fixture
-def shelf(pair: Pair) -> Path:
-    folder = pair[0].service.reports.folder
+@pytest.fixture(scope="module")
+def shelf(standing: Pair) -> Path:
+    folder = standing[0].service.reports.folder
     (folder / "arm").mkdir(parents=True)
     (folder / "pointing.html").write_text(PAGE)
     (folder / "arm" / "approach.html").write_text("no title")
@@ -249,12 +249,13 @@ def shelf(pair: Pair) -> Path:
     return folder
 
 
-def test_reports_are_listed_and_read_and_can_do_nothing(pair: Pair, ana: Client, shelf: Path) -> None:
-    told = ana.reports()
+def test_reports_are_listed_and_read_and_can_do_nothing(standing: Pair, shelf: Path) -> None:
+    with Client(standing[0].url) as client:
+        told = client.reports()
     assert {(one["name"], one["title"]) for one in told["reports"]} == {
         ("pointing.html", "Pointing & more"), ("arm.approach.html", "arm.approach.html"),
     }  # fmt: skip
-    answer = HTTP.get(f"{pair[0].url}/api/v1/reports/pointing.html")
+    answer = HTTP.get(f"{standing[0].url}/api/v1/reports/pointing.html")
     assert answer.text == PAGE and answer.headers["content-type"] == "text/html; charset=utf-8"
     policy = answer.headers["content-security-policy"].split("; ")
     assert "default-src 'none'" in policy and "sandbox" in policy and "frame-ancestors 'none'" in policy
@@ -262,7 +263,7 @@ def test_reports_are_listed_and_read_and_can_do_nothing(pair: Pair, ana: Client,
     assert (
         answer.headers["x-content-type-options"] == "nosniff" and answer.headers["x-frame-options"] == "DENY"
     )
-    page = HTTP.get(pair[0].url).headers["content-security-policy"]
+    page = HTTP.get(standing[0].url).headers["content-security-policy"]
     assert "unsafe" not in page and "sandbox" not in page
 
 
@@ -274,8 +275,8 @@ def test_reports_are_listed_and_read_and_can_do_nothing(pair: Pair, ana: Client,
         "arm%2fapproach.html", "/etc/passwd", "%2fetc%2fpasswd", "pointing.html/", "20260101-000000",
     ],
 )  # fmt: skip
-def test_what_is_no_report_is_not_there_whatever_its_name(pair: Pair, shelf: Path, name: str) -> None:
-    answer = HTTP.get(f"{pair[0].url}/api/v1/reports/{name}")
+def test_what_is_no_report_is_not_there_whatever_its_name(standing: Pair, shelf: Path, name: str) -> None:
+    answer = HTTP.get(f"{standing[0].url}/api/v1/reports/{name}")
     assert answer.status_code in (404, 422) or (name.endswith("/") and answer.status_code == 307)
     assert "secret" not in answer.text.replace("secret.html", "")
 

@@ -44,6 +44,12 @@ def web(pair: Pair) -> Iterator[httpx.Client]:
         yield client
 
 
+@pytest.fixture
+def quiet(standing: Pair) -> Iterator[httpx.Client]:
+    with httpx.Client(base_url=f"{standing[0].url}/api/v1", **PLAIN) as client:
+        yield client
+
+
 def refused(code: str, act: Callable[[], object]) -> ClientError:
     with pytest.raises(ClientError) as refusal:
         act()
@@ -208,12 +214,12 @@ def test_a_lease_can_be_shown_taken_and_given_back_by_hand(bench: Client, rover:
     ],
 )
 def test_what_is_wrong_with_a_lease_is_one_sentence(
-    web: httpx.Client, path: str, body: dict[str, Any], words: str
+    quiet: httpx.Client, path: str, body: dict[str, Any], words: str
 ) -> None:
-    answer = web.post(path, json=body)
+    answer = quiet.post(path, json=body)
     assert answer.status_code == 422
     assert words in answer.json()["error"]["message"]
-    assert web.get("/lease").json() == {"control": None}
+    assert quiet.get("/lease").json() == {"control": None}
 
 
 # Once and not twice
@@ -365,14 +371,14 @@ def test_the_shorter_of_the_deadlines_of_header_and_body_counts(
 
 @pytest.mark.parametrize("deadline", ["0", "-1", "3601", "nan", "inf", "soon", ""])
 def test_a_deadline_that_is_none_is_refused_by_a_command_and_nothing_to_a_stop(
-    web: httpx.Client, pair: Pair, deadline: str
+    quiet: httpx.Client, standing: Pair, deadline: str
 ) -> None:
-    answer = web.post("/point", json=ANGLES, headers={"Deadline-S": deadline})
+    answer = quiet.post("/point", json=ANGLES, headers={"Deadline-S": deadline})
     assert answer.status_code == 422
     assert "eadline" in answer.json()["error"]["message"]
-    assert moves(pair[1]) == 0
+    assert moves(standing[1]) == 0
     headers = {"Deadline-S": deadline, "Mastctl-Lease": "none", "Idempotency-Key": "\x7f" * 300}
-    assert web.post("/stop", headers=headers).json()["stopped"]
+    assert quiet.post("/stop", headers=headers).json()["stopped"]
 
 
 # What is left of it

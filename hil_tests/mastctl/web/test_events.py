@@ -22,7 +22,7 @@ from hil_tests.mastctl.service_fakes import HTTP, PLAIN, FakeHardware, ScriptedL
 from hil_tests.mastctl.web.network import NAME, Network, network_daemon
 from hil_tests.waiting import NET_S, joined, until
 from mastctl.daemon import RunningDaemon
-from mastctl.errors import Unable
+from mastctl.errors import Stopped, Unable
 from mastctl.guided.told import Run
 from mastctl.guided.told import heard as bench_heard
 from mastctl.state.publisher import TOPICS
@@ -65,9 +65,9 @@ def heard(line: ClientConnection) -> Iterator[dict[str, Any]]:
 def test_it_begins_with_what_is_known_and_then_tells_each_change(pair: BOTH) -> None:
     daemon, _ = pair
     with listening(daemon.url, "?topics=state,mast,track,operation,command") as events:
-        first = {event["topic"]: event for event in (next(events) for _ in range(3))}
-        assert set(first) == {"state", "mast", "track"}
-        assert first["mast"]["value"]["digest"] == daemon.service.stored.digest
+        known = {event["topic"]: event for event in (next(events) for _ in range(3))}
+        assert set(known) == {"state", "mast", "track"}
+        assert known["mast"]["value"]["digest"] == daemon.service.stored.digest
         with httpx.Client(base_url=f"{daemon.url}/api/v1", **PLAIN) as http:
             begun = http.post("/point", json={"pan_rad": 0.1, "tilt_rad": 0.0}).json()["id"]
         ended = first(events, lambda e: e["topic"] == "operation" and e["value"]["state"] == "done")
@@ -126,8 +126,8 @@ def test_topics_and_keys_are_chosen(pair: BOTH) -> None:
 
 
 @pytest.mark.parametrize("query", ["?topics=state,weather", "?topic=state", "?key=" + "&key=".join("a" * 17)])
-def test_what_is_no_topic_is_refused_in_a_sentence_both_ways(pair: BOTH, query: str) -> None:
-    daemon, _ = pair
+def test_what_is_no_topic_is_refused_in_a_sentence_both_ways(standing: BOTH, query: str) -> None:
+    daemon, _ = standing
     answer = HTTP.get(f"{daemon.url}/api/v1/events{query}")
     assert answer.status_code == 422
     with pytest.raises(InvalidStatus) as refused, socket_of(daemon.url, query):
@@ -171,11 +171,12 @@ def test_a_listener_that_stalls_holds_nobody(pair: BOTH) -> None:
 
 def test_it_ends_with_the_daemon_after_its_last_words(pair: BOTH, monkeypatch: pytest.MonkeyPatch) -> None:
     daemon, _ = pair
-    monkeypatch.setattr(
-        ScriptedLoop,
-        "script",
-        staticmethod(lambda request, record, cancelled, devices: cancelled.wait(NET_S)),
-    )
+
+    def until_stopped(request: Any, record: Any, cancelled: threading.Event, devices: Any) -> None:
+        assert cancelled.wait(NET_S)
+        raise Stopped("stopped")
+
+    monkeypatch.setattr(ScriptedLoop, "script", staticmethod(until_stopped))
     with httpx.Client(base_url=f"{daemon.url}/api/v1", **PLAIN) as http:
         http.post("/point", json={"pan_rad": 0.1, "tilt_rad": 0.0})
     with (
@@ -185,10 +186,11 @@ def test_it_ends_with_the_daemon_after_its_last_words(pair: BOTH, monkeypatch: p
         assert next(events)["value"]["state"] in ("queued", "running")
         ending = threading.Thread(target=daemon.close)
         ending.start()
-        assert [one["value"]["state"] for one in events][-1] in ("stopped", "done")
-        told = []
+        assert [one["value"]["state"] for one in events][-1] == "stopped"
         with pytest.raises(ConnectionClosed) as ended:
-            told += [one["value"]["state"] for one in heard(line)]
+            for one in heard(line):
+                told = one["value"]["state"]
+        assert told == "stopped", "its last words"
         assert ended.value.rcvd is not None and ended.value.rcvd.code == 1001
         joined(ending)
     assert not ending.is_alive()

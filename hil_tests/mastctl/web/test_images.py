@@ -152,8 +152,8 @@ def test_nobody_watching_asks_no_camera(pair: BOTH) -> None:
 
 
 @pytest.mark.parametrize("query, status", [("", 422), ("?camera=nobody", 404), ("?camera=a&quality=3", 422)])
-def test_what_makes_no_sense_is_refused_before_it_is_opened(pair: BOTH, query: str, status: int) -> None:
-    address = f"ws{pair[0].url.removeprefix('http')}/api/v1/images{query}"
+def test_what_makes_no_sense_is_refused_before_it_is_opened(standing: BOTH, query: str, status: int) -> None:
+    address = f"ws{standing[0].url.removeprefix('http')}/api/v1/images{query}"
     with pytest.raises(InvalidStatus) as refused, connect(address, proxy=None):
         pass
     assert refused.value.response.status_code == status

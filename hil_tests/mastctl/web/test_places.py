@@ -10,6 +10,7 @@ import pytest
 from hil_tests.mastctl.service_fakes import CONFIG, FakeHardware, fake_daemon
 from mastctl.client import Client, ClientError
 from mastctl.daemon import RunningDaemon
+from mastctl.errors import MastctlError
 from mastctl.service.places import FILE, MOST, Place, Places
 
 Pair = tuple[RunningDaemon, FakeHardware]
@@ -55,10 +56,12 @@ def test_places_outlive_the_daemon(monkeypatch: pytest.MonkeyPatch, tmp_path: Pa
         client.wait(client.point(pan_rad=0.1, tilt_rad=0.1))
 
 
-@pytest.mark.parametrize("name", ["", "../latch", "a/b", " x", "x" * 41, "<b>"])
-def test_a_name_that_is_none_is_refused(pair: Pair, name: str) -> None:
-    with Client(pair[0].url) as client, pytest.raises(ClientError):
-        client.keep_place(name, **CHART)
+def test_a_name_that_is_none_is_refused(pair: Pair) -> None:
+    with Client(pair[0].url) as client:
+        for name in ("", "../latch", "a/b", " x", "x" * 41, "<b>"):
+            with pytest.raises(ClientError):
+                client.keep_place(name, **CHART)
+        assert client.places() == {"home": HOME}
 
 
 @pytest.mark.parametrize(
@@ -72,22 +75,22 @@ def test_a_name_that_is_none_is_refused(pair: Pair, name: str) -> None:
 )
 def test_a_file_of_something_else_is_refused_in_a_sentence(tmp_path: Path, text: str) -> None:
     (tmp_path / FILE).write_text(text)
-    with pytest.raises(Exception, match=FILE) as refusal:
+    with pytest.raises(MastctlError, match=FILE) as refusal:
         Places(tmp_path).told()
-    assert getattr(refusal.value, "code", "") == "unreadable"
+    assert refusal.value.code == "unreadable"
 
 
 def test_no_more_places_are_kept_than_a_page_can_show(tmp_path: Path) -> None:
     places = Places(tmp_path)
     for number in range(MOST):
         places.keep(f"place {number}", Place(0.01 * number, 0.0))
-    with pytest.raises(Exception, match="forget one"):
+    with pytest.raises(MastctlError, match="forget one"):
         places.keep("one more", Place(0.0, 0.0))
     assert len(places.keep("place 3", Place(1.0, 0.0))["places"]) == MOST + 1, "and home"
 
 
 def test_a_disk_that_takes_nothing_is_told(tmp_path: Path) -> None:
     places = Places(tmp_path / "gone")
-    with pytest.raises(Exception, match="cannot be saved") as refusal:
+    with pytest.raises(MastctlError, match="cannot be saved") as refusal:
         places.keep("chart", Place(0.0, 0.0))
-    assert getattr(refusal.value, "code", "") == "not_saved"
+    assert refusal.value.code == "not_saved"

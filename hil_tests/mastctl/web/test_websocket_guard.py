@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from fastapi import FastAPI
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
@@ -22,8 +21,8 @@ NAME = "rover.test"
 ORIGIN = {"origin": f"http://{NAME}"}
 
 
-class Inside(FastAPI):
-    """What the guard lets through."""
+class Inside:
+    """What the guard lets through, without the 15 ms that FastAPI takes to be made."""
 
     came: Any = None
 
