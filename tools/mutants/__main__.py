@@ -40,7 +40,14 @@ from tools.mutants.trial import Ended, run, run_change, warm
 
 REPOSITORY = Path(__file__).resolve().parent.parent.parent
 FOLDERS = ("calib", "drivers", "mastctl", "hil_tests", "configs", "tools", "docs")
-FILES = ("pyproject.toml", "README.md", "CHANGELOG.md", "LICENSE", "requirements.lock")
+FILES = (
+    "pyproject.toml",
+    "README.md",
+    "CHANGELOG.md",
+    "LICENSE",
+    "requirements.lock",
+    "requirements-demo.txt",
+)
 ALONE_S = 10.0  # what any test may take in processor time, beside three times what its file takes unchanged
 PATIENCE_S = 1200.0  # by the clock on the wall, for a run that waits for what never comes
 
