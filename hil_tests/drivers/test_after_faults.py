@@ -101,7 +101,7 @@ def test_a_hardware_error_refuses_every_pointing_until_the_servo_starts_anew() -
 
 @pytest.mark.parametrize("made", [dynamixel, ptu], ids=lambda made: made.__name__)
 def test_a_pulled_plug_refuses_until_the_line_is_back_and_then_moves_only_when_asked(made: Any) -> None:
-    with made(turned=True) as rig, pointing(rig.head, rig.clock) as pointer:
+    with made(turned=True) as rig, rig.clock.at_work(), pointing(rig.head, rig.clock) as pointer:
         running = pointer.far()
         rig.line.hang_up()
         assert end(running) in ("line_lost", "no_reply")

@@ -1,14 +1,15 @@
 """What every pan/tilt driver has to do, whatever stands behind it: one suite for all of them.
 
-In memory; Dynamixel servos over a pseudo terminal; a PTU over a pseudo terminal and over TCP. What is true is
-known from the simulated motors, never from the driver. The last case is the demo's pointing loop.
+Without bytes; Dynamixel servos and a PTU over a line in memory: on a turned clock. Over a pseudo terminal and
+TCP, on the machine's clock, are a move, a stop, a pulled plug and what closing leaves, and in the long run
+all of it. What is true is known from the simulated motors, never from the driver. The last case is the
+demo's pointing loop.
 """
 
 from __future__ import annotations
 
 import threading
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
@@ -17,6 +18,7 @@ import pytest
 
 from drivers.errors import DriverError, LineLost, NoReply
 from drivers.interfaces import Reading
+from hil_tests.waiting import until
 from mastctl.client import Client
 from mastctl.config import load_config
 from mastctl.conform.checks import Check
@@ -25,23 +27,32 @@ from mastctl.conform.heads import HEADS, fastest_seen
 from mastctl.daemon import RunningDaemon
 from mastctl.experiment.demo import SimulationTruth, demo_config
 from mastctl.experiment.pointing import run_pointing_experiment
-from tools.campaigns.servo_rigs import LIMITS_RAD, RIGS, Rig
+from tools.campaigns.servo_rigs import LIMITS_RAD, RIGS, TURNED, Rig
 
-PATIENCE_S = 30.0
-"""No driver needs a tenth of this; it only keeps a broken one from hanging the suite on a busy machine."""
+REAL = [name for name in RIGS if name != "in_memory"]
+KERNEL = pytest.mark.long(
+    2, "in the quick run it is on a turned clock; here each case drives a head for seconds"
+)
+LONG = [pytest.param(name, marks=KERNEL) for name in REAL]
+WIRES = ["dynamixel", "ptu"]
+MADE = {**RIGS, **TURNED}
 
-WIRES = [name for name in RIGS if name != "in_memory"]
 
-
-@pytest.fixture(params=list(RIGS))
+@pytest.fixture(params=[*TURNED, *LONG])
 def rig(request: pytest.FixtureRequest) -> Iterator[Rig]:
-    with RIGS[request.param]() as made:
+    with MADE[request.param]() as made:
         yield made
 
 
-@pytest.fixture(params=WIRES)
+@pytest.fixture(params=[*WIRES, *LONG])
 def wired(request: pytest.FixtureRequest) -> Iterator[Rig]:
-    with RIGS[request.param]() as made:
+    with MADE[request.param]() as made:
+        yield made
+
+
+@pytest.fixture(params=[*WIRES, *REAL])
+def each_wired(request: pytest.FixtureRequest) -> Iterator[Rig]:
+    with MADE[request.param]() as made:
         yield made
 
 
@@ -49,16 +60,8 @@ def trial_of(rig: Rig) -> HeadTrial:
     """The rig as the checks of heads take one."""
     return HeadTrial(
         rig.head, LIMITS_RAD, 1.0, limits_rad=LIMITS_RAD, own_limits=True,
-        count_rad=rig.count_rad, settle_rad=rig.settle_rad, true_rad=rig.true_rad,
+        count_rad=rig.count_rad, settle_rad=rig.settle_rad, true_rad=rig.true_rad, clock=rig.clock,
     )  # fmt: skip
-
-
-def eventually(what: str, condition: Callable[[], object]) -> None:
-    """Wait until something holds."""
-    until_s = time.monotonic() + PATIENCE_S
-    while not condition():
-        assert time.monotonic() < until_s, f"{what} did not happen"
-        time.sleep(0.005)
 
 
 def settled(rig: Rig) -> Reading:
@@ -69,7 +72,7 @@ def settled(rig: Rig) -> Reading:
         readings.append(rig.head.read())
         return not readings[-1].moving
 
-    eventually("settling", stands)
+    until(stands, "settling", clock=rig.clock)
     return readings[-1]
 
 
@@ -84,7 +87,7 @@ def works_again(rig: Rig) -> Reading:
             return False
         return True
 
-    eventually("an answer", answers)
+    until(answers, "an answer", clock=rig.clock)
     return readings[-1]
 
 
@@ -101,9 +104,9 @@ def true_enough(rig: Rig, reading: Reading, began_s: float, ended_s: float) -> b
 
 def true_reading(rig: Rig) -> Reading:
     """Read, and see that it is true."""
-    began_s = time.monotonic()
+    began_s = rig.clock.now_s()
     reading = rig.head.read()
-    ended_s = time.monotonic()
+    ended_s = rig.clock.now_s()
     assert true_enough(rig, reading, began_s, ended_s), (reading, rig.true_rad(ended_s))
     assert began_s <= reading.time_s <= ended_s
     return reading
@@ -112,6 +115,14 @@ def true_reading(rig: Rig) -> Reading:
 @pytest.mark.parametrize("check", HEADS.checks, ids=lambda check: str(check.name))
 def test_every_head_keeps_every_promise(rig: Rig, check: Check[HeadTrial]) -> None:
     check.ask(trial_of(rig))
+
+
+@pytest.mark.parametrize("name", REAL)
+@pytest.mark.parametrize("promise", ["head.move", "head.stop"])
+def test_a_real_line_carries_moves_and_stops(name: str, promise: str) -> None:
+    (check,) = [one for one in HEADS.checks if one.name == promise]
+    with RIGS[name]() as rig:
+        check.ask(trial_of(rig))
 
 
 @pytest.mark.parametrize("asked", [0.3, 50.0])
@@ -136,7 +147,7 @@ def test_what_is_measured_is_told_not_what_was_commanded(rig: Rig) -> None:
     rig.head.move(0.6, -0.2)
     for _ in range(10):
         reading = true_reading(rig)
-        time.sleep(0.01)
+        rig.clock.sleep(0.01)
     assert (reading.pan_rad, reading.tilt_rad) == pytest.approx((at.pan_rad, at.tilt_rad), abs=1e-9)
 
 
@@ -153,7 +164,7 @@ def test_an_axis_that_does_not_follow_is_told_in_words(wired: Rig) -> None:
             words[:] = [str(error)]
         return bool(words)
 
-    eventually("a fault in words", told)
+    until(told, "a fault in words", clock=wired.clock)
     assert all(" " in word and "\n" not in word for word in words)
     assert any("pan" in word or "tilt" in word for word in words), words
 
@@ -161,7 +172,7 @@ def test_an_axis_that_does_not_follow_is_told_in_words(wired: Rig) -> None:
 def test_a_silent_device_is_an_error_and_comes_back_without_moving(rig: Rig) -> None:
     rig.head.move(0.2, 0.1)
     settled(rig)
-    held = rig.true_rad(time.monotonic())
+    held = rig.true_rad(rig.clock.now_s())
     rig.panel.set("pan_tilt", "off")
     for _ in range(2):
         with pytest.raises((NoReply, LineLost)) as caught:
@@ -173,38 +184,38 @@ def test_a_silent_device_is_an_error_and_comes_back_without_moving(rig: Rig) -> 
     works_again(rig)
     reading = settled(rig)
     assert (reading.pan_rad, reading.tilt_rad) == pytest.approx(held, abs=rig.count_rad + rig.settle_rad)
-    assert rig.true_rad(time.monotonic()) == pytest.approx(held, abs=rig.count_rad + rig.settle_rad)
+    assert rig.true_rad(rig.clock.now_s()) == pytest.approx(held, abs=rig.count_rad + rig.settle_rad)
     for _ in range(10):  # and goes on as before
         try:
             rig.head.stop()  # deliberate where a watchdog has stopped the head
             rig.head.move(0.0, 0.0)
             break
         except DriverError:
-            time.sleep(0.05)
+            rig.clock.sleep(0.05)
     assert settled(rig).pan_rad == pytest.approx(0.0, abs=rig.count_rad + rig.settle_rad)
 
 
-def test_a_pulled_plug_is_an_error_and_the_head_comes_back_by_itself(wired: Rig) -> None:
-    assert wired.line is not None
-    wired.head.move(0.2, 0.1)
-    settled(wired)
-    held = wired.true_rad(time.monotonic())
+def test_a_pulled_plug_is_an_error_and_the_head_comes_back_by_itself(each_wired: Rig) -> None:
+    assert each_wired.line is not None
+    each_wired.head.move(0.2, 0.1)
+    settled(each_wired)
+    held = each_wired.true_rad(each_wired.clock.now_s())
     for _ in range(2):
-        wired.line.hang_up()
+        each_wired.line.hang_up()
 
         def fails() -> bool:
             try:
-                wired.head.read()
+                each_wired.head.read()
             except (LineLost, NoReply):
                 return True
             return False
 
-        eventually("an error", fails)
-        wired.line.come_back()
-        works_again(wired)
-    reading = settled(wired)
-    assert (reading.pan_rad, reading.tilt_rad) == pytest.approx(held, abs=wired.count_rad)
-    assert wired.true_rad(time.monotonic()) == pytest.approx(held, abs=wired.count_rad)
+        until(fails, "an error", clock=each_wired.clock)
+        each_wired.line.come_back()
+        works_again(each_wired)
+    reading = settled(each_wired)
+    assert (reading.pan_rad, reading.tilt_rad) == pytest.approx(held, abs=each_wired.count_rad)
+    assert each_wired.true_rad(each_wired.clock.now_s()) == pytest.approx(held, abs=each_wired.count_rad)
 
 
 def test_a_late_reply_is_never_taken_for_the_next(wired: Rig) -> None:
@@ -214,20 +225,20 @@ def test_a_late_reply_is_never_taken_for_the_next(wired: Rig) -> None:
         with suppress(DriverError):
             wired.head.move(goal, 0.0)
         for _ in range(2):
-            began_s = time.monotonic()
+            began_s = wired.clock.now_s()
             try:
                 reading = wired.head.read()
             except DriverError:
                 continue
-            assert true_enough(wired, reading, began_s, time.monotonic())
+            assert true_enough(wired, reading, began_s, wired.clock.now_s())
     wired.panel.clear()
     for _ in range(40):
-        began_s = time.monotonic()
+        began_s = wired.clock.now_s()
         try:
             reading = wired.head.read()
         except DriverError:
             continue
-        assert true_enough(wired, reading, began_s, time.monotonic())
+        assert true_enough(wired, reading, began_s, wired.clock.now_s())
 
 
 def test_replies_lost_now_and_then_cost_errors_but_no_wrong_angle(rig: Rig) -> None:
@@ -237,32 +248,32 @@ def test_replies_lost_now_and_then_cost_errors_but_no_wrong_angle(rig: Rig) -> N
         if index % 6 == 0:
             with suppress(DriverError):
                 rig.head.move(0.3 if index % 12 else -0.3, 0.1)
-        began_s = time.monotonic()
+        began_s = rig.clock.now_s()
         try:
             reading = rig.head.read()
         except DriverError:
             continue
         good += 1
-        assert true_enough(rig, reading, began_s, time.monotonic())
+        assert true_enough(rig, reading, began_s, rig.clock.now_s())
     assert good > 5
     rig.panel.clear()
     works_again(rig)
 
 
-@pytest.mark.parametrize("name", list(RIGS))
+@pytest.mark.parametrize("name", list(MADE))
 def test_close_stops_the_head_and_leaves_no_thread_and_no_descriptor(name: str) -> None:
     threads, descriptors = set(threading.enumerate()), len(list(Path("/proc/self/fd").iterdir()))
-    with RIGS[name]() as rig:
+    with MADE[name]() as rig:
         rig.head.move(0.9, 0.3, 0.5)
-        eventually("motion", lambda: rig.head.read().pan_rad > 0.05)
+        until(lambda: rig.head.read().pan_rad > 0.05, "motion", clock=rig.clock)
         rig.head.close()
         rig.head.close()
         for call in (rig.head.read, rig.head.stop, lambda: rig.head.move(0.0, 0.0)):
             with pytest.raises(NoReply, match="closed"):
                 call()
-        eventually("standing", lambda: _stands(rig))
-        assert rig.true_rad(time.monotonic())[0] < 0.6
-    eventually("the end of every thread", lambda: set(threading.enumerate()) <= threads)
+        until(lambda: _stands(rig), "standing", clock=rig.clock)
+        assert rig.true_rad(rig.clock.now_s())[0] < 0.6
+    until(lambda: set(threading.enumerate()) <= threads, "the end of every thread")
     assert len(list(Path("/proc/self/fd").iterdir())) == descriptors
 
 
@@ -274,7 +285,7 @@ def test_close_of_a_head_that_is_gone_does_not_raise(wired: Rig) -> None:
 
 
 def _stands(rig: Rig) -> bool:
-    now_s = time.monotonic()
+    now_s = rig.clock.now_s()
     return rig.true_rad(now_s) == rig.true_rad(now_s - 0.05)
 
 

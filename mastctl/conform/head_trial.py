@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
 
+from drivers.clock import Clock, SystemClock
 from drivers.interfaces import PanTilt, Reading
 from mastctl.conform.checks import NotTried, SubjectLost, expect
 from mastctl.conform.worker import Worker
@@ -17,6 +17,7 @@ from mastctl.devices.frames import CLOCK_TOLERANCE_S
 Angles = tuple[float, float]
 LONGER = "a larger --reach or a lower --speed"
 SETTLES_WITHIN_S = 30.0
+READ_EVERY_S = 0.002  # on the way
 OUTSIDE_COUNT_RAD = 1e-3
 """Taken for the count of a head that nobody knows; a 12-bit servo has 1.5e-3."""
 
@@ -49,6 +50,8 @@ class HeadTrial:
         Whether it was closed for good.
     unplaced
         Why nobody knows where it stands, and so where it may be moved; empty where that is known.
+    clock
+        What the head stamps its readings by, and what the checks wait on.
     """
 
     head: PanTilt
@@ -62,6 +65,7 @@ class HeadTrial:
     open_again: Callable[[], PanTilt] | None = None
     closed: bool = False
     unplaced: str = ""
+    clock: Clock = field(default_factory=SystemClock)
     worker: Worker = field(default_factory=Worker)
 
     @property
@@ -78,9 +82,9 @@ class HeadTrial:
 
     def read(self) -> Reading:
         """Read in the head's own thread; the answer is one that can be true."""
-        began_s = time.monotonic()
+        began_s = self.clock.now_s()
         reading = self.worker.call("read()", self.head.read)
-        self.check_reading(reading, began_s, time.monotonic())
+        self.check_reading(reading, began_s, self.clock.now_s())
         return reading
 
     def move(self, goal: Angles, speed_rad_per_s: float | None = None) -> None:
@@ -124,12 +128,11 @@ class HeadTrial:
 
     def settled(self) -> Reading:
         """Read until the head says that it does not move."""
-        until_s = time.monotonic() + SETTLES_WITHIN_S
+        until_s = self.clock.now_s() + SETTLES_WITHIN_S
         while (reading := self.read()).moving:
-            expect(
-                time.monotonic() < until_s, f"the head still says that it moves after {SETTLES_WITHIN_S:g} s"
-            )
-            time.sleep(0.005)
+            words = f"the head still says that it moves after {SETTLES_WITHIN_S:g} s"
+            expect(self.clock.now_s() < until_s, words)
+            self.clock.sleep(0.005)
         return reading
 
     def sent(self, goal: Angles) -> Reading:
@@ -150,12 +153,13 @@ class HeadTrial:
         """Send the head off; return a reading after that part of the way. Raises NotTried if missed."""
         way_rad = away(self.read(), goal)
         self.move(goal)
-        until_s = time.monotonic() + SETTLES_WITHIN_S
+        until_s = self.clock.now_s() + SETTLES_WITHIN_S
         while away(reading := self.read(), goal) > (1 - part) * way_rad:
             expect(
-                time.monotonic() < until_s and (reading.moving or away(reading, goal) <= self.near_rad),
+                self.clock.now_s() < until_s and (reading.moving or away(reading, goal) <= self.near_rad),
                 f"sent to {goal[0]:.4f}, {goal[1]:.4f} rad the head does not go there",
             )
+            self.clock.sleep(READ_EVERY_S)
         if away(reading, goal) < 0.3 * way_rad:
             raise NotTried(
                 "the way was too short to catch the head on it; a larger --reach or a lower --speed helps"

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import time
 from contextlib import suppress
 from functools import partial
 from itertools import pairwise
@@ -15,6 +14,7 @@ from mastctl.conform.checks import NotTried, PromiseBroken, Suite, expect
 from mastctl.conform.head_trial import (
     LONGER,
     OUTSIDE_COUNT_RAD,
+    READ_EVERY_S,
     SETTLES_WITHIN_S,
     Angles,
     HeadTrial,
@@ -49,9 +49,9 @@ def _move(trial: HeadTrial) -> str:
     for parts in ((0.3, -0.2), (0.25033, -0.25047), (-0.0007, 0.0004), (-0.6, 0.5)):
         goal = trial.goal(*parts)
         way_rad = away(trial.settled(), goal)
-        began_s = time.monotonic()
+        began_s = trial.clock.now_s()
         trial.move(goal)
-        took_s = time.monotonic() - began_s
+        took_s = trial.clock.now_s() - began_s
         needs_s = way_rad / trial.speed_rad_per_s
         expect(took_s < MOVE_TIMEOUT_S, f"move() took {took_s:.2f} s, {MOVE_TIMEOUT_S:g} s are allowed")
         expect(
@@ -73,12 +73,12 @@ def _under_way(trial: HeadTrial) -> str:
     start = trial.sent(trial.goal(-0.5, -0.5))
     goal = trial.goal(0.7, 0.6)
     way_rad = away(start, goal)
-    began_s = time.monotonic()
+    began_s = trial.clock.now_s()
     trial.move(goal)
     readings = [trial.read()]
     until_s = began_s + SETTLES_WITHIN_S
-    while readings[-1].moving and time.monotonic() < until_s:
-        time.sleep(0.002)
+    while readings[-1].moving and trial.clock.now_s() < until_s:
+        trial.clock.sleep(READ_EVERY_S)
         readings.append(trial.read())
     for before, after in pairwise(readings):
         expect(
@@ -111,9 +111,10 @@ def _new_goal(trial: HeadTrial) -> None:
     trial.on_its_way(far)
     trial.move(back)
     nearest_rad = math.inf
-    until_s = time.monotonic() + SETTLES_WITHIN_S
-    while (reading := trial.read()).moving and time.monotonic() < until_s:
+    until_s = trial.clock.now_s() + SETTLES_WITHIN_S
+    while (reading := trial.read()).moving and trial.clock.now_s() < until_s:
         nearest_rad = min(nearest_rad, abs(reading.pan_rad - far[0]))
+        trial.clock.sleep(READ_EVERY_S)
     expect(nearest_rad > trial.near_rad, "sent back on its way, the head went to its old goal first")
     off_rad = away(reading, back)
     expect(off_rad <= trial.near_rad, f"it settled {off_rad:.4f} rad from the new goal")
@@ -128,14 +129,14 @@ def _stop(trial: HeadTrial) -> str:
     reading = trial.settled()
     left_rad = away(reading, goal)
     expect(left_rad > trial.near_rad, "the stop came on the way, and the head went on to its goal")
-    until_s = time.monotonic() + HOLDS_S
-    while time.monotonic() < until_s:
+    until_s = trial.clock.now_s() + HOLDS_S
+    while trial.clock.now_s() < until_s:
         later = trial.read()
         expect(
             away(later, at(reading)) <= trial.near_rad,
             f"after the stop it moved on by {away(later, at(reading)):.4f} rad",
         )
-        time.sleep(0.01)
+        trial.clock.sleep(0.01)
     trial.sent(trial.goal(0.0, 0.0))
     return f"{left_rad:.3f} rad before the goal"
 
@@ -160,15 +161,20 @@ def _stop_beside(trial: HeadTrial) -> str:
 
 def _stop_beside_a_move(trial: HeadTrial, goal: Angles) -> float:
     """Stop from another thread while a move goes out; return how long it took."""
-    move = beside(lambda: trial.head.move(*goal, trial.speed_rad_per_s))
-    time.sleep(0.05)
-    began_s = time.monotonic()
-    ended("stop() beside move()", beside(trial.head.stop))
-    took_s = time.monotonic() - began_s
+    move = beside(lambda: trial.head.move(*goal, trial.speed_rad_per_s), trial.clock)
+    trial.clock.sleep(0.05)
+    took_s = ended("stop() beside move()", beside(partial(_timed_stop, trial), trial.clock))
     with suppress(DriverError):  # a stop may end a move that is just going out
         ended("move()", move)
     trial.stop()
     return took_s
+
+
+def _timed_stop(trial: HeadTrial) -> float:
+    """Stop; return how long that took."""
+    began_s = trial.clock.now_s()
+    trial.head.stop()
+    return trial.clock.now_s() - began_s
 
 
 def _stops_beside_reads(trial: HeadTrial) -> float:
@@ -181,13 +187,11 @@ def _stops_beside_reads(trial: HeadTrial) -> float:
             except (NoReply, BadReply):  # a stop that cuts in may cost an answer: the service asks once more
                 trial.head.read()
 
-    reads = [beside(ask) for _ in range(2)]
+    reads = [beside(ask, trial.clock) for _ in range(2)]
     longest_s = 0.0
     for _ in range(2):
-        began_s = time.monotonic()
-        for stop in [beside(trial.head.stop) for _ in range(2)]:
-            ended("stop() beside read()", stop)
-        longest_s = max(longest_s, time.monotonic() - began_s)
+        for stop in [beside(partial(_timed_stop, trial), trial.clock) for _ in range(2)]:
+            longest_s = max(longest_s, ended("stop() beside read()", stop))
     for read in reads:
         ended("read() beside stop()", read)
     return longest_s
@@ -203,7 +207,7 @@ def _threads(trial: HeadTrial) -> None:
             if moves:
                 trial.head.move(*goal, trial.speed_rad_per_s)
 
-    for call in [beside(partial(work, moves)) for moves in (True, False, False, False)]:
+    for call in [beside(partial(work, moves), trial.clock) for moves in (True, False, False, False)]:
         try:
             ended("a call beside others", call, 2 * PATIENCE_S)
         except DriverError as error:
@@ -228,13 +232,14 @@ def fastest_seen(trial: HeadTrial, asked_rad_per_s: float) -> tuple[float, float
     trial.sent(trial.goal(-0.7, -0.7))
     goal = trial.goal(0.3, 0.3)
     readings: list[tuple[float, Angles]] = []
-    began_s = time.monotonic()
+    began_s = trial.clock.now_s()
     trial.move(goal, asked_rad_per_s)
     while True:
         reading = trial.read()
         readings.append((reading.time_s, at(reading)))
         if not reading.moving or reading.time_s > began_s + SETTLES_WITHIN_S:
             break
+        trial.clock.sleep(READ_EVERY_S)
     stamps_s = np.array([stamp_s for stamp_s, _ in readings])
     moments_s = np.linspace(stamps_s[0], stamps_s[-1], 13)
     step_s = float(moments_s[1] - moments_s[0])
@@ -291,7 +296,7 @@ def _refused(trial: HeadTrial, goal: Angles, speed_rad_per_s: float, words: str)
     else:
         trial.stop()
         raise PromiseBroken(f"{what}, a goal {words}, was not refused")
-    time.sleep(0.05)
+    trial.clock.sleep(0.05)
     after = trial.read()
     expect(
         away(after, at(before)) <= trial.near_rad,
@@ -313,9 +318,9 @@ def _deadlines(trial: HeadTrial) -> str:
     ):
         took_s = []
         for _ in range(3):
-            began_s = time.monotonic()
+            began_s = trial.clock.now_s()
             call()
-            took_s.append(time.monotonic() - began_s)
+            took_s.append(trial.clock.now_s() - began_s)
         expect(min(took_s) < deadline_s / 2, f"{name}() took {min(took_s):.2f} s of {deadline_s:g} s at best")
         told.append(f"{name} {1e3 * min(took_s):.1f} ms")
     return ", ".join(told)

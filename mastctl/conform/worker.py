@@ -8,6 +8,7 @@ from collections.abc import Callable
 from concurrent.futures import Future
 from typing import TypeVar
 
+from drivers.clock import Clock, SystemClock
 from drivers.errors import DriverError
 from mastctl.conform.checks import PromiseBroken, SubjectLost
 
@@ -38,10 +39,10 @@ class Worker:
             run()
 
 
-def beside(function: Callable[[], T]) -> Future[T]:
-    """Make a call in a thread of its own, beside those of the device's thread."""
+def beside(function: Callable[[], T], clock: Clock | None = None) -> Future[T]:
+    """Make a call in a thread of its own, one of the clock's, beside those of the device's thread."""
     future, run = _task(function)
-    threading.Thread(target=run, name="beside the device under test", daemon=True).start()
+    (clock or SystemClock()).thread(run, "beside the device under test").start()
     return future
 
 

@@ -55,7 +55,10 @@ from tools.campaigns.servo_rigs import (
 DRIVERS: dict[str, Callable[[], AbstractContextManager[Rig]]] = {
     "dynamixel_pty": partial(dynamixel, watchdog_s=0.3, reply_timeout_s=0.05),
     "ptu_pty": ptu,
+    "dynamixel": partial(dynamixel, watchdog_s=0.3, reply_timeout_s=0.05, turned=True),
+    "ptu": partial(ptu, turned=True),
 }
+"""The last two on a turned clock, without real time."""
 MIXTURE = "mixture"
 WORDS = (*HEAD_WORDS, MIXTURE)
 LYING = ("wrong", "drifting", "garbage")
@@ -117,7 +120,7 @@ class Judge:
 
     def __init__(self, rig: Rig, row: Row, lying: bool) -> None:
         self._rig, self._row, self.lying = rig, row, lying
-        self._seen_s = time.monotonic()
+        self._seen_s = self._rig.clock.now_s()
 
     def reading(self, reading: Reading, began_s: float, ended_s: float) -> None:
         """Judge one reading of a call."""
@@ -155,7 +158,7 @@ class Judge:
 
     def limits(self) -> None:
         """See that no axis was outside its limits since the last look."""
-        now_s = time.monotonic()
+        now_s = self._rig.clock.now_s()
         slack = 1.5 * self._rig.count_rad
         for truth in self._truths(max(self._seen_s, now_s - 30.0), now_s):
             for angle, (low, high) in zip(truth, LIMITS_RAD, strict=True):
@@ -206,7 +209,7 @@ class Run:
     def _under_fault(self) -> float | None:
         """Use the head while the fault lasts; return when it was first told."""
         watched = self._row.word in OF_THE_MECHANISM
-        began_s, length_s = time.monotonic(), self._rng.uniform(*(WATCHED_S if watched else EPISODE_S))
+        began_s, length_s = self._rig.clock.now_s(), self._rng.uniform(*(WATCHED_S if watched else EPISODE_S))
         told: list[float] = []
         if watched:
             with suppress(DriverError):
@@ -226,12 +229,12 @@ class Run:
         only_read: bool = False,
     ) -> None:
         """Read, move and stop at random."""
-        began_s, calls = time.monotonic(), 0
-        while not enough(calls, time.monotonic() - began_s):
+        began_s, calls = self._rig.clock.now_s(), 0
+        while not enough(calls, self._rig.clock.now_s() - began_s):
             calls += 1
             self._row.calls += 1
             dice = 1.0 if only_read else self._rng.random()
-            started_s = time.monotonic()
+            started_s = self._rig.clock.now_s()
             try:
                 if dice < 0.012:
                     self._move()
@@ -239,30 +242,30 @@ class Run:
                     self._rig.head.stop()
                 else:
                     reading = self._rig.head.read()
-                    ended_s = time.monotonic()
+                    ended_s = self._rig.clock.now_s()
                     self._judge.reading(reading, started_s, ended_s)
                     if reading.faults and told is not None:
                         told.append(ended_s)
             except DriverError:
                 self._row.errors += 1
-                ended_s = time.monotonic()
+                ended_s = self._rig.clock.now_s()
                 if told is not None:
                     told.append(ended_s)
-                time.sleep(max(0.0, AWAY_PERIOD_S - (ended_s - started_s)))
+                self._rig.clock.sleep(max(0.0, AWAY_PERIOD_S - (ended_s - started_s)))
             else:
-                time.sleep(PERIOD_S)
+                self._rig.clock.sleep(PERIOD_S)
         self._judge.limits()
 
     def _recover(self) -> bool:
         """Wait for a healthy reading and a move that is taken; False if it has to be switched off and on."""
-        began_s, read, hardware, last = time.monotonic(), False, False, ""
-        while time.monotonic() - began_s < RECOVERY_S:
+        began_s, read, hardware, last = self._rig.clock.now_s(), False, False, ""
+        while self._rig.clock.now_s() - began_s < RECOVERY_S:
             self._row.calls += 1
-            started_s = time.monotonic()
+            started_s = self._rig.clock.now_s()
             try:
                 if not read:
                     reading = self._rig.head.read()
-                    ended_s = time.monotonic()
+                    ended_s = self._rig.clock.now_s()
                     self._judge.reading(reading, started_s, ended_s)
                     read = not reading.faults
                     hardware = hardware or bool(reading.faults)
@@ -278,7 +281,7 @@ class Run:
                 return False
             except DriverError as error:
                 last = str(error)
-            time.sleep(AWAY_PERIOD_S)
+            self._rig.clock.sleep(AWAY_PERIOD_S)
         self._row.lost += 1
         self._row.complaints.append(f"not back {RECOVERY_S:g} s after the fault: {last}")
         return False
@@ -314,7 +317,9 @@ def run_word(driver: str, word: str, transactions: int, seed: int, until_s: floa
     threads, descriptors = set(threading.enumerate()), _descriptors()
     while row.calls < transactions and time.monotonic() < until_s:
         with ExitStack() as stack:
-            run = Run(_opened(stack, driver), row, rng)
+            rig = _opened(stack, driver)
+            stack.enter_context(rig.clock.at_work())
+            run = Run(rig, row, rng)
             while row.calls < transactions and time.monotonic() < until_s and run.episode():
                 pass
     waited_s = time.monotonic() + 10.0
@@ -403,7 +408,7 @@ def main() -> int:
     parser.add_argument("--transactions", type=at_least(1), default=10_000, help="calls a driver and word")
     parser.add_argument("--hours", type=positive_number, help="go on with new seeds for so long")
     parser.add_argument("--seed", type=at_least(0), help="chosen and printed when left out")
-    parser.add_argument("--driver", choices=list(DRIVERS), action="append", help="one or more (default both)")
+    parser.add_argument("--driver", choices=list(DRIVERS), action="append", help="one or more (default all)")
     parser.add_argument("--word", choices=WORDS, action="append", help="one or more (default all)")
     parser.add_argument(
         "--openings", type=at_least(1), help="only open a head so many times under each fault"

@@ -4,7 +4,7 @@ Backlash and sag are nothing here, so the angle that the mechanism stands at is 
 a reading has to tell; a reading rounds it to the device's count.
 
 A rig lives on the machine's clock behind a pseudo terminal or TCP, or (``turned``) in memory on a clock that
-is turned: whoever has it is at work on that clock, and waits on it.
+is turned: whoever has it waits on that clock.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ import math
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 from drivers.clock import Clock, SystemClock
@@ -82,17 +83,17 @@ class Rig:
 @contextmanager
 def in_memory(turned: bool = False) -> Iterator[Rig]:
     """The simulated head without any bytes."""
-    with _clock(turned) as clock:
-        axes = [
-            AxisSettings(X_COUNT_RAD, 0.0, low, high, SPEED_RAD_PER_S, ACCELERATION_RAD_PER_S2)
-            for low, high in LIMITS_RAD
-        ]
-        panel = FaultPanel(clock.now_s, ())
-        head = SimulatedPanTilt(HeadSettings("in memory", *axes), clock, panel)
-        try:
-            yield Rig("in memory", head, clock, panel, head.true_joints, X_COUNT_RAD)
-        finally:
-            head.close()
+    clock = _clock(turned)
+    axes = [
+        AxisSettings(X_COUNT_RAD, 0.0, low, high, SPEED_RAD_PER_S, ACCELERATION_RAD_PER_S2)
+        for low, high in LIMITS_RAD
+    ]
+    panel = FaultPanel(clock.now_s, ())
+    head = SimulatedPanTilt(HeadSettings("in memory", *axes), clock, panel)
+    try:
+        yield Rig("in memory", head, clock, panel, head.true_joints, X_COUNT_RAD)
+    finally:
+        head.close()
 
 
 @contextmanager
@@ -104,7 +105,7 @@ def dynamixel(
     By default patient and without a watchdog: on a busy machine simulator and driver both come late.
     """
     with ExitStack() as stack:
-        clock = stack.enter_context(_clock(turned))
+        clock = _clock(turned)
         panel, axes = _axes(clock)
         settings = {"baud_rate": 3, "return_delay_time": 0}  # 1 Mbaud
         servos = [
@@ -176,7 +177,7 @@ def as_opened(servo: SimulatedServo, head: DynamixelHead) -> bool:
 def ptu(*, turned: bool = False) -> Iterator[Rig]:
     """A D46-70 behind a serial line."""
     with ExitStack() as stack:
-        clock = stack.enter_context(_clock(turned))
+        clock = _clock(turned)
         panel, axes = _axes(clock)
         sent = [0]
         unit = SimulatedPtu("d46_70", *axes)
@@ -254,12 +255,9 @@ def _ptu_rig(
     return Rig(name, head, clock, panel, _truth(axes), step_rad, line, sent, fastest_rad_per_s=fastest)
 
 
-@contextmanager
-def _clock(turned: bool) -> Iterator[Clock]:
-    """What a rig lives on; whoever has the rig is at work on it."""
-    clock = SimulationClock(start_s=START_S) if turned else SystemClock()
-    with clock.at_work():
-        yield clock
+def _clock(turned: bool) -> Clock:
+    """What a rig lives on."""
+    return SimulationClock(start_s=START_S) if turned else SystemClock()
 
 
 def _serial_line(
@@ -306,3 +304,11 @@ RIGS: dict[str, Callable[[], Any]] = {
     "ptu_pty": ptu,
     "ptu_tcp": ptu_tcp,
 }
+"""On the machine's clock."""
+
+TURNED: dict[str, Callable[[], Any]] = {
+    "in_memory": partial(in_memory, turned=True),
+    "dynamixel": partial(dynamixel, turned=True),
+    "ptu": partial(ptu, turned=True),
+}
+"""On a turned clock."""

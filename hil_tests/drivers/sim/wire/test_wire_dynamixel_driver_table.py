@@ -20,47 +20,49 @@ NAMES = {
 CURRENT = {"current_limit", "goal_current", "present_current"}
 
 
-@pytest.mark.parametrize("name", ours.MODELS)
-def test_a_model(name: str) -> None:
-    driver, simulator = ours.MODELS[name], theirs.model_named(name)
-    assert driver.number == simulator.number
-    assert driver.counts_per_turn == simulator.counts_per_turn
-    assert driver.centre_count == simulator.zero_counts
-    assert driver.velocity_unit_rad_per_s == pytest.approx(simulator.velocity_unit_rad_per_s)
-    assert driver.acceleration_unit_rad_per_s2 == pytest.approx(simulator.acceleration_unit_rad_per_s2)
-    assert simulator.firmware >= driver.watchdog_firmware
-    limits = [simulator.by_name[f"{end}_position_limit"] for end in ("min", "max")]
-    assert {(limit.low, limit.high) for limit in limits} == {(driver.low_count, driver.high_count)}
-    if driver.current_unit_A is None:
-        assert "present_current" not in simulator.by_name
-    else:
-        assert driver.current_unit_A == simulator.current_unit_a
-        assert driver.most_current_counts == simulator.by_name["current_limit"].high
+def test_a_model() -> None:
+    for name in ours.MODELS:
+        driver, simulator = ours.MODELS[name], theirs.model_named(name)
+        assert driver.number == simulator.number, name
+        assert driver.counts_per_turn == simulator.counts_per_turn, name
+        assert driver.centre_count == simulator.zero_counts, name
+        assert driver.velocity_unit_rad_per_s == pytest.approx(simulator.velocity_unit_rad_per_s), name
+        assert driver.acceleration_unit_rad_per_s2 == pytest.approx(simulator.acceleration_unit_rad_per_s2), (
+            name
+        )
+        assert simulator.firmware >= driver.watchdog_firmware, name
+        limits = [simulator.by_name[f"{end}_position_limit"] for end in ("min", "max")]
+        assert {(limit.low, limit.high) for limit in limits} == {(driver.low_count, driver.high_count)}, name
+        if driver.current_unit_A is None:
+            assert "present_current" not in simulator.by_name, name
+        else:
+            assert driver.current_unit_A == simulator.current_unit_a, name
+            assert driver.most_current_counts == simulator.by_name["current_limit"].high, name
 
 
-@pytest.mark.parametrize("name", ours.MODELS)
-def test_its_registers(name: str) -> None:
-    driver, simulator = ours.MODELS[name], theirs.model_named(name)
-    for register in driver.registers.values():
-        if register.name in CURRENT and driver.current_unit_A is None:
-            continue
-        other = simulator.by_name[NAMES.get(register.name, register.name)]
-        assert (register.address, register.size) == (other.address, other.size), register.name
-        assert register.permanent == (other.address < simulator.ram_from), register.name
-        if other.low < 0:
-            assert register.signed, register.name
+def test_its_registers() -> None:
+    for name in ours.MODELS:
+        driver, simulator = ours.MODELS[name], theirs.model_named(name)
+        for register in driver.registers.values():
+            if register.name in CURRENT and driver.current_unit_A is None:
+                continue
+            other = simulator.by_name[NAMES.get(register.name, register.name)]
+            assert (register.address, register.size) == (other.address, other.size), register.name
+            assert register.permanent == (other.address < simulator.ram_from), register.name
+            if other.low < 0:
+                assert register.signed, register.name
 
 
-@pytest.mark.parametrize("name", ours.MODELS)
-def test_what_is_read_for_a_register_has_no_gaps_that_a_servo_refuses(name: str) -> None:
-    driver, simulator = ours.MODELS[name], theirs.model_named(name)
-    for register in driver.registers.values():
-        if register.name in CURRENT and driver.current_unit_A is None:
-            continue
-        first, length = register.window
-        assert first <= register.address, register.name
-        assert register.address + register.size <= first + length, register.name
-        assert all(at in simulator.by_byte for at in range(first, first + length)), register.name
+def test_what_is_read_for_a_register_has_no_gaps_that_a_servo_refuses() -> None:
+    for name in ours.MODELS:
+        driver, simulator = ours.MODELS[name], theirs.model_named(name)
+        for register in driver.registers.values():
+            if register.name in CURRENT and driver.current_unit_A is None:
+                continue
+            first, length = register.window
+            assert first <= register.address, register.name
+            assert register.address + register.size <= first + length, register.name
+            assert all(at in simulator.by_byte for at in range(first, first + length)), register.name
 
 
 @pytest.mark.parametrize("map_name", ["X", "P"])
