@@ -88,6 +88,9 @@ def test_every_head_of_this_repository_can_go_through_it() -> None:
     assert COUNTS.keys() == HEADS.keys()
 
 
+@pytest.mark.long(
+    2, "each runs the contract of heads once more, from a process of its own, for 20 s and more"
+)
 def test_a_head_of_this_repository_goes_through_it(
     simulated_line: tuple[str, str], repository: Path, tmp_path: Path
 ) -> None:

@@ -1,4 +1,4 @@
-"""`mastctl servo`: finding, reading, numbering and trying simulated servos behind a pseudo terminal."""
+"""`mastctl servo`: finding, reading, numbering and trying simulated servos on a turned clock."""
 
 from __future__ import annotations
 
@@ -6,21 +6,20 @@ import json
 import math
 import re
 import signal
-import time
 from collections.abc import Iterator
 from typing import Any
 
 import pytest
 
-from drivers.clock import SystemClock
-from drivers.dynamixel import models, trial
+from drivers.dynamixel import models, trial, workshop
 from drivers.dynamixel.link import Link
 from drivers.errors import HardwareFault, OutOfRange, WrongDevice
 from drivers.sim.pan_tilt import AxisSettings
 from drivers.sim.wire.axis import WireAxis
 from drivers.sim.wire.dynamixel_bus import DynamixelBus
 from drivers.sim.wire.dynamixel_servo import OVERLOAD, SimulatedServo
-from drivers.sim.wire.line import PtyLine
+from drivers.sim.wire.memory_line import MemoryLine
+from drivers.simulation_clock import SimulationClock
 from mastctl.cli.main import main
 
 BAUD = "1000000"
@@ -31,26 +30,22 @@ class Bench:
     """Two servos of different models on one line."""
 
     def __init__(self) -> None:
-        clock = SystemClock()
-        now_s = clock.now_s()
+        self.clock = SimulationClock(start_s=1000.0)
+        now_s = self.clock.now_s()
         self.axes = [WireAxis(PLAIN, number=n, time_s=now_s) for n in (0, 1)]
         self.servos = [
             SimulatedServo(model, i + 1, axis, settings={"baud_rate": 3}, time_s=now_s)
             for i, (model, axis) in enumerate(zip(("xm430_w350", "ph42_020_s300"), self.axes, strict=True))
         ]
-        self.line = PtyLine(DynamixelBus(self.servos), clock)
-
-
-PATIENT_S = 0.5
-"""What a reply is given here: a busy machine may hold the line's thread up for longer than 50 ms."""
+        self.line = MemoryLine(DynamixelBus(self.servos), self.clock)
 
 
 @pytest.fixture
 def bench(monkeypatch: pytest.MonkeyPatch) -> Iterator[Bench]:
-    _, never_urgent = Link.__init__.__defaults__ or ()
-    monkeypatch.setattr(Link.__init__, "__defaults__", (PATIENT_S, never_urgent))
     it = Bench()
-    with it.line:
+    monkeypatch.setattr(Link.__init__, "__kwdefaults__", {"clock": it.clock, "open_line": it.line.open})
+    monkeypatch.setattr(workshop.scan, "__defaults__", (it.clock, it.line.open))
+    with it.clock.at_work(), it.line:
         yield it
 
 
@@ -72,7 +67,7 @@ def test_scan_finds_every_servo_with_its_rate_and_moves_none(
         (2, "PH42-020-S300", 1_000_000),
     ]
     assert [s["hardware_errors"] for s in told["servos"]] == [[], ["overload"]]
-    now_s = time.monotonic()
+    now_s = bench.clock.now_s()
     assert [axis.angle_rad(now_s) for axis in bench.axes] == [0.0, 0.0]
 
 
@@ -179,12 +174,12 @@ def test_test_refuses_an_unfit_servo_and_moves_nothing(
     code, _, err = run(capsys, "test", bench.line.path, "1", "--baud", BAUD)
     assert code == 1
     assert error in err
-    assert bench.axes[0].angle_rad(time.monotonic()) == 0.0
+    assert bench.axes[0].angle_rad(bench.clock.now_s()) == 0.0
     assert bench.servos[0].table["torque_enable"] == 0
 
 
 def quiet_link(bench: Bench) -> Link:
-    return Link(bench.line.path, int(BAUD), PATIENT_S / 2)  # registers that are deaf are waited for
+    return Link(bench.line.path, int(BAUD))
 
 
 def deaf_to(bench: Bench, monkeypatch: pytest.MonkeyPatch, *registers: str) -> None:

@@ -1,11 +1,11 @@
-"""The simulated line as a plain pyserial host sees it, and what each fault of a line does to replies."""
+"""The simulated line as a plain pyserial host sees it through a kernel; what each fault does to replies."""
 
 from __future__ import annotations
 
 import socket
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import pytest
@@ -16,8 +16,7 @@ from drivers.errors import BadOptions
 from drivers.faults import PAN_TILT, FaultPanel
 from drivers.sim.wire.line import PtyLine, Reply, TcpLine
 from drivers.sim.wire.line_faults import LineFaults
-
-PATIENCE_S = 5.0
+from hil_tests.waiting import NET_S, until
 
 
 class Parrot:
@@ -60,30 +59,23 @@ def ask(host: serial.Serial, text: bytes, lines: int = 1) -> bytes:
     return b"".join(host.read_until(b"\n") for _ in range(lines))
 
 
-def wait_for(condition: Callable[[], bool]) -> None:
-    deadline_s = time.monotonic() + PATIENCE_S
-    while not condition():
-        assert time.monotonic() < deadline_s
-        time.sleep(0.005)
-
-
 def test_a_host_talks_to_the_device_and_others_find_it_after_him() -> None:
     with PtyLine(Parrot(), SystemClock()) as line:
         for _ in range(2):
-            with serial.Serial(line.path, 115200, timeout=PATIENCE_S) as host:
+            with serial.Serial(line.path, 115200, timeout=NET_S) as host:
                 assert ask(host, b"one\ntwo\n", 2) == b"one\ntwo\n"
-        with serial.Serial(line.path, 115200, timeout=PATIENCE_S) as host:
+        with serial.Serial(line.path, 115200, timeout=NET_S) as host:
             assert ask(host, b"!\n", 2) == b"!\n?\n", "the device speaks by itself"
 
 
 def test_every_byte_value_passes_unchanged() -> None:
     every = bytes(byte for byte in range(256) if byte != 10)
-    with PtyLine(Parrot(), SystemClock()) as line, serial.Serial(line.path, 115200, timeout=5) as host:
+    with PtyLine(Parrot(), SystemClock()) as line, serial.Serial(line.path, 115200, timeout=NET_S) as host:
         assert ask(host, every + b"\n") == every + b"\n"
 
 
 def test_bytes_take_their_time_both_ways() -> None:
-    with PtyLine(Parrot(9600), SystemClock()) as line, serial.Serial(line.path, 9600, timeout=5) as host:
+    with PtyLine(Parrot(9600), SystemClock()) as line, serial.Serial(line.path, 9600, timeout=NET_S) as host:
         began_s = time.monotonic()
         ask(host, b"x" * 47 + b"\n")
         assert time.monotonic() - began_s >= 2 * 48 * 10 / 9600, "10 bits a byte, there and back"
@@ -95,18 +87,18 @@ def test_a_host_at_another_baud_rate_is_not_understood() -> None:
         with serial.Serial(line.path, 115200, timeout=0.1) as host:
             assert ask(host, b"one\n") == b""
         assert device.heard == b""
-        with serial.Serial(line.path, 57600, timeout=PATIENCE_S) as host:
+        with serial.Serial(line.path, 57600, timeout=NET_S) as host:
             assert ask(host, b"one\n") == b"one\n"
     with (
         PtyLine(Parrot(57600), SystemClock(), wire_time=False) as line,
-        serial.Serial(line.path, 115200, timeout=PATIENCE_S) as host,
+        serial.Serial(line.path, 115200, timeout=NET_S) as host,
     ):
         assert ask(host, b"one\n") == b"one\n", "where bytes take no time every rate is right"
 
 
 def test_a_rate_that_no_table_of_the_kernel_has_is_understood() -> None:
     baud = 4_500_000
-    with PtyLine(Parrot(baud), SystemClock()) as line, serial.Serial(line.path, baud, timeout=5) as host:
+    with PtyLine(Parrot(baud), SystemClock()) as line, serial.Serial(line.path, baud, timeout=NET_S) as host:
         assert ask(host, b"fast\n") == b"fast\n"
 
 
@@ -115,13 +107,13 @@ def test_the_link_is_made_gone_while_hung_up_and_removed(tmp_path: Path) -> None
     link.symlink_to("/dev/pts/99999")  # left by one that was killed
     with PtyLine(Parrot(), SystemClock(), link=link) as line:
         assert line.path == str(link) and link.resolve().parent == Path("/dev/pts")
-        with serial.Serial(str(link), 115200, timeout=PATIENCE_S) as host:
+        with serial.Serial(str(link), 115200, timeout=NET_S) as host:
             line.hang_up()
             assert not link.is_symlink()
             with pytest.raises(serial.SerialException):
                 host.write(b"x\n")
         line.come_back()
-        with serial.Serial(str(link), 115200, timeout=PATIENCE_S) as host:
+        with serial.Serial(str(link), 115200, timeout=NET_S) as host:
             assert ask(host, b"again\n") == b"again\n"
     assert not link.is_symlink()
 
@@ -141,19 +133,19 @@ def test_a_link_that_cannot_be_made_is_refused(tmp_path: Path, kind: str) -> Non
 def test_tcp_greets_and_serves_one_host_at_a_time() -> None:
     with TcpLine(Parrot(), SystemClock(), banner=b"hello\n") as line:
         for _ in range(2):
-            with socket.create_connection((line.host, line.port), PATIENCE_S) as host:
+            with socket.create_connection((line.host, line.port), NET_S) as host:
                 assert host.recv(100) == b"hello\n"
-                with socket.create_connection((line.host, line.port), PATIENCE_S) as other:
+                with socket.create_connection((line.host, line.port), NET_S) as other:
                     assert other.recv(100) == b"", "taken"
                 host.sendall(b"one\n")
                 assert host.recv(100) == b"one\n"
-            wait_for(lambda: line._connection is None)
+            until(lambda: line._connection is None, "its end")
 
 
 def test_tcp_hangs_up_and_comes_back_at_the_same_port() -> None:
     with TcpLine(Parrot(), SystemClock()) as line:
         url = f"socket://127.0.0.1:{line.port}"
-        with serial.serial_for_url(url, timeout=PATIENCE_S) as host:
+        with serial.serial_for_url(url, timeout=NET_S) as host:
             assert ask(host, b"one\n") == b"one\n"
             line.hang_up()
             with pytest.raises(serial.SerialException):
@@ -161,7 +153,7 @@ def test_tcp_hangs_up_and_comes_back_at_the_same_port() -> None:
         with pytest.raises(serial.SerialException):
             serial.serial_for_url(url, timeout=0.1)
         line.come_back()
-        with serial.serial_for_url(url, timeout=PATIENCE_S) as host:
+        with serial.serial_for_url(url, timeout=NET_S) as host:
             assert ask(host, b"two\n") == b"two\n"
 
 
@@ -177,7 +169,7 @@ def test_the_observer_sees_both_sides() -> None:
     seen: list[tuple[str, bytes]] = []
     with (
         PtyLine(Parrot(), SystemClock(), observer=lambda who, data, time_s: seen.append((who, data))) as line,
-        serial.Serial(line.path, 115200, timeout=PATIENCE_S) as host,
+        serial.Serial(line.path, 115200, timeout=NET_S) as host,
     ):
         ask(host, b"one\n")
     assert b"".join(data for who, data in seen if who == "host") == b"one\n"
@@ -187,17 +179,17 @@ def test_the_observer_sees_both_sides() -> None:
 def test_the_fault_hang_up_pulls_the_cable_and_puts_it_back(panel: FaultPanel) -> None:
     with PtyLine(Parrot(), SystemClock(), panel) as line:
         panel.set(PAN_TILT, "hang_up")
-        wait_for(lambda: not Path(line.path).is_symlink())
+        until(lambda: not Path(line.path).is_symlink(), "the cable to be pulled")
         panel.clear()
-        wait_for(lambda: Path(line.path).is_symlink())
-        with serial.Serial(line.path, 115200, timeout=PATIENCE_S) as host:
+        until(lambda: Path(line.path).is_symlink(), "the cable to be back")
+        with serial.Serial(line.path, 115200, timeout=NET_S) as host:
             assert ask(host, b"one\n") == b"one\n"
 
 
 def test_a_late_reply_comes_when_the_host_has_asked_something_else(panel: FaultPanel) -> None:
     with (
         PtyLine(Parrot(), SystemClock(), panel, wire_time=False) as line,
-        serial.Serial(line.path, 115200, timeout=PATIENCE_S) as host,
+        serial.Serial(line.path, 115200, timeout=NET_S) as host,
     ):
         panel.set(PAN_TILT, "late", delay_s=0.2)
         assert ask(host, b"one\ntwo\n", 2) == b"two\none\n"
