@@ -7,7 +7,6 @@ import fcntl
 import os
 import socket
 import subprocess
-import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -15,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from calib.files.mast_file import save_rig
+from hil_tests import forks
 from hil_tests.mastctl.service_fakes import CONFIG, rig
 from hil_tests.waiting import NET_S, until
 from mastctl.client import Client, ClientError
@@ -96,12 +96,12 @@ def daemon_process(
     *,
     stdout: Any = subprocess.PIPE,
     stderr: Any = subprocess.PIPE,
-    prepare: Callable[[], object] = lambda: None,
+    prepare: Callable[[], object] | None = None,
 ) -> Iterator[subprocess.Popen[str]]:
-    """A daemon in a process of its own, on the devices above."""
+    """A daemon in a process of its own, on the devices above; forked, unless something is to be prepared."""
     environment = {**os.environ, "PYTHONPATH": str(folder)}
-    command = [sys.executable, "-m", "mastctl", "run", "--config", str(config)]
-    with subprocess.Popen(
+    command = [*forks.MASTCTL, "run", "--config", str(config)]
+    with (subprocess.Popen if prepare else forks.Popen)(
         command, stdout=stdout, stderr=stderr, text=True, env=environment, cwd=folder, preexec_fn=prepare
     ) as made:
         try:

@@ -9,7 +9,6 @@ import signal
 import socket
 import stat
 import subprocess
-import sys
 import threading
 import time
 from collections.abc import Iterator
@@ -22,6 +21,7 @@ import pytest
 from calib.errors import BadFile
 from calib.files.mast_file import save_rig
 from drivers.errors import DriverError
+from hil_tests import forks
 from hil_tests.mastctl.outside_daemon import write_config as outside_config
 from hil_tests.mastctl.service_fakes import (
     CONFIG,
@@ -88,11 +88,13 @@ def write_config(folder: Path, listen: str) -> Path:
 
 
 @contextmanager
-def process(folder: Path, *words: str) -> Iterator[subprocess.Popen[str]]:
+def process(
+    folder: Path, *words: str, popen: type[subprocess.Popen[str]] = forks.Popen
+) -> Iterator[subprocess.Popen[str]]:
     """``mastctl`` in a process of its own."""
     environment = {**os.environ, "PYTHONPATH": str(folder)}
-    with subprocess.Popen(
-        [sys.executable, "-m", "mastctl", *words],
+    with popen(
+        [*forks.MASTCTL, *words],
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
@@ -118,7 +120,7 @@ def test_a_signal_ends_the_daemon_cleanly_with_the_mast_stopped(
     tmp_path: Path, number: signal.Signals
 ) -> None:
     config = write_config(tmp_path, "{port: 0}")
-    with process(tmp_path, "run", "--config", str(config)) as daemon:
+    with process(tmp_path, "run", "--config", str(config), popen=subprocess.Popen) as daemon:
         url = first_line(daemon).removesuffix("\n")
         assert url.startswith("http://127.0.0.1:")
         with Client(url) as client:

@@ -7,7 +7,6 @@ import os
 import signal
 import socket
 import subprocess
-import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -16,6 +15,7 @@ import pytest
 import serial
 from dynamixel_sdk import PacketHandler, PortHandler
 
+from hil_tests import forks
 from hil_tests.waiting import NET_S
 from mastctl.cli.main import main
 
@@ -43,8 +43,8 @@ class Sim:
 
 @contextmanager
 def sim(repository: Path, *words: str) -> Iterator[Sim]:
-    process = subprocess.Popen(
-        [sys.executable, "-m", "mastctl", "sim", *words],
+    process = forks.Popen(
+        [*forks.MASTCTL, "sim", *words],
         cwd=repository,
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,

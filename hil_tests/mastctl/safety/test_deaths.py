@@ -10,7 +10,6 @@ import resource
 import signal
 import socket
 import subprocess
-import sys
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -20,6 +19,7 @@ from typing import Any
 import pytest
 
 from calib.files.mast_file import save_rig
+from hil_tests import forks
 from hil_tests.mastctl.outside_daemon import BOUND_S, Pipe, daemon_process, free_port, line
 from hil_tests.mastctl.service_fakes import eventually, rig
 from mastctl.client import Client, ClientError
@@ -65,8 +65,8 @@ class Bench:
         eventually(lambda: self.pan_rad > 0.02, "the move", BOUND_S)
 
     def halt(self) -> subprocess.CompletedProcess[str]:
-        command = [sys.executable, "-m", "mastctl", "halt", "--config", str(self.config), "--json"]
-        return subprocess.run(command, capture_output=True, text=True, timeout=BOUND_S, check=False)
+        command = [*forks.MASTCTL, "halt", "--config", str(self.config), "--json"]
+        return forks.run(command, timeout=BOUND_S)
 
 
 @pytest.fixture(params=DRIVERS)

@@ -23,6 +23,7 @@ from drivers import open_hardware as door
 from drivers.absence import FIRST_WAIT_S, LONGEST_WAIT_S
 from drivers.errors import BadFrame, BadOptions, DriverError, LineLost, NoReply
 from drivers.interfaces import Frame
+from hil_tests import forks
 from hil_tests.mastctl.service_fakes import FakeCamera, FakeHead, Hang, rig
 from hil_tests.waiting import NET_S, until
 from mastctl.cli.main import main
@@ -287,8 +288,8 @@ def test_every_ending_signal_ends_a_start_that_hangs_in_a_factory(tmp_path: Path
     )
     text = configuration(tmp_path).read_text().replace("bench_of_test:head", "hanging:head")
     (tmp_path / "daemon.yaml").write_text(text)
-    run = subprocess.Popen(
-        [sys.executable, "-m", "mastctl", "run", "--config", str(tmp_path / "daemon.yaml")],
+    run = forks.Popen(
+        [*forks.MASTCTL, "run", "--config", str(tmp_path / "daemon.yaml")],
         cwd=tmp_path,
         env={"PYTHONPATH": str(tmp_path), "PATH": "/usr/bin:/bin"},
         stderr=subprocess.PIPE,
