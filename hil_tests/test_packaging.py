@@ -8,7 +8,6 @@ import re
 import signal
 import subprocess
 import sys
-import time
 import zipfile
 from contextlib import suppress
 from dataclasses import dataclass
@@ -16,10 +15,10 @@ from pathlib import Path
 
 import pytest
 
-INSTALL_TIMEOUT_S = 600
-DEMO_TIMEOUT_S = 600
-PROJECT_TIMEOUT_S = 600
-LEFT_WITHIN_S = 30.0  # half a second is meant; the machine may be busy
+from hil_tests.waiting import until
+
+TIMEOUT_S = 600.0
+WHOLE = pytest.mark.long(1, "the whole demo and a whole project on the installed package")
 
 
 def run(*command: str | Path, timeout_s: float, **options: object) -> subprocess.CompletedProcess[str]:
@@ -39,7 +38,7 @@ def wheel(repository: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("dist")
     run(
         sys.executable, "-m", "build", "--no-isolation", "--outdir", out, repository,
-        timeout_s=INSTALL_TIMEOUT_S,
+        timeout_s=TIMEOUT_S,
     )  # fmt: skip
     assert len(list(out.glob("mastctl-*.tar.gz"))) == 1
     (built,) = out.glob("mastctl-*.whl")
@@ -82,7 +81,7 @@ def installed(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Installe
     if not wheels.is_dir():
         pytest.skip(f"no folder of wheels at {wheels}: tools/setup makes it")
     environment = tmp_path_factory.mktemp("installed") / "environment"
-    run(sys.executable, "-m", "venv", environment, timeout_s=INSTALL_TIMEOUT_S)
+    run(sys.executable, "-m", "venv", environment, timeout_s=TIMEOUT_S)
     clean = {
         key: value
         for key, value in os.environ.items()
@@ -92,42 +91,18 @@ def installed(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Installe
     run(
         environment / "bin" / "pip", "install", "-q", "--no-compile", "--no-index", "--find-links", wheels,
         f"{wheel}[sim,report]", "pytest", "pytest-xdist",
-        timeout_s=INSTALL_TIMEOUT_S, env=clean,
+        timeout_s=TIMEOUT_S, env=clean,
     )  # fmt: skip
     return Installed(environment, clean)
 
 
-def test_installed_wheel_runs_the_demo_from_another_folder(installed: Installed, tmp_path: Path) -> None:
-    elsewhere = tmp_path / "elsewhere"
-    elsewhere.mkdir()
-    done = run(
-        installed.program("mastctl"), "demo", "--targets", "1", "--out", "demo", "--json",
-        timeout_s=DEMO_TIMEOUT_S, env=installed.environ, cwd=elsewhere,
-    )  # fmt: skip
-    distances = json.loads(done.stdout)["distances"]
-    assert [row["distance_m"] for row in distances] == [10.0, 6.0, 2.0]
-    assert all(row["targets"] == 1 for row in distances)
-    page = (elsewhere / "demo" / "report.html").read_text(encoding="utf-8")
-    assert page.endswith("</html>\n") and "Every target" in page and 'src="data:image/png;base64,' in page
-
-
-def test_the_installed_command_checks_a_driver_and_a_daemon(installed: Installed, tmp_path: Path) -> None:
+def test_the_installed_command_points_a_small_rover_and_checks_it(
+    installed: Installed, tmp_path: Path
+) -> None:
     mastctl, how = installed.program("mastctl"), {"env": installed.environ, "cwd": tmp_path}
-    words = (
-        "conform",
-        "--driver",
-        "sim",
-        "--head",
-        "--only",
-        "head.reading",
-        "--only",
-        "head.move",
-        "--json",
-    )
-    told = json.loads(run(mastctl, *words, timeout_s=DEMO_TIMEOUT_S, **how).stdout)
-    assert told["conforms"] and told["passed"] == 2
+    assert "usage: mastctl" in run(mastctl, "--help", timeout_s=TIMEOUT_S, **how).stdout
     rig = ("sim", "new", "rig", "--size", "320x240", "--view-deg", "40", "--speed", "max")
-    run(mastctl, *rig, timeout_s=DEMO_TIMEOUT_S, **how)
+    run(mastctl, *rig, timeout_s=TIMEOUT_S, **how)
     config = tmp_path / "rig" / "config.yaml"
     config.write_text(config.read_text().replace("port: 8420", "port: 0"))
     daemon = subprocess.Popen(
@@ -137,12 +112,50 @@ def test_the_installed_command_checks_a_driver_and_a_daemon(installed: Installed
         try:
             assert daemon.stdout is not None
             url = daemon.stdout.readline().strip()
+            words = ("--url", url, "--targets", "1", "--distances", "6", "--out", "pointed", "--json")
+            pointed = json.loads(
+                run(mastctl, "experiment", "pointing", *words, timeout_s=TIMEOUT_S, **how).stdout
+            )
             words = ("conform", url, "--junit", "report.xml", "--json")
-            told = json.loads(run(mastctl, *words, timeout_s=DEMO_TIMEOUT_S, **how).stdout)
+            told = json.loads(run(mastctl, *words, timeout_s=TIMEOUT_S, **how).stdout)
         finally:
             daemon.terminate()
+    assert [(row["distance_m"], row["targets"], row["failed"]) for row in pointed["distances"]] == [
+        (6.0, 1, 0)
+    ]
+    assert_report(tmp_path / "pointed" / "report.html")
     assert told["conforms"] and told["passed"] > 30 and told["failed"] == 0
     assert (tmp_path / "report.xml").stat().st_size > 1000
+
+
+def assert_report(path: Path) -> None:
+    page = path.read_text(encoding="utf-8")
+    assert page.endswith("</html>\n") and "Every target" in page and 'src="data:image/png;base64,' in page
+
+
+@WHOLE
+def test_installed_wheel_runs_the_demo_from_another_folder(installed: Installed, tmp_path: Path) -> None:
+    elsewhere = tmp_path / "elsewhere"
+    elsewhere.mkdir()
+    done = run(
+        installed.program("mastctl"), "demo", "--targets", "1", "--out", "demo", "--json",
+        timeout_s=TIMEOUT_S, env=installed.environ, cwd=elsewhere,
+    )  # fmt: skip
+    distances = json.loads(done.stdout)["distances"]
+    assert [row["distance_m"] for row in distances] == [10.0, 6.0, 2.0]
+    assert all(row["targets"] == 1 for row in distances)
+    assert_report(elsewhere / "demo" / "report.html")
+
+
+@WHOLE
+def test_the_installed_command_checks_a_driver(installed: Installed, tmp_path: Path) -> None:
+    only = ("--only", "head.reading", "--only", "head.move")
+    done = run(
+        installed.program("mastctl"), "conform", "--driver", "sim", "--head", *only, "--json",
+        timeout_s=TIMEOUT_S, env=installed.environ, cwd=tmp_path,
+    )  # fmt: skip
+    told = json.loads(done.stdout)
+    assert told["conforms"] and told["passed"] == 2
 
 
 FAULT_ROW = re.compile(r"^\| `(\w+)` \| `([^`]+)` \| `?([\w.]+)`? \|$", re.MULTILINE)
@@ -167,7 +180,6 @@ def test_row(mast_client, fault, device, words, ends_with):
 """
 
 STAYS = """
-import time
 
 def test_stays(mast_daemon):
     print(mast_daemon, flush=True)
@@ -193,17 +205,19 @@ def project(repository: Path, tmp_path: Path) -> Path:
     return tmp_path
 
 
+@WHOLE
 def test_an_outside_project_is_tested_in_parallel_and_nothing_is_left(
     installed: Installed, project: Path
 ) -> None:
     done = run(
         installed.program("pytest"), "-n", "2", "--durations=8",
-        timeout_s=PROJECT_TIMEOUT_S, env=installed.environ, cwd=project,
+        timeout_s=TIMEOUT_S, env=installed.environ, cwd=project,
     )  # fmt: skip
     assert re.search(r"\b\d\d passed in", done.stdout), done.stdout
     assert installed.processes() == []
 
 
+@WHOLE
 @pytest.mark.parametrize("workers", ["0", "1"])
 def test_nothing_is_left_when_pytest_is_killed(installed: Installed, tmp_path: Path, workers: str) -> None:
     (tmp_path / "test_stays.py").write_text(STAYS)
@@ -215,13 +229,16 @@ def test_nothing_is_left_when_pytest_is_killed(installed: Installed, tmp_path: P
         )  # fmt: skip
     with pytest_process:
         try:
-            until_s = time.monotonic() + PROJECT_TIMEOUT_S
-            while not any("mastctl.testing.serve" in line for line in installed.processes()):
-                assert pytest_process.poll() is None and time.monotonic() < until_s, log.read_text()
-                time.sleep(0.1)
+            until(
+                lambda: pytest_process.poll() is not None or serving(installed),
+                "the daemon serves",
+                TIMEOUT_S,
+            )
+            assert pytest_process.poll() is None, log.read_text()
         finally:
             pytest_process.send_signal(signal.SIGKILL)
-    until_s = time.monotonic() + LEFT_WITHIN_S
-    while installed.processes():
-        assert time.monotonic() < until_s, installed.processes()
-        time.sleep(0.1)
+    until(lambda: not installed.processes(), "nothing runs any more")
+
+
+def serving(installed: Installed) -> bool:
+    return any("mastctl.testing.serve" in line for line in installed.processes())

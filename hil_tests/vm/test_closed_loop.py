@@ -9,19 +9,14 @@ import numpy as np
 from tools.closed_loop.__main__ import through_devices
 
 TIMEOUT_S = 900.0
-TOLD = ("no_reply", "no_fresh_frame", "bad_reply: pan_tilt: the joint readings around", "target_not_found")
-"""How a target fails when the machine is held up for a second by others, or when noise chooses a pixel
-at a rock's edge, whose match in the other eye stays undecided: told, and nothing wrong measured."""
 
 
 def test_targets_land_where_they_should_through_real_devices(vm_kernel: Path, tmp_path: Path) -> None:
     options = ["--targets", "3", "--distances", "6", "--seed", "1"]
     record = through_devices(vm_kernel, tmp_path, options, TIMEOUT_S)
     assert record["hardware"] == "real" and len(record["records"]) == 3
-    landed = [target for target in record["records"] if not target["error"]]
-    lost = [target["error"] for target in record["records"] if target["error"]]
-    assert len(lost) <= 1 and all(error.startswith(TOLD) for error in lost), lost
-    for target in landed:
+    for target in record["records"]:
+        assert not target["error"], target
         assert len(target["residuals_px"]) == 2
         measured, true = np.array(target["residuals_px"]), np.array(target["true_px"])
         # In memory the first pointing is off by 0.05 to 0.15 px here, the second by 0.01 to 0.04.

@@ -22,7 +22,6 @@ from calib.fit.start_values import SurveyNotFitted
 from calib.survey import Sigma, Survey
 from drivers.sim_survey.survey import SurveyPlan
 from hil_tests.mastctl.calibration.survey_world import RIG_FILE
-from hil_tests.mastctl.experiment.dask_workers import two_dask_workers
 from mastctl.calibration.run import FITS
 from mastctl.cli.main import main
 from mastctl.experiment.calibration import CalibrationExperiment, survey_tasks
@@ -172,24 +171,6 @@ def test_dask_without_its_package_is_refused_plainly(
     error = json.loads(capsys.readouterr().out)["error"]
     assert error["code"] == "no_executor"
     assert "pip install distributed" in error["message"]
-
-
-def test_two_processes_and_a_dask_cluster_of_two_workers_give_the_same_bits(
-    experiment: CalibrationExperiment,
-) -> None:
-    with open_executor("local", 2) as executor:
-        here = run(executor)
-    with two_dask_workers() as address, open_executor(f"dask:{address}") as executor:
-        there = run(executor)
-    for one, other in zip(here.outcomes, there.outcomes, strict=True):
-        assert one.mast.tobytes() == other.mast.tobytes()
-        assert one.sigma.tobytes() == other.sigma.tobytes()
-        for name in ("pointing_px", "exact_px", "handoff_px"):
-            mine, theirs = getattr(one, name), getattr(other, name)
-            assert {key: errors.tobytes() for key, errors in mine.items()} == {
-                key: errors.tobytes() for key, errors in theirs.items()
-            }
-    assert numbers(here) == numbers(there) == numbers(experiment)
 
 
 def test_a_silent_scheduler_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:

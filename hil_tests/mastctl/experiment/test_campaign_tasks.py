@@ -4,22 +4,12 @@ from __future__ import annotations
 
 import subprocess
 import sys
-from collections.abc import Mapping
-from concurrent.futures import Executor
-from contextlib import nullcontext
-from dataclasses import is_dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 
-from calib.files.mast_file import load_rig
-from drivers.sim.pan_tilt import PRESETS
 from hil_tests.mastctl.calibration.survey_world import RIG_FILE
-from hil_tests.mastctl.experiment.dask_workers import two_dask_workers
-from mastctl.experiment.executors import open_executor
-from mastctl.experiment.tasks import Work
 from tools.campaigns import (
     dots,
     handoff,
@@ -104,45 +94,3 @@ def test_walks_are_added_up() -> None:
 def test_blocks_of_cases_have_draws_of_their_own() -> None:
     first, second = (pointing.run_block(pointing.Block(1, start, 1))[0].case for start in (0, 1000))
     assert not np.allclose(first.pixel_px, second.pixel_px)
-
-
-def small_works() -> list[Work[Any, Any]]:
-    """Two tasks of each campaign that draws its cases, as small as they come."""
-    rig, head, stress = load_rig(RIG_FILE).rig, PRESETS["ptu_d46_70"], dots.STRESSES["none"]
-    tasks = {
-        dots.run_cell: [dots.Cell(1290.0, 3.0, tilt, 1, 1, stress, True) for tilt in (0.0, 30.0)],
-        refine.run_block: [refine.Block(rig, (2.0, 2.0), 1.0, n, 1, 9, 0.2, 0.4, 1) for n in (0, 10)],
-        render_bias.run_row: [render_bias.Row("flat", "hazcam turned", 2.0, n, 1, 2, 1) for n in (1, 2)],
-        life.offs: [life.Head("few or more", head, moves, 1) for moves in (2, 3)],
-        keep_out.run_case: [keep_out.Case(f"suite/{name}", True) for name in "ab"],
-        match_sigma.run_look: [match_sigma.Look(rig, 0.5, 1, number, 1) for number in (0, 1)],
-    }
-    return [Work(function, pair, lambda _: "small") for function, pair in tasks.items()]
-
-
-def results_in(executor: Executor) -> list[Any]:
-    """What they come to, but for the time that finding dots takes."""
-    dots_found, *others = [work.run(lambda: nullcontext(executor)) for work in small_works()]
-    untimed = [[replace(one, seconds=0.0) for one in cell.outcomes] for cell in dots_found]
-    return [untimed, [cell.pictures for cell in dots_found], *others]
-
-
-def values(result: Any) -> Any:
-    """Nested lists of numbers, words and arrays."""
-    if is_dataclass(result):
-        return [values(one) for one in vars(result).values()]
-    if isinstance(result, Mapping):
-        return [[str(key), values(one)] for key, one in result.items()]
-    return [values(one) for one in result] if isinstance(result, (list, tuple)) else result
-
-
-def test_campaigns_come_to_the_same_bits_in_one_process_and_in_a_cluster_of_two_workers() -> None:
-    with two_dask_workers() as address:
-        found = []
-        for place in (("local", 1), (f"dask:{address}", None)):
-            with open_executor(*place) as executor:
-                found.append(values(results_in(executor)))
-    here, there = found
-    np.testing.assert_equal(there, here)
-    _, pictures, *_ = here
-    assert len(pictures) == 2 and pictures[0] != pictures[1]

@@ -3,54 +3,12 @@
 from __future__ import annotations
 
 import json
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from hil_tests.mastctl.experiment.dask_workers import two_dask_workers
-from mastctl.cli.experiment_simulated import (
-    HandoffTask,
-    PointingTask,
-    Rover,
-    joined_handoffs,
-    joined_pointings,
-    one_handoff,
-    one_pointing,
-)
 from mastctl.cli.main import main
-from mastctl.experiment.executors import open_executor
-from mastctl.experiment.tasks import Kept, Work
-
-ROVER = Rover("ptu_d46_70", seed=5)
-POINTINGS = tuple(PointingTask(ROVER, 2.0, index) for index in range(2))
-HANDOFF = HandoffTask(ROVER, "navcam", 0, 0.2)
-
-
-def results(executor: Any, pointings: tuple[PointingTask, ...], kept: Kept | None = None) -> dict[str, Any]:
-    """What the tasks came to, as their records say it."""
-    pointed = Work(one_pointing, pointings, str).run(executor, kept)
-    handed = Work(one_handoff, [HANDOFF], str).run(executor, kept)
-    by_index = sorted(pointed, key=lambda part: part.records[0].index)
-    return {
-        "pointing": joined_pointings(by_index).as_json(),
-        "landings": [part.records[0].landings for part in by_index],
-        "hand-off": joined_handoffs(handed).as_json(),
-        "pixels": [[(one.geometric.pixel_px.tobytes(), one.refined.pixel_px.tobytes()) for one in r.handed]
-                   for r in handed[0].records],
-    }  # fmt: skip
-
-
-def test_two_processes_and_a_cluster_of_two_workers_give_the_same_bits(tmp_path: Path) -> None:
-    here = results(partial(open_executor, "local", 2), POINTINGS)
-    with two_dask_workers() as address:
-        there = results(partial(open_executor, f"dask:{address}"), POINTINGS[::-1])
-    assert here == there
-    assert here["pointing"]["distances"][0]["targets"] == 2
-    assert here["pointing"]["distances"][0]["failed"] == 0
-    first, second = here["landings"]
-    assert first != second, "each target has its own draw"
 
 
 @pytest.mark.parametrize("kind", ["pointing", "handoff"])

@@ -22,13 +22,11 @@ import pytest
 from calib.files.mast_file import load_rig
 from calib.mast.rig import Rig
 from hil_tests.mastctl.calibration.survey_world import RIG_FILE
-from hil_tests.mastctl.experiment.dask_workers import two_dask_workers
 from hil_tests.mastctl.experiment.toy_tasks import Draw, broken_when_odd, calls, drawn, drawn_or_stuck
 from mastctl.cli.main import main
 from mastctl.experiment import tasks
 from mastctl.experiment.calibration import survey_tasks
 from mastctl.experiment.calibration_survey import one_survey
-from mastctl.experiment.executors import open_executor
 from mastctl.experiment.tasks import Kept, OtherProgram, TaskFailed, Work
 
 
@@ -219,32 +217,6 @@ def test_a_killed_run_keeps_what_was_done_and_leaves_no_process(tmp_path: Path) 
 COVERAGE = ["experiment", "calibration", "--study", "prisms", "--surveys", "1", "--targets", "2", "--json"]
 
 
-def told(capsys: pytest.CaptureFixture[str], *words: str) -> dict[str, Any]:
-    assert main([*COVERAGE, *words]) == 0
-    return dict(json.loads(capsys.readouterr().out))
-
-
-def test_tasks_run_one_by_one_give_the_same_document_as_two_workers_and_a_cluster(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """As a batch system runs them; then all together, here and on two workers of a cluster."""
-    kept = ("--results", str(tmp_path / "kept"))
-    listed = told(capsys, "--list-tasks", *kept)["tasks"]
-    assert [row["done"] for row in listed] == [False, False]
-    for row in reversed(listed):
-        told(capsys, "--task", row["id"], *kept)
-    assert [row["done"] for row in told(capsys, "--list-tasks", *kept)["tasks"]] == [True, True]
-    documents = [told(capsys, *kept, "--executor", "dask:tcp://127.0.0.1:1")]  # nothing is left to run
-    documents.append(told(capsys, "--workers", "2"))
-    with two_dask_workers() as address:
-        documents.append(told(capsys, "--executor", f"dask:{address}"))
-    for document in documents:
-        document.pop("seconds")
-        for variant in document["variants"]:
-            variant.pop("fit_seconds")
-    assert documents[0] == documents[1] == documents[2]
-
-
 def test_an_interrupted_run_says_what_is_kept_and_how_to_go_on(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -268,8 +240,3 @@ def test_an_unknown_task_and_one_without_a_place_are_refused(
         assert main([*COVERAGE, *words]) == 2
         assert reason in json.loads(capsys.readouterr().out)["error"]["message"]
     assert not list(tmp_path.iterdir())
-
-
-def test_linear_algebra_of_every_executor_has_one_thread() -> None:
-    with two_dask_workers() as address, open_executor(f"dask:{address}") as executor:
-        assert set(executor.map(os.getenv, ["OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"])) == {"1"}

@@ -15,14 +15,15 @@ from drivers.v4l2.controls import get_value, list_controls, set_by_name
 from drivers.v4l2.errors import CameraBusy, NoCamera, NoPermission, NotACamera, StreamFailed
 from drivers.v4l2.find import Address, open_node
 from drivers.v4l2.node import Node
+from hil_tests.waiting import NET_S, until
 
-from .conftest import BUS, PATIENCE_S, VIVID, inject, options, until
+from .conftest import BUS, VIVID, inject, options
 
 PERIOD_S = 0.04
 
 
 def fresh(camera: V4l2Camera) -> None:
-    camera.next_frame(time.monotonic(), PATIENCE_S)
+    camera.next_frame(time.monotonic(), NET_S)
 
 
 def held() -> tuple[int, int]:
@@ -31,7 +32,7 @@ def held() -> tuple[int, int]:
 
 def test_dropped_frames_are_counted(camera: V4l2Camera) -> None:
     inject(0, "percentage_of_dropped_buffers", 50)
-    until(lambda: camera.counters.dropped > 5)
+    until(lambda: camera.counters.dropped > 5, "frames are dropped")
     fresh(camera)
     assert camera.counters.damaged == 0 and camera.counters.reopened == 0
 
@@ -39,7 +40,7 @@ def test_dropped_frames_are_counted(camera: V4l2Camera) -> None:
 def test_a_damaged_frame_is_not_given(camera: V4l2Camera) -> None:
     fresh(camera)
     inject(0, "inject_v4l2_buf_flag_error")
-    until(lambda: camera.counters.damaged == 1)
+    until(lambda: camera.counters.damaged == 1, "a frame is damaged")
     assert camera.counters.last_damage == "its driver marks it as damaged"
     fresh(camera)
     assert camera.counters.damaged == 1
@@ -48,14 +49,14 @@ def test_a_damaged_frame_is_not_given(camera: V4l2Camera) -> None:
 def test_a_fatal_streaming_error_is_got_over(camera: V4l2Camera) -> None:
     fresh(camera)
     inject(0, "inject_fatal_streaming_error")
-    until(lambda: camera.counters.reopened == 1)
+    until(lambda: camera.counters.reopened == 1, "the camera is opened again")
     fresh(camera)
 
 
 def test_a_refused_queue_is_got_over(camera: V4l2Camera) -> None:
     fresh(camera)
     inject(0, "inject_vidioc_qbuf_error")
-    until(lambda: camera.counters.reopened == 1)
+    until(lambda: camera.counters.reopened == 1, "the camera is opened again")
     fresh(camera)
 
 
@@ -84,7 +85,7 @@ def test_a_stream_error_while_it_is_opened_again_is_tried_again(camera: V4l2Came
     fresh(camera)
     inject(0, "inject_vidioc_streamon_error")
     inject(0, "inject_fatal_streaming_error")
-    until(lambda: camera.counters.reopened == 1)
+    until(lambda: camera.counters.reopened == 1, "the camera is opened again")
     fresh(camera)
 
 
@@ -93,9 +94,9 @@ def test_a_disconnected_camera_is_lost_and_comes_back_while_the_other_goes_on(ca
     fresh(camera)
     fresh(other)
     inject(0, "disconnect")
-    until(lambda: camera.capture.lost or camera.counters.reopened)
+    until(lambda: camera.capture.lost or camera.counters.reopened, "the camera is lost")
     fresh(other)
-    until(lambda: camera.counters.reopened >= 1)
+    until(lambda: camera.counters.reopened >= 1, "the camera is opened again")
     fresh(camera)
     assert other.counters.reopened == 0
     other.close()
@@ -107,13 +108,13 @@ def test_a_camera_that_is_unplugged_is_told_and_found_under_its_new_number() -> 
     holder = os.open(f"/dev/{numbers_before[BUS[0]]}", os.O_RDWR)  # keeps the old number taken
     fresh(camera)
     (VIVID / "unbind").write_text("vivid.0")
-    until(lambda: camera.capture.lost)
+    until(lambda: camera.capture.lost, "the camera is lost")
     with pytest.raises(NoCamera, match="left"):
-        camera.next_frame(time.monotonic(), PATIENCE_S)
+        camera.next_frame(time.monotonic(), NET_S)
     time.sleep(0.5)
     assert camera.capture.lost
     (VIVID / "bind").write_text("vivid.0")
-    until(lambda: camera.counters.reopened == 1)
+    until(lambda: camera.counters.reopened == 1, "the camera is opened again")
     fresh(camera)
     numbers_after = {c.bus: c.node.name for c in find.list_cameras()}
     os.close(holder)
