@@ -32,7 +32,7 @@ def marked() -> list[tuple[int, str, str]]:
 
 
 def _markers(file: Path) -> Iterator[tuple[int, str, str]]:
-    name = str(file.relative_to(REPOSITORY / "hil_tests"))
+    name = str(file.relative_to(REPOSITORY))
     place: dict[int, str] = {}
     tree = ast.parse(file.read_text())
     for node in ast.walk(tree):

@@ -15,6 +15,7 @@ from pathlib import Path
 import pytest
 import yaml
 
+from hil_tests.waiting import until
 from mastctl.cli.main import main
 
 SHIFTED = '''
@@ -127,16 +128,19 @@ def test_both_eyes_offsets_are_measured_within_three_sigma_and_told_where_they_c
     file = config(
         package, repository, {"navcam_left": {}, "navcam_right": {"early_s": 0.031, "offset_s": 0.010}}
     )
-    code, told = sync(capsys, "--config", file, "--seconds", "15")
+    code, told = sync(capsys, "--config", file, "--seconds", "12")
     assert code == 0, told
     left, right = told["cameras"]["navcam_left"], told["cameras"]["navcam_right"]
     for camera, true_s in ((left, 0.0), (right, 0.031)):
         assert abs(camera["offset_s"] - true_s) < 3 * camera["sigma_s"] + 1e-4, told
-        assert camera["sigma_s"] < 5e-4
+        assert (
+            camera["sigma_s"] < 5e-3
+        )  # what a busy machine leaves of the frames; test_camera_sync_fit is exact
     assert left["warning"] is None
-    assert re.search(
-        r"navcam_right: its pictures were taken 2[01]\.\d ms later than its stamps", right["warning"]
+    later = re.match(
+        r"navcam_right: its pictures were taken (\d+\.\d) ms later than its stamps", right["warning"]
     )
+    assert later and float(later[1]) == pytest.approx(21.0, abs=3e3 * right["sigma_s"] + 0.1)
     head = sys.modules["shifted_rig"].HEADS[-1]
     assert head.at(time.monotonic()) == (0.0, 0.0), "the head is where it was"
 
@@ -159,7 +163,10 @@ def test_pictures_older_than_their_stamps_are_told_unless_the_driver_says_how_un
     for name in ("navcam_left", "navcam_right"):
         camera = told["cameras"][name]
         assert abs(camera["offset_s"] + 0.120) < 3 * camera["sigma_s"] + 1e-4, told
-    assert "120.0 ms earlier" in told["cameras"]["navcam_left"]["warning"] or "earlier" in str(told["notes"])
+    early = re.search(r"taken (\d+\.\d) ms earlier", told["cameras"]["navcam_left"]["warning"])
+    assert early and float(early[1]) == pytest.approx(
+        120.0, abs=3e3 * told["cameras"]["navcam_left"]["sigma_s"] + 0.1
+    )
     assert told["cameras"]["navcam_right"]["warning"] is None
     assert told["cameras"]["pancam_left"]["offset_s"] is None
     assert "too plain" in told["cameras"]["pancam_left"]["failure"]
@@ -170,13 +177,12 @@ def test_a_signal_stops_the_head_where_it_is(
 ) -> None:
     file = config(package, repository, {"navcam_left": {}})
 
+    def turns() -> bool:
+        heads = getattr(sys.modules.get("shifted_rig"), "HEADS", ())  # the import may be under way
+        return bool(heads) and abs(heads[-1].at(time.monotonic())[0]) > 0.02
+
     def interrupt() -> None:
-        until_s = time.monotonic() + 60.0
-        while time.monotonic() < until_s:
-            heads = getattr(sys.modules.get("shifted_rig"), "HEADS", ())  # the import may be under way
-            if heads and abs(heads[-1].at(time.monotonic())[0]) > 0.02:
-                break
-            time.sleep(0.005)
+        until(turns, "the head turns")
         os.kill(os.getpid(), signal.SIGTERM)
 
     thread = threading.Thread(target=interrupt)
@@ -206,7 +212,7 @@ def test_stamps_of_another_clock_are_told_as_that(
     code, told = sync(capsys, "--config", file, "--seconds", "3")
     assert code == 1, told
     left, right = (told["cameras"][name]["failure"] for name in ("navcam_left", "navcam_right"))
-    assert re.search(r"stamps are 17\d{8}\.\d s later than the moments at which its frames came", left)
+    assert re.search(r"stamps are 1[67]\d{8}\.\d s later than the moments at which its frames came", left)
     assert re.search(r"stamps are 500\d\.\d s earlier than the moments at which its frames came", right)
     assert "CLOCK_MONOTONIC" in left
 
@@ -254,13 +260,12 @@ def test_a_signal_ends_it_while_a_cameras_driver_hangs(
     monkeypatch.setattr(sweep, "END_S", 0.5)
     file = config(package, repository, {"navcam_left": {"make": "Hanging"}})
 
+    def hangs() -> bool:
+        event = getattr(sys.modules.get("shifted_rig"), "HANGS", None)
+        return event is not None and event.is_set()
+
     def interrupt() -> None:
-        until_s = time.monotonic() + 60.0
-        while time.monotonic() < until_s:
-            hangs = getattr(sys.modules.get("shifted_rig"), "HANGS", None)
-            if hangs and hangs.is_set():
-                break
-            time.sleep(0.01)
+        until(hangs, "the driver hangs")
         os.kill(os.getpid(), signal.SIGTERM)
 
     thread = threading.Thread(target=interrupt)
