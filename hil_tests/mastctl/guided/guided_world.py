@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from drivers.clock import SystemClock
-from hil_tests.mastctl.service_fakes import eventually
+from hil_tests.waiting import NET_S, until
 from mastctl.commands.lease import Leases
 from mastctl.guided.guide import Door, Guide, Wanted
 from mastctl.guided.runs import Folder
@@ -73,8 +73,13 @@ class FakeStops:
 
     running: str | None = None
     reasons: list[str] = field(default_factory=list)
+    confirms: threading.Event = field(default_factory=threading.Event)
+
+    def __post_init__(self) -> None:
+        self.confirms.set()
 
     def stop(self, reason: str = "") -> str | None:
+        self.confirms.wait(NET_S)
         self.reasons.append(reason)
         was, self.running = self.running, None
         return was
@@ -102,8 +107,7 @@ class World:
             run = self.guide.run
             return run if run is not None and run.state == state else None
 
-        eventually(there, f"the run is {state}; it is {self.guide.run}")
-        run = self.guide.run
+        run = until(there, f"the run is {state}; it is {self.guide.run}")
         assert run is not None
         return run
 

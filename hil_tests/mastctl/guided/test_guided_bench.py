@@ -6,9 +6,10 @@ import os
 import signal
 from pathlib import Path
 
+import pytest
 import yaml
 
-from hil_tests.mastctl.service_fakes import eventually
+from hil_tests.waiting import until
 from mastctl.client import Client
 from tools.living_daemon import started, written
 
@@ -39,6 +40,7 @@ def children(pid: int) -> list[int]:
     return found
 
 
+@pytest.mark.long(2, "draws a bench at full speed for two daemons; each step has a quick test in test_guide")
 def test_a_run_whose_daemon_is_killed_leaves_nobody_behind_goes_on_with_the_next_and_obeys_a_stop(
     tmp_path: Path, repository: Path
 ) -> None:
@@ -49,20 +51,20 @@ def test_a_run_whose_daemon_is_killed_leaves_nobody_behind_goes_on_with_the_next
 
     with started(path) as (daemon, port), Client(f"http://127.0.0.1:{port}", name="Ana") as client:
         name = client.begin_bench("charuco_a2")["name"]
-        eventually(lambda: pictures(client) >= 2, "two pictures", BOUND_S)
+        until(lambda: pictures(client) >= 2, "two pictures", BOUND_S)
         (program,) = children(daemon.pid)
         os.kill(daemon.pid, signal.SIGKILL)
-        eventually(lambda: gone(program), "the program is over too", 30.0)
+        until(lambda: gone(program), "the program is over too")
     with started(path) as (daemon, port), Client(f"http://127.0.0.1:{port}", name="Ana") as client:
         (kept,) = client.bench()["runs"]
         assert (kept["name"], kept["state"]) == (name, "interrupted") and kept["pictures"] >= 2
         client.begin_bench(goes_on=name)
-        eventually(lambda: pictures(client) > kept["pictures"], "more", BOUND_S)
+        until(lambda: pictures(client) > kept["pictures"], "more", BOUND_S)
         (program,) = children(daemon.pid)
         run = client.bench()["run"]
         assert run is not None and any("going on with" in words for words in run["sentences"])
         client.stop()
-        eventually(lambda: client.bench()["runs"][0]["state"] == "interrupted", "it has ended", BOUND_S)
+        until(lambda: client.bench()["runs"][0]["state"] == "interrupted", "it has ended", BOUND_S)
         run = client.bench()["run"]
         assert run is not None and gone(program) and client.control() is None
         # Where the stop met a move the program itself may have been the first to say so.

@@ -26,7 +26,7 @@ class Viewer:
     messages: list[tuple[str, int, bytes]] = field(default_factory=list)
 
     def __post_init__(self) -> None:
-        self._socket = socket.create_connection(("127.0.0.1", self.port), timeout=10.0)
+        self._socket = socket.create_connection(("127.0.0.1", self.port), timeout=60.0)
         key = base64.b64encode(os.urandom(16)).decode()
         lines = (
             "GET / HTTP/1.1", f"Host: 127.0.0.1:{self.port}", "Upgrade: websocket", "Connection: Upgrade",
@@ -65,7 +65,7 @@ class Viewer:
         (number,) = (at for at, name in self._topics.items() if name == topic)
         self.tell(op="unsubscribe", subscriptionIds=[number])
 
-    def read(self, until: Any, seconds: float = 30.0) -> None:
+    def read(self, until: Any, seconds: float = 60.0) -> None:
         """Read until ``until(self)`` is true."""
         end_s = time.monotonic() + seconds
         while not until(self):

@@ -22,7 +22,7 @@ from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 
 from calib.errors import BadFile
 from hil_tests.mastctl.live.foxglove_client import Viewer
-from hil_tests.mastctl.recorder.recorder_world import until
+from hil_tests.waiting import until
 from mastctl.client import Client
 from mastctl.config import Config, Listen, load_config, parse_config
 from mastctl.daemon import RunningDaemon
@@ -213,9 +213,9 @@ def test_many_connections_cost_the_daemon_no_descriptor_and_the_view_comes_back(
         assert live is not None
         before = len(list(Path("/proc/self/fd").iterdir()))
         held = []
-        with contextlib.suppress(ConnectionRefusedError):  # that many make it deaf
+        with contextlib.suppress(ConnectionError):  # that many make it deaf, or end it
             for _ in range(100):
-                held.append(socket.create_connection(("127.0.0.1", port), timeout=10.0))
+                held.append(socket.create_connection(("127.0.0.1", port), timeout=60.0))
         of_the_daemon = len(list(Path("/proc/self/fd").iterdir())) - len(held)
         for one in held:
             one.close()

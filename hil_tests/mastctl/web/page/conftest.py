@@ -10,9 +10,23 @@ from typing import Any
 from urllib.parse import urlsplit
 
 import pytest
+from axe_playwright_python.sync_playwright import Axe
 from playwright.sync_api import Browser, BrowserContext, Page, sync_playwright
 
-BOUND_MS = 30_000
+from hil_tests.waiting import NET_S
+from mastctl.live import pictures
+from mastctl.web.page import page_files
+
+BOUND_MS = 1e3 * NET_S
+STALE = "const STALE_S = 1.0;"
+OLD_MS = 1e3 * (NET_S + 1.0)
+"""So far the page's clock is turned to make an image old, or a stream silent."""
+
+
+@pytest.fixture(autouse=True)
+def _few_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Drawing the usual 22 a second of each camera takes most of a browser's processor time."""
+    monkeypatch.setattr(pictures, "APART_S", 0.25)
 
 
 @pytest.fixture(scope="module")
@@ -23,7 +37,9 @@ def browser(request: pytest.FixtureRequest) -> Iterator[Browser]:
         words = "the page's tests need chromium: python -m tools.browser installs it on Debian"
         (pytest.fail if request.config.getoption("--require-vm") else pytest.skip)(words)
     with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=found, args=["--no-sandbox"])
+        browser = playwright.chromium.launch(
+            executable_path=found, args=["--no-sandbox", "--process-per-site"]
+        )
         yield browser
         browser.close()
 
@@ -55,21 +71,28 @@ class Visit:
     def choose(
         self, camera: str = "navcam_left", part: tuple[float, float] = (0.5, 0.5), press: str = "click"
     ) -> str:
-        """Choose a pixel, again where the machine was so busy that the image had grown old; what is told."""
-        for _ in range(6):
-            frame = self.frame(camera)
-            box = frame.bounding_box()
-            at = {"x": part[0] * box["width"], "y": part[1] * box["height"]}
-            getattr(frame, press)(position=at)
-            words = self.target("preview", "refused")
-            if "not of now" not in words:
-                break
-        return words
+        """Choose a pixel; what is told."""
+        frame = self.frame(camera)
+        box = frame.bounding_box()
+        getattr(frame, press)(position={"x": part[0] * box["width"], "y": part[1] * box["height"]})
+        return self.target("preview", "refused")
+
+    def wait_long(self) -> None:
+        """Turn the page's clock on by more than any image may be old; it was opened with ``turned=True``."""
+        self.page.clock.fast_forward(OLD_MS)
 
     def target(self, *states: str) -> str:
         """The words of the panel of the target, once it is in a state."""
         self.page.wait_for_selector(", ".join(f"#target[data-state={state}]" for state in states))
         return self.page.locator("#target").inner_text()
+
+    def serious(self, context: str | None = None) -> list[Any]:
+        """What axe finds that shuts somebody out, in a part of the page or all of it."""
+        return [
+            (each["id"], each["nodes"][0]["html"][:160], each["nodes"][0].get("failureSummary"))
+            for each in Axe().run(self.page, context=context).response["violations"]
+            if each["impact"] in ("serious", "critical")
+        ]
 
     def word(self, word: str) -> None:
         """Wait until the state is told in a word."""
@@ -78,15 +101,26 @@ class Visit:
 
 @pytest.fixture
 def visit(browser: Browser) -> Iterator[Callable[..., Visit]]:
-    """Opens the page; in the end nothing may have gone off the host, and the console must be silent."""
+    """Opens the page; in the end nothing may have gone off the host, and the console must be silent.
+
+    On a busy machine images come late. So they count as old after the net of 60 s, not after 1 s, and a test
+    of what is old turns the page's clock (``turned=True``).
+    """
     contexts: list[BrowserContext] = []
     made: list[Visit] = []
 
-    def opened(url: str, **options: Any) -> Visit:
+    source = page_files()["eye.js"].decode()
+    assert STALE in source
+    patient = source.replace(STALE, f"const STALE_S = {NET_S};")
+
+    def opened(url: str, turned: bool = False, **options: Any) -> Visit:
         context = browser.new_context(**{"viewport": {"width": 1400, "height": 950}, **options})
         contexts.append(context)
         context.set_default_timeout(BOUND_MS)
+        context.route("**/page/eye.js", lambda to: to.fulfill(content_type="text/javascript", body=patient))
         page = context.new_page()
+        if turned:
+            page.clock.install()
         one = Visit(page, url)
         made.append(one)
         page.on("console", lambda said: said.type == "error" and one.complaints.append(said.text))

@@ -11,13 +11,13 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from axe_playwright_python.sync_playwright import Axe
 
 from hil_tests.mastctl.guided.guided_world import BEGUN, DONE, PLACE, PROGRESS, lines
-from hil_tests.mastctl.service_fakes import FakeHardware, eventually, fake_daemon
+from hil_tests.mastctl.service_fakes import FakeHardware, fake_daemon
 from hil_tests.mastctl.web.network import network_daemon
 from hil_tests.mastctl.web.page.conftest import Visit
 from hil_tests.mastctl.web.test_bench_routes import scripted
+from hil_tests.waiting import until
 from mastctl.client import Client
 from mastctl.config import Listen, load_config
 from mastctl.daemon import RunningDaemon
@@ -45,12 +45,6 @@ AT_WORK = lines(BEGUN, PROGRESS) + "time.sleep(60)\n"
 def pair(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[BOTH]:
     with fake_daemon(monkeypatch, tmp_path) as made:
         yield made
-
-
-AWAY = """
-Object.defineProperty(document, "hidden", {configurable: true, get: () => true});
-document.dispatchEvent(new Event("visibilitychange"));
-"""
 
 
 def begin(one: Visit, board: str = "charuco_a3") -> None:
@@ -108,7 +102,7 @@ def test_from_the_button_over_two_placements_to_the_verdict_its_report_and_its_m
     one.page.wait_for_selector("#bench-use:disabled")
     assert daemon.service.masts.in_use.path.name == run.mast_file
     one.page.click("#mast-file button:has-text('Go back')")
-    eventually(lambda: daemon.service.masts.in_use.path.name == before, "the former one is in use again")
+    until(lambda: daemon.service.masts.in_use.path.name == before, "the former one is in use again")
     assert run.name in one.page.locator("#reports").inner_text()
 
 
@@ -244,46 +238,47 @@ def test_an_earlier_run_is_removed_by_a_second_press_and_its_size_was_told(pair:
     one.page.click(".bench-runs button:has-text('Remove')")
     assert len(daemon.service.guide.runs.all()) == 1, "one press removes nothing"
     one.page.click(".bench-runs button:has-text('Really remove')")
-    eventually(lambda: not daemon.service.guide.runs.all(), "the run is gone")
+    until(lambda: not daemon.service.guide.runs.all(), "the run is gone")
     one.page.wait_for_selector(".bench-runs", state="hidden")
 
 
-@pytest.mark.parametrize("scheme", ["dark", "light"])
-def test_it_goes_by_the_keyboard_alone_and_axe_finds_nothing_serious(
-    pair: BOTH, visit: Visits, scheme: str
+def test_it_goes_by_the_keyboard_alone_and_axe_finds_nothing_serious_in_dark_and_light(
+    pair: BOTH, visit: Visits
 ) -> None:
     daemon, _ = pair
     scripted(daemon, WHOLE)
-    one = visit(daemon.url, color_scheme=scheme)
+    one = visit(daemon.url)
     one.word("ready")
     one.page.locator("#bench > details:first-child > summary").focus()
     one.page.keyboard.press("Enter")
     one.page.locator(".bench-form select").focus()
     one.page.keyboard.type("ChArUco, A3")
-    for _ in range(3):
+    for there in (
+        ".bench-words:has-text('straight ahead')",
+        ".bench-words:has-text('50 deg')",
+        ".bench-grade",
+    ):
         _serious(one)
         one.page.locator(".bench-form button[type=submit], .stands").locator("visible=true").first.focus()
         one.page.keyboard.press("Enter")
-        one.page.wait_for_selector(".bench-grade, .bench-place[data-asking=true]")
-        one.page.wait_for_timeout(400)
-    one.page.wait_for_selector(".bench-grade")
+        one.page.wait_for_selector(there)
     _serious(one)
     assert one.page.locator("#said").inner_text() == "Bench calibration: verdict: trust it."
 
 
 def _serious(one: Visit) -> None:
-    found = [
-        (each["id"], each["nodes"][0]["html"][:160], each["nodes"][0].get("failureSummary"))
-        for each in Axe().run(one.page, context="#bench").response["violations"]
-        if each["impact"] in ("serious", "critical")
-    ]
-    assert not found, found
+    for scheme in ("dark", "light"):
+        one.page.emulate_media(color_scheme=scheme)
+        assert not one.serious("#bench"), scheme
 
 
+@pytest.mark.long(
+    3, "draws the whole bench at full speed, some 40 s; its parts are tested above on a program"
+)
 def test_a_simulated_bench_is_calibrated_from_the_button_to_the_verdict(
     repository: Path, tmp_path: Path, visit: Visits
 ) -> None:
-    """The program itself. The page says that it is not looked at, so that no pictures are drawn for it."""
+    """The program itself, while the page watches both cameras."""
     shutil.copy(repository / "configs/masts/bench_drawing.yaml", tmp_path)
     config = load_config(repository / "configs/bench.yaml")
     simulation = {**config.hardware.simulation, "speed": "max", "samples": 1}
@@ -298,7 +293,6 @@ def test_a_simulated_bench_is_calibrated_from_the_button_to_the_verdict(
         one = visit(daemon.url)
         one.page.context.set_default_timeout(540_000)
         opened(one)
-        one.page.evaluate(AWAY)
         wanted, pictures = one.page.locator(".bench-form input[type=number]").all()
         wanted.fill("5")
         pictures.fill("12")

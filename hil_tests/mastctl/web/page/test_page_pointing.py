@@ -7,8 +7,8 @@ from collections.abc import Callable, Iterator
 
 import pytest
 
-from hil_tests.mastctl.service_fakes import eventually
 from hil_tests.mastctl.web.page.conftest import Visit
+from hil_tests.waiting import until
 from mastctl.client import Client
 from mastctl.config import load_config
 from mastctl.daemon import RunningDaemon
@@ -53,7 +53,7 @@ def test_a_rock_is_clicked_pointed_at_and_its_residual_read(rover: RunningDaemon
         assert float(told.replace("−", "-")) == pytest.approx(value - aim, abs=6e-4)
     one.page.wait_for_selector(".eye[data-camera=navcam_left] .over .aim")
     one.page.locator("#again").click()
-    eventually(lambda: len(rover.service.operations.all()) == 2, "a second pointing was begun")
+    until(lambda: len(rover.service.operations.all()) == 2, "a second pointing was begun")
     one.target("ended")
     assert rover.service.operations.all()[0].told()["state"] == "done"
 
@@ -106,11 +106,11 @@ def test_a_box_round_a_rock_begins_a_track_that_is_drawn_in_both_eyes(
     assert row[:2] == ["0", "navcam"] and len(row) == 6
     assert "navcam" in one.page.locator("#track .strip").get_attribute("aria-label")
     one.page.get_by_role("button", name="End the track").click()
-    eventually(lambda: rover.service.tracker.status.state == "stopped", "the track has ended")
+    until(lambda: rover.service.tracker.status.state == "stopped", "the track has ended")
 
 
 def test_a_fault_from_the_drawer_is_set_told_and_cleared(rover: RunningDaemon, visit: Visits) -> None:
-    one = visit(rover.url)
+    one = visit(rover.url, turned=True)
     one.frame()
     one.page.get_by_label("Device").select_option("navcam_left")
     one.page.get_by_label("Fault", exact=True).select_option("slow")
@@ -137,7 +137,8 @@ def test_a_fault_from_the_drawer_is_set_told_and_cleared(rover: RunningDaemon, v
     one.page.get_by_label("Device").select_option("navcam_left")
     one.page.get_by_label("Fault", exact=True).select_option("off")
     one.page.get_by_role("button", name="Set", exact=True).click()
-    one.page.wait_for_selector(".eye[data-camera=navcam_left][data-stale]")
     one.page.wait_for_selector("#faults li")
+    one.wait_long()
+    one.page.wait_for_selector(".eye[data-camera=navcam_left][data-stale]")
     one.page.get_by_role("button", name="Clear all").click()
     one.frame()
