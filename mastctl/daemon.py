@@ -54,6 +54,7 @@ from mastctl.web.connections import (
 )
 from mastctl.web.entrance import Entrance
 from mastctl.web.secure import arriving
+from mastctl.web.server import Server
 from mastctl.web.sockets import LARGEST_BYTES, PING_S, Socket
 from mastctl.web.streams import Streams
 from mastctl.web.waiting import Waiting
@@ -243,14 +244,6 @@ def _let_log_stall(service: Service) -> None:
         stall_while(lambda: rover.faults.find(LOG, "stalled", clock.now_s()) is not None)
 
 
-class _Server(uvicorn.Server):
-    """uvicorn without its own signal handling: the mast is stopped first here."""
-
-    @contextlib.contextmanager
-    def capture_signals(self) -> Iterator[None]:
-        yield
-
-
 async def _serve(
     service: Service,
     listener: socket.socket,
@@ -268,12 +261,12 @@ async def _serve(
     most = most_connections()
     streams = Streams(service.machine.publisher, most // 2)
     settings = _settings(service, create_app(service, waiting, entrance, streams), most)
-    server = _Server(settings)
+    server = Server(settings)
     ending = asyncio.Event()
 
     def end() -> None:
         if ending.is_set():
-            server.force_exit = True  # asked twice: wait for nobody
+            server.force()  # asked twice: wait for nobody
         ending.set()
 
     def end_from_anywhere() -> None:
@@ -308,7 +301,7 @@ async def _serve(
     log.info("ending: the mast is stopped first")
     await stopped
     streams.end()
-    server.should_exit = True
+    server.end()
     loop.call_later(GRACE_S - 0.5, _leave, server.server_state.connections)  # before uvicorn's own impatience
     await serving
     for task in (sweeping, telling):

@@ -52,6 +52,11 @@ class Socket(WebSocketsSansIOProtocol):
         """Close it at once, whatever its client still expects."""
         self.transport.abort()
 
+    def shutdown(self) -> None:
+        """As uvicorn asks of all when the daemon ends: who tells here ends too, and says goodbye first."""
+        if self.close_sent or not self.handshake_complete:
+            super().shutdown()
+
     def pause_writing(self) -> None:
         super().pause_writing()
         self._stalled_since_s = self.loop.time()

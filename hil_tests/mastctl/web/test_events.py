@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
 import socket
 import threading
@@ -26,6 +27,7 @@ from mastctl.errors import Stopped, Unable
 from mastctl.guided.told import Run
 from mastctl.guided.told import heard as bench_heard
 from mastctl.state.publisher import TOPICS
+from mastctl.web import connections as connections_module
 from mastctl.web import sockets as sockets_module
 from mastctl.web.streams import Streams
 from tools.campaigns import fuzz_websocket
@@ -194,6 +196,35 @@ def test_it_ends_with_the_daemon_after_its_last_words(pair: BOTH, monkeypatch: p
         assert ended.value.rcvd is not None and ended.value.rcvd.code == 1001
         joined(ending)
     assert not ending.is_alive()
+
+
+def test_the_daemon_ends_by_events_whoever_is_connected(pair: BOTH, monkeypatch: pytest.MonkeyPatch) -> None:
+    daemon, _ = pair
+    slept_s: list[float] = []
+
+    async def sleep(delay_s: float, result: Any = None) -> Any:
+        slept_s.append(delay_s)
+        await plain(delay_s)
+        return result
+
+    plain = asyncio.sleep
+    with (
+        httpx.Client(base_url=f"{daemon.url}/api/v1", trust_env=False) as waits,
+        listening(daemon.url) as events,
+        socket_of(daemon.url) as line,
+    ):
+        waits.get("/status")
+        next(events)
+        line.recv()
+        monkeypatch.setattr(asyncio, "sleep", sleep)
+        ending = threading.Thread(target=daemon.close)
+        ending.start()
+        list(events)
+        with pytest.raises(ConnectionClosed):
+            list(heard(line))
+        ending.join(60.0)
+    assert not ending.is_alive()
+    assert [delay_s for delay_s in slept_s if delay_s != connections_module.SWEEP_S] == []
 
 
 def test_not_everybody_may_listen_at_once(pair: BOTH, monkeypatch: pytest.MonkeyPatch) -> None:
