@@ -115,6 +115,7 @@ def run(
 
                 def ready(_: Callable[[], None]) -> None:
                     on_ready(url)
+                    threading.Thread(target=_load_ahead, name="loading", daemon=True).start()
                     if draws_ahead:
                         _draw_ahead(service)
 
@@ -228,6 +229,11 @@ def _opened(config: Config, clock: Clock | None, folder: StateFolder | None, url
     socket_path = None if service.stop_socket is None else service.stop_socket.path
     service.folder.note_daemon(config.path, url, socket_path)
     return service
+
+
+def _load_ahead() -> None:
+    """Load what a pointing's first look needs, and neither an answer nor a stop does: it takes a moment."""
+    from scipy import ndimage, special  # noqa: F401
 
 
 def _draw_ahead(service: Service) -> None:

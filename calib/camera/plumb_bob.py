@@ -17,6 +17,7 @@ from calib.rigid import FloatArray, ReadOnlyArrays, frozen_array
 
 GRID = (25, 19)
 """Columns and rows of the pixels that the two are compared at, from edge to edge."""
+EXACT_PX = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,8 +69,6 @@ def nearest_plumb_bob(model: CameraModel) -> PlumbBob:
     ValueError
         If fewer than half of the image's pixels have a ray in front of the camera.
     """
-    from scipy.optimize import least_squares  # slow to load, and few ask for this
-
     width, height = model.size_px
     columns, rows = np.linspace(0.0, width - 1.0, GRID[0]), np.linspace(0.0, height - 1.0, GRID[1])
     pixels = np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2)
@@ -87,13 +86,17 @@ def nearest_plumb_bob(model: CameraModel) -> PlumbBob:
     def off_px(numbers: FloatArray) -> FloatArray:
         return (_pixels(numbers, directions) - pixels).ravel()
 
-    found = least_squares(off_px, start, x_scale=scale, method="lm")
-    off = np.linalg.norm(_pixels(found.x, directions) - pixels, axis=1)
-    fx, fy, cx, cy = found.x[:4]
+    numbers = start
+    if np.abs(off_px(start)).max() > EXACT_PX:
+        from scipy.optimize import least_squares  # slow to load, and a camera without a lens needs no fit
+
+        numbers = least_squares(off_px, start, x_scale=scale, method="lm").x
+    off = np.linalg.norm(_pixels(numbers, directions) - pixels, axis=1)
+    fx, fy, cx, cy = numbers[:4]
     return PlumbBob(
         (width, height),
         frozen_array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]], (3, 3)),
-        frozen_array(found.x[4:], (5,)),
+        frozen_array(numbers[4:], (5,)),
         frozen_array(axes, (3, 3)),
         float(np.sqrt(np.mean(off**2))),
         float(off.max()),

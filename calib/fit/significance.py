@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from scipy.special import chdtrc, fdtrc, ndtri
 
 from calib.rigid import FloatArray
 
@@ -31,6 +30,8 @@ def chance(chi2: float, freedom: int, scale: float = 1.0, scale_freedom: float =
         stated sigmas are too small; chi2 is then taken by it, and the F distribution counts how well the
         scale itself is known. Below one it is not used: luck makes no sigma smaller.
     """
+    from scipy.special import chdtrc, fdtrc  # slow to load, and a daemon that starts does not need it
+
     if freedom == 0:
         return 1.0
     if scale <= 1.0 or math.isinf(scale_freedom):
@@ -40,6 +41,8 @@ def chance(chi2: float, freedom: int, scale: float = 1.0, scale_freedom: float =
 
 def sigmas(probability: float) -> float:
     """Return how many sigmas a normal error is away whose chance (either side) this is; 37 at most."""
+    from scipy.special import ndtri  # slow to load, and a daemon that starts does not need it
+
     if probability <= 0.0:
         return MOST_SIGMAS
     return min(float(-ndtri(min(probability, 1.0) / 2)), MOST_SIGMAS)

@@ -7,11 +7,11 @@ stands out says that the two cameras do not mean the same rover frame (the paper
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import chdtri
 
 from calib.fit.significance import THREE_SIGMAS, chance, sigmas
 from calib.handoff.matched import MODEL_PX, MatchedHandoff
@@ -97,8 +97,9 @@ def _mean(source: str, camera: str, off_px: FloatArray, covariance_px2: FloatArr
     weights = np.linalg.inv(covariance_px2)
     apart = off_px - np.median(off_px, axis=0)
     statistics = np.einsum("ni,nij,nj->n", apart, weights, apart)
-    typical = max(1.0, float(np.median(statistics) / chdtri(2, 0.5)))
-    keep = statistics <= typical * chdtri(2, FALSE_ALARMS / len(off_px))
+    # Chi-square of two degrees of freedom is beyond -2 ln p with the chance p.
+    typical = max(1.0, float(np.median(statistics)) / (-2.0 * math.log(0.5)))
+    keep = statistics <= typical * (-2.0 * math.log(FALSE_ALARMS / len(off_px)))
     information = weights[keep].sum(axis=0)
     mean = np.linalg.solve(information, np.einsum("nij,nj->i", weights[keep], off_px[keep]))
     rest = off_px[keep] - mean

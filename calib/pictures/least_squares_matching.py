@@ -22,7 +22,6 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage
 
 from calib.pictures.warp import Grey, Surface, patch_grid
 from calib.rigid import FloatArray
@@ -97,6 +96,8 @@ def match_least_squares(
     refined
         None if it did not settle, left the image, or found nothing to hold on to.
     """
+    from scipy import ndimage  # slow to load, and a daemon that starts does not need it
+
     height, width = template.shape
     # q: from the target to each patch pixel
     offsets = patch_grid((width // 2, height // 2)) + (centre_px - target_px)
@@ -219,6 +220,8 @@ def _settled(
 
 def _gradient(values: FloatArray) -> FloatArray:
     """Return the derivatives (h, w, 2) along x and y, per pixel, of fourth order."""
+    from scipy import ndimage  # slow to load, and a daemon that starts does not need it
+
     taps = np.array([1.0, -8.0, 0.0, 8.0, -1.0]) / 12.0
     return np.stack(
         [ndimage.correlate1d(values, taps, axis=axis, mode="nearest") for axis in (1, 0)], axis=-1
@@ -257,6 +260,8 @@ def _correlation(a: FloatArray, b: FloatArray, counts: FloatArray) -> float:
 
 def _sum_of_neighbours(scores: FloatArray, reach_px: int) -> FloatArray:
     """Return Σ_i Σ_k w(k) s_i s_{i+k}ᵀ (p, p) of scores (h, w, p), w a triangle of half-width reach + 1."""
+    from scipy import ndimage  # slow to load, and a daemon that starts does not need it
+
     triangle = 1.0 - np.abs(np.arange(-reach_px, reach_px + 1)) / (reach_px + 1.0)
     spread = scores
     for axis in (0, 1):

@@ -13,7 +13,6 @@ from functools import cache, cached_property
 import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy import ndimage
 
 from calib.camera.cahvor import CameraModel
 from calib.errors import CalibError
@@ -221,6 +220,8 @@ class Surface:
     @classmethod
     def around(cls, image: Grey, low_px: ArrayLike, high_px: ArrayLike, margin_px: int = 0) -> Surface:
         """Return the spline of the image between two corners (x, y), with a margin as far as there is one."""
+        from scipy import ndimage  # slow to load, and a daemon that starts does not need it
+
         reach = SPLINE_MARGIN_PX + margin_px
         x0, y0 = np.maximum(np.floor(np.asarray(low_px)).astype(int) - reach, 0)
         x1, y1 = np.ceil(np.asarray(high_px)).astype(int) + reach + 1
@@ -229,6 +230,8 @@ class Surface:
 
     def at(self, pixels_px: FloatArray) -> NDArray[np.float64]:
         """Return the grey values (...) at pixels (..., 2); mirrored beyond the cut."""
+        from scipy import ndimage  # slow to load, and a daemon that starts does not need it
+
         places = np.stack([pixels_px[..., 1] - self.corner_px[1], pixels_px[..., 0] - self.corner_px[0]])
         values = ndimage.map_coordinates(self.coefficients, places, order=3, mode="mirror", prefilter=False)
         return np.asarray(values, dtype=np.float64)

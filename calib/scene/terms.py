@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from calib.camera.cahvor import CameraModel
 from calib.mast.joints import JOINTS_NAMES, joints_of
@@ -97,6 +96,8 @@ def corrected(rig: Rig, names: Sequence[str], values: FloatArray) -> Rig:
 
 def turned(model: CameraModel, turn_rad: FloatArray) -> CameraModel:
     """Return a camera turned about its C by a rotation vector (3,)."""
+    from scipy.spatial.transform import Rotation  # slow to load, and a daemon that starts does not need it
+
     rotation = Rotation.from_rotvec(turn_rad).as_matrix()
     return model.moved(Rigid(rotation, model.C - rotation @ model.C))
 

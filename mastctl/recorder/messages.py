@@ -15,12 +15,11 @@ from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 from google.protobuf.message import Message
 from google.protobuf.timestamp_pb2 import Timestamp
-from scipy.spatial.transform import Rotation
 
 from calib.camera.cahvor import CameraModel
 from calib.camera.plumb_bob import PlumbBob, camera_axes, nearest_plumb_bob
 from calib.mast.rig import Rig
-from calib.rigid import Rigid
+from calib.rigid import Rigid, quaternion_of
 from mastctl.as_json import as_json
 from mastctl.devices.frames import StampedFrame
 
@@ -95,7 +94,7 @@ def transforms(rig: Rig, pan_rad: float, tilt_rad: float, time_ns: int) -> Messa
 
 
 def _transform(parent: str, child: str, parent_from_child: Rigid, time_ns: int) -> FrameTransform:
-    x, y, z, w = Rotation.from_matrix(parent_from_child.rotation).as_quat().tolist()
+    w, x, y, z = quaternion_of(parent_from_child.rotation)
     message = FrameTransform(timestamp=_stamp(time_ns), parent_frame_id=parent, child_frame_id=child)
     moved = parent_from_child.translation_m.tolist()
     message.translation.x, message.translation.y, message.translation.z = moved

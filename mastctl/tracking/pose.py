@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from calib.rigid import FloatArray, Rigid
+from calib.rigid import FloatArray, Rigid, quaternion_of
 from mastctl.errors import BadRequest, NotNow
 
 STANDS_M, STANDS_RAD = 0.005, 0.001
@@ -44,12 +44,9 @@ class RoverPose:
 
     def told(self, now_s: float) -> dict[str, Any]:
         """Return it as JSON, with its age."""
-        from scipy.spatial.transform import Rotation  # slow to load, and not every command needs it
-
-        x, y, z, w = Rotation.from_matrix(self.site_from_rover.rotation).as_quat(canonical=True).tolist()
         return {
             "position_m": self.site_from_rover.translation_m.tolist(),
-            "quaternion": [w, x, y, z],
+            "quaternion": quaternion_of(self.site_from_rover.rotation),
             "time_s": self.time_s,
             "age_s": max(0.0, now_s - self.received_s),
         }

@@ -8,11 +8,12 @@ from __future__ import annotations
 
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
 from mastctl.commands.caller import Role
 from mastctl.state.standing import Word
 from mastctl.tracking.status import TrackState
+from mastctl.web.answer import ErrorTold, Told
 
 Pixel = Annotated[list[float], Field(min_length=2, max_length=2)]
 Point = Annotated[list[float], Field(min_length=3, max_length=3)]
@@ -24,13 +25,7 @@ Count = Annotated[int, Field(ge=0)]
 Json = dict[str, Any]
 
 
-class _Told(BaseModel):
-    """An answer, or a part of one. Each key is there unless it has a default; others may come later."""
-
-    model_config = ConfigDict(strict=True, allow_inf_nan=False)
-
-
-class Joints(_Told):
+class Joints(Told):
     """The head's joints as last measured, radians; ``measured_s`` of CLOCK_MONOTONIC.
 
     ``true_...`` by the mast file's ``joints``; ``..._approach``: from which side an axis came, 1 from smaller
@@ -47,7 +42,7 @@ class Joints(_Told):
     age_s: Seconds
 
 
-class BoxTold(_Told):
+class BoxTold(Told):
     """Where the head must not be: [lowest, highest] of each joint, radians."""
 
     name: str
@@ -55,7 +50,7 @@ class BoxTold(_Told):
     tilt_rad: Angles
 
 
-class SoftLimits(_Told):
+class SoftLimits(Told):
     """[lowest, highest] of each joint, radians, the fastest speed, rad/s, and where the head must not be."""
 
     pan_rad: Angles
@@ -66,7 +61,7 @@ class SoftLimits(_Told):
     keep_out: list[BoxTold]
 
 
-class Sun(_Told):
+class Sun(Told):
     """The direction that no head camera looks into; ``left_s``: how long that holds, null for good."""
 
     direction: Point
@@ -76,13 +71,13 @@ class Sun(_Told):
     holds: bool
 
 
-class LiveTold(_Told):
+class LiveTold(Told):
     """``GET /health/live``."""
 
     live: Literal[True]
 
 
-class ReadyTold(_Told):
+class ReadyTold(Told):
     """``GET /health/ready`` where commands are carried out: the state with its reason."""
 
     ready: Literal[True]
@@ -90,14 +85,14 @@ class ReadyTold(_Told):
     reason: str
 
 
-class SunTold(_Told):
+class SunTold(Told):
     """``GET /limits/sun``; null where none was told. ``boxes``: of joints, within its cone while it holds."""
 
     sun: Sun | None
     boxes: list[BoxTold]
 
 
-class SentinelTold(_Told):
+class SentinelTold(Told):
     """``GET /sentinel``: what its looks say together; ``none`` without a reference.
 
     ``reference``, ``last_look`` and ``since`` (of a change) as ISO 8601.
@@ -112,7 +107,7 @@ class SentinelTold(_Told):
     reference: str | None
 
 
-class LastResidual(_Told):
+class LastResidual(Told):
     """The last measured residual, with one sigma, and the operation that measured it."""
 
     residual_px: Pixel
@@ -120,7 +115,7 @@ class LastResidual(_Told):
     operation: str
 
 
-class MastTold(_Told):
+class MastTold(Told):
     """A mast file: its name on disk, the mast's, and the SHA-256 of its bytes."""
 
     file: str
@@ -128,7 +123,7 @@ class MastTold(_Told):
     digest: str
 
 
-class CameraTold(_Told):
+class CameraTold(Told):
     """A camera's newest frame; all null before the first."""
 
     frame_id: str | None
@@ -137,7 +132,7 @@ class CameraTold(_Told):
     age_s: Seconds | None
 
 
-class FaultTold(_Told):
+class FaultTold(Told):
     """What is wrong with a device, in plain words, for how long, and what takes it back."""
 
     device: str
@@ -147,7 +142,7 @@ class FaultTold(_Told):
     for_s: Seconds
 
 
-class PoseTold(_Told):
+class PoseTold(Told):
     """Where the rover stands in the site; ``time_s`` by the sender's clock."""
 
     position_m: Point
@@ -156,7 +151,7 @@ class PoseTold(_Told):
     age_s: Seconds
 
 
-class TrackWord(_Told):
+class TrackWord(Told):
     """The track in a word."""
 
     state: TrackState
@@ -164,7 +159,7 @@ class TrackWord(_Told):
     id: str | None
 
 
-class ControlTold(_Told):
+class ControlTold(Told):
     """Who steers, by a lease or by what runs; ``until`` by the wall clock, null for as long as it runs."""
 
     holder: str
@@ -173,13 +168,13 @@ class ControlTold(_Told):
     until: str | None
 
 
-class LeaseTold(_Told):
+class LeaseTold(Told):
     """``GET /lease``: who steers; null for nobody."""
 
     control: ControlTold | None
 
 
-class LeaseGranted(_Told):
+class LeaseGranted(Told):
     """A lease that commands carry as ``Mastctl-Lease``."""
 
     lease_id: str
@@ -188,7 +183,7 @@ class LeaseGranted(_Told):
     until: str
 
 
-class EstopHeld(_Told):
+class EstopHeld(Told):
     """The emergency stop that is latched: why, by whom, when (ISO 8601, UTC)."""
 
     reason: str
@@ -196,7 +191,7 @@ class EstopHeld(_Told):
     at: str
 
 
-class CalibrationTold(_Told):
+class CalibrationTold(Told):
     """Whether residuals are as the mast file predicts; ``since`` (ISO 8601, UTC) where they are not."""
 
     verdict: Literal["good", "drifts", "few", "unknown"]
@@ -205,7 +200,7 @@ class CalibrationTold(_Told):
     since: str | None
 
 
-class CameraMountTold(_Told):
+class CameraMountTold(Told):
     """A configured camera: where it looks, by its frame's axes, and how much it sees.
 
     ``azimuth_rad`` (to the right), ``elevation_rad`` (up) of the optical axis; ``width_rad``, ``height_rad``
@@ -223,7 +218,7 @@ class CameraMountTold(_Told):
     partner: str | None
 
 
-class RigTold(_Told):
+class RigTold(Told):
     """``GET /rig``: the configured cameras by the mast file in use, its date, its neighbours.
 
     ``made`` as the file's provenance says it; ``written_s``: when the file was, seconds since 1970 (UTC).
@@ -236,7 +231,7 @@ class RigTold(_Told):
     mast_files: list[str]
 
 
-class TurnedTold(_Told):
+class TurnedTold(Told):
     """How far a camera seems turned, by the axes of the frame that it is mounted on."""
 
     turn_rad: Point
@@ -244,7 +239,7 @@ class TurnedTold(_Told):
     log10_evidence: float
 
 
-class MeasuredTold(_Told):
+class MeasuredTold(Told):
     """A pointing that counts: where, the residual, the part that joints do not explain, its predicted sigma.
 
     ``time_s`` since 1970 (UTC); ``square``: of ``off_px`` over all that is expected, 2 on average.
@@ -283,7 +278,7 @@ class CalibrationHealthTold(CalibrationTold):
     sentinel: SentinelTold | None
 
 
-class StandingTold(_Told):
+class StandingTold(Told):
     """What the daemon is doing: the state's word, why, for how long, and what it rests on."""
 
     state: Word
@@ -295,7 +290,7 @@ class StandingTold(_Told):
     estop: EstopHeld | None
 
 
-class AxisTold(_Told):
+class AxisTold(Told):
     """How an axis of the head moves; ``count_rad`` null where nobody knows."""
 
     count_rad: float | None
@@ -326,7 +321,7 @@ class Status(StandingTold):
     uptime_s: Seconds
 
 
-class StepTold(_Told):
+class StepTold(Told):
     """One step of an operation; ``detail`` has units in its names."""
 
     name: str
@@ -336,7 +331,7 @@ class StepTold(_Told):
     detail: Json
 
 
-class PointingTold(_Told):
+class PointingTold(Told):
     """One pointing, and what was measured after it in a new picture."""
 
     commanded_pan_rad: float
@@ -358,21 +353,7 @@ class PointingTold(_Told):
     motion_evidence: dict[str, Json]
 
 
-class ErrorTold(_Told):
-    """Why something was refused: a word for programs, a sentence for people, more where there is more."""
-
-    code: str
-    message: str
-    detail: Json | None = None
-
-
-class ErrorBody(_Told):
-    """Every answer that is not a success."""
-
-    error: ErrorTold
-
-
-class OperationListed(_Told):
+class OperationListed(Told):
     """An operation without its steps; ``ended_because`` of a jog. Times of CLOCK_MONOTONIC."""
 
     id: str
@@ -398,19 +379,19 @@ class OperationTold(OperationListed):
     steps: list[StepTold]
 
 
-class Operations(_Told):
+class Operations(Told):
     """``GET /operations``: the newest first."""
 
     operations: list[OperationListed]
 
 
-class Started(_Told):
+class Started(Told):
     """What was started: the id of its operation."""
 
     id: str
 
 
-class AimTold(_Told):
+class AimTold(Told):
     """Where a target would come."""
 
     camera: str
@@ -418,14 +399,14 @@ class AimTold(_Told):
     y_px: float
 
 
-class RefusedTold(_Told):
+class RefusedTold(Told):
     """Why the head would not be sent."""
 
     code: str
     message: str
 
 
-class PreviewTold(_Told):
+class PreviewTold(Told):
     """``POST /point/preview``: what a clicked pixel shows, before anything moves."""
 
     camera: str
@@ -449,7 +430,7 @@ class PreviewTold(_Told):
     refused: RefusedTold | None
 
 
-class StopTold(_Told):
+class StopTold(Told):
     """``POST /stop``: the head has confirmed it; the operation that was stopped with it."""
 
     stopped: Literal[True]
@@ -466,14 +447,14 @@ class EstopTold(EstopHeld):
     message: str | None = None
 
 
-class ResetTold(_Told):
+class ResetTold(Told):
     """``POST /reset``: the emergency stop that was released."""
 
     latched: Literal[False]
     released: EstopHeld
 
 
-class RecordingListed(_Told):
+class RecordingListed(Told):
     """A recording on the disk: a run, what a fault kept, or the ring; size in 10⁶ bytes."""
 
     name: str
@@ -482,7 +463,7 @@ class RecordingListed(_Told):
     files: Count
 
 
-class RecorderTold(_Told):
+class RecorderTold(Told):
     """What is recorded now. ``dropped``: messages not written, by topic; ``fault``: what is wrong."""
 
     recording: bool
@@ -495,7 +476,7 @@ class RecorderTold(_Told):
     folder: str
 
 
-class Recordings(_Told):
+class Recordings(Told):
     """``GET /recordings``; ``free_mb``: of the disk, 10⁶ bytes, null if it does not say."""
 
     recordings: list[RecordingListed]
@@ -503,7 +484,7 @@ class Recordings(_Told):
     free_mb: float | None
 
 
-class RecordingEnded(_Told):
+class RecordingEnded(Told):
     """``POST /recordings/stop``: the run, its file on the daemon's machine, what it lacks."""
 
     run: str
@@ -512,7 +493,7 @@ class RecordingEnded(_Told):
     dropped: dict[str, Count]
 
 
-class JogTold(_Told):
+class JogTold(Told):
     """``POST /jog``: the jog's operation, whether the heartbeat was taken, and what holds an axis."""
 
     id: str | None
@@ -520,7 +501,7 @@ class JogTold(_Told):
     held: dict[str, str]
 
 
-class EyeTold(_Told):
+class EyeTold(Told):
     """What one eye told of the target; pixel and sigma are null without a good verdict."""
 
     frame_id: str
@@ -532,7 +513,7 @@ class EyeTold(_Told):
     correlation: float | None
 
 
-class HandoffTold(_Told):
+class HandoffTold(Told):
     """The target went from one pair to another, at a range of the new one."""
 
     from_pair: str
@@ -540,7 +521,7 @@ class HandoffTold(_Told):
     range_m: float
 
 
-class OffsetTold(_Told):
+class OffsetTold(Told):
     """What hand-offs from ``source`` to ``camera`` tell by more than chance: found less predicted."""
 
     source: str
@@ -553,14 +534,14 @@ class OffsetTold(_Told):
     sentence: str
 
 
-class SelfCheck(_Told):
+class SelfCheck(Told):
     """How the mast file in use agrees with the hand-offs."""
 
     handoffs: Count
     offsets: list[OffsetTold]
 
 
-class TrackTold(_Told):
+class TrackTold(Told):
     """``GET /track``, and each event of ``GET /track/stream``."""
 
     sequence: Count
@@ -587,21 +568,21 @@ class TrackTold(_Told):
     self_check: SelfCheck
 
 
-class PoseTaken(_Told):
+class PoseTaken(Told):
     """``POST /pose``: the look that follows, if one does, and the track."""
 
     operation: str | None
     track: TrackTold
 
 
-class MastsTold(_Told):
+class MastsTold(Told):
     """``POST /mast``: the mast file in use, and the one before it."""
 
     mast: MastTold
     former_mast: MastTold | None
 
 
-class ChangeTold(_Told):
+class ChangeTold(Told):
     """What two configurations say differently: the key, and what was and is there; null for nothing."""
 
     key: str
@@ -609,7 +590,7 @@ class ChangeTold(_Told):
     after: Any
 
 
-class ReloadTold(_Told):
+class ReloadTold(Told):
     """``POST /reload``: what changed, the mast file in use, and sentences that say what to know of it."""
 
     changed: list[ChangeTold]
@@ -617,14 +598,14 @@ class ReloadTold(_Told):
     notes: list[str]
 
 
-class StandTold(_Told):
+class StandTold(Told):
     """Where a simulated rover truly stands."""
 
     position_m: Point
     quaternion: Annotated[list[float], Field(min_length=4, max_length=4)]
 
 
-class BoardStands(_Told):
+class BoardStands(Told):
     """A board before a simulated rover: what it is, and rover_from_board."""
 
     board: dict[str, Any]
@@ -633,20 +614,20 @@ class BoardStands(_Told):
     bow_m: Annotated[list[float], Field(min_length=2, max_length=2)]
 
 
-class BoardsTold(_Told):
+class BoardsTold(Told):
     """The boards before a simulated rover, by name."""
 
     boards: dict[str, BoardStands]
 
 
-class TimeTold(_Told):
+class TimeTold(Told):
     """A simulated rover's time, seconds, and its speed, where it has one."""
 
     now_s: float
     speed: float | Literal["max"]
 
 
-class FaultSet(_Told):
+class FaultSet(Told):
     """A fault that is switched on; ``end_s`` is null for one without an end."""
 
     device: str
@@ -656,26 +637,26 @@ class FaultSet(_Told):
     end_s: float | None
 
 
-class FaultsSet(_Told):
+class FaultsSet(Told):
     """The faults that are switched on."""
 
     faults: list[FaultSet]
 
 
-class PlaceTold(_Told):
+class PlaceTold(Told):
     """A place of the head, radians as it reads them."""
 
     pan_rad: float
     tilt_rad: float
 
 
-class PlacesTold(_Told):
+class PlacesTold(Told):
     """The places that are kept, by name; ``home`` is always among them."""
 
     places: dict[str, PlaceTold]
 
 
-class ParameterTold(_Told):
+class ParameterTold(Told):
     """A parameter of a fault word: its usual value and its bounds; null for one without an end."""
 
     usual: float | None
@@ -683,20 +664,20 @@ class ParameterTold(_Told):
     most: float | None
 
 
-class WordTold(_Told):
+class WordTold(Told):
     """A fault word: what it does, in one sentence, and its parameters; the unit is in the name."""
 
     does: str
     parameters: dict[str, ParameterTold]
 
 
-class WordsTold(_Told):
+class WordsTold(Told):
     """The fault words of each simulated device."""
 
     devices: dict[str, dict[str, WordTold]]
 
 
-class TruthTold(_Told):
+class TruthTold(Told):
     """Where a point of the simulated scene truly is: in the site, in the rover frame of a frame, and in it.
 
     ``pixel_px`` is null where the camera could not see it, all three where the pixel shows the sky.
@@ -707,7 +688,7 @@ class TruthTold(_Told):
     pixel_px: Pixel | None
 
 
-class SessionTold(_Told):
+class SessionTold(Told):
     """``GET /session``: who asks, what it may do, and by which way it came.
 
     ``ends_in_s`` of a page's session; ``needs_token``: whether the daemon asks for one at all.
@@ -720,7 +701,7 @@ class SessionTold(_Told):
     needs_token: bool
 
 
-class LoggedOut(_Told):
+class LoggedOut(Told):
     """``POST /logout``."""
 
     logged_out: Literal[True]

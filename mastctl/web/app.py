@@ -10,14 +10,13 @@ from __future__ import annotations
 from functools import cache
 from importlib.metadata import version
 
-from fastapi import FastAPI
+from fastapi import FastAPI, Response
 from starlette.types import ASGIApp, Receive, Scope, Send
 
 from mastctl.service.service import Service
-from mastctl.web.answers import ErrorBody
+from mastctl.web.answer import ErrorBody
 from mastctl.web.bench import add_bench
 from mastctl.web.commands import Commands
-from mastctl.web.described import add_description
 from mastctl.web.entrance import Entrance
 from mastctl.web.estop import add_estop
 from mastctl.web.events import add_events
@@ -26,7 +25,7 @@ from mastctl.web.images import add_images
 from mastctl.web.lease import add_lease
 from mastctl.web.limits import add_limits
 from mastctl.web.page import add_page
-from mastctl.web.parts import Parts
+from mastctl.web.parts import Here, Parts
 from mastctl.web.pictures import add_pictures
 from mastctl.web.places import add_places
 from mastctl.web.recordings import add_recordings
@@ -86,7 +85,19 @@ def api() -> FastAPI:
     for add in (
         *(add_sessions, add_pointing, add_estop, add_lease, add_tracking, add_limits, add_pictures),
         *(add_places, add_recordings, add_bench, add_reload, add_simulation, add_watching, add_events),
-        *(add_images, add_page, add_description),
+        *(add_images, add_page),
     ):
         add(app)
+
+    @app.get("/openapi.json", include_in_schema=False)
+    async def told(here: Here) -> Response:
+        return Response(await here.waiting.run(_description), media_type="application/json")
+
     return app
+
+
+def _description() -> bytes:
+    """What /openapi.json tells; not for the event loop, which would let no stop through for 0.2 s."""
+    from mastctl.web.described import description  # its models are slow to load, and few ask for them
+
+    return description(api())

@@ -7,7 +7,8 @@ from typing import Annotated, Literal
 from pydantic import Field
 
 from mastctl.guided.told import MOST_CELLS, State, Step
-from mastctl.web.answers import Angles, Count, MaybePixel, Pixel, _Told
+from mastctl.web.answer import Told
+from mastctl.web.answers import Angles, Count, MaybePixel, Pixel
 
 Cells = Annotated[list[Count], Field(min_length=MOST_CELLS, max_length=MOST_CELLS)]
 Pair = Annotated[list[float], Field(min_length=2, max_length=2)]
@@ -15,7 +16,7 @@ OnCurve = Annotated[list[float], Field(min_length=2, max_length=2)]
 """Pictures of a camera, and the rms predicted with them, pixels."""
 
 
-class PlacementAsked(_Told):
+class PlacementAsked(Told):
     """Where a board is asked for, from the head's axes; ``waits``: until somebody says that it stands.
 
     ``bearing_deg`` to the right of pan zero, ``height_deg`` above the axes, ``turned_deg``: its face, to the
@@ -31,21 +32,21 @@ class PlacementAsked(_Told):
     waits: bool
 
 
-class CoverageTold(_Told):
+class CoverageTold(Told):
     """How many corners were seen in each cell of a camera's picture, 8 in a row, 6 rows."""
 
     size_px: Annotated[list[Count], Field(min_length=2, max_length=2)]
     cells: Cells
 
 
-class ReasonTold(_Told):
+class ReasonTold(Told):
     """One reason of a verdict."""
 
     grade: str
     sentence: str
 
 
-class VerdictTold(_Told):
+class VerdictTold(Told):
     """Whether to trust a calibration: ``good``, ``care``, ``bad``, and why."""
 
     grade: str
@@ -53,7 +54,7 @@ class VerdictTold(_Told):
     reasons: list[ReasonTold]
 
 
-class ResidualTold(_Told):
+class ResidualTold(Told):
     """Rms of a camera's corners: fitted, not fitted, and what was promised of those that were not."""
 
     camera: str
@@ -62,7 +63,7 @@ class ResidualTold(_Told):
     promised_px: float | None
 
 
-class BenchResult(_Told):
+class BenchResult(Told):
     """What came of a bench calibration.
 
     ``pointing_...``: corners that were pointed at, measured and promised; ``calibrated_px``, ``counts_px``:
@@ -82,7 +83,7 @@ class BenchResult(_Told):
     notes: list[str]
 
 
-class BenchRunTold(_Told):
+class BenchRunTold(Told):
     """A bench calibration as far as it is known; ``asking`` waits for a placement."""
 
     name: str
@@ -114,7 +115,7 @@ class BenchRunTold(_Told):
     report: str | None
 
 
-class BenchListed(_Told):
+class BenchListed(Told):
     """A bench calibration whose folder is there; ``size_mb``: of its pictures."""
 
     name: str
@@ -130,7 +131,7 @@ class BenchListed(_Told):
     report: str | None
 
 
-class BenchTold(_Told):
+class BenchTold(Told):
     """The bench calibration at work or the last one, those whose folders are there, and packaged boards."""
 
     run: BenchRunTold | None
@@ -141,13 +142,13 @@ class BenchTold(_Told):
     simulated: bool
 
 
-class BenchBegun(_Told):
+class BenchBegun(Told):
     """A bench calibration that has begun or goes on, is answered, or has ended."""
 
     run: BenchRunTold
 
 
-class ReportListed(_Told):
+class ReportListed(Told):
     """A report that can be read."""
 
     name: str
@@ -155,7 +156,7 @@ class ReportListed(_Told):
     written: str
 
 
-class ReportsTold(_Told):
+class ReportsTold(Told):
     """The reports, the newest first, and the folder where others may be put."""
 
     reports: list[ReportListed]

@@ -8,7 +8,7 @@ from functools import cache
 from typing import Any
 
 from fastapi import FastAPI
-from fastapi.responses import JSONResponse, Response
+from fastapi.responses import JSONResponse
 from pydantic import BaseModel
 from pydantic.json_schema import models_json_schema
 
@@ -17,7 +17,6 @@ from mastctl.web import PREFIX
 from mastctl.web import answers as told
 from mastctl.web import bench_answers as bench
 from mastctl.web.event_answers import Event
-from mastctl.web.parts import Here
 
 ANSWERS: Mapping[str, type[BaseModel]] = {
     "GET /calibration/health": told.CalibrationHealthTold,
@@ -89,18 +88,6 @@ FILES: Mapping[str, tuple[str, ...]] = {
 PICTURES = ("GET /snapshot/{camera}",)
 _ONE_MAKES_IT = threading.Lock()
 _REFERENCE = "#/components/schemas/{model}"
-
-
-def add_description(app: FastAPI) -> None:
-    """``GET /openapi.json``, of an app that has all its routes.
-
-    It is made when somebody first asks, and in a thread: that takes a tenth of a second, in which the event
-    loop would let no stop and no heartbeat through.
-    """
-
-    @app.get("/openapi.json", include_in_schema=False)
-    async def told(here: Here) -> Response:
-        return Response(await here.waiting.run(lambda: description(app)), media_type="application/json")
 
 
 def description(app: FastAPI) -> bytes:

@@ -7,6 +7,7 @@ from typing import Annotated, Literal
 from pydantic import Field, RootModel
 
 from mastctl.commands.caller import Role
+from mastctl.web.answer import Told
 from mastctl.web.answers import (
     Count,
     FaultTold,
@@ -18,7 +19,6 @@ from mastctl.web.answers import (
     Seconds,
     StandingTold,
     TrackTold,
-    _Told,
 )
 from mastctl.web.bench_answers import BenchRunTold
 
@@ -36,7 +36,7 @@ class StateTold(StandingTold):
     moving: bool
 
 
-class FrameTold(_Told):
+class FrameTold(Told):
     """The facts of a camera's newest frame, without its picture."""
 
     frame_id: str
@@ -55,7 +55,7 @@ class FrameTold(_Told):
     age_s: Seconds
 
 
-class CommandTold(_Told):
+class CommandTold(Told):
     """A command as it is recorded, or (``ended``) how the operation ended that it began."""
 
     number: Count
@@ -76,7 +76,7 @@ class CommandTold(_Told):
     code: str | None = None
 
 
-class _Event(_Told):
+class _Event(Told):
     """``sequence`` grows with each event; ``lost``: how many this listener was too slow to get, so far."""
 
     key: str

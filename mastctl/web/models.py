@@ -8,9 +8,8 @@ from typing import Annotated, Any, Literal, Self, cast
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, StringConstraints, model_validator
-from scipy.spatial.transform import Rotation
 
-from calib.rigid import Rigid
+from calib.rigid import Rigid, rotation_of
 from mastctl.commands.entry import LONGEST_DEADLINE_S
 from mastctl.commands.lease import LONGEST_S, SHORTEST_S, USUAL_S
 from mastctl.devices.sun import LEAST_CONE_RAD, WIDEST_CONE_RAD, Sun, direction_of
@@ -215,8 +214,7 @@ class PoseBody(_Strict):
 
     def pose(self, received_s: float) -> RoverPose:
         """Return it as the tracker takes it."""
-        w, x, y, z = self.quaternion
-        rotation = Rotation.from_quat([x, y, z, w]).as_matrix()
+        rotation = rotation_of(self.quaternion)
         covariance = None
         if self.covariance is not None:
             order = [3, 4, 5, 0, 1, 2]  # rotation first, as calib.tracking.track has it
@@ -335,7 +333,7 @@ class BoardBody(_Strict):
         """rover_from_board, (3, 3), where a quaternion tells it."""
         if self.quaternion is None:
             return None
-        return np.asarray(Rotation.from_quat(self.quaternion, scalar_first=True).as_matrix())
+        return rotation_of(self.quaternion)
 
 
 class TimeBody(_Strict):

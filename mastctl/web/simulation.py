@@ -7,11 +7,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 from fastapi import FastAPI, Path, Query
-from scipy.spatial.transform import Rotation
 
 from calib.boards.board_file import board_of, document_of
 from calib.errors import BadFile
-from calib.rigid import FloatArray, Rigid
+from calib.rigid import FloatArray, Rigid, quaternion_of
 from drivers.faults import BOUNDS, WHEN, FaultPanel
 from drivers.faults import Fault as SetFault
 from drivers.simulation_clock import MAX, SimulationClock
@@ -163,7 +162,7 @@ def _board_told(rover: SimulatedRover, stands: BenchBoard) -> dict[str, Any]:
     return {
         "board": document_of(stands.board),
         "position_m": pose.translation_m.tolist(),
-        "quaternion": Rotation.from_matrix(pose.rotation).as_quat(scalar_first=True).tolist(),
+        "quaternion": quaternion_of(pose.rotation),
         "bow_m": list(stands.bow_m),
     }
 
