@@ -9,9 +9,8 @@ import contextlib
 import errno
 import os
 import threading
-import time
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from itertools import pairwise
 from pathlib import Path
 
@@ -30,9 +29,9 @@ from drivers.v4l2.node import Dequeued, Identity, PictureFormat
 from drivers.v4l2.options import parse_options
 from drivers.v4l2.stamps import StampRule
 from drivers.v4l2.uevents import Uevent, UeventSocket, parse
+from hil_tests.waiting import NET_S, until
 
 SIZE_PX = (16, 8)
-PATIENCE_S = 20.0  # far longer than anything here takes on a loaded machine
 START = abi.BUF_FLAG_TIMESTAMP_MONOTONIC | abi.BUF_FLAG_TSTAMP_SRC_SOE
 
 
@@ -154,14 +153,6 @@ def held() -> tuple[int, int]:
     return len(list(Path("/proc/self/fd").iterdir())), threading.active_count()
 
 
-def until(done: Callable[[], object]) -> None:
-    """Wait for the capture thread to get there."""
-    end_s = time.monotonic() + PATIENCE_S
-    while not done():
-        assert time.monotonic() < end_s, "it did not come to that"
-        time.sleep(0.001)
-
-
 def test_it_is_a_camera(camera: V4l2Camera) -> None:
     assert isinstance(camera, Camera)
 
@@ -169,7 +160,7 @@ def test_it_is_a_camera(camera: V4l2Camera) -> None:
 def test_a_frame_carries_sequence_window_and_picture(bench: Bench, camera: V4l2Camera) -> None:
     bench.clock.time_s = 100.03
     bench.streams[0].frame(5, 100.0, level=77)
-    frame = camera.next_frame(99.9, PATIENCE_S)
+    frame = camera.next_frame(99.9, NET_S)
     assert frame.sequence == 5 and frame.image.shape == SIZE_PX[::-1] and (frame.image == 77).all()
     assert frame.mid_exposure_s - frame.exposure_s / 2 == pytest.approx(100.0)
     assert frame.mid_exposure_s + frame.exposure_s / 2 == pytest.approx(100.03)
@@ -180,38 +171,38 @@ def test_a_frame_carries_sequence_window_and_picture(bench: Bench, camera: V4l2C
 def test_an_old_frame_is_never_given(bench: Bench, camera: V4l2Camera) -> None:
     bench.clock.time_s = 101.0
     bench.streams[0].frame(0, 100.0)
-    until(lambda: camera.counters.good == 1)
+    until(lambda: camera.counters.good == 1, "good frames")
     with pytest.raises(
         NoFreshFrame, match=r"no frame exposed after 100.000 s .* is frame 0, exposed 0.000 s before"
     ):
         camera.next_frame(100.0, 0.01)  # began at that very moment, not after it
     bench.streams[0].frame(1, 100.04)
-    assert camera.next_frame(100.0, PATIENCE_S).sequence == 1
+    assert camera.next_frame(100.0, NET_S).sequence == 1
 
 
 def test_the_newest_frame_is_given_not_the_first_that_fits(bench: Bench, camera: V4l2Camera) -> None:
     bench.clock.time_s = 100.4
     for n in range(10):
         bench.streams[0].frame(n, 100.0 + 0.04 * n)
-    until(lambda: camera.counters.good == 10)
+    until(lambda: camera.counters.good == 10, "good frames")
     assert camera.next_frame(99.0, 0.0).sequence == 9
 
 
 def test_a_frame_older_than_the_next_should_be_is_waited_past(bench: Bench, camera: V4l2Camera) -> None:
     bench.clock.time_s = 100.04
     bench.streams[0].frame(0, 100.0)
-    assert camera.next_frame(99.0, PATIENCE_S).sequence == 0  # a period and 5 ms are allowed
+    assert camera.next_frame(99.0, NET_S).sequence == 0  # a period and 5 ms are allowed
     bench.clock.time_s = 100.046
     with pytest.raises(NoFreshFrame, match=r"the last good one is frame 0, 0\.046 s old"):
         camera.next_frame(99.0, 0.01)
     threading.Timer(0.05, lambda: bench.streams[0].frame(1, 100.045)).start()
-    assert camera.next_frame(99.0, PATIENCE_S).sequence == 1
+    assert camera.next_frame(99.0, NET_S).sequence == 1
 
 
 def test_a_frame_that_comes_late_is_given_to_who_waits(bench: Bench, camera: V4l2Camera) -> None:
     bench.clock.time_s = 100.5
     threading.Timer(0.05, lambda: bench.streams[0].frame(1, 100.3)).start()
-    assert camera.next_frame(100.2, PATIENCE_S).sequence == 1
+    assert camera.next_frame(100.2, NET_S).sequence == 1
 
 
 def test_a_broken_jpeg_is_damage_that_shows_when_it_is_decoded(bench: Bench) -> None:
@@ -226,7 +217,7 @@ def test_a_broken_jpeg_is_damage_that_shows_when_it_is_decoded(bench: Bench) -> 
         with pytest.raises(NoFreshFrame, match="1 came damaged"):
             camera.next_frame(99.9, 0.5)
         stream.node.put((Dequeued(1, len(whole), START, 1, 100.02), whole))
-        assert abs(int(camera.next_frame(99.9, PATIENCE_S).image.mean()) - 90) <= 2
+        assert abs(int(camera.next_frame(99.9, NET_S).image.mean()) - 90) <= 2
     finally:
         camera.close()
     assert (camera.counters.good, camera.counters.damaged) == (1, 1)
@@ -235,7 +226,7 @@ def test_a_broken_jpeg_is_damage_that_shows_when_it_is_decoded(bench: Bench) -> 
 def test_a_waiting_call_gets_the_frame_that_comes(bench: Bench, camera: V4l2Camera) -> None:
     bench.clock.time_s = 100.5
     threading.Timer(0.05, lambda: bench.streams[0].frame(3, 100.45)).start()
-    assert camera.next_frame(100.4, PATIENCE_S).sequence == 3
+    assert camera.next_frame(100.4, NET_S).sequence == 3
 
 
 def test_nothing_at_all_is_told(camera: V4l2Camera) -> None:
@@ -259,11 +250,13 @@ def test_a_damaged_frame_is_refused_counted_and_given_back(
 ) -> None:
     bench.clock.time_s = 100.1
     bench.streams[0].frame(0, 100.0)
-    until(lambda: camera.counters.good == 1)
+    until(lambda: camera.counters.good == 1, "good frames")
     bench.streams[0].frame(1, **{"stamp_s": 100.04, **damage})  # type: ignore[arg-type]
-    until(lambda: camera.counters.damaged == 1)
+    until(lambda: camera.counters.damaged == 1, "the damaged one")
     assert camera.counters.last_damage == words
-    until(lambda: bench.streams[0].node.queued == [1])  # and frame 0 is still held
+    until(
+        lambda: bench.streams[0].node.queued == [1], "its buffer is given back"
+    )  # and frame 0 is still held
     bench.clock.time_s = 100.04
     assert camera.next_frame(0.0, 0.0).sequence == 0
 
@@ -282,10 +275,10 @@ def test_a_call_that_saw_only_damage_says_so(bench: Bench, camera: V4l2Camera) -
 def test_dropped_and_late_frames_are_counted(bench: Bench, camera: V4l2Camera) -> None:
     bench.clock.time_s = 100.01
     bench.streams[0].frame(0, 100.0)
-    until(lambda: camera.counters.good == 1)
+    until(lambda: camera.counters.good == 1, "good frames")
     bench.clock.time_s = 100.2
     bench.streams[0].frame(4, 100.1)
-    until(lambda: camera.counters.good == 2)
+    until(lambda: camera.counters.good == 2, "good frames")
     counters = camera.counters
     assert (counters.dropped, counters.late) == (3, 1)
 
@@ -293,45 +286,45 @@ def test_dropped_and_late_frames_are_counted(bench: Bench, camera: V4l2Camera) -
 def test_a_lost_camera_is_told_at_once_and_opened_again(bench: Bench, camera: V4l2Camera) -> None:
     bench.clock.time_s = 100.1
     bench.streams[0].frame(41, 100.0)
-    assert camera.next_frame(0.0, PATIENCE_S).sequence == 41
+    assert camera.next_frame(0.0, NET_S).sequence == 41
     bench.refusals += [NoCamera("/dev/v4l/by-id/x is not there")] * 2
     bench.streams[0].node.put(NoCamera("/dev/video7 is gone", device="navcam_left"))
-    until(lambda: camera.capture.lost)
+    until(lambda: camera.capture.lost, "the loss")
     with pytest.raises(NoCamera):
-        camera.next_frame(0.0, PATIENCE_S)
-    until(lambda: len(bench.streams) == 2)
+        camera.next_frame(0.0, NET_S)
+    until(lambda: len(bench.streams) == 2, "it is opened again")
     assert bench.streams[0].closed
-    until(lambda: not camera.capture.lost)
+    until(lambda: not camera.capture.lost, "it is back")
     bench.clock.time_s = 103.0
     bench.streams[1].frame(0, 102.99)
-    frame = camera.next_frame(102.0, PATIENCE_S)
+    frame = camera.next_frame(102.0, NET_S)
     assert frame.sequence > 41 and frame.driver_sequence == 0 and frame.stream == 2
     assert camera.counters.reopened == 1
 
 
 def test_a_failed_stream_is_opened_again(bench: Bench, camera: V4l2Camera) -> None:
     bench.streams[0].node.put(StreamFailed("/dev/video7 does not give a frame: Input/output error"))
-    until(lambda: len(bench.streams) == 2)
+    until(lambda: len(bench.streams) == 2, "it is opened again")
 
 
 def test_a_stream_is_given_back_its_own_buffers_only(bench: Bench, camera: V4l2Camera) -> None:
     bench.clock.time_s = 100.01
     bench.streams[0].frame(2, 100.0)
-    until(lambda: camera.counters.good == 1)
+    until(lambda: camera.counters.good == 1, "good frames")
     bench.streams[0].node.put(StreamFailed("/dev/video7 does not give a frame: Input/output error"))
-    until(lambda: len(bench.streams) == 2)
+    until(lambda: len(bench.streams) == 2, "it is opened again")
     for index in (0, 1):
         bench.clock.time_s += 0.04
         bench.streams[1].frame(index, bench.clock.time_s - 0.01)
-        until(lambda wanted=2 + index: camera.counters.good == wanted)
-    until(lambda: bench.streams[1].node.queued)
+        until(lambda wanted=2 + index: camera.counters.good == wanted, "good frames")
+    until(lambda: bench.streams[1].node.queued, "its buffers")
     assert bench.streams[1].node.queued == [0]  # and no buffer 2, which it has never filled
 
 
 def test_a_closed_camera_gives_no_frame_though_one_had_come(bench: Bench, camera: V4l2Camera) -> None:
     bench.clock.time_s = 100.01
     bench.streams[0].frame(0, 100.0)
-    until(lambda: camera.counters.good == 1)
+    until(lambda: camera.counters.good == 1, "good frames")
     camera.close()
     with pytest.raises(NoFreshFrame):
         camera.next_frame(0.0, 0.0)
@@ -343,7 +336,7 @@ def test_the_count_grows_when_the_drivers_count_begins_again(bench: Bench, camer
     for index, count in enumerate((2**32 - 1, 0, 1, 0)):
         bench.clock.time_s = 100.01 + 0.04 * index
         bench.streams[0].frame(count, 100.0 + 0.04 * index)
-        until(lambda wanted=index + 1: camera.counters.good == wanted)
+        until(lambda wanted=index + 1: camera.counters.good == wanted, "good frames")
         sequences.append(camera.next_frame(0.0, 0.0).sequence)
     assert all(b > a for a, b in pairwise(sequences))
 
@@ -415,16 +408,16 @@ def test_closing_does_not_wait_for_ever_for_a_driver_that_hangs(
 
     def hang(index: int) -> None:
         hangs.set()
-        assert back.wait(PATIENCE_S)
+        assert back.wait(NET_S)
 
     monkeypatch.setattr(bench.streams[0].node, "queue", hang)
     bench.streams[0].frame(0, 100.0)
     bench.streams[0].frame(1, 100.04)  # the first one's buffer goes back, and the driver does not return
-    assert hangs.wait(PATIENCE_S)
+    assert hangs.wait(NET_S)
     camera.close()
     assert "eye: its driver hangs" in caplog.text and not bench.streams[0].closed
     back.set()
-    until(lambda: held()[1] == before[1])
+    until(lambda: held()[1] == before[1], "the thread's end")
     assert bench.streams[0].closed, "when the driver came back, the camera was let go"
     os.close(bench.streams[0].node.ready)
     assert held() == before
@@ -434,7 +427,7 @@ def test_only_the_newest_frames_buffer_is_held(bench: Bench, camera: V4l2Camera)
     bench.clock.time_s = 101.98
     for n in range(50):
         bench.streams[0].frame(n, 100.0 + 0.04 * n, level=n)
-    until(lambda: len(bench.streams[0].node.queued) == 49)
+    until(lambda: len(bench.streams[0].node.queued) == 49, "all but one")
     assert bench.streams[0].node.queued == [n % 4 for n in range(49)]
     frame = camera.next_frame(0.0, 0.0)
     assert frame.sequence == 49 and (frame.image == 49).all()
@@ -448,7 +441,7 @@ def test_a_frame_that_was_given_does_not_change_when_its_buffer_is_filled_again(
     for n in range(2):
         memory[:] = bytes([n + 1]) * 128
         bench.streams[0].node.put((Dequeued(0, 128, START, n, 100.0 + 0.04 * n), memory))
-        frame = camera.next_frame(100.0 + 0.04 * n - 0.01, PATIENCE_S)
+        frame = camera.next_frame(100.0 + 0.04 * n - 0.01, NET_S)
         memory[:] = bytes([99]) * 128
         assert (frame.image == n + 1).all()
 

@@ -10,7 +10,7 @@ import contextlib
 import os
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import pytest
@@ -23,10 +23,10 @@ from drivers.v4l2.controls import Control
 from drivers.v4l2.errors import StreamFailed, UnsupportedFormat
 from drivers.v4l2.options import parse_options
 from hil_tests.drivers.v4l2.v4l2_sensor import AUTO, EXPOSURE, Sensor, SensorNode, Shot, use
+from hil_tests.waiting import NET_S, until
 
 PERIOD_S = 0.040
 MARGIN_S = 0.002
-PATIENCE_S = 20.0
 KINDS = ("start", "uvc", "end")
 
 
@@ -75,7 +75,7 @@ class Bench:
         self.clock.time_s = max(shot.received_s, self.taken_at_s)
         through = self.node.through
         self.node.put(shot, wrong)
-        until(lambda: self.node.through > through)
+        until(lambda: self.node.through > through, "it is taken")
         if wrong:
             return
         self.clock.time_s = shot.stamp_s  # so that no frame is refused for its age instead
@@ -96,13 +96,6 @@ class Bench:
             assert abs(frame.mid_exposure_s - middle_s) <= frame.mid_uncertainty_s + self.slack_s + 1e-9
 
     slack_s = MARGIN_S  # a stamp that came late moves the middle by so much at most
-
-
-def until(done: Callable[[], object]) -> None:
-    end_s = time.monotonic() + PATIENCE_S
-    while not done():
-        assert time.monotonic() < end_s, "it did not come to that"
-        time.sleep(0.0005)
 
 
 @contextlib.contextmanager
@@ -268,7 +261,7 @@ def test_a_hold_lets_a_pending_change_show_first_and_then_keeps_it(monkeypatch: 
     monkeypatch.setattr(exposure.GROUPS, "join", lambda *ignored: wanted)
     options = {"exposure_s": 0.036, "auto_exposure": {"longest_s": 0.04}}
     with bench(monkeypatch, "uvc", controls=(AUTO, EXPOSURE), **options) as seen:
-        monkeypatch.setattr(camera_module, "HOLD_MOST_S", PATIENCE_S)
+        monkeypatch.setattr(camera_module, "HOLD_MOST_S", NET_S)
         monkeypatch.setattr(camera_module, "HOLD_PERIODS", 1e6)
         for _ in range(6):
             seen.arrive(sensor.shoot(PERIOD_S, 0.036))
@@ -278,11 +271,11 @@ def test_a_hold_lets_a_pending_change_show_first_and_then_keeps_it(monkeypatch: 
         def measure() -> None:
             with seen.camera.exposure_held():
                 held.set()
-                assert over.wait(PATIENCE_S)
+                assert over.wait(NET_S)
 
         thread = threading.Thread(target=measure)
         thread.start()
-        until(lambda: wanted.held)
+        until(lambda: wanted.held, "the hold")
         came = 0
         while not held.is_set():
             seen.arrive(sensor.shoot(PERIOD_S, 0.036 if came < 4 else 0.002))
@@ -297,7 +290,7 @@ def test_a_hold_lets_a_pending_change_show_first_and_then_keeps_it(monkeypatch: 
             assert seen.camera.next_frame(0.0, 0.0).set_exposure_s == pytest.approx(0.002)
         assert len(seen.node.sets) == sets, "nothing was set while it was held"
         over.set()
-        thread.join(PATIENCE_S)
+        thread.join(NET_S)
         seen.arrive(sensor.shoot(PERIOD_S, 0.002))
         assert seen.node.sets[-1] == (EXPOSURE.id, 100), "afterwards it is"
 
@@ -341,7 +334,7 @@ def test_a_hold_that_meets_a_change_that_does_not_end_is_refused(monkeypatch: py
 
         def hang(*args: object) -> object:
             hangs.set()
-            assert back.wait(PATIENCE_S)
+            assert back.wait(NET_S)
             return set_value(*args)  # type: ignore[arg-type]
 
         monkeypatch.setattr(stream, "set_value", hang)
@@ -349,7 +342,7 @@ def test_a_hold_that_meets_a_change_that_does_not_end_is_refused(monkeypatch: py
         shot = sensor.shoot(PERIOD_S, 0.036)
         seen.clock.time_s = shot.received_s
         seen.node.put(shot)
-        assert hangs.wait(PATIENCE_S)
+        assert hangs.wait(NET_S)
         with (
             pytest.raises(StreamFailed, match="still at a change of its exposure"),
             seen.camera.exposure_held(),

@@ -16,7 +16,8 @@ import pytest
 from calib.errors import BadFile
 from drivers.errors import DriverError
 from hil_tests.mastctl.outside_daemon import BOUND_S, daemon_process, free_port, line, under_way, write_config
-from hil_tests.mastctl.service_fakes import CONFIG, Hang, ScriptedLoop, eventually, fake_daemon
+from hil_tests.mastctl.service_fakes import CONFIG, Hang, ScriptedLoop, fake_daemon
+from hil_tests.waiting import until
 from mastctl.client import Client, ClientError
 from mastctl.errors import NotNow, Unable
 from mastctl.safety import latch as latch_module
@@ -120,7 +121,7 @@ def test_a_disk_that_refuses_leaves_it_latched_in_memory_and_says_so_until_it_ta
     assert latch.held == held
     assert "No space left" in latch.not_kept
     full.clear()
-    eventually(lambda: latch.not_kept == "", "the disk takes it")
+    until(lambda: latch.not_kept == "", "the disk takes it")
     assert Latch(folder).held == held
 
 
@@ -173,7 +174,7 @@ def test_a_stop_that_no_disk_ever_took_is_reset_on_that_disk_too(
     folder: StateFolder, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     latch = Latch(folder)
-    eventually((folder.path / FILE).exists, "a file that says that nothing is latched")
+    until((folder.path / FILE).exists, "a file that says that nothing is latched")
     for way in ("write", "overwrite", "remove"):
         monkeypatch.setattr(StateFile, way, refuse)
     latch.hold("smoke", "Ana")
@@ -192,7 +193,7 @@ def test_a_stop_that_the_disk_took_in_part_is_no_release_until_the_disk_says_so(
         refuse(file)
 
     latch = Latch(folder)
-    eventually((folder.path / FILE).exists, "a file that says that nothing is latched")
+    until((folder.path / FILE).exists, "a file that says that nothing is latched")
     with monkeypatch.context() as patch:
         patch.setattr(StateFile, "overwrite", torn)
         for way in ("write", "remove"):
@@ -219,12 +220,12 @@ def test_a_stop_during_a_reset_wins(folder: StateFolder, monkeypatch: pytest.Mon
     with pytest.raises(NotNow, match="another emergency stop"):
         latch.release("aired", "Ben")
     assert latch.held is not None
-    eventually(lambda: Latch(folder).held == latch.held, "the disk holds it again")
+    until(lambda: Latch(folder).held == latch.held, "the disk holds it again")
 
 
 def test_a_stop_is_written_over_the_file_that_is_there_from_the_start(folder: StateFolder) -> None:
     latch, path = Latch(folder), folder.path / FILE
-    eventually(path.exists, "a file that says that nothing is latched")
+    until(path.exists, "a file that says that nothing is latched")
     for _ in range(2):
         before = path.stat().st_ino
         latch.hold("smoke " * 100, "\U0001f525" * 500)  # six bytes and twelve a character
@@ -267,7 +268,7 @@ def test_a_file_that_cannot_be_written_over_is_written_anew(
         raise OSError(errno.EIO, os.strerror(errno.EIO))
 
     latch = Latch(folder)
-    eventually((folder.path / FILE).exists, "a file that says that nothing is latched")
+    until((folder.path / FILE).exists, "a file that says that nothing is latched")
     monkeypatch.setattr(os, "fdatasync", refuse)
     latch.hold("smoke", "Ana")
     latch.head_told()
@@ -482,13 +483,13 @@ def test_a_reset_waits_for_a_stop_that_is_under_way(monkeypatch: pytest.MonkeyPa
             patch.setattr(hardware.head, "stop", hang)
             stopping = threading.Thread(target=stop, args=(daemon.url,))
             stopping.start()
-            eventually(lambda: daemon.service.devices.stop_pending, "the stop")
+            until(lambda: daemon.service.devices.stop_pending, "the stop")
             with pytest.raises(ClientError, match="being stopped") as refused:
                 client.reset(reason="x", name="y")
             assert refused.value.code == "stopping"
             hang.let_go()
             stopping.join(BOUND_S)
-        eventually(lambda: not daemon.service.machine.standing.stops, "the stop's end")
+        until(lambda: not daemon.service.machine.standing.stops, "the stop's end")
         client.reset(reason="x", name="y")
 
 
@@ -580,7 +581,7 @@ def test_stops_that_all_hang_do_not_keep_an_emergency_stop_from_the_gate(
         futures = [daemon.service.stop_threads.submit(hang) for _ in range(stop_threads.THREADS)]
         began = daemon.service.stop_threads._began_s
         for future in futures:
-            eventually(lambda future=future: future in began, "the stops are under way")
+            until(lambda future=future: future in began, "the stops are under way")
             began[future] -= 1.0
         with pytest.raises(ClientError, match="latched, but") as told:
             client.estop(name="Ana")

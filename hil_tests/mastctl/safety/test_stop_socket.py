@@ -18,7 +18,8 @@ from typing import Any
 import pytest
 
 from drivers.errors import DriverError
-from hil_tests.mastctl.service_fakes import CONFIG, Hang, eventually, fake_daemon
+from hil_tests.mastctl.service_fakes import CONFIG, Hang, fake_daemon
+from hil_tests.waiting import NET_S, until
 from mastctl.cli.main import main
 from mastctl.client import Client
 from mastctl.errors import MastctlError
@@ -26,8 +27,6 @@ from mastctl.safety import stop_socket as stop_socket_module
 from mastctl.safety.state_folder import StateFolder, usual_folder
 from mastctl.safety.stop_line import NoAnswer, ask
 from mastctl.safety.stop_socket import SILENT_PEERS, StopSocket
-
-BOUND_S = 30.0
 
 
 class Stops:
@@ -63,7 +62,7 @@ def door(tmp_path: Path, stops: Stops) -> Iterator[StopSocket]:
 
 def peer(path: Path) -> socket.socket:
     made = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
-    made.settimeout(BOUND_S)
+    made.settimeout(NET_S)
     made.connect(str(path))
     return made
 
@@ -152,7 +151,7 @@ def test_who_goes_before_the_answer_hurts_nobody(
     monkeypatch.setattr(stops, "stop_told", hang)
     with peer(door.path) as made:
         made.sendall(b"stop\n")
-        eventually(lambda: door._threads._began_s, "the stop is under way")
+        until(lambda: door._threads._began_s, "the stop is under way")
     hang.let_go()
     monkeypatch.undo()
     assert said(door.path, b"stop\n").startswith("stop {")
@@ -164,7 +163,7 @@ def test_silent_peers_by_the_hundred_do_not_keep_a_stop_out(door: StopSocket) ->
             stack.enter_context(peer(door.path))
         for _ in range(20):
             assert said(door.path, b"stop\n").startswith("stop {")
-        eventually(lambda: len(door._peers) <= SILENT_PEERS, "the oldest go")
+        until(lambda: len(door._peers) <= SILENT_PEERS, "the oldest go")
 
 
 def test_silent_peers_who_come_again_and_again_do_not_keep_a_stop_out(door: StopSocket) -> None:
@@ -183,25 +182,25 @@ def test_silent_peers_who_come_again_and_again_do_not_keep_a_stop_out(door: Stop
     for thread in threads:
         thread.start()
     try:
-        for _ in range(20):
+        for _ in range(8):
             assert ask(door.path, "stop")["stopped"] is True
     finally:
         ended.set()
         for thread in threads:
-            thread.join(BOUND_S)
+            thread.join(NET_S)
 
 
 def test_silent_peers_are_left_after_a_while(door: StopSocket, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(stop_socket_module, "SILENT_S", 0.05)
     with peer(door.path) as made:
-        assert select.select([made], [], [], BOUND_S)[0]
+        assert select.select([made], [], [], NET_S)[0]
         assert made.recv(10) == b""
 
 
 def test_a_process_without_descriptors_still_takes_stops(door: StopSocket) -> None:
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     held: list[int] = []
-    eventually(lambda: len(door._spares) == stop_socket_module.SPARES, "the descriptors that are kept")
+    until(lambda: len(door._spares) == stop_socket_module.SPARES, "the descriptors that are kept")
     ends = [socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) for _ in range(30)]  # the peers' own
     try:
         resource.setrlimit(resource.RLIMIT_NOFILE, (256, hard))
@@ -209,7 +208,7 @@ def test_a_process_without_descriptors_still_takes_stops(door: StopSocket) -> No
             while True:
                 held.append(os.open(os.devnull, os.O_RDONLY))
         for end in ends:
-            end.settimeout(BOUND_S)
+            end.settimeout(NET_S)
             end.connect(str(door.path))
             end.sendall(b"stop\n")
             assert end.recv(4096).startswith(b"stop {")
@@ -229,7 +228,7 @@ def test_a_socket_that_a_dead_daemon_left_is_replaced(tmp_path: Path, stops: Sto
     door = StopSocket(path, stops)
     assert said(path, b"stop\n").startswith("stop {")
     door.close()
-    eventually(lambda: not path.exists(), "the end")
+    until(lambda: not path.exists(), "the end")
     with pytest.raises(NoAnswer, match="nobody listens"):
         ask(path, "stop")
 
@@ -254,12 +253,12 @@ def test_a_daemon_whose_event_loop_is_blocked_takes_a_stop_here(
         monkeypatch.setattr(type(daemon.service), "state", state)
         thread = threading.Thread(target=Client(daemon.url).status)
         thread.start()
-        assert hang.entered.wait(BOUND_S)
+        assert hang.entered.wait(NET_S)
         assert ask(path, "estop Ana: sparks")["latched"] is True
         assert ("stop",) in hardware.head.calls
         monkeypatch.undo()
         hang.let_go()
-        thread.join(BOUND_S)
+        thread.join(NET_S)
 
 
 # The command
