@@ -1,7 +1,7 @@
 """A Dynamixel head on simulated servos, on a turned clock: start-up, faults, watchdog, unplugging.
 
 The simulator's registers and packets are its own (``drivers/sim/wire``), not the driver's. On a real pseudo
-terminal and the machine's clock are a plug that is pulled under way, the process that is killed, the lock of
+terminal and the machine's clock are a plug that is pulled, the process that is killed, the lock of
 a line that is taken, and what closing leaves open: the kernel has its part in each.
 """
 
@@ -394,7 +394,7 @@ def drive_and_wait(path: str, options: dict[str, Any], ready: Any) -> None:
     """A process that moves the head far and is then killed."""
     head = open_head({**options, "port": path})
     head.move(2.4, 0.0)
-    while head.read().pan_rad < 0.05:
+    while not ((reading := read_or_none(head)) and reading.pan_rad > 0.05):
         pass
     ready.set()
     threading.Event().wait()
@@ -425,9 +425,17 @@ def test_a_killed_process_leaves_a_head_that_stops_by_itself() -> None:
         head.close()
 
 
-@pytest.mark.parametrize("real", [False, True], ids=["turned", "pseudo_terminal"])
-def test_unplugged_and_plugged_in_again_it_comes_back_without_moving(real: bool) -> None:
-    with opened(real=real) as (it, head):
+def test_a_real_plug_that_is_pulled_is_a_lost_line_and_the_head_comes_back_by_itself() -> None:
+    with opened(real=True, options={"watchdog_s": 0}) as (it, head):
+        it.line.hang_up()
+        error = it.until(lambda: isinstance(e := failed(head), LineLost) and e, "the fault")
+        assert it.line.path in str(error)
+        it.line.come_back()
+        assert it.until(lambda: read_or_none(head), "the head").pan_rad == pytest.approx(0, abs=COUNT_RAD)
+
+
+def test_unplugged_and_plugged_in_again_it_comes_back_without_moving() -> None:
+    with opened() as (it, head):
         head.move(2.0, 0.0)
         it.until(lambda: head.read().pan_rad > 0.1, "motion")
         it.line.hang_up()
