@@ -10,6 +10,7 @@ from pathlib import Path
 
 from calib.errors import CalibError
 from drivers.errors import DriverError
+from mastctl import signals
 from mastctl.cli.output import CommandError, as_command_error, one_line
 from mastctl.errors import MastctlError
 
@@ -25,13 +26,16 @@ def new_file(text: str) -> Path:
 
 
 def end(main: Callable[[], int | None]) -> None:
-    """Run a tool and exit with its code.
+    """Run a tool and exit with its code; a signal ends it in order, with its folders and processes.
 
     A refusal of the project's own is one sentence and the exit code that `mastctl` has for it; a file that
     cannot be read or written is one sentence and 2. What refuses in its own way carries its exit code.
     """
     try:
-        sys.exit(_by_its_name(main)())
+        with signals.raised():
+            sys.exit(_by_its_name(main)())
+    except signals.Ended as ended:
+        sys.exit(128 + ended.number)
     except (CalibError, DriverError, MastctlError, CommandError) as error:
         words, code = str(error), as_command_error(error).exit_code
     except OSError as error:

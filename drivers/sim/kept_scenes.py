@@ -20,9 +20,6 @@ from drivers.sim.compiled import kernels
 from drivers.sim.kept import digest_of, keep_newest, kept_folder
 from drivers.sim.scene import Scene, SceneSettings, build_scene
 
-SCENES_KEPT = 4
-"""A scene takes some 85 MB of disk."""
-
 FACTS = "scene.json"
 
 
@@ -39,7 +36,7 @@ def kept_scene(settings: SceneSettings) -> Scene:
         found = build_scene(settings)
         with contextlib.suppress(OSError):
             write(folder, found)
-            keep_newest(folder, SCENES_KEPT)
+            keep_newest(folder)
     return found
 
 

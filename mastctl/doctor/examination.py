@@ -13,7 +13,7 @@ from drivers.open_hardware import CAMERAS, HEADS, clock_for
 from mastctl.config import Config, load_config
 from mastctl.doctor.cameras import examine_camera
 from mastctl.doctor.findings import Finding, Level, Machine
-from mastctl.doctor.host import examine_clock, examine_descriptors, examine_folder
+from mastctl.doctor.host import examine_clock, examine_descriptors, examine_folder, examine_kept
 from mastctl.doctor.mast_file import examine_mast_file
 from mastctl.doctor.serial_lines import examine_port
 from mastctl.safety.state_folder import usual_folder
@@ -58,6 +58,7 @@ def examine(path: str | None, asked: Asked, machine: Machine | None = None) -> I
     )
     state_folder = config.state_folder or usual_folder(config.path, config.listen.url)
     yield from _sentinel(state_folder / SENTINEL_FOLDER)
+    yield examine_kept()
     yield examine_clock()
     yield examine_descriptors()
 

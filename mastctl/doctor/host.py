@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterator
 from datetime import UTC, datetime
 from pathlib import Path
 
+from drivers.sim.kept import MOST_BYTES, kept_bytes, kept_home
 from mastctl.doctor.findings import Finding
 
 LEAST_FREE_BYTES = 1_000_000_000  # the recorder's ring of some minutes of two cameras
@@ -70,6 +71,15 @@ def examine_folder(what: str, folder: Path) -> Iterator[Finding]:
         yield Finding(what, "unsure", told, "make room: what happened before a fault may not be recorded")
     else:
         yield Finding(what, "good", told)
+
+
+def examine_kept() -> Finding:
+    """Look how much is kept of what takes long to make, and how much that can become."""
+    sizes = {kind: kept_bytes(kind) for kind in MOST_BYTES}
+    kinds = ", ".join(f"{kind} {size / 1e6:.0f}" for kind, size in sizes.items())
+    most = sum(MOST_BYTES.values())
+    told = f"{kept_home()}: {sum(sizes.values()) / 1e6:.0f} MB ({kinds}) of at most {most / 1e6:.0f} MB"
+    return Finding("kept", "good", told)
 
 
 def examine_descriptors() -> Finding:

@@ -20,6 +20,7 @@ from typing import Any
 
 import numpy as np
 
+from drivers.sim.kept import kept_home
 from mastctl.cli.output import at_least, positive_number
 from tools.arguments import end
 from tools.closed_loop.run import RECORD
@@ -79,7 +80,7 @@ def through_devices(
     (out / RECORD).unlink(missing_ok=True)
     command = [sys.executable, "-m", "tools.closed_loop.run", "devices", *options, "--out", "/run/out"]
     # the machine has a home of its own, which is empty: what was compiled here is read from here
-    kept = os.environ.get("XDG_CACHE_HOME") or str(Path.home() / ".cache")
+    kept = str(kept_home().parent)
     environment = {"PYTHONPATH": str(REPOSITORY), "OPENBLAS_NUM_THREADS": "1", "XDG_CACHE_HOME": kept}
     result = boot.run(
         found, command, out, folder=REPOSITORY, cameras=boot.CAMERAS["hdmi"], timeout_s=timeout_s,

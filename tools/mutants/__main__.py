@@ -23,11 +23,12 @@ import os
 import py_compile
 import random
 import shutil
+import signal
 import tempfile
 from collections import Counter
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
-from multiprocessing import get_context
+from multiprocessing import active_children, get_context
 from multiprocessing.queues import SimpleQueue
 from pathlib import Path
 from typing import NamedTuple
@@ -36,7 +37,7 @@ from mastctl.cli.output import at_least
 from tools.arguments import end, new_file
 from tools.mutants.nearest import TESTS, imports, nearest
 from tools.mutants.sites import Site, sites
-from tools.mutants.trial import Ended, run, run_change, warm
+from tools.mutants.trial import Ended, end_with_tests, run, run_change, warm
 
 REPOSITORY = Path(__file__).resolve().parent.parent.parent
 FOLDERS = ("calib", "drivers", "mastctl", "hil_tests", "configs", "tools", "docs")
@@ -71,6 +72,8 @@ class _Own:
 def _begin(copies: SimpleQueue[Path]) -> None:
     _Own.copy = copies.get()
     os.environ["PYTHONPATH"] = str(_Own.copy)
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, end_with_tests)
     warm()
 
 
@@ -160,14 +163,18 @@ def _all_tried(chosen: list[Site], args: argparse.Namespace, copies: list[Path])
     for copy in copies:
         own.put(copy)
     with ProcessPoolExecutor(len(copies), context, _begin, (own,)) as pool:
-        runs = pool.map(_unchanged, files, [args.longest] * len(files))
-        alone = dict(zip(files, runs, strict=True))
-        for test, ended in alone.items():
-            if ended.outcome != "passed":
-                print(
-                    f"left out, unchanged it is {ended.outcome} after {ended.cpu_s:.0f} s: {test}", flush=True
-                )
-        yield from pool.map(_tried, chosen, [_allowed_s(site, near[site.file], alone) for site in chosen])
+        try:
+            runs = pool.map(_unchanged, files, [args.longest] * len(files))
+            alone = dict(zip(files, runs, strict=True))
+            for test, ended in alone.items():
+                if ended.outcome != "passed":
+                    why = f"unchanged it is {ended.outcome} after {ended.cpu_s:.0f} s"
+                    print(f"left out, {why}: {test}", flush=True)
+            yield from pool.map(_tried, chosen, [_allowed_s(site, near[site.file], alone) for site in chosen])
+        except BaseException:  # a signal too: nobody waits for what runs
+            for worker in active_children():
+                worker.terminate()
+            raise
 
 
 def main() -> int:

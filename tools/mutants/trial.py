@@ -11,6 +11,7 @@ import json
 import os
 import signal
 import sys
+import tempfile
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -74,6 +75,18 @@ def run_change(
         doubtful.append(ended.test)
 
 
+_running: list[int] = []
+"""The process in which tests run now, and the number of its group."""
+
+
+def end_with_tests(*_signal: object) -> NoReturn:
+    """End this process at once, and the tests that it runs with all that they began (a signal's handler)."""
+    for pid in _running:
+        with suppress(ProcessLookupError):
+            os.killpg(pid, signal.SIGKILL)
+    os._exit(1)
+
+
 def warm() -> None:
     """Import what nearly every test needs, once for all runs."""
     for name in LIBRARIES:
@@ -98,6 +111,7 @@ def run(
     pid = os.fork()
     if pid == 0:
         _in_the_fork(copy, said, allowed_s, watched, leave_out)
+    _running[:] = [pid]
     until_s = time.monotonic() + patience_s
     ended, status, used = os.wait4(pid, os.WNOHANG)
     while not ended and time.monotonic() < until_s:
@@ -107,6 +121,7 @@ def run(
         os.killpg(pid, signal.SIGKILL)  # and whatever the tests left running
     if not ended:
         _, status, used = os.wait4(pid, 0)
+    _running.clear()
     return _judged(said, bool(ended), status, used.ru_utime + used.ru_stime)
 
 
@@ -133,8 +148,13 @@ def _in_the_fork(
     """Be the process that runs the tests."""
     code = 4
     try:
+        signal.signal(signal.SIGTERM, signal.SIG_DFL)
+        signal.signal(signal.SIGINT, signal.default_int_handler)
         os.setsid()
         os.chdir(copy)
+        # it ends without clearing away: what it makes goes with the copy
+        os.environ |= {"TMPDIR": str(copy.parent), "PYTEST_DEBUG_TEMPROOT": str(copy.parent)}
+        tempfile.tempdir = None
         silence = os.open(os.devnull, os.O_RDWR)
         for stream in (0, 1, 2):
             os.dup2(silence, stream)

@@ -19,6 +19,7 @@ import time
 from collections import deque
 from pathlib import Path
 
+from drivers.sim.kept import keep_newest, kept_folder
 from tools.virtual_machine.apt import TOLD_AGAIN_S, Busy, Tell, apt_get, install
 
 INPUTS = Path(__file__).resolve().parents[2] / "hil_tests" / "vm" / "kernel"
@@ -63,8 +64,7 @@ def path_for(source_digest: str) -> Path:
     digest = hashlib.sha256(source_digest.encode())
     for file in (INPUTS / "kernel.config", *sorted(INPUTS.glob("*.patch"))):
         digest.update(file.read_bytes())
-    home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-    return home / "mastctl" / "vm" / digest.hexdigest()[:16] / "linux"
+    return kept_folder("vm", digest.hexdigest()) / "linux"
 
 
 def find() -> Path | None:
@@ -120,6 +120,7 @@ def build(package: Path | None, tell: Tell) -> Path:
         kernel = path_for(digest)
         if not kernel.is_file():
             _make(deb, folder, kernel, tell)
+            keep_newest(kernel.parent)
     return kernel
 
 

@@ -8,7 +8,6 @@ instruction is emulated, some fifty times slower.
 from __future__ import annotations
 
 import json
-import os
 import re
 import shutil
 import subprocess
@@ -16,6 +15,7 @@ import tempfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+from drivers.sim.kept import keep_newest, kept_home
 from tools.virtual_machine.boot import CAMERAS, INIT, Result, VmFailed
 
 PROGRAMS = {
@@ -62,12 +62,12 @@ def prepare() -> Path:
     if found is None:
         raise NoQemu(f"apt-cache knows no {META_PACKAGE}; on Debian amd64 it does")
     package, version = found.groups()
-    home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-    folder = home / "mastctl" / "vm" / f"qemu-{version}"
+    folder = kept_home() / "vm" / f"qemu-{version}"
     if not (folder / "initrd").is_file():
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(prefix="mastctl-qemu-") as name:
             _unpack(package, version, Path(name), folder)
+        keep_newest(folder)
     return folder
 
 

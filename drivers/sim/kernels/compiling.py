@@ -26,7 +26,6 @@ caching: Any = numba_caching
 Function = TypeVar("Function", bound=Callable[..., Any])
 
 SOURCES = digest_of(Path(__file__).parent.glob("*.py"))
-VERSIONS_KEPT = 3
 
 
 class Place:
@@ -82,7 +81,7 @@ class Kept(caching.FunctionCache):  # type: ignore[misc]
         """Keep the compiled function, if that can be done."""
         try:
             super().save_overload(signature, data)
-            keep_newest(Path(self.cache_path), VERSIONS_KEPT)
+            keep_newest(Path(self.cache_path))
         except OSError as error:
             _say_once(self.cache_path, error.strerror)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 from dataclasses import replace
@@ -10,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from drivers.sim import kept_scenes
+from drivers.sim import kept, kept_scenes
 from drivers.sim.kept import digest_of, keep_newest, kept_folder
 from drivers.sim.kept_scenes import FACTS, folder_of, kept_scene
 from drivers.sim.scene import Scene, SceneSettings
@@ -92,13 +93,22 @@ def test_writing_into_a_scene_that_was_read_changes_nobody_elses(home: list[Scen
     assert yours.world.broad.texels.any() and kept_scene(SETTINGS).world.broad.texels.any()
 
 
-def test_only_the_newest_are_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_was_used_longest_ago_goes_when_there_is_too_much(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.setitem(kept.MOST_BYTES, "scenes", 3500)
     folders = [kept_folder("scenes", f"{k:016d}") for k in range(6)]
-    for folder in folders:
+    for k, folder in enumerate(folders):
         folder.mkdir(parents=True)
-    keep_newest(folders[0], 2)
-    assert folders[0].is_dir() and sum(folder.is_dir() for folder in folders) <= 3
+        (folder / "file").write_bytes(bytes(1000))
+        os.utime(folder, (k, k))
+    keep_newest(folders[0])  # made now, whatever its time says
+    assert [folder.is_dir() for folder in folders] == [True, False, False, False, True, True]
+    assert kept.kept_bytes("scenes") == 3000
+    (folders[0] / "file").write_bytes(bytes(9000))
+    keep_newest(folders[0])
+    assert [folder for folder in folders if folder.is_dir()] == folders[:1]
 
 
 def test_any_changed_file_changes_the_digest(tmp_path: Path) -> None:

@@ -156,6 +156,16 @@ def test_the_packaged_simulated_rover_lacks_nothing(tmp_path: Path, machine: Mac
     assert {"configuration", "mast file", "simulation", "state folder", "clock", "descriptors"} <= set(found)
 
 
+def test_the_doctor_tells_what_is_kept_and_how_much_that_can_become(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    (tmp_path / "mastctl/scenes/one").mkdir(parents=True)
+    (tmp_path / "mastctl/scenes/one/file").write_bytes(bytes(3_000_000))
+    told = host.examine_kept().sentence
+    assert told == f"{tmp_path}/mastctl: 3 MB (compiled 0, scenes 3, vm 0) of at most 570 MB"
+
+
 def test_a_broken_configuration_is_told_and_the_machine_looked_at_all_the_same(
     tmp_path: Path, machine: Machine
 ) -> None:
