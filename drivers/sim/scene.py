@@ -189,9 +189,10 @@ def build_scene(settings: SceneSettings | None = None) -> Scene:
     if stood:
         stones = rocks.together(stones, boards.meshes(stood))
     tones = ground_tones(inner, sun, tone_rng, settings.terrain) * shadows(inner, stones, sun)
-    gravel = texture.gravel(gravel_rng, sun, texture.DETAIL_TEXELS)
-    if settings.terrain is not None and not settings.terrain.gravel:
-        gravel = np.ones_like(gravel)
+    if settings.terrain is None or settings.terrain.gravel:
+        gravel = texture.gravel(gravel_rng, sun, texture.DETAIL_TEXELS)
+    else:
+        gravel = np.ones((texture.DETAIL_TEXELS,) * 2, dtype=np.float32)
     detail = texture.pyramid(gravel, texture.DETAIL_TEXEL_M)
     stone = texture.pyramid(texture.stone(stone_rng, texture.STONE_TEXELS), texture.STONE_TEXEL_M)
     broad = texture.pyramid(tones, INNER_CELL_M)

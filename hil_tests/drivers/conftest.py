@@ -14,15 +14,16 @@ import pytest
 from calib.files.mast_file import load_rig, save_rig
 from calib.mast.rig import Rig, RigCamera
 from drivers.sim import rover
-from drivers.sim.scene import Scene, SceneSettings, build_scene
+from drivers.sim.kept_scenes import kept_scene
+from drivers.sim.scene import Scene, SceneSettings
 
 SHRINK = 4
 
 
 @pytest.fixture(scope="session")
 def scene() -> Scene:
-    """The scene of seed 1 with ten rocks."""
-    return build_scene(SceneSettings(seed=1, rocks=10))
+    """The scene of seed 1 with ten rocks, from disk where it was built before."""
+    return kept_scene(SceneSettings(seed=1, rocks=10))
 
 
 @pytest.fixture

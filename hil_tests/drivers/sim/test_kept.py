@@ -15,13 +15,14 @@ from drivers.sim import kept, kept_scenes
 from drivers.sim.kept import digest_of, keep_newest, kept_folder
 from drivers.sim.kept_scenes import FACTS, folder_of, kept_scene
 from drivers.sim.scene import Scene, SceneSettings
+from hil_tests.drivers.sim.small_scenes import build_small_scene
 
 SETTINGS = SceneSettings(seed=1, rocks=10, bricks=3)
 
 
 @pytest.fixture(scope="module")
 def built() -> Scene:
-    return kept_scenes.build_scene(SETTINGS)
+    return build_small_scene(SETTINGS)
 
 
 @pytest.fixture

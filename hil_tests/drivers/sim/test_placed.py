@@ -20,6 +20,7 @@ from drivers.sim.placed import check_clear_of
 from drivers.sim.render import Renderer
 from drivers.sim.scene import Scene, build_scene
 from drivers.sim.settings import scene_settings
+from hil_tests.drivers.sim.small_scenes import build_small_scene
 
 FOCAL_PX, SIZE_PX = 900.0, (800, 600)
 EYE_M = np.array([0.1, -0.05, -1.2])
@@ -55,7 +56,7 @@ PLACED: dict[str, Any] = {
 
 @pytest.fixture(scope="module")
 def placed() -> Scene:
-    return build_scene(scene_settings(PLACED, Path()))
+    return build_small_scene(scene_settings(PLACED, Path()))
 
 
 @pytest.fixture(scope="module")
@@ -174,11 +175,11 @@ def test_a_board_hides_what_is_behind_it_and_its_back_is_blank(placed: Scene) ->
 
 
 def test_scattered_rocks_keep_away_from_what_is_placed() -> None:
-    seeds = {"seed": 3, "relief_m": 0.0, "rocks": 300}
-    alone = build_scene(scene_settings(seeds, Path())).world.rocks.spheres_m
+    seeds = {"seed": 3, "relief_m": 0.0, "rocks": 60}
+    alone = build_small_scene(scene_settings(seeds, Path())).world.rocks.spheres_m
     near = alone[np.argmin(np.hypot(*alone[:, :2].T))]
     boards = [{"x_m": float(near[0]), "y_m": float(near[1])}]
-    beside = build_scene(scene_settings({**seeds, "boards": boards}, Path())).world.rocks
+    beside = build_small_scene(scene_settings({**seeds, "boards": boards}, Path())).world.rocks
     stones = beside.spheres_m[beside.boards < 0]
     assert len(stones) < len(alone)
     assert all((stone == alone).all(axis=1).any() for stone in stones), "the others stay where they were"
@@ -205,7 +206,7 @@ def test_another_picture_on_a_board_is_another_scene(tmp_path: Path) -> None:
     assert one != other and repr(one) != repr(other)
     assert one.boards[0].face.size_m == (0.5, 0.25)
     with pytest.raises(BadOptions, match="changed while the scene was built"):
-        build_scene(replace(one, relief_m=0.0))
+        build_small_scene(replace(one, relief_m=0.0))
 
 
 @pytest.mark.parametrize(

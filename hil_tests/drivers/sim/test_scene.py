@@ -11,6 +11,7 @@ import pytest
 from drivers.errors import BadOptions
 from drivers.sim import compiled, rocks
 from drivers.sim.scene import Scene, SceneSettings, build_scene, inner_relief_m, make_grid
+from hil_tests.drivers.sim.small_scenes import build_small_scene
 
 SAME_M = 1e-9
 """float64 along rays of some ten metres leaves 1e-13 m; grazing rays multiply it."""
@@ -19,12 +20,12 @@ EYE_M = np.array([0.4, -0.1, -1.5])
 
 @pytest.fixture(scope="module")
 def flat() -> Scene:
-    return build_scene(SceneSettings(seed=3, relief_m=0.0, rocks=0))
+    return build_small_scene(SceneSettings(seed=3, relief_m=0.0, rocks=0))
 
 
 @pytest.fixture(scope="module")
 def rough() -> Scene:
-    return build_scene(SceneSettings(seed=3))
+    return build_small_scene(SceneSettings(seed=3))
 
 
 def unit(vectors: np.ndarray) -> np.ndarray:
@@ -195,8 +196,8 @@ def test_rocks_are_closed_stones_that_stand_where_they_should(rough: Scene) -> N
 
 
 def test_same_seed_same_scene(rough: Scene, flat: Scene) -> None:
-    again = build_scene(SceneSettings(seed=3))
-    other = build_scene(SceneSettings(seed=4))
+    again = build_small_scene(SceneSettings(seed=3))
+    other = build_small_scene(SceneSettings(seed=4))
     for part, name in (
         ("inner", "elevation_m"),
         ("rocks", "corners_m"),

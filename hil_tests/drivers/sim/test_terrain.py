@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 
 from drivers.errors import BadOptions
-from drivers.sim.scene import Scene, build_scene
+from drivers.sim.scene import Scene
 from drivers.sim.settings import scene_settings
+from hil_tests.drivers.sim.small_scenes import build_small_scene
 
 ROWS, COLUMNS, STEP_M = 41, 61, 0.25
 PLACE = {"m_per_px": STEP_M, "origin_x_m": 7.0, "origin_y_m": -6.0}
@@ -32,7 +33,7 @@ def own(tmp_path_factory: pytest.TempPathFactory) -> Scene:
     picture[:, COLUMNS * 2 :] = 180  # the eastern half
     cv2.imwrite(str(folder / "ground.png"), picture)
     terrain = {"heights": "ground.npy", "texture": "ground.png", "gravel": False, **PLACE}
-    return build_scene(scene_settings({"rocks": 0, "terrain": terrain}, folder))
+    return build_small_scene(scene_settings({"rocks": 0, "terrain": terrain}, folder))
 
 
 def test_the_ground_is_where_the_map_says(own: Scene) -> None:
@@ -68,7 +69,7 @@ def test_grey_pictures_are_heights_between_black_and_white(tmp_path: Path) -> No
     grey[:14] = 65535
     cv2.imwrite(str(tmp_path / "ground.png"), grey)
     terrain = {"heights": "ground.png", "black_m": -1.0, "white_m": 0.5, **PLACE}
-    scene = build_scene(scene_settings({"rocks": 0, "terrain": terrain}, tmp_path))
+    scene = build_small_scene(scene_settings({"rocks": 0, "terrain": terrain}, tmp_path))
     assert scene.ground_z_m(5.0, 0.0) == pytest.approx(-1.5, abs=1e-6)
     assert scene.ground_z_m(1.0, 0.0) == pytest.approx(0.0, abs=1e-6)
 

@@ -27,7 +27,18 @@ def run_tool(repository: Path, words: list[str], monkeypatch: pytest.MonkeyPatch
     return int(ended.value.code or 0)
 
 
-@pytest.mark.parametrize("name", [name for name, _ in PAIRS])
+@pytest.mark.parametrize(
+    "name",
+    [
+        "rocky8_simulated",
+        pytest.param(
+            "skew8_simulated",
+            marks=pytest.mark.long(
+                2, "the same command with two more parameters of the mast; rocky8's is quick"
+            ),
+        ),
+    ],
+)
 def test_its_own_command_makes_the_shipped_mast_file_again(
     repository: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
 ) -> None:
