@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import random
+from collections.abc import Callable
 from datetime import timedelta
 from pathlib import Path
 from typing import Any
@@ -169,14 +170,22 @@ def test_the_campaign_notices_what_is_let_out(monkeypatch: pytest.MonkeyPatch, t
         check_command("solve mast.yaml --camera eye_left --target 1 2 3", "mast.yaml", b"", tmp_path)
 
 
+def many_anchors(count: int) -> bytes:
+    return b"".join(b"a%d: &x%d 1\n" % (i, i) for i in range(count))
+
+
+def many_keys(count: int) -> bytes:
+    return b"".join(b"k%d: 1\n" % i for i in range(count))
+
+
 BLOW_UPS = {
     "many flow brackets": b"[" * 200_000,
     "many braces": b"{a: " * 100_000,
     "many dashes": b"- " * 200_000,
     "many questions": b"? " * 200_000,
-    "many anchors": b"".join(b"a%d: &x%d 1\n" % (i, i) for i in range(20_000)),
+    "many anchors": many_anchors(2_000),
     "one long key": b"a" * 1_000_000 + b": 1",
-    "many keys": b"".join(b"k%d: 1\n" % i for i in range(20_000)),
+    "many keys": many_keys(2_000),
     "many quotes": b'"' * 1_000_000,
     "long comment": b"#" * 1_000_000,
     "many colons": b":" * 1_000_000,
@@ -198,3 +207,9 @@ def test_a_file_made_to_blow_up_is_refused_by_every_reader(case: str, tmp_path: 
     (tmp_path / "x").write_bytes(BLOW_UPS[case])
     with pytest.raises(BadFile):
         load_any(tmp_path / "x")
+
+
+@pytest.mark.parametrize("many", [many_anchors, many_keys])
+def test_ten_times_as_many_names_are_refused_too(many: Callable[[int], bytes]) -> None:
+    """By one reader: all that read YAML have one parser."""
+    assert check_reader("mast", many(20_000)) == "refused"

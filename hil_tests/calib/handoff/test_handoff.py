@@ -311,10 +311,11 @@ def test_one_good_pair_of_clicks_in_a_thousand_is_refused(
         rig, PAIR, *at, TARGET, sigma_px=0.2, calibration=known if calibrated else None
     )
     sigmas = []
+    eyes = [rig.camera_in_rover(name, *at) for name in PAIR]
     for _ in range(draws):
-        step = root @ rng.standard_normal(len(root)) * calibrated
-        believed = moved_rig(rig, known.names, step)
-        eyes = [believed.camera_in_rover(name, *at) for name in PAIR]
+        if calibrated:
+            believed = moved_rig(rig, known.names, root @ rng.standard_normal(len(root)))
+            eyes = [believed.camera_in_rover(name, *at) for name in PAIR]
         clicked = exact + rng.normal(0.0, 0.2, (2, 2))
         sigmas.append(ray_gap(triangulate(*eyes, *clicked), allowed).sigmas)
     assert FALSE_ALARMS == 0.001 and pytest.approx(norm.isf(0.0005), abs=1e-4) == MOST_SIGMAS

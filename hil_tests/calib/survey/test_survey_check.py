@@ -43,7 +43,10 @@ def with_station(survey: Survey, change: Callable[[StationPoint], StationPoint |
     return replace(survey, station=tuple(p for p in map(change, survey.station) if p is not None))
 
 
-@pytest.mark.parametrize("seed", range(6))
+MORE = pytest.mark.long(3, "more surveys of the same plan")
+
+
+@pytest.mark.parametrize("seed", [0, 1, *(pytest.param(seed, marks=MORE) for seed in range(2, 6))])
 @pytest.mark.parametrize("rough", [True, False])
 def test_nothing_is_said_about_a_good_survey(rig: Rig, seed: int, rough: bool) -> None:
     survey, _ = simulate_survey(rig, seed, SurveyPlan(rough=rough))
