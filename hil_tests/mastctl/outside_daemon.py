@@ -19,7 +19,6 @@ from hil_tests.mastctl.service_fakes import CONFIG, rig
 from hil_tests.waiting import NET_S, until
 from mastctl.client import Client, ClientError
 
-BOUND_S = NET_S
 GOAL_RAD = 1.9
 SPEED_RAD_PER_S = 0.01  # the goal is three minutes away: within a test's net the head does not arrive
 SHORT_OF_GOAL_RAD = 1.5  # a head that stands before this was stopped, however slow the machine is

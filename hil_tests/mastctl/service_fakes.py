@@ -163,14 +163,6 @@ class Hang:
         self._go.set()
 
 
-def eventually(holds: Callable[[], Any], what: str, within_s: float = 10.0) -> None:
-    """Wait until something holds; the bound is only there so that a failing test ends."""
-    until_s = time.monotonic() + within_s
-    while not holds():
-        assert time.monotonic() < until_s, f"never happened: {what}"
-        time.sleep(0.005)
-
-
 @dataclass(frozen=True)
 class FakeStep:
     """A step as a record shows it."""

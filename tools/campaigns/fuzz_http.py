@@ -60,26 +60,31 @@ def simulated_daemon() -> Iterator[str]:
         yield daemon.url
 
 
-def ask(url: str, seconds: float, examples: int, seed: int | None = None) -> int:
-    """Have schemathesis ask, as anybody and as who steers; return its exit code, its words go to stdout."""
+def ask(url: str, seconds: float | None, examples: int, seed: int | None = None) -> int:
+    """Have schemathesis ask, as anybody and as who steers; return its exit code, its words go to stdout.
+
+    With ``seconds`` None each route is asked ``examples`` times as anybody and as who steers, and no more.
+    """
     common = ["--max-examples", str(examples), *(() if seed is None else ("--seed", str(seed)))]
+    phases = "examples,fuzzing" if seconds is None else "examples,coverage,fuzzing"
     with taken_back(url):
-        anybody = ["--exclude-path-regex", UNASKED, "--phases", "examples,coverage,fuzzing"]
-        code = _asked(url, 2.0 / 3.0 * seconds, [*anybody, *common])
+        anybody = ["--exclude-path-regex", UNASKED, "--phases", phases]
+        code = _asked(url, None if seconds is None else 2.0 / 3.0 * seconds, [*anybody, *common])
     if code != 0:
         return code
     with Client(url, name="holder") as client:
         lease = client.acquire_lease(for_s=LONGEST_S, take_over="the campaign goes on")["lease_id"]
     holder = ["--exclude-path-regex", UNASKED_AS_HOLDER, "--phases", "fuzzing", "--mode", "positive"]
     headers = ["--header", f"Mastctl-Lease: {lease}", "--header", f"Deadline-S: {DEADLINE_S:g}"]
-    return _asked(url, seconds / 3.0, [*holder, *headers, *common])
+    return _asked(url, None if seconds is None else seconds / 3.0, [*holder, *headers, *common])
 
 
-def _asked(url: str, seconds: float, options: Sequence[str]) -> int:
+def _asked(url: str, seconds: float | None, options: Sequence[str]) -> int:
     command = [
         *(str(Path(sys.executable).with_name("schemathesis")), "run", f"{url}/openapi.json", "--no-color"),
-        *("--checks", "all", "--exclude-checks", ",".join(LEFT_OUT), "--max-time", f"{seconds:.0f}"),
-        *("--request-timeout", "30", "--warnings", "off", *options),
+        *("--checks", "all", "--exclude-checks", ",".join(LEFT_OUT)),
+        *(() if seconds is None else ("--max-time", f"{seconds:.0f}")),
+        *("--request-timeout", "60", "--warnings", "off", *options),
     ]
     with tempfile.TemporaryDirectory() as folder:  # it leaves a folder where it runs
         return subprocess.run(command, cwd=folder, text=True, check=False).returncode

@@ -14,7 +14,7 @@ from types import SimpleNamespace
 from typing import Any
 
 from calib.bench.placements import Placement
-from hil_tests.mastctl.service_fakes import eventually
+from hil_tests.waiting import until
 from mastctl.bench.lines import LEFT_ALONE, Lines
 from mastctl.bench.teller import Progress
 from mastctl.guided.told import Run, heard
@@ -49,10 +49,10 @@ def test_a_placement_waits_for_the_answer_and_for_none_that_came_before_it() -> 
     lines = Lines(out, pipe.answers, on_end=lambda: None)
     pipe.say("what?")
     pipe.say("stands")  # too early: nothing was asked
-    eventually(lambda: not lines._stands.empty(), "it was heard")
+    until(lambda: not lines._stands.empty(), "it was heard")
     waiting = threading.Thread(target=lines.place, args=("p1", PLACE, HEAD), daemon=True)
     waiting.start()
-    eventually(lambda: told(out), "it is asked for")
+    until(lambda: told(out), "it is asked for")
     waiting.join(0.2)
     assert waiting.is_alive(), "the answer of before is none"
     pipe.say("stands")

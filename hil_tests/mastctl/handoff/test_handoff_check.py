@@ -24,7 +24,8 @@ from hil_tests.calib.handoff.handed_over import (
     targets,
     vectors,
 )
-from hil_tests.mastctl.service_fakes import Hang, eventually
+from hil_tests.mastctl.service_fakes import Hang
+from hil_tests.waiting import until
 from mastctl.handoff import check as module
 from mastctl.handoff.check import NAME, HandoffCheck
 from mastctl.handoff.log import HandoffLog, read_log
@@ -112,7 +113,7 @@ def test_what_was_written_down_before_counts_after_a_restart(rig: Rig, tmp_path:
     for one in handed(rig, 12, 0.004):
         writer.append(one)
     selfcheck = check(tmp_path / "h.jsonl")
-    eventually(lambda: selfcheck.told()["handoffs"] == 12, "the record is read")
+    until(lambda: selfcheck.told()["handoffs"] == 12, "the record is read")
     assert len(selfcheck.told()["offsets"]) == 2
     assert selfcheck.faults() == ()
     selfcheck.close()
@@ -138,7 +139,7 @@ def test_a_record_that_cannot_be_written_is_a_fault_and_nothing_else(
     for one in handed(rig, 12, 0.004):
         selfcheck.add(one)
     assert len(selfcheck.told()["offsets"]) == 2
-    eventually(lambda: any(one.code == "unwritable" for one in selfcheck.faults()), "the fault")
+    until(lambda: any(one.code == "unwritable" for one in selfcheck.faults()), "the fault")
     fault = selfcheck.faults()[-1]
     assert fault.device == NAME
     assert fault.message.startswith(str(path)) and "hand-offs count, and wait" in fault.message
@@ -152,7 +153,7 @@ def test_what_waited_is_written_down_when_the_file_can_be_written_again(rig: Rig
     one, two, three = handed(rig, 3)
     selfcheck.add(one)
     selfcheck.add(two)
-    eventually(lambda: any(one.code == "unwritable" for one in selfcheck.faults()), "the fault")
+    until(lambda: any(one.code == "unwritable" for one in selfcheck.faults()), "the fault")
     path.rmdir()
     selfcheck.add(three)
     selfcheck.close()
@@ -166,7 +167,7 @@ def test_a_spoilt_record_is_a_fault_and_what_comes_counts(rig: Rig, tmp_path: Pa
     path.write_text("something else\nthat is no record\n")
     selfcheck = check(path)
     selfcheck.add(handed(rig, 1)[0])
-    eventually(lambda: len(selfcheck.faults()) == 2, "neither read nor written")
+    until(lambda: len(selfcheck.faults()) == 2, "neither read nor written")
     assert [one.code for one in selfcheck.faults()] == ["unreadable", "unwritable"]
     assert "line 1" in selfcheck.faults()[0].message
     assert selfcheck.told()["handoffs"] == 1
@@ -193,4 +194,4 @@ def test_a_file_that_hangs_keeps_nobody_waiting(
     assert "does not answer" in fault.message
     selfcheck.close()
     hang.let_go()
-    eventually(lambda: not any(t.name == NAME for t in threading.enumerate()), "its thread ends")
+    until(lambda: not any(t.name == NAME for t in threading.enumerate()), "its thread ends")

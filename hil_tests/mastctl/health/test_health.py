@@ -12,7 +12,7 @@ import pytest
 from calib.errors import BadFile
 from drivers.interfaces import COARSE_COUNT_RAD
 from hil_tests.mastctl.health.histories import DAY_S, NOON_S, bumped, pointing, stored_rig
-from hil_tests.mastctl.service_fakes import eventually
+from hil_tests.waiting import until
 from mastctl.health import journal as journal_module
 from mastctl.health.health import CalibrationHealth
 from mastctl.health.journal import FILE, Journal
@@ -102,7 +102,7 @@ def test_a_folder_that_is_no_folder_is_told(tmp_path: Path) -> None:
         Journal(tmp_path / FILE).read()
     health = CalibrationHealth(tmp_path, STORED, lambda: NOON_S)
     health.ended(STORED, ended_pointing())
-    eventually(lambda: health.told()["not_kept"], "the file is told")
+    until(lambda: health.told()["not_kept"], "the file is told")
     health.close()
 
 
@@ -110,14 +110,14 @@ def test_a_drift_is_told_after_a_restart_and_ends_with_another_mast_file(tmp_pat
     for one in history(6, 2e-3):
         Journal(tmp_path / FILE).add(one, [])
     health = CalibrationHealth(tmp_path, STORED, lambda: NOON_S + 600.0)
-    eventually(lambda: health.verdict.word == "drifts", "it drifts")
+    until(lambda: health.verdict.word == "drifts", "it drifts")
     told = health.told()
     assert "pancam_left" in told["sentence"] and "mrad" in told["sentence"]
     assert len(told["newest"]) == told["pointings"] == 6
     health.use_mast(replace(STORED, digest="0" * 64))
     assert health.verdict.word == "few"
     health.use_mast(STORED)
-    eventually(lambda: health.verdict.word == "drifts", "it drifts")
+    until(lambda: health.verdict.word == "drifts", "it drifts")
     health.close()
 
 

@@ -14,8 +14,8 @@ import pytest
 from calib.files.mast_file import load_rig, save_rig
 from calib.mast.rig import Rig
 from hil_tests.mastctl.recorder.test_what_if import wrong_mast
-from hil_tests.mastctl.service_fakes import eventually
 from hil_tests.mastctl.tracking.test_tracking_simulated import ROVER, STEP_M, Drive, begun, cropped
+from hil_tests.waiting import until
 from mastctl.cli.main import main
 from mastctl.client import Client
 from mastctl.config import load_config
@@ -36,7 +36,7 @@ def approach(folder: Path) -> Path:
         log = folder / "handed.jsonl"
         for step in range(1, 5):
             drive.to(STEP_M * step, 0.04 * step, 0.05 * step)
-        eventually(lambda: log.exists() and len(read_log(log).handoffs) == 1, "it was handed over")
+        until(lambda: log.exists() and len(read_log(log).handoffs) == 1, "it was handed over")
         return Path(client.stop_recording()["file"])
 
 

@@ -15,9 +15,9 @@ import pytest
 
 from calib.errors import BadFile
 from drivers.errors import DriverError
-from hil_tests.mastctl.outside_daemon import BOUND_S, daemon_process, free_port, line, under_way, write_config
+from hil_tests.mastctl.outside_daemon import daemon_process, free_port, line, under_way, write_config
 from hil_tests.mastctl.service_fakes import CONFIG, Hang, ScriptedLoop, fake_daemon
-from hil_tests.waiting import until
+from hil_tests.waiting import NET_S, until
 from mastctl.client import Client, ClientError
 from mastctl.errors import NotNow, Unable
 from mastctl.safety import latch as latch_module
@@ -50,7 +50,7 @@ def latched(folder: StateFolder) -> Latch:
     latch = Latch(folder)
     latch.hold("smoke", "Ana")
     latch.head_told()
-    assert latch.kept_within(BOUND_S)
+    assert latch.kept_within(NET_S)
     return latch
 
 
@@ -59,7 +59,7 @@ def test_a_latched_stop_is_found_by_the_next_daemon(folder: StateFolder) -> None
     assert latch.held is None
     held = latch.hold("sparks at the\nmast", "Ana")
     latch.head_told()
-    assert latch.kept_within(BOUND_S)
+    assert latch.kept_within(NET_S)
     assert (held.reason, held.name) == ("sparks at the mast", "Ana")
     assert Latch(folder).held == held
 
@@ -73,11 +73,11 @@ def test_the_disk_waits_for_the_head_but_not_for_long(
     assert not latch.kept_within(0.05)
     assert "not confirmed" in latch.not_kept
     latch.head_told()
-    assert latch.kept_within(BOUND_S)
+    assert latch.kept_within(NET_S)
     monkeypatch.setattr(latch_module, "HEAD_FIRST_S", 0.05)
     latch.release("looked", "Ben")
     latch.hold(None, None)
-    assert latch.kept_within(BOUND_S)  # a head that hangs does not keep the disk
+    assert latch.kept_within(NET_S)  # a head that hangs does not keep the disk
 
 
 @pytest.mark.parametrize("data", [b"", b"{}", b"\0" * 300, b'{"schema": "mastctl/latch/1"}', b"[]"])
@@ -117,7 +117,7 @@ def test_a_disk_that_refuses_leaves_it_latched_in_memory_and_says_so_until_it_ta
     latch = Latch(folder)
     held = latch.hold("smoke", "Ana")
     latch.head_told()
-    assert not latch.kept_within(BOUND_S)
+    assert not latch.kept_within(NET_S)
     assert latch.held == held
     assert "No space left" in latch.not_kept
     full.clear()
@@ -139,7 +139,7 @@ def test_a_reset_on_a_full_disk_leaves_the_file_its_room_for_the_next_stop(
     assert Latch(folder).held is None
     held = latch.hold("sparks", "Cem")
     latch.head_told()
-    assert latch.kept_within(BOUND_S)
+    assert latch.kept_within(NET_S)
     assert Latch(folder).held == held
 
 
@@ -179,7 +179,7 @@ def test_a_stop_that_no_disk_ever_took_is_reset_on_that_disk_too(
         monkeypatch.setattr(StateFile, way, refuse)
     latch.hold("smoke", "Ana")
     latch.head_told()
-    assert not latch.kept_within(BOUND_S)
+    assert not latch.kept_within(NET_S)
     latch.release("aired", "Ben")
     assert latch.held is None
     assert Latch(folder).held is None
@@ -200,7 +200,7 @@ def test_a_stop_that_the_disk_took_in_part_is_no_release_until_the_disk_says_so(
             patch.setattr(StateFile, way, refuse)
         latch.hold("smoke", "Ana")
         latch.head_told()
-        assert not latch.kept_within(BOUND_S)
+        assert not latch.kept_within(NET_S)
         with pytest.raises(Unable, match="stays latched"):
             latch.release("aired", "Ben")
     assert latch.held is not None
@@ -230,7 +230,7 @@ def test_a_stop_is_written_over_the_file_that_is_there_from_the_start(folder: St
         before = path.stat().st_ino
         latch.hold("smoke " * 100, "\U0001f525" * 500)  # six bytes and twelve a character
         latch.head_told()
-        assert latch.kept_within(BOUND_S)
+        assert latch.kept_within(NET_S)
         assert path.stat().st_ino == before
         assert Latch(folder).held == latch.held
         latch.release("aired", "Ben")
@@ -248,7 +248,7 @@ def test_a_power_cut_while_a_stop_is_written_leaves_what_is_latched_or_cannot_be
     old = path.read_bytes()
     latch.hold(reason, "Cem")
     latch.head_told()
-    assert latch.kept_within(BOUND_S)
+    assert latch.kept_within(NET_S)
     new = path.read_bytes()
     assert len(new) == len(old)
     parts = [slice(at, at + SECTOR_BYTES) for at in range(0, len(new), SECTOR_BYTES)]
@@ -272,7 +272,7 @@ def test_a_file_that_cannot_be_written_over_is_written_anew(
     monkeypatch.setattr(os, "fdatasync", refuse)
     latch.hold("smoke", "Ana")
     latch.head_told()
-    assert latch.kept_within(BOUND_S)
+    assert latch.kept_within(NET_S)
     assert Latch(folder).held == latch.held
 
 
@@ -293,7 +293,7 @@ def test_nobody_is_told_that_the_disk_holds_a_stop_while_a_reset_writes_there(
     with pytest.raises(NotNow, match="another emergency stop"):
         latch.release("aired", "Ben")
     assert told == [(False, False)]
-    assert latch.kept_within(BOUND_S)
+    assert latch.kept_within(NET_S)
     assert Latch(folder).held == latch.held
 
 
@@ -304,7 +304,7 @@ def test_words_that_no_terminal_and_no_answer_can_hold_are_kept_without_them(
     latch = Latch(folder)
     latch.hold(words, words)
     latch.head_told()
-    assert latch.kept_within(BOUND_S)
+    assert latch.kept_within(NET_S)
     found = Latch(folder).held
     assert found is not None
     assert found.reason == found.name == latch.release(words, words).reason
@@ -413,12 +413,12 @@ def test_an_emergency_stop_ends_the_running_operation(
 
         def wait(request: Any, record: Any, cancelled: threading.Event, devices: Any) -> Any:
             begun.set()
-            assert cancelled.wait(BOUND_S)
+            assert cancelled.wait(NET_S)
             devices.move(0.1, 0.1)
 
         monkeypatch.setattr(ScriptedLoop, "script", staticmethod(wait))
         operation = client.point(pan_rad=0.1, tilt_rad=0.1)
-        assert begun.wait(BOUND_S)
+        assert begun.wait(NET_S)
         assert client.estop(reason="sparks")["operation"] == operation
         record = client.wait(operation)
         assert record["state"] == "stopped"
@@ -454,9 +454,9 @@ def test_an_emergency_stop_is_never_refused_for_its_words(
 ) -> None:
     with fake_daemon(monkeypatch, tmp_path) as (daemon, hardware):
         headers = {"content-type": kind} if kind else {}
-        answer = httpx.post(f"{daemon.url}/api/v1/estop", content=body, headers=headers, timeout=BOUND_S)
+        answer = httpx.post(f"{daemon.url}/api/v1/estop", content=body, headers=headers, timeout=NET_S)
         assert (answer.status_code, answer.json()["reason"]) == (200, reason)
-        status = httpx.get(f"{daemon.url}/api/v1/status", timeout=BOUND_S)
+        status = httpx.get(f"{daemon.url}/api/v1/status", timeout=NET_S)
         assert status.json()["estop"]["reason"] == reason
         assert ("stop",) in hardware.head.calls
 
@@ -470,7 +470,7 @@ def test_a_reset_needs_a_reason_and_a_name(
 ) -> None:
     with fake_daemon(monkeypatch, tmp_path) as (daemon, _), Client(daemon.url) as client:
         client.estop()
-        answer = httpx.post(f"{daemon.url}/api/v1/reset", json=body, timeout=BOUND_S)
+        answer = httpx.post(f"{daemon.url}/api/v1/reset", json=body, timeout=NET_S)
         assert (answer.status_code, answer.json()["error"]["code"]) == (422, "bad_request")
         assert daemon.service.latch.held is not None
 
@@ -488,7 +488,7 @@ def test_a_reset_waits_for_a_stop_that_is_under_way(monkeypatch: pytest.MonkeyPa
                 client.reset(reason="x", name="y")
             assert refused.value.code == "stopping"
             hang.let_go()
-            stopping.join(BOUND_S)
+            stopping.join(NET_S)
         until(lambda: not daemon.service.machine.standing.stops, "the stop's end")
         client.reset(reason="x", name="y")
 
@@ -650,7 +650,7 @@ def test_a_second_daemon_of_one_state_folder_does_not_touch_the_head(tmp_path: P
     with daemon_process(tmp_path, config) as daemon:
         line(daemon)
         with daemon_process(tmp_path, config) as second:
-            _, words = second.communicate(timeout=BOUND_S)
+            _, words = second.communicate(timeout=NET_S)
         assert second.returncode == 1
         assert "is in use by another daemon" in words.splitlines()[-1]
         assert "Traceback" not in words

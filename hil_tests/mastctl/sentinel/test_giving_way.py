@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from hil_tests.mastctl.sentinel.small_rover import small_rover
-from hil_tests.mastctl.service_fakes import eventually
+from hil_tests.waiting import until
 from mastctl.client import Client, ClientError
 from mastctl.daemon import RunningDaemon
 
@@ -42,7 +42,7 @@ def moving(daemon: RunningDaemon, ana: Client) -> Iterator[tuple[Client, str]]:
         sentinel.lease("sentinel", for_s=60.0, gives_way=True),
     ):
         operation = sentinel.point(pan_rad=FAR_RAD, tilt_rad=-0.1)
-        eventually(lambda: ana.status()["moving"], "the sentinel's move", BOUND_S)
+        until(lambda: ana.status()["moving"], "the sentinel's move")
         ana.clear_faults()
         yield sentinel, operation
 
@@ -67,7 +67,7 @@ def test_who_comes_while_the_head_moves_is_obeyed_and_that_move_is_stopped(
     elif by == "jog":
         with ana.jog() as jog:
             jog.rates(0.05, 0.0)
-            eventually(lambda: sentinel.operation(operation)["state"] == "stopped", "the stop", BOUND_S)
+            until(lambda: sentinel.operation(operation)["state"] == "stopped", "the stop")
     else:
         granted = ana.acquire_lease(take_over="it is my turn" if by == "take" else None)
         ana.use_lease(granted["lease_id"])

@@ -14,7 +14,7 @@ from prometheus_client.parser import text_string_to_metric_families
 
 from calib.mast.rig import Rig
 from hil_tests.mastctl.sentinel.small_rover import RESTS, bumped, refocused, slipped, small_rover, truly
-from hil_tests.mastctl.service_fakes import eventually
+from hil_tests.waiting import until
 from mastctl.cli.main import main
 from mastctl.client import Client
 from mastctl.daemon import RunningDaemon
@@ -101,7 +101,7 @@ def test_a_change_of_the_truth_is_named_by_two_looks_and_told_everywhere(
         found = client.status()["sentinel"]
         return found is not None and found["level"] == "bad"
 
-    eventually(in_status, "the finding in the status")
+    until(in_status, "the finding in the status")
     assert client.status()["faults"] == [] and client.status()["state"] == "ready"
     health = client.calibration_health()
     assert health["sentinel"] is not None and health["sentinel"]["sentence"].startswith(what)

@@ -27,10 +27,10 @@ from hil_tests.mastctl.service_fakes import (
     FakeHardware,
     Hang,
     ScriptedLoop,
-    eventually,
     fake_daemon,
     rig,
 )
+from hil_tests.waiting import until
 from mastctl.cli.main import main
 from mastctl.client import Client, ClientError
 from mastctl.daemon import RunningDaemon
@@ -296,7 +296,7 @@ def test_hand_offs_that_tell_an_offset_say_so(
     code, out, _ = run(daemon, capsys, "status")
     assert (code, out.splitlines()[1:]) == (0, [offset["sentence"]])
     path = daemon.service.config.mast_file.parent / "handed/over.jsonl"
-    eventually(lambda: path.exists() and len(read_log(path).handoffs) == 12, "the record is written")
+    until(lambda: path.exists() and len(read_log(path).handoffs) == 12, "the record is written")
     folder = daemon.service.config.mast_file.parent
     save_rig(replace(rig(), name="better"), folder / "better.yaml")
     client._daemon.json("POST", "/mast", json={"file": "better.yaml"})
@@ -319,7 +319,7 @@ def test_a_record_that_cannot_be_written_is_told_and_stops_no_track(
     monkeypatch.setattr(ScriptedLooker, "script", staticmethod(hand_over))
     track = drive(client, 0.5, 2.0)
     assert (track["state"], track["self_check"]["handoffs"]) == ("tracking", 1)
-    eventually(lambda: client.status()["faults"], "the fault")
+    until(lambda: client.status()["faults"], "the fault")
     status = client.status()
     (fault,) = status["faults"]
     assert (fault["device"], fault["code"]) == ("handoff_log", "unwritable")
@@ -483,7 +483,7 @@ def test_poses_that_come_during_a_look_make_its_pictures_worthless(
     refusal(lambda: drive(client, 0.6, 2.5), "pose_runs_backwards")
     monkeypatch.setattr(ScriptedLooker, "script", staticmethod(found))
     hang.let_go()
-    eventually(lambda: client.track()["looks"] == 1, "the look from the second pose")
+    until(lambda: client.track()["looks"] == 1, "the look from the second pose")
     track = client.track()
     assert track["position_m"] == pytest.approx([4.5, 0.5, 0.0]), "the first look counts for nothing"
     assert (track["state"], track["predicted"], track["reason"]) == ("tracking", False, "")
@@ -504,7 +504,7 @@ def test_poses_of_a_standing_rover_leave_a_look_its_worth(
     assert hang.entered.wait(10.0)
     client.pose([0.501, 0, 0], [1, 0, 0, 0], sigma=(0.0, 0.0), time_s=3.0, look=False)
     hang.let_go()
-    eventually(lambda: client.track()["looks"] == 1, "the look")
+    until(lambda: client.track()["looks"] == 1, "the look")
     track = client.track()
     assert track["position_m"] == pytest.approx([4.399, 0.6, 0.0])
     assert not track["predicted"]
@@ -582,7 +582,7 @@ def test_whoever_reads_the_log_may_use_the_track(
     try:
         with caplog.at_level(logging.INFO, log.name):
             started(client)
-            eventually(lambda: len(waits) == 2, "the words of the start, and of its stop")
+            until(lambda: len(waits) == 2, "the words of the start, and of its stop")
     finally:
         log.removeFilter(stop)
     assert waits == [False, False], "the log was written with the lock held"
@@ -614,11 +614,11 @@ def test_the_stream_tells_the_track_now_and_at_each_change(client: Client, daemo
         ended.set()
 
     threading.Thread(target=watch, daemon=True).start()
-    eventually(lambda: told, "the first event")
+    until(lambda: told, "the first event")
     assert told[0]["state"] == "idle"
     started(client)
     drive(client, 0.5, 2.0)
-    eventually(lambda: told[-1]["looks"] == 1, "the look's event")
+    until(lambda: told[-1]["looks"] == 1, "the look's event")
     sequences = [track["sequence"] for track in told]
     assert sequences == sorted(set(sequences))
     daemon.close()

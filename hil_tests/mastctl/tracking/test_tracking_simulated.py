@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from calib.files.mast_file import load_rig, save_rig
 from calib.mast.rig import Rig, RigCamera
 from calib.rigid import FloatArray, Rigid
-from hil_tests.mastctl.service_fakes import eventually
+from hil_tests.waiting import until
 from mastctl.client import Client, ClientError
 from mastctl.config import load_config
 from mastctl.daemon import RunningDaemon
@@ -151,7 +151,7 @@ def test_an_approach_over_http_hands_over_and_keeps_its_target(client: Client, d
     assert track["looks"] == 4
     assert track["self_check"] == {"handoffs": 1, "offsets": []}
     path = daemon.service.config.mast_file.parent / "handed.jsonl"
-    eventually(lambda: path.exists() and len(read_log(path).handoffs) == 1, "the record is written")
+    until(lambda: path.exists() and len(read_log(path).handoffs) == 1, "the record is written")
     (record,) = read_log(path).handoffs
     assert record.pair == ("navcam_left", "navcam_right")
     assert list(record.found) == ["hazcam_left", "hazcam_right"]

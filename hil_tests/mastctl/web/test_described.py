@@ -15,6 +15,7 @@ from mastctl.web.described import ANSWERS, EVENTS, FILES
 from tools.campaigns.fuzz_http import UNASKED, ask, taken_back
 
 FUZZ_S = 30.0
+EXAMPLES = 4  # of each route, twice
 
 
 def test_every_route_has_a_model_a_kind_of_file_or_events_and_no_other_is_named(
@@ -54,9 +55,23 @@ def test_whatever_is_asked_the_answer_is_as_described(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
     with fake_daemon(monkeypatch, tmp_path) as (daemon, _):
-        code = ask(daemon.url, FUZZ_S, examples=3)
-        counted = HTTP.get(f"{daemon.url}/metrics").text
+        check(daemon.url, capfd, None, seed=1)
+        done = r'commands_total{command="(point|jog|track.stop|record.start|reload)",result="ok"}'
+        until(lambda: re.search(done, HTTP.get(f"{daemon.url}/metrics").text), "some were carried out")
+
+
+@pytest.mark.long(2, "half a minute by the clock; the edges of each form too, some 2,700 requests")
+def test_whatever_is_asked_for_a_while_the_answer_is_as_described(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    with fake_daemon(monkeypatch, tmp_path) as (daemon, _):
+        check(daemon.url, capfd, FUZZ_S)
+
+
+def check(
+    url: str, capfd: pytest.CaptureFixture[str], seconds: float | None, seed: int | None = None
+) -> None:
+    """Have a daemon asked, and nothing may be wrong."""
+    code = ask(url, seconds, EXAMPLES, seed)
     told = capfd.readouterr().out[-6000:].encode("ascii", "backslashreplace").decode()  # xdist sends UTF-8
     assert code == 0, told
-    done = r'commands_total{command="(point|jog|track.stop|record.start|reload)",result="ok"}'
-    assert re.search(done, counted), "some were carried out"
