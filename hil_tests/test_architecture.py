@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import re
 import runpy
 import sys
@@ -62,6 +63,16 @@ def test_the_page_lists_every_tool(repository: Path) -> None:
     assert listed == set(TOOLS)
 
 
+def test_every_tools_parser_describes_the_tool() -> None:
+    for tool in TOOLS:
+        place = FOLDER.joinpath(*tool.split("."))
+        tree = ast.parse((place / "__main__.py" if place.is_dir() else place.with_suffix(".py")).read_text())
+        calls = [node for node in ast.walk(tree) if isinstance(node, ast.Call)]
+        parsers = [call for call in calls if ast.unparse(call.func).endswith("ArgumentParser")]
+        assert any(word.arg == "description" for parser in parsers for word in parser.keywords), tool
+
+
+@pytest.mark.long(4, "each of 62 tools is run for its --help; the quick run looks at their parsers")
 @pytest.mark.parametrize("tool", TOOLS)
 def test_every_tool_says_how_it_is_used(
     tool: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
