@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import json
 import os
 import select
@@ -11,6 +12,7 @@ import stat
 import subprocess
 import threading
 import time
+import weakref
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -241,9 +243,12 @@ def test_a_file_in_the_sockets_place_is_left_alone(monkeypatch: pytest.MonkeyPat
     assert path.read_text() == "data"
 
 
-def test_a_daemon_leaves_no_thread_behind(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_a_daemon_leaves_no_thread_and_no_memory_behind(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
     before = set(threading.enumerate())  # what other tests made hang is theirs
     with fake_daemon(monkeypatch, tmp_path) as (daemon, _):
+        service, made = weakref.ref(daemon.service), weakref.ref(daemon)
         before_others = {thread for thread in threading.enumerate() if thread.name.startswith("AnyIO")}
         with Client(daemon.url) as client:
             client.wait(client.point(pan_rad=0.1, tilt_rad=0.1))
@@ -258,6 +263,9 @@ def test_a_daemon_leaves_no_thread_behind(monkeypatch: pytest.MonkeyPatch, tmp_p
         lambda: {t for t in threading.enumerate() if t.name.startswith("AnyIO")} <= before_others,
         "the web server's threads gone",
     )
+    del daemon
+    gc.collect()
+    assert service() is None and made() is None
 
 
 def test_the_end_is_bounded_although_everything_hangs(
