@@ -90,6 +90,9 @@ def outer(bound=2):
     assert functions == {"2": 0, "3": 0, "4": 5, "5": 3}
 
 
+OFTEN = pytest.mark.long(
+    3, "runs pytest in a process of its own three to five times; once is in the quick run"
+)
 CODE = "def doubled(a):\n    return a * 2\n\n\ndef unused(a):\n    while a:\n        a -= 1\n"
 
 
@@ -117,6 +120,7 @@ def test_a_run_says_who_objected_and_which_functions_were_entered(checkout: Path
     assert (killed.outcome, killed.test) == ("killed", "test_code.py::test_two")
 
 
+@OFTEN
 @pytest.mark.parametrize(
     ("code", "outcome"),
     [
@@ -131,6 +135,7 @@ def test_neither_an_endless_loop_nor_a_module_that_cannot_be_imported_is_a_test_
     assert run(checkout, {"test_code.py": 1.0}, 120.0).outcome == outcome
 
 
+@OFTEN
 def test_what_a_test_objects_to_once_or_without_the_change_too_is_no_kill(checkout: Path) -> None:
     (checkout / "test_code.py").write_text(
         """from pathlib import Path
@@ -165,6 +170,7 @@ def test_two(a):
     assert run_change(file, CODE.replace("-= 1", "-= 2"), checkout, allowed_s, 120.0).outcome == "passed"
 
 
+@OFTEN
 def test_tests_that_are_all_skipped_object_to_nothing(checkout: Path) -> None:
     (checkout / "test_code.py").write_text(
         "import pytest\n\npytest.skip('there is no camera', allow_module_level=True)\n"

@@ -7,7 +7,6 @@ import signal
 import subprocess
 import threading
 from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -95,24 +94,18 @@ def test_a_lease_that_is_taken_lets_the_move_end_and_no_other_begin(url: str) ->
         Client(url, name="Ana") as ana,
         Client(url, name="bench") as client,
         client.lease(name="calibrate bench"),
-        ThreadPoolExecutor(1) as beside,
     ):
         eyes = DaemonEyes(client, ("navcam_left",), BOARD)
-        looked = beside.submit(eyes.look, *a_little_from_here(ana))
-        until(lambda: ana.status()["moving"] or looked.done(), "the head turns")
+        move = client.point(pan_rad=FAR_RAD, tilt_rad=0.0)
+        until(lambda: ana.status()["moving"], "the head turns")
         with (
             ana.lease("Ana", take_over="the head is needed"),
             pytest.raises(Interrupted, match="Ana took over: the head is needed"),
         ):
-            looked.result()
-            eyes.look(FAR_RAD, 0.0)
-
-
-def a_little_from_here(client: Client) -> tuple[float, float]:
-    """Where the crawling head is in a second or two."""
-    here = client.status()["joints"]
-    assert here is not None
-    return here["pan_rad"] + 0.02, here["tilt_rad"]
+            eyes.look(-FAR_RAD, 0.0)
+        assert ana.operation(move)["state"] == "running"
+        ana.stop()
+        assert ana.wait(move)["state"] == "stopped"
 
 
 def test_a_stop_between_two_moves_ends_it_and_is_told(url: str) -> None:
@@ -122,7 +115,9 @@ def test_a_stop_between_two_moves_ends_it_and_is_told(url: str) -> None:
         client.lease(name="calibrate bench", ends_with_stop=True),
     ):
         eyes = DaemonEyes(client, ("navcam_left",), BOARD)
-        eyes.look(*a_little_from_here(ana))
+        here = ana.status()["joints"]
+        assert here is not None
+        client.wait(client.point(pan_rad=here["pan_rad"] + 0.01, tilt_rad=here["tilt_rad"]))
         ana.stop()
         stands = ana.status()["joints"]
         with pytest.raises(Interrupted, match=r"^the head was stopped by Ana$"):

@@ -85,15 +85,15 @@ def package(repository: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
 def config(folder: Path, repository: Path, cameras: dict[str, dict[str, object]], pan: float = 2.6) -> str:
     """A configuration whose pictures are small, so that the machine keeps up."""
     mast = yaml.safe_load((repository / "configs" / "masts" / "rocky8_simulated.yaml").read_text())
-    for camera in mast["cameras"].values():  # every third pixel: the vectors H and V in its units
+    for camera in mast["cameras"].values():  # every fifth pixel: the vectors H and V in its units
         width, height = camera["size_px"]
-        camera["size_px"] = [width // 3, height // 3]
+        camera["size_px"] = [width // 5, height // 5]
         for key, middle, new in (
-            ("H", (width - 1) / 2, (width // 3 - 1) / 2),
-            ("V", (height - 1) / 2, (height // 3 - 1) / 2),
+            ("H", (width - 1) / 2, (width // 5 - 1) / 2),
+            ("V", (height - 1) / 2, (height // 5 - 1) / 2),
         ):
             camera[key] = [
-                (h - middle * a) / 3 + new * a for h, a in zip(camera[key], camera["A"], strict=True)
+                (h - middle * a) / 5 + new * a for h, a in zip(camera[key], camera["A"], strict=True)
             ]
     mast.pop("fit", None)
     (folder / "mast.yaml").write_text(yaml.safe_dump(mast))
