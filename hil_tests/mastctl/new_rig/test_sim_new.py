@@ -108,7 +108,6 @@ def test_a_rig_is_never_overwritten_unless_that_is_asked_for(
         ("--head roof", "invalid choice"),
         ("--head ph42 --wire flir_ptu", "flir_ptu"),
         ("--speed often", "speed"),
-        ("--wire dynamixel --speed max", "travel in real time"),
         ("--boards 13", "--boards is 13 where 12 at most have room"),
         ("--seed -1", "'-1' where a whole number"),
         ("--from nowhere.yaml", "nowhere.yaml"),
