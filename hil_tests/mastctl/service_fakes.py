@@ -236,11 +236,20 @@ def fake_daemon(
     config: str | None = None,
     loop: type[ScriptedLoop] = ScriptedLoop,
 ) -> Iterator[tuple[RunningDaemon, FakeHardware]]:
-    """A daemon on fakes: a real server on loopback, fake devices, a scripted loop."""
+    """A daemon on fakes: a real server on loopback, fake devices, a scripted loop.
+
+    Its deadlines for the head are nets: a process that gets no processor for a second is no head that fails.
+    A test of such a deadline sets it inside the block.
+    """
     from mastctl.daemon import RunningDaemon  # slow to load, and most of these fakes need no daemon
+    from mastctl.devices import devices as devices_module
     from mastctl.service import service as service_module
     from mastctl.service import steering as steering_module
+    from mastctl.web import commands as commands_module
 
+    for name in ("READ_TIMEOUT_S", "MOVE_TIMEOUT_S", "STOP_TIMEOUT_S"):
+        monkeypatch.setattr(devices_module, name, NET_S)
+    monkeypatch.setattr(commands_module, "STOP_ANSWER_S", 2.0 * NET_S)
     hardware = FakeHardware()
     save_rig(rig(), folder / "little.yaml")
     (folder / "daemon.yaml").write_text((config or CONFIG).format(listen=listen))

@@ -271,11 +271,11 @@ def test_a_daemon_leaves_no_thread_and_no_memory_behind(
 def test_the_end_is_bounded_although_everything_hangs(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr(devices_module, "STOP_TIMEOUT_S", 0.2)
     monkeypatch.setattr(operations_module, "END_TIMEOUT_S", 0.2)
     monkeypatch.setattr(service_module, "HARDWARE_CLOSE_S", 0.2)
     hang = Hang()
     with fake_daemon(monkeypatch, tmp_path) as (daemon, hardware):
+        monkeypatch.setattr(devices_module, "STOP_TIMEOUT_S", 0.2)
         monkeypatch.setattr(ScriptedLoop, "script", staticmethod(lambda *any: hang()))
         with Client(daemon.url) as client:
             operation = client.point(pan_rad=0.1, tilt_rad=0.1)

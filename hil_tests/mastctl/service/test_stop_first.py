@@ -17,7 +17,7 @@ import pytest
 from drivers.clock import SystemClock
 from drivers.errors import DriverError
 from drivers.faults import FaultPanel
-from hil_tests.mastctl.service_fakes import FakeHardware, Hang, ScriptedLoop, fake_daemon
+from hil_tests.mastctl.service_fakes import HTTP, FakeHardware, Hang, ScriptedLoop, fake_daemon
 from hil_tests.waiting import NET_S, joined, until
 from mastctl.client import Client, ClientError
 from mastctl.daemon import RunningDaemon
@@ -118,7 +118,7 @@ def test_no_lock_that_somebody_holds_keeps_the_event_loop(
             with lock:
                 waiting = [asked(daemon.url, *request) for request in MAY_WAIT]
                 for path in 2 * ("/status", "/track", "/operations", f"/operations/{operation}", "/mast"):
-                    answer = client._daemon._http.get(f"/api/v1{path}")
+                    answer = HTTP.get(f"{daemon.url}/api/v1{path}")
                     assert answer.status_code == 200, f"{path} while {place} is held"
             for one in waiting:
                 with one:
@@ -149,8 +149,8 @@ def test_a_fifth_stop_is_answered_honestly_while_four_hang(
 ) -> None:
     hang = Hang()
     monkeypatch.setattr(stop_threads_module, "OVERDUE_S", 0.2)
-    monkeypatch.setattr(commands_module, "STOP_ANSWER_S", 0.5)
     with fake_daemon(monkeypatch, tmp_path) as (daemon, _):
+        monkeypatch.setattr(commands_module, "STOP_ANSWER_S", 0.5)
         monkeypatch.setattr(daemon.service.stopping, "stop", hang)
         told: list[ClientError] = []
         four = [asked_to_stop(daemon) for _ in range(4)]
