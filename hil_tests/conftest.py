@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import atexit
 import gc
 import os
-import shutil
 import signal
 import subprocess
 import sys
@@ -14,8 +12,11 @@ from collections import Counter
 from collections.abc import Generator
 from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 import pytest
+
+from hil_tests.left_behind import OwnFolder
 
 REPOSITORY = Path(__file__).resolve().parent.parent
 VM_CONFTEST = REPOSITORY / "hil_tests" / "vm" / "conftest.py"
@@ -34,10 +35,15 @@ with suppress(ValueError):  # not the main thread
         if signal.getsignal(_number) is signal.SIG_IGN:
             signal.signal(_number, _usual)
 
-# Daemons that tests start keep their state in a folder of these tests, and no two runs share one.
-os.environ["XDG_STATE_HOME"] = tempfile.mkdtemp(prefix="mastctl-tests-")
+# What tests make in the temporary folder, and the state of daemons that they start, is in a folder of this
+# process alone. pytest's own folders stay beside it.
+os.environ.setdefault("PYTEST_DEBUG_TEMPROOT", tempfile.gettempdir())
+OWN = OwnFolder(Path(os.environ["PYTEST_DEBUG_TEMPROOT"]))
+os.environ["TMPDIR"] = str(OWN.path)
+tempfile.tempdir = None  # asks the environment again
+os.environ["XDG_STATE_HOME"] = str(OWN.keep("state"))
 os.environ.pop("STATE_DIRECTORY", None)
-atexit.register(shutil.rmtree, os.environ["XDG_STATE_HOME"], ignore_errors=True)
+LEFT = pytest.StashKey[list[str]]()
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
@@ -61,6 +67,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 def pytest_configure(config: pytest.Config) -> None:
     """Declare the marker of the long run."""
+    config.stash[LEFT] = []
     config.addinivalue_line(
         "markers",
         "long(part, why): left out of the quick run; belongs to one of the four parts of the long run that "
@@ -110,12 +117,37 @@ def pytest_runtest_protocol(
     return ran
 
 
+def pytest_runtest_logfinish(nodeid: str) -> None:
+    """Look what is in the temporary folder after each test."""
+    OWN.look(nodeid)
+
+
+@pytest.hookimpl(trylast=True)
+def pytest_sessionfinish(session: pytest.Session) -> None:
+    """Fail a run that leaves a process or a temporary file behind; a worker tells the one who prints."""
+    config = session.config
+    if not config.pluginmanager.hasplugin("dsession"):  # it runs tests itself
+        config.stash[LEFT] += OWN.left()
+    if hasattr(config, "workeroutput"):
+        config.workeroutput["left"] = config.stash[LEFT]
+    elif config.stash[LEFT] and session.exitstatus == pytest.ExitCode.OK:
+        session.exitstatus = pytest.ExitCode.TESTS_FAILED
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_testnodedown(node: Any) -> None:
+    """Take what a worker of xdist left."""
+    node.config.stash[LEFT] += getattr(node, "workeroutput", {}).get("left", [])
+
+
 @pytest.hookimpl(wrapper=True, tryfirst=True)
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> Generator[None]:
     """Say in the last line before the counts what did not run for want of the kernel, and what mends it."""
     yield
     if terminalreporter.config.getoption("--tell-flaky"):
         _tell_flaky(terminalreporter)
+    for thing in terminalreporter.config.stash[LEFT]:
+        terminalreporter.write_line(f"LEFT BEHIND, so the run fails: {thing}", red=True)
     skipped = terminalreporter.getreports("skipped")
     reasons = Counter(
         why for path, _, why in (told.longrepr for told in skipped) if Path(path) == VM_CONFTEST

@@ -27,6 +27,7 @@ import socket
 import struct
 import subprocess
 import sys
+import tempfile
 import time
 from pathlib import Path
 from typing import Any
@@ -153,6 +154,7 @@ def _become(order: dict[str, Any], path: list[str]) -> None:
     os.chdir(order["cwd"])
     os.environ.clear()
     os.environ.update(env)
+    tempfile.tempdir = None  # may be another one
     sys.argv = ["mastctl", *order["words"]]
     sys.path[:] = [order["cwd"], *filter(None, env.get("PYTHONPATH", "").split(os.pathsep)), *path]
     unbuffered = bool(env.get("PYTHONUNBUFFERED"))

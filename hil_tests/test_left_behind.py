@@ -1,8 +1,9 @@
-"""What a signal ends clears away what it made."""
+"""A run of the suite that leaves something behind fails, and names it and the test."""
 
 from __future__ import annotations
 
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -12,6 +13,61 @@ from pathlib import Path
 import pytest
 
 from hil_tests.waiting import until
+
+CONFTEST = "from hil_tests.conftest import *\nfrom hil_tests.conftest import _tell_flaky\n"
+
+TESTS = {
+    "nothing": "def test_it(tmp_path):\n    (tmp_path / 'file').touch()\n",
+    "folder": "import tempfile\ndef test_it():\n    tempfile.mkdtemp(prefix='mastctl-')\n",
+    "process": """
+import subprocess, sys
+def test_it():
+    code = "import subprocess; subprocess.Popen(['sleep', '600'], start_new_session=True)"
+    subprocess.run([sys.executable, '-c', code], check=True, stdout=-3, stderr=-3)  # gone before the run ends
+""",
+}
+
+
+@pytest.mark.parametrize(
+    ("what", "workers"), [("nothing", 0), ("folder", 0), ("process", 0), ("folder", 1), ("nothing", 1)]
+)
+def test_what_is_left_behind_fails_the_run(repository: Path, tmp_path: Path, what: str, workers: int) -> None:
+    (tmp_path / "conftest.py").write_text(CONFTEST)
+    (tmp_path / "test_one.py").write_text(TESTS[what])
+    (tmp_path / "temporary").mkdir()
+    environment = {
+        **os.environ,
+        "PYTHONPATH": str(repository),
+        "PYTEST_DEBUG_TEMPROOT": f"{tmp_path}/temporary",
+    }
+    words = [
+        "-p",
+        "no:cacheprovider",
+        "-s",
+        "-c",
+        os.devnull,
+        "--rootdir",
+        ".",
+        "-n",
+        str(workers),
+        "test_one.py",
+    ]
+    done = subprocess.run(
+        [sys.executable, "-m", "pytest", *words],
+        cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=120, check=False,
+    )  # fmt: skip
+    told = [line for line in done.stdout.splitlines() if line.startswith("LEFT BEHIND")]
+    for process in re.findall(r"process (\d+): sleep 600", done.stdout):
+        os.kill(int(process), signal.SIGKILL)
+    assert "1 passed" in done.stdout, done.stdout + done.stderr
+    assert not [*tmp_path.glob("temporary/mastctl-*")]  # it clears away what it complains of
+    if what == "nothing":
+        assert done.returncode == 0 and told == []
+    else:
+        (line,) = told
+        assert done.returncode == 1
+        assert "sleep 600" in line if what == "process" else "/mastctl-" in line and "test_it" in line
+
 
 TOOL = """
 import subprocess, tempfile, time

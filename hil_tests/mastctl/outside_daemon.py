@@ -7,6 +7,7 @@ import fcntl
 import os
 import socket
 import subprocess
+import tempfile
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -100,9 +101,14 @@ def daemon_process(
     """A daemon in a process of its own, on the devices above; forked, unless something is to be prepared."""
     environment = {**os.environ, "PYTHONPATH": str(folder)}
     command = [*forks.MASTCTL, "run", "--config", str(config)]
-    with (subprocess.Popen if prepare else forks.Popen)(
-        command, stdout=stdout, stderr=stderr, text=True, env=environment, cwd=folder, preexec_fn=prepare
-    ) as made:
+    popen = subprocess.Popen if prepare else forks.Popen
+    with (
+        tempfile.TemporaryDirectory() as temporary,  # killed, it clears nothing away
+        popen(
+            command, stdout=stdout, stderr=stderr, text=True, env=environment | {"TMPDIR": temporary},
+            cwd=folder, preexec_fn=prepare,
+        ) as made,
+    ):  # fmt: skip
         try:
             yield made
         finally:

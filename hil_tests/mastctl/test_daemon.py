@@ -10,6 +10,7 @@ import signal
 import socket
 import stat
 import subprocess
+import tempfile
 import threading
 import time
 import weakref
@@ -95,14 +96,17 @@ def process(
 ) -> Iterator[subprocess.Popen[str]]:
     """``mastctl`` in a process of its own."""
     environment = {**os.environ, "PYTHONPATH": str(folder)}
-    with popen(
-        [*forks.MASTCTL, *words],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        env=environment,
-        cwd=folder,
-    ) as made:
+    with (
+        tempfile.TemporaryDirectory() as temporary,  # killed, it clears nothing away
+        popen(
+            [*forks.MASTCTL, *words],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            env=environment | {"TMPDIR": temporary},
+            cwd=folder,
+        ) as made,
+    ):
         try:
             yield made
         finally:

@@ -124,7 +124,10 @@ class StateFolder:
         if lock < 0:
             return
         if self.is_temporary:
-            shutil.rmtree(self.path, ignore_errors=True)
+            gone = self.path.with_name(f"{self.path.name}-gone")
+            with contextlib.suppress(OSError):
+                self.path.rename(gone)  # who still writes finds no folder: a file more would keep it
+            shutil.rmtree(gone, ignore_errors=True)
         with contextlib.suppress(OSError):
             os.close(lock)
 

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import os
 import re
 import signal
 import subprocess
+import tempfile
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -34,7 +36,12 @@ def crawling_daemon(repository: Path, folder: Path) -> Iterator[tuple[str, subpr
     text = re.sub(r"(speed_rad_per_s: )[\d.]+", rf"\g<1>{CRAWLING_RAD_PER_S}", text)
     (folder / "bench.yaml").write_text(text)
     command = [*forks.MASTCTL, "run", "--config", str(folder / "bench.yaml")]
-    with forks.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+    with (
+        tempfile.TemporaryDirectory() as temporary,  # killed, it clears nothing away
+        forks.Popen(
+            command, stdout=subprocess.PIPE, text=True, env={**os.environ, "TMPDIR": temporary}
+        ) as process,
+    ):
         assert process.stdout is not None
         try:
             yield process.stdout.readline().split()[-1], process

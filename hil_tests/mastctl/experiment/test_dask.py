@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import tempfile
 from collections.abc import Iterator, Mapping
 from concurrent.futures import Executor
 from contextlib import nullcontext
@@ -11,6 +12,7 @@ from dataclasses import is_dataclass
 from pathlib import Path
 from typing import Any
 
+import dask
 import numpy as np
 import pytest
 from distributed import LocalCluster
@@ -36,9 +38,14 @@ PLAN = SurveyPlan(sigma=Sigma(0.002, 0.1))
 @pytest.fixture(scope="module")
 def address() -> Iterator[str]:
     """The scheduler of a cluster of this machine: two workers in processes of their own."""
-    with LocalCluster(
-        n_workers=2, threads_per_worker=1, processes=True, dashboard_address=None, host="127.0.0.1"
-    ) as cluster:
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        dask.config.set(temporary_directory=folder),  # the scheduler's
+        LocalCluster(
+            n_workers=2, threads_per_worker=1, processes=True, dashboard_address=None, host="127.0.0.1",
+            local_directory=folder,
+        ) as cluster,
+    ):  # fmt: skip
         cluster.wait_for_workers(2, timeout=120)
         yield str(cluster.scheduler_address)
 

@@ -6,7 +6,9 @@ import contextlib
 import errno
 import os
 import random
+import shutil
 import threading
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -356,6 +358,23 @@ def test_systemd_names_the_folder_and_the_configuration_before_it(
         made = StateFolder.of(named, tmp_path / "rover.yaml", "http://127.0.0.1:1")
         assert made.path == expected
         made.close()
+
+
+def test_a_temporary_folder_goes_also_when_somebody_still_writes(monkeypatch: pytest.MonkeyPatch) -> None:
+    made = StateFolder.temporary()
+    (made.path / "latch.json").write_text("{}")
+
+    def removed(path: Path, ignore_errors: bool) -> None:
+        for file in path.iterdir():
+            file.unlink()
+        for late in (lambda: (made.path / "late.json").write_text("{}"), path.rmdir):
+            with suppress(OSError):
+                late()
+
+    with monkeypatch.context() as patch:
+        patch.setattr(shutil, "rmtree", removed)
+        made.close()
+    assert not [*made.path.parent.glob(f"{made.path.name}*")]
 
 
 def test_a_usual_place_that_cannot_be_made_is_replaced_and_told_a_named_one_is_insisted_upon(
