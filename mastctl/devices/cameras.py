@@ -103,8 +103,8 @@ class Cameras:
         self._looking = threading.Condition()
         self._looks = Counter[str]()  # calls of `frames` under way, of each camera
         self._people = SystemClock()  # who only watches lives in real time
-        self._glancing = False  # where a glance holds up the clock: one at a time, and not before this moment
-        self._glance_from_s = 0.0
+        self._row: list[object] = []  # where a glance holds up the clock: one after the other as they came
+        self._glance_from_s = 0.0  # and not before this moment
         self._threads = {name: self._thread_of(name) for name in self._cameras}
         if rig is not None:
             self._check_sizes()
@@ -175,6 +175,25 @@ class Cameras:
         BadFrame, NoReply, DriverError, BadReply
             As `frames`.
         """
+        place = object()
+        with self._looking:
+            self._row.append(place)
+        try:
+            return self._in_turn(place, camera, exposed_after_s, max_age_s, timeout_s, told)
+        finally:
+            with self._looking:
+                self._row.remove(place)
+                self._looking.notify_all()
+
+    def _in_turn(
+        self,
+        place: object,
+        camera: str,
+        exposed_after_s: float,
+        max_age_s: float,
+        timeout_s: float,
+        told: bool,
+    ) -> StampedFrame:
         until_s = self._people.now_s() + GLANCE_PATIENCE_S
         while True:
             after_s = max(exposed_after_s, self._clock.now_s() - max_age_s)
@@ -183,13 +202,12 @@ class Cameras:
                 return self._stamped(camera, newest, told)
             with self._looking:
                 began_s = self._people.now_s()
-                if self._in_the_way(camera):
+                if self._in_the_way(camera, place):
                     if began_s > until_s:
                         raise NoFreshFrame("all pictures taken now are needed elsewhere", device=camera)
                     early_s = self._glance_from_s - began_s
                     self._looking.wait(early_s if early_s > 0.0 else GLANCE_AGAIN_S)
                     continue
-                self._glancing = True
             try:
                 frame = self._glanced(camera, self._known_from(after_s), self._time.now_s() + timeout_s)
                 return self._stamped(camera, frame, told)
@@ -197,17 +215,15 @@ class Cameras:
                 continue
             finally:
                 with self._looking:
-                    self._glancing = False
                     ended_s = self._people.now_s()
                     self._glance_from_s = ended_s + (ended_s - began_s) * (1.0 / GLANCES_SHARE - 1.0)
-                    self._looking.notify_all()
 
-    def _in_the_way(self, camera: str) -> bool:
+    def _in_the_way(self, camera: str, place: object) -> bool:
         """Whether a glance would hold anybody up."""
         if not self._clock.stands_for_work:
             return self._looks[camera] > 0
         early = self._people.now_s() < self._glance_from_s
-        return early or self._glancing or any(count > 0 for count in self._looks.values())
+        return early or self._row[0] is not place or any(count > 0 for count in self._looks.values())
 
     def _glanced(self, camera: str, after_s: float, deadline_s: float) -> Frame | StampedFrame:
         take = self._taker(camera, after_s, deadline_s)

@@ -4,23 +4,38 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
 
 import pytest
+import yaml
 
 from hil_tests.mastctl.web.page.conftest import Visit
 from hil_tests.waiting import until
 from mastctl.client import Client
 from mastctl.config import load_config
 from mastctl.daemon import RunningDaemon
-from tools.living_daemon import simulated
+from mastctl.devices import cameras
+from tools.living_daemon import simulated, written
 
 Visits = Callable[..., Visit]
 
 
+@contextmanager
+def at_speed(folder: Path, speed: float) -> Iterator[RunningDaemon]:
+    """A rover whose clock stands while it draws: on a busy machine no deadline runs out."""
+    config = simulated(folder, "memory", ("navcam_left", "navcam_right"))
+    document = yaml.safe_load(config.read_text())
+    document["simulation"]["speed"] = speed
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(cameras, "GLANCES_SHARE", 0.5)  # the page's pictures matter here
+        with RunningDaemon(load_config(written(folder, document))) as daemon:
+            yield daemon
+
+
 @pytest.fixture(scope="module")
 def rover(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunningDaemon]:
-    config = simulated(tmp_path_factory.mktemp("rover"), "memory", ("navcam_left", "navcam_right"))
-    with RunningDaemon(load_config(config)) as daemon:
+    with at_speed(tmp_path_factory.mktemp("rover"), 3.0) as daemon:
         yield daemon
 
 
@@ -58,10 +73,13 @@ def test_a_rock_is_clicked_pointed_at_and_its_residual_read(rover: RunningDaemon
     assert rover.service.operations.all()[0].told()["state"] == "done"
 
 
-def test_stop_during_a_motion_ends_it_where_the_head_is(rover: RunningDaemon, visit: Visits) -> None:
-    one = visit(rover.url)
-    one.word("ready")
-    with Client(rover.url) as client:
+def test_stop_during_a_motion_ends_it_where_the_head_is(tmp_path: Path, visit: Visits) -> None:
+    with (
+        at_speed(tmp_path, 0.1) as slow,
+        Client(slow.url) as client,
+    ):
+        one = visit(slow.url)  # its head takes half a minute for a way of some seconds
+        one.word("ready")
         began = client.status()["joints"]
         operation = client.point(pan_rad=-2.4, tilt_rad=0.0)
         one.word("moving")
@@ -75,7 +93,6 @@ def test_stop_during_a_motion_ends_it_where_the_head_is(rover: RunningDaemon, vi
         assert -2.4 < stands["pan_rad"] < began["pan_rad"], "it stands on its way"
         one.page.wait_for_selector(".operation .word.stopped")
         one.page.wait_for_selector(".range .wanted", state="detached")
-        client.wait(client.point(**{axis: began[axis] for axis in ("pan_rad", "tilt_rad")}))
 
 
 def test_a_box_round_a_rock_begins_a_track_that_is_drawn_in_both_eyes(
