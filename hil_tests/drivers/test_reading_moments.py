@@ -56,8 +56,8 @@ def test_servos_are_read_in_the_middle_of_their_exchange_whatever_was_done_since
     ]
     watch = SimpleNamespace(look=lambda: None, faults=lambda now_s: ())
     monkeypatch.setattr(session, "Watch", lambda *_: watch)
-    monkeypatch.setattr(session, "time", SimpleNamespace(monotonic=lambda: 100.0))
-    pair: Any = SimpleNamespace(axes=axes, samples=lambda: samples)
+    line = SimpleNamespace(clock=TurnedClock(100.0))
+    pair: Any = SimpleNamespace(axes=axes, samples=lambda: samples, link=line)
     head: Any = SimpleNamespace(poll_hz=10.0, resting_poll_s=0.1, watchdog_counts=0)
     it = session.Session(pair, head, TurnedClock(5000.0), cast(Any, None))
     reading = it.read()

@@ -29,7 +29,7 @@ from mastctl.devices.faults import FaultWords
 from mastctl.devices.frames import FrameStore, StampedFrame
 from mastctl.devices.joint_history import JointHistory
 from mastctl.devices.thread import Asked, DeviceThread
-from mastctl.errors import MastctlError, NoLonger
+from mastctl.errors import NoLonger
 from mastctl.state.faults import StandingFault
 
 log = logging.getLogger(__name__)
@@ -210,9 +210,8 @@ class Cameras:
                     continue
             try:
                 frame = self._glanced(camera, self._known_from(after_s), self._time.now_s() + timeout_s)
-                return self._stamped(camera, frame, told)
-            except _Needed:
-                continue
+                if frame is not None:
+                    return self._stamped(camera, frame, told)
             finally:
                 with self._looking:
                     ended_s = self._people.now_s()
@@ -225,13 +224,12 @@ class Cameras:
         early = self._people.now_s() < self._glance_from_s
         return early or self._row[0] is not place or any(count > 0 for count in self._looks.values())
 
-    def _glanced(self, camera: str, after_s: float, deadline_s: float) -> Frame | StampedFrame:
+    def _glanced(self, camera: str, after_s: float, deadline_s: float) -> Frame | StampedFrame | None:
+        """A frame for watching; None where somebody needs one of that camera before it is begun."""
         take = self._taker(camera, after_s, deadline_s)
 
-        def unless_needed() -> Frame | StampedFrame:
-            if self._looks[camera] > 0:
-                raise _Needed
-            return take()
+        def unless_needed() -> Frame | StampedFrame | None:
+            return None if self._looks[camera] > 0 else take()
 
         left_s = max(0.0, deadline_s - self._time.now_s())
         asked = self._threads[camera].submit("next_frame", unless_needed, left_s + self._grace_s)
@@ -503,10 +501,6 @@ class Cameras:
                 f"the picture is frozen: equal to the last bit although the head moved {moved_rad:.6f} rad",
                 device=frame.camera,
             )
-
-
-class _Needed(MastctlError):
-    """A glance that gives way: somebody needs a frame of that camera."""
 
 
 @dataclass(frozen=True)
