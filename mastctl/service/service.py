@@ -135,14 +135,14 @@ class Service:
         mast: MastInUse,
         hardware: Hardware,
         clock: Clock,
-        folder: StateFolder | None = None,
+        folder: StateFolder,
     ) -> None:
         self.config = config
         self.hardware = hardware
         self.clock = clock
         self.started_s = clock.now_s()
         self._version = version("mastctl")
-        self.folder = folder or StateFolder.temporary()
+        self.folder = folder
         self.places = Places(self.folder.path)
         self.latch = Latch(self.folder)
         self.machine = Machine(clock, latch=self.latch.held)
@@ -242,11 +242,14 @@ class Service:
         if config.live is not None:
             check_installed()
         hardware = open_hardware(config.hardware, clock)
+        kept = folder or StateFolder.temporary()
         try:
             with clock.at_work():
-                return cls(config, mast, hardware, clock, folder)
+                return cls(config, mast, hardware, clock, kept)
         except BaseException:
             hardware.close()
+            if folder is None:
+                kept.close()
             raise
 
     @property

@@ -59,7 +59,8 @@ class NoiseCamera:
 
     def next_frame(self, exposed_after_s: float, timeout_s: float) -> Frame:
         now_s = time.monotonic()
-        sequence = int(max(exposed_after_s, now_s - KEPT_S) / PERIOD_S) + 1
+        # a thousandth of a period more: what begins at the very moment asked for must not count as before it
+        sequence = int(max(exposed_after_s, now_s - KEPT_S) / PERIOD_S + 0.001) + 1
         wait_s = sequence * PERIOD_S + 0.002 - now_s
         if self._closed.wait(max(0.0, min(wait_s, timeout_s))):
             raise NoReply("it is closed")
