@@ -73,6 +73,12 @@ def test_a_rock_is_clicked_pointed_at_and_its_residual_read(rover: RunningDaemon
     assert rover.service.operations.all()[0].told()["state"] == "done"
 
 
+def pan_rad(client: Client) -> float:
+    joints = client.status()["joints"]
+    assert joints is not None
+    return float(joints["pan_rad"])
+
+
 def test_stop_during_a_motion_ends_it_where_the_head_is(tmp_path: Path, visit: Visits) -> None:
     with (
         at_speed(tmp_path, 0.1) as slow,
@@ -80,17 +86,16 @@ def test_stop_during_a_motion_ends_it_where_the_head_is(tmp_path: Path, visit: V
     ):
         one = visit(slow.url)  # its head takes half a minute for a way of some seconds
         one.word("ready")
-        began = client.status()["joints"]
+        began_rad = pan_rad(client)
         operation = client.point(pan_rad=-2.4, tilt_rad=0.0)
         one.word("moving")
         one.page.wait_for_selector(".range .wanted", state="attached")
+        until(lambda: pan_rad(client) < began_rad, "it is on its way")
         one.page.keyboard.press("Escape")
         one.page.wait_for_selector("#stop[data-pressed=confirmed]")
         assert client.wait(operation)["state"] == "stopped"
         one.page.wait_for_selector("#state:not([data-word=moving])")
-        stands = client.status()["joints"]
-        assert began is not None and stands is not None
-        assert -2.4 < stands["pan_rad"] < began["pan_rad"], "it stands on its way"
+        assert -2.4 < pan_rad(client) < began_rad, "it stands on its way"
         one.page.wait_for_selector(".operation .word.stopped")
         one.page.wait_for_selector(".range .wanted", state="detached")
 
