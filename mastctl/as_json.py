@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 import math
 from collections.abc import Mapping
 from typing import Any
@@ -28,6 +29,34 @@ def as_json(value: Any) -> Any:
         return value
     text = str(value)  # a file's name may hold what no JSON can
     return text if text.isascii() else text.encode("utf-8", "replace").decode()
+
+
+TOO_DEEP = "nested too deeply to be told"
+
+
+def writable(value: Any) -> Any:
+    """Return a value as JSON holds it: itself if it does, else with text in the place of what it does not.
+
+    A number that is not finite becomes ``inf``, ``-inf`` or ``nan``, an object that is no JSON its text.
+    """
+    try:
+        json.dumps(value, allow_nan=False)
+    except (TypeError, ValueError, RecursionError):
+        try:
+            return _worded(value)
+        except RecursionError:
+            return TOO_DEEP
+    return value
+
+
+def _worded(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {str(key): _worded(entry) for key, entry in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_worded(entry) for entry in value]
+    if value is None or isinstance(value, (str, int)) or (isinstance(value, float) and math.isfinite(value)):
+        return value
+    return str(value)
 
 
 def picked(value: object, *names: str) -> dict[str, Any]:

@@ -18,6 +18,7 @@ from queue import Empty, SimpleQueue
 from typing import Any
 
 from drivers.clock import Clock, SystemClock
+from mastctl.as_json import writable
 from mastctl.state.faults import StandingFault
 
 log = logging.getLogger(__name__)
@@ -209,4 +210,4 @@ def _line(record: Mapping[str, Any]) -> bytes:
 
 
 def _json(value: Any) -> bytes:
-    return json.dumps(value, default=str, separators=(",", ":")).encode()
+    return json.dumps(writable(value), allow_nan=False, separators=(",", ":")).encode()

@@ -18,6 +18,7 @@ from datetime import UTC, datetime
 from typing import Any, Protocol
 
 from drivers.clock import Clock
+from mastctl.as_json import writable
 from mastctl.commands.audit import AuditLog
 from mastctl.commands.caller import Caller, Role
 from mastctl.commands.idempotency import Answer, Answers
@@ -296,7 +297,7 @@ class Entry:
             return
         who = {"command": command.name, "who": caller.name, "role": caller.role, "via": caller.via}
         number = next(self._numbers)
-        told = {"number": number, **self._now(), **who, "request": asked.request}
+        told = {"number": number, **self._now(), **who, "request": writable(asked.request)}
         if asked.lease is not None:
             told["lease"] = asked.lease[:8]  # names it, without being it
         if asked.key is not None:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import math
+import sys
 from collections.abc import Mapping
 from typing import Any, NoReturn
 
@@ -38,14 +40,20 @@ def _too_large() -> NoReturn:
 
 
 def check_json(body: bytes, headers: Mapping[str, str]) -> None:
-    """Pass nothing, or JSON with finite numbers and each key once. Raises GuardError ``not_json``."""
+    """Pass nothing, or JSON with finite numbers and each key once.
+
+    Raises
+    ------
+    GuardError
+        ``not_json``; ``bad_request`` for a number that is JSON and larger than any float.
+    """
     if not body.strip():
         return
     kind = headers.get("content-type", "").partition(";")[0].strip().lower()
     if kind != "application/json":
         raise GuardError(415, "not_json", f"Content-Type is '{kind[:60]}' where application/json is expected")
     try:
-        json.loads(body, parse_constant=_no_constant, object_pairs_hook=_no_duplicates)
+        json.loads(body, parse_constant=_no_constant, parse_float=_finite, object_pairs_hook=_no_duplicates)
     except RecursionError:
         raise GuardError(400, "not_json", "the body is nested too deeply") from None
     except ValueError as error:
@@ -54,6 +62,14 @@ def check_json(body: bytes, headers: Mapping[str, str]) -> None:
 
 def _no_constant(word: str) -> NoReturn:
     raise ValueError(f"{word} where a finite number is expected")
+
+
+def _finite(word: str) -> float:
+    number = float(word)
+    if math.isinf(number):
+        words = f"the body holds the number {word[:40]} where at most {sys.float_info.max:.1e} is possible"
+        raise GuardError(422, "bad_request", words)
+    return number
 
 
 def _no_duplicates(pairs: list[tuple[str, Any]]) -> dict[str, Any]:

@@ -18,7 +18,7 @@ from pydantic import ValidationError
 from starlette.types import Receive, Scope, Send
 from starlette.websockets import WebSocketDisconnect
 
-from mastctl.as_json import as_json
+from mastctl.as_json import as_json, writable
 from mastctl.errors import MastctlError
 from mastctl.service.service import Service
 from mastctl.service.state import fault_told, joints_told, standing_told
@@ -80,11 +80,11 @@ def _asked(line: WebSocket) -> EventsQuery:
 
 def _event(service: Service, one: Published, lost: int) -> str:
     event = {"topic": one.topic, "key": one.key, "sequence": one.sequence, "lost": lost}
-    return json.dumps(event | {"value": value_told(service, one)}, allow_nan=False)
+    return json.dumps(event | {"value": writable(value_told(service, one))}, allow_nan=False)
 
 
 def _track(service: Service, one: Published, lost: int) -> str:
-    return json.dumps(service.track_told(one.value), allow_nan=False)
+    return json.dumps(writable(service.track_told(one.value)), allow_nan=False)
 
 
 class _Lines(StreamingResponse):

@@ -89,6 +89,18 @@ def refused(code: str, act: Callable[[], object]) -> str:
     return str(refusal.value)
 
 
+def test_a_request_that_is_no_json_is_recorded_and_published_with_text_in_its_place(world: World) -> None:
+    deep: list[Any] = []
+    for _ in range(5000):
+        deep = [deep]
+    for request in ({"range_m": float("inf")}, {"range_m": [float("nan"), -float("inf")]}, {"deep": deep}):
+        world.entry.run(POSE, world.asked(request=request), dict)
+    recorded = [line["request"] for line in world.lines()]
+    assert recorded[:2] == [{"range_m": "inf"}, {"range_m": ["nan", "-inf"]}]
+    assert isinstance(recorded[2], str)
+    assert [one.value["request"] for one in world.published] == recorded
+
+
 def test_a_record_says_who_under_which_lease_what_when_and_with_which_result(world: World) -> None:
     lease = world.leases.acquire(BENCH)
     request = {"pan_rad": 0.1, "tilt_rad": 0.2}

@@ -10,6 +10,7 @@ import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 import httpx
@@ -113,6 +114,38 @@ def test_the_key_of_a_command_is_told_to_nobody_else(pair: BOTH) -> None:
         told = next(events), next(events)
     assert {one["topic"] for one in told} == {"command", "lease"}
     assert "very-own" not in json.dumps(told)
+
+
+def strictly(text: str) -> Any:
+    """JSON as the standard has it, without the words that Python adds."""
+    return json.loads(text, parse_constant=lambda word: pytest.fail(f"{word} is not JSON: {text}"))
+
+
+def test_a_number_that_no_float_holds_is_refused_and_blinds_no_listener(pair: BOTH) -> None:
+    daemon, _ = pair
+    body = b'{"position_m": [1, 0, 0], "board": {"square_m": 1e400}}'
+    with httpx.Client(base_url=f"{daemon.url}/api/v1", **PLAIN) as http:
+        kind = {"Content-Type": "application/json"}
+        answer = http.post("/simulation/boards/b", content=body, headers=kind)
+        assert answer.status_code == 422
+        assert "1e400" in answer.json()["error"]["message"]
+        http.post("/lease", json={})
+    with listening(daemon.url, "?topics=state,command") as events:
+        assert next(events)["topic"] == "state"
+    audit = daemon.service.entry.audit
+    assert audit.flush(NET_S)
+    for line in (daemon.service.folder.path / "audit.jsonl").read_text().splitlines():
+        strictly(line)
+
+
+def test_a_value_that_is_no_json_is_told_as_text_and_ends_no_stream(pair: BOTH) -> None:
+    daemon, _ = pair
+    request = {"range_m": float("inf"), "what": Path("rock")}
+    who = {"command": "pose", "who": "bench", "role": "admin", "via": "inside", "result": "ok"}
+    told = {"number": 1, "time": "2026-11-22T12:00:00+00:00", "monotonic_s": 1.0, **who}
+    with listening(daemon.url, "?topics=command") as events:
+        daemon.service.machine.publisher.publish("command", "1", {**told, "request": request})
+        assert next(events)["value"]["request"] == {"range_m": "inf", "what": "rock"}
 
 
 def test_topics_and_keys_are_chosen(pair: BOTH) -> None:
