@@ -139,12 +139,13 @@ class Recorder:
     def tell(self, topic: str, key: str, value: Any, time_s: float | None = None) -> None:
         """Leave something to be written down; never waits, never raises."""
         now = self._now
-        if not self._ring_s and now.run is None and not self._acts and topic not in Entries.STICKY:
+        mast = isinstance(value, MastTold)  # never left out: all later pictures are measured by it
+        if not (self._ring_s or now.run or self._acts or mast or topic in Entries.STICKY):
             return  # nothing is recorded
         one = Told(topic, key, value, self._clock.now_s() if time_s is None else time_s)
         with self._lock:
             full = self._queued_bytes + one.bytes > QUEUE_BYTES or len(self._queue) >= QUEUE_LENGTH
-            if full or self._closing:
+            if (full and not mast) or self._closing:
                 self._dropped[topic] += 1
                 return
             self._queue.append(one)
@@ -329,16 +330,17 @@ class Recorder:
         """Put what was told into the file, if there is one to be written."""
         dropped = self._dropped_so_far()
         for at, one in enumerate(batch):
-            self._notice(one)
-            if self._now.file is None and not self._open_ring():
-                self._entries.remember(one)
-                continue
-            assert self._now.file is not None
             try:
+                self._notice(one)
+                if self._now.file is None and not self._open_ring():
+                    self._remember(one)
+                    continue
+                assert self._now.file is not None
                 self._entries.write(self._now.file, one, time.monotonic())
             except OSError:
                 for rest in list(batch)[at:]:
                     self.missed(rest.topic, 1)
+                    self._remember(rest)
                 raise
             except Exception:  # a value of a kind that nobody expected must not end the recording
                 self.missed(one.topic, 1)
@@ -346,11 +348,17 @@ class Recorder:
         if dropped and self._now.file is not None:
             self._entries.tell_dropped(self._now.file, dropped, self._clock.now_s(), time.monotonic())
 
-    def _notice(self, one: Told) -> None:
-        """See what changes the recording itself: another mast file, a fault."""
+    def _remember(self, one: Told) -> None:
+        """Keep what the next file must begin with."""
+        self._entries.remember(one)
         if isinstance(one.value, MastTold):
             self._mast = one.value
             self._entries.use_mast(one.value.rig, one.value.file.digest)
+
+    def _notice(self, one: Told) -> None:
+        """See what changes the recording itself: another mast file, a fault."""
+        if isinstance(one.value, MastTold):
+            self._remember(one)
             if self._now.file is not None:
                 self._now.file.attach(one.value.file, self._now.file.clocks.ns(one.time_s))
                 self._entries.tell_cameras(self._now.file, one.time_s, time.monotonic())

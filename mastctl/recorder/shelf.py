@@ -1,10 +1,11 @@
 """The folder of recordings: the ring's segments, what was kept at faults, and runs; each within its bound.
 
-    ring/      000001-20261122T120341Z.mcap ...       goes round
-    kept/      20261122T120341Z-pan_tilt-no_reply/    segments of the ring, moved here at a fault
-    runs/      20261122T120341Z-NAME.mcap             begun and ended by command
+    ring/      000001-20261122T120341Z.mcap ...              goes round
+    kept/      000001-20261122T120341Z-pan_tilt-no_reply/    segments of the ring, moved here at a fault
+    runs/      20261122T120341Z-NAME.mcap                    begun and ended by command
 
-Segments are moved, not copied: keeping them needs no room and no time, on a full disk either.
+Segments are moved, not copied: keeping them needs no room and no time, on a full disk either. Which of them
+is older is told by their numbers and by the monotonic clock: the calendar may be set back, or ahead.
 """
 
 from __future__ import annotations
@@ -13,13 +14,15 @@ import contextlib
 import os
 import re
 import shutil
-from collections.abc import Iterable
+import time
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 
 SUFFIX = ".mcap"
 MB = 1e6
+_NUMBER = re.compile(r"(\d{6,})-")
 _NOT_IN_NAMES = re.compile(r"[^A-Za-z0-9_.-]+")
 
 
@@ -45,14 +48,24 @@ class Recorded:
 class Shelf:
     """The files of one daemon's recordings; used by the recorder's writing thread, read by any.
 
+    Parameters
+    ----------
+    folder
+        Where they lie.
+    clock_s
+        Tells how old segments are; never set back.
+
     Raises
     ------
     OSError
         From every method, if the disk does not do what is asked.
     """
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, clock_s: Callable[[], float] = time.monotonic) -> None:
         self.folder = folder
+        self._clock_s = clock_s
+        self._opened_s = clock_s()
+        self._begun_s: dict[str, float] = {}
         self._ring, self._kept, self._runs = (folder / name for name in ("ring", "kept", "runs"))
 
     def prepare(self) -> None:
@@ -67,23 +80,28 @@ class Shelf:
 
     def next_segment(self) -> Path:
         """Return the name of the ring's next file."""
-        numbers = [int(path.name[:6]) for path in _files(self._ring) if path.name[:6].isdigit()]
-        return self._ring / f"{max(numbers, default=0) % 999_999 + 1:06d}-{_stamp()}{SUFFIX}"
+        name = f"{_next_number(_files(self._ring)):06d}-{_stamp()}{SUFFIX}"
+        self._begun_s[name] = self._clock_s()
+        return self._ring / name
 
     def next_run(self, name: str) -> Path:
         """Return the file of a run that begins now; its name is not taken."""
         return _untaken(self._runs, f"{_stamp()}{_worded(name)}", SUFFIX)
 
     def trim_ring(self, ring_s: float, ring_mb: float) -> None:
-        """Let the oldest segments go: those that ended ``ring_s`` before the newest one did, by the files'
-        times, and what is beyond the ring's size. The newest stays.
+        """Let the oldest segments go when the newest one has ended: those that another followed ``ring_s``
+        ago, and what is beyond the ring's size. The newest stays. Those of an earlier daemon count as begun
+        when this one was.
         """
-        segments = [(path, path.stat()) for path in _files(self._ring)]
+        segments = [(path, path.stat().st_size) for path in _files(self._ring)]
+        begun_s = [self._begun_s.get(path.name, self._opened_s) for path, _ in segments]
+        too_old_s = self._clock_s() - ring_s
         while len(segments) > 1 and (
-            sum(told.st_size for _, told in segments) > ring_mb * MB
-            or segments[0][1].st_mtime < segments[-1][1].st_mtime - ring_s
+            sum(size for _, size in segments) > ring_mb * MB or begun_s[1] < too_old_s
         ):
             segments.pop(0)[0].unlink(missing_ok=True)
+            begun_s.pop(0)
+        self._begun_s = dict(zip((path.name for path, _ in segments), begun_s, strict=True))
 
     def drop_oldest_segment(self) -> bool:
         """Let the ring's oldest segment go; False if there is none beside the newest."""
@@ -99,7 +117,8 @@ class Shelf:
         """
         if not _files(self._ring):
             return ""
-        place = _untaken(self._kept, f"{_stamp()}{_worded(why)}", "")
+        number = _next_number(self._kept.iterdir())
+        place = self._kept / f"{number:06d}-{_stamp()}{_worded(why)}"
         place.mkdir(mode=0o700)
         for path in _files(self._ring):
             path.rename(place / path.name)
@@ -112,7 +131,7 @@ class Shelf:
         """Return every recording, the oldest of each kind first."""
         found = [_recorded(path.stem, "run", [path]) for path in _files(self._runs)]
         with contextlib.suppress(FileNotFoundError):
-            folders = sorted(path for path in self._kept.iterdir() if path.is_dir())
+            folders = sorted((path for path in self._kept.iterdir() if path.is_dir()), key=_order)
             found += [_recorded(path.name, "kept", _files(path)) for path in folders]
         if segments := _files(self._ring):
             found.append(_recorded("ring", "ring", segments))
@@ -120,11 +139,21 @@ class Shelf:
 
 
 def _files(folder: Path) -> list[Path]:
-    """The recordings in a folder, by name: the order in which they were made."""
+    """The recordings in a folder, by their numbers if they have such, else by name."""
     try:
-        return sorted(path for path in folder.iterdir() if path.suffix == SUFFIX)
+        return sorted((path for path in folder.iterdir() if path.suffix == SUFFIX), key=_order)
     except FileNotFoundError:
         return []
+
+
+def _order(path: Path) -> tuple[int, str]:
+    """Sorts by number; what has none is older than what has one."""
+    number = _NUMBER.match(path.name)
+    return 0 if number is None else int(number[1]), path.name
+
+
+def _next_number(paths: Iterable[Path]) -> int:
+    return max((_order(path)[0] for path in paths), default=0) + 1
 
 
 def _recorded(name: str, kind: str, files: Iterable[Path]) -> Recorded:

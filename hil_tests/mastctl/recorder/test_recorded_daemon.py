@@ -35,8 +35,11 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def daemon(folder: Path) -> Iterator[RunningDaemon]:
-    with RunningDaemon(config_with(folder, None)) as running:
+def daemon(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunningDaemon]:
+    config = config_with(folder, None)
+    mast_file = tmp_path_factory.mktemp("masts") / "used.yaml"
+    mast_file.write_bytes(config.mast_file.read_bytes())
+    with RunningDaemon(replace(config, mast_file=mast_file)) as running:
         yield running
 
 
@@ -85,6 +88,23 @@ def test_a_run_holds_what_was_asked_seen_and_found(client: Client, daemon: Runni
     assert commands.count("point") >= 2
     assert len({one["word"] for one in told(path, "/state")}) > 1
     assert len({one["pan_rad"] for one in told(path, "/joints")}) > 1
+
+
+def test_a_run_is_of_the_mast_file_in_use_though_nothing_was_recorded_as_it_came(
+    client: Client, daemon: RunningDaemon
+) -> None:
+    used = daemon.service.config.mast_file
+    other = used.with_name("other.yaml")
+    other.write_bytes(used.read_bytes() + b"# another\n")
+    client.use_mast(other.name)
+    digest = client.status()["mast"]["digest"]
+    client.start_recording("measured")
+    path = Path(client.stop_recording()["file"])
+    assert [(one.name, one.data) for one, _ in read_whole(path).masts.values()] == [
+        (other.name, other.read_bytes())
+    ]
+    assert {one["mast_digest"] for one in told(path, "/camera/navcam_left/cahvor")} == {digest}
+    assert {one["digest"] for one in told(path, "/mast")} == {digest}
 
 
 def _state_of(path: Path, operation: str) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import os
 import threading
 from dataclasses import replace
 from pathlib import Path
@@ -10,6 +11,7 @@ from typing import Any
 
 import pytest
 
+from drivers.clock import ManualClock
 from drivers.mcap_file import Entry, Found, read_items
 from hil_tests.mastctl.recorder.recorder_world import (
     files,
@@ -24,6 +26,8 @@ from hil_tests.mastctl.recorder.recorder_world import (
 )  # fmt: skip
 from mastctl.errors import NotNow, Unable
 from mastctl.recorder import recorder as module
+from mastctl.recorder import shelf as shelf_module
+from mastctl.recorder.recorded import read_whole
 from mastctl.recorder.recorder import MastTold
 from mastctl.recorder.shelf import Shelf
 from mastctl.recorder.writer import Attached, RecordFile
@@ -130,6 +134,67 @@ def test_what_was_kept_is_bounded_and_the_oldest_goes_first(tmp_path: Path) -> N
         shelf.next_segment().write_bytes(b"x" * 400_000)
         shelf.keep_ring(why, 1.0)
     assert [name[-1] for name in kinds(tmp_path)["kept"]] == ["b", "c"]
+
+
+def test_the_newest_fault_stays_and_comes_last_though_the_clock_was_set_back(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shelf = Shelf(tmp_path)
+    shelf.prepare()
+    former = tmp_path / "kept" / "20270101T000000Z-without_a_number"
+    former.mkdir()
+    (former / "000001.mcap").write_bytes(b"x")
+    for stamp, why in (("20301122T120000Z", "a"), ("20301122T120001Z", "b"), ("20261122T120000Z", "c")):
+        monkeypatch.setattr(shelf_module, "_stamp", lambda stamp=stamp: stamp)
+        shelf.next_segment().write_bytes(b"x" * 400_000)
+        assert shelf.keep_ring(why, 1.0).endswith(f"{stamp}-{why}")
+    assert [name[-1] for name in kinds(tmp_path)["kept"]] == ["b", "c"]
+
+
+@pytest.mark.parametrize("step_s", [-7200.0, 7200.0])
+def test_the_ring_goes_round_by_what_was_recorded_whatever_the_calendar_does(
+    tmp_path: Path, step_s: float
+) -> None:
+    clock = ManualClock()
+    shelf = Shelf(tmp_path, clock.now_s)
+    shelf.prepare()
+    for number in range(1, 13):
+        path = shelf.next_segment()
+        path.write_bytes(b"x")
+        clock.advance(100.0)
+        calendar_s = 1.8e9 + clock.now_s() + (step_s if number > 3 else 0.0)
+        os.utime(path, (calendar_s, calendar_s))
+        shelf.trim_ring(300.0, 1.0)
+        oldest = max(1, number - 3)  # the last to end no more than 300 s before this one
+        assert [int(one.name[:6]) for one in files(tmp_path)] == list(range(oldest, number + 1))
+
+
+def test_segments_of_an_earlier_daemon_leave_the_ring_when_it_has_gone_round(tmp_path: Path) -> None:
+    Shelf(tmp_path).prepare()
+    Shelf(tmp_path).next_segment().write_bytes(b"x")
+    clock = ManualClock()
+    shelf = Shelf(tmp_path, clock.now_s)
+    oldest = []
+    for _ in range(5):
+        path = shelf.next_segment()
+        path.write_bytes(b"x")
+        clock.advance(100.0)
+        os.utime(path, (0.0, 0.0))  # a calendar that begins anew with each start
+        shelf.trim_ring(300.0, 1.0)
+        oldest.append(int(files(tmp_path)[0].name[:6]))
+    assert oldest == [1, 1, 1, 2, 3]
+
+
+def test_the_ring_counts_on_beyond_six_digits(tmp_path: Path) -> None:
+    shelf = Shelf(tmp_path)
+    shelf.prepare()
+    (tmp_path / "ring" / "999999-20261122T120000Z.mcap").write_bytes(b"x")
+    for number in (1_000_000, 1_000_001):
+        path = shelf.next_segment()
+        path.write_bytes(b"x")
+        assert path.name.startswith(f"{number}-")
+    shelf.drop_oldest_segment()
+    assert [one.name.split("-")[0] for one in files(tmp_path)] == ["1000000", "1000001"]
 
 
 def test_a_disk_that_hangs_holds_nobody_and_what_was_dropped_is_told(
@@ -244,6 +309,70 @@ def test_another_mast_file_is_attached_and_its_cameras_told_when_it_comes(tmp_pa
 
     with path.open("rb") as file:
         assert other.data in [bytes(one.data) for one in make_reader(file).iter_attachments()]
+
+
+def another_mast(words: str) -> MastTold:
+    before = mast()
+    return MastTold(before.rig, Attached(f"{words}.yaml", before.file.data + f"# {words}\n".encode()))
+
+
+def masts_of(path: Path) -> tuple[list[str], str]:
+    """The names of a recording's mast files, and the digest that its cameras were told last by."""
+    cameras = told(path, "/camera/navcam_left/cahvor")
+    return [one.name for one, _ in read_whole(path).masts.values()], cameras[-1]["mast_digest"]
+
+
+def test_a_run_carries_the_mast_file_that_came_while_nothing_was_recorded(tmp_path: Path) -> None:
+    one = recorder(tmp_path, ring_s=0.0)
+    other = another_mast("other")
+    one.use_mast(other)
+    one.start_run("")
+    one.close()
+    (path,) = files(tmp_path)
+    assert masts_of(path) == (["other.yaml"], other.file.digest)
+
+
+def test_a_mast_file_gets_past_a_queue_that_is_full(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    one = recorder(tmp_path, ring_s=0.0)
+    other = another_mast("other")
+    monkeypatch.setattr(module, "QUEUE_LENGTH", 0)
+    one.use_mast(other)
+    monkeypatch.undo()
+    one.start_run("")
+    one.close()
+    (path,) = files(tmp_path)
+    assert masts_of(path) == (["other.yaml"], other.file.digest)
+
+
+def test_a_mast_file_that_came_as_the_disk_refused_is_in_the_next_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(module, "AGAIN_S", 0.0)
+    one = recorder(tmp_path)
+    one.start_run("")
+    refused, go_on = threading.Event(), threading.Event()
+
+    def full(*_: object) -> None:
+        refused.set()
+        assert go_on.wait(60.0)
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    with monkeypatch.context() as disk:
+        disk.setattr(RecordFile, "add_json", full)
+        disk.setattr(RecordFile, "attach", full)
+        one.tell("command", "1", {"number": 1})
+        one.tell("command", "2", {"number": 2})
+        assert refused.wait(60.0)
+        first, second = another_mast("first"), another_mast("second")
+        one.use_mast(first)  # refused as it is attached
+        one.use_mast(second)  # behind it in the queue
+        go_on.set()
+        until(lambda: not one._queue and one.faults(), "both were given up")
+        until(lambda: one._busy_since_s is None, "it rests")
+    name = one.start_run("again")["run"]
+    one.close()
+    (path,) = [path for path in files(tmp_path) if name in path.name]
+    assert masts_of(path) == (["second.yaml"], second.file.digest)
 
 
 def test_a_head_at_rest_writes_next_to_nothing(tmp_path: Path) -> None:
