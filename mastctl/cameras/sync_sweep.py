@@ -8,14 +8,15 @@ from __future__ import annotations
 
 import math
 import threading
-import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 
 import numpy as np
 
 from calib.mast.rig import Rig
 from calib.rigid import FloatArray
+from drivers.clock import Clock
 from drivers.errors import DriverError, NoReply
 from drivers.interfaces import Camera, Frame, Reading
 from mastctl.cameras.sync_fit import REACH_S, OffsetFit, fit_offset
@@ -112,17 +113,28 @@ class Sweep:
         The mast file's content and the soft limits.
     stop
         Set from anywhere it ends the sweep: the head is halted where it is.
+    clock
+        What readings and frames are stamped with, and what the sweep waits on.
     """
 
     def __init__(
-        self, devices: Devices, cameras: Mapping[str, Camera], rig: Rig, limits: Limits, stop: threading.Event
+        self,
+        devices: Devices,
+        cameras: Mapping[str, Camera],
+        rig: Rig,
+        limits: Limits,
+        stop: threading.Event,
+        clock: Clock,
     ) -> None:
         self._devices = devices
         self._cameras = cameras
         self._rig = rig
         self._limits = limits
         self._stop = stop
+        self._clock = clock
         self._over = threading.Event()
+        self._ended = clock.signal()
+        self._watching = 0  # cameras whose thread is at work
         self._readings: list[Reading] = []
         self.seen = {name: Sightings() for name in cameras}
 
@@ -143,12 +155,13 @@ class Sweep:
             self._limits.check(start.pan_rad + side * plan.amplitude_rad, start.tilt_rad)
         self._limits.speed(plan.speed_rad_per_s)
         threads = [
-            threading.Thread(target=self._watch, args=(name, start, plan), daemon=True)
+            self._clock.thread(partial(self._watch, name, start, plan), f"sweep {name}")
             for name in self._cameras
         ]
         try:
             self._rest(start)
             for thread in threads:
+                self._watching += 1
                 thread.start()
             self._wait_for_choices()
             if self._to_and_fro(start, plan):
@@ -158,10 +171,10 @@ class Sweep:
             raise
         finally:
             self._over.set()
-            end_s = time.monotonic() + END_S
-            for thread in threads:
-                if thread.ident is not None:
-                    thread.join(max(0.0, end_s - time.monotonic()))
+            end_s = self._clock.now_s() + END_S
+            with self._ended:
+                while self._watching and (left_s := end_s - self._clock.now_s()) > 0:
+                    self._ended.wait(left_s)
 
     def fit(self, camera: str) -> OffsetFit:
         """Return a camera's offset to the joint readings. Raises CannotTell."""
@@ -195,25 +208,25 @@ class Sweep:
 
     def _pause(self) -> None:
         self._check_stop()
-        self._stop.wait(READ_EVERY_S)
+        self._clock.sleep(READ_EVERY_S)
         self._check_stop()
 
     def _rest(self, start: Reading) -> None:
         """Wait until the head has stood still for long enough."""
-        since_s = time.monotonic()
+        since_s = self._clock.now_s()
         until_s = since_s + ARRIVE_S
-        while time.monotonic() - since_s < REST_S:
+        while self._clock.now_s() - since_s < REST_S:
             if self._note().moving:
-                since_s = time.monotonic()
-            if time.monotonic() > until_s:
+                since_s = self._clock.now_s()
+            if self._clock.now_s() > until_s:
                 raise NoReply("the head does not come to rest", device="pan_tilt")
             self._pause()
 
     def _wait_for_choices(self) -> None:
         """Wait until for each camera patches are chosen or it is known why not."""
-        until_s = time.monotonic() + FRAME_TIMEOUT_S + GRACE_S
+        until_s = self._clock.now_s() + FRAME_TIMEOUT_S + GRACE_S
         while waiting := [one for one in self.seen.values() if one.patches is None and not one.failure]:
-            if time.monotonic() > until_s:
+            if self._clock.now_s() > until_s:
                 for seen in waiting:
                     seen.failure = "its driver did not come back from next_frame in time"
                 return
@@ -221,9 +234,9 @@ class Sweep:
 
     def _to_and_fro(self, start: Reading, plan: SweepPlan) -> int:
         """Turn for the plan's time, and return how many ways that made: no more than any camera sees."""
-        until_s = time.monotonic() + plan.seconds
+        until_s = self._clock.now_s() + plan.seconds
         ways, side = 0, 1
-        while time.monotonic() < until_s and not all(seen.failure for seen in self.seen.values()):
+        while self._clock.now_s() < until_s and not all(seen.failure for seen in self.seen.values()):
             speed = plan.speed_rad_per_s * SPEEDS[ways % len(SPEEDS)]
             self._go(start.pan_rad + side * plan.amplitude_rad, start.tilt_rad, speed)
             ways, side = ways + 1, -side
@@ -233,23 +246,32 @@ class Sweep:
         """Go there, and take readings down until the head stands."""
         self._check_stop()
         self._devices.move(pan_rad, tilt_rad, speed_rad_per_s)
-        sent_s = time.monotonic()
+        sent_s = self._clock.now_s()
         while True:
             reading = self._note()
             if reading.time_s > sent_s + 0.05 and not reading.moving:
                 return
-            if time.monotonic() - sent_s > ARRIVE_S:
+            if self._clock.now_s() - sent_s > ARRIVE_S:
                 raise NoReply(f"the head does not come to pan {pan_rad:.3f} rad", device="pan_tilt")
             self._pause()
 
     def _choose(self, name: str, start: Reading, plan: SweepPlan) -> Patches:
         """Take a camera's picture at rest and choose what to follow in it."""
-        frame = self._cameras[name].next_frame(time.monotonic(), FRAME_TIMEOUT_S)
+        frame = self._cameras[name].next_frame(self._clock.now_s(), FRAME_TIMEOUT_S)
         joints_rad = self._rig.joints.true_rad((start.pan_rad, start.tilt_rad))
         return choose_patches(frame.image, self._rig, name, joints_rad, plan.amplitude_rad)
 
     def _watch(self, name: str, start: Reading, plan: SweepPlan) -> None:
-        """In a thread of its own: choose patches of a picture at rest, and find them in what comes."""
+        """In a thread of its own: follow one camera, and say when that has ended."""
+        try:
+            self._follow(name, start, plan)
+        finally:
+            with self._ended:
+                self._watching -= 1
+                self._ended.notify_all()
+
+    def _follow(self, name: str, start: Reading, plan: SweepPlan) -> None:
+        """Choose patches of a picture at rest, and find them in what comes."""
         seen, camera = self.seen[name], self._cameras[name]
         try:
             patches = self._choose(name, start, plan)
@@ -262,7 +284,7 @@ class Sweep:
         if seen.failure:  # it took too long: the head may be turning already
             return
         seen.patches = patches
-        lost, after_s = 0, time.monotonic()
+        lost, after_s = 0, self._clock.now_s()
         while not self._over.is_set():
             try:
                 frame = camera.next_frame(after_s, FRAME_TIMEOUT_S)
@@ -274,13 +296,13 @@ class Sweep:
                     known = isinstance(error, DriverError)
                     seen.failure = str(error) if known else f"{type(error).__name__}: {error}"
                     return
-                self._over.wait(0.05)
+                self._clock.sleep(0.05)
 
     def _take(self, seen: Sightings, patches: Patches, frame: Frame) -> None:
         stamp_s = float(frame.mid_exposure_s)
-        seen.came_after_s = min(seen.came_after_s, time.monotonic() - stamp_s)
+        seen.came_after_s = min(seen.came_after_s, self._clock.now_s() - stamp_s)
         if seen.stamps_s and stamp_s <= seen.stamps_s[-1]:
-            self._over.wait(0.002)  # the same one again
+            self._clock.sleep(0.002)  # the same one again
             return
         places_px = patches.places_px(frame.image)
         seen.uncertainty_s = float(getattr(frame, "mid_uncertainty_s", 0.0))

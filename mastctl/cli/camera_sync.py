@@ -67,7 +67,7 @@ def camera_sync(args: argparse.Namespace) -> int:
         head = SimpleNamespace(pan_tilt=hardware.pan_tilt, cameras={})
         devices = Devices(head, config.limits, mast.stored.digest, clock, rig)
         try:
-            sweep = Sweep(devices, hardware.cameras, rig, config.limits, stop)
+            sweep = Sweep(devices, hardware.cameras, rig, config.limits, stop, clock)
             if not args.json:
                 output.tell(
                     f"turning pan {plan.amplitude_rad:.3f} rad to either side for {plan.seconds:g} s, "

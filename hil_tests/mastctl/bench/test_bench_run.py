@@ -176,6 +176,7 @@ def test_two_runs_do_not_keep_their_looks_in_one_folder(repository: Path, tmp_pa
     run_of(corner_bench(repository), tmp_path / "bench")
 
 
+@pytest.mark.long(3, "a bench is killed and begun anew, look after look")
 def test_a_run_that_is_killed_again_and_again_loses_no_look_and_comes_to_its_end(
     repository: Path, tmp_path: Path
 ) -> None:

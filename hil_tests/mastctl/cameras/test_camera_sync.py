@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import re
 import signal
@@ -11,10 +12,13 @@ import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import yaml
 
+from drivers.clock import Clock
+from hil_tests.drivers.turned import turned
 from hil_tests.waiting import until
 from mastctl.cli.main import main
 
@@ -64,6 +68,47 @@ def head_that_tells():
 HEADS = []
 HANGS = threading.Event()
 '''
+
+
+class TurnedEvent:
+    """A `threading.Event` whose waits end by a turned clock."""
+
+    def __init__(self, clock: Clock) -> None:
+        self._signal, self._is_set = clock.signal(), False
+
+    def set(self) -> None:
+        with self._signal:
+            self._is_set = True
+            self._signal.notify_all()
+
+    def is_set(self) -> bool:
+        return self._is_set
+
+    def wait(self, timeout_s: float) -> bool:
+        with self._signal:
+            return self._is_set or self._signal.wait(timeout_s)
+
+
+@pytest.fixture
+def turned_package(package: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """The package on a turned clock: pictures take no time, however busy the machine is."""
+    with turned() as it:
+        clock = it.clock
+        shims = {
+            "time": SimpleNamespace(monotonic=clock.now_s, sleep=clock.sleep),
+            "threading": SimpleNamespace(Event=lambda: TurnedEvent(clock), Lock=threading.Lock),
+        }
+        monkeypatch.setitem(sys.modules, "turned_time", SimpleNamespace(**shims))
+        for path in (*(package / "bench_rig").glob("*.py"), package / "shifted_rig.py"):
+            text = path.read_text().replace("import threading\nimport time\n", IMPORTS)
+            path.write_text(text.replace("PERIOD_S, EXPOSURE_S, TEXEL_M = 0.1,", ODD_PERIOD))
+        monkeypatch.setattr("drivers.clock.SystemClock", lambda: clock)
+        yield package
+
+
+# Else each way of the head would show the same few phases of a pixel, and the same errors of the matcher.
+ODD_PERIOD = "PERIOD_S, EXPOSURE_S, TEXEL_M = 0.0937,"
+IMPORTS = "from turned_time import threading, time\n"
 
 
 @pytest.fixture
@@ -122,35 +167,33 @@ def sync(capsys: pytest.CaptureFixture[str], *words: str) -> tuple[int, dict[str
 
 
 def test_both_eyes_offsets_are_measured_within_three_sigma_and_told_where_they_contradict(
-    package: Path, repository: Path, capsys: pytest.CaptureFixture[str]
+    turned_package: Path, repository: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """One camera is right; the other's pictures are 31 ms later than stamped, of which 10 ms are known."""
     file = config(
-        package, repository, {"navcam_left": {}, "navcam_right": {"early_s": 0.031, "offset_s": 0.010}}
+        turned_package, repository, {"navcam_left": {}, "navcam_right": {"early_s": 0.031, "offset_s": 0.010}}
     )
     code, told = sync(capsys, "--config", file, "--seconds", "12")
     assert code == 0, told
     left, right = told["cameras"]["navcam_left"], told["cameras"]["navcam_right"]
     for camera, true_s in ((left, 0.0), (right, 0.031)):
         assert abs(camera["offset_s"] - true_s) < 3 * camera["sigma_s"] + 1e-4, told
-        assert (
-            camera["sigma_s"] < 5e-3
-        )  # what a busy machine leaves of the frames; test_camera_sync_fit is exact
+        assert camera["sigma_s"] < 1e-3
     assert left["warning"] is None
     later = re.match(
         r"navcam_right: its pictures were taken (\d+\.\d) ms later than its stamps", right["warning"]
     )
     assert later and float(later[1]) == pytest.approx(21.0, abs=3e3 * right["sigma_s"] + 0.1)
     head = sys.modules["shifted_rig"].HEADS[-1]
-    assert head.at(time.monotonic()) == (0.0, 0.0), "the head is where it was"
+    assert head.at(math.inf) == (0.0, 0.0), "the head is where it was"
 
 
 def test_pictures_older_than_their_stamps_are_told_unless_the_driver_says_how_uncertain_it_is(
-    package: Path, repository: Path, capsys: pytest.CaptureFixture[str]
+    turned_package: Path, repository: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """As a buffered capture does: one is silent about it, one states 0.2 s, one shows a plain wall."""
     file = config(
-        package,
+        turned_package,
         repository,
         {
             "navcam_left": {"early_s": -0.120},
@@ -198,11 +241,11 @@ def test_a_signal_stops_the_head_where_it_is(
 
 
 def test_stamps_of_another_clock_are_told_as_that(
-    package: Path, repository: Path, capsys: pytest.CaptureFixture[str]
+    turned_package: Path, repository: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Of the calendar's, and of one that something else started."""
     file = config(
-        package,
+        turned_package,
         repository,
         {
             "navcam_left": {"early_s": -1.7e9, "waits": False},
@@ -228,9 +271,9 @@ def soon(package: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.usefixtures("soon")
 def test_a_camera_whose_driver_hangs_is_told_of_and_the_other_one_measured(
-    package: Path, repository: Path, capsys: pytest.CaptureFixture[str]
+    turned_package: Path, repository: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    file = config(package, repository, {"navcam_left": {"make": "Hanging"}, "navcam_right": {}})
+    file = config(turned_package, repository, {"navcam_left": {"make": "Hanging"}, "navcam_right": {}})
     code, told = sync(capsys, "--config", file, "--seconds", "10")
     assert code == 0 and told["cameras"]["navcam_right"]["offset_s"] is not None, told
     assert "did not come back" in told["cameras"]["navcam_left"]["failure"]
@@ -238,9 +281,9 @@ def test_a_camera_whose_driver_hangs_is_told_of_and_the_other_one_measured(
 
 @pytest.mark.usefixtures("soon")
 def test_nothing_moves_where_no_camera_gives_a_picture(
-    package: Path, repository: Path, capsys: pytest.CaptureFixture[str]
+    turned_package: Path, repository: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    file = config(package, repository, {"navcam_left": {"make": "Hanging"}})
+    file = config(turned_package, repository, {"navcam_left": {"make": "Hanging"}})
     moves: list[tuple[object, ...]] = []
     from mastctl.devices.devices import Devices
 

@@ -243,8 +243,10 @@ def test_an_answer_from_before_a_stop_does_not_take_it_back(pair: BOTH, visit: V
     one = visit(daemon.url)
     one.word("ready")
     held: list[Any] = []
+    asked: list[Any] = []
 
     def hold(route: Any) -> None:
+        asked.append(route)
         if held:
             route.continue_()
         else:
@@ -253,8 +255,10 @@ def test_an_answer_from_before_a_stop_does_not_take_it_back(pair: BOTH, visit: V
     one.page.route("**/api/v1/status", hold)
     with Client(daemon.url) as client:
         client.keep_place("chart", 0.1, 0.1)  # a command: the page asks for the status again
+        until(lambda: one.page.wait_for_timeout(50) or held, "the page asks")
+        client.keep_place("board", 0.2, 0.1)
         one.page.wait_for_timeout(1500)
-        assert len(held) == 1, "one question at a time"
+        assert len(asked) == 1, "one question at a time"
         client.estop(name="Ana", reason="sparks")
     one.word("stopped")
     one.page.evaluate(
