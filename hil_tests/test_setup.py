@@ -57,6 +57,7 @@ def fetched(asked: list[str]) -> list[str]:
 def test_a_demo_fetches_its_part_and_tests_add_theirs_to_it(checkout: Path) -> None:
     asked = set_up(checkout, "demo")
     assert asked[0] == "-m venv .venv" and fetched(asked) == [".venv/demo.lock"]
+    assert (checkout / "log").read_text().endswith("\n-\n"), "at last it compiles what draws pictures"
     (checkout / ".venv/wheels/numba.whl").touch()
     assert set_up(checkout, "demo") == []
     asked = set_up(checkout)
