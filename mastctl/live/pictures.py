@@ -79,16 +79,30 @@ class WatchedCameras:
             Names of configured cameras.
         wake
             Called from another thread when a picture is there; must return at once.
+
+        Raises
+        ------
+        RuntimeError
+            If the system gives no thread; nobody watches then.
         """
         watcher = Watcher(self, f"watcher {next(self._numbers)}", cameras, wake)
         with self._changed:
             self._watchers.add(watcher)
+        try:
             for camera in watcher.cameras:
-                if camera not in self._at_work and not self._closed:
-                    self._at_work.add(camera)
-                    name = f"pictures of {camera}"
-                    threading.Thread(target=self._work, args=(camera,), name=name, daemon=True).start()
+                self._begin(camera)
+        except BaseException:
+            self.leave(watcher)
+            raise
         return watcher
+
+    def _begin(self, camera: str) -> None:
+        """Have a thread at work for a camera."""
+        with self._changed:
+            if camera not in self._at_work and not self._closed:
+                name = f"pictures of {camera}"
+                threading.Thread(target=self._work, args=(camera,), name=name, daemon=True).start()
+                self._at_work.add(camera)  # it waits for this lock before it looks whether anybody watches
 
     def close(self) -> None:
         """Ask no camera any more."""
@@ -135,7 +149,10 @@ class WatchedCameras:
             else:
                 for watcher in self._ready(camera):
                     self._cameras.hold(frame, watcher.name, HELD)
-                    watcher.put(made)
+                    if self._is_there(watcher):
+                        watcher.put(made)
+                    else:  # it left before the frame was held, and would hold it for ever
+                        self._cameras.let_go(watcher.name)
 
     def _wanted(self, camera: str, pause_s: float) -> bool:
         """Wait until somebody is ready for a picture; False if nobody watches any more."""
@@ -152,6 +169,10 @@ class WatchedCameras:
 
     def _watch(self, camera: str) -> bool:
         return not self._closed and any(camera in one.cameras for one in self._watchers)
+
+    def _is_there(self, watcher: Watcher) -> bool:
+        with self._changed:
+            return watcher in self._watchers
 
     def _ready(self, camera: str) -> list[Watcher]:
         with self._changed:

@@ -1,0 +1,85 @@
+"""Watching cameras: whoever has left holds no frame and has no camera asked."""
+
+from __future__ import annotations
+
+import threading
+from collections import Counter
+
+import numpy as np
+import pytest
+
+from drivers.clock import SystemClock
+from hil_tests.mastctl.recorder.recorder_world import frame
+from hil_tests.waiting import until
+from mastctl.devices.frames import StampedFrame
+from mastctl.live import pictures
+from mastctl.live.pictures import WatchedCameras
+
+LEFT, RIGHT = "navcam_left", "navcam_right"
+
+
+class FakeCameras:
+    """Gives pictures, and counts who holds any; ``as_held`` is called before each hold."""
+
+    def __init__(self) -> None:
+        self.held: Counter[str] = Counter()
+        self.glances: Counter[str] = Counter()
+        self.as_held = lambda: None
+
+    def glance(self, camera: str, exposed_after_s: float, max_age_s: float, timeout_s: float) -> StampedFrame:
+        self.glances[camera] += 1
+        return frame(self.glances[camera], np.zeros((4, 4), np.uint8), b"jpeg", camera)
+
+    def hold(self, frame: StampedFrame, by: str, kept: int) -> None:
+        self.as_held()
+        self.held[by] += 1
+
+    def let_go(self, by: str) -> None:
+        self.held.pop(by, None)
+
+
+def pictures_threads() -> list[str]:
+    return [one.name for one in threading.enumerate() if one.name.startswith("pictures of")]
+
+
+def test_a_watcher_who_leaves_as_a_picture_comes_holds_none() -> None:
+    cameras, leaving, left = FakeCameras(), threading.Event(), threading.Event()
+
+    def as_held() -> None:
+        leaving.set()
+        assert left.wait(60.0)
+
+    cameras.as_held = as_held
+    watched = WatchedCameras(cameras, SystemClock())
+    woken: list[str] = []
+    watcher = watched.watch((LEFT,), lambda: woken.append(LEFT))
+    assert leaving.wait(60.0)
+    watcher.end()
+    left.set()
+    until(lambda: not pictures_threads(), "the camera is asked no more")
+    assert cameras.held == Counter() and watcher.take() == [] and woken == []
+    watched.close()
+
+
+def test_a_watcher_whose_second_camera_has_no_thread_is_none(monkeypatch: pytest.MonkeyPatch) -> None:
+    cameras = FakeCameras()
+    watched = WatchedCameras(cameras, SystemClock())
+    start, started = threading.Thread.start, list[str]()
+
+    def once(thread: threading.Thread) -> None:
+        if started:
+            raise RuntimeError("can't start new thread")
+        started.append(thread.name)
+        start(thread)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(pictures.threading.Thread, "start", once)  # type: ignore[attr-defined]
+        with pytest.raises(RuntimeError, match="can't start"):
+            watched.watch((LEFT, RIGHT), lambda: None)
+    until(lambda: not pictures_threads(), "nobody watches")
+    assert cameras.held == Counter()
+    there = threading.Event()
+    again = watched.watch((LEFT, RIGHT), there.set)  # both cameras have their threads now
+    until(lambda: {LEFT, RIGHT} <= cameras.glances.keys(), "a picture of each")
+    again.end()
+    watched.close()
