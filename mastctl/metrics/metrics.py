@@ -68,7 +68,7 @@ class Metrics:
         )
         self._last_reading_s: float | None = None
         self._sequences: dict[str, int] = {}
-        self._news = publisher.subscribe("operation", "command", "frame", "joints", known=False)
+        self._news = publisher.subscribe("operation", "command", "frame", "joints", known=False, every=True)
         self._thread = threading.Thread(target=self._count, name="metrics", daemon=True)
         self._thread.start()
 
@@ -89,8 +89,14 @@ class Metrics:
     # In the listener's thread
 
     def _count(self) -> None:
+        lost = 0
         while not self._news.closed:
-            for one in self._news.wait():
+            news = self._news.wait()
+            if self._news.lost > lost:  # what is next follows nothing: no camera missed what was lost here
+                lost = self._news.lost
+                self._sequences.clear()
+                self._last_reading_s = None
+            for one in news:
                 try:
                     self._counted(one)
                 except Exception:  # a record that nobody foresaw must not end the counting

@@ -1,7 +1,8 @@
 """Each change of state published once, to listeners that get the newest and never hold anybody up.
 
 A subscriber has at most one value of each topic and key waiting for it. One that is slow loses values in
-between, never the newest, and is told how many it lost: `Publisher.publish` neither waits nor queues.
+between, never the newest, and is told how many it lost: `Publisher.publish` neither waits nor queues. A
+listener that counts may ask for every value, up to a bound beyond which it loses the oldest.
 
     topic       key                 value
     state       "machine"           `mastctl.state.standing.Standing`
@@ -37,6 +38,9 @@ TOPICS: frozenset[Topic] = frozenset(get_args(Topic))
 
 _Subscription = TypeVar("_Subscription", bound="Subscription")
 
+MOST_UNREAD = 10_000
+"""Values that wait for a listener that hears every one."""
+
 GONE: Any = object()
 
 
@@ -62,8 +66,10 @@ class Subscription:
     Attributes
     ----------
     lost
-        How many values were replaced by newer ones before they were read.
+        How many values were replaced by newer ones before they were read, or found no room.
     """
+
+    _every = False
 
     def __init__(
         self,
@@ -78,7 +84,7 @@ class Subscription:
         self._wake = wake
         self._end = end
         self._lock = threading.Lock()  # held while a mapping is changed or handed over, never for longer
-        self._unread: dict[tuple[Topic, str], Published] = {}
+        self._unread: dict[tuple[Topic, str] | int, Published] = {}
         self._closed = False
 
     @property
@@ -107,13 +113,15 @@ class Subscription:
     def _put(self, one: Published) -> None:
         if one.topic not in self._topics or (self._keys is not None and one.key not in self._keys):
             return
-        place = one.topic, one.key
+        place = one.sequence if self._every else (one.topic, one.key)
         with self._lock:
-            if place in self._unread:
-                self.lost += 1
             if one.value is GONE:
-                self._unread.pop(place, None)
+                self.lost += self._unread.pop(place, None) is not None
                 return
+            if self._every and len(self._unread) >= MOST_UNREAD:
+                del self._unread[next(iter(self._unread))]  # the oldest gives way
+                self.lost += 1
+            self.lost += place in self._unread
             self._unread[place] = one
         self._wake()
 
@@ -125,8 +133,11 @@ class Subscription:
 class ThreadSubscription(Subscription):
     """A subscription that a thread waits on."""
 
-    def __init__(self, topics: frozenset[Topic], end: Callable[[Subscription], None]) -> None:
+    def __init__(
+        self, topics: frozenset[Topic], end: Callable[[Subscription], None], every: bool = False
+    ) -> None:
         self._something = threading.Event()
+        self._every = every
         super().__init__(topics, None, self._something.set, end)
 
     def wait(self, timeout_s: float | None = None) -> list[Published]:
@@ -205,12 +216,13 @@ class Publisher:
         known = self._newest.get((topic, key))
         return None if known is None else known.value
 
-    def subscribe(self, *topics: Topic, known: bool = True) -> ThreadSubscription:
+    def subscribe(self, *topics: Topic, known: bool = True, every: bool = False) -> ThreadSubscription:
         """Return a subscription for a thread; without topics to all of them.
 
-        It begins with the newest value of each key that is known already, unless ``known`` is False.
+        It begins with the newest value of each key that is known already, unless ``known`` is False. With
+        ``every`` no value takes another one's place, and none is forgotten before it was read.
         """
-        return self._added(ThreadSubscription(_checked(topics), self._leave), known)
+        return self._added(ThreadSubscription(_checked(topics), self._leave, every), known)
 
     def subscribe_here(
         self, *topics: Topic, known: bool = True, keys: frozenset[str] | None = None

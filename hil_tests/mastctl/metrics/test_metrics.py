@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable
 from types import SimpleNamespace
 from typing import Any
@@ -103,6 +104,65 @@ def test_frames_that_nobody_got_are_counted_by_the_cameras_own_count(publisher: 
         publisher.publish("frame", "navcam_left", SimpleNamespace(sequence=sequence))
         until(lambda number=number: scraped(metrics).get(taken) == number, "the frame")
     assert scraped(metrics)["mastctl_frames_missed_total", (("camera", "navcam_left"),)] == 3.0
+    metrics.close()
+
+
+def test_what_comes_in_quick_succession_is_counted_each_and_none_of_it_as_missed(
+    publisher: Publisher,
+) -> None:
+    metrics = Metrics(lambda: STATUS, dict, publisher)
+    counting, go_on = threading.Event(), threading.Event()
+
+    class Held:
+        @property
+        def sequence(self) -> int:
+            counting.set()
+            assert go_on.wait(60.0)
+            return 0
+
+    publisher.publish("frame", "navcam_left", Held())
+    assert counting.wait(60.0)
+    for sequence in (1, 2, 3):
+        publisher.publish("frame", "navcam_left", SimpleNamespace(sequence=sequence))
+        publisher.publish("joints", "pan_tilt", Reading(0.0, 0.0, False, 10.0 + 0.1 * sequence))
+        publisher.publish("command", f"{sequence}", {"command": "stop", "result": "ok"})
+        publisher.forget("command", f"{sequence}")
+    publisher.publish("command", "last", {"command": "point", "result": "ok"})
+    go_on.set()
+    last = "mastctl_commands_total", (("command", "point"), ("result", "ok"))
+    until(lambda: last in scraped(metrics), "the last of them")
+    found, camera = scraped(metrics), (("camera", "navcam_left"),)
+    assert found["mastctl_frames_total", camera] == 4.0
+    assert found.get(("mastctl_frames_missed_total", camera), 0.0) == 0.0
+    assert found["mastctl_reading_interval_seconds_count", ()] == 2.0
+    assert found["mastctl_commands_total", (("command", "stop"), ("result", "ok"))] == 3.0
+    metrics.close()
+
+
+def test_news_that_could_not_be_counted_are_not_told_as_missed_frames(
+    publisher: Publisher, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("mastctl.state.publisher.MOST_UNREAD", 1)
+    metrics = Metrics(lambda: STATUS, dict, publisher)
+    counting, go_on = threading.Event(), threading.Event()
+
+    class Held:
+        @property
+        def sequence(self) -> int:
+            counting.set()
+            assert go_on.wait(60.0)
+            return 0
+
+    publisher.publish("frame", "navcam_left", Held())
+    assert counting.wait(60.0)
+    for sequence in (1, 2, 3):
+        publisher.publish("frame", "navcam_left", SimpleNamespace(sequence=sequence))
+    go_on.set()
+    taken = "mastctl_frames_total", (("camera", "navcam_left"),)
+    until(lambda: scraped(metrics).get(taken) == 2.0, "the one that was kept")
+    publisher.publish("frame", "navcam_left", SimpleNamespace(sequence=4))
+    until(lambda: scraped(metrics).get(taken) == 3.0, "the next")
+    assert scraped(metrics).get(("mastctl_frames_missed_total", taken[1]), 0.0) == 0.0
     metrics.close()
 
 
