@@ -290,6 +290,9 @@ async def _serve(
     serving = asyncio.create_task(server.serve(sockets=[listener]))
     while not server.started and not serving.done():
         await asyncio.sleep(0.005)
+    if serving.done():  # nobody is told an address that does not answer; the caller closes the service
+        await serving
+        raise MastctlError("the web server ended before it answered a request")
     listener.listen(WAITING_IN_KERNEL)  # asyncio has one number for this and for how many it takes at once
     sweeping = asyncio.create_task(sweep(server.server_state.connections))
     on_ready(end_from_anywhere)
@@ -402,9 +405,16 @@ def _suspend(service: Service) -> None:
     """Stop the mast, then let the process be suspended: nobody would watch a head under way."""
 
     def then(stopped: Future[str | None]) -> None:
-        os.kill(os.getpid(), signal.SIGSTOP)
+        error = stopped.exception()
+        if error is None:
+            os.kill(os.getpid(), signal.SIGSTOP)
+        else:
+            log.error("not suspended: the stop failed and the head may still move: %s", error)
 
-    service.stop_threads.submit(service.stopping.stop).add_done_callback(then)
+    try:
+        service.stop_threads.submit(service.stopping.stop).add_done_callback(then)
+    except StopsHang as error:
+        log.error("not suspended: the head could not be stopped and may still move: %s", error)
 
 
 @contextlib.contextmanager

@@ -15,8 +15,9 @@ import threading
 import time
 import weakref
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -37,10 +38,12 @@ from hil_tests.mastctl.service_fakes import (
 from hil_tests.waiting import NET_S, joined, until
 from mastctl.client import Client
 from mastctl.config import Listen, load_config
-from mastctl.daemon import AddressInUse, RunningDaemon, _tcp_socket
+from mastctl.daemon import AddressInUse, RunningDaemon, _suspend, _tcp_socket, run
 from mastctl.devices import devices as devices_module
 from mastctl.operations import operations as operations_module
+from mastctl.safety.stop_threads import StopThreads
 from mastctl.service import service as service_module
+from mastctl.web.server import Server
 
 # A driver package from outside, for daemons in a process of their own: it writes what it is told to a file.
 OUTSIDE = """
@@ -292,6 +295,81 @@ def test_the_end_is_bounded_although_everything_hangs(
     for words in ("did not confirm", "is given up", "is left behind"):
         assert words in caplog.text
     hang.let_go()
+
+
+def test_a_daemon_whose_server_fails_as_it_starts_is_never_told_ready(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    hardware = FakeHardware()
+    save_rig(rig(), tmp_path / "little.yaml")
+    path = tmp_path / "daemon.yaml"
+    path.write_text(CONFIG.format(listen="{port: 0}"))
+    monkeypatch.setattr(service_module, "open_hardware", lambda settings, clock: hardware)
+
+    async def fails(self: object, sockets: object = None) -> None:
+        raise OSError("no room for a server")
+
+    monkeypatch.setattr(Server, "serve", fails)
+    told: list[str] = []
+    with (
+        socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager,
+        monkeypatch.context() as patch,
+        pytest.raises(OSError, match="no room for a server"),
+    ):
+        manager.bind(str(tmp_path / "notify"))
+        manager.setblocking(False)
+        patch.setenv("NOTIFY_SOCKET", str(tmp_path / "notify"))
+        try:
+            run(load_config(path), told.append)
+        finally:
+            with suppress(BlockingIOError):
+                while True:
+                    told.append(manager.recv(1000).decode())
+    assert [one for one in told if "READY=1" in one or one.startswith("http")] == []
+    assert hardware.closed
+
+
+@pytest.mark.parametrize("stopped", [True, False])
+def test_a_daemon_is_suspended_only_once_the_mast_was_stopped(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, stopped: bool
+) -> None:
+    signals: list[int] = []
+    monkeypatch.setattr("mastctl.daemon.os.kill", lambda process, number: signals.append(number))
+
+    def stop() -> None:
+        if not stopped:
+            raise DriverError("the head did not confirm the stop", device="pan_tilt")
+
+    threads = StopThreads()
+    service = SimpleNamespace(stop_threads=threads, stopping=SimpleNamespace(stop=stop))
+    _suspend(service)  # type: ignore[arg-type]
+    until(lambda: signals or caplog.records, "what came of it")
+    threads.close()
+    assert signals == ([signal.SIGSTOP] if stopped else [])
+    if not stopped:
+        assert "not suspended: the stop failed and the head may still move" in caplog.text
+        assert "the head did not confirm the stop" in caplog.text
+
+
+def test_a_part_that_cannot_be_closed_keeps_no_other_open(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    with fake_daemon(monkeypatch, tmp_path) as (daemon, hardware):
+        service, closed = daemon.service, list[str]()
+        named = ("guide", "metrics", "stop_threads", "recording", "audit", "latch", "folder")
+        for name in named:
+            part = getattr(service, name)
+
+            def close(name: str = name, close: Any = part.close) -> None:
+                closed.append(name)
+                close()
+                if name in ("guide", "recording"):
+                    raise RuntimeError(f"a defect of {name}")
+
+            monkeypatch.setattr(part, "close", close)
+        service.close()
+        assert closed == list(named) and hardware.closed
+    assert "a defect of guide" in caplog.text and "a defect of recording" in caplog.text
 
 
 def test_what_keeps_a_daemon_from_starting_is_typed_and_leaves_nothing(

@@ -8,6 +8,7 @@ from __future__ import annotations
 import contextlib
 import logging
 import threading
+from collections.abc import Callable
 from dataclasses import asdict
 from importlib.metadata import version
 from typing import Any
@@ -344,27 +345,26 @@ class Service:
             if self._closed:
                 return
             self._closed = True
-        self.operations.close()
-        self.guide.close()
-        self.devices.close()
-        self.machine.publisher.close()
-        self.metrics.close()
-        self.stop_threads.close()
-        self.handoffs.close()
-        self.health.close()
-        self.sentinel.close()
-        self.recording.close()
-        self.watched.close()
-        if self.live is not None:
-            self.live.close()
-        bounded("closing the hardware", self.hardware.close, HARDWARE_CLOSE_S)
-        if self.stop_socket is not None:
-            self.stop_socket.close()
-        self.audit.close()
-        self.latch.close()
-        for folder in (self.folder, self._socket_folder):
-            if folder is not None:
-                folder.close()
+        maybe = (self.stop_socket, self.audit, self.latch, self.folder, self._socket_folder)
+        first_to_last: tuple[Callable[[], object], ...] = (
+            self.operations.close,
+            self.guide.close,
+            self.devices.close,
+            self.machine.publisher.close,
+            self.metrics.close,
+            self.stop_threads.close,
+            self.handoffs.close,
+            self.health.close,
+            self.sentinel.close,
+            self.recording.close,
+            self.watched.close,
+            *(() if self.live is None else (self.live.close,)),
+            lambda: bounded("closing the hardware", self.hardware.close, HARDWARE_CLOSE_S),
+            *(one.close for one in maybe if one is not None),
+        )
+        with contextlib.ExitStack() as rest:  # none is skipped, whatever ends another one
+            for close in reversed(first_to_last):
+                rest.callback(_tried, close)
 
     # What the parts tell each other
 
@@ -435,3 +435,11 @@ class Service:
         """Have a hand-off counted and recorded."""
         self.handoffs.add(handoff)
         self.recording.handed_over(handoff)
+
+
+def _tried(close: Callable[[], object]) -> None:
+    """Close a part; a defect of one must not keep the others open."""
+    try:
+        close()
+    except Exception:
+        log.exception("a part of the daemon could not be closed")
