@@ -6,6 +6,7 @@ import ast
 import re
 import runpy
 import sys
+import tomllib
 from pathlib import Path
 
 import pytest
@@ -107,3 +108,9 @@ def test_no_room_imports_upwards_or_in_a_circle() -> None:
 def test_the_picture_of_the_rooms_is_the_one_of_the_code(repository: Path) -> None:
     picture = (repository / "docs" / "img" / "rooms.svg").read_text()
     assert picture == drawn([read_package(name) for name in PACKAGES]), "run python -m tools.rooms --svg"
+
+
+def test_a_library_whose_inner_classes_are_subclassed_is_bounded_above(repository: Path) -> None:
+    project = tomllib.loads((repository / "pyproject.toml").read_text())["project"]
+    (server,) = [one for one in project["dependencies"] if one.startswith("uvicorn")]
+    assert re.fullmatch(r"uvicorn>=0\.\d+,<0\.\d+", server), "a minor version may change what is inner"

@@ -54,7 +54,7 @@ class Session:
         self._stamps = clock
         self._clock = pair.link.clock
         self._watch = Watch(pair, head, reboots)
-        self._polled_s = -math.inf
+        self._heard_s = -math.inf
         self._failed_polls = 0
 
     def look(self) -> None:
@@ -79,9 +79,9 @@ class Session:
             except LineLost as error:
                 raise GivenUp(error) from None
             except DriverError as error:
-                self._polled_s = self._clock.now_s()
-                self.poll_due_s = self._polled_s + 1 / self._head.poll_hz
-                if attempt < ATTEMPTS and self._polled_s - began_s < PATIENCE_S:
+                now_s = self._clock.now_s()
+                self.poll_due_s = now_s + 1 / self._head.poll_hz
+                if attempt < ATTEMPTS and now_s - began_s < PATIENCE_S:
                     continue
                 self._failed_polls += 1
                 if self._failed_polls >= FAILED_POLLS:
@@ -102,13 +102,13 @@ class Session:
         """
         samples = self.pair.samples()
         now_s = self._clock.now_s()
-        gap_s, self._polled_s = now_s - self._polled_s, now_s
+        silence_s, self._heard_s = now_s - self._heard_s, now_s
         self.poll_due_s = now_s + 1 / self._head.poll_hz
         for axis, sample in zip(self.pair.axes, samples, strict=True):
             axis.motion.take(sample)
             if sample.alert and not axis.hardware_error:
                 self._watch.note_alert(axis)
-        if self._head.watchdog_counts and gap_s > self._head.watchdog_s / 2:
+        if self._head.watchdog_counts and silence_s > self._head.watchdog_s / 2:
             self._watch.look_soon()  # the servos may have stopped by themselves meanwhile
         for axis in self.pair.axes:
             axis.go_on()

@@ -99,7 +99,7 @@ def against_joints(calibration: BenchCalibration, cameras: Sequence[str]) -> Any
                     if len(values):
                         axis.errorbar(
                             np.degrees(values[:, 0]), values[:, 1], values[:, 2], fmt="^" if check else "o",
-                            ms=4, lw=0.8, color=plots.COLOURS[index], alpha=0.75,
+                            ms=4, lw=0.8, color=plots.COLOURS[index % len(plots.COLOURS)], alpha=0.75,
                             label=f"{name}{', not fitted' if check else ''}",
                         )  # fmt: skip
             axis.axhline(0.0, color="0.6", lw=0.8)
