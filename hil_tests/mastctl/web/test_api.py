@@ -511,7 +511,8 @@ def test_stop_does_not_wait_behind_hanging_cameras(
         asker.start()
     assert hang.entered.wait(NET_S)
     assert web.post("/stop").status_code == 200
-    assert hardware.head.calls == [("stop",)]
+    # twice where the head's own thread was kept from running: beside it, and then in its turn
+    assert set(hardware.head.calls) == {("stop",)}
     hang.let_go()
     joined(*askers)
 
