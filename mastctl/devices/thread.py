@@ -245,7 +245,7 @@ class DeviceThread:
     def _overdue(self, now: _Now | None) -> str:
         """Say in plain words how late the call under way is; empty when it is not."""
         now_s = self._clock.now_s()
-        if now is None or now_s <= now.until_s:
+        if now is None or now_s < now.until_s:
             return ""
         return f"does not answer: {now.what} has been under way for {now_s - now.began_s:.1f} s"
 
