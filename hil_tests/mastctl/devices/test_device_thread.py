@@ -17,7 +17,7 @@ def test_a_call_that_is_given_up_at_its_deadline_is_overdue_for_whoever_comes_ne
         try:
             with pytest.raises(NoReply, match="did not end within its deadline"):
                 thread.call("read", hang, 1.0)
-            with pytest.raises(NoReply, match="read has been under way for 1.0 s"):
+            with pytest.raises(NoReply, match=r"read has been under way for 1\.0 s"):
                 thread.submit("read", lambda: None, 1.0)
         finally:
             hang.let_go()
