@@ -266,7 +266,8 @@ async def _serve(
     waiting = Waiting(service.clock)
     most = most_connections()
     streams = Streams(service.machine.publisher, most // 2)
-    settings = _settings(service, create_app(service, waiting, entrance, streams), most)
+    kind = type("Connection", (Connection,), {"most": most, "turns": waiting.turns})
+    settings = _settings(service, create_app(service, waiting, entrance, streams), kind)
     server = Server(settings)
     ending = asyncio.Event()
 
@@ -328,9 +329,8 @@ async def _tell_state(service: Service, manager: ServiceManager) -> None:
                 manager.status(f"{now.word}: {now.reason}" if now.reason else now.word)
 
 
-def _settings(service: Service, app: ASGIApp, most: int) -> uvicorn.Config:
+def _settings(service: Service, app: ASGIApp, kind: type[Connection]) -> uvicorn.Config:
     """How uvicorn serves. TLS is made by its options, and spoken by connections that are counted."""
-    kind = type("Connection", (Connection,), {"most": most})
     tls = service.config.listen.tls
     settings = uvicorn.Config(
         app,

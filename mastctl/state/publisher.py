@@ -24,10 +24,12 @@ import contextlib
 import itertools
 import threading
 import time
+from collections import deque
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from types import TracebackType
-from typing import Any, Literal, Self, TypeVar, get_args
+from typing import Any, ClassVar, Literal, Self, TypeVar, get_args
+from weakref import WeakKeyDictionary, ref
 
 from mastctl.state.in_turn import InTurn
 
@@ -162,6 +164,7 @@ class LoopSubscription(Subscription):
         self, topics: frozenset[Topic], keys: frozenset[str] | None, end: Callable[[Subscription], None]
     ) -> None:
         self._loop = asyncio.get_running_loop()
+        self._wakes = _Wakes.of(self._loop)
         self._something = asyncio.Event()
         self._woken = False
         super().__init__(topics, keys, self._wake_loop, end)
@@ -180,14 +183,56 @@ class LoopSubscription(Subscription):
             if unread or self._closed or (left_s is not None and left_s <= 0):
                 return unread
             with contextlib.suppress(TimeoutError):
-                await asyncio.wait_for(self._something.wait(), left_s)
+                async with asyncio.timeout(left_s):
+                    await self._something.wait()
 
     def _wake_loop(self) -> None:
-        if self._woken:
-            return
-        self._woken = True
+        if not self._woken:
+            self._woken = True
+            self._wakes.wake(self._something)
+
+
+class _Wakes:
+    """Wakes those who wait on one event loop, one in each of its turns.
+
+    However many listen, who publishes calls the loop once, and what else the loop has to do, a stop above
+    all, comes between them.
+    """
+
+    _known: ClassVar[WeakKeyDictionary[asyncio.AbstractEventLoop, _Wakes]] = WeakKeyDictionary()
+
+    @classmethod
+    def of(cls, loop: asyncio.AbstractEventLoop) -> _Wakes:
+        """Return the one of a loop; to be called on it."""
+        if loop not in cls._known:
+            cls._known[loop] = cls(loop)
+        return cls._known[loop]
+
+    def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
+        self._call = ref(loop)
+        self._due: deque[asyncio.Event] = deque()
+        self._called = False
+
+    def wake(self, waiting: asyncio.Event) -> None:
+        """Have an event set; from any thread."""
+        self._due.append(waiting)
+        if not self._called:
+            self._called = True
+            self._again()
+
+    def _again(self) -> None:
+        loop = self._call()
         with contextlib.suppress(RuntimeError):  # the loop has ended, and with it who would read
-            self._loop.call_soon_threadsafe(self._something.set)
+            if loop is not None:
+                loop.call_soon_threadsafe(self._next)
+
+    def _next(self) -> None:
+        self._called = False  # first: what comes from now on calls again
+        if self._due:
+            self._due.popleft().set()
+        if self._due and not self._called:
+            self._called = True
+            self._again()
 
 
 class Publisher:

@@ -4,13 +4,15 @@ uvicorn bounds neither how many connections there are nor how long one may be si
 Here the descriptors of the process are shared out: some stay free, the rest is the most connections. Beyond
 it the oldest connection that waits for a request is closed for each new one; where every one is at work,
 the new one is served for stop and status only. Some are kept by nobody for long: a request
-must have come whole within some seconds, and a client that takes no bytes for some seconds is left.
+must have come whole within some seconds, and a client that takes no bytes for some seconds is left. What is
+no stop is read in turn, so that a stop passes whatever else has come.
 """
 
 from __future__ import annotations
 
 import asyncio
 import logging
+import re
 import resource
 from collections.abc import Iterable
 from pathlib import Path
@@ -22,6 +24,7 @@ from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from mastctl.web import PREFIX
 from mastctl.web.answer import error_response
+from mastctl.web.turns import Turns
 
 log = logging.getLogger(__name__)
 log.setLevel(logging.ERROR)
@@ -32,7 +35,8 @@ SWEEP_S = 1.0
 MOST = 200
 LEAST = 8
 FREE_DESCRIPTORS = 24  # for devices that come back, mast files, and what is accepted before it is counted
-ACCEPTED_AT_ONCE = 4  # connections taken in one turn of the event loop
+MOST_UNREAD_BYTES = 1 << 16  # of one connection, until its turn
+ACCEPTED_AT_ONCE = 16  # connections taken in one turn of the event loop
 WAITING_IN_KERNEL = 128  # connections that the kernel keeps for us meanwhile
 ALWAYS = frozenset(f"{PREFIX}/{name}" for name in ("stop", "estop", "track/stop", "status"))
 """What is served to whoever comes."""
@@ -40,6 +44,12 @@ EVENTS = f"{PREFIX}/events"
 IMAGES = f"{PREFIX}/images"
 SOCKETS = frozenset({EVENTS, IMAGES})
 """Where a connection may become a WebSocket."""
+
+
+STOP_LINE = re.compile(
+    rb"POST (https?://[^/ ]*)?/+%s/+(stop|estop|track/+stop)/*[ ?]" % PREFIX.strip("/").encode()
+)
+"""How a request begins that stops something; everything else is read in turn."""
 
 
 class Counted(Protocol):
@@ -96,9 +106,12 @@ class Connection(H11Protocol):
     ----------
     most
         How many there may be.
+    turns
+        In which what is no stop is read.
     """
 
     most = MOST
+    turns: Turns
 
     def __init__(self, *args: Any, **options: Any) -> None:
         super().__init__(*args, **options)
@@ -106,6 +119,7 @@ class Connection(H11Protocol):
         self.waits_since_s = 0.0
         self._stalled_since_s: float | None = None
         self._early = b""
+        self._unread = b""
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         super().connection_made(transport)
@@ -121,10 +135,25 @@ class Connection(H11Protocol):
             super().connection_lost(exc)
 
     def data_received(self, data: bytes) -> None:
-        if self._made:
-            super().data_received(data)
-        else:  # a TLS client that asks in the same breath as it ends its handshake
+        if not self._made:  # a TLS client that asks in the same breath as it ends its handshake
             self._early += data
+        elif self._unread:
+            self._unread += data
+            if len(self._unread) > MOST_UNREAD_BYTES:
+                self.transport.pause_reading()
+        elif STOP_LINE.match(data):
+            super().data_received(data)
+        else:
+            self._unread = data
+            self.turns.call(self._read)
+
+    def _read(self) -> None:
+        """Read what came, now that it is its turn."""
+        data, self._unread = self._unread, b""
+        if not self.transport.is_closing():
+            super().data_received(data)
+            if len(data) > MOST_UNREAD_BYTES and not self.flow.read_paused:
+                self.transport.resume_reading()
 
     def send_400_response(self, msg: str) -> None:
         """Refuse what is no HTTP in the one form of refusals, and close."""

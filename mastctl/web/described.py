@@ -96,6 +96,11 @@ def description(app: FastAPI) -> bytes:
         return _made(app)
 
 
+def is_made() -> bool:
+    """Return whether `description` only hands out what it has made before."""
+    return _made.cache_info().currsize > 0
+
+
 @cache
 def _made(app: FastAPI) -> bytes:
     document = app.openapi()

@@ -9,8 +9,9 @@ from __future__ import annotations
 
 import asyncio
 import json
-from collections.abc import AsyncIterator, Callable, Mapping
+from collections.abc import AsyncIterator, Callable, Iterator, Mapping, Sequence
 from typing import Annotated, Any
+from weakref import WeakKeyDictionary
 
 from fastapi import FastAPI, Query, WebSocket
 from fastapi.responses import StreamingResponse
@@ -33,6 +34,10 @@ from mastctl.web.sentences import sentence
 
 ALIVE_S = 2.0  # between signs of life where nothing changes
 GOING_AWAY = 1001  # RFC 6455, 7.4.1
+TOLD_AT_ONCE = 16  # events, in one turn of the event loop
+AGES_HOLD_S = 0.02  # for how long a text that tells an age is told to others too
+AGELESS: frozenset[Topic] = frozenset({"operation", "mast", "command", "bench"})
+"""Topics whose values are told the same whenever it is."""
 
 Telling = Callable[[Service, Published, int], str]
 
@@ -63,7 +68,7 @@ def add_events(app: FastAPI) -> None:
         try:
             query = _asked(line)
             with here.streams.listening(query.names, query.keys) as news:
-                await _tell(line, news, here.service)
+                await _tell(line, news, here)
         except ValidationError as error:
             words = sentence({**error.errors()[0], "loc": ("query", *error.errors()[0]["loc"])}, EventsQuery)
             await line.send_denial_response(error_response(422, "bad_request", words))
@@ -78,9 +83,17 @@ def _asked(line: WebSocket) -> EventsQuery:
     return EventsQuery.model_validate(told | ({"key": query.getlist("key")} if "key" in query else {}))
 
 
+_texts: WeakKeyDictionary[Published, tuple[str, float]] = WeakKeyDictionary()
+"""The values of events as JSON, made once for all who listen, and when."""
+
+
 def _event(service: Service, one: Published, lost: int) -> str:
-    event = {"topic": one.topic, "key": one.key, "sequence": one.sequence, "lost": lost}
-    return json.dumps(event | {"value": writable(value_told(service, one))}, allow_nan=False)
+    now_s, known = service.clock.now_s(), _texts.get(one)
+    if known is None or not (one.topic in AGELESS or 0.0 <= now_s - known[1] <= AGES_HOLD_S):
+        text = json.dumps(writable(value_told(service, one)), allow_nan=False)
+        known = _texts[one] = text, now_s
+    head = json.dumps({"topic": one.topic, "key": one.key, "sequence": one.sequence, "lost": lost})
+    return f'{head[:-1]}, "value": {known[0]}}}'
 
 
 def _track(service: Service, one: Published, lost: int) -> str:
@@ -95,7 +108,7 @@ class _Lines(StreamingResponse):
     ) -> None:
         super().__init__(self._lines(), media_type="text/event-stream")
         self._listening = here.streams.listening(topics, keys)
-        self._service, self._tell = here.service, tell
+        self._service, self._tell, self._turns = here.service, tell, here.waiting.turns
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         with self._listening as self._news:
@@ -105,23 +118,34 @@ class _Lines(StreamingResponse):
         news = self._news
         while True:
             found = await news.wait(ALIVE_S)
-            for one in found:
-                yield f"id: {one.sequence}\ndata: {self._tell(self._service, one, news.lost)}\n\n"
+            for some in _by_few(found):
+                lines = [(one.sequence, self._tell(self._service, one, news.lost)) for one in some]
+                yield "".join(f"id: {number}\ndata: {text}\n\n" for number, text in lines)
+                if some[-1] is not found[-1]:
+                    await self._turns.turn()
             if not found:
                 if news.closed:
                     return
                 yield ": alive\n\n"
 
 
-async def _tell(line: WebSocket, news: LoopSubscription, service: Service) -> None:
+def _by_few(found: Sequence[Published]) -> Iterator[Sequence[Published]]:
+    """What there is to be told in pieces that keep a stop waiting for a moment only."""
+    return (found[begin : begin + TOLD_AT_ONCE] for begin in range(0, len(found), TOLD_AT_ONCE))
+
+
+async def _tell(line: WebSocket, news: LoopSubscription, here: Parts) -> None:
     """Tell through a WebSocket until the daemon or the client ends."""
     await line.accept()
     gone = asyncio.ensure_future(line.receive())  # a client's only message is its end
     gone.add_done_callback(lambda _: news.close())
     try:
         while found := await news.wait():
-            for one in found:
-                await line.send_text(_event(service, one, news.lost))
+            for some in _by_few(found):
+                for one in some:
+                    await line.send_text(_event(here.service, one, news.lost))
+                if some[-1] is not found[-1]:
+                    await here.waiting.turns.turn()
         if not gone.done():
             await line.close(GOING_AWAY)
     except WebSocketDisconnect:

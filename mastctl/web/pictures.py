@@ -9,7 +9,6 @@ from fastapi import FastAPI, Query
 from fastapi.responses import Response
 
 from mastctl.commands.entry import MAST, MAST_BACK
-from mastctl.devices.frames import StampedFrame
 from mastctl.frame_facts import headers_of
 from mastctl.report.pictures import encoded
 from mastctl.service.mast_in_use import MastInUse
@@ -33,11 +32,16 @@ def add_pictures(app: FastAPI) -> None:
         service, waiting = here.service, here.waiting
         service.check_camera(camera)
         frame_id = query.frame_id
-        if frame_id is not None:
-            return await waiting.run(lambda: _picture(service.kept_frame(camera, frame_id), query.format))
-        return await waiting.picture(
-            camera, lambda: _picture(service.snapshot(camera, query.fresh), query.format)
-        )
+
+        def picture() -> Response:
+            if frame_id is None:
+                frame = service.snapshot(camera, query.fresh)
+            else:
+                frame = service.kept_frame(camera, frame_id)
+            data = waiting.encode(lambda: encoded(frame.image, query.format))
+            return Response(data, media_type=f"image/{query.format}", headers=headers_of(frame))
+
+        return await waiting.picture(camera, picture, kept=frame_id is not None)
 
     @app.get(f"{PREFIX}/mast", summary="The mast file in use, byte for byte", response_class=Response)
     async def mast(here: Here) -> Response:
@@ -59,10 +63,6 @@ def add_pictures(app: FastAPI) -> None:
     async def back(came: Headers, here: Here) -> dict[str, Any]:
         masts = here.service.masts
         return await here.commands.run(MAST_BACK, came, {}, lambda: _told(masts, masts.back()))
-
-
-def _picture(frame: StampedFrame, kind: str) -> Response:
-    return Response(encoded(frame.image, kind), media_type=f"image/{kind}", headers=headers_of(frame))
 
 
 def _told(masts: Masts, mast: MastInUse) -> dict[str, Any]:

@@ -3,25 +3,30 @@
 The event loop itself never waits for a lock, a file or a device. What may, runs here in worker threads; a
 request that waits when the daemon ends is refused at once, and what its thread still brings is dropped.
 Pictures have a limit of their own for each camera, so that a dead camera, however often it is asked, takes
-no thread from anything else.
+no thread from anything else. What computes for long does it in a few threads of the lowest standing.
 """
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
+import os
 import threading
 from collections.abc import Awaitable, Callable
+from concurrent.futures import CancelledError, ThreadPoolExecutor
 from typing import TypeVar
 
 from drivers.clock import Clock, SystemClock
 from mastctl.errors import Unable
+from mastctl.web.turns import Turns
 
 T = TypeVar("T")
 
 AT_ONCE = 40  # worker threads for everything but pictures
 PICTURES_AT_ONCE = 4  # of one camera
 PICTURE_QUEUE_S = 2.0  # how long a request waits for those before it
+ENCODERS = 2
+ENCODERS_NICE = 10  # a stop's threads, and the event loop, go first
 
 
 class Waiting:
@@ -33,12 +38,29 @@ class Waiting:
     def __init__(self, clock: Clock | None = None) -> None:
         self._clock = clock or SystemClock()
         self._ending = asyncio.Event()
-        self._asked: dict[str, asyncio.Semaphore] = {}
+        self._asked: dict[tuple[str, bool], asyncio.Semaphore] = {}
         self._others = asyncio.Semaphore(AT_ONCE)
+        self.turns = Turns()
+        self._encoders = ThreadPoolExecutor(ENCODERS, "encoding", _give_way)
 
     def end(self) -> None:
         """Refuse what waits now and what will come."""
         self._ending.set()
+        self._encoders.shutdown(wait=False, cancel_futures=True)
+
+    def encode(self, function: Callable[[], T]) -> T:
+        """Return what ``function()`` returns, which computes for long: a few at a time, and everybody else's
+        work first. For a worker thread of `run` or `picture`.
+
+        Raises
+        ------
+        Unable
+            ``closing`` if the daemon ends.
+        """
+        try:
+            return self._encoders.submit(function).result()
+        except (RuntimeError, CancelledError):
+            raise Unable("closing", "the daemon ends; what was asked for will not come") from None
 
     async def run(self, function: Callable[[], T]) -> T:
         """Return what ``function()`` returns, run in a worker thread.
@@ -50,8 +72,9 @@ class Waiting:
         """
         return await self._unless_ending(self._worked(function))
 
-    async def picture(self, camera: str, function: Callable[[], T]) -> T:
-        """Return what ``function()`` returns, which takes a picture with a (known) camera.
+    async def picture(self, camera: str, function: Callable[[], T], kept: bool = False) -> T:
+        """Return what ``function()`` returns, which takes a picture with a (known) camera, or encodes one
+        that is ``kept``: as many of these at once, and none of them waits for the camera.
 
         Raises
         ------
@@ -59,14 +82,14 @@ class Waiting:
             ``too_many`` if so many others wait for this camera that it does not come to this one's turn in
             2 s; else as `run`.
         """
-        return await self._unless_ending(self._in_turn(camera, function))
+        return await self._unless_ending(self._in_turn(camera, function, kept))
 
     async def _worked(self, function: Callable[[], T]) -> T:
         async with self._others:
             return await _in_thread(self._at_work(function))
 
-    async def _in_turn(self, camera: str, function: Callable[[], T]) -> T:
-        turn = self._asked.setdefault(camera, asyncio.Semaphore(PICTURES_AT_ONCE))
+    async def _in_turn(self, camera: str, function: Callable[[], T], kept: bool) -> T:
+        turn = self._asked.setdefault((camera, kept), asyncio.Semaphore(PICTURES_AT_ONCE))
         try:
             await asyncio.wait_for(turn.acquire(), PICTURE_QUEUE_S)
         except TimeoutError:
@@ -99,6 +122,11 @@ class Waiting:
         finally:
             for one in (call, ending):
                 one.cancel()
+
+
+def _give_way() -> None:
+    """Let this thread come after everybody else's; Linux counts niceness by thread."""
+    os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), ENCODERS_NICE)
 
 
 async def _in_thread(function: Callable[[], T]) -> T:

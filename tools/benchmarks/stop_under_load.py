@@ -3,11 +3,17 @@
 Each of the four takes ten pictures a second.
 
     python -m tools.benchmarks.stop_under_load [--stops N] [--head memory|ptu|dynamixel]
+    python -m tools.benchmarks.stop_under_load --beside [CROWD ...] [--code FOLDER ...] [--rounds N]
 
 The daemon is a process of its own on the simulated rover, its head in memory or behind the bytes of a PTU or
 of Dynamixel servos. Each stop finds the head under way. `stop` and `estop` are asked over HTTP, by a new
 connection each, and over the stop socket; an emergency stop's answer has the latch on the disk (``kept``).
 The last column is from the answer to the end of the operation as the status tells it.
+
+``--beside`` measures stops of a head at rest beside crowds that ask for what costs much: 60 clients for a
+kept frame as PNG, 60 that connect to the events again and again, 30 for the description, 150 that ask for
+events and read none; and beside nobody, as the control. ``--code`` names checkouts whose daemons are
+compared, in turn in each round.
 """
 
 from __future__ import annotations
@@ -22,6 +28,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections import defaultdict
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -33,12 +40,15 @@ from mastctl.config import load_config
 from mastctl.packaged import default_config
 from mastctl.safety.stop_line import ask
 from tools.arguments import end
+from tools.benchmarks.crowd import LOADS
 
 HEADS = {"memory": None, "ptu": "flir_ptu", "dynamixel": "dynamixel"}
 STREAMS = 4
 CAMERA = "navcam_left"
 STARTED_S = 300.0
 FAR_RAD = 0.6
+SETTLE_S = 3.0
+APART_S = 0.03
 
 STREAM = """
 import http.client, sys, time
@@ -59,7 +69,17 @@ def main() -> int:
         "--stops", type=at_least(1), default=100, metavar="N", help="of each kind (default 100)"
     )
     parser.add_argument("--head", choices=sorted(HEADS), help="one of them (default: all)")
+    parser.add_argument(
+        "--beside", nargs="*", choices=sorted(LOADS), metavar="CROWD", help=f"{', '.join(LOADS)} (all)"
+    )
+    parser.add_argument(
+        "--code", nargs="+", type=Path, default=[Path.cwd()], metavar="FOLDER", help="checkouts (this one)"
+    )
+    parser.add_argument("--rounds", type=at_least(1), default=1, metavar="N", help="of all crowds (1)")
     args = parser.parse_args()
+    if args.beside is not None:
+        beside_crowds(args.beside or list(LOADS), args.code, args.stops, args.rounds)
+        return 0
     print(
         "head       asked             answered ms: median   90 %   99 %  longest   within 20 ms   ended: 99 %"
     )
@@ -80,6 +100,51 @@ def main() -> int:
                     flush=True,
                 )
     return 0
+
+
+def beside_crowds(crowds: list[str], checkouts: list[Path], stops: int, rounds: int) -> None:
+    """Print how soon stops were answered beside each crowd, by the daemon of each checkout."""
+    found: dict[tuple[str, Path, str], list[float]] = defaultdict(list)
+    for _ in range(rounds):
+        for code in checkouts:
+            for crowd in ("nobody", *crowds):  # a daemon of its own for each, as after a start
+                with (
+                    tempfile.TemporaryDirectory() as folder,
+                    _daemon(Path(folder), "memory", code) as (port, path),
+                    _crowd(crowd, port),
+                ):
+                    ways = _ways(port, path)
+                    for number in range(2 * stops):
+                        name = ("stop, HTTP", "stop, socket")[number % 2]
+                        began_s = time.monotonic()
+                        ways[name]()
+                        found[crowd, code, name].append(1e3 * (time.monotonic() - began_s))
+                        time.sleep(APART_S)
+    print(f"{'beside':<12} {'asked':<13} answered ms: median   99 %   worst   within 20 ms   code")
+    for (crowd, code, name), times_ms in sorted(found.items()):
+        ordered = sorted(times_ms)
+        within = sum(one <= 20.0 for one in ordered) / len(ordered)
+        print(
+            f"{crowd:<12} {name:<13} {_part(ordered, 0.5):>19.1f} {_part(ordered, 0.99):>6.1f}"
+            f" {ordered[-1]:>7.1f} {100 * within:>12.1f} %   {code}",
+            flush=True,
+        )
+
+
+@contextlib.contextmanager
+def _crowd(name: str, port: int) -> Iterator[None]:
+    """A crowd at work in a process of its own; ``nobody`` is none."""
+    _get(port, "/status")
+    if name == "nobody":
+        yield
+        return
+    command = [sys.executable, "-m", "tools.benchmarks.crowd", name, str(port)]
+    with subprocess.Popen(command) as crowd:
+        try:
+            time.sleep(SETTLE_S)
+            yield
+        finally:
+            crowd.terminate()
 
 
 def _part(ordered: list[float], part: float) -> float:
@@ -120,8 +185,8 @@ def _one(port: int, stop: Callable[[], object]) -> tuple[float, float]:
 
 
 @contextlib.contextmanager
-def _daemon(folder: Path, head: str) -> Iterator[tuple[int, Path]]:
-    """A daemon whose log nobody reads: its port and its stop socket."""
+def _daemon(folder: Path, head: str, code: Path | None = None) -> Iterator[tuple[int, Path]]:
+    """A daemon of a checkout (this one) whose log nobody reads: its port and its stop socket."""
     packaged = default_config()
     document = yaml.safe_load(packaged.read_text())
     document["listen"] = {"port": 0}
@@ -142,7 +207,11 @@ def _daemon(folder: Path, head: str) -> Iterator[tuple[int, Path]]:
             os.write(writing, b"\n" * 4096)
     os.set_blocking(writing, True)
     command = [sys.executable, "-m", "mastctl", "run", "--config", str(config)]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=writing, text=True) as daemon:
+    there = (code or Path.cwd()).resolve()
+    ours = {**os.environ, "PYTHONPATH": str(there)}
+    with subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=writing, text=True, cwd=there, env=ours
+    ) as daemon:
         try:
             assert daemon.stdout is not None
             url = daemon.stdout.readline().strip()
