@@ -113,14 +113,19 @@ class Hardware:
         self.close()
 
 
+def says_simulated(device: object) -> bool:
+    """Return whether a device says that nothing of it is real (`drivers.interfaces.SaysSimulated`)."""
+    try:
+        return getattr(device, "simulated", False) is True
+    except Exception:  # a property of somebody else's: what cannot be told is taken as real
+        return False
+
+
 def _own_word(device: object) -> HardwareKind:
     """What a device from outside says that it is."""
     if isinstance(device, AbsentCamera):
         device = device.camera
-    try:
-        return "simulated" if getattr(device, "simulated", False) is True else "real"
-    except Exception:  # a property of somebody else's: what cannot be told is taken as real
-        return "real"
+    return "simulated" if says_simulated(device) else "real"
 
 
 def close_devices(devices: Mapping[str, Any]) -> None:

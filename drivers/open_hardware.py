@@ -7,6 +7,7 @@ Nothing else knows real and simulated drivers both. A name is ``dynamixel``, ``f
 from __future__ import annotations
 
 import importlib
+import json
 import logging
 from collections.abc import Iterator
 from concurrent.futures import wait
@@ -22,6 +23,7 @@ from drivers.faults import PAN_TILT, nearest
 from drivers.hardware import DeviceSettings, Hardware, HardwareKind, HardwareSettings, close_devices
 from drivers.interfaces import Camera, PanTilt
 from drivers.outside import device_from_outside
+from drivers.serial_line import stable_name
 from drivers.simulation_clock import SimulationClock, simulation_speed
 
 if TYPE_CHECKING:
@@ -102,6 +104,24 @@ def open_hardware(settings: HardwareSettings, clock: Clock | None = None) -> Har
         raise
     pan_tilt = devices.pop(PAN_TILT)
     return Hardware(pan_tilt, devices, opener.kinds, opener.rover)
+
+
+def head_name(settings: HardwareSettings) -> str | None:
+    """Return which head the settings drive, whoever wrote them: None for one in this program's memory.
+
+    A head is its line (`drivers.serial_line.stable_name` of the option ``port``); one from outside without
+    such an option is its factory with all options.
+    """
+    device = settings.pan_tilt
+    outside = ":" in device.driver
+    if device.driver not in HEADS and not outside:
+        return None
+    port = device.options.get("port")
+    if isinstance(port, str) and port:
+        return stable_name(port)
+    if outside:
+        return f"{device.driver} {json.dumps(dict(device.options), sort_keys=True, default=str)}"
+    return None
 
 
 def halt_head(settings: HardwareSettings) -> list[str]:

@@ -15,6 +15,7 @@ import select
 import socket
 import termios
 import time
+from pathlib import Path
 from typing import Protocol
 from urllib.parse import urlsplit
 
@@ -29,9 +30,35 @@ SLICE_S = 0.01
 """pyserial's own timeout of one read, where there is no file to wait on. It never changes while the line is
 open, since changing it makes pyserial set up the port anew (over the network with rfc2217)."""
 
+BY_ID = Path("/dev/serial/by-id")
+"""Where udev names USB adapters by maker, model and serial number."""
+
 _BROKEN = (OSError, EOFError, termios.error, ValueError, TypeError, AttributeError, IndexError)
 """What pyserial raises when the other side is gone: SerialException, which is an OSError; reset_input_buffer
 gives termios.error; a port closed under a read TypeError or AttributeError."""
+
+
+def stable_name(port: str) -> str:
+    """Return a line's name, the same whatever path leads there: what is kept of a head is kept by it.
+
+    A USB adapter's is that of udev (with its serial number), of whatever number it got when it was plugged
+    in; that of another device its path without links; of a URL host and port. A pseudo terminal's number is
+    given again to the next one, so the moment at which it was made belongs to its name.
+    """
+    if "://" in port:
+        parts = urlsplit(port)
+        host = (parts.hostname or "").replace("localhost", "127.0.0.1")
+        with contextlib.suppress(ValueError):
+            return f"{f'[{host}]' if ':' in host else host}:{parts.port}"
+        return port
+    path = Path(os.path.realpath(port))
+    with contextlib.suppress(OSError):
+        if path.parent == Path("/dev/pts"):
+            return f"pts-{path.name}-{path.stat().st_ctime_ns}"
+        links = sorted(link.name for link in BY_ID.iterdir() if Path(os.path.realpath(link)) == path)
+        if links:
+            return links[0]
+    return path.name if path.parent == BY_ID else str(path)
 
 
 class ByteLine(Protocol):

@@ -42,6 +42,7 @@ OWN = OwnFolder(Path(os.environ["PYTEST_DEBUG_TEMPROOT"]))
 os.environ["TMPDIR"] = str(OWN.path)
 tempfile.tempdir = None  # asks the environment again
 os.environ["XDG_STATE_HOME"] = str(OWN.keep("state"))
+os.environ["MASTCTL_HEADS"] = str(OWN.keep("heads"))
 os.environ.pop("STATE_DIRECTORY", None)
 LEFT = pytest.StashKey[list[str]]()
 

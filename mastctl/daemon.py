@@ -145,7 +145,7 @@ class RunningDaemon:
         self._exit = contextlib.ExitStack()
         listener, self.url = self._exit.enter_context(_listening(config.listen))
         try:
-            named = config.state_folder
+            named = config.state_folder  # the program's own, whatever unit it runs in
             folder = None if named is None else StateFolder.of(named, config.path, self.url)
             self.service = _opened(config, clock, folder, self.url)
         except BaseException:
@@ -207,9 +207,9 @@ class RunningDaemon:
 
 
 def _state_folder(config: Config) -> StateFolder:
-    """The folder of a daemon's own process; at any free port nobody would find it again."""
-    if config.state_folder is None and config.listen.socket is None and config.listen.port == 0:
-        return StateFolder.temporary()
+    """The folder of a daemon's own process; at any free port nobody would find it again, if none is named."""
+    if config.listen.socket is None and config.listen.port == 0:
+        return StateFolder.named(config.state_folder) or StateFolder.temporary()
     return StateFolder.of(config.state_folder, config.path, config.listen.url)
 
 
@@ -227,7 +227,9 @@ def _opened(config: Config, clock: Clock | None, folder: StateFolder | None, url
         service.close()
         raise
     socket_path = None if service.stop_socket is None else service.stop_socket.path
-    service.folder.note_daemon(config.path, url, socket_path)
+    for kept in (service.folder, service.head_folder):  # a stop finds the daemon of a head by either
+        if kept is not None:
+            kept.note_daemon(config.path, url, socket_path)
     return service
 
 

@@ -7,8 +7,9 @@ daemon does not answer, by its stop socket.
 from __future__ import annotations
 
 import argparse
+import contextlib
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -34,6 +35,7 @@ def add_commands(subparsers: argparse._SubParsersAction[Any]) -> None:
     reset = subparsers.add_parser("reset", help="release an emergency stop; nothing moves by that")
     reset.add_argument("--reason", required=True, metavar="WORDS", help="why it is safe to move again")
     reset.add_argument("--name", required=True, metavar="WHO", help="who says so")
+    reset.add_argument("--of", metavar="NAME", help="whose emergency stop, where several are latched")
     reset.set_defaults(run=_reset)
 
     halt = subparsers.add_parser(
@@ -67,9 +69,11 @@ def _estop(args: argparse.Namespace) -> int:
 
 def _reset(args: argparse.Namespace) -> int:
     with client_of(args, whatever_configured=True) as client:
-        answer = client.reset(reason=args.reason, name=args.name)
+        answer = client.reset(reason=args.reason, name=args.name, of=args.of)
     was = answer["released"]
-    tell_result(args, answer, f"released (it was latched by {was['name']}, {was['at']}: {was['reason']})")
+    left = "".join(f"; still latched: {one['name']}: {one['reason']}" for one in answer["left"])
+    words = f"released (it was latched by {was['name']}, {was['at']}: {was['reason']})"
+    tell_result(args, answer, f"{words}{left}")
     return 0
 
 
@@ -82,13 +86,16 @@ def _by_any_way(
 
     answer: Mapping[str, Any] | None = None
     failed = ""
-    for path in _sockets(args):
-        try:
-            answer = ask_socket(path, line)
-        except NoAnswer:
-            continue
-        except ValueError as error:
-            failed = str(error)
+    for paths in _sockets(args):
+        for path in paths:
+            try:
+                answer = ask_socket(path, line)
+            except NoAnswer:
+                continue
+            except ValueError as error:
+                failed = str(error)
+        if answer is not None or failed:
+            break
     if failed:  # one of them could not; another way would meet the same head
         raise CommandError("stop_failed", failed)
     if answer is not None:
@@ -97,27 +104,34 @@ def _by_any_way(
         return ask(client)
 
 
-def _sockets(args: argparse.Namespace) -> list[Path]:
-    """The stop sockets of the daemon that is meant."""
+def _sockets(args: argparse.Namespace) -> Iterator[list[Path]]:
+    """The stop sockets of the daemon that is meant; the next ones if nobody answers at the ones before."""
     from calib.errors import BadFile
-    from mastctl.config import load_config
+    from mastctl.config import load_config, load_head
     from mastctl.packaged import default_config
     from mastctl.safety.state_folder import usual_folder
     from mastctl.safety.stop_line import sockets_of
 
     url = args.url or os.environ.get("MASTCTL_URL")
     if url is not None:
-        return sockets_of(None, None if args.config is None else Path(args.config), url)
+        yield sockets_of(None, None if args.config is None else Path(args.config), url)
+        return
     config = default_config() if args.config is None else Path(args.config)
-    try:
+    with contextlib.suppress(BadFile):
         loaded = load_config(config)
-    except BadFile:
-        return sockets_of(None, config, None)
-    if loaded.state_folder is not None:
-        return sockets_of(loaded.state_folder, None, None)
-    return sockets_of(None, config, loaded.listen.url) or sockets_of(
-        usual_folder(config, loaded.listen.url), None, None
-    )
+        if loaded.state_folder is not None:
+            yield sockets_of(loaded.state_folder, None, None)
+        else:
+            yield sockets_of(None, config, loaded.listen.url)
+            yield sockets_of(usual_folder(config, loaded.listen.url), None, None)
+    from drivers.open_hardware import head_name  # only where nobody answered yet: a stop is quick
+    from mastctl.safety.heads import head_folders
+
+    with contextlib.suppress(BadFile):  # whoever drives this head, by whatever configuration
+        name = head_name(load_head(config))
+        for folder in [] if name is None else head_folders(name):
+            yield sockets_of(folder, None, None)
+    yield sockets_of(None, config, None)  # or this configuration, by --listen
 
 
 def _halt(args: argparse.Namespace) -> int:

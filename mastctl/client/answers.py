@@ -763,10 +763,11 @@ class ReportsTold(TypedDict):
 
 
 class ResetTold(TypedDict):
-    """``POST /reset``: the emergency stop that was released."""
+    """``POST /reset``: the emergency stop that was released, and those that are ``left``."""
 
-    latched: Literal[False]
+    latched: bool
     released: EstopHeld
+    left: list[EstopHeld]
 
 
 class ResidualTold(TypedDict):
@@ -872,6 +873,7 @@ class StateTold(TypedDict):
     target: dict[str, Any] | None
     last_residual: LastResidual | None
     estop: EstopHeld | None
+    estops: list[EstopHeld]
     track: str | None
     moving: bool
 
@@ -888,6 +890,7 @@ class Status(TypedDict):
     target: dict[str, Any] | None
     last_residual: LastResidual | None
     estop: EstopHeld | None
+    estops: list[EstopHeld]
     simulated: bool
     hardware: str
     moving: bool

@@ -430,11 +430,10 @@ class AsyncClient:
         told = {key: value for key, value in body.items() if value is not None}
         return cast("EstopTold", await self._daemon.json("POST", "/estop", json=told))
 
-    async def reset(self, *, reason: str, name: str) -> ResetTold:
-        """Release the emergency stop; nothing moves before the next command."""
-        return cast(
-            "ResetTold", await self._daemon.json("POST", "/reset", json={"reason": reason, "name": name})
-        )
+    async def reset(self, *, reason: str, name: str, of: str | None = None) -> ResetTold:
+        """Release an emergency stop, of several that of ``of``; nothing moves before the next command."""
+        told = {"reason": reason, "name": name, **({} if of is None else {"of": of})}
+        return cast("ResetTold", await self._daemon.json("POST", "/reset", json=told))
 
     async def pose(
         self,

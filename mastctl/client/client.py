@@ -422,9 +422,10 @@ class Client:
         told = {key: value for key, value in body.items() if value is not None}
         return cast("EstopTold", self._daemon.json("POST", "/estop", json=told))
 
-    def reset(self, *, reason: str, name: str) -> ResetTold:
-        """Release the emergency stop; nothing moves before the next command."""
-        return cast("ResetTold", self._daemon.json("POST", "/reset", json={"reason": reason, "name": name}))
+    def reset(self, *, reason: str, name: str, of: str | None = None) -> ResetTold:
+        """Release an emergency stop, of several that of ``of``; nothing moves before the next command."""
+        told = {"reason": reason, "name": name, **({} if of is None else {"of": of})}
+        return cast("ResetTold", self._daemon.json("POST", "/reset", json=told))
 
     def pose(
         self,

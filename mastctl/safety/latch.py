@@ -1,4 +1,7 @@
-"""The latched emergency stop: held in memory from the first moment, and in the state folder across restarts.
+"""The latched emergency stops: held in memory from the first moment, and on the disk across restarts.
+
+They lie in the head's place (`mastctl.safety.heads`), or in the state folder for a head in this program's
+memory. Each person's stop is an entry, and each is released by itself.
 
 What cannot be read counts as latched: so a stop is written over the file that says that none is, which is
 there from the start, and quick. The disk never holds the stop up: a thread of its own writes, after the head
@@ -11,25 +14,31 @@ import contextlib
 import logging
 import threading
 import time
-from collections.abc import Callable, Mapping
-from dataclasses import asdict
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, replace
 from datetime import UTC, datetime
+from pathlib import Path
 from typing import Any
 
 from calib.errors import BadFile
 from mastctl.errors import NotNow, Stopped, Unable, one_line
 from mastctl.safety.state_file import StateFile
 from mastctl.safety.state_folder import StateFolder
-from mastctl.state.standing import Latched
+from mastctl.state.standing import Latched, latched_sentence
 
 log = logging.getLogger(__name__)
 
 SCHEMA = "mastctl/latch/1"
 FILE = "latch.json"
+USED_SCHEMA = "mastctl/latch-used/1"
+USED = "latch.used.json"
+"""Says where a latch file was: where it is gone, nobody knows what it said."""
+MOST = 5
+OTHERS = "others"  # stops of more people than entries are kept of
 HEAD_FIRST_S = 0.1  # how long the disk waits for the head to be told, at most
 AGAIN_S = 2.0
 PATIENCE_S = 2.0  # of a reset for a disk that is busy
-ROOM_BYTES = 8192  # for the longest reason and name, however they are written
+ROOM_BYTES = 32768  # for the longest reasons and names of all entries, however they are written
 LONGEST = 200
 """Characters of a reason or a name that are kept."""
 
@@ -42,58 +51,87 @@ class Estopped(Stopped):
 
 
 class Latch:
-    """The emergency stop of one daemon; safe to use from any thread.
+    """The emergency stops of one head; safe to use from any thread.
 
     Parameters
     ----------
     folder
-        Where it is kept.
+        Where they are kept.
+    state
+        The daemon's state folder, if that is another one; it remembers where the latch is.
+    others
+        Folders beside them: what is latched there holds too, and is released there too.
 
     Attributes
     ----------
-    held
-        The stop that is latched, None if none is; read without a lock.
+    entries
+        The stops that are latched, the oldest first; read without a lock.
+    folder
+        Where they are kept.
     since_s
-        When it was latched in this process, seconds of CLOCK_MONOTONIC.
+        When the first one was latched in this process, seconds of CLOCK_MONOTONIC.
     """
 
-    def __init__(self, folder: StateFolder) -> None:
-        self._folder = folder
-        self._file = StateFile(folder.path / FILE, SCHEMA, ROOM_BYTES)
+    def __init__(
+        self, folder: StateFolder, state: StateFolder | None = None, others: Sequence[Path] = ()
+    ) -> None:
+        self.folder = self._folder = folder
+        self._file = StateFile(folder.path / FILE, SCHEMA, ROOM_BYTES, 0o644)
+        self._marks = [StateFile(folder.path / USED, USED_SCHEMA)]
+        if state is not None:
+            self._marks.append(StateFile(state.path / USED, USED_SCHEMA))
+            others = (*others, state.path)
+        self._others = [StateFile(other / FILE, SCHEMA, ROOM_BYTES) for other in others]
         self._changed = threading.Condition()
         self._disk = threading.Lock()  # for who writes; a disk that hangs holds nobody else
-        self.held: Latched | None = None
-        self._kept: Latched | None = None  # what a restart would find latched
+        self.entries: tuple[Latched, ...] = ()
+        self._kept: tuple[Latched, ...] | None = ()  # what a restart would find latched
         self._problem = ""
         self._asked = 0
         self.since_s = time.monotonic()
         self._due_s = 0.0  # when the disk may be written to
         self._ended = False
-        try:
-            document = self._file.read()
-            if document is not None and _latched(document):
-                self.held = Latched(*(_text(document.get(key)) for key in ("name", "reason", "at")))
-        except BadFile as error:
-            self.held = Latched("mastctl", f"whether one was latched cannot be read: {error}", _now())
-        self._kept = self.held
-        self._on_disk = self.held is not None  # whether a restart may find one, this one or another
-        if self.held is not None:
-            log.warning("%s", self.held.sentence)
+        found = _entries(self._file)
+        if found is None:
+            self.entries = self._gone()
+        else:
+            self.entries = self._kept = found
+        for file in self._others:
+            self.entries = _merged(self.entries, _entries(file) or ())
+        if not self.entries or self.entries == self._kept:
+            self._kept = self.entries
+        self._on_disk = bool(self.entries)  # whether a restart may find one, this one or another
+        if self.entries:
+            log.warning("%s", latched_sentence(self.entries))
         threading.Thread(target=self._keep, name="latch", daemon=True).start()
 
+    @property
+    def held(self) -> Latched | None:
+        """The oldest stop that is latched, None if none is; read without a lock."""
+        entries = self.entries
+        return entries[0] if entries else None
+
     def hold(self, reason: str | None, name: str | None) -> Latched:
-        """Latch in memory, at once; a stop that is latched already stays as it is. Returns the one held.
+        """Latch in memory, at once; returns the entry of who asks, which stays as it is if there is one.
 
         The disk is written to when `head_told` is called, or a moment later.
         """
         with self._changed:
             self._asked += 1
-            if self.held is None:
-                self.held = Latched(_told(name, "anonymous"), _told(reason, "no reason given"), _now())
-                self.since_s = time.monotonic()
-                self._due_s = self.since_s + HEAD_FIRST_S
+            entry = Latched(_told(name, "anonymous"), _told(reason, "no reason given"), _now())
+            for one in self.entries:
+                if one.name == entry.name:
+                    return one
+            before = len(self.entries)
+            if before >= MOST - 1:  # strangers with many names fill no disk
+                entry = replace(entry, name=OTHERS, reason=f"stops of more than {MOST - 1} people")
+            self.entries = _merged(self.entries, (entry,))
+            if len(self.entries) > before:
+                now_s = time.monotonic()
+                self.since_s = self.since_s if before else now_s
+                self._due_s = now_s + HEAD_FIRST_S
                 self._changed.notify_all()
-            return self.held
+            return next(one for one in self.entries if one.name == entry.name)
 
     def head_told(self) -> None:
         """Let the disk be written to: the head comes first."""
@@ -105,7 +143,7 @@ class Latch:
         """Wait ``timeout_s`` seconds at most for the disk to hold what is latched; return whether it does."""
         until_s = time.monotonic() + timeout_s
         with self._changed:
-            while self._kept is not self.held and not self._problem:
+            while self._kept is not self.entries and not self._problem:
                 left_s = until_s - time.monotonic()
                 if left_s <= 0:
                     break
@@ -115,24 +153,32 @@ class Latch:
     @property
     def survives(self) -> bool:
         """Whether a restart would find what is latched."""
-        return self._kept is self.held and not self._folder.is_temporary
+        return self._kept is self.entries and not self._folder.is_temporary
 
     @property
     def not_kept(self) -> str:
         """Why an emergency stop is not kept, in plain words; empty if it is, or none is latched."""
-        if self.held is None or self.survives:
+        if not self.entries or self.survives:
             return ""
         if self._folder.is_temporary:
             return self._folder.why_temporary or "this daemon keeps its state in a temporary folder"
         return self._problem or "the disk has not confirmed it yet"
 
-    def release(self, reason: str, name: str) -> Latched:
-        """Release it on the disk, then in memory; return what was latched.
+    def release(self, reason: str, name: str, of: str | None = None) -> Latched:
+        """Release one entry on the disk, then in memory; return it.
+
+        Parameters
+        ----------
+        reason, name
+            Why, and who says so.
+        of
+            Whose stop it is; may be left out where only one is latched.
 
         Raises
         ------
         NotNow
-            ``not_estopped`` if none is latched, ``stopping`` if another stop came meanwhile.
+            ``not_estopped`` if none is latched, ``several_estops`` if it is not clear which is meant,
+            ``stopping`` if another stop came meanwhile.
         Unable
             ``not_saved`` if the disk goes on to say that one is: a restart would be latched again.
         """
@@ -141,19 +187,20 @@ class Latch:
             words = "the disk has not taken the emergency stop yet; a reset follows it"
             raise Unable("not_saved", words, PATIENCE_S)
         try:
-            held, asked = self.held, self._asked
-            if held is None:
-                raise NotNow("not_estopped", "no emergency stop is latched")
+            entries, asked = self.entries, self._asked
+            held = _meant(entries, of)
+            left = tuple(one for one in entries if one is not held)
             with self._changed:  # before the disk changes: from here on nobody is told that it holds a stop
                 self._kept = None
             if self._on_disk:
                 released = {"by": name, "reason": reason, "at": _now()}
-                self._write_released({"latched": False, **asdict(held), "released": released})
+                told = {**asdict(held), "released": released}
+                self._write_released(_document(left) if left else {"latched": False, **told}, bool(left))
             with self._changed:
                 self._changed.notify_all()
                 if asked != self._asked:
                     raise NotNow("stopping", "another emergency stop came during the reset; it is latched")
-                self.held = None
+                self.entries = self._kept = left
                 self._problem = ""
         finally:
             self._disk.release()
@@ -167,21 +214,32 @@ class Latch:
             self._due_s = 0.0
             self._changed.notify_all()
 
-    def _write_released(self, document: dict[str, Any]) -> None:
-        """Say on the disk that nothing is latched. Raises Unable."""
+    def _write_released(self, document: dict[str, Any], is_left: bool) -> None:
+        """Say on the disk that nothing, or only what is left, is latched. Raises Unable."""
+
+        def remove() -> None:
+            for file in (*self._marks, self._file):  # without its mark nobody misses the file
+                file.remove()
+
         ways: tuple[Callable[[], None], ...] = (
             lambda: self._file.write(document),
             lambda: self._file.overwrite(document),  # a full disk still takes this, and the room stays
-            self._file.remove,  # and this one that cannot be written to
+            *(() if is_left else (remove,)),  # and this one that cannot be written to
         )
         refused = ""
-        for way in ways:
+        for file in self._others if not is_left else ():
+            try:
+                if _entries(file):
+                    file.write({"latched": False})
+            except BadFile as error:
+                refused = str(error)
+        for way in () if refused else ways:
             try:
                 way()
             except BadFile as error:
                 refused = refused or str(error)
             else:
-                self._on_disk = False
+                self._on_disk = is_left
                 return
         with self._changed:  # what the disk says is not known: the thread writes it again
             self._changed.notify_all()
@@ -191,30 +249,56 @@ class Latch:
     def _keep(self) -> None:
         """Write what is latched, in a thread of its own."""
         with self._disk:
-            if self.held is None and not self._folder.is_temporary and not self._file.has_room:
+            if not self.entries and not self._folder.is_temporary and not self._file.has_room:
                 with contextlib.suppress(BadFile):  # then a stop is written anew, and tells what is wrong
                     self._file.write({"latched": False})
+            self._mark()
         while True:
             with self._changed:
-                while self.held is self._kept or time.monotonic() < self._due_s:
+                while self.entries is self._kept or time.monotonic() < self._due_s:
                     if self._ended:
                         return
                     left_s = self._due_s - time.monotonic()
-                    self._changed.wait(None if self.held is self._kept else max(0.0, left_s))
+                    self._changed.wait(None if self.entries is self._kept else max(0.0, left_s))
             with self._disk:
-                held = self.held
-                if held is None:
+                held = self.entries
+                if not held:
                     continue
                 try:
                     self._write_held(held)
+                    self._mark()
                     problem = ""
                 except BadFile as error:
                     problem = str(error)
                 self._tried(held, problem)
 
-    def _write_held(self, held: Latched) -> None:
-        """Have it on the disk. Raises BadFile."""
-        document = {"latched": True, **asdict(held)}
+    def _mark(self) -> None:
+        """Remember that the file is there, once it is."""
+        if self._folder.is_temporary or not self._file.path.exists():
+            return
+        for mark in self._marks:
+            with contextlib.suppress(BadFile):
+                if not self._names_it(mark):
+                    mark.write({"latch": str(self._file.path)})
+
+    def _names_it(self, mark: StateFile) -> bool:
+        """Whether a mark says that this latch file was there; one that cannot be read says so too."""
+        try:
+            told = mark.read()
+        except BadFile:
+            return True
+        return told is not None and told.get("latch") == str(self._file.path)
+
+    def _gone(self) -> tuple[Latched, ...]:
+        """What holds where there is no latch file: nothing, unless there was one."""
+        if not any(self._names_it(mark) for mark in self._marks):
+            return ()
+        words = f"whether one was latched is not known, since {self._file.path} is gone"
+        return (Latched("mastctl", one_line(words, LONGEST), _now()),)
+
+    def _write_held(self, held: tuple[Latched, ...]) -> None:
+        """Have them on the disk. Raises BadFile."""
+        document = _document(held)
         try:
             try:
                 self._file.overwrite(document)
@@ -227,13 +311,9 @@ class Latch:
 
     def _says_latched(self) -> bool:
         """Whether a restart would take the file for a latched stop."""
-        try:
-            document = self._file.read()
-        except BadFile:
-            return True
-        return document is not None and _latched(document)
+        return bool(_entries(self._file))
 
-    def _tried(self, held: Latched, problem: str) -> None:
+    def _tried(self, held: tuple[Latched, ...], problem: str) -> None:
         """Note how the writing went, and say each change once."""
         if problem and problem != self._problem:
             log.error("the emergency stop would not survive a restart: %s", problem)
@@ -247,8 +327,54 @@ class Latch:
                 self._kept = held  # nothing more can be done
 
 
-def _latched(document: Mapping[str, Any]) -> bool:
-    return document.get("latched") is not False
+def _entries(file: StateFile) -> tuple[Latched, ...] | None:
+    """What a latch file says is latched; None if there is none. What cannot be read counts as latched."""
+    try:
+        document = file.read()
+    except BadFile as error:
+        return (Latched("mastctl", f"whether one was latched cannot be read: {error}", _now()),)
+    if document is None:
+        return None
+    if document.get("latched") is False:
+        return ()
+    more = document.get("more")
+    parts = [document, *(more if isinstance(more, list) else ())]
+    found = (
+        Latched(*(_text(one.get(key)) for key in ("name", "reason", "at")))
+        for one in parts[:MOST]
+        if isinstance(one, Mapping)
+    )
+    return _merged((), tuple(found))
+
+
+def _document(entries: tuple[Latched, ...]) -> dict[str, Any]:
+    """As a file has them: the oldest at the top, as one alone always was."""
+    first, *more = entries
+    return {"latched": True, **asdict(first)} | ({"more": [asdict(one) for one in more]} if more else {})
+
+
+def _merged(entries: tuple[Latched, ...], more: tuple[Latched, ...]) -> tuple[Latched, ...]:
+    """Entries with those of further people; the same ones if there are none."""
+    for one in more:
+        if one.name not in [other.name for other in entries]:
+            entries = (*entries, one)
+    return entries
+
+
+def _meant(entries: tuple[Latched, ...], of: str | None) -> Latched:
+    """The entry that is to be released. Raises NotNow."""
+    if not entries:
+        raise NotNow("not_estopped", "no emergency stop is latched")
+    names = ", ".join(one.name for one in entries)
+    if of is not None:
+        for one in entries:
+            if one.name == _told(of, ""):
+                return one
+        raise NotNow("not_estopped", f"no emergency stop of {_told(of, 'nobody')} is latched, but of {names}")
+    if len(entries) > 1:
+        words = f"{len(entries)} emergency stops are latched, of {names}; each is released by itself"
+        raise NotNow("several_estops", f"{words}: say whose ('of'; mastctl reset --of NAME)")
+    return entries[0]
 
 
 def _now() -> str:

@@ -30,11 +30,14 @@ class StateFile:
         Its kind and version, such as ``mastctl/latch/1``: a file that says another one is refused.
     room
         How long the file is at least, bytes, filled up with blanks: what `overwrite` may need.
+    mode
+        Who may read and write it.
     """
 
     path: Path
     schema: str
     room: int = 0
+    mode: int = 0o600
 
     def read(self) -> dict[str, Any] | None:
         """Return the document without its schema; None if there is no file.
@@ -79,7 +82,7 @@ class StateFile:
         """
         data = self._data(document)
         try:
-            replace_bytes(self.path, data.ljust(self.room))
+            replace_bytes(self.path, data.ljust(self.room), self.mode)
         except OSError as error:
             raise BadFile(self.path, "", f"cannot be saved: {error.strerror or error}") from None
 

@@ -2,7 +2,8 @@
 
 In this order: ``state.folder`` of the configuration; ``$STATE_DIRECTORY`` (systemd); a folder of the
 configuration and address under ``$XDG_STATE_HOME`` or ``~/.local/state``. A daemon at any free port, and one
-inside another program, keeps its state in a temporary folder that goes with it.
+inside another program, keeps its state in a temporary folder that goes with it, if the first two name none.
+The latch of a head that others can reach has a place of its own: `mastctl.safety.heads`.
 """
 
 from __future__ import annotations
@@ -49,7 +50,9 @@ class StateFolder:
         Why the disk refused what was to be written at the start; empty if it did not.
     """
 
-    def __init__(self, path: Path, *, is_temporary: bool = False, why_temporary: str = "") -> None:
+    def __init__(
+        self, path: Path, *, is_temporary: bool = False, why_temporary: str = "", of_head: str = ""
+    ) -> None:
         self.path = path
         self.is_temporary = is_temporary
         self.why_temporary = why_temporary
@@ -62,10 +65,13 @@ class StateFolder:
             fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError:
             os.close(self._lock)
-            raise StateInUse(
-                f"the state folder {path} is in use by another daemon; end it, or give this one another "
+            words = (
+                f"the head at {of_head} is driven by another program (its place {path} is in use); end that"
+                if of_head
+                else f"the state folder {path} is in use by another daemon; end it, or give this one another "
                 "folder (key state.folder)"
-            ) from None
+            )
+            raise StateInUse(words) from None
 
     @classmethod
     def temporary(cls, why: str = "") -> StateFolder:
@@ -93,15 +99,23 @@ class StateFolder:
         StateInUse
             If another daemon uses it.
         """
-        path = named or _of_systemd()
-        if path is not None:
-            _made(path)
-            return cls(path)
+        told = cls.named(named)
+        if told is not None:
+            return told
         try:
             path = usual_folder(config, address)
             _made(path)
         except (BadFile, RuntimeError) as error:  # RuntimeError: this user has no home
             return cls.temporary(str(error))
+        return cls(path)
+
+    @classmethod
+    def named(cls, named: Path | None) -> StateFolder | None:
+        """Take the folder of the configuration or of systemd as `of`; None where neither names one."""
+        path = named or _of_systemd()
+        if path is None:
+            return None
+        _made(path)
         return cls(path)
 
     def note_daemon(self, config: Path, url: str, stop_socket: Path | None) -> None:

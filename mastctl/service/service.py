@@ -16,8 +16,8 @@ from typing import Any
 from calib.files.mast_file import StoredRig
 from calib.handoff.matched import MatchedHandoff
 from drivers.clock import Clock, SystemClock
-from drivers.hardware import Hardware
-from drivers.open_hardware import clock_for, open_hardware
+from drivers.hardware import Hardware, says_simulated
+from drivers.open_hardware import clock_for, head_name, open_hardware
 from mastctl.commands.audit import AuditLog
 from mastctl.commands.entry import Entry
 from mastctl.commands.idempotency import Answers
@@ -39,7 +39,7 @@ from mastctl.operations.operations import Operations
 from mastctl.operations.records import Operation, last_frame
 from mastctl.pointing.jog import Jogs
 from mastctl.pointing.wanted import wrong_camera
-from mastctl.safety import stop_socket
+from mastctl.safety import heads, stop_socket
 from mastctl.safety.latch import Latch
 from mastctl.safety.state_folder import StateFolder
 from mastctl.safety.stop_socket import StopSocket
@@ -86,7 +86,9 @@ class Service:
     clock
         The clock that stamps everything.
     folder
-        Where state is kept, closed by `close`; a temporary one by default.
+        Where state is kept, closed by `close`.
+    head
+        The head's own place, where its latch is kept, closed by `close`; the state folder by default.
 
     Attributes
     ----------
@@ -116,8 +118,10 @@ class Service:
         Pictures for who watches cameras by a page.
     stop_threads
         Where the web side stops: threads that nothing else can keep busy.
-    folder, latch
-        Where state is kept that outlives the daemon; the emergency stop, if one is latched.
+    folder, head_folder
+        Where state is kept that outlives the daemon; the head's own place, None for one in memory.
+    latch
+        The emergency stops that are latched.
     places
         Where the head is sent by a name.
     guide, reports
@@ -137,6 +141,7 @@ class Service:
         hardware: Hardware,
         clock: Clock,
         folder: StateFolder,
+        head: StateFolder | None = None,
     ) -> None:
         self.config = config
         self.hardware = hardware
@@ -145,8 +150,11 @@ class Service:
         self._version = version("mastctl")
         self.folder = folder
         self.places = Places(self.folder.path)
-        self.latch = Latch(self.folder)
-        self.machine = Machine(clock, latch=self.latch.held)
+        self.head_folder = head
+        beside = heads.others(head_name(config.hardware), head)
+        self.latch = Latch(folder, others=beside) if head is None else Latch(head, folder, beside)
+        entries = self.latch.entries
+        self.machine = Machine(clock, latch=self.latch.held, more_latched=entries[1:])
         publisher = self.machine.publisher
         self.health = CalibrationHealth(self.folder.path, mast.stored)
         self._open_head(mast)
@@ -233,6 +241,8 @@ class Service:
             If the mast file cannot be used, or lacks a configured camera.
         DriverError
             If a driver refuses its options or cannot reach its device.
+        StateInUse
+            If another program drives the head.
         Unable
             ``no_foxglove`` if a live view is asked for, and what shows it is not installed.
         """
@@ -242,16 +252,22 @@ class Service:
             log.warning("%s", note)
         if config.live is not None:
             check_installed()
-        hardware = open_hardware(config.hardware, clock)
-        kept = folder or StateFolder.temporary()
-        try:
-            with clock.at_work():
-                return cls(config, mast, hardware, clock, kept)
-        except BaseException:
-            hardware.close()
+        with contextlib.ExitStack() as undo:
+            head = heads.of_settings(config.hardware)  # before the head is touched
+            if head is not None:
+                undo.callback(head.close)
+            hardware = open_hardware(config.hardware, clock)
+            undo.callback(hardware.close)
+            if head is not None and says_simulated(hardware.pan_tilt):  # then it is as good as in memory
+                head.close()
+                head = None
+            kept = folder or StateFolder.temporary()
             if folder is None:
-                kept.close()
-            raise
+                undo.callback(kept.close)
+            with clock.at_work():
+                service = cls(config, mast, hardware, clock, kept, head)
+            undo.pop_all()
+        return service
 
     @property
     def stored(self) -> StoredRig:
@@ -345,7 +361,8 @@ class Service:
             if self._closed:
                 return
             self._closed = True
-        maybe = (self.stop_socket, self.audit, self.latch, self.folder, self._socket_folder)
+        folders = self.folder, self.head_folder, self._socket_folder
+        maybe = (self.stop_socket, self.audit, self.latch, *folders)
         first_to_last: tuple[Callable[[], object], ...] = (
             self.operations.close,
             self.guide.close,

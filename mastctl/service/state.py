@@ -115,6 +115,7 @@ def standing_told(now: Standing, now_s: float) -> dict[str, Any]:
         "reason": now.reason,
         "state_for_s": max(0.0, now_s - now.since_s),
         "estop": as_json(now.latch),
+        "estops": as_json(now.latched),
         "operation": now.operation,
         "target": as_json(now.target),
         "last_residual": as_json(now.residual),

@@ -35,7 +35,7 @@ class Stopping:
     machine
         Is told.
     latch
-        What outlives the daemon of an emergency stop. One that is found latched holds from the start.
+        What outlives the daemon of emergency stops. Those that are found latched hold from the start.
     """
 
     def __init__(
@@ -47,8 +47,8 @@ class Stopping:
         self._machine = machine
         self._latch = latch
         self._resetting = threading.Lock()
-        if latch.held is not None:
-            devices.block_moves(latch.held, Estopped(latch.held.sentence))
+        for entry in latch.entries:
+            devices.block_moves(entry, Estopped(entry.sentence))
 
     def stop(self, reason: str = STOP_ASKED) -> str | None:
         """Stop the mast, then what runs and the track; return the stopped operation's id.
@@ -118,13 +118,26 @@ class Stopping:
             self._machine.stop_ended()
         return held
 
-    def reset(self, reason: str, name: str) -> Latched:
-        """Release the emergency stop and return it; nothing moves before the next command.
+    def reset(self, reason: str, name: str, of: str | None = None) -> dict[str, Any]:
+        """Release one emergency stop; nothing moves before the last is released, and a command comes.
+
+        Parameters
+        ----------
+        reason, name
+            Why, and who says so.
+        of
+            Whose stop it is; may be left out where only one is latched.
+
+        Returns
+        -------
+        dict
+            As ``POST /reset`` tells it: what is ``released``, what is ``left``, and whether that is any.
 
         Raises
         ------
         NotNow
-            ``not_estopped`` if none is latched, ``stopping`` while a stop is under way.
+            ``not_estopped`` if none is latched, ``several_estops`` if it is not clear which is meant,
+            ``stopping`` while a stop is under way.
         Unable
             ``not_saved`` if the state folder goes on to say that it is latched; ``closing``.
         """
@@ -134,10 +147,11 @@ class Stopping:
         if self._devices.stop_pending:
             raise NotNow("stopping", "the mast is being stopped; an emergency stop is released after that")
         with self._resetting:
-            held = self._latch.release(reason, name)
+            held = self._latch.release(reason, name, of)
             self._devices.allow_moves(held)  # and not what another one blocks that came meanwhile
-            self._machine.reset(name, reason, lambda: self._latch.held)
-        return held
+            self._machine.reset(name, reason, lambda: self._latch.entries)
+            left = [asdict(one) for one in self._latch.entries]
+        return {"latched": bool(left), "released": asdict(held), "left": left}
 
 
 def state_faults(folder: StateFolder, latch: Latch, started_s: float) -> Iterator[StandingFault]:
@@ -151,11 +165,12 @@ def state_faults(folder: StateFolder, latch: Latch, started_s: float) -> Iterato
         When the daemon started.
     """
     if folder.why_temporary:
-        words = f"nothing outlives this daemon, an emergency stop above all: {folder.why_temporary}"
+        above = ", an emergency stop above all" if latch.folder is folder else ", but for an emergency stop"
+        words = f"nothing outlives this daemon{above}: {folder.why_temporary}"
         yield StandingFault(STATE, "state_not_kept", words, started_s, "the daemon has a state folder")
-    elif folder.refused and latch.held is None:
+    elif folder.refused and latch.folder is folder and latch.held is None:
         words = f"an emergency stop would not survive a restart: {folder.refused}"
         yield StandingFault(STATE, "state_not_kept", words, started_s, "the daemon is started again")
-    elif latch.not_kept and not folder.is_temporary:
+    elif latch.not_kept and not latch.folder.is_temporary:
         words = f"the emergency stop is held in memory only: {latch.not_kept}"
         yield StandingFault(STATE, "latch_not_kept", words, latch.since_s, "the disk takes it, or a reset")

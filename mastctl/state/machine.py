@@ -10,7 +10,7 @@ Nothing that a stop does on its way to the head waits here: `Machine.stop_asked`
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -38,8 +38,9 @@ class Machine:
         Stamps the changes.
     publisher
         Where they are published; one of its own by default.
-    latch
-        The emergency stop that held when the daemon ended, if one did: it begins ``stopped``.
+    latch, more_latched
+        The emergency stop that held when the daemon ended, if one did, and those of further people: it
+        begins ``stopped``.
 
     Attributes
     ----------
@@ -48,14 +49,18 @@ class Machine:
     """
 
     def __init__(
-        self, clock: Clock, publisher: Publisher | None = None, latch: Latched | None = None
+        self,
+        clock: Clock,
+        publisher: Publisher | None = None,
+        latch: Latched | None = None,
+        more_latched: tuple[Latched, ...] = (),
     ) -> None:
         self.publisher = publisher or Publisher()
         self._clock = clock
         self._turns = InTurn[_News](self._take)
         now = Standing(since_s=clock.now_s())
         if latch is not None:
-            now = replace(now, word="stopped", latch=latch)
+            now = replace(now, word="stopped", latch=latch, more_latched=more_latched)
         self._standing = replace(now, reason=why(now))
         self.publisher.publish("state", "machine", self._standing)
 
@@ -148,21 +153,30 @@ class Machine:
     def estop_asked(self, latch: Latched) -> None:
         """Note an emergency stop, between `stop_asked` and `stop_ended` of its stop.
 
-        From then on nothing may begin. The first one holds if another is latched already.
+        From then on nothing may begin. One that is latched already stays; the first one stays in front.
         """
-        self._turns.leave(
-            lambda now: ("estop_asked", replace(now, latch=now.latch or latch, held=AFTER_A_STOP))
-        )
 
-    def reset(self, name: str, reason: str, latched: Callable[[], Latched | None] = lambda: None) -> None:
-        """Take that the latch was released, of a service that asked `refusal` of ``latch`` before.
+        def news(now: Standing) -> tuple[Event, Standing]:
+            entries = now.latched if latch in now.latched else (*now.latched, latch)
+            return "estop_asked", replace(now, latch=entries[0], more_latched=entries[1:], held=AFTER_A_STOP)
 
-        ``latched`` tells what is latched then: another emergency stop may have come since. It must not wait.
+        self._turns.leave(news)
+
+    def reset(self, name: str, reason: str, latched: Callable[[], Sequence[Latched]] = tuple) -> None:
+        """Take that a latch was released, of a service that asked `refusal` of ``latch`` before.
+
+        ``latched`` tells what is latched then: other people's emergency stops, and what came since. It must
+        not wait.
         """
         held = f"reset by {name}: {reason}; the next command starts"
-        self._turns.bring(
-            lambda now: ("reset", replace(now, latch=latched(), held=held)) if now.latch else None
-        )
+
+        def news(now: Standing) -> tuple[Event, Standing] | None:
+            if now.latch is None:
+                return None
+            first, *more = latched() or (None,)
+            return "reset", replace(now, latch=first, more_latched=tuple(more), held=held)
+
+        self._turns.bring(news)
 
     def closing(self) -> None:
         """Note that the service is closing: nothing begins any more."""

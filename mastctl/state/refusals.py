@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Literal
 
 from mastctl.errors import MastctlError, NotNow, Unable
-from mastctl.state.standing import Standing
+from mastctl.state.standing import Standing, latched_sentence
 from mastctl.state.table import TABLE, Event
 from mastctl.state.words import CLOSING
 
@@ -40,7 +40,7 @@ def refusal_of(now: Standing, need: Need) -> MastctlError | None:
     if to == "refused: stopping":
         return NotNow("stopping", f"{now.reason}; ask again when that is over")
     if to == "refused: estopped" and need != "rest":
-        return NotNow("estopped", now.reason if now.latch is None else now.latch.sentence)
+        return NotNow("estopped", now.reason if now.latch is None else latched_sentence(now.latched))
     if need == "latch":
         return None
     if now.operation is not None:

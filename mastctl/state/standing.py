@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -45,6 +45,15 @@ class Latched:
         return f"{words}; 'mastctl reset' with a reason and a name releases it"
 
 
+def latched_sentence(entries: Sequence[Latched]) -> str:
+    """Return what is told of all emergency stops that hold."""
+    if len(entries) == 1:
+        return entries[0].sentence
+    told = "; ".join(f"{one.name}: {one.reason}" for one in entries)
+    words = f"{len(entries)} emergency stops are latched ({told})"
+    return f"{words}; 'mastctl reset' with a reason, a name and whose it is ('--of') releases each"
+
+
 @dataclass(frozen=True)
 class Standing:
     """What the daemon is doing at one moment; replaced at each change, never edited.
@@ -75,7 +84,9 @@ class Standing:
     faults
         What is wrong with the head.
     latch
-        The emergency stop that holds, None without one.
+        The emergency stop that holds, None without one; the oldest of several.
+    more_latched
+        Those of further people.
     """
 
     word: Word = "starting"
@@ -91,3 +102,9 @@ class Standing:
     held: str = ""
     faults: tuple[StandingFault, ...] = ()
     latch: Latched | None = None
+    more_latched: tuple[Latched, ...] = ()
+
+    @property
+    def latched(self) -> tuple[Latched, ...]:
+        """All emergency stops that hold, the oldest first."""
+        return () if self.latch is None else (self.latch, *self.more_latched)

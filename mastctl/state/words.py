@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from mastctl.state.faults import StandingFault
-from mastctl.state.standing import Standing
+from mastctl.state.standing import Standing, latched_sentence
 
 CLOSING = "the service is closing"
 
@@ -22,7 +22,7 @@ def why(now: Standing) -> str:
         case "stopping":
             return _why_stopping(now)
         case "stopped" if now.latch is not None:
-            return "; ".join([now.latch.sentence, *(_told(fault) for fault in now.faults[:1])])
+            return "; ".join([latched_sentence(now.latched), *(_told(fault) for fault in now.faults[:1])])
         case "fault" if now.faults:
             more = len(now.faults) - 1
             return _told(now.faults[0]) + (f" (and {more} more)" if more else "")

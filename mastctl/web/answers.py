@@ -288,6 +288,7 @@ class StandingTold(Told):
     target: Json | None
     last_residual: LastResidual | None
     estop: EstopHeld | None
+    estops: list[EstopHeld]
 
 
 class AxisTold(Told):
@@ -448,10 +449,11 @@ class EstopTold(EstopHeld):
 
 
 class ResetTold(Told):
-    """``POST /reset``: the emergency stop that was released."""
+    """``POST /reset``: the emergency stop that was released, and those that are ``left``."""
 
-    latched: Literal[False]
+    latched: bool
     released: EstopHeld
+    left: list[EstopHeld]
 
 
 class RecordingListed(Told):

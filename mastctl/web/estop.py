@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import json
-from dataclasses import asdict
 from typing import Any
 
 from fastapi import FastAPI, Request
@@ -42,11 +41,10 @@ def add_estop(app: FastAPI) -> None:
             await here.waiting.run(lambda: stopping.latch_estop(*words))
             raise Unable("stop_unconfirmed", f"the emergency stop is latched, but {error}") from None
 
-    @app.post(f"{PREFIX}/reset", summary="Release the emergency stop; nothing moves before the next command")
+    @app.post(f"{PREFIX}/reset", summary="Release an emergency stop; nothing moves before the next command")
     async def reset(body: ResetBody, came: Headers, here: Here) -> dict[str, Any]:
         def act() -> dict[str, Any]:
-            released = here.service.stopping.reset(body.reason, body.name)
-            return {"latched": False, "released": asdict(released)}
+            return here.service.stopping.reset(body.reason, body.name, body.of)
 
         return await here.commands.run(RESET, came, body.model_dump(), act)
 

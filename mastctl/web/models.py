@@ -61,10 +61,11 @@ class EstopBody(BaseModel):
 
 
 class ResetBody(_Strict):
-    """``POST /reset``: why the emergency stop is released, and by whom."""
+    """``POST /reset``: why the emergency stop is released, and by whom; of several, ``of`` says whose."""
 
     reason: Words
     name: Words
+    of: Words | None = None
 
 
 class LeaseBody(_Strict):

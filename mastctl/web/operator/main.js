@@ -100,6 +100,7 @@ new Reports(events);
 
 let since = 0;
 let latched = "";
+let releasing; // whose stop the dialog is about
 function standing(now) {
   set(byId("state"), "data-word", now.state);
   const before = byId("word").textContent;
@@ -113,10 +114,12 @@ function standing(now) {
   const latch = now.estop;
   byId("estop").hidden = !latch;
   set(byId("latch"), "aria-pressed", String(Boolean(latch)));
-  const words = latch ? ` by ${latch.name}: ${latch.reason}. Nothing moves until it is released, not even after a restart of the daemon. ` : "";
-  if (words !== latched) put(byId("estop"), h("span", {}, h("strong", {}, "Emergency stop"), words), h("button", { type: "button", id: "release", onclick: () => ask(byId("reset")) }, "Release …"));
+  const entries = now.estops ?? [];
+  if (!entries.some((one) => one.name === releasing)) releasing = entries[0]?.name;
+  const words = latch ? ` by ${entries.map((one) => `${one.name}: ${one.reason}`).join("; by ")}. Nothing moves until it is released, not even after a restart of the daemon. ` : "";
+  if (words !== latched) put(byId("estop"), h("span", {}, h("strong", {}, "Emergency stop"), words), ...entries.map((one, index) => h("button", { type: "button", id: index ? `release-${index}` : "release", onclick: () => { releasing = one.name; ask(byId("reset")); } }, index || entries.length > 1 ? `Release ${one.name}’s …` : "Release …")));
   latched = words;
-  if (latch) byId("release").disabled = !may;
+  for (const button of byId("estop").querySelectorAll("button")) button.disabled = !may;
   document.title = `${now.state} – mastctl`;
 }
 setInterval(() => say(byId("state-for"), events.connected ? `for ${forTime((performance.now() - since) / 1000)}` : ""), 500);
@@ -232,7 +235,7 @@ byId("reset-no").addEventListener("click", () => answered(byId("reset")));
 byId("reset-form").addEventListener("submit", async (event) => {
   event.preventDefault();
   try {
-    await post("/reset", { reason: byId("reset-reason").value, name: byId("reset-name").value });
+    await post("/reset", { reason: byId("reset-reason").value, name: byId("reset-name").value, of: releasing });
     answered(byId("reset"));
   } catch (error) {
     say(byId("reset-said"), error.message);

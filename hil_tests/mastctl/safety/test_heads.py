@@ -1,0 +1,335 @@
+"""The latch belongs to the head: whatever leads to its line finds it, and each person's stop is an entry."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import shutil
+import subprocess
+import tempfile
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from drivers.hardware import DeviceSettings, HardwareSettings
+from drivers.open_hardware import head_name
+from drivers.serial_line import stable_name
+from hil_tests import forks
+from hil_tests.mastctl.outside_daemon import OUTSIDE, free_port, line, write_config
+from hil_tests.mastctl.safety.test_deaths import Bench, made
+from hil_tests.mastctl.service_fakes import CONFIG, fake_daemon
+from hil_tests.waiting import NET_S, until
+from mastctl.client import Client, ClientError
+from mastctl.errors import NotNow
+from mastctl.safety import heads as heads_module
+from mastctl.safety import latch as latch_module
+from mastctl.safety.heads import head_folders
+from mastctl.safety.latch import FILE, USED, Latch
+from mastctl.safety.state_folder import StateFolder, StateInUse
+
+KEPT = CONFIG + "state: {{folder: state}}\n"
+
+
+@pytest.fixture
+def bench(tmp_path: Path) -> Iterator[Bench]:
+    """A real driver on a line of its own, with nothing said of where state is kept."""
+    with made("dynamixel", tmp_path) as one:
+        document = json.loads(one.config.read_text())
+        del document["state"]
+        one.config.write_text(json.dumps(document))
+        yield one
+
+
+@contextlib.contextmanager
+def running(
+    config: Path, *words: str, environment: Mapping[str, str] | None = None
+) -> Iterator[subprocess.Popen[str]]:
+    """A daemon of its own process, begun as told."""
+    with (
+        tempfile.TemporaryDirectory() as temporary,
+        forks.Popen(
+            [*forks.MASTCTL, "run", "--config", str(config), *words],
+            stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+            env={**os.environ, "TMPDIR": temporary, **(environment or {})}, cwd=config.parent,
+        ) as daemon,
+    ):  # fmt: skip
+        try:
+            yield daemon
+        finally:
+            daemon.kill()
+
+
+def killed_while_latched(bench: Bench) -> None:
+    """A daemon that told that its emergency stop is kept, and was killed."""
+    with running(bench.config) as daemon, Client(line(daemon)) as client:
+        assert client.estop(reason="sparks", name="Ana")["kept"] is True
+
+
+@pytest.mark.parametrize("way", ["listen", "any port", "copy", "STATE_DIRECTORY", "XDG_STATE_HOME", "HOME"])
+def test_the_next_daemon_of_the_head_is_latched_whatever_way_it_begins(
+    bench: Bench, tmp_path: Path, way: str
+) -> None:
+    killed_while_latched(bench)
+    config, words, environment = bench.config, [], {}
+    if way == "listen":
+        words = ["--listen", f"127.0.0.1:{free_port()}"]
+    elif way == "any port":
+        words = ["--listen", "127.0.0.1:0"]
+    elif way == "copy":
+        config = tmp_path / "copy.yaml"
+        document = json.loads(bench.config.read_text()) | {"state": {"folder": "elsewhere"}}
+        config.write_text(json.dumps(document))
+    else:
+        environment = {way: str(tmp_path / "other")}
+    with running(config, *words, environment=environment) as daemon, Client(line(daemon)) as client:
+        status = client.status()
+        assert (status["state"], status["estop"] and status["estop"]["name"]) == ("stopped", "Ana")
+        with pytest.raises(ClientError, match="latched"):
+            client.point(pan_rad=0.1, tilt_rad=0.0)
+        client.reset(reason="looked", name="Ben")
+    with running(bench.config) as daemon, Client(line(daemon)) as client:
+        assert client.status()["estop"] is None
+
+
+def test_a_daemon_at_any_port_keeps_its_state_where_systemd_says(tmp_path: Path) -> None:
+    devices = OUTSIDE.replace("class Head:\n", "class Head:\n    simulated = True\n")
+    config = write_config(tmp_path, devices=devices)
+    unit = {"STATE_DIRECTORY": str(tmp_path / "unit"), "PYTHONPATH": str(tmp_path)}
+    with running(config, environment=unit) as daemon, Client(line(daemon)) as client:
+        assert client.estop(reason="sparks", name="Ana")["kept"] is True
+    with running(config, environment=unit) as daemon, Client(line(daemon)) as client:
+        assert client.status()["estop"]["name"] == "Ana"
+
+
+def test_a_stop_finds_a_daemon_of_its_configuration_that_listens_elsewhere(bench: Bench) -> None:
+    elsewhere = f"127.0.0.1:{free_port()}"
+    with running(bench.config, "--listen", elsewhere) as daemon, Client(line(daemon)) as client:
+        command = [*forks.MASTCTL, "estop", "--config", str(bench.config), "--name", "Ana"]
+        done = forks.run(command, timeout=NET_S)
+        assert done.returncode == 0, done.stderr
+        assert client.status()["estop"]["name"] == "Ana"
+
+
+# A latch whose file is gone
+
+
+def used(folder: StateFolder) -> None:
+    Latch(folder).close()
+    until((folder.path / USED).exists, "the mark of a folder in use")
+
+
+def test_a_used_folder_whose_latch_file_is_gone_counts_as_latched(tmp_path: Path) -> None:
+    folder = StateFolder(tmp_path)
+    try:
+        used(folder)
+        (folder.path / FILE).unlink()
+        latch = Latch(folder)
+        assert latch.held is not None
+        assert "is gone" in latch.held.reason
+        latch.release("looked", "Ben")
+        assert Latch(folder).held is None
+    finally:
+        folder.close()
+
+
+def test_a_head_whose_whole_folder_is_gone_is_missed_by_the_state_folder(tmp_path: Path) -> None:
+    (tmp_path / "state").mkdir()
+    (tmp_path / "head").mkdir()
+    state, head = StateFolder(tmp_path / "state"), StateFolder(tmp_path / "head")
+    try:
+        latch = Latch(head, state)
+        until((state.path / USED).exists, "the mark in the state folder")
+        latch.close()
+        for file in head.path.iterdir():
+            file.unlink()
+        assert Latch(head, state).held is not None
+    finally:
+        state.close()
+        head.close()
+
+
+def test_what_a_state_folder_of_before_holds_is_latched_and_released_there_too(tmp_path: Path) -> None:
+    (tmp_path / "state").mkdir()
+    (tmp_path / "head").mkdir()
+    state, head = StateFolder(tmp_path / "state"), StateFolder(tmp_path / "head")
+    try:
+        before = Latch(state)
+        before.hold("smoke", "Ana")
+        before.head_told()
+        assert before.kept_within(NET_S)
+        before.close()
+        latch = Latch(head, state)
+        assert latch.held is not None and latch.held.name == "Ana"
+        latch.release("aired", "Ben")
+        assert Latch(head, state).held is None
+        assert Latch(state).held is None
+    finally:
+        state.close()
+        head.close()
+
+
+# Each person's stop
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Iterator[StateFolder]:
+    made_folder = StateFolder(tmp_path)
+    yield made_folder
+    made_folder.close()
+
+
+def test_two_peoples_stops_are_two_entries_and_each_is_released_by_itself(folder: StateFolder) -> None:
+    latch = Latch(folder)
+    latch.hold("smoke", "Ana")
+    latch.hold("a hand in the way", "Ben")
+    latch.hold("again", "Ana")  # hers stays as it is
+    latch.head_told()
+    assert latch.kept_within(NET_S)
+    assert [(one.name, one.reason) for one in Latch(folder).entries] == [
+        ("Ana", "smoke"), ("Ben", "a hand in the way"),
+    ]  # fmt: skip
+    with pytest.raises(NotNow, match=r"Ana.*Ben") as refused:
+        latch.release("aired", "Cem")
+    assert refused.value.code == "several_estops"
+    with pytest.raises(NotNow, match="Dan"):
+        latch.release("aired", "Cem", "Dan")
+    assert latch.release("aired", "Cem", "Ana").reason == "smoke"
+    assert [one.name for one in latch.entries] == ["Ben"]
+    assert [one.name for one in Latch(folder).entries] == ["Ben"]
+    latch.release("the hand is gone", "Cem")
+    assert Latch(folder).entries == ()
+
+
+def test_strangers_with_many_names_fill_no_disk(folder: StateFolder) -> None:
+    latch = Latch(folder)
+    for number in range(100):
+        latch.hold("\U0001f525" * 200, f"{number} " + "\U0001f525" * 200)
+    latch.head_told()
+    assert latch.kept_within(NET_S)
+    assert len(latch.entries) <= latch_module.MOST
+    assert (folder.path / FILE).stat().st_size <= latch_module.ROOM_BYTES
+    assert latch.entries == Latch(folder).entries
+
+
+def test_the_status_shows_all_stops_and_nothing_moves_before_the_last_is_released(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    with fake_daemon(monkeypatch, tmp_path, config=KEPT) as (daemon, hardware), Client(daemon.url) as client:
+        client.estop(reason="smoke", name="Ana")
+        assert client.estop(reason="a hand", name="Ben")["reason"] == "a hand"
+        status = client.status()
+        assert [one["name"] for one in status["estops"]] == ["Ana", "Ben"]
+        assert "Ana: smoke" in status["reason"] and "Ben: a hand" in status["reason"]
+        with pytest.raises(ClientError) as refused:
+            client.reset(reason="aired", name="Cem")
+        assert refused.value.code == "several_estops"
+        told = client.reset(reason="aired", name="Cem", of="Ana")
+        assert (told["latched"], told["released"]["name"]) == (True, "Ana")
+        assert [one["name"] for one in told["left"]] == ["Ben"]
+        assert client.status()["state"] == "stopped"
+        with pytest.raises(ClientError, match="Ben: a hand"):
+            client.point(pan_rad=0.1, tilt_rad=0.1)
+        told = client.reset(reason="gone", name="Cem")
+        assert (told["latched"], told["left"]) == (False, [])
+        client.wait(client.point(pan_rad=0.1, tilt_rad=0.1))
+        assert [call for call in hardware.head.calls if call[0] == "move"]
+
+
+# Which head
+
+
+def test_a_line_has_one_name_whatever_path_leads_to_it(tmp_path: Path) -> None:
+    primary, secondary = os.openpty()
+    try:
+        path = os.ttyname(secondary)
+        (tmp_path / "mast").symlink_to(path)
+        assert stable_name(str(tmp_path / "mast")) == stable_name(path)
+    finally:
+        os.close(primary)
+        os.close(secondary)
+    assert stable_name("socket://LOCALHOST:4001") == stable_name("socket://127.0.0.1:4001")
+    assert stable_name("socket://127.0.0.1:4001") != stable_name("socket://127.0.0.1:4002")
+
+
+def test_an_adapter_is_known_by_its_serial_number(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from drivers import serial_line
+
+    (tmp_path / "ttyUSB0").write_text("")
+    (tmp_path / "by-id").mkdir()
+    (tmp_path / "by-id" / "usb-FTDI_A6008isP-if00-port0").symlink_to(tmp_path / "ttyUSB0")
+    monkeypatch.setattr(serial_line, "BY_ID", tmp_path / "by-id")
+    name = stable_name(str(tmp_path / "ttyUSB0"))
+    assert name == stable_name(str(tmp_path / "by-id" / "usb-FTDI_A6008isP-if00-port0"))
+    (tmp_path / "by-id" / "usb-FTDI_A6008isP-if00-port0").unlink()
+    (tmp_path / "ttyUSB0").rename(tmp_path / "ttyUSB1")
+    (tmp_path / "by-id" / "usb-FTDI_A6008isP-if00-port0").symlink_to(tmp_path / "ttyUSB1")
+    assert stable_name(str(tmp_path / "ttyUSB1")) == name
+
+
+def test_a_head_in_this_programs_memory_is_nobody_elses() -> None:
+    settings = HardwareSettings(DeviceSettings("sim"), {})
+    assert head_name(settings) is None
+    assert head_name(replace(settings, pan_tilt=DeviceSettings("replay"))) is None
+    outside = DeviceSettings("package.module:Head", {"port": "socket://10.0.0.1:4001", "speed": 1})
+    slow = DeviceSettings("package.module:Head", {"port": "socket://10.0.0.1:4001", "speed": 2})
+    assert head_name(replace(settings, pan_tilt=outside)) == head_name(replace(settings, pan_tilt=slow))
+
+
+def test_a_true_line_has_its_place_by_no_environment(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Only lines of simulators follow $MASTCTL_HEADS, so that tests share nothing."""
+    monkeypatch.setattr(heads_module, "SYSTEM", tmp_path / "no_such")
+    monkeypatch.setattr(heads_module, "_home", lambda: tmp_path / "home")
+    places = []
+    for folder in ("one", "two"):
+        for name in ("MASTCTL_HEADS", "HOME", "XDG_STATE_HOME", "STATE_DIRECTORY", "TMPDIR"):
+            monkeypatch.setenv(name, str(tmp_path / folder))
+        places.append(head_folders("usb-FTDI_A6008isP-if00-port0"))
+    assert places[0] == places[1]
+    assert places[0][0].is_relative_to(tmp_path / "home")
+
+
+def test_the_systems_place_comes_before_a_users_and_a_latch_in_either_holds(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(heads_module, "SYSTEM", tmp_path / "system")
+    monkeypatch.setattr(heads_module, "_home", lambda: tmp_path / "home")
+    name = "usb-FTDI_A6008isP-if00-port0"
+    with contextlib.closing(heads_module.take(name)) as place:
+        latch = Latch(place)
+        latch.hold("smoke", "Ana")
+        latch.head_told()
+        assert latch.kept_within(NET_S)
+        latch.close()
+        assert place.path.is_relative_to(tmp_path / "home")
+    (tmp_path / "system").mkdir()
+    with contextlib.closing(heads_module.take(name)) as place:
+        assert place.path.is_relative_to(tmp_path / "system")
+        latch = Latch(place, others=heads_module.others(name, place))
+        assert latch.held is not None and latch.held.name == "Ana"
+        latch.release("aired", "Ben")
+    shutil.rmtree(tmp_path / "system")
+    with contextlib.closing(heads_module.take(name)) as place:
+        assert Latch(place).held is None
+
+
+def test_one_head_is_one_programs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(heads_module, "SYSTEM", tmp_path / "no_such")
+    monkeypatch.setattr(heads_module, "_home", lambda: tmp_path / "home")
+    with (
+        contextlib.closing(heads_module.take("usb-1")),
+        pytest.raises(StateInUse, match="the head at usb-1 is driven by another program"),
+    ):
+        heads_module.take("usb-1")
+
+
+def test_the_place_of_a_line_that_a_simulator_closed_is_cleared(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("MASTCTL_HEADS", str(tmp_path))
+    for stamp in (1, 2, 3):
+        heads_module.take(f"pts-7-{stamp}").close()
+    heads_module.take("pts-71-1").close()
+    assert len(list(tmp_path.iterdir())) == 2
