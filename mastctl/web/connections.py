@@ -36,7 +36,7 @@ MOST = 200
 LEAST = 8
 FREE_DESCRIPTORS = 24  # for devices that come back, mast files, and what is accepted before it is counted
 MOST_UNREAD_BYTES = 1 << 16  # of one connection, until its turn
-ACCEPTED_AT_ONCE = 16  # connections taken in one turn of the event loop
+ACCEPTED_AT_ONCE = 4  # connections taken in one turn of the event loop
 WAITING_IN_KERNEL = 128  # connections that the kernel keeps for us meanwhile
 ALWAYS = frozenset(f"{PREFIX}/{name}" for name in ("stop", "estop", "track/stop", "status"))
 """What is served to whoever comes."""

