@@ -47,7 +47,7 @@ def stable_name(port: str) -> str:
     """
     if "://" in port:
         parts = urlsplit(port)
-        host = (parts.hostname or "").replace("localhost", "127.0.0.1")
+        host = "127.0.0.1" if parts.hostname == "localhost" else parts.hostname or ""
         with contextlib.suppress(ValueError):
             return f"{f'[{host}]' if ':' in host else host}:{parts.port}"
         return port

@@ -161,8 +161,9 @@ class Sweep:
         try:
             self._rest(start)
             for thread in threads:
-                self._watching += 1
                 thread.start()
+                with self._ended:  # it may have ended already: then this makes up for what it took off
+                    self._watching += 1
             self._wait_for_choices()
             if self._to_and_fro(start, plan):
                 self._go(start.pan_rad, start.tilt_rad, plan.speed_rad_per_s)
@@ -173,7 +174,7 @@ class Sweep:
             self._over.set()
             end_s = self._clock.now_s() + END_S
             with self._ended:
-                while self._watching and (left_s := end_s - self._clock.now_s()) > 0:
+                while self._watching > 0 and (left_s := end_s - self._clock.now_s()) > 0:
                     self._ended.wait(left_s)
 
     def fit(self, camera: str) -> OffsetFit:

@@ -81,7 +81,7 @@ class Latch:
         if state is not None:
             self._marks.append(StateFile(state.path / USED, USED_SCHEMA))
             others = (*others, state.path)
-        self._others = [StateFile(other / FILE, SCHEMA, ROOM_BYTES) for other in others]
+        self._others = [StateFile(other / FILE, SCHEMA, ROOM_BYTES, 0o644) for other in others]
         self._changed = threading.Condition()
         self._disk = threading.Lock()  # for who writes; a disk that hangs holds nobody else
         self.entries: tuple[Latched, ...] = ()
@@ -227,10 +227,10 @@ class Latch:
             *(() if is_left else (remove,)),  # and this one that cannot be written to
         )
         refused = ""
-        for file in self._others if not is_left else ():
+        for file in self._others:
             try:
                 if _entries(file):
-                    file.write({"latched": False})
+                    file.write(document)
             except BadFile as error:
                 refused = str(error)
         for way in () if refused else ways:

@@ -13,7 +13,7 @@ import contextlib
 import os
 import threading
 from collections.abc import Awaitable, Callable
-from concurrent.futures import CancelledError, ThreadPoolExecutor
+from concurrent.futures import CancelledError, Future, ThreadPoolExecutor
 from typing import TypeVar
 
 from drivers.clock import Clock, SystemClock
@@ -58,8 +58,13 @@ class Waiting:
             ``closing`` if the daemon ends.
         """
         try:
-            return self._encoders.submit(function).result()
-        except (RuntimeError, CancelledError):
+            asked = self._encoders.submit(function)
+        except RuntimeError:  # the daemon ends
+            asked = Future[T]()
+            asked.cancel()
+        try:
+            return asked.result()
+        except CancelledError:
             raise Unable("closing", "the daemon ends; what was asked for will not come") from None
 
     async def run(self, function: Callable[[], T]) -> T:

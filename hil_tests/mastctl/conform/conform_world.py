@@ -34,8 +34,8 @@ CRAWLING_RAD_PER_S = 0.001
 """Nothing that a check asks for is reached within a minute: what is done meanwhile is done in the move."""
 
 
-def open_head(low_rad: float = -2.0, high_rad: float = 2.0, port: str = "") -> SimulatedPanTilt:
-    """A head in memory; ``port`` tells it from those of other daemons in this process."""
+def open_head(low_rad: float = -2.0, high_rad: float = 2.0, name: str = "") -> SimulatedPanTilt:
+    """A head in memory; ``name`` tells it from those of other daemons in this process."""
     axis = AxisSettings(COUNT_RAD, 0.0, low_rad, high_rad, FASTEST_RAD_PER_S, 20.0)
     clock = SystemClock()
     return SimulatedPanTilt(HeadSettings("in memory", axis, axis), clock, FaultPanel(clock.now_s, ()))
@@ -77,7 +77,7 @@ class NoiseCamera:
 def configuration(folder: Path, speed_rad_per_s: float = SPEED_RAD_PER_S) -> Path:
     """A configuration of devices from outside that never wait."""
     save_rig(rig(), folder / "little.yaml")
-    head = f"{{driver: '{HERE}:open_head', options: {{port: '{folder.name}'}}}}"
+    head = f"{{driver: '{HERE}:open_head', options: {{name: '{folder.name}'}}}}"
     text = CONFIG.format(listen="{port: 0}").replace("{driver: fake}", head, 1)
     text = re.sub(r"(speed_rad_per_s: )[\d.]+", rf"\g<1>{speed_rad_per_s}", text)
     (folder / "daemon.yaml").write_text(text.replace("{driver: fake}", f"{{driver: '{HERE}:NoiseCamera'}}"))

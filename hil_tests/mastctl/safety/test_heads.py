@@ -171,6 +171,29 @@ def test_what_a_state_folder_of_before_holds_is_latched_and_released_there_too(t
         head.close()
 
 
+def test_what_was_released_beside_others_stays_so_though_another_folder_held_it(tmp_path: Path) -> None:
+    (tmp_path / "state").mkdir()
+    (tmp_path / "head").mkdir()
+    state, head = StateFolder(tmp_path / "state"), StateFolder(tmp_path / "head")
+    try:
+        before = Latch(state)
+        before.hold("smoke", "Ana")
+        before.head_told()
+        assert before.kept_within(NET_S)
+        before.close()
+        latch = Latch(head, state)
+        latch.hold("a hand", "Ben")
+        latch.head_told()
+        assert latch.kept_within(NET_S)
+        latch.release("aired", "Cem", "Ana")
+        assert [one.name for one in Latch(head, state).entries] == ["Ben"]
+        latch.release("the hand is gone", "Cem", "Ben")
+        assert Latch(head, state).entries == Latch(state).entries == ()
+    finally:
+        state.close()
+        head.close()
+
+
 # Each person's stop
 
 
@@ -287,8 +310,9 @@ def test_a_true_line_has_its_place_by_no_environment(tmp_path: Path, monkeypatch
         for name in ("MASTCTL_HEADS", "HOME", "XDG_STATE_HOME", "STATE_DIRECTORY", "TMPDIR"):
             monkeypatch.setenv(name, str(tmp_path / folder))
         places.append(head_folders("usb-FTDI_A6008isP-if00-port0"))
-    assert places[0] == places[1]
-    assert places[0][0].is_relative_to(tmp_path / "home")
+        places.append(head_folders("10.0.0.5:4001"))
+    assert places[:2] == places[2:]
+    assert all(one[0].is_relative_to(tmp_path / "home") for one in places)
 
 
 def test_the_systems_place_comes_before_a_users_and_a_latch_in_either_holds(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import os
 import signal
 import subprocess
 import sys
@@ -291,7 +292,7 @@ def test_every_ending_signal_ends_a_start_that_hangs_in_a_factory(tmp_path: Path
     run = forks.Popen(
         [*forks.MASTCTL, "run", "--config", str(tmp_path / "daemon.yaml")],
         cwd=tmp_path,
-        env={"PYTHONPATH": str(tmp_path), "PATH": "/usr/bin:/bin"},
+        env={**os.environ, "PYTHONPATH": str(tmp_path)},
         stderr=subprocess.PIPE,
         text=True,
     )

@@ -195,7 +195,7 @@ def test_a_defect_in_the_loop_is_one_sentence_and_the_daemon_goes_on(
     assert record["state"] == "failed"
     assert record["error"]["code"] == "internal"
     assert "division" not in record["error"]["message"]
-    assert set(hardware.head.calls) == {("stop",)}  # beside a busy thread, and in turn
+    assert hardware.head.calls in ([("stop",)], [("stop",)] * 2)  # beside a busy thread, and in turn
     monkeypatch.setattr(ScriptedLoop, "script", staticmethod(ScriptedLoop.good))
     assert ended(web, web.post("/point", json=ANGLES).json()["id"])["state"] == "done"
 
@@ -512,7 +512,7 @@ def test_stop_does_not_wait_behind_hanging_cameras(
     assert hang.entered.wait(NET_S)
     assert web.post("/stop").status_code == 200
     # twice where the head's own thread was kept from running: beside it, and then in its turn
-    assert set(hardware.head.calls) == {("stop",)}
+    assert hardware.head.calls in ([("stop",)], [("stop",)] * 2)
     hang.let_go()
     joined(*askers)
 

@@ -115,7 +115,6 @@ function standing(now) {
   byId("estop").hidden = !latch;
   set(byId("latch"), "aria-pressed", String(Boolean(latch)));
   const entries = now.estops ?? [];
-  if (!entries.some((one) => one.name === releasing)) releasing = entries[0]?.name;
   const words = latch ? ` by ${entries.map((one) => `${one.name}: ${one.reason}`).join("; by ")}. Nothing moves until it is released, not even after a restart of the daemon. ` : "";
   if (words !== latched) put(byId("estop"), h("span", {}, h("strong", {}, "Emergency stop"), words), ...entries.map((one, index) => h("button", { type: "button", id: index ? `release-${index}` : "release", onclick: () => { releasing = one.name; ask(byId("reset")); } }, index || entries.length > 1 ? `Release ${one.name}’s …` : "Release …")));
   latched = words;
