@@ -38,11 +38,17 @@ class FakeCameras:
         self.held.pop(by, None)
 
 
-def pictures_threads() -> list[str]:
-    return [one.name for one in threading.enumerate() if one.name.startswith("pictures of")]
+def pictures_threads() -> set[threading.Thread]:
+    return {one for one in threading.enumerate() if one.name.startswith("pictures of")}
 
 
-def test_a_watcher_who_leaves_as_a_picture_comes_holds_none() -> None:
+@pytest.fixture
+def others() -> set[threading.Thread]:
+    """Those of daemons that other tests of this process still hold."""
+    return pictures_threads()
+
+
+def test_a_watcher_who_leaves_as_a_picture_comes_holds_none(others: set[threading.Thread]) -> None:
     cameras, leaving, left = FakeCameras(), threading.Event(), threading.Event()
 
     def as_held() -> None:
@@ -56,12 +62,14 @@ def test_a_watcher_who_leaves_as_a_picture_comes_holds_none() -> None:
     assert leaving.wait(60.0)
     watcher.end()
     left.set()
-    until(lambda: not pictures_threads(), "the camera is asked no more")
+    until(lambda: not pictures_threads() - others, "the camera is asked no more")
     assert cameras.held == Counter() and watcher.take() == [] and woken == []
     watched.close()
 
 
-def test_a_watcher_whose_second_camera_has_no_thread_is_none(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_watcher_whose_second_camera_has_no_thread_is_none(
+    monkeypatch: pytest.MonkeyPatch, others: set[threading.Thread]
+) -> None:
     cameras = FakeCameras()
     watched = WatchedCameras(cameras, SystemClock())
     start, started = threading.Thread.start, list[str]()
@@ -76,7 +84,7 @@ def test_a_watcher_whose_second_camera_has_no_thread_is_none(monkeypatch: pytest
         patch.setattr(pictures.threading.Thread, "start", once)  # type: ignore[attr-defined]
         with pytest.raises(RuntimeError, match="can't start"):
             watched.watch((LEFT, RIGHT), lambda: None)
-    until(lambda: not pictures_threads(), "nobody watches")
+    until(lambda: not pictures_threads() - others, "nobody watches")
     assert cameras.held == Counter()
     there = threading.Event()
     again = watched.watch((LEFT, RIGHT), there.set)  # both cameras have their threads now
