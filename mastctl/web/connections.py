@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import asyncio
 import logging
-import re
 import resource
 from collections.abc import Iterable
 from pathlib import Path
@@ -24,6 +23,7 @@ from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from mastctl.web import PREFIX
 from mastctl.web.answer import error_response
+from mastctl.web.stop_address import STOP_LINE, STOPS, TRACK_STOP, stop_named
 from mastctl.web.turns import Turns
 
 log = logging.getLogger(__name__)
@@ -38,18 +38,12 @@ FREE_DESCRIPTORS = 24  # for devices that come back, mast files, and what is acc
 MOST_UNREAD_BYTES = 1 << 16  # of one connection, until its turn
 ACCEPTED_AT_ONCE = 4  # connections taken in one turn of the event loop
 WAITING_IN_KERNEL = 128  # connections that the kernel keeps for us meanwhile
-ALWAYS = frozenset(f"{PREFIX}/{name}" for name in ("stop", "estop", "track/stop", "status"))
+ALWAYS = frozenset({*STOPS, TRACK_STOP, f"{PREFIX}/status"})
 """What is served to whoever comes."""
 EVENTS = f"{PREFIX}/events"
 IMAGES = f"{PREFIX}/images"
 SOCKETS = frozenset({EVENTS, IMAGES})
 """Where a connection may become a WebSocket."""
-
-
-STOP_LINE = re.compile(
-    rb"POST (https?://[^/ ]*)?/+%s/+(stop|estop|track/+stop)/*[ ?]" % PREFIX.strip("/").encode()
-)
-"""How a request begins that stops something; everything else is read in turn."""
 
 
 class Counted(Protocol):
@@ -229,7 +223,7 @@ class _Crowded:
         self._app = app
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        if scope["path"] in ALWAYS:
+        if stop_named(scope)["path"] in ALWAYS:
             await self._app(scope, receive, send)
             return
         response = error_response(

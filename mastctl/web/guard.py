@@ -20,13 +20,12 @@ from mastctl.web.answer import GuardError, error_response, marked
 from mastctl.web.bodies import check_json, once, whole_body
 from mastctl.web.entrance import Entrance, Rate, changes
 from mastctl.web.refusals import told
+from mastctl.web.stop_address import STOPS, TRACK_STOP, stop_named
 from mastctl.web.whose_page import check_site
 
 log = logging.getLogger(__name__)
 
-STOPS = frozenset({f"{PREFIX}/stop", f"{PREFIX}/estop"})
-"""What everybody may ask for who reaches the daemon, whatever else the request says."""
-UNREAD = frozenset({f"{PREFIX}/stop", f"{PREFIX}/track/stop"})
+UNREAD = frozenset({f"{PREFIX}/stop", TRACK_STOP})
 """Where no body is read; an emergency stop reads what it can of its own."""
 LOGIN, LOGOUT = f"{PREFIX}/login", f"{PREFIX}/logout"
 PAGES = frozenset({"/"})
@@ -70,7 +69,7 @@ class Guard:
             await self._app(scope, receive, send)
 
     async def _http(self, scope: Scope, receive: Receive, send: Send) -> None:
-        started = False
+        scope, started = stop_named(scope), False
 
         async def send_marked(message: Message) -> None:
             nonlocal started

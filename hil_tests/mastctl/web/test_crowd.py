@@ -151,9 +151,16 @@ def test_when_every_connection_is_at_work_stop_and_status_are_still_served(
         refused = get(connection(), "/operations")
         assert b"503" in refused
         assert b"retry-after" in refused
+        for stop in ("/stop", "/stop/", "//stop", "/estop/"):
+            hardware.head.calls.clear()
+            with socket.create_connection((host, int(port)), timeout=NET_S) as one:
+                one.sendall(f"POST /api/v1{stop} HTTP/1.0\r\n\r\n".encode())
+                answer = b"".join(
+                    iter(lambda one=one: one.recv(65536), b"")
+                )  # closed: the next is one too many
+            assert b"200 OK" in answer
+            assert ("stop",) in hardware.head.calls
         assert b"200 OK" in get(connection(), "/status")
-        assert b"200 OK" in get(connection(), "/stop", "POST")
-        assert ("stop",) in hardware.head.calls
 
 
 def test_streams_leave_half_of_the_connections_to_others(

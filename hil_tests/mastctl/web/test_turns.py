@@ -24,7 +24,9 @@ from mastctl.web.waiting import Waiting
 CROWD = 40
 
 
-@pytest.mark.parametrize("stop", ["/api/v1/stop", "/api/v1/estop"])
+@pytest.mark.parametrize(
+    "stop", ["/api/v1/stop", "/api/v1/estop", "//api/v1/stop/", "http://rover/api/v1/estop"]
+)
 def test_a_stop_passes_what_came_before_it(
     pair: tuple[RunningDaemon, FakeHardware], monkeypatch: pytest.MonkeyPatch, stop: str
 ) -> None:

@@ -145,6 +145,58 @@ def test_requests_in_one_breath_are_answered_one_after_another_and_the_stop_amon
     assert b'"stopped":true' in answers
 
 
+@pytest.mark.parametrize(
+    ("address", "latches"),
+    [
+        ("/api/v1/stop/", False),
+        ("//api/v1/stop", False),
+        ("/api//v1///stop//?now", False),
+        ("/api/v1/%73top/", False),
+        (f"http://{NAME}/api/v1/stop", False),
+        ("HTTPS://elsewhere.example:8420//api/v1/stop/", False),
+        ("/api/v1/estop/", True),
+        ("//api/v1/estop?why=fire", True),
+        (f"http://{NAME}/api/v1/estop", True),
+    ],
+)
+def test_a_stop_whose_address_is_written_otherwise_is_one(net: Network, address: str, latches: bool) -> None:
+    net.hardware.head.calls.clear()
+    answer = net.raw(f"POST {address} HTTP/1.1\r\nHost: {NAME}\r\nConnection: close\r\n\r\n")
+    assert answer.startswith(b"HTTP/1.1 200"), answer[:200]
+    assert ("stop",) in net.hardware.head.calls
+    assert bool(net.daemon.service.state().told()["estop"]) is latches
+    if latches:
+        net.daemon.service.stopping.reset("the test goes on", "test")
+
+
+@pytest.mark.parametrize("address", ["/api/v1/track/stop/", f"http://{NAME}//api/v1/track/stop"])
+def test_a_tracks_stop_written_otherwise_asks_for_the_same_token(net: Network, address: str) -> None:
+    head = f"POST {address} HTTP/1.1\r\nHost: {NAME}\r\nConnection: close\r\n"
+    refused(net.raw(f"{head}\r\n"), 401, "no_token")
+    bearer = f"Authorization: Bearer {net.token('operate')}\r\n"
+    assert net.raw(f"{head}{bearer}\r\n").startswith(b"HTTP/1.1 200")
+
+
+@pytest.mark.parametrize(
+    "address",
+    ["//api/v1/status", "/api/v1/status/", "/api/v1/stop/stop", "/x/api/v1/stop", "ftp://x/api/v1/stop"],
+)
+def test_nothing_but_a_stop_is_known_by_another_address(net: Network, address: str) -> None:
+    bearer = f"Authorization: Bearer {net.token('operate')}\r\n"
+    asked = f"POST {address} HTTP/1.1\r\nHost: {NAME}\r\nConnection: close\r\n{bearer}"
+    net.hardware.head.calls.clear()
+    answer = net.raw(f"{asked}Content-Type: application/json\r\nContent-Length: 2\r\n\r\n{{}}")
+    assert not answer.startswith(b"HTTP/1.1 2"), answer[:200]
+    assert ("stop",) not in net.hardware.head.calls
+
+
+def test_another_sites_page_stops_nothing_by_another_address(net: Network) -> None:
+    asked = f"POST //api/v1/stop/ HTTP/1.1\r\nHost: {NAME}\r\nOrigin: http://evil.example\r\n"
+    net.hardware.head.calls.clear()
+    refused(net.raw(f"{asked}Connection: close\r\n\r\n"), 403, "foreign_origin")
+    assert ("stop",) not in net.hardware.head.calls
+
+
 def test_an_upgrade_to_what_is_not_spoken_is_an_ordinary_request(net: Network) -> None:
     shown = f"Authorization: Bearer {net.token('view')}\r\n"
     for upgrade in ("websocket", "h2c", "TLS/1.0"):
