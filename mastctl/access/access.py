@@ -6,7 +6,6 @@ import hmac
 import logging
 import secrets
 import threading
-from collections import OrderedDict
 from collections.abc import Callable
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -21,7 +20,7 @@ log = logging.getLogger(__name__)
 
 REREAD_S = 1.0  # how late a new or a revoked token may be known
 SESSION_S = 12 * 3600.0
-MOST_SESSIONS = 200
+SESSIONS_OF_ONE = 20  # token; its oldest one goes
 
 
 @dataclass(frozen=True)
@@ -57,7 +56,7 @@ class Access:
         self._lent: tuple[Token, ...] = ()
         self._seen = self._stamp()
         self._guesses = Guesses()
-        self._sessions: OrderedDict[str, Session] = OrderedDict()
+        self._sessions: dict[str, Session] = {}  # oldest first
         self._closing = threading.Event()
         self._thread = threading.Thread(target=self._watch, name="tokens", daemon=True)
         self._thread.start()
@@ -68,25 +67,25 @@ class Access:
         return str(self._list.folder)
 
     def token_of(self, text: str, address: str) -> Token:
-        """Return whose token a text is.
+        """Return whose token a text is. A known one passes from anywhere; only others are counted and locked.
 
         Raises
         ------
         NotLetIn, TooMany
-            ``wrong_token`` if it is nobody's, ``too_many_guesses`` if ``address`` has tried too many.
+            ``wrong_token`` if it is nobody's, ``too_many_guesses`` if ``address`` has tried too many such.
         """
+        digest = digest_of(text)
+        found = self._find(digest)
+        if found is not None:
+            return found
         now_s = self._clock.now_s()
         wait_s = self._guesses.wait_s(address, now_s)
         if wait_s > 0.0:
             words = f"too many wrong tokens came from {address[:60]}; it is heard again in {wait_s:.0f} s"
             raise TooMany("too_many_guesses", words, max(1.0, wait_s))
-        digest = digest_of(text)
-        found = self._find(digest)
-        if found is None:
-            if self._guesses.wrong(address, digest, now_s):
-                log.warning("a wrong token came from %s", address[:60])
-            raise NotLetIn("wrong_token", "the token is nobody's; perhaps it was revoked")
-        return found
+        if self._guesses.wrong(address, digest, now_s):
+            log.warning("a wrong token came from %s", address[:60])
+        raise NotLetIn("wrong_token", "the token is nobody's; perhaps it was revoked")
 
     def lend(self, name: str) -> tuple[str, Callable[[], None]]:
         """Return a new token of the role operate for a program of this daemon's own, and what takes it back.
@@ -110,10 +109,13 @@ class Access:
         """Begin a session by a token; return the session's secret. Raises NotLetIn, TooMany as `token_of`."""
         token = self.token_of(text, address)
         secret = secrets.token_urlsafe(TOKEN_BYTES)
-        session = Session(token.sha256, self._clock.now_s() + SESSION_S)
+        now_s = self._clock.now_s()
+        session = Session(token.sha256, now_s + SESSION_S)
+        self._forget_ended(now_s)
+        own = [key for key, one in self._sessions.items() if one.token_sha256 == token.sha256]
+        for key in own[: max(0, len(own) + 1 - SESSIONS_OF_ONE)]:
+            del self._sessions[key]
         self._sessions[digest_of(secret)] = session
-        while len(self._sessions) > MOST_SESSIONS:
-            self._sessions.popitem(last=False)
         return secret, token, session
 
     def session_of(self, secret: str) -> tuple[Token, float] | None:
@@ -153,6 +155,13 @@ class Access:
     def close(self) -> None:
         """Look at the list no longer."""
         self._closing.set()
+
+    def _forget_ended(self, now_s: float) -> None:
+        """Keep no session whose time is over or whose token is gone."""
+        there = {one.sha256 for one in (*self._tokens, *self._lent)}
+        for key, one in list(self._sessions.items()):
+            if one.until_s <= now_s or one.token_sha256 not in there:
+                del self._sessions[key]
 
     def _find(self, digest: str) -> Token | None:
         """The token of a digest; as slow for one that is not there as for one that is."""

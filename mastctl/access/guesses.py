@@ -1,6 +1,8 @@
-"""Wrong tokens are counted, and who tries many is not heard for a while.
+"""Wrong tokens are counted, and no further ones are heard of an address that tries many.
 
-What is counted is different wrong tokens: a forgotten script that repeats an old one is no guessing.
+What is counted is different wrong tokens: a forgotten script that repeats an old one is no guessing. Known
+tokens are never asked about here, so that a guesser shuts out nobody who shares its address. What keeps
+guessing hopeless is a token's 256 random bits; this keeps it rare and known.
 """
 
 from __future__ import annotations
@@ -10,7 +12,7 @@ from collections import OrderedDict
 
 WINDOW_S = 60.0
 MOST_OF_ONE = 10  # different wrong tokens from one address in a window
-MOST_OF_ALL = 100  # from all; then nobody is heard who gave one of them
+MOST_OF_ALL = 100  # from all; then no wrong one is heard from any address that gave one
 MOST_ADDRESSES = 1000
 
 

@@ -11,7 +11,7 @@ from types import FunctionType, ModuleType
 import pytest
 
 from drivers.clock import ManualClock
-from mastctl.access.access import MOST_SESSIONS, SESSION_S, Access
+from mastctl.access.access import SESSION_S, SESSIONS_OF_ONE, Access
 from mastctl.access.guesses import MOST_ADDRESSES, MOST_OF_ALL, MOST_OF_ONE, WINDOW_S, Guesses, neighbourhood
 from mastctl.access.tokens import TokenList
 from mastctl.errors import NotLetIn, TooMany
@@ -123,23 +123,40 @@ def test_a_session_is_no_token_and_a_token_no_session(access: Access, tokens: To
     assert access.session_of(token(tokens)) is None
 
 
-def test_sessions_are_bounded_and_the_oldest_goes(access: Access, tokens: TokenList) -> None:
-    secrets = [access.log_in(token(tokens), HERE)[0] for _ in range(MOST_SESSIONS + 1)]
-    assert access.session_of(secrets[0]) is None
-    assert access.session_of(secrets[1]) is not None
+def test_sessions_of_a_token_are_bounded_and_its_own_oldest_goes(access: Access, tokens: TokenList) -> None:
+    admins, _, _ = access.log_in(token(tokens, "admin"), HERE)
+    secrets = [access.log_in(token(tokens, "view"), HERE)[0] for _ in range(200)]
+    assert access.session_of(admins) is not None, "a view token's log-ins end nobody else's session"
+    kept = [secret for secret in secrets if access.session_of(secret) is not None]
+    assert kept == secrets[-SESSIONS_OF_ONE:]
     assert len(set(secrets)) == len(secrets)
 
 
-def test_who_guesses_is_not_heard_for_a_while_even_with_the_right_token(
+def test_sessions_that_have_ended_are_not_kept(access: Access, tokens: TokenList, clock: ManualClock) -> None:
+    access.log_in(token(tokens, "view"), HERE)
+    access.log_in(token(tokens, "operate"), HERE)
+    tokens.revoke("view")
+    access.reread()
+    access.log_in(token(tokens, "operate"), HERE)
+    assert len(access._sessions) == 2
+    clock.advance(SESSION_S + 1.0)
+    access.log_in(token(tokens, "admin"), HERE)
+    assert len(access._sessions) == 1
+
+
+def test_who_guesses_is_not_heard_for_a_while_and_known_tokens_pass_there(
     access: Access, tokens: TokenList, clock: ManualClock
 ) -> None:
     for number in range(MOST_OF_ONE):
         assert code_of(access, f"guess {number}") == "wrong_token"
-    assert code_of(access, token(tokens)) == "too_many_guesses"
+    for number in range(5):
+        assert code_of(access, f"guess {MOST_OF_ONE + number}") == "too_many_guesses"
+    assert access.token_of(token(tokens), HERE).role == "operate", "colleagues behind the same address"
+    assert access.log_in(token(tokens, "admin"), HERE)[1].role == "admin"
+    assert code_of(access, "guess 0") == "too_many_guesses", "a known token lifts nothing"
     assert access.token_of(token(tokens), "10.0.0.2").role == "operate", "others are heard"
-    assert access.known(token(tokens)) is not None, "a stop is told apart without being counted"
     clock.advance(WINDOW_S + 1.0)
-    assert access.token_of(token(tokens), HERE).role == "operate"
+    assert code_of(access, "guess 0") == "wrong_token"
 
 
 def test_a_forgotten_script_that_repeats_an_old_token_keeps_nobody_out(
@@ -155,8 +172,9 @@ def test_guesses_from_many_addresses_close_the_door_to_guessers_only(
 ) -> None:
     for number in range(MOST_OF_ALL):
         code_of(access, f"guess {number}", f"10.1.0.{number}")
-    assert code_of(access, token(tokens), "10.1.0.7") == "too_many_guesses"
-    assert access.token_of(token(tokens), "10.2.0.1").role == "operate"
+    assert code_of(access, "one more", "10.1.0.7") == "too_many_guesses"
+    assert code_of(access, "the first", "10.2.0.1") == "wrong_token"
+    assert access.token_of(token(tokens), "10.1.0.7").role == "operate"
 
 
 def test_a_wrong_token_is_logged_once_a_minute_with_the_address_and_never_itself(
