@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import re
 import resource
 from collections.abc import Iterable
 from pathlib import Path
@@ -44,6 +45,7 @@ EVENTS = f"{PREFIX}/events"
 IMAGES = f"{PREFIX}/images"
 SOCKETS = frozenset({EVENTS, IMAGES})
 """Where a connection may become a WebSocket."""
+_HEADERS_END = re.compile(rb"\n\r?\n")
 
 
 class Counted(Protocol):
@@ -149,12 +151,22 @@ class Connection(H11Protocol):
             if len(data) > MOST_UNREAD_BYTES and not self.flow.read_paused:
                 self.transport.resume_reading()
 
+    def handle_events(self) -> None:
+        doubt = _doubt(self.conn.trailing_data[0]) if self.conn.their_state is h11.IDLE else ""
+        if doubt:
+            self._refuse("ambiguous", doubt)
+        else:
+            super().handle_events()
+
     def send_400_response(self, msg: str) -> None:
-        """Refuse what is no HTTP in the one form of refusals, and close."""
+        self._refuse("not_http", "this is no HTTP request, or its headers are too large")
+
+    def _refuse(self, code: str, words: str) -> None:
+        """Refuse what the API will never see in the one form of refusals, and close."""
         if self.conn.our_state not in (h11.IDLE, h11.SEND_RESPONSE):
             self.leave()  # an answer is half sent
             return
-        refused = error_response(400, "not_http", "this is no HTTP request, or its headers are too large")
+        refused = error_response(400, code, words)
         headers = [*refused.raw_headers, (b"connection", b"close")]
         for event in (
             h11.Response(status_code=400, headers=headers, reason=b"Bad Request"),
@@ -204,6 +216,18 @@ class Connection(H11Protocol):
     def leave(self) -> None:
         """Close it at once, whatever its client still expects."""
         self.transport.abort()
+
+
+def _doubt(data: bytes) -> str:
+    """What h11 would join in a request's headers and another program may read otherwise; '' if nothing."""
+    end = _HEADERS_END.search(data)
+    if end is None or STOP_LINE.match(data):  # a stop is one, however it is written
+        return ""
+    lines = data[: end.start()].lower().split(b"\n")[1:]
+    if any(line.startswith((b" ", b"\t")) for line in lines):
+        return "a header goes on in a second line"
+    lengths = [line for line in lines if line.startswith(b"content-length:")]
+    return "the header content-length is there twice" if len(lengths) > 1 or b"," in b"".join(lengths) else ""
 
 
 async def sweep(connections: Iterable[Any]) -> None:

@@ -71,9 +71,7 @@ def reset_where_unread(sent_bytes: int) -> contextlib.AbstractContextManager[Non
         b"GET /api/v1/status HTTP/1.1\r\nHost: x\r\nX: a\x00b\r\n\r\n",
         b"GET /" + b"a" * 70000,
         b"POST /api/v1/point HTTP/1.1\r\nHost: x\r\nContent-Length: -1\r\n\r\n",
-        b"POST /api/v1/point HTTP/1.1\r\nHost: x\r\nContent-Length: 1\r\nContent-Length: 2\r\n\r\n",
         b"POST /api/v1/point HTTP/1.1\r\nHost: x\r\nContent-Length: +5\r\n\r\n",
-        b"POST /api/v1/point HTTP/1.1\r\nHost: x\r\nContent-Length: 1, 2\r\n\r\n",
         b"POST /api/v1/point HTTP/1.1\r\nHost: x\r\nTransfer-Encoding: xchunked\r\n\r\n",
         b"POST /api/v1/point HTTP/1.1\r\nHost: x\r\nTransfer-Encoding: chunked, gzip\r\n\r\n",
         b"POST /api/v1/point HTTP/1.1\r\nHost: x\r\nTransfer-Encoding : chunked\r\n\r\n",
@@ -97,6 +95,14 @@ def test_what_is_no_http_is_refused_in_the_one_form_and_closed(net: Network, jun
         "Content-Type: application/json\r\nContent-Type: text/plain\r\n",
         "Cookie: a=b\r\nCookie: c=d\r\n",
         "Mastctl-Lease: a\r\nMastctl-Lease: b\r\n",
+        "Content-Length: 2\r\nContent-Length: 2\r\n",
+        "Content-Length: 1\r\ncontent-length: 2\r\n",
+        "Content-Length: 2, 2\r\n",
+        "Content-Length: 1, 2\r\n",
+        "Content-Length:\r\n 2\r\n",
+        "Cookie: a=b;\r\n\tmastctl-1=c\r\n",
+        "X: a\n b\r\n",
+        " X: a\r\n",
     ],
 )
 def test_what_two_programs_may_read_in_two_ways_is_refused_and_closed(net: Network, headers: str) -> None:
@@ -104,6 +110,35 @@ def test_what_two_programs_may_read_in_two_ways_is_refused_and_closed(net: Netwo
     answer = net.raw(f"POST /api/v1/point HTTP/1.1\r\nHost: {NAME}\r\n{headers}\r\n{smuggled}")
     refused(answer, 400, "ambiguous")
     assert answer.count(b"HTTP/1.1") == 1, "what was smuggled is not answered"
+
+
+DOUBTFUL = ("Content-Length: 2\r\nContent-Length: 2\r\n", "Content-Length: 2, 2\r\n", "X: a\r\n b\r\n")
+
+
+@pytest.mark.parametrize("headers", DOUBTFUL)
+def test_what_may_be_read_in_two_ways_is_refused_in_pieces_and_behind_another_request_too(
+    net: Network, headers: str
+) -> None:
+    shown = f"Authorization: Bearer {net.token('view')}\r\n"
+    behind = net.raw(STATUS + shown + "\r\n" + STATUS + headers + "\r\n{}")
+    assert behind.startswith(b"HTTP/1.1 200")
+    refused(behind[behind.index(b"HTTP/1.1 400") :], 400, "ambiguous")
+    with socket.create_connection(("127.0.0.1", net.port), timeout=NET_S) as line:
+        line.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        for sign in STATUS + headers + "\r\n":
+            line.sendall(sign.encode())
+        refused(b"".join(iter(lambda: line.recv(65536), b"")), 400, "ambiguous")
+
+
+@pytest.mark.parametrize("headers", DOUBTFUL)
+@pytest.mark.parametrize("path", ["stop", "estop", "/stop/"])
+def test_a_stop_is_one_however_its_headers_are_written(net: Network, path: str, headers: str) -> None:
+    body = "{}" if "Length" in headers else ""
+    head = f"POST /api/v1/{path} HTTP/1.1\r\nHost: {NAME}\r\n{headers}Connection: close\r\n\r\n{body}"
+    assert net.raw(head).startswith(b"HTTP/1.1 200")
+    if path == "estop":
+        why = {"reason": "a test", "name": "a test"}
+        assert net.ask("POST", "/reset", "admin", json=why).status_code == 200
 
 
 @pytest.mark.parametrize(
