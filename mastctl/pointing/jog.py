@@ -5,7 +5,8 @@ and it has braked. So whatever ends (heartbeats, this process, its machine) leav
 more, and every goal passes the door with all its limits: an axis at a bound stands while the other goes on.
 
 A heartbeat is good for half a second of the daemon's clock. One that names a jog which has ended moves
-nothing, so that none which was held up on its way begins a motion again.
+nothing, so that none which was held up on its way begins a motion again. Nor does one that names no jog and
+follows others through a stop, whether these moved the head or were refused: its client lets go first.
 """
 
 from __future__ import annotations
@@ -13,8 +14,8 @@ from __future__ import annotations
 import logging
 import math
 import threading
-from collections.abc import Callable, Mapping
-from contextlib import AbstractContextManager, nullcontext
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -22,7 +23,7 @@ from drivers.clock import Clock, SystemClock
 from drivers.interfaces import Reading
 from mastctl.devices.door import Door
 from mastctl.devices.keep_out import KeptOut, Pair
-from mastctl.errors import NotNow
+from mastctl.errors import MastctlError, NotNow
 from mastctl.operations.operations import Operations
 from mastctl.pointing.results import PointingError
 from mastctl.state.refusals import busy
@@ -90,6 +91,8 @@ class Jogs:
         What clients live by, whatever the clock of a simulated rover does; the machine's own by default.
     undisturbed
         A context in which a jog begins, for what needs a head that rests: it changes before or after.
+    last_stop
+        Returns the last stop that anybody asked for, another object as soon as another one comes.
     """
 
     def __init__(
@@ -99,8 +102,12 @@ class Jogs:
         clock: Clock,
         people: Clock | None = None,
         undisturbed: Callable[[], AbstractContextManager[object]] = nullcontext,
+        last_stop: Callable[[], object] = lambda: None,
     ) -> None:
         self._undisturbed = undisturbed
+        self._last_stop = last_stop
+        # Of heartbeats that name no jog, with numbers and without: the newest, and the last stop before them.
+        self._nameless: dict[bool, tuple[float, object]] = {}
         self._operations = operations
         self._devices = devices
         self._clock = clock
@@ -108,17 +115,49 @@ class Jogs:
         self._lock = threading.Lock()
         self._jog: tuple[str, _Jog] | None = None
 
-    def beat(self, beat: Beat) -> dict[str, Any]:
+    @contextmanager
+    def heard(self, beat: Beat) -> Iterator[bool]:
+        """Hear a heartbeat before anybody may refuse it; the block carries it out. Used on one thread.
+
+        Yields whether it may begin a jog. One that names none may not if it follows others within
+        `PATIENCE_S`, and a stop came since the first of these. Of those with numbers only what was refused
+        counts: a client that numbers them names its jog as soon as it has one.
+        """
+        if beat.jog is not None or beat.rates_rad_per_s == (0.0, 0.0):
+            yield True
+            return
+        counts, now_s, stop = beat.sequence is not None, self._clock.now_s(), self._last_stop()
+        newest_s, since = self._nameless.get(counts, (-math.inf, stop))
+        if now_s - newest_s > PATIENCE_S:
+            since = stop
+        if not counts:
+            self._nameless[counts] = now_s, since
+        try:
+            yield since is stop
+        except MastctlError:
+            if counts:
+                self._nameless[counts] = now_s, since
+            raise
+
+    def beat(self, beat: Beat, may_begin: bool = True) -> dict[str, Any]:
         """Take a heartbeat; return the jog's ``id``, whether it was ``taken``, and what holds an axis.
+
+        ``may_begin`` is what `heard` yielded.
 
         Raises
         ------
         NotNow
-            ``jog_ended`` if it names a jog that does not run; ``busy`` if an operation runs, or a jog that
-            counts its heartbeats and is not named; else as `Operations.start`.
+            ``jog_ended`` if it names a jog that does not run, or may not begin one; ``busy`` if an operation
+            runs, or a jog that counts its heartbeats and is not named; else as `Operations.start`.
         """
         if beat.jog is None:
             self._operations.let_stopped_end()
+            if not may_begin:
+                raise self._operations.refusal("motion") or NotNow(
+                    "jog_ended",
+                    "a stop ended the jog of these heartbeats; send none that turns the head for "
+                    f"{PATIENCE_S:g} s, then begin another",
+                )
         with self._lock:
             running = self._running()
             if beat.jog is not None:

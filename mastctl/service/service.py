@@ -229,7 +229,13 @@ class Service:
         self.steering = Steering(
             self.masts, rig, self.devices, clock, self.operations, self.tracker, self.health
         )
-        self.jogs = Jogs(self.operations, self.devices, clock, undisturbed=self.masts.unchanged)
+        self.jogs = Jogs(
+            self.operations,
+            self.devices,
+            clock,
+            undisturbed=self.masts.unchanged,
+            last_stop=lambda: self.leases.last_stop,
+        )
 
     @classmethod
     def open(cls, config: Config, clock: Clock | None = None, folder: StateFolder | None = None) -> Service:

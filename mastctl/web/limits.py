@@ -19,8 +19,9 @@ def add_limits(app: FastAPI) -> None:
 
     @app.post(f"{PREFIX}/jog", summary="A heartbeat: turn the head at a rate, for half a second")
     async def jog(body: JogBody, came: Headers, here: Here) -> dict[str, Any]:
-        asked = body.model_dump(exclude_none=True)
-        return await here.commands.run(JOG, came, asked, lambda: here.service.jogs.beat(body.beat()))
+        asked, beat, jogs = body.model_dump(exclude_none=True), body.beat(), here.service.jogs
+        with jogs.heard(beat) as may_begin:
+            return await here.commands.run(JOG, came, asked, lambda: jogs.beat(beat, may_begin))
 
     @app.get(f"{PREFIX}/limits/sun", summary="The direction that no head camera looks into")
     async def sun(here: Here) -> dict[str, Any]:

@@ -211,6 +211,48 @@ def test_a_stop_is_the_last_word(rig: Rig) -> None:
     assert len(rig.head.moves) == moves and not rig.devices.read().moving
 
 
+def test_nameless_heartbeats_begin_a_jog_after_a_stop_when_none_came_for_half_a_second(rig: Rig) -> None:
+    stops: list[object] = [object()]
+    jogs = Jogs(rig.operations, rig.devices, rig.clock, last_stop=lambda: stops[-1])
+    stick, still, counted = Beat((RATE, 0.0)), Beat((0.0, 0.0)), Beat((RATE, 0.0), sequence=8)
+
+    def refused(beat: Beat) -> str:
+        with pytest.raises(NotNow) as error, jogs.heard(beat) as may_begin:
+            jogs.beat(beat, may_begin)
+        return error.value.code
+
+    def taken(beat: Beat) -> str | None:
+        with jogs.heard(beat) as may_begin:
+            told: str | None = jogs.beat(beat, may_begin)["id"]
+        return told
+
+    first = taken(stick)
+    assert first is not None
+    rig.pass_by(0.3)
+    assert taken(stick) == first
+    with rig.clock.at_work():
+        rig.operations.stop()
+        stops.append(object())
+    rig.ended(first)
+    moves = len(rig.head.moves)
+    for _ in range(10):
+        assert refused(stick) == "jog_ended"
+        assert taken(still) is None
+        rig.pass_by(PATIENCE_S - 0.01)
+    assert len(rig.head.moves) == moves
+    rig.pass_by(0.02)
+    second = taken(Beat((RATE, 0.0), sequence=1))
+    assert second is not None
+    assert refused(counted) == "busy"
+    with rig.clock.at_work():
+        rig.operations.stop()
+        stops.append(object())
+    rig.ended(second)
+    assert refused(counted) == "jog_ended", "its number makes it none that begins"
+    rig.pass_by(PATIENCE_S + 0.01)
+    assert taken(counted) is not None
+
+
 def test_a_head_that_reports_a_fault_is_stopped(rig: Rig) -> None:
     name = rig.beats(RATE, 0.0, 0.3)["id"]
     rig.panel.set("pan_tilt", "voltage_dip", factor=0.5)
