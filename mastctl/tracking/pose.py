@@ -18,6 +18,9 @@ from mastctl.errors import BadRequest, NotNow
 STANDS_M, STANDS_RAD = 0.005, 0.001
 """Within these of each other two poses are one standing, told twice: an odometer's noise, no motion."""
 
+HELD_UP_S = 60.0
+"""No pose is longer on its way. One that seems so was stamped by a clock that was set, or by another one."""
+
 
 @dataclass(frozen=True, eq=False)
 class RoverPose:
@@ -53,20 +56,39 @@ class RoverPose:
 
 
 def check_follows(pose: RoverPose, before: RoverPose | None) -> None:
-    """Pass a pose that is later than the one before it. Raises BadRequest, NotNow."""
+    """Pass a pose that is later than the one before it, or has another clock than that one.
+
+    The sender's clock may be any, so no time of it is impossible, and none binds later poses for more than
+    `HELD_UP_S`: a pose that is not later by it is refused while it may have been held up on its way.
+
+    Raises
+    ------
+    BadRequest
+        ``pose_without_time``.
+    NotNow
+        ``pose_runs_backwards``.
+    """
     if before is None or before.time_s is None:
         return
+    passed_s = pose.received_s - before.received_s
     if pose.time_s is None:
+        if passed_s > HELD_UP_S:
+            return
         raise BadRequest(
             "pose_without_time",
             f"time_s is missing; the pose before had one ({before.time_s:g} s), and without it nobody knows "
-            "which of the two is later",
+            f"which of the two is later; {HELD_UP_S:g} s after that pose it may be left out",
         )
-    if pose.time_s <= before.time_s:
+    if clock_was_set(pose, before) and before.time_s - pose.time_s + passed_s <= HELD_UP_S:
         raise NotNow(
             "pose_runs_backwards",
             f"time_s is {pose.time_s:g} s, which is not later than the pose before it ({before.time_s:g} s)",
         )
+
+
+def clock_was_set(pose: RoverPose, before: RoverPose) -> bool:
+    """Return whether a pose that follows another is not later than it by their times."""
+    return pose.time_s is not None and before.time_s is not None and pose.time_s <= before.time_s
 
 
 def motion_between(before: RoverPose, now: RoverPose) -> Rigid:

@@ -33,6 +33,7 @@ from mastctl.tracking.outcomes import Outcome, Turn, looked, moved_on, started
 from mastctl.tracking.pose import (
     RoverPose,
     check_follows,
+    clock_was_set,
     motion_between,
     stands,
 )
@@ -180,6 +181,9 @@ class Tracker:
                     "covariance (6 rows of 6) or sigma of the motion since the pose before is missing; while "
                     "a track runs it says where to look",
                 )
+            if before is not None and clock_was_set(pose, before):
+                words = "the clock of the rover's poses was set, or is another: %g s after %g s"
+                self._say(logging.INFO, words, pose.time_s, before.time_s)
             stands_at(pose)
             if before is not None and not stands(motion_between(before, pose)):
                 self._moved_s = pose.received_s

@@ -21,6 +21,7 @@ from mastctl.errors import MastctlError
 from mastctl.tracking.carried import Carried
 from mastctl.tracking.choice import HandoffRules, PairBounds, choose_pairs
 from mastctl.tracking.pose import (
+    HELD_UP_S,
     RoverPose,
     check_follows,
     motion_between,
@@ -91,9 +92,11 @@ def test_nobody_who_sees_it_is_told_camera_by_camera(rig: Rig) -> None:
         choose_pairs(rig, np.array([-5.0, 0.2, 0.0]), limits=Limits((-1.0, 1.0), (-1.2, 0.5), 1.0))
 
 
-def pose(time_s: float | None, x_m: float = 0.0, heading_rad: float = 0.0) -> RoverPose:
+def pose(
+    time_s: float | None, x_m: float = 0.0, heading_rad: float = 0.0, received_s: float = 0.0
+) -> RoverPose:
     turned = Rotation.from_euler("z", heading_rad).as_matrix()
-    return RoverPose(Rigid(turned, np.array([x_m, 0.0, 0.0])), None, time_s)
+    return RoverPose(Rigid(turned, np.array([x_m, 0.0, 0.0])), None, time_s, received_s)
 
 
 @pytest.mark.parametrize(
@@ -107,6 +110,39 @@ def test_poses_come_in_order(before_s: float, now_s: float | None, code: str) ->
     check_follows(pose(5.1), pose(5.0))
     check_follows(pose(None), pose(None))
     check_follows(pose(1.0), None)
+
+
+@pytest.mark.parametrize(
+    ("before_s", "now_s", "later_s"),
+    [
+        (1e12, 17.5, 0.01),
+        (1e12, -1e12, 0.0),
+        (5.0 + HELD_UP_S, 4.99, 0.0),
+        (5.0, 4.9, HELD_UP_S),
+        (5.0, 5.0, HELD_UP_S + 0.01),
+        (5.0, None, HELD_UP_S + 0.01),
+    ],
+)
+def test_a_pose_that_cannot_have_been_on_its_way_so_long_has_another_clock(
+    before_s: float, now_s: float | None, later_s: float
+) -> None:
+    check_follows(pose(now_s, received_s=100.0 + later_s), pose(before_s, received_s=100.0))
+
+
+@pytest.mark.parametrize(
+    ("before_s", "now_s", "later_s", "code"),
+    [
+        (5.0 + HELD_UP_S, 5.0, 0.0, "pose_runs_backwards"),
+        (6.0, 5.0, HELD_UP_S - 1.0, "pose_runs_backwards"),
+        (5.0, None, HELD_UP_S, "pose_without_time"),
+    ],
+)
+def test_a_pose_that_was_held_up_on_its_way_comes_too_late(
+    before_s: float, now_s: float | None, later_s: float, code: str
+) -> None:
+    with pytest.raises(MastctlError) as refused:
+        check_follows(pose(now_s, received_s=100.0 + later_s), pose(before_s, received_s=100.0))
+    assert refused.value.code == code
 
 
 def test_a_motion_is_where_the_frame_before_lies_in_the_one_of_now() -> None:

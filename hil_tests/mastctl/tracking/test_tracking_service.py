@@ -363,6 +363,16 @@ def test_poses_that_run_backwards_or_say_too_little_are_refused(client: Client) 
     assert client.track()["sequence"] == before["sequence"], "a refused pose changes nothing"
 
 
+@pytest.mark.parametrize("time_s", [1e12, 1.7e9, 1e4])
+def test_a_pose_from_the_far_future_keeps_no_later_one_out(client: Client, time_s: float) -> None:
+    started(client)
+    assert drive(client, 0.1, time_s)["state"] == "tracking"
+    assert drive(client, 0.2, 2.0)["state"] == "tracking", "a client that is in order"
+    assert client.status()["pose"]["time_s"] == 2.0
+    assert "1.9 s" in refusal(lambda: drive(client, 0.1, 1.9), "pose_runs_backwards")
+    assert drive(client, 0.3, 3.0)["state"] == "tracking"
+
+
 def test_a_first_pose_during_a_track_says_nothing_about_its_motion(client: Client) -> None:
     started(client, first_pose=False)
     told = refusal(lambda: drive(client, 0.1, 2.0), "no_pose_before")
