@@ -20,7 +20,7 @@ from typing import Any, Protocol
 from drivers.clock import Clock
 from mastctl.as_json import writable
 from mastctl.commands.audit import AuditLog
-from mastctl.commands.caller import Caller, Role
+from mastctl.commands.caller import ANONYMOUS, Caller, Role
 from mastctl.commands.idempotency import Answer, Answers
 from mastctl.commands.lease import Leases, StopCame
 from mastctl.errors import BadRequest, MastctlError, NotNow, Stopped, error_body
@@ -49,6 +49,9 @@ class Command:
     goes_on
         Whether it is sent again and again to keep its operation going: then only the first is recorded, and
         what is refused.
+    grants
+        Whether its answer tells a lease's id, which proves the lease: none by a key that may be anybody's,
+        and none that has ended.
     """
 
     name: str
@@ -56,6 +59,7 @@ class Command:
     steers: bool = False
     need: Need | None = None
     goes_on: bool = False
+    grants: bool = False
 
 
 POINT = Command("point", steers=True, need="motion")
@@ -82,10 +86,10 @@ BENCH = Command("bench", steers=True, need="track")
 BENCH_STANDS = Command("bench.stands")  # a fact about the board, told by who has placed it
 BENCH_LEAVE = Command("bench.leave")
 BENCH_FORGET = Command("bench.forget")
-LEASE = Command("lease")
-LEASE_RENEW = Command("lease.renew")
+LEASE = Command("lease", grants=True)
+LEASE_RENEW = Command("lease.renew", grants=True)
 LEASE_RELEASE = Command("lease.release")
-LEASE_TAKE = Command("lease.take")
+LEASE_TAKE = Command("lease.take", grants=True)
 SIMULATION_POSE = Command("simulation.pose")  # acts on the world, not on the head
 SIMULATION_TIME = Command("simulation.time")
 SIMULATION_BOARD = Command("simulation.board")
@@ -201,7 +205,7 @@ class Entry:
         NotAllowed
             ``role``.
         BadRequest
-            ``key_reused``.
+            ``key_reused``; ``bad_request`` for a key of nobody's name where a lease is granted.
         NotNow
             ``deadline_passed`` if its time was over before it began; ``leased``, ``lease_over``,
             ``lease_unknown``; ``key_in_use``; ``stopped`` if a stop came since it was asked for; what the
@@ -210,6 +214,11 @@ class Entry:
         again = False
         try:
             asked.caller.check_may(command.role, command.name)
+            if command.grants and asked.key is not None and asked.caller.name == ANONYMOUS:
+                words = (
+                    "Idempotency-Key without a name (Mastctl-Client) may be anybody's; a lease is one party's"
+                )
+                raise BadRequest("bad_request", words)
             if asked.key is None:
                 answer = self._act(command, asked, act, usual_s)
             else:
@@ -217,6 +226,8 @@ class Entry:
                 answer, again = self._answers.once(
                     asked.caller.name, asked.key, same, lambda: self._act(command, asked, act, usual_s)
                 )
+                if again and command.grants:
+                    self._check_holds(answer["lease_id"])
         except BaseException as error:
             self._record(command, asked, None, error, again)
             raise
@@ -273,6 +284,13 @@ class Entry:
             if operation is not None and allowed_s is not None and operation not in self._began:
                 self._operations.end_within(operation, self._left_s(asked, allowed_s), allowed_s)
             return answer
+
+    def _check_holds(self, lease_id: str) -> None:
+        """Pass a lease that was granted before and still holds. Raises NotNow."""
+        try:
+            self.leases.check(lease_id)
+        except NotNow as over:
+            raise NotNow(over.code, f"{over}, with another Idempotency-Key") from None
 
     def _stopped_since(self, command: Command, asked: Asked) -> bool:
         """Whether a stop came after a command that steers was asked for."""

@@ -14,10 +14,11 @@ from urllib.parse import urlsplit
 import httpx
 import pytest
 
-from hil_tests.mastctl.service_fakes import PLAIN, FakeHardware, ScriptedLoop
+from hil_tests.mastctl.service_fakes import PLAIN, FakeHardware, ScriptedLoop, fake_daemon
 from hil_tests.waiting import NET_S, joined, until
 from mastctl.client import Client, ClientError
 from mastctl.commands.audit import AuditLog
+from mastctl.commands.caller import Caller
 from mastctl.daemon import RunningDaemon
 from mastctl.errors import Stopped
 from mastctl.safety.stop_line import ask
@@ -264,6 +265,74 @@ def test_a_key_that_released_one_lease_does_not_tell_that_the_next_one_is_releas
         assert send(second).json()["error"]["code"] == "key_reused"
         assert web.get("/lease").json()["control"]["holder"] == "bench"
         web.request("DELETE", "/lease", headers={"Mastctl-Lease": second["Mastctl-Lease"]})
+
+
+KEYED = {"Mastctl-Client": "bench", "Idempotency-Key": "a-key"}
+
+
+@pytest.mark.parametrize("path", ["/lease", "/lease/take"])
+@pytest.mark.parametrize("name", [{}, {"Mastctl-Client": "anonymous"}], ids=["no name", "anonymous"])
+def test_nobody_shares_a_lease_by_a_key_without_a_name(
+    web: httpx.Client, path: str, name: dict[str, str]
+) -> None:
+    body = {"reason": "work"} if path.endswith("take") else {}
+    for _ in range(2):
+        answer = web.post(path, json=body, headers={"Idempotency-Key": "1", **name})
+        assert (answer.status_code, answer.json()["error"]["code"]) == (422, "bad_request")
+        assert "Mastctl-Client" in answer.json()["error"]["message"]
+        assert "lease_id" not in answer.text
+    assert web.get("/lease").json() == {"control": None}
+
+
+def test_a_lease_whose_answer_was_lost_is_had_by_its_key_while_it_holds_and_no_longer(
+    web: httpx.Client, pair: Pair
+) -> None:
+    leases = pair[0].service.leases
+    first = web.post("/lease", json={}, headers=KEYED).json()
+    assert web.post("/lease", json={}, headers=KEYED).json() == first
+
+    def ended(key: dict[str, str], lease: str, path: str = "/lease", body: Any = None) -> str:
+        headers = {**key, "Mastctl-Lease": lease}
+        answer = web.post(path, json={} if body is None else body, headers=headers)
+        told = answer.json()["error"]
+        assert (answer.status_code, told["code"]) == (409, "lease_over")
+        assert told["message"].endswith("with another Idempotency-Key")
+        return str(told["message"])
+
+    renewal = {**KEYED, "Idempotency-Key": "renewal"}
+    held = {"Mastctl-Lease": first["lease_id"]}
+    assert web.post("/lease/renew", headers={**renewal, **held}).status_code == 200
+    web.request("DELETE", "/lease", headers=held).raise_for_status()
+    assert "it was released" in ended(KEYED, "")
+    assert "it was released" in ended(renewal, first["lease_id"], "/lease/renew")
+
+    take = {**KEYED, "Idempotency-Key": "take"}
+    reason = {"reason": "work"}
+    second = web.post("/lease/take", json=reason, headers=take).json()
+    leases.take(Caller("rover"), "mine")
+    assert "rover took over: mine" in ended(take, second["lease_id"], "/lease/take", reason)
+    leases.take(Caller("bench"), "back")
+    ending = {**KEYED, "Idempotency-Key": "ending"}
+    leases._end("the test goes on")
+    web.post("/lease", json={"ends_with_stop": True}, headers=ending).raise_for_status()
+    web.post("/stop").raise_for_status()
+    assert "the head was stopped" in ended(ending, "", body={"ends_with_stop": True})
+    assert web.get("/lease").json() == {"control": None}
+
+
+def test_a_key_from_before_a_restart_grants_a_lease_that_holds(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    granted = []
+    for _ in range(2):
+        with fake_daemon(monkeypatch, tmp_path) as (daemon, _), httpx.Client(**PLAIN) as web:
+            url = f"{daemon.url}/api/v1/lease"
+            granted.append(web.post(url, json={}, headers=KEYED).json()["lease_id"])
+            assert daemon.service.leases.holds(granted[-1])
+            if len(granted) == 2:
+                answer = web.post(f"{url}/renew", headers={"Mastctl-Lease": granted[0]})
+                assert answer.json()["error"]["code"] == "lease_unknown"
+    assert granted[0] != granted[1]
 
 
 def test_a_command_sent_twice_with_one_key_is_carried_out_once(web: httpx.Client, pair: Pair) -> None:
