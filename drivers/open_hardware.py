@@ -7,7 +7,6 @@ Nothing else knows real and simulated drivers both. A name is ``dynamixel``, ``f
 from __future__ import annotations
 
 import importlib
-import json
 import logging
 from collections.abc import Iterator
 from concurrent.futures import wait
@@ -22,53 +21,19 @@ from drivers.errors import BadOptions, DriverError, NoReply
 from drivers.faults import PAN_TILT, nearest
 from drivers.hardware import DeviceSettings, Hardware, HardwareKind, HardwareSettings, close_devices
 from drivers.interfaces import Camera, PanTilt
+from drivers.known import BUILT_IN, CAMERAS, HALTS, HEADS, OURS
 from drivers.outside import device_from_outside
-from drivers.serial_line import stable_name
-from drivers.simulation_clock import SimulationClock, simulation_speed
 
 if TYPE_CHECKING:
     from drivers.sim.rover import SimulatedRover
 
 log = logging.getLogger(__name__)
 
-HEADS = {"dynamixel": "drivers.dynamixel.head", "flir_ptu": "drivers.flir_ptu.head"}
-"""Pan/tilt drivers of this repository: the module whose ``open_head(options, clock)`` opens them."""
-
-HALTS = {"dynamixel": "drivers.dynamixel.halt", "flir_ptu": "drivers.flir_ptu.halt"}
-"""The module of each whose ``halt(options)`` stops a head that no daemon drives any more."""
-
-CAMERAS = {"v4l2": "drivers.v4l2.camera"}
-"""Camera drivers of this repository: the module whose ``open_camera(options, clock, name)`` opens one."""
-
-OURS = ("sim", "replay")
-"""No device behind them: they neither fail for a moment nor block, and live on any clock."""
-
-BUILT_IN = (*HEADS, *CAMERAS, *OURS)
-
 OPENING_PATIENCE_S = 5.0
 """A device that takes longer to open is named; if it is a camera, the others go on without it."""
 
 HEAD_OPENING_S = 60.0
 """A head that takes longer to open is refused: without its readings nothing can be done."""
-
-
-def clock_for(settings: HardwareSettings) -> Clock:
-    """Return the clock that these devices live on: the simulation's, if it is not to go as life does.
-
-    Raises
-    ------
-    BadOptions
-        If a speed is asked for that is none, or that a device cannot follow: real ones and those from outside
-        live in real time.
-    """
-    speed = simulation_speed(settings.simulation.get("speed", 1.0))
-    if speed == 1.0:
-        return SystemClock()
-    told = f"simulation.speed is {settings.simulation['speed']}, expected 1:"
-    for name, device in {PAN_TILT: settings.pan_tilt, **settings.cameras}.items():
-        if device.driver not in OURS:
-            raise BadOptions(f"{told} driver {device.driver!r} lives in real time", device=name)
-    return SimulationClock(speed)
 
 
 def open_hardware(settings: HardwareSettings, clock: Clock | None = None) -> Hardware:
@@ -82,8 +47,8 @@ def open_hardware(settings: HardwareSettings, clock: Clock | None = None) -> Har
     settings
         Drivers and their options.
     clock
-        Time for simulated and replayed devices, as a rule that of `clock_for`; the machine's monotonic clock
-        when left out.
+        Time for simulated and replayed devices, as a rule that of `drivers.known.clock_for`; the machine's
+        monotonic clock when left out.
 
     Raises
     ------
@@ -104,24 +69,6 @@ def open_hardware(settings: HardwareSettings, clock: Clock | None = None) -> Har
         raise
     pan_tilt = devices.pop(PAN_TILT)
     return Hardware(pan_tilt, devices, opener.kinds, opener.rover)
-
-
-def head_name(settings: HardwareSettings) -> str | None:
-    """Return which head the settings drive, whoever wrote them: None for one in this program's memory.
-
-    A head is its line (`drivers.serial_line.stable_name` of the option ``port``); one from outside without
-    such an option is its factory with all options.
-    """
-    device = settings.pan_tilt
-    outside = ":" in device.driver
-    if device.driver not in HEADS and not outside:
-        return None
-    port = device.options.get("port")
-    if isinstance(port, str) and port:
-        return stable_name(port)
-    if outside:
-        return f"{device.driver} {json.dumps(dict(device.options), sort_keys=True, default=str)}"
-    return None
 
 
 def halt_head(settings: HardwareSettings) -> list[str]:

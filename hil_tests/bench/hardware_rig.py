@@ -12,6 +12,7 @@ from drivers.hardware import DeviceSettings
 from mastctl.config import load_config
 from mastctl.conform.drivers_run import head_under_test
 from mastctl.conform.head_trial import HeadTrial
+from mastctl.service.mast_in_use import bounds_of
 
 CHOSEN: str | None = None
 """The configuration that --hardware names."""
@@ -21,9 +22,8 @@ CHOSEN: str | None = None
 def hardware_trial(file: Path) -> Iterator[HeadTrial]:
     """The head of a configuration, standing in the middle of its limits."""
     config = load_config(file)
-    limits = config.limits
-    ends = (limits.pan_rad, limits.tilt_rad)
-    with head_under_test(config.hardware, math.inf, limits.speed_rad_per_s, ends, False) as trial:
+    speed = config.limits.speed_rad_per_s
+    with head_under_test(config.hardware, bounds_of(config), math.inf, speed, None, moves=True) as trial:
         trial.sent(trial.goal(0.0, 0.0))
         yield trial
 

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from drivers.open_hardware import HEADS
+from drivers.known import HEADS
 from mastctl.cli.main import main
 from mastctl.conform.drivers_run import COUNTS
 from tools.campaigns.servo_rigs import LIMITS_RAD, RIGS

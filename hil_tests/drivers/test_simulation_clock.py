@@ -17,7 +17,7 @@ from drivers import simulation_clock
 from drivers.clock import SystemClock, Turn
 from drivers.errors import BadOptions
 from drivers.hardware import DeviceSettings, HardwareSettings
-from drivers.open_hardware import clock_for
+from drivers.known import clock_for
 from drivers.simulation_clock import SimulationClock
 
 LONG_S = 20.0

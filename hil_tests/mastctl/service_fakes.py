@@ -243,7 +243,6 @@ def fake_daemon(
     """
     from mastctl.daemon import RunningDaemon  # slow to load, and most of these fakes need no daemon
     from mastctl.devices import devices as devices_module
-    from mastctl.service import service as service_module
     from mastctl.service import steering as steering_module
     from mastctl.web import commands as commands_module
 
@@ -253,7 +252,7 @@ def fake_daemon(
     hardware = FakeHardware()
     save_rig(rig(), folder / "little.yaml")
     (folder / "daemon.yaml").write_text((config or CONFIG).format(listen=listen))
-    monkeypatch.setattr(service_module, "open_hardware", lambda settings, clock: hardware)
+    monkeypatch.setattr("mastctl.devices.opening.open_hardware", lambda settings, clock: hardware)
     monkeypatch.setattr(steering_module, "PointingLoop", loop)
     monkeypatch.setattr(ScriptedLoop, "script", staticmethod(ScriptedLoop.good), raising=False)
     with RunningDaemon(load_config(folder / "daemon.yaml")) as daemon:

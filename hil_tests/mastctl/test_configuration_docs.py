@@ -19,7 +19,7 @@ from drivers import options as driver_options
 from drivers.dynamixel import settings as dynamixel
 from drivers.errors import BadOptions
 from drivers.flir_ptu import options as flir_ptu
-from drivers.open_hardware import CAMERAS, HEADS, OURS
+from drivers.known import CAMERAS, HEADS, OURS
 from drivers.replay import OPTIONS as REPLAY_OPTIONS
 from drivers.sim import settings as simulation
 from drivers.sim.cameras import CameraSettings

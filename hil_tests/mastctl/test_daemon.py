@@ -304,7 +304,7 @@ def test_a_daemon_whose_server_fails_as_it_starts_is_never_told_ready(
     save_rig(rig(), tmp_path / "little.yaml")
     path = tmp_path / "daemon.yaml"
     path.write_text(CONFIG.format(listen="{port: 0}"))
-    monkeypatch.setattr(service_module, "open_hardware", lambda settings, clock: hardware)
+    monkeypatch.setattr("mastctl.devices.opening.open_hardware", lambda settings, clock: hardware)
 
     async def fails(self: object, sockets: object = None) -> None:
         raise OSError("no room for a server")
@@ -384,10 +384,10 @@ def test_what_keeps_a_daemon_from_starting_is_typed_and_leaves_nothing(
     save_rig(rig(), tmp_path / "little.yaml")
     path = tmp_path / "daemon.yaml"
     path.write_text(CONFIG.format(listen="{port: 0}"))
-    monkeypatch.setattr(service_module, "open_hardware", fail)
+    monkeypatch.setattr("mastctl.devices.opening.open_hardware", fail)
     with pytest.raises(DriverError, match="no head on the bus"):
         RunningDaemon(load_config(path))
-    monkeypatch.setattr(service_module, "open_hardware", lambda settings, clock: hardware)
+    monkeypatch.setattr("mastctl.devices.opening.open_hardware", lambda settings, clock: hardware)
     path.write_text(path.read_text().replace("navcam_left:", "navcam_lift:"))
     with pytest.raises(BadFile, match="navcam_lift"):
         RunningDaemon(load_config(path))

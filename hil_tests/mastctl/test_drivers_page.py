@@ -16,7 +16,7 @@ from drivers import interfaces
 from drivers.clock import SystemClock
 from drivers.errors import DriverError
 from drivers.interfaces import Frame, Reading
-from drivers.open_hardware import BUILT_IN
+from drivers.known import BUILT_IN
 from hil_tests.mastctl.service_fakes import FakeHardware, Hang, rig
 from hil_tests.waiting import until
 from mastctl.devices import devices as devices_module

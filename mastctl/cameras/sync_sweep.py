@@ -145,21 +145,23 @@ class Sweep:
         ------
         Stopped
             If it was stopped; the head stands where that was.
-        OutsideLimits
-            Before anything moves, if the sweep would pass a limit.
+        OutsideLimits, KeptOut
+            Before anything moves, if the sweep would pass a limit or a keep-out.
         DriverError
             If the head fails; it is halted. A camera that fails is only told of (`seen`).
         """
+        self._rest()
         start = self._devices.read()
         for side in (-1, 1):
-            self._limits.check(start.pan_rad + side * plan.amplitude_rad, start.tilt_rad)
+            goal = start.pan_rad + side * plan.amplitude_rad, start.tilt_rad
+            self._limits.check(*goal)
+            self._devices.door.check_move(goal, lambda: start)
         self._limits.speed(plan.speed_rad_per_s)
         threads = [
             self._clock.thread(partial(self._watch, name, start, plan), f"sweep {name}")
             for name in self._cameras
         ]
         try:
-            self._rest(start)
             for thread in threads:
                 thread.start()
                 with self._ended:  # it may have ended already: then this makes up for what it took off
@@ -212,7 +214,7 @@ class Sweep:
         self._clock.sleep(READ_EVERY_S)
         self._check_stop()
 
-    def _rest(self, start: Reading) -> None:
+    def _rest(self) -> None:
         """Wait until the head has stood still for long enough."""
         since_s = self._clock.now_s()
         until_s = since_s + ARRIVE_S

@@ -70,17 +70,18 @@ def camera_check(args: argparse.Namespace) -> int:
 def _check_any(args: argparse.Namespace, config: Config) -> int:
     """Hold a configured camera of any driver against what a driver promises."""
     from drivers.clock import SystemClock
-    from drivers.open_hardware import open_hardware, open_one_camera
     from mastctl.cameras.check import CameraCheck
-    from mastctl.service.mast_in_use import read_mast
+    from mastctl.devices.opening import devices_beside, open_one_camera
+    from mastctl.service.mast_in_use import bounds_of
 
-    rig = read_mast(config.mast_file, config).stored.rig
+    bounds = bounds_of(config)
+    assert bounds.stored is not None
     settings = with_cameras(config, [args.camera])
     clock = SystemClock()
-    size_px = rig.cameras[args.camera].model.size_px
+    size_px = bounds.stored.rig.cameras[args.camera].model.size_px
     if args.with_head:
-        with open_hardware(settings, clock) as hardware:
-            found = CameraCheck(args.camera, hardware.cameras[args.camera], clock, size_px).run(args.seconds)
+        with devices_beside(settings, bounds, clock, moves=False, own_cameras=True) as (_, cameras):
+            found = CameraCheck(args.camera, cameras[args.camera], clock, size_px).run(args.seconds)
     else:
         with open_one_camera(settings, args.camera, clock) as camera:
             found = CameraCheck(args.camera, camera, clock, size_px).run(args.seconds)

@@ -7,7 +7,6 @@ import signal
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
-from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 from mastctl import signals
@@ -50,32 +49,28 @@ def add_action(actions: Any) -> None:
 def camera_sync(args: argparse.Namespace) -> int:
     """Measure, and tell each camera's offset_s; 1 if no camera's could be told."""
     from drivers.clock import SystemClock
-    from drivers.open_hardware import open_hardware
     from mastctl.cameras.sync_sweep import Sweep, plan_sweep
     from mastctl.config import load_config
-    from mastctl.devices.devices import Devices
-    from mastctl.service.mast_in_use import read_mast
+    from mastctl.devices.opening import devices_beside
+    from mastctl.service.mast_in_use import bounds_of
 
     config = load_config(args.config)
-    mast = read_mast(config.mast_file, config)
-    rig = mast.stored.rig
+    bounds = bounds_of(config)
+    assert bounds.stored is not None
+    rig = bounds.stored.rig
     names = _chosen(args, config, rig)
     plan = plan_sweep(rig, names, config.limits, args.amplitude, args.speed, args.seconds)
     settings = with_cameras(config, names)
     clock = SystemClock()
-    with _ending_signals() as stop, open_hardware(settings, clock) as hardware:
-        head = SimpleNamespace(pan_tilt=hardware.pan_tilt, cameras={})
-        devices = Devices(head, config.limits, mast.stored.digest, clock, rig)
-        try:
-            sweep = Sweep(devices, hardware.cameras, rig, config.limits, stop, clock)
-            if not args.json:
-                output.tell(
-                    f"turning pan {plan.amplitude_rad:.3f} rad to either side for {plan.seconds:g} s, "
-                    f"at {plan.speed_rad_per_s:.3f} rad/s at most; Ctrl-C stops the head"
-                )
-            sweep.run(plan)
-        finally:
-            devices.close()
+    opened = devices_beside(settings, bounds, clock, moves=True, own_cameras=True)
+    with _ending_signals() as stop, opened as (devices, cameras):
+        sweep = Sweep(devices, cameras, rig, config.limits, stop, clock)
+        if not args.json:
+            output.tell(
+                f"turning pan {plan.amplitude_rad:.3f} rad to either side for {plan.seconds:g} s, "
+                f"at {plan.speed_rad_per_s:.3f} rad/s at most; Ctrl-C stops the head"
+            )
+        sweep.run(plan)
     found = {name: _found(sweep, name, settings.cameras[name].offset_s) for name in names}
     document = {"cameras": found, "sweep": vars(plan), "notes": _notes(found)}
     if args.json:

@@ -151,22 +151,16 @@ def _configured_frame(args: argparse.Namespace) -> StampedFrame:
     """One fresh frame of a configured camera (of any driver) with the joint angles of its moment."""
     from drivers.absent_camera import AbsentCamera
     from drivers.clock import SystemClock
-    from drivers.open_hardware import open_hardware
-    from mastctl.devices.devices import Devices
-    from mastctl.service.mast_in_use import read_mast
+    from mastctl.devices.opening import devices_beside
+    from mastctl.service.mast_in_use import bounds_of
 
     config = config_of(args)
-    mast = read_mast(config.mast_file, config)
-    clock = SystemClock()
-    with open_hardware(with_cameras(config, [args.camera]), clock) as hardware:
-        place = hardware.cameras[args.camera]
+    settings, clock = with_cameras(config, [args.camera]), SystemClock()
+    with devices_beside(settings, bounds_of(config), clock, moves=False) as (devices, cameras):
+        place = cameras[args.camera]
         if isinstance(place, AbsentCamera) and place.error is not None:
             raise place.error  # nobody waits here until it joins
-        devices = Devices(hardware, config.limits, mast.stored.digest, clock, mast.stored.rig)
-        try:
-            return devices.frames([args.camera], clock.now_s(), FRAME_TIMEOUT_S)[args.camera]
-        finally:
-            devices.close()
+        return devices.frames([args.camera], clock.now_s(), FRAME_TIMEOUT_S)[args.camera]
 
 
 def _utc(monotonic_s: float) -> str:

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from mastctl.conform.checks import Check, Outcome
     from mastctl.conform.head_trial import Angles
     from mastctl.conform.report import Report
+    from mastctl.devices.opening import Bounds
 
 MARKS = {"passed": "ok", "failed": "FAILED", "skipped": "-"}
 
@@ -117,28 +118,27 @@ def _driver(args: argparse.Namespace) -> int:
     checks = chosen(drivers_run.ALL[kind], args.only)
     if args.list:
         return _list(checks, args.json)
-    settings, name, limits, size_px = _device(args, kind)
+    settings, name, bounds, size_px = _device(args, kind)
     if kind == "camera":
         driver = settings.cameras[name].driver
-        with drivers_run.camera_under_test(settings, name, size_px, args.seconds, args.with_head) as camera:
+        with_head = bounds if args.with_head else None
+        with drivers_run.camera_under_test(settings, name, size_px, args.seconds, with_head) as camera:
             return told(args, drivers_run.check_camera(camera, driver, checks, tell_of(args)))
     driver = settings.pan_tilt.driver
     if driver == "replay":
         raise WrongUse("a replayed head stands at recorded pointings only; there is no motion to check")
     motion = _motion(args, checks, f"the head of driver {driver}", driver == "sim")
-    with drivers_run.head_under_test(
-        settings, args.reach, args.speed, limits, args.limits is not None
-    ) as head:
+    own = None if args.limits is None else _limits(args.limits, bounds)
+    with drivers_run.head_under_test(settings, bounds, args.reach, args.speed, own, moves=motion) as head:
         return told(args, drivers_run.check_head(head, driver, checks, motion, tell_of(args)))
 
 
 def _device(
     args: argparse.Namespace, kind: str
-) -> tuple[HardwareSettings, str, tuple[Angles, Angles] | None, tuple[int, int] | None]:
-    """What opens the device, its name, its limits and the size of its pictures, as far as they are known."""
+) -> tuple[HardwareSettings, str, Bounds | None, tuple[int, int] | None]:
+    """What opens the device, its name, what bounds its moves, the size of its pictures; as far as known."""
     from mastctl.conform.drivers_run import device_settings
 
-    limits = None if args.limits is None else _limits(args.limits)
     size_px = None if args.size is None else (int(args.size[0]), int(args.size[1]))
     if args.config is None:
         name = (
@@ -146,32 +146,36 @@ def _device(
             if args.driver == "sim" and args.camera in (None, "camera")
             else args.camera or "camera"
         )
-        return device_settings(args.driver, _options(args.options), kind, name), name, limits, size_px
+        return device_settings(args.driver, _options(args.options), kind, name), name, None, size_px
     from mastctl.cli.camera_choice import with_cameras
     from mastctl.config import load_config
-    from mastctl.service.mast_in_use import read_mast
+    from mastctl.service.mast_in_use import bounds_of
 
     if args.driver is not None or args.options is not None:
         raise WrongUse("--driver and --options do not go with --config, which says them")
     config = load_config(args.config)
+    bounds = bounds_of(config)
     if kind == "head":
-        own = (config.limits.pan_rad, config.limits.tilt_rad)
-        args.speed = min(args.speed, config.limits.speed_rad_per_s)
-        return config.hardware, "", limits or own, None
+        return config.hardware, "", bounds, None
     if args.camera not in config.hardware.cameras:
         known = ", ".join(config.hardware.cameras) or "none"
         raise WrongUse(f"{config.path} has no camera {args.camera}; it has {known}")
-    rig = read_mast(config.mast_file, config).stored.rig
-    size_px = size_px or rig.cameras[args.camera].model.size_px
-    return with_cameras(config, [args.camera]), args.camera, None, size_px
+    assert bounds.stored is not None
+    size_px = size_px or bounds.stored.rig.cameras[args.camera].model.size_px
+    return with_cameras(config, [args.camera]), args.camera, bounds, size_px
 
 
-def _limits(numbers: Sequence[float]) -> tuple[Angles, Angles]:
-    """The ends of both axes. Raises WrongUse."""
+def _limits(numbers: Sequence[float], bounds: Bounds | None) -> tuple[Angles, Angles]:
+    """The driver's own ends of both axes, inside those of its configuration. Raises WrongUse."""
     pan, tilt = (numbers[0], numbers[1]), (numbers[2], numbers[3])
     for low, high in (pan, tilt):
         if low >= high:
             raise WrongUse(f"--limits: {low:g} {high:g} where the lower angle first is expected")
+    if bounds is not None:
+        for axis, ends, most in (("pan", pan, bounds.limits.pan_rad), ("tilt", tilt, bounds.limits.tilt_rad)):
+            if not most[0] <= ends[0] < ends[1] <= most[1]:
+                words = f"{axis} {ends[0]:g} to {ends[1]:g} is not within {most[0]:g} to {most[1]:g}"
+                raise WrongUse(f"--limits: {words}, where the configuration lets it be moved")
     return pan, tilt
 
 

@@ -68,6 +68,7 @@ def _info(args: argparse.Namespace) -> int:
 def _home(args: argparse.Namespace) -> int:
     """Reset a unit, if it is really meant."""
     from drivers.flir_ptu.workshop import home
+    from mastctl.devices.opening import line_held
 
     if not args.sweep_full_range:
         raise WrongUse(
@@ -75,7 +76,9 @@ def _home(args: argparse.Namespace) -> int:
             "clear the mast, then give --sweep-full-range"
         )
     output.tell("homing: both axes sweep their full range, up to half a minute")
-    _show(args, home(args.port, args.baud))
+    with line_held(args.port):
+        found = home(args.port, args.baud)
+    _show(args, found)
     return 0
 
 

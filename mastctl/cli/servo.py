@@ -166,8 +166,9 @@ def _info(args: argparse.Namespace) -> int:
 def _set_id(args: argparse.Namespace) -> int:
     """Change a servo's id and baud rate."""
     from drivers.dynamixel.workshop import set_id
+    from mastctl.devices.opening import line_held
 
-    with _line(args) as link:
+    with line_held(args.port), _line(args) as link:
         set_id(link, args.id, args.new_id, args.new_baud, torque_off=args.torque_off)
         baud = link.baud
     if args.json:
@@ -180,6 +181,7 @@ def _set_id(args: argparse.Namespace) -> int:
 def _test(args: argparse.Namespace) -> int:
     """Turn a servo a little."""
     from drivers.dynamixel.trial import try_out
+    from mastctl.devices.opening import line_held
 
     if args.degrees > FARTHEST_DEG:
         raise WrongUse(f"--degrees is {args.degrees:g}, expected at most {FARTHEST_DEG:g} for a careful test")
@@ -189,7 +191,7 @@ def _test(args: argparse.Namespace) -> int:
         f"servo {args.id} is to turn {args.degrees:g} degrees to each side and back, at most "
         f"{args.torque_percent:g} % of its strength"
     )
-    with _line(args) as link:
+    with line_held(args.port), _line(args) as link:
         trial = try_out(link, args.id, math.radians(args.degrees), args.torque_percent)
     count_deg = math.degrees(trial.count_rad)
     worst = max(abs(step.left_counts) for step in trial.steps)

@@ -69,7 +69,7 @@ def run(args: argparse.Namespace) -> int:
     import numpy as np
 
     from drivers.hardware import DeviceSettings, HardwareSettings
-    from drivers.open_hardware import clock_for
+    from drivers.known import clock_for
     from drivers.sim.pan_tilt import head_settings
     from drivers.sim.wired_head import DEFAULT_HEADS, check_head
     from mastctl.new_rig.folder import boards_about, check_empty, write_built, write_twin

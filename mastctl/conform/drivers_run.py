@@ -10,19 +10,21 @@ from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
 from typing import Any
 
+from drivers.clock import SystemClock
 from drivers.errors import BadOptions, DriverError
 from drivers.faults import PAN_TILT
 from drivers.hardware import DeviceSettings, HardwareSettings
-from drivers.interfaces import Camera, PanTilt
-from drivers.open_hardware import CAMERAS as CAMERA_DRIVERS
-from drivers.open_hardware import HEADS as HEAD_DRIVERS
-from drivers.open_hardware import open_hardware, open_one_camera
+from drivers.interfaces import Camera
+from drivers.known import CAMERAS as CAMERA_DRIVERS
+from drivers.known import HEADS as HEAD_DRIVERS
 from mastctl.conform.cameras import CAMERAS, CameraTrial
 from mastctl.conform.checks import Check, Outcome, PromiseBroken, SubjectLost, run_checks
-from mastctl.conform.head_trial import Angles, HeadTrial
+from mastctl.conform.head_trial import Angles, HeadTrial, at
 from mastctl.conform.heads import HEADS
 from mastctl.conform.report import Report
 from mastctl.conform.worker import beside
+from mastctl.devices.limits import Limits
+from mastctl.devices.opening import Bounds, head_beside, open_one_camera
 
 log = logging.getLogger(__name__)
 
@@ -30,6 +32,8 @@ COUNTS = {"dynamixel": 3, "flir_ptu": 1}
 """How many counts from its goal a head of this repository may stand when it calls itself settled."""
 
 STOPS_WITHIN_S = 3.0
+ANYWHERE: tuple[Angles, Angles] = ((-math.pi, math.pi), (-math.pi / 2, math.pi / 2))
+"""Where a head may be moved of which nothing is known."""
 
 
 def kind_of(driver: str) -> str:
@@ -57,47 +61,61 @@ def device_settings(driver: str, options: Mapping[str, Any], kind: str, name: st
 
 @contextmanager
 def head_under_test(
-    settings: HardwareSettings, reach_rad: float, speed_rad_per_s: float,
-    limits_rad: tuple[Angles, Angles] | None, own_limits: bool,
+    settings: HardwareSettings, bounds: Bounds | None, reach_rad: float, speed_rad_per_s: float,
+    own_limits_rad: tuple[Angles, Angles] | None, *, moves: bool,
 ) -> Iterator[HeadTrial]:  # fmt: skip
-    """Open a head; leaving stops and closes it.
+    """Open a head through the door (`mastctl.devices.opening`); leaving stops and closes it.
 
     Parameters
     ----------
     settings
         What opens it.
+    bounds
+        Of its configuration; None: it has none.
     reach_rad, speed_rad_per_s
         How far from where it stands it may be moved (infinite: over all of the limits), and how fast.
-    limits_rad
-        The ends that it may not pass; None: not known.
-    own_limits
-        Whether these are the driver's own: it is sent to them, and a hair beyond, which it has to refuse.
+    own_limits_rad
+        The driver's own ends, where they are known: it is sent to them, and a hair beyond, which it has to
+        refuse.
+    moves
+        Whether it is to be moved at all.
+
+    Raises
+    ------
+    Estopped, StateInUse, DriverError
+        As `mastctl.devices.opening.devices_beside`.
     """
-    count_rad = count_of(settings.pan_tilt)
-    with ExitStack() as stack:
-
-        def opened() -> PanTilt:
-            head: PanTilt = stack.enter_context(open_hardware(replace(settings, cameras={}))).pan_tilt
-            return head
-
+    ends = own_limits_rad or ANYWHERE
+    if bounds is None:
+        bounds = Bounds(Limits(*ends, speed_rad_per_s))
+    elif own_limits_rad is None:
+        ends = bounds.limits.pan_rad, bounds.limits.tilt_rad
+    known = own_limits_rad is not None or bounds.stored is not None
+    with head_beside(settings, bounds, SystemClock(), moves=moves) as opened:
+        count_rad = count_of(settings.pan_tilt)
+        head = opened()
         trial = HeadTrial(
-            opened(), ((0.0, 0.0), (0.0, 0.0)), speed_rad_per_s,
-            limits_rad=limits_rad if own_limits or math.isinf(reach_rad) else None, own_limits=own_limits,
+            head, ((0.0, 0.0), (0.0, 0.0)), min(speed_rad_per_s, bounds.limits.speed_rad_per_s),
+            limits_rad=ends if own_limits_rad is not None or (known and math.isinf(reach_rad)) else None,
+            own_limits=own_limits_rad is not None,
             count_rad=count_rad, open_again=None if settings.pan_tilt.driver == "sim" else opened,
         )  # fmt: skip
         if count_rad is not None:
             trial.settle_rad = COUNTS[settings.pan_tilt.driver] * count_rad
         try:
-            ends = limits_rad or ((-math.pi, math.pi), (-math.pi / 2, math.pi / 2))
             try:
                 first = trial.read()
             except (PromiseBroken, SubjectLost, DriverError) as reason:  # the checks have to tell of it
-                trial.unplaced = str(reason)
+                trial.unplaced = f"nobody knows from where: {reason}"
             else:
-                trial.box_rad = (
-                    box(first.pan_rad, ends[0], reach_rad),
-                    box(first.tilt_rad, ends[1], reach_rad),
-                )
+                room = head.door.room(at(first))
+                if room is None:
+                    trial.unplaced = "it stands in a keep-out, or too near to one"
+                else:
+                    trial.box_rad = (
+                        box(first.pan_rad, room.pan_rad, reach_rad),
+                        box(first.tilt_rad, room.tilt_rad, reach_rad),
+                    )
             yield trial
         finally:
             trial.worker.close()
@@ -113,12 +131,19 @@ def box(at_rad: float, ends_rad: Angles, reach_rad: float) -> Angles:
 
 @contextmanager
 def camera_under_test(
-    settings: HardwareSettings, name: str, size_px: tuple[int, int] | None, seconds: float, with_head: bool
+    settings: HardwareSettings,
+    name: str,
+    size_px: tuple[int, int] | None,
+    seconds: float,
+    with_head: Bounds | None,
 ) -> Iterator[CameraTrial]:
-    """Open a camera, after the head if it is one of a simulator that looks from it; leaving closes it."""
+    """Open a camera, after the head if it is one of a simulator that looks from it; leaving closes it.
+
+    ``with_head`` bounds that head, which is not moved; None: it is not opened.
+    """
     with ExitStack() as stack:
-        if with_head:
-            stack.enter_context(open_hardware(replace(settings, cameras={})))
+        if with_head is not None:
+            stack.enter_context(head_beside(settings, with_head, SystemClock(), moves=False))()
 
         def opened() -> Camera:
             return stack.enter_context(open_one_camera(settings, name))

@@ -13,6 +13,7 @@ from drivers.interfaces import PanTilt, Reading
 from mastctl.conform.checks import NotTried, SubjectLost, expect
 from mastctl.conform.worker import Worker
 from mastctl.devices.frames import CLOCK_TOLERANCE_S
+from mastctl.devices.opening import GuardedHead
 
 Angles = tuple[float, float]
 LONGER = "a larger --reach or a lower --speed"
@@ -49,7 +50,7 @@ class HeadTrial:
     closed
         Whether it was closed for good.
     unplaced
-        Why nobody knows where it stands, and so where it may be moved; empty where that is known.
+        Why nobody knows where it may be moved; empty where that is known.
     clock
         What the head stamps its readings by, and what the checks wait on.
     """
@@ -76,7 +77,7 @@ class HeadTrial:
     def goal(self, pan_part: float, tilt_part: float) -> Angles:
         """Return angles in the box; parts from -1 (its lower end) to 1. Raises SubjectLost without a box."""
         if self.unplaced:
-            raise SubjectLost(f"the head is not moved, nobody knows from where: {self.unplaced}")
+            raise SubjectLost(f"the head is not moved: {self.unplaced}")
         (a, b), (c, d) = self.box_rad
         return a + (pan_part + 1) / 2 * (b - a), c + (tilt_part + 1) / 2 * (d - c)
 
@@ -91,6 +92,11 @@ class HeadTrial:
         """Send the head to a goal."""
         speed = self.speed_rad_per_s if speed_rad_per_s is None else speed_rad_per_s
         self.worker.call("move()", lambda: self.head.move(goal[0], goal[1], speed))
+
+    def try_refusal(self, goal: Angles, speed_rad_per_s: float) -> None:
+        """Send what the driver has to refuse."""
+        ask = self.head.try_refusal if isinstance(self.head, GuardedHead) else self.head.move
+        self.worker.call("move()", lambda: ask(goal[0], goal[1], speed_rad_per_s))
 
     def stop(self) -> None:
         """Stop, in the head's own thread."""

@@ -295,7 +295,7 @@ def _refused(trial: HeadTrial, goal: Angles, speed_rad_per_s: float, words: str)
     before = trial.settled()
     what = f"move({goal[0]!r}, {goal[1]!r}, {speed_rad_per_s!r})"
     try:
-        trial.move(goal, speed_rad_per_s)
+        trial.try_refusal(goal, speed_rad_per_s)
     except DriverError as error:
         expect("\n" not in str(error), f"{what}: {str(error)!r} is not one sentence")
     else:

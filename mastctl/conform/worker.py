@@ -10,7 +10,9 @@ from typing import TypeVar
 
 from drivers.clock import Clock, SystemClock
 from drivers.errors import DriverError
-from mastctl.conform.checks import PromiseBroken, SubjectLost
+from mastctl.conform.checks import NotTried, PromiseBroken, SubjectLost
+from mastctl.devices.keep_out import KeptOut
+from mastctl.devices.limits import OutsideLimits
 
 T = TypeVar("T")
 
@@ -53,8 +55,10 @@ def ended(what: str, future: Future[T], patience_s: float = PATIENCE_S) -> T:
     ------
     DriverError
         What the driver raised.
+    NotTried
+        If the door let a move not out.
     PromiseBroken
-        If that was anything else.
+        If anything else was raised.
     SubjectLost
         If the call does not come back.
     """
@@ -62,6 +66,8 @@ def ended(what: str, future: Future[T], patience_s: float = PATIENCE_S) -> T:
         return future.result(patience_s)
     except DriverError:
         raise
+    except (KeptOut, OutsideLimits) as error:
+        raise NotTried(f"{what} was not sent: {error}") from None
     except TimeoutError:
         if future.done():
             raise PromiseBroken(f"{what} raised TimeoutError where a DriverError is expected") from None

@@ -175,6 +175,16 @@ class Door:
             return Way((goal,), duration_s(here, (goal,), speed))
         return plan(keep_outs, here, goal, speed)
 
+    def room(self, here: Pair) -> Span | None:
+        """Return a wide free rectangle within the limits about a place; None for one that is kept out.
+
+        A place beyond the limits counts as on them.
+        """
+        limits, keep_outs = self.limits, self._now()
+        within = Span(limits.pan_rad, limits.tilt_rad)
+        on = _into(here[0], limits.pan_rad), _into(here[1], limits.tilt_rad)
+        return within if keep_outs is None else keep_outs.room(on, within)
+
     def check_move(self, goal: Pair, read: Callable[[], Reading]) -> Span | None:
         """Pass a move that may go out now; return where it begins, as `sent` takes it.
 

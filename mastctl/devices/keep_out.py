@@ -78,6 +78,11 @@ class Span:
         )
         return Span(pan, tilt) if pan[0] <= pan[1] and tilt[0] <= tilt[1] else None
 
+    @property
+    def area(self) -> float:
+        """Pan times tilt, rad²."""
+        return (self.pan_rad[1] - self.pan_rad[0]) * (self.tilt_rad[1] - self.tilt_rad[0])
+
     def gap(self, other: Span) -> float:
         """Return how far apart two are: the larger of pan's and tilt's distance, negative if they overlap."""
         pairs = (self.pan_rad, other.pan_rad), (self.tilt_rad, other.tilt_rad)
@@ -163,6 +168,31 @@ class KeepOuts:
             if point.enters(full):
                 where = "in" if point.enters(box.span) else "too near to"
                 raise KeptOut(box.name, f"{_told(goal)} is {where} the {box.told()}{self._slack_told()}")
+
+    def room(self, here: Pair, most: Span) -> Span | None:
+        """Return a wide part of ``most`` around a place in it that no keep-out reaches into, or None.
+
+        Each keep-out takes the side away that leaves the most; one that holds the place leaves nothing.
+        """
+        for full in self.full:
+            if not most.enters(full):
+                continue
+            (pan, tilt), (low, high) = here, most.corners
+            sides = [
+                Span.around((max(low[0], full.pan_rad[1]), low[1]), high),
+                Span.around(low, (min(high[0], full.pan_rad[0]), high[1])),
+                Span.around((low[0], max(low[1], full.tilt_rad[1])), high),
+                Span.around(low, (high[0], min(high[1], full.tilt_rad[0]))),
+            ]
+            keeps = (
+                full.pan_rad[1] <= pan, full.pan_rad[0] >= pan,
+                full.tilt_rad[1] <= tilt, full.tilt_rad[0] >= tilt,
+            )  # fmt: skip
+            left = [side for side, kept in zip(sides, keeps, strict=True) if kept]
+            if not left:
+                return None
+            most = max(left, key=lambda span: span.grown(TOUCH_RAD, TOUCH_RAD).area)
+        return most
 
     def near(self, start: Span) -> tuple[Span, ...]:
         """Return every box with as much of its margin as a start leaves: nearer than it is, nothing goes."""

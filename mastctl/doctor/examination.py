@@ -9,7 +9,7 @@ from typing import Any
 
 from calib.errors import BadFile
 from drivers.errors import BadOptions
-from drivers.open_hardware import CAMERAS, HEADS, clock_for
+from drivers.known import CAMERAS, HEADS, clock_for
 from mastctl.config import Config, load_config
 from mastctl.doctor.cameras import examine_camera
 from mastctl.doctor.findings import Finding, Level, Machine

@@ -76,12 +76,12 @@ class Latch:
         self, folder: StateFolder, state: StateFolder | None = None, others: Sequence[Path] = ()
     ) -> None:
         self.folder = self._folder = folder
-        self._file = StateFile(folder.path / FILE, SCHEMA, ROOM_BYTES, 0o644)
+        self._file = _file_in(folder.path)
         self._marks = [StateFile(folder.path / USED, USED_SCHEMA)]
         if state is not None:
             self._marks.append(StateFile(state.path / USED, USED_SCHEMA))
             others = (*others, state.path)
-        self._others = [StateFile(other / FILE, SCHEMA, ROOM_BYTES, 0o644) for other in others]
+        self._others = [_file_in(other) for other in others]
         self._changed = threading.Condition()
         self._disk = threading.Lock()  # for who writes; a disk that hangs holds nobody else
         self.entries: tuple[Latched, ...] = ()
@@ -93,7 +93,7 @@ class Latch:
         self._ended = False
         found = _entries(self._file)
         if found is None:
-            self.entries = self._gone()
+            self.entries = _gone(self._file, self._marks)
         else:
             self.entries = self._kept = found
         for file in self._others:
@@ -278,23 +278,8 @@ class Latch:
             return
         for mark in self._marks:
             with contextlib.suppress(BadFile):
-                if not self._names_it(mark):
+                if not _names(mark, self._file):
                     mark.write({"latch": str(self._file.path)})
-
-    def _names_it(self, mark: StateFile) -> bool:
-        """Whether a mark says that this latch file was there; one that cannot be read says so too."""
-        try:
-            told = mark.read()
-        except BadFile:
-            return True
-        return told is not None and told.get("latch") == str(self._file.path)
-
-    def _gone(self) -> tuple[Latched, ...]:
-        """What holds where there is no latch file: nothing, unless there was one."""
-        if not any(self._names_it(mark) for mark in self._marks):
-            return ()
-        words = f"whether one was latched is not known, since {self._file.path} is gone"
-        return (Latched("mastctl", one_line(words, LONGEST), _now()),)
 
     def _write_held(self, held: tuple[Latched, ...]) -> None:
         """Have them on the disk. Raises BadFile."""
@@ -325,6 +310,39 @@ class Latch:
             self._changed.notify_all()
             if problem and self._ended:
                 self._kept = held  # nothing more can be done
+
+
+def latched_at(folder: Path | None, others: Sequence[Path]) -> tuple[Latched, ...]:
+    """Return the stops that are latched in a head's place, and in folders beside it, for who only asks."""
+    entries: tuple[Latched, ...] = ()
+    if folder is not None:
+        file = _file_in(folder)
+        found = _entries(file)
+        entries = _gone(file, [StateFile(folder / USED, USED_SCHEMA)]) if found is None else found
+    for other in others:
+        entries = _merged(entries, _entries(_file_in(other)) or ())
+    return entries
+
+
+def _file_in(folder: Path) -> StateFile:
+    return StateFile(folder / FILE, SCHEMA, ROOM_BYTES, 0o644)
+
+
+def _names(mark: StateFile, file: StateFile) -> bool:
+    """Whether a mark says that a latch file was there; one that cannot be read says so too."""
+    try:
+        told = mark.read()
+    except BadFile:
+        return True
+    return told is not None and told.get("latch") == str(file.path)
+
+
+def _gone(file: StateFile, marks: Sequence[StateFile]) -> tuple[Latched, ...]:
+    """What holds where there is no latch file: nothing, unless there was one."""
+    if not any(_names(mark, file) for mark in marks):
+        return ()
+    words = f"whether one was latched is not known, since {file.path} is gone"
+    return (Latched("mastctl", one_line(words, LONGEST), _now()),)
 
 
 def _entries(file: StateFile) -> tuple[Latched, ...] | None:

@@ -15,6 +15,7 @@ from calib.files.yaml_text import MAX_BYTES
 from calib.mast.covariance import stored_covariance
 from calib.mast.rig import Rig
 from mastctl.config import Config, check_cameras
+from mastctl.devices.opening import Bounds
 from mastctl.errors import BadRequest
 
 log = logging.getLogger(__name__)
@@ -122,3 +123,8 @@ def _check_camera(camera: str, stored: StoredRig, now: StoredRig) -> None:
     if new.model.size_px != old.model.size_px:
         sizes = ["x".join(map(str, entry.model.size_px)) for entry in (new, old)]
         raise BadMastFile(f"{stored.path.name} has {camera} with {sizes[0]} px where it takes {sizes[1]} px")
+
+
+def bounds_of(config: Config) -> Bounds:
+    """Return what bounds the moves of a configuration's head. Raises BadFile, as `read_mast`."""
+    return Bounds(config.limits, read_mast(config.mast_file, config).stored, config.sun)

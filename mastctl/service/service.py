@@ -16,8 +16,8 @@ from typing import Any
 from calib.files.mast_file import StoredRig
 from calib.handoff.matched import MatchedHandoff
 from drivers.clock import Clock, SystemClock
-from drivers.hardware import Hardware, says_simulated
-from drivers.open_hardware import clock_for, head_name, open_hardware
+from drivers.hardware import Hardware
+from drivers.known import clock_for, head_name
 from mastctl.commands.audit import AuditLog
 from mastctl.commands.entry import Entry
 from mastctl.commands.idempotency import Answers
@@ -25,6 +25,7 @@ from mastctl.commands.lease import Control, Leases
 from mastctl.config import Config
 from mastctl.devices.devices import Devices
 from mastctl.devices.frames import StampedFrame, check_known
+from mastctl.devices.opening import open_rig
 from mastctl.errors import MastctlError
 from mastctl.guided.guide import Guide
 from mastctl.guided.reports import Reports
@@ -259,14 +260,10 @@ class Service:
         if config.live is not None:
             check_installed()
         with contextlib.ExitStack() as undo:
-            head = heads.of_settings(config.hardware)  # before the head is touched
+            hardware, head = open_rig(config.hardware, clock)
             if head is not None:
                 undo.callback(head.close)
-            hardware = open_hardware(config.hardware, clock)
             undo.callback(hardware.close)
-            if head is not None and says_simulated(hardware.pan_tilt):  # then it is as good as in memory
-                head.close()
-                head = None
             kept = folder or StateFolder.temporary()
             if folder is None:
                 undo.callback(kept.close)

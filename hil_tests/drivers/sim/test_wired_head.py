@@ -16,7 +16,8 @@ from drivers.errors import BadOptions, DriverError
 from drivers.faults import PAN_TILT
 from drivers.hardware import DeviceSettings, HardwareSettings
 from drivers.interfaces import Reading
-from drivers.open_hardware import clock_for, open_hardware
+from drivers.known import clock_for
+from drivers.open_hardware import open_hardware
 from drivers.sim.render import Renderer
 from drivers.sim.rover import SimulatedRover
 from drivers.sim.scene import Scene

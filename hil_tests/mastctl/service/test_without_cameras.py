@@ -15,7 +15,6 @@ from hil_tests.waiting import until
 from mastctl.cli.main import main
 from mastctl.config import load_config
 from mastctl.daemon import RunningDaemon
-from mastctl.service import service as service_module
 
 BARE_MAST = """
 schema: mastctl/mast/1
@@ -46,7 +45,7 @@ def started(
     else:
         save_rig(rig(), folder / "little.yaml")
     (folder / "daemon.yaml").write_text(CONFIG.format(cameras=cameras))
-    monkeypatch.setattr(service_module, "open_hardware", lambda settings, clock: hardware)
+    monkeypatch.setattr("mastctl.devices.opening.open_hardware", lambda settings, clock: hardware)
     return RunningDaemon(load_config(folder / "daemon.yaml"))
 
 

@@ -1,0 +1,245 @@
+"""The one way to open a head: nothing else in this program does (held by the import contracts).
+
+Whoever opens one holds its place (`mastctl.safety.heads`), so that no other program drives it; knows its
+latch; and moves it within limits, around keep-outs and off the sun, as `mastctl.devices.door` judges.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import threading
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, replace
+from types import SimpleNamespace
+
+from calib.files.mast_file import StoredRig
+from drivers.clock import Clock
+from drivers.hardware import Hardware, HardwareSettings, says_simulated
+from drivers.interfaces import Camera, PanTilt, Reading
+from drivers.known import head_name
+from drivers.open_hardware import open_hardware
+from drivers.open_hardware import open_one_camera as open_one_camera
+from drivers.serial_line import stable_name
+from mastctl.devices.devices import HEAD, Devices
+from mastctl.devices.door import Door
+from mastctl.devices.limits import Limits
+from mastctl.devices.sun import Sun
+from mastctl.errors import Stopped
+from mastctl.safety import heads
+from mastctl.safety.latch import Estopped, latched_at
+from mastctl.safety.state_folder import StateFolder
+from mastctl.state.standing import latched_sentence
+
+STILL = "this program moves no head"
+
+
+@dataclass(frozen=True)
+class Bounds:
+    """What bounds the moves of a head that is opened beside a daemon.
+
+    Attributes
+    ----------
+    limits
+        Soft limits and keep-outs.
+    stored
+        The mast file, whose cameras the sun is judged by; None: there is none.
+    sun
+        The direction that is kept out of the cameras' sight.
+    """
+
+    limits: Limits
+    stored: StoredRig | None = None
+    sun: Sun | None = None
+
+
+def open_rig(settings: HardwareSettings, clock: Clock) -> tuple[Hardware, StateFolder | None]:
+    """Take the place of the head, then open all devices; return both, to be closed by the caller.
+
+    The place is None for a head in memory, and for one that says it is simulated: it is as good as in memory.
+
+    Raises
+    ------
+    StateInUse
+        If another program drives the head; nothing was opened.
+    DriverError
+        As `drivers.open_hardware.open_hardware`.
+    """
+    with ExitStack() as undo:
+        place = heads.of_settings(settings)
+        if place is not None:
+            undo.callback(place.close)
+        hardware = open_hardware(settings, clock)
+        if place is None or not says_simulated(hardware.pan_tilt):
+            undo.pop_all()
+            return hardware, place
+    return hardware, None
+
+
+@contextmanager
+def devices_beside(
+    settings: HardwareSettings, bounds: Bounds, clock: Clock, *, moves: bool, own_cameras: bool = False
+) -> Iterator[tuple[Devices, Mapping[str, Camera]]]:
+    """Open a rig for a program beside the daemon; leaving stops and closes it.
+
+    Parameters
+    ----------
+    settings, bounds, clock
+        The rig, with its mast file, and what bounds its moves.
+    moves
+        Whether the head is to be moved; if not, no move is let out.
+    own_cameras
+        Whether the caller asks the cameras itself; `Devices` has none then.
+
+    Yields
+    ------
+    Devices, Mapping of str to Camera
+        The head's moves pass the first; the cameras are in both, or in the second alone.
+
+    Raises
+    ------
+    Estopped
+        If the head is to be moved and its emergency stop is latched; nothing was opened.
+    StateInUse
+        If another program drives the head; nothing was opened.
+    DriverError
+        As `drivers.open_hardware.open_hardware`.
+    """
+    stored = bounds.stored
+    assert stored is not None
+    with _alone(settings, moves), open_hardware(settings, clock) as hardware:
+        mine = SimpleNamespace(pan_tilt=hardware.pan_tilt, cameras={}) if own_cameras else hardware
+        devices = Devices(mine, bounds.limits, stored.digest, clock, stored.rig, sun=bounds.sun)
+        if not moves:
+            devices.block_moves(STILL, STILL)
+        try:
+            yield devices, hardware.cameras
+        finally:
+            devices.close()
+
+
+@contextmanager
+def head_beside(
+    settings: HardwareSettings, bounds: Bounds, clock: Clock, *, moves: bool
+) -> Iterator[Callable[[], GuardedHead]]:
+    """Hold a head's place for a test of its driver; yields what opens the head, as often as it is called.
+
+    Parameters and errors are those of `devices_beside`; no camera is opened. Leaving closes what was opened.
+    """
+    with _alone(settings, moves), ExitStack() as stack:
+
+        def opened() -> GuardedHead:
+            head = stack.enter_context(open_hardware(replace(settings, cameras={}), clock)).pan_tilt
+            rig = None if bounds.stored is None else bounds.stored.rig
+            return GuardedHead(head, Door(bounds.limits, head, clock, HEAD, rig, bounds.sun), moves)
+
+        yield opened
+
+
+@contextmanager
+def line_held(port: str) -> Iterator[None]:
+    """Hold the place of the head at a line, for a program that moves what is on it without a configuration.
+
+    Limits and keep-outs are not known there. Raises Estopped, StateInUse.
+    """
+    with _held(stable_name(port), moves=True):
+        yield
+
+
+class GuardedHead:
+    """A head whose every move is judged by the door before it goes out; safe as far as the driver is.
+
+    Attributes
+    ----------
+    door
+        What judges.
+    """
+
+    def __init__(self, head: PanTilt, door: Door, moves: bool) -> None:
+        self._head = head
+        self.door = door
+        self._moves = moves
+        self._moving = threading.Lock()  # what was judged goes out before the next is judged
+
+    def read(self) -> Reading:
+        """As the driver."""
+        return self._head.read()
+
+    def move(self, pan_rad: float, tilt_rad: float, speed_rad_per_s: float | None = None) -> None:
+        """Start the head towards a goal.
+
+        Raises
+        ------
+        OutsideLimits, KeptOut
+            If goal or speed may not be commanded, or the head might pass a keep-out; nothing was sent.
+        Stopped
+            If this program moves no head.
+        DriverError
+            From the driver.
+        """
+        goal = pan_rad, tilt_rad
+        self.door.limits.check(*goal)
+        speed = self.door.limits.speed(speed_rad_per_s)
+        with self._moving:
+            self._judged(goal, speed)
+            self._head.move(*goal, speed)
+
+    def try_refusal(self, pan_rad: float, tilt_rad: float, speed_rad_per_s: float) -> None:
+        """Send what the driver has to refuse: angles or a speed that cannot be.
+
+        What is judged is where a driver that takes it could go: to the limits, or nowhere for what is no
+        number. Raises as `move`.
+        """
+        limits, here = self.door.limits, self._head.read()
+        pan, tilt = (
+            at if math.isnan(asked) else min(max(asked, low), high)
+            for asked, at, (low, high) in (
+                (pan_rad, here.pan_rad, limits.pan_rad),
+                (tilt_rad, here.tilt_rad, limits.tilt_rad),
+            )
+        )
+        with self._moving:
+            self._judged((pan, tilt), limits.speed_rad_per_s)
+            self._head.move(pan_rad, tilt_rad, speed_rad_per_s)
+
+    def stop(self) -> None:
+        """As the driver; never waits for a move."""
+        self._head.stop()
+
+    def close(self) -> None:
+        """As the driver."""
+        self._head.close()
+
+    def _judged(self, goal: tuple[float, float], speed_rad_per_s: float) -> None:
+        if not self._moves:
+            raise Stopped(STILL)
+        start = self.door.check_move(goal, self._head.read)
+        self.door.sent(start, goal, speed_rad_per_s)
+
+
+@contextmanager
+def _alone(settings: HardwareSettings, moves: bool) -> Iterator[None]:
+    """Hold the head's place; who moves it finds no stop latched."""
+    name = head_name(settings)
+    with contextlib.nullcontext() if name is None else _held(name, moves):  # in memory it is nobody else's
+        yield
+
+
+@contextmanager
+def _held(name: str, moves: bool) -> Iterator[None]:
+    place = heads.take(name)
+    try:
+        if moves:
+            _check_latch(name, place)
+        yield
+    finally:
+        if place is not None:
+            place.close()
+
+
+def _check_latch(name: str, place: StateFolder | None) -> None:
+    """Pass a head whose emergency stop is not latched. Raises Estopped."""
+    entries = latched_at(None if place is None else place.path, heads.others(name, place))
+    if entries:
+        raise Estopped(f"{latched_sentence(entries)} at the head's daemon; until then nothing moves the head")
