@@ -46,6 +46,7 @@ ANSWER_S = 5.0
 CLOSE_S = 3.0
 SMALL_BYTES = 1000
 WAIT_S = 0.25
+ANOTHER_RUN = "another run begins"
 
 
 @dataclass(frozen=True)
@@ -230,7 +231,7 @@ class Recorder:
         NotNow
             ``not_recording``.
         Unable
-            ``slow`` if the disk does not answer in time.
+            ``run_gone`` if its file is there no longer; ``slow`` if the disk does not answer in time.
         """
         return self._asked(self._stop_run)
 
@@ -380,7 +381,7 @@ class Recorder:
         if now.keep_at_s is not None and (now_s >= now.keep_at_s or self._closing):
             self._keep()
         file = now.file
-        if file is None:
+        if file is None or self._gone(file):
             return
         file.flush_if_due(now_s)
         if file.size == now.judged_bytes or self._room_is_low():
@@ -390,12 +391,24 @@ class Recorder:
             if file.size > self.settings.run_mb * MB:
                 name, mb = now.run, self.settings.run_mb
                 self._end_file()
-                self._stands("run_full", f"the run {name} has ended: it has {mb:g} MB", "another run begins")
+                self._stands("run_full", f"the run {name} has ended: it has {mb:g} MB", ANOTHER_RUN)
         elif (
             now_s - now.begun_s > self._ring_s / SEGMENTS or file.size > self.settings.ring_mb * MB / SEGMENTS
         ):
             self._end_file(wait=False)
             self._shelf.trim_ring(self._ring_s, self.settings.ring_mb)
+
+    def _gone(self, file: RecordFile) -> bool:
+        """End a file that somebody took away, so that it is not written on where nobody finds it."""
+        if file.in_place:
+            return False
+        run, how = self._now.run, f"its file {file.path} was deleted or moved while it was recorded"
+        self._end_file(wait=False)
+        if run is None:
+            log.warning("another segment of the ring begins: %s", how)
+        else:
+            self._stands("run_gone", f"the run {run} has ended: {how}", ANOTHER_RUN)
+        return True
 
     def _room_is_low(self) -> bool:
         """End the recording before the disk is full, the ring's oldest first; whether it was ended."""
@@ -443,7 +456,8 @@ class Recorder:
         facts = self._facts | ({} if run is None else {"run": run})
         self._now.file = RecordFile(path(), [self._mast.file, *self._others], facts, clocks)
         self._now.begun_s, self._now.run = time.monotonic(), run
-        self._now.words = None
+        if run is not None or (self._now.words is not None and self._now.words.until != ANOTHER_RUN):
+            self._now.words = None
         self._entries.begin(self._now.file, self._clock.now_s(), time.monotonic())
         return True
 
@@ -469,6 +483,9 @@ class Recorder:
         file, run = self._now.file, self._now.run
         if file is None or run is None:
             raise NotNow("not_recording", "no run is recorded; 'record start' begins one")
+        if self._gone(file):
+            assert self._now.words is not None
+            raise Unable("run_gone", self._now.words.message)
         self._end_file()
         log.info("run %s has ended", run)
         lost = {"dropped": self._dropped_so_far()}

@@ -127,6 +127,14 @@ class RecordFile:
         """`size` in 10⁶ bytes; asked from any thread."""
         return self._size / 1e6
 
+    @property
+    def in_place(self) -> bool:
+        """Whether it is still what its path names: nobody deleted or moved it. Asks the disk."""
+        try:
+            return os.path.samestat(self.path.stat(), os.fstat(self._file.fileno()))
+        except (FileNotFoundError, NotADirectoryError):
+            return False
+
     def add_json(self, topic: str, kind: str, told: Mapping[str, Any], time_s: float, now_s: float) -> None:
         """Add one JSON message; ``kind`` names its schema. ``now_s`` is the flush's clock."""
         data = json.dumps(told, allow_nan=False, separators=(",", ":")).encode()

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import errno
 import os
+import shutil
 import threading
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -292,6 +294,88 @@ def test_a_run_ends_at_its_size_and_says_so(tmp_path: Path) -> None:
         assert number < 200
     until(lambda: one.faults(), "it says so")
     assert one.faults()[0].code == "run_full"
+    one.close()
+
+
+def deleted(path: Path) -> None:
+    path.unlink()
+
+
+def moved(path: Path) -> None:
+    path.rename(path.parent.parent / "elsewhere.mcap")
+
+
+def replaced(path: Path) -> None:
+    path.unlink()
+    path.write_bytes(b"another's")
+
+
+def with_its_folder(path: Path) -> None:
+    shutil.rmtree(path.parent.parent)
+
+
+@pytest.mark.parametrize("goes", [deleted, moved, replaced, with_its_folder])
+@pytest.mark.parametrize("ring_s", [0.0, 600.0])
+def test_a_run_whose_file_goes_while_it_is_recorded_is_a_fault_until_the_next_one(
+    tmp_path: Path, goes: Callable[[Path], None], ring_s: float
+) -> None:
+    one = recorder(tmp_path / "recordings", ring_s=ring_s)
+    run = one.start_run("rock")["run"]
+    (path,) = files(tmp_path)
+    one.tell("command", "1", {"number": 1})
+    until(lambda: one.told()["size_mb"] and not one._queue, "it is written")
+    goes(path)
+    until(lambda: one.faults(), "it says so")
+    one.tell("command", "2", {"number": 2})
+    until(lambda: not one._queue and one.told()["recording"] is (ring_s > 0.0), "the ring goes on")
+    (fault,) = one.faults()
+    words = f"the run {run} has ended: its file {path} was deleted or moved while it was recorded"
+    assert (fault.code, fault.message, fault.until) == ("run_gone", words, "another run begins")
+    assert one.told()["fault"] == words and one.told()["run"] is None
+    with pytest.raises(NotNow, match="no run is recorded"):
+        one.stop_run()
+    one.start_run("again")
+    assert one.faults() == ()
+    one.stop_run()
+    one.close()
+    if goes is moved:
+        assert [n["number"] for n in told(tmp_path / "recordings" / "elsewhere.mcap", "/command")] == [1]
+
+
+def test_a_run_whose_file_went_is_no_recording_that_can_be_ended(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    one = recorder(tmp_path)
+    run = one.start_run("rock")["run"]
+    monkeypatch.setattr(module.Recorder, "_look_after", lambda self: None)
+    next(path for path in files(tmp_path) if run in path.name).unlink()
+    with pytest.raises(Unable, match=f"the run {run} has ended: its file .* was deleted or moved") as gone:
+        one.stop_run()
+    assert gone.value.code == "run_gone" and one.faults()[0].code == "run_gone"
+    one.close()
+
+
+def test_a_segment_of_the_ring_that_goes_is_followed_by_the_next_at_once(tmp_path: Path) -> None:
+    one = recorder(tmp_path)
+    one.tell("command", "1", {"number": 1})
+    until(lambda: files(tmp_path), "its first segment")
+    (path,) = files(tmp_path)
+    path.unlink()
+    until(lambda: not one.told()["recording"], "it is seen")
+    one.tell("command", "2", {"number": 2})
+    one.close()
+    assert one.faults() == ()
+    assert [n["number"] for n in told(files(tmp_path)[-1], "/command")] == [2]
+
+
+def test_a_run_that_ended_at_its_size_is_told_though_the_ring_goes_on(tmp_path: Path) -> None:
+    one = recorder(tmp_path, run_mb=0.1)
+    one.start_run("full")
+    one.tell("frame", "navcam_left", frame(1, picture(1, (300, 1000))))
+    until(lambda: one.faults(), "it says so")
+    one.tell("command", "1", {"number": 1})
+    until(lambda: one.told()["recording"] and not one._queue, "the ring goes on")
+    assert [fault.code for fault in one.faults()] == ["run_full"]
     one.close()
 
 
