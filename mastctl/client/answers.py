@@ -222,6 +222,7 @@ class CommandTold(TypedDict):
     who: str
     role: Literal["view", "operate", "admin"]
     via: str
+    address: NotRequired[str | None]
     request: NotRequired[dict[str, Any] | None]
     lease: NotRequired[str | None]
     again: NotRequired[bool]

@@ -19,6 +19,7 @@ from typing import Any
 
 from drivers.clock import Clock, SystemClock
 from mastctl.as_json import writable
+from mastctl.errors import one_line
 from mastctl.state.faults import StandingFault
 
 log = logging.getLogger(__name__)
@@ -27,6 +28,8 @@ DEVICE = "audit_log"
 WAITING = 1000  # lines that wait for the disk
 FILE_BYTES = 4 << 20
 FILES = 8  # 32 MiB: some 100,000 commands
+STRANGERS = "strangers_log"
+STRANGERS_FILES = 2
 LONGEST_LINE_BYTES = 16384
 SYNC_S = 1.0  # what a power cut may take
 
@@ -42,12 +45,20 @@ class AuditLog:
         Stamps the fault.
     file_bytes, files
         When a new file begins, and how many are kept with it.
+    device
+        Under what name its fault is told.
     """
 
     def __init__(
-        self, path: Path | None, clock: Clock | None = None, file_bytes: int = FILE_BYTES, files: int = FILES
+        self,
+        path: Path | None,
+        clock: Clock | None = None,
+        file_bytes: int = FILE_BYTES,
+        files: int = FILES,
+        device: str = DEVICE,
     ) -> None:
         self._path = path
+        self._device = device
         self._clock = clock or SystemClock()
         self._file_bytes = file_bytes
         self._files = files
@@ -113,12 +124,13 @@ class AuditLog:
                 self._write(entry)
 
     def _write(self, record: Mapping[str, Any]) -> None:
-        lost, line = self._lost, _line(record)
-        if lost:
-            line = _line({"time": datetime.now(UTC).isoformat(), "lost": lost}) + line
+        lost = self._lost
         try:
+            line = _line(record)
+            if lost:
+                line = _line({"time": datetime.now(UTC).isoformat(), "lost": lost}) + line
             self._append(line)
-        except OSError as error:
+        except Exception as error:  # the disk's, or of a record that cannot be written; the next one may be
             self._count_lost(1)
             self._close_file()
             self._fail(error)
@@ -188,12 +200,13 @@ class AuditLog:
                 os.close(self._descriptor)
         self._descriptor = -1
 
-    def _fail(self, error: OSError) -> None:
-        words = f"commands are not recorded: {self._path}: {error.strerror or error}"
+    def _fail(self, error: Exception) -> None:
+        why = error.strerror if isinstance(error, OSError) else None
+        words = f"commands are not recorded: {self._path}: {why or one_line(error, 200)}"
         if self._fault is None:
             log.error("%s", words)
             until = "a command can be recorded again"
-            self._fault = StandingFault(DEVICE, "not_recorded", words, self._clock.now_s(), until)
+            self._fault = StandingFault(self._device, "not_recorded", words, self._clock.now_s(), until)
 
 
 def _opened(path: Path) -> int:

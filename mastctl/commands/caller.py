@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal
 
 from mastctl.errors import NotAllowed, one_line
@@ -14,6 +14,7 @@ ROLES: tuple[Role, ...] = ("view", "operate", "admin")
 
 ANONYMOUS = "anonymous"
 LONGEST_NAME = 80
+NETWORK = "network"
 
 
 @dataclass(frozen=True)
@@ -27,12 +28,24 @@ class Caller:
     role
         What it may do. On the way that needs no token everybody is ``admin``.
     via
-        The way it came: ``loopback``, ``unix``, ``token``, ``inside`` (this process itself).
+        The way it came: ``loopback``, ``unix``, ``token``, ``inside`` (this process itself), ``network``
+        (a stranger, who showed nothing that is known).
+    address
+        Where it came from; empty where it came from inside.
+    credential
+        Digest of the token or the session that it showed; empty for none.
     """
 
     name: str = ANONYMOUS
     role: Role = "admin"
     via: str = "loopback"
+    address: str = field(default="", compare=False)
+    credential: str = field(default="", compare=False, repr=False)
+
+    @property
+    def stranger(self) -> bool:
+        """Whether nothing is known of it but its address."""
+        return self.via == NETWORK
 
     def may(self, role: Role) -> bool:
         """Return whether it may do what ``role`` may."""

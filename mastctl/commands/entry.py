@@ -20,7 +20,7 @@ from typing import Any, Protocol
 from drivers.clock import Clock
 from mastctl.as_json import writable
 from mastctl.commands.audit import AuditLog
-from mastctl.commands.caller import ANONYMOUS, Caller, Role
+from mastctl.commands.caller import ANONYMOUS, NETWORK, Caller, Role
 from mastctl.commands.idempotency import Answer, Answers
 from mastctl.commands.lease import Leases, StopCame
 from mastctl.errors import BadRequest, MastctlError, NotNow, Stopped, error_body
@@ -30,6 +30,7 @@ from mastctl.state.refusals import Need
 LONGEST_DEADLINE_S = 3600.0
 FOLLOWED = 256  # operations whose end is still recorded with who began them
 PUBLISHED = 256  # records that who begins to listen still hears of
+PUBLISHED_OF_STRANGERS = 32  # beside them
 
 
 @dataclass(frozen=True)
@@ -160,6 +161,8 @@ class Entry:
         Refuses what does not fit the state, and ends operations at their deadline.
     publisher
         Gets each record, the newest 256 to be had later; one of its own by default.
+    strangers
+        Where records of strangers go, who may be many: they push nobody else's out of ``audit``.
     """
 
     def __init__(
@@ -170,14 +173,19 @@ class Entry:
         audit: AuditLog,
         operations: JudgesAndEnds,
         publisher: Publisher | None = None,
+        strangers: AuditLog | None = None,
     ) -> None:
         self.leases = leases
         self.audit = audit
+        self.strangers = strangers or audit
         self._clock = clock
         self._answers = answers
         self._operations = operations
         self._publisher = publisher or Publisher()
-        self._published: deque[str] = deque()  # keys, oldest first
+        self._published: tuple[deque[str], deque[str]] = (
+            deque(),
+            deque(),
+        )  # keys, strangers' too; oldest first
         self._numbers = itertools.count(1)
         self._matching = threading.Lock()
         self._began: dict[str, dict[str, Any]] = {}  # operation: who began it, until it has ended
@@ -251,6 +259,15 @@ class Entry:
         """Record a stop that could not even be tried."""
         self._record(command, asked, None, error, begins=False)
 
+    def refused(self, caller: Caller, what: str, code: str, message: str, times: int | None = None) -> None:
+        """Record a request that was refused before it was a command; ``times``, how often that has come to be
+        where not each one is recorded. Nobody is told of it."""
+        told = {"number": next(self._numbers), **self._now(), **_who(what, caller), "request": {}}
+        told |= {"result": code, "message": message}
+        if times is not None:
+            told["times"] = times
+        (self.strangers if caller.stranger else self.audit).put(told)
+
     def ended(self, operation: str, state: str, error: Mapping[str, Any] | None) -> None:
         """Record how an operation ended that a command began."""
         told = {**self._now(), "ended": operation, "state": state}
@@ -313,7 +330,7 @@ class Entry:
         operation = None if answer is None else _operation_of(answer)
         if command.goes_on and error is None and (operation is None or operation in self._began):
             return
-        who = {"command": command.name, "who": caller.name, "role": caller.role, "via": caller.via}
+        who = _who(command.name, caller)
         number = next(self._numbers)
         told = {"number": number, **self._now(), **who, "request": writable(asked.request)}
         if asked.lease is not None:
@@ -339,15 +356,23 @@ class Entry:
                 del known[next(iter(known))]
 
     def _tell(self, told: dict[str, Any]) -> None:
-        self.audit.put(told)
+        stranger = told["via"] == NETWORK
+        (self.strangers if stranger else self.audit).put(told)
         key = f"{told['number']}.end" if "ended" in told else f"{told['number']}"
         self._publisher.publish("command", key, told)
-        self._published.append(key)
-        while len(self._published) > PUBLISHED:
-            self._publisher.forget("command", self._published.popleft())
+        keys, most = self._published[stranger], PUBLISHED_OF_STRANGERS if stranger else PUBLISHED
+        keys.append(key)
+        while len(keys) > most:
+            self._publisher.forget("command", keys.popleft())
 
     def _now(self) -> dict[str, Any]:
         return {"time": datetime.now(UTC).isoformat(), "monotonic_s": self._clock.now_s()}
+
+
+def _who(command: str, caller: Caller) -> dict[str, Any]:
+    """What is asked, and who asks, as it is recorded."""
+    who = {"command": command, "who": caller.name, "role": caller.role, "via": caller.via}
+    return who | ({"address": caller.address} if caller.address else {})
 
 
 def _operation_of(answer: Answer) -> str | None:

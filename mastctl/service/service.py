@@ -18,7 +18,7 @@ from calib.handoff.matched import MatchedHandoff
 from drivers.clock import Clock, SystemClock
 from drivers.hardware import Hardware
 from drivers.known import clock_for, head_name
-from mastctl.commands.audit import AuditLog
+from mastctl.commands.audit import STRANGERS, STRANGERS_FILES, AuditLog
 from mastctl.commands.entry import Entry
 from mastctl.commands.idempotency import Answers
 from mastctl.commands.lease import Control, Leases
@@ -69,6 +69,7 @@ SNAPSHOT_TIMEOUT_S = 5.0
 RENDERING_S = 20.0  # six simulated cameras share one renderer, on a machine that may be busy
 HARDWARE_CLOSE_S = 3.0
 AUDIT_FILE = "audit.jsonl"
+STRANGERS_FILE = "strangers.jsonl"
 OPERATIONS = "operations"  # who holds the pictures that pointings end with
 KEPT_PICTURES = 8  # of a camera
 
@@ -107,8 +108,8 @@ class Service:
         What the pointings' residuals say of it.
     sentinel
         What reference pictures, looked at again, say of it.
-    entry, leases, audit
-        Where each command passes, who steers, and what is recorded of it.
+    entry, leases, audit, strangers
+        Where each command passes, who steers, and what is recorded of it; of strangers' elsewhere.
     metrics
         What is counted, for Prometheus.
     recording
@@ -176,8 +177,12 @@ class Service:
         people_s = SystemClock()  # clients live in real time, whatever a simulated rover's clock does
         self.leases = Leases(people_s, self._runs, self._steered, self.stopping.stop)
         self.audit = AuditLog(self.folder.path / AUDIT_FILE, clock)
+        strangers = self.folder.path / STRANGERS_FILE
+        self.strangers = AuditLog(strangers, clock, files=STRANGERS_FILES, device=STRANGERS)
         answers = Answers(people_s, clock)
-        self.entry = Entry(clock, self.leases, answers, self.audit, self.operations, publisher)
+        self.entry = Entry(
+            clock, self.leases, answers, self.audit, self.operations, publisher, self.strangers
+        )
         self.guide = Guide(
             self.folder.path,
             lambda: self.masts.in_use.path.parent,
@@ -365,7 +370,7 @@ class Service:
                 return
             self._closed = True
         folders = self.folder, self.head_folder, self._socket_folder
-        maybe = (self.stop_socket, self.audit, self.latch, *folders)
+        maybe = (self.stop_socket, self.audit, self.strangers, self.latch, *folders)
         first_to_last: tuple[Callable[[], object], ...] = (
             self.operations.close,
             self.guide.close,
@@ -395,6 +400,7 @@ class Service:
             *self.recording.faults(),
             *(() if self.live is None else self.live.faults()),
             *self.audit.faults(),
+            *self.strangers.faults(),
             *state_faults(self.folder, self.latch, self.started_s),
         )
 

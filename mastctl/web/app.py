@@ -67,7 +67,7 @@ def create_app(
         scope.setdefault("state", {})["parts"] = parts
         await routes(scope, receive, send)
 
-    return Guard(served, entrance)
+    return Guard(served, entrance, service.entry)
 
 
 @cache

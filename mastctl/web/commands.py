@@ -33,6 +33,11 @@ class Came:
         self.lease = lease
         self.key = key
         self.deadline_s = deadline_s
+        self._state: dict[str, Any] = request.scope.setdefault("state", {})
+
+    def recorded(self) -> None:
+        """Say that whatever comes of it is recorded as a command."""
+        self._state["recorded"] = True
 
 
 async def _came(
@@ -123,7 +128,7 @@ class Commands:
 
     def _asked(self, came: Came, request: Mapping[str, Any], keyed: bool = True) -> Asked:
         times_s = [time_s for time_s in (came.deadline_s, request.get("deadline_s")) if time_s is not None]
-        return Asked(
+        asked = Asked(
             came.caller,
             self._service.clock.now_s(),
             request,
@@ -132,6 +137,8 @@ class Commands:
             min(times_s, default=None),
             self._service.leases.last_stop,
         )
+        came.recorded()
+        return asked
 
 
 async def stopped(service: Service, stop: Callable[[], T]) -> T:

@@ -8,15 +8,14 @@ from typing import Any
 
 from mastctl.access.access import Access
 from mastctl.access.guesses import neighbourhood
-from mastctl.access.tokens import Token
-from mastctl.commands.caller import Caller, told_name
+from mastctl.access.tokens import Token, digest_of
+from mastctl.commands.caller import NETWORK, Caller, told_name
 from mastctl.errors import NotLetIn, TooMany
 from mastctl.web.answer import GuardError
 from mastctl.web.whose_page import Names
 
 SCHEME = "bearer "
 MOST_REQUESTS_PER_S = 1000
-NETWORK = "network"
 
 
 @dataclass(frozen=True)
@@ -57,12 +56,13 @@ class Entrance:
             ``foreign_origin`` for a page's session without an Origin where something is changed.
         """
         if self.access is None:
-            return Caller(told_name(headers.get("mastctl-client")), "admin", self.via)
+            name = told_name(headers.get("mastctl-client"))
+            return Caller(name, "admin", self.via, address_of(scope))
         shown = credentials(scope, headers)
         token = self._token(shown, address_of(scope))
         if shown.token is None and changes(scope) and "origin" not in headers:
             raise GuardError(403, "foreign_origin", "a page's session says its Origin")
-        return _named(token, headers)
+        return _named(token, shown, scope, headers)
 
     def stopper(self, scope: Mapping[str, Any], headers: Mapping[str, str]) -> Caller:
         """Return who asks for a stop: anybody may. Nothing is counted and nothing is logged on this way."""
@@ -71,11 +71,11 @@ class Entrance:
         shown = credentials(scope, headers)
         held = None if shown.session is None else self.access.session_of(shown.session)
         token = self.access.known(shown.token) if shown.token is not None else held[0] if held else None
-        return self.stranger(headers) if token is None else _named(token, headers)
+        return self.stranger(scope, headers) if token is None else _named(token, shown, scope, headers)
 
-    def stranger(self, headers: Mapping[str, str]) -> Caller:
-        """Return who asks without a token what needs none."""
-        return Caller(told_name(headers.get("mastctl-client")), "view", NETWORK)
+    def stranger(self, scope: Mapping[str, Any], headers: Mapping[str, str]) -> Caller:
+        """Return who asks without a token what needs none, or is refused before it is known."""
+        return Caller(told_name(headers.get("mastctl-client")), "view", NETWORK, address_of(scope))
 
     def _token(self, shown: Credentials, address: str) -> Token:
         assert self.access is not None
@@ -89,10 +89,12 @@ class Entrance:
         raise NotLetIn("no_token", "a token is expected: Authorization: Bearer TOKEN, or POST /api/v1/login")
 
 
-def _named(token: Token, headers: Mapping[str, str]) -> Caller:
+def _named(token: Token, shown: Credentials, scope: Mapping[str, Any], headers: Mapping[str, str]) -> Caller:
     """Who shows a token: its name, which is proven, and what the program calls itself, which is not."""
     told = headers.get("mastctl-client")
-    return Caller(f"{token.name}/{told_name(told)}" if told else token.name, token.role, "token")
+    name = f"{token.name}/{told_name(told)}" if told else token.name
+    credential = token.sha256 if shown.token is not None else digest_of(shown.session or "")
+    return Caller(name, token.role, "token", address_of(scope), credential)
 
 
 class Rate:

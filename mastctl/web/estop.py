@@ -9,7 +9,8 @@ from typing import Any
 from fastapi import FastAPI, Request
 
 from mastctl.commands.entry import ESTOP, RESET
-from mastctl.errors import Unable
+from mastctl.errors import Unable, one_line
+from mastctl.safety.latch import LONGEST
 from mastctl.safety.stop_threads import StopsHang
 from mastctl.web import PREFIX
 from mastctl.web.commands import Headers
@@ -62,7 +63,7 @@ async def _told(request: Request) -> dict[str, str]:
     except Exception:  # late, broken off, no JSON: a stop is not refused for its words
         return {}
     return (
-        {key: value for key, value in found.items() if isinstance(value, str)}
+        {key: one_line(value, LONGEST) for key, value in found.items() if isinstance(value, str)}
         if isinstance(found, dict)
         else {}
     )

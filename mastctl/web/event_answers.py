@@ -65,6 +65,7 @@ class CommandTold(Told):
     who: str
     role: Role
     via: str
+    address: str | None = None
     request: Json | None = None
     lease: str | None = None
     again: bool = False

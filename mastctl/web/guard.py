@@ -6,15 +6,17 @@ A stop passes nearly all of it: only another site's page is refused one.
 from __future__ import annotations
 
 import asyncio
+import json
 import logging
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, Protocol
 from urllib.parse import parse_qsl
 
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
+from mastctl.access.guesses import neighbourhood
 from mastctl.commands.caller import Caller
-from mastctl.errors import MastctlError
+from mastctl.errors import MastctlError, one_line
 from mastctl.web import PREFIX
 from mastctl.web.answer import GuardError, error_response, marked
 from mastctl.web.bodies import check_json, once, whole_body
@@ -34,6 +36,12 @@ FILES = "/page/"
 LARGEST_HEADERS_BYTES = 16384
 MOST_HEADERS = 100
 
+ATTACKS = frozenset({"wrong_token", "too_many_guesses", "foreign_host", "foreign_origin"})
+"""Refusals that are recorded of reading too; of what changes something each one is."""
+RECORDED = 100  # refusals of one party in a minute; then each RARELY-th
+RARELY = 1000
+MOST_PARTIES = 1000
+
 _ONCE = frozenset(
     (
         *("host", "origin", "authorization", "cookie", "content-type", "content-length", "transfer-encoding"),
@@ -42,6 +50,14 @@ _ONCE = frozenset(
     )
 )
 _SECRETS = frozenset({"token", "access_token", "authorization", "api_key", "apikey"})
+
+
+class Records(Protocol):
+    """What of `mastctl.commands.entry.Entry` keeps refusals."""
+
+    def refused(
+        self, caller: Caller, what: str, code: str, message: str, times: int | None = None
+    ) -> None: ...
 
 
 class Guard:
@@ -53,12 +69,19 @@ class Guard:
         What it guards.
     entrance
         What the daemon asks of who comes in.
+    records
+        Gets what is refused before it is a command; nobody by default.
     """
 
-    def __init__(self, app: ASGIApp, entrance: Entrance | None = None) -> None:
+    def __init__(
+        self, app: ASGIApp, entrance: Entrance | None = None, records: Records | None = None
+    ) -> None:
         self._app = app
         self._entrance = entrance or Entrance()
         self._rate = Rate()
+        self._records = records
+        self._minute = -1
+        self._refused: dict[tuple[str, str], int] = {}  # of this minute, by credential and address
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["type"] == "http":
@@ -69,13 +92,16 @@ class Guard:
             await self._app(scope, receive, send)
 
     async def _http(self, scope: Scope, receive: Receive, send: Send) -> None:
-        scope, started = stop_named(scope), False
+        scope, started, refuses = stop_named(scope), False, False
 
         async def send_marked(message: Message) -> None:
-            nonlocal started
+            nonlocal started, refuses
             if message["type"] == "http.response.start":
-                started = True
+                started, refuses = True, 400 <= message["status"] < 500
                 message = {**message, "headers": marked(message.get("headers", []))}
+            elif refuses:
+                refuses = False
+                self._record(scope, message.get("body", b""))
             await send(message)
 
         try:
@@ -111,6 +137,7 @@ class Guard:
             if "cookie" in headers and "authorization" not in headers and self._entrance.access is not None:
                 _check_origin_said(headers)
         except (GuardError, MastctlError) as refused:
+            self._record(scope, bytes(told(refused).body))
             await _refuse_websocket(refused, scope, receive, send)
             return
         await self._app(scope, receive, send)
@@ -137,13 +164,38 @@ class Guard:
         check_site(headers, page=path in PAGES and not changes(scope))
         _check_no_secret(scope)
         if path == LOGIN or path in PAGES or path.startswith(FILES):
-            caller = entrance.stranger(headers)
+            _hand_on(scope, entrance.stranger(scope, headers))
         else:
             caller = entrance.caller(scope, headers)
+            _hand_on(scope, caller)
             if changes(scope) and path != LOGOUT and not caller.may("operate"):
                 words = f"{caller.name} may {caller.role}; {scope['method']} {path[:80]} needs operate"
                 raise GuardError(403, "role", words)
-        _hand_on(scope, caller)
+
+    def _record(self, scope: Scope, body: bytes) -> None:
+        """Record a refusal, as it is told, that no record of a command holds."""
+        state: dict[str, Any] = scope.get("state", {})
+        try:
+            error = json.loads(body)["error"]
+        except (ValueError, KeyError):  # no refusal of ours
+            return
+        if self._records is None or state.get("recorded") or not (changes(scope) or error["code"] in ATTACKS):
+            return
+        caller = state.get("caller") or self._entrance.stranger(scope, _headers(scope)[0])
+        minute = int(asyncio.get_running_loop().time() // 60.0)
+        if minute != self._minute or len(self._refused) > MOST_PARTIES:
+            self._minute, self._refused = minute, {}
+        party = caller.credential, neighbourhood(caller.address)
+        times = self._refused[party] = self._refused.get(party, 0) + 1
+        if times <= RECORDED or times % RARELY == 0:
+            what = one_line(f"{scope.get('method', 'GET')} {scope['path']}", 100)
+            self._records.refused(
+                caller,
+                what,
+                error["code"],
+                one_line(error["message"], 200),
+                times if times > RECORDED else None,
+            )
 
 
 def _headers(scope: Scope) -> tuple[dict[str, str], set[str]]:

@@ -20,6 +20,7 @@ from mastctl.web.connections import IMAGES
 
 log = logging.getLogger(__name__)
 log.setLevel(logging.ERROR)
+log.addFilter(lambda record: "without completing handshake" not in record.msg)  # it was refused
 
 LARGEST_BYTES = 1024  # of what a client sends; it has nothing to say
 PING_S = 20.0

@@ -178,3 +178,20 @@ def test_without_a_place_nothing_is_kept_and_nobody_waits(tmp_path: Path) -> Non
     log.put({"number": 0})
     assert log.flush()
     log.close()
+
+
+def test_a_record_that_cannot_be_written_is_counted_and_ends_nothing(tmp_path: Path) -> None:
+    class Odd:
+        def __str__(self) -> str:
+            raise RuntimeError("no words")
+
+    path = tmp_path / "audit.jsonl"
+    log = AuditLog(path)
+    log.put({"number": 0, "request": Odd()})
+    assert log.flush()
+    assert "no words" in log.faults()[0].message
+    log.put({"number": 1})
+    assert log.flush(NET_S), "the log goes on"
+    assert [line.get("lost", line.get("number")) for line in lines(path)] == [1, 1]
+    assert log.faults() == ()
+    log.close()

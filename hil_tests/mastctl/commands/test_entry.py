@@ -15,7 +15,7 @@ from drivers.errors import NoReply
 from hil_tests.waiting import NET_S, joined
 from mastctl.commands.audit import AuditLog
 from mastctl.commands.caller import Caller
-from mastctl.commands.entry import JOG, POINT, POSE, STOP, Answer, Asked, Command, Entry
+from mastctl.commands.entry import ESTOP, JOG, POINT, POSE, STOP, Answer, Asked, Command, Entry
 from mastctl.commands.idempotency import Answers
 from mastctl.commands.lease import Leases
 from mastctl.errors import MastctlError, NotNow
@@ -28,12 +28,14 @@ ROVER = Caller("rover")
 class World:
     """An entry on a turned clock; what it tells operations; what it records."""
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, strangers: Path | None = None) -> None:
         self.clock = ManualClock(100.0)
         self.runs = False
         self.leases = Leases(self.clock, lambda: self.runs)
         self.path = path
-        self.audit = AuditLog(path)
+        small = {} if strangers is None else {"file_bytes": 50_000, "files": 2}
+        self.audit = AuditLog(path, **small)
+        self.strangers = AuditLog(strangers, **small)
         self.deadlines: list[tuple[str, float, float]] = []
         self.ended_by_stop: list[str] = []
         self.refuses: str | None = None
@@ -45,6 +47,7 @@ class World:
             self.audit,
             self,
             self.publisher,
+            self.strangers,
         )
         self.acts = 0
 
@@ -310,3 +313,28 @@ def test_what_begins_while_a_stop_comes_is_ended_by_it(world: World) -> None:
 
     world.entry.run(POINT, world.asked(last_stop=world.leases.last_stop), act)
     assert world.ended_by_stop == ["000001-abcd"]
+
+
+def test_strangers_push_nobody_elses_records_out(tmp_path: Path) -> None:
+    world = World(tmp_path / "audit.jsonl", tmp_path / "strangers.jsonl")
+    who = Caller("anonymous", "view", "network", "10.0.0.9")
+    world.entry.run(POINT, world.asked(Caller("operate", via="token", address="10.0.0.1")), world.act)
+    for number in range(1000):
+        world.entry.first(ESTOP, world.asked(who, request={"reason": "x" * 4000}), lambda: {"id": "-"})
+        if number % 50 == 0:
+            assert world.strangers.flush(NET_S)
+    world.entry.refused(Caller("view", "view", "token", "10.0.0.2"), "POST /point", "role", "may view", 2000)
+    world.entry.refused(who, "GET /status", "wrong_token", "nobody's")
+    known = world.lines()
+    assert [(line["who"], line["address"], line["result"]) for line in known] == [
+        ("operate", "10.0.0.1", "ok"),
+        ("view", "10.0.0.2", "role"),
+    ]
+    assert known[1]["command"] == "POST /point" and known[1]["times"] == 2000
+    assert world.strangers.flush(NET_S)
+    last = json.loads((tmp_path / "strangers.jsonl").read_text().splitlines()[-1])
+    assert (last["address"], last["result"]) == ("10.0.0.9", "wrong_token")
+    told = [one.value["who"] for one in world.published]
+    assert (told.count("operate"), told.count("anonymous")) == (1, 32), "what is refused is not published"
+    world.audit.close()
+    world.strangers.close()

@@ -13,9 +13,10 @@ import pytest
 
 from hil_tests.mastctl.service_fakes import PLAIN, FakeHardware, fake_daemon
 from hil_tests.mastctl.web.network import NAME, Network, network_daemon
-from hil_tests.waiting import until
+from hil_tests.waiting import NET_S, until
 from mastctl.access.guesses import MOST_OF_ONE
 from mastctl.commands.caller import Role
+from mastctl.web import guard
 
 ANGLES = {"pan_rad": 0.1, "tilt_rad": -0.1}
 
@@ -396,6 +397,86 @@ def test_a_strange_name_of_a_client_is_one_printable_line(net: Network) -> None:
     )
     told = json.loads(raw.partition(b"\r\n\r\n")[2])["name"]
     assert told.startswith("view/x") and told.isprintable() and len(told) < 100
+
+
+# What is recorded
+
+
+def recorded(net: Network, strangers: bool = False) -> list[dict[str, Any]]:
+    """The audit log, or that of strangers."""
+    service = net.daemon.service
+    log = service.strangers if strangers else service.audit
+    assert log.flush(NET_S)
+    path = service.folder.path / ("strangers.jsonl" if strangers else "audit.jsonl")
+    return [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
+
+
+def test_each_refusal_is_recorded_with_the_address_it_came_from(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    with network_daemon(monkeypatch, tmp_path) as net:
+        net.ask("POST", "/point", "view", json=ANGLES)
+        net.ask("POST", "/point", "operate", json={"pan_rad": "left"}, headers={"Mastctl-Client": "x"})
+        net.ask("POST", "/point", "operate", content=b"{", headers={"Content-Type": "application/json"})
+        net.ask("POST", "/lease/renew", "operate")
+        net.ask("POST", "/nothing", "operate")
+        net.ask("POST", "/point", "operate", json={**ANGLES, "deadline_s": 0.5}, headers={"Deadline-S": "no"})
+        net.ask("GET", "/nothing", "operate")
+        net.ask("POST", "/lease/renew", "operate", headers={"Mastctl-Lease": "x"})
+        lines = recorded(net)
+        assert {line["address"] for line in lines} == {"127.0.0.1"}
+        assert [(line["command"], line["who"], line["result"]) for line in lines] == [
+            ("POST /api/v1/point", "view", "role"),
+            ("POST /api/v1/point", "operate/x", "bad_request"),
+            ("POST /api/v1/point", "operate", "not_json"),
+            ("POST /api/v1/lease/renew", "operate", "bad_request"),
+            ("POST /api/v1/nothing", "operate", "not_found"),
+            ("POST /api/v1/point", "operate", "bad_request"),
+            ("lease.renew", "operate", "lease_unknown"),
+        ]
+        foreign = {"Origin": "http://evil.example"}
+        net.ask("GET", "/status", headers={"Authorization": "Bearer wrong"})
+        net.ask("POST", "/login", json={"token": "wrong too"})
+        net.ask("POST", "/point", "admin", json=ANGLES, headers=foreign)
+        net.ask("POST", "/stop", headers=foreign)
+        net.ask("GET", "/status", "admin", headers={"Host": "evil.example"})
+        net.ask("GET", "/status")
+        net.ask("POST", "/point", json=ANGLES)
+        upgrade = (
+            f"GET /api/v1/events HTTP/1.1\r\nHost: {NAME}:{net.port}\r\nOrigin: http://evil.example\r\n"
+            f"Authorization: Bearer {net.token('view')}\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
+            "Sec-WebSocket-Version: 13\r\nSec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==\r\n\r\n"
+        )
+        assert b"foreign_origin" in net.raw(upgrade)
+        net.ask("POST", "/estop", json={"reason": "y" * 4000})
+        told = recorded(net, strangers=True)
+        assert {(line["via"], line["role"], line["address"]) for line in told} == {
+            ("network", "view", "127.0.0.1")
+        }
+        assert [(line["command"], line["result"]) for line in told] == [
+            ("GET /api/v1/status", "wrong_token"),
+            ("POST /api/v1/login", "wrong_token"),
+            ("POST /api/v1/point", "foreign_origin"),
+            ("POST /api/v1/stop", "foreign_origin"),
+            ("GET /api/v1/status", "foreign_host"),
+            ("POST /api/v1/point", "no_token"),
+            ("estop", "ok"),
+        ]
+        assert len(told[-1]["request"]["reason"]) == 200, "as it is latched"
+        (socket,) = recorded(net)[len(lines) :]
+        assert (socket["command"], socket["who"]) == ("GET /api/v1/events", "view")
+        assert socket["result"] == "foreign_origin"
+        assert not [one for one in caplog.records if one.levelname == "ERROR"], caplog.text
+        assert "wrong too" not in json.dumps(told)
+
+
+def test_refusals_in_a_flood_are_counted_instead(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(guard, "RARELY", 150)
+    with network_daemon(monkeypatch, tmp_path) as net:
+        for _ in range(160):
+            net.ask("POST", "/point", "view", json=ANGLES)
+        net.ask("POST", "/nothing", "operate")
+        assert [line.get("times") for line in recorded(net)] == [None] * guard.RECORDED + [150, None]
 
 
 # A daemon of this machine only
