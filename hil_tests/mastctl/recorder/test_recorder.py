@@ -382,6 +382,7 @@ def test_a_run_that_ended_at_its_size_is_told_though_the_ring_goes_on(tmp_path: 
 def test_another_mast_file_is_attached_and_its_cameras_told_when_it_comes(tmp_path: Path) -> None:
     one = recorder(tmp_path)
     one.tell("joints", "pan_tilt", reading(0.1))
+    until(lambda: one.told()["recording"] and one._busy_since_s is None, "the file has begun")
     other = Attached("other.yaml", b"another mast file")
     one.use_mast(MastTold(mast().rig, other))
     one.tell("joints", "pan_tilt", reading(0.2))
