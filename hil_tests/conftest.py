@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import gc
 import os
 import signal
@@ -22,6 +23,7 @@ REPOSITORY = Path(__file__).resolve().parent.parent
 VM_CONFTEST = REPOSITORY / "hil_tests" / "vm" / "conftest.py"
 SHARED_DATA = REPOSITORY.parent / "shared" / "data"
 MOST_ALONE = 12  # failed tests that are tried alone: more than these are no matter of chance
+GIVE_BACK = getattr(ctypes.CDLL(None), "malloc_trim", None)  # glibc's: what was freed goes to the machine
 LONG_PARTS = (1, 2, 3, 4)  # of the long run; CI takes them in turns
 
 # Whoever runs the tests may ignore signals, as nohup does and a shell for what it puts into the background;
@@ -115,6 +117,8 @@ def pytest_runtest_protocol(
     if nextitem is None or nextitem.path != item.path:
         gc.collect()
         gc.freeze()
+        if GIVE_BACK is not None:
+            GIVE_BACK(0)
     return ran
 
 
