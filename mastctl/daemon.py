@@ -297,7 +297,8 @@ async def _serve(
         await serving
         raise MastctlError("the web server ended before it answered a request")
     listener.listen(WAITING_IN_KERNEL)  # asyncio has one number for this and for how many it takes at once
-    sweeping = asyncio.create_task(sweep(server.server_state.connections))
+    stands = (lambda credential: True) if entrance.access is None else entrance.access.stands
+    sweeping = asyncio.create_task(sweep(server.server_state.connections, stands))
     on_ready(end_from_anywhere)
     manager.ready()
     telling = asyncio.create_task(_tell_state(service, manager))
@@ -373,6 +374,7 @@ def _entrance(service: Service, url: str) -> Iterator[Entrance]:
     tokens = TokenList(service.folder.path)
     access = Access(tokens)
     service.guide.door = Door(url, access.lend, certificate)
+    service.leases.stands = access.stands
     try:
         log.warning("%s asks everybody for a token, but for a stop; tokens lie in %s", url, tokens.folder)
         if listen.tls is None and listen.socket is None:

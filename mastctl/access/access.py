@@ -6,6 +6,7 @@ import hmac
 import logging
 import secrets
 import threading
+from collections import OrderedDict
 from collections.abc import Callable
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -18,9 +19,9 @@ from mastctl.errors import NotLetIn, TooMany
 
 log = logging.getLogger(__name__)
 
-REREAD_S = 1.0  # how late a new or a revoked token may be known
+REREAD_S = 0.5  # how late a new or a revoked token may be known
 SESSION_S = 12 * 3600.0
-SESSIONS_OF_ONE = 20  # token; its oldest one goes
+SESSIONS_OF_ONE = 20  # token; the one that was not used for longest goes
 
 
 @dataclass(frozen=True)
@@ -34,7 +35,8 @@ class Session:
 class Access:
     """The tokens of a daemon, read again when they change, and the sessions of pages.
 
-    What is asked of it belongs to one thread, the event loop's, and touches no file; `reread` is the other's.
+    What is asked of it belongs to one thread, the event loop's, and touches no file, where nothing else is
+    said; `reread` is the other's.
 
     Parameters
     ----------
@@ -56,7 +58,7 @@ class Access:
         self._lent: tuple[Token, ...] = ()
         self._seen = self._stamp()
         self._guesses = Guesses()
-        self._sessions: dict[str, Session] = {}  # oldest first
+        self._sessions: OrderedDict[str, Session] = OrderedDict()  # last used first
         self._closing = threading.Event()
         self._thread = threading.Thread(target=self._watch, name="tokens", daemon=True)
         self._thread.start()
@@ -129,7 +131,15 @@ class Access:
         if token is None or left_s <= 0.0:
             del self._sessions[digest]
             return None
+        self._sessions.move_to_end(digest)
         return token, left_s
+
+    def stands(self, credential: str) -> bool:
+        """Return whether a token or a session, by its digest, still lets in. Safe to use from any thread."""
+        session = self._sessions.get(credential)
+        if session is not None and self._clock.now_s() < session.until_s:
+            credential = session.token_sha256
+        return any(one.sha256 == credential for one in (*self._tokens, *self._lent))
 
     def log_out(self, secret: str) -> None:
         """End a session, if there is one."""

@@ -15,7 +15,7 @@ import secrets
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime, timedelta
 from typing import Any, Literal
 
@@ -48,6 +48,7 @@ class Lease:
 
     One that ``gives_way`` ends as soon as anybody else wants to steer, or stops the head.
     ``last_stop`` is that of `Leases.last_stop` after which the next one ends it; None: no stop does.
+    ``credential`` is what its caller showed, without which it ends; empty: nothing.
     """
 
     id: str
@@ -57,6 +58,7 @@ class Lease:
     until_s: float
     gives_way: bool = False
     last_stop: StopCame | None = None
+    credential: str = field(default="", repr=False)
 
 
 @dataclass(frozen=True)
@@ -104,6 +106,11 @@ class Leases:
     give_way
         Stops what runs under a lease that gives way, before who came for it goes on; gets why. Called
         without the lock.
+
+    Attributes
+    ----------
+    stands
+        Whether a credential still lets in; called with the lock held, from any thread.
     """
 
     def __init__(
@@ -117,6 +124,7 @@ class Leases:
         self._running = running
         self._on_change = on_change
         self._give_way = give_way
+        self.stands: Callable[[str], bool] = lambda credential: True
         self._last_stop = StopCame()
         self._lock = threading.Lock()
         self._lease: Lease | None = None
@@ -127,7 +135,7 @@ class Leases:
     def control(self) -> Control | None:
         """Return who steers now, None for nobody."""
         lease = self._lease
-        if lease is not None and self._clock.now_s() < lease.until_s and not self.was_stopped(lease):
+        if lease is not None and not self._over_by(lease):
             return Control(lease.holder, "lease", lease.until_s)
         under_way = next(iter(tuple(self._under_way.values())), None)
         party = under_way or (self._party if self._running() else None)
@@ -191,7 +199,7 @@ class Leases:
         with self._changing():
             why = self._check_free(caller)
             last_stop = self._last_stop if gives_way or ends_with_stop else None
-            lease = self._grant(name or caller.name, for_s, gives_way, last_stop)
+            lease = self._grant(caller, name, for_s, gives_way, last_stop)
         if why:
             self._give_way(why)
         return lease
@@ -199,7 +207,7 @@ class Leases:
     def holds(self, lease_id: str) -> bool:
         """Return whether a lease runs now; takes no lock."""
         lease = self._lease
-        return lease is not None and lease.id == lease_id and self._clock.now_s() < lease.until_s
+        return lease is not None and lease.id == lease_id and not self._over_by(lease)
 
     def check(self, lease_id: str) -> None:
         """Pass a lease that runs now. Raises NotNow as `renew`."""
@@ -248,7 +256,7 @@ class Leases:
             gave_way = self._lease is not None and self._lease.gives_way and self._running()
             how = f"{name or caller.name} took over: {reason}"
             self._end(how)
-            lease = self._grant(name or caller.name, for_s, last_stop=last_stop)
+            lease = self._grant(caller, name, for_s, last_stop=last_stop)
         if gave_way:
             self._give_way(how)
         return lease
@@ -294,10 +302,9 @@ class Leases:
         try:
             with self._lock:
                 before = self._lease
-                if before is not None and self._clock.now_s() >= before.until_s:
-                    self._end(f"its {before.for_s:g} s were over")
-                elif before is not None and self.was_stopped(before):
-                    self._end(self._last_stop.how)
+                over = "" if before is None else self._over_by(before)
+                if over:
+                    self._end(over)
                 try:
                     yield
                 finally:
@@ -305,6 +312,16 @@ class Leases:
         finally:
             if changed:
                 self._on_change(self.control())
+
+    def _over_by(self, lease: Lease) -> str:
+        """What has ended a lease that nobody released or took, '' if nothing has; takes no lock."""
+        if self._clock.now_s() >= lease.until_s:
+            return f"its {lease.for_s:g} s were over"
+        if self.was_stopped(lease):
+            return self._last_stop.how
+        if lease.credential and not self.stands(lease.credential):
+            return "the token or the session that it was granted to has ended"
+        return ""
 
     def _check_free(self, caller: Caller) -> str:
         """Pass unless a lease runs, or somebody of another name steers. Raises Leased.
@@ -332,11 +349,18 @@ class Leases:
         raise NotNow("lease_over", f"the lease has ended: {how}; acquire another")
 
     def _grant(
-        self, holder: str, for_s: float, gives_way: bool = False, last_stop: StopCame | None = None
+        self,
+        caller: Caller,
+        name: str | None,
+        for_s: float,
+        gives_way: bool = False,
+        last_stop: StopCame | None = None,
     ) -> Lease:
-        now_s = self._clock.now_s()
-        self._lease = Lease(secrets.token_hex(16), holder, now_s, for_s, now_s + for_s, gives_way, last_stop)
-        return self._lease
+        now_s, holder = self._clock.now_s(), name or caller.name
+        times_s = now_s, for_s, now_s + for_s
+        lease = Lease(secrets.token_hex(16), holder, *times_s, gives_way, last_stop, caller.credential)
+        self._lease = lease
+        return lease
 
     def _end(self, how: str) -> None:
         if self._lease is None:

@@ -14,7 +14,7 @@ import asyncio
 import logging
 import re
 import resource
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any, Protocol, cast
 
@@ -22,6 +22,7 @@ import h11
 from starlette.types import ASGIApp, Receive, Scope, Send
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
+from mastctl.commands.caller import Caller
 from mastctl.web import PREFIX
 from mastctl.web.answer import error_response
 from mastctl.web.stop_address import STOP_LINE, STOPS, TRACK_STOP, stop_named
@@ -32,7 +33,7 @@ log.setLevel(logging.ERROR)
 
 REQUEST_S = 10.0  # for a request to come whole, from the connection's beginning or the answer before
 STALLED_S = 10.0  # for a client that does not read its answer
-SWEEP_S = 1.0
+SWEEP_S = 0.5
 MOST = 200
 LEAST = 8
 FREE_DESCRIPTORS = 24  # for devices that come back, mast files, and what is accepted before it is counted
@@ -67,6 +68,10 @@ class Counted(Protocol):
 
     def leave(self) -> None:
         """Close it at once."""
+        ...
+
+    def end_reading(self, stands: Callable[[str], bool]) -> None:
+        """Close it if it reads by a credential that lets in no more."""
         ...
 
 
@@ -217,6 +222,17 @@ class Connection(H11Protocol):
         """Close it at once, whatever its client still expects."""
         self.transport.abort()
 
+    def end_reading(self, stands: Callable[[str], bool]) -> None:
+        """Close it if a long answer is read by a credential that lets in no more; what acts goes on."""
+        if not self.waits and self.scope["method"] == "GET" and not let_in(self.scope, stands):
+            self.leave()
+
+
+def let_in(scope: Mapping[str, Any], stands: Callable[[str], bool]) -> bool:
+    """Return whether what a request's caller showed, if anything, still lets in."""
+    caller = scope["state"].get("caller")
+    return not isinstance(caller, Caller) or not caller.credential or stands(caller.credential)
+
 
 def _doubt(data: bytes) -> str:
     """What h11 would join in a request's headers and another program may read otherwise; '' if nothing."""
@@ -230,14 +246,16 @@ def _doubt(data: bytes) -> str:
     return "the header content-length is there twice" if len(lengths) > 1 or b"," in b"".join(lengths) else ""
 
 
-async def sweep(connections: Iterable[Any]) -> None:
-    """Leave overdue connections, again and again, until cancelled."""
+async def sweep(connections: Iterable[Any], stands: Callable[[str], bool] = lambda credential: True) -> None:
+    """Leave overdue connections, and readers whose token or session has ended, until cancelled."""
     while True:
         await asyncio.sleep(SWEEP_S)
         now_s = asyncio.get_running_loop().time()
         for one in counted(list(connections)):
             if one.overdue(now_s):
                 one.leave()
+            else:
+                one.end_reading(stands)
 
 
 class _Crowded:

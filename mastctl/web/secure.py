@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import asyncio
 import ssl
+from collections.abc import Callable
 from typing import Any, cast
 
 from mastctl.web.connections import Connection, room_for
@@ -64,6 +65,9 @@ class Arriving(asyncio.Protocol):
     def leave(self) -> None:
         """Close it at once."""
         self.transport.abort()
+
+    def end_reading(self, stands: Callable[[str], bool]) -> None:
+        """Nobody was let in yet."""
 
     def shutdown(self) -> None:
         """Close it, as uvicorn asks of all when the daemon ends."""

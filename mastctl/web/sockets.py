@@ -9,6 +9,7 @@ told, a client says by short words which of them it has shown.
 from __future__ import annotations
 
 import logging
+from collections.abc import Callable
 from typing import Any
 
 from uvicorn.protocols.utils import ClientDisconnected
@@ -16,7 +17,7 @@ from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIO
 from websockets.frames import Frame
 from websockets.protocol import State
 
-from mastctl.web.connections import IMAGES
+from mastctl.web.connections import IMAGES, let_in
 
 log = logging.getLogger(__name__)
 log.setLevel(logging.ERROR)
@@ -52,6 +53,11 @@ class Socket(WebSocketsSansIOProtocol):
     def leave(self) -> None:
         """Close it at once, whatever its client still expects."""
         self.transport.abort()
+
+    def end_reading(self, stands: Callable[[str], bool]) -> None:
+        """Close it if its credential lets in no more."""
+        if self.handshake_complete and not let_in(self.scope, stands):
+            self._end(BROKEN_RULES, "the token or the session that opened this has ended")
 
     def shutdown(self) -> None:
         """As uvicorn asks of all when the daemon ends: who tells here ends too, and says goodbye first."""

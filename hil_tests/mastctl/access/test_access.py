@@ -13,7 +13,7 @@ import pytest
 from drivers.clock import ManualClock
 from mastctl.access.access import SESSION_S, SESSIONS_OF_ONE, Access
 from mastctl.access.guesses import MOST_ADDRESSES, MOST_OF_ALL, MOST_OF_ONE, WINDOW_S, Guesses, neighbourhood
-from mastctl.access.tokens import TokenList
+from mastctl.access.tokens import TokenList, digest_of
 from mastctl.errors import NotLetIn, TooMany
 
 HERE = "10.0.0.1"
@@ -130,6 +130,37 @@ def test_sessions_of_a_token_are_bounded_and_its_own_oldest_goes(access: Access,
     kept = [secret for secret in secrets if access.session_of(secret) is not None]
     assert kept == secrets[-SESSIONS_OF_ONE:]
     assert len(set(secrets)) == len(secrets)
+
+
+def test_a_session_that_is_used_outlasts_those_that_are_not(access: Access, tokens: TokenList) -> None:
+    used = access.log_in(token(tokens), HERE)[0]
+    for _ in range(3 * SESSIONS_OF_ONE):
+        access.log_in(token(tokens), HERE)
+        assert access.session_of(used) is not None
+
+
+def test_what_stands_is_a_token_of_the_list_and_a_session_of_one(
+    access: Access, tokens: TokenList, clock: ManualClock
+) -> None:
+    digest = access.token_of(token(tokens), HERE).sha256
+    secret, out = (access.log_in(token(tokens), HERE)[0] for _ in range(2))
+    lent, take_back = access.lend("guide")
+    lent_digest = access.token_of(lent, HERE).sha256
+    known = digest, digest_of(secret), digest_of(out), lent_digest
+
+    def standing() -> list[bool]:
+        return [access.stands(one) for one in known]
+
+    assert standing() == [True, True, True, True] and not access.stands("") and not access.stands("x")
+    access.log_out(out)
+    take_back()
+    assert standing() == [True, True, False, False]
+    clock.advance(SESSION_S + 1.0)
+    assert standing() == [True, False, False, False]
+    again = access.log_in(token(tokens), HERE)[0]
+    tokens.revoke("operate")
+    access.reread()
+    assert standing() == [False, False, False, False] and not access.stands(digest_of(again))
 
 
 def test_sessions_that_have_ended_are_not_kept(access: Access, tokens: TokenList, clock: ManualClock) -> None:

@@ -272,3 +272,21 @@ def test_a_lease_that_is_taken_ends_with_a_stop_that_came_while_it_was_being_ask
     assert "the head was stopped" in refused("lease_over", lambda: world.steer(BENCH, lease))
     lease = world.leases.take(BENCH, "another begins", last_stop=world.leases.last_stop)
     world.steer(BENCH, lease)
+
+
+def test_a_lease_ends_with_the_token_or_the_session_that_it_was_granted_to(world: World) -> None:
+    shown = {"of a token"}
+    world.leases.stands = shown.__contains__
+    inside = world.leases.acquire(BENCH)
+    assert world.leases.holds(inside.id), "who showed none keeps it"
+    world.leases.release(inside.id)
+    for grant in (world.leases.acquire, lambda caller: world.leases.take(caller, "a test")):
+        shown.add("of a token")
+        lease = grant(Caller("bench", credential="of a token"))
+        assert world.leases.renew(lease.id).credential == "of a token"
+        shown.clear()
+        assert world.leases.control() is None
+        assert not world.leases.holds(lease.id)
+        with pytest.raises(NotNow, match="token or the session"):
+            world.leases.renew(lease.id)
+        world.leases.release(world.leases.acquire(ROVER).id)

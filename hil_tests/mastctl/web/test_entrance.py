@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
+import itertools
 import json
+import socket
 from collections.abc import Iterator
 from http.cookies import SimpleCookie
 from pathlib import Path
@@ -10,6 +13,8 @@ from typing import Any
 
 import httpx
 import pytest
+from websockets.exceptions import ConnectionClosed
+from websockets.sync.client import ClientConnection, connect
 
 from hil_tests.mastctl.service_fakes import PLAIN, FakeHardware, fake_daemon
 from hil_tests.mastctl.web.network import NAME, Network, network_daemon
@@ -463,9 +468,9 @@ def test_each_refusal_is_recorded_with_the_address_it_came_from(
             ("estop", "ok"),
         ]
         assert len(told[-1]["request"]["reason"]) == 200, "as it is latched"
-        (socket,) = recorded(net)[len(lines) :]
-        assert (socket["command"], socket["who"]) == ("GET /api/v1/events", "view")
-        assert socket["result"] == "foreign_origin"
+        (line,) = recorded(net)[len(lines) :]
+        assert (line["command"], line["who"]) == ("GET /api/v1/events", "view")
+        assert line["result"] == "foreign_origin"
         assert not [one for one in caplog.records if one.levelname == "ERROR"], caplog.text
         assert "wrong too" not in json.dumps(told)
 
@@ -477,6 +482,76 @@ def test_refusals_in_a_flood_are_counted_instead(monkeypatch: pytest.MonkeyPatch
             net.ask("POST", "/point", "view", json=ANGLES)
         net.ask("POST", "/nothing", "operate")
         assert [line.get("times") for line in recorded(net)] == [None] * guard.RECORDED + [150, None]
+
+
+# What is open when a token or a session ends
+
+
+@pytest.mark.parametrize("how", ["revoked", "logged out"])
+def test_what_a_token_or_a_session_opened_is_closed_with_it_and_its_lease_ends(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, how: str
+) -> None:
+    with network_daemon(monkeypatch, tmp_path) as net, contextlib.ExitStack() as stack:
+        made = net.tokens.new("bench", "operate")
+        bearer = {"Authorization": f"Bearer {made}"}
+        until(lambda: net.ask("GET", "/status", headers=bearer).status_code == 200, "the new token")
+        if how == "logged out":
+            answer = net.ask("POST", "/login", json={"token": made}, headers={"Origin": net.origin})
+            (morsel,) = SimpleCookie(answer.headers["set-cookie"]).values()
+            shown = {"Cookie": f"{morsel.key}={morsel.value}", "Origin": net.origin}
+        else:
+            shown = bearer
+
+        def opened(path: str, headers: dict[str, str]) -> ClientConnection:
+            told = dict(headers)
+            origin = told.pop("Origin", None)
+            sock = socket.create_connection(("127.0.0.1", net.port))
+            address = f"ws://{NAME}:{net.port}/api/v1{path}"
+            return stack.enter_context(
+                connect(address, sock=sock, additional_headers=told, origin=origin, close_timeout=2.0)  # type: ignore[arg-type]
+            )
+
+        admins = opened("/events", {"Authorization": f"Bearer {net.token('admin')}"})
+        lines = [opened("/events", shown), opened("/images?camera=navcam_left", shown)]
+        client = stack.enter_context(httpx.Client(base_url=f"{net.url}/api/v1", **PLAIN))
+        host = {"Host": f"{NAME}:{net.port}"}
+        streams = []
+        for path in ("/events", "/track/stream"):
+            asked = client.build_request("GET", path, headers={**host, **shown}, timeout=NET_S)
+            answer = client.send(asked, stream=True)
+            stack.callback(answer.close)
+            assert answer.status_code == 200
+            streams.append(answer.iter_raw())
+            next(streams[-1])
+        lease = net.ask("POST", "/lease", headers=shown, json={"for_s": 3600.0}).json()["lease_id"]
+        steering = {**shown, "Mastctl-Lease": lease}
+        rates = {"pan_rad_per_s": 0.01, "tilt_rad_per_s": 0.0}
+        assert net.ask("POST", "/jog", headers=steering, json=rates).status_code == 200
+        assert code(net.ask("POST", "/lease", "operate", json={})) == (409, "leased")
+
+        if how == "revoked":
+            net.tokens.revoke("bench")
+        else:
+            assert net.ask("POST", "/logout", headers=shown).status_code == 200
+        for line in lines:
+            with pytest.raises(ConnectionClosed) as closed:
+                for _ in range(1000):
+                    line.recv(timeout=NET_S)
+            assert closed.value.rcvd is not None and closed.value.rcvd.code == 1008
+            assert "ended" in closed.value.rcvd.reason
+        for stream in streams:
+            with contextlib.suppress(httpx.HTTPError):
+                assert len(list(itertools.islice(stream, 1000))) < 1000
+        assert net.ask("GET", "/lease", "view").json()["control"] in (
+            None, {"holder": "bench", "kind": "operation", "for_s": None, "until": None},
+        )  # fmt: skip
+        assert code(net.ask("POST", "/jog", headers=steering, json=rates))[0] == 401
+        until(lambda: net.ask("POST", "/lease", "operate", json={}).status_code == 200, "another's lease")
+        assert code(net.ask("POST", "/lease/renew", "admin", headers={"Mastctl-Lease": lease})) == (
+            409, "lease_over",
+        )  # fmt: skip
+        while json.loads(admins.recv(timeout=NET_S))["topic"] != "lease":
+            pass  # the administrator's is told on
 
 
 # A daemon of this machine only
