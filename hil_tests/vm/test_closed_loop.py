@@ -15,9 +15,7 @@ TOLD = "target_not_found"
 No device may: the machine's clock stands while it computes, so that no load makes a reply or a frame late."""
 
 
-@pytest.mark.long(
-    4, "computes for 37 s on the kernel with cameras; the driver is tested there in the quick run"
-)
+@pytest.mark.long(4, "computes for 37 s on the kernel; its cameras are tried there in the quick run")
 def test_targets_land_where_they_should_through_real_devices(vm_kernel: Path, tmp_path: Path) -> None:
     options = ["--targets", "3", "--distances", "6", "--seed", "1"]
     record = through_devices(vm_kernel, tmp_path, options, TIMEOUT_S)
