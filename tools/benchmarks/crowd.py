@@ -2,8 +2,8 @@
 
     python -m tools.benchmarks.crowd LOAD PORT
 
-A crowd's clients each ask again as soon as they have been answered. `stop_under_load` measures stops beside
-them.
+A crowd's clients each ask again as soon as they have been answered; at the end it prints how often that was.
+`stop_under_load` measures stops beside them.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ import asyncio
 import contextlib
 import signal
 import socket
+from collections import Counter
 from collections.abc import Awaitable, Callable
 
 from tools.arguments import end
@@ -23,6 +24,7 @@ READ_BYTES = 1 << 16
 EVENTS_S = 0.05  # how long a client that comes again and again listens
 
 Client = Callable[[int], Awaitable[None]]
+ANSWERED: Counter[str] = Counter()
 
 
 def main() -> int:
@@ -33,6 +35,7 @@ def main() -> int:
     args = parser.parse_args()
     count, client = LOADS[args.load](args.port)
     asyncio.run(_crowd(args.port, count, client))
+    print(ANSWERED.total())
     return 0
 
 
@@ -68,6 +71,7 @@ def _asking(path: str) -> Client:
                 head = (await reader.readuntil(b"\r\n\r\n")).lower()
                 length = head.split(b"content-length:")[1].split(b"\r\n")[0]
                 await reader.readexactly(int(length))
+                ANSWERED[path] += 1
                 if b"connection: close" in head:
                     raise EOFError
         finally:
@@ -84,7 +88,7 @@ async def _coming_again(port: int) -> None:
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(EVENTS_S):
                 while await reader.read(READ_BYTES):
-                    pass
+                    ANSWERED["events"] += 1
     finally:
         writer.close()
 

@@ -13,7 +13,7 @@ The last column is from the answer to the end of the operation as the status tel
 ``--beside`` measures stops of a head at rest beside crowds that ask for what costs much: 60 clients for a
 kept frame as PNG, 60 that connect to the events again and again, 30 for the description, 150 that ask for
 events and read none; and beside nobody, as the control. ``--code`` names checkouts whose daemons are
-compared, in turn in each round.
+compared, in turn in each round; the last column but one is how often a second the crowd was answered.
 """
 
 from __future__ import annotations
@@ -105,13 +105,14 @@ def main() -> int:
 def beside_crowds(crowds: list[str], checkouts: list[Path], stops: int, rounds: int) -> None:
     """Print how soon stops were answered beside each crowd, by the daemon of each checkout."""
     found: dict[tuple[str, Path, str], list[float]] = defaultdict(list)
+    answered: dict[tuple[str, Path], list[float]] = defaultdict(list)
     for _ in range(rounds):
         for code in checkouts:
             for crowd in ("nobody", *crowds):  # a daemon of its own for each, as after a start
                 with (
                     tempfile.TemporaryDirectory() as folder,
                     _daemon(Path(folder), "memory", code) as (port, path),
-                    _crowd(crowd, port),
+                    _crowd(crowd, port, answered[crowd, code]),
                 ):
                     ways = _ways(port, path)
                     for number in range(2 * stops):
@@ -120,31 +121,35 @@ def beside_crowds(crowds: list[str], checkouts: list[Path], stops: int, rounds: 
                         ways[name]()
                         found[crowd, code, name].append(1e3 * (time.monotonic() - began_s))
                         time.sleep(APART_S)
-    print(f"{'beside':<12} {'asked':<13} answered ms: median   99 %   worst   within 20 ms   code")
+    print(f"{'beside':<12} {'asked':<13} answered ms: median   99 %   worst   within 20 ms   crowd/s   code")
     for (crowd, code, name), times_ms in sorted(found.items()):
         ordered = sorted(times_ms)
         within = sum(one <= 20.0 for one in ordered) / len(ordered)
+        rate = sum(answered[crowd, code]) / len(answered[crowd, code])
         print(
             f"{crowd:<12} {name:<13} {_part(ordered, 0.5):>19.1f} {_part(ordered, 0.99):>6.1f}"
-            f" {ordered[-1]:>7.1f} {100 * within:>12.1f} %   {code}",
+            f" {ordered[-1]:>7.1f} {100 * within:>12.1f} % {rate:>9.1f}   {code}",
             flush=True,
         )
 
 
 @contextlib.contextmanager
-def _crowd(name: str, port: int) -> Iterator[None]:
-    """A crowd at work in a process of its own; ``nobody`` is none."""
+def _crowd(name: str, port: int, answered: list[float]) -> Iterator[None]:
+    """A crowd at work in a process of its own; ``nobody`` is none. Notes how often a second it is answered."""
     _get(port, "/status")
     if name == "nobody":
+        answered.append(0.0)
         yield
         return
     command = [sys.executable, "-m", "tools.benchmarks.crowd", name, str(port)]
-    with subprocess.Popen(command) as crowd:
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as crowd:
+        began_s = time.monotonic()
         try:
             time.sleep(SETTLE_S)
             yield
         finally:
             crowd.terminate()
+        answered.append(float(crowd.communicate()[0]) / (time.monotonic() - began_s))
 
 
 def _part(ordered: list[float], part: float) -> float:
