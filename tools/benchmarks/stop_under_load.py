@@ -135,7 +135,7 @@ def beside_crowds(crowds: list[str], checkouts: list[Path], stops: int, rounds: 
 
 @contextlib.contextmanager
 def _crowd(name: str, port: int, answered: list[float]) -> Iterator[None]:
-    """A crowd at work in a process of its own; ``nobody`` is none. Notes how often a second it is answered."""
+    """A crowd at work in a process of its own; ``nobody`` is none. Notes its answers a second."""
     _get(port, "/status")
     if name == "nobody":
         answered.append(0.0)
