@@ -209,7 +209,8 @@ class Devices:
         """Return the readings to send the head to, so that it comes to true angles.
 
         By the mast file's joints. The side from which each axis will come follows from where it stands, and
-        from whether the head comes to its goals from one side by itself.
+        from whether the head comes to its goals from one side by itself. Nearer than half the play to where
+        that side changes no goal leads to the angle: the one returned leads past it, by the play at most.
 
         Parameters
         ----------
@@ -228,7 +229,7 @@ class Devices:
                     true_rad,
                     (here.pan_rad, here.tilt_rad),
                     here.approach,
-                    self.door.turns_to(true_rad),
+                    self.door.turns_to(self._joints.read_rad(true_rad)),
                     strict=True,
                 )
             )

@@ -96,7 +96,7 @@ class Door:
         return {axis: one.count_rad for axis, one in self._stated.items() if one.count_rad}
 
     def turns_to(self, goal: Pair) -> tuple[int, int]:
-        """Return from which side pan and tilt come to a goal by themselves: 1, -1, 0 for the shortest way."""
+        """Return from which side pan and tilt come to a reading by themselves: 1, -1, 0 for either."""
         pan, tilt = (
             self._stated[axis].turn_to(to) if axis in self._stated else 0
             for axis, to in zip(("pan", "tilt"), goal, strict=True)

@@ -106,6 +106,21 @@ def test_by_way_of_a_corner_an_axis_comes_from_the_side_that_the_corner_leaves_i
     assert np.abs(off).max() < ORDER_RAD
 
 
+@pytest.mark.parametrize("turnover_rad", [-0.2, 0.3])
+def test_a_goal_near_the_turnover_of_the_weight_is_for_the_side_from_which_the_driver_comes(
+    turnover_rad: float,
+) -> None:
+    bench = Bench(simulated())
+    hangs = AxisMotion(1.0, rising_below_rad=turnover_rad)
+    bench.devices.door._stated = {"pan": AxisMotion(1.0), "tilt": hangs}
+    for past_rad in (-0.007, -0.003, 0.003, 0.007):  # from it, in readings: the true angle is 5 mrad away
+        wanted_rad = TOLD.tilt.true_rad(turnover_rad + past_rad)
+        assert abs(wanted_rad - turnover_rad - past_rad) > 0.003, "there is something to mistake"
+        goal_rad = bench.devices.goal((0.1, wanted_rad), bench.here)[1]
+        comes_to_rad = TOLD.tilt.true_rad(goal_rad, hangs.turn_to(goal_rad))
+        assert comes_to_rad == pytest.approx(wanted_rad, abs=1e-12), past_rad
+
+
 def test_a_true_rig_with_joints_makes_the_simulated_head_err_by_them() -> None:
     plain = head_settings({"preset": "dynamixel_x"})
     erring = with_joints(plain, TOLD)
