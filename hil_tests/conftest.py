@@ -17,7 +17,7 @@ from typing import Any
 
 import pytest
 
-from hil_tests.left_behind import OwnFolder
+from hil_tests.left_behind import Homes, OwnFolder
 
 REPOSITORY = Path(__file__).resolve().parent.parent
 VM_CONFTEST = REPOSITORY / "hil_tests" / "vm" / "conftest.py"
@@ -46,6 +46,7 @@ tempfile.tempdir = None  # asks the environment again
 os.environ["XDG_STATE_HOME"] = str(OWN.keep("state"))
 os.environ["MASTCTL_HEADS"] = str(OWN.keep("heads"))
 os.environ.pop("STATE_DIRECTORY", None)
+HOMES = Homes()
 LEFT = pytest.StashKey[list[str]]()
 
 
@@ -122,20 +123,28 @@ def pytest_runtest_protocol(
     return ran
 
 
+def pytest_runtest_logstart(nodeid: str) -> None:
+    """Know which tests run, in the workers too."""
+    HOMES.begin(nodeid)
+
+
 def pytest_runtest_logfinish(nodeid: str) -> None:
-    """Look what is in the temporary folder after each test."""
+    """Look what is in the temporary folder, and new at home, after each test."""
     OWN.look(nodeid)
+    HOMES.look(nodeid)
 
 
 @pytest.hookimpl(trylast=True)
 def pytest_sessionfinish(session: pytest.Session) -> None:
-    """Fail a run that leaves a process or a temporary file behind; a worker tells the one who prints."""
+    """Fail a run that leaves something behind; a worker tells the one who prints, who looks at home."""
     config = session.config
     if not config.pluginmanager.hasplugin("dsession"):  # it runs tests itself
         config.stash[LEFT] += OWN.left()
     if hasattr(config, "workeroutput"):
         config.workeroutput["left"] = config.stash[LEFT]
-    elif config.stash[LEFT] and session.exitstatus == pytest.ExitCode.OK:
+        return
+    config.stash[LEFT] += HOMES.left()
+    if config.stash[LEFT] and session.exitstatus == pytest.ExitCode.OK:
         session.exitstatus = pytest.ExitCode.TESTS_FAILED
 
 

@@ -1,13 +1,15 @@
-"""What a run of the tests leaves behind: processes, and things in the temporary folder that is its own.
+"""What a run of the tests leaves behind: processes, temporary files, and daemons' state in the user's home.
 
 Each process that runs tests has a folder of its own as ``TMPDIR``, which all that it starts inherits. So what
-it left can be told from what others do on the same machine at the same time.
+it left can be told from what others do on the same machine at the same time. Where daemons keep the state of
+their heads is one place for all: there, what is new since the run began counts unless somebody else holds it.
 """
 
 from __future__ import annotations
 
 import atexit
 import os
+import pwd
 import shutil
 import tempfile
 from contextlib import suppress
@@ -18,6 +20,56 @@ from hil_tests.waiting import until
 ENDING_S = 10.0  # for processes that were told to end a moment ago
 OF_THIS_PROCESS = (b"multiprocessing.resource_tracker", b"multiprocessing.forkserver")
 """Commands of processes that end with the one that runs the tests, when its pipe to them closes."""
+
+
+class Homes:
+    """Where daemons of this user keep state that outlives them, whatever the environment of a test says.
+
+    For the process that sees each test begin and end: the only one, or the one that has workers.
+    """
+
+    def __init__(self) -> None:
+        homes = {Path.home()}
+        with suppress(KeyError):  # a user whom the password database does not know
+            homes.add(Path(pwd.getpwuid(os.getuid()).pw_dir))
+        self._folders = [Path("/var/lib/mastctl"), *(home / ".local/state/mastctl" for home in homes)]
+        self._before = self._places()
+        self._running: set[str] = set()
+        self._first_seen: dict[Path, str] = {}
+
+    def begin(self, test: str) -> None:
+        """Remember that a test runs."""
+        self._running.add(test)
+
+    def look(self, test: str) -> None:
+        """Remember of what is new after which test it was there first, and which others ran then."""
+        self._running.discard(test)
+        meanwhile = "".join(f", while {other} ran" for other in sorted(self._running))
+        for place in self._places() - self._before:
+            self._first_seen.setdefault(place, test + meanwhile)
+
+    def left(self) -> list[str]:
+        """Return what is new and still there, a line each."""
+        self.look("the last test")
+        held = _held_by_others()
+        return [
+            f"{place} (first seen after {self._first_seen[place]})"
+            for place in sorted(self._places() - self._before)
+            if place.stat().st_ino not in held
+        ]
+
+    def _places(self) -> set[Path]:
+        """State folders of daemons, and places of heads."""
+        found = {
+            place for folder in self._folders for kind in ("*", "heads/*") for place in folder.glob(kind)
+        }
+        return {place for place in found if place.name != "heads"}
+
+
+def _held_by_others() -> set[int]:
+    """The inodes of what other processes have locked, as a daemon locks its folders (proc_locks(5))."""
+    locks = [line.split() for line in Path("/proc/locks").read_text().splitlines()]
+    return {int(words[-3].rpartition(":")[2]) for words in locks if words[-4] != str(os.getpid())}
 
 
 class OwnFolder:

@@ -14,7 +14,12 @@ import pytest
 
 from hil_tests.waiting import until
 
-CONFTEST = "from hil_tests.conftest import *\nfrom hil_tests.conftest import _tell_flaky\n"
+CONFTEST = """
+import os, pwd
+pwd.getpwuid = lambda user, was=pwd.getpwuid: pwd.struct_passwd([*was(user)[:5], os.environ["USERS"], "sh"])
+from hil_tests.conftest import *
+from hil_tests.conftest import _tell_flaky
+"""
 
 TESTS = {
     "nothing": "def test_it(tmp_path):\n    (tmp_path / 'file').touch()\n",
@@ -25,18 +30,61 @@ def test_it():
     code = "import subprocess; subprocess.Popen(['sleep', '600'], start_new_session=True)"
     subprocess.run([sys.executable, '-c', code], check=True, stdout=-3, stderr=-3)  # gone before the run ends
 """,
+    "place of a head": """
+import os, pathlib, pwd
+def test_it():
+    place = pathlib.Path(pwd.getpwuid(os.getuid()).pw_dir, ".local/state/mastctl/heads/usb-1234-left")
+    place.mkdir(parents=True)
+    place.with_name("10.0.0.5-another").mkdir()
+    place.with_name("10.0.0.5-another").rmdir()
+def test_after_it():
+    pass
+""",
+    "state folder": """
+import pathlib
+def test_it():
+    home = pathlib.Path.home() / ".local/state/mastctl"
+    assert (home / "heads/of_before").is_dir()
+    (home / "rover-left").mkdir()
+""",
+    "nothing of ours": """
+import os, pathlib, subprocess, sys
+HELD = "import fcntl, os, time; fcntl.flock(os.open('.', 0), fcntl.LOCK_EX); print(os.getpid(), flush=True); "
+HELD = [sys.executable, "-c", HELD + "os.close(1); time.sleep(600)"]
+def test_it():
+    place = pathlib.Path.home() / ".local/state/mastctl/rover-of-others"
+    place.mkdir()
+    others = {name: value for name, value in os.environ.items() if name != "TMPDIR"}
+    ends = [sys.executable, "-c", f"import subprocess; subprocess.Popen({HELD})"]
+    (place / "pid").write_bytes(subprocess.run(ends, env=others, cwd=place, stdout=-1, stderr=-3).stdout)
+""",
+}
+
+LEFT_BY_IT = {
+    "folder": "/mastctl-",
+    "process": "sleep 600",
+    "place of a head": "/user/.local/state/mastctl/heads/usb-1234-left ",
+    "state folder": "/home/.local/state/mastctl/rover-left ",
 }
 
 
 @pytest.mark.parametrize(
-    ("what", "workers"), [("nothing", 0), ("folder", 0), ("process", 0), ("folder", 1), ("nothing", 1)]
-)
+    ("what", "workers"),
+    [
+        ("nothing", 0), ("folder", 0), ("process", 0), ("folder", 1), ("nothing", 1),
+        ("place of a head", 0), ("place of a head", 2), ("state folder", 0), ("state folder", 1),
+        ("nothing of ours", 0), ("nothing of ours", 1),
+    ],
+)  # fmt: skip
 def test_what_is_left_behind_fails_the_run(repository: Path, tmp_path: Path, what: str, workers: int) -> None:
     (tmp_path / "conftest.py").write_text(CONFTEST)
     (tmp_path / "test_one.py").write_text(TESTS[what])
     (tmp_path / "temporary").mkdir()
+    (tmp_path / "home/.local/state/mastctl/heads/of_before").mkdir(parents=True)
     environment = {
         **os.environ,
+        "HOME": f"{tmp_path}/home",
+        "USERS": f"{tmp_path}/user",
         "PYTHONPATH": str(repository),
         "PYTEST_DEBUG_TEMPROOT": f"{tmp_path}/temporary",
     }
@@ -59,14 +107,17 @@ def test_what_is_left_behind_fails_the_run(repository: Path, tmp_path: Path, wha
     told = [line for line in done.stdout.splitlines() if line.startswith("LEFT BEHIND")]
     for process in re.findall(r"process (\d+): sleep 600", done.stdout):
         os.kill(int(process), signal.SIGKILL)
-    assert "1 passed" in done.stdout, done.stdout + done.stderr
+    for file in tmp_path.glob("home/.local/state/mastctl/*/pid"):
+        os.kill(int(file.read_text()), signal.SIGKILL)
+    assert " passed" in done.stdout and "failed" not in done.stdout, done.stdout + done.stderr
     assert not [*tmp_path.glob("temporary/mastctl-*")]  # it clears away what it complains of
-    if what == "nothing":
+    if what in ("nothing", "nothing of ours"):
         assert done.returncode == 0 and told == []
     else:
         (line,) = told
         assert done.returncode == 1
-        assert "sleep 600" in line if what == "process" else "/mastctl-" in line and "test_it" in line
+        assert LEFT_BY_IT[what] in line
+        assert what == "process" or re.search(r"\(first seen after .*test_one.py::test_it\b", line)
 
 
 TOOL = """

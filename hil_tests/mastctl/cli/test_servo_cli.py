@@ -7,6 +7,7 @@ import math
 import re
 import signal
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -21,6 +22,7 @@ from drivers.sim.wire.dynamixel_servo import OVERLOAD, SimulatedServo
 from drivers.sim.wire.memory_line import MemoryLine
 from drivers.simulation_clock import SimulationClock
 from mastctl.cli.main import main
+from mastctl.safety import heads
 
 BAUD = "1000000"
 PLAIN = AxisSettings(math.tau / 4096, 0.0, -3.0, 3.0, 1.0, 4.0)
@@ -41,8 +43,10 @@ class Bench:
 
 
 @pytest.fixture
-def bench(monkeypatch: pytest.MonkeyPatch) -> Iterator[Bench]:
+def bench(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[Bench]:
     it = Bench()
+    monkeypatch.setattr(heads, "SYSTEM", tmp_path / "no_such")
+    monkeypatch.setattr(heads, "_home", lambda: tmp_path)  # the name of a line in memory is a true line's
     monkeypatch.setattr(Link.__init__, "__kwdefaults__", {"clock": it.clock, "open_line": it.line.open})
     monkeypatch.setattr(workshop.scan, "__defaults__", (it.clock, it.line.open))
     with it.clock.at_work(), it.line:
