@@ -48,6 +48,7 @@ os.environ["MASTCTL_HEADS"] = str(OWN.keep("heads"))
 os.environ.pop("STATE_DIRECTORY", None)
 HOMES = Homes()
 LEFT = pytest.StashKey[list[str]]()
+SEEN = pytest.StashKey[list[dict[str, str]]]()
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
@@ -72,6 +73,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 def pytest_configure(config: pytest.Config) -> None:
     """Declare the marker of the long run."""
     config.stash[LEFT] = []
+    config.stash[SEEN] = [HOMES.first_seen]
     config.addinivalue_line(
         "markers",
         "long(part, why): left out of the quick run; belongs to one of the four parts of the long run that "
@@ -115,6 +117,7 @@ def pytest_runtest_protocol(
     What is left then is what modules and the session keep; the next collection does not look at it again.
     """
     ran = yield
+    HOMES.look(item.nodeid)
     if nextitem is None or nextitem.path != item.path:
         gc.collect()
         gc.freeze()
@@ -123,15 +126,9 @@ def pytest_runtest_protocol(
     return ran
 
 
-def pytest_runtest_logstart(nodeid: str) -> None:
-    """Know which tests run, in the workers too."""
-    HOMES.begin(nodeid)
-
-
 def pytest_runtest_logfinish(nodeid: str) -> None:
-    """Look what is in the temporary folder, and new at home, after each test."""
+    """Look what is in the temporary folder after each test."""
     OWN.look(nodeid)
-    HOMES.look(nodeid)
 
 
 @pytest.hookimpl(trylast=True)
@@ -141,9 +138,9 @@ def pytest_sessionfinish(session: pytest.Session) -> None:
     if not config.pluginmanager.hasplugin("dsession"):  # it runs tests itself
         config.stash[LEFT] += OWN.left()
     if hasattr(config, "workeroutput"):
-        config.workeroutput["left"] = config.stash[LEFT]
+        config.workeroutput |= {"left": config.stash[LEFT], "seen": HOMES.first_seen}
         return
-    config.stash[LEFT] += HOMES.left()
+    config.stash[LEFT] += HOMES.left(config.stash[SEEN])
     if config.stash[LEFT] and session.exitstatus == pytest.ExitCode.OK:
         session.exitstatus = pytest.ExitCode.TESTS_FAILED
 
@@ -151,7 +148,9 @@ def pytest_sessionfinish(session: pytest.Session) -> None:
 @pytest.hookimpl(optionalhook=True)
 def pytest_testnodedown(node: Any) -> None:
     """Take what a worker of xdist left."""
-    node.config.stash[LEFT] += getattr(node, "workeroutput", {}).get("left", [])
+    told = getattr(node, "workeroutput", {})
+    node.config.stash[LEFT] += told.get("left", [])
+    node.config.stash[SEEN].append(told.get("seen", {}))
 
 
 @pytest.hookimpl(wrapper=True, tryfirst=True)

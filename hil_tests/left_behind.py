@@ -25,7 +25,8 @@ OF_THIS_PROCESS = (b"multiprocessing.resource_tracker", b"multiprocessing.forkse
 class Homes:
     """Where daemons of this user keep state that outlives them, whatever the environment of a test says.
 
-    For the process that sees each test begin and end: the only one, or the one that has workers.
+    Several processes run tests and none can see whose a place is: each remembers after which test of its own
+    it was there first. That of the process that made it is among these, whoever is slow to tell.
     """
 
     def __init__(self) -> None:
@@ -34,28 +35,21 @@ class Homes:
             homes.add(Path(pwd.getpwuid(os.getuid()).pw_dir))
         self._folders = [Path("/var/lib/mastctl"), *(home / ".local/state/mastctl" for home in homes)]
         self._before = self._places()
-        self._running: set[str] = set()
-        self._first_seen: dict[Path, str] = {}
-
-    def begin(self, test: str) -> None:
-        """Remember that a test runs."""
-        self._running.add(test)
+        self.first_seen: dict[str, str] = {}
 
     def look(self, test: str) -> None:
-        """Remember of what is new after which test it was there first, and which others ran then."""
-        self._running.discard(test)
-        meanwhile = "".join(f", while {other} ran" for other in sorted(self._running))
+        """Remember after which test of this process something new was there first."""
         for place in self._places() - self._before:
-            self._first_seen.setdefault(place, test + meanwhile)
+            self.first_seen.setdefault(str(place), test)
 
-    def left(self) -> list[str]:
-        """Return what is new and still there, a line each."""
-        self.look("the last test")
+    def left(self, seen: list[dict[str, str]]) -> list[str]:
+        """Return what is new and still there, a line each, with what each process saw first."""
         held = _held_by_others()
         return [
-            f"{place} (first seen after {self._first_seen[place]})"
+            f"{place} (first seen after {' or '.join(tests) or 'the last test'})"
             for place in sorted(self._places() - self._before)
             if place.stat().st_ino not in held
+            for tests in [sorted({one[str(place)] for one in seen if str(place) in one})]
         ]
 
     def _places(self) -> set[Path]:
