@@ -98,7 +98,9 @@ def minimise(
             expected = float(-step @ (2 * scaled_gradient + scaled @ step))
             if expected <= gain * normal.cost + NOTHING and damping <= FIRST_DAMPING:
                 moved = _try(problem, state, scale * step, normal.cost)
-                return Minimum(state if moved is None else moved, normal, True, count)
+                if moved is not None:
+                    state, normal = moved, problem.normal(moved)
+                return Minimum(state, normal, True, count)
             moved = _try(problem, state, scale * step, normal.cost)
             if moved is None:
                 damping, rejected_in_a_row = max(10 * damping, 1e-12), rejected_in_a_row + 1

@@ -143,3 +143,14 @@ def test_minimum_is_found_and_what_nothing_depends_on_stays() -> None:
     found = minimise(Valley(), np.array([-1.2, 1.0, 7.0]), weak=np.full(3, 1e-6))
     assert found.settled
     assert np.abs(found.state - [1.0, 1.0, 7.0]).max() < 1e-8
+
+
+@pytest.mark.parametrize("gain", [1e-1, 1e-4, 1e-10])
+def test_normal_equations_are_those_of_the_state_where_a_fit_ended(gain: float) -> None:
+    valley = Valley()
+    found = minimise(valley, np.array([-1.2, 1.0, 7.0]), weak=np.full(3, 1e-6), gain=gain)
+    there = valley.normal(found.state)
+    assert found.settled
+    assert found.normal.cost == there.cost
+    assert np.array_equal(found.normal.matrix, there.matrix)
+    assert np.array_equal(found.normal.gradient, there.gradient)
