@@ -138,17 +138,18 @@ def variance_components(
     return tuple(found)
 
 
-def found_sigmas(components: Sequence[Component]) -> dict[str, float]:
+def found_sigmas(components: Sequence[Component], *, narrows: bool = True) -> dict[str, float]:
     """Return by kind what a stated sigma should be multiplied by.
 
     Luck changes none: a kind is widened, or narrowed, where chance does not explain its residuals; one that
     was before stays so a little longer, so that none comes and goes. Tapes and prisms are taken together
-    where they agree.
+    where they agree. Without ``narrows`` no sigma becomes smaller than stated.
     """
     told = [c for c in components if np.isfinite(c.factor)]
     found = {c.kind: c.factor for c in told}
     limit = {c.kind: (STAYS if c.weighed != 1.0 else 1.0) * RARELY / len(told) for c in told}
-    wrong = {c.kind for c in told if min(c.chance, c.small_chance) < limit[c.kind]}
+    odd = {c.kind: 2 * min(c.chance, c.small_chance) if narrows else c.chance for c in told}
+    wrong = {kind for kind, chance in odd.items() if chance < limit[kind]}
     station = {c.kind: c for c in told if c.kind in (TAPES, PRISMS)}
     if len(station) == 2 and wrong & set(station) and as_one(station[TAPES], station[PRISMS]):
         square = sum(c.redundancy * c.factor**2 for c in station.values())

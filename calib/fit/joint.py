@@ -113,9 +113,7 @@ def weigh(
         covariance = covariance_of(fit.normal.matrix, problem.weak)
         components = variance_components(problem.blocks(fit.state), covariance, weighed)
         first = first or components
-        wanted = found_sigmas(components)
-        if not narrows:
-            wanted = {kind: max(1.0, factor) for kind, factor in wanted.items()}
+        wanted = found_sigmas(components, narrows=narrows)
         change = {kind: factor / weighed.get(kind, 1.0) for kind, factor in wanted.items()}
         if count == WEIGHINGS or all(abs(ratio - 1.0) < WEIGHED for ratio in change.values()):
             break

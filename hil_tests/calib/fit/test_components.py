@@ -9,7 +9,7 @@ import pytest
 
 from calib.fit.adjustment import Block
 from calib.fit.calibration import Calibration
-from calib.fit.components import Component, found_sigmas, variance_components
+from calib.fit.components import RARELY, Component, found_sigmas, variance_components
 from calib.fit.joint import fit_joint
 from calib.fit.terms import StationTerm
 from calib.mast.rig import Rig
@@ -90,6 +90,24 @@ def test_luck_with_few_numbers_narrows_nothing() -> None:
     few = Component("prisms", 24, 8.0, 0.5, 0.1, 1.0, 0.99, 0.02)
     many = Component("dots of navcam_left", 800, 700.0, 0.97, 0.03, 1.0, 0.9, 0.1)
     assert found_sigmas([few, many]) == {"prisms": 1.0, "dots of navcam_left": 1.0}
+
+
+@pytest.mark.parametrize("kinds", [1, 4])
+def test_right_sigmas_are_called_wrong_as_seldom_as_stated_all_kinds_together(kinds: int) -> None:
+    others = [Component(f"dots of c{k}", 800, 700.0, 1.0, 0.03, 1.0, 0.5, 0.5) for k in range(1, kinds)]
+    chances = (np.arange(16_000) + 0.5) / 16_000  # what right sigmas give: every chance as often as any other
+
+    def alarms(**options: bool) -> float:
+        found = [
+            found_sigmas(
+                [Component("dots of c0", 800, 700.0, 1.1, 0.03, 1.0, p, 1.0 - p), *others], **options
+            )
+            for p in chances.tolist()
+        ]
+        return kinds * float(np.mean([one["dots of c0"] != 1.0 for one in found]))
+
+    assert alarms() == pytest.approx(RARELY, rel=0.11)
+    assert alarms(narrows=False) == pytest.approx(RARELY, rel=0.11), "one side alone has it all"
 
 
 def heights(sigma_m: float, count: int, rng: np.random.Generator) -> list[tuple[StationTerm, Block]]:
