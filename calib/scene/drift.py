@@ -18,7 +18,7 @@ from typing import NamedTuple
 import numpy as np
 
 from calib.camera.cahvor import CameraModel
-from calib.fit.significance import chance, sigmas
+from calib.fit.significance import MEDIAN_OF_TWO, chance, sigmas
 from calib.mast.rig import Rig
 from calib.rigid import FloatArray, Rigid, rot_x, rot_y, rot_z
 from calib.scene.terms import corrected
@@ -163,7 +163,7 @@ def view_change(shift: ViewShift, size_px: tuple[int, int]) -> ViewChange | None
     agreeing = float(np.mean(weights > 0.1))
     if agreeing < LEAST_PART or spread > MOST_SPREAD_PX:
         return None
-    scatter = max(1.0, (spread / float(np.median(sigma))) ** 2)
+    scatter = max(1.0, (spread / float(np.median(sigma))) ** 2 / MEDIAN_OF_TWO)
     covariance = np.asarray(scatter * np.linalg.inv(normal) + np.diag(VIEW_SIGMA**2), dtype=np.float64)
     return ViewChange(numbers, covariance, agreeing)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from calib.scene.drift import ALARM_SIGMAS, ViewShift, find_drift, view_change
+from calib.scene.drift import ALARM_SIGMAS, VIEW_SIGMA, ViewShift, find_drift, view_change
 from tools.campaigns.sentinel import RESTS, SIZE, Site, Truth, rig, shown
 
 SEED = 11
@@ -63,6 +63,21 @@ def test_rocks_that_move_together_do_not_move_a_view() -> None:
     # the numbers are of the picture's middle
     predicted = change.numbers[:2] + change.numbers[3] * (pixels.mean(axis=0) - middle)
     np.testing.assert_allclose(predicted, [1.5, -0.5], atol=0.1)
+
+
+@pytest.mark.parametrize("times", [1.0, 3.0], ids=["as told", "three times as told"])
+def test_a_view_is_as_unsure_as_its_features_scatter(times: float) -> None:
+    rng = np.random.default_rng(SEED)
+    normalised = []
+    for _ in range(300):
+        pixels = rng.uniform(50, 700, (60, 2))
+        moved = times * 0.1 * rng.normal(size=(60, 2))
+        change = view_change(ViewShift("navcam_left", 0, 0.0, 0.0, pixels, moved, np.full(60, 0.1)), SIZE)
+        assert change is not None
+        own = change.covariance - np.diag(VIEW_SIGMA**2)
+        normalised.append(change.numbers @ np.linalg.solve(own, change.numbers) / 4)
+    # robust weights cost a tenth; the mean over 300 views of four numbers is good to 4 %
+    assert 0.8 < np.mean(normalised) < 1.1
 
 
 def test_another_scene_says_nothing_instead_of_something() -> None:
