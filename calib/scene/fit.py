@@ -253,7 +253,8 @@ def _without_outliers(
 
 def _told_by(problem: SceneProblem, state: State) -> float:
     """How many numbers the features themselves tell, where rests are loose."""
-    prior = np.where(problem.prior == problem.joint_sigma_rad, LOOSE_RAD, problem.prior)
+    prior = problem.prior
+    prior[problem.terms :] = LOOSE_RAD
     matrix = problem.linear(state).matrix
     return float(np.trace(np.linalg.solve(matrix + np.diag(prior**-2), matrix)))
 

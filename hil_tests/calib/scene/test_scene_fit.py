@@ -12,7 +12,7 @@ from calib.errors import NoCorrection
 from calib.mast.rig import Mast, Rig, RigCamera
 from calib.scene.features import Feature
 from calib.scene.fit import fit_scene
-from calib.scene.terms import terms_of
+from calib.scene.terms import PRIOR, terms_of
 from calib.scene.views import View
 
 SIZE = (1024, 768)
@@ -192,6 +192,14 @@ def test_rests_that_scatter_more_than_was_told_are_not_taken_for_a_wrong_rig() -
     with pytest.raises(NoCorrection) as refused:
         fit_scene(believed(), views, features)
     assert refused.value.code == "not_significant"
+
+
+def test_a_told_scatter_that_equals_what_eyes_may_turn_by_is_no_other_scatter() -> None:
+    views, features = scene(5, {"eye_left": np.array([0.012, -0.018, 0.009])}, count=60)
+    noisier = [replace(f, covariances_px2=f.covariances_px2 / 9.0) for f in features]
+    scales = [fit_scene(believed(), views, noisier, PRIOR["turn"] * by).scale for by in (1.0 - 1e-7, 1.0)]
+    assert 4.0 < scales[0] < 16.0
+    assert scales[1] == pytest.approx(scales[0], rel=1e-6)
 
 
 def test_an_axis_with_play_is_told_by_rests_from_both_sides() -> None:
