@@ -199,7 +199,7 @@ def _fit_from(
         mast = minimise(
             _Images(seen, free, _cauchy(seen, mast, expected_px)), mast, weak=weak, steps=steps
         ).state
-    rms = np.array([typical_px(mast_residual(view, mast)) for view in views])
+    rms = _typical_px(views, mast)
     typical = float(np.median(rms))
     limit_px = GROSS * max(typical, expected_px)
     good = (rms <= limit_px) | keep_all
@@ -207,7 +207,8 @@ def _fit_from(
     if np.isfinite(typical) and kept:
         sigmas = [np.ones(len(view.points_m)) for view in kept]
         last = minimise(_Images(kept, free, sigmas), mast, weak=weak, steps=LAST_STEPS)
-        mast, typical = last.state, typical if last.settled else np.inf
+        mast = last.state
+        typical = float(np.median(_typical_px(views, mast))) if last.settled else np.inf
     else:
         kept = list(views)
     residuals = np.concatenate([mast_residual(view, mast) for view in kept])
@@ -229,9 +230,14 @@ def _thinned(view: MastView) -> MastView:
     )
 
 
+def _typical_px(views: Sequence[MastView], mast: FloatArray) -> FloatArray:
+    """What a coordinate of each image is typically off by (n,), infinite where most have no pixel."""
+    return np.array([typical_px(mast_residual(view, mast)) for view in views])
+
+
 def _cauchy(views: Sequence[MastView], mast: FloatArray, expected_px: float) -> list[FloatArray]:
     """Sigmas that take the pull from images far from the typical one."""
-    rms = np.array([typical_px(mast_residual(view, mast)) for view in views])
+    rms = _typical_px(views, mast)
     typical = max(float(np.median(rms)), expected_px)
     if not np.isfinite(typical):
         return [np.ones(len(view.points_m)) for view in views]

@@ -61,6 +61,19 @@ def test_a_mast(navcams: Rig, stopped: Callable[..., None], parameters: int) -> 
         fit_mast.fit_mast(views, parameters, keep_all=parameters == 4)
 
 
+def test_a_mast_is_judged_by_where_its_last_fit_ended(navcams: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
+    views, far = mast_views(navcams), np.array([0.5, 0.2, -1.7, 0.1, -0.1, 0.1, 0.0, 0.0])
+    fit = fit_mast.fit_mast(views, 6, expected_px=0.3, rough=far)
+
+    def minimise(*arguments: object, steps: int = 200, **options: object) -> object:
+        return least_squares.minimise(*arguments, steps=steps if steps >= 100 else 0, **options)  # type: ignore
+
+    monkeypatch.setattr(fit_mast, "minimise", minimise)  # what leads there does not
+    late = fit_mast.fit_mast(views, 6, expected_px=0.3, rough=far)
+    assert not late.left_out
+    assert np.abs(late.mast - fit.mast).max() < 1e-6
+
+
 def mast_views(rig: Rig) -> list[fit_mast.MastView]:
     """Images of random points at many joint angles."""
     rng, views = np.random.default_rng(3), []
