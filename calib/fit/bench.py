@@ -124,8 +124,7 @@ def _look_for_changes(bench: BenchProblem, chosen: Sequence[str]) -> tuple[Adjus
         fit = minimise(problem, fit.state, weak=problem.weak, gain=1e-6)
         if not np.isfinite(fit.normal.cost) or not left:
             break
-        freedom = sum(2 * int(t.keep.sum()) for t in problem.images) - len(problem.names)
-        change = find_change(problem, fit.state, freedom)
+        change = find_change(problem, fit.state)
         _refuse_slip(bench, fit.state)
         if change is None:
             break

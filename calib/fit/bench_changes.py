@@ -17,6 +17,7 @@ import numpy as np
 
 from calib.camera.cahvor import CameraModel
 from calib.fit.adjustment import Adjustment, Estimate
+from calib.fit.joint import goodness
 from calib.fit.least_squares import covariance_of
 from calib.fit.significance import chance
 from calib.fit.terms import ImageTerm
@@ -113,13 +114,13 @@ class _Rows:
     rates: dict[str, FloatArray]
 
 
-def find_change(problem: Adjustment, state: Estimate, freedom: float) -> Change | None:
+def find_change(problem: Adjustment, state: Estimate) -> Change | None:
     """Return the change that explains most, or None if none is significant.
 
     Parameters
     ----------
-    problem, state, freedom
-        A fit with pulls bounded, and its degrees of freedom.
+    problem, state
+        A fit with pulls bounded.
     """
     rows = [_rows(problem, state, image) for image in problem.images if image.keep.any()]
     # Of this very state: what is left of a change that others nearly take up is a small difference.
@@ -138,6 +139,7 @@ def find_change(problem: Adjustment, state: Estimate, freedom: float) -> Change 
     most = max(change.chi2 for change in found)
     as_good = [c for c in found if c.chi2 >= AS_GOOD * most]
     best = min(as_good, key=lambda c: (len(c.step), -c.chi2))
+    _, freedom = goodness(problem, state, covariance)
     scale = max((chi2 - best.chi2) / max(freedom, 1.0), 0.1)
     if scale > STILL_FAR and best.chi2 < 0.5 * chi2:  # it is the model that is wrong
         return None

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from calib.fit import bench_changes
 from calib.fit.bench import BenchOptions, fit_bench
 from calib.fit.bench_calibration import BenchCalibration
 from calib.fit.bench_start import BenchNotFitted
@@ -80,6 +81,22 @@ def test_harmonics_backlash_and_bow_enter_and_say_what_they_gain() -> None:
         assert sigma < 4e-4
         off = np.diff(joint.true_rad(readings, 1)) - np.diff(true.true_rad(readings, 1))
         assert abs(off[0]) < IN_SIGMAS * sigma
+
+
+def test_joint_readings_count_as_measurements_where_changes_are_looked_for(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    asked: list[float] = []
+
+    def chance(chi2: float, numbers: int, scale: float, freedom: float) -> float:
+        asked.append(freedom)
+        return 1.0
+
+    monkeypatch.setattr(bench_changes, "chance", chance)
+    fit = fit_bench(simulate_bench(1, BenchPlan(attitudes=10, **SERVO)))
+    terms = sum(len(t.parameters) for t in fit.terms)
+    # all terms are fitted then; readings without a number of their own would be some 70 fewer
+    assert asked == [pytest.approx(fit.degrees_of_freedom, abs=terms)]
 
 
 def test_skew_axes_enter_when_they_are_there() -> None:
