@@ -10,6 +10,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import errno
+import gc
 import logging
 import os
 import signal
@@ -299,6 +300,11 @@ async def _serve(
     listener.listen(WAITING_IN_KERNEL)  # asyncio has one number for this and for how many it takes at once
     stands = (lambda credential: True) if entrance.access is None else entrance.access.stands
     sweeping = asyncio.create_task(sweep(server.server_state.connections, stands))
+    if in_process:
+        # What the start has made stays. Looked through again by each full collection it held every thread for
+        # some 80 ms, a stop's too.
+        gc.collect()
+        gc.freeze()
     on_ready(end_from_anywhere)
     manager.ready()
     telling = asyncio.create_task(_tell_state(service, manager))
