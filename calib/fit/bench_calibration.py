@@ -10,6 +10,7 @@ import numpy as np
 
 from calib.fit.calibration import Degenerate, ImageResiduals, Outlier
 from calib.fit.components import Component
+from calib.fit.model_terms import ModelTerm
 from calib.fit.significance import THREE_SIGMAS
 from calib.mast.rig import Rig
 from calib.rigid import FloatArray, Rigid
@@ -21,12 +22,12 @@ class TermGain:
 
     Attributes
     ----------
-    name
-        ``pan harmonic 1``, ``tilt backlash``, ``axis offset``, ``bow of b1``.
+    term
+        What it is; its name is ``pan harmonic 1``, ``tilt backlash``, ``axis offset``, ``bow of b1``.
     entered
         Whether it is part of the model.
-    parameters, values
-        Its numbers' names (k,) and what the fit with it says they are (k,), in the names' units.
+    values
+        What the fit with it says its parameters are (k,), in the units of their names.
     sigma
         (k,) of these.
     chi2
@@ -37,9 +38,8 @@ class TermGain:
         Rms over all corners of what it moves pixels by; nan where it did not enter.
     """
 
-    name: str
+    term: ModelTerm
     entered: bool
-    parameters: tuple[str, ...]
     values: FloatArray
     sigma: FloatArray
     chi2: float
@@ -47,15 +47,25 @@ class TermGain:
     moves_px: float
 
     @property
+    def name(self) -> str:
+        """What a person calls the term."""
+        return self.term.name
+
+    @property
+    def parameters(self) -> tuple[str, ...]:
+        """Its numbers' names (k,)."""
+        return self.term.parameters
+
+    @property
     def sentence(self) -> str:
         """The term in words."""
         size = float(np.linalg.norm(self.values))
         spread = float(np.sqrt(np.mean(self.sigma**2)))
-        milli = "mm" if self.parameters[0].endswith("_m") or ".bow_m" in self.parameters[0] else "mrad"
+        milli = "mm" if self.term.kind in ("offset", "bow") else "mrad"
         told = f"{self.name}: {1e3 * size:.2f} ± {1e3 * spread:.2f} {milli}"
         if not self.entered:
             return f"{told}, not significant (chi-square {self.chi2:.1f}): left out"
-        if self.chance > THREE_SIGMAS and not self.name.endswith("harmonic 2"):
+        if self.chance > THREE_SIGMAS and self.term.kind != "harmonic 2":
             return f"{told}, chi-square {self.chi2:.1f}: not significant, but the pictures cannot exclude it"
         return f"{told}, moves pixels by {self.moves_px:.2f} px rms, lowers chi-square by {self.chi2:.0f}"
 

@@ -13,7 +13,7 @@ from calib.camera.cahvor import Kind
 from calib.fit.adjustment import HUBER, Adjustment, Estimate
 from calib.fit.bench_start import BenchNotFitted, BenchStart, SomethingChanged, bench_start
 from calib.fit.bench_terms import BenchTerms, bench_terms
-from calib.fit.model_terms import AXIS_TERMS, candidate_terms, joint_numbers
+from calib.fit.model_terms import AXIS_TERMS, bow_of, candidate_terms, joint_numbers
 from calib.fit.significance import MEDIAN_OF_TWO
 from calib.fit.terms import ImageTerm, with_kept
 from calib.fit.view_poses import ViewPoses, ViewsTooFew, view_poses
@@ -31,7 +31,7 @@ TURNABOUTS = 0.34
 INEXACT = 1.15
 """Corners that are typically so many of their own sigmas off are less exact than noise leaves them."""
 
-AXES = tuple(MAST_NAMES.index(names[0].removeprefix("mast.")) for names in AXIS_TERMS.values())
+AXES = tuple(MAST_NAMES.index(t.parameters[0].removeprefix("mast.")) for t in AXIS_TERMS.values())
 
 
 @dataclass(frozen=True)
@@ -197,7 +197,7 @@ class BenchProblem:
             mast_parameters=[*(() if known is None else range(6)), *axes],
             joint_rad=self.joint_rad,
             joint_errors=joint_numbers(chosen),
-            bowed=[b for b in self.boards if f"bow of {b}" in chosen],
+            bowed=[b for b in self.boards if bow_of(b).name in chosen],
             held=() if known is None else (known[0],),
             huber=HUBER,
         )
@@ -252,12 +252,13 @@ class BenchProblem:
         """Terms that pictures could tell: backlash only where the axis came from both sides."""
         found = []
         approaches = np.array([t.approach for t in self.terms.images if t.attitude is not None])
-        for term in candidate_terms(self.boards):
-            axis = 0 if term.startswith("pan") else 1
-            if term.endswith("backlash") and not {-1, 1} <= set(approaches[:, axis].tolist()):
-                self.notes.append(_one_sided(term, ("pan", "tilt")[axis], set(approaches[:, axis].tolist())))
-                continue
-            found.append(term)
+        for name, term in candidate_terms(self.boards).items():
+            if term.kind == "backlash":
+                sides = set(approaches[:, ("pan", "tilt").index(term.of)].tolist())
+                if not {-1, 1} <= sides:
+                    self.notes.append(_one_sided(name, term.of, sides))
+                    continue
+            found.append(name)
         return tuple(found)
 
 
@@ -283,8 +284,8 @@ def without_terms(state: Estimate, terms: set[str]) -> Estimate:
     """Return the state with some terms' numbers at nothing."""
     mast, errors = state.mast.copy(), state.joint_errors.copy()
     mast[[i for i, term in zip(AXES, AXIS_TERMS, strict=True) if term in terms]] = 0.0
-    errors[joint_numbers([term for term in terms if term.startswith(("pan ", "tilt "))])] = 0.0
-    bows = {b: np.zeros(2) if f"bow of {b}" in terms else bow for b, bow in state.bows_m.items()}
+    errors[joint_numbers(list(terms))] = 0.0
+    bows = {b: np.zeros(2) if bow_of(b).name in terms else bow for b, bow in state.bows_m.items()}
     return replace(state, mast=mast, joint_errors=errors, bows_m=bows)
 
 

@@ -154,7 +154,7 @@ def _gains(
         test = now[term] if term in chosen else tests[term]
         found.append(
             TermGain(
-                term, term in chosen, every[term], test.values, test.sigma, test.chi2, test.chance,
+                every[term], term in chosen, test.values, test.sigma, test.chi2, test.chance,
                 moves.get(term, float("nan")),
             )
         )  # fmt: skip

@@ -14,8 +14,9 @@ most of the other's work, and a fit with the wrong one alone would be sure of nu
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 
@@ -23,35 +24,68 @@ from calib.fit.significance import THREE_SIGMAS, chance
 from calib.mast.joints import JOINTS_NAMES
 from calib.rigid import FloatArray
 
-JOINT_TERMS = {
-    f"{axis} {word}": tuple(f"joints.{axis}.{number}" for number in numbers)
-    for axis in ("pan", "tilt")
-    for word, numbers in (
-        ("harmonic 1", ("c1", "s1")),
-        ("harmonic 2", ("c2", "s2")),
-        ("backlash", ("backlash_rad",)),
-    )
-}
-AXIS_TERMS = {"axis offset": ("mast.axis_offset_m",), "axis twist": ("mast.axis_twist_rad",)}
+Kind = Literal["harmonic 1", "harmonic 2", "backlash", "offset", "twist", "bow"]
 
+
+@dataclass(frozen=True)
+class ModelTerm:
+    """A part of the model: its kind, what it is of (a joint, ``axis``, a board), its parameters' names."""
+
+    kind: Kind
+    of: str
+    parameters: tuple[str, ...]
+
+    @property
+    def name(self) -> str:
+        """What a person calls it; no two terms of a model have the same."""
+        return f"bow of {self.of}" if self.kind == "bow" else f"{self.of} {self.kind}"
+
+    @property
+    def group(self) -> tuple[str, str]:
+        """Terms of one group enter together or not at all."""
+        return "harmonic" if self.kind in ("harmonic 1", "harmonic 2") else self.kind, self.of
+
+
+def _by_name(terms: Iterable[ModelTerm]) -> dict[str, ModelTerm]:
+    return {term.name: term for term in terms}
+
+
+_JOINT_KINDS: dict[Kind, tuple[str, ...]] = {
+    "harmonic 1": ("c1", "s1"),
+    "harmonic 2": ("c2", "s2"),
+    "backlash": ("backlash_rad",),
+}
+JOINT_TERMS = _by_name(
+    ModelTerm(kind, joint, tuple(f"joints.{joint}.{number}" for number in numbers))
+    for joint in ("pan", "tilt")
+    for kind, numbers in _JOINT_KINDS.items()
+)
+AXIS_TERMS = _by_name(
+    (
+        ModelTerm("offset", "axis", ("mast.axis_offset_m",)),
+        ModelTerm("twist", "axis", ("mast.axis_twist_rad",)),
+    )
+)
 
 HIDDEN_PX = 0.1
 """What may hide in a term that is left out, one sigma, rms: half of what a person's click is off by."""
 
 
-def candidate_terms(boards: Sequence[str]) -> dict[str, tuple[str, ...]]:
-    """Return the terms that a model of some boards may have, by name, as their parameters' names."""
-    bows = {f"bow of {board}": tuple(f"board {board}.bow_m.{a}" for a in "xy") for board in boards}
-    return {**JOINT_TERMS, **AXIS_TERMS, **bows}
+def bow_of(board: str) -> ModelTerm:
+    """Return the term of a board that is not flat."""
+    return ModelTerm("bow", board, tuple(f"board {board}.bow_m.{a}" for a in "xy"))
 
 
-def entering_together(terms: Sequence[str]) -> list[tuple[str, ...]]:
-    """Return the terms in groups of which all enter or none."""
-    groups: dict[str, list[str]] = {}
+def candidate_terms(boards: Sequence[str]) -> dict[str, ModelTerm]:
+    """Return the terms that a model of some boards may have, by name."""
+    return {**JOINT_TERMS, **AXIS_TERMS, **_by_name(bow_of(board) for board in boards)}
+
+
+def entering_together(terms: Iterable[ModelTerm]) -> list[tuple[str, ...]]:
+    """Return the terms' names in groups of which all enter or none."""
+    groups: dict[tuple[str, str], list[str]] = {}
     for term in terms:
-        groups.setdefault(
-            term.split(" harmonic")[0] + " harmonics" if "harmonic" in term else term, []
-        ).append(term)
+        groups.setdefault(term.group, []).append(term.name)
     return [tuple(group) for group in groups.values()]
 
 
@@ -69,13 +103,13 @@ class Tested:
 
 
 def choose_terms(
-    terms: Mapping[str, tuple[str, ...]],
+    terms: Mapping[str, ModelTerm],
     names: Sequence[str],
     values: Mapping[str, float],
     covariance: FloatArray,
     scale: float,
     freedom: float,
-    motions: Mapping[str, FloatArray],
+    motions: Mapping[tuple[str, ...], FloatArray],
     enters: float = THREE_SIGMAS,
 ) -> tuple[tuple[str, ...], dict[str, Tested]]:
     """Return the terms that are needed, and how each one does beside these.
@@ -83,7 +117,7 @@ def choose_terms(
     Parameters
     ----------
     terms
-        Names to parameters; of those that were fitted.
+        By name; those that were fitted.
     names, covariance
         Of the whole fit, stated sigmas taken as they are.
     values
@@ -91,17 +125,20 @@ def choose_terms(
     scale, freedom
         The fit's chi-square over its degrees of freedom, and these.
     motions
-        By group (its terms joined by a comma) the matrix (k, k), px², that gives the mean square of what its
+        By group (`entering_together`) the matrix (k, k), px², that gives the mean square of what its
         numbers move pixels by.
     enters
         A group enters if so large a gain, were it nothing, had at most this chance.
     """
     at = {name: i for i, name in enumerate(names)}
-    places = {term: [at[name] for name in parameters] for term, parameters in terms.items()}
+    places = {name: [at[number] for number in term.parameters] for name, term in terms.items()}
     everything = [i for place in places.values() for i in place]
     of_terms = {i: k for k, i in enumerate(everything)}
     x = np.array([values[names[i]] for i in everything])
     c = covariance[np.ix_(everything, everything)]
+
+    def is_play(group: Sequence[str]) -> bool:
+        return terms[group[0]].kind == "backlash"
 
     def told(group: Sequence[str], beside: Sequence[str]) -> Tested:
         """The test of a group in the model of itself and some other terms."""
@@ -114,37 +151,37 @@ def choose_terms(
             here, spread = here - pull @ x[gone], spread - pull @ c[np.ix_(gone, mine)]
         gain = float(here @ np.linalg.solve(spread, here))
         # Play is a width: what comes out negative is none.
-        negative = group[0].endswith("backlash") and here[0] <= 0.0
+        negative = is_play(group) and here[0] <= 0.0
         likely = 1.0 if negative else chance(gain, len(mine), scale, freedom)
-        motion = motions.get(",".join(group))
+        motion = motions.get(tuple(group))
         hidden = (
             0.0 if motion is None else float(np.sqrt(max(np.sum(motion * spread) * max(scale, 1.0), 0.0)))
         )
         return Tested(gain, likely, hidden, here, np.sqrt(np.maximum(np.diag(spread), 0.0)))
 
-    kept = entering_together(list(terms))
+    kept = entering_together(terms.values())
     while kept:
         beside = [term for group in kept for term in group]
         tests = {group: told(group, beside) for group in kept}
         needless = [
             group
             for group, test in tests.items()
-            if test.chance > enters and (test.hidden_px < HIDDEN_PX or group[0].endswith("backlash"))
+            if test.chance > enters and (test.hidden_px < HIDDEN_PX or is_play(group))
         ]
         if not needless:
             break
         kept.remove(max(needless, key=lambda group: (tests[group].chance, -tests[group].chi2)))
     chosen = tuple(term for term in terms if any(term in group for group in kept))
     found = {}
-    for term in places:
-        found[term] = told((term,), chosen)
-        if term.endswith("harmonic 1"):  # what it gains alone, before the second one
-            alone = told((term,), [other for other in chosen if other != term.replace("1", "2")])
-            found[term] = replace(found[term], chi2=alone.chi2, chance=alone.chance)
+    for name, term in terms.items():
+        found[name] = told((name,), chosen)
+        if term.kind == "harmonic 1":  # what it gains alone, before the second one
+            alone = told((name,), [other for other in chosen if terms[other].group != term.group])
+            found[name] = replace(found[name], chi2=alone.chi2, chance=alone.chance)
     return chosen, found
 
 
 def joint_numbers(chosen: Sequence[str]) -> list[int]:
     """Return which of the ten numbers of ``calib.mast.joints.JOINTS_NAMES`` some terms have."""
-    wanted = [name for term in chosen for name in JOINT_TERMS.get(term, ())]
+    wanted = [name for term in chosen if term in JOINT_TERMS for name in JOINT_TERMS[term].parameters]
     return sorted(JOINTS_NAMES.index(name) for name in wanted)

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from calib.fit.adjustment import Adjustment, Estimate
-from calib.fit.model_terms import JOINT_TERMS, entering_together
+from calib.fit.model_terms import JOINT_TERMS, ModelTerm, entering_together
 from calib.fit.terms import ImageTerm
 from calib.mast.joints import AXIS_NAMES
 from calib.rigid import FloatArray
@@ -16,11 +16,11 @@ from calib.rigid import FloatArray
 def moves_px(
     problem: Adjustment,
     state: Estimate,
-    terms: Mapping[str, Sequence[str]],
+    terms: Mapping[str, ModelTerm],
     values: Mapping[str, float],
 ) -> dict[str, float]:
     """Return the rms over all corners of what each term's ``values`` move pixels by, all else held."""
-    at = {term: {problem.names.index(n): values[n] for n in names} for term, names in terms.items()}
+    at = {name: {problem.names.index(n): values[n] for n in term.parameters} for name, term in terms.items()}
     total, count = dict.fromkeys(terms, 0.0), 0
     for image, block in problem.blocks(state):
         if not isinstance(image, ImageTerm):
@@ -35,15 +35,15 @@ def moves_px(
 
 
 def term_motions(
-    problem: Adjustment, state: Estimate, terms: Mapping[str, Sequence[str]]
-) -> dict[str, FloatArray]:
-    """Return by group of terms (joined by a comma) the matrix (k, k), px², of how they move pixels.
+    problem: Adjustment, state: Estimate, terms: Mapping[str, ModelTerm]
+) -> dict[tuple[str, ...], FloatArray]:
+    """Return by group of terms (`entering_together`) the matrix (k, k), px², of how they move pixels.
 
     With numbers x of a group, xᵀ M x is the mean square of the motion. What a joint's harmonics do to all
     pictures alike is no motion: another zero of the joint, which is none's to know, does the same.
     """
     names = {
-        ",".join(group): [n for t in group for n in terms[t]] for group in entering_together(list(terms))
+        group: [n for t in group for n in terms[t].parameters] for group in entering_together(terms.values())
     }
     found = {group: np.zeros((len(mine), len(mine))) for group, mine in names.items()}
     count = 0
@@ -54,11 +54,11 @@ def term_motions(
         count += len(sigma)
         place = {problem.names[i]: k for k, i in enumerate(block.columns.tolist())}
         for group, mine in names.items():
-            if group.split(",")[0] not in JOINT_TERMS and set(mine) <= set(place):
+            if group[0] not in JOINT_TERMS and set(mine) <= set(place):
                 moved = sigma[:, None] * block.jacobian[:, [place[n] for n in mine]]
                 found[group] += moved.T @ moved
     for group, mine in names.items():
-        if group.split(",")[0] in JOINT_TERMS:
+        if group[0] in JOINT_TERMS:
             found[group] = _by_joint(problem, state, mine)
         else:
             found[group] /= max(count, 1)

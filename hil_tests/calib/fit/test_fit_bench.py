@@ -11,6 +11,7 @@ from calib.fit import bench_changes
 from calib.fit.bench import BenchOptions, fit_bench
 from calib.fit.bench_calibration import BenchCalibration
 from calib.fit.bench_start import BenchNotFitted
+from calib.fit.model_terms import candidate_terms, entering_together
 from calib.fit.uncertainty import pixel_covariance
 from calib.mast.rig import Mast
 from calib.rigid import Rigid
@@ -97,6 +98,36 @@ def test_joint_readings_count_as_measurements_where_changes_are_looked_for(
     terms = sum(len(t.parameters) for t in fit.terms)
     # all terms are fitted then; readings without a number of their own would be some 70 fewer
     assert asked == [pytest.approx(fit.degrees_of_freedom, abs=terms)]
+
+
+def test_a_board_may_have_the_name_of_another_term() -> None:
+    plan = BenchPlan(attitudes=16, bow_m=(0.002, -0.001), **SERVO)
+    survey = simulate_bench(1, plan)
+    survey = replace(survey, images=tuple(replace(i, tilt_approach=1) for i in survey.images))
+    bows = {}
+    for board in ("b1", "backlash", "harmonic 2"):
+        renamed = replace(
+            survey,
+            boards={board: survey.boards["b1"]},
+            images=tuple(replace(i, board=board) for i in survey.images),
+        )
+        fit = fit_bench(renamed)
+        assert [note for note in fit.notes if "backlash" in note] == [
+            note for note in fit.notes if note.startswith("tilt backlash is not looked for")
+        ]
+        (bows[board],) = (t for t in fit.terms if t.name == f"bow of {board}")
+    for board, bow in bows.items():
+        assert bow.entered
+        np.testing.assert_allclose(bow.values, bows["b1"].values)
+        assert bow.sentence == bows["b1"].sentence.replace("bow of b1", f"bow of {board}")
+
+
+def test_only_the_harmonics_of_one_joint_enter_together() -> None:
+    groups = entering_together(candidate_terms(["harmonic left", "harmonic right", "pan", "x,y"]).values())
+    assert [g for g in groups if len(g) > 1] == [
+        ("pan harmonic 1", "pan harmonic 2"),
+        ("tilt harmonic 1", "tilt harmonic 2"),
+    ]
 
 
 def test_skew_axes_enter_when_they_are_there() -> None:
