@@ -72,8 +72,12 @@ def written(folder: Path, document: Mapping[str, Any]) -> Path:
 
 
 @contextlib.contextmanager
-def started(config: Path) -> Iterator[tuple[subprocess.Popen[str], int]]:
+def started(
+    config: Path, environment: Mapping[str, str] | None = None
+) -> Iterator[tuple[subprocess.Popen[str], int]]:
     """Run a daemon: its process and its port; what it says goes to ``daemon.log`` beside its configuration.
+
+    ``environment`` stands before this process's own.
 
     Raises
     ------
@@ -84,7 +88,9 @@ def started(config: Path) -> Iterator[tuple[subprocess.Popen[str], int]]:
     command = [sys.executable, "-m", "mastctl", "run", "--config", str(config)]
     with (
         log.open("w") as said,
-        subprocess.Popen(command, stdout=subprocess.PIPE, stderr=said, text=True) as daemon,
+        subprocess.Popen(
+            command, stdout=subprocess.PIPE, stderr=said, text=True, env={**os.environ, **(environment or {})}
+        ) as daemon,
     ):
         try:
             assert daemon.stdout is not None

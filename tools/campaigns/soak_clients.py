@@ -15,12 +15,12 @@ from types import TracebackType
 from typing import Any
 
 from drivers.faults import CAMERA_WORDS, HEAD_WORDS, LOG_WORDS
-from tools.campaigns.soak_ledger import Ledger
+from tools.campaigns.soak_ledger import SEES, Ledger
 from tools.living_daemon import Asker
 
-SEES = ("navcam_left", "navcam_right", "hazcam_left", "hazcam_right")
 DEADLINE_S = 45.0
 ENDS_S = 60.0  # beyond a deadline, before a client gives up waiting
+WARM_S = 900.0  # a net: nobody warms up for longer
 JOG_S = 1.5
 NAME = "steerer"
 
@@ -82,6 +82,14 @@ class Crowd:
         """Let everybody do their worst for so long."""
         self._go.set()
         time.sleep(duration_s)
+
+    def warm_up(self, least_s: float) -> None:
+        """Let everybody do their worst for at least so long, and until all of it was done once."""
+        until_s = time.monotonic() + WARM_S
+        self.work(least_s)
+        while (lacking := self._ledger.lacking()) and time.monotonic() < until_s:
+            time.sleep(0.2)
+        self._ledger.check(not lacking, f"not warm after {WARM_S:g} s: {sorted(lacking)}")
 
     def rest(self, settle_s: float) -> None:
         """Have everybody end what they do, take all faults back, and wait until the daemon is at rest."""
@@ -218,7 +226,8 @@ def _quiet(client: Client) -> dict[str, Any]:
 
 def _look(client: Client) -> None:
     camera = client.draw.choice(SEES)
-    client.ask("GET", f"/snapshot/{camera}?fresh=false&format=jpeg")
+    if client.ask("GET", f"/snapshot/{camera}?fresh=false&format=jpeg")["http"] == 200:
+        client.ledger.first(f"looked by {camera}")
     time.sleep(0.2)
 
 
@@ -232,11 +241,15 @@ def _watch(client: Client) -> None:
 
 
 def _steer(client: Client) -> None:
+    """What is not done yet comes first, in this order; then each as often as its weight says."""
     acts = {
-        _angles: 4, _pixel: 3, _place: 2, _track: 2, _jog: 2, _stop: 2, _estop: 1, _mast: 1, _outside: 1,
-        _twice: 1, _record: 1,
+        _angles: (4, "angles done"), _pixel: (3, "pixel done"), _place: (2, "place done"),
+        _track: (2, "look done"), _jog: (2, "jog done"), _stop: (2, "stop"), _estop: (1, "estop"),
+        _mast: (1, "mast"), _outside: (1, "outside"), _twice: (1, "twice"), _record: (1, "recording"),
     }  # fmt: skip
-    client.draw.choices(list(acts), list(acts.values()))[0](client)
+    lacking = client.ledger.lacking()
+    first = [act for act, (_, what) in acts.items() if what in lacking]
+    (first or client.draw.choices(list(acts), [weight for weight, _ in acts.values()]))[0](client)
 
 
 def _angles(client: Client) -> None:
@@ -368,8 +381,8 @@ def _estop(client: Client) -> None:
 def _mast(client: Client) -> None:
     """Use another mast file, point, and go back."""
     _settle(client)
-    client.ledger.act("mast")
     if client.ask("POST", "/mast", {"file": "other_mast.yaml"})["http"] == 200:
+        client.ledger.act("mast")
         client.point("angles", client.angles())
         _settle(client)
         client.ask("POST", "/mast", {"file": "mast.yaml"})
@@ -390,10 +403,9 @@ def _twice(client: Client) -> None:
 def _record(client: Client) -> None:
     """Record a pointing into a file of its own."""
     began = client.ask("POST", "/recordings/start", {})
-    client.ledger.act("recording")
     client.point("angles", client.angles())
-    if began["http"] == 200:
-        client.ask("POST", "/recordings/stop")
+    if began["http"] == 200 and client.ask("POST", "/recordings/stop")["http"] == 200:
+        client.ledger.act("recording")
 
 
 # Who disturbs

@@ -7,6 +7,10 @@ import time
 from collections import Counter
 from typing import Any
 
+from drivers.faults import LOG
+
+SEES = ("navcam_left", "navcam_right", "hazcam_left", "hazcam_right")
+
 AFTER_S = 10.0
 """So long after its end a fault explains what is seen: a call under way, a line that comes back."""
 
@@ -29,6 +33,13 @@ OF_LOAD = {"too_many", "too_many_requests"}
 OF_THE_DISK = {"latch_not_kept"}
 """Told while a busy disk has not confirmed yet; at rest it must be gone."""
 
+EVERYTHING = frozenset({
+    "angles done", "pixel done", "place done", "look done", "jog done", "rival", "stop", "estop", "mast",
+    "outside", "twice", "recording", "stalled", "killed", "rubbish", "fault of the head",
+    "fault of a camera", *(f"looked by {camera}" for camera in SEES),
+})  # fmt: skip
+"""What the first time takes memory that stays; a daemon is warm when it has done all of it."""
+
 SHOWN = 12
 
 
@@ -45,6 +56,7 @@ class Ledger:
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
+        self._lacking = set(EVERYTHING)
         self._faults: list[tuple[str, str, float, float]] = []
         self._answers = Counter[tuple[str, str]]()
         self._ends = Counter[tuple[str, str]]()
@@ -75,11 +87,24 @@ class Ledger:
         """Count something that a client did."""
         with self._lock:
             self._acts[what] += 1
+            self._lacking.discard(what)
+
+    def first(self, what: str) -> None:
+        """Note something that needs no counting, as done."""
+        with self._lock:
+            self._lacking.discard(what)
+
+    def lacking(self) -> set[str]:
+        """Return what of ``EVERYTHING`` was not done yet."""
+        with self._lock:
+            return set(self._lacking)
 
     def fault_set(self, device: str, word: str, begin_s: float, end_s: float) -> None:
         """Note a fault that was set, with its times (CLOCK_MONOTONIC)."""
         with self._lock:
             self._words[f"{device} {word}"] += 1
+            if device != LOG:
+                self._lacking.discard("fault of a camera" if device in SEES else "fault of the head")
             self._faults.append((device, word, begin_s, end_s))
 
     def faults_taken_back(self) -> None:
@@ -123,6 +148,7 @@ class Ledger:
         took_s = record["ended_s"] - record["created_s"]
         with self._lock:
             self._ends[what, f"{state} {code}".strip()] += 1
+            self._lacking.discard(f"{what} {state}")
             self._longest_over_s = max(self._longest_over_s, took_s - deadline_s)
         self.check(took_s <= deadline_s + 5.0, f"{what}: {took_s:.1f} s, {deadline_s:g} s were given")
         self.check(state != "failed" or bool(error.get("message")), f"{what}: failed and says not why")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -9,9 +10,11 @@ from typing import Any
 
 import pytest
 
+from hil_tests.waiting import joined, until
 from tools.campaigns import soak as campaign
+from tools.campaigns import soak_clients
 from tools.campaigns.faults import trials
-from tools.campaigns.soak_ledger import Ledger
+from tools.campaigns.soak_ledger import EVERYTHING, Ledger
 from tools.living_daemon import Vitals
 
 
@@ -20,13 +23,44 @@ def test_a_daemon_among_faults_and_bad_clients_does_as_wanted(
 ) -> None:
     """So short a run has no warm-up: whether the daemon grows is the long one's question."""
     monkeypatch.setattr(campaign, "WEIGH_S", 0.0)
+    monkeypatch.setattr(campaign.Crowd, "warm_up", lambda crowd, least_s: crowd.work(1.0))
     monkeypatch.setattr(campaign, "judge", lambda first, last, ledger: None)
     assert campaign.soak(tmp_path, "memory", 3.0, seed=3, settle_s=0.5, rests=1) == []
 
 
-@pytest.mark.long(4, "two minutes: memory, threads and descriptors are weighed after a warm-up")
+@pytest.mark.long(4, "three minutes: memory, threads and descriptors are weighed after a warm-up")
 def test_a_daemon_among_faults_and_bad_clients_stays_the_same(tmp_path: Path) -> None:
-    assert campaign.soak(tmp_path, "memory", 80.0, seed=3, rests=1) == []
+    assert campaign.soak(tmp_path, "memory", 60.0, seed=3, rests=1) == []
+
+
+def test_the_warm_up_ends_when_everything_was_done_once() -> None:
+    ledger = Ledger()
+    *others, last = sorted(EVERYTHING)
+    warming = threading.Thread(target=campaign.Crowd(0, 1, ledger).warm_up, args=(0.0,), daemon=True)
+    warming.start()
+    for what in others:
+        ledger.act(what)
+    until(lambda: ledger.lacking() == {last}, "all but one")
+    warming.join(1.0)
+    assert warming.is_alive()
+    ledger.act(last)
+    joined(warming)
+    assert ledger.wrong == []
+
+
+def test_a_warm_up_that_lacks_something_says_what(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(soak_clients, "WARM_S", 0.0)
+    ledger = Ledger()
+    for what in EVERYTHING - {"jog done"}:
+        ledger.act(what)
+    campaign.Crowd(0, 1, ledger).warm_up(0.0)
+    assert ledger.wrong == ["not warm after 0 s: ['jog done']"]
+
+
+def test_a_moment_between_two_files_is_not_what_a_daemon_weighs() -> None:
+    at_rest, between = Vitals(500.0, 30, 49, 1.0, {}), Vitals(480.0, 29, 47, 1.0, {})
+    lighter, leaving = replace(at_rest, rss_mb=490.0), Vitals(470.0, 31, 50, 1.0, {})
+    assert campaign.usual([leaving, at_rest, between, lighter, at_rest]) == lighter
 
 
 @pytest.mark.parametrize(
