@@ -10,12 +10,15 @@ slow (numpy, cv2, numba, fastapi) inside its functions.
 from __future__ import annotations
 
 import argparse
+import atexit
+import contextlib
 import importlib
 import logging
 import os
 import re
 import signal
 import sys
+import threading
 from collections.abc import Sequence
 from difflib import get_close_matches
 from typing import Any, NoReturn
@@ -124,6 +127,19 @@ def build_parser(argv: Sequence[str]) -> Parser:
     return parser
 
 
+def process() -> NoReturn:
+    """Be the process of one command: run it, and end with its exit code."""
+    code = main()
+    others = [one for one in threading.enumerate() if one is not threading.main_thread()]
+    if others and all(one.daemon for one in others):
+        # The interpreter's own end would end them where they are, and C++ (OpenCV, SciPy) aborts on that.
+        atexit._run_exitfuncs()
+        with contextlib.suppress(OSError):
+            sys.stderr.flush()
+        os._exit(code)
+    sys.exit(code)
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command and return its exit code; never raises, never shows a traceback.
 
@@ -230,4 +246,4 @@ def _check_command(words: Sequence[str]) -> None:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    process()

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -13,6 +15,7 @@ import pytest
 
 from drivers.errors import NoReply
 from hil_tests.mastctl.service_fakes import FakeHardware, FakePointing, FakeResult, ScriptedLoop
+from hil_tests.waiting import NET_S
 from mastctl.cli.main import main
 from mastctl.daemon import RunningDaemon
 
@@ -246,3 +249,33 @@ def test_run_refuses_a_bad_configuration_in_one_line(
     assert out == ""
     assert log.startswith(f"mastctl: {config}: line ")
     assert log.count("\n") == 1
+
+
+ENCODES = """
+import atexit, threading, time
+import cv2, numpy as np
+from mastctl.cli import main as cli
+
+picture = np.random.default_rng(1).integers(0, 255, (2000, 3000), np.uint8)
+
+def encodes():
+    while True:
+        cv2.imencode(".png", picture)
+
+def command(words):
+    for _ in range(2):
+        threading.Thread(target=encodes, daemon=True).start()
+    time.sleep(0.3)
+    atexit.register(print, "and tidied", flush=True)
+    print("ended")
+    return 3
+
+cli._run = command
+cli.process()
+"""
+
+
+def test_a_process_ends_with_its_code_while_opencv_is_at_work() -> None:
+    """A daemon thread that came back from C++ into an interpreter at its end made it abort (SIGABRT)."""
+    done = subprocess.run([sys.executable, "-c", ENCODES], capture_output=True, text=True, timeout=NET_S)
+    assert (done.returncode, done.stdout, done.stderr) == (3, "ended\nand tidied\n", "")
