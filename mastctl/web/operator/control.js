@@ -7,8 +7,8 @@ const FOR_S = 30;
 const RENEW_MS = 10000;
 
 export class Control {
-  constructor(alarm) {
-    this.alarm = alarm;
+  constructor(alarm, taken) {
+    [this.alarm, this.taken] = [alarm, taken];
     this.words = byId("control");
     [this.name, this.more] = [h("span", { class: "name" }), h("span")];
     put(this.words, this.name, this.more);
@@ -20,6 +20,8 @@ export class Control {
   }
 
   told(control) {
+    const other = control?.kind === "lease" && !control.holder.endsWith(client);
+    if (other && control.holder !== this.control?.holder) this.taken(control.holder);
     this.control = control;
     this.toldMs = performance.now();
     this.draw();

@@ -48,6 +48,7 @@ function notice(words) {
 // STOP and E-STOP: no lease, no confirmation, no queue; Escape does what STOP does wherever the focus is.
 async function press(button, send, name, done) {
   button.dataset.pressed = "sent";
+  target.disarm(`${name} was pressed`);
   const failed = byId("stop-failed");
   try {
     await send();
@@ -86,7 +87,7 @@ const target = new Target(views, events, (words, urgent) => (urgent ? announce :
 const track = new TrackPanel(events, views, speak);
 const head = new HeadPanel(events);
 const jog = new Jog(alarm);
-const control = new Control(alarm);
+const control = new Control(alarm, (holder) => target.disarm(`${holder} took over`));
 const recording = new Recording(alarm);
 const mastFile = new MastFile(alarm);
 const residuals = new Residuals();
@@ -108,10 +109,12 @@ function standing(now) {
   say(byId("reason"), now.estop ? "" : sentence(now.reason)); // the latch tells who and why itself
   since = performance.now() - 1000 * now.state_for_s;
   if (before !== now.state) {
+    if (["stopping", "stopped"].includes(now.state)) target.disarm("The head was stopped");
     if (["stopped", "fault"].includes(now.state) && now.reason) announce(`${now.state}. ${now.reason}`);
     else speak(`${now.state}. ${now.reason}`);
   }
   const latch = now.estop;
+  target.latch(Boolean(latch));
   byId("estop").hidden = !latch;
   set(byId("latch"), "aria-pressed", String(Boolean(latch)));
   const entries = now.estops ?? [];
@@ -131,6 +134,7 @@ events.addEventListener("mast", () => refresh());
 events.addEventListener("fault", (event) => { if (event.detail.key === "sun") refresh(); });
 events.addEventListener("command", (event) => {
   const kind = event.detail.value.command ?? "";
+  if (kind === "stop") target.disarm("The head was stopped");
   refresh();
   if (kind.startsWith("record")) recording.look();
   if (kind.startsWith("place")) jog.look();

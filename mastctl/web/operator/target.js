@@ -11,6 +11,7 @@ const STEPS = {
   look: "new pictures", measure: "the target is found in them", eyes: "the other eye confirms it",
 };
 
+const TURNED_RAD = 0.005; // the joints' readings at rest scatter by less, some counts of a coarse encoder
 const ENDED = ["done", "failed", "stopped"];
 
 const FROM = {
@@ -40,9 +41,10 @@ export class Target {
     this.state = "none";
     this.number = 0;
     this.place = byId("target");
-    this.may = false;
+    this.may = this.latched = false;
     events.addEventListener("operation", (event) => this.operation(event.detail.value));
-    events.addEventListener("joints", () => this.state === "sent" && this.render());
+    events.addEventListener("joints", (event) => this.joints(event.detail.value));
+    events.addEventListener("lost", () => this.disarm("The connection was lost"));
     events.addEventListener("mast", (event) => this.mast(event.detail.value.digest));
     document.addEventListener("views-changed", () => this.draw());
     document.addEventListener("keydown", (event) => {
@@ -58,6 +60,26 @@ export class Target {
 
   use(status) {
     this.simulated = status.simulated;
+  }
+
+  /** A preview belongs to the head as it stood: after a stop, a turn or a takeover it is asked for anew. */
+  disarm(what) {
+    if (!["asked", "preview"].includes(this.state)) return;
+    this.number += 1; // an answer that is under way comes too late
+    this.refuse(`${what} after this point was chosen. Choose it again.`);
+  }
+
+  latch(latched) {
+    if (latched === this.latched) return;
+    this.latched = latched;
+    this.disarm(`The emergency stop was ${latched ? "pressed" : "released"}`);
+    this.render();
+  }
+
+  joints(now) {
+    const then = this.click?.facts;
+    if (then && Math.hypot(now.pan_rad - then.pan_rad, now.tilt_rad - then.tilt_rad) > TURNED_RAD) this.disarm("The head turned");
+    if (this.state === "sent") this.render();
   }
 
   refuse(words, code = "") {
@@ -101,7 +123,7 @@ export class Target {
   }
 
   async send(pixel = null) {
-    if (!this.may || (!pixel && (this.state !== "preview" || this.preview.refused))) return;
+    if (!this.may || this.latched || (!pixel && (this.state !== "preview" || this.preview.refused))) return;
     const target = pixel ?? this.target();
     this.state = "sent";
     this.record = null;
@@ -123,6 +145,7 @@ export class Target {
   }
 
   operation(record) {
+    if (record && !ENDED.includes(record.state) && !record.request?.track) this.disarm("The head was sent elsewhere");
     if (!record || record.id !== this.id) return;
     this.record = record;
     if (ENDED.includes(record.state) && this.state === "sent") {
@@ -152,7 +175,7 @@ export class Target {
   }
 
   mast(digest) {
-    if (["asked", "preview"].includes(this.state) && this.click.facts?.mast_digest !== digest) this.refuse("Another mast file came into use: what was chosen belongs to the one before. Choose it again.", "other_mast_file");
+    if (this.click?.facts?.mast_digest !== digest) this.disarm("Another mast file came into use");
   }
 
   /** Cross-hairs in the images: what was clicked, the other eye's match, the aim. */
@@ -225,6 +248,7 @@ export class Target {
 
   go() {
     if (this.preview.refused) return null;
+    if (this.latched) return h("p", { class: "bad" }, "The emergency stop is latched. Release it, then choose the point again.");
     return h("div", { class: "buttons" }, h("button", { type: "button", class: "go", id: "point", onclick: () => this.send() }, "Point ", h("kbd", {}, "P")));
   }
 
@@ -251,7 +275,7 @@ export class Target {
         h("tr", {}, h("td", {}), h("th", { scope: "col" }, "commanded"), h("th", { scope: "col" }, "measured")),
         h("tr", {}, h("th", { scope: "row" }, "Pan"), h("td", { class: "n" }, deg(last.commanded_pan_rad, 3)), h("td", { class: "n" }, deg(last.measured_pan_rad, 3))),
         h("tr", {}, h("th", { scope: "row" }, "Tilt"), h("td", { class: "n" }, deg(last.commanded_tilt_rad, 3)), h("td", { class: "n" }, deg(last.measured_tilt_rad, 3)))),
-      this.may ? h("div", { class: "buttons" }, h("button", { type: "button", id: "again", onclick: () => this.again() }, "Point a second time")) : null,
+      this.may ? h("div", { class: "buttons" }, h("button", { type: "button", id: "again", disabled: this.latched, onclick: () => this.again() }, "Point a second time")) : null,
     ];
   }
 

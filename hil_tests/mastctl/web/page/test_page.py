@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import re
 import socket
@@ -411,6 +412,81 @@ def test_by_the_keyboard_alone_a_pixel_is_chosen_and_sent(pair: BOTH, visit: Vis
     assert (pixel["x_px"], pixel["y_px"]) == (30.6, 13.5)
     one.page.keyboard.press("p")
     one.target("ended")
+
+
+def test_what_was_chosen_before_a_stop_a_turn_or_a_takeover_is_never_sent(pair: BOTH, visit: Visits) -> None:
+    daemon, hardware = pair
+    one = visit(daemon.url)
+    ben = {"Mastctl-Client": "Ben"}
+    with httpx.Client(base_url=f"{daemon.url}/api/v1", trust_env=False, headers=ben) as http:
+
+        def released() -> None:
+            one.page.wait_for_selector("#latch[aria-pressed=true]")
+            http.post("/reset", json={"reason": "mended", "name": "Ben"}).raise_for_status()
+
+        def taken() -> None:
+            lease = http.post("/lease", json={"for_s": 60.0}).json()["lease_id"]
+            one.page.wait_for_selector("#control >> text=Ben")
+            http.delete("/lease", headers={"Mastctl-Lease": lease}).raise_for_status()
+
+        comings: dict[str, Callable[[], Any]] = {
+            "STOP was pressed": lambda: one.page.keyboard.press("Escape"),
+            "E-STOP was pressed": lambda: (one.page.locator("#latch").click(), released()),
+            "The head was stopped": lambda: http.post("/stop"),
+            "stopped|emergency stop was pressed": lambda: (http.post("/estop"), released()),
+            "Ben took over": taken,
+            "The head was sent elsewhere": lambda: http.post(
+                "/point", json={"pan_rad": 0.1, "tilt_rad": 0.0}
+            ),
+            "The head turned": lambda: setattr(hardware.head, "pan_rad", -0.3),
+        }
+        for words, come in comings.items():
+            facing = (
+                f"{round(math.degrees(hardware.head.pan_rad), 2):+.2f}°" if hardware.head.pan_rad else "0.00°"
+            )
+            one.page.wait_for_selector(
+                f".eye[data-camera=navcam_left] .facing >> text=/^{re.escape(facing)}/"
+            )
+            assert "6.020" in one.choose(), words
+            come()
+            assert re.search(words, one.target("refused")), words
+            assert one.page.locator(".over :is(.click, .match)").count() == 0, words
+            one.page.keyboard.press("p")
+    assert not one.posts("/point")
+
+
+def test_a_preview_that_is_under_way_when_stop_is_pressed_is_not_offered(
+    pair: BOTH, visit: Visits, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    answered = threading.Event()
+    monkeypatch.setattr(Previewing, "preview", lambda *_: answered.wait(NET_S) and SEEN)
+    one = visit(pair[0].url)
+    one.frame().click()
+    one.target("asked")
+    one.page.keyboard.press("Escape")
+    with one.page.expect_response("**/point/preview"):
+        answered.set()
+    assert "STOP was pressed" in one.target("refused")
+    one.page.keyboard.press("p")
+    assert not one.posts("/point")
+
+
+def test_point_is_not_offered_while_an_emergency_stop_is_latched(pair: BOTH, visit: Visits) -> None:
+    daemon, _ = pair
+    one = visit(daemon.url)
+    with httpx.Client(base_url=f"{daemon.url}/api/v1", trust_env=False) as http:
+        http.post("/estop")
+        one.word("stopped")
+        assert "The emergency stop is latched" in one.choose()
+        assert one.page.locator("#point").count() == 0
+        one.page.keyboard.press("p")
+        http.post("/reset", json={"reason": "mended", "name": "Ben"}).raise_for_status()
+        assert "was released" in one.target("refused")
+        one.page.keyboard.press("p")
+        assert not one.posts("/point")
+        one.choose()
+        one.page.keyboard.press("p")
+        one.target("ended")
 
 
 def test_another_mast_file_takes_back_what_was_chosen(pair: BOTH, visit: Visits, tmp_path: Path) -> None:
