@@ -19,6 +19,11 @@ from mastctl.cli.service import add_daemon_options, client_of, tell_result
 if TYPE_CHECKING:
     from mastctl.client import Client
 
+WITHOUT_DAEMON = (
+    "if the head moves, end the program that moves it ('camera sync', 'conform') with Ctrl-C, "
+    "or stop it with 'mastctl halt --config FILE'"
+)
+
 
 def add_commands(subparsers: argparse._SubParsersAction[Any]) -> None:
     """Add stop, estop, reset and halt."""
@@ -100,8 +105,16 @@ def _by_any_way(
         raise CommandError("stop_failed", failed)
     if answer is not None:
         return answer
-    with client_of(args, whatever_configured=True) as client:
-        return ask(client)
+    from mastctl.client import ClientError
+
+    try:
+        with client_of(args, whatever_configured=True) as client:
+            return ask(client)
+    except ClientError as error:
+        if error.code != "no_daemon":
+            raise
+        why = str(error).partition(";")[0]  # to start a daemon is no help here
+        raise CommandError(error.code, f"{why}; {WITHOUT_DAEMON}") from None
 
 
 def _sockets(args: argparse.Namespace) -> Iterator[list[Path]]:

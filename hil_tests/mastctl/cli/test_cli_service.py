@@ -214,12 +214,24 @@ def test_no_daemon_is_one_line_and_1(capsys: pytest.CaptureFixture[str], tmp_pat
     url = f"unix:{tmp_path}/none.sock"
     for words in (
         ("status",),
-        ("stop",),
         ("point", "--angles", "0", "0"),
         ("snapshot", "a", "--out", "a.png"),
     ):
         assert main([*words, "--url", url]) == 1
         assert capsys.readouterr().err == f"mastctl: no daemon answers at {url}; 'mastctl run' starts one\n"
+
+
+@pytest.mark.parametrize("word", ["stop", "estop"])
+def test_a_stop_without_a_daemon_says_what_else_stops_a_head(
+    word: str, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    url = f"unix:{tmp_path}/none.sock"
+    assert main([word, "--url", url]) == 1
+    said = capsys.readouterr().err
+    assert (
+        said.startswith(f"mastctl: no daemon answers at {url}; if the head moves") and "mastctl halt" in said
+    )
+    assert "starts one" not in said
 
 
 def test_the_address_comes_from_the_configuration(
