@@ -182,10 +182,8 @@ class Entry:
         self._answers = answers
         self._operations = operations
         self._publisher = publisher or Publisher()
-        self._published: tuple[deque[str], deque[str]] = (
-            deque(),
-            deque(),
-        )  # keys, strangers' too; oldest first
+        # Keys, oldest first: of who is known, and of strangers.
+        self._published: tuple[deque[str], deque[str]] = deque(), deque()
         self._numbers = itertools.count(1)
         self._matching = threading.Lock()
         self._began: dict[str, dict[str, Any]] = {}  # operation: who began it, until it has ended

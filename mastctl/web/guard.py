@@ -81,7 +81,7 @@ class Guard:
         self._rate = Rate()
         self._records = records
         self._minute = -1
-        self._refused: dict[tuple[str, str], int] = {}  # of this minute, by credential and address
+        self._refused: dict[tuple[str, str], int] = {}  # of this minute, by token and address
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["type"] == "http":
@@ -185,7 +185,8 @@ class Guard:
         minute = int(asyncio.get_running_loop().time() // 60.0)
         if minute != self._minute or len(self._refused) > MOST_PARTIES:
             self._minute, self._refused = minute, {}
-        party = caller.credential, neighbourhood(caller.address)
+        token = caller.name.partition("/")[0] if caller.credential else ""  # one, in all of its sessions
+        party = token, neighbourhood(caller.address)
         times = self._refused[party] = self._refused.get(party, 0) + 1
         if times <= RECORDED or times % RARELY == 0:
             what = one_line(f"{scope.get('method', 'GET')} {scope['path']}", 100)

@@ -484,6 +484,20 @@ def test_refusals_in_a_flood_are_counted_instead(monkeypatch: pytest.MonkeyPatch
         assert [line.get("times") for line in recorded(net)] == [None] * guard.RECORDED + [150, None]
 
 
+def test_a_token_has_its_refusals_counted_over_all_of_its_sessions(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr(guard, "RECORDED", 5)
+    with network_daemon(monkeypatch, tmp_path) as net:
+        for _ in range(4):
+            jar = net.ask("POST", "/login", json={"token": net.token("view")}).headers["set-cookie"]
+            page = {"Cookie": jar.partition(";")[0], "Origin": net.origin}
+            for name in ("x", "y", "z"):
+                answer = net.ask("POST", "/point", json=ANGLES, headers=page | {"Mastctl-Client": name})
+                assert code(answer) == (403, "role")
+        assert [line["who"] for line in recorded(net)] == [f"view/{name}" for name in "xyzxy"]
+
+
 # What is open when a token or a session ends
 
 
