@@ -12,6 +12,7 @@ import threading
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
+from pathlib import Path
 from types import SimpleNamespace
 
 from calib.files.mast_file import StoredRig
@@ -47,11 +48,14 @@ class Bounds:
         The mast file, whose cameras the sun is judged by; None: there is none.
     sun
         The direction that is kept out of the cameras' sight.
+    state
+        The state folder of the head's daemon: a stop that is latched there holds too.
     """
 
     limits: Limits
     stored: StoredRig | None = None
     sun: Sun | None = None
+    state: Path | None = None
 
 
 def open_rig(settings: HardwareSettings, clock: Clock) -> tuple[Hardware, StateFolder | None]:
@@ -108,7 +112,7 @@ def devices_beside(
     """
     stored = bounds.stored
     assert stored is not None
-    with _alone(settings, moves), open_hardware(settings, clock) as hardware:
+    with _alone(settings, moves, bounds.state), open_hardware(settings, clock) as hardware:
         mine = SimpleNamespace(pan_tilt=hardware.pan_tilt, cameras={}) if own_cameras else hardware
         devices = Devices(mine, bounds.limits, stored.digest, clock, stored.rig, sun=bounds.sun)
         if not moves:
@@ -127,7 +131,7 @@ def head_beside(
 
     Parameters and errors are those of `devices_beside`; no camera is opened. Leaving closes what was opened.
     """
-    with _alone(settings, moves), ExitStack() as stack:
+    with _alone(settings, moves, bounds.state), ExitStack() as stack:
 
         def opened() -> GuardedHead:
             head = stack.enter_context(open_hardware(replace(settings, cameras={}), clock)).pan_tilt
@@ -219,27 +223,28 @@ class GuardedHead:
 
 
 @contextmanager
-def _alone(settings: HardwareSettings, moves: bool) -> Iterator[None]:
+def _alone(settings: HardwareSettings, moves: bool, state: Path | None) -> Iterator[None]:
     """Hold the head's place; who moves it finds no stop latched."""
-    name = head_name(settings)
-    with contextlib.nullcontext() if name is None else _held(name, moves):  # in memory it is nobody else's
+    name = head_name(settings)  # in memory it is nobody else's
+    with contextlib.nullcontext() if name is None else _held(name, moves=moves, state=state):
         yield
 
 
 @contextmanager
-def _held(name: str, moves: bool) -> Iterator[None]:
+def _held(name: str, *, moves: bool, state: Path | None = None) -> Iterator[None]:
     place = heads.take(name)
     try:
         if moves:
-            _check_latch(name, place)
+            _check_latch(name, place, state)
         yield
     finally:
         if place is not None:
             place.close()
 
 
-def _check_latch(name: str, place: StateFolder | None) -> None:
+def _check_latch(name: str, place: StateFolder | None, state: Path | None) -> None:
     """Pass a head whose emergency stop is not latched. Raises Estopped."""
-    entries = latched_at(None if place is None else place.path, heads.others(name, place))
+    folders = [folder for folder in (None if place is None else place.path, state) if folder is not None]
+    entries = latched_at(folders, heads.others(name, place))
     if entries:
         raise Estopped(f"{latched_sentence(entries)} at the head's daemon; until then nothing moves the head")

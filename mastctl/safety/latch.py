@@ -312,14 +312,18 @@ class Latch:
                 self._kept = held  # nothing more can be done
 
 
-def latched_at(folder: Path | None, others: Sequence[Path]) -> tuple[Latched, ...]:
-    """Return the stops that are latched in a head's place, and in folders beside it, for who only asks."""
+def latched_at(folders: Sequence[Path], others: Sequence[Path]) -> tuple[Latched, ...]:
+    """Return the stops of a head, for a program that only asks.
+
+    ``folders`` are its place and the state folder, as far as they are known; ``others`` as of `Latch`.
+    """
     entries: tuple[Latched, ...] = ()
-    if folder is not None:
-        file = _file_in(folder)
+    if folders:
+        file = _file_in(folders[0])
         found = _entries(file)
-        entries = _gone(file, [StateFile(folder / USED, USED_SCHEMA)]) if found is None else found
-    for other in others:
+        marks = [StateFile(folder / USED, USED_SCHEMA) for folder in folders]
+        entries = _gone(file, marks) if found is None else found
+    for other in (*others, *folders[1:]):
         entries = _merged(entries, _entries(_file_in(other)) or ())
     return entries
 

@@ -158,6 +158,13 @@ def usual_folder(config: Path, address: str) -> Path:
     return state_home() / f"{config.stem}-{digest}"
 
 
+def folder_of(named: Path | None, config: Path, address: str) -> Path | None:
+    """Return the folder that `StateFolder.of` takes; None for a user without a home."""
+    with contextlib.suppress(RuntimeError):
+        return named or _of_systemd() or usual_folder(config, address)
+    return None
+
+
 def folders_of(config: Path | None) -> list[Path]:
     """Return the places in which a daemon's state may be, of one configuration or of any, as far as known.
 

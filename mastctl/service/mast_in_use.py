@@ -17,6 +17,7 @@ from calib.mast.rig import Rig
 from mastctl.config import Config, check_cameras
 from mastctl.devices.opening import Bounds
 from mastctl.errors import BadRequest
+from mastctl.safety.state_folder import folder_of
 
 log = logging.getLogger(__name__)
 
@@ -127,4 +128,5 @@ def _check_camera(camera: str, stored: StoredRig, now: StoredRig) -> None:
 
 def bounds_of(config: Config) -> Bounds:
     """Return what bounds the moves of a configuration's head. Raises BadFile, as `read_mast`."""
-    return Bounds(config.limits, read_mast(config.mast_file, config).stored, config.sun)
+    state = folder_of(config.state_folder, config.path, config.listen.url)
+    return Bounds(config.limits, read_mast(config.mast_file, config).stored, config.sun, state)

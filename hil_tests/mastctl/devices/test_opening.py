@@ -22,6 +22,7 @@ from mastctl.cli.main import MODULES, build_parser, main
 from mastctl.client import Client
 from mastctl.safety import heads
 from mastctl.safety.latch import Latch
+from mastctl.safety.state_folder import StateFolder
 
 CAMERA = "navcam_left"
 SOURCE = '''
@@ -80,12 +81,12 @@ class Watched:
         """How far either axis went."""
         return float(np.ptp(self.path(), axis=0).max())
 
-    def latch(self) -> None:
-        """As a daemon left it that was stopped by Ana, and has ended."""
+    def latch(self, state: Path | None = None) -> None:
+        """As a daemon left it that Ana stopped: in the head's place, or in a state folder."""
         head = DeviceSettings(self.bench.driver, self.document["pan_tilt"]["options"])
         name = head_name(HardwareSettings(head, {}))
         assert name is not None
-        place = heads.take(name)
+        place = heads.take(name) if state is None else StateFolder.named(state)
         assert place is not None
         latch = Latch(place)
         latch.hold("sparks", "Ana")
@@ -184,6 +185,27 @@ def test_no_command_moves_a_latched_head(
     assert watched.swept_rad < STILL_RAD
     for name in MOVING & said.keys():
         assert "an emergency stop is latched (Ana: sparks)" in said[name], (name, said[name])
+
+
+@pytest.mark.parametrize("place", ["can be made", "cannot be made"])
+def test_a_latch_in_the_state_folder_alone_holds_too(
+    watched: Watched,
+    place: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """As a daemon left it that could not make the head's place, or that was of a version without one."""
+    if place == "cannot be made":
+        monkeypatch.setenv(heads.VARIABLE, "/proc/nowhere")
+    watched.latch(tmp_path / "state")
+    for words in (
+        ["camera", "sync", "--seconds", "1"],
+        ["conform", "--head", "--motion", "--only", "head.move"],
+    ):
+        assert main([*words, "--config", watched.config]) == 1
+        assert "an emergency stop is latched (Ana: sparks)" in capsys.readouterr().err
+    assert watched.swept_rad < STILL_RAD
 
 
 def in_the_bar(watched: Watched, bar: str) -> np.ndarray[Any, np.dtype[np.bool_]]:
