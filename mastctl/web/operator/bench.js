@@ -45,7 +45,7 @@ export class Bench {
     this.said = h("p", { class: "bad", role: "alert" });
     this.buildForm();
     this.others = h("details", { class: "bench-runs" }, h("summary", {}, "Earlier runs"), h("table", { class: "figures list" }));
-    this.anew = h("details", {}, h("summary", {}, "Begin a bench calibration …"), this.form);
+    this.anew = h("details", { class: "bench-new" }, h("summary", {}, "Begin a bench calibration …"), this.form);
     put(byId("bench"), this.anew, this.now, this.said, this.others);
     this.now.hidden = true;
   }

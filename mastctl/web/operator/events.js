@@ -51,6 +51,7 @@ export class Events extends EventTarget {
     this.heardMs = performance.now();
     if (this.connected) return;
     this.connected = true;
+    this.known.clear(); // what is told now is the whole: of a daemon that was started again nothing before it holds
     this.dispatchEvent(new Event("connected"));
   }
 

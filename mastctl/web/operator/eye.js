@@ -5,6 +5,8 @@ import { camera as called, deg, number } from "./words.js";
 const STALE_S = 1.0;
 const LOUPE_PX = 21; // image pixels across
 const ZOOM = 8;
+const SHAKES_PX = 10; // of the screen: a hand that clicks or a thumb that holds moves by less
+const HELD_MS = 500;
 
 export class Eye {
   constructor(name, choose) {
@@ -26,10 +28,11 @@ export class Eye {
     this.frame = h("div", {
       class: "frame", tabindex: 0, role: "application", "aria-label": `Image of ${called(name)}: arrow keys move the cross-hair, Enter chooses`,
       onpointermove: (event) => this.moved(event), onpointerleave: () => this.left(), onpointerdown: (event) => this.pressed(event),
-      onpointerup: (event) => this.released(event), onpointercancel: () => { this.drag = null; }, onkeydown: (event) => this.key(event), onblur: () => this.left(),
+      onpointerup: (event) => this.released(event), onpointercancel: () => this.cancelled(), oncontextmenu: (event) => event.preventDefault(), onkeydown: (event) => this.key(event), onblur: () => this.left(),
     }, this.canvas, this.over, this.loupe, this.stale);
     this.save = h("a", { class: "save", download: "", hidden: true }, "PNG");
-    this.element = h("figure", { class: "eye", "data-camera": name, "data-stale": "" }, this.frame,
+    this.question = h("div", { class: "follow", role: "group", "aria-label": "Follow it?", hidden: true }, h("button", { type: "button", class: "go", onclick: () => this.follow() }, "Follow it"), h("button", { type: "button", onclick: () => this.leave() }, "Leave it"));
+    this.element = h("figure", { class: "eye", "data-camera": name, "data-stale": "" }, this.frame, this.question,
       h("figcaption", {}, h("strong", {}, called(name)), this.age, this.facing, this.where, this.save));
   }
 
@@ -73,7 +76,10 @@ export class Eye {
 
   moved(event) {
     this.cursor = this.pixel(event);
-    if (this.drag) this.drawBox();
+    if (this.drag && this.shaken(event)) {
+      clearTimeout(this.drag.held);
+      if (event.pointerType !== "touch") this.drawBox();
+    }
     this.look(this.cursor);
   }
 
@@ -88,21 +94,61 @@ export class Eye {
     if (event.button !== 0) return;
     this.frame.setPointerCapture?.(event.pointerId);
     this.cursor = this.pixel(event);
-    this.drag = { from: this.cursor, facts: this.facts, stale: this.isStale };
+    this.leave();
+    this.drag = { from: this.cursor, facts: this.facts, at: [event.clientX, event.clientY] };
+    if (event.pointerType === "touch") this.drag.held = setTimeout(() => this.holds(), HELD_MS);
     this.look(this.cursor);
   }
 
+  shaken({ clientX, clientY }) {
+    return Math.hypot(clientX - this.drag.at[0], clientY - this.drag.at[1]) > SHAKES_PX;
+  }
+
+  cancelled() {
+    clearTimeout(this.drag?.held);
+    this.drag = null;
+    this.left();
+  }
+
+  /** A finger that stays: what is under it is to be followed. */
+  holds() {
+    const { from, facts } = this.drag;
+    this.drag = null;
+    this.propose(from, facts);
+  }
+
+  /** A gesture begins no track by itself: hands slip. */
+  propose(pixel, facts) {
+    this.proposed = { pixel, facts };
+    this.question.hidden = false;
+    this.mark("box", pixel, "click", "follow?");
+  }
+
+  follow() {
+    const { pixel, facts } = this.proposed;
+    this.leave();
+    this.choose(this, pixel, facts, "track");
+  }
+
+  leave() {
+    this.question.hidden = true;
+    this.draw("box", null);
+  }
+
   released(event) {
-    const drag = this.drag;
+    const { drag } = this;
+    if (!drag) return;
+    clearTimeout(drag.held);
+    const touch = event.pointerType === "touch";
+    const to = this.pixel(event);
+    const [width, height] = [0, 1].map((k) => Math.abs(to[k] - drag.from[k]));
+    const shaken = this.shaken(event);
     this.drag = null;
     this.draw("box", null);
-    if (!drag) return;
-    const to = this.pixel(event);
-    const [width, height] = [Math.abs(to[0] - drag.from[0]), Math.abs(to[1] - drag.from[1])];
-    if (width > 12 && height > 12) this.choose(this, [(to[0] + drag.from[0]) / 2, (to[1] + drag.from[1]) / 2], drag.facts, "track");
+    if (shaken && !touch && width > 12 && height > 12) this.propose([(to[0] + drag.from[0]) / 2, (to[1] + drag.from[1]) / 2], drag.facts);
     // a finger hits with its centre where it leaves; a mouse where it went down
-    else this.choose(this, event.pointerType === "touch" ? to : drag.from, drag.facts, "point");
-    if (event.pointerType === "touch") this.left();
+    else if (!shaken) this.choose(this, touch ? to : drag.from, drag.facts, "point");
+    if (touch) this.left();
   }
 
   key(event) {

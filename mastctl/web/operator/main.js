@@ -49,6 +49,7 @@ function notice(words) {
 async function press(button, send, name, done) {
   button.dataset.pressed = "sent";
   target.disarm(`${name} was pressed`);
+  for (const eye of views.eyes.values()) eye.leave();
   const failed = byId("stop-failed");
   try {
     await send();
@@ -57,11 +58,17 @@ async function press(button, send, name, done) {
     say(byId("said"), done);
   } catch (error) {
     failed.hidden = false;
+    failedAfter = command;
     failed.textContent = `${name} IS NOT CONFIRMED. ${error.message} Use the switch in the supply.`;
     button.dataset.pressed = "failed";
   }
   setTimeout(() => { button.dataset.pressed = ""; }, 1200);
 }
+/** A stop that was carried out late, or a head that rests when the connection is back, ends the alarm. */
+const stopConfirmed = () => { byId("stop-failed").hidden = true; };
+let doubted = false; // a stop was not confirmed, and the connection was lost since
+let command = 0; // number of the newest that was told
+let failedAfter = 0;
 const stopNow = () => press(byId("stop"), stop, "STOP", "Stopped.");
 const latchNow = () => press(byId("latch"), estop, "E-STOP", "Emergency stop. Nothing moves until it is released.");
 for (const [id, now] of [["stop", stopNow], ["latch", latchNow]]) {
@@ -113,6 +120,8 @@ function standing(now) {
     if (["stopped", "fault"].includes(now.state) && now.reason) announce(`${now.state}. ${now.reason}`);
     else speak(`${now.state}. ${now.reason}`);
   }
+  if (doubted && ["ready", "holding", "stopped"].includes(now.state)) stopConfirmed();
+  doubted = false;
   const latch = now.estop;
   target.latch(Boolean(latch));
   byId("estop").hidden = !latch;
@@ -133,7 +142,9 @@ events.addEventListener("joints", (event) => { jog.here = [event.detail.value.pa
 events.addEventListener("mast", () => refresh());
 events.addEventListener("fault", (event) => { if (event.detail.key === "sun") refresh(); });
 events.addEventListener("command", (event) => {
-  const kind = event.detail.value.command ?? "";
+  const { command: kind = "", number, result, ended } = event.detail.value;
+  if (kind.endsWith("stop") && result === "ok" && !ended && number > failedAfter) stopConfirmed();
+  command = number;
   if (kind === "stop") target.disarm("The head was stopped");
   refresh();
   if (kind.startsWith("record")) recording.look();
@@ -145,7 +156,7 @@ events.addEventListener("operation", (event) => {
   const going = record.state === "running" ? record.steps.findLast((step) => step.name === "limits") : null;
   head.goal(going ? [going.detail.pan_rad, going.detail.tilt_rad] : undefined);
 });
-events.addEventListener("connected", () => { byId("lost").hidden = true; refresh(); recording.look(); residuals.look(); mastFile.look(); jog.look(); control.again(); });
+events.addEventListener("connected", () => { byId("lost").hidden = true; doubted = !byId("stop-failed").hidden; head.goal(); refresh(); recording.look(); residuals.look(); mastFile.look(); jog.look(); control.again(); });
 events.addEventListener("lost", () => {
   byId("lost").hidden = false;
   jog.release();

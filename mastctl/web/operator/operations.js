@@ -15,7 +15,7 @@ export class OperationList {
     this.items = new Map();
     events.addEventListener("operation", (event) => this.told(event.detail.value));
     events.addEventListener("command", (event) => this.asked(event.detail.value));
-    events.addEventListener("connected", () => { for (const each of [this.records, this.by, this.items]) each.clear(); });
+    events.addEventListener("connected", () => { for (const each of [this.records, this.by, this.items]) each.clear(); this.soon(); });
     this.draw();
   }
 

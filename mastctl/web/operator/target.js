@@ -1,6 +1,6 @@
 // Click, see what it would mean, send it, read the residual.
 import { byId, h, put } from "./dom.js";
-import { fileOf, post } from "./api.js";
+import { fileOf, get, post } from "./api.js";
 import { camera as called, deg, metres, number, px } from "./words.js";
 import { residualPicture } from "./residual.js";
 import { placeIn, shownBy } from "./truth.js";
@@ -21,7 +21,7 @@ const FROM = {
 
 const HOW = [
   ["Click", "a point of a fresh image: its range is told before anything moves"],
-  ["Drag", "a box round a target to follow it"],
+  ["Drag", "a box round a target, then confirm, to follow it; on a touch screen hold a finger on it"],
   ["← ↑ → ↓", "move the cross-hair of a focused image (Shift: 10 px, Alt: 0.1 px)", "keys"],
   ["Enter, T", "choose its point; follow it", "keys"],
 ];
@@ -44,6 +44,7 @@ export class Target {
     this.may = this.latched = false;
     events.addEventListener("operation", (event) => this.operation(event.detail.value));
     events.addEventListener("joints", (event) => this.joints(event.detail.value));
+    events.addEventListener("connected", () => this.askAgain());
     events.addEventListener("lost", () => this.disarm("The connection was lost"));
     events.addEventListener("mast", (event) => this.mast(event.detail.value.digest));
     document.addEventListener("views-changed", () => this.draw());
@@ -67,6 +68,17 @@ export class Target {
     if (!["asked", "preview"].includes(this.state)) return;
     this.number += 1; // an answer that is under way comes too late
     this.refuse(`${what} after this point was chosen. Choose it again.`);
+  }
+
+  /** After a loss: a daemon that was started again knows nothing of what was sent to the one before. */
+  async askAgain() {
+    const { id } = this;
+    if (this.state !== "sent" || !id) return;
+    try {
+      this.operation(await get(`/operations/${id}`));
+    } catch (error) {
+      if (error.status && this.id === id) this.refuse("The daemon was started again and does not know how the pointing ended. Choose the point again.");
+    }
   }
 
   latch(latched) {

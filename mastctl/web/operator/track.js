@@ -20,9 +20,10 @@ export class TrackPanel {
     this.look = h("button", { type: "button", onclick: () => this.act("/track/look") }, "Look again");
     this.end = h("button", { type: "button", onclick: () => this.act("/track/stop") }, "End the track");
     this.buttons = h("div", { class: "buttons" }, this.look, this.end);
-    this.hint = h("p", { class: "quiet" }, "Drag a box round a target, or press T at the cross-hair.");
+    this.hint = h("p", { class: "quiet" }, "Drag a box round a target, hold a finger on it, or press T at the cross-hair.");
     this.bad = h("p", { class: "bad" });
     put(byId("track"), this.head, this.plots, this.table.place, this.bad, this.buttons, this.hint);
+    events.addEventListener("connected", () => { this.status = null; this.draw(); }); // it is told again where there is one
     events.addEventListener("track", (event) => this.told(event.detail.value));
     this.draw();
   }
@@ -62,8 +63,8 @@ export class TrackPanel {
   }
 
   told(status) {
-    if (status.id !== this.status?.id) [this.trail, this.chosen] = [[], null];
-    this.status = status;
+    if (status.id !== this.id) [this.trail, this.chosen] = [[], null];
+    [this.status, this.id] = [status, status.id];
     if (status.range_m !== null && !status.predicted && !status.misses && status.looks !== this.trail.at(-1)?.look) {
       const covariance = status.covariance_m2;
       const look = { look: status.looks, pair: status.pair, range: status.range_m, sigma: covariance ? Math.sqrt(covariance[0][0] + covariance[1][1] + covariance[2][2]) : null, error: null, off: [] };
@@ -108,6 +109,7 @@ export class TrackPanel {
     const row = (name, value) => h("tr", {}, h("th", { scope: "row" }, name), h("td", { class: "n" }, value));
     const pose = status?.pose;
     const stands = pose ? row("Rover at", `${number(pose.position_m[0], 2, true)}, ${number(pose.position_m[1], 2, true)} m, ${deg(2 * Math.atan2(pose.quaternion[3], pose.quaternion[0]), 1)}`) : null;
+    this.drawApproach(none ? [] : this.trail);
     if (none) return put(this.head, stands ? h("table", { class: "figures" }, stands) : null);
     const last = this.trail.at(-1);
     put(this.head,
@@ -121,11 +123,9 @@ export class TrackPanel {
         row("Looks, misses", `${status.looks}, ${status.misses}`),
         status.handoffs.length ? row("Hand-offs", status.handoffs.map((one) => h("div", {}, `${called(one.from_pair)} → ${called(one.to_pair)} at ${metres(one.range_m, 2)}`))) : null,
         stands));
-    this.drawApproach();
   }
 
-  drawApproach() {
-    const { trail } = this;
+  drawApproach(trail) {
     const drawn = trail.length > 1;
     put(this.plots, drawn ? [this.ranges(), this.errors(), strip(trail.map((one) => called(one.pair ?? "")), `Camera in use, now ${called(trail.at(-1).pair ?? "")}`)] : null);
     const judged = trail.some((one) => one.error !== null);

@@ -17,10 +17,11 @@ import httpx
 import pytest
 
 from drivers.errors import NoReply
-from hil_tests.mastctl.service_fakes import CONFIG, FakeHardware, ScriptedLoop, fake_daemon
+from hil_tests.mastctl.service_fakes import CONFIG, FakeHardware, FakeStep, ScriptedLoop, fake_daemon
 from hil_tests.mastctl.web.network import network_daemon
 from hil_tests.mastctl.web.page.conftest import Visit
 from hil_tests.waiting import NET_S, until
+from mastctl.client import Client
 from mastctl.daemon import RunningDaemon
 from mastctl.pointing.requests import Aim
 from mastctl.pointing.results import Preview
@@ -236,6 +237,60 @@ def test_a_stop_that_is_not_confirmed_is_told_loudly(pair: BOTH, visit: Visits) 
     said.wait_for()
     assert "NOT CONFIRMED" in said.inner_text()
     hardware.head.hook = lambda name: None
+    with Client(daemon.url) as client:
+        client.keep_place("chart", 0.1, 0.1)
+        one.page.get_by_role("button", name="chart", exact=True).wait_for()
+        assert said.is_visible(), "another command confirms no stop"
+        client.stop()
+    said.wait_for(state="hidden")
+
+
+def test_after_a_restart_nothing_of_the_dead_daemon_is_shown(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, visit: Visits
+) -> None:
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    listen = f"{{port: {port}}}"
+    dead = threading.Event()
+    lines: list[Any] = []
+
+    def relay(line: Any) -> None:
+        """Of a daemon that was killed nothing is heard, not how its operations end either."""
+        server, first = line.connect_to_server(), not lines
+        lines.append(line)
+        server.on_message(lambda told: None if first and dead.is_set() else line.send(told))
+
+    def waits(request: Any, record: Any, cancelled: threading.Event, devices: Any) -> Any:
+        record(FakeStep("limits", "done", 0.0, 0.01, {"pan_rad": 0.3, "tilt_rad": 0.1}))
+        cancelled.wait(NET_S)
+        raise NoReply("it was ended", device="pan_tilt")
+
+    with fake_daemon(monkeypatch, tmp_path, listen, loop=Previewing) as (daemon, _):
+        monkeypatch.setattr(ScriptedLoop, "script", staticmethod(waits))
+        one = visit("about:blank")
+        one.page.route_web_socket(re.compile("/events"), relay)
+        one.url = daemon.url
+        one.page.goto(daemon.url)
+        one.choose()
+        one.page.keyboard.press("p")
+        one.page.wait_for_selector("#target >> text=Under way")
+        one.page.wait_for_selector(".operation .word.running")
+        one.page.wait_for_selector(".range .wanted", state="attached")
+        one.page.route("**/api/v1/stop", lambda route: route.abort())
+        one.page.keyboard.press("Escape")
+        one.page.wait_for_selector("#stop-failed:not([hidden])")
+        dead.set()
+    one.word("lost")
+    assert one.page.locator("#stop-failed").is_visible(), "nobody knows yet"
+    with fake_daemon(monkeypatch, tmp_path, listen, loop=Previewing):
+        one.word("ready")
+        one.page.wait_for_selector("#stop-failed", state="hidden")
+        assert "started again" in one.target("refused")
+        one.page.wait_for_selector("#operations >> text=None since the daemon began")
+        one.page.wait_for_selector(".range .wanted", state="detached")
+        one.page.unroute_all()
+        one.complaints.clear()
 
 
 def test_two_pages_and_the_lease(pair: BOTH, visit: Visits) -> None:
@@ -396,6 +451,66 @@ def test_a_finger_turns_the_head_and_chooses_a_point(pair: BOTH, visit: Visits) 
     assert max(json.loads(body)["pan_rad_per_s"] for body in one.posts("/jog")) > 0
 
 
+def test_no_gesture_begins_a_track_without_a_press(pair: BOTH, visit: Visits) -> None:
+    one = visit(pair[0].url)
+    follow = one.page.get_by_role("button", name="Follow it")
+
+    def drag(way_px: float) -> None:
+        box = one.frame().bounding_box()
+        x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
+        one.page.mouse.move(x, y)
+        one.page.mouse.down()
+        one.page.mouse.move(x + way_px, y + way_px, steps=4)
+        one.page.mouse.up()
+
+    drag(7.0 / math.sqrt(2.0))
+    one.target("preview")  # a hand that shakes has clicked
+    assert not follow.is_visible()
+    drag(150.0)
+    follow.wait_for()
+    one.page.keyboard.press("Escape")
+    follow.wait_for(state="hidden")
+    drag(150.0)
+    one.page.get_by_role("button", name="Leave it").click()
+    drag(150.0)
+    assert not one.posts("/track")
+    with one.page.expect_request("**/api/v1/track"):
+        follow.click()
+    assert len(one.posts("/track")) == 1 and not follow.is_visible()
+
+
+def test_a_finger_scrolls_over_an_image_and_follows_what_it_is_held_on(pair: BOTH, visit: Visits) -> None:
+    one = visit(pair[0].url, has_touch=True, is_mobile=True, viewport={"width": 390, "height": 844})
+    frame = one.frame()
+    frame.scroll_into_view_if_needed()
+    finger = one.page.context.new_cdp_session(one.page)
+
+    def touch(kind: str, *points: tuple[float, float]) -> None:
+        places = [{"x": x, "y": y} for x, y in points]
+        finger.send("Input.dispatchTouchEvent", {"type": kind, "touchPoints": places})
+
+    def middle() -> tuple[float, float]:
+        box = frame.bounding_box()
+        return box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
+
+    before = one.page.evaluate("scrollY")
+    x, y = middle()
+    touch("touchStart", (x, y))
+    for k in range(1, 21):
+        touch("touchMove", (x + k / 4, y - 10 * k))
+    touch("touchEnd")
+    one.page.wait_for_function(f"scrollY > {before}")
+    assert not one.posts("/track") and not one.posts("/point/preview")
+    frame.scroll_into_view_if_needed()
+    follow = one.page.get_by_role("button", name="Follow it").first
+    touch("touchStart", middle())
+    follow.wait_for()
+    touch("touchEnd")
+    assert not one.posts("/track") and not one.posts("/point/preview")
+    with one.page.expect_request("**/api/v1/track"):
+        follow.tap()
+
+
 def test_by_the_keyboard_alone_a_pixel_is_chosen_and_sent(pair: BOTH, visit: Visits) -> None:
     daemon, _ = pair
     one = visit(daemon.url)
@@ -520,6 +635,24 @@ def test_an_emergency_stop_is_told_and_released_with_a_reason(pair: BOTH, visit:
     one.page.get_by_role("button", name="Release", exact=True).click()
     one.word("holding")
     assert one.page.locator("#estop").is_hidden()
+
+
+def test_a_release_that_came_too_late_releases_nobody_else_s_stop(pair: BOTH, visit: Visits) -> None:
+    daemon, _ = pair
+    one = visit(daemon.url)
+    with httpx.Client(base_url=f"{daemon.url}/api/v1", trust_env=False) as http:
+        for name in ("Ana", "Ben"):
+            http.post("/estop", json={"reason": "sparks", "name": name})
+        one.page.get_by_role("button", name="Release Ana’s").click()
+        http.post("/reset", json={"reason": "mended", "name": "Cleo", "of": "Ana"}).raise_for_status()
+        one.page.wait_for_selector("#estop:not(:has-text('Ana'))")
+        one.page.locator("#reset-reason").fill("mended")
+        one.page.locator("#reset-name").fill("Dan")
+        one.page.get_by_role("button", name="Release", exact=True).click()
+        one.page.wait_for_selector("#reset-said >> text=Ana")
+        assert [each["name"] for each in http.get("/status").json()["estops"]] == ["Ben"]
+        one.page.get_by_role("button", name="Leave it").click()
+        assert "by Ben: sparks" in one.page.locator("#estop").inner_text()
 
 
 def test_an_emergency_stop_is_pressed_without_a_lease_and_holds(pair: BOTH, visit: Visits) -> None:

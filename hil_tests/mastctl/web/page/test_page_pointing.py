@@ -112,6 +112,7 @@ def test_a_box_round_a_rock_begins_a_track_that_is_drawn_in_both_eyes(
     one.page.mouse.down()
     one.page.mouse.move(x + 20, y + 20, steps=4)
     one.page.mouse.up()
+    one.page.get_by_role("button", name="Follow it").click()
     one.page.wait_for_selector("#track .word.tracking, #track .word.lost, #track .bad")
     assert "tracking" in one.page.locator("#track").inner_text(), one.page.locator("#track").inner_text()
     for camera in ("navcam_left", "navcam_right"):
