@@ -479,7 +479,7 @@ def test_no_gesture_begins_a_track_without_a_press(pair: BOTH, visit: Visits) ->
     assert len(one.posts("/track")) == 1 and not follow.is_visible()
 
 
-def test_a_finger_scrolls_over_an_image_and_follows_what_it_is_held_on(pair: BOTH, visit: Visits) -> None:
+def test_a_finger_scrolls_over_an_image_and_begins_nothing(pair: BOTH, visit: Visits) -> None:
     one = visit(pair[0].url, has_touch=True, is_mobile=True, viewport={"width": 390, "height": 844})
     frame = one.frame()
     frame.scroll_into_view_if_needed()
@@ -499,16 +499,8 @@ def test_a_finger_scrolls_over_an_image_and_follows_what_it_is_held_on(pair: BOT
     for k in range(1, 21):
         touch("touchMove", (x + k / 4, y - 10 * k))
     touch("touchEnd")
-    one.page.wait_for_function(f"scrollY > {before}")
+    until(lambda: one.page.evaluate("scrollY") > before, "the page scrolls")
     assert not one.posts("/track") and not one.posts("/point/preview")
-    frame.scroll_into_view_if_needed()
-    follow = one.page.get_by_role("button", name="Follow it").first
-    touch("touchStart", middle())
-    follow.wait_for()
-    touch("touchEnd")
-    assert not one.posts("/track") and not one.posts("/point/preview")
-    with one.page.expect_request("**/api/v1/track"):
-        follow.tap()
 
 
 def test_by_the_keyboard_alone_a_pixel_is_chosen_and_sent(pair: BOTH, visit: Visits) -> None:
@@ -550,7 +542,7 @@ def test_what_was_chosen_before_a_stop_a_turn_or_a_takeover_is_never_sent(pair: 
             "The head was stopped": lambda: http.post("/stop"),
             "stopped|emergency stop was pressed": lambda: (http.post("/estop"), released()),
             "Ben took over": taken,
-            "The head was sent elsewhere": lambda: http.post(
+            "The head (was sent elsewhere|turned)": lambda: http.post(
                 "/point", json={"pan_rad": 0.1, "tilt_rad": 0.0}
             ),
             "The head turned": lambda: setattr(hardware.head, "pan_rad", -0.3),
