@@ -503,6 +503,22 @@ def test_a_finger_scrolls_over_an_image_and_begins_nothing(pair: BOTH, visit: Vi
     assert not one.posts("/track") and not one.posts("/point/preview")
 
 
+def test_a_finger_that_is_held_on_an_image_asks_whether_to_follow(pair: BOTH, visit: Visits) -> None:
+    one = visit(pair[0].url, has_touch=True, is_mobile=True, viewport={"width": 390, "height": 844})
+    frame = one.frame()
+    frame.scroll_into_view_if_needed()
+    finger = one.page.context.new_cdp_session(one.page)
+    box = frame.bounding_box()
+    place = {"x": box["x"] + box["width"] / 2, "y": box["y"] + box["height"] / 2}
+    finger.send("Input.dispatchTouchEvent", {"type": "touchStart", "touchPoints": [place]})
+    follow = one.page.get_by_role("button", name="Follow it").first
+    follow.wait_for()
+    finger.send("Input.dispatchTouchEvent", {"type": "touchEnd", "touchPoints": []})
+    assert not one.posts("/track") and not one.posts("/point/preview")
+    with one.page.expect_request("**/api/v1/track"):
+        follow.tap()
+
+
 def test_by_the_keyboard_alone_a_pixel_is_chosen_and_sent(pair: BOTH, visit: Visits) -> None:
     daemon, _ = pair
     one = visit(daemon.url)
