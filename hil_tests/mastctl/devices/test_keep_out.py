@@ -244,3 +244,31 @@ def test_what_a_head_passes_on_its_approach_is_no_place_that_the_next_goal_may_u
     keep_outs.check_move(moving, (beside, 0.1), False)
     with pytest.raises(KeptOut):
         keep_outs.check_move(moving, (beside - 0.006, 0.1), False)
+
+
+def test_the_room_about_a_place_holds_it_and_no_keep_out() -> None:
+    draw = random.Random(4)
+
+    def between(low: float, high: float) -> Pair:
+        one, other = sorted(draw.uniform(low, high) for _ in range(2))
+        return one, other + 0.01
+
+    most, found = Span((-1.0, 1.0), (-0.5, 0.5)), 0
+    for _ in range(300):
+        boxes = tuple(
+            Box(str(number), between(-1.2, 1.2), between(-0.6, 0.6)) for number in range(draw.randint(1, 4))
+        )
+        keep_outs = KeepOuts(boxes, 0.02, (0.03, 0.0), most.pan_rad, most.tilt_rad)
+        here = draw.uniform(-1.0, 1.0), draw.uniform(-0.5, 0.5)
+        room, free = (
+            keep_outs.room(here, most),
+            not any(Span.around(here).enters(one) for one in keep_outs.full),
+        )
+        assert (room is not None) == free, (boxes, here)
+        if room is None:
+            continue
+        found += 1
+        assert room.overlap(most) == room and Span.around(here, *room.corners) == room
+        for corner in room.corners:  # each move in it goes out
+            keep_outs.check_move(Span.around(here), corner, True)
+    assert 50 < found < 250
