@@ -345,7 +345,8 @@ def test_a_run_whose_file_goes_while_it_is_recorded_is_a_fault_until_the_next_on
 def test_a_run_whose_file_went_is_no_recording_that_can_be_ended(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    # Before the writing thread starts: it would look after the run once more behind its start, and see the loss first.
+    # Before the writing thread starts: it would look after the run once more behind its
+    # start, and see the loss first.
     monkeypatch.setattr(module.Recorder, "_look_after", lambda self: None)
     one = recorder(tmp_path)
     run = one.start_run("rock")["run"]
