@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -60,6 +61,10 @@ class Caller:
 def told_name(header: str | None) -> str:
     """Return what a caller calls itself as one printable line, cut to 80 signs; `ANONYMOUS` for nothing.
 
-    Never refuses: a stop with a strange name is a stop.
+    Headers are read as Latin-1; what is UTF-8 in one is told as that. Never refuses: a stop with a strange
+    name is a stop.
     """
-    return one_line(header or "", LONGEST_NAME).strip() or ANONYMOUS
+    told = header or ""
+    with contextlib.suppress(UnicodeError):  # what is no UTF-8 is told as it came
+        told = told.encode("latin-1").decode()
+    return one_line(told, LONGEST_NAME).strip() or ANONYMOUS

@@ -164,7 +164,8 @@ class Head:
         reading, before = self._head.read(), self._last
         now_s = self._clock.now_s()
         if not all(map(math.isfinite, (reading.pan_rad, reading.tilt_rad, reading.time_s))):
-            words = f"the head reads pan {reading.pan_rad}, tilt {reading.tilt_rad} at {reading.time_s} s"
+            words = f"the head reads pan {reading.pan_rad}, tilt {reading.tilt_rad}"
+            words += "" if math.isfinite(reading.time_s) else f" at {reading.time_s} s"
             raise PointingError("bad_reading", f"{words}: not finite numbers")
         if reading.faults:
             raise PointingError("head_fault", f"the head reports: {'; '.join(reading.faults)}")

@@ -18,6 +18,7 @@ import numpy as np
 
 from calib.handoff.matched import MatchedHandoff
 from calib.mast.rig import Rig
+from calib.rigid import Rigid
 from drivers.clock import Clock
 from mastctl.devices.limits import Limits
 from mastctl.errors import BadRequest, MastctlError, NotNow
@@ -43,6 +44,11 @@ from mastctl.tracking.status import ACTIVE, TrackStatus
 log = logging.getLogger(__name__)
 
 Told = Mapping[str, Any]
+
+FIRST_POSE = (
+    "the rover's first pose came while the track ran: how far the rover moved since the track began is not "
+    "known; begin the track again"
+)
 
 
 class HoldingDevices(DevicesLike, Protocol):
@@ -162,20 +168,17 @@ class Tracker:
         Raises
         ------
         BadRequest, NotNow
-            If it is not later than the one before, or, while a track runs, if it has no covariance or no
-            pose came before it.
+            If it is not later than the one before, or, while a track runs, if it has no covariance: then the
+            track is lost if the rover moved.
+
+        The first pose ends a track that began without one.
         """
         with self._held():
             before = self._status.pose
             check_follows(pose, before)
             active = self._status.state in ACTIVE
-            if active and before is None:
-                raise NotNow(
-                    "no_pose_before",
-                    "no pose was known when the track began, so that the motion since is not known; stop the "
-                    "track, send the pose, and start it again",
-                )
-            if active and pose.covariance is None:
+            if active and before is not None and pose.covariance is None:
+                self._doubted(motion_between(before, pose))
                 raise BadRequest(
                     "pose_without_covariance",
                     "covariance (6 rows of 6) or sigma of the motion since the pose before is missing; while "
@@ -188,6 +191,9 @@ class Tracker:
             if before is not None and not stands(motion_between(before, pose)):
                 self._moved_s = pose.received_s
             status = replace(self._status, pose=pose)
+            if active and before is None:
+                self._end(status, FIRST_POSE)
+                return None
             operation = status.operation
             if active:
                 stood = status.stands_at
@@ -227,9 +233,7 @@ class Tracker:
             if self._status.state not in ACTIVE:
                 return None
             running = self._status.operation
-            self._carried, self._waiting, self._look_again = None, [], False
-            self._publish(replace(self._status, state="stopped", reason=reason, operation=None))
-            self._say(logging.INFO, "track %s stopped: %s", self._status.id, reason)
+            self._end(self._status, reason)
             return running
 
     def use_rig(self, rig: Rig, name: str) -> None:
@@ -260,6 +264,22 @@ class Tracker:
     def _say(self, level: int, words: str, *about: Any) -> None:
         """Have something logged when the lock is let go."""
         self._said.append((level, words, *about))
+
+    def _end(self, status: TrackStatus, reason: str) -> None:
+        """Follow nothing any more."""
+        self._carried, self._waiting, self._look_again = None, [], False
+        self._publish(replace(status, state="stopped", reason=reason, operation=None))
+        self._say(logging.INFO, "track %s stopped: %s", status.id, reason)
+
+    def _doubted(self, motion: Rigid) -> None:
+        """Say that the target is lost if the rover moved by a pose that says too little to be followed."""
+        if self._carried is None or stands(motion):
+            return
+        # Whatever is found after this must be confirmed by both eyes.
+        self._carried = replace(self._carried, track=replace(self._carried.track, state="lost"))
+        way_m = float(np.linalg.norm(motion.translation_m))
+        words = f"the rover moved by {way_m:.2f} m, and its pose was refused: it had no covariance"
+        self._publish(replace(self._status, state="lost", predicted=True, reason=words))
 
     def _run(self, told: Told, work: Callable[[Looker], Outcome]) -> Operation:
         """Start an operation that looks; its outcome comes to `_ended`."""

@@ -19,8 +19,16 @@ REPORT = (
     "form-action 'none'; frame-ancestors 'none'"
 )
 """The Content-Security-Policy of a report: its own styles and drawings, no script, an origin of nobody's."""
-RunName = Annotated[str, Path(pattern=f"^{NAME.pattern}$")]
-ReportName = Annotated[str, Path(pattern="^[A-Za-z0-9][A-Za-z0-9._-]{0,99}$")]
+RunName = Annotated[
+    str, Path(pattern=f"^{NAME.pattern}$", description="a run's name, such as 20261126-093000,")
+]
+ReportName = Annotated[
+    str,
+    Path(
+        pattern="^[A-Za-z0-9][A-Za-z0-9._-]{0,99}$",
+        description="1 to 100 letters a to z, digits, '.', '_' and '-', the first a letter or digit,",
+    ),
+]
 
 
 def add_bench(app: FastAPI) -> None:

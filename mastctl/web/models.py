@@ -92,7 +92,9 @@ class TakeBody(_Strict):
 
     name: Name | None = None
     for_s: LeaseS = USUAL_S
-    reason: Annotated[str, Field(min_length=1, max_length=400, pattern=r"\S")]
+    reason: Annotated[
+        str, Field(min_length=1, max_length=400, pattern=r"\S", description="a reason in words")
+    ]
 
 
 class RecordBody(_Strict):

@@ -13,7 +13,13 @@ from mastctl.web.commands import Headers
 from mastctl.web.models import PlaceBody
 from mastctl.web.parts import Here
 
-PlaceName = Annotated[str, Path(pattern=r"^[\w+−-][\w .,:°+−-]{0,39}$")]
+PlaceName = Annotated[
+    str,
+    Path(
+        pattern=r"^[\w+−-][\w .,:°+−-]{0,39}$",
+        description="a name of 1 to 40 letters, digits, spaces and . , : ° + - that begins with no space",
+    ),
+]
 
 
 def add_places(app: FastAPI) -> None:

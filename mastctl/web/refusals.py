@@ -111,5 +111,8 @@ def _read_by(request: Request, problem: Mapping[str, Any]) -> object:
     route = request.scope.get("route")
     if not isinstance(route, APIRoute):
         return None
+    if problem["loc"][0] == "path":
+        named = (one for one in route.dependant.path_params if one.name == problem["loc"][1])
+        return next((one.field_info for one in named), None)
     params = route.dependant.body_params if problem["loc"][0] == "body" else route.dependant.query_params
     return params[0].field_info.annotation if params else None

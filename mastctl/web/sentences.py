@@ -17,7 +17,8 @@ def sentence(problem: Mapping[str, Any], model: object) -> str:
     problem
         One entry of pydantic's list of errors.
     model
-        What the body or the query is read by, for the keys it knows; None if not known.
+        What the body or the query is read by, for the keys it knows and the words for what is expected; of a
+        path, the parameter's own facts. None if not known.
     """
     where = tuple(str(step) for step in problem["loc"])
     place = _place(where)
@@ -31,6 +32,8 @@ def sentence(problem: Mapping[str, Any], model: object) -> str:
         known = _keys(model, where[1:-1])
         return f"{place}: unknown key; {nearest(where[-1], known)}" if known else f"{place}: unknown key"
     value = _short(problem.get("input"))
+    if kind == "string_pattern_mismatch" and (expected := _described(model, where[1:])):
+        return f"{place}: {value} where {expected} is expected"
     if kind in ("too_short", "too_long"):
         size = 4 if where[-1] == "quaternion" else 3
         return f"{place}: {value} where a list of {size} numbers is expected"
@@ -54,6 +57,15 @@ def _keys(model: object, place: Sequence[str]) -> list[str]:
         if place[0] in fields:
             return _keys(fields[place[0]].annotation, place[1:])
     return []
+
+
+def _described(model: object, place: Sequence[str]) -> str | None:
+    """What is expected at a place, in the words of the model, or of a path's parameter itself."""
+    for candidate in (model, *get_args(model)):
+        fields = getattr(candidate, "model_fields", None) or {}
+        if place and place[0] in fields:
+            return fields[place[0]].description or _described(fields[place[0]].annotation, place[1:])
+    return getattr(model, "description", None)
 
 
 def _place(where: tuple[str, ...]) -> str:

@@ -35,7 +35,13 @@ if TYPE_CHECKING:
     from drivers.sim.bench_boards import BenchBoard
     from drivers.sim.rover import SimulatedRover
 
-BoardName = Annotated[str, Path(pattern="^[A-Za-z0-9][A-Za-z0-9_-]{0,39}$")]
+BoardName = Annotated[
+    str,
+    Path(
+        pattern="^[A-Za-z0-9][A-Za-z0-9_-]{0,39}$",
+        description="1 to 40 letters a to z, digits, '_' and '-', the first a letter or digit,",
+    ),
+]
 
 
 def add_simulation(app: FastAPI) -> None:

@@ -30,7 +30,7 @@ from hil_tests.mastctl.service_fakes import (
     fake_daemon,
     rig,
 )
-from hil_tests.waiting import until
+from hil_tests.waiting import NET_S, until
 from mastctl.cli.main import main
 from mastctl.client import Client, ClientError
 from mastctl.daemon import RunningDaemon
@@ -358,9 +358,15 @@ def test_poses_that_run_backwards_or_say_too_little_are_refused(client: Client) 
     assert "0.5 s" in told
     assert "1 s" in told
     refusal(lambda: client.pose([0.1, 0, 0], [1, 0, 0, 0], sigma=SIGMA), "pose_without_time")
-    told = refusal(lambda: client.pose([0.1, 0, 0], [1, 0, 0, 0], time_s=2.0), "pose_without_covariance")
+    told = refusal(lambda: client.pose([0, 0, 0], [1, 0, 0, 0], time_s=2.0), "pose_without_covariance")
     assert "covariance (6 rows of 6) or sigma" in told
     assert client.track()["sequence"] == before["sequence"], "a refused pose changes nothing"
+    refusal(lambda: client.pose([0.1, 0, 0], [1, 0, 0, 0], time_s=2.0), "pose_without_covariance")
+    track = client.track()
+    assert track["state"] == "lost", "but what stood still is not where the rover was said to go"
+    assert "moved by 0.10 m" in track["reason"]
+    assert drive(client, 0.1, 3.0)["state"] == "tracking"
+    assert ScriptedLooker.looks[-1].state == "lost", "both eyes must find it after that"
 
 
 @pytest.mark.parametrize("time_s", [1e12, 1.7e9, 1e4])
@@ -373,13 +379,25 @@ def test_a_pose_from_the_far_future_keeps_no_later_one_out(client: Client, time_
     assert drive(client, 0.3, 3.0)["state"] == "tracking"
 
 
-def test_a_first_pose_during_a_track_says_nothing_about_its_motion(client: Client) -> None:
-    started(client, first_pose=False)
-    told = refusal(lambda: drive(client, 0.1, 2.0), "no_pose_before")
-    assert "stop the track" in told
-    client.stop_track()
-    client.pose([0.1, 0, 0], [1, 0, 0, 0])
+def test_a_first_pose_ends_a_track_that_began_without_one(client: Client) -> None:
+    began = started(client, first_pose=False)
+    track = drive(client, 0.1, 2.0)
+    assert (track["state"], track["id"]) == ("stopped", began["id"])
+    assert "how far the rover moved since the track began is not known" in track["reason"]
+    assert client.status()["pose"]["position_m"] == [0.1, 0.0, 0.0], "the pose holds"
     assert started(client, first_pose=False)["state"] == "tracking"
+    assert drive(client, 0.2, 3.0)["state"] == "tracking"
+
+
+def test_a_first_pose_while_a_track_begins_ends_it(client: Client, monkeypatch: pytest.MonkeyPatch) -> None:
+    told, goes_on = threading.Event(), threading.Event()
+    monkeypatch.setattr(ScriptedLooker, "begin", staticmethod(lambda: (told.set(), goes_on.wait(NET_S))))
+    operation = client.start_track(pixel=click(client))
+    assert told.wait(NET_S)
+    assert client.pose([0.1, 0, 0], [1, 0, 0, 0])["track"]["state"] == "stopped"
+    goes_on.set()
+    client.wait(operation)
+    assert client.track()["state"] == "stopped"
 
 
 COUPLED = np.zeros((6, 6))

@@ -1,16 +1,27 @@
 // Requests to the daemon. At most four are under way besides stops, so that a browser, which opens six
 // connections, always has one free for a stop.
+import { kept } from "./dom.js";
+import { inDegrees } from "./words.js";
+
 const PREFIX = "/api/v1";
 const AT_ONCE = 4;
 const ANSWER_MS = 20000;
 
 const words = new Uint32Array(1);
 crypto.getRandomValues(words);
+/** By which this page is told from others; `me.name` is what its user is called, for people. */
 export const client = `page-${words[0].toString(36)}`;
+export const NAME = "mastctl name";
+export const me = { name: kept(NAME) ?? "" };
+const called = () => (me.name ? `${me.name}, ${client}` : client);
+/** Who steers, for people: without what tells one page of theirs from another. */
+export const person = (holder) => holder.replace(/, page-[0-9a-z]+$/, "");
+/** A header holds bytes: those of UTF-8. */
+const bytes = (text) => String.fromCharCode(...new TextEncoder().encode(text));
 
 export class Refusal extends Error {
   constructor(status, code, message, detail) {
-    super(message);
+    super(code === "not_found" ? "The daemon does not know what the page asked for. Reload the page." : inDegrees(message));
     this.status = status;
     this.code = code;
     this.detail = detail;
@@ -40,7 +51,7 @@ function dropWaiting() {
 }
 
 async function sent(method, path, body, options) {
-  const headers = { "Mastctl-Client": client };
+  const headers = { "Mastctl-Client": bytes(called()) };
   if (held.lease && method !== "GET") headers["Mastctl-Lease"] = held.lease;
   if (method !== "GET") headers["Content-Type"] = "application/json";
   let answer;
@@ -83,7 +94,7 @@ function first(path, body) {
 }
 export const stop = () => first("/stop", {});
 /** It latches: nothing moves until somebody releases it with a reason. */
-export const estop = () => first("/estop", { reason: "pressed on the page", name: client });
+export const estop = () => first("/estop", { reason: "pressed on the page", name: called() });
 /** Nor does the question whether anybody is there. */
 export const live = () => sent("GET", "/health/live", null, { ms: 2000 });
 /** Neither do heartbeats, of which one is under way at a time, nor what is said on leaving. */

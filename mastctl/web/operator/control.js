@@ -1,6 +1,6 @@
 // Who steers: the lease, renewed while it is held, and given back on leaving.
 import { byId, h, put, say, set } from "./dom.js";
-import { client, held, parting, post, ask } from "./api.js";
+import { client, held, parting, person, post, ask } from "./api.js";
 import { forTime } from "./words.js";
 
 const FOR_S = 30;
@@ -21,7 +21,7 @@ export class Control {
 
   told(control) {
     const other = control?.kind === "lease" && !control.holder.endsWith(client);
-    if (other && control.holder !== this.control?.holder) this.taken(control.holder);
+    if (other && control.holder !== this.control?.holder) this.taken(person(control.holder));
     this.control = control;
     this.toldMs = performance.now();
     this.draw();
@@ -37,11 +37,11 @@ export class Control {
     const left = control?.for_s == null ? null : control.for_s - (performance.now() - this.toldMs) / 1000;
     const gone = left !== null && left <= 0;
     const mine = held.lease !== null;
-    const whose = control?.holder.endsWith(client) ? "you" : control?.holder;
+    const whose = control?.holder.endsWith(client) ? "you" : control && person(control.holder);
     if (mine) this.say("you", ", renewed");
     else if (!control || gone) this.say("nobody", "");
     else if (control.kind === "operation") this.say(whose, ", while it runs");
-    else this.say(control.holder, `, ${forTime(left)} left`);
+    else this.say(person(control.holder), `, ${forTime(left)} left`);
     this.words.parentElement.dataset.whose = mine ? "mine" : control && !gone && !control.holder.endsWith(client) ? "other" : "nobody";
     if (this.sure && (mine || gone || control?.kind !== "lease")) this.sure = false;
     say(this.button, !this.may ? "View only" : this.sure ? "Take it from them?" : mine ? "Release" : control && !gone && control.kind === "lease" ? "Take over" : "Take");

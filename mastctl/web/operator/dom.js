@@ -15,6 +15,14 @@ export const h = (tag, attributes, ...children) => filled(document.createElement
 export const s = (tag, attributes, ...children) => filled(document.createElementNS(SVG, tag), attributes, children);
 export const byId = (id) => document.getElementById(id);
 
+/** What this browser keeps, where it keeps anything. */
+export function kept(name) {
+  try { return localStorage.getItem(name); } catch { return null; }
+}
+export function keep(name, value) {
+  try { localStorage.setItem(name, value); } catch { /* it holds until the page is left */ }
+}
+
 export function put(element, ...children) {
   element.replaceChildren(...children.flat(Infinity).filter((child) => child !== null && child !== undefined && child !== false));
 }

@@ -42,13 +42,14 @@ export class Eye {
       [this.canvas.width, this.canvas.height] = [width, height];
       this.over.setAttribute("viewBox", `0 0 ${width} ${height}`);
       this.frame.style.aspectRatio = `${width} / ${height}`;
+      this.element.style.setProperty("--ratio", width / height);
     }
     this.pen.drawImage(bitmap, 0, 0);
     if (this.facts) this.intervals = [...this.intervals.slice(-4), facts.mid_exposure_s - this.facts.mid_exposure_s];
     this.facts = facts;
     this.exposedMs = cameMs - 1000 * facts.age_s;
     this.markTrack(facts.track);
-    set(this.facing, "title", `frame ${facts.frame_id}, exposed at ${number(facts.mid_exposure_s, 3)} s, mast file ${facts.mast_digest.slice(0, 12)}`);
+    set(this.facing, "title", `frame ${facts.frame_id}, mast file ${facts.mast_digest.slice(0, 12)}`);
     this.fresh(performance.now());
     if (this.cursor) this.look(this.cursor);
     document.dispatchEvent(new CustomEvent("image-shown", { detail: { ...facts, shown_ms: performance.timeOrigin + performance.now() } }));

@@ -1,10 +1,11 @@
 // Turning the head by hand: heartbeats for as long as a key or a finger holds, and an end whatever ends it.
 import { byId, h, put, say } from "./dom.js";
 import { ask, beat, get, post } from "./api.js";
-import { deg, degrees, figure, number } from "./words.js";
+import { deg, degrees, figure, inDegrees, number } from "./words.js";
 
 const BEAT_MS = 120;
 const WAYS = { up: [0, 1, "▲", "Tilt up"], left: [-1, 0, "◀", "Pan left"], right: [1, 0, "▶", "Pan right"], down: [0, -1, "▼", "Tilt down"] };
+const PLACE = /^[\p{L}\p{N}_+\u2212-][\p{L}\p{N}_ .,:°+\u2212-]*$/u;
 const KEYS = { ArrowUp: "up", ArrowLeft: "left", ArrowRight: "right", ArrowDown: "down" };
 
 export class Jog {
@@ -103,7 +104,7 @@ export class Jog {
         if (this.id !== null) body.id = this.id;
         const told = await beat(body);
         this.id = told.id;
-        say(this.held, Object.values(told.held ?? {}).join(" "));
+        say(this.held, inDegrees(Object.values(told.held ?? {}).join(" ")));
         if (still) { this.id = null; continue; }
         if (rates === this.rates) {
           await new Promise((go) => { this.wake = go; setTimeout(go, BEAT_MS); });
@@ -132,6 +133,7 @@ export class Jog {
   goTyped() {
     const [pan, tilt] = [this.pan, this.tilt].map((input) => figure(input.value));
     if (!Number.isFinite(pan) || !Number.isFinite(tilt)) return say(this.goSaid, "Two angles in degrees are expected, such as 12.5 and -8.");
+    for (const [name, typed] of [["Pan", pan], ["Tilt", tilt]]) if (Math.abs(typed) > 360) return say(this.goSaid, `${name} ${number(typed, 1)}° where \u2212360° to 360° is expected.`);
     this.go((pan * Math.PI) / 180, (tilt * Math.PI) / 180);
   }
 
@@ -167,6 +169,7 @@ export class Jog {
     if (!this.here) return;
     const [pan, tilt] = this.here;
     const typed = this.name.value.trim();
+    if (typed && !PLACE.test(typed)) return say(this.goSaid, `'${typed}' where a name of letters, digits, spaces and . , : ° + - is expected, which begins with a letter or a digit.`);
     const name = typed.toLowerCase() === "home" ? "home" : typed || `${deg(pan, 1)} ${deg(tilt, 1)}`;
     await this.change(() => post(`/places/${encodeURIComponent(name)}`, { pan_rad: pan, tilt_rad: tilt }));
     if (!this.goSaid.textContent) this.name.value = "";

@@ -1,7 +1,7 @@
 // The page: what is always in sight, and the panels told of what changes.
-import { byId, h, put, say, set } from "./dom.js";
-import { estop, get, post, stop } from "./api.js";
-import { forTime, sentence } from "./words.js";
+import { byId, h, keep, kept, put, say, set } from "./dom.js";
+import { NAME, ask as request, estop, get, held, me, post, stop } from "./api.js";
+import { forTime, inDegrees, sentence } from "./words.js";
 import { Bench } from "./bench.js";
 import { Control } from "./control.js";
 import { Events } from "./events.js";
@@ -113,12 +113,12 @@ function standing(now) {
   set(byId("state"), "data-word", now.state);
   const before = byId("word").textContent;
   say(byId("word"), WORDS[now.state] ?? now.state);
-  say(byId("reason"), now.estop ? "" : sentence(now.reason)); // the latch tells who and why itself
+  say(byId("reason"), now.estop ? "" : sentence(inDegrees(now.reason ?? ""))); // the latch tells who and why itself
   since = performance.now() - 1000 * now.state_for_s;
   if (before !== now.state) {
     if (["stopping", "stopped"].includes(now.state)) target.disarm("The head was stopped");
-    if (["stopped", "fault"].includes(now.state) && now.reason) announce(`${now.state}. ${now.reason}`);
-    else speak(`${now.state}. ${now.reason}`);
+    if (["stopped", "fault"].includes(now.state) && now.reason) announce(`${now.state}. ${inDegrees(now.reason)}`);
+    else speak(`${now.state}. ${inDegrees(now.reason ?? "")}`);
   }
   if (doubted && ["ready", "holding", "stopped"].includes(now.state)) stopConfirmed();
   doubted = false;
@@ -207,7 +207,7 @@ function show(status) {
   head.use(status, rig, views);
   jog.use(status.limits);
   mastFile.told(status, rig);
-  for (const part of [simulation, track, target]) part.use(status);
+  for (const part of [simulation, track, target]) part.use(status, rig);
   set(document.body, "data-simulated", simulated);
 }
 
@@ -224,6 +224,7 @@ async function enter() {
     const session = await get("/session");
     answered(byId("login"));
     allow(session.role);
+    byId("logout").hidden = !session.needs_token;
     events.open();
   } catch (error) {
     if (error.status === 401) {
@@ -244,8 +245,45 @@ byId("login-form").addEventListener("submit", async (event) => {
     say(byId("login-said"), error.message);
   }
 });
+byId("logout").addEventListener("click", async () => {
+  try {
+    if (held.lease) await request("DELETE", "/lease");
+    await post("/logout");
+    location.reload();
+  } catch (error) {
+    alarm(error.message);
+  }
+});
+
+// What is this browser's own: a name, and whether single keys do something
+
+const KEYS = "mastctl keys";
+const singleKeys = byId("single-keys");
+singleKeys.checked = kept(KEYS) !== "off";
+singleKeys.addEventListener("change", () => keep(KEYS, singleKeys.checked ? "on" : "off"));
+byId("keys-open").addEventListener("click", () => ask(byId("keys")));
+document.addEventListener("keydown", (event) => {
+  const key = event.key.toLowerCase();
+  if (!singleKeys.checked || event.ctrlKey || event.metaKey || event.altKey || event.target.closest("input:not([type=checkbox]), select, textarea")) return;
+  if (key === "?") (byId("keys").open ? answered : ask)(byId("keys"));
+  if (key === "p" && !document.querySelector("dialog[open]")) target.send();
+});
+const tellName = () => say(byId("name-open"), me.name ? `as ${me.name}` : "Your name …");
+tellName();
+byId("name-open").addEventListener("click", () => {
+  byId("name").value = me.name;
+  ask(byId("named"));
+  byId("name").focus();
+});
+byId("name-form").addEventListener("submit", (event) => {
+  event.preventDefault();
+  me.name = byId("name").value.trim();
+  keep(NAME, me.name);
+  tellName();
+  answered(byId("named"));
+});
 document.addEventListener("no-session", () => ask(byId("login")));
-byId("reset-no").addEventListener("click", () => answered(byId("reset")));
+for (const dialog of document.querySelectorAll("dialog")) dialog.querySelector("[data-closes]")?.addEventListener("click", () => answered(dialog));
 byId("reset-form").addEventListener("submit", async (event) => {
   event.preventDefault();
   try {

@@ -1,7 +1,7 @@
 // The last operations: what was asked by whom, what came of it, and each one's picture, opened by who wants it.
 import { byId, h, put } from "./dom.js";
 import { fileOf } from "./api.js";
-import { clock, deg, number } from "./words.js";
+import { clock, deg, inDegrees, number } from "./words.js";
 import { residualPicture } from "./residual.js";
 import { steps } from "./target.js";
 
@@ -62,7 +62,7 @@ export class OperationList {
   whole(record) {
     const last = record.pointings?.at(-1);
     const place = h("div", { class: "whole" }, h("p", { class: "quiet" }, `${record.id}${this.by.has(record.id) ? `, ${this.by.get(record.id)}` : ""}`),
-      record.error ? h("p", { class: "bad" }, record.error.message) : null);
+      record.error ? h("p", { class: "bad" }, inDegrees(record.error.message)) : null);
     if (last) {
       place.append(h("table", { class: "figures" },
         h("tr", {}, h("td", {}), h("th", { scope: "col" }, "commanded"), h("th", { scope: "col" }, "measured")),

@@ -1,10 +1,10 @@
 // The quiet panels: faults, recording, mast file.
-import { byId, h, put, say } from "./dom.js";
+import { byId, h, put, say, set } from "./dom.js";
 import { get, post } from "./api.js";
-import { camera as called, forTime, moment, number, sentence } from "./words.js";
+import { camera as called, forTime, inDegrees, moment, number, sentence } from "./words.js";
 
 /** A fault's message without the device's name, which stands before it. */
-const plain = ({ device, message }) => (message.startsWith(`${device}: `) ? message.slice(device.length + 2) : message).replace(/\.$/, "");
+const plain = ({ device, message: told }, message = inDegrees(told)) => (message.startsWith(`${device}: `) ? message.slice(device.length + 2) : message).replace(/\.$/, "");
 
 export class Faults {
   constructor(events, alarm) {
@@ -55,6 +55,7 @@ export class Recording {
     const what = recorder.run ? `run ${recorder.run}` : recorder.recording ? `last ${forTime(recorder.ring_s)}` : "off";
     const space = free === null ? "" : `, ${number(free / 1000, 1)} GB free`;
     say(byId("recording"), recorder.fault ? `fault: ${recorder.fault}` : what + space);
+    set(byId("recording"), "title", byId("recording").textContent);
     byId("recording").parentElement.dataset.on = recorder.recording;
     say(byId("record"), recorder.run ? "End run" : "Record");
   }

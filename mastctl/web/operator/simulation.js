@@ -23,13 +23,14 @@ export class Simulation {
     this.list = h("ul", { class: "set" });
     this.said = h("p", { class: "bad", role: "alert" });
     this.rover = h("p", { class: "quiet" });
+    this.refused = h("p", { class: "bad", id: "drive-said", role: "alert" });
     this.set = h("button", { type: "submit" }, "Set");
     this.clear = h("button", { type: "button", onclick: () => this.act(() => ask("DELETE", "/simulation/faults")) }, "Clear all");
     this.drive = h("div", { class: "buttons" }, [["Ahead 0.25 m", 0.25, 0], ["Back 0.25 m", -0.25, 0], ["Turn left 5°", 0, -0.0873], ["Turn right 5°", 0, 0.0873]].map(([words, ahead, turn]) =>
-      h("button", { type: "button", onclick: () => this.act(() => this.stand(ahead, turn)) }, words)));
+      h("button", { type: "button", onclick: () => this.act(() => this.stand(ahead, turn), this.refused) }, words)));
     this.form = h("form", { onsubmit: (event) => { event.preventDefault(); this.act(() => this.setFault()); } },
       h("div", { class: "two" }, this.device, this.word), this.does, this.parameters, h("div", { class: "buttons" }, this.set, this.clear));
-    put(byId("simulated"), this.form, this.list, this.said, h("h3", {}, "Drive the simulated rover"), this.drive, this.rover);
+    put(byId("simulated"), this.form, this.list, this.said, h("h3", {}, "Drive the simulated rover"), this.drive, this.refused, this.rover);
     setInterval(() => this.words && !document.hidden && this.look(), LOOK_MS);
   }
 
@@ -79,6 +80,9 @@ export class Simulation {
       if (!input.value.trim()) continue;
       const value = figure(input.value);
       if (!Number.isFinite(value)) throw new Error(`${label}: '${input.value}' where a number${unit ? ` in ${unit}` : ""} is expected.`);
+      const { least, most } = this.words[this.device.value][this.word.value].parameters[name];
+      const [low, high] = [least, most].map((end) => (end === null ? null : Number((end * scale).toPrecision(4))));
+      if ((low !== null && value < low) || (high !== null && value > high)) throw new Error(`${label} is ${value} where ${high === null ? `${low} or more` : `${low} to ${high}`}${unit ? ` ${unit}` : ""} is expected.`);
       parameters[name] = value / scale;
     }
     await post("/simulation/faults", { device: this.device.value, word: this.word.value, parameters });
@@ -88,12 +92,12 @@ export class Simulation {
     for (const one of [this.device, this.word, this.set, this.clear, ...this.drive.children]) one.disabled = !may;
   }
 
-  async act(work) {
-    say(this.said, "");
+  async act(work, place = this.said) {
+    say(place, "");
     try {
       await work();
     } catch (error) {
-      say(this.said, error.message);
+      say(place, error.message);
     }
     this.look();
   }
@@ -126,8 +130,11 @@ export class Simulation {
     const [w, , , z] = now.quaternion;
     const heading = 2 * Math.atan2(z, w);
     const place = { x_m: now.position_m[0] + ahead * Math.cos(heading), y_m: now.position_m[1] + ahead * Math.sin(heading), heading_rad: heading + turn };
+    const { state: followed } = await get("/track");
     const pose = await post("/simulation/pose", place);
-    await post("/pose", { position_m: pose.position_m, quaternion: pose.quaternion, sigma: { position_m: 0.01, rotation_rad: 0.009 } });
     say(this.rover, `The rover stands at ${number(place.x_m, 2, true)}, ${number(place.y_m, 2, true)} m, heading ${deg(place.heading_rad, 1)}.`);
+    const told = { position_m: pose.position_m, quaternion: pose.quaternion, sigma: { position_m: 0.01, rotation_rad: 0.009 } };
+    const { track } = await post("/pose", told).catch((error) => { throw new Error(`The rover has moved, but the daemon refused its pose: ${error.message}`); });
+    if (track.state === "stopped" && followed !== "stopped") throw new Error(`The track has ended: ${track.reason}.`);
   }
 }

@@ -1,7 +1,7 @@
 // Click, see what it would mean, send it, read the residual.
 import { byId, h, put } from "./dom.js";
 import { fileOf, get, post } from "./api.js";
-import { camera as called, deg, metres, number, px } from "./words.js";
+import { camera as called, deg, inDegrees, metres, number, px } from "./words.js";
 import { residualPicture } from "./residual.js";
 import { placeIn, shownBy } from "./truth.js";
 
@@ -11,6 +11,7 @@ const STEPS = {
   look: "new pictures", measure: "the target is found in them", eyes: "the other eye confirms it",
 };
 
+const SMALL = matchMedia("(max-width: 599px) and (max-height: 499px)");
 const TURNED_RAD = 0.005; // the joints' readings at rest scatter by less, some counts of a coarse encoder
 const ENDED = ["done", "failed", "stopped"];
 
@@ -48,9 +49,6 @@ export class Target {
     events.addEventListener("lost", () => this.disarm("The connection was lost"));
     events.addEventListener("mast", (event) => this.mast(event.detail.value.digest));
     document.addEventListener("views-changed", () => this.draw());
-    document.addEventListener("keydown", (event) => {
-      if (event.key.toLowerCase() === "p" && !event.target.closest("input, select, textarea") && !event.ctrlKey && !event.metaKey) this.send();
-    });
     this.render();
   }
 
@@ -59,8 +57,9 @@ export class Target {
     this.render();
   }
 
-  use(status) {
+  use(status, rig) {
     this.simulated = status.simulated;
+    this.cameras = rig.cameras;
   }
 
   /** A preview belongs to the head as it stood: after a stop, a turn or a takeover it is asked for anew. */
@@ -120,7 +119,7 @@ export class Target {
       if (mine !== this.number) return;
       this.preview = preview;
       this.state = "preview";
-      this.say(`Range ${preview.range_sigma_m === null ? this.interval(preview) : `${metres(preview.range_m)} plus or minus ${metres(preview.range_sigma_m)}`}. ${preview.refused ? preview.refused.message : "Press P to point."}`);
+      this.say(`Range ${preview.range_sigma_m === null ? this.interval(preview) : `${metres(preview.range_m)} plus or minus ${metres(preview.range_sigma_m)}`}. ${preview.refused ? inDegrees(preview.refused.message) : "Press P to point."}`);
     } catch (error) {
       if (mine !== this.number) return;
       return this.refuse(error.message, error.code);
@@ -134,9 +133,11 @@ export class Target {
     return { camera, frame_id: facts.frame_id, x_px: pixel[0], y_px: pixel[1], mast_digest: facts.mast_digest };
   }
 
-  async send(pixel = null) {
-    if (!this.may || this.latched || (!pixel && (this.state !== "preview" || this.preview.refused))) return;
-    const target = pixel ?? this.target();
+  /** Send what was chosen; `again`: once more, after a pointing at it has ended. */
+  async send(again = false) {
+    if (!this.may || this.latched || this.state !== (again ? "ended" : "preview") || (!again && this.preview.refused)) return;
+    const target = this.target();
+    this.repeats = again; // the head has turned since it was chosen: its pixel is another one now
     this.state = "sent";
     this.record = null;
     this.id = null;
@@ -145,15 +146,8 @@ export class Target {
       this.id = (await post("/point", { pixel: target })).id;
       this.operation(this.events.newest("operation", this.id));
     } catch (error) {
-      this.refuse(error.message, error.code);
+      this.refuse(error.code === "frame_too_old" ? "The image in which the point was chosen is no longer kept. Choose the point again." : error.message, error.code);
     }
-  }
-
-  /** Point again at what the new image showed. */
-  again() {
-    const last = this.record?.pointings.at(-1);
-    if (!last?.target_px) return;
-    this.send({ camera: last.camera, frame_id: last.frame_id, x_px: last.target_px[0], y_px: last.target_px[1] });
   }
 
   operation(record) {
@@ -165,7 +159,7 @@ export class Target {
       this.truly = null;
       if (this.simulated && record.residual_px) this.judge(record);
       if (record.residual_px) this.say(`Residual x ${number(record.residual_px[0], 2, true)}, y ${number(record.residual_px[1], 2, true)} pixels.`);
-      else if (record.error) this.say(record.error.message, true);
+      else if (record.error) this.say(inDegrees(record.error.message), true);
       this.draw();
     }
     this.render();
@@ -173,10 +167,11 @@ export class Target {
 
   /** What only a simulation knows: how far what was chosen truly is from the aim in the new image. */
   async judge(record) {
-    const { pixel } = record.request;
+    const { click } = this;
     const last = record.pointings.at(-1);
     try {
-      const place = await shownBy(pixel.frame_id, [pixel.x_px, pixel.y_px]);
+      click.place ??= await shownBy(click.facts.frame_id, click.pixel);
+      const { place } = click;
       const there = place && (await placeIn(last.frame_id, place)).pixel_px;
       if (!there || this.record !== record) return;
       this.truly = there.map((value, k) => value - last.aim_px[k]);
@@ -194,12 +189,13 @@ export class Target {
   draw() {
     for (const [name, eye] of this.views.eyes) {
       let click = null, match = null, aim = null, found = null;
-      if (["asked", "preview", "sent"].includes(this.state) && this.click.camera === name) click = this.click.pixel;
-      if (["preview", "sent"].includes(this.state) && this.preview?.other_camera === name && name) match = this.preview.other_pixel_px;
+      const chosen = this.state === "sent" ? !this.repeats && !this.moving() : ["asked", "preview"].includes(this.state);
+      if (chosen && this.click.camera === name) click = this.click.pixel;
+      if (chosen && this.preview?.other_camera === name) match = this.preview.other_pixel_px;
       const last = this.state === "ended" ? this.record?.pointings.at(-1) : null;
       if (last?.camera === name) [aim, found] = [last.aim_px, last.target_px];
-      eye.mark("click", this.state === "sent" && this.moving() ? null : click, "click", null);
-      eye.mark("match", this.state === "sent" && this.moving() ? null : match, "match", match ? number(this.preview.correlation, 2) : null);
+      eye.mark("click", click, "click", null);
+      eye.mark("match", match, "match", match ? number(this.preview.correlation, 2) : null);
       eye.mark("aim", aim, "aim", aim && !found ? "aim" : null);
     }
   }
@@ -218,6 +214,8 @@ export class Target {
       ended: () => [this.result(), this.progress()],
     };
     put(this.place, parts[this.state]());
+    // Where a window holds little more than the image, what came of it is brought into sight.
+    if (this.place.dataset.state !== this.state && ["preview", "refused", "ended"].includes(this.state) && SMALL.matches) this.place.parentElement.scrollIntoView();
     this.place.dataset.state = this.state;
     if (this.state === "ended" && this.record?.pointings.at(-1)?.aim_px && this.record.residual_px && this.drawn !== this.record.id) this.picture();
   }
@@ -252,7 +250,7 @@ export class Target {
 
   way() {
     const seen = this.preview;
-    if (seen.refused) return h("p", { class: "bad" }, seen.refused.message);
+    if (seen.refused) return h("p", { class: "bad" }, inDegrees(seen.refused.message));
     const here = this.events.newest("joints", "pan_tilt");
     const row = (name, k, now) => h("tr", {}, h("th", { scope: "row" }, name), h("td", { class: "n" }, deg(now)), h("td", {}, "→"), h("td", { class: "n" }, deg(seen.goal_rad[k])));
     return h("table", { class: "figures" }, row("Pan", 0, here?.pan_rad), row("Tilt", 1, here?.tilt_rad));
@@ -272,7 +270,7 @@ export class Target {
 
   result() {
     const record = this.record;
-    if (record.state !== "done") return h("p", { class: "bad" }, record.error?.message ?? `The operation was ${record.state}.`);
+    if (record.state !== "done") return h("p", { class: "bad" }, record.error ? inDegrees(record.error.message) : `The operation was ${record.state}.`);
     const last = record.pointings.at(-1);
     if (!last.residual_px) return h("p", { class: "quiet" }, last.note);
     const [x, y] = last.residual_px;
@@ -287,8 +285,21 @@ export class Target {
         h("tr", {}, h("td", {}), h("th", { scope: "col" }, "commanded"), h("th", { scope: "col" }, "measured")),
         h("tr", {}, h("th", { scope: "row" }, "Pan"), h("td", { class: "n" }, deg(last.commanded_pan_rad, 3)), h("td", { class: "n" }, deg(last.measured_pan_rad, 3))),
         h("tr", {}, h("th", { scope: "row" }, "Tilt"), h("td", { class: "n" }, deg(last.commanded_tilt_rad, 3)), h("td", { class: "n" }, deg(last.measured_tilt_rad, 3)))),
-      this.may ? h("div", { class: "buttons" }, h("button", { type: "button", id: "again", disabled: this.latched, onclick: () => this.again() }, "Point a second time")) : null,
+      h("p", { class: "quiet", id: "gain" }, this.gain(record, last)),
+      this.may ? h("div", { class: "buttons" }, h("button", { type: "button", id: "again", disabled: this.latched, onclick: () => this.send(true) }, "Point again")) : null,
     ];
+  }
+
+  /** Whether another pointing could leave less: not where the match and the head's counts leave as much. */
+  gain(record, last) {
+    const counts = record.steps.findLast((step) => step.name === "settle")?.detail.count_rad ?? {};
+    const camera = this.cameras?.[last.camera];
+    if (!camera) return "";
+    const [width, height] = camera.size_px;
+    const shares = [["pan", width / 2 / Math.tan(camera.width_rad / 2) * Math.cos(last.true_tilt_rad ?? 0)], ["tilt", height / 2 / Math.tan(camera.height_rad / 2)]];
+    const bounds = shares.map(([axis, pxPerRad], k) => 2 * last.residual_sigma_px[k] + ((counts[axis] ?? 0) / 2) * pxPerRad);
+    if (last.residual_px.some((value, k) => Math.abs(value) > bounds[k])) return "";
+    return `Nothing is to be gained by pointing again: two sigma of the match and half a count of the head come to ${bounds.map((one) => number(one, 2)).join(", ")} px.`;
   }
 
   async picture() {

@@ -1,7 +1,7 @@
 // The track: by whom the target is seen, and the approach look by look: range, error, camera in use.
-import { byId, h, put, s } from "./dom.js";
+import { byId, h, put, s, say } from "./dom.js";
 import { post } from "./api.js";
-import { camera as called, deg, metres, number } from "./words.js";
+import { camera as called, deg, forTime, inDegrees, metres, number } from "./words.js";
 import { hiddenTable, plot, roundUp, strip } from "./plots.js";
 import { placeIn, shownBy } from "./truth.js";
 
@@ -25,6 +25,7 @@ export class TrackPanel {
     put(byId("track"), this.head, this.plots, this.table.place, this.bad, this.buttons, this.hint);
     events.addEventListener("connected", () => { this.status = null; this.draw(); }); // it is told again where there is one
     events.addEventListener("track", (event) => this.told(event.detail.value));
+    setInterval(() => this.ago(), 1000);
     this.draw();
   }
 
@@ -63,7 +64,9 @@ export class TrackPanel {
   }
 
   told(status) {
-    if (status.id !== this.id) [this.trail, this.chosen] = [[], null];
+    if (status.id !== this.id) [this.trail, this.chosen, this.looks] = [[], null, null];
+    if (status.looks !== this.looks || this.status?.state === "starting") this.lookedMs = performance.now() - 1000 * status.age_s;
+    this.looks = status.looks;
     [this.status, this.id] = [status, status.id];
     if (status.range_m !== null && !status.predicted && !status.misses && status.looks !== this.trail.at(-1)?.look) {
       const covariance = status.covariance_m2;
@@ -98,9 +101,14 @@ export class TrackPanel {
     return this.chosen;
   }
 
+  /** How old the last look is: what was seen then need not be there now. */
+  ago() {
+    if (this.looked) say(this.looked, `${forTime((performance.now() - this.lookedMs) / 1000)} ago`);
+  }
+
   draw() {
     const { status } = this;
-    const on = Boolean(status) && ["starting", "tracking"].includes(status.state);
+    const on = Boolean(status) && ["starting", "tracking", "lost"].includes(status.state);
     const none = !status || status.state === "idle";
     this.bad.textContent = this.said;
     this.hint.hidden = on;
@@ -111,18 +119,20 @@ export class TrackPanel {
     const stands = pose ? row("Rover at", `${number(pose.position_m[0], 2, true)}, ${number(pose.position_m[1], 2, true)} m, ${deg(2 * Math.atan2(pose.quaternion[3], pose.quaternion[0]), 1)}`) : null;
     this.drawApproach(none ? [] : this.trail);
     if (none) return put(this.head, stands ? h("table", { class: "figures" }, stands) : null);
-    const last = this.trail.at(-1);
+    const last = status.state === "tracking" && !status.predicted ? this.trail.at(-1) : null; // else it is of a place that was
     put(this.head,
-      h("p", {}, h("strong", { class: `word ${status.state}` }, status.state), " ", status.reason),
+      h("p", {}, h("strong", { class: `word ${status.state}` }, status.state), " ", inDegrees(status.reason)),
       h("table", { class: "figures" },
         status.pair ? row("In use", called(status.pair)) : null,
         status.range_m !== null ? row("Range", metres(status.range_m) + (status.predicted ? " (carried over)" : "")) : null,
         last?.sigma == null ? null : row("One sigma", `${mm(last.sigma)} mm`),
         last?.error == null ? null : row("Truly off", `${mm(last.error)} mm${last.off.length ? `, ${number(Math.max(...last.off), 2)} px` : ""}`),
         Object.entries(status.pixels ?? {}).map(([name, eye]) => row(called(name), eye.x_px === null ? eye.verdict.replaceAll("_", " ") : `${number(eye.x_px, 1)}, ${number(eye.y_px, 1)} px`)),
+        on ? row("Last look", this.looked = h("span")) : null,
         row("Looks, misses", `${status.looks}, ${status.misses}`),
         status.handoffs.length ? row("Hand-offs", status.handoffs.map((one) => h("div", {}, `${called(one.from_pair)} → ${called(one.to_pair)} at ${metres(one.range_m, 2)}`))) : null,
         stands));
+    this.ago();
   }
 
   drawApproach(trail) {

@@ -1,5 +1,5 @@
 // Which cameras are in view, and their images.
-import { byId, h, put } from "./dom.js";
+import { byId, h, keep, kept, put } from "./dom.js";
 import { Eye } from "./eye.js";
 import { Images } from "./images.js";
 import { fileOf } from "./api.js";
@@ -21,14 +21,14 @@ export class Views {
       groups.set(key, [...(groups.get(key) ?? []), name]);
     }
     this.groups = [...groups].map(([key, names]) => [key, names.sort((a, b) => (rig.cameras[a].eye ?? "").localeCompare(rig.cameras[b].eye ?? ""))]);
-    const kept = localStorage.getItem("mastctl view");
+    const before = kept("mastctl view");
     const first = ["navcam", ...groups.keys()].find((key) => groups.has(key));
-    this.choosePair(groups.has(kept) ? kept : first);
+    this.choosePair(groups.has(before) ? before : first);
   }
 
   choosePair(key) {
     this.key = key;
-    localStorage.setItem("mastctl view", key ?? "");
+    keep("mastctl view", key ?? "");
     put(byId("tabs"), this.groups.map(([name]) => h("button", { type: "button", "aria-pressed": String(name === key), onclick: () => this.choosePair(name) }, name.replaceAll("_", " "))));
     const names = this.names();
     this.eyes = new Map(names.map((name) => [name, this.eyes.get(name) ?? new Eye(name, this.choose)]));

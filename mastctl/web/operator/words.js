@@ -42,5 +42,15 @@ export function unitOf(name) {
 
 export const camera = (name) => name.replaceAll("_", " ");
 
+const NUMBER = "[+\\-\u2212]?\\d+(?:\\.\\d+)?(?:e[+-]?\\d+)?";
+const ANGLES = new RegExp(`(?:(?:pan|tilt) ${NUMBER}(?: to ${NUMBER})?,? (?:and )?(?:pan|tilt) ${NUMBER}(?: to ${NUMBER})?|${NUMBER}) rad(/s2?)?\\b`, "g");
+
+/** A sentence of the daemon's with its angles as people type them here: in degrees. */
+export const inDegrees = (words) => words.replace(ANGLES, (angles, per = "") =>
+  angles.slice(0, -" rad".length - per.length).replace(new RegExp(NUMBER, "g"), (value) => {
+    const there = degrees(figure(value));
+    return `${String(Number(Math.abs(there) >= 1 ? there.toFixed(2) : there.toPrecision(3))).replace("-", MINUS)}°`;
+  }) + per);
+
 /** A sentence begins with a capital, unless with a device's name. */
 export const sentence = (text) => (!text || /^\w*[_\d]/.test(text) ? text ?? "" : text[0].toUpperCase() + text.slice(1));

@@ -17,7 +17,15 @@ import httpx
 import pytest
 
 from drivers.errors import NoReply
-from hil_tests.mastctl.service_fakes import CONFIG, FakeHardware, FakeStep, ScriptedLoop, fake_daemon
+from hil_tests.mastctl.service_fakes import (
+    CONFIG,
+    FakeHardware,
+    FakePointing,
+    FakeResult,
+    FakeStep,
+    ScriptedLoop,
+    fake_daemon,
+)
 from hil_tests.mastctl.web.network import network_daemon
 from hil_tests.mastctl.web.page.conftest import Visit
 from hil_tests.waiting import NET_S, until
@@ -85,8 +93,33 @@ def test_a_click_shows_range_and_sigma_before_anything_moves_and_a_key_sends_it(
     one.page.keyboard.press("p")
     words = one.target("ended")
     assert "+0.250" in words and "−0.500" in words and "± 0.050" in words
+    assert "Nothing is to be gained" not in words
     sent = json.loads(one.posts("/point")[0])["pixel"]
     assert sent == asked, "what was seen is what is sent"
+
+
+def test_the_page_says_when_nothing_is_to_be_gained_and_points_again_at_the_first_click(
+    pair: BOTH, visit: Visits, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    settle = FakeStep("settle", "done", 0.0, 0.01, {"count_rad": {"pan": 0.003, "tilt": 0.0}})
+
+    def script(request: Any, record: Callable[[Any], None], *_: Any) -> FakeResult:
+        record(settle)  # half a count of pan is 0.07 px of the little camera
+        pointing = FakePointing([0.15, -0.1], [0.05, 0.06], "a", aim_px=[31.5, 23.5], target_px=[31.65, 23.4])
+        return FakeResult([6.0, 0.0, 0.1], 6.0, (pointing,))
+
+    monkeypatch.setattr(ScriptedLoop, "script", staticmethod(script))
+    one = visit(pair[0].url)
+    one.choose()
+    one.page.keyboard.press("p")
+    words = one.target("ended")
+    assert re.search(r"Nothing is to be gained .* come to 0\.1\d, 0\.12 px", words), words
+    one.page.keyboard.press("p")
+    with one.page.expect_response("**/api/v1/point"):
+        one.page.locator("#again").click()
+    first, again = (json.loads(body) for body in one.posts("/point"))
+    assert again == first
+    one.target("ended")
 
 
 def test_one_camera_alone_tells_between_which_ranges_it_is(
@@ -396,9 +429,13 @@ def test_a_token_is_asked_for_and_who_may_look_cannot_move(
         one.page.get_by_role("button", name="Log in").click()
         one.frame().click()
         assert "You may look" in one.target("refused")
+        one.page.wait_for_selector("#logout:not([hidden])")
         assert one.page.locator("#home").is_disabled() and one.page.locator("#take").is_disabled()
         assert not one.posts("/point/preview")
         assert net.token("view") not in one.page.content()
+        one.page.get_by_role("button", name="Log out").click()
+        one.page.locator("#login").wait_for(state="visible")
+        assert one.page.evaluate("fetch('/api/v1/status').then((answer) => answer.status)") == 401
 
 
 def test_a_jog_ends_when_its_key_its_window_or_its_focus_is_gone(pair: BOTH, visit: Visits) -> None:
@@ -780,6 +817,143 @@ def test_places_are_kept_and_gone_to(pair: BOTH, visit: Visits) -> None:
     one.page.get_by_role("button", name="Go", exact=True).click()
     one.page.wait_for_selector("#jog .bad:not(:empty)")
     assert "degrees" in one.page.locator("#jog .bad").inner_text()
+
+
+SIZES = {
+    "a desk": (1400, 950), "a small tablet": (1024, 768), "a phone on its side": (844, 390),
+    "a phone": (390, 844), "200 %": (640, 512),
+}  # fmt: skip
+"""CSS pixels; the last is a window of 1280x1024 at that zoom, at 400 % it is 320x256."""
+SEEN_AT = """(place) => {
+  const box = place.getBoundingClientRect();
+  const top = document.elementFromPoint(box.x + box.width / 2, box.y + box.height / 2);
+  return Boolean(top) && place.contains(top) && box.top >= 0 && box.bottom <= innerHeight;
+}"""
+WIDER = "document.documentElement.scrollWidth - innerWidth"
+
+
+def test_image_stop_and_point_are_in_sight_together_at_each_size(pair: BOTH, visit: Visits) -> None:
+    one = visit(pair[0].url)
+    for name, (width, height) in SIZES.items():
+        one.page.set_viewport_size({"width": width, "height": height})
+        one.choose()
+        for part in ("#point", "#stop", "#latch"):
+            assert one.page.locator(part).evaluate(SEEN_AT), f"{part} is in sight and not covered at {name}"
+        shown = one.page.locator(".eye[data-camera=navcam_left] .frame").evaluate(
+            "(frame) => { const [image, bar] = [frame, document.querySelector('#stop')].map((one) =>"
+            " one.getBoundingClientRect());"
+            " return Math.min(innerHeight, image.bottom) - Math.max(bar.bottom, image.top); }"
+        )
+        assert shown > 150, f"{shown} px of the image's height are in sight at {name}"
+        assert one.page.evaluate(WIDER) <= 0, name
+    one.page.set_viewport_size({"width": 320, "height": 256})
+    one.choose()
+    for part in ("#point", "#stop"):
+        assert one.page.locator(part).evaluate(SEEN_AT), f"{part} is in sight at 400 %"
+    assert one.page.evaluate(WIDER) <= 0
+    assert one.page.locator("h1").count() == 1
+
+
+def test_the_pad_stays_where_it_is_during_a_pointing(pair: BOTH, visit: Visits) -> None:
+    one = visit(pair[0].url)
+    for width, height in ((1400, 950), (1024, 768), (390, 844)):
+        one.page.set_viewport_size({"width": width, "height": height})
+        one.frame()
+        before = "document.getElementById('pad').getBoundingClientRect().top + scrollY"
+        stood = one.page.evaluate(before)
+        one.choose()
+        assert one.page.evaluate(before) == stood
+        one.page.keyboard.press("p")
+        one.target("ended")
+        assert one.page.evaluate(before) == stood
+
+
+def test_long_names_scroll_nothing_sideways(pair: BOTH, visit: Visits, tmp_path: Path) -> None:
+    daemon, _ = pair
+    name = 40 * "W"
+    (tmp_path / f"{name}.yaml").write_text((tmp_path / "little.yaml").read_text())
+    with httpx.Client(base_url=f"{daemon.url}/api/v1", trust_env=False) as http:
+        http.post("/mast", json={"file": f"{name}.yaml"}).raise_for_status()
+        http.post(f"/places/{name}", json={"pan_rad": 0.1, "tilt_rad": 0.1}).raise_for_status()
+        http.post("/lease", json={"for_s": 60.0, "name": name}).raise_for_status()
+        http.post("/recordings/start", json={"name": name}).raise_for_status()
+        http.post("/recordings/stop")
+    one = visit(daemon.url)
+    one.page.get_by_role("button", name=name, exact=True).wait_for()
+    one.page.wait_for_selector(f"#control >> text={name}")
+    for width, height in (*SIZES.values(), (320, 256)):
+        one.page.set_viewport_size({"width": width, "height": height})
+        assert one.page.evaluate(WIDER) <= 0, (width, height)
+
+
+def test_an_emergency_stop_under_the_pointer_can_be_read(pair: BOTH, visit: Visits) -> None:
+    one = visit(pair[0].url, color_scheme="light")
+    one.word("ready")
+    one.page.locator("#latch").click()
+    one.page.wait_for_selector("#latch[aria-pressed=true]")
+    one.page.locator("#latch").hover()
+    style = "(b) => [getComputedStyle(b).color, getComputedStyle(b).backgroundColor]"
+    assert one.page.locator("#latch").evaluate(style) == ["rgb(255, 255, 255)", "rgb(198, 36, 26)"]
+    assert not one.serious("#latch")
+
+
+def test_single_keys_are_listed_and_can_be_switched_off(pair: BOTH, visit: Visits) -> None:
+    one = visit(pair[0].url)
+    one.choose()
+    one.page.keyboard.press("?")
+    keys = one.page.locator("#keys")
+    assert "STOP, wherever the focus is" in keys.inner_text()
+    assert not one.serious("#keys")
+    one.page.get_by_label("The keys P and ? do something").uncheck()
+    keys.get_by_role("button", name="Close").click()
+    one.page.keyboard.press("p")
+    one.page.keyboard.press("?")
+    assert not keys.is_visible() and not one.posts("/point")
+    one.page.reload()
+    one.choose()
+    one.page.keyboard.press("p")
+    one.page.get_by_role("button", name="Keys").click()
+    assert not one.posts("/point") and not one.page.get_by_label("The keys P and ?").is_checked()
+
+
+def test_who_steers_is_told_by_the_name_that_was_typed(pair: BOTH, visit: Visits) -> None:
+    one, other = visit(pair[0].url), visit(pair[0].url)
+    other.word("ready")
+    one.page.get_by_role("button", name="Your name").click()
+    assert not one.serious("#named")
+    one.page.get_by_label("Name", exact=True).fill("Žofie 李")
+    one.page.get_by_role("button", name="Keep it").click()
+    one.page.get_by_role("button", name="as Žofie 李").wait_for()
+    one.page.get_by_role("button", name="Take", exact=True).click()
+    one.page.wait_for_selector("#control >> text=you, renewed")
+    other.page.wait_for_selector("#control >> text=/^Žofie 李, \\d+ s left/")
+    other.page.locator("#home").click()
+    other.page.wait_for_selector("#jog .bad >> text=Žofie 李")
+
+
+def test_refusals_speak_the_units_that_were_typed(pair: BOTH, visit: Visits) -> None:
+    one = visit(pair[0].url)
+    one.word("ready")
+    said = one.page.locator("#jog .bad")
+
+    def refused(pan: str, place: str = "") -> str:
+        one.page.locator("#goal-pan").fill(pan)
+        one.page.locator("#goal-tilt").fill("0")
+        one.page.locator("#place-name").fill(place)
+        button = "Keep this place" if place else "Go"
+        one.page.get_by_role("button", name=button, exact=True).click()
+        one.page.wait_for_selector("#jog .bad:not(:empty)")
+        words = said.inner_text()
+        one.page.evaluate("document.querySelector('#jog .bad').textContent = ''")
+        assert not re.search(r"\brad\b|_rad|\^|\[\\|openapi", words), words
+        return words
+
+    assert "pan 120° is beyond the soft limit 114.59°" in refused("120")
+    assert "2000.0° where −360° to 360° is expected" in refused("2000")
+    assert "letters, digits" in refused("0", "a/b")
+    with httpx.Client(base_url=f"{pair[0].url}/api/v1", trust_env=False) as http:
+        told = http.post("/places/{a}", json={"pan_rad": 0.1, "tilt_rad": 0.1}).json()["error"]["message"]
+    assert told.startswith('name: "{a}" where a name of 1 to 40 letters, digits')
 
 
 def test_axe_finds_nothing_serious_in_dark_and_light(pair: BOTH, visit: Visits) -> None:
