@@ -150,7 +150,8 @@ def test_a_box_round_a_rock_begins_a_track_that_is_drawn_in_both_eyes(
     frame.focus()
     frame.hover(position={"x": 0.5 * box["width"], "y": 0.5 * box["height"]})  # where the head looks
     for _ in range(2):  # an image from before the drive
-        frame.evaluate("() => new Promise((go) => document.addEventListener('image-shown', go, {once: true}))")
+        shown = "() => new Promise((go) => document.addEventListener('image-shown', go, {once: true}))"
+        frame.evaluate(shown)
     one.page.keyboard.press("t")
     one.page.wait_for_selector("#track .word.tracking, #track .word.idle, #track .bad:not(:empty)")
     assert "tracking" in one.page.locator("#track").inner_text(), one.page.locator("#track").inner_text()
