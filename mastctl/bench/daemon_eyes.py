@@ -16,15 +16,20 @@ from calib.corners import CornersNotFound, find_corners
 from calib.files.mast_file import parse_rig
 from calib.fit.bench_terms import FEWEST_CORNERS
 from calib.mast.rig import Rig
-from mastctl.bench.eyes import Head, Look, NotThere, Seen
+from mastctl.bench.eyes import Head, Interrupted, Look, NoLight, NotThere, Seen
 from mastctl.client import Client, ClientError, Snapshot
-from mastctl.errors import MastctlError
 
 TURN_TIMEOUT_S = 90.0
 PATIENCE_S = 30.0
 """How long a camera or a head that fails is waited for: a cable is put back, a driver opens it again."""
 
 AGAIN_S = 1.0
+ADJUSTING_S = 1.0
+"""How long pictures without light are taken again: an automatic exposure needs some frames."""
+
+UNLIT = ("the picture is dark", "the picture is saturated")
+"""What a daemon says of pictures without light, or with too much of it."""
+
 COME_FROM_RAD = 0.06
 """How far beside an attitude the head goes first to come to it from the other side: more than any play."""
 
@@ -41,12 +46,6 @@ LASTING = frozenset(
     }
 )  # fmt: skip
 """What waiting does not mend: somebody has to do something."""
-
-
-class Interrupted(MastctlError):
-    """The bench cannot go on just now; nothing is lost."""
-
-    code = "interrupted"
 
 
 class DaemonEyes:
@@ -92,6 +91,8 @@ class DaemonEyes:
             longer than a cable takes to be put back.
         NotThere
             If the daemon does not turn there.
+        NoLight
+            If every camera that gives a picture has too little light there, or too much.
         """
         begun = time.monotonic()
         while True:
@@ -100,35 +101,40 @@ class DaemonEyes:
             except ClientError as error:
                 if error.code in ("outside_limits", "keep_out", "sun", "unreachable", "no_way"):
                     raise NotThere(str(error)) from None
-                if error.code in LASTING or time.monotonic() - begun > PATIENCE_S:
+                waited_s = time.monotonic() - begun
+                if _unlit(error) and waited_s > min(ADJUSTING_S, PATIENCE_S):
+                    raise NoLight(_sentence(error)) from None
+                if error.code in LASTING or waited_s > PATIENCE_S:
                     raise Interrupted(f"{_sentence(error)}") from None
                 time.sleep(AGAIN_S)
 
-    def pictures(self) -> Mapping[str, Snapshot]:
-        """Return a new picture of each camera; of those that give one."""
+    def _pictures(self) -> tuple[dict[str, Snapshot], dict[str, ClientError]]:
+        """A new picture of each camera that gives one, and why the others give none."""
         shots: dict[str, Snapshot] = {}
-        failure: ClientError | None = None
+        failed: dict[str, ClientError] = {}
         for camera in self._cameras:
             try:
                 shots[camera] = self._client.snapshot(camera)
             except ClientError as error:
-                failure = error
+                failed[camera] = error
                 if error.code in LASTING:
                     raise
-        if not shots and failure is not None:
-            raise failure
-        return shots
+        if not shots and failed:
+            raise max(failed.values(), key=_unlit)
+        return shots, failed
 
     def _look(self, pan_rad: float, tilt_rad: float, approach: tuple[int, int]) -> Look:
         begun_s = self._now_s()
         self._turn(pan_rad, tilt_rad, approach)
-        shots = self.pictures()
+        shots, failed = self._pictures()
         seconds = self._now_s() - begun_s
         if any(shot.moving for shot in shots.values()):
             raise ClientError("moving", "the head moved while the pictures were taken")
         found = dict(zip(shots, self._pool.map(self._seen, shots.values()), strict=True))
-        seen = [found[name] if name in found else _missing(name, shots) for name in self._cameras]
         one = next(iter(shots.values()))
+        for name, error in failed.items():
+            found[name] = Seen(name, one.pan_rad, one.tilt_rad, None, _without_picture(name, error))
+        seen = [found[name] for name in self._cameras]
         return Look(tuple(seen), _side(one, "pan_approach"), _side(one, "tilt_approach"), seconds)
 
     def _turn(self, pan_rad: float, tilt_rad: float, approach: tuple[int, int]) -> None:
@@ -219,9 +225,14 @@ def _side(shot: Snapshot, name: str) -> int:
     return 1 if told > SIDE else -1 if told < -SIDE else 0
 
 
-def _missing(camera: str, shots: Mapping[str, Snapshot]) -> Seen:
-    one = next(iter(shots.values()))
-    return Seen(camera, one.pan_rad, one.tilt_rad, None, f"camera {camera} gave no picture")
+def _unlit(error: ClientError) -> bool:
+    """Whether a daemon refused a picture for its light."""
+    return any(words in str(error) for words in UNLIT)
+
+
+def _without_picture(camera: str, error: ClientError) -> str:
+    """Why there is no picture of a camera beside another one's."""
+    return str(error).removeprefix(f"{camera}: ") if _unlit(error) else f"camera {camera} gave no picture"
 
 
 def _why(image: Any, reason: str) -> str:
@@ -243,6 +254,6 @@ def _sentence(error: ClientError) -> str:
     if error.code == "lease_over" and "the head was stopped" in str(error):
         how = str(error).removeprefix("the lease has ended: ").removesuffix("; acquire another")
         return f"{how}; 'mastctl reset' releases it" if "emergency" in how else how
-    if "picture is dark" in str(error):
+    if UNLIT[0] in str(error):
         return f"{error}; turn on a light, or let the camera expose longer"
     return str(error)

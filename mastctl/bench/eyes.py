@@ -16,6 +16,18 @@ class NotThere(MastctlError):
     code = "not_there"
 
 
+class Interrupted(MastctlError):
+    """The bench cannot go on just now; nothing is lost."""
+
+    code = "interrupted"
+
+
+class NoLight(Interrupted):
+    """Every camera's picture at an attitude is too dark, or too bright, to be used; elsewhere it may do."""
+
+    code = "interrupted"
+
+
 @dataclass(frozen=True, eq=False)
 class Seen:
     """One camera's picture of a look.
@@ -106,6 +118,8 @@ class Eyes(Protocol):
         ------
         NotThere
             If the head must not go there.
+        NoLight
+            If the pictures are too dark or too bright.
         MastctlError
             If the head does not get there, or no camera gives a picture.
         """

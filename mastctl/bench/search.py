@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
@@ -12,14 +12,12 @@ from calib.bench.knowledge import Knowledge
 from calib.bench.placements import Placement
 from calib.bench.poses import Sought, readings
 from calib.errors import CalibError, Unreachable
-from mastctl.bench.eyes import Eyes, Look, NotThere
+from mastctl.bench.eyes import Eyes, Look, NoLight, NotThere
 from mastctl.bench.teller import Teller
 from mastctl.errors import MastctlError
 
 OVERLAP = 0.7
 """Of a picture's view: how far apart the looks of a search are."""
-
-MOST_LOOKS = 120
 
 TELLING = ("another board", "mirrored", "two boards")
 """What `calib.corners` says of a board in view that is not the one that is looked for."""
@@ -27,9 +25,8 @@ TELLING = ("another board", "mirrored", "two boards")
 LOOKS_BESIDE = 8
 """Looks after such a one: the right board may hang beside it."""
 
-SPOILED = ("too dark", "too bright", "next to nothing", "is blurred", "during its exposure")
-SPOILED_LOOKS, MOSTLY = 24, 0.9
-"""If so many looks, and so large a part of them, were no good, no other will be."""
+MOST_KINDS = 4
+"""So many things that were seen instead are told, the most frequent."""
 
 _NUMBERS = re.compile(r"[-+]?[0-9][0-9.]*")
 
@@ -50,29 +47,35 @@ class Search:
     def find(self, placement: Placement) -> Look:
         """Return the first look that shows the board.
 
+        Views without light or with nothing in them end nothing: the board may stand beside them.
+
         Raises
         ------
         BoardNotFound
-            With what the pictures showed instead.
+            With what the pictures showed instead, and where.
         """
-        whys = _Whys()
-        for pan_rad, tilt_rad in self._attitudes(placement):
+        attitudes = list(self._attitudes(placement))
+        instead = _Instead()
+        for at_rad in attitudes:
             try:
-                look = self._eyes.look(pan_rad, tilt_rad)
+                look = self._eyes.look(*at_rad)
             except NotThere as reason:
-                whys.refused(str(reason))
+                instead.refused(str(reason), at_rad)
                 continue
-            if any(one.camera in self._on_head for one in look.found):
-                return look
-            whys.add(look)
-            if whys.looks == 1:
-                self._teller.say("the board is not where it was asked for; looking around")
-            if whys.decided or whys.looks >= MOST_LOOKS:
+            except NoLight as reason:
+                instead.looked([str(reason).partition("; ")[0]], at_rad)
+            else:
+                if any(one.camera in self._on_head for one in look.found):
+                    return look
+                instead.looked([one.why for one in look.seen if one.why], at_rad)
+            if instead.looks == 1:
+                words = f"({instead.told}); looking around, {len(attitudes) - 1} looks at most"
+                self._teller.say(f"the board is not where it was asked for {words}")
+            if instead.another_board:
                 break
-        everywhere = "" if whys.decided else " all over the head's limits"
-        count = "1 look" if whys.looks == 1 else f"{whys.looks} looks"
+        everywhere = "" if instead.another_board else " all over the head's limits"
         raise BoardNotFound(
-            f"the board was not found in {count}{everywhere} ({whys.shown}); place it as "
+            f"the board was not found in {_counted(instead.looks)}{everywhere} ({instead.told}); place it as "
             "asked, in the light, facing the head, and start the same command again"
         )
 
@@ -108,52 +111,61 @@ class Search:
             return min(max(pan, limits[0][0]), limits[0][1]), min(max(tilt, limits[1][0]), limits[1][1])
 
 
-class _Whys:
-    """What looks showed instead of the board."""
+class _Instead:
+    """What looks showed instead of the board, and where."""
 
     def __init__(self) -> None:
         self.looks = 0
-        self._counts: dict[str, int] = {}
+        self._first_other = 0
         self._told: dict[str, str] = {}
-        self._first_telling = 0
+        self._where: dict[str, list[tuple[float, float]]] = {}
 
-    def refused(self, reason: str) -> None:
-        """Count an attitude that the head does not turn to."""
-        self._count(reason)
+    def refused(self, reason: str, at_rad: tuple[float, float]) -> None:
+        """Keep an attitude that the head does not turn to."""
+        kind = _NUMBERS.sub("", reason)  # the same thing with other numbers is the same
+        self._told.setdefault(kind, reason)
+        self._where.setdefault(kind, []).append(at_rad)
 
-    def add(self, look: Look) -> None:
-        """Count a look; the same thing with other numbers is the same."""
+    def looked(self, whys: Sequence[str], at_rad: tuple[float, float]) -> None:
+        """Keep why a look does not show the board, camera by camera."""
         self.looks += 1
-        whys = {_NUMBERS.sub("", one.why): one.why for one in look.seen if one.why}
-        for why in whys.values():
-            self._count(why)
-        if not self._first_telling and any(_has(why, TELLING) for why in whys):
-            self._first_telling = self.looks
+        for why in {_NUMBERS.sub("", why): why for why in whys}.values():
+            self.refused(why, at_rad)
+        if not self._first_other and any(_is_another(why) for why in whys):
+            self._first_other = self.looks
 
     @property
-    def decided(self) -> bool:
-        """Whether looking further shows nothing else: another board is there, or pictures are no good."""
-        if self._first_telling and self.looks >= self._first_telling + LOOKS_BESIDE:
-            return True
-        spoiled = sum(count for why, count in self._counts.items() if _has(why, SPOILED))
-        return self.looks >= SPOILED_LOOKS and spoiled >= MOSTLY * self.looks
+    def another_board(self) -> bool:
+        """Whether another board is there, and the right one not beside it."""
+        return bool(self._first_other) and self.looks >= self._first_other + LOOKS_BESIDE
 
     @property
-    def shown(self) -> str:
-        """The sentence that tells most."""
-        if not self._counts:
+    def told(self) -> str:
+        """What was seen, and where: another board first, then what most views showed."""
+        if not self._where:
             return "no corners were found"
-        most = max(self._counts, key=lambda why: (_has(why, TELLING), self._counts[why]))
-        return self._told[most]
-
-    def _count(self, why: str) -> None:
-        kind = _NUMBERS.sub("", why)
-        self._counts[kind] = self._counts.get(kind, 0) + 1
-        self._told.setdefault(kind, why)
+        kinds = sorted(self._where, key=lambda kind: (not _is_another(kind), -len(self._where[kind])))
+        words = [f"{self._told[kind]}, {_place(self._where[kind])}" for kind in kinds[:MOST_KINDS]]
+        more = len(kinds) - len(words)
+        return "; ".join([*words, f"{more} other reasons"] if more else words)
 
 
-def _has(why: str, words: tuple[str, ...]) -> bool:
-    return any(word in why for word in words)
+def _is_another(why: str) -> bool:
+    return any(words in why for words in TELLING)
+
+
+def _counted(looks: int) -> str:
+    return "1 look" if looks == 1 else f"{looks} looks"
+
+
+def _place(attitudes_rad: Sequence[tuple[float, float]]) -> str:
+    """How often, and within which angles, as a person reads it."""
+    told = []
+    for name, angles_rad in zip(("pan", "tilt"), zip(*attitudes_rad, strict=True), strict=True):
+        low, high = (f"{math.degrees(end(angles_rad)):+.0f}" for end in (min, max))
+        told.append(f"{name} {low}" if low == high else f"{name} {low} to {high}")
+    times = "once" if len(attitudes_rad) == 1 else f"{len(attitudes_rad)} times"
+    return f"{times} at {', '.join(told)} degrees"
 
 
 def _steps(low: float, high: float, middle: float, step: float) -> list[float]:

@@ -192,7 +192,7 @@ def _drive(args: argparse.Namespace) -> int:
     from calib.boards import load_board
     from calib.fit.bench import BenchNotFitted
     from calib.survey.bench_writer import NotWritten
-    from mastctl.bench.daemon_eyes import Interrupted
+    from mastctl.bench.eyes import Interrupted
     from mastctl.bench.looks import BoardLost
     from mastctl.bench.result import finish
     from mastctl.bench.search import BoardNotFound
@@ -240,7 +240,8 @@ def _go_on(args: argparse.Namespace, reason: Exception, folder: Path) -> bool:
 def _bench(args: argparse.Namespace, board: Any, folder: Path) -> Iterator[tuple[BenchRun, Teller]]:
     """A run on a daemon that runs, or on one that is started for it, under a lease."""
     from calib.survey import Sigma
-    from mastctl.bench.daemon_eyes import DaemonEyes, Interrupted
+    from mastctl.bench.daemon_eyes import DaemonEyes
+    from mastctl.bench.eyes import Interrupted
     from mastctl.bench.fitting import fit_in_rover
     from mastctl.bench.folder import Kept, kept_frame, survey_cameras
     from mastctl.bench.run import BenchRun

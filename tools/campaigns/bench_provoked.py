@@ -14,6 +14,7 @@ import argparse
 import contextlib
 import io
 import json
+import math
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -23,6 +24,7 @@ from typing import Any
 
 import cv2
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from calib.boards import AnyBoard, AprilGrid, Charuco, save_board
 from calib.boards.board_file import document_of
@@ -39,6 +41,9 @@ from tools.arguments import end
 
 PRINTED = Charuco(10, 6, 0.055, 0.04125)
 LEFT, RIGHT = "navcam_left", "navcam_right"
+PAN_AXIS_M = (0.3443, -0.0043)
+"""x and y in the rover, of configs/sim/rocky8.yaml."""
+
 HALF_WAY = 6
 """Looks after which something happens."""
 
@@ -48,14 +53,16 @@ Change = Callable[[str, Image], Image]
 
 @dataclass(frozen=True)
 class Case:
-    """Something wrong: from which look on, what is done to the rover, what to pictures, and which board it is
-    that stands there."""
+    """Something wrong: from which look on, what is done to the rover, once or before each picture, what to
+    pictures, which board it is that stands there, and how far to the right of where it was asked for."""
 
     name: str
     after: int = 0
     act: Act = lambda client: None
     change: Change = lambda camera, image: image
     stands: AnyBoard = PRINTED
+    aside_deg: float = 0.0
+    always: bool = False
 
 
 def board_aside(client: Client) -> None:
@@ -74,7 +81,7 @@ def twin_board(client: Client) -> None:
 
 def slipped(client: Client) -> None:
     """The whole rover turns by 10 mrad about its pan axis, and so the head, which reads what it read."""
-    turn_rad, (ahead_m, aside_m) = 0.01, (0.3443, -0.0043)  # of configs/sim/rocky8.yaml
+    turn_rad, (ahead_m, aside_m) = 0.01, PAN_AXIS_M
     client.stand(turn_rad * aside_m, -turn_rad * ahead_m, turn_rad)
 
 
@@ -88,6 +95,15 @@ def dark(client: Client) -> None:
     """The lamp is off."""
     for camera in (LEFT, RIGHT):
         client.set_fault(camera, "dark")
+
+
+def night(client: Client) -> None:
+    """Light falls on the board only: where it is out of the picture nothing is seen."""
+    x, y, _ = client.boards()[BOARD]["position_m"]
+    pan_rad = (client.status()["joints"] or {})["pan_rad"]
+    client.clear_faults()
+    if abs(math.atan2(y - PAN_AXIS_M[1], x - PAN_AXIS_M[0]) - pan_rad) > math.radians(32.0):
+        dark(client)
 
 
 def refocused(camera: str, image: Image) -> Image:
@@ -117,6 +133,8 @@ CASES = (
     Case("another kind of board", stands=AprilGrid(6, 4, 0.061, 0.0183)),
     Case("half a per cent larger than stated", stands=Charuco(10, 6, 0.055275, 0.04145625)),
     Case("mirrored print", change=mirrored),
+    Case("34 degrees aside, and night but there", act=night, always=True, aside_deg=34.0),
+    Case("100 degrees aside, and night but there", act=night, always=True, aside_deg=100.0),
     Case("two boards of the same ids", 1, twin_board),
     Case("board moved 2 cm in a placement", HALF_WAY, board_aside),
     Case("pan slipped by 10 mrad", HALF_WAY, slipped),
@@ -138,7 +156,7 @@ def provoked(case: Case) -> Iterator[None]:
 
     def look(client: Client, camera: str, *args: Any, **options: Any) -> Snapshot:
         nonlocal looks, acted
-        if looks >= case.after and not acted:
+        if looks >= case.after and (case.always or not acted):
             acted = True
             case.act(client)
         shot = snapshot(client, camera, *args, **options)
@@ -152,6 +170,12 @@ def provoked(case: Case) -> Iterator[None]:
 
     def put(client: Client, name: str, position_m: Any, board: Any = None, **options: Any) -> Any:
         printed = document_of(case.stands) if board is not None and name == BOARD else board
+        if case.aside_deg and name == BOARD:
+            turn = Rotation.from_euler("z", case.aside_deg, degrees=True)
+            axis_m = np.array([*PAN_AXIS_M, 0.0])
+            position_m = (axis_m + turn.apply(np.subtract(position_m, axis_m))).tolist()
+            stood = Rotation.from_quat(options["quaternion"], scalar_first=True)
+            options["quaternion"] = (turn * stood).as_quat(scalar_first=True).tolist()
         return put_board(client, name, position_m, printed, **options)
 
     Client.snapshot, Client.put_board = look, put  # type: ignore[assignment,method-assign]

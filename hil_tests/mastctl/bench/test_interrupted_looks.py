@@ -18,7 +18,8 @@ from calib.boards import Charuco
 from hil_tests import forks
 from hil_tests.waiting import until
 from mastctl.bench import daemon_eyes
-from mastctl.bench.daemon_eyes import DaemonEyes, Interrupted, _beside
+from mastctl.bench.daemon_eyes import DaemonEyes, _beside
+from mastctl.bench.eyes import Interrupted
 from mastctl.client import Client
 
 BOARD = Charuco(10, 7, 0.055, 0.042)
