@@ -13,6 +13,7 @@ import subprocess
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -123,20 +124,36 @@ def test_killed_during_a_jog_the_head_goes_no_further_than_the_goal_ahead_whatev
     bench: Bench,
 ) -> None:
     with daemon_process(bench.folder, bench.config) as daemon, Client(line(daemon)) as client:
-        with pytest.raises(ClientError) as gone, client.jog() as jog:
-            jog.rates(SPEED_RAD_PER_S, 0.0)
-            until(lambda: bench.pan_rad > 0.02, "the jog")
+        with pytest.raises(ClientError) as gone, contextlib.ExitStack() as jogs:
+            jog = turning(client, bench, jogs)
             daemon.kill()
             daemon.wait(NET_S)
             killed_at_rad = bench.pan_rad
             until(bench.stands, "the head stands")
             stood_at_rad = bench.pan_rad
             until(lambda: not_taken(jog), "a heartbeat is missed")
-        assert gone.value.code == "no_daemon"
+        assert gone.value.code in ("no_daemon", "jog_ended")  # the latter where one was late before the kill
     assert 0.0 <= stood_at_rad - killed_at_rad <= SPEED_RAD_PER_S * JOG_GOES_ON_S + COUNTS_RAD
     done = bench.halt()
     assert done.returncode == 0, done.stderr
     assert abs(bench.pan_rad - stood_at_rad) < COUNTS_RAD
+
+
+def turning(client: Client, bench: Bench, jogs: contextlib.ExitStack) -> Jog:
+    """A jog under which the head turns: begun anew where a busy machine was late with a heartbeat."""
+    while True:
+        jog = client.jog().__enter__()
+        jog.rates(SPEED_RAD_PER_S, 0.0)
+        until(partial(turns_or_ended, bench, jog), "the jog")
+        if not not_taken(jog):
+            jogs.push(jog)
+            return jog
+        with contextlib.suppress(ClientError):
+            jog.__exit__(None)
+
+
+def turns_or_ended(bench: Bench, jog: Jog) -> bool:
+    return bench.pan_rad > 0.02 or not_taken(jog)
 
 
 def not_taken(jog: Jog) -> bool:
