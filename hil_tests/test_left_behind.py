@@ -68,12 +68,17 @@ LEFT_BY_IT = {
 }
 
 
+IN_WORKERS = pytest.mark.long(2, "four cases in workers of xdist; one is in the quick run")
+
+
 @pytest.mark.parametrize(
     ("what", "workers"),
     [
-        ("nothing", 0), ("folder", 0), ("process", 0), ("folder", 1), ("nothing", 1),
-        ("place of a head", 0), ("place of a head", 2), ("state folder", 0), ("state folder", 1),
-        ("nothing of ours", 0), ("nothing of ours", 1),
+        ("nothing", 0), ("folder", 0), ("process", 0), ("place of a head", 0), ("state folder", 0),
+        ("nothing of ours", 0), ("folder", 1), pytest.param("nothing", 1, marks=IN_WORKERS),
+        pytest.param("place of a head", 2, marks=IN_WORKERS),
+        pytest.param("state folder", 1, marks=IN_WORKERS),
+        pytest.param("nothing of ours", 1, marks=IN_WORKERS),
     ],
 )  # fmt: skip
 def test_what_is_left_behind_fails_the_run(repository: Path, tmp_path: Path, what: str, workers: int) -> None:

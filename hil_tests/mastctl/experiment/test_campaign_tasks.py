@@ -33,6 +33,7 @@ def run(repository: Path, *words: str) -> tuple[str, str]:
     return "\n".join(line for line in done.stdout.splitlines() if "µs" not in line), done.stderr
 
 
+@pytest.mark.long(2, "five processes; test_dask.py compares tasks with a cluster in the quick run")
 def test_a_campaign_tells_the_same_of_one_process_two_and_its_tasks_one_by_one(
     repository: Path, tmp_path: Path
 ) -> None:

@@ -38,7 +38,12 @@ def config_of(folder: Path, bump_rad: float) -> Config:
     return replace(config, hardware=replace(config.hardware, simulation=simulation))
 
 
-@pytest.mark.parametrize("bump_rad", [0.0, BUMP_RAD], ids=["as calibrated", "bumped"])
+AS_CALIBRATED = pytest.mark.long(3, "the case of no bump; test_evidence.py has honest days quickly")
+
+
+@pytest.mark.parametrize(
+    "bump_rad", [pytest.param(0.0, marks=AS_CALIBRATED), BUMP_RAD], ids=["as calibrated", "bumped"]
+)
 def test_a_bumped_camera_is_named_and_one_that_stands_is_not(tmp_path: Path, bump_rad: float) -> None:
     with RunningDaemon(config_of(tmp_path, bump_rad)) as daemon, Client(daemon.url) as client:
         said = []

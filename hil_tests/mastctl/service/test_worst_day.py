@@ -9,6 +9,7 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+import pytest
 
 from hil_tests.waiting import until
 from mastctl.config import load_config
@@ -66,6 +67,7 @@ def test_who_does_not_let_the_mast_settle_points_beside_and_is_told_another_resi
     assert max(np.abs(truly_px - told["residual_px"]).max() for told, truly_px in found) > 0.6
 
 
+@pytest.mark.long(1, "draws the worst day twice more; a kind day is drawn twice in the quick run")
 def test_two_worst_days_of_one_seed_are_the_same_to_the_last_bit() -> None:
     runs = []
     for _ in range(2):
